@@ -1,0 +1,109 @@
+"""The canonical log: named SI channels over one clock, as it lies on disk (Parquet, metadata inside)."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from residnet.core.errors import DataError, UsageError
+from residnet.core.names import CHANNEL_UNITS, nearest
+
+SCHEMA = "residnet.log/1"
+
+
+@dataclass(frozen=True)
+class Log:
+    """One recorded or simulated manoeuvre.
+
+    Attributes:
+        name: unique within a run; the stem of its file names.
+        t: time [T] in s, strictly increasing, on the log's own clock.
+        channels: name -> values [T], float64, SI and radians; psi unwrapped; NaN where nothing was measured.
+        units: name -> SI unit.
+        manoeuvre: kind of manoeuvre, for example `zigzag`; `unknown` where nobody said.
+        masks: reason -> [T] bool, True where samples must not be scored or learned from.
+        meta: anything else worth keeping (source file, SHA-256, set-up); JSON values only.
+    """
+
+    name: str
+    t: np.ndarray
+    channels: dict[str, np.ndarray]
+    units: dict[str, str] = field(default_factory=dict)
+    manoeuvre: str = "unknown"
+    masks: dict[str, np.ndarray] = field(default_factory=dict)
+    meta: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name, values in self.channels.items():
+            if values.shape != self.t.shape:
+                raise DataError(f"log {self.name}: channel {name} has {values.size} samples, time has {self.t.size}")
+        missing = {name: CHANNEL_UNITS.get(name, "-") for name in self.channels if name not in self.units}
+        object.__setattr__(self, "units", {**self.units, **missing})
+
+    def __len__(self) -> int:
+        return int(self.t.size)
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """Values [T] of one channel.
+
+        Raises:
+            UsageError: where the log has no such channel.
+        """
+        if name not in self.channels:
+            raise UsageError(f"log {self.name}: no channel '{name}'{nearest(name, self.channels)}")
+        return self.channels[name]
+
+    def stack(self, names: tuple[str, ...] | list[str]) -> np.ndarray:
+        """Channels side by side, [T, len(names)]."""
+        return np.stack([self[name] for name in names], axis=-1) if names else np.zeros((len(self), 0))
+
+    @property
+    def usable(self) -> np.ndarray:
+        """[T] bool: samples that no mask excludes."""
+        bad = np.zeros(len(self), dtype=bool)
+        for mask in self.masks.values():
+            bad |= mask
+        return ~bad
+
+    def replace(self, **changes: Any) -> Log:
+        """A copy with some attributes changed."""
+        return dataclasses.replace(self, **changes)
+
+    def save(self, path: Path) -> None:
+        """Write the canonical Parquet file: columns t, channels, `mask:<reason>`; the rest as JSON in its metadata."""
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        columns = {"t": self.t, **self.channels, **{f"mask:{reason}": mask for reason, mask in self.masks.items()}}
+        about = {"schema": SCHEMA, "name": self.name, "manoeuvre": self.manoeuvre, "units": self.units, "meta": self.meta}
+        table = pa.table(columns).replace_schema_metadata({"residnet": json.dumps(about)})
+        pq.write_table(table, path)
+
+    @classmethod
+    def load(cls, path: Path) -> Log:
+        """Read a file that `save` wrote.
+
+        Raises:
+            UsageError: where the file is missing or not a canonical log.
+        """
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        try:
+            table = pq.read_table(path)
+        except FileNotFoundError as error:
+            raise UsageError(f"{path}: no such file") from error
+        except pa.ArrowException as error:
+            raise UsageError(f"{path}: not a Parquet file ({str(error).splitlines()[0]})") from error
+        about = json.loads((table.schema.metadata or {}).get(b"residnet", b"{}"))
+        if about.get("schema") != SCHEMA:
+            raise UsageError(f"{path}: not a residnet log ({SCHEMA}); give a channel map to read a foreign table")
+        columns = {name: table.column(name).to_numpy() for name in table.column_names}
+        masks = {n.removeprefix("mask:"): c.astype(bool) for n, c in columns.items() if n.startswith("mask:")}
+        channels = {n: c for n, c in columns.items() if n != "t" and not n.startswith("mask:")}
+        return cls(about["name"], columns["t"], channels, about["units"], about["manoeuvre"], masks, about["meta"])
