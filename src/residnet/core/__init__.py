@@ -1,0 +1,1 @@
+"""What everything else stands on: errors, names and units, frames, the canonical log, configuration."""

@@ -1,0 +1,206 @@
+"""One line out of pydantic's validation errors: which key, what is wrong, what was given, the nearest valid name."""
+
+from __future__ import annotations
+
+import re
+import types
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
+
+from residnet.core.config_yaml import KeyPath
+from residnet.core.names import nearest
+
+_EXPECTED = {
+    "int_type": "a whole number",
+    "int_from_float": "a whole number",
+    "int_parsing": "a whole number",
+    "float_type": "a number",
+    "float_parsing": "a number",
+    "string_type": "text",
+    "bool_type": "true or false",
+    "bool_parsing": "true or false",
+    "none_required": "null",
+    "list_type": "a list",
+    "tuple_type": "a list",
+    "set_type": "a list",
+    "frozen_set_type": "a list",
+    "dict_type": "a mapping",
+    "model_type": "a mapping",
+    "model_attributes_type": "a mapping",
+}
+_LONGEST_VALUE = 60
+
+
+@dataclass(frozen=True)
+class _Fault:
+    kind: str
+    path: KeyPath
+    text: str
+
+
+def describe(error: ValidationError, model: Any, where: Callable[[KeyPath], str]) -> str:
+    """The first fault of `error` as one line.
+
+    Args:
+        error: what pydantic raised.
+        model: the type that was validated against.
+        where: file (with line) or override in which the value at a key path was set.
+    """
+    faults = [_fault(details, model) for details in error.errors(include_url=False)]
+    # a mistyped key is also a missing one; the typo is what the user has to see
+    first = next((fault for fault in faults if fault.kind == "extra_forbidden"), faults[0])
+    # below a plain union, the member that got furthest into the value is the one that was meant
+    first = max((fault for fault in faults if fault.path[: len(first.path)] == first.path), key=lambda fault: len(fault.path))
+    text = _either([fault.text for fault in faults if fault.path == first.path])
+    others = {fault.path for fault in faults if first.path[: len(fault.path)] != fault.path}
+    more = f" (and {len(others)} more)" if others else ""
+    key = ".".join(str(element) for element in first.path)
+    return " ".join(f"{where(first.path)}: {key + ': ' if key else ''}{text}{more}".split())
+
+
+def _either(texts: list[str]) -> str:
+    """Complaints of all members of a union about one value, in one phrase."""
+    texts = list(dict.fromkeys(texts))
+    split = [re.fullmatch(r"expected (.*?)( \(given .*\))", text) for text in texts]
+    if all(split):
+        parts = [match for match in split if match]
+        return "expected " + " or ".join(dict.fromkeys(match[1] for match in parts)) + parts[0][2]
+    return "; or ".join(texts)
+
+
+def _fault(details: ErrorDetails, model: Any) -> _Fault:
+    path, parents, here = _locate(details["loc"], model)
+    kind, context, value = details["type"], details.get("ctx", {}), details["input"]
+    match kind:
+        case "missing" if path and isinstance(path[-1], int):
+            return _Fault(kind, path[:-1], f"item {path[-1]} is missing {_given(value)}")
+        case "missing":
+            text = "missing"
+        case "extra_forbidden":
+            text = f"unknown key{nearest(str(path[-1]), _keys(parents))}"
+        case "union_tag_invalid":
+            path += _discriminator(context)
+            text = f"unknown value '{context['tag']}'{nearest(str(context['tag']), _quoted(context['expected_tags']))}"
+        case "union_tag_not_found":
+            path += _discriminator(context)
+            text = f"missing{nearest('', _tags(here, path[-1]))}"
+        case "literal_error" | "enum":
+            valid = _quoted(context["expected"])
+            unknown = isinstance(value, str) and bool(valid)
+            text = f"unknown value '{value}'{nearest(value, valid)}" if unknown else f"expected {context['expected']} {_given(value)}"
+        case "value_error" | "assertion_error":
+            text = _own_text(str(context["error"]), value)
+        case _ if kind in _EXPECTED:
+            text = f"expected {_EXPECTED[kind]} {_given(value)}"
+        case _:
+            text = f"{details['msg'].replace('Input should', 'must')} {_given(value)}"
+    return _Fault(kind, path, text)
+
+
+def _own_text(text: str, value: Any) -> str:
+    # a validator of a whole section has said which of its keys it means; the section itself would only fill the line
+    scalar = isinstance(value, (str, int, float)) and str(value) not in text
+    return f"{text} {_given(value)}" if scalar else text
+
+
+def _given(value: Any) -> str:
+    text = repr(value)
+    return f"(given {text if len(text) <= _LONGEST_VALUE else text[: _LONGEST_VALUE - 4] + ' ...'})"
+
+
+def _quoted(text: str) -> list[str]:
+    return re.findall(r"'([^']*)'", text)
+
+
+def _discriminator(context: dict[str, Any]) -> KeyPath:
+    # pydantic quotes the name of a key; a callable discriminator has none
+    return tuple(_quoted(context["discriminator"])[:1])
+
+
+def _locate(loc: tuple[str | int, ...], model: Any) -> tuple[KeyPath, tuple[Any, ...], tuple[Any, ...]]:
+    """Key path that the user wrote, types that may hold its last key, and types of its value.
+
+    pydantic puts the chosen member of a union between the keys; only the types tell such a label from a key.
+    """
+    path: list[str | int] = []
+    parents: tuple[Any, ...] = ()
+    here = _members(model)
+    for element in loc:
+        if any(_is_union(kind) for kind in here):
+            here = _chosen(here, str(element))
+        elif element != "[key]":
+            path.append(element)
+            parents, here = here, tuple(inner for kind in here for inner in _inner(kind, element))
+    return tuple(path), parents, here
+
+
+def _plain(annotation: Any) -> Any:
+    """The type without the wrappers that add nothing to an error's location: Annotated and `| None`."""
+    while True:
+        if get_origin(annotation) is Annotated:
+            annotation = get_args(annotation)[0]
+        elif _is_union(annotation) and len(_options(annotation)) == 1:
+            annotation = _options(annotation)[0]
+        else:
+            return annotation
+
+
+def _is_union(annotation: Any) -> bool:
+    return get_origin(annotation) in (Union, types.UnionType)
+
+
+def _options(union: Any) -> list[Any]:
+    return [member for member in get_args(union) if member is not type(None)]
+
+
+def _members(annotation: Any) -> tuple[Any, ...]:
+    return (_plain(annotation),)
+
+
+def _chosen(kinds: tuple[Any, ...], label: str) -> tuple[Any, ...]:
+    """Members of unions that pydantic's label stands for: a discriminator's value or the name of a type; all where none fits."""
+    options = [_plain(member) for kind in kinds if _is_union(kind) for member in _options(kind)]
+    by_tag = [option for option in options if any(label in values for values in _literals(option).values())]
+    words = re.findall(r"\w+", label)
+    by_name = [option for option in options if getattr(get_origin(option) or option, "__name__", "") in words]
+    return tuple(by_tag or by_name or options)
+
+
+def _inner(kind: Any, element: str | int) -> list[Any]:
+    """Types of what stands under `element` in a value of type `kind`."""
+    if _is_model(kind):
+        return [_plain(annotation) for key, annotation in _fields(kind).items() if key == element]
+    arguments = get_args(kind)
+    if get_origin(kind) is tuple and isinstance(element, int) and Ellipsis not in arguments:
+        return [_plain(argument) for argument in arguments[element : element + 1]]
+    # a mapping's values come last, a list's items first and last
+    return [_plain(argument) for argument in arguments if argument is not Ellipsis][-1:]
+
+
+def _is_model(kind: Any) -> bool:
+    return isinstance(kind, type) and issubclass(kind, BaseModel)
+
+
+def _fields(model: type[BaseModel]) -> dict[str, Any]:
+    return {field.alias or name: field.annotation for name, field in model.model_fields.items()}
+
+
+def _keys(kinds: tuple[Any, ...]) -> list[str]:
+    return [key for kind in kinds if _is_model(kind) for key in _fields(kind)]
+
+
+def _literals(kind: Any) -> dict[str, tuple[Any, ...]]:
+    """Fields of a model that take only fixed values, with these values."""
+    if not _is_model(kind):
+        return {}
+    plain = {key: _plain(annotation) for key, annotation in _fields(kind).items()}
+    return {key: get_args(annotation) for key, annotation in plain.items() if get_origin(annotation) is Literal}
+
+
+def _tags(kinds: tuple[Any, ...], key: str | int) -> list[str]:
+    options = [_plain(member) for kind in kinds if _is_union(kind) for member in _options(kind)]
+    return [str(tag) for option in options for tag in _literals(option).get(str(key), ())]
