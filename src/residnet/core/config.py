@@ -6,7 +6,7 @@ no number, `64.0` is no count. Dimensional values are SI numbers or text with a 
 
 from __future__ import annotations
 
-import json
+import math
 import os
 import re
 from collections.abc import Sequence
@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar, overload
 
 from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, TypeAdapter, ValidationError, ValidationInfo
-from pydantic_core import CoreSchema, core_schema
+from pydantic_core import CoreSchema, PydanticSerializationError, core_schema, to_json
 from yaml.nodes import Node
 
-from residnet.core.config_errors import describe
+from residnet.core.config_errors import describe, given
 from residnet.core.config_yaml import KeyPath, dump, line_of, parse
 from residnet.core.errors import ConfigError, UsageError
 from residnet.core.names import nearest, si_unit, to_si, units
@@ -50,27 +50,37 @@ class Quantity:
             raise UsageError(f"unit '{self.si}' is not SI; the SI unit is '{si_unit(self.si)}'")
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        """Schema of a finite float behind the conversion."""
-        return core_schema.no_info_before_validator_function(self.convert, core_schema.float_schema(allow_inf_nan=False))
+        """The float's own schema, constraints included, behind the conversion."""
+        return core_schema.no_info_before_validator_function(self.convert, handler(source))
 
-    def convert(self, value: object) -> int | float:
+    def convert(self, value: object) -> float:
         """Value in SI.
 
         Raises:
-            ValueError: where the value is not a number or `<number> <unit>`, or the unit is unknown or of another dimension.
+            ValueError: where the value is not a finite number or `<number> <unit>`, or the unit is unknown or of another dimension.
         """
+        try:
+            si = self._parsed(value)
+        except OverflowError:
+            si = math.inf
+        if not math.isfinite(si):
+            raise ValueError(f"must be a finite number {given(value)}")
+        return si
+
+    def _parsed(self, value: object) -> float:
         if isinstance(value, (int, float)) and not isinstance(value, bool):
-            return value
+            return float(value)
         match = _QUANTITY.fullmatch(value) if isinstance(value, str) else None
         if match is None:
-            raise ValueError(f"expected a number in {self.si} or text such as '1.5 {self._fitting()[-1]}' (given {value!r})")
+            example = next((unit for unit in self._fitting() if unit != self.si), self.si)
+            raise ValueError(f"expected a number in {self.si} or text such as '1.5 {example}' {given(value)}")
         number, unit = match.groups()
         if unit and unit not in units():
-            raise ValueError(f"unknown unit '{unit}'{nearest(unit, self._fitting())} (given {value!r})")
+            raise ValueError(f"unknown unit '{unit}'{nearest(unit, self._fitting())} {given(value)}")
         try:
             return float(number) * to_si(unit or self.si, self.si)
         except UsageError as error:
-            raise ValueError(f"{error} (given {value!r})") from error
+            raise ValueError(f"{error} {given(value)}") from error
 
     def _fitting(self) -> list[str]:
         return [unit for unit in units() if si_unit(unit) == self.si]
@@ -111,7 +121,7 @@ class _PathRule:
 
     def resolve(self, value: object, info: ValidationInfo) -> Path:
         if not isinstance(value, (str, Path)) or not str(value):
-            raise ValueError(f"expected a path (given {value!r})")
+            raise ValueError(f"expected a path {given(value)}")
         path = _expanded(str(value))
         folder: Path | None = (info.context or {}).get("folder")
         places = [place / path for place in (folder, Path.cwd()) if place is not None]
@@ -131,7 +141,7 @@ def _expanded(text: str) -> Path:
     try:
         return Path(re.sub(r"\$\{([^}]*)\}", environment, text)).expanduser()
     except RuntimeError as error:
-        raise ValueError(f"{error} (given {text!r})") from error
+        raise ValueError(f"no home folder is known for '~' {given(text)}") from error
 
 
 def _exists(path: Path) -> bool:
@@ -167,12 +177,15 @@ class _Origin:
     overrides: tuple[_Override, ...] = ()
 
     def of(self, path: KeyPath) -> str:
+        """Source of the value at `path`: the last override that set it, else the file; and the last one that changed a part of it."""
+        inside = ""
         for override in reversed(self.overrides):
             if path[: len(override.path)] == override.path:
-                return override.where
-        inside = next((override for override in reversed(self.overrides) if override.path[: len(path)] == path), None)
+                return override.where + inside
+            if override.path[: len(path)] == path:
+                inside = inside or f" with {override.where}"
         line = "" if self.root is None else f":{line_of(self.root, path)}"
-        return f"{self.where}{line}" + (f" with {inside.where}" if inside else "")
+        return self.where + line + inside
 
 
 def _read(path: Path) -> tuple[dict[str, Any], Node]:
@@ -247,9 +260,11 @@ def validate(data: Any, model: Any, where: str, folder: Path | None = None) -> A
 def _validated(data: Any, model: Any, origin: _Origin, folder: Path | None) -> Any:
     # pydantic is strict without refusing lists for tuples or text for enums and paths only when it reads JSON
     try:
-        return TypeAdapter(model).validate_json(json.dumps(data), strict=True, context={"folder": folder})
+        return TypeAdapter(model).validate_json(to_json(data), strict=True, context={"folder": folder})
     except ValidationError as error:
         raise ConfigError(describe(error, model, origin.of)) from error
+    except PydanticSerializationError as error:
+        raise ConfigError(f"{origin.where}: holds a value that YAML cannot ({error})") from error
 
 
 def _apply(data: dict[str, Any], text: str) -> _Override:
@@ -259,7 +274,7 @@ def _apply(data: dict[str, Any], text: str) -> _Override:
     if not equals or not all(keys):
         raise ConfigError(f"override '{text}': expected key=value, for example head.lstm.hidden_size=64")
     where = f"override '{text}'"
-    value, _ = parse(value_text, where)
+    value, _ = parse(value_text, where, located=False)
     path: KeyPath = ()
     here: Any = data
     for i, name in enumerate(keys):
@@ -279,7 +294,7 @@ def _element(here: Any, name: str, where: str, path: KeyPath) -> str | int:
     if isinstance(here, dict):
         return name
     if not isinstance(here, list):
-        raise ConfigError(f"{where}: {at}: holds {here!r}, which has no key '{name}'")
+        raise ConfigError(f"{where}: {at}: has no key '{name}' {given(here)}")
     if not name.isdecimal() or int(name) >= len(here):
         raise ConfigError(f"{where}: {at}: a list of {len(here)} items has no item '{name}'; the first is 0")
     return int(name)

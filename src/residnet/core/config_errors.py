@@ -77,11 +77,11 @@ def _fault(details: ErrorDetails, model: Any) -> _Fault:
     kind, context, value = details["type"], details.get("ctx", {}), details["input"]
     match kind:
         case "missing" if path and isinstance(path[-1], int):
-            return _Fault(kind, path[:-1], f"item {path[-1]} is missing {_given(value)}")
+            return _Fault(kind, path[:-1], f"item {path[-1]} is missing {given(value)}")
         case "missing":
-            text = "missing"
+            text = f"missing{_of_kind(parents)}"
         case "extra_forbidden":
-            text = f"unknown key{nearest(str(path[-1]), _keys(parents))}"
+            text = f"unknown key{nearest(str(path[-1]), _keys(parents))}{_of_kind(parents)}"
         case "union_tag_invalid":
             path += _discriminator(context)
             text = f"unknown value '{context['tag']}'{nearest(str(context['tag']), _quoted(context['expected_tags']))}"
@@ -91,24 +91,26 @@ def _fault(details: ErrorDetails, model: Any) -> _Fault:
         case "literal_error" | "enum":
             valid = _quoted(context["expected"])
             unknown = isinstance(value, str) and bool(valid)
-            text = f"unknown value '{value}'{nearest(value, valid)}" if unknown else f"expected {context['expected']} {_given(value)}"
+            text = f"unknown value '{value}'{nearest(value, valid)}" if unknown else f"expected {context['expected']} {given(value)}"
         case "value_error" | "assertion_error":
             text = _own_text(str(context["error"]), value)
         case _ if kind in _EXPECTED:
-            text = f"expected {_EXPECTED[kind]} {_given(value)}"
+            text = f"expected {_EXPECTED[kind]} {given(value)}"
         case _:
-            text = f"{details['msg'].replace('Input should', 'must')} {_given(value)}"
+            text = f"{details['msg'].replace('Input should', 'must')} {given(value)}"
     return _Fault(kind, path, text)
 
 
 def _own_text(text: str, value: Any) -> str:
     # a validator of a whole section has said which of its keys it means; the section itself would only fill the line
-    scalar = isinstance(value, (str, int, float)) and str(value) not in text
-    return f"{text} {_given(value)}" if scalar else text
+    scalar = isinstance(value, (str, int, float)) and "(given " not in text
+    return f"{text} {given(value)}" if scalar else text
 
 
-def _given(value: Any) -> str:
-    text = repr(value)
+def given(value: Any) -> str:
+    """Text `(given 'x')` with the value as YAML would have it, cut where it is long; for error messages."""
+    names = {None: "null", True: "true", False: "false"}
+    text = names[value] if value is None or isinstance(value, bool) else repr(value)
     return f"(given {text if len(text) <= _LONGEST_VALUE else text[: _LONGEST_VALUE - 4] + ' ...'})"
 
 
@@ -199,6 +201,12 @@ def _literals(kind: Any) -> dict[str, tuple[Any, ...]]:
         return {}
     plain = {key: _plain(annotation) for key, annotation in _fields(kind).items()}
     return {key: get_args(annotation) for key, annotation in plain.items() if get_origin(annotation) is Literal}
+
+
+def _of_kind(kinds: tuple[Any, ...]) -> str:
+    # which keys a section has follows from its kind, and an override may have changed that
+    fixed = [(key, values[0]) for kind in kinds for key, values in _literals(kind).items() if len(values) == 1]
+    return f" ({fixed[0][0]} '{fixed[0][1]}')" if len(fixed) == 1 else ""
 
 
 def _tags(kinds: tuple[Any, ...], key: str | int) -> list[str]:

@@ -84,12 +84,13 @@ class _Dumper(yaml.SafeDumper):
 _Dumper.add_representer(list, _Dumper.represent_short_list)
 
 
-def parse(text: str, where: str) -> tuple[Any, Node | None]:
+def parse(text: str, where: str, *, located: bool = True) -> tuple[Any, Node | None]:
     """Plain value (dict with text keys, list, scalar) and node tree of one YAML document; (None, None) where there is none.
 
     Args:
         text: the document.
         where: file or override that errors name.
+        located: whether errors give the line and column.
 
     Raises:
         ConfigError: where the text is not YAML, repeats a key or refers to itself.
@@ -103,8 +104,8 @@ def parse(text: str, where: str) -> tuple[Any, Node | None]:
         mark = error.problem_mark
         problem = error.problem or error.context or "cannot be read"
         if isinstance(error, _DuplicateKey) and mark is not None:
-            raise ConfigError(f"{where}:{mark.line + 1}: {problem}") from error
-        place = "" if mark is None else f":{mark.line + 1}:{mark.column + 1}"
+            raise ConfigError(f"{where}{f':{mark.line + 1}' if located else ''}: {problem}") from error
+        place = "" if mark is None or not located else f":{mark.line + 1}:{mark.column + 1}"
         raise ConfigError(f"{where}{place}: not YAML: {' '.join(problem.split())}") from error
     except (yaml.YAMLError, ValueError) as error:
         raise ConfigError(f"{where}: not YAML: {' '.join(str(error).split())}") from error
