@@ -1,0 +1,26 @@
+"""Readers of logs: one file per format, listed once in `ReaderConfig`."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field
+
+from residnet.data.readers.base import LogReader
+from residnet.data.readers.canonical import CanonicalConfig, CanonicalReader
+from residnet.data.readers.table import ChannelMap, CsvConfig, ParquetConfig, TableReader, TimeColumn
+
+ReaderConfig = Annotated[CsvConfig | ParquetConfig | CanonicalConfig, Field(discriminator="kind")]
+"""Config of any reader; its `kind` says which."""
+
+__all__ = [
+    "CanonicalConfig",
+    "CanonicalReader",
+    "ChannelMap",
+    "CsvConfig",
+    "LogReader",
+    "ParquetConfig",
+    "ReaderConfig",
+    "TableReader",
+    "TimeColumn",
+]
