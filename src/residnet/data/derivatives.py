@@ -65,7 +65,7 @@ class SavitzkyGolay(Derivative):
     """
 
     kind: Literal["savitzky_golay"] = "savitzky_golay"
-    window: Seconds = Field(gt=0.0)
+    window: Seconds = Field(default=1.5, gt=0.0)
     order: int = Field(default=2, ge=1)
 
     def samples(self, step: float) -> int:
