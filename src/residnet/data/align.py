@@ -13,6 +13,8 @@ from residnet.data.readers.base import unwrap
 
 # share of a step within which a sample counts as lying on the grid
 _ON_GRID = 1e-3
+# share of a time step within which a grid point is a sample, so that rounding of the clock does not drag in the neighbour
+_AT_SAMPLE = 1e-5
 # grid points per sample beyond which the clock or its unit must be wrong
 _MOST_POINTS = 1000
 
@@ -103,7 +105,7 @@ class _Reach:
         """Index of the sample before each time, and how far towards the next one it lies, 0 to 1."""
         left = np.clip(np.searchsorted(self._t, at, side="right") - 1, 0, self._t.size - 2)
         weight = np.clip((at - self._t[left]) / (self._t[left + 1] - self._t[left]), 0.0, 1.0)
-        return left, np.where(weight < _ON_GRID, 0.0, np.where(weight > 1.0 - _ON_GRID, 1.0, weight))
+        return left, np.where(weight < _AT_SAMPLE, 0.0, np.where(weight > 1.0 - _AT_SAMPLE, 1.0, weight))
 
     def previous(self, x: np.ndarray) -> np.ndarray:
         """Last value at or before each grid point, [G, n] from [T, n]."""

@@ -249,7 +249,6 @@ def _read_csv(path: Path, columns: Sequence[str], delimiter: str, decimal: str) 
             skip_blank_lines=False,
             skipinitialspace=True,
             low_memory=False,
-            float_precision="round_trip" if decimal == "." else None,
             encoding="utf-8-sig",
         )
     except UnicodeDecodeError as error:
