@@ -94,11 +94,11 @@ class Log:
         import pyarrow as pa
         import pyarrow.parquet as pq
 
+        if not path.is_file():
+            raise UsageError(f"{path}: no such file")
         try:
             table = pq.read_table(path)
-        except FileNotFoundError as error:
-            raise UsageError(f"{path}: no such file") from error
-        except pa.ArrowException as error:
+        except (pa.ArrowException, OSError) as error:
             raise UsageError(f"{path}: not a Parquet file ({str(error).splitlines()[0]})") from error
         about = json.loads((table.schema.metadata or {}).get(b"residnet", b"{}"))
         if about.get("schema") != SCHEMA:

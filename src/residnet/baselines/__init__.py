@@ -1,0 +1,16 @@
+"""The known part, identified from data: one config class per kind, listed in `BaselineConfig`."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field
+
+from residnet.baselines.base import Baseline
+from residnet.baselines.linear_steady import LinearSteadyConfig
+from residnet.baselines.regressors import Coefficient, RegressorBaseline, RegressorsConfig
+from residnet.baselines.still import StillConfig
+
+BaselineConfig = Annotated[LinearSteadyConfig | RegressorsConfig | StillConfig, Field(discriminator="kind")]
+
+__all__ = ["Baseline", "BaselineConfig", "Coefficient", "LinearSteadyConfig", "RegressorBaseline", "RegressorsConfig", "StillConfig"]

@@ -1,0 +1,36 @@
+"""The baseline that knows nothing: velocities held. It makes the model `zero`, and a black box where a head is set on it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from residnet.baselines.base import Baseline
+from residnet.baselines.regressors import Coefficient
+from residnet.core.config import Config
+from residnet.core.samples import Samples
+
+
+class StillBaseline(Baseline):
+    """nu_dot = 0."""
+
+    def forward(self, z: Tensor) -> Tensor:
+        """Zeros [..., 3] for channels z [..., nz]."""
+        return torch.zeros_like(z[..., :3])
+
+
+class StillConfig(Config):
+    """No known part: the head learns the whole acceleration."""
+
+    kind: Literal["still"] = "still"
+
+    def build(self, names: Sequence[str]) -> StillBaseline:
+        """The module; it has no parameters."""
+        return StillBaseline()
+
+    def fit(self, baseline: Baseline, samples: Samples) -> list[Coefficient]:
+        """Nothing to fit: an empty table."""
+        return []

@@ -1,0 +1,52 @@
+"""Samples of identification: channels and accelerations of many manoeuvres, side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Samples:
+    """N good samples.
+
+    Attributes:
+        z: channels [N, nz], float64 (columns named by `names`).
+        target: what a fit explains, [N, 3]: accelerations, or what a baseline leaves of them.
+        group: number of the manoeuvre of each sample, [N], ascending.
+        t: time since the manoeuvre's start [N] in s.
+        kinds: kind of each manoeuvre, by number.
+        names: names of the columns of z.
+    """
+
+    z: Tensor
+    target: Tensor
+    group: Tensor
+    t: Tensor
+    kinds: tuple[str, ...]
+    names: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return int(self.z.shape[0])
+
+    def of_kinds(self, kinds: Collection[str]) -> Samples:
+        """The samples of manoeuvres of some kinds; all where `kinds` is empty."""
+        if not kinds:
+            return self
+        wanted = torch.tensor([kind in kinds for kind in self.kinds], dtype=torch.bool)
+        return self.where(wanted[self.group])
+
+    def where(self, keep: Tensor) -> Samples:
+        """The samples at which `keep` [N] is True."""
+        return Samples(self.z[keep], self.target[keep], self.group[keep], self.t[keep], self.kinds, self.names)
+
+    def with_target(self, target: Tensor) -> Samples:
+        """The same samples with another target [N, 3]."""
+        return Samples(self.z, target, self.group, self.t, self.kinds, self.names)
+
+    def column(self, name: str) -> Tensor:
+        """One channel [N]."""
+        return self.z[:, self.names.index(name)]

@@ -1,0 +1,128 @@
+"""From logs to identification data: a uniform grid, masks, smoothed states and derivatives."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from pydantic import Field
+
+from residnet.core.config import Config, Seconds
+from residnet.core.errors import DataError
+from residnet.core.log import Log
+from residnet.core.names import STATE
+from residnet.core.samples import Samples
+from residnet.data.align import GridConfig, align
+from residnet.data.derivatives import DerivativeConfig, SavitzkyGolay
+from residnet.data.masks import MaskConfig, apply_masks, scored, segments
+from residnet.physics.signals import Signals
+
+
+class PrepareConfig(Config):
+    """How logs become samples.
+
+    Attributes:
+        grid: the uniform time grid; its step is the model's dt.
+        masks: which samples are excluded, and why.
+        derivative: how velocities are smoothed and differentiated.
+        trim: seconds cut from the start and the end of every log before samples are taken for identification.
+    """
+
+    grid: GridConfig
+    masks: tuple[MaskConfig, ...] = ()
+    derivative: DerivativeConfig = Field(default_factory=SavitzkyGolay)
+    trim: Seconds = Field(default=0.0, ge=0)
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """One log on the grid, with what identification and evaluation need (float64 arrays of T samples).
+
+    Attributes:
+        log: the aligned log with its masks.
+        split: train, validation, test or external.
+        y: measured states [T, 6].
+        smooth: states with smoothed velocities [T, 6].
+        nu_dot: accelerations [T, 3].
+        w: inputs [T, m].
+        piece: number of the stretch that nothing crosses, [T]; -1 where there is none.
+        usable: samples that may be scored [T].
+        good: samples whose smoothed state and derivative may be learned from [T].
+    """
+
+    log: Log
+    split: str
+    y: np.ndarray
+    smooth: np.ndarray
+    nu_dot: np.ndarray
+    w: np.ndarray
+    piece: np.ndarray
+    usable: np.ndarray
+    good: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.log)
+
+
+def prepare(log: Log, split: str, columns: Sequence[str], config: PrepareConfig) -> Prepared:
+    """Align, mask, smooth and differentiate one log.
+
+    Args:
+        log: canonical log; needs the channels x, y, psi, u, v, r and `columns`.
+        split: which split it belongs to.
+        columns: input channels, in the order of w.
+        config: grid, masks, derivative.
+
+    Raises:
+        UsageError: where a channel is missing.
+        DataError: where no sample remains.
+    """
+    # masks look at the samples as recorded: interpolation hides a frozen sensor
+    log = align(apply_masks(log, config.masks), config.grid)
+    y, w = log.stack(STATE), log.stack(tuple(columns))
+    piece = np.where(np.isfinite(y).all(1) & np.isfinite(w).all(1), segments(log), -1)
+    usable = scored(log) & (piece >= 0)
+    if not usable.any():
+        reasons = ", ".join(f"{reason} {mask.mean():.0%}" for reason, mask in log.masks.items()) or "NaN in a channel that the model needs"
+        raise DataError(f"log {log.name}: no sample is usable ({reasons}); check the masks and the channels {', '.join((*STATE, *columns))}")
+    # derivatives must not see masked samples, so a piece ends at each of them
+    clean = _renumber(np.where(log.usable & usable, piece, -1))
+    smooth_nu, nu_dot, valid = config.derivative.derive(y[:, 3:], config.grid.step, clean)
+    smooth = np.concatenate((y[:, :3], np.where(valid[:, None], smooth_nu, y[:, 3:])), axis=1)
+    trimmed = (log.t >= log.t[0] + config.trim - 1e-9) & (log.t <= log.t[-1] - config.trim + 1e-9)
+    return Prepared(log, split, y, smooth, nu_dot, w, piece, usable, usable & valid & trimmed)
+
+
+def _renumber(labels: np.ndarray) -> np.ndarray:
+    """Contiguous runs of equal labels numbered from 0; -1 stays."""
+    change = np.concatenate(([True], labels[1:] != labels[:-1]))
+    return np.where(labels >= 0, np.cumsum(change) - 1, -1)
+
+
+def samples(logs: Sequence[Prepared], signals: Signals) -> Samples:
+    """Samples of identification from prepared logs: smoothed channels and measured accelerations, float64.
+
+    Raises:
+        DataError: where no log has a sample to learn from.
+    """
+    if not any(p.good.any() for p in logs):
+        raise DataError(f"none of {len(logs)} training logs has a sample to learn from; are the logs shorter than the derivative's window?")
+    z, target, group, time = [], [], [], []
+    for number, p in enumerate(logs):
+        x, w = torch.from_numpy(p.smooth[p.good]), torch.from_numpy(p.w[p.good])
+        with torch.no_grad():
+            z.append(signals(x, signals.prepare(w)))
+        target.append(torch.from_numpy(p.nu_dot[p.good]))
+        group.append(torch.full((len(x),), number))
+        time.append(torch.from_numpy(p.log.t[p.good] - p.log.t[0]))
+    return Samples(torch.cat(z), torch.cat(target), torch.cat(group), torch.cat(time), tuple(p.log.manoeuvre for p in logs), signals.names)
+
+
+def envelope(logs: Sequence[Prepared]) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest measured velocities and inputs, [3 + m] each, over the usable samples of logs."""
+    joined = np.concatenate([np.concatenate((p.y[p.usable, 3:], p.w[p.usable]), axis=1) for p in logs])
+    return joined.min(0), joined.max(0)
+
+

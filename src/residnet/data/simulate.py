@@ -1,0 +1,154 @@
+"""Simulated sea trials: a plant, a programme of manoeuvres, disturbances and sensors, all in one batch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import groupby
+from typing import Literal
+
+import numpy as np
+import torch
+from pydantic import Field
+
+from residnet.core.config import Config, MetresPerSecond, NewtonMetres, Newtons, RadiansPerSecond, Seconds
+from residnet.core.log import Log
+from residnet.core.names import CHANNEL_UNITS, VELOCITY
+from residnet.dynamics.rollout import Rollout
+from residnet.dynamics.simulated import PlantDynamics
+from residnet.manoeuvres import FamilyConfig, Manoeuvre, StackedSource
+from residnet.physics.plant import DifferentialThrustVessel
+from residnet.physics.vessel import load_vessel
+
+
+class SensorNoise(Config):
+    """Standard deviations of white noise on the measured velocities; position and heading are measured exactly."""
+
+    u: MetresPerSecond = Field(default=0.03, ge=0)
+    v: MetresPerSecond = Field(default=0.03, ge=0)
+    r: RadiansPerSecond = Field(default=float(np.radians(0.2)), ge=0)
+
+
+class Disturbance(Config):
+    """Random forces and a constant current.
+
+    Attributes:
+        force_x: standard deviation of an Ornstein-Uhlenbeck force along the hull; force_y and force_n likewise.
+        correlation: correlation time of the three processes.
+        current_north: current, towards north; current_east likewise.
+    """
+
+    force_x: Newtons = Field(default=0.0, ge=0)
+    force_y: Newtons = Field(default=0.0, ge=0)
+    force_n: NewtonMetres = Field(default=0.0, ge=0)
+    correlation: Seconds = Field(default=5.0, gt=0)
+    current_north: MetresPerSecond = 0.0
+    current_east: MetresPerSecond = 0.0
+
+
+class SimulatedTrials(Config):
+    """A programme of sea trials on a simulated vessel, from rest.
+
+    Attributes:
+        vessel: name of a vessel of residnet, or path of a vessel file.
+        trials: families of manoeuvres; what is random in them is drawn by `seed`.
+        duration: of each manoeuvre.
+        step: sampling interval of the logs.
+        substeps: steps of the plant within one sampling interval.
+        identification: number of manoeuvres of each kind that models may be fitted on, drawn by `seed`; kinds that are not named
+            are for identification altogether. The rest is the test set.
+        validation: how many of those are kept back to choose between models.
+        seed: of everything random in the data (the run's own seed moves only the training).
+    """
+
+    kind: Literal["simulated"] = "simulated"
+    vessel: str
+    trials: tuple[FamilyConfig, ...] = Field(min_length=1)
+    duration: Seconds = Field(default=60.0, gt=0)
+    step: Seconds = Field(default=0.05, gt=0)
+    substeps: int = Field(default=5, ge=1)
+    noise: SensorNoise = SensorNoise()
+    disturbance: Disturbance = Disturbance()
+    identification: dict[str, int]
+    validation: dict[str, int]
+    seed: int = Field(default=0, ge=0)
+
+    def draw(self) -> list[Manoeuvre]:
+        """The manoeuvres, by family."""
+        random = np.random.default_rng([self.seed, 1])
+        return [manoeuvre for family in self.trials for manoeuvre in family.draw(random, self.duration)]
+
+    def splits(self, manoeuvres: Sequence[Manoeuvre]) -> list[str]:
+        """`train`, `validation` or `test` of each manoeuvre; whole manoeuvres only.
+
+        Raises:
+            ValueError: where a split asks for more manoeuvres than there are.
+        """
+        random = np.random.default_rng([self.seed, 2])
+        out = ["train"] * len(manoeuvres)
+        for kind, count in self.identification.items():
+            members = [i for i, manoeuvre in enumerate(manoeuvres) if manoeuvre.kind == kind]
+            kept = self.validation.get(kind, 0)
+            if not 0 < count < len(members) or not 0 <= kept < count:
+                raise ValueError(
+                    f"{count} of {len(members)} '{kind}' manoeuvres for identification, {kept} of them for validation: leaves a split empty"
+                )
+            order = random.permutation(members)
+            for i in order[:kept]:
+                out[i] = "validation"
+            for i in order[count:]:
+                out[i] = "test"
+        return out
+
+
+def simulate(manoeuvres: Sequence[Manoeuvre], config: SimulatedTrials) -> list[Log]:
+    """Fly the manoeuvres in one batch and log them as sensors would.
+
+    Channels: t, x, y, psi, u, v, r (velocities noisy), n_port, n_stbd (actual), cmd_port, cmd_stbd (commanded). Float64.
+    """
+    plant = DifferentialThrustVessel(load_vessel(config.vessel))
+    steps = round(config.duration / config.step)
+    t = torch.arange(steps, dtype=torch.float64) * config.step
+    runs = [list(members) for _, members in groupby(manoeuvres, key=lambda m: m.kind)]
+    sources = [type(members[0]).source(members, plant.demand, t) for members in runs]
+    source = StackedSource(sources, [len(members) for members in runs])
+    random = np.random.default_rng([config.seed, 3])
+    w = torch.from_numpy(_environment(config.disturbance, len(manoeuvres), steps, config.step, random))
+    rest = torch.zeros(len(manoeuvres), len(plant.state), dtype=torch.float64)
+    with torch.no_grad():
+        states, inputs, _ = Rollout(PlantDynamics(plant, config.step, config.substeps), source)(rest, w, rest[:, :0])
+    x, acting = states[:, :-1].numpy(), inputs.numpy()
+    noise = random.standard_normal((len(manoeuvres), steps, 3)) * [config.noise.u, config.noise.v, config.noise.r]
+    time = t.numpy()
+    logs = []
+    count: dict[str, int] = {}
+    for i, manoeuvre in enumerate(manoeuvres):
+        count[manoeuvre.kind] = count.get(manoeuvre.kind, 0) + 1
+        channels = {name: x[i, :, j].copy() for j, name in enumerate(plant.state)}
+        for j, name in enumerate(VELOCITY):
+            channels[name] = channels[name] + noise[i, :, j]
+        channels |= {name: acting[i, :, j].copy() for j, name in enumerate(plant.inputs[: plant.commands])}
+        logs.append(
+            Log(
+                name=f"{manoeuvre.kind}_{count[manoeuvre.kind]:02d}",
+                t=time.copy(),
+                channels=channels,
+                units={name: CHANNEL_UNITS[name] for name in channels},
+                manoeuvre=manoeuvre.kind,
+                meta={"vessel": config.vessel, "demand": manoeuvre.model_dump(mode="json"), "seed": config.seed},
+            )
+        )
+    return logs
+
+
+def _environment(config: Disturbance, rows: int, steps: int, step: float, random: np.random.Generator) -> np.ndarray:
+    """Inputs of the plant [B, T, 7] with the commands zero: Ornstein-Uhlenbeck forces (exact discretisation) and current."""
+    from scipy.signal import lfilter
+
+    keep = np.exp(-step / config.correlation)
+    drive = random.standard_normal((rows, steps, 3)) * np.sqrt(1 - keep**2)
+    drive[:, 0] /= np.sqrt(1 - keep**2)
+    forces = lfilter([1.0], [1.0, -keep], drive, axis=1) * [config.force_x, config.force_y, config.force_n]
+    w = np.zeros((rows, steps, len(DifferentialThrustVessel.inputs)))
+    w[:, :, 2:5] = forces
+    w[:, :, 5:] = [config.current_north, config.current_east]
+    return w

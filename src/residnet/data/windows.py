@@ -1,0 +1,110 @@
+"""Training windows as batches of indices over one tensor."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from residnet.core.errors import DataError
+from residnet.data.prepare import Prepared
+
+
+@dataclass(frozen=True)
+class WindowStore:
+    """All logs end to end.
+
+    Attributes:
+        y: measured states [N, 6].
+        smooth: states with smoothed velocities [N, 6].
+        nu_dot: accelerations [N, 3].
+        w: inputs [N, m].
+        usable: samples that may be scored [N].
+        good: samples whose derivative may be learned from [N].
+        reach: samples from here to the end of the stretch, itself included, [N]; 0 where there is none.
+        depth: samples since the stretch began, [N].
+    """
+
+    y: Tensor
+    smooth: Tensor
+    nu_dot: Tensor
+    w: Tensor
+    usable: Tensor
+    good: Tensor
+    reach: Tensor
+    depth: Tensor
+
+    @classmethod
+    def gather(cls, logs: Sequence[Prepared], dtype: torch.dtype = torch.float32) -> WindowStore:
+        """From prepared logs; positions are counted from each log's start so that float32 keeps them exact enough."""
+        y = np.concatenate([p.y - p.y[0] * [1, 1, 0, 0, 0, 0] for p in logs])
+        smooth = np.concatenate([p.smooth - p.y[0] * [1, 1, 0, 0, 0, 0] for p in logs])
+        labels = np.concatenate([np.where(p.piece >= 0, p.piece + 1_000_000 * i, -1) for i, p in enumerate(logs)])
+        starts = np.flatnonzero(np.concatenate(([True], labels[1:] != labels[:-1])))
+        lengths = np.diff(np.append(starts, labels.size))
+        depth = np.arange(labels.size) - np.repeat(starts, lengths)
+        reach = np.where(labels >= 0, np.repeat(lengths, lengths) - depth, 0)
+
+        def tensor(array: np.ndarray) -> Tensor:
+            return torch.from_numpy(np.nan_to_num(array)).to(dtype)
+
+        def flags(parts: list[np.ndarray]) -> Tensor:
+            return torch.from_numpy(np.concatenate(parts))
+
+        return cls(
+            tensor(y),
+            tensor(smooth),
+            tensor(np.concatenate([p.nu_dot for p in logs])),
+            tensor(np.concatenate([p.w for p in logs])),
+            flags([p.usable for p in logs]),
+            flags([p.good for p in logs]),
+            torch.from_numpy(reach),
+            torch.from_numpy(depth),
+        )
+
+    def starts(self, length: int, share: float = 0.5) -> Tensor:
+        """Rows at which a window of `length` samples may start: within one stretch, the first sample good, at least `share` of all usable.
+
+        Raises:
+            DataError: where no log holds such a window.
+        """
+        total = torch.nn.functional.pad(self.usable.cumsum(0), (1, 0))
+        fits = self.good & (self.reach >= length)
+        rows = torch.nonzero(fits).squeeze(1)
+        rows = rows[(total[rows + length] - total[rows]) >= share * length]
+        if rows.numel() == 0:
+            raise DataError(f"no training log holds a window of {length} samples without a break; shorten the horizon or give longer logs")
+        return rows
+
+    def take(self, values: Tensor, starts: Tensor, length: int) -> Tensor:
+        """Windows [B, length, ...] of one of the tensors, from rows `starts` [B] on."""
+        index = starts[:, None] + torch.arange(length)
+        return values.index_select(0, index.reshape(-1)).reshape(starts.numel(), length, *values.shape[1:])
+
+    def history(self, starts: Tensor, length: int) -> tuple[Tensor, Tensor]:
+        """States and inputs of the `length` samples before each start; where the stretch is shorter, its first sample is repeated."""
+        back = torch.arange(-length, 0)
+        index = starts[:, None] + torch.maximum(back, -self.depth[starts][:, None])
+        rows = index.reshape(-1)
+        shape = (starts.numel(), length)
+        return self.smooth.index_select(0, rows).reshape(*shape, -1), self.w.index_select(0, rows).reshape(*shape, -1)
+
+
+class WindowBatches:
+    """Random batches of window starts, the same for the same seed, stage and epoch: a resumed run sees what the undisturbed one did."""
+
+    def __init__(self, starts: Tensor, batch: int, steps: int) -> None:
+        self.starts = starts
+        self.batch = batch
+        self.steps = steps
+
+    def epoch(self, seed: int, epoch: int) -> Tensor:
+        """Starts [steps, batch] of one epoch, drawn without replacement as far as they last."""
+        generator = torch.Generator().manual_seed((seed * 1_000_003 + epoch) % (2**63))
+        need = self.batch * self.steps
+        rounds = -(-need // self.starts.numel())
+        order = torch.cat([torch.randperm(self.starts.numel(), generator=generator) for _ in range(rounds)])[:need]
+        return self.starts[order].reshape(self.steps, self.batch)

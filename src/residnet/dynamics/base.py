@@ -1,0 +1,66 @@
+"""What the time loop steps: abstract `Dynamics`, with the explicit Runge-Kutta step that all models share."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from residnet.core.frames import to_earth
+
+Integrator = Literal["rk4", "heun", "euler", "semi_implicit_euler"]
+
+# nodes and weights of explicit schemes in which every stage starts from the one before it
+_TABLEAUX: dict[str, tuple[list[float], list[float]]] = {
+    "rk4": ([0.5, 0.5, 1.0], [1 / 6, 1 / 3, 1 / 3, 1 / 6]),
+    "heun": ([1.0], [0.5, 0.5]),
+    "euler": ([], [1.0]),
+    "semi_implicit_euler": ([], [1.0]),
+}
+
+
+class Dynamics(nn.Module):
+    """A vessel model in discrete time: `step(x, w, s) -> (x', s')` at a fixed dt, inputs held over the step.
+
+    Subclasses give `rate(x, p, rho)`, the derivative of the state at a stage, and `step`. All is pure tensor code that
+    TorchScript compiles.
+    """
+
+    def __init__(self, dt: float, integrator: Integrator) -> None:
+        super().__init__()
+        self.dt = dt
+        self.integrator = str(integrator)
+        self.nodes, self.weights = (list(part) for part in _TABLEAUX[integrator])
+        self.semi_implicit = integrator == "semi_implicit_euler"
+        self.n_state = 0
+
+    def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
+        """Derivative of the state [B, nx] with what a step holds fixed, p [B, k] and rho [B, n]."""
+        raise NotImplementedError
+
+    def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """State [B, nx] and memory [B, n_state] one step later under inputs w [B, m]."""
+        raise NotImplementedError
+
+    def initial_state(self, batch: int) -> Tensor:
+        """Memory [batch, n_state] without a past: zeros."""
+        return torch.zeros(batch, self.n_state)
+
+    def kinematics(self, x: Tensor) -> Tensor:
+        """Derivative [B, 3] of the pose (x, y, psi) of states [B, nx] (document 003 eq. (1))."""
+        north, east = to_earth(x[:, 3], x[:, 4], x[:, 2])
+        return torch.stack((north, east, x[:, 5]), dim=-1)
+
+    def integrate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
+        """State one step later, [B, nx]."""
+        k = self.rate(x, p, rho)
+        total = self.weights[0] * k
+        for i, node in enumerate(self.nodes):
+            k = self.rate(x + (self.dt * node) * k, p, rho)
+            total = total + self.weights[i + 1] * k
+        after = x + self.dt * total
+        if self.semi_implicit:
+            # the pose moves with the new velocities, which keeps an undamped oscillation bounded
+            return torch.cat((x[:, :3] + self.dt * self.kinematics(torch.cat((x[:, :3], after[:, 3:]), dim=-1)), after[:, 3:]), dim=-1)
+        return after

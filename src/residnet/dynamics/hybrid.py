@@ -1,0 +1,43 @@
+"""The hybrid model: nu_dot = baseline + residual, in acceleration space (document 003 eq. (19))."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from residnet.baselines.base import Baseline
+from residnet.dynamics.base import Dynamics, Integrator
+from residnet.heads.base import ResidualHead
+from residnet.physics.signals import Signals
+
+
+class HybridDynamics(Dynamics):
+    """State x [B, 6] = (x, y, psi, u, v, r); the head is evaluated once per step and held over the integrator's stages."""
+
+    def __init__(self, signals: Signals, baseline: Baseline, head: ResidualHead, dt: float, integrator: Integrator = "rk4") -> None:
+        super().__init__(dt, integrator)
+        self.signals = signals
+        self.baseline = baseline
+        self.head = head
+        self.n_state = head.n_state
+
+    def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
+        """x_dot [B, 6] from what the step holds fixed: p = signals.prepare(w) and the residual rho [B, 3]."""
+        nu_dot = self.baseline(self.signals(x, p)) + rho
+        return torch.cat((self.kinematics(x), nu_dot), dim=-1)
+
+    def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """State and memory one step of dt later."""
+        p = self.signals.prepare(w)
+        rho, s = self.head(self.signals(x, p), s)
+        return self.integrate(x, p, rho), s
+
+    def warmup(self, y_history: Tensor, w_history: Tensor) -> Tensor:
+        """Memory [B, n_state] that a measured past leaves.
+
+        Args:
+            y_history: measured states [B, T, 6], oldest first; T may be 0.
+            w_history: inputs [B, T, m] at the same samples.
+        """
+        z = self.signals(y_history, self.signals.prepare(w_history))
+        return self.head.warmup(z)

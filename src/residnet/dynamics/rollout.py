@@ -1,0 +1,72 @@
+"""The only time loop: batched, differentiable, scriptable.
+
+Its inputs come from a `Source`: playback of given inputs, or a manoeuvre that steers by the state that it sees. Rows
+whose source says so stop there: their state is held from that sample on.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from residnet.dynamics.base import Dynamics
+
+
+class Source(nn.Module):
+    """Where the inputs of a rollout come from."""
+
+    may_stop: bool = False
+
+    def initial(self, x: Tensor) -> Tensor:
+        """Memory of the source [B, k] at the start, from the initial state x [B, nx]."""
+        return x[:, :0]
+
+    def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """Inputs [B, m] for step k and the new memory, from the state x [B, nx] and the inputs given for that step, w [B, m]."""
+        raise NotImplementedError
+
+    def finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
+        """[B] bool: rows that stop at this state; asked only where `may_stop`."""
+        return torch.zeros(x.shape[0], dtype=torch.bool, device=x.device)
+
+
+class Playback(Source):
+    """Gives back the inputs as they are."""
+
+    def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """Inputs w [B, m], unchanged."""
+        return w, memory
+
+
+class Rollout(nn.Module):
+    """Free run of a model from an initial state under a source of inputs."""
+
+    def __init__(self, model: Dynamics, source: Source | None = None) -> None:
+        super().__init__()
+        self.model = model
+        self.source = Playback() if source is None else source
+
+    def forward(self, x0: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Simulate T steps.
+
+        Args:
+            x0: initial states [B, nx].
+            w: given inputs [B, T, m], each row held over its step.
+            s: initial memory [B, n_state].
+
+        Returns:
+            states [B, T+1, nx] from x0 on, inputs that acted [B, T, m], and the memory after the last step [B, n_state].
+        """
+        x, memory = x0, self.source.initial(x0)
+        states = [x0]
+        applied: list[Tensor] = []
+        for k in range(w.shape[1]):
+            acting, memory = self.source(x, w[:, k], k, memory)
+            after, s = self.model.step(x, acting, s)
+            if self.source.may_stop:
+                after = torch.where(self.source.finished(x, k, memory).unsqueeze(-1), x, after)
+            x = after
+            states.append(x)
+            applied.append(acting)
+        inputs = torch.stack(applied, dim=1) if w.shape[1] > 0 else w
+        return torch.stack(states, dim=1), inputs, s

@@ -1,0 +1,18 @@
+"""What is learned on top of the baseline: one config class per kind, listed in `HeadConfig`."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field
+
+from residnet.heads.base import ClosedFormHead, ResidualHead
+from residnet.heads.lstm import LstmConfig
+from residnet.heads.mlp import MlpConfig
+from residnet.heads.plsr import PlsrConfig
+from residnet.heads.ridge import RidgeConfig
+from residnet.heads.zero import ZeroHead
+
+HeadConfig = Annotated[PlsrConfig | RidgeConfig | MlpConfig | LstmConfig, Field(discriminator="kind")]
+
+__all__ = ["ClosedFormHead", "HeadConfig", "LstmConfig", "MlpConfig", "PlsrConfig", "ResidualHead", "RidgeConfig", "ZeroHead"]

@@ -1,0 +1,133 @@
+"""The interface of residual heads, and the scaling and guard that all of them share."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+
+from residnet.core.config import Config
+from residnet.core.errors import ConfigError
+from residnet.core.names import nearest
+from residnet.core.samples import Samples
+
+
+class ResidualHead(nn.Module):
+    """What is learned on top of the baseline: rho [B, 3] in m/s^2, m/s^2, rad/s^2 from channels z [B, nz] and memory s [B, n_state].
+
+    A memoryless head has n_state = 0. Every head is scriptable, however its parameters were found.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.n_state = 0
+
+    def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Residual [B, 3] at channels z [B, nz], and the memory for the next step [B, n_state]; called once per step."""
+        raise NotImplementedError
+
+    def sequence(self, z: Tensor) -> Tensor:
+        """Residuals [B, T, 3] along measured channels [B, T, nz], from an empty memory (teacher forcing)."""
+        return self.forward(z, z[..., :0])[0]
+
+    def warmup(self, z: Tensor) -> Tensor:
+        """Memory [B, n_state] that past channels [B, T, nz] leave, oldest first; zeros where T = 0."""
+        return torch.zeros(z.shape[0], self.n_state, dtype=z.dtype, device=z.device)
+
+    def calibrate(self, samples: Samples) -> None:
+        """Take scales and ranges from the training samples; called once, before anything is fitted."""
+
+
+class ClosedFormHead(ResidualHead):
+    """A head whose parameters come from a closed-form solution."""
+
+    def solve(self, samples: Samples) -> dict[str, object]:
+        """Fill the buffers from samples whose target is the residual [N, 3]; returns what there is to say about the fit.
+
+        Raises:
+            FitError: where the data do not determine the parameters.
+        """
+        raise NotImplementedError
+
+
+class FeatureConfig(Config):
+    """Which channels a head sees, and how far beyond the training range it follows them.
+
+    Attributes:
+        features: names of channels; empty for all.
+        margin: features are held at the training range widened by this share of it; outside, the residual stays what it was
+            at the edge instead of running away.
+    """
+
+    features: tuple[str, ...] = ()
+    margin: float = Field(default=0.1, ge=0)
+
+    def chosen(self, names: Sequence[str]) -> tuple[str, ...]:
+        """Names of the features among the channels `names`.
+
+        Raises:
+            ConfigError: where a feature is no channel.
+        """
+        for name in self.features:
+            if name not in names:
+                raise ConfigError(f"head feature '{name}' is not a channel of the model{nearest(name, names)}")
+        return self.features or tuple(names)
+
+
+class Features(nn.Module):
+    """Selected, guarded and standardised channels: z [..., nz] -> [..., F], near zero mean and unit variance on the training data."""
+
+    def __init__(self, chosen: Sequence[str], names: Sequence[str], margin: float) -> None:
+        super().__init__()
+        self.names = tuple(chosen)
+        self.count = len(self.names)
+        self.margin = margin
+        self.register_buffer("index", torch.tensor([list(names).index(name) for name in chosen], dtype=torch.long), persistent=False)
+        self.register_buffer("mean", torch.zeros(self.count, dtype=torch.float64))
+        self.register_buffer("std", torch.ones(self.count, dtype=torch.float64))
+        self.register_buffer("low", torch.full((self.count,), -torch.inf, dtype=torch.float64))
+        self.register_buffer("high", torch.full((self.count,), torch.inf, dtype=torch.float64))
+        self.index: Tensor
+        self.mean: Tensor
+        self.std: Tensor
+        self.low: Tensor
+        self.high: Tensor
+
+    def calibrate(self, samples: Samples) -> None:
+        """Take mean, spread and range of each feature from the samples; a constant feature is left unscaled."""
+        z = samples.z.index_select(1, self.index)
+        low, high = z.amin(0), z.amax(0)
+        reach = self.margin * (high - low)
+        std = z.std(0, correction=0)
+        self.mean.copy_(z.mean(0))
+        self.std.copy_(torch.where(std > 1e-9 * (1 + self.mean.abs()), std, torch.ones_like(std)))
+        self.low.copy_(low - reach)
+        self.high.copy_(high + reach)
+
+    def guarded(self, z: Tensor) -> Tensor:
+        """Selected channels [..., F], held at the edge of the training range."""
+        chosen = z.index_select(-1, self.index)
+        return torch.minimum(torch.maximum(chosen, self.low.to(z.dtype)), self.high.to(z.dtype))
+
+    def forward(self, z: Tensor) -> Tensor:
+        """Standardised features [..., F]."""
+        return (self.guarded(z) - self.mean.to(z.dtype)) / self.std.to(z.dtype)
+
+
+class ResidualScale(nn.Module):
+    """Turns a network's output near one into accelerations: the spread of the residual on the training samples."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("spread", torch.ones(3, dtype=torch.float64))
+        self.spread: Tensor
+
+    def calibrate(self, samples: Samples) -> None:
+        """Take the spread of each axis from the samples' target."""
+        self.spread.copy_(samples.target.std(0, correction=0).clamp(min=1e-9))
+
+    def forward(self, out: Tensor) -> Tensor:
+        """[..., 3] -> residual accelerations [..., 3]."""
+        return out * self.spread.to(out.dtype)

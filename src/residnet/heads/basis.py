@@ -1,0 +1,129 @@
+"""Heads that are linear in basis functions of the channels; their solutions differ, their evaluation does not."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from residnet.core.errors import FitError
+from residnet.core.samples import Samples
+from residnet.heads.base import ClosedFormHead, FeatureConfig, Features
+from residnet.physics.terms import TermLibrary, polynomial_terms
+
+
+class BasisConfig(FeatureConfig):
+    """Which basis functions.
+
+    Attributes:
+        terms: basis functions by name (see `residnet.physics.terms`), in units of each feature's spread; empty: all products of the features up
+            to `degree` and x|x| of the velocities.
+        degree: highest degree of the products where `terms` is empty.
+        folds: folds of the cross-validation that chooses the complexity; a manoeuvre is never split between folds.
+    """
+
+    terms: tuple[str, ...] = ()
+    degree: int = Field(default=2, ge=1, le=4)
+    folds: int = Field(default=5, ge=2)
+
+
+class BasisHead(ClosedFormHead):
+    """rho [..., 3] = intercept + phi(features / spread) coefficients; buffers found by `fit_moments` of the subclass."""
+
+    def __init__(self, config: BasisConfig, names: Sequence[str]) -> None:
+        super().__init__()
+        chosen = config.chosen(names)
+        self.features = Features(chosen, names, config.margin)
+        magnitudes = [name for name in ("u", "v", "r") if name in chosen]
+        self.library = TermLibrary(config.terms or polynomial_terms(chosen, config.degree, magnitudes=magnitudes), chosen)
+        self.folds = config.folds
+        self.register_buffer("coefficients", torch.zeros(self.library.count, 3, dtype=torch.float64))
+        self.register_buffer("intercept", torch.zeros(3, dtype=torch.float64))
+        self.coefficients: Tensor
+        self.intercept: Tensor
+
+    def calibrate(self, samples: Samples) -> None:
+        """Take scales and ranges of the features from the samples."""
+        self.features.calibrate(samples)
+
+    def basis(self, z: Tensor) -> Tensor:
+        """Basis functions [..., J] at channels z [..., nz]; features are scaled but not centred, so that names keep their meaning."""
+        return self.library(self.features.guarded(z) / self.features.std.to(z.dtype))
+
+    def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Residual [..., 3] at channels z [..., nz]; the memory is empty."""
+        return self.basis(z) @ self.coefficients.to(z.dtype) + self.intercept.to(z.dtype), s
+
+    def moments(self, samples: Samples) -> FoldMoments:
+        """Moments of basis functions and target by fold.
+
+        Raises:
+            FitError: with fewer manoeuvres than folds, or fewer samples than basis functions.
+        """
+        groups = torch.unique(samples.group)
+        if groups.numel() < self.folds:
+            raise FitError(f"{self.folds} folds need as many manoeuvres, the training data have {groups.numel()}; lower `folds`")
+        if len(samples) <= self.library.count:
+            raise FitError(f"{len(samples)} samples do not determine {self.library.count} basis functions; give more data or fewer terms")
+        fold = torch.searchsorted(groups, samples.group) % self.folds
+        return FoldMoments.gather(self.basis(samples.z), samples.target, fold, self.folds)
+
+    def coefficient_table(self) -> dict[str, list[float]]:
+        """Basis function -> its coefficients (u, v, r axis), for features in units of their spread; for the report."""
+        return dict(zip(self.library.terms, self.coefficients.tolist(), strict=True))
+
+
+class FoldMoments:
+    """Sums over each fold of [1, X, Y]' [1, X, Y], float64: all that closed-form fits and their cross-validation need.
+
+    The data are passed once; a fold is left out by subtraction. X is shifted by its overall mean before, which keeps the
+    differences well conditioned.
+    """
+
+    def __init__(self, sums: Tensor, shift_x: Tensor, shift_y: Tensor) -> None:
+        self.sums = sums
+        self.shift_x = shift_x
+        self.shift_y = shift_y
+        self.folds = sums.shape[0]
+        self.regressors = shift_x.numel()
+
+    @classmethod
+    def gather(cls, x: Tensor, y: Tensor, fold: Tensor, folds: int) -> FoldMoments:
+        """From X [N, J], Y [N, K] and the fold of each sample [N]."""
+        shift_x, shift_y = x.mean(0), y.mean(0)
+        joined = torch.cat((torch.ones_like(y[:, :1]), x - shift_x, y - shift_y), dim=1)
+        sums = torch.stack([joined[fold == f].T @ joined[fold == f] for f in range(folds)])
+        return cls(sums, shift_x, shift_y)
+
+    def centred(self, total: Tensor) -> tuple[float, Tensor, Tensor, Tensor, Tensor]:
+        """(count, mean of X, mean of Y, X'X, X'Y) about the means, from summed moments."""
+        j = self.regressors
+        n = float(total[0, 0])
+        mean = total[0, 1:] / n
+        cross = total[1:, 1:] - n * torch.outer(mean, mean)
+        return n, mean[:j], mean[j:], cross[:j, :j], cross[:j, j:]
+
+    def all(self) -> tuple[float, Tensor, Tensor, Tensor, Tensor]:
+        """`centred` of all folds."""
+        return self.centred(self.sums.sum(0))
+
+    def without(self, fold: int) -> tuple[float, Tensor, Tensor, Tensor, Tensor]:
+        """`centred` of all folds but one."""
+        return self.centred(self.sums.sum(0) - self.sums[fold])
+
+    def squared_error(self, fold: int, coefficients: Tensor, mean_x: Tensor, mean_y: Tensor) -> Tensor:
+        """Sum of squared errors on one fold [C, K] of candidates y = mean_y + (x - mean_x) coefficients [C, J, K]."""
+        j = self.regressors
+        s = self.sums[fold]
+        intercept = mean_y - torch.einsum("j,cjk->ck", mean_x, coefficients)
+        weights = torch.cat((intercept[:, None, :], coefficients), dim=1)
+        xx, xy, yy = s[: j + 1, : j + 1], s[: j + 1, j + 1 :], s[j + 1 :, j + 1 :].diagonal()
+        quadratic = torch.einsum("cik,ij,cjk->ck", weights, xx, weights)
+        return yy - 2 * torch.einsum("cik,ik->ck", weights, xy) + quadratic
+
+    def cross_validate(self, path: list[tuple[Tensor, Tensor, Tensor]]) -> Tensor:
+        """Mean squared error [C, K] over left-out folds of candidate coefficients; path: per fold (coefficients [C, J, K], mean of X, mean of Y)."""
+        errors = torch.stack([self.squared_error(f, *path[f]) for f in range(self.folds)])
+        return errors.sum(0) / self.sums[:, 0, 0].sum()

@@ -1,0 +1,179 @@
+"""Long short-term memory: a residual with a hidden state (document 003 eq. (17), ERRATA W4)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+from pydantic import Field, model_validator
+from torch import Tensor, nn
+
+from residnet.core.samples import Samples
+from residnet.heads.base import FeatureConfig, Features, ResidualHead, ResidualScale
+
+
+class LstmConfig(FeatureConfig):
+    """One LSTM for all axes, or one for each.
+
+    Attributes:
+        hidden_size: units.
+        readout: units of one tanh layer between (memory, features) and the residual; 0 reads the memory alone by a linear map, as
+            document 003 does.
+        activation: of block input and output; the document uses softsign in place of the usual tanh.
+        dropout: share of hidden outputs dropped before the readout while training.
+        per_axis: one network for each of surge, sway, yaw, as the document has it.
+        axis_features: channels of each axis' network, where they differ; needs `per_axis`.
+    """
+
+    kind: Literal["lstm"] = "lstm"
+    hidden_size: int = Field(default=100, ge=1)
+    readout: int = Field(default=0, ge=0)
+    activation: Literal["tanh", "softsign"] = "tanh"
+    dropout: float = Field(default=0.0, ge=0, lt=1)
+    per_axis: bool = False
+    axis_features: dict[Literal["u", "v", "r"], tuple[str, ...]] | None = None
+
+    @model_validator(mode="after")
+    def _axes(self) -> LstmConfig:
+        if self.axis_features is not None:
+            if not self.per_axis:
+                raise ValueError("axis_features needs per_axis: true")
+            if set(self.axis_features) != {"u", "v", "r"}:
+                raise ValueError(f"axis_features needs all of u, v, r; given {sorted(self.axis_features)}")
+        return self
+
+    def build(self, names: Sequence[str]) -> LstmHead:
+        """The module for channels `names`."""
+        return LstmHead(self, names)
+
+    def networks(self, names: Sequence[str]) -> list[tuple[tuple[str, ...], int]]:
+        """(features, number of outputs) of each network."""
+        if not self.per_axis:
+            return [(self.chosen(names), 3)]
+        if self.axis_features is None:
+            return [(self.chosen(names), 1)] * 3
+        return [(FeatureConfig(features=self.axis_features[axis]).chosen(names), 1) for axis in ("u", "v", "r")]
+
+
+class LstmCore(nn.Module):
+    """One LSTM layer with a single bias per gate, stepped by a cell and run over sequences with the same weights.
+
+    Memory s [B, 2H] holds h and c side by side. 4 H (F + H + 1) parameters.
+    """
+
+    def __init__(self, inputs: int, hidden: int, softsign: bool) -> None:
+        super().__init__()
+        self.hidden = hidden
+        self.softsign = softsign
+        bound = 1.0 / math.sqrt(hidden)
+        self.w_input = nn.Parameter(torch.empty(4 * hidden, inputs).uniform_(-bound, bound))
+        self.w_hidden = nn.Parameter(torch.empty(4 * hidden, hidden).uniform_(-bound, bound))
+        self.bias = nn.Parameter(torch.zeros(4 * hidden))
+        with torch.no_grad():
+            # a forget gate that starts open lets the memory reach back from the first epoch
+            self.bias[hidden : 2 * hidden] = 1.0
+        self.register_buffer("no_bias", torch.zeros(4 * hidden), persistent=False)
+        self.no_bias: Tensor
+
+    def forward(self, f: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """One step: features [B, F], memory [B, 2H] -> output h [B, H], new memory [B, 2H]."""
+        gates = f @ self.w_input.T + s[:, : self.hidden] @ self.w_hidden.T + self.bias
+        i, forget, g, o = gates.chunk(4, dim=-1)
+        if self.softsign:
+            block = nn.functional.softsign(g)
+        else:
+            block = torch.tanh(g)
+        c = torch.sigmoid(forget) * s[:, self.hidden :] + torch.sigmoid(i) * block
+        if self.softsign:
+            h = torch.sigmoid(o) * nn.functional.softsign(c)
+        else:
+            h = torch.sigmoid(o) * torch.tanh(c)
+        return h, torch.cat((h, c), dim=-1)
+
+    def sequence(self, f: Tensor) -> tuple[Tensor, Tensor]:
+        """Features [B, T, F] -> outputs [B, T, H] from an empty memory, and the memory after them [B, 2H]."""
+        zeros = torch.zeros(f.shape[0], self.hidden, dtype=f.dtype, device=f.device)
+        if f.shape[1] == 0:
+            return f[:, :, :0].expand(-1, -1, self.hidden), torch.cat((zeros, zeros), dim=-1)
+        if not self.softsign:
+            weights = [self.w_input, self.w_hidden, self.bias, self.no_bias]
+            start = [zeros.unsqueeze(0), zeros.unsqueeze(0)]
+            out, h, c = torch.lstm(f, start, weights, True, 1, 0.0, self.training, False, True)
+            return out, torch.cat((h[0], c[0]), dim=-1)
+        s = torch.cat((zeros, zeros), dim=-1)
+        outputs: list[Tensor] = []
+        for k in range(f.shape[1]):
+            h, s = self.forward(f[:, k], s)
+            outputs.append(h)
+        return torch.stack(outputs, dim=1), s
+
+
+class LstmNetwork(nn.Module):
+    """Features, LSTM and readout of one or all axes; `outputs` numbers per sample."""
+
+    def __init__(self, config: LstmConfig, chosen: Sequence[str], outputs: int, names: Sequence[str]) -> None:
+        super().__init__()
+        self.features = Features(chosen, names, config.margin)
+        self.core = LstmCore(self.features.count, config.hidden_size, config.activation == "softsign")
+        self.dropout = nn.Dropout(config.dropout)
+        self.skip = config.readout > 0
+        out = nn.Linear(config.readout or config.hidden_size, outputs)
+        with torch.no_grad():
+            out.weight.mul_(0.1)
+            out.bias.zero_()
+        mixer = nn.Sequential(nn.Linear(config.hidden_size + self.features.count, config.readout), nn.Tanh()) if self.skip else nn.Sequential()
+        self.readout = nn.Sequential(*mixer, out)
+
+    def read(self, h: Tensor, f: Tensor) -> Tensor:
+        """Scaled residual [..., outputs] from LSTM outputs [..., H] and features [..., F]."""
+        h = self.dropout(h)
+        return self.readout(torch.cat((h, f), dim=-1) if self.skip else h)
+
+    def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """One step: channels [B, nz], memory [B, 2H] -> [B, outputs], new memory."""
+        f = self.features(z)
+        h, s = self.core(f, s)
+        return self.read(h, f), s
+
+    def sequence(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Channels [B, T, nz] -> [B, T, outputs] and the memory after them."""
+        f = self.features(z)
+        h, s = self.core.sequence(f)
+        return self.read(h, f), s
+
+
+class LstmHead(ResidualHead):
+    """Residual with memory; s packs (h, c) of each network."""
+
+    def __init__(self, config: LstmConfig, names: Sequence[str]) -> None:
+        super().__init__()
+        self.networks = nn.ModuleList([LstmNetwork(config, chosen, outputs, names) for chosen, outputs in config.networks(names)])
+        self.width = 2 * config.hidden_size
+        self.n_state = self.width * len(self.networks)
+        self.scale = ResidualScale()
+
+    def calibrate(self, samples: Samples) -> None:
+        """Take the scales of features and residual from the samples."""
+        for network in self.networks:
+            network.features.calibrate(samples)
+        self.scale.calibrate(samples)
+
+    def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Residual [B, 3] at channels z [B, nz] and the memory for the next step."""
+        out: list[Tensor] = []
+        memory: list[Tensor] = []
+        for i, network in enumerate(self.networks):
+            y, m = network(z, s[:, i * self.width : (i + 1) * self.width])
+            out.append(y)
+            memory.append(m)
+        return self.scale(torch.cat(out, dim=-1)), torch.cat(memory, dim=-1)
+
+    def sequence(self, z: Tensor) -> Tensor:
+        """Residuals [B, T, 3] along measured channels [B, T, nz], from an empty memory."""
+        return self.scale(torch.cat([network.sequence(z)[0] for network in self.networks], dim=-1))
+
+    def warmup(self, z: Tensor) -> Tensor:
+        """Memory [B, n_state] that past channels [B, T, nz] leave."""
+        return torch.cat([network.sequence(z)[1] for network in self.networks], dim=-1)

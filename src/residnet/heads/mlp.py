@@ -1,0 +1,58 @@
+"""Multi-layer perceptron: a memoryless residual of the present state and inputs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+
+from residnet.core.samples import Samples
+from residnet.heads.base import FeatureConfig, Features, ResidualHead, ResidualScale
+
+ACTIVATIONS: dict[str, type[nn.Module]] = {"tanh": nn.Tanh, "silu": nn.SiLU, "relu": nn.ReLU, "softsign": nn.Softsign}
+
+
+class MlpConfig(FeatureConfig):
+    """Layers of `hidden` units with one activation; the output layer starts near zero, so that training starts from the baseline."""
+
+    kind: Literal["mlp"] = "mlp"
+    hidden: tuple[int, ...] = Field(default=(64, 64), min_length=1)
+    activation: Literal["tanh", "silu", "relu", "softsign"] = "tanh"
+    dropout: float = Field(default=0.0, ge=0, lt=1)
+
+    def build(self, names: Sequence[str]) -> MlpHead:
+        """The module for channels `names`."""
+        return MlpHead(self, names)
+
+
+class MlpHead(ResidualHead):
+    """rho = spread * net(features)."""
+
+    def __init__(self, config: MlpConfig, names: Sequence[str]) -> None:
+        super().__init__()
+        self.features = Features(config.chosen(names), names, config.margin)
+        self.scale = ResidualScale()
+        layers: list[nn.Module] = []
+        width = self.features.count
+        for units in config.hidden:
+            layers += [nn.Linear(width, units), ACTIVATIONS[config.activation]()]
+            if config.dropout > 0:
+                layers.append(nn.Dropout(config.dropout))
+            width = units
+        out = nn.Linear(width, 3)
+        with torch.no_grad():
+            out.weight.mul_(0.1)
+            out.bias.zero_()
+        self.net = nn.Sequential(*layers, out)
+
+    def calibrate(self, samples: Samples) -> None:
+        """Take the scales of features and residual from the samples."""
+        self.features.calibrate(samples)
+        self.scale.calibrate(samples)
+
+    def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Residual [..., 3] at channels z [..., nz]; the memory is empty."""
+        return self.scale(self.net(self.features(z))), s

@@ -1,0 +1,102 @@
+"""Partial least squares regression over basis functions (document 002 section 3.2, ERRATA J14-J17), from moments alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from residnet.core.samples import Samples
+from residnet.heads.basis import BasisConfig, BasisHead
+
+
+def pls_path(xx: Tensor, xy: Tensor, orders: int) -> Tensor:
+    """Regression coefficients of PLS2 for every order up to `orders`, [A, J, K], by the kernel algorithm of Dayal and MacGregor (1997).
+
+    Args:
+        xx: X'X of centred, scaled columns [J, J].
+        xy: X'Y [J, K].
+        orders: number of latent variables; the path ends early where nothing is left to explain.
+    """
+    j, k = xy.shape
+    weights: list[Tensor] = []
+    loadings: list[Tensor] = []
+    rotations: list[Tensor] = []
+    coefficients = torch.zeros(j, k, dtype=xy.dtype)
+    path: list[Tensor] = []
+    rest = xy.clone()
+    start = float(torch.linalg.matrix_norm(xy))
+    for _ in range(orders):
+        left, singular, _right = torch.linalg.svd(rest, full_matrices=False)
+        if float(singular[0]) <= 1e-13 * start:
+            break
+        w = left[:, 0]
+        r = w.clone()
+        for p_old, r_old in zip(loadings, rotations, strict=True):
+            r = r - (p_old @ w) * r_old
+        energy = r @ xx @ r
+        if float(energy) <= 0:
+            break
+        p = xx @ r / energy
+        q = rest.T @ r / energy
+        rest = rest - torch.outer(p, q) * energy
+        weights.append(w)
+        loadings.append(p)
+        rotations.append(r)
+        coefficients = coefficients + torch.outer(r, q)
+        path.append(coefficients)
+    return torch.stack(path) if path else torch.zeros(0, j, k, dtype=xy.dtype)
+
+
+class PlsrConfig(BasisConfig):
+    """PLSR of the three residuals together.
+
+    Attributes:
+        order: number of latent variables; None chooses the one with the least cross-validated error (sum over axes, each in
+            units of its variance).
+        max_order: highest order tried.
+    """
+
+    kind: Literal["plsr"] = "plsr"
+    order: int | None = Field(default=None, ge=1)
+    max_order: int = Field(default=40, ge=1)
+
+    def build(self, names: Sequence[str]) -> PlsrHead:
+        """The module for channels `names`."""
+        return PlsrHead(self, names)
+
+
+class PlsrHead(BasisHead):
+    """Basis functions with coefficients by PLSR."""
+
+    def __init__(self, config: PlsrConfig, names: Sequence[str]) -> None:
+        super().__init__(config, names)
+        self.order = config.order or 0
+        self.max_order = config.max_order
+
+    def solve(self, samples: Samples) -> dict[str, object]:
+        """Fit from samples whose target is the residual [N, 3]; returns the order and the cross-validated error by order."""
+        moments = self.moments(samples)
+        highest = min(self.max_order, self.library.count) if self.order == 0 else min(self.order, self.library.count)
+        folds = [self._scaled_path(moments.without(f), highest) for f in range(self.folds)]
+        shortest = min(int(path.shape[0]) for path, _, _ in folds)
+        error = moments.cross_validate([(path[:shortest], mx, my) for path, mx, my in folds])
+        variance = samples.target.var(0, correction=0).clamp(min=1e-300)
+        score = (error / variance).mean(-1)
+        order = min(self.order, shortest) if self.order else int(score.argmin()) + 1
+        path, mean_x, mean_y = self._scaled_path(moments.all(), order)
+        self.coefficients.copy_(path[-1])
+        self.intercept.copy_(mean_y + moments.shift_y - (mean_x + moments.shift_x) @ path[-1])
+        return {"order": order, "cross_validated_share": score.tolist(), "terms": self.library.count}
+
+    @staticmethod
+    def _scaled_path(centred: tuple[float, Tensor, Tensor, Tensor, Tensor], orders: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Path of coefficients in unscaled columns [A, J, K], with the means that they refer to."""
+        n, mean_x, mean_y, xx, xy = centred
+        scale_x = (xx.diagonal() / (n - 1)).sqrt()
+        scale_x = torch.where(scale_x > 0, scale_x, torch.ones_like(scale_x))
+        path = pls_path(xx / torch.outer(scale_x, scale_x), xy / scale_x[:, None], orders)
+        return path / scale_x[None, :, None], mean_x, mean_y

@@ -1,0 +1,57 @@
+"""Ridge regression over basis functions (document 001 section 2.2, ERRATA M4), the penalty by cross-validation from moments."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from residnet.core.samples import Samples
+from residnet.heads.basis import BasisConfig, BasisHead
+
+
+class RidgeConfig(BasisConfig):
+    """Ridge of each residual; penalties are in units of a standardised column's energy (alpha = penalty * samples in scikit-learn's terms).
+
+    Attributes:
+        penalties: candidates; with several, each axis takes the one with the least cross-validated error.
+    """
+
+    kind: Literal["ridge"] = "ridge"
+    penalties: tuple[float, ...] = Field(default=(1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0), min_length=1)
+
+    def build(self, names: Sequence[str]) -> RidgeHead:
+        """The module for channels `names`."""
+        return RidgeHead(self, names)
+
+
+class RidgeHead(BasisHead):
+    """Basis functions with coefficients by ridge regression."""
+
+    def __init__(self, config: RidgeConfig, names: Sequence[str]) -> None:
+        super().__init__(config, names)
+        self.penalties = tuple(sorted(config.penalties))
+
+    def solve(self, samples: Samples) -> dict[str, object]:
+        """Fit from samples whose target is the residual [N, 3]; returns the penalties and the cross-validated error of each."""
+        moments = self.moments(samples)
+        error = moments.cross_validate([self._scaled_path(moments.without(f)) for f in range(self.folds)])
+        best = error.argmin(0)
+        path, mean_x, mean_y = self._scaled_path(moments.all())
+        chosen = torch.stack([path[int(best[k]), :, k] for k in range(3)], dim=1)
+        self.coefficients.copy_(chosen)
+        self.intercept.copy_(mean_y + moments.shift_y - (mean_x + moments.shift_x) @ chosen)
+        return {"penalty": [self.penalties[int(i)] for i in best], "cross_validated_error": error.tolist(), "terms": self.library.count}
+
+    def _scaled_path(self, centred: tuple[float, Tensor, Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+        """Coefficients for every penalty [C, J, K] from one eigendecomposition, with the means that they refer to."""
+        n, mean_x, mean_y, xx, xy = centred
+        scale = (xx.diagonal() / n).sqrt()
+        scale = torch.where(scale > 0, scale, torch.ones_like(scale))
+        values, vectors = torch.linalg.eigh(xx / torch.outer(scale, scale) / n)
+        projected = vectors.T @ (xy / scale[:, None]) / n
+        path = torch.stack([vectors @ (projected / (values.clamp(min=0.0) + penalty)[:, None]) for penalty in self.penalties])
+        return path / scale[None, :, None], mean_x, mean_y

@@ -1,0 +1,16 @@
+"""The head of a model without a residual."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from residnet.heads.base import ResidualHead
+
+
+class ZeroHead(ResidualHead):
+    """rho = 0: the baseline alone."""
+
+    def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Zeros [..., 3]."""
+        return torch.zeros_like(z[..., :3]), s

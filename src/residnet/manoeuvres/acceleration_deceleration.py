@@ -1,0 +1,56 @@
+"""Acceleration-deceleration: speed steps straight ahead (document 003 section 4.2.2)."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+import torch
+from pydantic import Field, model_validator
+from torch import Tensor
+
+from residnet.core.config import Config, Seconds
+from residnet.manoeuvres.base import Manoeuvre, Range
+
+
+class AccelerationDeceleration(Manoeuvre):
+    """Drive levels, each held from its time on; the steer is zero."""
+
+    kind: Literal["acceleration_deceleration"] = "acceleration_deceleration"
+    times: tuple[Seconds, ...] = Field(min_length=1)
+    levels: tuple[float, ...] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _pairs(self) -> AccelerationDeceleration:
+        if len(self.times) != len(self.levels) or list(self.times) != sorted(self.times):
+            raise ValueError("times and levels need the same number of entries, times ascending")
+        return self
+
+    def demands(self, t: Tensor) -> tuple[Tensor, Tensor]:
+        """Stepped drive [T], zero before the first time; zero steer [T]."""
+        index = torch.searchsorted(torch.tensor(self.times, dtype=t.dtype), t, right=True)
+        return torch.tensor((0.0, *self.levels), dtype=t.dtype)[index], torch.zeros_like(t)
+
+
+class AccelerationDecelerationFamily(Config):
+    """Steps between a high level, lowered by a quarter and by half in turn, and a low level; all uniform in their ranges."""
+
+    kind: Literal["acceleration_deceleration"] = "acceleration_deceleration"
+    count: int = Field(ge=1)
+    high: Range = (0.4, 1.0)
+    low: Range = (0.0, 0.3)
+    hold: tuple[Seconds, Seconds] = (6.0, 12.0)
+
+    def draw(self, random: np.random.Generator, duration: float) -> list[Manoeuvre]:
+        """`count` manoeuvres of `duration` seconds."""
+        most = int(duration / self.hold[0]) + 2
+        out: list[Manoeuvre] = []
+        for _ in range(self.count):
+            high, low = random.uniform(*self.high), random.uniform(*self.low)
+            holds = random.uniform(*self.hold, size=most)
+            times = np.concatenate(([0.0], np.cumsum(holds)[:-1]))
+            peaks = high * np.array([1.0, 0.75, 0.5])[(np.arange(most) // 2) % 3]
+            levels = np.where(np.arange(most) % 2 == 0, peaks, low)
+            keep = times < duration
+            out.append(AccelerationDeceleration(times=tuple(times[keep].tolist()), levels=tuple(levels[keep].tolist())))
+        return out

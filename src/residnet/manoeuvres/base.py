@@ -1,0 +1,85 @@
+"""The interface of manoeuvres.
+
+A manoeuvre demands a normalised drive (mean thrust or revolutions) and steer (difference, or rudder) over time, open
+loop or by the heading that it sees. The vessel turns the two into its own commands, so one manoeuvre drives any plant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Literal
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from residnet.core.config import Config, Seconds
+from residnet.dynamics.rollout import Source
+
+Demand = Callable[[Tensor, Tensor], Tensor]
+"""Turns drive [...] and steer [...] into commands [..., c], the first c columns of the inputs."""
+
+
+class ScheduleSource(Source):
+    """Open-loop demands given in advance."""
+
+    def __init__(self, drive: Tensor, steer: Tensor, demand: Demand) -> None:
+        super().__init__()
+        self.commands = demand(drive, steer)
+
+    def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """Inputs [B, m] with the scheduled commands in the first columns."""
+        command = self.commands[:, k].to(w.dtype)
+        return torch.cat((command, w[:, command.shape[-1] :]), dim=-1), memory
+
+
+class StackedSource(Source):
+    """Different manoeuvres side by side in one batch: each source drives its own rows."""
+
+    def __init__(self, sources: Sequence[Source], rows: Sequence[int]) -> None:
+        super().__init__()
+        self.sources = torch.nn.ModuleList(sources)
+        self.rows = list(rows)
+
+    def initial(self, x: Tensor) -> Tensor:
+        """Memories of all sources, padded to the widest, [B, k]."""
+        parts = [source.initial(part) for source, part in zip(self.sources, x.split(self.rows), strict=True)]
+        width = max(part.shape[1] for part in parts)
+        return torch.cat([torch.nn.functional.pad(part, (0, width - part.shape[1])) for part in parts])
+
+    def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """Inputs [B, m], each block of rows from its source."""
+        inputs, memories = [], []
+        for source, xs, ws, ms in zip(self.sources, x.split(self.rows), w.split(self.rows), memory.split(self.rows), strict=True):
+            acting, after = source(xs, ws, k, ms)
+            inputs.append(acting)
+            memories.append(after)
+        return torch.cat(inputs), torch.cat(memories)
+
+
+class Manoeuvre(Config):
+    """One manoeuvre of normalised demands; `kind` names it in logs and metrics."""
+
+    kind: str
+
+    def demands(self, t: Tensor) -> tuple[Tensor, Tensor]:
+        """Open-loop drive and steer [T] at times t [T] in s."""
+        raise NotImplementedError
+
+    @classmethod
+    def source(cls, manoeuvres: Sequence[Manoeuvre], demand: Demand, t: Tensor) -> Source:
+        """The source that flies several manoeuvres of this kind side by side; t [T] are the times of the steps."""
+        pairs = [manoeuvre.demands(t) for manoeuvre in manoeuvres]
+        return ScheduleSource(torch.stack([d for d, _ in pairs]), torch.stack([s for _, s in pairs]), demand)
+
+
+class Steering(Manoeuvre):
+    """A manoeuvre that holds the drive and steers from `start` on."""
+
+    drive: float = Field(ge=-1, le=1)
+    steer: float = Field(ge=-1, le=1)
+    start: Seconds = Field(default=5.0, ge=0)
+
+
+Range = tuple[float, float]
+Side = Literal["starboard", "port"]

@@ -1,0 +1,116 @@
+"""From state and inputs to the channels that baselines and heads may use: velocities, commands, forces, relative wind.
+
+Position and heading are not offered: a model in body axes must not depend on where the vessel is or where it points.
+True wind enters earth-fixed and is turned into wind relative to the vessel with the predicted heading and velocity.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import torch
+from pydantic import Field, model_validator
+from torch import Tensor, nn
+
+from residnet.core.config import Config
+from residnet.core.frames import to_body
+from residnet.core.names import CHANNEL_UNITS, STATE, VELOCITY, nearest
+from residnet.physics.actuators import DifferentialThrustConfig
+from residnet.physics.vessel import load_vessel
+
+WIND_INPUTS = ("wind_speed", "wind_dir")
+WIND_CHANNELS = ("wind_u", "wind_v", "wind_mag")
+FORCE_CHANNELS = ("tau_x", "tau_y", "tau_n")
+
+
+class SignalsConfig(Config):
+    """What drives the model.
+
+    Attributes:
+        inputs: command channels of the log, in order; held over a step.
+        exogenous: channels that nobody commands; `wind_speed` and `wind_dir` (where the true wind comes FROM, earth-fixed)
+            become the channels wind_u, wind_v, wind_mag: velocity of the air relative to the vessel in body axes.
+        forces: a vessel whose thrusters turn the first two inputs into tau_x, tau_y, tau_n.
+    """
+
+    inputs: tuple[str, ...] = Field(min_length=1)
+    exogenous: tuple[str, ...] = ()
+    forces: str | None = None
+    thrusters: Annotated[DifferentialThrustConfig | None, Field(description="filled from `forces`; stands in saved models")] = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _resolve(cls, data: object) -> object:
+        if isinstance(data, dict) and data.get("forces") and not data.get("thrusters"):
+            return {**data, "thrusters": load_vessel(str(data["forces"])).actuators.model_dump()}
+        return data
+
+    @model_validator(mode="after")
+    def _combination(self) -> SignalsConfig:
+        for name in self.exogenous:
+            if name not in WIND_INPUTS:
+                raise ValueError(f"exogenous channel '{name}' is not understood{nearest(name, WIND_INPUTS)}")
+        if self.exogenous and set(self.exogenous) != set(WIND_INPUTS):
+            raise ValueError(f"true wind needs both {' and '.join(WIND_INPUTS)}; given {list(self.exogenous)}")
+        if self.thrusters is not None and len(self.inputs) != 2:
+            raise ValueError(f"forces '{self.forces}' are made by two thrusters, but inputs are {list(self.inputs)}")
+        repeated = {name for name in self.inputs if name in self.exogenous or self.inputs.count(name) > 1}
+        if repeated:
+            raise ValueError(f"inputs {sorted(repeated)} are named twice")
+        return self
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of the columns of w [B, m]: inputs, then exogenous channels."""
+        return self.inputs + self.exogenous
+
+    def units(self) -> dict[str, str]:
+        """SI unit of each state and input."""
+        return {name: CHANNEL_UNITS.get(name, "-") for name in STATE + self.columns}
+
+    def build(self) -> Signals:
+        """The module."""
+        return Signals(self)
+
+
+class Signals(nn.Module):
+    """Channels z [B, nz] from state x [B, nx] and inputs w [B, m]; `names` holds the names of the columns of z.
+
+    `prepare` does what depends on the inputs alone, once per step; `forward` does the rest at every stage of the integrator.
+    """
+
+    def __init__(self, config: SignalsConfig) -> None:
+        super().__init__()
+        self.inputs = len(config.inputs)
+        self.wind = len(config.exogenous) > 0
+        self.forces = config.thrusters is not None
+        columns = config.columns
+        self.speed_column = columns.index("wind_speed") if self.wind else 0
+        self.direction_column = columns.index("wind_dir") if self.wind else 0
+        self.thrusters: nn.Module = config.thrusters.build() if config.thrusters is not None else nn.Identity()
+        names = VELOCITY + config.inputs
+        names += FORCE_CHANNELS if self.forces else ()
+        names += WIND_CHANNELS if self.wind else ()
+        self.names: tuple[str, ...] = names
+        self.count = len(names)
+
+    def prepare(self, w: Tensor) -> Tensor:
+        """What a step holds fixed: inputs, forces and the air's velocity over ground (north, east), [..., k]."""
+        parts = [w[..., : self.inputs]]
+        if self.forces:
+            parts.append(self.thrusters(w[..., : self.inputs]))
+        if self.wind:
+            speed, direction = w[..., self.speed_column], w[..., self.direction_column]
+            parts.append(torch.stack((-speed * torch.cos(direction), -speed * torch.sin(direction)), dim=-1))
+        return torch.cat(parts, dim=-1)
+
+    def forward(self, x: Tensor, p: Tensor) -> Tensor:
+        """Channels z [..., nz] from state x [..., nx] (x, y, psi, u, v, r first) and p = prepare(w)."""
+        if not self.wind:
+            return torch.cat((x[..., 3:6], p), dim=-1)
+        known = p.shape[-1] - 2
+        along, across = to_body(p[..., known], p[..., known + 1], x[..., 2])
+        along, across = along - x[..., 3], across - x[..., 4]
+        # the offset keeps the gradient finite in a calm
+        magnitude = torch.sqrt(along * along + across * across + 1e-8)
+        return torch.cat((x[..., 3:6], p[..., :known], torch.stack((along, across, magnitude), dim=-1)), dim=-1)
