@@ -89,7 +89,6 @@ def test_missing_file(tmp_path: Path) -> None:
         pytest.param(
             b"PAR1" + bytes(40) + b"PAR1",
             id="damaged footer",
-            marks=pytest.mark.xfail(raises=OSError, strict=True, reason="Log.load does not catch the plain OSError of pyarrow"),
         ),
     ],
 )

@@ -85,12 +85,12 @@ class WindowStore:
         return values.index_select(0, index.reshape(-1)).reshape(starts.numel(), length, *values.shape[1:])
 
     def history(self, starts: Tensor, length: int) -> tuple[Tensor, Tensor]:
-        """States and inputs of the `length` samples before each start; where the stretch is shorter, its first sample is repeated."""
+        """Measured states and inputs of the `length` samples before each start; where the stretch is shorter, its first sample is repeated."""
         back = torch.arange(-length, 0)
         index = starts[:, None] + torch.maximum(back, -self.depth[starts][:, None])
         rows = index.reshape(-1)
         shape = (starts.numel(), length)
-        return self.smooth.index_select(0, rows).reshape(*shape, -1), self.w.index_select(0, rows).reshape(*shape, -1)
+        return self.y.index_select(0, rows).reshape(*shape, -1), self.w.index_select(0, rows).reshape(*shape, -1)
 
 
 class WindowBatches:

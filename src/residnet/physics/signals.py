@@ -6,13 +6,12 @@ True wind enters earth-fixed and is turned into wind relative to the vessel with
 
 from __future__ import annotations
 
-from typing import Annotated
-
 import torch
 from pydantic import Field, model_validator
 from torch import Tensor, nn
 
 from residnet.core.config import Config
+from residnet.core.errors import ConfigError
 from residnet.core.frames import to_body
 from residnet.core.names import CHANNEL_UNITS, STATE, VELOCITY, nearest
 from residnet.physics.actuators import DifferentialThrustConfig
@@ -30,20 +29,12 @@ class SignalsConfig(Config):
         inputs: command channels of the log, in order; held over a step.
         exogenous: channels that nobody commands; `wind_speed` and `wind_dir` (where the true wind comes FROM, earth-fixed)
             become the channels wind_u, wind_v, wind_mag: velocity of the air relative to the vessel in body axes.
-        forces: a vessel whose thrusters turn the first two inputs into tau_x, tau_y, tau_n.
+        forces: a vessel (by name or file) whose thrusters turn the two inputs into tau_x, tau_y, tau_n; or the thrusters themselves.
     """
 
     inputs: tuple[str, ...] = Field(min_length=1)
     exogenous: tuple[str, ...] = ()
-    forces: str | None = None
-    thrusters: Annotated[DifferentialThrustConfig | None, Field(description="filled from `forces`; stands in saved models")] = None
-
-    @model_validator(mode="before")
-    @classmethod
-    def _resolve(cls, data: object) -> object:
-        if isinstance(data, dict) and data.get("forces") and not data.get("thrusters"):
-            return {**data, "thrusters": load_vessel(str(data["forces"])).actuators.model_dump()}
-        return data
+    forces: str | DifferentialThrustConfig | None = None
 
     @model_validator(mode="after")
     def _combination(self) -> SignalsConfig:
@@ -52,8 +43,8 @@ class SignalsConfig(Config):
                 raise ValueError(f"exogenous channel '{name}' is not understood{nearest(name, WIND_INPUTS)}")
         if self.exogenous and set(self.exogenous) != set(WIND_INPUTS):
             raise ValueError(f"true wind needs both {' and '.join(WIND_INPUTS)}; given {list(self.exogenous)}")
-        if self.thrusters is not None and len(self.inputs) != 2:
-            raise ValueError(f"forces '{self.forces}' are made by two thrusters, but inputs are {list(self.inputs)}")
+        if self.resolved().forces is not None and len(self.inputs) != 2:
+            raise ValueError(f"forces are made by two thrusters, but inputs are {list(self.inputs)}")
         repeated = {name for name in self.inputs if name in self.exogenous or self.inputs.count(name) > 1}
         if repeated:
             raise ValueError(f"inputs {sorted(repeated)} are named twice")
@@ -64,13 +55,26 @@ class SignalsConfig(Config):
         """Names of the columns of w [B, m]: inputs, then exogenous channels."""
         return self.inputs + self.exogenous
 
+    def resolved(self) -> SignalsConfig:
+        """The same with the vessel's name replaced by its thrusters, so that a saved model needs no vessel file.
+
+        Raises:
+            ValueError: where there is no such vessel.
+        """
+        if not isinstance(self.forces, str):
+            return self
+        try:
+            return self.model_copy(update={"forces": load_vessel(self.forces).actuators})
+        except ConfigError as error:
+            raise ValueError(str(error)) from None
+
     def units(self) -> dict[str, str]:
         """SI unit of each state and input."""
         return {name: CHANNEL_UNITS.get(name, "-") for name in STATE + self.columns}
 
     def build(self) -> Signals:
         """The module."""
-        return Signals(self)
+        return Signals(self.resolved())
 
 
 class Signals(nn.Module):
@@ -83,11 +87,12 @@ class Signals(nn.Module):
         super().__init__()
         self.inputs = len(config.inputs)
         self.wind = len(config.exogenous) > 0
-        self.forces = config.thrusters is not None
+        thrusters = config.forces if isinstance(config.forces, DifferentialThrustConfig) else None
+        self.forces = thrusters is not None
         columns = config.columns
         self.speed_column = columns.index("wind_speed") if self.wind else 0
         self.direction_column = columns.index("wind_dir") if self.wind else 0
-        self.thrusters: nn.Module = config.thrusters.build() if config.thrusters is not None else nn.Identity()
+        self.thrusters: nn.Module = thrusters.build() if thrusters is not None else nn.Identity()
         names = VELOCITY + config.inputs
         names += FORCE_CHANNELS if self.forces else ()
         names += WIND_CHANNELS if self.wind else ()

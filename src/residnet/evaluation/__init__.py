@@ -1,0 +1,1 @@
+"""Free-run evaluation: protocols, the evaluator, metrics, figures and the report."""

@@ -1,0 +1,116 @@
+"""Protocols: which stretches of a log a model is asked to predict, from which initial state."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+
+from residnet.core.config import Config, Seconds
+from residnet.core.errors import DataError
+from residnet.data.prepare import Prepared
+
+
+@dataclass(frozen=True)
+class Window:
+    """One free run: samples start .. stop-1 of a log, the first of them the initial state.
+
+    Attributes:
+        log: number of the log.
+        start: sample of the initial state.
+        stop: one past the last sample.
+        past: first sample of the measured past that may warm up a memory.
+        nu: initial velocities [3].
+    """
+
+    log: int
+    start: int
+    stop: int
+    past: int
+    nu: np.ndarray
+
+
+class Windows(Config):
+    """Back-to-back windows of one length (the free-run protocol of the measured tanker).
+
+    The first starts `first` after the log's start; a start on a sample that is not usable moves on to the first that is; an
+    incomplete tail is dropped. The initial state is measured. `history` seconds before the window may warm up a memory.
+    """
+
+    kind: Literal["windows"] = "windows"
+    length: Seconds = Field(gt=0)
+    first: Seconds = Field(default=5.0, ge=0)
+    history: Seconds = Field(default=5.0, ge=0)
+
+    def windows(self, log: Prepared, number: int, step: float) -> list[Window]:
+        """The windows of one log; none where it is too short."""
+        steps, start, out = round(self.length / step), round(self.first / step), []
+        end = _ends(log.piece)
+        while start + steps < len(log):
+            while start < len(log) and not log.usable[start]:
+                start += 1
+            if start + steps >= len(log):
+                break
+            if end[start] <= start + steps:
+                # a break inside: nothing can be simulated across it
+                start = int(end[start])
+                continue
+            out.append(Window(number, start, start + steps + 1, max(start - round(self.history / step), 0), log.y[start, 3:].copy()))
+            start += steps
+        return out
+
+
+class WholeManoeuvre(Config):
+    """Every uninterrupted stretch of a log as one free run.
+
+    The initial velocities are the mean of the first `initial` seconds, which also warm up a memory; scoring starts after them.
+    Stretches shorter than `shortest` are left out.
+    """
+
+    kind: Literal["manoeuvre"] = "manoeuvre"
+    initial: Seconds = Field(default=0.5, gt=0)
+    shortest: Seconds = Field(default=5.0, gt=0)
+
+    def windows(self, log: Prepared, number: int, step: float) -> list[Window]:
+        """One window per stretch."""
+        lead, out = max(round(self.initial / step), 1), []
+        end = _ends(log.piece)
+        begin = 0
+        while begin < len(log):
+            if log.piece[begin] < 0:
+                begin += 1
+                continue
+            stop = int(end[begin])
+            if stop - begin > max(lead + 1, round(self.shortest / step)):
+                out.append(Window(number, begin + lead, stop, begin, log.y[begin : begin + lead, 3:].mean(0)))
+            begin = stop
+        return out
+
+
+ProtocolConfig = Annotated[Windows | WholeManoeuvre, Field(discriminator="kind")]
+
+
+def _ends(piece: np.ndarray) -> np.ndarray:
+    """One past the last sample of each sample's stretch, [T]; the sample itself where there is none."""
+    change = np.flatnonzero(np.append(piece[1:] != piece[:-1], True)) + 1
+    ends = change[np.searchsorted(change, np.arange(piece.size), side="right")]
+    return np.where(piece >= 0, ends, np.arange(piece.size))
+
+
+def all_windows(protocol: Windows | WholeManoeuvre, logs: Sequence[Prepared], step: float, name: str) -> list[Window]:
+    """The windows of a protocol over several logs.
+
+    Raises:
+        DataError: where no log is long enough for a single one.
+    """
+    out = [window for number, log in enumerate(logs) for window in protocol.windows(log, number, step)]
+    if not out:
+        longest = max(logs, key=len)
+        raise DataError(
+            f"protocol {name}: none of {len(logs)} '{logs[0].split}' logs holds a window; the longest, {longest.log.name}, lasts "
+            f"{len(longest) * step:.1f} s; give longer logs or shorten the protocol"
+        )
+    return out

@@ -1,0 +1,85 @@
+"""Task `fit`: logs to baseline, heads, free-run comparison, report and export."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field, model_validator
+
+from residnet.baselines import BaselineConfig
+from residnet.core.config import Config
+from residnet.core.errors import ConfigError
+from residnet.core.names import nearest
+from residnet.data.prepare import PrepareConfig
+from residnet.data.simulate import SimulatedTrials
+from residnet.data.sources import DataConfig
+from residnet.dynamics.base import Integrator
+from residnet.evaluation.config import EvaluationConfig
+from residnet.heads import HeadConfig
+from residnet.physics.signals import SignalsConfig
+from residnet.training.config import TrainingConfig
+
+_TAKEN = ("zero", "baseline", "truth")
+
+
+class ExportConfig(Config):
+    """Which models are exported as TorchScript; `selected` is the one chosen on validation data."""
+
+    models: tuple[str, ...] = ("selected",)
+
+
+class FitConfig(Config):
+    """A complete fit.
+
+    Attributes:
+        name: of the run; its folder is runs/<name> unless --out says otherwise.
+        seed: of weights and batches.
+        threads: of PyTorch; part of what makes a run repeatable. One is fastest for these small products.
+        data: logs and splits.
+        prepare: grid, masks, derivatives.
+        signals: inputs of the models.
+        integrator: of the models; their step is the grid's.
+        baseline: the known part.
+        heads: residual heads by name.
+        training: of network heads by the name of the head; the defaults where absent.
+        evaluation: protocols and scales.
+        export: TorchScript.
+    """
+
+    task: Literal["fit"]
+    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")
+    description: str = ""
+    seed: int = Field(default=0, ge=0)
+    threads: int = Field(default=1, ge=1)
+    data: DataConfig
+    prepare: PrepareConfig
+    signals: SignalsConfig
+    integrator: Integrator = "rk4"
+    baseline: BaselineConfig
+    heads: dict[str, HeadConfig] = Field(default_factory=dict)
+    training: dict[str, TrainingConfig] = Field(default_factory=dict)
+    evaluation: EvaluationConfig
+    export: ExportConfig = ExportConfig()
+
+    @model_validator(mode="after")
+    def _combination(self) -> FitConfig:
+        for name in self.heads:
+            if name in _TAKEN or not name.replace("_", "").replace("-", "").isalnum():
+                raise ValueError(f"heads: '{name}' cannot name a head; use letters, digits, '-', '_' and none of {', '.join(_TAKEN)}")
+        for name in self.training:
+            if name not in self.heads:
+                raise ValueError(f"training: no head is named '{name}'{nearest(name, self.heads)}")
+        for name in self.export.models:
+            if name not in ("selected", "baseline", *self.heads):
+                raise ValueError(f"export.models: no model is named '{name}'{nearest(name, ('selected', 'baseline', *self.heads))}")
+        names = self.signals.build().names
+        for key, part in {"baseline": self.baseline, **{f"heads.{name}": head for name, head in self.heads.items()}}.items():
+            try:
+                part.build(names)
+            except ConfigError as error:
+                raise ValueError(f"{key}: {error}") from None
+        if isinstance(self.data, SimulatedTrials):
+            self.data.splits(self.data.draw())
+            if abs(self.data.step - self.prepare.grid.step) > 1e-9:
+                raise ValueError(f"prepare.grid.step ({self.prepare.grid.step:g} s) must equal data.step ({self.data.step:g} s) for simulated trials")
+        return self

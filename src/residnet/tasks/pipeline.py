@@ -1,0 +1,222 @@
+"""Steps of a fit, each from the results of the one before: prepared logs, baseline, heads, evaluation."""
+
+from __future__ import annotations
+
+import copy
+import json
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from residnet.baselines import Coefficient, StillConfig
+from residnet.core.errors import DataError
+from residnet.core.log import Log
+from residnet.core.samples import Samples
+from residnet.data.prepare import Prepared, envelope, prepare, samples
+from residnet.data.simulate import SimulatedTrials
+from residnet.data.sources import MeasuredLogs
+from residnet.data.windows import WindowStore
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.simulated import PlantDynamics
+from residnet.dynamics.store import ModelSpec, load_model, save_model
+from residnet.evaluation.config import EvaluationConfig
+from residnet.evaluation.freerun import Candidate, FreeRun, free_run
+from residnet.evaluation.metrics import rows, window_errors
+from residnet.evaluation.protocol import all_windows
+from residnet.evaluation.rollout_files import write_rollouts
+from residnet.heads import ClosedFormHead
+from residnet.physics.plant import DifferentialThrustVessel
+from residnet.physics.vessel import load_vessel
+from residnet.run_folder import RunFolder
+from residnet.tasks.fit import FitConfig
+from residnet.training.config import TrainingConfig
+
+PreparedSplits = dict[str, list[Prepared]]
+
+
+def say(text: str) -> None:
+    """A line about the progress of a run, on standard error."""
+    print(text, file=sys.stderr, flush=True)
+
+
+def prepare_logs(splits: Mapping[str, Sequence[Log]], config: FitConfig) -> PreparedSplits:
+    """Prepare every log.
+
+    Raises:
+        DataError: where a log has nothing to learn from or to predict.
+    """
+    out = {split: [prepare(log, split, config.signals.columns, config.prepare) for log in logs] for split, logs in splits.items()}
+    for logs in out.values():
+        for log in logs:
+            require_length(log, config)
+    return out
+
+
+def require_length(log: Prepared, config: FitConfig) -> None:
+    """Check that a log holds at least one window of what will be asked of it.
+
+    Raises:
+        DataError: where it does not.
+    """
+    step = config.prepare.grid.step
+    if not log.good.any():
+        raise DataError(f"log {log.log.name}: its {len(log) * step:.1f} s hold no stretch as long as the derivative's window; leave it out or shorten prepare.derivative.window")
+    protocols = config.evaluation.protocols
+    if log.split != "train" and not any(protocol.windows(log, 0, step) for protocol in protocols.values()):
+        raise DataError(f"log {log.log.name}: its {len(log) * step:.1f} s are shorter than a window of every protocol ({', '.join(protocols)}); leave it out or shorten the protocols")
+
+
+class Bench:
+    """Free-run validation of a model during training and selection: the windows are laid out once."""
+
+    def __init__(self, logs: Sequence[Prepared], config: EvaluationConfig, step: float, limit: np.ndarray) -> None:
+        self.logs = logs
+        self.step = step
+        self.limit = limit
+        self.scales = config.scales.array()
+        self.windows = all_windows(config.protocols[config.selection], logs, step, config.selection)
+
+    def __call__(self, model: HybridDynamics) -> float:
+        """Mean nrmse over u, v, r of the validation windows; a diverged window counts with the error of `zero`."""
+        training = model.training
+        candidate = Candidate("validated", "head", model)
+        predictions = free_run([candidate], self.windows, self.logs, self.step, self.limit, dtype=torch.float32)
+        model.train(training)
+        errors = window_errors(FreeRun("", "", self.windows, predictions), "validated", self.logs)
+        return float((errors["rmse"].mean(0) / self.scales).mean())
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A model with what there is to say about its fit."""
+
+    spec: ModelSpec
+    model: HybridDynamics
+    notes: dict[str, Any]
+
+
+class Fitter:
+    """Identifies the baseline, then fits heads on what it leaves, and keeps each model in the run folder as it is done."""
+
+    def __init__(self, config: FitConfig, logs: PreparedSplits, folder: RunFolder) -> None:
+        self.config = config
+        self.folder = folder
+        self.train = logs["train"]
+        self.signals = config.signals.build()
+        self.low, self.high = envelope(self.train)
+        self.limit = config.evaluation.divergence * np.maximum(np.abs(self.low[:3]), np.abs(self.high[:3]))
+        self.samples = samples(self.train, self.signals)
+        self.bench = Bench(logs["validation"], config.evaluation, config.prepare.grid.step, self.limit)
+
+    def spec(self, name: str, role: str) -> ModelSpec:
+        """The description of a model of this run."""
+        config = self.config
+        return ModelSpec.model_validate(
+            {
+                "schema": "residnet.model/1",
+                "name": name,
+                "role": role,
+                "signals": config.signals.resolved().model_dump(),
+                "baseline": (StillConfig() if role == "zero" else config.baseline).model_dump(),
+                "head": config.heads[name].model_dump() if role == "head" else None,
+                "dt": config.prepare.grid.step,
+                "integrator": config.integrator,
+                "low": self.low.tolist(),
+                "high": self.high.tolist(),
+            }
+        )
+
+    def zero(self) -> Fitted:
+        """The model that holds the velocities."""
+        spec = self.spec("zero", "zero")
+        return self._keep(Fitted(spec, spec.build(), {}))
+
+    def baseline(self) -> Fitted:
+        """The identified baseline."""
+        spec = self.spec("baseline", "baseline")
+        model = spec.build()
+        started = time.perf_counter()
+        table = spec.baseline.fit(model.baseline, self.samples)
+        notes = {"coefficients": [_row(entry) for entry in table], "samples": len(self.samples), "seconds": round(time.perf_counter() - started, 3)}
+        return self._keep(Fitted(spec, model, notes))
+
+    def head(self, name: str, baseline: HybridDynamics) -> Fitted:
+        """One head on top of the baseline; taken from the run folder where it is finished there."""
+        folder = self.folder.models / name
+        if (folder / "model.json").is_file():
+            spec, model = load_model(folder)
+            return Fitted(spec, model, json.loads((folder / "fit.json").read_text()))
+        spec = self.spec(name, "head")
+        # seeded by the head's own name, so that adding a head changes no other
+        seed = self.config.seed * 1_000 + sum(map(ord, name))
+        torch.manual_seed(seed)
+        model = spec.build()
+        model.baseline.load_state_dict(copy.deepcopy(baseline.baseline.state_dict()))
+        residual = self.residual(baseline, self.samples)
+        started = time.perf_counter()
+        if isinstance(model.head, ClosedFormHead):
+            model.head.calibrate(residual)
+            notes = dict(model.head.solve(residual))
+        else:
+            notes = self._train(name, model, residual, seed)
+        notes["seconds"] = round(time.perf_counter() - started, 1)
+        notes["validation"] = self.bench(model)
+        return self._keep(Fitted(spec, model, notes))
+
+    def residual(self, baseline: HybridDynamics, of: Samples) -> Samples:
+        """Samples whose target is what the baseline leaves of the acceleration (document 003 eq. (19))."""
+        with torch.no_grad():
+            return of.with_target(of.target - baseline.baseline(of.z))
+
+    def _train(self, name: str, model: HybridDynamics, residual: Samples, seed: int) -> dict[str, Any]:
+        from residnet.training.trainer import train
+
+        store = WindowStore.gather(self.train)
+        scales = torch.from_numpy(self.config.evaluation.scales.array())
+        settings = self.config.training.get(name, TrainingConfig())
+        return train(name, model, residual, store, settings, scales, self.bench, seed, self.folder.path)
+
+    def _keep(self, fitted: Fitted) -> Fitted:
+        folder = self.folder.models / fitted.spec.name
+        self.folder.write_json(folder / "fit.json", fitted.notes)
+        save_model(folder, fitted.spec, fitted.model)
+        return fitted
+
+
+def _row(entry: Coefficient) -> dict[str, Any]:
+    return {"axis": entry.axis, "term": entry.term, "value": entry.value, "standard_error": entry.error}
+
+
+def candidates(fitted: Sequence[Fitted], data: MeasuredLogs | SimulatedTrials) -> list[Candidate]:
+    """Models to evaluate: all that were fitted, and where the data are simulated the plant that made them."""
+    out = [Candidate(f.spec.name, f.spec.role, f.model) for f in fitted]
+    if isinstance(data, SimulatedTrials):
+        plant = DifferentialThrustVessel(load_vessel(data.vessel))
+        known = plant.inputs[: plant.commands]
+        model = PlantDynamics(plant, data.step, data.substeps)
+        out.append(Candidate("truth", "truth", model, plant.state[6:], known, len(plant.inputs) - len(known)))
+    return out
+
+
+def evaluate(
+    models: Sequence[Candidate], logs: Sequence[Prepared], config: EvaluationConfig, step: float, limit: np.ndarray, folder: RunFolder
+) -> list[dict[str, Any]]:
+    """Free-run all models over all protocols of one split; writes the rollouts and returns the rows of metrics.json."""
+    table: list[dict[str, Any]] = []
+    runs: list[FreeRun] = []
+    split = logs[0].split
+    for name, protocol in config.protocols.items():
+        windows = [window for number, log in enumerate(logs) for window in protocol.windows(log, number, step)]
+        if not windows:
+            continue
+        run = FreeRun(name, split, windows, free_run(models, windows, logs, step, limit))
+        runs.append(run)
+        scales = {key: float(value) for key, value in config.scales.model_dump().items()}
+        table += rows(run, models, logs, scales, config.groups)
+    write_rollouts(folder.rollouts / split, runs, logs)
+    return table

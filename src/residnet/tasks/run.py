@@ -1,0 +1,103 @@
+"""Running a fit from start to end, into a run folder."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from residnet.core.config import dump_config
+from residnet.core.names import STATE, si_unit
+from residnet.data.sources import input_files, read_logs
+from residnet.evaluation.metrics import SCHEMA, find
+from residnet.run_folder import RunFolder
+from residnet.tasks.fit import FitConfig
+from residnet.tasks.pipeline import Fitted, Fitter, candidates, evaluate, prepare_logs, say
+
+
+def run_fit(config: FitConfig, *, source: Path, overrides: Sequence[str], out: Path | None, resume: bool) -> RunFolder:
+    """Fit, evaluate, report and export.
+
+    Args:
+        config: the complete configuration.
+        source: the file that it came from, for the record.
+        overrides: likewise.
+        out: run folder; None for runs/<name>.
+        resume: continue an unfinished run in that folder.
+
+    Raises:
+        ResidnetError: where the input does not allow it.
+    """
+    started = time.time()
+    torch.set_num_threads(config.threads)
+    files = input_files(config.data)
+    folder = RunFolder.create(out or Path("runs") / config.name, dump_config(config), resume=resume)
+    folder.write_provenance(config=source, overrides=overrides, seed=config.seed, files=files, started=started)
+    say(f"{config.name}: reading logs")
+    logs = prepare_logs(read_logs(config.data), config)
+    say("  " + ", ".join(f"{split} {len(members)} logs" for split, members in logs.items()))
+    write_data_quality(folder, logs)
+    fitter = Fitter(config, logs, folder)
+    zero, baseline = fitter.zero(), fitter.baseline()
+    fitted = [zero, baseline]
+    for name in config.heads:
+        say(f"  fitting {name}")
+        head = fitter.head(name, baseline.model)
+        say(f"  {name}: validation free-run error {head.notes['validation']:.4f} after {head.notes['seconds']:.1f} s")
+        fitted.append(head)
+    say("  free runs")
+    models = candidates(fitted, config.data)
+    table: list[dict[str, Any]] = []
+    for split in config.evaluation.splits:
+        table += evaluate(models, logs[split], config.evaluation, config.prepare.grid.step, fitter.limit, folder)
+    selected = select(table, fitted, config.evaluation.selection)
+    write_metrics(folder, config, table, selected)
+    finish(folder, config, fitter, logs, fitted, selected)
+    folder.write_provenance(config=source, overrides=overrides, seed=config.seed, files=files, started=started)
+    return folder
+
+
+def select(table: Sequence[dict[str, Any]], fitted: Sequence[Fitted], protocol: str) -> str:
+    """Name of the model (a head, or the baseline where no head beats it) with the least mean nrmse on validation."""
+    names = [f.spec.name for f in fitted if f.spec.role != "zero"]
+    return min(names, key=lambda name: float(find(table, model=name, split="validation", protocol=protocol)["nrmse"]["mean"]))
+
+
+def write_metrics(folder: RunFolder, config: FitConfig, table: Sequence[dict[str, Any]], selected: str) -> None:
+    """metrics.json with schema, units, scales and rows."""
+    for row in table:
+        row["selected"] = row["model"] == selected
+    units = {name: si_unit(unit) for name, unit in config.signals.units().items() if name in STATE}
+    scales = {name: float(value) for name, value in config.evaluation.scales.model_dump().items()}
+    content = {"schema": SCHEMA, "run": config.name, "channels": units, "scales": scales, "selected": selected, "rows": list(table)}
+    folder.write_json(folder.metrics, content)
+
+
+def write_data_quality(folder: RunFolder, logs: dict[str, list[Any]]) -> None:
+    """What each log contributes, for the report: data_quality.json."""
+    out = []
+    for split, members in logs.items():
+        for p in members:
+            masked = {reason: float(np.mean(mask)) for reason, mask in p.log.masks.items() if mask.any()}
+            out.append(
+                {
+                    "log": p.log.name,
+                    "split": split,
+                    "manoeuvre": p.log.manoeuvre,
+                    "seconds": float(p.log.t[-1] - p.log.t[0]),
+                    "samples": len(p),
+                    "usable": float(p.usable.mean()),
+                    "learned_from": float(p.good.mean()),
+                    "masked": masked,
+                    "largest": {name: float(np.abs(p.y[p.usable, 3 + i]).max()) for i, name in enumerate(("u", "v", "r"))},
+                }
+            )
+    folder.write_json(folder.data_quality, out)
+
+
+def finish(folder: RunFolder, config: FitConfig, fitter: Fitter, logs: dict[str, list[Any]], fitted: Sequence[Fitted], selected: str) -> None:
+    """Figures, report, exports."""

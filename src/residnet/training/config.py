@@ -1,0 +1,99 @@
+"""How a network head is trained. No Lightning here: `residnet check` must stay quick."""
+
+from __future__ import annotations
+
+from pydantic import Field, model_validator
+
+from residnet.core.config import Config, Seconds
+
+
+class OneStep(Config):
+    """Teacher-forced start: residual accelerations along measured windows (document 003 eq. (20)).
+
+    Attributes:
+        epochs: of `steps` batches each.
+        window: length of a window; the loss counts its part after `washout`, which fills a memory first.
+        washout: see above.
+        batch: windows per batch.
+        learning_rate: of Adam.
+    """
+
+    epochs: int = Field(default=10, ge=0)
+    window: Seconds = Field(default=5.0, gt=0)
+    washout: Seconds = Field(default=0.0, ge=0)
+    batch: int = Field(default=64, ge=1)
+    learning_rate: float = Field(default=2e-3, gt=0)
+
+    @model_validator(mode="after")
+    def _washout(self) -> OneStep:
+        if self.washout >= self.window:
+            raise ValueError(f"washout ({self.washout:g} s) must be shorter than window ({self.window:g} s)")
+        return self
+
+
+class MultiStep(Config):
+    """A stage of free-run training: the model is rolled out over `horizon` and its velocities are compared with the measured ones.
+
+    Attributes:
+        horizon: length of the rollouts.
+        epochs: of `steps` batches each.
+        batch: rollouts per batch.
+        learning_rate: at the start of the stage; it falls to `final` of it over the stage, along a cosine.
+        final: share of the learning rate at the stage's end.
+    """
+
+    horizon: Seconds = Field(gt=0)
+    epochs: int = Field(ge=1)
+    batch: int = Field(default=128, ge=1)
+    learning_rate: float = Field(default=1e-3, gt=0)
+    final: float = Field(default=1.0, gt=0, le=1)
+
+
+class TrainingConfig(Config):
+    """Stages in order: one-step, then each of `multi_step` (a curriculum of horizons).
+
+    Attributes:
+        one_step: the teacher-forced start.
+        multi_step: free-run stages.
+        steps: batches per epoch.
+        history: measured past that warms up the memory before a rollout.
+        start_noise: standard deviation of the noise on the initial velocities of rollouts, in units of the metrics' scales.
+        gradient_clip: largest norm of the gradient.
+        weight_decay: of AdamW, on matrices only.
+        average: decay of the exponential average of the weights that is validated and kept; 0 for none.
+        refit_baseline: let free-run stages move the baseline's coefficients too.
+        patience: stop when this many validations in a row bring no better free run, once the last stage has begun.
+        validate_every: epochs between validations.
+    """
+
+    one_step: OneStep = OneStep()
+    multi_step: tuple[MultiStep, ...] = ()
+    steps: int = Field(default=25, ge=1)
+    history: Seconds = Field(default=0.5, ge=0)
+    start_noise: float = Field(default=0.0, ge=0)
+    gradient_clip: float = Field(default=1.0, gt=0)
+    weight_decay: float = Field(default=0.0, ge=0)
+    average: float = Field(default=0.0, ge=0, lt=1)
+    refit_baseline: bool = False
+    patience: int = Field(default=20, ge=1)
+    validate_every: int = Field(default=1, ge=1)
+
+    @model_validator(mode="after")
+    def _work(self) -> TrainingConfig:
+        if self.epochs == 0:
+            raise ValueError("nothing to train: one_step.epochs is 0 and multi_step is empty")
+        return self
+
+    @property
+    def epochs(self) -> int:
+        """Epochs of all stages together."""
+        return self.one_step.epochs + sum(stage.epochs for stage in self.multi_step)
+
+    def stage(self, epoch: int) -> tuple[int, int]:
+        """(stage, epoch within it); stage 0 is one-step, stage i the i-th free-run stage."""
+        begin = 0
+        for number, length in enumerate((self.one_step.epochs, *(stage.epochs for stage in self.multi_step))):
+            if epoch < begin + length:
+                return number, epoch - begin
+            begin += length
+        return len(self.multi_step), max(epoch - begin, 0)

@@ -1,0 +1,46 @@
+"""Training losses over windows; pure tensor code."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.rollout import Rollout
+
+
+def one_step_loss(model: HybridDynamics, y: Tensor, w: Tensor, nu_dot: Tensor, good: Tensor, spread: Tensor, washout: int) -> Tensor:
+    """Mean squared error of accelerations along measured windows, in units of the residual's spread (document 003 eq. (20)).
+
+    Args:
+        model: the hybrid model.
+        y: smoothed states [B, T, 6].
+        w: inputs [B, T, m].
+        nu_dot: accelerations [B, T, 3].
+        good: samples whose acceleration is known [B, T].
+        spread: of the residual, [3].
+        washout: samples at the start of each window that only fill the memory.
+    """
+    z = model.signals(y, model.signals.prepare(w))
+    error = (nu_dot - model.baseline(z) - model.head.sequence(z))[:, washout:] / spread
+    weight = good[:, washout:].to(error.dtype).unsqueeze(-1)
+    return (error.square() * weight).sum() / (3.0 * weight.sum()).clamp(min=1.0)
+
+
+def rollout_loss(rollout: Rollout, x0: Tensor, w: Tensor, s: Tensor, y: Tensor, usable: Tensor, scales: Tensor) -> Tensor:
+    """Mean squared error of free-run velocities, in units of the metrics' scales.
+
+    Args:
+        rollout: the free run of the model.
+        x0: initial states [B, 6].
+        w: inputs [B, T, m].
+        s: initial memory [B, n_state].
+        y: measured states after each step [B, T, 6].
+        usable: measured samples that may be scored [B, T].
+        scales: [3].
+    """
+    states, _, _ = rollout(x0, w, s)
+    error = (states[:, 1:, 3:6] - y[:, :, 3:6]) / scales
+    weight = usable.to(error.dtype).unsqueeze(-1)
+    # a rollout that runs away must pull back, not drown the batch
+    return (torch.nn.functional.huber_loss(error, torch.zeros_like(error), reduction="none", delta=5.0) * 2.0 * weight).sum() / (3.0 * weight.sum())

@@ -1,0 +1,168 @@
+"""The Lightning module that trains one head: stages, losses, free-run validation, and everything that a resumed run needs."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import lightning as L
+import torch
+from torch import Tensor
+
+from residnet.data.windows import WindowBatches, WindowStore
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.rollout import Rollout
+from residnet.training.config import TrainingConfig
+from residnet.training.losses import one_step_loss, rollout_loss
+
+Validate = Callable[[HybridDynamics], float]
+
+
+class HeadTraining(L.LightningModule):
+    """Trains `model.head` (and the baseline, where the config says so) and keeps the weights that validate best in free run.
+
+    Every epoch is seeded by (seed, epoch) alone, so that a run resumed at an epoch's end repeats the undisturbed one.
+    """
+
+    def __init__(self, model: HybridDynamics, store: WindowStore, config: TrainingConfig, scales: Tensor, validate: Validate, seed: int) -> None:
+        super().__init__()
+        self.model = model
+        self.average = copy.deepcopy(model).requires_grad_(False) if config.average > 0 else None
+        self.rollout = Rollout(model)
+        self.store = store
+        self.settings = config
+        self.scales = scales
+        self.validate = validate
+        self.seed = seed
+        self.best_score = math.inf
+        self.best_state: dict[str, Tensor] = {}
+        self.without_gain = 0
+        self.history: list[dict[str, float]] = []
+        self.batches = [WindowBatches(store.starts(length), batch, config.steps) for length, batch in self._stages()]
+
+    def _stages(self) -> list[tuple[int, int]]:
+        dt, config = self.model.dt, self.settings
+        return [(round(config.one_step.window / dt), config.one_step.batch)] + [(round(s.horizon / dt) + 1, s.batch) for s in config.multi_step]
+
+    def train_dataloader(self) -> EpochBatches:
+        """Window starts [batch], `steps` times an epoch."""
+        return EpochBatches(self)
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        """AdamW; weight decay on matrices of the head only."""
+        head = list(self.model.head.parameters())
+        groups = [
+            {"params": [p for p in head if p.ndim > 1], "weight_decay": self.settings.weight_decay},
+            {"params": [p for p in head if p.ndim <= 1], "weight_decay": 0.0},
+        ]
+        if self.settings.refit_baseline:
+            groups.append({"params": list(self.model.baseline.parameters()), "weight_decay": 0.0})
+        return torch.optim.AdamW(groups, lr=1e-3)
+
+    def on_train_epoch_start(self) -> None:
+        """Seed the epoch and set the stage's learning rate."""
+        torch.manual_seed((self.seed * 7_919 + self.current_epoch) % (2**63))
+        stage, epoch = self.settings.stage(self.current_epoch)
+        if stage == 0:
+            rate = self.settings.one_step.learning_rate
+        else:
+            own = self.settings.multi_step[stage - 1]
+            progress = 0.5 * (1 - math.cos(math.pi * epoch / max(own.epochs - 1, 1)))
+            rate = own.learning_rate * (1 - progress * (1 - own.final))
+        for parameter in self.model.baseline.parameters():
+            parameter.requires_grad_(self.settings.refit_baseline and stage > 0)
+        for group in self.trainer.optimizers[0].param_groups:
+            group["lr"] = rate
+
+    def training_step(self, starts: Tensor, batch_index: int) -> Tensor:
+        """Loss of one batch of windows."""
+        stage, _ = self.settings.stage(self.current_epoch)
+        length, _ = self._stages()[stage]
+        take = self.store.take
+        if stage == 0:
+            washout = round(self.settings.one_step.washout / self.model.dt)
+            y, w = take(self.store.smooth, starts, length), take(self.store.w, starts, length)
+            spread = self.model.head.scale.spread.to(y.dtype)
+            loss = one_step_loss(self.model, y, w, take(self.store.nu_dot, starts, length), take(self.store.good, starts, length), spread, washout)
+        else:
+            s = self.model.warmup(*self.store.history(starts, round(self.settings.history / self.model.dt)))
+            x0 = self.store.smooth[starts]
+            if self.settings.start_noise > 0:
+                noise = self.settings.start_noise * self.scales * torch.randn(len(starts), 3, dtype=x0.dtype)
+                x0 = torch.cat((x0[:, :3], x0[:, 3:] + noise), dim=1)
+            w = take(self.store.w, starts, length - 1)
+            loss = rollout_loss(self.rollout, x0, w, s, take(self.store.y, starts + 1, length - 1), take(self.store.usable, starts + 1, length - 1), self.scales)
+        self._losses.append(float(loss.detach()))
+        return loss
+
+    def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
+        """Move the averaged weights."""
+        if self.average is None:
+            return
+        # a short memory at first, or the average would remember the untrained start
+        decay = min(self.settings.average, (1.0 + self.global_step) / (10.0 + self.global_step))
+        for kept, new in zip(self.average.parameters(), self.model.parameters(), strict=True):
+            kept.lerp_(new.detach(), 1.0 - decay)
+
+    def finish_epoch(self) -> None:
+        """Validate in free run; keep the best weights; stop early in the last stage. Called by the first callback of an epoch's end."""
+        stage, _ = self.settings.stage(self.current_epoch)
+        last = self.current_epoch + 1 == self.settings.epochs
+        entry = {"epoch": float(self.current_epoch), "stage": float(stage), "loss": sum(self._losses) / max(len(self._losses), 1)}
+        self._losses.clear()
+        if last or (self.current_epoch + 1) % self.settings.validate_every == 0:
+            model = self.model if self.average is None else self.average
+            score = self.validate(model)
+            entry["validation"] = score
+            if score < self.best_score:
+                self.best_score, self.without_gain = score, 0
+                self.best_state = {name: value.detach().clone() for name, value in model.state_dict().items()}
+            else:
+                self.without_gain += 1
+        self.history.append(entry)
+        logger = self.trainer.logger
+        if logger is not None:
+            logger.log_metrics({k: v for k, v in entry.items() if k != "epoch"}, step=self.current_epoch)
+        if stage == len(self.settings.multi_step) and self.without_gain >= self.settings.patience:
+            self.trainer.should_stop = True
+
+    def on_fit_start(self) -> None:
+        """Losses of the running epoch."""
+        self._losses: list[float] = []
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Beside weights and optimiser: the best weights, the curve, random state and thread count."""
+        checkpoint["residnet"] = {
+            "best_score": self.best_score,
+            "best_state": self.best_state,
+            "without_gain": self.without_gain,
+            "history": self.history,
+            "stage": self.settings.stage(self.current_epoch)[0],
+            "random": torch.get_rng_state(),
+            "threads": torch.get_num_threads(),
+        }
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Put back what `on_save_checkpoint` kept."""
+        own = checkpoint["residnet"]
+        self.best_score, self.best_state, self.without_gain = own["best_score"], own["best_state"], own["without_gain"]
+        self.history = own["history"]
+        torch.set_rng_state(own["random"])
+        torch.set_num_threads(own["threads"])
+
+
+class EpochBatches:
+    """The batches of the module's present epoch."""
+
+    def __init__(self, module: HeadTraining) -> None:
+        self.module = module
+
+    def __len__(self) -> int:
+        return self.module.settings.steps
+
+    def __iter__(self) -> Iterator[Tensor]:
+        epoch = self.module.current_epoch
+        stage, _ = self.module.settings.stage(epoch)
+        return iter(self.module.batches[stage].epoch(self.module.seed, epoch))
