@@ -15,7 +15,9 @@ from residnet.dynamics.base import Dynamics
 class Source(nn.Module):
     """Where the inputs of a rollout come from."""
 
-    may_stop: bool = False
+    def __init__(self) -> None:
+        super().__init__()
+        self.may_stop = False
 
     def initial(self, x: Tensor) -> Tensor:
         """Memory of the source [B, k] at the start, from the initial state x [B, nx]."""

@@ -1,0 +1,162 @@
+"""Export to TorchScript: one file that a controller loads with torch alone.
+
+The exported module works in float32 at a fixed step and is frozen; its card is an extra file of the archive. TorchScript
+is code: load only files that you trust.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from residnet import __version__
+from residnet.core.errors import ExportError
+from residnet.core.names import STATE
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.rollout import Rollout
+from residnet.dynamics.store import ModelSpec
+
+PARITY_STEPS = 1000
+PARITY_TOLERANCE = 1e-5
+_METHODS = ["initial_state", "warmup", "step", "rollout"]
+
+
+class ExportedModel(nn.Module):
+    """What a controller sees; all tensors float32, SI and radians."""
+
+    def __init__(self, model: HybridDynamics, spec: ModelSpec) -> None:
+        super().__init__()
+        self.simulate = Rollout(model)
+        self.register_buffer("low", torch.tensor(spec.low, dtype=torch.float32))
+        self.register_buffer("high", torch.tensor(spec.high, dtype=torch.float32))
+        self.low: Tensor
+        self.high: Tensor
+        self.inputs = len(spec.signals.columns)
+
+    @torch.jit.export
+    def initial_state(self, batch: int) -> Tensor:
+        """Memory s [batch, n_state] without a past."""
+        return self.simulate.model.initial_state(batch)
+
+    @torch.jit.export
+    def warmup(self, y_history: Tensor, w_history: Tensor) -> Tensor:
+        """Memory s [B, n_state] that a measured past leaves: states [B, T, 6] and inputs [B, T, m], oldest first."""
+        return self.simulate.model.warmup(y_history, w_history)
+
+    @torch.jit.export
+    def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """State [B, 6] and memory after one step under inputs w [B, m]; `outside` [B] is True beyond the training range."""
+        seen = torch.cat((x[:, 3:6], w), dim=-1)
+        outside = ((seen < self.low) | (seen > self.high)).any(dim=-1)
+        x, s = self.simulate.model.step(x, w, s)
+        return x, s, outside
+
+    @torch.jit.export
+    def rollout(self, x0: Tensor, w: Tensor, s: Tensor) -> Tensor:
+        """States [B, T+1, 6] from x0 [B, 6] on under inputs w [B, T, m]."""
+        return self.simulate(x0, w, s)[0]
+
+    def forward(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """As `step`."""
+        return self.step(x, w, s)
+
+
+def export_torchscript(spec: ModelSpec, model: HybridDynamics, file: Path, metrics: list[Mapping[str, Any]]) -> dict[str, Any]:
+    """Write one model as TorchScript with its card, after a parity check.
+
+    Args:
+        spec: the model's description.
+        model: the model; left in float32.
+        file: where to write.
+        metrics: rows of metrics.json of this model, for the card.
+
+    Returns:
+        The card.
+
+    Raises:
+        ExportError: where the exported module does not reproduce the model.
+    """
+    model = model.to(torch.float32).eval().requires_grad_(False)
+    with warnings.catch_warnings():
+        # TorchScript still works in torch 2.13 but announces its end; this file is the only place that depends on it
+        warnings.filterwarnings("ignore", category=DeprecationWarning)
+        warnings.filterwarnings("ignore", category=FutureWarning)
+        warnings.filterwarnings("ignore", message=".*torch.jit.*")
+        scripted = torch.jit.freeze(torch.jit.script(ExportedModel(model, spec).eval()), preserved_attrs=_METHODS)
+        parity = check_parity(spec, model, scripted)
+        card = make_card(spec, model, metrics, parity)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        partial = file.with_name(file.name + ".partial")
+        torch.jit.save(scripted, str(partial), _extra_files={"card.json": json.dumps(card, indent=1)})
+        partial.replace(file)
+        reloaded = torch.jit.load(str(file))
+        check_parity(spec, model, reloaded)
+    return card
+
+
+def check_parity(spec: ModelSpec, model: HybridDynamics, exported: Any) -> dict[str, float]:
+    """Largest difference of each state between the model and the exported module over 1,000 steps from a warmed-up memory, as a share of its range.
+
+    Inputs sweep the training range as slow sines, so that the run passes through what the model knows.
+
+    Raises:
+        ExportError: where a share exceeds 1e-5 or a value is not finite.
+    """
+    low, high = torch.tensor(spec.low), torch.tensor(spec.high)
+    past = 50
+    steps = torch.arange(PARITY_STEPS + past, dtype=torch.float32)
+    phase = torch.arange(low.numel() - 3, dtype=torch.float32)
+    sweep = 0.5 + 0.4 * torch.sin(0.02 * (1 + 0.37 * phase)[None] * steps[:, None] + phase[None])
+    w = (low[3:] + sweep * (high - low)[3:]).unsqueeze(0)
+    y = torch.zeros(1, past, len(STATE))
+    y[:, :, 3] = 0.5 * (low[0] + high[0])
+    x = y[:, -1].clone()
+    with torch.no_grad():
+        s = model.warmup(y, w[:, :past])
+        mine, _, _ = Rollout(model)(x, w[:, past:], s)
+        theirs = [x]
+        memory = exported.warmup(y, w[:, :past])
+        for k in range(PARITY_STEPS):
+            x, memory, _ = exported.step(x, w[:, past + k], memory)
+            theirs.append(x)
+        together = exported.rollout(theirs[0], w[:, past:], exported.warmup(y, w[:, :past]))
+    single = torch.stack(theirs, dim=1)
+    span = (mine.amax(1) - mine.amin(1)).clamp(min=1e-6)
+    worst = torch.maximum((single - mine).abs(), (together - mine).abs()).amax(1) / span
+    shares = {name: float(value) for name, value in zip(STATE, worst[0], strict=True)}
+    if not torch.isfinite(single).all() or not max(shares.values()) <= PARITY_TOLERANCE:
+        raise ExportError(f"model {spec.name}: the exported module differs from the model by {shares} of each channel's range over {PARITY_STEPS} steps; allowed {PARITY_TOLERANCE:g}")
+    return shares
+
+
+def make_card(spec: ModelSpec, model: HybridDynamics, metrics: list[Mapping[str, Any]], parity: Mapping[str, float]) -> dict[str, Any]:
+    """The model card: all that a user needs to drive the module, and how good it is."""
+    units = spec.signals.units()
+    return {
+        "schema": "residnet.card/1",
+        "model": spec.name,
+        "states": [{"name": name, "unit": units[name]} for name in STATE],
+        "inputs": [
+            {"name": name, "unit": units[name], "role": "command" if name in spec.signals.inputs else "exogenous"} for name in spec.signals.columns
+        ],
+        "memory": model.n_state,
+        "dt": spec.dt,
+        "integrator": spec.integrator,
+        "dtype": "float32",
+        "frame": "NED; body axes x forward, y starboard, z down; psi unwrapped, clockwise from north; wind_dir is where the wind comes from",
+        "training_range": {name: list(limits) for name, limits in spec.ranges.items()},
+        "baseline": spec.baseline.model_dump(mode="json"),
+        "head": None if spec.head is None else spec.head.model_dump(mode="json"),
+        "metrics": [dict(row) for row in metrics],
+        "parity": {"steps": PARITY_STEPS, "share_of_range": dict(parity)},
+        "versions": {"residnet": __version__, "torch": torch.__version__},
+        "exported": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        "safety": "TorchScript is code that runs when loaded: load only files that you trust. The files under models/ hold numbers only.",
+    }
