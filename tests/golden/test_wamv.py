@@ -1,0 +1,219 @@
+"""The WAM-V plant and the linear model of document 003 against golden runs of another implementation (golden/README.md, g4_wamv)."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from scipy.linalg import expm
+
+from residnet.baselines.regressors import RegressorBaseline
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.rollout import Rollout
+from residnet.dynamics.simulated import PlantDynamics
+from residnet.heads import ZeroHead
+from residnet.manoeuvres import AccelerationDeceleration, ConstantInput, Manoeuvre, StackedSource, ThreeTwoOneOne, Zigzag
+from residnet.physics.plant import DifferentialThrustVessel
+from residnet.physics.signals import SignalsConfig
+from residnet.physics.vessel import load_vessel
+
+GROUP = "g4_wamv"
+DT, EVERY = 0.01, 5
+VESSELS = {"CAL": "wam_v_cal", "VRXNEW": "wam_v_vrx"}
+
+
+def tenth(text: str) -> float:
+    """`05` is 0.5, `10` is 1.0, `-03` is -0.3."""
+    return int(text) / 10.0
+
+
+MANOEUVRES: dict[str, Callable[..., Manoeuvre]] = {
+    r"accdec": lambda: AccelerationDeceleration(times=(0.0, 15.0, 30.0, 45.0, 60.0, 75.0), levels=(0.2, 0.8, 0.4, 1.0, 0.1, 0.6)),
+    r"zz(\d+)_(\d+)": lambda heading, nd: Zigzag(drive=0.6, steer=tenth(nd), start=8.0, heading=float(np.radians(float(heading)))),
+    r"t3211": lambda: ThreeTwoOneOne(drive=0.5, steer=0.5, start=10.0, unit=3.0, repeat=False),
+    r"turn(-?\d+)_(-?\d+)": lambda nm, nd: ConstantInput(drive=tenth(nm), steer=tenth(nd)),
+    r"pivot": lambda: ConstantInput(drive=0.0, steer=1.0),
+}
+
+
+@dataclass(frozen=True)
+class Case:
+    """Set-up of one file, from its name alone."""
+
+    vessel: str
+    manoeuvre: Manoeuvre
+
+
+def case_of(path: Path) -> Case:
+    """Vessel and manoeuvre that a name stands for."""
+    name = path.name.removesuffix(".csv.gz")
+    head, _, rest = name.partition("_")
+    assert head in VESSELS, f"{name}: no parameter set {head}"
+    for pattern, make in MANOEUVRES.items():
+        if match := re.fullmatch(pattern, rest):
+            return Case(VESSELS[head], make(*match.groups()))
+    raise AssertionError(f"{name}: no manoeuvre is written {rest}")
+
+
+def is_linear(path: Path) -> bool:
+    return path.name.startswith("linear")
+
+
+def on_plant(function: Any) -> Any:
+    function.only = lambda path: not is_linear(path)
+    return function
+
+
+def on_linear(function: Any) -> Any:
+    function.only = is_linear
+    return function
+
+
+@cache
+def table(path: Path) -> pd.DataFrame:
+    names = pd.read_csv(path, nrows=0).columns
+    # every digit counts: not pandas' fast parser
+    return pd.DataFrame(np.loadtxt(path, delimiter=",", skiprows=1), columns=names)
+
+
+def tensor(frame: pd.DataFrame, *columns: str) -> torch.Tensor:
+    return torch.from_numpy(frame[list(columns)].to_numpy(dtype=float))
+
+
+@cache
+def trajectories(vessel: str, folder: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """States [T+1, 8] and commands [T, 2] of every file of one vessel, flown side by side."""
+    files = [path for path in sorted(folder.glob("*.csv.gz")) if not is_linear(path) and case_of(path).vessel == vessel]
+    longest = max(float(table(path)["t"].iloc[-1]) for path in files)
+    steps = round(longest / DT) + 1
+    t = torch.arange(steps, dtype=torch.float64) * DT
+    plant = DifferentialThrustVessel(load_vessel(vessel))
+    manoeuvres = [case_of(path).manoeuvre for path in files]
+    source = StackedSource([type(m).source([m], plant.demand, t) for m in manoeuvres], [1] * len(files))
+    x0 = torch.zeros(len(files), len(plant.state), dtype=torch.float64)
+    w = torch.zeros(len(files), steps, len(plant.inputs), dtype=torch.float64)
+    with torch.no_grad():
+        states, inputs, _ = Rollout(PlantDynamics(plant, DT), source)(x0, w, x0[:, :0])
+    return {path.name: (states[i].numpy(), inputs[i, :, :2].numpy()) for i, path in enumerate(files)}
+
+
+@on_plant
+def test_thrust_columns(golden_file: Path) -> None:
+    frame = table(golden_file)
+    thrusters = load_vessel(case_of(golden_file).vessel).actuators.build()
+    thrust = thrusters.thrust(tensor(frame, "n_port", "n_stbd") / 60.0).numpy()
+    truth = frame[["T_port", "T_stbd"]].to_numpy()
+    # the printed polynomial cancels near zero thrust, where only its largest term bounds the rounding
+    np.testing.assert_allclose(thrust, truth, rtol=1e-12, atol=1e-12 * 3.8)
+
+
+@on_plant
+def test_right_hand_side_row_by_row(golden_file: Path) -> None:
+    frame = table(golden_file)
+    plant = DifferentialThrustVessel(load_vessel(case_of(golden_file).vessel))
+    x = torch.cat((tensor(frame, "x", "y", "psi", "u", "v", "r"), tensor(frame, "n_port", "n_stbd") / 60.0), dim=1)
+    with torch.no_grad():
+        rate = plant.rate(x, torch.zeros(len(frame), len(plant.inputs), dtype=torch.float64)).numpy()
+        hull = plant.hull
+        nu = x[:, 3:6]
+        parts = [plant.thrusters(x[:, 6:8]), hull.coriolis(nu), hull.drag(nu)]
+        # a difference of forces cannot be more exact than its largest part
+        size = (torch.stack(parts).abs().amax(0) @ hull.inverse.abs().T).numpy()
+    truth = frame[["du", "dv", "dr"]].to_numpy()
+    assert (np.abs(rate[:, 3:6] - truth) <= 1e-12 * np.maximum(size, np.abs(truth))).all()
+    nu_rows = frame[["u", "v", "r"]].to_numpy()
+    c, s = np.cos(frame["psi"]), np.sin(frame["psi"])
+    north, east = c * nu_rows[:, 0] - s * nu_rows[:, 1], s * nu_rows[:, 0] + c * nu_rows[:, 1]
+    np.testing.assert_allclose(rate[:, :3], np.stack((north, east, nu_rows[:, 2]), axis=1), rtol=1e-12, atol=1e-15)
+
+
+@on_plant
+def test_trajectory(golden_file: Path) -> None:
+    frame = table(golden_file)
+    states, commands = trajectories(case_of(golden_file).vessel, golden_file.parent)[golden_file.name]
+    rows = np.rint(frame["t"].to_numpy() / DT).astype(int)
+    np.testing.assert_allclose(frame["t"], rows * DT, atol=1e-9)
+    np.testing.assert_array_equal(rows, EVERY * np.arange(len(frame)))
+    simulated = dict(zip(("x", "y", "psi", "u", "v", "r", "n_port", "n_stbd"), states[rows].T, strict=True))
+    simulated |= dict(zip(("cmd_port", "cmd_stbd"), commands[rows].T, strict=True))
+    for name, values in simulated.items():
+        truth = frame[name].to_numpy()
+        values = values * 60.0 if name.startswith(("n_", "cmd_")) else values
+        allowed = 1e-6 * np.ptp(truth) + 1e-12
+        assert np.abs(values - truth).max() <= allowed, f"{name} differs by {np.abs(values - truth).max():.3g} (allowed {allowed:.3g})"
+
+
+@on_linear
+def test_linear_model_by_exact_discretisation(golden_file: Path) -> None:
+    """(33), (34) as printed, or with B = -A Phi from Table 1 (ERRATA W11-W14): the file's own matrices, by the matrix exponential."""
+    frame = table(golden_file)
+    a, b, c = linear_model(golden_file)
+    dt = float(frame["t"].iloc[1])
+    block = np.zeros((6, 6))
+    block[:3, :3], block[:3, 3:5], block[:3, 5] = a, b, c
+    step = expm(block * dt)
+    tau = frame[["tau_x", "tau_N"]].to_numpy()
+    x = np.zeros((len(frame), 3))
+    for k in range(len(frame) - 1):
+        x[k + 1] = (step @ np.concatenate((x[k], tau[k], [1.0])))[:3]
+    # here r is in deg/s
+    truth = frame[["u", "v_mps", "r_degps"]].to_numpy()
+    assert (np.abs(x - truth).max(0) <= 1e-11 * np.ptp(truth, axis=0)).all()
+
+
+@on_linear
+def test_linear_model_as_a_baseline(golden_file: Path) -> None:
+    frame = table(golden_file)
+    a, b, c = linear_model(golden_file)
+    dt = float(frame["t"].iloc[1])
+    # from r in deg/s to rad/s
+    scale = np.diag([1.0, 1.0, np.pi / 180.0])
+    a, b, c = scale @ a @ np.linalg.inv(scale), scale @ b, scale @ c
+    signals = SignalsConfig(inputs=("tau_x", "tau_n")).build()
+    terms = ("u", "v", "r", "tau_x", "tau_n", "1")
+    baseline = RegressorBaseline([terms] * 3, signals.names)
+    baseline.theta.data.copy_(torch.from_numpy(np.concatenate((a, b, c[:, None]), axis=1)))
+    model = HybridDynamics(signals, baseline, ZeroHead(), dt, "rk4")
+    w = tensor(frame, "tau_x", "tau_N")[None, :-1]
+    x0 = torch.zeros(1, 6, dtype=torch.float64)
+    with torch.no_grad():
+        states, _, _ = Rollout(model)(x0, w, x0[:, :0])
+    nu = states[0, :, 3:].numpy() @ np.linalg.inv(scale)
+    truth = frame[["u", "v_mps", "r_degps"]].to_numpy()
+    assert (np.abs(nu - truth).max(0) <= 1e-6 * np.ptp(truth, axis=0)).all()
+
+
+def linear_model(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A [3, 3], B [3, 2], bias [3] of (u, v, r) with r in deg/s and inputs (tau_x, tau_N)."""
+    name = path.name.removesuffix(".csv.gz")
+    a = np.array([[-1.3191, 0.0, 0.0], [0.0, 0.0161, -0.0052], [0.0, 8.2861, -0.9860]])
+    steer = {
+        "linear33_34_printed": np.array([0.0002, 0.0307]),
+        "linear33_34_consistent": -a[1:, 1:] @ np.array([2.23e-4, 0.0330]),
+    }
+    assert name in steer, f"{name}: no linear model of this name"
+    b = np.zeros((3, 2))
+    b[0, 0], b[1:, 1] = 0.0028, steer[name]
+    return a, b, np.array([0.6836, 0.0068, 1.3276])
+
+
+def test_names_of_further_files_are_understood() -> None:
+    """Files are kept back for acceptance: names of the same pattern give the set-ups that golden/README.md describes."""
+    zigzag = case_of(Path("VRXNEW_zz20_10.csv.gz"))
+    assert zigzag.vessel == "wam_v_vrx"
+    assert zigzag.manoeuvre == Zigzag(drive=0.6, steer=1.0, start=8.0, heading=float(np.radians(20.0)))
+    assert case_of(Path("CAL_turn08_02.csv.gz")).manoeuvre == ConstantInput(drive=0.8, steer=0.2)
+    times = torch.arange(0.0, 60.0, 1.0, dtype=torch.float64)
+    drive, steer = case_of(Path("CAL_t3211.csv.gz")).manoeuvre.demands(times)
+    assert drive.tolist() == [0.5] * 60
+    assert steer.tolist() == [0.0] * 10 + [0.5] * 9 + [-0.5] * 6 + [0.5] * 3 + [-0.5] * 3 + [0.0] * 29
+    with pytest.raises(AssertionError, match="no manoeuvre"):
+        case_of(Path("CAL_loop.csv.gz"))
