@@ -149,7 +149,9 @@ class LstmHead(ResidualHead):
 
     def __init__(self, config: LstmConfig, names: Sequence[str]) -> None:
         super().__init__()
-        self.networks = nn.ModuleList([LstmNetwork(config, chosen, outputs, names) for chosen, outputs in config.networks(names)])
+        self.networks: Sequence[LstmNetwork] = nn.ModuleList(  # type: ignore[assignment]
+            [LstmNetwork(config, chosen, outputs, names) for chosen, outputs in config.networks(names)]
+        )
         self.width = 2 * config.hidden_size
         self.n_state = self.width * len(self.networks)
         self.scale = ResidualScale()

@@ -38,7 +38,7 @@ class StackedSource(Source):
 
     def __init__(self, sources: Sequence[Source], rows: Sequence[int]) -> None:
         super().__init__()
-        self.sources = torch.nn.ModuleList(sources)
+        self.sources: Sequence[Source] = torch.nn.ModuleList(sources)  # type: ignore[assignment]
         self.rows = list(rows)
 
     def initial(self, x: Tensor) -> Tensor:

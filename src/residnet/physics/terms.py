@@ -82,8 +82,8 @@ class TermLibrary(nn.Module):
             columns.append(column)
         self.depth = max([len(column) for column in columns], default=0)
         padded = [column + [0] * (self.depth - len(column)) for column in columns]
-        index = torch.tensor(padded, dtype=torch.long).reshape(len(columns), self.depth).T.contiguous()
-        self.register_buffer("index", index, persistent=False)
+        gather = torch.tensor(padded, dtype=torch.long).reshape(len(columns), self.depth).T.contiguous()
+        self.register_buffer("index", gather, persistent=False)
         self.index: Tensor
         self.count = len(columns)
 

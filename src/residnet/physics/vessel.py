@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-from pydantic import Field, field_validator
+from pydantic import AfterValidator, Field, field_validator
 
 from residnet.core.config import Config, load_config
 from residnet.core.errors import ConfigError, UsageError
@@ -29,9 +30,8 @@ class Parameter(Config):
         return source
 
 
-def _parameter(unit: str) -> Any:
-    """Annotated parameter whose unit must measure `unit`; the value is converted to it."""
-    from pydantic import AfterValidator
+def _in(unit: str) -> Callable[[Parameter], Parameter]:
+    """Validator of a parameter whose unit must measure `unit`; the value is converted to it."""
 
     def convert(parameter: Parameter) -> Parameter:
         try:
@@ -40,21 +40,21 @@ def _parameter(unit: str) -> Any:
             raise ValueError(str(error)) from None
         return Parameter(value=parameter.value * factor, unit=unit, source=parameter.source)
 
-    return Annotated[Parameter, AfterValidator(convert)]
+    return convert
 
 
-Mass = _parameter("kg")
-MassArm = _parameter("kg m")
-Inertia = _parameter("kg m^2")
-Length = _parameter("m")
+Mass = Annotated[Parameter, AfterValidator(_in("kg"))]
+MassArm = Annotated[Parameter, AfterValidator(_in("kg m"))]
+Inertia = Annotated[Parameter, AfterValidator(_in("kg m^2"))]
+Length = Annotated[Parameter, AfterValidator(_in("m"))]
 
 
 class RigidBody(Config):
     """Mass, yaw inertia about the body origin and longitudinal centre of gravity."""
 
-    m: Mass  # type: ignore[valid-type]
-    I_z: Inertia  # type: ignore[valid-type]
-    x_G: Length  # type: ignore[valid-type]
+    m: Mass
+    I_z: Inertia
+    x_G: Length
 
     @field_validator("m", "I_z")
     @classmethod
@@ -67,11 +67,11 @@ class RigidBody(Config):
 class AddedMass(Config):
     """Hydrodynamic derivatives with respect to accelerations (SNAME: negative for a normal hull)."""
 
-    X_udot: Mass  # type: ignore[valid-type]
-    Y_vdot: Mass  # type: ignore[valid-type]
-    Y_rdot: MassArm  # type: ignore[valid-type]
-    N_vdot: MassArm  # type: ignore[valid-type]
-    N_rdot: Inertia  # type: ignore[valid-type]
+    X_udot: Mass
+    Y_vdot: Mass
+    Y_rdot: MassArm
+    N_vdot: MassArm
+    N_rdot: Inertia
 
 
 class Damping(Config):
@@ -87,7 +87,7 @@ class VesselConfig(Config):
 
     name: str
     description: str
-    length: Length  # type: ignore[valid-type]
+    length: Length
     rigid_body: RigidBody
     added_mass: AddedMass
     damping: Damping
