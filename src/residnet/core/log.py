@@ -84,6 +84,19 @@ class Log:
         table = pa.table(columns).replace_schema_metadata({"residnet": json.dumps(about)})
         pq.write_table(table, path)
 
+    @staticmethod
+    def recognises(path: Path) -> bool:
+        """Whether a file is a canonical log."""
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        if path.suffix != ".parquet" or not path.is_file():
+            return False
+        try:
+            return b"residnet" in (pq.read_schema(path).metadata or {})
+        except (pa.ArrowException, OSError):
+            return False
+
     @classmethod
     def load(cls, path: Path) -> Log:
         """Read a file that `save` wrote.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Literal
 
 from pydantic import Field, model_validator
@@ -12,7 +14,7 @@ from residnet.core.errors import ConfigError
 from residnet.core.names import nearest
 from residnet.data.prepare import PrepareConfig
 from residnet.data.simulate import SimulatedTrials
-from residnet.data.sources import DataConfig
+from residnet.data.sources import DataConfig, MeasuredLogs
 from residnet.dynamics.base import Integrator
 from residnet.evaluation.config import EvaluationConfig
 from residnet.heads import HeadConfig
@@ -83,3 +85,18 @@ class FitConfig(Config):
             if abs(self.data.step - self.prepare.grid.step) > 1e-9:
                 raise ValueError(f"prepare.grid.step ({self.prepare.grid.step:g} s) must equal data.step ({self.data.step:g} s) for simulated trials")
         return self
+
+    def check(self) -> None:
+        """What reading the config does not show: that the logs' files are there and no split is empty.
+
+        Raises:
+            ConfigError: where they are not.
+        """
+        if isinstance(self.data, MeasuredLogs):
+            self.data.split.resolve()
+
+    def run(self, *, source: Path, overrides: Sequence[str], out: Path | None, resume: bool) -> None:
+        """Carry out the fit; see `residnet.tasks.run.run_fit`."""
+        from residnet.tasks.run import run_fit
+
+        run_fit(self, source=source, overrides=overrides, out=out, resume=resume)

@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ import torch
 from residnet.baselines import Coefficient, StillConfig
 from residnet.core.errors import DataError
 from residnet.core.log import Log
+from residnet.core.names import ACCELERATION
 from residnet.core.samples import Samples
 from residnet.data.prepare import Prepared, envelope, prepare, samples
 from residnet.data.simulate import SimulatedTrials
@@ -58,17 +60,32 @@ def prepare_logs(splits: Mapping[str, Sequence[Log]], config: FitConfig) -> Prep
 
 
 def require_length(log: Prepared, config: FitConfig) -> None:
-    """Check that a log holds at least one window of what will be asked of it.
+    """Check that a log holds something to learn from and, unless it is for training, at least one window of a protocol.
 
     Raises:
         DataError: where it does not.
     """
-    step = config.prepare.grid.step
     if not log.good.any():
-        raise DataError(f"log {log.log.name}: its {len(log) * step:.1f} s hold no stretch as long as the derivative's window; leave it out or shorten prepare.derivative.window")
-    protocols = config.evaluation.protocols
-    if log.split != "train" and not any(protocol.windows(log, 0, step) for protocol in protocols.values()):
-        raise DataError(f"log {log.log.name}: its {len(log) * step:.1f} s are shorter than a window of every protocol ({', '.join(protocols)}); leave it out or shorten the protocols")
+        seconds = len(log) * config.prepare.grid.step
+        raise DataError(
+            f"log {log.log.name}: its {seconds:.1f} s hold no stretch as long as the derivative's window; leave it out or shorten prepare.derivative.window"
+        )
+    if log.split != "train":
+        require_window(log, config)
+
+
+def require_window(log: Prepared, config: FitConfig) -> None:
+    """Check that a log holds at least one window of some protocol.
+
+    Raises:
+        DataError: where it does not.
+    """
+    step, protocols = config.prepare.grid.step, config.evaluation.protocols
+    if not any(protocol.windows(log, 0, step) for protocol in protocols.values()):
+        raise DataError(
+            f"log {log.log.name}: its {len(log) * step:.1f} s are shorter than a window of every protocol ({', '.join(protocols)}); "
+            "leave it out or shorten evaluation.protocols"
+        )
 
 
 class Bench:
@@ -186,6 +203,37 @@ class Fitter:
         self.folder.write_json(folder / "fit.json", fitted.notes)
         save_model(folder, fitted.spec, fitted.model)
         return fitted
+
+
+def write_residuals(file: Path, fitter: Fitter, fitted: Sequence[Fitted], logs: Sequence[Prepared], most: int = 1500) -> None:
+    """Residual targets of one split against what each head says along the measured states: columns model, axis, target, predicted.
+
+    Every head runs teacher-forced over each log; at most `most` samples of each axis are kept, evenly spaced.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    parts: dict[str, list[np.ndarray]] = {"model": [], "axis": [], "target": [], "predicted": []}
+    for f in fitted:
+        if f.spec.role != "head":
+            continue
+        model = f.model.to(torch.float64)
+        pairs = []
+        for log in logs:
+            with torch.no_grad():
+                x, w = torch.from_numpy(np.nan_to_num(log.smooth))[None], torch.from_numpy(np.nan_to_num(log.w))[None]
+                z = model.signals(x, model.signals.prepare(w))
+                said, known = model.head.sequence(z)[0].numpy(), model.baseline(z)[0].numpy()
+            pairs.append(np.stack((log.nu_dot - known, said), axis=-1)[log.good])
+        joined = np.concatenate(pairs)
+        joined = joined[:: max(len(joined) // most, 1)]
+        for axis, name in enumerate(ACCELERATION):
+            parts["model"].append(np.full(len(joined), f.spec.name))
+            parts["axis"].append(np.full(len(joined), name))
+            parts["target"].append(joined[:, axis, 0])
+            parts["predicted"].append(joined[:, axis, 1])
+    if parts["model"]:
+        pq.write_table(pa.table({name: pa.array(np.concatenate(values)) for name, values in parts.items()}), file)
 
 
 def _row(entry: Coefficient) -> dict[str, Any]:

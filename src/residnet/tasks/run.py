@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,9 @@ from residnet.data.sources import input_files, read_logs
 from residnet.evaluation.metrics import SCHEMA, find
 from residnet.run_folder import RunFolder
 from residnet.tasks.fit import FitConfig
-from residnet.tasks.pipeline import Fitted, Fitter, candidates, evaluate, prepare_logs, say
+from residnet.tasks.exporting import export_model
+from residnet.tasks.pipeline import Fitted, Fitter, candidates, evaluate, prepare_logs, say, write_residuals
+from residnet.tasks.reporting import report_run
 
 
 def run_fit(config: FitConfig, *, source: Path, overrides: Sequence[str], out: Path | None, resume: bool) -> RunFolder:
@@ -56,7 +59,8 @@ def run_fit(config: FitConfig, *, source: Path, overrides: Sequence[str], out: P
         table += evaluate(models, logs[split], config.evaluation, config.prepare.grid.step, fitter.limit, folder)
     selected = select(table, fitted, config.evaluation.selection)
     write_metrics(folder, config, table, selected)
-    finish(folder, config, fitter, logs, fitted, selected)
+    write_residuals(folder.residuals, fitter, fitted, logs["test"])
+    finish(folder, config)
     folder.write_provenance(config=source, overrides=overrides, seed=config.seed, files=files, started=started)
     return folder
 
@@ -99,5 +103,24 @@ def write_data_quality(folder: RunFolder, logs: dict[str, list[Any]]) -> None:
     folder.write_json(folder.data_quality, out)
 
 
-def finish(folder: RunFolder, config: FitConfig, fitter: Fitter, logs: dict[str, list[Any]], fitted: Sequence[Fitted], selected: str) -> None:
-    """Figures, report, exports."""
+def finish(folder: RunFolder, config: FitConfig) -> None:
+    """Exports, figures and report, then the table and where things are."""
+    for name in config.export.models:
+        print(f"exported: {export_model(folder.path, name, None)}")
+    report = report_run(folder.path)
+    print_table(folder.read_metrics()["rows"], "test")
+    print(f"report: {report}")
+
+
+def print_table(table: Sequence[Mapping[str, Any]], split: str) -> None:
+    """The free-run table of one split on standard output."""
+    print(f"{'protocol':12s} {'model':14s} {'u m/s':>8s} {'v m/s':>8s} {'r deg/s':>8s} {'nrmse':>7s} {'position m':>11s} {'heading deg':>12s} {'diverged':>9s}")
+    for row in table:
+        if row["split"] != split or row["manoeuvre"] != "all":
+            continue
+        rmse, mark = row["rmse"], " *" if row["selected"] else ""
+        print(
+            f"{row['protocol']:12s} {row['model'] + mark:14s} {rmse['u']:8.4f} {rmse['v']:8.4f} {math.degrees(rmse['r']):8.3f} {row['nrmse']['mean']:7.4f} "
+            f"{row['position_error_end']:11.2f} {math.degrees(row['heading_error_end']):12.2f} {row['diverged']:5d}/{row['windows']}"
+        )
+    print("free-run errors, mean over windows; * = selected on validation data")

@@ -1,0 +1,134 @@
+"""The command line. Imports stay inside the commands: `residnet --help` must not wait for PyTorch."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from residnet.core.errors import ResidnetError
+
+app = typer.Typer(
+    name="residnet",
+    help="Models of real vessels: an identified baseline, learned residuals, free-run validation, export for controllers.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+Overrides = Annotated[list[str] | None, typer.Option("-s", "--set", metavar="KEY=VALUE", help="Override a key of the config; may be repeated.")]
+RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a finished run.")]
+
+
+@app.command()
+def run(
+    config: Annotated[Path, typer.Argument(metavar="CONFIG", help="YAML file of one run.")],
+    overrides: Overrides = None,
+    out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Run folder; runs/<name> where not given.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue an interrupted run in its folder.")] = False,
+) -> None:
+    """Carry out a run: fit, evaluate, report and export, or any other task."""
+    from residnet.tasks import load_task
+
+    _limit_threads()
+    task = load_task(config, overrides or [])
+    task.run(source=config, overrides=overrides or [], out=out, resume=resume)
+
+
+@app.command()
+def check(
+    config: Annotated[Path, typer.Argument(metavar="CONFIG", help="YAML file of one run.")],
+    overrides: Overrides = None,
+) -> None:
+    """Validate a config and everything that it names, without running it."""
+    from residnet.tasks import load_task
+
+    task = load_task(config, overrides or [])
+    task.check()
+    print(f"{config}: fine (task {task.task}, run {task.name})")
+
+
+@app.command()
+def inspect(
+    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="Logs to look at: canonical Parquet, or anything that the config's reader reads.")],
+    config: Annotated[Path | None, typer.Option("--config", metavar="CONFIG", help="A run whose channel map reads these logs.")] = None,
+) -> None:
+    """Look at logs as a doctor would: channels, rates, gaps, jumps, frames, excitation. Exit 1 where a fit would be misled."""
+    from residnet.tasks.inspection import inspect_logs
+
+    if inspect_logs(logs, config):
+        raise typer.Exit(1)
+
+
+@app.command()
+def evaluate(
+    folder: RunPath,
+    logs: Annotated[list[Path], typer.Option("--logs", metavar="PATH", help="Logs to predict: files or folders; may be repeated.")],
+    out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Where results go; RUN/external-<time> where not given.")] = None,
+    more: Annotated[list[Path] | None, typer.Argument(metavar="[PATH]...", help="Further logs.")] = None,
+) -> None:
+    """Free-run a finished run's models on other logs."""
+    from residnet.tasks.external import evaluate_external
+
+    _limit_threads()
+    evaluate_external(folder, [*logs, *(more or [])], out)
+
+
+@app.command()
+def export(
+    folder: RunPath,
+    model: Annotated[str, typer.Option("--model", metavar="NAME", help="Name of the model; 'selected' for the one chosen on validation data.")],
+    file_format: Annotated[Literal["torchscript"], typer.Option("--format", help="File format.")] = "torchscript",
+    out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="File to write; RUN/exports/<model>.pt where not given.")] = None,
+) -> None:
+    """Export a model for controllers, after a parity check."""
+    from residnet.tasks.exporting import export_model
+
+    _limit_threads()
+    print(export_model(folder, model, out))
+
+
+@app.command()
+def report(folder: RunPath) -> None:
+    """Write figures and report of a finished run anew."""
+    from residnet.tasks.reporting import report_run
+
+    _limit_threads()
+    print(report_run(folder))
+
+
+@app.command(name="list")
+def list_names(what: Annotated[Literal["vessels", "heads", "manoeuvres", "readers", "tasks", "baselines"], typer.Argument(help="What to list.")]) -> None:
+    """List what there is to choose from."""
+    from residnet.tasks.catalogue import catalogue
+
+    for name, about in catalogue(what):
+        print(f"{name:28s} {about}")
+
+
+def _limit_threads() -> None:
+    # small products are thirty times slower where several libraries fight for the cores
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+
+
+def main() -> None:
+    """Entry point: one line on standard error and an exit code for every error that a user can cause."""
+    try:
+        app(standalone_mode=True)
+    except ResidnetError as error:
+        print(f"residnet: {error}", file=sys.stderr)
+        sys.exit(error.exit_code)
+    except KeyboardInterrupt:
+        print("residnet: interrupted; continue the run with the same command and --resume", file=sys.stderr)
+        sys.exit(130)
+    except BrokenPipeError:
+        sys.exit(0)
+
+
+if __name__ == "__main__":
+    main()

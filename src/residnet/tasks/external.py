@@ -1,0 +1,72 @@
+"""`residnet evaluate`: the models of a finished run on logs that they have never seen."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from residnet.core.config import dump_config, load_config
+from residnet.core.errors import DataError
+from residnet.core.log import Log
+from residnet.data.prepare import prepare
+from residnet.data.readers import CanonicalConfig
+from residnet.data.simulate import SimulatedTrials
+from residnet.dynamics.store import load_model, model_names
+from residnet.run_folder import RunFolder
+from residnet.tasks.fit import FitConfig
+from residnet.tasks.inspection import log_files
+from residnet.tasks.pipeline import Fitted, candidates, evaluate, require_window, say
+from residnet.tasks.reporting import report_run
+from residnet.tasks.run import print_table, write_data_quality, write_metrics
+
+
+def evaluate_external(run: Path, paths: Sequence[Path], out: Path | None) -> RunFolder:
+    """Free-run every model of a run on other logs, with the run's reader, masks, protocols and scales; the split is called `external`.
+
+    Raises:
+        ResidnetError: where the run, a log or a channel is missing, or a log is too short.
+    """
+    started = time.time()
+    source = RunFolder.open(run)
+    config = load_config(source.resolved, [], FitConfig)
+    torch.set_num_threads(config.threads)
+    files = log_files(paths)
+    logs = [prepare(read_external(path, config), "external", config.signals.columns, config.prepare) for path in files]
+    names = [log.log.name for log in logs]
+    for name in names:
+        if names.count(name) > 1:
+            raise DataError(f"two logs are named '{name}'; rename one file")
+    for log in logs:
+        require_window(log, config)
+    folder = RunFolder.create(out or run / time.strftime("external-%Y%m%dT%H%M%S"), dump_config(config), resume=False)
+    fitted = [Fitted(*load_model(source.models / name), notes={}) for name in model_names(source.models)]
+    order = ["zero", "baseline", *config.heads]
+    fitted.sort(key=lambda f: order.index(f.spec.name) if f.spec.name in order else len(order))
+    low, high = np.array(fitted[0].spec.low[:3]), np.array(fitted[0].spec.high[:3])
+    limit = config.evaluation.divergence * np.maximum(np.abs(low), np.abs(high))
+    say(f"{config.name}: {len(logs)} logs, {len(fitted)} models")
+    simulated = isinstance(config.data, SimulatedTrials) and all("vessel" in log.log.meta for log in logs)
+    models = [c for c in candidates(fitted, config.data) if c.kind != "truth" or simulated]
+    table = evaluate(models, logs, config.evaluation, config.prepare.grid.step, limit, folder)
+    write_data_quality(folder, {"external": logs})
+    write_metrics(folder, config, table, str(source.read_metrics()["selected"]))
+    folder.write_provenance(config=source.resolved, overrides=[], seed=config.seed, files=files, started=started)
+    report = report_run(folder.path)
+    print_table(table, "external")
+    print(f"report: {report}")
+    return folder
+
+
+def read_external(path: Path, config: FitConfig) -> Log:
+    """A log read as the run read its own; canonical files are recognised by their own mark.
+
+    Raises:
+        ResidnetError: where the file cannot be read.
+    """
+    if isinstance(config.data, SimulatedTrials) or Log.recognises(path):
+        return CanonicalConfig().build().read(path)
+    return config.data.reader.build().read(path)

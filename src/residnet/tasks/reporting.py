@@ -1,0 +1,20 @@
+"""`residnet report`, and the report at the end of a fit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from residnet.evaluation.figures import write_figures
+from residnet.evaluation.report import write_report
+from residnet.run_folder import RunFolder
+
+
+def report_run(path: Path) -> Path:
+    """Write figures and report of a finished run from its folder alone; returns the report's path.
+
+    Raises:
+        UsageError: where there is no finished run.
+    """
+    folder = RunFolder.open(path)
+    write_figures(folder.path)
+    return write_report(folder.path)
