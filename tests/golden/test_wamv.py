@@ -85,7 +85,7 @@ def table(path: Path) -> pd.DataFrame:
 
 
 def tensor(frame: pd.DataFrame, *columns: str) -> torch.Tensor:
-    return torch.from_numpy(frame[list(columns)].to_numpy(dtype=float))
+    return torch.tensor(frame[list(columns)].to_numpy(), dtype=torch.float64)
 
 
 @cache

@@ -48,6 +48,9 @@ class SignalsConfig(Config):
         repeated = {name for name in self.inputs if name in self.exogenous or self.inputs.count(name) > 1}
         if repeated:
             raise ValueError(f"inputs {sorted(repeated)} are named twice")
+        made = STATE + (FORCE_CHANNELS if self.forces is not None else ()) + (WIND_CHANNELS if self.exogenous else ())
+        if taken := [name for name in self.inputs if name in made]:
+            raise ValueError(f"input '{taken[0]}' is a channel that the model has or makes itself; leave it out or rename it in the log's channel map")
         return self
 
     @property

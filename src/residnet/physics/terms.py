@@ -37,6 +37,8 @@ def parse_term(term: str, names: Sequence[str]) -> tuple[Factor, ...]:
     Raises:
         ConfigError: where the text cannot be read or names an unknown channel.
     """
+    if not term.strip():
+        raise ConfigError("a term is empty; write '1' for the constant")
     factors: list[Factor] = []
     position = 0
     while position < len(term):
@@ -50,8 +52,6 @@ def parse_term(term: str, names: Sequence[str]) -> tuple[Factor, ...]:
         if name not in names:
             raise ConfigError(f"term '{term}': no channel '{name}'{nearest(name, names)}")
         factors.append(Factor(name, match["magnitude"] is not None, int(match["power"] or 1)))
-    if not term.strip():
-        raise ConfigError("a term is empty; write '1' for the constant")
     return tuple(factors)
 
 

@@ -1,0 +1,107 @@
+"""Thrusters: the printed curves (document 003 eqs. (21), (22)), their clipping, saturation and rate limit."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from residnet.core.config import validate
+from residnet.core.errors import ConfigError
+from residnet.physics.actuators import DifferentialThrust, DifferentialThrustConfig
+from residnet.physics.vessel import load_vessel
+
+N_MAX = 2380.0 / 60.0
+
+
+@pytest.fixture(scope="module")
+def thrusters() -> DifferentialThrust:
+    return load_vessel("wam_v_cal").actuators.build()
+
+
+def rpm(*values: float) -> torch.Tensor:
+    return torch.tensor(values, dtype=torch.float64) / 60.0
+
+
+def test_curve_is_the_printed_one_in_rpm(thrusters: DifferentialThrust) -> None:
+    ahead, astern = np.linspace(45, 2380, 40), np.linspace(-2380, -61, 40)
+    np.testing.assert_allclose(thrusters.thrust(rpm(*ahead)), 3.54e-5 * ahead**2 + 0.084 * ahead - 3.798, rtol=1e-4)
+    np.testing.assert_allclose(thrusters.thrust(rpm(*astern)), -1.189e-5 * astern**2 + 0.0707 * astern + 4.331, rtol=1e-3, atol=1e-3)
+
+
+def test_full_thrust_of_two_is_what_errata_states(thrusters: DifferentialThrust) -> None:
+    tau = thrusters(rpm(2380, 2380))
+    np.testing.assert_allclose(tau, [793.3, 0.0, 0.0], atol=0.1)
+    np.testing.assert_allclose(thrusters(rpm(-2380, -2380)), [-462.6, 0.0, 0.0], atol=0.1)
+
+
+def test_dead_band_and_sign(thrusters: DifferentialThrust) -> None:
+    """Clipped, the curve is zero from -60.6 to 44.4 rpm (ERRATA W5) and never opposes the rotation."""
+    n = torch.linspace(-2380, 2380, 20_001, dtype=torch.float64) / 60.0
+    thrust = thrusters.thrust(n)
+    assert bool((thrust * n >= 0).all())
+    inside = (n * 60 > -60.0) & (n * 60 < 44.0)
+    assert bool((thrust[inside] == 0).all())
+    assert bool((thrust[n * 60 > 44.5] > 0).all())
+    assert bool((thrust[n * 60 < -60.8] < 0).all())
+    # continuous and rising: no jump larger than the steepest slope allows
+    rise = thrust.diff()
+    assert bool((rise >= 0).all())
+    assert float(rise.max()) < 1.05 * float(n[1] - n[0]) * (5.04 + 2 * 0.12744 * N_MAX)
+
+
+def test_zero_and_not_a_number(thrusters: DifferentialThrust) -> None:
+    assert thrusters.thrust(rpm(0.0, -0.0)).tolist() == [0.0, 0.0]
+
+
+def test_moment_arm_and_side(thrusters: DifferentialThrust) -> None:
+    """Port thrust turns to starboard (r > 0) about half the spacing."""
+    tau = thrusters(rpm(1200, 0))
+    force = 3.54e-5 * 1200**2 + 0.084 * 1200 - 3.798
+    np.testing.assert_allclose(tau, [force, 0.0, 1.22 * force], rtol=1e-4)
+    np.testing.assert_allclose(thrusters(rpm(0, 1200)), [force, 0.0, -1.22 * force], rtol=1e-4)
+
+
+def test_shapes(thrusters: DifferentialThrust) -> None:
+    n = torch.rand(3, 5, 2, dtype=torch.float64)
+    assert thrusters(n).shape == (3, 5, 3)
+    assert thrusters(n.float()).dtype == torch.float32
+    np.testing.assert_array_equal(thrusters(n)[1, 2], thrusters(n[1, 2]))
+
+
+def test_rate_limit(thrusters: DifferentialThrust) -> None:
+    """From rest to full in 2380 / 1500 = 1.59 s, a reversal in 3.17 s (ERRATA W7)."""
+    dt, n, command = 0.01, torch.zeros(1, 2, dtype=torch.float64), torch.tensor([[N_MAX, -N_MAX]], dtype=torch.float64)
+    steps = 0
+    while not torch.equal(n, command):
+        before, n = n, thrusters.advance(n, command, dt)
+        assert bool(((n - before).abs() <= 1500 / 60 * dt + 1e-12).all())
+        steps += 1
+    assert steps == 159
+    reversal = 0
+    while not torch.equal(n, -command):
+        n = thrusters.advance(n, -command, dt)
+        reversal += 1
+    assert reversal in (317, 318)
+
+
+def test_saturation_and_small_steps(thrusters: DifferentialThrust) -> None:
+    far = torch.tensor([[100.0, -100.0]], dtype=torch.float64)
+    held = torch.tensor([[N_MAX, -N_MAX]], dtype=torch.float64)
+    assert torch.equal(thrusters.advance(held, far, 0.1), held)
+    n, near = torch.tensor([[10.0, 10.0]], dtype=torch.float64), torch.tensor([[10.001, 9.999]], dtype=torch.float64)
+    torch.testing.assert_close(thrusters.advance(n, near, 0.1), near, rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"), [("spacing", "0 m", "greater than 0"), ("n_max", "-3 rpm", "greater than 0"), ("n_rate", "10 rpm", "rpm")]
+)
+def test_wrong_limits_are_config_errors(key: str, value: str, message: str) -> None:
+    curve = [0.0, 1.0, 0.0]
+    limits = {"spacing": 2.0, "n_max": "1000 rpm", "n_rate": "500 rpm/s"}
+    good = {"kind": "differential_thrust", "forward": curve, "reverse": curve, "source": "made", **limits}
+    validate(good, DifferentialThrustConfig, "here")
+    with pytest.raises(ConfigError, match=message) as caught:
+        validate({**good, key: value}, DifferentialThrustConfig, "here")
+    assert "\n" not in str(caught.value)
+    assert key in str(caught.value)

@@ -1,0 +1,87 @@
+"""Terms by name against NumPy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from residnet.core.errors import ConfigError
+from residnet.physics.terms import Factor, TermLibrary, parse_term, polynomial_terms
+
+NAMES = ("u", "v", "r", "n_port", "delta2")
+
+READ = {
+    "1": (),
+    "u": (("u", False, 1),),
+    "u|u|": (("u", False, 1), ("u", True, 1)),
+    "|u|v": (("u", True, 1), ("v", False, 1)),
+    "v |r|": (("v", False, 1), ("r", True, 1)),
+    "  v   r ": (("v", False, 1), ("r", False, 1)),
+    "v*r": (("v", False, 1), ("r", False, 1)),
+    "n_port^2 delta2": (("n_port", False, 2), ("delta2", False, 1)),
+    "|v|^3 u^9": (("v", True, 3), ("u", False, 9)),
+    "1 u": (("u", False, 1),),
+    "|u||v|": (("u", True, 1), ("v", True, 1)),
+}
+
+
+@pytest.mark.parametrize("term", READ)
+def test_parse(term: str) -> None:
+    assert parse_term(term, NAMES) == tuple(Factor(*factor) for factor in READ[term])
+
+
+@pytest.mark.parametrize(
+    ("term", "message"),
+    [
+        ("", "empty"),
+        ("   ", "empty"),
+        ("n_prt u", "did you mean 'n_port'"),
+        ("w", "no channel 'w'"),
+        ("|w|", "no channel 'w'"),
+        ("uv", "no channel 'uv'"),
+        ("u|v", "cannot read it from '|v'"),
+        ("u+v", r"cannot read it from '\+v'"),
+        ("2 u", "cannot read it from '2 u'"),
+        ("u^-1", r"cannot read it from '\^-1'"),
+        ("u^1.5", r"cannot read it"),
+        ("u^0", r"cannot read it from '\^0'"),
+        ("u^10", r"cannot read it from '0'"),
+        ("u**2", r"cannot read it"),
+        ("sin(u)", "no channel 'sin'"),
+    ],
+)
+def test_what_cannot_be_read_is_one_line(term: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message) as caught:
+        parse_term(term, NAMES)
+    assert "\n" not in str(caught.value)
+
+
+def test_library_equals_numpy() -> None:
+    terms = ["1", "u", "u|u|", "|u|v", "v |r|", "n_port^2 delta2", "|v|^3 u^2", "1"]
+    z = np.random.default_rng(0).normal(size=(7, 11, len(NAMES)))
+    u, v, r, n, d = (z[..., i] for i in range(5))
+    truth = [np.ones_like(u), u, u * abs(u), abs(u) * v, v * abs(r), n**2 * d, abs(v) ** 3 * u**2, np.ones_like(u)]
+    library = TermLibrary(terms, NAMES)
+    assert library.count == len(terms)
+    np.testing.assert_allclose(library(torch.from_numpy(z)), np.stack(truth, axis=-1), rtol=1e-14)
+    single = library(torch.from_numpy(z).float())
+    assert single.dtype == torch.float32
+    np.testing.assert_allclose(single, np.stack(truth, axis=-1), rtol=3e-5, atol=1e-6)
+
+
+def test_library_of_constants_and_of_nothing() -> None:
+    z = torch.randn(4, 2, len(NAMES))
+    assert torch.equal(TermLibrary(["1", "1"], NAMES)(z), torch.ones(4, 2, 2))
+    assert TermLibrary([], NAMES)(z).shape == (4, 2, 0)
+
+
+def test_polynomials_are_all_products_once() -> None:
+    names = ("u", "v", "r")
+    terms = polynomial_terms(names, 3, magnitudes=("u", "r"))
+    # binomial(3 + 3, 3) - 1 products, then the magnitudes
+    assert len(terms) == len(set(terms)) == 19 + 2
+    assert terms[-2:] == ("u|u|", "r|r|")
+    z = torch.rand(1, 3, dtype=torch.float64) + 0.5
+    values = TermLibrary(terms[:19], names)(z)[0]
+    assert len({round(float(value), 12) for value in values}) == 19

@@ -1,0 +1,106 @@
+"""Vessel files: every one loads, and a wrong one stops with a line that says where."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from residnet.core.config import load_config
+from residnet.core.errors import ConfigError
+from residnet.physics.fossen import Fossen3
+from residnet.physics.vessel import Parameter, VesselConfig, load_vessel, vessel_files
+
+CAL = vessel_files()["wam_v_cal"]
+
+
+@pytest.mark.parametrize("name", vessel_files())
+def test_every_vessel_file(name: str) -> None:
+    vessel = load_vessel(name)
+    assert vessel.name == name, "a vessel is called as its file"
+    hull = Fossen3(vessel)
+    assert hull.mass.shape == (3, 3)
+    assert vessel.actuators.source
+    vessel.actuators.build()
+
+
+def test_calibrated_numbers_are_those_of_errata() -> None:
+    vessel = load_vessel("wam_v_cal")
+    body, added, damping = vessel.rigid_body, vessel.added_mass, vessel.damping
+    assert (body.m.value, body.I_z.value, body.x_G.value) == (315, 760, 0)
+    assert (added.X_udot.value, added.Y_vdot.value, added.N_rdot.value) == (-42, -250, -500)
+    assert {term: p.value for term, p in damping.X.items()} == {"u": 180, "u|u|": 83}
+    assert {term: p.value for term, p in damping.Y.items()} == {"v": 250, "|u|v": 150, "v|v|": 600}
+    assert {term: p.value for term, p in damping.N.items()} == {"r": 900, "r|r|": 1700, "|u|v": -320}
+    assert (vessel.actuators.spacing, vessel.actuators.n_max * 60, vessel.actuators.n_rate * 60) == pytest.approx((2.44, 2380, 1500))
+
+
+def test_units_are_converted_at_the_door() -> None:
+    vessel = load_config(CAL, ["rigid_body.m.value=0.315", "rigid_body.m.unit=t", "length.value=488", "length.unit=cm"], VesselConfig)
+    assert vessel.rigid_body.m == Parameter(value=315.0, unit="kg", source=vessel.rigid_body.m.source)
+    assert vessel.length.value == pytest.approx(4.88)
+    # what is converted once is not converted again
+    again = VesselConfig.model_validate(vessel.model_dump())
+    assert again == vessel
+
+
+@pytest.mark.parametrize(
+    ("override", "place", "message"),
+    [
+        ("rigid_body.m.unit=m", "rigid_body.m", r"unit 'm' does not measure \[kg\]"),
+        ("rigid_body.m.unit=kilo", "rigid_body.m", "unknown unit 'kilo'"),
+        ("rigid_body.m.value=-1", "rigid_body.m", "must be positive"),
+        ("rigid_body.I_z.value=0", "rigid_body.I_z", "must be positive"),
+        ("rigid_body.m.value=.nan", "rigid_body.m.value", "finite"),
+        ("rigid_body.m.value=heavy", "rigid_body.m.value", "number"),
+        ("rigid_body.m.source=' '", "rigid_body.m.source", "needs its source"),
+        ("rigid_body.mass.value=3", "rigid_body.mass", "rigid_body.m"),
+        ("added_mass.N_rdot.unit=kg m", "added_mass.N_rdot", r"does not measure \[kg m\^2\]"),
+        ("length.value=-3", "length", "must be positive"),
+        ("actuators.kind=sail", "actuators", "sail"),
+        ("actuators.n_max=2380 rpm/s", "actuators.n_max", "rpm/s"),
+    ],
+)
+def test_a_wrong_value_is_one_line_with_its_place(override: str, place: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message) as caught:
+        load_config(CAL, [override], VesselConfig)
+    text = str(caught.value)
+    assert "\n" not in text
+    assert place in text
+    assert override in text
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("damping.X.w={value: 1, unit: kg/s, source: made}", "no channel 'w'"),
+        ("damping.X.u+v={value: 1, unit: kg/s, source: made}", "cannot read"),
+        ("damping.X.u.unit=kg", "kg/s"),
+        ("damping.N.r.unit=kg/s", r"kg m\^2/s"),
+        ("damping.Y.v.unit=t/s", "kg/s"),
+        ("damping.Y.v.unit=kg2/s", "kg/s"),
+        ("damping.N.|u|v|v|={value: 1, unit: kg, source: made}", "kg s/m"),
+    ],
+)
+def test_a_wrong_damping_term_is_found_when_the_file_is_read(override: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message) as caught:
+        load_config(CAL, [override], VesselConfig)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "override",
+    ["damping.X.u.unit=N s/m", "damping.N.r.unit=N m s/rad", "damping.N.r.unit=N m s", "damping.N.|u|v|v|={value: 1, unit: kg s/m, source: made}"],
+)
+def test_equal_units_of_damping_are_taken(override: str) -> None:
+    load_config(CAL, [override], VesselConfig)
+
+
+def test_a_vessel_by_path_and_a_vessel_that_is_not_there(tmp_path: Path) -> None:
+    copy = tmp_path / "mine.yaml"
+    copy.write_text(CAL.read_text())
+    assert load_vessel(str(copy)) == load_vessel("wam_v_cal")
+    with pytest.raises(ConfigError, match="did you mean 'wam_v_cal'"):
+        load_vessel("wam_v_cla")
+    with pytest.raises(ConfigError, match="no such file"):
+        load_vessel(str(tmp_path / "other.yaml"))
