@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -74,7 +75,8 @@ def _run(candidate: Candidate, windows: Sequence[Window], logs: Sequence[Prepare
     behind = [np.maximum(np.arange(w.start - past, w.start), w.past) for w in windows]
     y_past = np.stack([logs[w.log].y[rows] for w, rows in zip(windows, behind, strict=True)])
     w_past = np.stack([tables[w.log][rows] for w, rows in zip(windows, behind, strict=True)])
-    model = candidate.model.to(dtype).eval()
+    # a copy: a validation in float32 must not round the model that it validates
+    model = copy.deepcopy(candidate.model).to(dtype).eval()
     with torch.no_grad():
         if isinstance(model, HybridDynamics):
             s = model.warmup(torch.from_numpy(y_past).to(dtype), torch.from_numpy(w_past).to(dtype))

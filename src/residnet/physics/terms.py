@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from residnet.core.errors import ConfigError
 from residnet.core.names import nearest
 
-_FACTOR = re.compile(r"\s*(?:\|(?P<magnitude>\w+)\||(?P<name>[A-Za-z_]\w*)|(?P<one>1))(?:\^(?P<power>[1-9]))?\s*\*?")
+_FACTOR = re.compile(r"\s*(?:\|(?P<magnitude>\w+)\||(?P<name>[A-Za-z_]\w*)|(?P<one>1))(?:\^(?P<power>-?[1-9]))?\s*\*?")
 
 
 class Factor(NamedTuple):
@@ -31,7 +31,8 @@ def parse_term(term: str, names: Sequence[str]) -> tuple[Factor, ...]:
     """Factors of a term.
 
     Args:
-        term: product of channels; factors stand apart by spaces, `*` or the bars of a magnitude; `^2` is a power; `1` the constant.
+        term: product of channels; factors stand apart by spaces, `*` or the bars of a magnitude; `^2` is a power; `1` the constant;
+            `^-1` divides, for channels that stay away from zero, such as `wind_mag`.
         names: channels that may appear.
 
     Raises:
@@ -66,19 +67,26 @@ def polynomial_terms(names: Sequence[str], degree: int, *, magnitudes: Sequence[
 class TermLibrary(nn.Module):
     """Values of J terms from channels: [..., nz] -> [..., J].
 
-    Every term is a product of columns of [1, z, |z|], gathered by index, so that the number of tensor operations is
-    the largest number of factors and not the number of terms.
+    Every term is a product of columns of [1, z, |z|, 1/z], gathered by index, so that the number of tensor operations is
+    the largest number of factors and not the number of terms; 1/z is there for the channels that a term divides by.
     """
 
     def __init__(self, terms: Sequence[str], names: Sequence[str]) -> None:
         super().__init__()
         self.terms = tuple(terms)
+        parsed = [parse_term(term, names) for term in terms]
+        places = {name: i for i, name in enumerate(names)}
+        divisors = sorted({factor.name for factors in parsed for factor in factors if factor.power < 0}, key=places.__getitem__)
+        self.register_buffer("divisors", torch.tensor([places[name] for name in divisors], dtype=torch.long), persistent=False)
+        self.divisors: Tensor
+        self.divides = len(divisors) > 0
         columns: list[list[int]] = []
-        for term in terms:
+        for factors in parsed:
             column: list[int] = []
-            for factor in parse_term(term, names):
-                index = 1 + list(names).index(factor.name) + (len(names) if factor.magnitude else 0)
-                column.extend([index] * factor.power)
+            for factor in factors:
+                inverse = 1 + 2 * len(names) + (divisors.index(factor.name) if factor.power < 0 else 0)
+                index = 1 + places[factor.name] + (len(names) if factor.magnitude else 0)
+                column.extend([inverse if factor.power < 0 else index] * abs(factor.power))
             columns.append(column)
         self.depth = max([len(column) for column in columns], default=0)
         padded = [column + [0] * (self.depth - len(column)) for column in columns]
@@ -91,6 +99,8 @@ class TermLibrary(nn.Module):
         """Channels z [..., nz] -> terms [..., J]."""
         one = torch.ones_like(z[..., :1])
         base = torch.cat((one, z, z.abs()), dim=-1)
+        if self.divides:
+            base = torch.cat((base, z.index_select(-1, self.divisors).reciprocal()), dim=-1)
         if self.depth == 0:
             return one.expand(z.shape[:-1] + (self.count,))
         out = base.index_select(-1, self.index[0])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -20,6 +20,7 @@ from residnet.evaluation.config import EvaluationConfig
 from residnet.heads import HeadConfig
 from residnet.physics.signals import SignalsConfig
 from residnet.training.config import TrainingConfig
+from residnet.training.refit import RefitConfig
 
 _TAKEN = ("zero", "baseline", "truth")
 
@@ -28,6 +29,13 @@ class ExportConfig(Config):
     """Which models are exported as TorchScript; `selected` is the one chosen on validation data."""
 
     models: tuple[str, ...] = ("selected",)
+
+
+def _known(key: str, given: Iterable[str], valid: Iterable[str], what: str) -> None:
+    valid = tuple(valid)
+    for name in given:
+        if name not in valid:
+            raise ValueError(f"{key}: no {what} is named '{name}'{nearest(name, valid)}")
 
 
 class FitConfig(Config):
@@ -42,7 +50,10 @@ class FitConfig(Config):
         signals: inputs of the models.
         integrator: of the models; their step is the grid's.
         baseline: the known part.
+        baselines: further baselines by name; free-run beside the first, and heads may stand on them.
+        refit: baselines (by name, `baseline` for the first) whose coefficients are moved through rollouts after least squares.
         heads: residual heads by name.
+        base_of: the baseline that a head stands on, by the head's name; `baseline` where absent.
         training: of network heads by the name of the head; the defaults where absent.
         evaluation: protocols and scales.
         export: TorchScript.
@@ -58,24 +69,28 @@ class FitConfig(Config):
     signals: SignalsConfig
     integrator: Integrator = "rk4"
     baseline: BaselineConfig
+    baselines: dict[str, BaselineConfig] = Field(default_factory=dict)
+    refit: dict[str, RefitConfig] = Field(default_factory=dict)
     heads: dict[str, HeadConfig] = Field(default_factory=dict)
+    base_of: dict[str, str] = Field(default_factory=dict)
     training: dict[str, TrainingConfig] = Field(default_factory=dict)
     evaluation: EvaluationConfig
     export: ExportConfig = ExportConfig()
 
     @model_validator(mode="after")
     def _combination(self) -> FitConfig:
-        for name in self.heads:
-            if name in _TAKEN or not name.replace("_", "").replace("-", "").isalnum():
-                raise ValueError(f"heads: '{name}' cannot name a head; use letters, digits, '-', '_' and none of {', '.join(_TAKEN)}")
-        for name in self.training:
-            if name not in self.heads:
-                raise ValueError(f"training: no head is named '{name}'{nearest(name, self.heads)}")
-        for name in self.export.models:
-            if name not in ("selected", "baseline", *self.heads):
-                raise ValueError(f"export.models: no model is named '{name}'{nearest(name, ('selected', 'baseline', *self.heads))}")
+        baselines = {"baseline": self.baseline, **self.baselines}
+        models = (*baselines, *self.heads)
+        for name in (*self.baselines, *self.heads):
+            if name in _TAKEN or models.count(name) > 1 or not name.replace("_", "").replace("-", "").isalnum():
+                raise ValueError(f"'{name}' cannot name a model; use letters, digits, '-', '_', each name once and none of {', '.join(_TAKEN)}")
+        _known("training", self.training, self.heads, "head")
+        _known("base_of", self.base_of, self.heads, "head")
+        _known("base_of", self.base_of.values(), baselines, "baseline")
+        _known("refit", self.refit, baselines, "baseline")
+        _known("export.models", self.export.models, ("selected", *models), "model")
         names = self.signals.build().names
-        for key, part in {"baseline": self.baseline, **{f"heads.{name}": head for name, head in self.heads.items()}}.items():
+        for key, part in {**baselines, **self.heads}.items():
             try:
                 part.build(names)
             except ConfigError as error:

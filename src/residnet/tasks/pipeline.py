@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from residnet.baselines import Coefficient, StillConfig
+from residnet.baselines import Baseline, BaselineConfig, Coefficient, RegressorBaseline, StillConfig
 from residnet.core.errors import DataError
 from residnet.core.log import Log
-from residnet.core.names import ACCELERATION
+from residnet.core.names import ACCELERATION, VELOCITY
 from residnet.core.samples import Samples
 from residnet.data.prepare import Prepared, envelope, prepare, samples
 from residnet.data.simulate import SimulatedTrials
@@ -37,6 +37,7 @@ from residnet.physics.vessel import load_vessel
 from residnet.run_folder import RunFolder
 from residnet.tasks.fit import FitConfig
 from residnet.training.config import TrainingConfig
+from residnet.training.refit import refit
 
 PreparedSplits = dict[str, list[Prepared]]
 
@@ -100,10 +101,8 @@ class Bench:
 
     def __call__(self, model: HybridDynamics) -> float:
         """Mean nrmse over u, v, r of the validation windows; a diverged window counts with the error of `zero`."""
-        training = model.training
         candidate = Candidate("validated", "head", model)
         predictions = free_run([candidate], self.windows, self.logs, self.step, self.limit, dtype=torch.float32)
-        model.train(training)
         errors = window_errors(FreeRun("", "", self.windows, predictions), "validated", self.logs)
         return float((errors["rmse"].mean(0) / self.scales).mean())
 
@@ -130,7 +129,7 @@ class Fitter:
         self.samples = samples(self.train, self.signals)
         self.bench = Bench(logs["validation"], config.evaluation, config.prepare.grid.step, self.limit)
 
-    def spec(self, name: str, role: str) -> ModelSpec:
+    def spec(self, name: str, role: str, baseline: BaselineConfig) -> ModelSpec:
         """The description of a model of this run."""
         config = self.config
         return ModelSpec.model_validate(
@@ -139,7 +138,7 @@ class Fitter:
                 "name": name,
                 "role": role,
                 "signals": config.signals.resolved().model_dump(),
-                "baseline": (StillConfig() if role == "zero" else config.baseline).model_dump(),
+                "baseline": baseline.model_dump(),
                 "head": config.heads[name].model_dump() if role == "head" else None,
                 "dt": config.prepare.grid.step,
                 "integrator": config.integrator,
@@ -150,25 +149,31 @@ class Fitter:
 
     def zero(self) -> Fitted:
         """The model that holds the velocities."""
-        spec = self.spec("zero", "zero")
+        spec = self.spec("zero", "zero", StillConfig())
         return self._keep(Fitted(spec, spec.build(), {}))
 
-    def baseline(self) -> Fitted:
-        """The identified baseline."""
-        spec = self.spec("baseline", "baseline")
+    def baseline(self, name: str = "baseline") -> Fitted:
+        """An identified baseline, refitted through rollouts where the config asks for it."""
+        spec = self.spec(name, "baseline", self.config.baselines.get(name, self.config.baseline))
         model = spec.build()
         started = time.perf_counter()
         table = spec.baseline.fit(model.baseline, self.samples)
-        notes = {"coefficients": [_row(entry) for entry in table], "samples": len(self.samples), "seconds": round(time.perf_counter() - started, 3)}
+        notes: dict[str, Any] = {"samples": len(self.samples), "least_squares": self.bench(model)}
+        if name in self.config.refit:
+            scales = torch.from_numpy(self.config.evaluation.scales.array())
+            notes["refit"] = refit(model, self.samples, WindowStore.gather(self.train, torch.float64), self.config.refit[name], scales)
+            table = moved(table, model.baseline)
+        notes |= {"coefficients": [_row(entry) for entry in table], "validation": self.bench(model), "seconds": round(time.perf_counter() - started, 1)}
         return self._keep(Fitted(spec, model, notes))
 
     def head(self, name: str, baseline: HybridDynamics) -> Fitted:
-        """One head on top of the baseline; taken from the run folder where it is finished there."""
+        """One head on top of a baseline; taken from the run folder where it is finished there."""
         folder = self.folder.models / name
         if (folder / "model.json").is_file():
             spec, model = load_model(folder)
             return Fitted(spec, model, json.loads((folder / "fit.json").read_text()))
-        spec = self.spec(name, "head")
+        below = self.config.base_of.get(name, "baseline")
+        spec = self.spec(name, "head", self.config.baselines.get(below, self.config.baseline))
         # seeded by the head's own name, so that adding a head changes no other
         seed = self.config.seed * 1_000 + sum(map(ord, name))
         torch.manual_seed(seed)
@@ -181,8 +186,7 @@ class Fitter:
             notes = dict(model.head.solve(residual))
         else:
             notes = self._train(name, model, residual, seed)
-        notes["seconds"] = round(time.perf_counter() - started, 1)
-        notes["validation"] = self.bench(model)
+        notes |= {"baseline": below, "seconds": round(time.perf_counter() - started, 1), "validation": self.bench(model)}
         return self._keep(Fitted(spec, model, notes))
 
     def residual(self, baseline: HybridDynamics, of: Samples) -> Samples:
@@ -238,6 +242,15 @@ def write_residuals(file: Path, fitter: Fitter, fitted: Sequence[Fitted], logs: 
 
 def _row(entry: Coefficient) -> dict[str, Any]:
     return {"axis": entry.axis, "term": entry.term, "value": entry.value, "standard_error": entry.error}
+
+
+def moved(table: Sequence[Coefficient], baseline: Baseline) -> list[Coefficient]:
+    """The least-squares table with the coefficients as a refit left them; standard errors stay those of least squares."""
+    if not isinstance(baseline, RegressorBaseline):
+        return list(table)
+    terms = baseline.library.terms
+    axes = [f"{name}_dot" for name in VELOCITY]
+    return [Coefficient(c.axis, c.term, float(baseline.theta[axes.index(c.axis), terms.index(c.term)]), c.error) for c in table]
 
 
 def candidates(fitted: Sequence[Fitted], data: MeasuredLogs | SimulatedTrials) -> list[Candidate]:

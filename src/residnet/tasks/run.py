@@ -45,11 +45,13 @@ def run_fit(config: FitConfig, *, source: Path, overrides: Sequence[str], out: P
     say("  " + ", ".join(f"{split} {len(members)} logs" for split, members in logs.items()))
     write_data_quality(folder, logs)
     fitter = Fitter(config, logs, folder)
-    zero, baseline = fitter.zero(), fitter.baseline()
-    fitted = [zero, baseline]
+    baselines = {name: fitter.baseline(name) for name in ("baseline", *config.baselines)}
+    fitted = [fitter.zero(), *baselines.values()]
+    for name, known in baselines.items():
+        say(f"  {name}: validation free-run error {known.notes['validation']:.4f}")
     for name in config.heads:
         say(f"  fitting {name}")
-        head = fitter.head(name, baseline.model)
+        head = fitter.head(name, baselines[config.base_of.get(name, "baseline")].model)
         say(f"  {name}: validation free-run error {head.notes['validation']:.4f} after {head.notes['seconds']:.1f} s")
         fitted.append(head)
     say("  free runs")

@@ -1,0 +1,34 @@
+"""Port/starboard symmetry: how channels and terms change when a vessel and all that happens to it are mirrored."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from residnet.core.names import VELOCITY
+from residnet.physics.terms import parse_term
+
+_ODD = ("v", "r", "delta", "tau_y", "tau_n", "wind_v")
+_EVEN = ("u", "n", "tau_x", "wind_u", "wind_mag")
+
+
+def channel_parity(name: str) -> int | None:
+    """+1 where a channel keeps its sign in the mirror, -1 where it changes it, None where nobody said."""
+    return -1 if name in _ODD else 1 if name in _EVEN else None
+
+
+def term_parity(term: str, names: Sequence[str]) -> int | None:
+    """Parity of a product of channels; None where a channel's is not known."""
+    parity = 1
+    for factor in parse_term(term, names):
+        own = channel_parity(factor.name)
+        if own is None:
+            return None
+        if own < 0 and not factor.magnitude and factor.power % 2 == 1:
+            parity = -parity
+    return parity
+
+
+def wrong_parity(term: str, axis: int, names: Sequence[str]) -> bool:
+    """Whether a mirror-symmetric vessel cannot have this term in the acceleration of this axis (0 surge, 1 sway, 2 yaw)."""
+    parity = term_parity(term, names)
+    return parity is not None and parity != (1 if VELOCITY[axis] == "u" else -1)
