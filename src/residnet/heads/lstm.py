@@ -96,7 +96,7 @@ class LstmCore(nn.Module):
         """Features [B, T, F] -> outputs [B, T, H] from an empty memory, and the memory after them [B, 2H]."""
         zeros = torch.zeros(f.shape[0], self.hidden, dtype=f.dtype, device=f.device)
         if f.shape[1] == 0:
-            return f[:, :, :0].expand(-1, -1, self.hidden), torch.cat((zeros, zeros), dim=-1)
+            return torch.zeros(f.shape[0], 0, self.hidden, dtype=f.dtype, device=f.device), torch.cat((zeros, zeros), dim=-1)
         if not self.softsign:
             weights = [self.w_input, self.w_hidden, self.bias, self.no_bias]
             start = [zeros.unsqueeze(0), zeros.unsqueeze(0)]
