@@ -1,0 +1,81 @@
+"""Models on disk: complete, harmless, and named when missing."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from residnet.baselines import RegressorsConfig, StillConfig
+from residnet.core.errors import ConfigError, UsageError
+from residnet.dynamics.store import ModelSpec, load_model, model_names, save_model
+from residnet.physics.signals import SignalsConfig
+from residnet.physics.vessel import load_vessel
+
+
+def spec(**changes: object) -> ModelSpec:
+    fields: dict[str, object] = {
+        "schema": "residnet.model/1",
+        "name": "baseline",
+        "role": "baseline",
+        "signals": SignalsConfig(inputs=("n_port", "n_stbd"), forces="wam_v_cal").resolved().model_dump(),
+        "baseline": RegressorsConfig(terms=("u", "tau_x", "1")).model_dump(),
+        "head": None,
+        "dt": 0.05,
+        "integrator": "semi_implicit_euler",
+        "low": [-0.1, -0.2, -0.3, -4.0, -5.0],
+        "high": [0.1, 0.2, 0.3, 4.0, 5.0],
+    }
+    return ModelSpec.model_validate({**fields, **changes})
+
+
+def test_round_trip(tmp_path: Path) -> None:
+    saved, model = spec(), spec().build()
+    with torch.no_grad():
+        model.baseline.theta.copy_(torch.randn(3, 3, dtype=torch.float64))  # type: ignore[union-attr, operator]
+    save_model(tmp_path / "baseline", saved, model)
+    assert sorted(path.name for path in (tmp_path / "baseline").iterdir()) == ["model.json", "model.safetensors"]
+    loaded, again = load_model(tmp_path / "baseline")
+    assert loaded == saved
+    assert torch.equal(again.baseline.theta, model.baseline.theta)  # type: ignore[union-attr, arg-type]
+    assert (again.dt, again.integrator) == (0.05, "semi_implicit_euler")
+    assert loaded.ranges == {"u": (-0.1, 0.1), "v": (-0.2, 0.2), "r": (-0.3, 0.3), "n_port": (-4.0, 4.0), "n_stbd": (-5.0, 5.0)}
+    x, w = torch.randn(2, 6, dtype=torch.float64), torch.randn(2, 2, dtype=torch.float64) * 20
+    for a, b in zip(model.step(x, w, x[:, :0]), again.step(x, w, x[:, :0]), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_a_stored_model_needs_no_vessel_file(tmp_path: Path) -> None:
+    save_model(tmp_path / "m", spec(), spec().build())
+    text = (tmp_path / "m" / "model.json").read_text()
+    assert "wam_v_cal" not in text
+    assert json.loads(text)["signals"]["forces"]["forward"] == list(load_vessel("wam_v_cal").actuators.forward)
+
+
+def test_zero_has_no_numbers(tmp_path: Path) -> None:
+    saved = spec(name="zero", role="zero", baseline=StillConfig().model_dump())
+    save_model(tmp_path / "zero", saved, saved.build())
+    _, model = load_model(tmp_path / "zero")
+    x = torch.tensor([[0.0, 0.0, 0.0, 1.0, 0.2, 0.0]])
+    after, _ = model.step(x, torch.ones(1, 2), x[:, :0])
+    assert torch.equal(after[:, 3:], x[:, 3:])
+    torch.testing.assert_close(after[:, :2], torch.tensor([[0.05, 0.01]]))
+
+
+def test_a_missing_model_names_its_neighbours(tmp_path: Path) -> None:
+    save_model(tmp_path / "baseline", spec(), spec().build())
+    (tmp_path / "unfinished").mkdir()
+    assert model_names(tmp_path) == ["baseline"]
+    with pytest.raises(UsageError, match="did you mean 'baseline'"):
+        load_model(tmp_path / "basline")
+
+
+def test_a_card_that_was_tampered_with_is_refused(tmp_path: Path) -> None:
+    save_model(tmp_path / "m", spec(), spec().build())
+    card = tmp_path / "m" / "model.json"
+    content = json.loads(card.read_text())
+    card.write_text(json.dumps(content | {"dt": -1.0}))
+    with pytest.raises(ConfigError, match=r"model\.json.*dt"):
+        load_model(tmp_path / "m")
