@@ -1,0 +1,103 @@
+"""How every figure looks: one colour and line style per role, sizes for print, saving as light PNG files."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+from residnet.evaluation.run_reader import RunFiles
+
+DPI = 140
+WIDTH = 7.0
+"""Width of every figure in inches: the text block of an A4 page, so that 9 pt stay 9 pt in print."""
+
+# Okabe and Ito's palette, which stays distinct under the common colour-vision deficiencies
+_ORANGE, _SKY, _GREEN, _BLUE, _VERMILLION, _PURPLE, _GREY = "#E69F00", "#56B4E9", "#009E73", "#0072B2", "#D55E00", "#CC79A7", "#7F7F7F"
+_HEADS: tuple[tuple[str, Any], ...] = (
+    (_BLUE, "-"),
+    (_VERMILLION, (0, (6, 1.5))),
+    (_PURPLE, (0, (4, 1, 1, 1))),
+    (_SKY, (0, (2, 1))),
+)
+# the plant lies on the head that comes near it and shows it through its gaps
+_ORDER = {"zero": 3, "baseline": 3, "truth": 5}
+MEASURED: dict[str, Any] = {"color": "black", "linestyle": "-", "linewidth": 0.7, "label": "measured", "zorder": 2}
+MASKED: dict[str, Any] = {"color": "0.88", "linewidth": 0, "zorder": 0}
+
+RC: dict[str, Any] = {
+    "font.size": 9,
+    "axes.titlesize": 9,
+    "axes.labelsize": 9,
+    "xtick.labelsize": 8,
+    "ytick.labelsize": 8,
+    "legend.fontsize": 9,
+    "legend.frameon": False,
+    "legend.handlelength": 2.6,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.linewidth": 0.7,
+    "axes.grid": True,
+    "grid.color": "0.9",
+    "grid.linewidth": 0.6,
+    "axes.axisbelow": True,
+    "axes.formatter.useoffset": False,
+    "figure.facecolor": "white",
+    "path.simplify": True,
+}
+
+
+def new_figure(height: float) -> Any:
+    """A figure `WIDTH` wide and `height` inches high, without pyplot."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(WIDTH, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def save(figure: Any, path: Path) -> None:
+    """Write a PNG with a palette of 128 colours: a third of the bytes, no visible difference in line drawings."""
+    from PIL import Image
+
+    raw = io.BytesIO()
+    figure.savefig(raw, format="png", dpi=DPI, metadata={"Software": None})
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + ".partial")
+    Image.open(raw).convert("RGB").quantize(128, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE).save(
+        partial, format="PNG", optimize=True, dpi=(DPI, DPI)
+    )
+    partial.replace(path)
+
+
+def styles(run: RunFiles) -> dict[str, dict[str, Any]]:
+    """Line properties of each model: zero, baseline and truth have their own; the selected head is always the solid blue one."""
+    fixed: dict[str, tuple[str, Any]] = {"zero": (_GREY, ":"), "baseline": (_ORANGE, "--"), "truth": (_GREEN, "-.")}
+    out: dict[str, dict[str, Any]] = {}
+    for model, kind in run.kinds.items():
+        if kind in fixed:
+            color, line = fixed[kind]
+        else:
+            place = run.heads.index(model)
+            color, line = _HEADS[place % len(_HEADS)][0], _HEADS[(place + place // len(_HEADS)) % len(_HEADS)][1]
+        out[model] = {"color": color, "linestyle": line, "linewidth": 1.4, "label": label(run, model), "zorder": _ORDER.get(kind, 4)}
+    return out
+
+
+def label(run: RunFiles, model: str) -> str:
+    """Name of a model in legends."""
+    if run.kinds.get(model) == "truth":
+        return f"{model} (plant)"
+    return f"{model} (selected)" if model == run.selected else model
+
+
+def legend_above(figure: Any, handles: dict[str, Any], columns: int = 5) -> None:
+    """One legend for the whole figure, above its panels."""
+    figure.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=min(columns, max(len(handles), 1)))
+
+
+def collect(handles: dict[str, Any], axes: Any) -> None:
+    """Add the labelled artists of some axes to the handles of a figure's legend, each label once."""
+    for handle, text in zip(*axes.get_legend_handles_labels(), strict=True):
+        handles.setdefault(text, handle)

@@ -1,0 +1,56 @@
+"""A configuration that runs in seconds, and how tests call commands."""
+
+from __future__ import annotations
+
+import pytest
+
+from residnet.cli import main
+
+TINY = {
+    "task": "fit",
+    "name": "tiny",
+    "data": {
+        "kind": "simulated",
+        "vessel": "wam_v_cal",
+        "duration": 30,
+        "substeps": 1,
+        "step": 0.1,
+        "trials": [
+            {"kind": "constant", "drive": [0.4, 0.9], "steer": [-0.4, 0.0, 0.4]},
+            {"kind": "zigzag", "count": 5, "heading": ["20 deg"], "start": 3},
+            {"kind": "acceleration_deceleration", "count": 3},
+            {"kind": "three_two_one_one", "count": 3, "start": 3},
+        ],
+        "identification": {"zigzag": 4, "acceleration_deceleration": 2, "three_two_one_one": 2},
+        "validation": {"zigzag": 1, "acceleration_deceleration": 0, "three_two_one_one": 0},
+    },
+    "prepare": {"grid": {"step": 0.1}, "derivative": {"kind": "savitzky_golay", "window": 1.1, "order": 2}},
+    "signals": {"inputs": ["n_port", "n_stbd"], "forces": "wam_v_cal"},
+    "baseline": {"kind": "linear_steady", "settled": 20},
+    "heads": {"ridge": {"kind": "ridge"}, "lstm": {"kind": "lstm", "hidden_size": 6, "dropout": 0.1}},
+    "training": {
+        "lstm": {
+            "steps": 3,
+            "one_step": {"epochs": 2, "window": 2.0, "batch": 16},
+            "multi_step": [{"horizon": 1.0, "epochs": 2, "batch": 16}, {"horizon": 2.0, "epochs": 3, "batch": 16}],
+            "average": 0.9,
+            "start_noise": 0.1,
+        }
+    },
+    "evaluation": {
+        "protocols": {"manoeuvre": {"kind": "manoeuvre"}, "T10": {"kind": "windows", "length": 10, "first": 2, "history": 1}},
+        "selection": "manoeuvre",
+        "scales": {"u": 0.35, "v": 0.16, "r": 0.24},
+    },
+    "export": {"models": ["lstm"]},
+}
+
+
+def call(monkeypatch: pytest.MonkeyPatch, *words: object) -> int:
+    """Exit code of a command, in this process."""
+    monkeypatch.setattr("sys.argv", ["residnet", *map(str, words)])
+    try:
+        main()
+    except SystemExit as end:
+        return int(end.code or 0)
+    return 0
