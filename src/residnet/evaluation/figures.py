@@ -26,7 +26,7 @@ class FigureFile:
 
 
 def write_figures(run: Path) -> list[FigureFile]:
-    """Write `figures/*.png` of a run folder; what the folder has no data for is left out.
+    """Write `figures/*.png` of a run folder; what the folder has no data for is left out, and figures of an earlier call are replaced.
 
     Args:
         run: folder with metrics.json, and rollouts/, residuals.parquet, models/*/fit.json where there are any.
@@ -40,12 +40,28 @@ def write_figures(run: Path) -> list[FigureFile]:
     from matplotlib import rc_context
 
     files = RunFiles(run)
+    for figure_file in read_figures(run):
+        figure_file.path.unlink()
     out: list[FigureFile] = []
     with rc_context(RC):
         for name, title, caption, figure in _figures(files):
-            path = run / "figures" / f"{name}.png"
-            save(figure, path)
+            # the number keeps the order for whoever lists the folder
+            path = run / "figures" / f"{len(out) + 1:02d}_{name}.png"
+            save(figure, path, title, caption)
             out.append(FigureFile(path, title, caption))
+    return out
+
+
+def read_figures(run: Path) -> list[FigureFile]:
+    """The figures that stand in a run folder, in their order; pictures that do not carry a caption are not ours and are left out."""
+    from PIL import Image
+
+    out = []
+    for path in sorted((run / "figures").glob("*.png")):
+        with Image.open(path) as picture:
+            words = dict(picture.info)
+        if "Title" in words and "Description" in words:
+            out.append(FigureFile(path, str(words["Title"]), str(words["Description"])))
     return out
 
 
@@ -73,7 +89,8 @@ def _of_runs(run: RunFiles) -> Iterator[tuple[str, str, str, Any]]:
         yield (
             f"history_{window.manoeuvre}",
             f"Time history: {kind}",
-            f"Free run of {window.log} from its first measured state and its inputs alone; look for lag at the reversals and for levels that stay apart once the motion has settled.",
+            f"Free run of {window.log} from its first measured state and its inputs alone; look for lag at the reversals and for levels "
+            "that stay apart once the motion has settled.",
             figures_tracks.history(run, window),
         )
     for name in run.protocols:
@@ -82,8 +99,8 @@ def _of_runs(run: RunFiles) -> Iterator[tuple[str, str, str, Any]]:
             yield (
                 f"horizon_{name}",
                 f"Error against horizon: {name}",
-                f"RMS over the {len(own)} free runs of protocol {name} ({run.focus} data), logarithmic; a curve that stays level predicts as well late as early, "
-                "one that climbs drifts; the level that no model undercuts is the measuring noise.",
+                f"RMS over the {len(own)} free runs of protocol {name} ({run.focus} data), logarithmic; a curve that stays level predicts as well "
+                "late as early, one that climbs drifts; the level that no model undercuts is the measuring noise.",
                 figures_errors.horizon(run, own),
             )
 
@@ -111,8 +128,8 @@ def _of_errors(run: RunFiles) -> Iterator[tuple[str, str, str, Any]]:
         yield (
             f"residuals_{place // _PER_FIGURE + 1}" if len(models) > _PER_FIGURE else "residuals",
             "Residual: target against prediction",
-            "Acceleration that the baseline leaves (from smoothed derivatives, so noisy itself) against what each head makes of it; a cloud along the line is learned, "
-            "a cloud upright on zero is not in the head's reach.",
+            "Acceleration that the baseline leaves (from smoothed derivatives, so noisy itself) against what each head makes of it; "
+            "a cloud along the line is learned, a cloud upright on zero is not in the head's reach.",
             figures_errors.residuals(run, table, models[place : place + _PER_FIGURE]),
         )
 
@@ -123,6 +140,7 @@ def _of_training(run: RunFiles) -> Iterator[tuple[str, str, str, Any]]:
         yield (
             f"learning_{place // _PER_FIGURE + 1}" if len(models) > _PER_FIGURE else "learning",
             "Learning curves",
-            "Stages (one-step, then free runs of the stated length) have losses of their own, so only the slopes count; the lower panels decide: the kept weights are those of the circled epoch, and a curve still falling at its end asks for more epochs.",
+            "Stages (one-step, then free runs of the stated length) have losses of their own, so only the slopes count; "
+            "the lower panels decide: the kept weights are those of the circled epoch, and a curve still falling at its end asks for more epochs.",
             figures_errors.learning_curves(run, models[place : place + _PER_FIGURE]),
         )

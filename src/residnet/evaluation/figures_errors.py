@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from residnet.evaluation.figures_style import WIDTH, collect, label, legend_above, new_figure, styles
+from residnet.evaluation.figures_style import collect, label, legend_above, new_figure, styles
 from residnet.evaluation.run_reader import Row, RunFiles, StoredWindow
 
 _DEG = 180.0 / math.pi
@@ -138,7 +138,9 @@ def residuals(run: RunFiles, table: Mapping[str, np.ndarray], models: Sequence[s
                 continue
             # the outermost thousandth would shrink the cloud to a dot
             reach = 1.08 * float(np.quantile(np.abs(np.concatenate((target, predicted))), 0.999)) or 1.0
-            axes.hexbin(predicted, target, gridsize=45, extent=(-reach, reach, -reach, reach), bins="log", mincnt=1, cmap="Blues", vmin=0.3, linewidths=0.1)
+            axes.hexbin(
+                predicted, target, gridsize=45, extent=(-reach, reach, -reach, reach), bins="log", mincnt=1, cmap="Blues", vmin=0.3, linewidths=0.1
+            )
             axes.plot([-reach, reach], [-reach, reach], color="black", linewidth=0.9)
             axes.set_xlim(-reach, reach)
             axes.set_ylim(-reach, reach)
@@ -201,7 +203,9 @@ def _stages(top: Any, bottom: Any, epoch: np.ndarray, stage: np.ndarray, resolve
         index = int(number) - 1
         text = "one-step" if index < 0 else f"{steps[index]['horizon']:g} s" if index < len(steps) else f"stage {index + 1}"
         middle = float(epoch[stage == number].mean())
-        top.annotate(text, (middle, 1.0), (0, 2), xycoords=("data", "axes fraction"), textcoords="offset points", ha="center", fontsize=8, color="0.25")
+        top.annotate(
+            text, (middle, 1.0), (0, 2), xycoords=("data", "axes fraction"), textcoords="offset points", ha="center", fontsize=8, color="0.25"
+        )
 
 
 def _number(value: object) -> float:

@@ -57,17 +57,23 @@ def new_figure(height: float) -> Any:
     return figure
 
 
-def save(figure: Any, path: Path) -> None:
-    """Write a PNG with a palette of 128 colours: a third of the bytes, no visible difference in line drawings."""
+def save(figure: Any, path: Path, title: str, caption: str) -> None:
+    """Write a PNG that carries its title and caption as text.
+
+    Its palette of 128 colours takes a third of the bytes and shows no difference in line drawings.
+    """
     from PIL import Image
+    from PIL.PngImagePlugin import PngInfo
 
     raw = io.BytesIO()
     figure.savefig(raw, format="png", dpi=DPI, metadata={"Software": None})
+    picture = Image.open(raw).convert("RGB").quantize(128, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+    words = PngInfo()
+    words.add_itxt("Title", title)
+    words.add_itxt("Description", caption)
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.name + ".partial")
-    Image.open(raw).convert("RGB").quantize(128, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE).save(
-        partial, format="PNG", optimize=True, dpi=(DPI, DPI)
-    )
+    picture.save(partial, format="PNG", optimize=True, dpi=(DPI, DPI), pnginfo=words)
     partial.replace(path)
 
 

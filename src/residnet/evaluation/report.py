@@ -1,0 +1,83 @@
+"""The report: one self-contained HTML file, from the run folder alone."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from residnet.evaluation import report_tables as tables
+from residnet.evaluation.figures import FigureFile, read_figures
+from residnet.evaluation.report_text import cautions, fitted_on, verdict
+from residnet.evaluation.run_reader import RunFiles
+from residnet.evaluation.sanity import CHECKS, Finding, check_run
+
+_TEMPLATE = "report.html.j2"
+
+
+def write_report(run: Path) -> Path:
+    """Write `report.html` into a run folder (or what `residnet evaluate` wrote) from what stands there; sections without data are left out.
+
+    Figures are taken from `figures/`: call `residnet.evaluation.figures.write_figures` before.
+
+    Args:
+        run: folder with metrics.json.
+
+    Returns:
+        Path of the report.
+
+    Raises:
+        UsageError: where the folder holds no metrics.json.
+        DataError: where a file in it cannot be read.
+    """
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    files = RunFiles(run)
+    divergence = float(files.evaluation.get("divergence") or 3.0)
+    findings = check_run(run, divergence=divergence)
+    environment = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    text = environment.get_template(_TEMPLATE).render(_context(files, findings, read_figures(run)))
+    path = run / "report.html"
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(text, encoding="utf-8")
+    partial.replace(path)
+    return path
+
+
+def _context(run: RunFiles, findings: Sequence[Finding], figures: Sequence[FigureFile]) -> dict[str, Any]:
+    protocols = [
+        {"name": name, "table": tables.free_runs(run, name), "kinds": tables.by_manoeuvre(run, name, run.focus), "first": name == run.protocols[0]}
+        for name in run.protocols
+    ]
+    return {
+        "title": str(run.metrics.get("run") or run.path.name),
+        "description": str(run.resolved.get("description") or ""),
+        "date": str(run.provenance.get("started") or "")[:10],
+        "version": run.provenance.get("residnet"),
+        "selected": run.selected,
+        "verdict": [sentence for sentence in verdict(run) if sentence],
+        "cautions": cautions(run, findings),
+        "focus": run.focus,
+        "sides": run.sides,
+        "has_baseline": run.baseline is not None,
+        "fitted_on": fitted_on(run),
+        "quality": tables.quality(run),
+        "baseline": tables.baseline_parameters(run),
+        "heads": tables.heads(run),
+        "protocols": [entry for entry in protocols if entry["table"] is not None],
+        "figures": [{"title": f.title, "caption": f.caption, "name": f.path.name, "data": _embedded(f.path)} for f in figures],
+        "checks": CHECKS,
+        "sanity": _by_model(findings),
+        "provenance": tables.provenance(run),
+        "inputs": list((run.provenance.get("inputs") or {}).items()),
+        "resolved": run.resolved_text,
+    }
+
+
+def _by_model(findings: Sequence[Finding]) -> list[tuple[str, list[Finding]]]:
+    return [(model, [f for f in findings if f.model == model]) for model in dict.fromkeys(f.model for f in findings)]
+
+
+def _embedded(path: Path) -> str:
+    return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode("ascii")
