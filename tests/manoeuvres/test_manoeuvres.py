@@ -1,0 +1,276 @@
+"""The contract of every manoeuvre and family, found from the unions themselves, and the shape of each kind."""
+
+from __future__ import annotations
+
+from typing import Any, get_args
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from residnet.core.config import validate
+from residnet.core.errors import ConfigError
+from residnet.data.simulate import SimulatedTrials, simulate
+from residnet.dynamics.rollout import Rollout
+from residnet.dynamics.simulated import PlantDynamics
+from residnet.manoeuvres import (
+    AccelerationDeceleration,
+    ConstantInput,
+    FamilyConfig,
+    Manoeuvre,
+    ManoeuvreConfig,
+    StackedSource,
+    ThreeTwoOneOne,
+    Zigzag,
+)
+from residnet.physics.plant import DifferentialThrustVessel
+from residnet.physics.vessel import load_vessel
+
+
+def kinds(union: Any) -> dict[str, Any]:
+    return {config.model_fields["kind"].default: config for config in get_args(get_args(union)[0])}
+
+
+FAMILIES, MANOEUVRES = kinds(FamilyConfig), kinds(ManoeuvreConfig)
+# what a family cannot do without; a new family whose fields have defaults beyond these needs no line here
+NEEDS: dict[str, Any] = {"count": 5, "heading": (0.2, 0.4), "drive": (0.3, 0.8), "steer": (-0.5, 0.4)}
+DURATION, DT = 15.0, 0.1
+
+
+def family(kind: str) -> Any:
+    required = {name: NEEDS[name] for name, info in FAMILIES[kind].model_fields.items() if info.is_required()}
+    return FAMILIES[kind](**required)
+
+
+def drawn(kind: str, seed: int = 0) -> list[Manoeuvre]:
+    return family(kind).draw(np.random.default_rng(seed), DURATION)
+
+
+@pytest.fixture(params=FAMILIES)
+def kind(request: pytest.FixtureRequest) -> str:
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def plant() -> DifferentialThrustVessel:
+    return DifferentialThrustVessel(load_vessel("wam_v_cal"))
+
+
+def times(seconds: float = DURATION, dt: float = DT) -> Tensor:
+    return torch.arange(round(seconds / dt), dtype=torch.float64) * dt
+
+
+def fly(
+    plant: DifferentialThrustVessel, manoeuvres: list[Manoeuvre], dt: float = DT, seconds: float = DURATION, psi: float = 0.0
+) -> tuple[Tensor, Tensor]:
+    """States [B, T+1, 8] and commands [B, T, 2]."""
+    t = times(seconds, dt)
+    source = type(manoeuvres[0]).source(manoeuvres, plant.demand, t)
+    x0 = torch.zeros(len(manoeuvres), 8, dtype=torch.float64)
+    x0[:, 2] = psi
+    w = torch.zeros(len(manoeuvres), len(t), 7, dtype=torch.float64)
+    with torch.no_grad():
+        states, inputs, _ = Rollout(PlantDynamics(plant, dt), source)(x0, w, x0[:, :0])
+    return states, inputs[:, :, :2]
+
+
+def test_every_family_draws_a_manoeuvre_of_its_kind() -> None:
+    assert set(FAMILIES) == set(MANOEUVRES)
+    for kind in FAMILIES:
+        assert {type(m) for m in drawn(kind)} == {MANOEUVRES[kind]}
+
+
+def test_draws_are_repeatable_by_seed(kind: str) -> None:
+    assert drawn(kind) == drawn(kind)
+    if "count" in FAMILIES[kind].model_fields:
+        assert drawn(kind) != drawn(kind, seed=1)
+        assert len(drawn(kind)) == 5
+        assert len({m.model_dump_json() for m in drawn(kind)}) == 5
+
+
+def test_what_was_drawn_can_be_written_down_and_read_back(kind: str) -> None:
+    for manoeuvre in drawn(kind):
+        assert validate(manoeuvre.model_dump(mode="json"), ManoeuvreConfig, "log") == manoeuvre
+
+
+def test_commands_are_within_bounds(kind: str, plant: DifferentialThrustVessel) -> None:
+    states, commands = fly(plant, drawn(kind))
+    assert bool(torch.isfinite(states).all())
+    assert float(commands.abs().max()) <= plant.thrusters.n_max
+    assert float(commands.abs().max()) > 0
+    # the propellers follow
+    assert float(states[..., 6:].abs().max()) <= plant.thrusters.n_max
+
+
+def test_a_batch_equals_single_flights(kind: str, plant: DifferentialThrustVessel) -> None:
+    manoeuvres = drawn(kind)
+    states, commands = fly(plant, manoeuvres)
+    for i, manoeuvre in enumerate(manoeuvres[:2]):
+        alone, command = fly(plant, [manoeuvre])
+        torch.testing.assert_close(alone[0], states[i], rtol=1e-10, atol=1e-12)
+        assert torch.equal(command[0], commands[i])
+
+
+def test_all_kinds_side_by_side_equal_each_alone(plant: DifferentialThrustVessel) -> None:
+    groups = [drawn(kind)[:2] for kind in FAMILIES]
+    t = times()
+    source = StackedSource([type(g[0]).source(g, plant.demand, t) for g in groups], [2] * len(groups))
+    x0 = torch.zeros(2 * len(groups), 8, dtype=torch.float64)
+    w = torch.zeros(len(x0), len(t), 7, dtype=torch.float64)
+    w[:, :, 2] = 5.0
+    with torch.no_grad():
+        states, inputs, _ = Rollout(PlantDynamics(plant, DT), source)(x0, w, x0[:, :0])
+        assert bool((inputs[:, :, 2] == 5.0).all()), "disturbances pass through a manoeuvre"
+        for i, group in enumerate(groups):
+            alone, _, _ = Rollout(PlantDynamics(plant, DT), type(group[0]).source(group, plant.demand, t))(x0[:2], w[:2], x0[:2, :0])
+            torch.testing.assert_close(alone, states[2 * i : 2 * i + 2], rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize("first", ["starboard", "port"])
+@pytest.mark.parametrize("psi", [0.0, 2.5, -7.0])
+def test_zigzag_switches_at_its_bound(first: str, psi: float, plant: DifferentialThrustVessel) -> None:
+    bound = float(np.radians(15))
+    zigzag = Zigzag(drive=0.5, steer=0.4, start=4.0, heading=bound, first=first)  # type: ignore[arg-type]
+    states, commands = fly(plant, [zigzag], seconds=40.0, psi=psi)
+    heading = states[0, :-1, 2].numpy() - psi
+    side = np.sign((commands[0, :, 0] - commands[0, :, 1]).numpy())
+    t = times(40.0).numpy()
+    assert (side[t < 4.0 - 1e-9] == 0).all()
+    expected, current = [], 1.0 if first == "starboard" else -1.0
+    for k in range(len(t)):
+        if current * heading[k] >= bound:
+            current = -current
+        expected.append(current if t[k] >= 4.0 else 0.0)
+    np.testing.assert_array_equal(side, expected)
+    assert (np.diff(side[t >= 4.0]) != 0).sum() >= 4
+    # positive steer turns to starboard: the heading first grows for `starboard`
+    later = heading[(t > 5.0)][:20]
+    assert (np.sign(later) == (1.0 if first == "starboard" else -1.0)).all()
+    # and overshoots the bound
+    assert np.abs(heading).max() > bound
+
+
+def test_three_two_one_one_pattern() -> None:
+    m = ThreeTwoOneOne(drive=0.4, steer=0.7, start=5.0, unit=2.0)
+    t = torch.arange(0.0, 40.0, 1.0, dtype=torch.float64)
+    drive, steer = m.demands(t)
+    once = [0.7] * 6 + [-0.7] * 4 + [0.7] * 2 + [-0.7] * 2
+    assert drive.tolist() == [0.4] * 40
+    assert steer.tolist() == ([0.0] * 5 + once * 3)[:40]
+    _, single = m.model_copy(update={"repeat": False}).demands(t)
+    assert single.tolist() == [0.0] * 5 + once + [0.0] * 21
+
+
+@pytest.mark.parametrize(("dt", "unit", "start"), [(0.01, 3.0, 10.0), (0.05, 0.35, 1.15), (0.1, 0.3, 0.7), (0.02, 1.1, 2.3)])
+def test_edges_fall_on_the_grid_point_they_name(dt: float, unit: float, start: float) -> None:
+    """Rounding must not move an edge by a step, wherever it lies."""
+    t = times(30.0, dt)
+    _, steer = ThreeTwoOneOne(drive=0.0, steer=1.0, start=start, unit=unit).demands(t)
+    edges = np.flatnonzero(np.diff(steer.numpy()) != 0) + 1
+    units = np.cumsum([0, 3, 2, 1] + [1, 3, 2, 1] * 200)
+    expected = np.rint((start + unit * units) / dt).astype(int)
+    np.testing.assert_array_equal(edges, expected[expected < len(t)])
+    levels = AccelerationDeceleration(times=tuple(start + unit * k for k in range(5)), levels=(1.0, 0.5, 0.2, 0.8, 0.1))
+    drive, _ = levels.demands(t)
+    edges = np.flatnonzero(np.diff(drive.numpy()) != 0) + 1
+    np.testing.assert_array_equal(edges, np.rint((start + unit * np.arange(5)) / dt).astype(int))
+
+
+@pytest.mark.parametrize(("dt", "start"), [(0.01, 2.3), (0.05, 1.15), (0.1, 0.7), (0.02, 1.14)])
+def test_zigzag_starts_on_the_grid_point_it_names(dt: float, start: float, plant: DifferentialThrustVessel) -> None:
+    _, commands = fly(plant, [Zigzag(drive=0.5, steer=0.4, start=start, heading=0.3)], dt=dt, seconds=3.0)
+    turning = np.flatnonzero((commands[0, :, 0] != commands[0, :, 1]).numpy())
+    assert turning[0] == round(start / dt)
+
+
+def test_acceleration_deceleration_levels() -> None:
+    m = AccelerationDeceleration(times=(1.0, 3.0, 4.0), levels=(0.8, 0.2, 0.5))
+    drive, steer = m.demands(torch.arange(0.0, 6.0, 0.5, dtype=torch.float64))
+    assert drive.tolist() == [0, 0, 0.8, 0.8, 0.8, 0.8, 0.2, 0.2, 0.5, 0.5, 0.5, 0.5]
+    assert steer.abs().max() == 0
+    for draw in drawn("acceleration_deceleration"):
+        assert isinstance(draw, AccelerationDeceleration)
+        assert draw.times[0] == 0.0
+        assert draw.times[-1] < DURATION
+        assert all(6.0 <= b - a <= 12.0 for a, b in zip(draw.times[:-1], draw.times[1:], strict=True))
+        assert all(0.0 <= level <= 1.0 for level in draw.levels)
+        assert min(draw.levels[::2]) > max(draw.levels[1::2], default=0.0) - 0.1
+
+
+def test_constant_family_is_every_combination() -> None:
+    got = FAMILIES["constant"](drive=(0.2, 0.6), steer=(-0.1, 0.0, 0.1)).draw(np.random.default_rng(0), 10.0)
+    assert got == [ConstantInput(drive=d, steer=s) for d in (0.2, 0.6) for s in (-0.1, 0.0, 0.1)]
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        ({"kind": "zigzag", "drive": 0.5, "steer": 0.4, "heading": "-10 deg"}, "greater than 0"),
+        ({"kind": "zigzag", "drive": 1.5, "steer": 0.4, "heading": "10 deg"}, "less than or equal to 1"),
+        ({"kind": "constant", "drive": 0.5, "steer": -1.1}, "greater than or equal to -1"),
+        ({"kind": "three_two_one_one", "drive": 0.5, "steer": 0.4, "unit": 0}, "greater than 0"),
+        ({"kind": "acceleration_deceleration", "times": [0, 5], "levels": [0.3]}, "same number"),
+        ({"kind": "acceleration_deceleration", "times": [5, 0], "levels": [0.3, 0.4]}, "ascending"),
+        ({"kind": "zigzog", "drive": 0.5, "steer": 0.4}, "zigzag"),
+    ],
+)
+def test_wrong_manoeuvres(config: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message) as caught:
+        validate(config, ManoeuvreConfig, "here")
+    assert "\n" not in str(caught.value)
+
+
+def trials(**changes: Any) -> SimulatedTrials:
+    return SimulatedTrials.model_validate(
+        {
+            "vessel": "wam_v_cal",
+            "trials": [{"kind": "zigzag", "count": 4, "heading": [0.2]}, {"kind": "constant", "drive": [0.5], "steer": [0.2]}],
+            "duration": 10.0,
+            "substeps": 1,
+            "identification": {"zigzag": 3},
+            "validation": {"zigzag": 1},
+            "noise": {"u": 0.0, "v": 0.0, "r": 0.0},
+            **changes,
+        }
+    )
+
+
+def test_simulated_trials_are_repeatable_and_split_whole() -> None:
+    config = trials()
+    manoeuvres = config.draw()
+    assert sorted(config.splits(manoeuvres)) == ["test", "train", "train", "train", "validation"]
+    assert config.splits(manoeuvres)[-1] == "train", "kinds that are not named are for identification"
+    one, two = simulate(manoeuvres, config), simulate(config.draw(), config)
+    for a, b in zip(one, two, strict=True):
+        assert a.name == b.name
+        for name in a.channels:
+            np.testing.assert_array_equal(a[name], b[name])
+    with pytest.raises(ValueError, match="leaves a split empty"):
+        trials(identification={"zigzag": 4}).splits(manoeuvres)
+
+
+def test_disturbance_has_the_spread_and_correlation_it_claims() -> None:
+    from residnet.data.simulate import Disturbance, _environment
+
+    config = Disturbance(force_x=30.0, force_y=20.0, force_n=10.0, correlation=2.0, current_north=0.3, current_east=-0.1)
+    w = _environment(config, 400, 800, 0.1, np.random.default_rng(0))
+    assert (w[:, :, :2] == 0).all()
+    np.testing.assert_allclose(w[:, :, 5:], np.broadcast_to([0.3, -0.1], (400, 800, 2)))
+    forces = w[:, :, 2:5]
+    np.testing.assert_allclose(forces.std((0, 1)), [30, 20, 10], rtol=0.02)
+    np.testing.assert_allclose(forces[:, 0].std(0), [30, 20, 10], rtol=0.12)
+    np.testing.assert_allclose((forces[:, 20:] * forces[:, :-20]).mean((0, 1)) / forces.var((0, 1)), np.exp(-1.0), atol=0.02)
+
+
+def test_sensor_noise_is_on_the_velocities_alone() -> None:
+    config = trials(noise={"u": 0.03, "v": 0.02, "r": 0.01}, duration=20.0)
+    manoeuvres = config.draw()
+    noisy, clean = simulate(manoeuvres, config), simulate(manoeuvres, trials(duration=20.0))
+    for name, spread in {"u": 0.03, "v": 0.02, "r": 0.01}.items():
+        error = np.concatenate([a[name] - b[name] for a, b in zip(noisy, clean, strict=True)])
+        assert error.std() == pytest.approx(spread, rel=0.07)
+        assert abs(error.mean()) < 5 * spread / np.sqrt(error.size)
+    for name in ("x", "y", "psi", "n_port", "cmd_stbd"):
+        for a, b in zip(noisy, clean, strict=True):
+            np.testing.assert_array_equal(a[name], b[name])
