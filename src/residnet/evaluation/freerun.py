@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -68,20 +68,13 @@ def free_run(
 
 def _run(candidate: Candidate, windows: Sequence[Window], logs: Sequence[Prepared], step: float, limit: np.ndarray, dtype: torch.dtype) -> list[Prediction]:
     longest = max(window.stop - window.start for window in windows)
-    past = max(window.start - window.past for window in windows)
     tables = {n: _inputs(candidate, logs[n]) for n in {window.log for window in windows}}
     x0 = np.stack([_initial(candidate, window, logs[window.log]) for window in windows])
     ahead = np.stack([tables[w.log][np.minimum(np.arange(w.start, w.start + longest - 1), w.stop - 1)] for w in windows])
-    behind = [np.maximum(np.arange(w.start - past, w.start), w.past) for w in windows]
-    y_past = np.stack([logs[w.log].y[rows] for w, rows in zip(windows, behind, strict=True)])
-    w_past = np.stack([tables[w.log][rows] for w, rows in zip(windows, behind, strict=True)])
     # a copy: a validation in float32 must not round the model that it validates
     model = copy.deepcopy(candidate.model).to(dtype).eval()
     with torch.no_grad():
-        if isinstance(model, HybridDynamics):
-            s = model.warmup(torch.from_numpy(y_past).to(dtype), torch.from_numpy(w_past).to(dtype))
-        else:
-            s = model.initial_state(len(windows)).to(dtype)
+        s = _memory(model, windows, logs, tables, dtype)
         states, _, _ = Rollout(model)(torch.from_numpy(x0).to(dtype), torch.from_numpy(ahead).to(dtype), s)
     nu = states[:, :, 3:6].double().numpy()
     out = []
@@ -94,6 +87,20 @@ def _run(candidate: Candidate, windows: Sequence[Window], logs: Sequence[Prepare
         pose = integrate(logs[window.log].y[window.start, :3], velocities, step)
         out.append(Prediction(np.concatenate((pose, velocities), axis=1), bad))
     return out
+
+
+def _memory(model: Dynamics, windows: Sequence[Window], logs: Sequence[Prepared], tables: Mapping[int, np.ndarray], dtype: torch.dtype) -> torch.Tensor:
+    """Memory [W, n_state] that each window's own past leaves; windows with pasts of equal length go together."""
+    s = model.initial_state(len(windows)).to(dtype)
+    if isinstance(model, HybridDynamics):
+        lengths = np.array([window.start - window.past for window in windows])
+        for length in np.unique(lengths):
+            rows = np.flatnonzero(lengths == length)
+            members = [windows[i] for i in rows]
+            y = np.stack([logs[window.log].y[window.past : window.start] for window in members])
+            w = np.stack([tables[window.log][window.past : window.start] for window in members])
+            s[torch.from_numpy(rows)] = model.warmup(torch.from_numpy(y).to(dtype), torch.from_numpy(w).to(dtype))
+    return s
 
 
 def _inputs(candidate: Candidate, log: Prepared) -> np.ndarray:

@@ -58,7 +58,9 @@ class Windows(Config):
                 # a break inside: nothing can be simulated across it
                 start = int(end[start])
                 continue
-            out.append(Window(number, start, start + steps + 1, max(start - round(self.history / step), 0), log.y[start, 3:].copy()))
+            # a break ends the past that may warm up a memory
+            past = max(start - round(self.history / step), int(np.searchsorted(end, end[start])))
+            out.append(Window(number, start, start + steps + 1, past, log.y[start, 3:].copy()))
             start += steps
         return out
 
@@ -67,7 +69,7 @@ class WholeManoeuvre(Config):
     """Every uninterrupted stretch of a log as one free run.
 
     The initial velocities are the mean of the first `initial` seconds, which also warm up a memory; scoring starts after them.
-    Stretches shorter than `shortest` are left out.
+    Stretches shorter than `shortest`, or without a sample to score, are left out.
     """
 
     kind: Literal["manoeuvre"] = "manoeuvre"
@@ -84,7 +86,7 @@ class WholeManoeuvre(Config):
                 begin += 1
                 continue
             stop = int(end[begin])
-            if stop - begin > max(lead + 1, round(self.shortest / step)):
+            if stop - begin > max(lead + 1, round(self.shortest / step)) and log.usable[begin + lead : stop].any():
                 out.append(Window(number, begin + lead, stop, begin, log.y[begin : begin + lead, 3:].mean(0)))
             begin = stop
         return out
