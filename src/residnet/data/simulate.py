@@ -8,9 +8,10 @@ from typing import Literal
 
 import numpy as np
 import torch
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from residnet.core.config import Config, MetresPerSecond, NewtonMetres, Newtons, RadiansPerSecond, Seconds
+from residnet.core.errors import ConfigError
 from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS, VELOCITY
 from residnet.dynamics.rollout import Rollout
@@ -71,6 +72,15 @@ class SimulatedTrials(Config):
     identification: dict[str, int]
     validation: dict[str, int]
     seed: int = Field(default=0, ge=0)
+
+    @field_validator("vessel")
+    @classmethod
+    def _vessel(cls, vessel: str) -> str:
+        try:
+            load_vessel(vessel)
+        except ConfigError as error:
+            raise ValueError(str(error)) from None
+        return vessel
 
     def draw(self) -> list[Manoeuvre]:
         """The manoeuvres, by family."""

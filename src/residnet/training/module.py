@@ -39,8 +39,14 @@ class HeadTraining(L.LightningModule):
         self.best_score = math.inf
         self.best_state: dict[str, Tensor] = {}
         self.without_gain = 0
+        self.stopped = False
         self.history: list[dict[str, float]] = []
         self.batches = [WindowBatches(store.starts(length), batch, config.steps) for length, batch in self._stages()]
+
+    @property
+    def epoch(self) -> int:
+        """Epochs finished; Lightning's own count is one behind while it restores a checkpoint."""
+        return len(self.history)
 
     def _stages(self) -> list[tuple[int, int]]:
         dt, config = self.model.dt, self.settings
@@ -63,8 +69,8 @@ class HeadTraining(L.LightningModule):
 
     def on_train_epoch_start(self) -> None:
         """Seed the epoch and set the stage's learning rate."""
-        torch.manual_seed((self.seed * 7_919 + self.current_epoch) % (2**63))
-        stage, epoch = self.settings.stage(self.current_epoch)
+        torch.manual_seed((self.seed * 7_919 + self.epoch) % (2**63))
+        stage, epoch = self.settings.stage(self.epoch)
         if stage == 0:
             rate = self.settings.one_step.learning_rate
         else:
@@ -78,7 +84,7 @@ class HeadTraining(L.LightningModule):
 
     def training_step(self, starts: Tensor, batch_index: int) -> Tensor:
         """Loss of one batch of windows."""
-        stage, _ = self.settings.stage(self.current_epoch)
+        stage, _ = self.settings.stage(self.epoch)
         length, _ = self._stages()[stage]
         take = self.store.take
         if stage == 0:
@@ -108,11 +114,11 @@ class HeadTraining(L.LightningModule):
 
     def finish_epoch(self) -> None:
         """Validate in free run; keep the best weights; stop early in the last stage. Called by the first callback of an epoch's end."""
-        stage, _ = self.settings.stage(self.current_epoch)
-        last = self.current_epoch + 1 == self.settings.epochs
-        entry = {"epoch": float(self.current_epoch), "stage": float(stage), "loss": sum(self._losses) / max(len(self._losses), 1)}
+        stage, _ = self.settings.stage(self.epoch)
+        last = self.epoch + 1 == self.settings.epochs
+        entry = {"epoch": float(self.epoch), "stage": float(stage), "loss": sum(self._losses) / max(len(self._losses), 1)}
         self._losses.clear()
-        if last or (self.current_epoch + 1) % self.settings.validate_every == 0:
+        if last or (self.epoch + 1) % self.settings.validate_every == 0:
             model = self.model if self.average is None else self.average
             score = self.validate(model)
             entry["validation"] = score
@@ -124,9 +130,9 @@ class HeadTraining(L.LightningModule):
         self.history.append(entry)
         logger = self.trainer.logger
         if logger is not None:
-            logger.log_metrics({k: v for k, v in entry.items() if k != "epoch"}, step=self.current_epoch)
-        if stage == len(self.settings.multi_step) and self.without_gain >= self.settings.patience:
-            self.trainer.should_stop = True
+            logger.log_metrics({k: v for k, v in entry.items() if k != "epoch"}, step=self.epoch)
+        self.stopped = stage == len(self.settings.multi_step) and self.without_gain >= self.settings.patience
+        self.trainer.should_stop = self.stopped
 
     def on_fit_start(self) -> None:
         """Losses of the running epoch."""
@@ -139,18 +145,27 @@ class HeadTraining(L.LightningModule):
             "best_state": self.best_state,
             "without_gain": self.without_gain,
             "history": self.history,
-            "stage": self.settings.stage(self.current_epoch)[0],
+            "stopped": self.stopped,
+            "stage": self.settings.stage(self.epoch)[0],
             "random": torch.get_rng_state(),
             "threads": torch.get_num_threads(),
         }
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Put back what `on_save_checkpoint` kept."""
-        own = checkpoint["residnet"]
+        self.restore(checkpoint["residnet"])
+
+    def restore(self, own: dict[str, Any]) -> None:
+        """Put back what a checkpoint kept of this module."""
         self.best_score, self.best_state, self.without_gain = own["best_score"], own["best_state"], own["without_gain"]
-        self.history = own["history"]
+        self.history, self.stopped = own["history"], own["stopped"]
         torch.set_rng_state(own["random"])
         torch.set_num_threads(own["threads"])
+
+    @property
+    def finished(self) -> bool:
+        """Whether all epochs are done or training has stopped early."""
+        return self.stopped or self.epoch >= self.settings.epochs
 
 
 class EpochBatches:
@@ -163,6 +178,6 @@ class EpochBatches:
         return self.module.settings.steps
 
     def __iter__(self) -> Iterator[Tensor]:
-        epoch = self.module.current_epoch
+        epoch = self.module.epoch
         stage, _ = self.module.settings.stage(epoch)
         return iter(self.module.batches[stage].epoch(self.module.seed, epoch))

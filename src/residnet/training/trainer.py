@@ -110,9 +110,13 @@ def train(
         num_sanity_val_steps=0,
         log_every_n_steps=10**9,
     )
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        trainer.fit(module, ckpt_path=str(last) if last.is_file() else None, weights_only=True)
+    if last.is_file():
+        module.restore(torch.load(last, weights_only=True)["residnet"])
+    # killed between the last epoch and the model's file: there is nothing left to train
+    if not module.finished:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            trainer.fit(module, ckpt_path=str(last) if last.is_file() else None, weights_only=True)
     if trainer.interrupted:
         raise KeyboardInterrupt
     if not module.best_state:
