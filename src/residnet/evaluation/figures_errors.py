@@ -127,7 +127,9 @@ def _alpha(run: RunFiles, split: str) -> float:
 
 def residuals(run: RunFiles, table: Mapping[str, np.ndarray], models: Sequence[str]) -> Any:
     """Residual target against prediction, one line of panels for each head; table: columns model, axis, target, predicted (SI)."""
-    figure = new_figure(0.3 + 2.25 * len(models))
+    from matplotlib.ticker import MaxNLocator
+
+    figure = new_figure(0.2 + 2.5 * len(models))
     panels = figure.subplots(len(models), 3, squeeze=False)
     for line, model in zip(panels, models, strict=True):
         for axes, (axis, name, unit, factor) in zip(line, _AXES, strict=True):
@@ -145,7 +147,9 @@ def residuals(run: RunFiles, table: Mapping[str, np.ndarray], models: Sequence[s
             axes.set_xlim(-reach, reach)
             axes.set_ylim(-reach, reach)
             axes.set_aspect("equal")
-            axes.set_title(f"{label(run, model)}, {name}: R² = {r_squared(target, predicted):.2f}")
+            axes.set_title(f"{label(run, model)}\n{name}, R² = {r_squared(target, predicted):.2f}")
+            axes.xaxis.set_major_locator(MaxNLocator(4, symmetric=True))
+            axes.yaxis.set_major_locator(MaxNLocator(4, symmetric=True))
             axes.set_xlabel(f"predicted [{unit}]")
             axes.set_ylabel(f"target [{unit}]")
     return figure

@@ -25,7 +25,8 @@ _ORDER = {"zero": 3, "baseline": 3, "truth": 5}
 MEASURED: dict[str, Any] = {"color": "black", "linestyle": "-", "linewidth": 0.7, "label": "measured", "zorder": 2}
 MASKED: dict[str, Any] = {"color": "0.88", "linewidth": 0, "zorder": 0}
 
-RC: dict[str, Any] = {
+# Any: matplotlib types the keys as a closed set of literals
+RC: Any = {
     "font.size": 9,
     "axes.titlesize": 9,
     "axes.labelsize": 9,

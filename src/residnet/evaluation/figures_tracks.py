@@ -51,7 +51,7 @@ def tracks(run: RunFiles, windows: Sequence[StoredWindow]) -> Any:
     columns = min(2, len(windows))
     lines = math.ceil(len(windows) / columns)
     side = WIDTH / columns if columns > 1 else 0.7 * WIDTH
-    figure = new_figure(0.5 + lines * (0.92 * side + 0.25))
+    figure = new_figure(0.5 + lines * (0.92 * side + 0.35))
     handles: dict[str, Any] = {}
     look = styles(run)
     for place, window in enumerate(windows):
@@ -67,6 +67,7 @@ def tracks(run: RunFiles, windows: Sequence[StoredWindow]) -> Any:
         axes.plot(0, 0, "o", color="black", markerfacecolor="white", markersize=6, linestyle="none", label="start", zorder=6)
         axes.set_aspect("equal", adjustable="datalim")
         axes.margins(0.08)
+        axes.locator_params(axis="x", nbins=5)
         axes.set_title(_title(window))
         axes.set_xlabel("east [m]")
         axes.set_ylabel("north [m]")
@@ -95,7 +96,7 @@ def history(run: RunFiles, window: StoredWindow) -> Any:
         collect(handles, axes)
     panels[-1].set_xlabel("time since the start of the free run [s]")
     panels[-1].set_xlim(0, time[-1])
-    panels[0].set_title(_title(window))
+    panels[0].set_title(_title(window).replace("\n", ": "))
     figure.align_ylabels(panels)
     legend_above(figure, handles)
     return figure
@@ -110,5 +111,5 @@ def shade(axes: Any, time: np.ndarray, usable: np.ndarray) -> None:
 
 
 def _title(window: StoredWindow) -> str:
-    name = window.log if window.log.startswith(window.manoeuvre) else f"{window.manoeuvre.replace('_', ' ')}: {window.log}"
-    return name + (f", window {window.number + 1}" if window.number else "")
+    name = window.log if len(window.log) <= 36 else f"{window.log[:20]}…{window.log[-15:]}"
+    return f"{window.manoeuvre.replace('_', ' ')}\n{name}" + (f", window {window.number + 1}" if window.number else "")

@@ -36,7 +36,8 @@ def write_report(run: Path) -> Path:
     files = RunFiles(run)
     divergence = float(files.evaluation.get("divergence") or 3.0)
     findings = check_run(run, divergence=divergence)
-    environment = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    loader = FileSystemLoader(Path(__file__).parent)
+    environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     text = environment.get_template(_TEMPLATE).render(_context(files, findings, read_figures(run)))
     path = run / "report.html"
     partial = path.with_name(path.name + ".partial")

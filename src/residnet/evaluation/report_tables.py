@@ -63,7 +63,7 @@ def number(value: float | None, digits: int = 3) -> str:
 
 def percent(value: float) -> str:
     """Change in percent with its sign."""
-    return f"{value:+.0f} %".replace("-", "−")
+    return f"{value:+.0f} %".replace("-", "−") if abs(value) >= 0.5 else "0 %"
 
 
 def change(value: float, reference: float) -> str:
@@ -78,7 +78,7 @@ def free_runs(run: RunFiles, protocol: str) -> Table | None:
         return None
     quantities = [*run.channels, "nrmse", "position", "heading", "diverged"]
     titles = {channel: f"{title_of(channel)} [{unit_of(run, channel)[0]}]" for channel in run.channels}
-    titles |= {"nrmse": "NRMSE, mean [-]", "position": "position at end [m]", "heading": "heading at end [deg]", "diverged": "diverged"}
+    titles |= {"nrmse": "NRMSE, mean [-]", "position": "position, end [m]", "heading": "heading, end [deg]", "diverged": "diverged"}
     table = Table(heads=[split for _ in quantities for split in sides], groups=[(titles[key], len(sides)) for key in quantities])
     for model in run.kinds:
         found = [run.row(model, split, protocol) for split in sides]
@@ -90,12 +90,12 @@ def free_runs(run: RunFiles, protocol: str) -> Table | None:
 
 def by_manoeuvre(run: RunFiles, protocol: str, split: str) -> Table | None:
     """The focus split taken apart by kind and named group of manoeuvre; None where there is only one."""
-    kinds = run.manoeuvres(split, protocol)
-    if not kinds:
+    kinds = _distinct(run, run.manoeuvres(split, protocol), split, protocol)
+    if len(kinds) < 2:
         return None
     quantities = [*run.channels, "nrmse", "position", "heading", "diverged"]
     heads = [f"{title_of(channel)} [{unit_of(run, channel)[0]}]" for channel in run.channels]
-    table = Table(heads=["runs", *heads, "NRMSE [-]", "position at end [m]", "heading at end [deg]", "diverged"], corner="manoeuvre, model")
+    table = Table(heads=["runs", *heads, "NRMSE [-]", "position, end [m]", "heading, end [deg]", "diverged"], corner="manoeuvre, model")
     for kind in kinds:
         for place, model in enumerate(model for model, role in run.kinds.items() if role != "zero"):
             row = run.row(model, split, protocol, kind)
@@ -110,11 +110,23 @@ def by_manoeuvre(run: RunFiles, protocol: str, split: str) -> Table | None:
     return table
 
 
+def _distinct(run: RunFiles, kinds: Sequence[str], split: str, protocol: str) -> list[str]:
+    """Kinds and groups without those that hold the same runs as one before (a group of a single kind)."""
+    seen: list[Any] = []
+    out: list[str] = []
+    for kind in kinds:
+        errors = [(row["windows"], row["rmse"]) for model in run.kinds if (row := run.row(model, split, protocol, kind)) is not None]
+        if errors not in seen:
+            seen.append(errors)
+            out.append(kind)
+    return out
+
+
 def _quantity(run: RunFiles, key: str, row: Row | None, base: Row | None) -> Cell:
     if row is None:
         return Cell("–")
     if key == "diverged":
-        return Cell(f"{row['diverged']} of {row['windows']}", mark="bad" if row["diverged"] else "")
+        return Cell(f"{row['diverged']}/{row['windows']}", mark="bad" if row["diverged"] else "")
     if key == "position":
         return Cell(number(row.get("position_error_end"), 2))
     if key == "heading":
@@ -142,7 +154,8 @@ def baseline_parameters(run: RunFiles) -> Table | None:
         ratio = number(abs(value) / error, 2) if error > 0 else "–"
         decimals = min(max(1 - math.floor(math.log10(error)), 0), 12) if error > 0 else 4
         shown = f"{value:.{decimals}f}" if decimals <= 6 else number(value, 3)
-        cells = [Cell(shown.replace("-", "−")), Cell(number(error, 2)), Cell(ratio, mark="weak" if weak else ""), Cell(term_unit(entry["axis"], entry["term"]))]
+        unit = Cell(term_unit(entry["axis"], entry["term"]))
+        cells = [Cell(shown.replace("-", "−")), Cell(number(error, 2)), Cell(ratio, mark="weak" if weak else ""), unit]
         table.rows.append((f"{entry['axis'].replace('_dot', '')}′: {entry['term']}", cells))
     return table
 
@@ -191,9 +204,9 @@ def heads(run: RunFiles) -> Table | None:
         count = notes.get("parameters") or (3 * (int(notes["terms"]) + 1) if "terms" in notes else None)
         cells = [
             Cell(str(head.get("kind", "–"))),
-            Cell(_complexity(notes, head)),
+            Cell(_complexity(notes, head), mark="text"),
             Cell(f"{count:,}".replace(",", "\u2009") if count else "–"),
-            Cell(", ".join(head.get("features") or []) or "all channels"),
+            Cell(", ".join(head.get("features") or []) or "all channels", mark="text"),
             Cell(number(notes.get("seconds"), 2)),
             Cell(str(notes.get("epochs", "–"))),
             Cell(number(error), mark="best" if model == run.selected else ""),
@@ -222,7 +235,8 @@ def quality(run: RunFiles) -> tuple[Table, Table] | None:
     """What the logs hold: by split and kind of manoeuvre, and log by log."""
     if not run.quality:
         return None
-    columns = ["logs", "seconds", "samples", "scored [%]", "learned from [%]", "masked", "largest |u| [m/s]", "largest |v| [m/s]", "largest |r| [deg/s]"]
+    columns = ["logs", "seconds", "samples", "scored [%]", "learned from [%]", "masked"]
+    columns += ["largest |u| [m/s]", "largest |v| [m/s]", "largest |r| [deg/s]"]
     short, full = Table(heads=columns, corner="split, manoeuvre"), Table(heads=columns[1:], corner="log")
     groups: dict[tuple[str, str], list[Row]] = {}
     for entry in run.quality:
@@ -232,7 +246,7 @@ def quality(run: RunFiles) -> tuple[Table, Table] | None:
     for (split, manoeuvre), members in groups.items():
         cells = [Cell(str(len(members))), *_log_cells(members)]
         if split != last:
-            cells = [Cell(cell.text, cell.note, "first") for cell in cells]
+            cells = [Cell(cell.text, cell.note, (cell.mark + " first").strip()) for cell in cells]
         short.rows.append((f"{split}: {manoeuvre.replace('_', ' ')}", cells))
         last = split
     return short, full
@@ -253,16 +267,18 @@ def _log_cells(entries: Sequence[Row]) -> list[Cell]:
 
     reasons = ", ".join(f"{reason} {100 * share:.2g} %" for reason, share in masked.items()) or "nothing"
     seconds = sum(entry["seconds"] for entry in entries)
-    return [Cell(f"{seconds:.0f}"), Cell(str(samples)), mean("usable"), mean("learned_from"), Cell(reasons), largest("u", 1), largest("v", 1), largest("r", DEG)]
+    reach = [largest("u", 1), largest("v", 1), largest("r", DEG)]
+    return [Cell(f"{seconds:.0f}"), Cell(str(samples)), mean("usable"), mean("learned_from"), Cell(reasons, mark="text"), *reach]
 
 
 def provenance(run: RunFiles) -> list[tuple[str, Any]]:
     """Facts about how the run came to be."""
     record = run.provenance
     out: list[tuple[str, Any]] = []
-    for key, name in (("residnet", "residnet"), ("git", "git revision"), ("seed", "seed"), ("python", "Python"), ("machine", "machine"), ("started", "started (UTC)")):
+    named = {"git": "git revision", "python": "Python", "started": "started (UTC)"}
+    for key in ("residnet", "git", "seed", "python", "machine", "started"):
         if record.get(key) is not None:
-            out.append((name, record[key]))
+            out.append((named.get(key, key), record[key]))
     if record.get("seconds") is not None:
         out.append(("duration", f"{record['seconds']:.0f} s"))
     if record.get("packages"):

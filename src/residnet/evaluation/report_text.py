@@ -18,7 +18,9 @@ def verdict(run: RunFiles) -> list[str]:
         return [f"The run holds no free runs of its selected model on {split} data; see the tables."]
     unseen = "that no fit has seen" if split in ("test", "external") else f"of the {split} data (not unseen: read with care)"
     why = "chosen on validation data" if run.selected else "the first head; nothing was selected"
-    out = [f"Model {lead} ({why}) was free-run over {row['windows']} {'windows' if row['windows'] != 1 else 'window'} {unseen} (protocol {protocol})."]
+    kind = ((run.evaluation.get("protocols") or {}).get(protocol) or {}).get("kind")
+    runs = {"manoeuvre": "whole manoeuvre", "windows": "window"}.get(str(kind), "run") + ("" if row["windows"] == 1 else "s")
+    out = [f"Model {lead} ({why}) was free-run over {row['windows']} {runs} {unseen} (protocol {protocol})."]
     out.append(_level(run, lead, row, run.row(run.baseline, split, protocol)))
     truth = run.row(run.truth, split, protocol)
     if truth is not None and run.truth != lead:
@@ -35,12 +37,12 @@ def _level(run: RunFiles, lead: str, row: Row, base: Row | None) -> str:
         text = f"{title_of(channel)} {number(factor * row['rmse'][channel])} {unit}"
         interval = (row.get("rmse_ci95") or {}).get(channel)
         if interval:
-            text += f" (95 % interval {number(factor * interval[0])} to {number(factor * interval[1])})"
+            text += f" ({number(factor * interval[0])} to {number(factor * interval[1])})"
         if base is not None and lead != run.baseline and base["rmse"][channel] > 0:
             cut = 100 * (1 - row["rmse"][channel] / base["rmse"][channel])
             text += f", {abs(cut):.0f} % {'below' if cut >= 0 else 'ABOVE'} the baseline"
         parts.append(text)
-    return "Root mean square errors: " + "; ".join(parts) + "."
+    return "Root mean square errors (95 % interval of the mean over runs): " + "; ".join(parts) + "."
 
 
 def _against_plant(run: RunFiles, row: Row, truth: Row, base: Row | None) -> str:
@@ -50,28 +52,31 @@ def _against_plant(run: RunFiles, row: Row, truth: Row, base: Row | None) -> str
         text = f"{title_of(channel)} {number(factor * truth['rmse'][channel])} {unit}"
         if base is not None and base["rmse"][channel] > 1.02 * truth["rmse"][channel]:
             share = (base["rmse"][channel] - row["rmse"][channel]) / (base["rmse"][channel] - truth["rmse"][channel])
-            text += f" ({100 * share:.0f} % of the possible reduction attained)"
+            text += f" (attained: {100 * share:.0f} % of the possible reduction)"
         parts.append(text)
-    return "The simulated plant itself, started from the same measured state and knowing neither noise nor disturbance, leaves " + "; ".join(parts) + "."
+    intro = "The simulated plant itself, started from the same measured state and knowing neither noise nor disturbance, leaves "
+    return intro + "; ".join(parts) + "."
 
 
 def _end(run: RunFiles, row: Row, base: Row | None, lead: str) -> str:
     if "position_error_end" not in row:
         return ""
-    text = f"At the end of a free run the position is off by {number(row['position_error_end'], 2)} m and the heading by {number(DEG * row['heading_error_end'], 2)} deg on average"
+
+    def off(of: Row) -> tuple[str, str]:
+        return number(of["position_error_end"], 2) + " m", number(DEG * of["heading_error_end"], 2) + " deg"
+
+    text = "At the end of a free run the position is off by {} and the heading by {} on average".format(*off(row))
     if base is not None and lead != run.baseline:
-        text += f" (baseline: {number(base['position_error_end'], 2)} m, {number(DEG * base['heading_error_end'], 2)} deg)"
+        text += " (baseline: {}, {})".format(*off(base))
     return text + "."
 
 
 def _divergence(run: RunFiles, split: str) -> str:
-    lost: dict[str, int] = {}
-    for row in run.rows:
-        if row["split"] == split and row.get("manoeuvre", "all") == "all" and row["diverged"]:
-            lost[row["model"]] = lost.get(row["model"], 0) + row["diverged"]
+    whole = [row for row in run.rows if row["split"] == split and row.get("manoeuvre", "all") == "all"]
+    lost = [f"{row['model']} {row['diverged']} of {row['windows']} ({row['protocol']})" for row in whole if row["diverged"]]
     if not lost:
         return f"No free run of any model diverged on {split} data."
-    return "DIVERGED free runs, counted with the error of held velocities: " + ", ".join(f"{model} {count}" for model, count in lost.items()) + f" ({split} data)."
+    return f"DIVERGED on {split} data, counted with the error of held velocities: {', '.join(lost)}."
 
 
 def cautions(run: RunFiles, findings: Sequence[Finding]) -> list[str]:
@@ -87,60 +92,71 @@ def cautions(run: RunFiles, findings: Sequence[Finding]) -> list[str]:
         if worse:
             out.append(f"Protocol {protocol}: {lead} is worse than the baseline in {', '.join(worse)}.")
         if seen is not None and seen is not row and row["nrmse"]["mean"] > 1.5 * seen["nrmse"]["mean"]:
-            ratio = row["nrmse"]["mean"] / seen["nrmse"]["mean"]
-            out.append(f"Protocol {protocol}: the {run.focus} error of {lead} is {ratio:.1f} times its training error; it may be overfitted, or the {run.focus} data differ.")
+            times = f"{row['nrmse']['mean'] / seen['nrmse']['mean']:.1f} times its training error"
+            out.append(f"Protocol {protocol}: the {run.focus} error of {lead} is {times}; it may be overfitted, or the {run.focus} data differ.")
         if row["windows"] < 5:
             out.append(f"Protocol {protocol}: only {row['windows']} free runs on {run.focus} data; the intervals say little.")
     if lead is not None and lead == run.baseline and run.heads:
         out.append("No head beats the baseline on validation data: the baseline was selected.")
-    out += [f"{finding.model}, {finding.check}: {finding.text}" for finding in findings if finding.ok is False and finding.model == lead]
+    # the first sentence; the figures stand in the section on sanity
+    failed = [finding for finding in findings if finding.ok is False and finding.model == lead]
+    out += [f"{finding.model}, {finding.check}: {finding.text.partition('. ')[0].rstrip('.')}." for finding in failed]
     return out
 
 
 def fitted_on(run: RunFiles) -> list[tuple[str, str]]:
     """What was fitted on what, as pairs of a name and a sentence."""
-    out: list[tuple[str, str]] = []
-    data, signals, card = run.resolved.get("data") or {}, run.resolved.get("signals") or {}, run.card(run.baseline or "baseline")
-    if data.get("kind") == "simulated":
-        noise = data.get("noise") or {}
-        text = f"simulated sea trials of vessel {data.get('vessel')}"
-        if noise:
-            text += f", noise u {number(noise.get('u'), 2)} m/s, v {number(noise.get('v'), 2)} m/s, r {number(DEG * noise.get('r', 0), 2)} deg/s; data seed {data.get('seed')}"
-        out.append(("data", text))
-    elif data:
-        out.append(("data", f"measured logs ({(data.get('reader') or {}).get('kind', 'files')}), {len(run.provenance.get('inputs') or {})} files"))
-    splits: dict[str, list[Row]] = {}
-    for entry in run.quality:
-        splits.setdefault(entry["split"], []).append(entry)
-    if splits:
-        out.append(("splits", "; ".join(f"{split} {len(logs)} logs, {sum(log['seconds'] for log in logs) / 60:.1f} min" for split, logs in splits.items())))
-    if signals.get("inputs"):
-        text = ", ".join(signals["inputs"])
-        if signals.get("exogenous"):
-            text += "; exogenous: " + ", ".join(signals["exogenous"])
-        if signals.get("forces"):
-            text += f"; forces from the thrusters of {signals['forces']}" if isinstance(signals["forces"], str) else "; forces from given thrusters"
-        out.append(("inputs", text))
-    if card:
-        out.append(("model step", f"{card['dt']:g} s, {card['integrator']}; inputs held over a step"))
-        names = ["u", "v", "r", *((card.get("signals") or {}).get("inputs") or []), *((card.get("signals") or {}).get("exogenous") or [])]
-        units = {"r": ("deg/s", DEG), "delta": ("deg", DEG), "wind_dir": ("deg", DEG)}
-        ranges = [_range(name, low, high, *units.get(name, ("m/s" if name in "uv" else "", 1.0))) for name, low, high in zip(names, card["low"], card["high"], strict=False)]
-        out.append(("training range", "; ".join(ranges)))
-    samples = run.fit(run.baseline or "baseline").get("samples")
     baseline = run.resolved.get("baseline") or {}
-    if baseline:
-        out.append(("baseline", str(baseline.get("kind", "")) + (f", fitted on {samples:,} samples".replace(",", "\u2009") if samples else "")))
-    for name, protocol in (run.evaluation.get("protocols") or {}).items():
-        out.append((f"protocol {name}", _protocol(protocol) + ("; selects the model" if name == run.evaluation.get("selection") else "")))
-    scales = run.metrics.get("scales") or {}
-    if scales:
-        out.append(("NRMSE divides by", ", ".join(f"{name} {number(unit_of(run, name)[1] * value)} {unit_of(run, name)[0]}" for name, value in scales.items())))
-    return out
+    samples = run.fit(run.baseline or "baseline").get("samples")
+    fit = f", fitted on {samples} samples" if samples else ""
+    logs: dict[str, list[Row]] = {}
+    for entry in run.quality:
+        logs.setdefault(entry["split"], []).append(entry)
+    splits = [f"{split} {len(members)} logs, {sum(log['seconds'] for log in members) / 60:.1f} min" for split, members in logs.items()]
+    protocols = run.evaluation.get("protocols") or {}
+    scales = [f"{name} {number(unit_of(run, name)[1] * value)} {unit_of(run, name)[0]}" for name, value in (run.metrics.get("scales") or {}).items()]
+    facts = [("data", _data(run)), ("splits", "; ".join(splits)), ("inputs", _inputs(run)), *_model(run)]
+    facts.append(("baseline", str(baseline.get("kind", "")) + fit if baseline else ""))
+    for name, protocol in protocols.items():
+        facts.append((f"protocol {name}", _protocol(protocol) + ("; selects the model" if name == run.evaluation.get("selection") else "")))
+    facts.append(("NRMSE divides by", ", ".join(scales)))
+    return [(name, text) for name, text in facts if text]
 
 
-def _range(name: str, low: float, high: float, unit: str, factor: float) -> str:
-    return f"{name} {number(factor * low)} to {number(factor * high)} {unit}".strip()
+def _data(run: RunFiles) -> str:
+    data = run.resolved.get("data") or {}
+    if not data:
+        return ""
+    if data.get("kind") != "simulated":
+        return f"measured logs ({(data.get('reader') or {}).get('kind', 'files')}), {len(run.provenance.get('inputs') or {})} files"
+    text = f"simulated sea trials of vessel {data.get('vessel')}"
+    noise = data.get("noise") or {}
+    if noise:
+        text += f", noise u {number(noise.get('u'), 2)} m/s, v {number(noise.get('v'), 2)} m/s, r {number(DEG * noise.get('r', 0), 2)} deg/s"
+    return text + f"; data seed {data.get('seed')}"
+
+
+def _inputs(run: RunFiles) -> str:
+    signals = run.resolved.get("signals") or {}
+    text = ", ".join(signals.get("inputs") or [])
+    if signals.get("exogenous"):
+        text += "; exogenous: " + ", ".join(signals["exogenous"])
+    if signals.get("forces"):
+        text += f"; forces from the thrusters of {signals['forces']}" if isinstance(signals["forces"], str) else "; forces from given thrusters"
+    return text
+
+
+def _model(run: RunFiles) -> list[tuple[str, str]]:
+    card = run.card(run.baseline or "baseline")
+    if not card:
+        return []
+    signals = card.get("signals") or {}
+    names = ["u", "v", "r", *(signals.get("inputs") or []), *(signals.get("exogenous") or [])]
+    ranges = []
+    for name, low, high in zip(names, card["low"], card["high"], strict=False):
+        unit, factor = unit_of(run, name)
+        ranges.append(f"{name} {number(factor * low)} to {number(factor * high)} {unit}".removesuffix(" -"))
+    return [("model step", f"{card['dt']:g} s, {card['integrator']}; inputs held over a step"), ("training range", "; ".join(ranges))]
 
 
 def _protocol(protocol: Row) -> str:

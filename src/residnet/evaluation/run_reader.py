@@ -163,7 +163,7 @@ class RunFiles:
                         log=path.stem,
                         manoeuvre=self.manoeuvre_of(path.stem),
                         protocol=str(protocol),
-                        number=int(number),
+                        number=int(str(number)),
                         t=first["t"].to_numpy(float),
                         usable=first["usable"].to_numpy(bool),
                         measured=first[list(COLUMNS)].to_numpy(float),

@@ -40,10 +40,16 @@ def check_run(run: Path, *, divergence: float = 3.0) -> list[Finding]:
         UsageError: where a model cannot be read.
     """
     out: list[Finding] = []
-    for name in model_names(run / "models"):
-        spec, model = load_model(run / "models" / name)
-        if spec.role != "zero":
-            out += check_model(spec, model, divergence=divergence)
+    threads = torch.get_num_threads()
+    # products this small only lose time to a second thread
+    torch.set_num_threads(1)
+    try:
+        for name in model_names(run / "models"):
+            spec, model = load_model(run / "models" / name)
+            if spec.role != "zero":
+                out += check_model(spec, model, divergence=divergence)
+    finally:
+        torch.set_num_threads(threads)
     return out
 
 
@@ -76,7 +82,7 @@ def check_damping(spec: ModelSpec, model: HybridDynamics, points: Sequence[Opera
     wrong = slopes > 0.05 * slopes.abs().amax(0)
     parts = []
     for row, point in enumerate(chosen):
-        values = ", ".join(f"d{name}'/d{name} {float(slopes[row, i]):+.3g}" for i, name in enumerate(VELOCITY))
+        values = ", ".join(f"d{name}′/d{name} {float(slopes[row, i]):+.3g}" for i, name in enumerate(VELOCITY))
         parts.append(f"{point.text}: {values} 1/s")
     if not bool(wrong.any()):
         return Finding(spec.name, DAMPING, True, "every velocity decays by itself. " + "; ".join(parts))
@@ -97,7 +103,8 @@ def check_stability(spec: ModelSpec, model: HybridDynamics, points: Sequence[Ope
     summary = "; ".join(parts)
     if not unstable:
         reach = f"{points[0].speed:.2g} to {points[-1].speed:.2g} m/s"
-        return Finding(spec.name, STABILITY, True, f"sway and yaw are stable in straight running at {reach} (no mode doubles within {_DOUBLING:.0f} s). {summary}")
+        text = f"sway and yaw are stable in straight running at {reach} (no mode doubles within {_DOUBLING:.0f} s). {summary}"
+        return Finding(spec.name, STABILITY, True, text)
     inside = [(point, rate) for point, rate in unstable if point.inside]
     worst, rate = max(inside or unstable, key=lambda pair: pair[1])
     where = "inside the training data" if inside else "only outside the training data"
@@ -136,10 +143,13 @@ def check_symmetry(spec: ModelSpec, model: HybridDynamics, *, samples: int = 500
     uneven = 0.5 * (one - sign * other).abs()
     spread = torch.cat((one, sign * other)).std(0).clamp(min=1e-12)
     typical, largest = uneven.square().mean(0).sqrt() / spread, uneven.amax(0) / spread
-    figures = ", ".join(f"{name}' {100 * float(t):.1f} % (largest {100 * float(m):.1f} %)" for name, t, m in zip(VELOCITY, typical, largest, strict=True))
+    parts = [f"{name}′ {100 * float(t):.1f} % (largest {100 * float(m):.1f} %)" for name, t, m in zip(VELOCITY, typical, largest, strict=True)]
     ok = bool((typical <= _ASYMMETRY).all())
-    text = "port and starboard alike" if ok else "port and starboard differ (a single screw, an offset or too few turns one way may be the reason)"
-    return Finding(spec.name, SYMMETRY, ok, f"{text}; uneven part of the acceleration relative to its spread over {samples} points in the training box: {figures}")
+    word = "alike" if ok else "differ"
+    text = f"port and starboard {word}: the uneven part of the acceleration is up to {100 * float(typical.max()):.0f} % of its spread. "
+    if not ok:
+        text += "A single screw, an offset of the steering or too few turns one way may be the reason. "
+    return Finding(spec.name, SYMMETRY, ok, text + f"RMS over {samples} points in the training box: " + ", ".join(parts))
 
 
 def check_bounded(spec: ModelSpec, model: HybridDynamics, divergence: float) -> Finding:
@@ -170,7 +180,10 @@ def check_bounded(spec: ModelSpec, model: HybridDynamics, divergence: float) -> 
     if not bool(torch.isfinite(x).all()) or float(largest.max()) > divergence:
         text = f"runs away within {seconds:.0f} s with {inputs} held from rest (more than {divergence:g} times the largest training velocity)"
         return Finding(spec.name, BOUNDED, False, text)
-    text = f"{len(corners)} runs of {_LONG_RUN:.0f} s from rest with inputs held at their extremes stay bounded; the farthest ({inputs}) reaches {reached} of the largest training values"
+    text = (
+        f"{len(corners)} runs of {_LONG_RUN:.0f} s from rest with inputs held at their extremes stay bounded; "
+        f"the farthest ({inputs}) reaches {reached} of the largest training values"
+    )
     return Finding(spec.name, BOUNDED, True, text)
 
 

@@ -106,7 +106,7 @@ class Mirror:
         rudders, pairs = steering(columns)
         paired = {i for pair in pairs for i in pair}
         lone = [name for i, name in enumerate(columns) if name.endswith(("_port", "_stbd")) and i not in paired]
-        if not rudders and not pairs or lone:
+        if lone or not (rudders or pairs):
             return None
         return cls(tuple(columns), tuple(rudders), tuple(pairs))
 
