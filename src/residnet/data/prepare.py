@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import torch
@@ -28,12 +29,16 @@ class PrepareConfig(Config):
         masks: which samples are excluded, and why.
         derivative: how velocities are smoothed and differentiated.
         trim: seconds cut from the start and the end of every log before samples are taken for identification.
+        hold: what a model is given as an input over the step that follows a sample. `start`: the sample itself, exact for a command that
+            changes on the grid. `mean`: the mean of the samples at both ends of the step, for a measured quantity that moves on during the
+            step, such as shaft revolutions; held from the start it would lag by half a step.
     """
 
     grid: GridConfig
     masks: tuple[MaskConfig, ...] = ()
     derivative: DerivativeConfig = Field(default_factory=SavitzkyGolay)
     trim: Seconds = Field(default=0.0, ge=0)
+    hold: Literal["start", "mean"] = "start"
 
 
 @dataclass(frozen=True)
@@ -46,7 +51,8 @@ class Prepared:
         y: measured states [T, 6].
         smooth: states with smoothed velocities [T, 6].
         nu_dot: accelerations [T, 3].
-        w: inputs [T, m].
+        w: inputs held over the step that follows each sample [T, m].
+        recorded: inputs at the samples themselves [T, m].
         piece: number of the stretch that nothing crosses, [T]; -1 where there is none.
         usable: samples that may be scored [T].
         good: samples whose smoothed state and derivative may be learned from [T].
@@ -58,6 +64,7 @@ class Prepared:
     smooth: np.ndarray
     nu_dot: np.ndarray
     w: np.ndarray
+    recorded: np.ndarray
     piece: np.ndarray
     usable: np.ndarray
     good: np.ndarray
@@ -92,7 +99,16 @@ def prepare(log: Log, split: str, columns: Sequence[str], config: PrepareConfig)
     smooth_nu, nu_dot, valid = config.derivative.derive(y[:, 3:], config.grid.step, clean)
     smooth = np.concatenate((y[:, :3], np.where(valid[:, None], smooth_nu, y[:, 3:])), axis=1)
     trimmed = (log.t >= log.t[0] + config.trim - 1e-9) & (log.t <= log.t[-1] - config.trim + 1e-9)
-    return Prepared(log, split, y, smooth, nu_dot, w, piece, usable, usable & valid & trimmed)
+    held = _means(w, piece) if config.hold == "mean" else w
+    return Prepared(log, split, y, smooth, nu_dot, held, w, piece, usable, usable & valid & trimmed)
+
+
+def _means(w: np.ndarray, piece: np.ndarray) -> np.ndarray:
+    """Mean of each sample and the next [T, m]; the sample itself where its piece ends."""
+    out = w.copy()
+    on = (piece[:-1] >= 0) & (piece[1:] == piece[:-1])
+    out[:-1][on] = 0.5 * (w[:-1] + w[1:])[on]
+    return out
 
 
 def _renumber(labels: np.ndarray) -> np.ndarray:
@@ -111,7 +127,7 @@ def samples(logs: Sequence[Prepared], signals: Signals) -> Samples:
         raise DataError(f"none of {len(logs)} training logs has a sample to learn from; are the logs shorter than the derivative's window?")
     z, target, group, time = [], [], [], []
     for number, p in enumerate(logs):
-        x, w = torch.from_numpy(p.smooth[p.good]), torch.from_numpy(p.w[p.good])
+        x, w = torch.from_numpy(p.smooth[p.good]), torch.from_numpy(p.recorded[p.good])
         with torch.no_grad():
             z.append(signals(x, signals.prepare(w)))
         target.append(torch.from_numpy(p.nu_dot[p.good]))
