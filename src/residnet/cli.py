@@ -54,7 +54,7 @@ def check(
 
 @app.command()
 def inspect(
-    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="Logs to look at: canonical Parquet, or anything that the config's reader reads.")],
+    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="Logs: canonical Parquet, or anything that the config's reader reads.")],
     config: Annotated[Path | None, typer.Option("--config", metavar="CONFIG", help="A run whose channel map reads these logs.")] = None,
 ) -> None:
     """Look at logs as a doctor would: channels, rates, gaps, jumps, frames, excitation. Exit 1 where a fit would be misled."""
@@ -102,7 +102,9 @@ def report(folder: RunPath) -> None:
 
 
 @app.command(name="list")
-def list_names(what: Annotated[Literal["vessels", "heads", "manoeuvres", "readers", "tasks", "baselines"], typer.Argument(help="What to list.")]) -> None:
+def list_names(
+    what: Annotated[Literal["vessels", "heads", "manoeuvres", "readers", "tasks", "baselines"], typer.Argument(help="What to list.")],
+) -> None:
     """List what there is to choose from."""
     from residnet.tasks.catalogue import catalogue
 

@@ -44,7 +44,9 @@ class RunFolder:
         folder = cls(path)
         if folder.resolved.is_file() and resume:
             if folder.resolved.read_text() != resolved:
-                raise UsageError(f"{path}: was made with another configuration ({folder.resolved} differs); resume with the same one or give another --out")
+                raise UsageError(
+                    f"{path}: was made with another configuration ({folder.resolved} differs); resume with the same one or give another --out"
+                )
             return folder
         if path.exists() and (not path.is_dir() or any(path.iterdir())):
             raise UsageError(f"{path}: exists already; give another --out, remove it, or continue it with --resume")

@@ -89,7 +89,8 @@ def test_help_does_not_import_torch() -> None:
 
 
 def test_check_does_not_import_lightning(tiny_config: Path) -> None:
-    code = f"import sys; from pathlib import Path; from residnet.tasks import load_task; load_task(Path({str(tiny_config)!r}), []); sys.exit('lightning' in sys.modules)"
+    load = f"from residnet.tasks import load_task; load_task(Path({str(tiny_config)!r}), [])"
+    code = f"import sys; from pathlib import Path; {load}; sys.exit('lightning' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 

@@ -92,7 +92,8 @@ class RegressorsConfig(Config):
         assert isinstance(baseline, RegressorBaseline)
         chosen = samples.of_kinds(self.manoeuvres)
         if len(chosen) == 0:
-            raise FitError(f"no sample is of the manoeuvres {list(self.manoeuvres)} that the baseline is fitted on; kinds in the data: {sorted(set(samples.kinds))}")
+            kinds = sorted(set(samples.kinds))
+            raise FitError(f"no sample is of the manoeuvres {list(self.manoeuvres)} that the baseline is fitted on; kinds in the data: {kinds}")
         phi = baseline.library(chosen.z)
         table: list[Coefficient] = []
         for axis, name in enumerate(VELOCITY):

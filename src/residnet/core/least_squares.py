@@ -44,7 +44,8 @@ def solve(x: Tensor, y: Tensor, group: Tensor, *, names: tuple[str, ...], ridge:
         vector = torch.linalg.eigh(gram).eigenvectors[:, 0].abs()
         worst = [names[i] for i in vector.argsort(descending=True)[:2].tolist()]
         raise FitError(
-            f"the data cannot tell apart regressors '{worst[0]}' and '{worst[1]}' (condition {condition:.1e}); leave one out or excite them separately"
+            f"the data cannot tell apart regressors '{worst[0]}' and '{worst[1]}' (condition {condition:.1e}); "
+            "leave one out or excite them separately"
         )
     inverse = torch.linalg.inv(gram + ridge * torch.eye(j, dtype=x.dtype))
     coefficients = inverse @ (a.T @ y) / n

@@ -20,7 +20,6 @@ from residnet.heads import HeadConfig, ZeroHead
 from residnet.physics.signals import SignalsConfig
 
 
-
 class ModelSpec(Config):
     """Everything that determines a hybrid model but its numbers.
 

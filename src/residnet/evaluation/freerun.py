@@ -56,7 +56,12 @@ class FreeRun:
 
 
 def free_run(
-    candidates: Sequence[Candidate], windows: Sequence[Window], logs: Sequence[Prepared], step: float, limit: np.ndarray, dtype: torch.dtype = torch.float64
+    candidates: Sequence[Candidate],
+    windows: Sequence[Window],
+    logs: Sequence[Prepared],
+    step: float,
+    limit: np.ndarray,
+    dtype: torch.dtype = torch.float64,
 ) -> dict[str, list[Prediction]]:
     """Free-run every candidate over every window.
 
@@ -66,7 +71,9 @@ def free_run(
     return {candidate.name: _run(candidate, windows, logs, step, limit, dtype) for candidate in candidates}
 
 
-def _run(candidate: Candidate, windows: Sequence[Window], logs: Sequence[Prepared], step: float, limit: np.ndarray, dtype: torch.dtype) -> list[Prediction]:
+def _run(
+    candidate: Candidate, windows: Sequence[Window], logs: Sequence[Prepared], step: float, limit: np.ndarray, dtype: torch.dtype
+) -> list[Prediction]:
     longest = max(window.stop - window.start for window in windows)
     tables = {n: _inputs(candidate, logs[n]) for n in {window.log for window in windows}}
     x0 = np.stack([_initial(candidate, window, logs[window.log]) for window in windows])
@@ -89,14 +96,16 @@ def _run(candidate: Candidate, windows: Sequence[Window], logs: Sequence[Prepare
     return out
 
 
-def _memory(model: Dynamics, windows: Sequence[Window], logs: Sequence[Prepared], tables: Mapping[int, np.ndarray], dtype: torch.dtype) -> torch.Tensor:
+def _memory(
+    model: Dynamics, windows: Sequence[Window], logs: Sequence[Prepared], tables: Mapping[int, np.ndarray], dtype: torch.dtype
+) -> torch.Tensor:
     """Memory [W, n_state] that each window's own past leaves; windows with pasts of equal length go together."""
     s = model.initial_state(len(windows)).to(dtype)
     if isinstance(model, HybridDynamics):
         lengths = np.array([window.start - window.past for window in windows])
         for length in np.unique(lengths):
             rows = np.flatnonzero(lengths == length)
-            members = [windows[i] for i in rows]
+            members = [windows[i] for i in rows.tolist()]
             y = np.stack([logs[window.log].y[window.past : window.start] for window in members])
             w = np.stack([tables[window.log][window.past : window.start] for window in members])
             s[torch.from_numpy(rows)] = model.warmup(torch.from_numpy(y).to(dtype), torch.from_numpy(w).to(dtype))

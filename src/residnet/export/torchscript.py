@@ -48,7 +48,7 @@ class ExportedModel(nn.Module):
     @torch.jit.export
     def warmup(self, y_history: Tensor, w_history: Tensor) -> Tensor:
         """Memory s [B, n_state] that a measured past leaves: states [B, T, 6] and inputs [B, T, m], oldest first."""
-        return self.simulate.model.warmup(y_history, w_history)
+        return self.simulate.model.warmup(y_history, w_history)  # type: ignore[operator]
 
     @torch.jit.export
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -132,7 +132,10 @@ def check_parity(spec: ModelSpec, model: HybridDynamics, exported: Any) -> dict[
     worst = torch.maximum((single - mine).abs(), (together - mine).abs()).amax(1) / span
     shares = {name: float(value) for name, value in zip(STATE, worst[0], strict=True)}
     if not torch.isfinite(single).all() or not max(shares.values()) <= PARITY_TOLERANCE:
-        raise ExportError(f"model {spec.name}: the exported module differs from the model by {shares} of each channel's range over {PARITY_STEPS} steps; allowed {PARITY_TOLERANCE:g}")
+        raise ExportError(
+            f"model {spec.name}: the exported module differs from the model by {shares} of each channel's range over {PARITY_STEPS} steps; "
+            f"allowed {PARITY_TOLERANCE:g}"
+        )
     return shares
 
 

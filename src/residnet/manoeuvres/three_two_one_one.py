@@ -46,7 +46,10 @@ class ThreeTwoOneOneFamily(Config):
         """`count` manoeuvres."""
         return [
             ThreeTwoOneOne(
-                unit=float(random.uniform(*self.unit)), steer=float(random.uniform(*self.steer)), drive=float(random.uniform(*self.drive)), start=self.start
+                unit=float(random.uniform(*self.unit)),
+                steer=float(random.uniform(*self.steer)),
+                drive=float(random.uniform(*self.drive)),
+                start=self.start,
             )
             for _ in range(self.count)
         ]

@@ -31,7 +31,9 @@ class Fossen3(nn.Module):
             dtype=torch.float64,
         )
         if bool((torch.linalg.eigvals(mass).real <= 0).any()):
-            raise ConfigError(f"vessel {vessel.name}: the mass matrix is not positive definite; added mass (X_udot, Y_vdot, N_rdot) is negative for a hull")
+            raise ConfigError(
+                f"vessel {vessel.name}: the mass matrix is not positive definite; added mass (X_udot, Y_vdot, N_rdot) is negative for a hull"
+            )
         self.register_buffer("mass", mass, persistent=False)
         self.register_buffer("inverse", torch.linalg.inv(mass), persistent=False)
         rows = (vessel.damping.X, vessel.damping.Y, vessel.damping.N)

@@ -50,7 +50,7 @@ class SignalsConfig(Config):
             raise ValueError(f"inputs {sorted(repeated)} are named twice")
         made = STATE + (FORCE_CHANNELS if self.forces is not None else ()) + (WIND_CHANNELS if self.exogenous else ())
         if taken := [name for name in self.inputs if name in made]:
-            raise ValueError(f"input '{taken[0]}' is a channel that the model has or makes itself; leave it out or rename it in the log's channel map")
+            raise ValueError(f"input '{taken[0]}' is a channel that the model has or makes itself; leave it out or rename it in the channel map")
         return self
 
     @property

@@ -102,7 +102,7 @@ class TermLibrary(nn.Module):
         if self.divides:
             base = torch.cat((base, z.index_select(-1, self.divisors).reciprocal()), dim=-1)
         if self.depth == 0:
-            return one.expand(z.shape[:-1] + (self.count,))
+            return one.expand(z.shape[:-1] + (self.count,))  # noqa: RUF005 (TorchScript)
         out = base.index_select(-1, self.index[0])
         for d in range(1, self.depth):
             out = out * base.index_select(-1, self.index[d])

@@ -16,7 +16,13 @@ def catalogue(what: str) -> list[tuple[str, str]]:
     """Names and one-line descriptions of `vessels`, `heads`, `manoeuvres`, `readers`, `tasks` or `baselines`."""
     if what == "vessels":
         return [(name, load_vessel(name).description) for name in vessel_files()]
-    unions: dict[str, Any] = {"heads": HeadConfig, "manoeuvres": ManoeuvreConfig, "readers": ReaderConfig, "tasks": TaskConfig, "baselines": BaselineConfig}
+    unions: dict[str, Any] = {
+        "heads": HeadConfig,
+        "manoeuvres": ManoeuvreConfig,
+        "readers": ReaderConfig,
+        "tasks": TaskConfig,
+        "baselines": BaselineConfig,
+    }
     members = get_args(get_args(unions[what])[0])
     return [(_tag(member), (member.__doc__ or "").strip().splitlines()[0]) for member in members]
 

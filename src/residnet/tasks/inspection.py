@@ -8,6 +8,7 @@ from pathlib import Path
 from residnet.core.errors import ConfigError, UsageError
 from residnet.data.doctor import inspect
 from residnet.data.readers import CanonicalConfig
+from residnet.data.readers.base import LogReader
 from residnet.data.sources import MeasuredLogs
 
 
@@ -20,7 +21,8 @@ def inspect_logs(paths: Sequence[Path], config: Path | None) -> bool:
     from residnet.tasks import load_task
     from residnet.tasks.fit import FitConfig
 
-    reader, inputs = CanonicalConfig().build(), None
+    reader: LogReader = CanonicalConfig().build()
+    inputs: Sequence[str] | None = None
     if config is not None:
         task = load_task(config, [])
         if not isinstance(task, FitConfig) or not isinstance(task.data, MeasuredLogs):

@@ -69,7 +69,8 @@ def require_length(log: Prepared, config: FitConfig) -> None:
     if not log.good.any():
         seconds = len(log) * config.prepare.grid.step
         raise DataError(
-            f"log {log.log.name}: its {seconds:.1f} s hold no stretch as long as the derivative's window; leave it out or shorten prepare.derivative.window"
+            f"log {log.log.name}: its {seconds:.1f} s hold no stretch as long as the derivative's window; "
+            "leave it out or shorten prepare.derivative.window"
         )
     if log.split != "train":
         require_window(log, config)
@@ -163,7 +164,8 @@ class Fitter:
             scales = torch.from_numpy(self.config.evaluation.scales.array())
             notes["refit"] = refit(model, self.samples, WindowStore.gather(self.train, torch.float64), self.config.refit[name], scales)
             table = moved(table, model.baseline)
-        notes |= {"coefficients": [_row(entry) for entry in table], "validation": self.bench(model), "seconds": round(time.perf_counter() - started, 1)}
+        notes |= {"coefficients": [_row(entry) for entry in table], "validation": self.bench(model)}
+        notes["seconds"] = round(time.perf_counter() - started, 1)
         return self._keep(Fitted(spec, model, notes))
 
     def head(self, name: str, baseline: HybridDynamics) -> Fitted:

@@ -16,8 +16,8 @@ from residnet.core.names import STATE, si_unit
 from residnet.data.sources import input_files, read_logs
 from residnet.evaluation.metrics import SCHEMA, find
 from residnet.run_folder import RunFolder
-from residnet.tasks.fit import FitConfig
 from residnet.tasks.exporting import export_model
+from residnet.tasks.fit import FitConfig
 from residnet.tasks.pipeline import Fitted, Fitter, candidates, evaluate, prepare_logs, say, write_residuals
 from residnet.tasks.reporting import report_run
 
@@ -116,13 +116,15 @@ def finish(folder: RunFolder, config: FitConfig) -> None:
 
 def print_table(table: Sequence[Mapping[str, Any]], split: str) -> None:
     """The free-run table of one split on standard output."""
-    print(f"{'protocol':12s} {'model':14s} {'u m/s':>8s} {'v m/s':>8s} {'r deg/s':>8s} {'nrmse':>7s} {'position m':>11s} {'heading deg':>12s} {'diverged':>9s}")
+    titles = f"{'protocol':12s} {'model':14s} {'u m/s':>8s} {'v m/s':>8s} {'r deg/s':>8s} {'nrmse':>7s}"
+    print(f"{titles} {'position m':>11s} {'heading deg':>12s} {'diverged':>9s}")
     for row in table:
         if row["split"] != split or row["manoeuvre"] != "all":
             continue
         rmse, mark = row["rmse"], " *" if row["selected"] else ""
         print(
-            f"{row['protocol']:12s} {row['model'] + mark:14s} {rmse['u']:8.4f} {rmse['v']:8.4f} {math.degrees(rmse['r']):8.3f} {row['nrmse']['mean']:7.4f} "
+            f"{row['protocol']:12s} {row['model'] + mark:14s} {rmse['u']:8.4f} {rmse['v']:8.4f} {math.degrees(rmse['r']):8.3f} "
+            f"{row['nrmse']['mean']:7.4f} "
             f"{row['position_error_end']:11.2f} {math.degrees(row['heading_error_end']):12.2f} {row['diverged']:5d}/{row['windows']}"
         )
     print("free-run errors, mean over windows; * = selected on validation data")

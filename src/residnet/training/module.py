@@ -90,7 +90,7 @@ class HeadTraining(L.LightningModule):
         if stage == 0:
             washout = round(self.settings.one_step.washout / self.model.dt)
             y, w = take(self.store.smooth, starts, length), take(self.store.w, starts, length)
-            spread = self.model.head.scale.spread.to(y.dtype)
+            spread: Tensor = self.model.head.scale.spread.to(y.dtype)  # type: ignore[union-attr, assignment]
             loss = one_step_loss(self.model, y, w, take(self.store.nu_dot, starts, length), take(self.store.good, starts, length), spread, washout)
         else:
             s = self.model.warmup(*self.store.history(starts, round(self.settings.history / self.model.dt)))
@@ -99,7 +99,8 @@ class HeadTraining(L.LightningModule):
                 noise = self.settings.start_noise * self.scales * torch.randn(len(starts), 3, dtype=x0.dtype)
                 x0 = torch.cat((x0[:, :3], x0[:, 3:] + noise), dim=1)
             w = take(self.store.w, starts, length - 1)
-            loss = rollout_loss(self.rollout, x0, w, s, take(self.store.y, starts + 1, length - 1), take(self.store.usable, starts + 1, length - 1), self.scales)
+            y, usable = (take(part, starts + 1, length - 1) for part in (self.store.y, self.store.usable))
+            loss = rollout_loss(self.rollout, x0, w, s, y, usable, self.scales)
         self._losses.append(float(loss.detach()))
         return loss
 

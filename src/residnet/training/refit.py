@@ -45,7 +45,8 @@ class RefitConfig(Config):
 
 @dataclass(frozen=True)
 class _Problem:
-    """Windows x0 [B, 6], w [B, T, m], measured nu [B, T, 3], weights [B, T, 3] (0 or 1/scale); prior precision [P, P] about theta0 [P], pull to zero [P]."""
+    """Windows x0 [B, 6], w [B, T, m], measured nu [B, T, 3], weights [B, T, 3] (0 or 1/scale); prior precision [P, P] about theta0 [P],
+    pull to zero [P]."""
 
     x0: Tensor
     w: Tensor
@@ -108,7 +109,9 @@ def refit(model: HybridDynamics, samples: Samples, store: WindowStore, config: R
     return {"cost_before": float(first), "cost_after": float(cost), "iterations": count, "windows": len(problem.x0), "horizon": config.horizon}
 
 
-def _problem(model: HybridDynamics, baseline: RegressorBaseline, samples: Samples, store: WindowStore, config: RefitConfig, scales: Tensor) -> _Problem:
+def _problem(
+    model: HybridDynamics, baseline: RegressorBaseline, samples: Samples, store: WindowStore, config: RefitConfig, scales: Tensor
+) -> _Problem:
     steps, every = round(config.horizon / model.dt), max(round(config.every / model.dt), 1)
     starts = store.starts(steps + 1)
     starts = starts[store.depth[starts] % every == 0]
@@ -209,7 +212,7 @@ def _slopes(model: HybridDynamics, x: Tensor, p: Tensor) -> Tensor:
     for direction in range(4):
         tangent[direction, :, 2 + direction] = 1.0
     repeated, inputs = x.repeat(4, 1), p.repeat(4, 1)
-    _, slopes = torch.func.jvp(lambda state: model.baseline(model.signals(state, inputs)), (repeated,), (tangent.reshape(-1, x.shape[1]),))
+    slopes = torch.func.jvp(lambda state: model.baseline(model.signals(state, inputs)), (repeated,), (tangent.reshape(-1, x.shape[1]),))[1]
     return slopes.reshape(4, batch, 3).permute(1, 2, 0)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import sys
 import warnings
 from pathlib import Path
@@ -40,7 +39,7 @@ class KeepCheckpoint(L.Callback):
         """Write beside the old one, then put it in place."""
         partial = self.path.with_suffix(".partial")
         trainer.save_checkpoint(partial)
-        os.replace(partial, self.path)
+        partial.replace(self.path)
 
 
 class ProgressLine(L.Callback):
@@ -54,7 +53,8 @@ class ProgressLine(L.Callback):
         """Show epoch, loss and free-run errors."""
         assert isinstance(pl_module, HeadTraining)
         done, last = trainer.current_epoch + 1, pl_module.history[-1]
-        text = f"  {self.name}: epoch {done}/{self.epochs}, stage {int(last['stage'])}, loss {last['loss']:.4g}, best free-run error {pl_module.best_score:.4g}"
+        text = f"  {self.name}: epoch {done}/{self.epochs}, stage {int(last['stage'])}, loss {last['loss']:.4g}"
+        text += f", best free-run error {pl_module.best_score:.4g}"
         if sys.stderr.isatty():
             print(f"\r{text}\033[K", end="\n" if done == self.epochs or trainer.should_stop else "", file=sys.stderr, flush=True)
         elif done % max(self.epochs // 10, 1) == 0 or done == self.epochs:
