@@ -69,6 +69,15 @@ def test_library_equals_numpy() -> None:
     np.testing.assert_allclose(single, np.stack(truth, axis=-1), rtol=3e-5, atol=1e-6)
 
 
+def test_division_keeps_signs_and_leaves_other_gradients_finite() -> None:
+    z = torch.tensor([[-2.0, 0.0, 0.5, -4.0, 0.0]], dtype=torch.float64, requires_grad=True)
+    out = TermLibrary(["n_port^-1", "u |n_port|^-2", "|u|^-1 r", "v"], NAMES)(z)
+    np.testing.assert_allclose(out.detach(), [[-0.25, -0.125, 0.25, 0.0]], rtol=1e-14)
+    out.sum().backward()
+    assert z.grad is not None
+    assert bool(torch.isfinite(z.grad).all())
+
+
 def test_library_of_constants_and_of_nothing() -> None:
     z = torch.randn(4, 2, len(NAMES))
     assert torch.equal(TermLibrary(["1", "1"], NAMES)(z), torch.ones(4, 2, 2))

@@ -76,6 +76,7 @@ def test_a_wrong_value_is_one_line_with_its_place(override: str, place: str, mes
         ("damping.X.w={value: 1, unit: kg/s, source: made}", "no channel 'w'"),
         ("damping.X.u+v={value: 1, unit: kg/s, source: made}", "cannot read"),
         ("damping.X.u.unit=kg", "kg/s"),
+        ("damping.X.u^-1={value: 1, unit: kg, source: made}", "infinite at rest"),
         ("damping.N.r.unit=kg/s", r"kg m\^2/s"),
         ("damping.Y.v.unit=t/s", "kg/s"),
         ("damping.Y.v.unit=kg2/s", "kg/s"),

@@ -84,9 +84,13 @@ class TermLibrary(nn.Module):
         for factors in parsed:
             column: list[int] = []
             for factor in factors:
-                inverse = 1 + 2 * len(names) + (divisors.index(factor.name) if factor.power < 0 else 0)
                 index = 1 + places[factor.name] + (len(names) if factor.magnitude else 0)
-                column.extend([inverse if factor.power < 0 else index] * abs(factor.power))
+                if factor.power < 0:
+                    inverse = 1 + 2 * len(names) + divisors.index(factor.name)
+                    # 1/|z| = |z| / z^2
+                    column.extend(([index, inverse, inverse] if factor.magnitude else [inverse]) * -factor.power)
+                else:
+                    column.extend([index] * factor.power)
             columns.append(column)
         self.depth = max([len(column) for column in columns], default=0)
         padded = [column + [0] * (self.depth - len(column)) for column in columns]

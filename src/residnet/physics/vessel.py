@@ -115,6 +115,8 @@ class Damping(Config):
                 try:
                     metres, seconds = force
                     for factor in parse_term(term, VELOCITY):
+                        if factor.power < 0:
+                            raise ConfigError(f"term '{term}' is infinite at rest")
                         metres -= factor.power * (factor.name != "r")
                         seconds += factor.power
                 except ConfigError as error:
