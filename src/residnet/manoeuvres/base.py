@@ -53,7 +53,8 @@ class StackedSource(Source):
         for source, xs, ws, ms in zip(self.sources, x.split(self.rows), w.split(self.rows), memory.split(self.rows), strict=True):
             acting, after = source(xs, ws, k, ms)
             inputs.append(acting)
-            memories.append(after)
+            # a source may need less memory than the widest of the batch
+            memories.append(torch.nn.functional.pad(after, (0, memory.shape[1] - after.shape[1])))
         return torch.cat(inputs), torch.cat(memories)
 
 

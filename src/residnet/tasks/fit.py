@@ -19,6 +19,7 @@ from residnet.dynamics.base import Integrator
 from residnet.evaluation.config import EvaluationConfig
 from residnet.heads import HeadConfig
 from residnet.physics.signals import SignalsConfig
+from residnet.studies import StudyName
 from residnet.training.config import TrainingConfig
 from residnet.training.refit import RefitConfig
 
@@ -43,6 +44,7 @@ class FitConfig(Config):
 
     Attributes:
         name: of the run; its folder is runs/<name> unless --out says otherwise.
+        study: a published experiment whose figures are drawn too.
         seed: of weights and batches.
         threads: of PyTorch; part of what makes a run repeatable. One is fastest for these small products.
         data: logs and splits.
@@ -62,6 +64,7 @@ class FitConfig(Config):
     task: Literal["fit"]
     name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")
     description: str = ""
+    study: StudyName | None = None
     seed: int = Field(default=0, ge=0)
     threads: int = Field(default=1, ge=1)
     data: DataConfig

@@ -16,6 +16,7 @@ from residnet.core.names import STATE, si_unit
 from residnet.data.sources import input_files, read_logs
 from residnet.evaluation.metrics import SCHEMA, find
 from residnet.run_folder import RunFolder
+from residnet.studies import draw_study
 from residnet.tasks.exporting import export_model
 from residnet.tasks.fit import FitConfig
 from residnet.tasks.pipeline import Fitted, Fitter, candidates, evaluate, prepare_logs, say, write_residuals
@@ -111,6 +112,8 @@ def finish(folder: RunFolder, config: FitConfig) -> None:
         print(f"exported: {export_model(folder.path, name, None)}")
     report = report_run(folder.path)
     print_table(folder.read_metrics()["rows"], "test")
+    for path in draw_study(config.study, folder.path) if config.study else ():
+        print(f"study figure: {path}")
     print(f"report: {report}")
 
 

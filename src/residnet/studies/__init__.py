@@ -1,0 +1,16 @@
+"""The source documents' experiments: what a config under `configs/studies` draws beside the ordinary report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+StudyName = Literal["woo2018"]
+
+
+def draw_study(name: StudyName, run: Path) -> list[Path]:
+    """Write a study's figures into the `figures` folder of a finished run; returns their paths."""
+    from residnet.studies import woo2018
+
+    studies = {"woo2018": woo2018.draw}
+    return studies[name](run)
