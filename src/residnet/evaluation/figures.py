@@ -90,7 +90,7 @@ def _of_runs(run: RunFiles) -> Iterator[tuple[str, str, str, Any]]:
             f"history_{window.manoeuvre}",
             f"Time history: {kind}",
             f"Free run of {window.log} from its first measured state and its inputs alone; look for lag at the reversals and for levels "
-            "that stay apart once the motion has settled.",
+            "that stay apart once the motion has settled. Grey: masked, u and v not scored.",
             figures_tracks.history(run, window),
         )
     for name in run.protocols:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from residnet.evaluation.figures_style import collect, label, legend_above, new_figure, styles
+from residnet.evaluation.figures_style import collect, legend_above, new_figure, short_label, styles
 from residnet.evaluation.run_reader import Row, RunFiles, StoredWindow
 
 _DEG = 180.0 / math.pi
@@ -108,7 +108,7 @@ def bars(run: RunFiles, protocol: str) -> Any:
         axes.set_title(text.rsplit(" ", 2)[0] + (f"\n({group.replace('_', ' ')} runs)" if group != "all" else ""))
         axes.grid(False, axis="y")
         axes.set_xlim(left=0)
-    panels[0].set_yticks(range(len(models)), [label(run, model) for model in models])
+    panels[0].set_yticks(range(len(models)), [short_label(run, model) for model in models])
     panels[0].invert_yaxis()
     handles = {split: Patch(facecolor="0.4", alpha=_alpha(run, split), edgecolor="black", linewidth=0.5) for split in run.sides}
     legend_above(figure, handles)
@@ -147,7 +147,7 @@ def residuals(run: RunFiles, table: Mapping[str, np.ndarray], models: Sequence[s
             axes.set_xlim(-reach, reach)
             axes.set_ylim(-reach, reach)
             axes.set_aspect("equal")
-            axes.set_title(f"{label(run, model)}\n{name}, R² = {r_squared(target, predicted):.2f}")
+            axes.set_title(f"{short_label(run, model)}\n{name}, R² = {r_squared(target, predicted):.2f}")
             axes.xaxis.set_major_locator(MaxNLocator(4, symmetric=True))
             axes.yaxis.set_major_locator(MaxNLocator(4, symmetric=True))
             axes.set_xlabel(f"predicted [{unit}]")
@@ -186,7 +186,7 @@ def learning_curves(run: RunFiles, models: Sequence[str]) -> Any:
             bottom.axhline(reference["nrmse"]["mean"], color=look[str(run.baseline)]["color"], linestyle="--", linewidth=1.2, label=str(run.baseline))
         _stages(top, bottom, epoch, stage, run.resolved, model)
         top.set_yscale("log")
-        top.set_title(label(run, model), pad=14)
+        top.set_title(short_label(run, model), pad=14)
         bottom.set_xlabel("epoch")
         bottom.xaxis.set_major_locator(MaxNLocator(integer=True))
     panels[0, 0].set_ylabel("training loss [-]")

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from residnet.evaluation.run_reader import RunFiles
 
@@ -53,7 +54,7 @@ def new_figure(height: float) -> Any:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(WIDTH, height), layout="constrained")
+    figure = Figure(figsize=(WIDTH, height), dpi=DPI, layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 
@@ -66,9 +67,12 @@ def save(figure: Any, path: Path, title: str, caption: str) -> None:
     from PIL import Image
     from PIL.PngImagePlugin import PngInfo
 
-    raw = io.BytesIO()
-    figure.savefig(raw, format="png", dpi=DPI, metadata={"Software": None})
-    picture = Image.open(raw).convert("RGB").quantize(128, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+    figure.canvas.draw()
+    picture = (
+        Image.fromarray(np.asarray(figure.canvas.buffer_rgba()))
+        .convert("RGB")
+        .quantize(128, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+    )
     words = PngInfo()
     words.add_itxt("Title", title)
     words.add_itxt("Description", caption)
@@ -88,20 +92,42 @@ def styles(run: RunFiles) -> dict[str, dict[str, Any]]:
         else:
             place = run.heads.index(model)
             color, line = _HEADS[place % len(_HEADS)][0], _HEADS[(place + place // len(_HEADS)) % len(_HEADS)][1]
-        out[model] = {"color": color, "linestyle": line, "linewidth": 1.4, "label": label(run, model), "zorder": _ORDER.get(kind, 4)}
+        out[model] = {"color": color, "linestyle": line, "linewidth": 1.4, "label": short_label(run, model), "zorder": _ORDER.get(kind, 4)}
     return out
 
 
 def label(run: RunFiles, model: str) -> str:
-    """Name of a model in legends."""
+    """Name of a model in tables."""
     if run.kinds.get(model) == "truth":
         return f"{model} (plant)"
     return f"{model} (selected)" if model == run.selected else model
 
 
-def legend_above(figure: Any, handles: dict[str, Any], columns: int = 5) -> None:
-    """One legend for the whole figure, above its panels."""
-    figure.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=min(columns, max(len(handles), 1)))
+def short_label(run: RunFiles, model: str) -> str:
+    """Name of a model in figures, where a long one would run over its neighbours."""
+    full = label(run, model)
+    return full if len(model) <= 20 else full.replace(model, model[:19] + "…")
+
+
+def legend_above(figure: Any, handles: dict[str, Any]) -> None:
+    """One legend for the whole figure, above its panels, in as many columns as its width holds."""
+    # in points: the sample and its spaces, then the text at 9 pt
+    widths = [48.0 + 5.4 * len(text) for text in handles]
+    columns = max(len(widths), 1)
+    while columns > 1 and _legend_width(widths, columns) > 72.0 * WIDTH - 16.0:
+        columns -= 1
+    figure.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=columns)
+
+
+def _legend_width(widths: list[float], columns: int) -> float:
+    # matplotlib fills a legend column by column
+    lines, longer = divmod(len(widths), columns)
+    total, start = 0.0, 0
+    for column in range(columns):
+        stop = start + lines + (1 if column < longer else 0)
+        total += max(widths[start:stop])
+        start = stop
+    return total
 
 
 def collect(handles: dict[str, Any], axes: Any) -> None:

@@ -12,6 +12,7 @@ from residnet.evaluation.figures_style import MASKED, MEASURED, WIDTH, collect, 
 from residnet.evaluation.run_reader import RunFiles, StoredWindow
 
 MOST_KINDS = 6
+MASKED_LABEL = "masked"
 _DEG = 180.0 / math.pi
 _PANELS = (("surge velocity\nu [m/s]", 1.0), ("sway velocity\nv [m/s]", 1.0), ("yaw rate\nr [deg/s]", _DEG), ("heading\n[deg]", _DEG))
 
@@ -98,7 +99,8 @@ def history(run: RunFiles, window: StoredWindow) -> Any:
     panels[-1].set_xlim(0, time[-1])
     panels[0].set_title(_title(window).replace("\n", ": "))
     figure.align_ylabels(panels)
-    legend_above(figure, handles)
+    # what was measured comes first
+    legend_above(figure, {text: handles[text] for text in sorted(handles, key=lambda text: text == MASKED_LABEL)})
     return figure
 
 
@@ -106,7 +108,7 @@ def shade(axes: Any, time: np.ndarray, usable: np.ndarray) -> None:
     """Grey ground where samples are masked."""
     edges = np.flatnonzero(np.diff(np.concatenate(([True], usable, [True])).astype(int)))
     for i, (begin, end) in enumerate(zip(edges[::2], edges[1::2], strict=True)):
-        extra = {"label": "masked: not scored (u, v)"} if i == 0 else {}
+        extra = {"label": MASKED_LABEL} if i == 0 else {}
         axes.axvspan(time[begin], time[min(end, time.size - 1)], **MASKED, **extra)
 
 

@@ -1,0 +1,153 @@
+"""A tiny run folder with hand-made numbers."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+DEG = 180.0 / math.pi
+MODELS = {"zero": "zero", "baseline": "baseline", "mlp": "head", "plsr": "head", "truth": "truth"}
+# error of each model: rmse of u [m/s], v [m/s], r [rad/s]
+LEVEL = {
+    "zero": (1.2345, 0.2222, 0.2111),
+    "baseline": (0.1000, 0.0500, 0.0200),
+    "mlp": (0.0700, 0.0510, 0.0150),
+    "plsr": (0.0400, 0.0300, 0.0100),
+    "truth": (0.0200, 0.0250, 0.0050),
+}
+KINDS = {"zigzag_01": "zigzag", "zigzag_02": "zigzag", "zigzag_03": "zigzag", "turning_01": "turning"}
+RESOLVED = """task: fit
+name: made
+description: made by hand <script>alert(1)</script>
+data: {kind: simulated, vessel: wam_v_cal, seed: 0, noise: {u: 0.03, v: 0.03, r: 0.0035}}
+signals: {inputs: [n_port, n_stbd], exogenous: [], forces: wam_v_cal}
+baseline: {kind: linear_steady}
+training: {mlp: {one_step: {epochs: 2}, multi_step: [{horizon: 2.0, epochs: 2}]}}
+evaluation:
+  protocols:
+    T30: {kind: windows, length: 30.0, first: 5.0}
+    whole: {kind: manoeuvre, initial: 0.5}
+  selection: whole
+  divergence: 3.0
+"""
+
+
+def row(model: str, split: str, protocol: str, manoeuvre: str = "all", *, factor: float = 1.0, diverged: int = 0) -> dict[str, Any]:
+    """One row of metrics.json."""
+    rmse = {name: factor * value for name, value in zip("uvr", LEVEL[model], strict=True)}
+    mean = (rmse["u"] / 0.5 + rmse["v"] / 0.25 + rmse["r"] / 0.25) / 3
+    return {
+        "model": model,
+        "kind": MODELS[model],
+        "split": split,
+        "protocol": protocol,
+        "manoeuvre": manoeuvre,
+        "windows": 6,
+        "n": 600,
+        "diverged": diverged,
+        "rmse": rmse,
+        "mae": rmse,
+        "nrmse": {"u": rmse["u"] / 0.5, "v": rmse["v"] / 0.25, "r": rmse["r"] / 0.25, "mean": mean},
+        "rmse_ci95": {name: [0.9 * value, 1.1 * value] for name, value in rmse.items()},
+        "nrmse_mean_ci95": [0.9 * mean, 1.1 * mean],
+        "position_error_end": 10 * rmse["u"],
+        "heading_error_end": rmse["r"],
+        "selected": model == "plsr",
+    }
+
+
+def metrics(splits: tuple[str, ...] = ("train", "validation", "test"), models: tuple[str, ...] = tuple(MODELS)) -> dict[str, Any]:
+    """Contents of metrics.json."""
+    rows = []
+    for split in splits:
+        for protocol in ("T30", "whole"):
+            for model in models:
+                rows.append(row(model, split, protocol, factor=0.8 if split == "train" else 1.0))
+                for number, kind in enumerate(("turning", "zigzag")):
+                    rows.append(row(model, split, protocol, kind, factor=1.1 + 0.1 * number))
+    units = {"x": "m", "y": "m", "psi": "rad", "u": "m/s", "v": "m/s", "r": "rad/s"}
+    scales = {"u": 0.5, "v": 0.25, "r": 0.25}
+    return {"schema": "residnet.metrics/1", "run": "made", "channels": units, "scales": scales, "selected": "plsr", "rows": rows}
+
+
+def write_json(path: Path, content: Any) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(content))
+
+
+def write_rollout(folder: Path, log: str, models: tuple[str, ...], size: float) -> None:
+    """One log of 6 s under two protocols; errors are `size` times the levels, constant in time, samples 20..29 masked and off by 9 m/s."""
+    t = np.arange(61) * 0.1
+    usable = (t < 1.95) | (t > 2.95)
+    u, v, r = 1.0 + 0 * t, 0.1 * np.sin(t), 0.2 * np.cos(t)
+    psi = 0.2 * np.sin(t)
+    x, y = np.cumsum(0.1 * u * np.cos(psi)), np.cumsum(0.1 * u * np.sin(psi))
+    parts = []
+    for protocol in ("T30", "whole"):
+        for model in models:
+            eu, ev, er = (size * level for level in LEVEL[model])
+            parts.append(
+                pd.DataFrame(
+                    {
+                        "protocol": protocol,
+                        "model": model,
+                        "window": 0,
+                        "t": t,
+                        "usable": usable,
+                        "diverged": False,
+                        **{"u": np.where(usable, u, u + 9), "v": v, "r": r, "psi": psi, "x": x, "y": y},
+                        **{"u_hat": u + eu, "v_hat": v + ev, "r_hat": r + er, "psi_hat": psi + er * t, "x_hat": x + eu * t, "y_hat": y + ev * t},
+                    }
+                )
+            )
+    folder.mkdir(parents=True, exist_ok=True)
+    pd.concat(parts).to_parquet(folder / f"{log}.parquet")
+
+
+def curve() -> list[dict[str, float]]:
+    """A learning curve of two stages."""
+    return [{"epoch": float(e), "stage": float(e > 1), "loss": 1.0 / (1 + e) ** 2, "validation": 0.2 - 0.02 * e} for e in range(4)]
+
+
+def residuals() -> pd.DataFrame:
+    """Contents of residuals.parquet: `plsr` explains all of it, `mlp` nothing."""
+    random = np.random.default_rng(0)
+    parts = []
+    for model in ("plsr", "mlp"):
+        for axis in ("u_dot", "v_dot", "r_dot"):
+            target = random.normal(0, 0.1, 400)
+            parts.append(pd.DataFrame({"model": model, "axis": axis, "target": target, "predicted": target if model == "plsr" else 0 * target}))
+    return pd.concat(parts)
+
+
+def made_run(run: Path, *, split: str = "test") -> Path:
+    """The whole folder, but for models that can be loaded."""
+    write_json(run / "metrics.json", metrics())
+    (run / "resolved.yaml").write_text(RESOLVED)
+    provenance = {"residnet": "9.8.7", "git": "abc123", "seed": 5, "inputs": {"logs/a.csv": "f00d"}, "packages": {"torch": "2.13.0"}, "seconds": 12.3}
+    write_json(run / "provenance.json", provenance)
+    entry = {
+        "seconds": 60.0,
+        "samples": 600,
+        "usable": 0.975,
+        "learned_from": 0.95,
+        "masked": {"frozen": 0.025},
+        "largest": {"u": 1.5, "v": 0.2, "r": 0.1},
+    }
+    write_json(run / "data_quality.json", [{"log": log, "split": split, "manoeuvre": kind} | entry for log, kind in KINDS.items()])
+    for number, log in enumerate(KINDS):
+        write_rollout(run / "rollouts" / split, log, tuple(MODELS), 0.5 + 0.5 * number)
+    coefficients = [
+        {"axis": "u_dot", "term": "u", "value": -0.91393, "standard_error": 0.0762},
+        {"axis": "v_dot", "term": "tau_n", "value": 1.0e-5, "standard_error": 5.8e-5},
+        {"axis": "r_dot", "term": "v|v|", "value": 0.5, "standard_error": 0.1},
+    ]
+    write_json(run / "models" / "baseline" / "fit.json", {"coefficients": coefficients, "samples": 2400, "seconds": 0.01})
+    write_json(run / "models" / "plsr" / "fit.json", {"order": 7, "terms": 23, "seconds": 0.1, "validation": 0.1})
+    write_json(run / "models" / "mlp" / "fit.json", {"parameters": 1347, "epochs": 4, "seconds": 23.0, "validation": 0.14, "curve": curve()})
+    return run
