@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, final
 
 import torch
 from pydantic import Field, model_validator
@@ -31,6 +31,7 @@ class Coefficient:
     error: float
 
 
+@final
 class RegressorBaseline(Baseline):
     """nu_dot [..., 3] = theta [3, J] phi(z) [..., J]; a term that an axis does not have keeps a zero."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, final
 
 import torch
 from torch import Tensor
@@ -14,6 +14,7 @@ from residnet.core.config import Config
 from residnet.core.samples import Samples
 
 
+@final
 class StillBaseline(Baseline):
     """nu_dot = 0."""
 

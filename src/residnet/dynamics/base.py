@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from typing import Literal
 
 import torch
@@ -20,7 +21,7 @@ _TABLEAUX: dict[str, tuple[list[float], list[float]]] = {
 }
 
 
-class Dynamics(nn.Module):
+class Dynamics(nn.Module, ABC):
     """A vessel model in discrete time: `step(x, w, s) -> (x', s')` at a fixed dt, inputs held over the step.
 
     Subclasses give `rate(x, p, rho)`, the derivative of the state at a stage, and `step`. All is pure tensor code that
@@ -35,13 +36,13 @@ class Dynamics(nn.Module):
         self.semi_implicit = integrator == "semi_implicit_euler"
         self.n_state = 0
 
+    @abstractmethod
     def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
         """Derivative of the state [B, nx] with what a step holds fixed, p [B, k] and rho [B, n]."""
-        raise NotImplementedError
 
+    @abstractmethod
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """State [B, nx] and memory [B, n_state] one step later under inputs w [B, m]."""
-        raise NotImplementedError
 
     def initial_state(self, batch: int) -> Tensor:
         """Memory [batch, n_state] without a past: zeros."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import final
+
 import torch
 from torch import Tensor
 
@@ -11,6 +13,7 @@ from residnet.heads.base import ResidualHead
 from residnet.physics.signals import Signals
 
 
+@final
 class HybridDynamics(Dynamics):
     """State x [B, 6] = (x, y, psi, u, v, r); the head is evaluated once per step and held over the integrator's stages."""
 

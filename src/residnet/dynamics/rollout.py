@@ -6,13 +6,16 @@ whose source says so stop there: their state is held from that sample on.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from typing import final
+
 import torch
 from torch import Tensor, nn
 
 from residnet.dynamics.base import Dynamics
 
 
-class Source(nn.Module):
+class Source(nn.Module, ABC):
     """Where the inputs of a rollout come from."""
 
     def __init__(self) -> None:
@@ -23,15 +26,16 @@ class Source(nn.Module):
         """Memory of the source [B, k] at the start, from the initial state x [B, nx]."""
         return x[:, :0]
 
+    @abstractmethod
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Inputs [B, m] for step k and the new memory, from the state x [B, nx] and the inputs given for that step, w [B, m]."""
-        raise NotImplementedError
 
     def finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
         """[B] bool: rows that stop at this state; asked only where `may_stop`."""
         return torch.zeros(x.shape[0], dtype=torch.bool, device=x.device)
 
 
+@final
 class Playback(Source):
     """Gives back the inputs as they are."""
 

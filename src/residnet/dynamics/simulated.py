@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import final
+
 from torch import Tensor
 
 from residnet.dynamics.base import Dynamics
 from residnet.physics.plant import DifferentialThrustVessel
 
 
+@final
 class PlantDynamics(Dynamics):
     """Steps a plant's hull with held actuators by RK4, then moves the actuators (the order of the golden runs).
 

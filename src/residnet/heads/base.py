@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
 import torch
@@ -14,7 +15,7 @@ from residnet.core.names import nearest
 from residnet.core.samples import Samples
 
 
-class ResidualHead(nn.Module):
+class ResidualHead(nn.Module, ABC):
     """What is learned on top of the baseline: rho [B, 3] in m/s^2, m/s^2, rad/s^2 from channels z [B, nz] and memory s [B, n_state].
 
     A memoryless head has n_state = 0. Every head is scriptable, however its parameters were found.
@@ -24,9 +25,9 @@ class ResidualHead(nn.Module):
         super().__init__()
         self.n_state = 0
 
+    @abstractmethod
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Residual [B, 3] at channels z [B, nz], and the memory for the next step [B, n_state]; called once per step."""
-        raise NotImplementedError
 
     def sequence(self, z: Tensor) -> Tensor:
         """Residuals [B, T, 3] along measured channels [B, T, nz], from an empty memory (teacher forcing)."""
@@ -43,13 +44,13 @@ class ResidualHead(nn.Module):
 class ClosedFormHead(ResidualHead):
     """A head whose parameters come from a closed-form solution."""
 
+    @abstractmethod
     def solve(self, samples: Samples) -> dict[str, object]:
         """Fill the buffers from samples whose target is the residual [N, 3]; returns what there is to say about the fit.
 
         Raises:
             FitError: where the data do not determine the parameters.
         """
-        raise NotImplementedError
 
 
 class FeatureConfig(Config):

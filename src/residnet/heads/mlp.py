@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, final
 
 import torch
 from pydantic import Field
@@ -28,6 +28,7 @@ class MlpConfig(FeatureConfig):
         return MlpHead(self, names)
 
 
+@final
 class MlpHead(ResidualHead):
     """rho = spread * net(features)."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, final
 
 import torch
 from pydantic import Field
@@ -69,6 +69,7 @@ class PlsrConfig(BasisConfig):
         return PlsrHead(self, names)
 
 
+@final
 class PlsrHead(BasisHead):
     """Basis functions with coefficients by PLSR."""
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import final
+
 import torch
 from torch import Tensor
 
 from residnet.heads.base import ResidualHead
 
 
+@final
 class ZeroHead(ResidualHead):
     """rho = 0: the baseline alone."""
 

@@ -10,10 +10,10 @@ from pydantic import Field, model_validator
 from torch import Tensor
 
 from residnet.core.config import Config, Seconds
-from residnet.manoeuvres.base import Manoeuvre, Range
+from residnet.manoeuvres.base import Manoeuvre, Range, Scheduled
 
 
-class AccelerationDeceleration(Manoeuvre):
+class AccelerationDeceleration(Scheduled):
     """Drive levels, each held from its time on; the steer is zero."""
 
     kind: Literal["acceleration_deceleration"] = "acceleration_deceleration"

@@ -6,8 +6,9 @@ loop or by the heading that it sees. The vessel turns the two into its own comma
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Literal
+from typing import Literal, final
 
 import torch
 from pydantic import Field
@@ -20,6 +21,7 @@ Demand = Callable[[Tensor, Tensor], Tensor]
 """Turns drive [...] and steer [...] into commands [..., c], the first c columns of the inputs."""
 
 
+@final
 class ScheduleSource(Source):
     """Open-loop demands given in advance."""
 
@@ -33,6 +35,7 @@ class ScheduleSource(Source):
         return torch.cat((command, w[:, command.shape[-1] :]), dim=-1), memory
 
 
+@final
 class StackedSource(Source):
     """Different manoeuvres side by side in one batch: each source drives its own rows."""
 
@@ -58,24 +61,33 @@ class StackedSource(Source):
         return torch.cat(inputs), torch.cat(memories)
 
 
-class Manoeuvre(Config):
+class Manoeuvre(Config, ABC):
     """One manoeuvre of normalised demands; `kind` names it in logs and metrics."""
 
     kind: str
 
+    @classmethod
+    @abstractmethod
+    def source(cls, manoeuvres: Sequence[Manoeuvre], demand: Demand, t: Tensor) -> Source:
+        """The source that flies several manoeuvres of this kind side by side; t [T] are the times of the steps."""
+
+
+class Scheduled(Manoeuvre):
+    """An open-loop manoeuvre: its demands are known in advance."""
+
+    @abstractmethod
     def demands(self, t: Tensor) -> tuple[Tensor, Tensor]:
-        """Open-loop drive and steer [T] at times t [T] in s."""
-        raise NotImplementedError
+        """Drive and steer [T] at times t [T] in s."""
 
     @classmethod
     def source(cls, manoeuvres: Sequence[Manoeuvre], demand: Demand, t: Tensor) -> Source:
-        """The source that flies several manoeuvres of this kind side by side; t [T] are the times of the steps."""
-        pairs = [manoeuvre.demands(t) for manoeuvre in manoeuvres]
+        """Playback of the demands."""
+        pairs = [manoeuvre.demands(t) for manoeuvre in manoeuvres if isinstance(manoeuvre, Scheduled)]
         return ScheduleSource(torch.stack([d for d, _ in pairs]), torch.stack([s for _, s in pairs]), demand)
 
 
-class Steering(Manoeuvre):
-    """A manoeuvre that holds the drive and steers from `start` on."""
+class Steering(Config):
+    """What manoeuvres share that hold the drive and steer from `start` on."""
 
     drive: float = Field(ge=-1, le=1)
     steer: float = Field(ge=-1, le=1)

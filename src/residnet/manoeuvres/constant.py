@@ -11,10 +11,10 @@ from pydantic import Field
 from torch import Tensor
 
 from residnet.core.config import Config
-from residnet.manoeuvres.base import Manoeuvre
+from residnet.manoeuvres.base import Manoeuvre, Scheduled
 
 
-class ConstantInput(Manoeuvre):
+class ConstantInput(Scheduled):
     """Drive and steer held from the start."""
 
     kind: Literal["constant"] = "constant"

@@ -10,12 +10,12 @@ from pydantic import Field
 from torch import Tensor
 
 from residnet.core.config import Config, Seconds
-from residnet.manoeuvres.base import Manoeuvre, Range, Steering
+from residnet.manoeuvres.base import Manoeuvre, Range, Scheduled, Steering
 
 _PATTERN = (1.0, 1.0, 1.0, -1.0, -1.0, 1.0, -1.0)
 
 
-class ThreeTwoOneOne(Steering):
+class ThreeTwoOneOne(Steering, Scheduled):
     """The pattern in units of `unit` seconds, once or again and again; zero steer after it."""
 
     kind: Literal["three_two_one_one"] = "three_two_one_one"

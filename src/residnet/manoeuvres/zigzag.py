@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, final
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ from residnet.dynamics.rollout import Source
 from residnet.manoeuvres.base import Demand, Manoeuvre, Range, Side, Steering
 
 
-class Zigzag(Steering):
+class Zigzag(Steering, Manoeuvre):
     """Steer to one side until the heading has changed by `heading`, then to the other, and so on."""
 
     kind: Literal["zigzag"] = "zigzag"
@@ -29,6 +29,7 @@ class Zigzag(Steering):
         return ZigzagSource(chosen, demand, t)
 
 
+@final
 class ZigzagSource(Source):
     """Memory [B, 2]: side of the command (+1 starboard, -1 port) and heading at the start."""
 

@@ -63,7 +63,10 @@ def draw(run: Path) -> list[Path]:
         figures = {
             13: ("Simplified steering models in a zigzag", _histories([(zigzag, "v"), (zigzag, "r")], _SIMPLE)),
             14: ("Surge in an acceleration-deceleration test", _histories([(speed, "u")], _LEARNED)),
-            15: ("Sway and yaw rate in a zigzag and a 3-2-1-1 test", _histories([(zigzag, "v"), (zigzag, "r"), (steps, "v"), (steps, "r")], _LEARNED)),
+            15: (
+                "Sway and yaw rate in a zigzag and a 3-2-1-1 test",
+                _histories([(zigzag, "v"), (zigzag, "r"), (steps, "v"), (steps, "r")], _LEARNED),
+            ),
             16: ("Errors of the speed models", _bars(files, ("u",), "speed", _LEARNED)),
             17: ("Errors of the steering models", _bars(files, ("v", "r"), "steering", (*_SIMPLE, *_LEARNED[1:]))),
             18: ("A zigzag: track, yaw rate and sway velocity", _track(zigzag, (*_SIMPLE, "lstm"))),
@@ -71,7 +74,8 @@ def draw(run: Path) -> list[Path]:
         out = []
         for number, (title, figure) in figures.items():
             path = run / "figures" / f"woo2018_{number}.png"
-            save(figure, path, f"Figure {number} of document 003: {title}", "Unseen manoeuvres unless it says otherwise; simulated WAM-V, sensor noise only.")
+            caption = "Unseen manoeuvres unless it says otherwise; simulated WAM-V, sensor noise only."
+            save(figure, path, f"Figure {number} of document 003: {title}", caption)
             out.append(path)
     return out
 
