@@ -87,6 +87,13 @@ def test_roles_have_fixed_looks_and_no_two_models_share_one(run: Path) -> None:
     assert len({(style["color"], str(style["linestyle"])) for style in look.values()}) == len(look)
 
 
+def test_lines_keep_their_colours(run: Path) -> None:
+    with Image.open(run / "figures" / "03_history_zigzag.png") as picture:
+        pixels = np.asarray(picture.convert("RGB")).astype(int).reshape(-1, 3)
+    for color in ((0, 114, 178), (230, 159, 0), (0, 158, 115), (0, 0, 0)):
+        assert (np.abs(pixels - color).max(1) < 12).sum() > 200, color
+
+
 def test_many_heads_keep_distinct_looks(tmp_path: Path) -> None:
     content = metrics(("test",), ("plsr",))
     content["rows"] = [content["rows"][0] | {"model": f"head{i}", "selected": False} for i in range(12)]

@@ -62,7 +62,8 @@ def new_figure(height: float) -> Any:
 def save(figure: Any, path: Path, title: str, caption: str) -> None:
     """Write a PNG that carries its title and caption as text.
 
-    Its palette of 128 colours takes a third of the bytes and shows no difference in line drawings.
+    Its palette of 128 colours takes a third of the bytes; chosen by coverage, it keeps the thin lines' own colours, which a
+    palette chosen by frequency would mix.
     """
     from PIL import Image
     from PIL.PngImagePlugin import PngInfo
@@ -71,7 +72,7 @@ def save(figure: Any, path: Path, title: str, caption: str) -> None:
     picture = (
         Image.fromarray(np.asarray(figure.canvas.buffer_rgba()))
         .convert("RGB")
-        .quantize(128, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+        .quantize(128, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
     )
     words = PngInfo()
     words.add_itxt("Title", title)
@@ -112,9 +113,9 @@ def short_label(run: RunFiles, model: str) -> str:
 def legend_above(figure: Any, handles: dict[str, Any]) -> None:
     """One legend for the whole figure, above its panels, in as many columns as its width holds."""
     # in points: the sample and its spaces, then the text at 9 pt
-    widths = [48.0 + 5.4 * len(text) for text in handles]
+    widths = [46.0 + 4.9 * len(text) for text in handles]
     columns = max(len(widths), 1)
-    while columns > 1 and _legend_width(widths, columns) > 72.0 * WIDTH - 16.0:
+    while columns > 1 and _legend_width(widths, columns) > 72.0 * WIDTH:
         columns -= 1
     figure.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=columns)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -38,6 +39,7 @@ def write_report(run: Path) -> Path:
     findings = check_run(run, divergence=divergence)
     loader = FileSystemLoader(Path(__file__).parent)
     environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment.filters["minus"] = _minus
     text = environment.get_template(_TEMPLATE).render(_context(files, findings, read_figures(run)))
     path = run / "report.html"
     partial = path.with_name(path.name + ".partial")
@@ -78,6 +80,11 @@ def _context(run: RunFiles, findings: Sequence[Finding], figures: Sequence[Figur
 
 def _by_model(findings: Sequence[Finding]) -> list[tuple[str, list[Finding]]]:
     return [(model, [f for f in findings if f.model == model]) for model in dict.fromkeys(f.model for f in findings)]
+
+
+def _minus(text: str) -> str:
+    """Hyphens before numbers as minus signs."""
+    return re.sub(r"(?<![\w-])-(?=\d)", "−", text)
 
 
 def _embedded(path: Path) -> str:
