@@ -79,6 +79,18 @@ class WindowStore:
             raise DataError(f"no training log holds a window of {length} samples without a break; shorten the horizon or give longer logs")
         return rows
 
+    def beginnings(self, length: int, lead: int) -> Tensor:
+        """Rows `lead` samples after the beginning of a stretch at which a window of `length` samples may start.
+
+        Raises:
+            DataError: where no stretch is long enough.
+        """
+        rows = self.starts(length)
+        rows = rows[self.depth[rows] == lead]
+        if rows.numel() == 0:
+            raise DataError(f"no training log holds a window of {length} samples {lead} samples after its beginning; shorten the horizon or leave out beginnings")
+        return rows
+
     def take(self, values: Tensor, starts: Tensor, length: int) -> Tensor:
         """Windows [B, length, ...] of one of the tensors, from rows `starts` [B] on."""
         index = starts[:, None] + torch.arange(length)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, final
 
 import torch
 from pydantic import Field, model_validator
@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from residnet.core.samples import Samples
 from residnet.heads.base import FeatureConfig, Features, ResidualHead, ResidualScale
+from residnet.heads.mirror import MirroredHead
 
 
 class LstmConfig(FeatureConfig):
@@ -21,19 +22,24 @@ class LstmConfig(FeatureConfig):
         hidden_size: units.
         readout: units of one tanh layer between (memory, features) and the residual; 0 reads the memory alone by a linear map, as
             document 003 does.
+        memory: features that the memory sees; empty for all. A memory of the commands alone is the same in free run as along measurements:
+            it can hold the state of an actuator, but no measured acceleration. Needs `readout`, which sees all features.
         activation: of block input and output; the document uses softsign in place of the usual tanh.
         dropout: share of hidden outputs dropped before the readout while training.
         per_axis: one network for each of surge, sway, yaw, as the document has it.
         axis_features: channels of each axis' network, where they differ; needs `per_axis`.
+        mirror: make the residual mirror-symmetric between port and starboard by construction.
     """
 
     kind: Literal["lstm"] = "lstm"
     hidden_size: int = Field(default=100, ge=1)
     readout: int = Field(default=0, ge=0)
+    memory: tuple[str, ...] = ()
     activation: Literal["tanh", "softsign"] = "tanh"
     dropout: float = Field(default=0.0, ge=0, lt=1)
     per_axis: bool = False
     axis_features: dict[Literal["u", "v", "r"], tuple[str, ...]] | None = None
+    mirror: bool = False
 
     @model_validator(mode="after")
     def _axes(self) -> LstmConfig:
@@ -42,11 +48,14 @@ class LstmConfig(FeatureConfig):
                 raise ValueError("axis_features needs per_axis: true")
             if set(self.axis_features) != {"u", "v", "r"}:
                 raise ValueError(f"axis_features needs all of u, v, r; given {sorted(self.axis_features)}")
+        if self.memory and not self.readout:
+            raise ValueError("memory needs a readout layer, or the other features are never seen; set readout")
         return self
 
-    def build(self, names: Sequence[str]) -> LstmHead:
+    def build(self, names: Sequence[str]) -> ResidualHead:
         """The module for channels `names`."""
-        return LstmHead(self, names)
+        head = LstmHead(self, names)
+        return MirroredHead(head, names) if self.mirror else head
 
     def networks(self, names: Sequence[str]) -> list[tuple[tuple[str, ...], int]]:
         """(features, number of outputs) of each network."""
@@ -116,7 +125,11 @@ class LstmNetwork(nn.Module):
     def __init__(self, config: LstmConfig, chosen: Sequence[str], outputs: int, names: Sequence[str]) -> None:
         super().__init__()
         self.features = Features(chosen, names, config.margin)
-        self.core = LstmCore(self.features.count, config.hidden_size, config.activation == "softsign")
+        seen = FeatureConfig(features=config.memory).chosen(chosen)
+        self.partial = len(config.memory) > 0
+        self.register_buffer("seen", torch.tensor([list(chosen).index(name) for name in seen], dtype=torch.long), persistent=False)
+        self.seen: Tensor
+        self.core = LstmCore(len(seen), config.hidden_size, config.activation == "softsign")
         self.dropout = nn.Dropout(config.dropout)
         self.skip = config.readout > 0
         out = nn.Linear(config.readout or config.hidden_size, outputs)
@@ -126,6 +139,10 @@ class LstmNetwork(nn.Module):
         mixer = nn.Sequential(nn.Linear(config.hidden_size + self.features.count, config.readout), nn.Tanh()) if self.skip else nn.Sequential()
         self.readout = nn.Sequential(*mixer, out)
 
+    def remembered(self, f: Tensor) -> Tensor:
+        """The features that the memory sees."""
+        return f.index_select(-1, self.seen) if self.partial else f
+
     def read(self, h: Tensor, f: Tensor) -> Tensor:
         """Scaled residual [..., outputs] from LSTM outputs [..., H] and features [..., F]."""
         h = self.dropout(h)
@@ -134,16 +151,17 @@ class LstmNetwork(nn.Module):
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """One step: channels [B, nz], memory [B, 2H] -> [B, outputs], new memory."""
         f = self.features(z)
-        h, s = self.core(f, s)
+        h, s = self.core(self.remembered(f), s)
         return self.read(h, f), s
 
     def sequence(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """Channels [B, T, nz] -> [B, T, outputs] and the memory after them."""
         f = self.features(z)
-        h, s = self.core.sequence(f)
+        h, s = self.core.sequence(self.remembered(f))
         return self.read(h, f), s
 
 
+@final
 class LstmHead(ResidualHead):
     """Residual with memory; s packs (h, c) of each network."""
 
@@ -161,6 +179,10 @@ class LstmHead(ResidualHead):
         for network in self.networks:
             network.features.calibrate(samples)
         self.scale.calibrate(samples)
+
+    def spread(self) -> Tensor:
+        """Spread of the residual on the training samples, [3]."""
+        return self.scale.spread
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Residual [B, 3] at channels z [B, nz] and the memory for the next step."""

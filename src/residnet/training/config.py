@@ -15,7 +15,8 @@ class OneStep(Config):
         window: length of a window; the loss counts its part after `washout`, which fills a memory first.
         washout: see above.
         batch: windows per batch.
-        learning_rate: of Adam.
+        learning_rate: of Adam; it falls to `final` of it over the stage, along a cosine.
+        final: share of the learning rate at the stage's end.
     """
 
     epochs: int = Field(default=10, ge=0)
@@ -23,6 +24,7 @@ class OneStep(Config):
     washout: Seconds = Field(default=0.0, ge=0)
     batch: int = Field(default=64, ge=1)
     learning_rate: float = Field(default=2e-3, gt=0)
+    final: float = Field(default=1.0, gt=0, le=1)
 
     @model_validator(mode="after")
     def _washout(self) -> OneStep:
@@ -49,6 +51,21 @@ class MultiStep(Config):
     final: float = Field(default=1.0, gt=0, le=1)
 
 
+class Beginnings(Config):
+    """Windows at the beginning of a stretch, where there is hardly a past: whole manoeuvres are run from there.
+
+    One-step windows start with the stretch and are scored from their first sample on; rollouts start after `initial`, from the mean
+    velocities of that time, which alone warms up the memory.
+
+    Attributes:
+        share: of each batch.
+        initial: see above.
+    """
+
+    share: float = Field(default=0.25, gt=0, lt=1)
+    initial: Seconds = Field(default=0.5, gt=0)
+
+
 class TrainingConfig(Config):
     """Stages in order: one-step, then each of `multi_step` (a curriculum of horizons).
 
@@ -57,7 +74,10 @@ class TrainingConfig(Config):
         multi_step: free-run stages.
         steps: batches per epoch.
         history: measured past that warms up the memory before a rollout.
+        beginnings: windows at the beginning of stretches in every batch; null for no more than chance brings.
         start_noise: standard deviation of the noise on the initial velocities of rollouts, in units of the metrics' scales.
+        robust: 0 for the mean square of free-run errors; else windows whose error (in units of the scales) is far above this count by their
+            error and not by its square.
         gradient_clip: largest norm of the gradient.
         weight_decay: of AdamW, on matrices only.
         average: decay of the exponential average of the weights that is validated and kept; 0 for none.
@@ -70,7 +90,9 @@ class TrainingConfig(Config):
     multi_step: tuple[MultiStep, ...] = ()
     steps: int = Field(default=25, ge=1)
     history: Seconds = Field(default=0.5, ge=0)
+    beginnings: Beginnings | None = None
     start_noise: float = Field(default=0.0, ge=0)
+    robust: float = Field(default=0.0, ge=0)
     gradient_clip: float = Field(default=1.0, gt=0)
     weight_decay: float = Field(default=0.0, ge=0)
     average: float = Field(default=0.0, ge=0, lt=1)

@@ -9,7 +9,7 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 
 
-def one_step_loss(model: HybridDynamics, y: Tensor, w: Tensor, nu_dot: Tensor, good: Tensor, spread: Tensor, washout: int) -> Tensor:
+def one_step_loss(model: HybridDynamics, y: Tensor, w: Tensor, nu_dot: Tensor, good: Tensor, spread: Tensor) -> Tensor:
     """Mean squared error of accelerations along measured windows, in units of the residual's spread (document 003 eq. (20)).
 
     Args:
@@ -17,18 +17,17 @@ def one_step_loss(model: HybridDynamics, y: Tensor, w: Tensor, nu_dot: Tensor, g
         y: smoothed states [B, T, 6].
         w: inputs [B, T, m].
         nu_dot: accelerations [B, T, 3].
-        good: samples whose acceleration is known [B, T].
+        good: samples that count: acceleration known, memory filled [B, T].
         spread: of the residual, [3].
-        washout: samples at the start of each window that only fill the memory.
     """
     z = model.signals(y, model.signals.prepare(w))
-    error = (nu_dot - model.baseline(z) - model.head.sequence(z))[:, washout:] / spread
-    weight = good[:, washout:].to(error.dtype).unsqueeze(-1)
+    error = (nu_dot - model.baseline(z) - model.head.sequence(z)) / spread
+    weight = good.to(error.dtype).unsqueeze(-1)
     return (error.square() * weight).sum() / (3.0 * weight.sum()).clamp(min=1.0)
 
 
-def rollout_loss(rollout: Rollout, x0: Tensor, w: Tensor, s: Tensor, y: Tensor, usable: Tensor, scales: Tensor) -> Tensor:
-    """Mean squared error of free-run velocities, in units of the metrics' scales.
+def rollout_loss(rollout: Rollout, x0: Tensor, w: Tensor, s: Tensor, y: Tensor, usable: Tensor, scales: Tensor, robust: float) -> Tensor:
+    """Error of free-run velocities, in units of the metrics' scales: their mean square, or the mean over windows of their root mean square.
 
     Args:
         rollout: the free run of the model.
@@ -38,9 +37,13 @@ def rollout_loss(rollout: Rollout, x0: Tensor, w: Tensor, s: Tensor, y: Tensor, 
         y: measured states after each step [B, T, 6].
         usable: measured samples that may be scored [B, T].
         scales: [3].
+        robust: 0 for the mean square; else windows count by sqrt(mean square + robust^2), as the metrics do, so that few bad ones do not rule.
     """
     states, _, _ = rollout(x0, w, s)
     error = (states[:, 1:, 3:6] - y[:, :, 3:6]) / scales
     weight = usable.to(error.dtype).unsqueeze(-1)
+    if robust > 0:
+        square = (error.square() * weight).sum((1, 2)) / (3.0 * weight.sum((1, 2))).clamp(min=1.0)
+        return torch.sqrt(square + robust**2).mean()
     # a rollout that runs away must pull back, not drown the batch
     return (torch.nn.functional.huber_loss(error, torch.zeros_like(error), reduction="none", delta=5.0) * 2.0 * weight).sum() / (3.0 * weight.sum())

@@ -41,7 +41,7 @@ class HeadTraining(L.LightningModule):
         self.without_gain = 0
         self.stopped = False
         self.history: list[dict[str, float]] = []
-        self.batches = [WindowBatches(store.starts(length), batch, config.steps) for length, batch in self._stages()]
+        self.batches = [self._batches(stage, length, batch) for stage, (length, batch) in enumerate(self._stages())]
 
     @property
     def epoch(self) -> int:
@@ -51,6 +51,15 @@ class HeadTraining(L.LightningModule):
     def _stages(self) -> list[tuple[int, int]]:
         dt, config = self.model.dt, self.settings
         return [(round(config.one_step.window / dt), config.one_step.batch)] + [(round(s.horizon / dt) + 1, s.batch) for s in config.multi_step]
+
+    def _batches(self, stage: int, length: int, batch: int) -> list[WindowBatches]:
+        """Where the windows of a stage's batches come from: anywhere, then the beginnings of stretches."""
+        own, steps = self.settings.beginnings, self.settings.steps
+        if own is None:
+            return [WindowBatches(self.store.starts(length), batch, steps)]
+        few = min(max(round(own.share * batch), 1), batch - 1) if batch > 1 else 0
+        begins = self.store.beginnings(length, 0 if stage == 0 else round(own.initial / self.model.dt))
+        return [WindowBatches(self.store.starts(length), batch - few, steps), WindowBatches(begins, few, steps)]
 
     def train_dataloader(self) -> EpochBatches:
         """Window starts [batch], `steps` times an epoch."""
@@ -71,12 +80,9 @@ class HeadTraining(L.LightningModule):
         """Seed the epoch and set the stage's learning rate."""
         torch.manual_seed((self.seed * 7_919 + self.epoch) % (2**63))
         stage, epoch = self.settings.stage(self.epoch)
-        if stage == 0:
-            rate = self.settings.one_step.learning_rate
-        else:
-            own = self.settings.multi_step[stage - 1]
-            progress = 0.5 * (1 - math.cos(math.pi * epoch / max(own.epochs - 1, 1)))
-            rate = own.learning_rate * (1 - progress * (1 - own.final))
+        own = self.settings.one_step if stage == 0 else self.settings.multi_step[stage - 1]
+        progress = 0.5 * (1 - math.cos(math.pi * epoch / max(own.epochs - 1, 1)))
+        rate = own.learning_rate * (1 - progress * (1 - own.final))
         for parameter in self.model.baseline.parameters():
             parameter.requires_grad_(self.settings.refit_baseline and stage > 0)
         for group in self.trainer.optimizers[0].param_groups:
@@ -86,23 +92,37 @@ class HeadTraining(L.LightningModule):
         """Loss of one batch of windows."""
         stage, _ = self.settings.stage(self.epoch)
         length, _ = self._stages()[stage]
-        take = self.store.take
-        if stage == 0:
-            washout = round(self.settings.one_step.washout / self.model.dt)
-            y, w = take(self.store.smooth, starts, length), take(self.store.w, starts, length)
-            spread: Tensor = self.model.head.scale.spread.to(y.dtype)  # type: ignore[union-attr, assignment]
-            loss = one_step_loss(self.model, y, w, take(self.store.nu_dot, starts, length), take(self.store.good, starts, length), spread, washout)
-        else:
-            s = self.model.warmup(*self.store.history(starts, round(self.settings.history / self.model.dt)))
-            x0 = self.store.smooth[starts]
-            if self.settings.start_noise > 0:
-                noise = self.settings.start_noise * self.scales * torch.randn(len(starts), 3, dtype=x0.dtype)
-                x0 = torch.cat((x0[:, :3], x0[:, 3:] + noise), dim=1)
-            w = take(self.store.w, starts, length - 1)
-            y, usable = (take(part, starts + 1, length - 1) for part in (self.store.y, self.store.usable))
-            loss = rollout_loss(self.rollout, x0, w, s, y, usable, self.scales)
+        loss = self._one_step(starts, length) if stage == 0 else self._multi_step(starts, length, self.batches[stage])
         self._losses.append(float(loss.detach()))
         return loss
+
+    def _one_step(self, starts: Tensor, length: int) -> Tensor:
+        take = self.store.take
+        washout = torch.full_like(starts, round(self.settings.one_step.washout / self.model.dt))
+        if self.settings.beginnings is not None:
+            washout[self.store.depth[starts] == 0] = 0
+        counted = take(self.store.good, starts, length) & (torch.arange(length) >= washout[:, None])
+        y, w = take(self.store.smooth, starts, length), take(self.store.w, starts, length)
+        spread = self.model.head.spread().to(y.dtype)
+        return one_step_loss(self.model, y, w, take(self.store.nu_dot, starts, length), counted, spread)
+
+    def _multi_step(self, starts: Tensor, length: int, sources: list[WindowBatches]) -> Tensor:
+        take, dt = self.store.take, self.model.dt
+        x0 = self.store.smooth[starts]
+        own = self.settings.beginnings
+        parts = starts.split([source.batch for source in sources])
+        memories = [self.model.warmup(*self.store.history(parts[0], round(self.settings.history / dt)))]
+        if own is not None:
+            past, w_past = self.store.history(parts[1], round(own.initial / dt))
+            memories.append(self.model.warmup(past, w_past))
+            begun = torch.cat((x0[len(parts[0]) :, :3], past[:, :, 3:].mean(1)), dim=1)
+            x0 = torch.cat((x0[: len(parts[0])], begun))
+        if self.settings.start_noise > 0:
+            noise = self.settings.start_noise * self.scales * torch.randn(len(starts), 3, dtype=x0.dtype)
+            x0 = torch.cat((x0[:, :3], x0[:, 3:] + noise), dim=1)
+        w, y = take(self.store.w, starts, length - 1), take(self.store.y, starts + 1, length - 1)
+        usable = take(self.store.usable, starts + 1, length - 1)
+        return rollout_loss(self.rollout, x0, w, torch.cat(memories), y, usable, self.scales, self.settings.robust)
 
     def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Move the averaged weights."""
@@ -181,4 +201,5 @@ class EpochBatches:
     def __iter__(self) -> Iterator[Tensor]:
         epoch = self.module.epoch
         stage, _ = self.module.settings.stage(epoch)
-        return iter(self.module.batches[stage].epoch(self.module.seed, epoch))
+        drawn = [source.epoch(self.module.seed, epoch) for source in self.module.batches[stage]]
+        return iter(torch.cat(drawn, dim=1))
