@@ -40,6 +40,10 @@ class ResidualHead(nn.Module, ABC):
     def calibrate(self, samples: Samples) -> None:
         """Take scales and ranges from the training samples; called once, before anything is fitted."""
 
+    def spread(self) -> Tensor:
+        """Spread of the residual on the training samples, [3], float64: what a one-step loss is measured in; ones where a head keeps none."""
+        return torch.ones(3, dtype=torch.float64)
+
 
 class ClosedFormHead(ResidualHead):
     """A head whose parameters come from a closed-form solution."""

@@ -11,21 +11,31 @@ from torch import Tensor, nn
 
 from residnet.core.samples import Samples
 from residnet.heads.base import FeatureConfig, Features, ResidualHead, ResidualScale
+from residnet.heads.mirror import MirroredHead
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {"tanh": nn.Tanh, "silu": nn.SiLU, "relu": nn.ReLU, "softsign": nn.Softsign}
 
 
 class MlpConfig(FeatureConfig):
-    """Layers of `hidden` units with one activation; the output layer starts near zero, so that training starts from the baseline."""
+    """Layers of `hidden` units with one activation; the output layer starts near zero, so that training starts from the baseline.
+
+    Attributes:
+        hidden: units of each layer.
+        activation: after each layer.
+        dropout: share of units dropped while training.
+        mirror: make the residual mirror-symmetric between port and starboard by construction.
+    """
 
     kind: Literal["mlp"] = "mlp"
     hidden: tuple[int, ...] = Field(default=(64, 64), min_length=1)
     activation: Literal["tanh", "silu", "relu", "softsign"] = "tanh"
     dropout: float = Field(default=0.0, ge=0, lt=1)
+    mirror: bool = False
 
-    def build(self, names: Sequence[str]) -> MlpHead:
+    def build(self, names: Sequence[str]) -> ResidualHead:
         """The module for channels `names`."""
-        return MlpHead(self, names)
+        head = MlpHead(self, names)
+        return MirroredHead(head, names) if self.mirror else head
 
 
 @final
@@ -53,6 +63,10 @@ class MlpHead(ResidualHead):
         """Take the scales of features and residual from the samples."""
         self.features.calibrate(samples)
         self.scale.calibrate(samples)
+
+    def spread(self) -> Tensor:
+        """Spread of the residual on the training samples, [3]."""
+        return self.scale.spread
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Residual [..., 3] at channels z [..., nz]; the memory is empty."""

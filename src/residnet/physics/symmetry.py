@@ -9,6 +9,7 @@ from residnet.physics.terms import parse_term
 
 _ODD = ("v", "r", "delta", "tau_y", "tau_n", "wind_v")
 _EVEN = ("u", "n", "tau_x", "wind_u", "wind_mag")
+_OTHER_SIDE = {"port": "stbd", "stbd": "port"}
 
 
 def channel_parity(name: str) -> int | None:
@@ -32,3 +33,20 @@ def wrong_parity(term: str, axis: int, names: Sequence[str]) -> bool:
     """Whether a mirror-symmetric vessel cannot have this term in the acceleration of this axis (0 surge, 1 sway, 2 yaw)."""
     parity = term_parity(term, names)
     return parity is not None and parity != (1 if VELOCITY[axis] == "u" else -1)
+
+
+def mirrored_channels(names: Sequence[str]) -> tuple[list[int], list[float]] | None:
+    """How channels look in the mirror: the column that each takes its value from, and the sign; None where one is not known.
+
+    Channels of a port/starboard pair change places.
+    """
+    index, sign = [], []
+    for place, name in enumerate(names):
+        other = _OTHER_SIDE.get(name.rpartition("_")[2])
+        partner = f"{name.rpartition('_')[0]}_{other}" if other else name
+        parity = 1 if other else channel_parity(name)
+        if partner not in names or parity is None:
+            return None
+        index.append(names.index(partner) if other else place)
+        sign.append(float(parity))
+    return index, sign

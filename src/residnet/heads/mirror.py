@@ -1,0 +1,82 @@
+"""Heads that are mirror-symmetric by construction: what happens to starboard happens, mirrored, to port.
+
+A hull is symmetric to better than the data can tell, and knowing it halves what a network has to learn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import final
+
+import torch
+from torch import Tensor
+
+from residnet.core.errors import ConfigError
+from residnet.core.samples import Samples
+from residnet.heads.base import ResidualHead
+from residnet.physics.symmetry import mirrored_channels
+
+
+@final
+class MirroredHead(ResidualHead):
+    """rho = (g(z) + M g(M z)) / 2 of an inner head g, in one batch of twice the size; M mirrors port and starboard.
+
+    The memory holds that of both halves side by side.
+    """
+
+    def __init__(self, inner: ResidualHead, names: Sequence[str]) -> None:
+        super().__init__()
+        mirror = mirrored_channels(names)
+        if mirror is None:
+            raise ConfigError(f"mirror: nobody said how all of the channels {', '.join(names)} change in the mirror; leave `mirror` out")
+        self.inner = inner
+        self.width = inner.n_state
+        self.n_state = 2 * inner.n_state
+        self.register_buffer("index", torch.tensor(mirror[0], dtype=torch.long), persistent=False)
+        self.register_buffer("sign", torch.tensor(mirror[1], dtype=torch.float64), persistent=False)
+        self.register_buffer("turned", torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64), persistent=False)
+        self.index: Tensor
+        self.sign: Tensor
+        self.turned: Tensor
+
+    def calibrate(self, samples: Samples) -> None:
+        """Take scales from the samples and their mirror images, so that the mirror of a known state is known too."""
+        other = samples.z.index_select(1, self.index) * self.sign
+        both = Samples(
+            torch.cat((samples.z, other)),
+            torch.cat((samples.target, samples.target * self.turned)),
+            torch.cat((samples.group, samples.group)),
+            torch.cat((samples.t, samples.t)),
+            samples.kinds,
+            samples.names,
+        )
+        self.inner.calibrate(both)
+
+    def spread(self) -> Tensor:
+        """Spread of the residual on the training samples, [3]."""
+        return self.inner.spread()
+
+    def both(self, z: Tensor) -> Tensor:
+        """Channels and their mirror images, [2 B, ...]."""
+        return torch.cat((z, z.index_select(-1, self.index) * self.sign.to(z.dtype)), dim=0)
+
+    def mean(self, rho: Tensor) -> Tensor:
+        """Mean of residuals [2 B, ..., 3] and their mirror images, [B, ..., 3]."""
+        half = rho.shape[0] // 2
+        return 0.5 * (rho[:half] + rho[half:] * self.turned.to(rho.dtype))
+
+    def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Residual [B, 3] at channels z [B, nz] and the memory for the next step."""
+        rho, after = self.inner(self.both(z), torch.cat((s[:, : self.width], s[:, self.width :]), dim=0))
+        half = z.shape[0]
+        return self.mean(rho), torch.cat((after[:half], after[half:]), dim=-1)
+
+    def sequence(self, z: Tensor) -> Tensor:
+        """Residuals [B, T, 3] along measured channels [B, T, nz], from an empty memory."""
+        return self.mean(self.inner.sequence(self.both(z)))
+
+    def warmup(self, z: Tensor) -> Tensor:
+        """Memory [B, n_state] that past channels [B, T, nz] leave."""
+        s = self.inner.warmup(self.both(z))
+        half = z.shape[0]
+        return torch.cat((s[:half], s[half:]), dim=-1)
