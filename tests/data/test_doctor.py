@@ -159,10 +159,20 @@ def test_a_log_without_position_says_so() -> None:
     assert not report.misled
 
 
-def test_short_logs_do_not_break_it() -> None:
+@pytest.mark.parametrize("size", [2, 3, 20, 60])
+def test_short_logs_are_examined_as_far_as_they_go(size: int) -> None:
     log = wavy()
-    for size in (2, 3, 20, 60):
-        inspect(Log("short", log.t[:size], {name: values[:size] for name, values in log.channels.items()}))
+    report = inspect(Log("short", log.t[:size], {name: values[:size] for name, values in log.channels.items()}))
+    assert f"7 channels, {size} samples" in one(report, "channels").text
+    assert one(report, "clock").figures["span"] == pytest.approx(0.1 * (size - 1))
+    assert {finding.text.split()[0]: finding.figures["max"] for finding in report.find("range")} == {
+        name: log[name][:size].max() for name in ("u", "v", "r", "delta")
+    }
+    # frames need 50 samples, and each extreme that is reached once is no clipping
+    assert bool(report.find("frames")) == (size >= 50)
+    assert bool(report.find("frames_unchecked")) == (size < 50)
+    assert report.find("clipping") == ()
+    assert not report.misled
 
 
 def test_faults() -> None:

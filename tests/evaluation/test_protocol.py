@@ -13,7 +13,7 @@ STEP = 0.1
 
 
 def starts_by_loop(bad: np.ndarray, seconds: float, first: float) -> list[int]:
-    """The published protocol as /work/shared/tools/check_rollouts.py states it (no breaks)."""
+    """The published protocol of the data README, sample by sample (no breaks)."""
     steps, start, starts = round(seconds / STEP), round(first / STEP), []
     while start + steps < len(bad):
         while start < len(bad) and bad[start]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+import torch
 
 from residnet.core.config import load_config
 from residnet.core.errors import ConfigError
@@ -94,7 +95,15 @@ def test_a_wrong_damping_term_is_found_when_the_file_is_read(override: str, mess
     ["damping.X.u.unit=N s/m", "damping.N.r.unit=N m s/rad", "damping.N.r.unit=N m s", "damping.N.|u|v|v|={value: 1, unit: kg s/m, source: made}"],
 )
 def test_equal_units_of_damping_are_taken(override: str) -> None:
-    load_config(CAL, [override], VesselConfig)
+    vessel, known = load_config(CAL, [override], VesselConfig), load_vessel("wam_v_cal")
+    axis, term = override.split(".")[1], override.removeprefix("damping.").split(".")[1].split("=")[0]
+    row = getattr(vessel.damping, axis)
+    assert row[term].value == (1.0 if term == "|u|v|v|" else getattr(known.damping, axis)[term].value)
+    assert row[term].unit in override
+    # the plant brakes with the number as it stands, whichever of its equal units was named
+    nu = torch.tensor([[1.5, -0.4, 0.3]], dtype=torch.float64)
+    extra = torch.tensor([[0.0, 0.0, 1.5 * -0.4 * 0.4 if term == "|u|v|v|" else 0.0]], dtype=torch.float64)
+    torch.testing.assert_close(Fossen3(vessel).drag(nu), Fossen3(known).drag(nu) + extra)
 
 
 def test_a_vessel_by_path_and_a_vessel_that_is_not_there(tmp_path: Path) -> None:

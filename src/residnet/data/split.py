@@ -76,17 +76,25 @@ def _matches(root: Path, patterns: Sequence[str], where: str) -> list[Path]:
     """Files of all patterns, each once."""
     found: dict[Path, None] = {}
     for pattern in patterns:
-        try:
-            # a plain path may hold characters that a pattern would read otherwise
-            files = [root / pattern] if (root / pattern).is_file() else sorted(path for path in root.glob(pattern) if path.is_file())
-        except (ValueError, NotImplementedError) as error:
-            raise ConfigError(f"{where}: '{pattern}' is not a pattern relative to {root} ({error}); set `root` instead") from error
+        # a plain path may hold characters that a pattern would read otherwise
+        files = [root / pattern] if (root / pattern).is_file() else _globbed(root, pattern, where)
         if not files:
             parent = (root / pattern).parent
             near = nearest(Path(pattern).name, (path.name for path in parent.iterdir())) if parent.is_dir() else f"; there is no folder {parent}"
             raise ConfigError(f"{where}: '{pattern}' matches no file in {root}{near}")
         found.update(dict.fromkeys(files))
     return list(found)
+
+
+def _globbed(root: Path, pattern: str, where: str) -> list[Path]:
+    """Files below `root` that a pattern matches, in order."""
+    why = "it is an absolute path" if Path(pattern).is_absolute() else ""
+    try:
+        if not why:
+            return sorted(path for path in root.glob(pattern) if path.is_file())
+    except ValueError as error:
+        why = str(error)
+    raise ConfigError(f"{where}: '{pattern}' is not a pattern relative to {root} ({why}); set `root` instead")
 
 
 def _require_distinct(files: Mapping[str, Sequence[Path]], where: str) -> None:
