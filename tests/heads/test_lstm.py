@@ -158,3 +158,20 @@ def test_dropout_acts_only_while_training() -> None:
 def test_wrong_configs(config: dict[str, object], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         validate({"kind": "lstm", **config}, LstmConfig, "here")
+
+
+def test_a_memory_of_chosen_features_ignores_the_others() -> None:
+    head = built(memory=(NAMES[-1],), readout=5)
+    z = windows()
+    other = z.clone()
+    other[:, :, : len(NAMES) - 1] += 0.1
+    assert torch.equal(head.warmup(z), head.warmup(other))
+    assert not torch.equal(head.sequence(z), head.sequence(other))
+    out, s = stepped(head, z)
+    torch.testing.assert_close(head.sequence(z), out)
+    torch.testing.assert_close(head.warmup(z), s)
+
+
+def test_a_memory_of_chosen_features_needs_a_readout() -> None:
+    with pytest.raises(ConfigError, match="readout"):
+        validate({"kind": "lstm", "memory": [NAMES[-1]]}, LstmConfig, "test")

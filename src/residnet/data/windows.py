@@ -88,7 +88,9 @@ class WindowStore:
         rows = self.starts(length)
         rows = rows[self.depth[rows] == lead]
         if rows.numel() == 0:
-            raise DataError(f"no training log holds a window of {length} samples {lead} samples after its beginning; shorten the horizon or leave out beginnings")
+            raise DataError(
+                f"no training log holds a window of {length} samples from {lead} samples after its beginning on; shorten it or leave out `beginnings`"
+            )
         return rows
 
     def take(self, values: Tensor, starts: Tensor, length: int) -> Tensor:
