@@ -106,6 +106,7 @@ def csv_config(folder: Path, **reader: object) -> Path:
         },
         "baseline": {"kind": "regressors", "terms": ["1", "u", "v", "r", "tau_x", "tau_n"]},
         "heads": {"ridge": {"kind": "ridge", "folds": 2}},
+        "ensembles": {},
         "training": {},
         "export": {"models": ["selected"]},
     }

@@ -27,8 +27,22 @@ def test_folder_is_complete(tiny_run: Path) -> None:
     for name in ("resolved.yaml", "provenance.json", "metrics.json", "report.html", "data_quality.json", "residuals.parquet", "exports/lstm.pt"):
         assert (tiny_run / name).stat().st_size > 0, name
     models = {path.name for path in (tiny_run / "models").iterdir()}
-    assert models == {"zero", "baseline", "ridge", "lstm"}
+    assert models == {"zero", "baseline", "ridge", "lstm", "mean"}
     assert {path.suffix for path in (tiny_run / "models").rglob("*") if path.is_file()} == {".json", ".safetensors"}
+
+
+def test_ensemble_averages_accelerations(tiny_run: Path) -> None:
+    from residnet.dynamics.store import load_model
+
+    models = {name: load_model(tiny_run / "models" / name)[1].double() for name in ("ridge", "lstm", "mean")}
+    random = torch.Generator().manual_seed(0)
+    y, w = torch.rand(3, 7, 6, generator=random, dtype=torch.float64), 20 * torch.rand(3, 7, 2, generator=random, dtype=torch.float64)
+    rates = {}
+    for name, model in models.items():
+        p = model.signals.prepare(w[:, -1])
+        rho, _ = model.head(model.signals(y[:, -1], p), model.warmup(y[:, :-1], w[:, :-1]))
+        rates[name] = model.rate(y[:, -1], p, rho)[:, 3:]
+    torch.testing.assert_close(rates["mean"], (rates["ridge"] + rates["lstm"]) / 2)
 
 
 def test_metrics_follow_from_rollouts(tiny_run: Path) -> None:
@@ -65,7 +79,7 @@ def test_same_seed_same_metrics(tiny_config: Path, tiny_run: Path, tmp_path: Pat
 def test_another_seed_other_head(tiny_config: Path, tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert call(monkeypatch, "run", tiny_config, "-s", "seed=1", "--out", tmp_path / "other") == 0
     changed = {row["model"] for row, old in zip(rows(tmp_path / "other"), rows(tiny_run), strict=True) if row["rmse"] != old["rmse"]}
-    assert changed == {"lstm"}
+    assert changed == {"lstm", "mean"}
 
 
 def test_killed_and_resumed(tiny_config: Path, tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -28,6 +28,7 @@ TINY = {
     "signals": {"inputs": ["n_port", "n_stbd"], "forces": "wam_v_cal"},
     "baseline": {"kind": "linear_steady", "settled": 20},
     "heads": {"ridge": {"kind": "ridge"}, "lstm": {"kind": "lstm", "hidden_size": 6, "dropout": 0.1}},
+    "ensembles": {"mean": ["ridge", "lstm"]},
     "training": {
         "lstm": {
             "steps": 3,

@@ -31,7 +31,7 @@ class Dynamics(nn.Module, ABC):
     def __init__(self, dt: float, integrator: Integrator) -> None:
         super().__init__()
         self.dt = dt
-        self.integrator = str(integrator)
+        self.integrator: Integrator = integrator
         self.nodes, self.weights = (list(part) for part in _TABLEAUX[integrator])
         self.semi_implicit = integrator == "semi_implicit_euler"
         self.n_state = 0

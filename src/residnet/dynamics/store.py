@@ -15,6 +15,7 @@ from residnet.core.config import Config, validate
 from residnet.core.errors import UsageError
 from residnet.core.names import VELOCITY, nearest
 from residnet.dynamics.base import Integrator
+from residnet.dynamics.ensemble import mean_of
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.heads import HeadConfig, ZeroHead
 from residnet.physics.signals import SignalsConfig
@@ -25,7 +26,7 @@ class ModelSpec(Config):
 
     Attributes:
         name: of the model in its run.
-        role: zero, baseline or head.
+        role: zero, baseline, head or ensemble.
         signals: what drives it.
         baseline: the known part.
         head: the learned part; None for none.
@@ -33,12 +34,13 @@ class ModelSpec(Config):
         integrator: explicit scheme.
         low: smallest u, v, r and inputs of the training data, SI, [3 + m].
         high: their largest.
+        members: of an ensemble, whose accelerations are averaged; its own baseline and head are then empty.
     """
 
     schema_name: Literal["residnet.model/1"] = Field(default="residnet.model/1", alias="schema")
     version: str = __version__
     name: str
-    role: Literal["zero", "baseline", "head"]
+    role: Literal["zero", "baseline", "head", "ensemble"]
     signals: SignalsConfig
     baseline: BaselineConfig
     head: HeadConfig | None = None
@@ -46,9 +48,12 @@ class ModelSpec(Config):
     integrator: Integrator
     low: tuple[float, ...]
     high: tuple[float, ...]
+    members: tuple[ModelSpec, ...] = ()
 
     def build(self) -> HybridDynamics:
         """The model with its numbers not yet filled in."""
+        if self.members:
+            return mean_of([member.build() for member in self.members])
         signals = self.signals.build()
         head = ZeroHead() if self.head is None else self.head.build(signals.names)
         return HybridDynamics(signals, self.baseline.build(signals.names), head, self.dt, self.integrator)
@@ -71,7 +76,7 @@ def save_model(folder: Path, spec: ModelSpec, model: HybridDynamics) -> None:
 
 
 def load_model(folder: Path) -> tuple[ModelSpec, HybridDynamics]:
-    """Read a model that `save_model` wrote.
+    """Read a model that `save_model` wrote; in evaluation mode.
 
     Raises:
         UsageError: where the folder holds no model; the message names the models beside it.
@@ -88,7 +93,7 @@ def load_model(folder: Path) -> tuple[ModelSpec, HybridDynamics]:
         if name in numbers and parameter.dtype != numbers[name].dtype:
             numbers[name] = numbers[name].to(parameter.dtype)
     model.load_state_dict(numbers)
-    return spec, model
+    return spec, model.eval()
 
 
 def model_names(folder: Path) -> Sequence[str]:

@@ -44,7 +44,7 @@ def evaluate_external(run: Path, paths: Sequence[Path], out: Path | None) -> Run
         require_window(log, config)
     folder = RunFolder.create(out or run / time.strftime("external-%Y%m%dT%H%M%S"), dump_config(config), resume=False)
     fitted = [Fitted(*load_model(source.models / name), notes={}) for name in model_names(source.models)]
-    order = ["zero", "baseline", *config.heads]
+    order = ["zero", "baseline", *config.baselines, *config.heads, *config.ensembles]
     fitted.sort(key=lambda f: order.index(f.spec.name) if f.spec.name in order else len(order))
     low, high = np.array(fitted[0].spec.low[:3]), np.array(fitted[0].spec.high[:3])
     limit = config.evaluation.divergence * np.maximum(np.abs(low), np.abs(high))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
@@ -56,6 +56,7 @@ class FitConfig(Config):
         refit: baselines (by name, `baseline` for the first) whose coefficients are moved through rollouts after least squares.
         heads: residual heads by name.
         base_of: the baseline that a head stands on, by the head's name; `baseline` where absent.
+        ensembles: models whose mean acceleration makes another model, by its name.
         training: of network heads by the name of the head; the defaults where absent.
         evaluation: protocols and scales.
         export: TorchScript.
@@ -76,6 +77,7 @@ class FitConfig(Config):
     refit: dict[str, RefitConfig] = Field(default_factory=dict)
     heads: dict[str, HeadConfig] = Field(default_factory=dict)
     base_of: dict[str, str] = Field(default_factory=dict)
+    ensembles: dict[str, Annotated[tuple[str, ...], Field(min_length=2)]] = Field(default_factory=dict)
     training: dict[str, TrainingConfig] = Field(default_factory=dict)
     evaluation: EvaluationConfig
     export: ExportConfig = ExportConfig()
@@ -83,14 +85,16 @@ class FitConfig(Config):
     @model_validator(mode="after")
     def _combination(self) -> FitConfig:
         baselines = {"baseline": self.baseline, **self.baselines}
-        models = (*baselines, *self.heads)
-        for name in (*self.baselines, *self.heads):
+        single = (*baselines, *self.heads)
+        models = (*single, *self.ensembles)
+        for name in (*self.baselines, *self.heads, *self.ensembles):
             if name in _TAKEN or models.count(name) > 1 or not name.replace("_", "").replace("-", "").isalnum():
                 raise ValueError(f"'{name}' cannot name a model; use letters, digits, '-', '_', each name once and none of {', '.join(_TAKEN)}")
         _known("training", self.training, self.heads, "head")
         _known("base_of", self.base_of, self.heads, "head")
         _known("base_of", self.base_of.values(), baselines, "baseline")
         _known("refit", self.refit, baselines, "baseline")
+        _known("ensembles", (name for members in self.ensembles.values() for name in members), single, "model")
         _known("export.models", self.export.models, ("selected", *models), "model")
         names = self.signals.build().names
         for key, part in {**baselines, **self.heads}.items():

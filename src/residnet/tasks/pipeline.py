@@ -23,6 +23,7 @@ from residnet.data.prepare import Prepared, envelope, prepare, samples
 from residnet.data.simulate import SimulatedTrials
 from residnet.data.sources import MeasuredLogs
 from residnet.data.windows import WindowStore
+from residnet.dynamics.ensemble import mean_of
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.simulated import PlantDynamics
 from residnet.dynamics.store import ModelSpec, load_model, save_model
@@ -190,6 +191,12 @@ class Fitter:
             notes = self._train(name, model, residual, seed)
         notes |= {"baseline": below, "seconds": round(time.perf_counter() - started, 1), "validation": self.bench(model)}
         return self._keep(Fitted(spec, model, notes))
+
+    def ensemble(self, name: str, members: Sequence[Fitted]) -> Fitted:
+        """The mean of fitted models."""
+        spec = self.spec(name, "ensemble", StillConfig()).model_copy(update={"members": tuple(member.spec for member in members)})
+        model = mean_of([copy.deepcopy(member.model).to(torch.float64) for member in members])
+        return self._keep(Fitted(spec, model, {"members": [member.spec.name for member in members], "validation": self.bench(model)}))
 
     def residual(self, baseline: HybridDynamics, of: Samples) -> Samples:
         """Samples whose target is what the baseline leaves of the acceleration (document 003 eq. (19))."""

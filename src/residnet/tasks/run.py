@@ -55,6 +55,10 @@ def run_fit(config: FitConfig, *, source: Path, overrides: Sequence[str], out: P
         head = fitter.head(name, baselines[config.base_of.get(name, "baseline")].model)
         say(f"  {name}: validation free-run error {head.notes['validation']:.4f} after {head.notes['seconds']:.1f} s")
         fitted.append(head)
+    by_name = {f.spec.name: f for f in fitted}
+    for name, members in config.ensembles.items():
+        fitted.append(fitter.ensemble(name, [by_name[member] for member in members]))
+        say(f"  {name}: validation free-run error {fitted[-1].notes['validation']:.4f}")
     say("  free runs")
     models = candidates(fitted, config.data)
     table: list[dict[str, Any]] = []

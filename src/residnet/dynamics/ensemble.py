@@ -1,0 +1,73 @@
+"""The mean of several models as one: accelerations are averaged inside one free run, so it steps, warms up and exports like any model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import final
+
+import torch
+from torch import Tensor, nn
+
+from residnet.baselines.base import Baseline
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.heads.base import ResidualHead
+
+
+@final
+class MeanBaseline(Baseline):
+    """Mean acceleration of several baselines."""
+
+    def __init__(self, members: Sequence[nn.Module]) -> None:
+        super().__init__()
+        self.members = nn.ModuleList(members)
+
+    def forward(self, z: Tensor) -> Tensor:
+        """nu_dot [..., 3] at channels z [..., nz]."""
+        total = torch.zeros_like(z[..., :3])
+        for member in self.members:
+            total = total + member(z)
+        return total / len(self.members)
+
+
+@final
+class MeanHead(ResidualHead):
+    """Mean residual of several heads; the memory holds theirs side by side."""
+
+    def __init__(self, members: Sequence[ResidualHead]) -> None:
+        super().__init__()
+        self.members = nn.ModuleList(members)
+        self.widths = [member.n_state for member in members]
+        self.n_state = sum(self.widths)
+
+    def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Residual [B, 3] at channels z [B, nz] and the memory for the next step."""
+        total = torch.zeros_like(z[..., :3])
+        memory: list[Tensor] = []
+        begin = 0
+        for i, member in enumerate(self.members):
+            rho, after = member(z, s[..., begin : begin + self.widths[i]])
+            total = total + rho
+            memory.append(after)
+            begin += self.widths[i]
+        return total / len(self.members), torch.cat(memory, dim=-1)
+
+    def sequence(self, z: Tensor) -> Tensor:
+        """Residuals [B, T, 3] along measured channels [B, T, nz], from an empty memory."""
+        total = torch.zeros_like(z[..., :3])
+        for member in self.members:
+            total = total + member.sequence(z)  # type: ignore[operator]
+        return total / len(self.members)
+
+    def warmup(self, z: Tensor) -> Tensor:
+        """Memory [B, n_state] that past channels [B, T, nz] leave."""
+        memory: list[Tensor] = []
+        for member in self.members:
+            memory.append(member.warmup(z))  # type: ignore[operator]
+        return torch.cat(memory, dim=-1)
+
+
+def mean_of(members: Sequence[HybridDynamics]) -> HybridDynamics:
+    """The mean of models with the same signals, step and integrator."""
+    first = members[0]
+    baseline, head = MeanBaseline([member.baseline for member in members]), MeanHead([member.head for member in members])
+    return HybridDynamics(first.signals, baseline, head, first.dt, first.integrator)
