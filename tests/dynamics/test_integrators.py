@@ -138,3 +138,18 @@ def test_semi_implicit_euler_keeps_an_undamped_oscillation_bounded() -> None:
         reach[integrator] = float(states[0, -200:, 1].abs().max())
     assert reach["euler"] > 1e3
     assert reach["semi_implicit_euler"] == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.parametrize("integrator", ["rk4", "heun", "euler", "semi_implicit_euler"])
+def test_every_integrator_is_scriptable(integrator: Integrator) -> None:
+    from residnet.baselines import RegressorsConfig
+    from residnet.dynamics.hybrid import HybridDynamics
+    from residnet.heads import ZeroHead
+    from residnet.physics.signals import SignalsConfig
+
+    signals = SignalsConfig(inputs=("delta",)).build()
+    model = HybridDynamics(signals, RegressorsConfig(terms=("u", "delta")).build(signals.names), ZeroHead(), 0.1, integrator)
+    with torch.no_grad():
+        model.baseline.theta.copy_(torch.tensor([[-0.5, 0.1], [0.0, 0.2], [0.0, 0.3]]))
+    x, w, s = torch.ones(2, 6), torch.ones(2, 5, 1), torch.zeros(2, 0)
+    torch.testing.assert_close(torch.jit.script(Rollout(model))(x, w, s)[0], Rollout(model)(x, w, s)[0], rtol=0, atol=0)

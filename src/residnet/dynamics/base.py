@@ -12,12 +12,12 @@ from residnet.core.frames import to_earth
 
 Integrator = Literal["rk4", "heun", "euler", "semi_implicit_euler"]
 
-# nodes and weights of explicit schemes in which every stage starts from the one before it
+# nodes and weights of explicit schemes in which every stage starts from the one before it; the first stage is at the state itself
 _TABLEAUX: dict[str, tuple[list[float], list[float]]] = {
-    "rk4": ([0.5, 0.5, 1.0], [1 / 6, 1 / 3, 1 / 3, 1 / 6]),
-    "heun": ([1.0], [0.5, 0.5]),
-    "euler": ([], [1.0]),
-    "semi_implicit_euler": ([], [1.0]),
+    "rk4": ([0.0, 0.5, 0.5, 1.0], [1 / 6, 1 / 3, 1 / 3, 1 / 6]),
+    "heun": ([0.0, 1.0], [0.5, 0.5]),
+    "euler": ([0.0], [1.0]),
+    "semi_implicit_euler": ([0.0], [1.0]),
 }
 
 
@@ -57,9 +57,9 @@ class Dynamics(nn.Module, ABC):
         """State one step later, [B, nx]."""
         k = self.rate(x, p, rho)
         total = self.weights[0] * k
-        for i, node in enumerate(self.nodes):
-            k = self.rate(x + (self.dt * node) * k, p, rho)
-            total = total + self.weights[i + 1] * k
+        for i in range(1, len(self.nodes)):
+            k = self.rate(x + (self.dt * self.nodes[i]) * k, p, rho)
+            total = total + self.weights[i] * k
         after = x + self.dt * total
         if self.semi_implicit:
             # the pose moves with the new velocities, which keeps an undamped oscillation bounded

@@ -32,6 +32,7 @@ class ModelSpec(Config):
         head: the learned part; None for none.
         dt: step in s.
         integrator: explicit scheme.
+        hold: whether an input is the sample at a step's start or the mean of the samples at its ends.
         low: smallest u, v, r and inputs of the training data, SI, [3 + m].
         high: their largest.
         members: of an ensemble, whose accelerations are averaged; its own baseline and head are then empty.
@@ -46,6 +47,7 @@ class ModelSpec(Config):
     head: HeadConfig | None = None
     dt: float = Field(gt=0)
     integrator: Integrator
+    hold: Literal["start", "mean"] = "start"
     low: tuple[float, ...]
     high: tuple[float, ...]
     members: tuple[ModelSpec, ...] = ()

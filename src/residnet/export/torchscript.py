@@ -149,6 +149,7 @@ def make_card(spec: ModelSpec, model: HybridDynamics, metrics: list[Mapping[str,
         "inputs": [
             {"name": name, "unit": units[name], "role": "command" if name in spec.signals.inputs else "exogenous"} for name in spec.signals.columns
         ],
+        "inputs_held": {"start": "the sample at the step's start", "mean": "the mean of the samples at the step's start and end"}[spec.hold],
         "memory": model.n_state,
         "dt": spec.dt,
         "integrator": spec.integrator,

@@ -144,6 +144,7 @@ class Fitter:
                 "head": config.heads[name].model_dump() if role == "head" else None,
                 "dt": config.prepare.grid.step,
                 "integrator": config.integrator,
+                "hold": config.prepare.hold,
                 "low": self.low.tolist(),
                 "high": self.high.tolist(),
             }
