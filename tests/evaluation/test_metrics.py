@@ -6,11 +6,15 @@ import numpy as np
 import pytest
 from made_logs import made, random_states
 
-from residnet.dynamics.base import Dynamics
+from residnet.baselines.still import StillBaseline
+from residnet.dynamics.hybrid import HybridDynamics
 from residnet.evaluation.freerun import Candidate, FreeRun, Prediction
 from residnet.evaluation.metrics import find, rows, window_errors
 from residnet.evaluation.protocol import Window
+from residnet.heads import ZeroHead
+from residnet.physics.signals import SignalsConfig
 
+SIGNALS = SignalsConfig(inputs=("delta",)).build()
 SCALES = {"u": 0.5, "v": 0.25, "r": 0.1}
 
 
@@ -19,7 +23,7 @@ def window(log: int, start: int, stop: int) -> Window:
 
 
 def candidate(name: str) -> Candidate:
-    return Candidate(name, "head", Dynamics(0.1, "euler"))
+    return Candidate(name, "head", HybridDynamics(SIGNALS, StillBaseline(), ZeroHead(), 0.1, "euler"))
 
 
 def test_by_hand() -> None:

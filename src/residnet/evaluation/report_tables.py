@@ -196,23 +196,34 @@ def heads(run: RunFiles) -> Table | None:
     if not any(run.fit(model) for model in run.heads):
         return None
     protocol = run.protocols[0]
-    table = Table(heads=["kind", "complexity", "parameters", "sees", "fit [s]", "epochs", "validation NRMSE [-]"], corner="head")
+    table = Table(heads=["kind", "complexity", "parameters", "sees; stands on", "fit [s]", "epochs", "validation NRMSE [-]"], corner="head")
     for model in run.heads:
-        notes, head = run.fit(model), run.card(model).get("head") or {}
+        notes, card = run.fit(model), run.card(model)
+        head = card.get("head") or {}
         row = run.row(model, "validation", protocol)
         error = row["nrmse"]["mean"] if row else notes.get("validation")
         count = notes.get("parameters") or (3 * (int(notes["terms"]) + 1) if "terms" in notes else None)
         cells = [
-            Cell(str(head.get("kind", "–"))),
+            Cell(str(head.get("kind") or card.get("role", "–"))),
             Cell(_complexity(notes, head), mark="text"),
             Cell(f"{count:,}".replace(",", "\u2009") if count else "–"),
-            Cell(", ".join(head.get("features") or []) or "all channels", mark="text"),
+            Cell(_foundation(notes, head), mark="text"),
             Cell(number(notes.get("seconds"), 2)),
             Cell(str(notes.get("epochs", "–"))),
             Cell(number(error), mark="best" if model == run.selected else ""),
         ]
         table.rows.append((label(run, model), cells))
     return table
+
+
+def _foundation(notes: Row, head: Row) -> str:
+    """What a head sees and the baseline below it, or the members of an ensemble."""
+    if notes.get("members"):
+        return "mean of " + ", ".join(notes["members"])
+    if not head:
+        return "refitted through rollouts" if notes.get("refit") else "least squares"
+    sees = ", ".join(head.get("features") or []) or "all channels"
+    return f"{sees}; {notes['baseline']}" if notes.get("baseline", "baseline") != "baseline" else sees
 
 
 def _complexity(notes: Row, head: Row) -> str:

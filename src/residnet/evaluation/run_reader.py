@@ -65,8 +65,13 @@ class RunFiles:
 
     @cached_property
     def kinds(self) -> dict[str, str]:
-        """Kind (zero, baseline, head, truth, ...) of each model, in the order of metrics.json."""
-        return {row["model"]: row.get("kind", "head") for row in self.rows}
+        """Kind (zero, baseline, head, truth, ...) of each model, in the order of metrics.json.
+
+        Only the first baseline is one here, what reductions refer to; others are `further` models, judged like heads.
+        """
+        kinds = {row["model"]: row.get("kind", "head") for row in self.rows}
+        first = next((model for model, kind in kinds.items() if kind == "baseline"), None)
+        return {model: "further" if kind == "baseline" and model != first else kind for model, kind in kinds.items()}
 
     @cached_property
     def selected(self) -> str | None:
