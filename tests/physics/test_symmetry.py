@@ -1,0 +1,108 @@
+"""Port/starboard symmetry against what a mirror does: scenes turned over, and terms evaluated on both sides of it."""
+
+from __future__ import annotations
+
+from itertools import combinations_with_replacement
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from residnet.physics.fossen import Fossen3
+from residnet.physics.signals import SignalsConfig
+from residnet.physics.symmetry import channel_parity, mirrored_channels, term_parity, wrong_parity
+from residnet.physics.terms import TermLibrary
+from residnet.physics.vessel import load_vessel
+
+NAMES = ("u", "v", "r", "delta", "n", "tau_x", "tau_y", "tau_n", "wind_u", "wind_v", "wind_mag")
+# what a mirror at the vessel's centre plane does to each, from the definition of the channels
+SIGNS = (1, -1, -1, -1, 1, 1, -1, -1, 1, -1, 1)
+TURNED = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
+
+
+def random_channels(count: int = 50, width: int = len(NAMES)) -> Tensor:
+    return torch.from_numpy(np.random.default_rng(0).normal(size=(count, width)))
+
+
+def mirrored(z: Tensor, names: tuple[str, ...]) -> Tensor:
+    found = mirrored_channels(names)
+    assert found is not None
+    index, sign = found
+    return z[..., index] * torch.tensor(sign, dtype=z.dtype)
+
+
+def test_parity_of_each_channel() -> None:
+    assert tuple(channel_parity(name) for name in NAMES) == SIGNS
+    assert [channel_parity(name) for name in ("n_port", "cmd_stbd", "psi", "anything")] == [None] * 4
+
+
+def test_parity_of_terms_is_the_sign_that_the_mirror_gives_their_values() -> None:
+    factors = [form.format(name) for name in NAMES for form in ("{}", "|{}|", "{}^2", "|{}|^3", "{}^-1", "|{}|^-1", "{}^-2")]
+    terms = ["1", *factors, *(f"{a} {b}" for a, b in combinations_with_replacement(factors, 2)), "v |v| r", "|u| v |v|", "n^2 delta", "v r delta^3 u"]
+    z = random_channels()
+    library = TermLibrary(terms, NAMES)
+    here, there = library(z), library(z * torch.tensor(SIGNS, dtype=z.dtype))
+    parity = torch.tensor([term_parity(term, NAMES) or 0 for term in terms], dtype=z.dtype)
+    torch.testing.assert_close(there, here * parity, rtol=1e-12, atol=0)
+    assert set(parity.tolist()) == {-1.0, 1.0}
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_term_is_wrong_where_it_breaks_the_symmetry_of_its_axis(axis: int) -> None:
+    """A symmetric vessel's acceleration f has f(M z) = M f(z)."""
+    terms = ["1", *NAMES, *(f"{a} {b}" for a, b in combinations_with_replacement(NAMES, 2)), *(f"|{a}|" for a in NAMES)]
+    z = random_channels()
+    library = TermLibrary(terms, NAMES)
+    broken = (library(z * torch.tensor(SIGNS, dtype=z.dtype)) - TURNED[axis] * library(z)).abs().amax(0) > 1e-9
+    assert [wrong_parity(term, axis, NAMES) for term in terms] == broken.tolist()
+
+
+def test_a_symmetric_hull_has_no_wrong_term() -> None:
+    vessel = load_vessel("wam_v_cal")
+    for axis, row in enumerate((vessel.damping.X, vessel.damping.Y, vessel.damping.N)):
+        assert row
+        assert not any(wrong_parity(term, axis, ("u", "v", "r")) for term in row)
+    hull, nu = Fossen3(vessel), random_channels(20, 3)
+    tau = random_channels(20, 3) * torch.tensor([100.0, 50.0, 50.0], dtype=torch.float64)
+    torch.testing.assert_close(hull(nu * TURNED, tau * TURNED), hull(nu, tau) * TURNED)
+
+
+def test_what_nobody_said_is_not_called_wrong() -> None:
+    names = ("u", "v", "trim")
+    assert term_parity("u trim", names) is None
+    assert term_parity("|trim|", names) is None
+    assert term_parity("u |v|", names) == 1
+    assert not any(wrong_parity("trim", axis, names) for axis in range(3))
+
+
+def test_channels_are_those_of_the_scene_in_the_mirror() -> None:
+    """The same vessel, thrusters and wind, turned over: y, psi, v, r and the wind's direction change sign, port and starboard change places."""
+    signals = SignalsConfig(inputs=("n_port", "n_stbd"), exogenous=("wind_speed", "wind_dir"), forces="wam_v_cal").build()
+    random = np.random.default_rng(1)
+    x = torch.from_numpy(random.normal(size=(40, 6)) * [20, 20, 2, 1, 0.3, 0.2])
+    w = torch.from_numpy(random.uniform([-20, -20, 0, -4], [30, 30, 12, 4], size=(40, 4)))
+    x_there = x * torch.tensor([1, -1, -1, 1, -1, -1.0], dtype=x.dtype)
+    w_there = w[:, [1, 0, 2, 3]] * torch.tensor([1, 1, 1, -1.0], dtype=x.dtype)
+    z, z_there = signals(x, signals.prepare(w)), signals(x_there, signals.prepare(w_there))
+    torch.testing.assert_close(mirrored(z, signals.names), z_there, rtol=1e-12, atol=1e-9)
+    assert float((z - z_there).abs().max()) > 1
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (("u", "v", "r", "n", "delta"), ([0, 1, 2, 3, 4], [1.0, -1.0, -1.0, 1.0, -1.0])),
+        (("u", "n_port", "n_stbd"), ([0, 2, 1], [1.0, 1.0, 1.0])),
+        (("cmd_stbd", "n_port", "v", "n_stbd", "cmd_port"), ([4, 3, 2, 1, 0], [1.0, 1.0, -1.0, 1.0, 1.0])),
+    ],
+)
+def test_pairs_change_places(names: tuple[str, ...], expected: tuple[list[int], list[float]]) -> None:
+    assert mirrored_channels(names) == expected
+    z = random_channels(5, len(names))
+    assert torch.equal(mirrored(mirrored(z, names), names), z), "twice mirrored is as before"
+
+
+@pytest.mark.parametrize("names", [("u", "n_port"), ("u", "trim"), ("u", "n_port", "m_stbd")])
+def test_no_mirror_where_a_channel_or_its_partner_is_unknown(names: tuple[str, ...]) -> None:
+    assert mirrored_channels(names) is None
