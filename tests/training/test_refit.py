@@ -1,0 +1,192 @@
+"""The refit through rollouts: what it gains over least squares, its gradient, its knowledge of symmetry, its errors."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+import torch
+from made_system import LINEAR, QUADRATIC, SCALES, STEP, free_run_error, inputs, model_of, trials, truth
+from torch import Tensor
+
+from residnet.baselines import RegressorsConfig, StillConfig
+from residnet.baselines.regressors import RegressorBaseline
+from residnet.core.errors import DataError, FitError, ResidnetError
+from residnet.core.samples import Samples
+from residnet.data.prepare import Prepared, samples
+from residnet.data.windows import WindowStore
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.heads import ZeroHead
+from residnet.physics.signals import SignalsConfig
+from residnet.training import refit as module
+from residnet.training.refit import RefitConfig, refit
+
+
+def fitted(terms: Sequence[str], logs: Sequence[Prepared]) -> tuple[HybridDynamics, Samples, WindowStore]:
+    """Least squares on derivatives."""
+    model = model_of(terms)
+    known = samples(logs, model.signals)
+    RegressorsConfig(terms=tuple(terms)).fit(model.baseline, known)
+    return model, known, WindowStore.gather(logs, torch.float64)
+
+
+def theta_of(model: HybridDynamics) -> Tensor:
+    assert isinstance(model.baseline, RegressorBaseline)
+    return model.baseline.theta
+
+
+@pytest.fixture(scope="module")
+def smoothed() -> list[Prepared]:
+    """Derivatives over 3 s of motions that take one: least squares finds the vessel too slow."""
+    return trials(window=3.1)
+
+
+@pytest.mark.parametrize("terms", [QUADRATIC, LINEAR], ids=["quadratic", "linear"])
+def test_free_runs_on_fresh_data_improve_on_biased_least_squares(smoothed: list[Prepared], terms: Sequence[str]) -> None:
+    model, known, store = fitted(terms, smoothed)
+    before, start = free_run_error(copy.deepcopy(model)), theta_of(model).detach().clone()
+    notes = refit(model, known, store, RefitConfig(horizon=8.0, every=4.0, prior=1e-4), SCALES)
+    assert notes["cost_after"] < notes["cost_before"]
+    assert notes["iterations"] >= 1
+    after = free_run_error(model)
+    assert after < (0.2 if terms == QUADRATIC else 0.6) * before, (before, after)
+    assert not torch.equal(theta_of(model), start)
+
+
+def test_a_strong_prior_holds_least_squares(smoothed: list[Prepared]) -> None:
+    model, known, store = fitted(LINEAR, smoothed)
+    start = theta_of(model).detach().clone()
+    refit(model, known, store, RefitConfig(horizon=8.0, every=4.0, prior=1e9), SCALES)
+    torch.testing.assert_close(theta_of(model).detach(), start, rtol=0, atol=1e-4)
+
+
+def test_windows_are_laid_every_so_often(smoothed: list[Prepared]) -> None:
+    model, known, store = fitted(LINEAR, smoothed)
+    notes = refit(model, known, store, RefitConfig(horizon=8.0, every=4.0, iterations=1), SCALES)
+    steps, every, count = 80, 40, 0
+    for log in smoothed:
+        for k in range(0, len(log) - steps, every):
+            count += bool(log.good[k]) and log.usable[k : k + steps + 1].mean() >= 0.5
+    assert notes["windows"] == count > 0
+    assert notes["horizon"] == 8.0
+
+
+def windy() -> tuple[HybridDynamics, module._Problem]:
+    """A model in true wind, whose heading matters to it, and windows with samples that do not count; everything moved off its start."""
+    signals = SignalsConfig(inputs=("tau_x", "tau_n"), exogenous=("wind_speed", "wind_dir")).build()
+    rows = [("1", "u", "u|u|", "tau_x", "wind_u"), ("v", "u r", "wind_v wind_mag"), ("r", "v", "r|r|", "tau_n", "wind_v wind_mag")]
+    baseline = RegressorBaseline(rows, signals.names)
+    random = np.random.default_rng(5)
+    baseline.theta.data.copy_(torch.from_numpy(random.normal(size=tuple(baseline.theta.shape)) * 0.1))
+    with torch.no_grad():
+        for axis, name in enumerate("uvr"):
+            baseline.theta[axis, baseline.library.terms.index(name)] = -0.7
+    model = HybridDynamics(signals, baseline, ZeroHead(), STEP, "rk4")
+    active = torch.nonzero(baseline.allowed.flatten() > 0).squeeze(1)
+    batch, steps, count = 5, 25, len(active)
+    wind = torch.from_numpy(random.uniform([2, -3], [6, 3], size=(batch, 1, 2))).expand(-1, steps, -1)
+    usable = torch.from_numpy(random.random((batch, steps, 1)) < 0.8).double()
+    half = torch.from_numpy(random.normal(size=(count, count)))
+    problem = module._Problem(
+        x0=torch.from_numpy(random.normal(size=(batch, 6)) * [5, 5, 1, 0.5, 0.2, 0.2]),
+        w=torch.cat((inputs(batch, steps, 6), wind), dim=-1),
+        nu=torch.from_numpy(random.normal(size=(batch, steps, 3)) * 0.3),
+        weight=torch.cat((usable, usable, torch.ones_like(usable)), dim=-1) / SCALES,
+        precision=0.01 * half @ half.T,
+        start=torch.from_numpy(random.normal(size=count) * 0.1),
+        pull=torch.from_numpy(random.uniform(0, 0.1, size=count)),
+        active=active,
+        robust=0.05,
+    )
+    return model, problem
+
+
+def with_step(model: HybridDynamics, problem: module._Problem, place: int, step: float) -> float:
+    """Cost with one coefficient moved."""
+    other = copy.deepcopy(model)
+    assert isinstance(other.baseline, RegressorBaseline)
+    with torch.no_grad():
+        other.baseline.theta.view(-1)[problem.active[place]] += step
+    return float(module._cost(other, problem, other.baseline))
+
+
+def test_normal_equations_hold_half_the_gradient_of_the_cost() -> None:
+    """With m the mean square error of a window, d sqrt(m + c^2) = dm / (2 sqrt(m + c^2)); the prior's d (t'Pt) = 2 P t: half of both is returned."""
+    model, problem = windy()
+    assert isinstance(model.baseline, RegressorBaseline)
+    hessian, gradient = module._normal_equations(model, problem, model.baseline)
+    step = 1e-5
+    central = [(with_step(model, problem, i, step) - with_step(model, problem, i, -step)) / (2 * step) for i in range(len(gradient))]
+    torch.testing.assert_close(2.0 * gradient, torch.tensor(central, dtype=torch.float64), rtol=1e-6, atol=1e-8)
+    assert float(gradient.abs().min()) > 1e-4, "every coefficient is seen"
+    torch.testing.assert_close(hessian, hessian.T)
+    assert float(torch.linalg.eigvalsh(hessian)[0]) > 0
+
+
+def test_hessian_is_half_that_of_the_cost_where_the_errors_vanish() -> None:
+    """At a perfect fit without a prior Gauss-Newton is Newton."""
+    model, problem = windy()
+    assert isinstance(model.baseline, RegressorBaseline)
+    x, exact = problem.x0, []
+    with torch.no_grad():
+        for k in range(problem.w.shape[1]):
+            x = module._euler(model, x, model.signals.prepare(problem.w[:, k]))
+            exact.append(x[:, 3:])
+    fields = {**vars(problem), "nu": torch.stack(exact, dim=1), "precision": 0 * problem.precision, "pull": 0 * problem.pull}
+    perfect = module._Problem(**fields)
+    hessian, gradient = module._normal_equations(model, perfect, model.baseline)
+    torch.testing.assert_close(gradient, torch.zeros_like(gradient), rtol=0, atol=1e-14)
+    step = 3e-6
+    centre = with_step(model, perfect, 0, 0.0)
+    assert centre == pytest.approx(problem.robust)
+    for i in range(len(gradient)):
+        curvature = (with_step(model, perfect, i, step) - 2 * centre + with_step(model, perfect, i, -step)) / step**2
+        assert 2.0 * float(hessian[i, i]) == pytest.approx(curvature, rel=2e-3)
+
+
+def test_a_symmetric_vessel_loses_what_it_cannot_have(smoothed: list[Prepared]) -> None:
+    free, known, store = fitted(LINEAR, smoothed)
+    held = copy.deepcopy(free)
+    config = {"horizon": 8.0, "every": 4.0, "prior": 1e-4}
+    refit(free, known, store, RefitConfig.model_validate(config), SCALES)
+    refit(held, known, store, RefitConfig.model_validate(config | {"asymmetric": 1e4}), SCALES)
+    # by hand: surge has no v, r, tau_n; sway and yaw have no constant, u, tau_x
+    wrong = torch.tensor([[False, False, True, True, False, True], [True, True, False, False, True, False], [True, True, False, False, True, False]])
+    assert float(theta_of(held)[wrong].abs().max()) < 1e-5
+    assert float(theta_of(free)[wrong].abs().max()) > 1e-3
+    assert float(theta_of(held)[~wrong].abs().min()) > 1e-3
+    # the vessel is symmetric, so knowing it costs next to nothing
+    assert free_run_error(held) < 1.2 * free_run_error(free)
+
+
+def one_line(error: type[ResidnetError], words: str, model: HybridDynamics, known: Samples, store: WindowStore, config: RefitConfig) -> None:
+    with pytest.raises(error, match=words) as caught:
+        refit(model, known, store, config, SCALES)
+    assert "\n" not in str(caught.value)
+
+
+def test_errors(smoothed: list[Prepared]) -> None:
+    model, known, store = fitted(LINEAR, smoothed)
+    still = HybridDynamics(model.signals, StillConfig().build(model.signals.names), ZeroHead(), STEP)
+    one_line(FitError, "needs a baseline of kind 'regressors' or 'linear_steady'", still, known, store, RefitConfig())
+    one_line(DataError, "shorten the horizon or give longer logs", model, known, store, RefitConfig(horizon=100.0))
+    # a raster wider than a log starts with it alone, and there nothing is known
+    late = dataclasses.replace(store, good=store.good & (store.depth > 0))
+    one_line(FitError, "no training log holds a free run of 8 s", model, known, late, RefitConfig(horizon=8.0, every=1000.0))
+    with torch.no_grad():
+        theta_of(model)[0, LINEAR.index("u")] = 1e6
+    one_line(FitError, "diverges within the refit's horizon", model, known, store, RefitConfig(horizon=30.0))
+
+
+def test_nothing_moves_from_the_truth_without_noise() -> None:
+    """Exact data, exact start: the cost is that of the refit's Euler scheme alone, and the free run stays where it was."""
+    logs = trials(noise=0.0, window=0.5)
+    model, known, store = fitted(QUADRATIC, logs)
+    with torch.no_grad():
+        theta_of(model).copy_(theta_of(truth()))
+    notes = refit(model, known, store, RefitConfig(horizon=8.0, every=4.0, robust=1e-3), SCALES)
+    assert notes["cost_after"] <= notes["cost_before"] < 0.05
+    assert free_run_error(model) < 0.05
