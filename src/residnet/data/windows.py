@@ -104,7 +104,7 @@ class WindowStore:
         index = starts[:, None] + torch.maximum(back, -self.depth[starts][:, None])
         rows = index.reshape(-1)
         shape = (starts.numel(), length)
-        return self.y.index_select(0, rows).reshape(*shape, -1), self.w.index_select(0, rows).reshape(*shape, -1)
+        return self.y.index_select(0, rows).unflatten(0, shape), self.w.index_select(0, rows).unflatten(0, shape)
 
 
 class WindowBatches:

@@ -104,6 +104,8 @@ class TrainingConfig(Config):
     def _work(self) -> TrainingConfig:
         if self.epochs == 0:
             raise ValueError("nothing to train: one_step.epochs is 0 and multi_step is empty")
+        if self.beginnings is not None and 1 in (self.one_step.batch, *(stage.batch for stage in self.multi_step)):
+            raise ValueError("beginnings need batches of at least 2 windows: some lie at the beginning of a stretch, the others anywhere")
         return self
 
     @property

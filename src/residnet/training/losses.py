@@ -46,4 +46,5 @@ def rollout_loss(rollout: Rollout, x0: Tensor, w: Tensor, s: Tensor, y: Tensor, 
         square = (error.square() * weight).sum((1, 2)) / (3.0 * weight.sum((1, 2))).clamp(min=1.0)
         return torch.sqrt(square + robust**2).mean()
     # a rollout that runs away must pull back, not drown the batch
-    return (torch.nn.functional.huber_loss(error, torch.zeros_like(error), reduction="none", delta=5.0) * 2.0 * weight).sum() / (3.0 * weight.sum())
+    square = 2.0 * torch.nn.functional.huber_loss(error, torch.zeros_like(error), reduction="none", delta=5.0)
+    return (square * weight).sum() / (3.0 * weight.sum()).clamp(min=1.0)

@@ -55,10 +55,12 @@ class HeadTraining(L.LightningModule):
     def _batches(self, stage: int, length: int, batch: int) -> list[WindowBatches]:
         """Where the windows of a stage's batches come from: anywhere, then the beginnings of stretches."""
         own, steps = self.settings.beginnings, self.settings.steps
+        if stage == 0 and self.settings.one_step.epochs == 0:
+            return []
         if own is None:
             return [WindowBatches(self.store.starts(length), batch, steps)]
-        few = min(max(round(own.share * batch), 1), batch - 1) if batch > 1 else 0
-        begins = self.store.beginnings(length, 0 if stage == 0 else round(own.initial / self.model.dt))
+        few = min(max(round(own.share * batch), 1), batch - 1)
+        begins = self.store.beginnings(length, 0 if stage == 0 else max(round(own.initial / self.model.dt), 1))
         return [WindowBatches(self.store.starts(length), batch - few, steps), WindowBatches(begins, few, steps)]
 
     def train_dataloader(self) -> EpochBatches:
@@ -113,7 +115,7 @@ class HeadTraining(L.LightningModule):
         parts = starts.split([source.batch for source in sources])
         memories = [self.model.warmup(*self.store.history(parts[0], round(self.settings.history / dt)))]
         if own is not None:
-            past, w_past = self.store.history(parts[1], round(own.initial / dt))
+            past, w_past = self.store.history(parts[1], max(round(own.initial / dt), 1))
             memories.append(self.model.warmup(past, w_past))
             begun = torch.cat((x0[len(parts[0]) :, :3], past[:, :, 3:].mean(1)), dim=1)
             x0 = torch.cat((x0[: len(parts[0])], begun))
