@@ -1,0 +1,257 @@
+"""Exported modules of every head kind, found from the union itself: the model's answers, the flags, the card, and refusal of what differs."""
+
+from __future__ import annotations
+
+import copy
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from residnet.baselines import RegressorsConfig
+from residnet.baselines.regressors import RegressorBaseline
+from residnet.core.errors import ExportError
+from residnet.core.names import STATE
+from residnet.core.samples import Samples
+from residnet.dynamics.ensemble import mean_of
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.store import ModelSpec
+from residnet.export import torchscript
+from residnet.export.torchscript import check_parity, export_torchscript
+from residnet.heads import ClosedFormHead, HeadConfig
+from residnet.physics.signals import SignalsConfig
+
+SIGNALS = SignalsConfig(inputs=("n_port", "n_stbd"), exogenous=("wind_speed", "wind_dir"), forces="wam_v_cal").resolved()
+NAMES = SIGNALS.build().names
+FEATURES = ("u", "v", "r", "tau_x", "tau_n", "wind_u", "wind_v", "wind_mag")
+LOW, HIGH = (-0.5, -0.6, -0.4, -10.0, -12.0, 0.0, -3.0), (3.0, 0.6, 0.4, 30.0, 32.0, 9.0, 3.0)
+KINDS: dict[str, type[Any]] = {config.model_fields["kind"].default: config for config in get_args(get_args(HeadConfig)[0])}
+# smaller than the defaults, for the sake of time
+SIZES: dict[str, dict[str, Any]] = {"mlp": {"hidden": (8,)}, "lstm": {"hidden_size": 6}}
+VARIANTS: dict[str, dict[str, Any]] = {
+    **{kind: {"kind": kind, "features": FEATURES, **SIZES.get(kind, {})} for kind in KINDS},
+    "mlp_mirror": {"kind": "mlp", "hidden": (8,), "mirror": True},
+    "lstm_mirror": {"kind": "lstm", "hidden_size": 5, "readout": 4, "memory": ("tau_x", "tau_n"), "mirror": True},
+    "lstm_per_axis": {"kind": "lstm", "hidden_size": 4, "per_axis": True, "activation": "softsign"},
+}
+ROW = {"model": "mine", "split": "test", "protocol": "T30", "manoeuvre": "all", "nrmse": {"mean": 0.1}}
+
+
+def spec_of(head: dict[str, Any] | None, **changes: Any) -> ModelSpec:
+    baseline = RegressorsConfig(terms=("1", "u", "v", "r", "tau_x", "tau_n", "wind_v wind_mag"))
+    content = {"schema": "residnet.model/1", "name": "mine", "role": "head", "signals": SIGNALS.model_dump(), "baseline": baseline.model_dump()}
+    content |= {"head": head, "dt": 0.1, "integrator": "rk4", "low": LOW, "high": HIGH}
+    return ModelSpec.model_validate(content | changes)
+
+
+def fill(model: HybridDynamics, seed: int = 0) -> None:
+    """A stable baseline, and a residual that is small beside it but matters."""
+    random = np.random.default_rng(seed)
+    assert isinstance(model.baseline, RegressorBaseline)
+    with torch.no_grad():
+        rows = [[0, -0.5, 0, 0, 2e-3, 0, 0], [0, 0, -0.8, -0.1, 0, 1e-4, 1e-3], [0, 0, 0.1, -0.9, 0, 1e-3, 1e-4]]
+        model.baseline.theta.copy_(torch.tensor(rows, dtype=torch.float64))
+    z = torch.from_numpy(
+        random.normal(size=(400, len(NAMES))) * [1, 0.2, 0.2, 10, 10, 200, 1, 100, 4, 4, 2] + [1.2, 0, 0, 10, 10, 200, 0, 0, 0, 0, 5]
+    )
+    target = torch.stack((0.05 * torch.tanh(z[:, 0]), 0.05 * torch.sin(z[:, 9]), 0.05 * torch.tanh(3 * z[:, 2])), dim=1)
+    target = target + 0.01 * torch.from_numpy(random.normal(size=(400, 3)))
+    samples = Samples(z, target, torch.arange(400) // 40, torch.zeros(400), ("zigzag",) * 10, NAMES)
+    model.head.calibrate(samples)
+    if isinstance(model.head, ClosedFormHead):
+        model.head.solve(samples)
+    with torch.no_grad():
+        for parameter in model.head.parameters():
+            parameter.add_(0.2 * torch.randn_like(parameter))
+
+
+def built(variant: str) -> tuple[ModelSpec, HybridDynamics]:
+    torch.manual_seed(0)
+    spec = spec_of(VARIANTS[variant])
+    model = spec.build()
+    fill(model)
+    return spec, model
+
+
+# the full length is run by the tests of the task `fit`
+FULL, STEPS = torchscript.PARITY_STEPS, 120
+
+
+@pytest.fixture(scope="module", autouse=True)
+def short_parity() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(torchscript, "PARITY_STEPS", STEPS)
+        yield
+
+
+class Exported:
+    """A model, its file loaded back, and its card as returned."""
+
+    def __init__(self, variant: str, folder: Path) -> None:
+        self.spec, self.model = built(variant)
+        self.file = folder / "deep" / f"{variant}.pt"
+        self.card = export_torchscript(self.spec, self.model, self.file, [ROW])
+        extra = {"card.json": ""}
+        self.module: Any = torch.jit.load(str(self.file), _extra_files=extra)
+        self.stored = json.loads(extra["card.json"])
+
+
+@pytest.fixture(scope="module", params=VARIANTS)
+def exported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Exported:
+    return Exported(request.param, tmp_path_factory.mktemp("export"))
+
+
+@pytest.fixture(scope="module")
+def lstm(tmp_path_factory: pytest.TempPathFactory) -> Exported:
+    return Exported("lstm", tmp_path_factory.mktemp("export"))
+
+
+def drives(batch: int, steps: int) -> tuple[Tensor, Tensor]:
+    """Initial states and jumping inputs, float32."""
+    random = np.random.default_rng(1)
+    x = random.normal(size=(batch, 6)) * [50, 50, 3, 0.5, 0.1, 0.1] + [0, 0, 0, 1, 0, 0]
+    w = random.uniform(LOW[3:], HIGH[3:], size=(batch, steps, 4))
+    return torch.from_numpy(x).float(), torch.from_numpy(w).float()
+
+
+def test_the_union_is_covered() -> None:
+    assert set(KINDS) <= set(VARIANTS)
+    assert len(KINDS) == len(get_args(get_args(HeadConfig)[0])) >= 4
+
+
+def test_parity_is_stated_and_small(exported: Exported) -> None:
+    parity = exported.card["parity"]
+    assert parity["steps"] == STEPS
+    assert FULL == 1000
+    assert list(parity["share_of_range"]) == list(STATE)
+    assert all(0 <= share <= 1e-5 for share in parity["share_of_range"].values())
+
+
+def test_steps_rollout_and_warm_up_are_those_of_the_model(exported: Exported) -> None:
+    """Random jumps instead of the sines of the export's own check."""
+    module, model, batch, steps = exported.module, exported.model, 3, 30
+    x0, w = drives(batch, steps)
+    past = torch.cat((x0[:, None, :3].expand(-1, 8, -1), torch.linspace(0.1, 0.3, 8)[None, :, None].expand(batch, -1, 3)), dim=-1)
+    with torch.no_grad():
+        s = model.warmup(past, w[:, :8])
+        theirs = module.warmup(past, w[:, :8])
+        torch.testing.assert_close(theirs, s, rtol=1e-5, atol=1e-6)
+        x, y, memory = x0, x0, s
+        path = [x0]
+        for k in range(steps):
+            x, memory = model.step(x, w[:, k], memory)
+            y, theirs, _ = module.step(y, w[:, k], theirs)
+            path.append(y)
+        torch.testing.assert_close(y, x, rtol=1e-5, atol=1e-5)
+        torch.testing.assert_close(theirs, memory, rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(module.rollout(x0, w, s), torch.stack(path, dim=1), rtol=1e-5, atol=1e-5)
+        empty = module.initial_state(batch)
+    assert torch.equal(empty, torch.zeros(batch, exported.card["memory"]))
+
+
+def test_everything_is_single_precision(exported: Exported) -> None:
+    module = exported.module
+    x, w = drives(2, 4)
+    with torch.no_grad():
+        s = module.initial_state(2)
+        after, memory, outside = module.step(x, w[:, 0], s)
+        path, warm = module.rollout(x, w, s), module.warmup(x[:, None].expand(-1, 4, -1), w)
+    assert {tensor.dtype for tensor in (s, after, memory, path, warm)} == {torch.float32}
+    assert outside.dtype == torch.bool
+    assert {value.dtype for value in exported.model.state_dict().values()} == {torch.float32}
+    assert exported.card["dtype"] == "float32"
+
+
+def test_outside_flags_each_channel_beyond_its_range(lstm: Exported) -> None:
+    module = lstm.module
+    low, high = torch.tensor(LOW), torch.tensor(HIGH)
+    middle = 0.5 * (low + high)
+    # rows: the middle, both corners, then each channel just below and just above its range
+    seen = [middle, low, high]
+    for i in range(len(LOW)):
+        for edge, step in ((low, -1e-3), (high, 1e-3)):
+            row = middle.clone()
+            row[i] = edge[i] + step
+            seen.append(row)
+    rows = torch.stack(seen)
+    x = torch.cat((torch.full((len(rows), 3), 1e4), rows[:, :3]), dim=1)
+    _, _, outside = module.step(x, rows[:, 3:], module.initial_state(len(rows)))
+    assert outside.tolist() == [False] * 3 + [True] * (2 * len(LOW)), "position and heading have no range"
+
+
+def test_the_card_says_what_a_controller_needs(exported: Exported) -> None:
+    card, spec = exported.stored, exported.spec
+    assert card == json.loads(json.dumps(exported.card)), "the file holds the card that was returned"
+    assert card["schema"] == "residnet.card/1"
+    units = {"x": "m", "y": "m", "psi": "rad", "u": "m/s", "v": "m/s", "r": "rad/s"}
+    assert card["states"] == [{"name": name, "unit": unit} for name, unit in units.items()]
+    assert card["inputs"] == [
+        {"name": "n_port", "unit": "1/s", "role": "command"},
+        {"name": "n_stbd", "unit": "1/s", "role": "command"},
+        {"name": "wind_speed", "unit": "m/s", "role": "exogenous"},
+        {"name": "wind_dir", "unit": "rad", "role": "exogenous"},
+    ]
+    assert (card["dt"], card["integrator"], card["model"]) == (0.1, "rk4", "mine")
+    names = ("u", "v", "r", "n_port", "n_stbd", "wind_speed", "wind_dir")
+    assert card["training_range"] == {name: [low, high] for name, low, high in zip(names, LOW, HIGH, strict=True)}
+    assert card["metrics"] == [ROW]
+    assert card["memory"] == exported.model.n_state
+    assert card["head"]["kind"] == spec.head.kind  # type: ignore[union-attr]
+    assert card["baseline"]["kind"] == "regressors"
+    assert card["members"] == []
+    assert card["versions"]["torch"] == torch.__version__
+    assert "code" in card["safety"]
+    assert "start" in card["inputs_held"]
+
+
+def test_an_ensemble_exports_and_names_its_members(tmp_path: Path) -> None:
+    parts = [built("mlp"), built("lstm")]
+    members = [spec.model_copy(update={"name": name}) for (spec, _), name in zip(parts, ("one", "two"), strict=True)]
+    spec = spec_of(None, role="ensemble", baseline={"kind": "still"}).model_copy(update={"members": tuple(members)})
+    card = export_torchscript(spec, mean_of([model for _, model in parts]), tmp_path / "mean.pt", [])
+    assert [(member["name"], member["head"]["kind"]) for member in card["members"]] == [("one", "mlp"), ("two", "lstm")]
+    assert max(card["parity"]["share_of_range"].values()) <= 1e-5
+
+
+def test_a_changed_weight_is_found(lstm: Exported) -> None:
+    assert max(check_parity(lstm.spec, lstm.model, lstm.module).values()) <= 1e-5
+    other = copy.deepcopy(lstm.model)
+    with torch.no_grad():
+        other.head.networks[0].readout[0].bias[2] += 1e-3  # type: ignore[union-attr, index]
+    with pytest.raises(ExportError, match=r"model mine: the exported module differs .* allowed 1e-05") as caught:
+        check_parity(lstm.spec, other, lstm.module)
+    assert "\n" not in str(caught.value)
+
+
+class NotFinite:
+    """An exported module whose rollout alone goes wrong, in the last channel."""
+
+    def __init__(self, module: Any) -> None:
+        self.warmup, self.step, self.good = module.warmup, module.step, module.rollout
+
+    def rollout(self, x: Tensor, w: Tensor, s: Tensor) -> Tensor:
+        out: Tensor = self.good(x, w, s)
+        out[:, -1, 5] = torch.nan
+        return out
+
+
+def test_a_value_that_is_not_finite_is_found(lstm: Exported) -> None:
+    with pytest.raises(ExportError, match="differs from the model"):
+        check_parity(lstm.spec, lstm.model, NotFinite(lstm.module))
+
+
+def test_a_file_that_differs_from_its_model_does_not_stand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is written is read back and compared before it takes its place."""
+    spec, model = built("mlp")
+    _, other = built("mlp_mirror")
+    wrong = torch.jit.script(torchscript.ExportedModel(other.float().eval(), spec).eval())
+    save = torch.jit.save
+    monkeypatch.setattr(torch.jit, "save", lambda module, path, _extra_files: save(wrong, path, _extra_files=_extra_files))
+    with pytest.raises(ExportError, match="model mine"):
+        export_torchscript(spec, model, tmp_path / "mine.pt", [])
+    assert not (tmp_path / "mine.pt").exists()
