@@ -162,23 +162,26 @@ def test_a_symmetric_vessel_loses_what_it_cannot_have(smoothed: list[Prepared]) 
     assert free_run_error(held) < 1.2 * free_run_error(free)
 
 
-def one_line(error: type[ResidnetError], words: str, model: HybridDynamics, known: Samples, store: WindowStore, config: RefitConfig) -> None:
-    with pytest.raises(error, match=words) as caught:
+def failure(error: type[ResidnetError], model: HybridDynamics, known: Samples, store: WindowStore, config: RefitConfig) -> str:
+    """The one line that a refit stops with."""
+    with pytest.raises(error) as caught:
         refit(model, known, store, config, SCALES)
     assert "\n" not in str(caught.value)
+    return str(caught.value)
 
 
 def test_errors(smoothed: list[Prepared]) -> None:
     model, known, store = fitted(LINEAR, smoothed)
     still = HybridDynamics(model.signals, StillConfig().build(model.signals.names), ZeroHead(), STEP)
-    one_line(FitError, "needs a baseline of kind 'regressors' or 'linear_steady'", still, known, store, RefitConfig())
-    one_line(DataError, "shorten the horizon or give longer logs", model, known, store, RefitConfig(horizon=100.0))
+    assert "needs a baseline of kind 'regressors' or 'linear_steady'" in failure(FitError, still, known, store, RefitConfig())
+    assert "shorten the horizon or give longer logs" in failure(DataError, model, known, store, RefitConfig(horizon=100.0))
     # a raster wider than a log starts with it alone, and there nothing is known
     late = dataclasses.replace(store, good=store.good & (store.depth > 0))
-    one_line(FitError, "no training log holds a free run of 8 s", model, known, late, RefitConfig(horizon=8.0, every=1000.0))
+    wide = RefitConfig(horizon=8.0, every=1000.0)
+    assert "no training log holds a free run of 8 s" in failure(FitError, model, known, late, wide)
     with torch.no_grad():
         theta_of(model)[0, LINEAR.index("u")] = 1e6
-    one_line(FitError, "diverges within the refit's horizon", model, known, store, RefitConfig(horizon=30.0))
+    assert "diverges within the refit's horizon" in failure(FitError, model, known, store, RefitConfig(horizon=30.0))
 
 
 def test_nothing_moves_from_the_truth_without_noise() -> None:
