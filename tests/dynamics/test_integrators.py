@@ -11,7 +11,6 @@ from torch import Tensor
 from residnet.dynamics.base import Dynamics, Integrator
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import PlantDynamics
-from residnet.physics.plant import DifferentialThrustVessel
 from residnet.physics.vessel import load_vessel
 
 SECONDS = 4.0
@@ -22,7 +21,7 @@ class SmoothPlant(Dynamics):
 
     def __init__(self, dt: float, integrator: Integrator) -> None:
         super().__init__(dt, integrator)
-        self.plant = DifferentialThrustVessel(load_vessel("wam_v_cal"))
+        self.plant = load_vessel("wam_v_cal").build()
 
     def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
         t = x[:, 6]
@@ -84,14 +83,15 @@ def test_rk4_equals_dop853(truth: np.ndarray) -> None:
 
 def test_plant_with_held_commands_equals_dop853() -> None:
     """Propellers at their command, commands held over a step, current and force: SciPy integrates step by step."""
-    plant = DifferentialThrustVessel(load_vessel("wam_v_cal"))
+    plant = load_vessel("wam_v_cal").build()
     dt, steps = 0.1, 30
     rng = np.random.default_rng(0)
     n = np.array([25.0, 15.0])
-    w = torch.zeros(1, steps, 7, dtype=torch.float64)
+    w = torch.zeros(1, steps, len(plant.inputs), dtype=torch.float64)
     w[:, :, :2] = torch.from_numpy(n)
     w[0, :, 2:5] = torch.from_numpy(rng.normal(size=(steps, 3)) * [30, 20, 20])
-    w[0, :, 5:] = torch.tensor([0.2, -0.1], dtype=torch.float64)
+    w[0, :, 5:7] = torch.tensor([0.2, -0.1], dtype=torch.float64)
+    w[0, :, 7:] = torch.tensor([15.0, -25.0], dtype=torch.float64)
     x0 = torch.tensor([[0.0, 0.0, 0.1, 1.0, 0.2, 0.2, *n]], dtype=torch.float64)
     with torch.no_grad():
         states, _, _ = Rollout(PlantDynamics(plant, dt, substeps=5))(x0, w, x0[:, :0])
@@ -109,9 +109,9 @@ def test_plant_with_held_commands_equals_dop853() -> None:
 
 def test_substeps_are_steps_of_the_plant() -> None:
     """Five sub-steps of 0.02 s under one command are five steps of 0.02 s."""
-    plant = DifferentialThrustVessel(load_vessel("wam_v_vrx"))
+    plant = load_vessel("wam_v_vrx").build()
     rng = torch.Generator().manual_seed(0)
-    w = torch.zeros(2, 20, 7, dtype=torch.float64)
+    w = torch.zeros(2, 20, len(plant.inputs), dtype=torch.float64)
     w[:, :, :2] = 40 * torch.rand(2, 20, 2, generator=rng, dtype=torch.float64) - 10
     x0 = torch.zeros(2, 8, dtype=torch.float64)
     with torch.no_grad():

@@ -16,7 +16,6 @@ from residnet.dynamics.simulated import PlantDynamics
 from residnet.evaluation.freerun import Candidate, free_run, integrate
 from residnet.evaluation.protocol import Window
 from residnet.heads import LstmConfig, ResidualHead, ZeroHead
-from residnet.physics.plant import DifferentialThrustVessel
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.vessel import load_vessel
 
@@ -158,10 +157,10 @@ def test_single_precision_is_close() -> None:
 
 def test_the_plant_itself_predicts_its_own_noise_free_trial() -> None:
     """The candidate `truth`: actuator states from the log, commands as inputs, nothing else known."""
-    plant = DifferentialThrustVessel(load_vessel("wam_v_cal"))
+    plant = load_vessel("wam_v_cal").build()
     model = PlantDynamics(plant, STEP, 2)
     count = 80
-    w = torch.zeros(1, count, 7, dtype=torch.float64)
+    w = torch.zeros(1, count, len(plant.inputs), dtype=torch.float64)
     w[0, :, 0] = 20 + 10 * torch.sin(torch.arange(count) * 0.1)
     w[0, :, 1] = 15.0
     x = torch.zeros(1, 8, dtype=torch.float64)
@@ -175,7 +174,7 @@ def test_the_plant_itself_predicts_its_own_noise_free_trial() -> None:
     log = Log("trial", STEP * np.arange(count), channels)
     good = np.ones(count, dtype=bool)
     trial = prepared(log, truth[:, :6], np.zeros((count, 2)), good, np.zeros(count, dtype=int))
-    candidate = Candidate("truth", "truth", model, plant.state[6:], plant.inputs[:2], 5)
+    candidate = Candidate("truth", "truth", model, plant.state[6:], plant.inputs[:2], len(plant.inputs) - 2)
     windows = [window(0, s, s + 30, nu=tuple(truth[s, 3:6])) for s in (0, 25, 50)]
     for w_, p in zip(windows, free_run([candidate], windows, [trial], STEP, LIMIT)["truth"], strict=True):
         np.testing.assert_allclose(p.states[:, 3:], truth[w_.start : w_.stop, 3:6], atol=1e-12)

@@ -20,8 +20,7 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import PlantDynamics
 from residnet.heads import ZeroHead
-from residnet.manoeuvres import AccelerationDeceleration, ConstantInput, Manoeuvre, StackedSource, ThreeTwoOneOne, Zigzag
-from residnet.physics.plant import DifferentialThrustVessel
+from residnet.manoeuvres import AccelerationDeceleration, ConstantInput, Helm, Manoeuvre, StackedSource, ThreeTwoOneOne, Zigzag
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.vessel import load_vessel
 
@@ -95,9 +94,9 @@ def trajectories(vessel: str, folder: Path) -> dict[str, tuple[np.ndarray, np.nd
     longest = max(float(table(path)["t"].iloc[-1]) for path in files)
     steps = round(longest / DT) + 1
     t = torch.arange(steps, dtype=torch.float64) * DT
-    plant = DifferentialThrustVessel(load_vessel(vessel))
+    plant = load_vessel(vessel).build()
     manoeuvres = [case_of(path).manoeuvre for path in files]
-    source = StackedSource([type(m).source([m], plant.demand, t) for m in manoeuvres], [1] * len(files))
+    source = StackedSource([type(m).source([m], Helm.of(plant), t) for m in manoeuvres], [1] * len(files))
     x0 = torch.zeros(len(files), len(plant.state), dtype=torch.float64)
     w = torch.zeros(len(files), steps, len(plant.inputs), dtype=torch.float64)
     with torch.no_grad():
@@ -118,13 +117,13 @@ def test_thrust_columns(golden_file: Path) -> None:
 @on_plant
 def test_right_hand_side_row_by_row(golden_file: Path) -> None:
     frame = table(golden_file)
-    plant = DifferentialThrustVessel(load_vessel(case_of(golden_file).vessel))
+    plant = load_vessel(case_of(golden_file).vessel).build()
     x = torch.cat((tensor(frame, "x", "y", "psi", "u", "v", "r"), tensor(frame, "n_port", "n_stbd") / 60.0), dim=1)
     with torch.no_grad():
         rate = plant.rate(x, torch.zeros(len(frame), len(plant.inputs), dtype=torch.float64)).numpy()
         hull = plant.hull
         nu = x[:, 3:6]
-        parts = [plant.thrusters(x[:, 6:8]), hull.coriolis(nu), hull.drag(nu)]
+        parts = [plant.actuators(x[:, 6:8]), hull.coriolis(nu), hull.drag(nu)]
         # a difference of forces cannot be more exact than its largest part
         size = (torch.stack(parts).abs().amax(0) @ hull.inverse.abs().T).numpy()
     truth = frame[["du", "dv", "dr"]].to_numpy()

@@ -18,13 +18,14 @@ from residnet.manoeuvres import (
     AccelerationDeceleration,
     ConstantInput,
     FamilyConfig,
+    Helm,
     Manoeuvre,
     ManoeuvreConfig,
     StackedSource,
     ThreeTwoOneOne,
     Zigzag,
 )
-from residnet.physics.plant import DifferentialThrustVessel
+from residnet.physics.plant import Plant
 from residnet.physics.vessel import load_vessel
 
 
@@ -53,23 +54,21 @@ def kind(request: pytest.FixtureRequest) -> str:
 
 
 @pytest.fixture(scope="module")
-def plant() -> DifferentialThrustVessel:
-    return DifferentialThrustVessel(load_vessel("wam_v_cal"))
+def plant() -> Plant:
+    return load_vessel("wam_v_cal").build()
 
 
 def times(seconds: float = DURATION, dt: float = DT) -> Tensor:
     return torch.arange(round(seconds / dt), dtype=torch.float64) * dt
 
 
-def fly(
-    plant: DifferentialThrustVessel, manoeuvres: list[Manoeuvre], dt: float = DT, seconds: float = DURATION, psi: float = 0.0
-) -> tuple[Tensor, Tensor]:
+def fly(plant: Plant, manoeuvres: list[Manoeuvre], dt: float = DT, seconds: float = DURATION, psi: float = 0.0) -> tuple[Tensor, Tensor]:
     """States [B, T+1, 8] and commands [B, T, 2]."""
     t = times(seconds, dt)
-    source = type(manoeuvres[0]).source(manoeuvres, plant.demand, t)
+    source = type(manoeuvres[0]).source(manoeuvres, Helm.of(plant), t)
     x0 = torch.zeros(len(manoeuvres), 8, dtype=torch.float64)
     x0[:, 2] = psi
-    w = torch.zeros(len(manoeuvres), len(t), 7, dtype=torch.float64)
+    w = torch.zeros(len(manoeuvres), len(t), len(plant.inputs), dtype=torch.float64)
     with torch.no_grad():
         states, inputs, _ = Rollout(PlantDynamics(plant, dt), source)(x0, w, x0[:, :0])
     return states, inputs[:, :, :2]
@@ -94,16 +93,16 @@ def test_what_was_drawn_can_be_written_down_and_read_back(kind: str) -> None:
         assert validate(manoeuvre.model_dump(mode="json"), ManoeuvreConfig, "log") == manoeuvre
 
 
-def test_commands_are_within_bounds(kind: str, plant: DifferentialThrustVessel) -> None:
+def test_commands_are_within_bounds(kind: str, plant: Plant) -> None:
     states, commands = fly(plant, drawn(kind))
     assert bool(torch.isfinite(states).all())
-    assert float(commands.abs().max()) <= plant.thrusters.n_max
+    assert float(commands.abs().max()) <= plant.actuators.n_max
     assert float(commands.abs().max()) > 0
     # the propellers follow
-    assert float(states[..., 6:].abs().max()) <= plant.thrusters.n_max
+    assert float(states[..., 6:].abs().max()) <= plant.actuators.n_max
 
 
-def test_a_batch_equals_single_flights(kind: str, plant: DifferentialThrustVessel) -> None:
+def test_a_batch_equals_single_flights(kind: str, plant: Plant) -> None:
     manoeuvres = drawn(kind)
     states, commands = fly(plant, manoeuvres)
     for i, manoeuvre in enumerate(manoeuvres[:2]):
@@ -112,24 +111,24 @@ def test_a_batch_equals_single_flights(kind: str, plant: DifferentialThrustVesse
         assert torch.equal(command[0], commands[i])
 
 
-def test_all_kinds_side_by_side_equal_each_alone(plant: DifferentialThrustVessel) -> None:
+def test_all_kinds_side_by_side_equal_each_alone(plant: Plant) -> None:
     groups = [drawn(kind)[:2] for kind in FAMILIES]
     t = times()
-    source = StackedSource([type(g[0]).source(g, plant.demand, t) for g in groups], [2] * len(groups))
+    source = StackedSource([type(g[0]).source(g, Helm.of(plant), t) for g in groups], [2] * len(groups))
     x0 = torch.zeros(2 * len(groups), 8, dtype=torch.float64)
-    w = torch.zeros(len(x0), len(t), 7, dtype=torch.float64)
+    w = torch.zeros(len(x0), len(t), len(plant.inputs), dtype=torch.float64)
     w[:, :, 2] = 5.0
     with torch.no_grad():
         states, inputs, _ = Rollout(PlantDynamics(plant, DT), source)(x0, w, x0[:, :0])
         assert bool((inputs[:, :, 2] == 5.0).all()), "disturbances pass through a manoeuvre"
         for i, group in enumerate(groups):
-            alone, _, _ = Rollout(PlantDynamics(plant, DT), type(group[0]).source(group, plant.demand, t))(x0[:2], w[:2], x0[:2, :0])
+            alone, _, _ = Rollout(PlantDynamics(plant, DT), type(group[0]).source(group, Helm.of(plant), t))(x0[:2], w[:2], x0[:2, :0])
             torch.testing.assert_close(alone, states[2 * i : 2 * i + 2], rtol=1e-10, atol=1e-12)
 
 
 @pytest.mark.parametrize("first", ["starboard", "port"])
 @pytest.mark.parametrize("psi", [0.0, 2.5, -7.0])
-def test_zigzag_switches_at_its_bound(first: str, psi: float, plant: DifferentialThrustVessel) -> None:
+def test_zigzag_switches_at_its_bound(first: str, psi: float, plant: Plant) -> None:
     bound = float(np.radians(15))
     zigzag = Zigzag(drive=0.5, steer=0.4, start=4.0, heading=bound, first=first)  # type: ignore[arg-type]
     states, commands = fly(plant, [zigzag], seconds=40.0, psi=psi)
@@ -178,7 +177,7 @@ def test_edges_fall_on_the_grid_point_they_name(dt: float, unit: float, start: f
 
 
 @pytest.mark.parametrize(("dt", "start"), [(0.01, 2.3), (0.05, 1.15), (0.1, 0.7), (0.02, 1.14)])
-def test_zigzag_starts_on_the_grid_point_it_names(dt: float, start: float, plant: DifferentialThrustVessel) -> None:
+def test_zigzag_starts_on_the_grid_point_it_names(dt: float, start: float, plant: Plant) -> None:
     _, commands = fly(plant, [Zigzag(drive=0.5, steer=0.4, start=start, heading=0.3)], dt=dt, seconds=3.0)
     turning = np.flatnonzero((commands[0, :, 0] != commands[0, :, 1]).numpy())
     assert turning[0] == round(start / dt)
@@ -254,9 +253,9 @@ def test_disturbance_has_the_spread_and_correlation_it_claims() -> None:
     from residnet.data.simulate import Disturbance, _environment
 
     config = Disturbance(force_x=30.0, force_y=20.0, force_n=10.0, correlation=2.0, current_north=0.3, current_east=-0.1)
-    w = _environment(config, 400, 800, 0.1, np.random.default_rng(0))
+    w = _environment(config, load_vessel("wam_v_cal").build(), 400, 800, 0.1, np.random.default_rng(0))
     assert (w[:, :, :2] == 0).all()
-    np.testing.assert_allclose(w[:, :, 5:], np.broadcast_to([0.3, -0.1], (400, 800, 2)))
+    np.testing.assert_allclose(w[:, :, 5:7], np.broadcast_to([0.3, -0.1], (400, 800, 2)))
     forces = w[:, :, 2:5]
     np.testing.assert_allclose(forces.std((0, 1)), [30, 20, 10], rtol=0.02)
     np.testing.assert_allclose(forces[:, 0].std(0), [30, 20, 10], rtol=0.12)

@@ -11,7 +11,6 @@ from residnet.core.errors import ConfigError
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import PlantDynamics
 from residnet.physics.fossen import Fossen3
-from residnet.physics.plant import DifferentialThrustVessel
 from residnet.physics.vessel import VesselConfig, load_vessel, vessel_files
 
 # centre of gravity off the origin and off-diagonal added mass, so that nothing vanishes by luck
@@ -79,11 +78,11 @@ def test_damping_takes_energy(vessel: VesselConfig) -> None:
 @pytest.mark.parametrize("name", ["wam_v_vrx"])
 def test_kinetic_energy_never_grows_without_input(name: str) -> None:
     """VRX damping is diagonal, so every motion must lose energy at every step."""
-    plant = DifferentialThrustVessel(load_vessel(name))
+    plant = load_vessel(name).build()
     x0 = torch.zeros(64, 8, dtype=torch.float64)
     x0[:, 3:6] = motions(64, 3)
     with torch.no_grad():
-        states, _, _ = Rollout(PlantDynamics(plant, 0.02))(x0, torch.zeros(64, 500, 7, dtype=torch.float64), x0[:, :0])
+        states, _, _ = Rollout(PlantDynamics(plant, 0.02))(x0, torch.zeros(64, 500, len(plant.inputs), dtype=torch.float64), x0[:, :0])
     nu = states[..., 3:6]
     energy = 0.5 * torch.einsum("bti,ij,btj->bt", nu, plant.hull.mass, nu)
     assert bool((energy.diff(dim=1) < 0).all())
@@ -91,22 +90,22 @@ def test_kinetic_energy_never_grows_without_input(name: str) -> None:
 
 
 def test_every_vessel_comes_to_rest_without_input(vessel: VesselConfig) -> None:
-    plant = DifferentialThrustVessel(vessel)
+    plant = vessel.build()
     x0 = torch.zeros(32, 8, dtype=torch.float64)
     x0[:, 3:6] = motions(32, 4)
     with torch.no_grad():
-        states, _, _ = Rollout(PlantDynamics(plant, 0.05))(x0, torch.zeros(32, 800, 7, dtype=torch.float64), x0[:, :0])
+        states, _, _ = Rollout(PlantDynamics(plant, 0.05))(x0, torch.zeros(32, 800, len(plant.inputs), dtype=torch.float64), x0[:, :0])
     assert float(states[:, -1, 3:6].abs().max()) < 1e-3
 
 
 def test_inertia_alone_keeps_energy(vessel: VesselConfig) -> None:
     """Without damping and force the kinetic energy of a symmetric mass matrix is a constant of motion: RK4 drifts by O(dt^5) only."""
     bare = vessel.model_copy(update={"damping": type(vessel.damping)()})
-    plant = DifferentialThrustVessel(bare)
+    plant = bare.build()
     x0 = torch.zeros(16, 8, dtype=torch.float64)
     x0[:, 3:6] = motions(16, 5)
     with torch.no_grad():
-        states, _, _ = Rollout(PlantDynamics(plant, 0.01))(x0, torch.zeros(16, 300, 7, dtype=torch.float64), x0[:, :0])
+        states, _, _ = Rollout(PlantDynamics(plant, 0.01))(x0, torch.zeros(16, 300, len(plant.inputs), dtype=torch.float64), x0[:, :0])
     nu = states[..., 3:6]
     energy = 0.5 * torch.einsum("bti,ij,btj->bt", nu, plant.hull.mass, nu)
     assert float((energy / energy[:, :1] - 1).abs().max()) < 1e-7
@@ -120,8 +119,8 @@ def test_port_and_starboard_are_mirror_images(vessel: VesselConfig) -> None:
 
 
 def test_mirrored_commands_give_the_mirrored_track(vessel: VesselConfig) -> None:
-    plant = DifferentialThrustVessel(vessel)
-    w = torch.zeros(2, 600, 7, dtype=torch.float64)
+    plant = vessel.build()
+    w = torch.zeros(2, 600, len(plant.inputs), dtype=torch.float64)
     w[0, :, :2] = plant.demand(torch.tensor(0.5, dtype=torch.float64), torch.tensor(0.3, dtype=torch.float64))
     w[1, :, :2] = plant.demand(torch.tensor(0.5, dtype=torch.float64), torch.tensor(-0.3, dtype=torch.float64))
     x0 = torch.zeros(2, 8, dtype=torch.float64)
@@ -134,22 +133,22 @@ def test_mirrored_commands_give_the_mirrored_track(vessel: VesselConfig) -> None
 
 def test_gradients_of_the_right_hand_side(vessel: VesselConfig) -> None:
     """Away from the kinks of |.| and of the dead band."""
-    plant = DifferentialThrustVessel(vessel)
+    plant = vessel.build()
     x = torch.tensor([[1.0, -2.0, 0.7, 1.2, -0.3, 0.25, 20.0, -15.0], [0.0, 0.0, -1.0, -0.8, 0.4, -0.3, 10.0, 30.0]], dtype=torch.float64)
-    w = torch.tensor([[0, 0, 30.0, -20.0, 10.0, 0.2, -0.1], [0, 0, 0, 0, 0, -0.3, 0.2]], dtype=torch.float64)
+    w = torch.tensor([[0, 0, 30.0, -20.0, 10.0, 0.2, -0.1, 40.0, 15.0], [0, 0, 0, 0, 0, -0.3, 0.2, 0.0, -30.0]], dtype=torch.float64)
     assert torch.autograd.gradcheck(plant.rate, (x.requires_grad_(), w.requires_grad_()))
 
 
 def test_a_current_that_carries_the_vessel_exerts_no_force(vessel: VesselConfig) -> None:
     """At rest relative to the water at any heading: no acceleration over ground; it drifts with the water and keeps its heading."""
-    plant = DifferentialThrustVessel(vessel)
+    plant = vessel.build()
     psi = torch.linspace(-3, 3, 7, dtype=torch.float64)
     north, east = 0.4, -0.25
     x = torch.zeros(7, 8, dtype=torch.float64)
     x[:, 2] = psi
     x[:, 3] = north * torch.cos(psi) + east * torch.sin(psi)
     x[:, 4] = -north * torch.sin(psi) + east * torch.cos(psi)
-    w = torch.zeros(7, 200, 7, dtype=torch.float64)
+    w = torch.zeros(7, 200, len(plant.inputs), dtype=torch.float64)
     w[:, :, 5], w[:, :, 6] = north, east
     assert float(plant.rate(x, w[:, 0])[:, 3:].abs().max()) < 1e-13
     with torch.no_grad():
@@ -160,8 +159,8 @@ def test_a_current_that_carries_the_vessel_exerts_no_force(vessel: VesselConfig)
 
 def test_a_current_is_a_moving_frame(vessel: VesselConfig) -> None:
     """Galilei: a manoeuvre in a current is the manoeuvre in still water plus the drift."""
-    plant = DifferentialThrustVessel(vessel)
-    w = torch.zeros(2, 1500, 7, dtype=torch.float64)
+    plant = vessel.build()
+    w = torch.zeros(2, 1500, len(plant.inputs), dtype=torch.float64)
     w[:, :, :2] = plant.demand(torch.tensor(0.6, dtype=torch.float64), torch.tensor(0.3, dtype=torch.float64))
     w[1, :, 5], w[1, :, 6] = 0.3, 0.2
     x0 = torch.zeros(2, 8, dtype=torch.float64)
@@ -175,8 +174,8 @@ def test_a_current_is_a_moving_frame(vessel: VesselConfig) -> None:
 
 def test_top_speed_and_pivot_of_the_calibrated_set() -> None:
     """ERRATA: 2.19 m/s at full thrust; turning on the spot 25.9 deg/s with v = -0.19 m/s."""
-    plant = DifferentialThrustVessel(load_vessel("wam_v_cal"))
-    w = torch.zeros(2, 1200, 7, dtype=torch.float64)
+    plant = load_vessel("wam_v_cal").build()
+    w = torch.zeros(2, 1200, len(plant.inputs), dtype=torch.float64)
     w[0, :, :2] = plant.demand(torch.tensor(1.0, dtype=torch.float64), torch.tensor(0.0, dtype=torch.float64))
     w[1, :, :2] = plant.demand(torch.tensor(0.0, dtype=torch.float64), torch.tensor(1.0, dtype=torch.float64))
     x0 = torch.zeros(2, 8, dtype=torch.float64)
@@ -195,3 +194,16 @@ def test_a_mass_matrix_that_is_not_positive_stops() -> None:
     coupled = load_config(vessel_files()["wam_v_cal"], ["added_mass.Y_rdot.value=-2000", "added_mass.N_vdot.value=-2000"], VesselConfig)
     with pytest.raises(ConfigError, match="positive definite"):
         Fossen3(coupled)
+
+
+def test_a_force_held_in_earth_axes_turns_with_the_hull() -> None:
+    """The same force given in earth axes and, turned by hand, in body axes."""
+    plant = load_vessel("wam_v_cal").build()
+    x = torch.zeros(2, 8, dtype=torch.float64)
+    x[:, 2] = 0.7
+    w = torch.zeros(2, len(plant.inputs), dtype=torch.float64)
+    w[0, 7:] = torch.tensor([40.0, -15.0], dtype=torch.float64)
+    w[1, 2] = 40.0 * np.cos(0.7) - 15.0 * np.sin(0.7)
+    w[1, 3] = -40.0 * np.sin(0.7) - 15.0 * np.cos(0.7)
+    given, turned = plant.rate(x, w)
+    torch.testing.assert_close(given, turned, rtol=1e-13, atol=0)

@@ -10,7 +10,8 @@ import torch
 from residnet.core.config import load_config
 from residnet.core.errors import ConfigError
 from residnet.physics.fossen import Fossen3
-from residnet.physics.vessel import Parameter, VesselConfig, load_vessel, vessel_files
+from residnet.physics.parameters import Parameter
+from residnet.physics.vessel import VesselConfig, load_vessel, vessel_files
 
 CAL = vessel_files()["wam_v_cal"]
 

@@ -16,8 +16,8 @@ from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS, VELOCITY
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import PlantDynamics
-from residnet.manoeuvres import FamilyConfig, Manoeuvre, StackedSource
-from residnet.physics.plant import DifferentialThrustVessel
+from residnet.manoeuvres import FamilyConfig, Helm, Manoeuvre, StackedSource
+from residnet.physics.plant import Plant
 from residnet.physics.vessel import load_vessel
 
 
@@ -115,14 +115,14 @@ def simulate(manoeuvres: Sequence[Manoeuvre], config: SimulatedTrials) -> list[L
 
     Channels: t, x, y, psi, u, v, r (velocities noisy), n_port, n_stbd (actual), cmd_port, cmd_stbd (commanded). Float64.
     """
-    plant = DifferentialThrustVessel(load_vessel(config.vessel))
+    plant = load_vessel(config.vessel).build()
     steps = round(config.duration / config.step)
     t = torch.arange(steps, dtype=torch.float64) * config.step
     runs = [list(members) for _, members in groupby(manoeuvres, key=lambda m: m.kind)]
-    sources = [type(members[0]).source(members, plant.demand, t) for members in runs]
+    sources = [type(members[0]).source(members, Helm.of(plant), t) for members in runs]
     source = StackedSource(sources, [len(members) for members in runs])
     random = np.random.default_rng([config.seed, 3])
-    w = torch.from_numpy(_environment(config.disturbance, len(manoeuvres), steps, config.step, random))
+    w = torch.from_numpy(_environment(config.disturbance, plant, len(manoeuvres), steps, config.step, random))
     rest = torch.zeros(len(manoeuvres), len(plant.state), dtype=torch.float64)
     with torch.no_grad():
         states, inputs, _ = Rollout(PlantDynamics(plant, config.step, config.substeps), source)(rest, w, rest[:, :0])
@@ -150,15 +150,17 @@ def simulate(manoeuvres: Sequence[Manoeuvre], config: SimulatedTrials) -> list[L
     return logs
 
 
-def _environment(config: Disturbance, rows: int, steps: int, step: float, random: np.random.Generator) -> np.ndarray:
-    """Inputs of the plant [B, T, 7] with the commands zero: Ornstein-Uhlenbeck forces (exact discretisation) and current."""
+def _environment(config: Disturbance, plant: Plant, rows: int, steps: int, step: float, random: np.random.Generator) -> np.ndarray:
+    """Inputs of the plant [B, T, m] with the commands zero: Ornstein-Uhlenbeck forces (exact discretisation) and current."""
     from scipy.signal import lfilter
 
     keep = np.exp(-step / config.correlation)
     drive = random.standard_normal((rows, steps, 3)) * np.sqrt(1 - keep**2)
     drive[:, 0] /= np.sqrt(1 - keep**2)
     forces = lfilter([1.0], [1.0, -keep], drive, axis=1) * [config.force_x, config.force_y, config.force_n]
-    w = np.zeros((rows, steps, len(DifferentialThrustVessel.inputs)))
-    w[:, :, 2:5] = forces
-    w[:, :, 5:] = [config.current_north, config.current_east]
+    w = np.zeros((rows, steps, len(plant.inputs)))
+    for j, name in enumerate(("force_x", "force_y", "force_n")):
+        w[:, :, plant.inputs.index(name)] = forces[:, :, j]
+    w[:, :, plant.inputs.index("current_north")] = config.current_north
+    w[:, :, plant.inputs.index("current_east")] = config.current_east
     return w

@@ -7,7 +7,7 @@ from typing import Annotated
 from pydantic import Field
 
 from residnet.manoeuvres.acceleration_deceleration import AccelerationDeceleration, AccelerationDecelerationFamily
-from residnet.manoeuvres.base import Manoeuvre, StackedSource
+from residnet.manoeuvres.base import Helm, Manoeuvre, StackedSource
 from residnet.manoeuvres.constant import ConstantFamily, ConstantInput
 from residnet.manoeuvres.three_two_one_one import ThreeTwoOneOne, ThreeTwoOneOneFamily
 from residnet.manoeuvres.zigzag import Zigzag, ZigzagFamily
@@ -19,6 +19,7 @@ __all__ = [
     "AccelerationDeceleration",
     "ConstantInput",
     "FamilyConfig",
+    "Helm",
     "Manoeuvre",
     "ManoeuvreConfig",
     "StackedSource",

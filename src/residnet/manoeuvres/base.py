@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Literal, final
 
 import torch
@@ -15,10 +16,40 @@ from pydantic import Field
 from torch import Tensor
 
 from residnet.core.config import Config, Seconds
+from residnet.core.errors import UsageError
 from residnet.dynamics.rollout import Source
+from residnet.physics.plant import Plant
 
 Demand = Callable[[Tensor, Tensor], Tensor]
 """Turns drive [...] and steer [...] into commands [..., c], the first c columns of the inputs."""
+
+
+@dataclass(frozen=True)
+class Helm:
+    """What a manoeuvre needs to know of the vessel that it steers.
+
+    Attributes:
+        demand: turns its normalised demands into the vessel's commands.
+        state: names of the columns of the vessel's state.
+    """
+
+    demand: Demand
+    state: tuple[str, ...]
+
+    @classmethod
+    def of(cls, plant: Plant) -> Helm:
+        """The helm of a plant."""
+        return cls(plant.demand, plant.state)
+
+    def column(self, name: str) -> int:
+        """Column of a state.
+
+        Raises:
+            UsageError: where the vessel has no such state.
+        """
+        if name not in self.state:
+            raise UsageError(f"the manoeuvre watches '{name}', which the vessel does not have; it has {', '.join(self.state)}")
+        return self.state.index(name)
 
 
 @final
@@ -68,7 +99,7 @@ class Manoeuvre(Config, ABC):
 
     @classmethod
     @abstractmethod
-    def source(cls, manoeuvres: Sequence[Manoeuvre], demand: Demand, t: Tensor) -> Source:
+    def source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
         """The source that flies several manoeuvres of this kind side by side; t [T] are the times of the steps."""
 
 
@@ -80,10 +111,10 @@ class Scheduled(Manoeuvre):
         """Drive and steer [T] at times t [T] in s."""
 
     @classmethod
-    def source(cls, manoeuvres: Sequence[Manoeuvre], demand: Demand, t: Tensor) -> Source:
+    def source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
         """Playback of the demands."""
         pairs = [manoeuvre.demands(t) for manoeuvre in manoeuvres if isinstance(manoeuvre, Scheduled)]
-        return ScheduleSource(torch.stack([d for d, _ in pairs]), torch.stack([s for _, s in pairs]), demand)
+        return ScheduleSource(torch.stack([d for d, _ in pairs]), torch.stack([s for _, s in pairs]), helm.demand)
 
 
 class Steering(Config):

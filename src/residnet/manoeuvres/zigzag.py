@@ -12,7 +12,7 @@ from torch import Tensor
 
 from residnet.core.config import Config, Radians, Seconds
 from residnet.dynamics.rollout import Source
-from residnet.manoeuvres.base import Demand, Manoeuvre, Range, Side, Steering
+from residnet.manoeuvres.base import Helm, Manoeuvre, Range, Side, Steering
 
 
 class Zigzag(Steering, Manoeuvre):
@@ -23,31 +23,32 @@ class Zigzag(Steering, Manoeuvre):
     first: Side = "starboard"
 
     @classmethod
-    def source(cls, manoeuvres: Sequence[Manoeuvre], demand: Demand, t: Tensor) -> Source:
+    def source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
         """Closed loop on the heading of each row."""
         chosen = [m for m in manoeuvres if isinstance(m, Zigzag)]
-        return ZigzagSource(chosen, demand, t)
+        return ZigzagSource(chosen, helm, t)
 
 
 @final
 class ZigzagSource(Source):
     """Memory [B, 2]: side of the command (+1 starboard, -1 port) and heading at the start."""
 
-    def __init__(self, manoeuvres: Sequence[Zigzag], demand: Demand, t: Tensor) -> None:
+    def __init__(self, manoeuvres: Sequence[Zigzag], helm: Helm, t: Tensor) -> None:
         super().__init__()
         columns = [[m.drive, m.steer, m.start, m.heading, 1.0 if m.first == "starboard" else -1.0] for m in manoeuvres]
         self.drive, self.steer, self.start, self.heading, self.first = torch.tensor(columns, dtype=torch.float64).unbind(-1)
-        self.demand = demand
+        self.demand = helm.demand
+        self.psi = helm.column("psi")
         self.times = t.tolist()
 
     def initial(self, x: Tensor) -> Tensor:
         """First side and present heading, [B, 2]."""
-        return torch.stack((self.first.to(x.dtype), x[:, 2]), dim=-1)
+        return torch.stack((self.first.to(x.dtype), x[:, self.psi]), dim=-1)
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Inputs [B, m]; the bound is tested on the heading at the start of the step."""
         side, origin = memory[:, 0], memory[:, 1]
-        reached = side * (x[:, 2] - origin) >= self.heading.to(x.dtype)
+        reached = side * (x[:, self.psi] - origin) >= self.heading.to(x.dtype)
         side = torch.where(reached, -side, side)
         steer = torch.where(self.times[k] >= self.start, side * self.steer.to(x.dtype), torch.zeros_like(side))
         command = self.demand(self.drive.to(x.dtype), steer)

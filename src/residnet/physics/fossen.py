@@ -2,13 +2,94 @@
 
 from __future__ import annotations
 
+from typing import Literal, final
+
 import torch
+from pydantic import Field, field_validator, model_validator
 from torch import Tensor, nn
 
+from residnet.core.config import Config
 from residnet.core.errors import ConfigError
 from residnet.core.names import VELOCITY
-from residnet.physics.terms import TermLibrary
-from residnet.physics.vessel import VesselConfig
+from residnet.physics.actuators import ActuatorsConfig
+from residnet.physics.kinematics import Planar
+from residnet.physics.parameters import Inertia, Length, Mass, MassArm, Parameter, above_zero, dimension, unit_text
+from residnet.physics.plant import HullPlant
+from residnet.physics.terms import TermLibrary, parse_term
+
+
+class RigidBody(Config):
+    """Mass, yaw inertia about the body origin and longitudinal centre of gravity."""
+
+    m: Mass
+    I_z: Inertia
+    x_G: Length
+
+    _positive = field_validator("m", "I_z")(above_zero)
+
+
+class AddedMass(Config):
+    """Hydrodynamic derivatives with respect to accelerations (SNAME: negative for a normal hull)."""
+
+    X_udot: Mass
+    Y_vdot: Mass
+    Y_rdot: MassArm
+    N_vdot: MassArm
+    N_rdot: Inertia
+
+
+class Damping(Config):
+    """Damping force of each axis as terms of (u, v, r), positive = damping, e.g. `X: {u: ..., "u|u|": ...}`."""
+
+    X: dict[str, Parameter] = Field(default_factory=dict)
+    Y: dict[str, Parameter] = Field(default_factory=dict)
+    N: dict[str, Parameter] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _units(self) -> Damping:
+        for axis, row, force in (("X", self.X, (1, -2)), ("Y", self.Y, (1, -2)), ("N", self.N, (2, -2))):
+            for term, parameter in row.items():
+                try:
+                    metres, seconds = force
+                    for factor in parse_term(term, VELOCITY):
+                        if factor.power < 0:
+                            raise ConfigError(f"term '{term}' is infinite at rest")
+                        metres -= factor.power * (factor.name != "r")
+                        seconds += factor.power
+                except ConfigError as error:
+                    raise ValueError(f"{axis}: {error}") from None
+                if dimension(parameter.unit) != (metres, seconds):
+                    raise ValueError(f"{axis}.{term}: its unit must be {unit_text(metres, seconds)}, given '{parameter.unit}'")
+        return self
+
+
+class FossenConfig(Config):
+    """A 3-DOF vessel: inertia, added mass, damping by terms, actuators.
+
+    Attributes:
+        name: of the vessel, as its file is called.
+        description: one line for `residnet list vessels`.
+        length: of the hull, which manoeuvring indices are measured in.
+    """
+
+    kind: Literal["fossen"] = "fossen"
+    name: str
+    description: str
+    length: Length
+    rigid_body: RigidBody
+    added_mass: AddedMass
+    damping: Damping
+    actuators: ActuatorsConfig
+
+    _positive = field_validator("length")(above_zero)
+
+    def build(self) -> FossenVessel:
+        """The plant.
+
+        Raises:
+            ConfigError: where the mass matrix is not positive definite.
+        """
+        return FossenVessel(self)
 
 
 class Fossen3(nn.Module):
@@ -18,7 +99,7 @@ class Fossen3(nn.Module):
     results take the dtype of the input.
     """
 
-    def __init__(self, vessel: VesselConfig) -> None:
+    def __init__(self, vessel: FossenConfig) -> None:
         super().__init__()
         body, added = vessel.rigid_body, vessel.added_mass
         m, arm = body.m.value, body.m.value * body.x_G.value
@@ -61,3 +142,19 @@ class Fossen3(nn.Module):
         """Acceleration nu_dot [..., 3] from velocities through the water nu [..., 3] and forces tau [..., 3]."""
         force = tau - self.coriolis(nu) - self.drag(nu)
         return force @ self.inverse.to(nu.dtype).T
+
+
+@final
+class FossenVessel(HullPlant):
+    """The hull with its actuators, in current and external force.
+
+    State x [B, 6 + k]: x, y [m], psi [rad], u, v [m/s] over ground, r [rad/s], then the actuators' states.
+    """
+
+    def __init__(self, vessel: FossenConfig) -> None:
+        super().__init__(Planar(), vessel.actuators.build())
+        self.hull = Fossen3(vessel)
+
+    def acceleration(self, pose: Tensor, nu: Tensor, tau: Tensor) -> Tensor:
+        """nu_dot [B, 3] from velocities through the water [B, 3] and forces [B, 3]."""
+        return self.hull(nu, tau)

@@ -2,51 +2,83 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from typing import final
+
 import torch
 from torch import Tensor, nn
 
-from residnet.core.frames import to_body, to_earth
-from residnet.core.names import STATE
-from residnet.physics.actuators import DifferentialThrust
-from residnet.physics.fossen import Fossen3
-from residnet.physics.vessel import VesselConfig
+from residnet.physics.actuators import Actuators
+from residnet.physics.kinematics import Kinematics
 
 
-class DifferentialThrustVessel(nn.Module):
-    """A 3-DOF vessel on two thrusters in current and external force.
+class Plant(nn.Module, ABC):
+    """The truth of a simulation.
 
-    State x [B, 8]: x, y [m], psi [rad], u, v [m/s] over ground, r [rad/s], n_port, n_stbd [1/s].
-    Inputs w [B, 7]: cmd_port, cmd_stbd [1/s], force_x, force_y [N], force_n [N m] (body axes), current_north, current_east [m/s].
+    Attributes:
+        state: names of the columns of x [B, nx]: pose, velocities, then states of the actuators.
+        inputs: names of the columns of w [B, m]: commands, then what nobody commands.
+        commands: how many of the inputs are commands.
     """
 
-    state = (*STATE, "n_port", "n_stbd")
-    inputs = ("cmd_port", "cmd_stbd", "force_x", "force_y", "force_n", "current_north", "current_east")
-    commands = 2
+    state: tuple[str, ...]
+    inputs: tuple[str, ...]
+    commands: int
 
-    def __init__(self, vessel: VesselConfig) -> None:
-        super().__init__()
-        self.hull = Fossen3(vessel)
-        self.thrusters: DifferentialThrust = vessel.actuators.build()
-
+    @abstractmethod
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Commands [..., 2] in 1/s from the normalised mean and difference of revolutions (document 003 eqs. (30), (31)), clipped to +-1 per side."""
-        both = torch.stack((drive + steer, drive - steer), dim=-1)
-        return both.clamp(-1.0, 1.0) * self.thrusters.n_max
+        """Commands [..., c] from the normalised drive and steer [...] of a manoeuvre."""
 
+    @abstractmethod
     def rate(self, x: Tensor, w: Tensor) -> Tensor:
-        """x_dot [B, 8] at held actuator states; a constant current acts through the velocity relative to the water."""
-        psi, nu = x[:, 2], x[:, 3:6]
-        r = nu[:, 2]
-        along, across = to_body(w[:, 5], w[:, 6], psi)
-        relative = torch.stack((nu[:, 0] - along, nu[:, 1] - across, r), dim=-1)
-        acceleration = self.hull(relative, self.thrusters(x[:, 6:8]) + w[:, 2:5])
-        # the current is constant in earth axes, so it turns in body axes
-        u_dot = acceleration[:, 0] + r * across
-        v_dot = acceleration[:, 1] - r * along
-        north, east = to_earth(nu[:, 0], nu[:, 1], psi)
-        zero = torch.zeros_like(r)
-        return torch.stack((north, east, r, u_dot, v_dot, acceleration[:, 2], zero, zero), dim=-1)
+        """x_dot [B, nx] under inputs w [B, m]."""
 
     def settle(self, x: Tensor, w: Tensor, dt: float) -> Tensor:
-        """State [B, 8] with the actuators moved on by a step of dt seconds (they are held while the hull moves)."""
-        return torch.cat((x[:, :6], self.thrusters.advance(x[:, 6:8], w[:, :2], dt)), dim=-1)
+        """State [B, nx] after what moves once per step of dt seconds has moved."""
+        return x
+
+
+class HullPlant(Plant, ABC):
+    """A hull with actuators in current and external forces; a subclass gives the acceleration of the hull.
+
+    Inputs: commands; force_x, force_y, (force_k,) force_n in body axes [N, N, (N m,) N m]; current_north, current_east [m/s];
+    force_north, force_east [N], constant in earth axes. A current is constant in earth axes and acts through the velocity
+    relative to the water.
+    """
+
+    def __init__(self, kinematics: Kinematics, actuators: Actuators) -> None:
+        super().__init__()
+        self.kinematics = kinematics
+        self.actuators = actuators
+        self.n = len(kinematics.velocity)
+        self.state = (*kinematics.pose, *kinematics.velocity, *actuators.state)
+        self.commands = len(actuators.commands)
+        forces = tuple(f"force_{axis}" for axis in kinematics.axes)
+        self.inputs = (*actuators.commands, *forces, "current_north", "current_east", "force_north", "force_east")
+
+    @abstractmethod
+    def acceleration(self, pose: Tensor, nu: Tensor, tau: Tensor) -> Tensor:
+        """nu_dot [B, n] at pose [B, n] from velocities through the water [B, n] and forces [B, n]."""
+
+    @final
+    def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
+        """Commands [..., c] from the normalised drive and steer [...] of a manoeuvre."""
+        return self.actuators.demand(drive, steer)
+
+    @final
+    def rate(self, x: Tensor, w: Tensor) -> Tensor:
+        """x_dot [B, nx] under inputs w [B, m]."""
+        n, c = self.n, self.commands
+        pose, nu, a = x[:, :n], x[:, n : 2 * n], x[:, 2 * n :]
+        command = w[:, :c]
+        water, turned = self.kinematics.carried(w[:, c + n], w[:, c + n + 1], pose, nu)
+        relative = nu - water
+        tau = self.actuators.force(a, command, relative) + w[:, c : c + n] + self.kinematics.pushed(w[:, c + n + 2], w[:, c + n + 3], pose)
+        nu_dot = self.acceleration(pose, relative, tau) + turned
+        return torch.cat((self.kinematics.rate(pose, nu), nu_dot, self.actuators.rate(a, command)), dim=-1)
+
+    @final
+    def settle(self, x: Tensor, w: Tensor, dt: float) -> Tensor:
+        """State [B, nx] with the actuators moved on by a step of dt seconds (they are held while the hull moves)."""
+        after = self.actuators.advance(x[:, 2 * self.n :], w[:, : self.commands], dt)
+        return torch.cat((x[:, : 2 * self.n], after), dim=-1)

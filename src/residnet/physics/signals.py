@@ -67,9 +67,12 @@ class SignalsConfig(Config):
         if not isinstance(self.forces, str):
             return self
         try:
-            return self.model_copy(update={"forces": load_vessel(self.forces).actuators})
+            actuators = load_vessel(self.forces).actuators
         except ConfigError as error:
             raise ValueError(str(error)) from None
+        if not isinstance(actuators, DifferentialThrustConfig):
+            raise ValueError(f"forces: the actuators of '{self.forces}' are not two thrusters (differential_thrust); leave forces out")
+        return self.model_copy(update={"forces": actuators})
 
     def units(self) -> dict[str, str]:
         """SI unit of each state and input."""

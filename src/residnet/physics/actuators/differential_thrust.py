@@ -1,17 +1,18 @@
-"""Actuators: thrust curves, rate limits and the forces that they make on the hull."""
+"""Two fixed thrusters side by side: thrust curves, rate limits and the forces that they make on the hull."""
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, final
 
 import torch
 from pydantic import Field
-from torch import Tensor, nn
+from torch import Tensor
 
-from residnet.core.config import Config, Metres, RevRate, RevsPerSecond
+from residnet.core.config import Metres, RevRate, RevsPerSecond
+from residnet.physics.actuators.base import ActuatorConfig, Actuators
 
 
-class DifferentialThrustConfig(Config):
+class DifferentialThrustConfig(ActuatorConfig):
     """Two fixed thrusters side by side (document 003 section 4.1; revolutions in 1/s).
 
     `forward` and `reverse` are the coefficients (c0 [N], c1 [N s], c2 [N s^2]) of T = c0 + c1 n + c2 n^2 per thruster,
@@ -25,15 +26,18 @@ class DifferentialThrustConfig(Config):
     n_rate: RevRate = Field(gt=0)
     forward: tuple[float, float, float]
     reverse: tuple[float, float, float]
-    source: str
 
     def build(self) -> DifferentialThrust:
         """The force map."""
         return DifferentialThrust(self)
 
 
-class DifferentialThrust(nn.Module):
+@final
+class DifferentialThrust(Actuators):
     """Forces of two thrusters: revolutions n [..., 2] (port, starboard; 1/s) -> tau [..., 3] (N, N, N m), document 003 eq. (6)."""
+
+    state = ("n_port", "n_stbd")
+    commands = ("cmd_port", "cmd_stbd")
 
     def __init__(self, config: DifferentialThrustConfig) -> None:
         super().__init__()
@@ -58,8 +62,17 @@ class DifferentialThrust(nn.Module):
         port, stbd = t[..., 0], t[..., 1]
         return torch.stack((port + stbd, torch.zeros_like(port), self.arm * (port - stbd)), dim=-1)
 
-    def advance(self, n: Tensor, command: Tensor, dt: float) -> Tensor:
+    def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
+        """Commands [..., 2] in 1/s from the normalised mean and difference of revolutions (document 003 eqs. (30), (31)), clipped to +-1 per side."""
+        both = torch.stack((drive + steer, drive - steer), dim=-1)
+        return both.clamp(-1.0, 1.0) * self.n_max
+
+    def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
+        """tau [..., 3] of the present revolutions a [..., 2], whatever is commanded."""
+        return self.forward(a)
+
+    def advance(self, a: Tensor, command: Tensor, dt: float) -> Tensor:
         """Revolutions [..., 2] after a step of dt seconds: towards the saturated command by at most the rate limit."""
         target = command.clamp(-self.n_max, self.n_max)
         step = self.n_rate * dt
-        return n + (target - n).clamp(-step, step)
+        return a + (target - a).clamp(-step, step)

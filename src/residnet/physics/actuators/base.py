@@ -1,0 +1,52 @@
+"""The interface of actuators: what turns commands into forces on the hull."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import torch
+from torch import Tensor, nn
+
+from residnet.core.config import Config
+
+
+class Actuators(nn.Module, ABC):
+    """All actuators of a vessel: commands [..., c] move their states a [..., k], and these push the hull.
+
+    A state may move continuously (`rate`, integrated with the hull: lags) or once per step (`advance`, after the hull has
+    moved with the states held: rate limits).
+
+    Attributes:
+        state: names of the states; empty where the commands act at once.
+        commands: names of the commands.
+    """
+
+    state: tuple[str, ...] = ()
+    commands: tuple[str, ...] = ()
+
+    @abstractmethod
+    def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
+        """Commands [..., c] from the normalised drive and steer [...] of a manoeuvre, each within +-1."""
+
+    @abstractmethod
+    def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
+        """Forces tau [..., n] on the hull from states a [..., k], commands [..., c] and velocities through the water nu [..., n]."""
+
+    def rate(self, a: Tensor, command: Tensor) -> Tensor:
+        """Derivative [..., k] of the states."""
+        return torch.zeros_like(a)
+
+    def advance(self, a: Tensor, command: Tensor, dt: float) -> Tensor:
+        """States [..., k] after a step of dt seconds, of what moves once per step."""
+        return a
+
+
+class ActuatorConfig(Config, ABC):
+    """What all actuators of a vessel file have."""
+
+    kind: str
+    source: str
+
+    @abstractmethod
+    def build(self) -> Actuators:
+        """The module."""
