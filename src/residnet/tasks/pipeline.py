@@ -33,7 +33,6 @@ from residnet.evaluation.metrics import rows, window_errors
 from residnet.evaluation.protocol import all_windows
 from residnet.evaluation.rollout_files import write_rollouts
 from residnet.heads import ClosedFormHead
-from residnet.physics.plant import DifferentialThrustVessel
 from residnet.physics.vessel import load_vessel
 from residnet.run_folder import RunFolder
 from residnet.tasks.fit import FitConfig
@@ -267,7 +266,7 @@ def candidates(fitted: Sequence[Fitted], data: MeasuredLogs | SimulatedTrials) -
     """Models to evaluate: all that were fitted, and where the data are simulated the plant that made them."""
     out = [Candidate(f.spec.name, f.spec.role, f.model) for f in fitted]
     if isinstance(data, SimulatedTrials):
-        plant = DifferentialThrustVessel(load_vessel(data.vessel))
+        plant = load_vessel(data.vessel).build()
         known = plant.inputs[: plant.commands]
         model = PlantDynamics(plant, data.step, data.substeps)
         out.append(Candidate("truth", "truth", model, plant.state[6:], known, len(plant.inputs) - len(known)))
