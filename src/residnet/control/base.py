@@ -1,0 +1,87 @@
+"""The interface of controllers and guidance, and the source that flies them in the one time loop."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import final
+
+import torch
+from torch import Tensor, nn
+
+from residnet.dynamics.rollout import Source
+
+
+class Policy(nn.Module, ABC):
+    """A controller: commands from the state and a reference, once per step; the same tensor code trains, flies and is exported."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.n_state = 0
+
+    def initial_state(self, x: Tensor) -> Tensor:
+        """Memory [B, n_state] at the first state x [B, nx]: zeros."""
+        return torch.zeros(x.shape[0], self.n_state, dtype=x.dtype, device=x.device)
+
+    @abstractmethod
+    def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Command [B, c] and new memory from the state x [B, nx], the reference [B, r] of this step and the memory s [B, n_state]."""
+
+
+class Reference(nn.Module, ABC):
+    """Guidance: what the controller shall follow."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.n_state = 0
+        self.may_finish = False
+
+    def initial_state(self, x: Tensor) -> Tensor:
+        """Memory [B, n_state] at the first state x [B, nx]: zeros."""
+        return torch.zeros(x.shape[0], self.n_state, dtype=x.dtype, device=x.device)
+
+    @abstractmethod
+    def forward(self, x: Tensor, k: int, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Reference [B, r] for step k and new memory, from the state x [B, nx] and the memory s [B, n_state]."""
+
+    def finished(self, x: Tensor, k: int, s: Tensor) -> Tensor:
+        """[B] bool: rows that have arrived; asked only where `may_finish`."""
+        return torch.zeros(x.shape[0], dtype=torch.bool, device=x.device)
+
+
+@final
+class GivenReference(Reference):
+    """A reference known in advance, [B, T, r]; its last value holds beyond T."""
+
+    def __init__(self, values: Tensor) -> None:
+        super().__init__()
+        self.values = values
+
+    def forward(self, x: Tensor, k: int, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Row k of the values."""
+        return self.values[:, min(k, self.values.shape[1] - 1)].to(x.dtype), s
+
+
+@final
+class ClosedLoop(Source):
+    """A controller under guidance as the source of a rollout's inputs: its commands take the first columns of w."""
+
+    def __init__(self, policy: Policy, reference: Reference) -> None:
+        super().__init__()
+        self.policy = policy
+        self.reference = reference
+        self.may_stop = reference.may_finish
+
+    def initial(self, x: Tensor) -> Tensor:
+        """Memories of guidance and controller side by side."""
+        return torch.cat((self.reference.initial_state(x), self.policy.initial_state(x)), dim=-1)
+
+    def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """Inputs [B, m]: the command, then what else was given."""
+        n = self.reference.n_state
+        target, guided = self.reference(x, k, memory[:, :n])
+        command, s = self.policy(x, target, memory[:, n:])
+        return torch.cat((command, w[:, command.shape[-1] :]), dim=-1), torch.cat((guided, s), dim=-1)
+
+    def finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
+        """Rows whose guidance has arrived."""
+        return self.reference.finished(x, k, memory[:, : self.reference.n_state])
