@@ -33,6 +33,7 @@ class RunFolder:
         self.exports = path / "exports"
         self.data_quality = path / "data_quality.json"
         self.residuals = path / "residuals.parquet"
+        self.limits = path / "limits.json"
 
     @classmethod
     def create(cls, path: Path, resolved: str, *, resume: bool) -> RunFolder:
@@ -100,6 +101,12 @@ class RunFolder:
     def read_metrics(self) -> Mapping[str, Any]:
         """Contents of metrics.json."""
         content: Mapping[str, Any] = json.loads(self.metrics.read_text())
+        return content
+
+    def fit_notes(self, model: str) -> dict[str, Any]:
+        """What models/<model>/fit.json says about a model's fit; empty where there is none."""
+        path = self.models / model / "fit.json"
+        content: dict[str, Any] = json.loads(path.read_text()) if path.is_file() else {}
         return content
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from made_logs import made, random_states
@@ -85,21 +87,41 @@ def test_rows_equal_a_loop_over_windows() -> None:
         assert row["diverged"] == sum(run.predictions[row["model"]][i].diverged for i in chosen)
 
 
-def test_intervals_hold_the_mean_and_shrink_with_more_windows() -> None:
+def test_intervals_hold_the_mean_and_say_what_was_drawn() -> None:
     run, logs = made_run()
     row = find(rows(run, [candidate("a")], logs, SCALES, {}), model="a")
+    # four logs of three windows: whole logs are too few, runs of two and one make eight
+    assert row["ci95_blocks"] == {"of": "windows", "count": 8}
     for c in "uvr":
         low, high = row["rmse_ci95"][c]
         assert low < row["rmse"][c] < high
     low, high = row["nrmse_mean_ci95"]
     assert low < row["nrmse"]["mean"] < high
-    # near the normal interval of the mean of windows
-    errors = window_errors(run, "a", logs)["rmse"]
-    width = 2 * 1.96 * errors[:, 0].std(ddof=0) / np.sqrt(len(errors))
-    assert row["rmse_ci95"]["u"][1] - row["rmse_ci95"]["u"][0] == pytest.approx(width, rel=0.25)
     alone = FreeRun("T3", "test", run.windows[:1], {"a": run.predictions["a"][:1]})
     (single,) = [r for r in rows(alone, [candidate("a")], logs, SCALES, {}) if r["manoeuvre"] == "all"]
-    assert single["rmse_ci95"]["u"] == pytest.approx([single["rmse"]["u"]] * 2)
+    assert single["rmse_ci95"] == {"u": None, "v": None, "r": None}
+    assert single["nrmse_mean_ci95"] is single["ci95_blocks"] is None
+
+
+def test_differences_are_paired_by_window_and_kind() -> None:
+    run, logs = made_run()
+    errors = {name: (window_errors(run, name, logs)["rmse"] / [0.5, 0.25, 0.1]).mean(1) for name in "ab"}
+    compared = replace(candidate("a"), reference="b")
+    table = rows(run, [compared, candidate("b")], logs, SCALES, {})
+    for row in table:
+        chosen = [row["manoeuvre"] in ("all", logs[w.log].log.manoeuvre) for w in run.windows]
+        if row["model"] == "b":
+            assert row["difference"] is None
+            continue
+        found = row["difference"]
+        assert found["to"] == "b"
+        assert found["nrmse_mean"] == pytest.approx(float((errors["a"] - errors["b"])[chosen].mean()))
+        assert found["nrmse_mean"] == pytest.approx(row["nrmse"]["mean"] - find(table, model="b", manoeuvre=row["manoeuvre"])["nrmse"]["mean"])
+        assert found["ratio"] == pytest.approx(errors["a"][chosen].mean() / errors["b"][chosen].mean())
+        # only all kinds together make blocks enough
+        assert (found["ci95"] is None) == (row["manoeuvre"] != "all")
+    lost = rows(run, [replace(compared, reference="absent")], logs, SCALES, {})
+    assert {row["difference"] for row in lost} == {None}
 
 
 def test_perfect_predictions_have_no_error() -> None:

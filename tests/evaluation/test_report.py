@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import html
+import json
 import re
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import pytest
 from made_run import DEG, LEVEL, made_run, metrics, residuals, row, write_json
@@ -127,6 +129,79 @@ def test_parameters_heads_data_and_provenance(run: Path) -> None:
     assert quality["test: zigzag"] == ["3", "180", "1800", "97.5", "95.0", "frozen 2.5 %", "1.50", "0.200", "5.73"]
     for part in ("9.8.7", "abc123", "f00d", "torch 2.13.0", "fitted on 2400 samples", "selection: whole"):
         assert part in text
+
+
+def limits_file() -> dict[str, Any]:
+    """Contents of limits.json for the protocol that selects."""
+    paired = {"to": "baseline", "nrmse_mean": -0.02, "ci95": [-0.03, -0.01], "excludes_zero": True, "ratio": 0.8, "worse": False}
+    bands = [{"by": "wind", "low": 1.0, "high": 2.5, "windows": 4, "models": {"plsr": {"nrmse_mean": 0.08, "difference": paired}}}]
+    worst = [{"log": "zigzag_02", "manoeuvre": "zigzag", "t": 12.5, "nrmse": 0.3, "rmse": {"u": 0.1, "v": 0.2, "r": 0.01}, "position_error_end": 4.2}]
+    kinematics = {"windows": 6, "position_mean": 0.37, "position_rms": 0.47, "heading_mean": 1.35 / DEG, "heading_rms": 1.8 / DEG}
+    part = {"kinematics": kinematics, "bands": bands, "worst": {"plsr": worst}}
+    tolerance = {"command_share_of_range": 0.05, "start": {"u": 0.125, "v": 0.0625, "r": 0.0625}}
+    motion = {"u": 0.04, "v": 0.02, "r": 1 / DEG, "position": 2.0, "heading": 5 / DEG, "nrmse": 0.2}
+    repeats = {"tolerance": tolerance, "pairs": 3, "logs": 2, **motion, "manoeuvres": {"zigzag": {"pairs": 3, **motion}}}
+    return {"schema": "residnet.limits/1", "run": "made", "splits": {"test": {"whole": part}}, "repeatability": {"whole": repeats}}
+
+
+def compared(change: dict[str, float]) -> dict[str, Any]:
+    """metrics.json whose heads are compared with the baseline; `change` is the ratio of plsr by kind of manoeuvre."""
+    content = metrics()
+    for line in content["rows"]:
+        ratio = change.get(line["manoeuvre"], 0.8) if line["model"] == "plsr" else 0.9
+        apart = line["nrmse"]["mean"] * (1 - 1 / ratio)
+        span = [1.5 * apart, 0.5 * apart] if line["manoeuvre"] == "all" else None
+        found = {"to": "baseline", "nrmse_mean": apart, "ci95": span, "excludes_zero": span is not None, "ratio": ratio, "worse": ratio > 1.05}
+        line["difference"] = found if line["kind"] == "head" else None
+        line["ci95_blocks"] = {"of": "logs", "count": 6}
+    return content
+
+
+def test_how_good_where_it_fails_and_what_limits_it(run: Path) -> None:
+    write_json(run / "metrics.json", compared({"turning": 1.2}))
+    write_json(run / "limits.json", limits_file())
+    text = write_report(run).read_text()
+    cells = Page(text).table("windows of", "all")
+    # plsr has 0.08, 0.8 times its reference, so that has 0.1
+    assert cells["all"] == ["6", "0.0800", "0.100", "−20 %", "−0.0200", "−0.0300 to −0.0100"]
+    assert cells["turning"] == ["6", "0.0880", "0.0733", "+20 %", "+0.0147", "–"]
+    assert cells["wind 1.0 to 2.5 m/s"] == ["4", "0.0800", "0.100", "−20 %", "−0.0200", "−0.0300 to −0.0100"]
+    worst = Page(text).table("worst windows", "zigzag_02 (zigzag)")
+    assert worst["zigzag_02 (zigzag)"] == ["12.5", "0.300", "0.100", "0.200", "0.573", "4.2"]
+    page = html.unescape(text)
+    for part in (
+        "plsr: NRMSE 0.0800, 95 % interval 0.0720 to 0.0880 (bootstrap of 6 blocks: whole logs).",
+        "Against baseline over the same windows: −0.0200 (−20 %), paired 95 % interval −0.0300 to −0.0100, without zero: better.",
+        "end 0.37 m and 1.4 deg from the measured pose on average (root mean square 0.47 m, 1.8 deg)",
+        "3 pairs of stretches (zigzag 3) in 2 of the logs of all splits have commands within 5 % of their range",
+        "differ by u 0.0400 m/s, v 0.0200 m/s, r 1.00 deg/s (root mean square), 2.0 m and 5.0 deg at the end",
+        "an NRMSE of 0.141 and 1.4 m",
+        "Protocol whole: worse by more than 5 % in NRMSE on test data: plsr against baseline (turning +20 %).",
+    ):
+        assert part in page
+
+
+def test_no_repeats_no_reference_and_no_interval_are_said(run: Path) -> None:
+    content = compared({})
+    for line in content["rows"]:
+        line |= {"difference": None, "ci95_blocks": None, "nrmse_mean_ci95": None, "rmse_ci95": dict.fromkeys("uvr")}
+    write_json(run / "metrics.json", content)
+    found = limits_file()
+    found["repeatability"]["whole"] = {"tolerance": found["repeatability"]["whole"]["tolerance"], "pairs": 0, "logs": 0}
+    write_json(run / "limits.json", found)
+    write_figures(run)
+    text = html.unescape(write_report(run).read_text())
+    assert "plsr: NRMSE 0.0800; too few logs for an interval." in text
+    assert "hold no two stretches as long as a window" in text
+    assert "worse by more than 5 %" not in text
+
+
+def test_standard_errors_of_a_refitted_baseline_are_named(run: Path) -> None:
+    note = "the standard errors are those of the least-squares fit before it"
+    assert note not in write_report(run).read_text()
+    path = run / "models" / "baseline" / "fit.json"
+    write_json(path, json.loads(path.read_text()) | {"refit": {"iterations": 3}})
+    assert note in write_report(run).read_text()
 
 
 def test_the_file_stands_alone_and_nothing_in_it_runs(run: Path) -> None:

@@ -99,7 +99,8 @@ def bars(run: RunFiles, protocol: str) -> Any:
                 if row is None or channel not in row["rmse"]:
                     continue
                 value = factor * row["rmse"][channel]
-                low, high = (factor * edge for edge in (row.get("rmse_ci95") or {}).get(channel, [row["rmse"][channel]] * 2))
+                interval = (row.get("rmse_ci95") or {}).get(channel) or [row["rmse"][channel]] * 2
+                low, high = (factor * edge for edge in interval)
                 y = number + (place - 0.5 * (len(run.sides) - 1)) * thick
                 axes.barh(y, value, thick, color=look[model]["color"], alpha=_alpha(run, split), edgecolor="black", linewidth=0.5)
                 spread = [[max(value - low, 0.0)], [max(high - value, 0.0)]]

@@ -27,6 +27,7 @@ class Candidate:
         states: channels of the log that continue the state after x, y, psi, u, v, r (a plant's actuators).
         inputs: channels of the log that make w; None for the prepared inputs.
         idle: inputs after those that are held at zero (disturbances that the model is not told about).
+        reference: name of the model that this one is compared with, window by window; None for none.
     """
 
     name: str
@@ -35,6 +36,7 @@ class Candidate:
     states: tuple[str, ...] = ()
     inputs: tuple[str, ...] | None = None
     idle: int = 0
+    reference: str | None = None
 
 
 @dataclass(frozen=True)

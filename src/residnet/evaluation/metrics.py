@@ -9,10 +9,10 @@ import numpy as np
 
 from residnet.core.names import VELOCITY
 from residnet.data.prepare import Prepared
+from residnet.evaluation.bootstrap import Blocks, blocks, difference, intervals
 from residnet.evaluation.freerun import Candidate, FreeRun
 
 SCHEMA = "residnet.metrics/1"
-_RESAMPLES = 2000
 
 
 def window_errors(run: FreeRun, model: str, logs: Sequence[Prepared]) -> dict[str, np.ndarray]:
@@ -48,27 +48,47 @@ def rows(
     scales: Mapping[str, float],
     groups: Mapping[str, Sequence[str]],
 ) -> list[dict[str, Any]]:
-    """Rows of metrics.json for one protocol and split: every model, over all windows, every kind of manoeuvre and every named group of kinds."""
+    """Rows of metrics.json for one protocol and split: every model, over all windows, every kind of manoeuvre and every named group of kinds.
+
+    `difference` compares a model with its reference (`Candidate.reference`) over the same windows; None where it has none.
+    """
     kinds = [logs[window.log].log.manoeuvre for window in run.windows]
     subsets = {"all": sorted(set(kinds))} | {kind: [kind] for kind in sorted(set(kinds))} | {name: list(members) for name, members in groups.items()}
+    errors = {candidate.name: window_errors(run, candidate.name, logs) for candidate in candidates}
     out = []
     for candidate in candidates:
-        errors = window_errors(run, candidate.name, logs)
         diverged = np.array([prediction.diverged for prediction in run.predictions[candidate.name]])
         for name, members in subsets.items():
             chosen = np.array([kind in members for kind in kinds])
             if chosen.any():
                 row = {"model": candidate.name, "kind": candidate.kind, "split": run.split, "protocol": run.protocol, "manoeuvre": name}
-                part = {key: values[chosen] for key, values in errors.items()}
-                out.append(row | _summary(part, int(diverged[chosen].sum()), scales))
+                part = {key: values[chosen] for key, values in errors[candidate.name].items()}
+                drawn = blocks([window.log for window, taken in zip(run.windows, chosen, strict=True) if taken])
+                row |= _summary(part, int(diverged[chosen].sum()), scales, drawn)
+                out.append(row | {"difference": against(errors, candidate, scales, chosen, drawn)})
     return out
 
 
-def _summary(errors: Mapping[str, np.ndarray], diverged: int, scales: Mapping[str, float]) -> dict[str, Any]:
+def nrmse_of_windows(errors: Mapping[str, np.ndarray], scales: Mapping[str, float]) -> np.ndarray:
+    """Mean over u, v, r of rmse / scale for each window, [W]."""
+    return np.asarray((errors["rmse"] / np.array([scales[name] for name in VELOCITY])).mean(1))
+
+
+def against(
+    errors: Mapping[str, Mapping[str, np.ndarray]], candidate: Candidate, scales: Mapping[str, float], chosen: np.ndarray, drawn: Blocks | None
+) -> dict[str, Any] | None:
+    """Paired difference of a model to its reference over chosen windows [W] bool; None where it has none among the models."""
+    if candidate.reference is None or candidate.reference not in errors:
+        return None
+    own, other = (nrmse_of_windows(errors[name], scales)[chosen] for name in (candidate.name, candidate.reference))
+    return difference(own, other, candidate.reference, drawn)
+
+
+def _summary(errors: Mapping[str, np.ndarray], diverged: int, scales: Mapping[str, float], drawn: Blocks | None) -> dict[str, Any]:
     divisor = np.array([scales[name] for name in VELOCITY])
     rmse, mae = errors["rmse"].mean(0), errors["mae"].mean(0)
     nrmse = rmse / divisor
-    spread = _intervals(np.concatenate((errors["rmse"], (errors["rmse"] / divisor).mean(1, keepdims=True)), axis=1))
+    spread = intervals(np.concatenate((errors["rmse"], nrmse_of_windows(errors, scales)[:, None]), axis=1), drawn)
 
     def named(values: np.ndarray) -> dict[str, float]:
         return {name: float(value) for name, value in zip(VELOCITY, values, strict=True)}
@@ -82,17 +102,10 @@ def _summary(errors: Mapping[str, np.ndarray], diverged: int, scales: Mapping[st
         "nrmse": named(nrmse) | {"mean": float(nrmse.mean())},
         "rmse_ci95": {name: spread[i] for i, name in enumerate(VELOCITY)},
         "nrmse_mean_ci95": spread[3],
+        "ci95_blocks": drawn.row() if drawn is not None else None,
         "position_error_end": float(errors["position_error_end"].mean()),
         "heading_error_end": float(errors["heading_error_end"].mean()),
     }
-
-
-def _intervals(values: np.ndarray) -> list[list[float]]:
-    """95 % percentile-bootstrap intervals of the means of columns [W, C] over windows; one window has no interval but its value."""
-    random = np.random.default_rng(0)
-    index = random.integers(0, len(values), size=(_RESAMPLES, len(values)))
-    means = values[index].mean(1)
-    return [[float(low), float(high)] for low, high in np.quantile(means, [0.025, 0.975], axis=0).T]
 
 
 def find(table: Sequence[Mapping[str, Any]], **wanted: str) -> Mapping[str, Any]:

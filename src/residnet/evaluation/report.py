@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from residnet.evaluation import report_limits
 from residnet.evaluation import report_tables as tables
 from residnet.evaluation.figures import FigureFile, read_figures
 from residnet.evaluation.report_text import cautions, fitted_on, verdict
@@ -66,7 +67,8 @@ def _context(run: RunFiles, findings: Sequence[Finding], figures: Sequence[Figur
         "has_baseline": run.baseline is not None,
         "fitted_on": fitted_on(run),
         "quality": tables.quality(run),
-        "baseline": tables.baseline_parameters(run),
+        "good": report_limits.section(run),
+        "baselines": _coefficients(run),
         "heads": tables.heads(run),
         "protocols": [entry for entry in protocols if entry["table"] is not None],
         "figures": [{"title": f.title, "caption": f.caption, "name": f.path.name, "data": _embedded(f.path)} for f in figures],
@@ -76,6 +78,13 @@ def _context(run: RunFiles, findings: Sequence[Finding], figures: Sequence[Figur
         "inputs": list((run.provenance.get("inputs") or {}).items()),
         "resolved": run.resolved_text,
     }
+
+
+def _coefficients(run: RunFiles) -> list[dict[str, Any]]:
+    """Tables of identified coefficients, the first baseline's first."""
+    names = [run.baseline or "baseline", *(model for model, kind in run.kinds.items() if kind == "further")]
+    found = [{"name": name, "table": tables.baseline_parameters(run, name), "refitted": bool(run.fit(name).get("refit"))} for name in names]
+    return [entry for entry in found if entry["table"] is not None]
 
 
 def _by_model(findings: Sequence[Finding]) -> list[tuple[str, list[Finding]]]:

@@ -90,7 +90,7 @@ def free_runs(run: RunFiles, protocol: str) -> Table | None:
 
 def by_manoeuvre(run: RunFiles, protocol: str, split: str) -> Table | None:
     """The focus split taken apart by kind and named group of manoeuvre; None where there is only one."""
-    kinds = _distinct(run, run.manoeuvres(split, protocol), split, protocol)
+    kinds = distinct(run, run.manoeuvres(split, protocol), split, protocol)
     if len(kinds) < 2:
         return None
     quantities = [*run.channels, "nrmse", "position", "heading", "diverged"]
@@ -110,7 +110,7 @@ def by_manoeuvre(run: RunFiles, protocol: str, split: str) -> Table | None:
     return table
 
 
-def _distinct(run: RunFiles, kinds: Sequence[str], split: str, protocol: str) -> list[str]:
+def distinct(run: RunFiles, kinds: Sequence[str], split: str, protocol: str) -> list[str]:
     """Kinds and groups without those that hold the same runs as one before (a group of a single kind)."""
     seen: list[Any] = []
     out: list[str] = []
@@ -142,9 +142,9 @@ def _quantity(run: RunFiles, key: str, row: Row | None, base: Row | None) -> Cel
     return Cell(number(unit_of(run, key)[1] * value), change(value, base["rmse"][key]) if base is not None else "", "bad" if worse else "")
 
 
-def baseline_parameters(run: RunFiles) -> Table | None:
-    """Identified coefficients with standard errors; None where the folder does not hold them."""
-    entries = run.fit(run.baseline or "baseline").get("coefficients") or []
+def baseline_parameters(run: RunFiles, model: str) -> Table | None:
+    """Identified coefficients of a baseline with standard errors; None where the folder does not hold them."""
+    entries = run.fit(model).get("coefficients") or []
     if not entries:
         return None
     table = Table(heads=["value", "standard error", "value / error", "unit"], corner="term")

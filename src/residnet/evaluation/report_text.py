@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from residnet.evaluation.report_tables import DEG, number, title_of, unit_of
+from residnet.evaluation.report_tables import DEG, distinct, number, percent, title_of, unit_of
 from residnet.evaluation.run_reader import Row, RunFiles
 from residnet.evaluation.sanity import Finding
 
@@ -42,7 +42,7 @@ def _level(run: RunFiles, lead: str, row: Row, base: Row | None) -> str:
             cut = 100 * (1 - row["rmse"][channel] / base["rmse"][channel])
             text += f", {abs(cut):.0f} % {'below' if cut >= 0 else 'ABOVE'} the baseline"
         parts.append(text)
-    return "Root mean square errors (95 % interval of the mean over runs): " + "; ".join(parts) + "."
+    return f"Root mean square errors{' (95 % interval of the mean)' if row.get('nrmse_mean_ci95') else ''}: " + "; ".join(parts) + "."
 
 
 def _against_plant(run: RunFiles, row: Row, truth: Row, base: Row | None) -> str:
@@ -96,12 +96,29 @@ def cautions(run: RunFiles, findings: Sequence[Finding]) -> list[str]:
             out.append(f"Protocol {protocol}: the {run.focus} error of {lead} is {times}; it may be overfitted, or the {run.focus} data differ.")
         if row["windows"] < 5:
             out.append(f"Protocol {protocol}: only {row['windows']} free runs on {run.focus} data; the intervals say little.")
+    out += [text for text in (worse_than_reference(run, protocol) for protocol in run.protocols) if text]
     if lead is not None and lead == run.baseline and run.heads:
         out.append("No head beats the baseline on validation data: the baseline was selected.")
     # the first sentence; the figures stand in the section on sanity
     failed = [finding for finding in findings if finding.ok is False and finding.model == lead]
     out += [f"{finding.model}, {finding.check}: {finding.text.partition('. ')[0].rstrip('.')}." for finding in failed]
     return out
+
+
+def worse_than_reference(run: RunFiles, protocol: str) -> str:
+    """Heads and ensembles that are worse than what they are compared with by more than 5 %, by kind of manoeuvre; empty where there are none."""
+    lost = []
+    for model in run.heads:
+        rows = [
+            row
+            for kind in distinct(run, run.manoeuvres(run.focus, protocol), run.focus, protocol)
+            if (row := run.row(model, run.focus, protocol, kind))
+        ]
+        bad = [row for row in rows if (row.get("difference") or {}).get("worse") and run.kinds[model] in ("head", "ensemble")]
+        if bad:
+            where = ", ".join(f"{row['manoeuvre'].replace('_', ' ')} {percent(100 * (row['difference']['ratio'] - 1))}" for row in bad)
+            lost.append(f"{model} against {bad[0]['difference']['to']} ({where})")
+    return f"Protocol {protocol}: worse by more than 5 % in NRMSE on {run.focus} data: {'; '.join(lost)}." if lost else ""
 
 
 def fitted_on(run: RunFiles) -> list[tuple[str, str]]:

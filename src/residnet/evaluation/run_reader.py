@@ -59,6 +59,7 @@ class RunFiles:
         self.rows: Sequence[Row] = self.metrics["rows"]
         self.quality: Sequence[Row] = _json(path / "data_quality.json", [])
         self.provenance: Row = _json(path / "provenance.json", {})
+        self.limits: Row = _json(path / "limits.json", {})
         resolved = path / "resolved.yaml"
         self.resolved_text = resolved.read_text() if resolved.is_file() else ""
         self.resolved: Row = yaml.safe_load(self.resolved_text) or {}

@@ -127,7 +127,9 @@ def _bars(files: RunFiles, channels: Sequence[str], group: str, models: Sequence
         for offset, split, fill in ((-0.2, "train", "0.75"), (0.2, "test", "#0072B2")):
             rows = [files.row(model, split, _PROTOCOL, group) for model in models]
             value = np.array([factor * row["rmse"][channel] if row else np.nan for row in rows])
-            low, high = (np.array([factor * row["rmse_ci95"][channel][end] if row else np.nan for row in rows]) for end in (0, 1))
+            # too few manoeuvres have no interval
+            spans = [(row["rmse_ci95"][channel] if row else None) or [np.nan, np.nan] for row in rows]
+            low, high = factor * np.array(spans).T
             name = {"train": "training data", "test": "unseen manoeuvres"}[split]
             error = np.abs(np.stack((value - low, high - value)))
             axes.bar(np.arange(len(models)) + offset, value, 0.38, color=fill, edgecolor="black", linewidth=0.5, label=name)

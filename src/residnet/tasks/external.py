@@ -21,7 +21,7 @@ from residnet.tasks.fit import FitConfig
 from residnet.tasks.inspection import log_files
 from residnet.tasks.pipeline import Fitted, candidates, evaluate, require_window, say
 from residnet.tasks.reporting import report_run
-from residnet.tasks.run import print_table, write_data_quality, write_metrics
+from residnet.tasks.run import print_table, write_data_quality, write_limits, write_metrics
 
 
 def evaluate_external(run: Path, paths: Sequence[Path], out: Path | None) -> RunFolder:
@@ -43,7 +43,7 @@ def evaluate_external(run: Path, paths: Sequence[Path], out: Path | None) -> Run
     for log in logs:
         require_window(log, config)
     folder = RunFolder.create(out or run / time.strftime("external-%Y%m%dT%H%M%S"), dump_config(config), resume=False)
-    fitted = [Fitted(*load_model(source.models / name), notes={}) for name in model_names(source.models)]
+    fitted = [Fitted(*load_model(source.models / name), notes=source.fit_notes(name)) for name in model_names(source.models)]
     order = ["zero", "baseline", *config.baselines, *config.heads, *config.ensembles]
     fitted.sort(key=lambda f: order.index(f.spec.name) if f.spec.name in order else len(order))
     low, high = np.array(fitted[0].spec.low[:3]), np.array(fitted[0].spec.high[:3])
@@ -51,9 +51,10 @@ def evaluate_external(run: Path, paths: Sequence[Path], out: Path | None) -> Run
     say(f"{config.name}: {len(logs)} logs, {len(fitted)} models")
     simulated = isinstance(config.data, SimulatedTrials) and all("vessel" in log.log.meta for log in logs)
     models = [c for c in candidates(fitted, config.data) if c.kind != "truth" or simulated]
-    table = evaluate(models, logs, config.evaluation, config.prepare.grid.step, limit, folder)
+    table, limiting = evaluate(models, logs, config.evaluation, config.prepare.grid.step, limit, folder)
     write_data_quality(folder, {"external": logs})
     write_metrics(folder, config, table, str(source.read_metrics()["selected"]))
+    write_limits(folder, config, {"external": limiting}, logs)
     folder.write_provenance(config=source.resolved, overrides=[], seed=config.seed, files=files, started=started)
     report = report_run(folder.path)
     print_table(table, "external")

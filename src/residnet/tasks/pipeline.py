@@ -29,6 +29,7 @@ from residnet.dynamics.simulated import PlantDynamics
 from residnet.dynamics.store import ModelSpec, load_model, save_model
 from residnet.evaluation.config import EvaluationConfig
 from residnet.evaluation.freerun import Candidate, FreeRun, free_run
+from residnet.evaluation.limits import limits
 from residnet.evaluation.metrics import rows, window_errors
 from residnet.evaluation.protocol import all_windows
 from residnet.evaluation.rollout_files import write_rollouts
@@ -36,6 +37,7 @@ from residnet.heads import ClosedFormHead
 from residnet.physics.vessel import load_vessel
 from residnet.run_folder import RunFolder
 from residnet.tasks.fit import FitConfig
+from residnet.tasks.references import references
 from residnet.training.config import TrainingConfig
 from residnet.training.refit import refit
 
@@ -264,20 +266,22 @@ def moved(table: Sequence[Coefficient], baseline: Baseline) -> list[Coefficient]
 
 def candidates(fitted: Sequence[Fitted], data: MeasuredLogs | SimulatedTrials) -> list[Candidate]:
     """Models to evaluate: all that were fitted, and where the data are simulated the plant that made them."""
-    out = [Candidate(f.spec.name, f.spec.role, f.model) for f in fitted]
+    to = references({f.spec.name: f.spec.role for f in fitted}, {f.spec.name: f.notes for f in fitted})
+    out = [Candidate(f.spec.name, f.spec.role, f.model, reference=to.get(f.spec.name)) for f in fitted]
     if isinstance(data, SimulatedTrials):
         plant = load_vessel(data.vessel).build()
         known = plant.inputs[: plant.commands]
         model = PlantDynamics(plant, data.step, data.substeps)
-        out.append(Candidate("truth", "truth", model, plant.state[6:], known, len(plant.inputs) - len(known)))
+        out.append(Candidate("truth", "truth", model, plant.state[6:], known, len(plant.inputs) - len(known), "baseline"))
     return out
 
 
 def evaluate(
     models: Sequence[Candidate], logs: Sequence[Prepared], config: EvaluationConfig, step: float, limit: np.ndarray, folder: RunFolder
-) -> list[dict[str, Any]]:
-    """Free-run all models over all protocols of one split; writes the rollouts and returns the rows of metrics.json."""
+) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """Free-run all models over all protocols of one split; writes the rollouts, returns the rows of metrics.json and, by protocol, of limits.json."""
     table: list[dict[str, Any]] = []
+    limiting: dict[str, Any] = {}
     runs: list[FreeRun] = []
     split = logs[0].split
     for name, protocol in config.protocols.items():
@@ -288,5 +292,6 @@ def evaluate(
         runs.append(run)
         scales = {key: float(value) for key, value in config.scales.model_dump().items()}
         table += rows(run, models, logs, scales, config.groups)
+        limiting[name] = limits(run, models, logs, scales, step)
     write_rollouts(folder.rollouts / split, runs, logs)
-    return table
+    return table, limiting

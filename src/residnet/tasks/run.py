@@ -13,8 +13,11 @@ import torch
 
 from residnet.core.config import dump_config
 from residnet.core.names import STATE, si_unit
+from residnet.data.prepare import Prepared
 from residnet.data.sources import input_files, read_logs
+from residnet.evaluation.limits import SCHEMA as LIMITS
 from residnet.evaluation.metrics import SCHEMA, find
+from residnet.evaluation.repeats import repeatability
 from residnet.run_folder import RunFolder
 from residnet.studies import draw_study
 from residnet.tasks.exporting import export_model
@@ -62,10 +65,13 @@ def run_fit(config: FitConfig, *, source: Path, overrides: Sequence[str], out: P
     say("  free runs")
     models = candidates(fitted, config.data)
     table: list[dict[str, Any]] = []
+    limiting: dict[str, Any] = {}
     for split in config.evaluation.splits:
-        table += evaluate(models, logs[split], config.evaluation, config.prepare.grid.step, fitter.limit, folder)
+        found, limiting[split] = evaluate(models, logs[split], config.evaluation, config.prepare.grid.step, fitter.limit, folder)
+        table += found
     selected = select(table, fitted, config.evaluation.selection)
     write_metrics(folder, config, table, selected)
+    write_limits(folder, config, limiting, [log for split in config.evaluation.splits for log in logs[split]])
     write_residuals(folder.residuals, fitter, fitted, logs["test"])
     finish(folder, config)
     folder.write_provenance(config=source, overrides=overrides, seed=config.seed, files=files, started=started)
@@ -86,6 +92,14 @@ def write_metrics(folder: RunFolder, config: FitConfig, table: Sequence[dict[str
     scales = {name: float(value) for name, value in config.evaluation.scales.model_dump().items()}
     content = {"schema": SCHEMA, "run": config.name, "channels": units, "scales": scales, "selected": selected, "rows": list(table)}
     folder.write_json(folder.metrics, content)
+
+
+def write_limits(folder: RunFolder, config: FitConfig, limiting: Mapping[str, Any], logs: Sequence[Prepared]) -> None:
+    """limits.json: where models fail and what limits them, by split and protocol, and how well the vessel repeats itself over all logs."""
+    scales = {name: float(value) for name, value in config.evaluation.scales.model_dump().items()}
+    commands, step = len(config.signals.inputs), config.prepare.grid.step
+    repeats = {name: repeatability(protocol, logs, commands, scales, step) for name, protocol in config.evaluation.protocols.items()}
+    folder.write_json(folder.limits, {"schema": LIMITS, "run": config.name, "splits": limiting, "repeatability": repeats})
 
 
 def write_data_quality(folder: RunFolder, logs: dict[str, list[Any]]) -> None:

@@ -1,0 +1,35 @@
+"""Who is compared with whom."""
+
+from __future__ import annotations
+
+from residnet.tasks.references import references
+
+ROLES = {"zero": "zero", "baseline": "baseline", "physics": "baseline", "hull": "baseline", "mlp": "head", "ridge": "head", "mean": "ensemble"}
+NOTES = {
+    "zero": {},
+    "baseline": {"validation": 0.5},
+    "physics": {"validation": 0.16},
+    "hull": {"validation": 0.18},
+    "mlp": {"baseline": "hull", "validation": 0.1},
+    "ridge": {"validation": 0.2},
+    "mean": {"validation": 0.1},
+}
+
+
+def test_each_model_has_its_reference() -> None:
+    found = references(ROLES | {"truth": "truth"}, NOTES)
+    assert found == {
+        "zero": "baseline",
+        "physics": "baseline",
+        "hull": "baseline",
+        "mlp": "hull",
+        "ridge": "baseline",
+        "mean": "physics",
+        "truth": "baseline",
+    }
+
+
+def test_what_is_not_there_is_no_reference() -> None:
+    assert references({"mlp": "head", "mean": "ensemble"}, {"mlp": {"baseline": "hull"}, "mean": {}}) == {}
+    # baselines without a recorded validation error: the first
+    assert references({"baseline": "baseline", "b": "baseline", "mean": "ensemble"}, {"baseline": {}, "b": {}, "mean": {}})["mean"] == "baseline"
