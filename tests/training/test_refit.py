@@ -173,7 +173,7 @@ def failure(error: type[ResidnetError], model: HybridDynamics, known: Samples, s
 def test_errors(smoothed: list[Prepared]) -> None:
     model, known, store = fitted(LINEAR, smoothed)
     still = HybridDynamics(model.signals, StillConfig().build(model.signals.names), ZeroHead(), STEP)
-    assert "needs a baseline of kind 'regressors' or 'linear_steady'" in failure(FitError, still, known, store, RefitConfig())
+    assert "needs a baseline of kind 'regressors', 'linear_steady'" in failure(FitError, still, known, store, RefitConfig())
     assert "shorten the horizon or give longer logs" in failure(DataError, model, known, store, RefitConfig(horizon=100.0))
     # a raster wider than a log starts with it alone, and there nothing is known
     late = dataclasses.replace(store, good=store.good & (store.depth > 0))

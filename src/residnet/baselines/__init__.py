@@ -8,9 +8,24 @@ from pydantic import Field
 
 from residnet.baselines.base import Baseline
 from residnet.baselines.linear_steady import LinearSteadyConfig
-from residnet.baselines.regressors import Coefficient, RegressorBaseline, RegressorsConfig
+from residnet.baselines.nomoto import NomotoConfig, NomotoSideslipConfig
+from residnet.baselines.regressors import RegressorBaseline, RegressorsConfig
 from residnet.baselines.still import StillConfig
+from residnet.core.solutions import Coefficient
 
-BaselineConfig = Annotated[LinearSteadyConfig | RegressorsConfig | StillConfig, Field(discriminator="kind")]
+BaselineConfig = Annotated[
+    LinearSteadyConfig | NomotoConfig | NomotoSideslipConfig | RegressorsConfig | StillConfig,
+    Field(discriminator="kind"),
+]
 
-__all__ = ["Baseline", "BaselineConfig", "Coefficient", "LinearSteadyConfig", "RegressorBaseline", "RegressorsConfig", "StillConfig"]
+__all__ = [
+    "Baseline",
+    "BaselineConfig",
+    "Coefficient",
+    "LinearSteadyConfig",
+    "NomotoConfig",
+    "NomotoSideslipConfig",
+    "RegressorBaseline",
+    "RegressorsConfig",
+    "StillConfig",
+]

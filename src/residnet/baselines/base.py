@@ -1,10 +1,17 @@
-"""The interface of baselines: the part of the dynamics that is known or identified first."""
+"""The interfaces of baselines: the part of the dynamics that is known or identified first."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import final
 
 from torch import Tensor, nn
+
+from residnet.core.config import Config
+from residnet.core.errors import ConfigError, FitError
+from residnet.core.samples import Samples
+from residnet.core.solutions import Coefficient, Solution
 
 
 class Baseline(nn.Module, ABC):
@@ -13,3 +20,55 @@ class Baseline(nn.Module, ABC):
     @abstractmethod
     def forward(self, z: Tensor) -> Tensor:
         """nu_dot [..., 3] at channels z [..., nz] (see `residnet.physics.signals`)."""
+
+
+class IdentifiedConfig(Config, ABC):
+    """A kind of baseline and how it is identified."""
+
+    @abstractmethod
+    def build(self, names: Sequence[str]) -> Baseline:
+        """The module, its numbers not yet found, for channels `names`.
+
+        Raises:
+            ConfigError: where a channel that it needs is missing.
+        """
+
+    @abstractmethod
+    def solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
+        """Identify from samples whose target is the measured acceleration; several solutions where free runs are to choose between them.
+
+        Raises:
+            FitError: where the data do not determine a coefficient.
+        """
+
+    @final
+    def fit(self, baseline: Baseline, samples: Samples) -> list[Coefficient]:
+        """Fill the baseline with the first (or only) of `solutions`; returns its coefficients."""
+        first = self.solutions(baseline, samples)[0]
+        baseline.load_state_dict(first.state, strict=False)
+        return list(first.table)
+
+
+def require(names: Sequence[str], wanted: Sequence[str], who: str) -> None:
+    """Check that channels exist.
+
+    Raises:
+        ConfigError: naming the first that does not.
+    """
+    for name in wanted:
+        if name not in names:
+            raise ConfigError(f"{who} needs the channel '{name}', but the model has {', '.join(names)}; add it to signals")
+
+
+def of_manoeuvres(samples: Samples, kinds: Sequence[str]) -> Samples:
+    """The samples of some kinds of manoeuvre; all where `kinds` is empty.
+
+    Raises:
+        FitError: where there are none.
+    """
+    chosen = samples.of_kinds(kinds)
+    if len(chosen) == 0:
+        raise FitError(
+            f"no sample is of the manoeuvres {list(kinds)} that the baseline is fitted on; kinds in the data: {sorted(set(samples.kinds))}"
+        )
+    return chosen

@@ -8,15 +8,16 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from residnet.baselines.base import Baseline
-from residnet.baselines.regressors import Coefficient, RegressorBaseline, require
-from residnet.core.config import Config, Seconds
+from residnet.baselines.base import Baseline, IdentifiedConfig, require
+from residnet.baselines.regressors import RegressorBaseline
+from residnet.core.config import Seconds
 from residnet.core.errors import FitError
 from residnet.core.least_squares import LinearFit, solve
 from residnet.core.samples import Samples
+from residnet.core.solutions import Coefficient, Solution
 
 
-class LinearSteadyConfig(Config):
+class LinearSteadyConfig(IdentifiedConfig):
     """u_dot = a u + b tau + c and (v, r)_dot = A (v, r) + B tau + C (eqs. (12), (16)).
 
     First the steady states of constant-input manoeuvres give x_ss = Phi tau + Phi_bias by least squares (eqs. (24), (32));
@@ -45,8 +46,8 @@ class LinearSteadyConfig(Config):
         steering = ("v", "r", self.steer, "1")
         return RegressorBaseline([("u", self.drive, "1"), steering, steering], names)
 
-    def fit(self, baseline: Baseline, samples: Samples) -> list[Coefficient]:
-        """Fill the baseline's coefficients from samples whose target is the measured acceleration.
+    def solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
+        """The one solution.
 
         Raises:
             FitError: where a kind of manoeuvre that a step needs is absent.
@@ -56,13 +57,12 @@ class LinearSteadyConfig(Config):
         steering = self._block(samples, ("v", "r"), self.steer, self.steering)
         table: list[Coefficient] = []
         terms = baseline.library.terms
-        with torch.no_grad():
-            baseline.theta.zero_()
-            for axis, row in ((0, speed[:1]), (1, steering[:1]), (2, steering[1:])):
-                for term, value, error in row[0]:
-                    baseline.theta[axis, terms.index(term)] = value
-                    table.append(Coefficient(f"{'uvr'[axis]}_dot", term, value, error))
-        return table
+        theta = torch.zeros_like(baseline.theta)
+        for axis, row in enumerate((*speed, *steering)):
+            for term, value, error in row:
+                theta[axis, terms.index(term)] = value
+                table.append(Coefficient(f"{'uvr'[axis]}_dot", term, value, error))
+        return [Solution({}, {"theta": theta}, tuple(table))]
 
     def _steady_states(self, samples: Samples, states: tuple[str, ...], drive: str) -> LinearFit:
         """Phi and Phi_bias [2, n] (rows: slope, bias) from the means of the settled part of every constant manoeuvre."""

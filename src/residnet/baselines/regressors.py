@@ -3,45 +3,37 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal, final
+from typing import Annotated, Literal, final
 
 import torch
 from pydantic import Field, model_validator
 from torch import Tensor, nn
 
-from residnet.baselines.base import Baseline
-from residnet.core.config import Config
-from residnet.core.errors import ConfigError, FitError
-from residnet.core.least_squares import solve
+from residnet.baselines.base import Baseline, IdentifiedConfig, of_manoeuvres
+from residnet.baselines.sets import Roles, SetName, expand, merged
+from residnet.core.least_squares import LinearFit, solve_path
 from residnet.core.names import VELOCITY
 from residnet.core.samples import Samples
+from residnet.core.solutions import Coefficient, Solution
 from residnet.physics.terms import TermLibrary
 
 RowTerms = dict[Literal["u", "v", "r"], tuple[str, ...]]
-
-
-@dataclass(frozen=True)
-class Coefficient:
-    """One identified number: nu_dot of `axis` has the term `term` with `value` +- `error` (standard error)."""
-
-    axis: str
-    term: str
-    value: float
-    error: float
+Penalty = Annotated[float, Field(ge=0)]
 
 
 @final
 class RegressorBaseline(Baseline):
     """nu_dot [..., 3] = theta [3, J] phi(z) [..., J]; a term that an axis does not have keeps a zero."""
 
-    def __init__(self, rows: Sequence[Sequence[str]], names: Sequence[str]) -> None:
+    def __init__(self, rows: Sequence[Sequence[str]], names: Sequence[str], held: Sequence[tuple[int, str]] = ()) -> None:
+        """From the terms of each axis; `held`: (axis, term) of coefficients that a refit through rollouts must leave as they are."""
         super().__init__()
         terms = list(dict.fromkeys(term for row in rows for term in row))
         self.library = TermLibrary(terms, names)
         allowed = torch.tensor([[term in row for term in terms] for row in rows], dtype=torch.float64)
         self.register_buffer("allowed", allowed, persistent=False)
         self.allowed: Tensor
+        self.held = tuple((axis, terms.index(term)) for axis, term in held)
         self.theta = nn.Parameter(torch.zeros(3, len(terms), dtype=torch.float64), requires_grad=False)
 
     def forward(self, z: Tensor) -> Tensor:
@@ -53,67 +45,84 @@ class RegressorBaseline(Baseline):
         """Numbers of the terms that an axis has."""
         return [j for j in range(self.library.count) if bool(self.allowed[axis, j] > 0)]
 
+    def movable(self) -> Tensor:
+        """Numbers of the coefficients, in theta flattened, that a refit may move, [P]."""
+        free = self.allowed > 0
+        for axis, column in self.held:
+            free[axis, column] = False
+        return torch.nonzero(free.flatten()).squeeze(1)
 
-class RegressorsConfig(Config):
+    def solved(self, fits: Sequence[tuple[Sequence[str], LinearFit]], choice: dict[str, float]) -> Solution:
+        """A solution from the fit of each axis: its terms, and coefficients [J, 1] with their errors."""
+        theta = torch.zeros_like(self.theta)
+        table: list[Coefficient] = []
+        for axis, (terms, fit) in enumerate(fits):
+            for term, value, error in zip(terms, fit.coefficients[:, 0].tolist(), fit.errors[:, 0].tolist(), strict=True):
+                theta[axis, self.library.terms.index(term)] = value
+                table.append(Coefficient(f"{VELOCITY[axis]}_dot", term, value, error))
+        return Solution(dict(choice), {"theta": theta}, tuple(table))
+
+
+class RegressorsConfig(IdentifiedConfig):
     """Least squares (or ridge) of accelerations on named regressors.
 
     Attributes:
-        terms: regressors of every axis, or of each axis `u`, `v`, `r`; empty: the constant and every channel (a linear model).
-        ridge: penalty as a share of each regressor's energy; 0 for ordinary least squares.
+        sets: regressors of every axis by the name of a set, written out for the model's channels: `linear`; `fossen` (linear and quadratic
+            damping, Coriolis products, propeller and rudder); `abkowitz` (third-order Taylor series about straight ahead); `wind`;
+            `polynomial_1`, `polynomial_2` (all products of velocities and inputs, the ridge models of document 001 section 2.2).
+        terms: further regressors of every axis, or of each axis `u`, `v`, `r`; with neither sets nor terms: the constant and every channel.
+        drive: channels that the sets take as thrust; empty: n, or tau_x where the model makes forces.
+        steer: channels that the sets take as steering; empty: delta, or tau_n where the model makes forces.
+        ridge: penalty as a share of each regressor's energy, 0 for ordinary least squares; of several the one whose free run is best on
+            validation data.
         manoeuvres: kinds of manoeuvre to fit on; empty for all.
     """
 
     kind: Literal["regressors"] = "regressors"
+    sets: tuple[SetName, ...] = ()
     terms: tuple[str, ...] | RowTerms = ()
-    ridge: float = Field(default=0.0, ge=0)
+    drive: tuple[str, ...] = ()
+    steer: tuple[str, ...] = ()
+    ridge: Penalty | Annotated[tuple[Penalty, ...], Field(min_length=2)] = 0.0
     manoeuvres: tuple[str, ...] = ()
 
     @model_validator(mode="after")
     def _rows(self) -> RegressorsConfig:
         if isinstance(self.terms, dict) and set(self.terms) != set(VELOCITY):
             raise ValueError(f"terms per axis need all of u, v, r; given {sorted(self.terms)}")
+        if (self.drive or self.steer) and not self.sets:
+            raise ValueError("drive and steer say what `sets` are written out for; give sets, or leave them out")
         return self
 
     def rows(self, names: Sequence[str]) -> list[tuple[str, ...]]:
-        """Regressors of each axis for channels `names`."""
-        if isinstance(self.terms, dict):
-            return [tuple(self.terms[axis]) for axis in ("u", "v", "r")]
-        return [self.terms or ("1", *names)] * 3
+        """Regressors of each axis for channels `names`; one that sets and terms both name stands once, as it was named first."""
+        own = [tuple(self.terms[axis]) for axis in ("u", "v", "r")] if isinstance(self.terms, dict) else [tuple(self.terms)] * 3
+        if self.sets:
+            shared = expand(self.sets, Roles.of(names, self.drive, self.steer))
+            return [merged((*shared, *row), names) for row in own]
+        return [row or ("1", *names) for row in own] if self.terms == () else own
 
     def build(self, names: Sequence[str]) -> RegressorBaseline:
         """The module, coefficients zero, for channels `names`."""
         return RegressorBaseline(self.rows(names), names)
 
-    def fit(self, baseline: Baseline, samples: Samples) -> list[Coefficient]:
-        """Fill the baseline's coefficients from samples whose target is the measured acceleration.
+    def solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
+        """One solution for each penalty.
 
         Raises:
             FitError: where the data do not determine a coefficient.
         """
         assert isinstance(baseline, RegressorBaseline)
-        chosen = samples.of_kinds(self.manoeuvres)
-        if len(chosen) == 0:
-            kinds = sorted(set(samples.kinds))
-            raise FitError(f"no sample is of the manoeuvres {list(self.manoeuvres)} that the baseline is fitted on; kinds in the data: {kinds}")
+        chosen = of_manoeuvres(samples, self.manoeuvres)
+        ridges = self.ridge if isinstance(self.ridge, tuple) else (self.ridge,)
         phi = baseline.library(chosen.z)
-        table: list[Coefficient] = []
-        for axis, name in enumerate(VELOCITY):
+        terms, paths = [], []
+        for axis in range(3):
             columns = baseline.columns(axis)
-            terms = tuple(baseline.library.terms[j] for j in columns)
-            fit = solve(phi[:, columns], chosen.target[:, axis : axis + 1], chosen.group, names=terms, ridge=self.ridge)
-            with torch.no_grad():
-                baseline.theta[axis, columns] = fit.coefficients[:, 0]
-            pairs = zip(terms, fit.coefficients[:, 0].tolist(), fit.errors[:, 0].tolist(), strict=True)
-            table += [Coefficient(f"{name}_dot", term, value, error) for term, value, error in pairs]
-        return table
-
-
-def require(names: Sequence[str], wanted: Sequence[str], who: str) -> None:
-    """Check that channels exist.
-
-    Raises:
-        ConfigError: naming the first that does not.
-    """
-    for name in wanted:
-        if name not in names:
-            raise ConfigError(f"{who} needs the channel '{name}', but the model has {', '.join(names)}; add it to model.signals")
+            terms.append(tuple(baseline.library.terms[j] for j in columns))
+            target = chosen.target[:, axis : axis + 1]
+            paths.append(solve_path(phi[:, columns], target, chosen.group, names=terms[-1], ridges=ridges))
+        return [
+            baseline.solved([(terms[axis], paths[axis][i]) for axis in range(3)], {"ridge": ridge} if len(ridges) > 1 else {})
+            for i, ridge in enumerate(ridges)
+        ]

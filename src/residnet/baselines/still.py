@@ -8,10 +8,9 @@ from typing import Literal, final
 import torch
 from torch import Tensor
 
-from residnet.baselines.base import Baseline
-from residnet.baselines.regressors import Coefficient
-from residnet.core.config import Config
+from residnet.baselines.base import Baseline, IdentifiedConfig
 from residnet.core.samples import Samples
+from residnet.core.solutions import Solution
 
 
 @final
@@ -23,7 +22,7 @@ class StillBaseline(Baseline):
         return torch.zeros_like(z[..., :3])
 
 
-class StillConfig(Config):
+class StillConfig(IdentifiedConfig):
     """No known part: the head learns the whole acceleration."""
 
     kind: Literal["still"] = "still"
@@ -32,6 +31,6 @@ class StillConfig(Config):
         """The module; it has no parameters."""
         return StillBaseline()
 
-    def fit(self, baseline: Baseline, samples: Samples) -> list[Coefficient]:
-        """Nothing to fit: an empty table."""
-        return []
+    def solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
+        """Nothing to fit: one solution without numbers."""
+        return [Solution({}, {})]

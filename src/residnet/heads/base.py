@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from pydantic import Field
@@ -13,6 +14,7 @@ from residnet.core.config import Config
 from residnet.core.errors import ConfigError
 from residnet.core.names import nearest
 from residnet.core.samples import Samples
+from residnet.core.solutions import Solution
 
 
 class ResidualHead(nn.Module, ABC):
@@ -49,12 +51,18 @@ class ClosedFormHead(ResidualHead):
     """A head whose parameters come from a closed-form solution."""
 
     @abstractmethod
-    def solve(self, samples: Samples) -> dict[str, object]:
-        """Fill the buffers from samples whose target is the residual [N, 3]; returns what there is to say about the fit.
+    def solutions(self, samples: Samples) -> list[Solution]:
+        """Fit samples whose target is the residual [N, 3]: the solution that one-step errors choose, then those that free runs may prefer.
 
         Raises:
             FitError: where the data do not determine the parameters.
         """
+
+    def solve(self, samples: Samples) -> dict[str, Any]:
+        """Fill the buffers with the first of `solutions`; returns what there is to say about the fit."""
+        first = self.solutions(samples)[0]
+        self.load_state_dict(first.state, strict=False)
+        return first.choice | first.notes
 
 
 class FeatureConfig(Config):

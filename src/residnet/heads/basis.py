@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any, Literal
 
 import torch
 from pydantic import Field
@@ -10,6 +11,7 @@ from torch import Tensor
 
 from residnet.core.errors import FitError
 from residnet.core.samples import Samples
+from residnet.core.solutions import Solution
 from residnet.heads.base import ClosedFormHead, FeatureConfig, Features
 from residnet.physics.terms import TermLibrary, polynomial_terms
 
@@ -21,16 +23,19 @@ class BasisConfig(FeatureConfig):
         terms: basis functions by name (see `residnet.physics.terms`), in units of each feature's spread; empty: all products of the features up
             to `degree` and x|x| of the velocities.
         degree: highest degree of the products where `terms` is empty.
-        folds: folds of the cross-validation that chooses the complexity; a manoeuvre is never split between folds.
+        choose: what the complexity is chosen by: `one_step`, cross-validated error of accelerations, or `free_run`, error of free runs on
+            validation data.
+        folds: folds of the cross-validation; a manoeuvre is never split between folds.
     """
 
     terms: tuple[str, ...] = ()
     degree: int = Field(default=2, ge=1, le=4)
+    choose: Literal["one_step", "free_run"] = "one_step"
     folds: int = Field(default=5, ge=2)
 
 
 class BasisHead(ClosedFormHead):
-    """rho [..., 3] = intercept + phi(features / spread) coefficients; buffers found by `fit_moments` of the subclass."""
+    """rho [..., 3] = intercept + phi(features / spread) coefficients; buffers found by the subclass."""
 
     def __init__(self, config: BasisConfig, names: Sequence[str]) -> None:
         super().__init__()
@@ -39,6 +44,7 @@ class BasisHead(ClosedFormHead):
         magnitudes = [name for name in ("u", "v", "r") if name in chosen]
         self.library = TermLibrary(config.terms or polynomial_terms(chosen, config.degree, magnitudes=magnitudes), chosen)
         self.folds = config.folds
+        self.by_free_run = config.choose == "free_run"
         self.register_buffer("coefficients", torch.zeros(self.library.count, 3, dtype=torch.float64))
         self.register_buffer("intercept", torch.zeros(3, dtype=torch.float64))
         self.coefficients: Tensor
@@ -69,6 +75,13 @@ class BasisHead(ClosedFormHead):
             raise FitError(f"{len(samples)} samples do not determine {self.library.count} basis functions; give more data or fewer terms")
         fold = torch.searchsorted(groups, samples.group) % self.folds
         return FoldMoments.gather(self.basis(samples.z), samples.target, fold, self.folds)
+
+    def solution(
+        self, choice: dict[str, Any], coefficients: Tensor, mean_x: Tensor, mean_y: Tensor, moments: FoldMoments, notes: dict[str, Any] | None = None
+    ) -> Solution:
+        """A solution y = mean_y + (x - mean_x) coefficients [J, 3], means as `moments` counts them."""
+        intercept = mean_y + moments.shift_y - (mean_x + moments.shift_x) @ coefficients
+        return Solution(choice, {"coefficients": coefficients, "intercept": intercept}, notes=notes or {})
 
     def coefficient_table(self) -> dict[str, list[float]]:
         """Basis function -> its coefficients (u, v, r axis), for features in units of their spread; for the report."""

@@ -10,6 +10,7 @@ from pydantic import Field
 from torch import Tensor
 
 from residnet.core.samples import Samples
+from residnet.core.solutions import Solution
 from residnet.heads.basis import BasisConfig, BasisHead
 
 
@@ -55,8 +56,8 @@ class PlsrConfig(BasisConfig):
     """PLSR of the three residuals together.
 
     Attributes:
-        order: number of latent variables; None chooses the one with the least cross-validated error (sum over axes, each in
-            units of its variance).
+        order: number of latent variables; None chooses it as `choose` says (by one-step errors: the sum over axes, each in units of its
+            variance).
         max_order: highest order tried.
     """
 
@@ -78,8 +79,8 @@ class PlsrHead(BasisHead):
         self.order = config.order or 0
         self.max_order = config.max_order
 
-    def solve(self, samples: Samples) -> dict[str, object]:
-        """Fit from samples whose target is the residual [N, 3]; returns the order and the cross-validated error by order."""
+    def solutions(self, samples: Samples) -> list[Solution]:
+        """The order given, or that of the least cross-validated error; then every order where free runs choose."""
         moments = self.moments(samples)
         highest = min(self.max_order, self.library.count) if self.order == 0 else min(self.order, self.library.count)
         folds = [self._scaled_path(moments.without(f), highest) for f in range(self.folds)]
@@ -87,11 +88,11 @@ class PlsrHead(BasisHead):
         error = moments.cross_validate([(path[:shortest], mx, my) for path, mx, my in folds])
         variance = samples.target.var(0, correction=0).clamp(min=1e-300)
         score = (error / variance).mean(-1)
-        order = min(self.order, shortest) if self.order else int(score.argmin()) + 1
-        path, mean_x, mean_y = self._scaled_path(moments.all(), order)
-        self.coefficients.copy_(path[-1])
-        self.intercept.copy_(mean_y + moments.shift_y - (mean_x + moments.shift_x) @ path[-1])
-        return {"order": order, "cross_validated_share": score.tolist(), "terms": self.library.count}
+        notes = {"cross_validated_share": score.tolist(), "terms": self.library.count}
+        path, mean_x, mean_y = self._scaled_path(moments.all(), shortest)
+        order = min(self.order or int(score.argmin()) + 1, len(path))
+        orders = [order, *range(1, len(path) + 1)] if self.by_free_run and not self.order else [order]
+        return [self.solution({"order": k}, path[k - 1], mean_x, mean_y, moments, notes) for k in orders]
 
     @staticmethod
     def _scaled_path(centred: tuple[float, Tensor, Tensor, Tensor, Tensor], orders: int) -> tuple[Tensor, Tensor, Tensor]:

@@ -10,6 +10,7 @@ from pydantic import Field
 from torch import Tensor
 
 from residnet.core.samples import Samples
+from residnet.core.solutions import Solution
 from residnet.heads.basis import BasisConfig, BasisHead
 
 
@@ -17,7 +18,7 @@ class RidgeConfig(BasisConfig):
     """Ridge of each residual; penalties are in units of a standardised column's energy (alpha = penalty * samples in scikit-learn's terms).
 
     Attributes:
-        penalties: candidates; with several, each axis takes the one with the least cross-validated error.
+        penalties: candidates. By one-step errors each axis takes its own; free runs choose between those and one penalty for all axes.
     """
 
     kind: Literal["ridge"] = "ridge"
@@ -36,16 +37,25 @@ class RidgeHead(BasisHead):
         super().__init__(config, names)
         self.penalties = tuple(sorted(config.penalties))
 
-    def solve(self, samples: Samples) -> dict[str, object]:
-        """Fit from samples whose target is the residual [N, 3]; returns the penalties and the cross-validated error of each."""
+    def solutions(self, samples: Samples) -> list[Solution]:
+        """Of each axis the penalty of the least cross-validated error; then every penalty for all axes where free runs choose."""
         moments = self.moments(samples)
         error = moments.cross_validate([self._scaled_path(moments.without(f)) for f in range(self.folds)])
         best = error.argmin(0)
+        notes = {"cross_validated_error": error.tolist(), "terms": self.library.count}
         path, mean_x, mean_y = self._scaled_path(moments.all())
-        chosen = torch.stack([path[int(best[k]), :, k] for k in range(3)], dim=1)
-        self.coefficients.copy_(chosen)
-        self.intercept.copy_(mean_y + moments.shift_y - (mean_x + moments.shift_x) @ chosen)
-        return {"penalty": [self.penalties[int(i)] for i in best], "cross_validated_error": error.tolist(), "terms": self.library.count}
+        picks = [[int(i) for i in best]] + ([[i] * 3 for i in range(len(path))] if self.by_free_run else [])
+        return [
+            self.solution(
+                {"penalty": [self.penalties[i] for i in pick]},
+                torch.stack([path[i, :, axis] for axis, i in enumerate(pick)], dim=1),
+                mean_x,
+                mean_y,
+                moments,
+                notes,
+            )
+            for pick in picks
+        ]
 
     def _scaled_path(self, centred: tuple[float, Tensor, Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
         """Coefficients for every penalty [C, J, K] from one eigendecomposition, with the means that they refer to."""

@@ -7,7 +7,7 @@ import json
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +36,7 @@ from residnet.evaluation.rollout_files import write_rollouts
 from residnet.heads import ClosedFormHead
 from residnet.physics.vessel import load_vessel
 from residnet.run_folder import RunFolder
+from residnet.tasks.choosing import choose
 from residnet.tasks.fit import FitConfig
 from residnet.tasks.references import references
 from residnet.training.config import TrainingConfig
@@ -161,8 +162,9 @@ class Fitter:
         spec = self.spec(name, "baseline", self.config.baselines.get(name, self.config.baseline))
         model = spec.build()
         started = time.perf_counter()
-        table = spec.baseline.fit(model.baseline, self.samples)
-        notes: dict[str, Any] = {"samples": len(self.samples), "least_squares": self.bench(model)}
+        chosen, tried = choose(model, model.baseline, spec.baseline.solutions(model.baseline, self.samples), self.bench)
+        table = list(chosen.table)
+        notes: dict[str, Any] = {"samples": len(self.samples), **chosen.choice, **tried, "least_squares": self.bench(model)}
         if name in self.config.refit:
             scales = torch.from_numpy(self.config.evaluation.scales.array())
             notes["refit"] = refit(model, self.samples, WindowStore.gather(self.train, torch.float64), self.config.refit[name], scales)
@@ -188,7 +190,8 @@ class Fitter:
         started = time.perf_counter()
         if isinstance(model.head, ClosedFormHead):
             model.head.calibrate(residual)
-            notes = dict(model.head.solve(residual))
+            chosen, tried = choose(model, model.head, model.head.solutions(residual), self.bench)
+            notes = chosen.choice | chosen.notes | tried
         else:
             notes = self._train(name, model, residual, seed)
         notes |= {"baseline": below, "seconds": round(time.perf_counter() - started, 1), "validation": self.bench(model)}
@@ -259,9 +262,8 @@ def moved(table: Sequence[Coefficient], baseline: Baseline) -> list[Coefficient]
     """The least-squares table with the coefficients as a refit left them; standard errors stay those of least squares."""
     if not isinstance(baseline, RegressorBaseline):
         return list(table)
-    terms = baseline.library.terms
-    axes = [f"{name}_dot" for name in VELOCITY]
-    return [Coefficient(c.axis, c.term, float(baseline.theta[axes.index(c.axis), terms.index(c.term)]), c.error) for c in table]
+    rows = {f"{name}_dot": dict(zip(baseline.library.terms, baseline.theta[axis].tolist(), strict=True)) for axis, name in enumerate(VELOCITY)}
+    return [replace(c, value=c.ratio.of(rows[c.axis]) if c.ratio is not None else rows[c.axis][c.term]) for c in table]
 
 
 def candidates(fitted: Sequence[Fitted], data: MeasuredLogs | SimulatedTrials) -> list[Candidate]:

@@ -77,7 +77,7 @@ def refit(model: HybridDynamics, samples: Samples, store: WindowStore, config: R
     """
     baseline = model.baseline
     if not isinstance(baseline, RegressorBaseline):
-        raise FitError("a refit through rollouts needs a baseline of kind 'regressors' or 'linear_steady'")
+        raise FitError("a refit through rollouts needs a baseline of kind 'regressors', 'linear_steady', 'nomoto' or 'nomoto_sideslip'")
     problem = _problem(model, baseline, samples, store, config, scales)
     theta = baseline.theta
     cost = first = _cost(model, problem, baseline)
@@ -125,7 +125,7 @@ def _problem(
     residual = samples.target - phi @ (baseline.theta * baseline.allowed).T
     variance = residual.square().mean(0)
     gram = phi.T @ phi / len(samples)
-    active = torch.nonzero(baseline.allowed.flatten() > 0).squeeze(1)
+    active = baseline.movable()
     precision = config.prior * torch.block_diag(*[gram / variance[axis] for axis in range(3)])
     terms = baseline.library.terms
     odd = torch.tensor([[float(wrong_parity(term, axis, samples.names)) for term in terms] for axis in range(3)], dtype=scales.dtype)

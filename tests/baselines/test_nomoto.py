@@ -1,0 +1,140 @@
+"""Nomoto's models: parameters of known lags, their errors, step responses in closed form, what a refit may move."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from residnet.baselines import NomotoConfig, NomotoSideslipConfig, RegressorBaseline
+from residnet.core.errors import ConfigError, FitError
+from residnet.core.samples import Samples
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.rollout import Rollout
+from residnet.heads import ZeroHead
+from residnet.physics.signals import SignalsConfig
+from residnet.tasks.pipeline import moved
+
+NAMES = ("u", "v", "r", "n", "delta")
+LAGS = {"T_u": 8.0, "K_u": 0.09, "b_u": -0.02, "T": 4.0, "K": 0.3, "b": 0.01}
+SLIP = {"T_beta": 3.0, "K_beta": 5.0, "b_beta": 0.02}
+
+
+def made(noise: float = 0.0, count: int = 600, groups: int = 12, seed: int = 0) -> Samples:
+    rng = np.random.default_rng(seed)
+    z = rng.normal(size=(count, 5)) * [0.3, 0.05, 0.05, 3.0, 0.3] + [0.6, 0, 0, 8, 0]
+    u, v, r, n, delta = z.T
+    target = np.stack(
+        (
+            (-u + LAGS["K_u"] * n + LAGS["b_u"]) / LAGS["T_u"],
+            (-v - SLIP["K_beta"] * u * r + SLIP["b_beta"] * u) / SLIP["T_beta"],
+            (-r + LAGS["K"] * delta + LAGS["b"]) / LAGS["T"],
+        ),
+        axis=1,
+    )
+    target += noise * rng.normal(size=target.shape) * [0.05, 0.02, 0.02]
+    group = torch.arange(count) * groups // count
+    return Samples(torch.from_numpy(z), torch.from_numpy(target), group, torch.zeros(count), ("zigzag",) * groups, NAMES)
+
+
+def test_parameters_of_known_lags_are_exact() -> None:
+    config = NomotoSideslipConfig()
+    found = {c.term: c.value for c in config.fit(config.build(NAMES), made()) if c.ratio is not None}
+    assert found == pytest.approx(LAGS | SLIP, rel=1e-9)
+    config2 = NomotoConfig()
+    found = {c.term: c.value for c in config2.fit(config2.build(NAMES), made()) if c.ratio is not None}
+    assert found == pytest.approx(LAGS, rel=1e-9)
+
+
+def test_errors_of_parameters_are_their_spread() -> None:
+    """T, K and b of many repetitions spread as the standard errors of one say: ratios need the coefficients' covariance."""
+    config = NomotoSideslipConfig()
+    baseline = config.build(NAMES)
+    runs = [{c.term: (c.value, c.error) for c in config.fit(baseline, made(1.0, seed=seed, groups=40)) if c.ratio is not None} for seed in range(60)]
+    for name in LAGS | SLIP:
+        values = np.array([run[name][0] for run in runs])
+        claimed = np.sqrt(np.mean([run[name][1] ** 2 for run in runs]))
+        assert 0.7 < claimed / values.std() < 1.4, name
+
+
+def hybrid(config: NomotoConfig | NomotoSideslipConfig) -> HybridDynamics:
+    signals = SignalsConfig(inputs=("n", "delta")).build()
+    baseline = config.build(signals.names)
+    config.fit(baseline, made())
+    return HybridDynamics(signals, baseline, ZeroHead(), 0.05, "rk4")
+
+
+def test_step_response_in_closed_form() -> None:
+    """r = (K delta + b)(1 - exp(-t/T)); u likewise; side slip at constant speed follows r through its own lag."""
+    model = hybrid(NomotoSideslipConfig())
+    n = 8.0
+    speed = LAGS["K_u"] * n + LAGS["b_u"]
+    w = torch.tensor([n, 0.2], dtype=torch.float64).expand(1, 400, 2)
+    x0 = torch.tensor([[0, 0, 0, speed, speed * SLIP["b_beta"], 0.0]], dtype=torch.float64)
+    with torch.no_grad():
+        states = Rollout(model)(x0, w, x0[:, :0])[0][0].numpy()
+    t = 0.05 * np.arange(401)
+    steady, slow, fast = LAGS["K"] * 0.2 + LAGS["b"], LAGS["T"], SLIP["T_beta"]
+    r = steady * (1 - np.exp(-t / slow))
+    lagged = 1 - (slow * np.exp(-t / slow) - fast * np.exp(-t / fast)) / (slow - fast)
+    v = speed * (SLIP["b_beta"] - SLIP["K_beta"] * steady * lagged)
+    np.testing.assert_allclose(states[:, 3], speed, rtol=1e-9)
+    np.testing.assert_allclose(states[:, 5], r, atol=1e-8)
+    np.testing.assert_allclose(states[:, 4], v, atol=1e-8)
+
+
+def test_first_order_model_lets_sway_die_out_with_t() -> None:
+    model = hybrid(NomotoConfig())
+    x0 = torch.tensor([[0, 0, 0, 0.5, 0.1, 0.02]], dtype=torch.float64)
+    with torch.no_grad():
+        states = Rollout(model)(x0, torch.zeros(1, 200, 2, dtype=torch.float64), x0[:, :0])[0][0]
+    assert float(states[-1, 4]) == pytest.approx(0.1 * math.exp(-10 / LAGS["T"]), rel=1e-6)
+
+
+def test_a_refit_may_not_move_what_nothing_determines() -> None:
+    """The decay of sway is no observation: a refit would make it grow where sway is left unexplained."""
+    baseline = NomotoConfig().build(NAMES)
+    movable = {(int(i) // baseline.library.count, baseline.library.terms[int(i) % baseline.library.count]) for i in baseline.movable()}
+    assert movable == {(0, "u"), (0, "n"), (0, "1"), (2, "r"), (2, "delta"), (2, "1")}
+    assert len(NomotoSideslipConfig().build(NAMES).movable()) == 9
+
+
+def test_parameters_follow_moved_coefficients() -> None:
+    config = NomotoConfig()
+    baseline = config.build(NAMES)
+    table = config.fit(baseline, made())
+    assert isinstance(baseline, RegressorBaseline)
+    terms = baseline.library.terms
+    with torch.no_grad():
+        baseline.theta[2, terms.index("r")] = -0.5
+        baseline.theta[2, terms.index("delta")] = 0.4
+    after = {(c.axis, c.term): c.value for c in moved(table, baseline)}
+    assert after["r_dot", "T"] == pytest.approx(2.0)
+    assert after["r_dot", "K"] == pytest.approx(0.8)
+    assert after["r_dot", "r"] == -0.5
+    assert [c.error for c in moved(table, baseline)] == [c.error for c in table]
+
+
+def test_other_channels_and_manoeuvres() -> None:
+    samples = made()
+    renamed = dataclasses.replace(samples, names=("u", "v", "r", "tau_x", "tau_n"), kinds=("turning", "zigzag") * 6)
+    spoiled = renamed.target.clone()
+    spoiled[samples.group % 2 == 0] = 99.0
+    config = NomotoConfig(drive="tau_x", steer="tau_n", manoeuvres=("zigzag",))
+    table = config.fit(config.build(renamed.names), renamed.with_target(spoiled))
+    assert {c.term: c.value for c in table if c.ratio is not None} == pytest.approx(LAGS, rel=1e-9)
+
+
+def test_errors() -> None:
+    with pytest.raises(ConfigError, match="needs the channel 'delta'"):
+        NomotoConfig().build(("u", "v", "r", "n"))
+    samples = made()
+    unstable = samples.target.clone()
+    unstable[:, 2] += samples.column("r")
+    with pytest.raises(FitError, match="needs r to settle, but r_dot rises with r"):
+        NomotoConfig().fit(NomotoConfig().build(NAMES), samples.with_target(unstable))
+    with pytest.raises(FitError, match="turning"):
+        NomotoConfig(manoeuvres=("turning",)).fit(NomotoConfig().build(NAMES), samples)
