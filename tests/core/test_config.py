@@ -272,3 +272,27 @@ def test_dump_is_complete_and_in_order_of_the_fields(tmp_path: Path, monkeypatch
 def test_import_is_light() -> None:
     code = "import sys, residnet.core.config; print(sorted({'torch', 'numpy', 'pandas', 'lightning', 'scipy'} & set(sys.modules)))"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
+
+
+class Parts(Config):
+    """A mapping and a default."""
+
+    parts: dict[str, int]
+    size: int = 3
+
+
+def test_a_key_is_taken_away(tmp_path: Path) -> None:
+    path = tmp_path / "parts.yaml"
+    path.write_text("parts: {a: 1, b: 2}\nsize: 5\n")
+    assert load_config(path, ["~parts.a"], Parts) == Parts(parts={"b": 2}, size=5)
+    assert load_config(path, ["~size"], Parts).size == 3
+    assert load_config(path, ["~parts.a", "parts.a=7"], Parts).parts == {"a": 7, "b": 2}
+
+
+@pytest.mark.parametrize(("override", "message"), [("~parts.aa", "did you mean 'a'"), ("~parts.a.x", "no 'parts.a.x'"), ("~", "no ''")])
+def test_what_is_not_there_cannot_be_taken_away(override: str, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "parts.yaml"
+    path.write_text("parts: {a: 1, b: 2}\n")
+    with pytest.raises(ConfigError, match=message) as caught:
+        load_config(path, [override], Parts)
+    assert "\n" not in str(caught.value)

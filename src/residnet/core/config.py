@@ -226,7 +226,7 @@ def load_config(path: Path, overrides: Sequence[str], model: Any) -> Any:
 
     Args:
         path: YAML file.
-        overrides: `dotted.key=value`, value in YAML, in order; an element of a list is addressed by its index.
+        overrides: `dotted.key=value`, value in YAML, in order; an element of a list is addressed by its index. `~dotted.key` takes a key away.
         model: config class, or a union of them (`Annotated[A | B, Field(discriminator="kind")]`).
 
     Raises:
@@ -268,7 +268,9 @@ def _validated(data: Any, model: Any, origin: _Origin, folder: Path | None) -> A
 
 
 def _apply(data: dict[str, Any], text: str) -> _Override:
-    """Set the value of one override in `data`; keys on the way that the file leaves out are made."""
+    """Set the value of one override in `data`; keys on the way that the file leaves out are made. `~key` takes a key away."""
+    if text.startswith("~"):
+        return _remove(data, text)
     key, equals, value_text = text.partition("=")
     keys = key.strip().split(".")
     if not equals or not all(keys):
@@ -285,6 +287,23 @@ def _apply(data: dict[str, Any], text: str) -> _Override:
         elif isinstance(here, dict) and here.get(name) is None:
             here[element] = {}
         here = here[element]
+    return _Override(text, path)
+
+
+def _remove(data: dict[str, Any], text: str) -> _Override:
+    where = f"override '{text}'"
+    keys = text[1:].strip().split(".")
+    here: Any = data
+    path: KeyPath = ()
+    for i, name in enumerate(keys):
+        if not isinstance(here, dict) or name not in here:
+            at = ".".join(keys[: i + 1])
+            raise ConfigError(f"{where}: there is no '{at}' to take away{nearest(name, here) if isinstance(here, dict) and here else ''}")
+        path += (name,)
+        if i == len(keys) - 1:
+            del here[name]
+            break
+        here = here[name]
     return _Override(text, path)
 
 

@@ -26,7 +26,7 @@ from residnet.tasks.pipeline import Fitted, Fitter, candidates, evaluate, prepar
 from residnet.tasks.reporting import report_run
 
 
-def run_fit(config: FitConfig, *, source: Path, overrides: Sequence[str], out: Path | None, resume: bool) -> RunFolder:
+def run_fit(config: FitConfig, *, source: Path, overrides: Sequence[str], out: Path | None, resume: bool, report: bool = True) -> RunFolder:
     """Fit, evaluate, report and export.
 
     Args:
@@ -35,6 +35,7 @@ def run_fit(config: FitConfig, *, source: Path, overrides: Sequence[str], out: P
         overrides: likewise.
         out: run folder; None for runs/<name>.
         resume: continue an unfinished run in that folder.
+        report: draw figures, write the report and export; else stop at the metrics.
 
     Raises:
         ResidnetError: where the input does not allow it.
@@ -73,7 +74,8 @@ def run_fit(config: FitConfig, *, source: Path, overrides: Sequence[str], out: P
     write_metrics(folder, config, table, selected)
     write_limits(folder, config, limiting, [log for split in config.evaluation.splits for log in logs[split]])
     write_residuals(folder.residuals, fitter, fitted, logs["test"])
-    finish(folder, config)
+    if report:
+        finish(folder, config)
     folder.write_provenance(config=source, overrides=overrides, seed=config.seed, files=files, started=started)
     return folder
 

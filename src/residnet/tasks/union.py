@@ -8,5 +8,6 @@ from pydantic import Field
 
 from residnet.tasks.fit import FitConfig
 from residnet.tasks.simulate import SimulateConfig
+from residnet.tasks.study import StudyConfig
 
-TaskConfig = Annotated[FitConfig | SimulateConfig, Field(discriminator="task")]
+TaskConfig = Annotated[FitConfig | SimulateConfig | StudyConfig, Field(discriminator="task")]
