@@ -152,11 +152,11 @@ def _repeats(run: RunFiles, found: Row) -> str:
     apart = ", ".join(f"{name} {number(unit_of(run, name)[1] * found[name])} {unit_of(run, name)[0]}" for name in tolerance["start"])
     kinds = ", ".join(f"{name.replace('_', ' ')} {part['pairs']}" for name, part in found["manoeuvres"].items())
     exogenous = (run.resolved.get("signals") or {}).get("exogenous")
-    told = " One that is told the wind, as the models here are, can." if exogenous else ""
+    told = " One that is told the wind, as the models here are, can do better." if exogenous else ""
     return (
         f"Repeatability: {found['pairs']} pair{'s' if found['pairs'] > 1 else ''} of stretches ({kinds}) in {found['logs']} of {where} have {rule}. "
         f"Their measured motions differ by {apart} (root mean square), {number(found['position'], 2)} m and "
         f"{number(DEG * found['heading'], 2)} deg at the end; each is so off what they share by 1/√2 of that, an NRMSE of "
         f"{number(share * found['nrmse'])} and {number(share * found['position'], 2)} m; what is left of unlike commands and starts is in it. "
-        f"A model that knows only commands and initial velocities can hardly be better than this in such runs, whatever its form.{told}"
+        f"An error of this order is left to a model that knows only commands and initial velocities in such runs, whatever its form.{told}"
     )
