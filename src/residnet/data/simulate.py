@@ -8,42 +8,18 @@ from typing import Literal
 
 import numpy as np
 import torch
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
-from residnet.core.config import Config, MetresPerSecond, NewtonMetres, Newtons, RadiansPerSecond, Seconds
+from residnet.core.config import Config, Seconds
 from residnet.core.errors import ConfigError
 from residnet.core.log import Log
-from residnet.core.names import CHANNEL_UNITS, VELOCITY
-from residnet.dynamics.rollout import Rollout
+from residnet.core.names import CHANNEL_UNITS
+from residnet.data.environment import Disturbance
+from residnet.data.sensors import SensorNoise
+from residnet.dynamics.rollout import Rollout, Source
 from residnet.dynamics.simulated import PlantDynamics
 from residnet.manoeuvres import FamilyConfig, Helm, Manoeuvre, StackedSource
-from residnet.physics.plant import Plant
 from residnet.physics.vessel import load_vessel
-
-
-class SensorNoise(Config):
-    """Standard deviations of white noise on the measured velocities; position and heading are measured exactly."""
-
-    u: MetresPerSecond = Field(default=0.03, ge=0)
-    v: MetresPerSecond = Field(default=0.03, ge=0)
-    r: RadiansPerSecond = Field(default=float(np.radians(0.2)), ge=0)
-
-
-class Disturbance(Config):
-    """Random forces and a constant current.
-
-    Attributes:
-        force_x: standard deviation of an Ornstein-Uhlenbeck force along the hull; force_y and force_n likewise.
-        correlation: correlation time of the three processes.
-        current_north: current, towards north; current_east likewise.
-    """
-
-    force_x: Newtons = Field(default=0.0, ge=0)
-    force_y: Newtons = Field(default=0.0, ge=0)
-    force_n: NewtonMetres = Field(default=0.0, ge=0)
-    correlation: Seconds = Field(default=5.0, gt=0)
-    current_north: MetresPerSecond = 0.0
-    current_east: MetresPerSecond = 0.0
 
 
 class SimulatedTrials(Config):
@@ -82,6 +58,16 @@ class SimulatedTrials(Config):
             raise ValueError(str(error)) from None
         return vessel
 
+    @model_validator(mode="after")
+    def _felt(self) -> SimulatedTrials:
+        try:
+            plant = load_vessel(self.vessel).build()
+            self.disturbance.check(plant, self.vessel)
+            self.noise.check((*plant.state, *plant.inputs[: plant.commands], *self.disturbance.logged), self.step, self.vessel)
+        except ConfigError as error:
+            raise ValueError(str(error)) from None
+        return self
+
     def draw(self) -> list[Manoeuvre]:
         """The manoeuvres, by family."""
         random = np.random.default_rng([self.seed, 1])
@@ -113,16 +99,18 @@ class SimulatedTrials(Config):
 def simulate(manoeuvres: Sequence[Manoeuvre], config: SimulatedTrials) -> list[Log]:
     """Fly the manoeuvres in one batch and log them as sensors would.
 
-    Channels: t, x, y, psi, u, v, r (velocities noisy), n_port, n_stbd (actual), cmd_port, cmd_stbd (commanded). Float64.
+    Channels: the plant's state (for the WAM-V x, y, psi, u, v, r, n_port, n_stbd) as its sensors measure it, the commands, and the
+    true wind where there is any. Float64.
     """
     plant = load_vessel(config.vessel).build()
     steps = round(config.duration / config.step)
     t = torch.arange(steps, dtype=torch.float64) * config.step
     runs = [list(members) for _, members in groupby(manoeuvres, key=lambda m: m.kind)]
     sources = [type(members[0]).source(members, Helm.of(plant), t) for members in runs]
-    source = StackedSource(sources, [len(members) for members in runs])
+    source: Source = StackedSource(sources, [len(members) for members in runs])
     random = np.random.default_rng([config.seed, 3])
-    w = torch.from_numpy(_environment(config.disturbance, plant, len(manoeuvres), steps, config.step, random))
+    w = torch.from_numpy(config.disturbance.series(plant, len(manoeuvres), steps, config.step, config.seed, random))
+    source = config.disturbance.surround(source, plant, len(manoeuvres), config.step, config.seed)
     rest = torch.zeros(len(manoeuvres), len(plant.state), dtype=torch.float64)
     with torch.no_grad():
         states, inputs, _ = Rollout(PlantDynamics(plant, config.step, config.substeps), source)(rest, w, rest[:, :0])
@@ -133,10 +121,10 @@ def simulate(manoeuvres: Sequence[Manoeuvre], config: SimulatedTrials) -> list[L
     count: dict[str, int] = {}
     for i, manoeuvre in enumerate(manoeuvres):
         count[manoeuvre.kind] = count.get(manoeuvre.kind, 0) + 1
-        channels = {name: x[i, :, j].copy() for j, name in enumerate(plant.state)}
-        for j, name in enumerate(VELOCITY):
-            channels[name] = channels[name] + noise[i, :, j]
-        channels |= {name: acting[i, :, j].copy() for j, name in enumerate(plant.inputs[: plant.commands])}
+        clean = {name: x[i, :, j] for j, name in enumerate(plant.state)}
+        known = (*plant.inputs[: plant.commands], *config.disturbance.logged)
+        clean |= {name: acting[i, :, plant.inputs.index(name)] for name in known}
+        channels = config.noise.measured(clean, time, noise[i], (config.seed, 6, i))
         logs.append(
             Log(
                 name=f"{manoeuvre.kind}_{count[manoeuvre.kind]:02d}",
@@ -148,19 +136,3 @@ def simulate(manoeuvres: Sequence[Manoeuvre], config: SimulatedTrials) -> list[L
             )
         )
     return logs
-
-
-def _environment(config: Disturbance, plant: Plant, rows: int, steps: int, step: float, random: np.random.Generator) -> np.ndarray:
-    """Inputs of the plant [B, T, m] with the commands zero: Ornstein-Uhlenbeck forces (exact discretisation) and current."""
-    from scipy.signal import lfilter
-
-    keep = np.exp(-step / config.correlation)
-    drive = random.standard_normal((rows, steps, 3)) * np.sqrt(1 - keep**2)
-    drive[:, 0] /= np.sqrt(1 - keep**2)
-    forces = lfilter([1.0], [1.0, -keep], drive, axis=1) * [config.force_x, config.force_y, config.force_n]
-    w = np.zeros((rows, steps, len(plant.inputs)))
-    for j, name in enumerate(("force_x", "force_y", "force_n")):
-        w[:, :, plant.inputs.index(name)] = forces[:, :, j]
-    w[:, :, plant.inputs.index("current_north")] = config.current_north
-    w[:, :, plant.inputs.index("current_east")] = config.current_east
-    return w

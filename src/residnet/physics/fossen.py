@@ -12,6 +12,7 @@ from residnet.core.config import Config
 from residnet.core.errors import ConfigError
 from residnet.core.names import VELOCITY
 from residnet.physics.actuators import ActuatorsConfig
+from residnet.physics.environment_wind import WindLoadsConfig
 from residnet.physics.kinematics import Planar
 from residnet.physics.parameters import Inertia, Length, Mass, MassArm, Parameter, above_zero, dimension, unit_text
 from residnet.physics.plant import HullPlant
@@ -70,6 +71,7 @@ class FossenConfig(Config):
         name: of the vessel, as its file is called.
         description: one line for `residnet list vessels`.
         length: of the hull, which manoeuvring indices are measured in.
+        wind: coefficients of the hull above water; without them the vessel feels no wind.
     """
 
     kind: Literal["fossen"] = "fossen"
@@ -80,6 +82,7 @@ class FossenConfig(Config):
     added_mass: AddedMass
     damping: Damping
     actuators: ActuatorsConfig
+    wind: WindLoadsConfig | None = None
 
     _positive = field_validator("length")(above_zero)
 
@@ -152,7 +155,7 @@ class FossenVessel(HullPlant):
     """
 
     def __init__(self, vessel: FossenConfig) -> None:
-        super().__init__(Planar(), vessel.actuators.build())
+        super().__init__(Planar(), vessel.actuators.build(), vessel.wind.build() if vessel.wind is not None else None)
         self.hull = Fossen3(vessel)
 
     def acceleration(self, pose: Tensor, nu: Tensor, tau: Tensor) -> Tensor:

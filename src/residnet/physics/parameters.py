@@ -8,9 +8,12 @@ from typing import Annotated
 
 from pydantic import AfterValidator, field_validator
 
-from residnet.core.config import Config
+from residnet.core.config import Config, Quantity
 from residnet.core.errors import UsageError
 from residnet.core.names import to_si
+
+SquareMetres = Annotated[float, Quantity("m^2")]
+Density = Annotated[float, Quantity("kg/m^3")]
 
 
 class Parameter(Config):

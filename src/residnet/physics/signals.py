@@ -15,9 +15,9 @@ from residnet.core.errors import ConfigError
 from residnet.core.frames import to_body
 from residnet.core.names import CHANNEL_UNITS, STATE, VELOCITY, nearest
 from residnet.physics.actuators import DifferentialThrustConfig
+from residnet.physics.environment_wind import WIND_INPUTS
 from residnet.physics.vessel import load_vessel
 
-WIND_INPUTS = ("wind_speed", "wind_dir")
 WIND_CHANNELS = ("wind_u", "wind_v", "wind_mag")
 FORCE_CHANNELS = ("tau_x", "tau_y", "tau_n")
 
