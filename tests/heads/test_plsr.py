@@ -113,3 +113,40 @@ def test_named_terms_and_features() -> None:
     u, r = samples.z[:, 0] / samples.z[:, 0].std(correction=0), samples.z[:, 2] / samples.z[:, 2].std(correction=0)
     np.testing.assert_allclose(head.basis(samples.z), torch.stack((u * u.abs(), u * r, r * r.abs()), dim=1), rtol=1e-12)
     assert list(head.coefficient_table()) == ["u|u|", "u r", "r|r|"]
+
+
+def test_free_runs_are_offered_every_order_and_none() -> None:
+    """First the cross-validated order, then orders from one to the highest, each scikit-learn's, and a residual of zero."""
+    samples = made()
+    head = PlsrConfig().build(NAMES)
+    head.calibrate(samples)
+    found = head.solutions(samples)
+    orders = [solution.choice["order"] for solution in found]
+    assert orders[0] == int(np.argmin(found[0].notes["cross_validated_share"])) + 1
+    assert orders[1:9] == [1, 2, 3, 4, 5, 6, 7, 8]
+    assert orders[-2:] == [23, 0]
+    x, y = basis(head, samples.z), samples.target.numpy()
+    scale = x.std(0, ddof=1)
+    for solution, order in list(zip(found, orders, strict=True))[:9]:
+        head.load_state_dict(solution.state, strict=False)
+        predicted = head(samples.z, samples.z[:, :0])[0].numpy()
+        np.testing.assert_allclose(predicted, sklearn_fit(x / scale, y, order).predict(x / scale), atol=1e-8 * y.std())
+    head.load_state_dict(found[-1].state, strict=False)
+    assert float(head(samples.z, samples.z[:, :0])[0].abs().max()) == 0.0
+
+
+@pytest.mark.parametrize("config", [{"order": 3}, {"choose": "one_step"}])
+def test_what_is_settled_is_not_offered(config: dict[str, object]) -> None:
+    samples = made()
+    head = PlsrConfig.model_validate({"kind": "plsr", **config}).build(NAMES)
+    head.calibrate(samples)
+    assert len(head.solutions(samples)) == 1
+
+
+def test_a_residual_of_nothing_is_left_out() -> None:
+    samples = made()
+    head = PlsrConfig().build(NAMES)
+    head.calibrate(samples)
+    notes = head.solve(samples.with_target(torch.zeros_like(samples.target)))
+    assert notes["order"] == 0
+    assert float(head(samples.z, samples.z[:, :0])[0].abs().max()) == 0.0

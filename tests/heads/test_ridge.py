@@ -70,3 +70,21 @@ def test_a_constant_basis_function_does_no_harm() -> None:
     joined = np.concatenate((np.ones((len(samples), 1)), samples.z[:, :2].numpy()), axis=1)
     truth = joined @ np.linalg.lstsq(joined, samples.target.numpy(), rcond=None)[0]
     np.testing.assert_allclose(head(samples.z, samples.z[:, :0])[0], truth, atol=1e-6)
+
+
+def test_free_runs_are_offered_one_penalty_for_all_axes_and_none() -> None:
+    penalties = (1e-6, 1e-2, 1.0)
+    samples = made()
+    head = RidgeConfig(penalties=penalties).build(NAMES)
+    head.calibrate(samples)
+    found = head.solutions(samples)
+    assert [solution.choice["penalty"] for solution in found[1:]] == [[penalty] * 3 for penalty in penalties] + [[]]
+    for solution, penalty in zip(found[1:], penalties, strict=False):
+        alone, _ = fitted((penalty,))
+        torch.testing.assert_close(solution.state["coefficients"], alone.coefficients)
+        torch.testing.assert_close(solution.state["intercept"], alone.intercept)
+    head.load_state_dict(found[-1].state, strict=False)
+    assert float(head(samples.z, samples.z[:, :0])[0].abs().max()) == 0.0
+    single = RidgeConfig(penalties=penalties, choose="one_step").build(NAMES)
+    single.calibrate(samples)
+    assert [solution.choice for solution in single.solutions(samples)] == [found[0].choice]

@@ -72,7 +72,7 @@ def test_in_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path.write_text(yaml.safe_dump(config))
     assert call(monkeypatch, "run", path, "--out", tmp_path / "run") == 0
     notes = {name: json.loads((tmp_path / "run" / "models" / name / "fit.json").read_text()) for name in ("poly", "plsr", "ridge", "nomoto")}
-    for name, key, count in (("poly", "ridge", 2), ("plsr", "order", 7), ("ridge", "penalty", 3)):
+    for name, key, count in (("poly", "ridge", 2), ("plsr", "order", 8), ("ridge", "penalty", 4)):
         tried = notes[name]["free_run_choice"]
         assert len(tried) == count
         best = min(tried, key=lambda entry: entry["validation"])

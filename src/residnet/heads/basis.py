@@ -23,14 +23,14 @@ class BasisConfig(FeatureConfig):
         terms: basis functions by name (see `residnet.physics.terms`), in units of each feature's spread; empty: all products of the features up
             to `degree` and x|x| of the velocities.
         degree: highest degree of the products where `terms` is empty.
-        choose: what the complexity is chosen by: `one_step`, cross-validated error of accelerations, or `free_run`, error of free runs on
-            validation data.
+        choose: what the complexity is chosen by: `free_run`, error of free runs on validation data, which may find that no residual at all
+            is best; or `one_step`, cross-validated error of accelerations.
         folds: folds of the cross-validation; a manoeuvre is never split between folds.
     """
 
     terms: tuple[str, ...] = ()
     degree: int = Field(default=2, ge=1, le=4)
-    choose: Literal["one_step", "free_run"] = "one_step"
+    choose: Literal["one_step", "free_run"] = "free_run"
     folds: int = Field(default=5, ge=2)
 
 
@@ -82,6 +82,10 @@ class BasisHead(ClosedFormHead):
         """A solution y = mean_y + (x - mean_x) coefficients [J, 3], means as `moments` counts them."""
         intercept = mean_y + moments.shift_y - (mean_x + moments.shift_x) @ coefficients
         return Solution(choice, {"coefficients": coefficients, "intercept": intercept}, notes=notes or {})
+
+    def nothing(self, choice: dict[str, Any], notes: dict[str, Any]) -> Solution:
+        """The solution that leaves the baseline as it is: a residual that explains accelerations may still spoil free runs."""
+        return Solution(choice, {"coefficients": torch.zeros_like(self.coefficients), "intercept": torch.zeros_like(self.intercept)}, notes=notes)
 
     def coefficient_table(self) -> dict[str, list[float]]:
         """Basis function -> its coefficients (u, v, r axis), for features in units of their spread; for the report."""

@@ -52,6 +52,14 @@ def pls_path(xx: Tensor, xy: Tensor, orders: int) -> Tensor:
     return torch.stack(path) if path else torch.zeros(0, j, k, dtype=xy.dtype)
 
 
+def _ladder(highest: int) -> list[int]:
+    """Orders worth a free run: each of the first eight, then steps of a quarter."""
+    orders = [1]
+    while orders[-1] < highest:
+        orders.append(min(max(orders[-1] + 1, orders[-1] * 5 // 4), highest))
+    return orders
+
+
 class PlsrConfig(BasisConfig):
     """PLSR of the three residuals together.
 
@@ -80,19 +88,22 @@ class PlsrHead(BasisHead):
         self.max_order = config.max_order
 
     def solutions(self, samples: Samples) -> list[Solution]:
-        """The order given, or that of the least cross-validated error; then every order where free runs choose."""
+        """The order given, or that of the least cross-validated error; then a ladder of orders and none where free runs choose."""
         moments = self.moments(samples)
         highest = min(self.max_order, self.library.count) if self.order == 0 else min(self.order, self.library.count)
         folds = [self._scaled_path(moments.without(f), highest) for f in range(self.folds)]
         shortest = min(int(path.shape[0]) for path, _, _ in folds)
+        if shortest == 0:
+            # a residual without variance
+            return [self.nothing({"order": 0}, {"terms": self.library.count})]
         error = moments.cross_validate([(path[:shortest], mx, my) for path, mx, my in folds])
         variance = samples.target.var(0, correction=0).clamp(min=1e-300)
         score = (error / variance).mean(-1)
         notes = {"cross_validated_share": score.tolist(), "terms": self.library.count}
         path, mean_x, mean_y = self._scaled_path(moments.all(), shortest)
         order = min(self.order or int(score.argmin()) + 1, len(path))
-        orders = [order, *range(1, len(path) + 1)] if self.by_free_run and not self.order else [order]
-        return [self.solution({"order": k}, path[k - 1], mean_x, mean_y, moments, notes) for k in orders]
+        found = [self.solution({"order": k}, path[k - 1], mean_x, mean_y, moments, notes) for k in (order, *_ladder(len(path)))]
+        return [*found, self.nothing({"order": 0}, notes)] if self.by_free_run and not self.order else found[:1]
 
     @staticmethod
     def _scaled_path(centred: tuple[float, Tensor, Tensor, Tensor, Tensor], orders: int) -> tuple[Tensor, Tensor, Tensor]:

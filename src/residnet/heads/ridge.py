@@ -18,7 +18,8 @@ class RidgeConfig(BasisConfig):
     """Ridge of each residual; penalties are in units of a standardised column's energy (alpha = penalty * samples in scikit-learn's terms).
 
     Attributes:
-        penalties: candidates. By one-step errors each axis takes its own; free runs choose between those and one penalty for all axes.
+        penalties: candidates. By one-step errors each axis takes its own; free runs choose between those, one penalty for all axes, and no
+            residual (an empty list in fit.json).
     """
 
     kind: Literal["ridge"] = "ridge"
@@ -38,14 +39,14 @@ class RidgeHead(BasisHead):
         self.penalties = tuple(sorted(config.penalties))
 
     def solutions(self, samples: Samples) -> list[Solution]:
-        """Of each axis the penalty of the least cross-validated error; then every penalty for all axes where free runs choose."""
+        """Of each axis the penalty of the least cross-validated error; then every penalty for all axes, and no residual, where free runs choose."""
         moments = self.moments(samples)
         error = moments.cross_validate([self._scaled_path(moments.without(f)) for f in range(self.folds)])
         best = error.argmin(0)
         notes = {"cross_validated_error": error.tolist(), "terms": self.library.count}
         path, mean_x, mean_y = self._scaled_path(moments.all())
         picks = [[int(i) for i in best]] + ([[i] * 3 for i in range(len(path))] if self.by_free_run else [])
-        return [
+        found = [
             self.solution(
                 {"penalty": [self.penalties[i] for i in pick]},
                 torch.stack([path[i, :, axis] for axis, i in enumerate(pick)], dim=1),
@@ -56,6 +57,7 @@ class RidgeHead(BasisHead):
             )
             for pick in picks
         ]
+        return [*found, self.nothing({"penalty": []}, notes)] if self.by_free_run else found
 
     def _scaled_path(self, centred: tuple[float, Tensor, Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
         """Coefficients for every penalty [C, J, K] from one eigendecomposition, with the means that they refer to."""
