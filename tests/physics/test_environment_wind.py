@@ -11,7 +11,8 @@ import torch
 from residnet.core.config import load_config, validate
 from residnet.core.errors import ConfigError
 from residnet.physics.environment_wind import SymmetricWindConfig, TabulatedWindConfig, WindLoads, WindLoadsConfig
-from residnet.physics.vessel import VesselConfig, load_vessel, vessel_files
+from residnet.physics.fossen import FossenConfig
+from residnet.physics.vessel import load_vessel, vessel_files
 
 AREAS: dict[str, Any] = {"frontal_area": 3.0, "lateral_area": 6.0, "length": 5.0, "centre_height": 0.8, "source": "made"}
 SYMMETRIC = AREAS | {"kind": "symmetric", "c_x": 0.7, "c_y": 0.8, "c_n": 0.1}
@@ -84,9 +85,9 @@ def test_gradients(content: dict[str, Any]) -> None:
     assert bool(torch.isfinite(calm.grad).all())  # type: ignore[arg-type]
 
 
-def windy(*extra: str) -> VesselConfig:
+def windy(*extra: str) -> FossenConfig:
     section = "wind={kind: symmetric, frontal_area: 3, lateral_area: 6, length: 5, c_x: 0.7, c_y: 0.8, c_n: 0.1, source: made}"
-    return load_config(vessel_files()["wam_v_cal"], [section, *extra], VesselConfig)
+    return load_config(vessel_files()["wam_v_cal"], [section, *extra], FossenConfig)
 
 
 def test_a_plant_feels_the_wind_relative_to_itself() -> None:

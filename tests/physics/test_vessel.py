@@ -9,9 +9,9 @@ import torch
 
 from residnet.core.config import load_config
 from residnet.core.errors import ConfigError
-from residnet.physics.fossen import Fossen3
+from residnet.physics.fossen import Fossen3, FossenConfig
 from residnet.physics.parameters import Parameter
-from residnet.physics.vessel import VesselConfig, load_vessel, vessel_files
+from residnet.physics.vessel import load_vessel, vessel_files
 
 CAL = vessel_files()["wam_v_cal"]
 
@@ -20,10 +20,16 @@ CAL = vessel_files()["wam_v_cal"]
 def test_every_vessel_file(name: str) -> None:
     vessel = load_vessel(name)
     assert vessel.name == name, "a vessel is called as its file"
-    hull = Fossen3(vessel)
-    assert hull.mass.shape == (3, 3)
-    assert vessel.actuators.source
-    vessel.actuators.build()
+    plant = vessel.build()
+    x = plant.approach(2)
+    assert x.shape == (2, len(plant.state))
+    zero = torch.zeros(2, dtype=torch.float64)
+    w = torch.zeros(2, len(plant.inputs), dtype=torch.float64)
+    w[:, : plant.commands] = plant.demand(zero + 0.5, zero + 0.2)
+    rate = plant.rate(x, w)
+    assert rate.shape == x.shape
+    assert bool(torch.isfinite(rate).all())
+    assert plant.settle(x, w, 0.01).shape == x.shape
 
 
 def test_calibrated_numbers_are_those_of_errata() -> None:
@@ -38,11 +44,11 @@ def test_calibrated_numbers_are_those_of_errata() -> None:
 
 
 def test_units_are_converted_at_the_door() -> None:
-    vessel = load_config(CAL, ["rigid_body.m.value=0.315", "rigid_body.m.unit=t", "length.value=488", "length.unit=cm"], VesselConfig)
+    vessel = load_config(CAL, ["rigid_body.m.value=0.315", "rigid_body.m.unit=t", "length.value=488", "length.unit=cm"], FossenConfig)
     assert vessel.rigid_body.m == Parameter(value=315.0, unit="kg", source=vessel.rigid_body.m.source)
     assert vessel.length.value == pytest.approx(4.88)
     # what is converted once is not converted again
-    again = VesselConfig.model_validate(vessel.model_dump())
+    again = FossenConfig.model_validate(vessel.model_dump())
     assert again == vessel
 
 
@@ -65,7 +71,7 @@ def test_units_are_converted_at_the_door() -> None:
 )
 def test_a_wrong_value_is_one_line_with_its_place(override: str, place: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message) as caught:
-        load_config(CAL, [override], VesselConfig)
+        load_config(CAL, [override], FossenConfig)
     text = str(caught.value)
     assert "\n" not in text
     assert place in text
@@ -87,7 +93,7 @@ def test_a_wrong_value_is_one_line_with_its_place(override: str, place: str, mes
 )
 def test_a_wrong_damping_term_is_found_when_the_file_is_read(override: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message) as caught:
-        load_config(CAL, [override], VesselConfig)
+        load_config(CAL, [override], FossenConfig)
     assert "\n" not in str(caught.value)
 
 
@@ -96,7 +102,7 @@ def test_a_wrong_damping_term_is_found_when_the_file_is_read(override: str, mess
     ["damping.X.u.unit=N s/m", "damping.N.r.unit=N m s/rad", "damping.N.r.unit=N m s", "damping.N.|u|v|v|={value: 1, unit: kg s/m, source: made}"],
 )
 def test_equal_units_of_damping_are_taken(override: str) -> None:
-    vessel, known = load_config(CAL, [override], VesselConfig), load_vessel("wam_v_cal")
+    vessel, known = load_config(CAL, [override], FossenConfig), load_vessel("wam_v_cal")
     axis, term = override.split(".")[1], override.removeprefix("damping.").split(".")[1].split("=")[0]
     row = getattr(vessel.damping, axis)
     assert row[term].value == (1.0 if term == "|u|v|v|" else getattr(known.damping, axis)[term].value)

@@ -87,6 +87,8 @@ CHANNEL_UNITS: dict[str, str] = {
     "n_stbd": "1/s",
     "cmd_port": "1/s",
     "cmd_stbd": "1/s",
+    "cmd_delta": "rad",
+    "cmd_n": "1/s",
     "tau_x": "N",
     "tau_y": "N",
     "tau_n": "N m",

@@ -23,7 +23,7 @@ from residnet.physics.vessel import load_vessel
 
 
 class SimulatedTrials(Config):
-    """A programme of sea trials on a simulated vessel, from rest.
+    """A programme of sea trials on a simulated vessel, from rest (a model that only holds near its service speed starts there).
 
     Attributes:
         vessel: name of a vessel of residnet, or path of a vessel file.
@@ -111,9 +111,9 @@ def simulate(manoeuvres: Sequence[Manoeuvre], config: SimulatedTrials) -> list[L
     random = np.random.default_rng([config.seed, 3])
     w = torch.from_numpy(config.disturbance.series(plant, len(manoeuvres), steps, config.step, config.seed, random))
     source = config.disturbance.surround(source, plant, len(manoeuvres), config.step, config.seed)
-    rest = torch.zeros(len(manoeuvres), len(plant.state), dtype=torch.float64)
+    start = plant.approach(len(manoeuvres))
     with torch.no_grad():
-        states, inputs, _ = Rollout(PlantDynamics(plant, config.step, config.substeps), source)(rest, w, rest[:, :0])
+        states, inputs, _ = Rollout(PlantDynamics(plant, config.step, config.substeps), source)(start, w, start[:, :0])
     x, acting = states[:, :-1].numpy(), inputs.numpy()
     noise = random.standard_normal((len(manoeuvres), steps, 3)) * [config.noise.u, config.noise.v, config.noise.r]
     time = t.numpy()
@@ -121,7 +121,7 @@ def simulate(manoeuvres: Sequence[Manoeuvre], config: SimulatedTrials) -> list[L
     count: dict[str, int] = {}
     for i, manoeuvre in enumerate(manoeuvres):
         count[manoeuvre.kind] = count.get(manoeuvre.kind, 0) + 1
-        clean = {name: x[i, :, j] for j, name in enumerate(plant.state)}
+        clean = {name: x[i, :, j] for j, name in enumerate(plant.state) if not name.startswith("_")}
         known = (*plant.inputs[: plant.commands], *config.disturbance.logged)
         clean |= {name: acting[i, :, plant.inputs.index(name)] for name in known}
         channels = config.noise.measured(clean, time, noise[i], (config.seed, 6, i))
@@ -130,7 +130,7 @@ def simulate(manoeuvres: Sequence[Manoeuvre], config: SimulatedTrials) -> list[L
                 name=f"{manoeuvre.kind}_{count[manoeuvre.kind]:02d}",
                 t=time.copy(),
                 channels=channels,
-                units={name: CHANNEL_UNITS[name] for name in channels},
+                units={name: CHANNEL_UNITS.get(name, "-") for name in channels},
                 manoeuvre=manoeuvre.kind,
                 meta={"vessel": config.vessel, "demand": manoeuvre.model_dump(mode="json"), "seed": config.seed},
             )

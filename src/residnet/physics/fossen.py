@@ -14,6 +14,7 @@ from residnet.core.names import VELOCITY
 from residnet.physics.actuators import ActuatorsConfig
 from residnet.physics.environment_wind import WindLoadsConfig
 from residnet.physics.kinematics import Planar
+from residnet.physics.mass import inverse_mass
 from residnet.physics.parameters import Inertia, Length, Mass, MassArm, Parameter, above_zero, dimension, unit_text
 from residnet.physics.plant import HullPlant
 from residnet.physics.terms import TermLibrary, parse_term
@@ -90,7 +91,7 @@ class FossenConfig(Config):
         """The plant.
 
         Raises:
-            ConfigError: where the mass matrix is not positive definite.
+            ConfigError: where the mass matrix is not positive definite or is singular.
         """
         return FossenVessel(self)
 
@@ -114,12 +115,8 @@ class Fossen3(nn.Module):
             ],
             dtype=torch.float64,
         )
-        if bool((torch.linalg.eigvals(mass).real <= 0).any()):
-            raise ConfigError(
-                f"vessel {vessel.name}: the mass matrix is not positive definite; added mass (X_udot, Y_vdot, N_rdot) is negative for a hull"
-            )
         self.register_buffer("mass", mass, persistent=False)
-        self.register_buffer("inverse", torch.linalg.inv(mass), persistent=False)
+        self.register_buffer("inverse", inverse_mass(mass, vessel.name), persistent=False)
         rows = (vessel.damping.X, vessel.damping.Y, vessel.damping.N)
         terms = sorted({term for row in rows for term in row})
         self.terms = TermLibrary(terms, VELOCITY)

@@ -34,6 +34,10 @@ class Plant(nn.Module, ABC):
     def rate(self, x: Tensor, w: Tensor) -> Tensor:
         """x_dot [B, nx] under inputs w [B, m]."""
 
+    def approach(self, rows: int) -> Tensor:
+        """State [rows, nx] that trials start from, float64: at rest; a model that only holds near its service speed starts there."""
+        return torch.zeros(rows, len(self.state), dtype=torch.float64)
+
     def settle(self, x: Tensor, w: Tensor, dt: float) -> Tensor:
         """State [B, nx] after what moves once per step of dt seconds has moved."""
         return x

@@ -16,6 +16,7 @@ from residnet.core.frames import to_body
 from residnet.core.names import CHANNEL_UNITS, STATE, VELOCITY, nearest
 from residnet.physics.actuators import DifferentialThrustConfig
 from residnet.physics.environment_wind import WIND_INPUTS
+from residnet.physics.fossen import FossenConfig
 from residnet.physics.vessel import load_vessel
 
 WIND_CHANNELS = ("wind_u", "wind_v", "wind_mag")
@@ -67,9 +68,10 @@ class SignalsConfig(Config):
         if not isinstance(self.forces, str):
             return self
         try:
-            actuators = load_vessel(self.forces).actuators
+            vessel = load_vessel(self.forces)
         except ConfigError as error:
             raise ValueError(str(error)) from None
+        actuators = vessel.actuators if isinstance(vessel, FossenConfig) else None
         if not isinstance(actuators, DifferentialThrustConfig):
             raise ValueError(f"forces: the actuators of '{self.forces}' are not two thrusters (differential_thrust); leave forces out")
         return self.model_copy(update={"forces": actuators})

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
 
 from residnet.core.config import load_config
 from residnet.core.errors import ConfigError
 from residnet.core.names import nearest
 from residnet.core.resources import config_folder
+from residnet.physics.abkowitz import AbkowitzConfig
 from residnet.physics.fossen import FossenConfig
 
-VesselConfig = FossenConfig
+VesselConfig = Annotated[FossenConfig | AbkowitzConfig, Field(discriminator="kind")]
+AnyVessel = FossenConfig | AbkowitzConfig
 
 
 def vessel_files() -> dict[str, Path]:
@@ -18,7 +23,7 @@ def vessel_files() -> dict[str, Path]:
     return {path.stem: path for path in sorted((config_folder() / "vessels").glob("*.yaml"))}
 
 
-def load_vessel(name: str) -> VesselConfig:
+def load_vessel(name: str) -> AnyVessel:
     """Read a vessel by the name of a file in `configs/vessels` or by the path of a YAML file.
 
     Raises:

@@ -17,7 +17,7 @@ class Actuators(nn.Module, ABC):
     moved with the states held: rate limits).
 
     Attributes:
-        state: names of the states; empty where the commands act at once.
+        state: names of the states; empty where the commands act at once. What no sensor measures begins with `_` and enters no log.
         commands: names of the commands.
     """
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 from typing import Literal, final
 
 import torch
-from pydantic import Field
+from pydantic import Field, model_validator
 from torch import Tensor
 
 from residnet.core.config import Metres, RevRate, RevsPerSecond
 from residnet.physics.actuators.base import ActuatorConfig, Actuators
+from residnet.physics.actuators.thrust_curve import Coefficients, CurveRange, ThrustCurve, require_range
 
 
 class DifferentialThrustConfig(ActuatorConfig):
@@ -17,15 +18,22 @@ class DifferentialThrustConfig(ActuatorConfig):
 
     `forward` and `reverse` are the coefficients (c0 [N], c1 [N s], c2 [N s^2]) of T = c0 + c1 n + c2 n^2 per thruster,
     for n > 0 and n < 0 (signed). The curve is clipped so that thrust never opposes the sense of rotation, which closes
-    the jump that the printed polynomials have at zero (ERRATA W5). `spacing` is the distance between the thrusters.
+    the jump that the printed polynomials have at zero (ERRATA W5). `spacing` is the distance between the thrusters,
+    `curve_range` the revolutions (astern, ahead) that the curves were measured between, which must include +-n_max.
     """
 
     kind: Literal["differential_thrust"] = "differential_thrust"
     spacing: Metres = Field(gt=0)
     n_max: RevsPerSecond = Field(gt=0)
     n_rate: RevRate = Field(gt=0)
-    forward: tuple[float, float, float]
-    reverse: tuple[float, float, float]
+    forward: Coefficients
+    reverse: Coefficients
+    curve_range: CurveRange | None = None
+
+    @model_validator(mode="after")
+    def _range(self) -> DifferentialThrustConfig:
+        require_range(self)
+        return self
 
     def build(self) -> DifferentialThrust:
         """The force map."""
@@ -44,17 +52,12 @@ class DifferentialThrust(Actuators):
         self.n_max = config.n_max
         self.n_rate = config.n_rate
         self.arm = 0.5 * config.spacing
-        self.register_buffer("forward_curve", torch.tensor(config.forward, dtype=torch.float64), persistent=False)
-        self.register_buffer("reverse_curve", torch.tensor(config.reverse, dtype=torch.float64), persistent=False)
-        self.forward_curve: Tensor
-        self.reverse_curve: Tensor
+        self.curve = ThrustCurve(config.forward, config.reverse)
 
     def thrust(self, n: Tensor) -> Tensor:
         """Thrust of one propeller [N] at revolutions n [1/s], any shape (document 003 eqs. (21), (22), clipped as in ERRATA W5)."""
-        f, b = self.forward_curve.to(n.dtype), self.reverse_curve.to(n.dtype)
-        ahead = (f[0] + n * (f[1] + n * f[2])).clamp(min=0.0)
-        astern = (b[0] + n * (b[1] + n * b[2])).clamp(max=0.0)
-        return torch.where(n > 0, ahead, torch.where(n < 0, astern, torch.zeros_like(n)))
+        thrust: Tensor = self.curve(n)
+        return thrust
 
     def forward(self, n: Tensor) -> Tensor:
         """n [..., 2] -> tau [..., 3]."""
