@@ -76,6 +76,20 @@ def test_current_by_speed_and_direction() -> None:
         validate({"current_speed": 1, "current_direction": 0, "current_east": 0.1}, Disturbance, "here")
 
 
+def test_each_trial_may_have_a_current_of_its_own() -> None:
+    disturbance = validate({"current_north": 1.0, "current_each": ["0.1 m/s", 0.4]}, Disturbance, "here")
+    drawn = disturbance.currents(400, 3)
+    speed, direction = np.hypot(drawn[:, 0] - 1.0, drawn[:, 1]), np.arctan2(drawn[:, 1], drawn[:, 0] - 1.0)
+    assert 0.1 <= speed.min() < 0.11 < 0.39 < speed.max() <= 0.4
+    assert abs(np.exp(1j * direction).mean()) < 0.15
+    np.testing.assert_array_equal(drawn, disturbance.currents(400, 3))
+    plant = load_vessel("wam_v_cal").build()
+    series = disturbance.series(plant, 400, 5, 0.1, 3, np.random.default_rng(0))
+    np.testing.assert_array_equal(series[:, :, 5:7], np.repeat(drawn[:, None], 5, axis=1))
+    with pytest.raises(ConfigError, match="is faster than the fastest"):
+        validate({"current_each": [0.4, 0.1]}, Disturbance, "here")
+
+
 def test_gusts_have_the_stated_spread_memory_and_spectrum() -> None:
     step, time = 0.5, 6.0
     process = ornstein_uhlenbeck(np.random.default_rng(0), (200, 2048, 1), step, time)[:, :, 0]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import final
+from typing import Annotated, final
 
 import numpy as np
 import torch
@@ -45,6 +45,7 @@ class Disturbance(Config):
         force_north: constant force towards north; force_east likewise.
         current_north: current, towards north; current_east likewise.
         current_speed, current_direction: the same current as its speed and where it sets TO, clockwise from north, instead of the two.
+        current_each: slowest and fastest of a further current that each trial has of its own, constant in speed and direction.
         wind: mean wind and gusts, for vessels with wind coefficients.
         waves: first-order wave forces.
     """
@@ -59,6 +60,7 @@ class Disturbance(Config):
     current_east: MetresPerSecond = 0.0
     current_speed: MetresPerSecond | None = Field(default=None, ge=0)
     current_direction: Radians | None = None
+    current_each: tuple[Annotated[MetresPerSecond, Field(ge=0)], Annotated[MetresPerSecond, Field(ge=0)]] | None = None
     wind: WindField | None = None
     waves: WavesConfig | None = None
 
@@ -68,10 +70,21 @@ class Disturbance(Config):
             raise ValueError("current_speed and current_direction belong together; give both, or current_north and current_east")
         if self.current_speed is not None and (self.current_north or self.current_east):
             raise ValueError("the current is given twice; give current_speed and current_direction, or current_north and current_east")
+        if self.current_each is not None and self.current_each[0] > self.current_each[1]:
+            raise ValueError(f"current_each: the slowest ({self.current_each[0]:g} m/s) is faster than the fastest ({self.current_each[1]:g} m/s)")
         return self
 
+    def currents(self, rows: int, seed: int) -> np.ndarray:
+        """The current of each trial towards north and east in m/s, [B, 2]."""
+        out = np.tile(self.current(), (rows, 1))
+        if self.current_each is not None:
+            random = np.random.default_rng([seed, 7])
+            speed, direction = random.uniform(*self.current_each, rows), random.uniform(0.0, 2.0 * np.pi, rows)
+            out += speed[:, None] * np.stack((np.cos(direction), np.sin(direction)), axis=1)
+        return out
+
     def current(self) -> tuple[float, float]:
-        """The current towards north and east in m/s."""
+        """The current of all trials towards north and east in m/s."""
         if self.current_speed is None or self.current_direction is None:
             return self.current_north, self.current_east
         return self.current_speed * float(np.cos(self.current_direction)), self.current_speed * float(np.sin(self.current_direction))
@@ -87,7 +100,7 @@ class Disturbance(Config):
         asked = {
             "force_x": self.force_x != 0, "force_y": self.force_y != 0, "force_n": self.force_n != 0,
             "force_north": self.force_north != 0, "force_east": self.force_east != 0,
-            "current_north": north != 0, "current_east": east != 0,
+            "current_north": north != 0 or self.current_each is not None, "current_east": east != 0 or self.current_each is not None,
         }  # fmt: skip
         needs = {name: name for name, wanted in asked.items() if wanted}
         needs |= dict.fromkeys(WIND_INPUTS, "wind") if self.wind is not None else {}
@@ -114,7 +127,7 @@ class Disturbance(Config):
         """
         forces = ornstein_uhlenbeck(random, (rows, steps, 3), step, self.correlation) * [self.force_x, self.force_y, self.force_n]
         values: dict[str, np.ndarray | float] = {name: forces[:, :, j] for j, name in enumerate(("force_x", "force_y", "force_n"))}
-        values["current_north"], values["current_east"] = self.current()
+        values["current_north"], values["current_east"] = self.currents(rows, seed).T[:, :, None]
         values |= {"force_north": self.force_north, "force_east": self.force_east}
         if self.wind is not None:
             values |= dict(zip(WIND_INPUTS, gusty_wind(self.wind, rows, steps, step, np.random.default_rng([seed, 4])), strict=True))

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from residnet.baselines import BaselineConfig
+from residnet.baselines import BaselineConfig, RegressorBaseline
 from residnet.core.config import Config
 from residnet.core.errors import ConfigError
 from residnet.core.names import nearest
@@ -21,6 +21,7 @@ from residnet.heads import HeadConfig
 from residnet.physics.signals import SignalsConfig
 from residnet.studies import StudyName
 from residnet.training.config import TrainingConfig
+from residnet.training.current import CurrentConfig
 from residnet.training.refit import RefitConfig
 
 _TAKEN = ("zero", "baseline", "truth")
@@ -53,6 +54,7 @@ class FitConfig(Config):
         integrator: of the models; their step is the grid's.
         baseline: the known part.
         baselines: further baselines by name; free-run beside the first, and heads may stand on them.
+        current: training and validation logs ran in constant currents that are estimated first; null for water at rest.
         refit: baselines (by name, `baseline` for the first) whose coefficients are moved through rollouts after least squares.
         heads: residual heads by name.
         base_of: the baseline that a head stands on, by the head's name; `baseline` where absent.
@@ -74,6 +76,7 @@ class FitConfig(Config):
     integrator: Integrator = "rk4"
     baseline: BaselineConfig
     baselines: dict[str, BaselineConfig] = Field(default_factory=dict)
+    current: CurrentConfig | None = None
     refit: dict[str, RefitConfig] = Field(default_factory=dict)
     heads: dict[str, HeadConfig] = Field(default_factory=dict)
     base_of: dict[str, str] = Field(default_factory=dict)
@@ -102,6 +105,10 @@ class FitConfig(Config):
                 part.build(names)
             except ConfigError as error:
                 raise ValueError(f"{key}: {error}") from None
+        if self.current is not None:
+            _known("current.baseline", (self.current.baseline,), baselines, "baseline")
+            if not isinstance(baselines[self.current.baseline].build(names), RegressorBaseline):
+                raise ValueError(f"current.baseline: '{self.current.baseline}' has no regressors to tell a current by; name a baseline that has")
         if isinstance(self.data, SimulatedTrials):
             self.data.splits(self.data.draw())
             if abs(self.data.step - self.prepare.grid.step) > 1e-9:

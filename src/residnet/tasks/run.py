@@ -20,6 +20,7 @@ from residnet.evaluation.metrics import SCHEMA, find
 from residnet.evaluation.repeats import repeatability
 from residnet.run_folder import RunFolder
 from residnet.studies import draw_study
+from residnet.tasks.drifting import summary, through_currents
 from residnet.tasks.exporting import export_model
 from residnet.tasks.fit import FitConfig
 from residnet.tasks.pipeline import Fitted, Fitter, candidates, evaluate, prepare_logs, say, write_residuals
@@ -48,6 +49,10 @@ def run_fit(config: FitConfig, *, source: Path, overrides: Sequence[str], out: P
     say(f"{config.name}: reading logs")
     logs = prepare_logs(read_logs(config.data), config)
     say("  " + ", ".join(f"{split} {len(members)} logs" for split, members in logs.items()))
+    if config.current is not None:
+        logs, currents = through_currents(logs, config, config.current)
+        folder.write_json(folder.path / "currents.json", currents)
+        say(f"  {summary(currents)}")
     write_data_quality(folder, logs)
     fitter = Fitter(config, logs, folder)
     baselines = {name: fitter.baseline(name) for name in ("baseline", *config.baselines)}
