@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 from residnet.core.errors import ConfigError
 from residnet.core.names import VELOCITY, nearest
 from residnet.physics.signals import FORCE_CHANNELS, WIND_CHANNELS
-from residnet.physics.terms import parse_term, polynomial_terms
+from residnet.physics.terms import Factor, parse_term, polynomial_terms
 
 SetName = Literal["linear", "fossen", "abkowitz", "astern", "wind", "polynomial_1", "polynomial_2"]
 
@@ -144,17 +144,18 @@ def expand(sets: Sequence[SetName], roles: Roles) -> tuple[str, ...]:
 
 def merged(terms: Sequence[str], names: Sequence[str]) -> tuple[str, ...]:
     """The terms without those that say the same as one before them, such as `v u` after `u v` or `n^2` after `n n`."""
-    seen: dict[frozenset[tuple[str, int, bool]], str] = {}
+    seen: dict[frozenset[tuple[Factor, int, bool]], str] = {}
     for term in terms:
         seen.setdefault(_meaning(term, names), term)
     return tuple(seen.values())
 
 
-def _meaning(term: str, names: Sequence[str]) -> frozenset[tuple[str, int, bool]]:
-    """Power of each channel, and whether the product changes sign with it."""
-    power: dict[str, int] = {}
-    odd: dict[str, bool] = {}
+def _meaning(term: str, names: Sequence[str]) -> frozenset[tuple[Factor, int, bool]]:
+    """What a term multiplies: each thing without its power or magnitude, its whole power, and whether the product changes sign with it."""
+    power: dict[Factor, int] = {}
+    odd: dict[Factor, bool] = {}
     for factor in parse_term(term, names):
-        power[factor.name] = power.get(factor.name, 0) + factor.power
-        odd[factor.name] = odd.get(factor.name, False) ^ (not factor.magnitude and factor.power % 2 != 0)
-    return frozenset((name, power[name], odd[name]) for name in power)
+        thing = factor._replace(power=1, magnitude=False)
+        power[thing] = power.get(thing, 0) + factor.power
+        odd[thing] = odd.get(thing, False) ^ (not factor.magnitude and factor.power % 2 != 0)
+    return frozenset((thing, power[thing], odd[thing]) for thing in power)
