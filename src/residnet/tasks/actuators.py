@@ -1,0 +1,233 @@
+"""Task `actuators`: throttle, step and bollard-pull tests to the actuators of a vessel file (document 003 section 4.1)."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field, field_validator, model_validator
+
+from residnet.core.config import Config, ExistingPath, dump_config
+from residnet.core.errors import DataError, UsageError
+from residnet.core.names import nearest, to_si
+from residnet.physics.actuators.identify import StepAnswer, ThrottleMap, ThrustFit, fit_step, fit_throttle, fit_thrust
+from residnet.run_folder import RunFolder
+
+
+class Column(Config):
+    """A column of a csv file and its unit."""
+
+    column: str
+    unit: str
+
+    @field_validator("unit")
+    @classmethod
+    def _unit(cls, unit: str) -> str:
+        try:
+            to_si(unit)
+        except UsageError as error:
+            raise ValueError(str(error)) from None
+        return unit
+
+    def measures(self, si: str, key: str) -> None:
+        """Stop where the unit does not measure `si`.
+
+        Raises:
+            ValueError: naming the key.
+        """
+        try:
+            to_si(self.unit, si)
+        except UsageError as error:
+            raise ValueError(f"{key}: {error}") from None
+
+
+class _Test(Config):
+    files: Annotated[tuple[ExistingPath, ...], Field(min_length=1)]
+
+
+class ThrottleTest(_Test):
+    """Steady revolutions `n` over `throttle`, one row per point."""
+
+    throttle: Column
+    n: Column
+
+    @model_validator(mode="after")
+    def _units(self) -> ThrottleTest:
+        self.throttle.measures("-", "throttle")
+        self.n.measures("1/s", "n")
+        return self
+
+
+class StepTest(_Test):
+    """Revolutions `n` over time after steps of `command`, one file per step response."""
+
+    t: Column
+    command: Column
+    n: Column
+
+    @model_validator(mode="after")
+    def _units(self) -> StepTest:
+        self.t.measures("s", "t")
+        self.command.measures("1/s", "command")
+        self.n.measures("1/s", "n")
+        return self
+
+
+class BollardTest(_Test):
+    """Steady pull on the tether over revolutions `n`, positive ahead, of all `thrusters` running together."""
+
+    n: Column
+    pull: Column
+    thrusters: int = Field(default=1, ge=1)
+
+    @model_validator(mode="after")
+    def _units(self) -> BollardTest:
+        self.n.measures("1/s", "n")
+        self.pull.measures("N", "pull")
+        return self
+
+
+class ActuatorsTaskConfig(Config):
+    """Throttle map, rate limit and thrust curves from tests of the actuators, as lines for a vessel file.
+
+    Attributes:
+        name: of the run.
+        throttle, step, bollard: the tests; at least one.
+    """
+
+    task: Literal["actuators"]
+    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")
+    description: str = ""
+    throttle: ThrottleTest | None = None
+    step: StepTest | None = None
+    bollard: BollardTest | None = None
+
+    @model_validator(mode="after")
+    def _any(self) -> ActuatorsTaskConfig:
+        if not self.files():
+            raise ValueError("no test is named; give at least one of throttle, step, bollard")
+        return self
+
+    def files(self) -> list[Path]:
+        """All logs."""
+        tests: tuple[_Test | None, ...] = (self.throttle, self.step, self.bollard)
+        return [path for test in tests if test is not None for path in test.files]
+
+    def check(self) -> None:
+        """Read the logs.
+
+        Raises:
+            ResidnetError: where a column is missing or holds what is no number.
+        """
+        _Logs(self)
+
+    def run(self, *, source: Path, overrides: Sequence[str], out: Path | None, resume: bool) -> RunFolder:
+        """Identify, then write actuators.yaml, actuators.json and a figure.
+
+        Raises:
+            ResidnetError: where the logs cannot be used or do not determine the actuators.
+        """
+        started = time.time()
+        logs = _Logs(self)
+        throttle = fit_throttle(logs.throttle[0], logs.throttle[1]) if logs.throttle else None
+        step = fit_step(logs.steps) if logs.steps else None
+        thrust = fit_thrust(logs.bollard[0], logs.bollard[1], self.bollard.thrusters) if self.bollard is not None and logs.bollard else None
+        folder = RunFolder.create(out or Path("runs") / self.name, dump_config(self), resume=resume)
+        text = vessel_lines(self, throttle, step, thrust)
+        folder.write(folder.path / "actuators.yaml", text)
+        folder.write_json(folder.path / "actuators.json", _numbers(throttle, step, thrust))
+        from residnet.evaluation.figures_actuators import draw_actuators
+
+        draw_actuators(folder.figures / "actuators.png", self, logs, throttle, step, thrust)
+        folder.write_provenance(config=source, overrides=overrides, seed=0, files=self.files(), started=started)
+        print(text + f"written: {folder.path / 'actuators.yaml'}, {folder.figures / 'actuators.png'}")
+        return folder
+
+
+class _Logs:
+    """Contents of the tests in SI: throttle and n; (t, command, n) of each step; n and pull."""
+
+    def __init__(self, config: ActuatorsTaskConfig) -> None:
+        self.throttle = _together(config.throttle.files, config.throttle.throttle, config.throttle.n) if config.throttle else None
+        self.bollard = _together(config.bollard.files, config.bollard.n, config.bollard.pull) if config.bollard else None
+        self.steps: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+        for path in config.step.files if config.step else ():
+            assert config.step is not None
+            t, command, n = _read(path, config.step.t, config.step.command, config.step.n)
+            self.steps.append((t, command, n))
+            if (np.diff(t) <= 0).any():
+                raise DataError(f"{path}: time repeats or runs backwards in row {int(np.flatnonzero(np.diff(t) <= 0)[0]) + 2} of the data")
+
+
+def _together(paths: Sequence[Path], *columns: Column) -> tuple[np.ndarray, ...]:
+    parts = [_read(path, *columns) for path in paths]
+    return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
+
+
+def _read(path: Path, *columns: Column) -> tuple[np.ndarray, ...]:
+    """Columns [N] of a csv file in SI; rows with an empty cell are left out.
+
+    Raises:
+        UsageError: where a column is missing.
+        DataError: where a cell is no number, or no row is complete.
+    """
+    import pandas as pd
+
+    try:
+        table = pd.read_csv(path, skipinitialspace=True)
+    except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
+        raise DataError(f"{path}: not a readable csv table ({' '.join(str(error).split())})") from error
+    out = []
+    for entry in columns:
+        if entry.column not in table.columns:
+            raise UsageError(f"{path}: no column '{entry.column}'{nearest(entry.column, map(str, table.columns))}")
+        values = pd.to_numeric(table[entry.column], errors="coerce").to_numpy(dtype=np.float64)
+        bad = np.flatnonzero(~np.isfinite(values) & table[entry.column].notna().to_numpy())
+        if bad.size:
+            raise DataError(
+                f"{path}: line {int(bad[0]) + 2}, column '{entry.column}': '{table[entry.column].iloc[int(bad[0])]}' is not a finite number"
+            )
+        out.append(values * to_si(entry.unit))
+    whole = np.isfinite(np.stack(out)).all(axis=0)
+    if not whole.any():
+        raise DataError(f"{path}: no row has a number in all of {', '.join(entry.column for entry in columns)}")
+    return tuple(values[whole] for values in out)
+
+
+def vessel_lines(
+    config: ActuatorsTaskConfig, throttle: ThrottleMap | None, step: StepAnswer | None, thrust: tuple[ThrustFit, ThrustFit] | None
+) -> str:
+    """Lines for the section `actuators` of a vessel file, with 95 % intervals as comments."""
+    lines = [f"# from {', '.join(path.name for path in config.files())}; intervals are 95 %"]
+    if throttle is not None:
+        k, o, m = throttle.slope, throttle.offset, throttle.n_max
+        lines.append(f"# n = {k.value * 60:.6g} rpm * throttle {o.value * 60:+.4g} rpm (slope {k.low * 60:.6g} .. {k.high * 60:.6g})")
+        about = f"{m.low * 60:.5g} .. {m.high * 60:.5g}" if throttle.saturated else "largest measured: nothing saturated"
+        lines.append(f"n_max: {m.value * 60:.5g} rpm  # {about}")
+    if step is not None:
+        lines.append(f"n_rate: {step.rate.value * 60:.5g} rpm/s  # {step.rate.low * 60:.5g} .. {step.rate.high * 60:.5g}")
+        lines.append(f"# dead_time: {step.dead_time.value:.3g} s  ({step.dead_time.low:.3g} .. {step.dead_time.high:.3g})")
+    for name, fit in zip(("forward", "reverse"), thrust or (), strict=False):
+        lines.append(f"{name}: [{', '.join(f'{c.value:.6g}' for c in fit.coefficients)}]  # rms residual {fit.rms:.3g} N per thruster")
+        lines += [f"#   c{i}: {c.low:.6g} .. {c.high:.6g} {c.unit}" for i, c in enumerate(fit.coefficients)]
+    if thrust is not None:
+        lines.append(f"curve_range: [{thrust[1].low * 60:.5g} rpm, {thrust[0].high * 60:.5g} rpm]")
+    lines.append(f"source: {json.dumps(f'identified by residnet, run {config.name}')}")
+    return "\n".join(lines) + "\n"
+
+
+def _numbers(throttle: ThrottleMap | None, step: StepAnswer | None, thrust: tuple[ThrustFit, ThrustFit] | None) -> dict[str, Any]:
+    out: dict[str, Any] = {"schema": "residnet.actuators/1"}
+    if throttle is not None:
+        parts = {"slope": throttle.slope, "offset": throttle.offset, "n_max": throttle.n_max}
+        out["throttle"] = {name: estimate._asdict() for name, estimate in parts.items()} | {"saturated": throttle.saturated}
+    if step is not None:
+        out["step"] = {name: estimate._asdict() for name, estimate in step._asdict().items()}
+    for name, fit in zip(("forward", "reverse"), thrust or (), strict=False):
+        entries = {f"c{i}": c._asdict() for i, c in enumerate(fit.coefficients)}
+        out[name] = entries | {"low": fit.low, "high": fit.high, "rms": fit.rms}
+    return out
