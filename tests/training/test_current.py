@@ -11,11 +11,10 @@ import torch
 from residnet.baselines import RegressorsConfig
 from residnet.core.config import validate
 from residnet.core.errors import FitError
-from residnet.data.environment import Disturbance
 from residnet.data.prepare import PrepareConfig, Prepared, prepare, samples
-from residnet.data.sensors import SensorNoise
 from residnet.data.simulate import SimulatedTrials, simulate
 from residnet.physics.signals import SignalsConfig
+from residnet.training import current as module
 from residnet.training.current import CurrentConfig, estimate_currents, through_water
 
 SIGNALS = SignalsConfig(inputs=("n_port", "n_stbd"), forces="wam_v_cal")
@@ -108,6 +107,19 @@ def test_currents_and_coefficients_come_back(seed: int) -> None:
     moved = hull([through_water(log, current, signals) for log, current in zip(logs, found, strict=True)])
     naive = hull(logs)
     assert float((moved - own).square().mean()) < 0.02 * float((naive - own).square().mean())
+
+
+def test_a_start_in_a_wrong_valley_is_left() -> None:
+    """The cost has other minima, which the search over a grid leaves: from a current half a metre per second off the same ones come out."""
+    logs, truth = sailed(**CURRENT)
+    signals = SIGNALS.build()
+    problem = module._Problem(RegressorsConfig(sets=("fossen",)).build(signals.names), signals, logs, 4.0)
+    right = torch.from_numpy(truth)
+    _, state = problem.solve(right)
+    wrong = right.clone()
+    wrong[3] += torch.tensor([0.3, -0.4], dtype=torch.float64)
+    found = problem.search(wrong, state, 0.5)
+    assert float((found[3] - right[3]).norm()) < 0.1 < float((wrong[3] - right[3]).norm())
 
 
 def test_calm_water_has_no_current() -> None:

@@ -7,7 +7,6 @@ in body axes as the vessel does; Gauss-Newton finds all of them, the coefficient
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -23,8 +22,10 @@ from residnet.core.errors import FitError
 from residnet.data.prepare import Prepared, samples
 from residnet.physics.signals import Signals
 
-# of descent and search; a search that finds nothing ends them
+# of search and descent; one that gains nothing ends them
 _ROUNDS = 4
+# the search looks at every so many samples
+_THIN = 10
 
 
 class CurrentConfig(Config):
@@ -60,13 +61,13 @@ def estimate_currents(
             raise FitError(f"log {p.log.name}: has no sample to estimate its current from; leave it out")
     problem = _Problem(baseline, signals, logs, config.spread**-2)
     current = torch.zeros(len(logs), 2, dtype=torch.float64)
+    best = _descend(problem, current, config)
     for _round in range(_ROUNDS):
-        current, state = _descend(problem, current, config)
-        jumped = problem.search(current, state, config.spread)
-        if torch.equal(jumped, current):
+        again = _descend(problem, problem.search(best[1], best[2], config.spread), config)
+        if again[0] > best[0] - 0.1:
             break
-        current = jumped
-    current, state = _descend(problem, current, config)
+        best = again
+    _cost, current, state = best
     error = problem.step(current, state)[1].diagonal().sqrt().reshape(-1, 2)
     rows = [
         {"log": p.log.name, "current_north": float(c[0]), "current_east": float(c[1]), "standard_error": e.tolist()}
@@ -75,8 +76,8 @@ def estimate_currents(
     return current.numpy(), rows
 
 
-def _descend(problem: _Problem, current: Tensor, config: CurrentConfig) -> tuple[Tensor, _State]:
-    """Gauss-Newton from some currents [L, 2] on; the best on the way."""
+def _descend(problem: _Problem, current: Tensor, config: CurrentConfig) -> tuple[float, Tensor, _State]:
+    """Gauss-Newton from some currents [L, 2] on; the best on the way, with its cost."""
     cost, state = problem.solve(current)
     best = (cost, current, state)
     for _ in range(config.iterations):
@@ -89,7 +90,7 @@ def _descend(problem: _Problem, current: Tensor, config: CurrentConfig) -> tuple
             best = (cost, current, state)
         if float(step.abs().max()) < 1e-4:
             break
-    return best[1], best[2]
+    return best
 
 
 def through_water(log: Prepared, current: np.ndarray, signals: Signals) -> Prepared:
@@ -179,18 +180,18 @@ class _Problem:
         return -(covariance @ gradient.flatten()).reshape(-1, 2), covariance
 
     def search(self, current: Tensor, state: _State, spread: float) -> Tensor:
-        """Currents [L, 2] with a lower cost than `current` at the same coefficients, log by log, on two circles about it; else as they are."""
+        """Currents [L, 2] with a lower cost than `current` at the same coefficients, log by log, on a grid over what is likely; else as they are."""
+        thin = replace(self, logs=[replace(p, good=p.good & (np.arange(len(p)) % _THIN == 0)) for p in self.logs])
         count = len(self.logs)
 
         def cost(trial: Tensor) -> Tensor:
-            phi, target, group = self.regression(trial)
+            phi, target, group = thin.regression(trial)
             square = ((target - phi @ state.theta.T).square() / state.variance).sum(1)
-            return torch.zeros(count, dtype=torch.float64).index_add_(0, group, square) + self.precision * trial.square().sum(1)
+            return _THIN * torch.zeros(count, dtype=torch.float64).index_add_(0, group, square) + self.precision * trial.square().sum(1)
 
         best, found = cost(current), current.clone()
-        for turn in range(16):
-            angle, radius = turn * math.pi / 4, spread * (0.5 if turn < 8 else 1.0)
-            trial = current + radius * torch.tensor([math.cos(angle), math.sin(angle)], dtype=torch.float64)
+        for point in _grid(1.25 * spread, spread / 6):
+            trial = point.expand(count, 2)
             own = cost(trial)
             found = torch.where((own < best)[:, None], trial, found)
             best = torch.minimum(best, own)
@@ -205,6 +206,13 @@ class _Problem:
             phi, target, _ = self.regression(moved)
             ends.append(target - phi @ state.theta.T)
         return (ends[0] - ends[1]) / 2e-4
+
+
+def _grid(radius: float, spacing: float) -> Tensor:
+    """Points [G, 2] of a square grid within a circle about zero."""
+    line = torch.arange(-radius, radius + spacing / 2, spacing, dtype=torch.float64)
+    points = torch.cartesian_prod(line, line)
+    return points[points.norm(dim=1) <= radius]
 
 
 def _gram(phi: Tensor) -> Tensor:
