@@ -218,9 +218,15 @@ def load_mapping(path: Path) -> dict[str, Any]:
 
 
 @overload
-def load_config(path: Path, overrides: Sequence[str], model: type[T]) -> T: ...
+def load_config(path: Path, overrides: Sequence[str], model: type[T]) -> T:
+    """Of a class."""
+
+
 @overload
-def load_config(path: Path, overrides: Sequence[str], model: Any) -> Any: ...
+def load_config(path: Path, overrides: Sequence[str], model: Any) -> Any:
+    """Of a union."""
+
+
 def load_config(path: Path, overrides: Sequence[str], model: Any) -> Any:
     """Config of type `model` from a YAML file and overrides.
 
@@ -239,9 +245,15 @@ def load_config(path: Path, overrides: Sequence[str], model: Any) -> Any:
 
 
 @overload
-def validate(data: Any, model: type[T], where: str, folder: Path | None = None) -> T: ...
+def validate(data: Any, model: type[T], where: str, folder: Path | None = None) -> T:
+    """Of a class."""
+
+
 @overload
-def validate(data: Any, model: Any, where: str, folder: Path | None = None) -> Any: ...
+def validate(data: Any, model: Any, where: str, folder: Path | None = None) -> Any:
+    """Of a union."""
+
+
 def validate(data: Any, model: Any, where: str, folder: Path | None = None) -> Any:
     """Config of type `model` from plain values (what JSON can hold), under the rules of `load_config`.
 

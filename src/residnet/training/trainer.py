@@ -91,9 +91,24 @@ def train(
     Raises:
         FitError: where training never gave a finite free run.
     """
-    logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
     model.head.calibrate(samples)
     module = HeadTraining(model.to(torch.float32), store, config, scales.to(torch.float32), validate, seed)
+    run_epochs(name, module, config, folder)
+    if not module.best_state:
+        raise FitError(f"head {name}: no epoch gave a finite free run on the validation data; lower the learning rate or the horizon")
+    model.load_state_dict(module.best_state)
+    model.eval().requires_grad_(False)
+    return {
+        "parameters": sum(p.numel() for p in model.head.parameters()),
+        "best_validation": module.best_score,
+        "epochs": len(module.history),
+        "curve": module.history,
+    }
+
+
+def run_epochs(name: str, module: HeadTraining, config: TrainingConfig, folder: Path) -> None:
+    """Train a module to its last epoch, from its last checkpoint where there is one; Ctrl-C leaves one to resume from."""
+    logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
     checkpoints = folder / "checkpoints" / name
     checkpoints.mkdir(parents=True, exist_ok=True)
     last = checkpoints / "last.ckpt"
@@ -119,13 +134,3 @@ def train(
             trainer.fit(module, ckpt_path=str(last) if last.is_file() else None, weights_only=True)
     if trainer.interrupted:
         raise KeyboardInterrupt
-    if not module.best_state:
-        raise FitError(f"head {name}: no epoch gave a finite free run on the validation data; lower the learning rate or the horizon")
-    model.load_state_dict(module.best_state)
-    model.eval().requires_grad_(False)
-    return {
-        "parameters": sum(p.numel() for p in model.head.parameters()),
-        "best_validation": module.best_score,
-        "epochs": len(module.history),
-        "curve": module.history,
-    }
