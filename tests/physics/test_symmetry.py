@@ -39,6 +39,7 @@ def test_parity_of_each_channel() -> None:
 
 def test_parity_of_terms_is_the_sign_that_the_mirror_gives_their_values() -> None:
     factors = [form.format(name) for name in NAMES for form in ("{}", "|{}|", "{}^2", "|{}|^3", "{}^-1", "|{}|^-1", "{}^-2")]
+    factors += [form.format(name) for name in ("v", "u") for form in ("sin({})", "cos({})", "sqrt({})", "ssqrt({})", "inv({})", "sin({})^2")]
     terms = ["1", *factors, *(f"{a} {b}" for a, b in combinations_with_replacement(factors, 2)), "v |v| r", "|u| v |v|", "n^2 delta", "v r delta^3 u"]
     z = random_channels()
     library = TermLibrary(terms, NAMES)

@@ -47,7 +47,12 @@ def test_parse(term: str) -> None:
         ("u^0", r"cannot read it from '\^0'"),
         ("u^10", r"cannot read it from '0'"),
         ("u**2", r"cannot read it"),
-        ("sin(u)", "no channel 'sin'"),
+        ("sin u", "no channel 'sin'"),
+        ("sin(w)", "no channel 'w'"),
+        ("tan(u)", "no function 'tan'"),
+        ("sin(u v)", r"cannot read it from '\(u v\)'|no channel 'sin'"),
+        ("|sin(u)|", "cannot read it"),
+        ("cos(u)^-1 v", r"cannot divide by cos\(u\)"),
     ],
 )
 def test_what_cannot_be_read_is_one_line(term: str, message: str) -> None:
@@ -82,6 +87,40 @@ def test_library_of_constants_and_of_nothing() -> None:
     z = torch.randn(4, 2, len(NAMES))
     assert torch.equal(TermLibrary(["1", "1"], NAMES)(z), torch.ones(4, 2, 2))
     assert TermLibrary([], NAMES)(z).shape == (4, 2, 0)
+
+
+def test_functions_equal_numpy() -> None:
+    terms = ["sin(u)", "cos(v)^2 n_port", "u^2 n_port^2 cos(delta2)", "sqrt(r)", "ssqrt(r) |v|", "inv(n_port) u", "inv(r)^2", "u^-1 sin(v)"]
+    z = np.random.default_rng(1).normal(size=(9, len(NAMES)))
+    u, v, r, n, d = z.T
+    truth = [
+        np.sin(u),
+        np.cos(v) ** 2 * n,
+        u**2 * n**2 * np.cos(d),
+        np.sqrt(abs(r)),
+        np.sign(r) * np.sqrt(abs(r)) * abs(v),
+        u / n,
+        1 / r**2,
+        np.sin(v) / u,
+    ]
+    library = TermLibrary(terms, NAMES)
+    np.testing.assert_allclose(library(torch.from_numpy(z)), np.stack(truth, axis=-1), rtol=1e-13)
+    np.testing.assert_allclose(torch.jit.script(library)(torch.from_numpy(z)), np.stack(truth, axis=-1), rtol=1e-13)
+
+
+def test_protected_functions_are_finite_at_zero_with_their_gradients() -> None:
+    z = torch.zeros(1, len(NAMES), dtype=torch.float64, requires_grad=True)
+    out = TermLibrary(["sqrt(u)", "ssqrt(v)", "inv(r)"], NAMES)(z)
+    np.testing.assert_allclose(out.detach(), np.zeros((1, 3)), atol=1e-11)
+    out.sum().backward()
+    assert z.grad is not None
+    assert bool(torch.isfinite(z.grad).all())
+
+
+def test_functions_can_be_forbidden() -> None:
+    assert parse_term("u sin(v)", NAMES)[1] == Factor("v", False, 1, "sin")
+    with pytest.raises(ConfigError, match="only products of channels"):
+        parse_term("u sin(v)", NAMES, functions=False)
 
 
 def test_polynomials_are_all_products_once() -> None:

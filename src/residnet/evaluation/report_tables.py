@@ -164,7 +164,7 @@ def term_unit(axis: str, term: str) -> str:
     """Unit of a coefficient: that of the acceleration over that of its term; empty where a factor's unit is not known."""
     units = CHANNEL_UNITS | _EXTRA_UNITS
     try:
-        factors = parse_term(term, [name for name in units if name != "t"])
+        factors = parse_term(term, [name for name in units if name != "t"], functions=False)
     except ConfigError:
         return ""
     powers: dict[str, int] = {}

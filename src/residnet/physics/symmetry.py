@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from residnet.core.names import VELOCITY
-from residnet.physics.terms import parse_term
+from residnet.physics.terms import EVEN_FUNCTIONS, parse_term
 
 _ODD = ("v", "r", "delta", "tau_y", "tau_n", "wind_v")
 _EVEN = ("u", "n", "tau_x", "wind_u", "wind_mag")
@@ -24,7 +24,7 @@ def term_parity(term: str, names: Sequence[str]) -> int | None:
         own = channel_parity(factor.name)
         if own is None:
             return None
-        if own < 0 and not factor.magnitude and factor.power % 2 == 1:
+        if own < 0 and not factor.magnitude and factor.function not in EVEN_FUNCTIONS and factor.power % 2 == 1:
             parity = -parity
     return parity
 
