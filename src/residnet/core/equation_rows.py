@@ -1,0 +1,190 @@
+"""Rows of a regression from sampled terms: as they are, integrated over short windows, or behind lagged instruments.
+
+Noise enters an equation twice: through the derivative on its left, which differentiation amplifies, and through the regressors on its right, which
+pull coefficients towards zero. Integrating both sides against a test function w that vanishes at the ends of a window,
+int w y dt = sum c_j int w f_j dt, takes the derivative off the noisy record (by parts, int w x_dot dt = -int w_dot x dt). Where accelerations are
+central differences (`savitzky_golay` over three samples) summing them is the same as summing by parts. Instruments, the terms themselves some
+time earlier, share what is true with the regressors and not the noise.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Annotated, ClassVar, Literal, NamedTuple, final
+
+import numpy as np
+from pydantic import Field
+
+from residnet.core.config import Config, Seconds
+from residnet.core.errors import ConfigError, FitError
+
+
+class Rows(NamedTuple):
+    """Terms [N, J] and targets [N, K], and the number of the stretch of unbroken samples that each belongs to, ascending [N]."""
+
+    x: np.ndarray
+    y: np.ndarray
+    stretch: np.ndarray
+
+
+class Estimator(Config, ABC):
+    """How sampled terms become rows of a regression.
+
+    Attributes:
+        sequential: whether rows are made of neighbouring samples, so that times must be known.
+    """
+
+    sequential: ClassVar[bool] = True
+
+    @abstractmethod
+    def rows(self, sampled: Rows, step: float, exact: np.ndarray) -> Rows:
+        """Rows of the regression.
+
+        Args:
+            sampled: terms and targets at samples `step` seconds apart within each stretch.
+            step: time between samples, s.
+            exact: which terms are free of measuring noise, such as those of commands alone, [J] bool.
+
+        Raises:
+            ConfigError: where a window or a lag holds too few samples.
+            FitError: where no stretch is as long as it must be.
+        """
+
+
+@final
+class LeastSquares(Estimator):
+    """Every sample is a row."""
+
+    sequential: ClassVar[bool] = False
+    kind: Literal["least_squares"] = "least_squares"
+
+    def rows(self, sampled: Rows, step: float, exact: np.ndarray) -> Rows:
+        """The samples; see `Estimator.rows`."""
+        return sampled
+
+
+@final
+class Weak(Estimator):
+    """Both sides integrated over windows against (1 - s^2)^2, s from -1 to 1 (weak form; Bortz, Messenger and others, 2021).
+
+    Attributes:
+        window: length of a window.
+        every: distance between windows as a share of their length.
+    """
+
+    kind: Literal["weak"] = "weak"
+    window: Seconds = Field(default=4.0, gt=0.0)
+    every: float = Field(default=0.05, gt=0.0, le=1.0)
+
+    def rows(self, sampled: Rows, step: float, exact: np.ndarray) -> Rows:
+        """One row for each window; see `Estimator.rows`."""
+        return integrated(sampled, step, self.window, self.every)
+
+
+@final
+class Instruments(Estimator):
+    """Regressors projected on instruments, the terms one and two lags earlier and the exact terms (two-stage least squares).
+
+    Attributes:
+        lag: longer than noise stays correlated, shorter than the motion takes to change.
+        window: of a weak form taken first, s; 0 for none. Windows that overlap share noise: a lag should then be as long.
+        every: distance between windows as a share of their length.
+    """
+
+    kind: Literal["instruments"] = "instruments"
+    lag: Seconds = Field(default=0.5, gt=0.0)
+    window: Seconds = Field(default=0.0, ge=0.0)
+    every: float = Field(default=0.05, gt=0.0, le=1.0)
+
+    def rows(self, sampled: Rows, step: float, exact: np.ndarray) -> Rows:
+        """Rows with projected terms; see `Estimator.rows`."""
+        if self.window > 0:
+            apart = max(round(self.every * self.window / step), 1) * step
+            sampled, step = integrated(sampled, step, self.window, self.every), apart
+        lag = round(self.lag / step)
+        if lag < 1:
+            raise ConfigError(f"instruments: a lag of {self.lag:g} s is less than one step of {step:g} s; lengthen it")
+        now = np.arange(2 * lag, len(sampled.stretch))
+        now = now[sampled.stretch[now] == sampled.stretch[now - 2 * lag]]
+        x = sampled.x[now]
+        behind = np.concatenate((sampled.x[now - lag], sampled.x[now - 2 * lag][:, ~exact], x[:, exact]), axis=1)
+        if len(now) <= behind.shape[1]:
+            few = f"{len(now)} samples have a past of {2 * self.lag:g} s"
+            raise FitError(f"instruments: {few}, {behind.shape[1]} instruments need more; shorten the lag or give longer logs")
+        length = np.linalg.norm(behind, axis=0)
+        q, r = np.linalg.qr(behind / np.where(length > 0, length, 1.0))
+        q = q[:, np.abs(np.diagonal(r)) > 1e-10]
+        return Rows(np.where(exact, x, q @ (q.T @ x)), sampled.y[now], sampled.stretch[now])
+
+
+EstimatorConfig = Annotated[LeastSquares | Weak | Instruments, Field(discriminator="kind")]
+"""Any estimator; its `kind` says which."""
+
+
+def integrated(sampled: Rows, step: float, window: float, every: float) -> Rows:
+    """Weighted sums over windows of `window` seconds within each stretch, scaled so that a constant keeps its value.
+
+    Raises:
+        ConfigError: where a window holds fewer than three samples.
+        FitError: where no stretch is as long as a window.
+    """
+    size = round(window / step)
+    if size < 3:
+        raise ConfigError(f"weak form: a window of {window:g} s holds {size} samples of {step:g} s; set it to {3 * step:g} s or longer")
+    place = np.linspace(-1.0, 1.0, size + 2)[1:-1]
+    weight = np.square(1.0 - np.square(place))
+    weight /= weight.sum()
+    first = np.arange(0, len(sampled.stretch) - size + 1)
+    first = first[sampled.stretch[first] == sampled.stretch[first + size - 1]]
+    if not first.size:
+        raise FitError(f"weak form: no unbroken stretch of samples is {window:g} s long; shorten the window or give logs with fewer gaps")
+    # windows every so many samples, counted from the start of each stretch
+    begins = np.searchsorted(sampled.stretch, sampled.stretch[first])
+    first = first[(first - begins) % max(round(every * size), 1) == 0]
+    joined = np.concatenate((sampled.x, sampled.y), axis=1)
+    size_of_block = max(8_000_000 // (size * joined.shape[1]), 1)
+    parts = []
+    view = np.lib.stride_tricks.sliding_window_view(joined, size, axis=0)
+    for begin in range(0, first.size, size_of_block):
+        parts.append(view[first[begin : begin + size_of_block]] @ weight)
+    out = np.concatenate(parts)
+    return Rows(out[:, : sampled.x.shape[1]], out[:, sampled.x.shape[1] :], sampled.stretch[first])
+
+
+def stretches(group: np.ndarray, t: np.ndarray, step: float) -> np.ndarray:
+    """Number of the unbroken stretch of each sample [N], ascending from 0.
+
+    Args:
+        group: manoeuvre of each sample [N], ascending.
+        t: time of each sample within its manoeuvre [N], s.
+        step: time between neighbouring samples, s.
+    """
+    broken = (np.diff(group) != 0) | (np.abs(np.diff(t) - step) > 0.01 * step)
+    return np.concatenate(([0], np.cumsum(broken)))
+
+
+def step_of(group: np.ndarray, t: np.ndarray) -> float:
+    """Time between samples: the median distance of neighbours in one manoeuvre, s.
+
+    Raises:
+        FitError: where no manoeuvre has two samples.
+    """
+    apart = np.diff(t)[np.diff(group) == 0]
+    if not apart.size or float(np.median(apart)) <= 0:
+        raise FitError("no manoeuvre has two samples at different times; the step between samples is not known")
+    return float(np.median(apart))
+
+
+def correlation_time(residual: np.ndarray) -> np.ndarray:
+    """How many neighbouring rows say together what one independent row would, [K], at least 1, from residuals [N, K].
+
+    1 + 2 sum rho over the first lags until rho is negative (initial positive sequence).
+    """
+    n = len(residual)
+    centred = residual - residual.mean(axis=0)
+    spectrum = np.abs(np.fft.rfft(centred, 2 * n, axis=0)) ** 2
+    covariance = np.fft.irfft(spectrum, axis=0)[:n]
+    rho = covariance / np.maximum(covariance[0], 1e-300)
+    # noise of an estimate of zero: what is less than two of its deviations ends the sum
+    positive = np.cumprod(rho > 2.0 / np.sqrt(n), axis=0).astype(bool)
+    return np.maximum(2.0 * np.where(positive, rho, 0.0).sum(axis=0) - 1.0, 1.0)
