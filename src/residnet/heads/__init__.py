@@ -11,8 +11,9 @@ from residnet.heads.lstm import LstmConfig
 from residnet.heads.mlp import MlpConfig
 from residnet.heads.plsr import PlsrConfig
 from residnet.heads.ridge import RidgeConfig
+from residnet.heads.symbolic import SymbolicConfig
 from residnet.heads.zero import ZeroHead
 
-HeadConfig = Annotated[PlsrConfig | RidgeConfig | MlpConfig | LstmConfig, Field(discriminator="kind")]
+HeadConfig = Annotated[PlsrConfig | RidgeConfig | SymbolicConfig | MlpConfig | LstmConfig, Field(discriminator="kind")]
 
-__all__ = ["ClosedFormHead", "HeadConfig", "LstmConfig", "MlpConfig", "PlsrConfig", "ResidualHead", "RidgeConfig", "ZeroHead"]
+__all__ = ["ClosedFormHead", "HeadConfig", "LstmConfig", "MlpConfig", "PlsrConfig", "ResidualHead", "RidgeConfig", "SymbolicConfig", "ZeroHead"]

@@ -121,8 +121,11 @@ class Features(nn.Module):
 
     def guarded(self, z: Tensor) -> Tensor:
         """Selected channels [..., F], held at the edge of the training range."""
-        chosen = z.index_select(-1, self.index)
-        return torch.minimum(torch.maximum(chosen, self.low.to(z.dtype)), self.high.to(z.dtype))
+        return self.held(z.index_select(-1, self.index))
+
+    def held(self, chosen: Tensor) -> Tensor:
+        """Channels that are selected already [..., F], held at the edge of the training range."""
+        return torch.minimum(torch.maximum(chosen, self.low.to(chosen.dtype)), self.high.to(chosen.dtype))
 
     def forward(self, z: Tensor) -> Tensor:
         """Standardised features [..., F]."""

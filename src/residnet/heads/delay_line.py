@@ -1,0 +1,121 @@
+"""Inputs as they were some steps ago: the memory of a model whose actuators answer late."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+
+from residnet.core.config import Config
+from residnet.core.delay import delay_profile
+from residnet.core.errors import ConfigError
+from residnet.core.names import nearest
+from residnet.physics.terms import TermLibrary, parse_term
+
+
+class DelayConfig(Config):
+    """A delay that the fit finds, one for all of its channels.
+
+    Attributes:
+        channels: inputs that act late.
+        longest: longest delay that is tried, in steps of the grid; the memory is as long.
+    """
+
+    channels: tuple[str, ...] = Field(min_length=1)
+    longest: int = Field(default=20, ge=1, le=500)
+
+
+class DelayLine(nn.Module):
+    """Channels with some of them as they were `steps` ago; the memory holds the last `longest` values of these, oldest first."""
+
+    def __init__(self, config: DelayConfig | None, names: Sequence[str]) -> None:
+        super().__init__()
+        late = config.channels if config is not None else ()
+        for name in late:
+            if name not in names:
+                raise ConfigError(f"delay: '{name}' is not a feature of the head{nearest(name, names)}")
+        self.longest = config.longest if config is not None else 0
+        self.channels = late
+        self.count = len(late)
+        self.n_state = self.longest * self.count
+        self.register_buffer("index", torch.tensor([list(names).index(name) for name in late], dtype=torch.long), persistent=False)
+        # a float, as all stored numbers are
+        self.register_buffer("steps", torch.zeros(1, dtype=torch.float64))
+        self.index: Tensor
+        self.steps: Tensor
+
+    def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Channels [B, nz] with the late ones delayed, and the memory [B, n_state] one step on."""
+        if self.count == 0:
+            return z, s
+        line = torch.cat((s, z.index_select(-1, self.index)), dim=-1)
+        first = (self.longest - self.steps.round().to(torch.long)) * self.count
+        late = line.index_select(-1, first + torch.arange(self.count, device=z.device))
+        return z.index_copy(-1, self.index, late), line[..., self.count :]
+
+    def sequence(self, z: Tensor) -> Tensor:
+        """Channels [..., T, nz] with the late ones delayed, from an empty memory."""
+        if self.count == 0:
+            return z
+        late = z.index_select(-1, self.index)
+        line = torch.cat((torch.zeros_like(late[..., :1, :]).expand(late.shape[:-2] + (self.longest, self.count)), late), dim=-2)  # noqa: RUF005 (TorchScript)
+        first = self.longest - self.steps.round().to(torch.long)
+        return z.index_copy(-1, self.index, line.index_select(-2, first + torch.arange(z.shape[-2], device=z.device)))
+
+    def warmup(self, z: Tensor) -> Tensor:
+        """Memory [B, n_state] after channels [B, T, nz]; zero before their first."""
+        late = z.index_select(-1, self.index)
+        line = torch.cat((late.new_zeros((z.shape[0], self.longest, self.count)), late), dim=1)
+        return line[:, line.shape[1] - self.longest :].reshape(z.shape[0], self.n_state)
+
+
+class Past(NamedTuple):
+    """Features [N, F] and targets [N, K] of samples, the unbroken stretch of each, ascending [N], and the step between neighbours in s."""
+
+    chosen: np.ndarray
+    target: np.ndarray
+    stretch: np.ndarray
+    step: float
+
+    def delayed(self, steps: int, index: np.ndarray) -> Past:
+        """The samples that have a past of `steps`, with the features `index` from then."""
+        if steps == 0:
+            return self
+        now = np.arange(steps, len(self.stretch))
+        now = now[self.stretch[now] == self.stretch[now - steps]]
+        chosen = self.chosen[now].copy()
+        chosen[:, index] = self.chosen[now - steps][:, index]
+        return Past(chosen, self.target[now], self.stretch[now], self.step)
+
+
+def best_delay(past: Past, terms: Sequence[Sequence[str]], names: Sequence[str], late: Sequence[str], longest: int) -> tuple[int, np.ndarray]:
+    """Delay in steps at which terms explain their targets best, and the mean over targets of ln(RSS) for each delay [longest + 1].
+
+    Args:
+        past: samples.
+        terms: of each target.
+        names: of the features.
+        late: features that are delayed.
+        longest: longest delay, in steps.
+
+    Raises:
+        FitError: with too few samples that have such a past.
+    """
+    z = torch.from_numpy(past.chosen)
+    total = np.zeros(longest + 1)
+    for own, y in zip(terms, past.target.T, strict=True):
+        held, moved = (TermLibrary([_part(term, names, late, take) for term in own], names)(z).numpy() for take in (False, True))
+        rss = delay_profile(held, moved, y, past.stretch, longest).rss
+        # what rounding leaves of a perfect fit is no evidence
+        total += np.log(rss + 1e-14 * float(y @ y) + 1e-300) / len(terms)
+    return int(total.argmin()), total
+
+
+def _part(term: str, names: Sequence[str], late: Sequence[str], take: bool) -> str:
+    """The factors of a term that are delayed, or those that are not."""
+    factors = [factor for factor in parse_term(term, names) if (factor.name in late) == take]
+    return " ".join(f"{f'|{f.name}|' if f.magnitude else f.symbol}^{f.power}" for f in factors) or "1"
