@@ -22,7 +22,7 @@ def draw_actuators(
         figure = new_figure(2.6)
         axes = dict(zip(panels, np.atleast_1d(figure.subplots(1, len(panels))), strict=True))
         if throttle is not None:
-            _throttle(axes["throttle"], *logs.throttle, throttle)
+            _throttle(axes["throttle"], logs.throttle[0], logs.throttle[1], throttle)
         if step is not None:
             _steps(axes["step"], logs.steps, step)
         if thrust is not None:

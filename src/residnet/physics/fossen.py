@@ -122,7 +122,7 @@ class Fossen3(nn.Module):
         self.terms = TermLibrary(terms, VELOCITY)
         damping = torch.tensor([[row[t].value if t in row else 0.0 for t in terms] for row in rows], dtype=torch.float64)
         self.register_buffer("damping", damping.reshape(3, len(terms)), persistent=False)
-        self.register_buffer("response", torch.zeros(0, 3, dtype=torch.float64), persistent=False)
+        self.register_buffer("response", torch.zeros(3, 0, dtype=torch.float64), persistent=False)
         self.compacted = False
         self.response: Tensor
         self.mass: Tensor
@@ -153,13 +153,19 @@ class Fossen3(nn.Module):
             force[axis, self.terms.count + column] = value
         force[2, -1] = cross
         self.terms = TermLibrary(terms, VELOCITY)
-        self.response = -(self.inverse @ force).T.contiguous()
+        self.response = -(self.inverse @ force)
         self.compacted = True
 
     def forward(self, nu: Tensor, tau: Tensor) -> Tensor:
-        """Acceleration nu_dot [..., 3] from velocities through the water nu [..., 3] and forces tau [..., 3]."""
+        """Acceleration nu_dot [..., 3] from velocities through the water nu [..., 3] and forces tau [..., 3]; [B, 3] once compacted."""
         if self.compacted:
-            return tau @ self.inverse.to(nu.dtype).T + self.terms(nu) @ self.response.to(nu.dtype)
+            # terms as rows: gathering rows and a product of few long rows cost a third of gathering columns
+            motion = nu.mT.contiguous()
+            base = torch.cat((torch.ones_like(motion[:1]), motion, motion.abs()))
+            rows = base.index_select(0, self.terms.index[0])
+            for depth in range(1, self.terms.depth):
+                rows = rows * base.index_select(0, self.terms.index[depth])
+            return (self.inverse.to(nu.dtype) @ tau.mT + self.response.to(nu.dtype) @ rows).mT
         force = tau - self.coriolis(nu) - self.drag(nu)
         return force @ self.inverse.to(nu.dtype).T
 

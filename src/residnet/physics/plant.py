@@ -34,6 +34,14 @@ class Plant(nn.Module, ABC):
     def rate(self, x: Tensor, w: Tensor) -> Tensor:
         """x_dot [B, nx] under inputs w [B, m]."""
 
+    def prepare(self, x: Tensor, w: Tensor) -> Tensor:
+        """What a step holds fixed, p [B, k], from the state x [B, nx] at its start and its inputs w [B, m]."""
+        return w
+
+    def held_rate(self, x: Tensor, p: Tensor) -> Tensor:
+        """x_dot [B, nx] within a step that holds p = prepare(x, w); equals `rate` under the same inputs."""
+        return self.rate(x, p)
+
     def approach(self, rows: int) -> Tensor:
         """State [rows, nx] that trials start from, float64: at rest; a model that only holds near its service speed starts there."""
         return torch.zeros(rows, len(self.state), dtype=torch.float64)
@@ -56,6 +64,7 @@ class HullPlant(Plant, ABC):
         self.kinematics = kinematics
         self.actuators = actuators
         self.wind = wind
+        self.weather = True
         self.n = len(kinematics.velocity)
         self.state = (*kinematics.pose, *kinematics.velocity, *actuators.state)
         self.commands = len(actuators.commands)
@@ -75,19 +84,50 @@ class HullPlant(Plant, ABC):
         """Commands [..., c] from the normalised drive and steer [...] of a manoeuvre."""
         return self.actuators.demand(drive, steer)
 
+    def in_calm_water(self) -> HullPlant:
+        """This plant without its exogenous inputs: no body or earth-fixed forces, current or wind; several times faster."""
+        self.weather = False
+        self.inputs = self.actuators.commands
+        return self
+
+    @final
+    def prepare(self, x: Tensor, w: Tensor) -> Tensor:
+        """Inputs with the actuators' forces, where these stay the same over a step, added to the body forces; w itself elsewhere."""
+        if not self.actuators.held:
+            return w
+        n, c = self.n, self.commands
+        force = self.actuators.force(x[:, 2 * n :], w[:, :c], x[:, n : 2 * n])
+        if self.weather:
+            force = force + w[:, c : c + n]
+        return torch.cat((w[:, :c], force, w[:, c + n :]), dim=-1)
+
+    @final
+    def held_rate(self, x: Tensor, p: Tensor) -> Tensor:
+        """x_dot [B, nx] within a step, from p = prepare(x, w)."""
+        return self._rate(x, p, self.actuators.held)
+
     @final
     def rate(self, x: Tensor, w: Tensor) -> Tensor:
         """x_dot [B, nx] under inputs w [B, m]."""
+        return self._rate(x, w, False)
+
+    def _rate(self, x: Tensor, w: Tensor, held: bool) -> Tensor:
+        """x_dot; `held`: the actuators' forces are among the body forces already, and their states stand still."""
         n, c = self.n, self.commands
         pose, nu, a = x[:, :n], x[:, n : 2 * n], x[:, 2 * n :]
         command = w[:, :c]
+        moving = torch.zeros_like(a) if held else self.actuators.rate(a, command)
+        if not self.weather:
+            tau = w[:, c : c + n] if held else self.actuators.force(a, command, nu)
+            return torch.cat((self.kinematics.rate(pose, nu), self.acceleration(pose, nu, tau), moving), dim=-1)
         water, turned = self.kinematics.carried(w[:, c + n], w[:, c + n + 1], pose, nu)
         relative = nu - water
-        tau = self.actuators.force(a, command, relative) + w[:, c : c + n] + self.kinematics.pushed(w[:, c + n + 2], w[:, c + n + 3], pose)
+        body = w[:, c : c + n] if held else self.actuators.force(a, command, relative) + w[:, c : c + n]
+        tau = body + self.kinematics.pushed(w[:, c + n + 2], w[:, c + n + 3], pose)
         if self.wind is not None:
             tau = tau + self._wind(w[:, c + n + 4], w[:, c + n + 5], pose, nu)
         nu_dot = self.acceleration(pose, relative, tau) + turned
-        return torch.cat((self.kinematics.rate(pose, nu), nu_dot, self.actuators.rate(a, command)), dim=-1)
+        return torch.cat((self.kinematics.rate(pose, nu), nu_dot, moving), dim=-1)
 
     def _wind(self, speed: Tensor, direction: Tensor, pose: Tensor, nu: Tensor) -> Tensor:
         """Forces [B, n] of the true wind on the vessel that moves over ground with nu [B, n]."""

@@ -19,10 +19,12 @@ class Actuators(nn.Module, ABC):
     Attributes:
         state: names of the states; empty where the commands act at once. What no sensor measures begins with `_` and enters no log.
         commands: names of the commands.
+        held: whether forces stay the same over a step: no state moves continuously, and the vessel's speed does not matter.
     """
 
     state: tuple[str, ...] = ()
     commands: tuple[str, ...] = ()
+    held: bool = False
 
     @abstractmethod
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:

@@ -46,6 +46,7 @@ class DifferentialThrust(Actuators):
 
     state = ("n_port", "n_stbd")
     commands = ("cmd_port", "cmd_stbd")
+    held = True
 
     def __init__(self, config: DifferentialThrustConfig) -> None:
         super().__init__()

@@ -30,6 +30,7 @@ class ForceCommands(Actuators):
     """tau [..., 3] = command [..., 3], saturated."""
 
     commands = ("tau_x", "tau_y", "tau_n")
+    held = True
 
     def __init__(self, config: ForceCommandsConfig) -> None:
         super().__init__()

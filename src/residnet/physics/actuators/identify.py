@@ -176,12 +176,13 @@ def _least_squares(
     from scipy.optimize import least_squares
     from scipy.stats import t as student
 
-    found = least_squares(residual, start, x_scale=np.abs(scale), diff_step=1e-3)
+    found = least_squares(residual, start, x_scale=np.abs(scale), diff_step=[1e-3] * len(start))
     variance = 2 * float(found.cost) / (size - len(start))
     if serial:
         e = found.fun - found.fun.mean()
         keep = float(np.clip(np.sum(e[1:] * e[:-1]) / max(float(np.sum(e * e)), 1e-300), 0.0, 0.99))
         variance *= (1 + keep) / (1 - keep)
-    covariance = np.linalg.pinv(found.jac.T @ found.jac) * variance
+    slopes = np.asarray(found.jac)
+    covariance = np.linalg.pinv(slopes.T @ slopes) * variance
     half = np.sqrt(np.diag(covariance)) * float(student.ppf(0.975, size - len(start)))
     return [float(v) for v in found.x], [float(h) for h in half]
