@@ -242,7 +242,7 @@ def test_physical_sanity_is_shown_where_models_can_be_loaded(run: Path) -> None:
     save_model(run / "models" / "plsr", spec, model)
     page = html.unescape(write_report(run).read_text())
     assert "Physical sanity" in page
-    assert "plsr, damping: wrong sign (grows by itself): u at rest, u at cruise." in page
+    assert "plsr, damping: not damped (wrong sign or none): u at rest, v at rest, r at rest, u at cruise" in page
 
 
 def test_a_folder_of_evaluate_has_other_splits_and_no_models(tmp_path: Path) -> None:

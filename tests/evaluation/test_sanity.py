@@ -66,10 +66,16 @@ def test_a_vessel_that_behaves_passes(terms: dict[str, tuple[float, float, float
 def test_wrong_sign_of_damping_is_flagged() -> None:
     found = findings(*made(RUDDER | {"u": (0.1, 0, 0)}))
     assert found[DAMPING].ok is False
-    assert "grows by itself): u at rest, u at cruise" in found[DAMPING].text
+    assert "not damped (wrong sign or none): u at rest, u at cruise" in found[DAMPING].text
     assert "du′/du +0.1" in found[DAMPING].text
     assert found[BOUNDED].ok is False
     assert "runs away" in found[BOUNDED].text
+
+
+def test_a_model_that_no_velocity_changes_is_not_damped() -> None:
+    found = findings(*made({"1": (0.0, 0.0, 0.0)}))
+    assert found[DAMPING].ok is False
+    assert "u at cruise, v at cruise, r at cruise" in found[DAMPING].text
 
 
 def test_purely_quadratic_damping_is_no_wrong_sign() -> None:

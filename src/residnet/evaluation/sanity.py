@@ -76,10 +76,12 @@ def check_damping(spec: ModelSpec, model: HybridDynamics, points: Sequence[Opera
     """Does each velocity decay by itself? Slopes d u_dot/du, d v_dot/dv, d r_dot/dr with the memory settled, by autograd."""
     chosen = [point for point in points if point.label in ("rest", "cruise")]
     x = torch.stack([point.x for point in chosen]).requires_grad_()
-    nu_dot = acceleration(model, x, torch.stack([point.w for point in chosen]))
+    # a model may depend on no velocity at all
+    nu_dot = acceleration(model, x, torch.stack([point.w for point in chosen])) + 0.0 * x[:, 3:6]
     slopes = torch.stack([torch.autograd.grad(nu_dot[:, i].sum(), x, retain_graph=True)[0][:, 3 + i] for i in range(3)], dim=1)
     # a slope that is small beside the other point's is no damping at all, as of a purely quadratic drag at rest
-    wrong = slopes > 0.05 * slopes.abs().amax(0)
+    largest = slopes.abs().amax(0)
+    wrong = (slopes > 0.05 * largest) | (largest == 0)
     parts = []
     for row, point in enumerate(chosen):
         values = ", ".join(f"d{name}′/d{name} {float(slopes[row, i]):+.3g}" for i, name in enumerate(VELOCITY))
@@ -87,7 +89,7 @@ def check_damping(spec: ModelSpec, model: HybridDynamics, points: Sequence[Opera
     if not bool(wrong.any()):
         return Finding(spec.name, DAMPING, True, "every velocity decays by itself. " + "; ".join(parts))
     which = [f"{VELOCITY[i]} at {point.label}" for row, point in enumerate(chosen) for i in range(3) if bool(wrong[row, i])]
-    return Finding(spec.name, DAMPING, False, f"wrong sign (grows by itself): {', '.join(which)}. " + "; ".join(parts))
+    return Finding(spec.name, DAMPING, False, f"not damped (wrong sign or none): {', '.join(which)}. " + "; ".join(parts))
 
 
 def check_stability(spec: ModelSpec, model: HybridDynamics, points: Sequence[OperatingPoint]) -> Finding:
