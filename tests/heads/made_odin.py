@@ -110,7 +110,8 @@ def msd_log(seconds: float = 50.0, step: float = 0.1, delay: float = 0.0) -> dic
     def square(t: np.ndarray) -> np.ndarray:
         return np.where(np.mod(t, 6 * np.pi) < 3 * np.pi, 1.0, -1.0)
 
-    log = simulate(
-        msd_rate, ("x", "w"), {"tau": lambda t: np.where(np.asarray(t) < delay, square(np.zeros(1)), square(np.asarray(t) - delay))}, seconds, step
-    )
+    def late(t: np.ndarray) -> np.ndarray:
+        return square(np.maximum(np.asarray(t) - delay, 0.0))
+
+    log = simulate(msd_rate, ("x", "w"), {"tau": late}, seconds, step)
     return log | {"tau_late": log["tau"], "tau": square(log["t"])}

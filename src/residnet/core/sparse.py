@@ -8,7 +8,7 @@ the Gram matrix, loses: candidates such as u, u cos(delta) and u |u| differ in t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pydantic import Field
@@ -20,6 +20,8 @@ from residnet.core.sparse_search import Criterion, Search, coefficients, swap_ta
 
 _DEPENDENT = 1e-12
 """Share of a column's length that must be left beside simpler columns; below it rounding decides."""
+_NOISY = 1e-9
+"""Unexplained share of a target from which data count as noisy."""
 _EVIDENCE = 6.0
 """Difference of the criterion above which one model is strongly preferred to another (Kass and Raftery 1995)."""
 
@@ -32,12 +34,15 @@ class SearchConfig(Config):
         gamma: weight of the number of candidates in the extended BIC (Chen and Chen 2008), n ln(RSS) + k ln(n) + 2 gamma ln(J over k); 0 is BIC.
         precision: error relative to the target below which a fit counts as exact.
         swaps: k of the largest swap of k terms for k - 1.
+        resolution: share of its length by which a term must differ from simpler ones where the data are noisy (or the unexplained share of the
+            target, if that is less). u|u| differs from u^2 by noise alone on a vessel that is at rest for a moment and never goes astern.
     """
 
     max_terms: int = Field(default=30, ge=1, le=80)
     gamma: float = Field(default=0.5, ge=0.0, le=1.0)
     precision: float = Field(default=1e-13, ge=1e-15, lt=1.0)
     swaps: int = Field(default=3, ge=1, le=3)
+    resolution: float = Field(default=1e-3, ge=0.0, lt=1.0)
 
 
 @dataclass(frozen=True)
@@ -126,24 +131,39 @@ def reduce(x: np.ndarray, y: np.ndarray, names: Sequence[str], degree: Sequence[
         raise FitError(f"sparse regression: {x.shape[0]} samples do not determine {excited.size} candidates; give longer logs or fewer candidates")
     scale = np.linalg.norm(x[:, excited], axis=0)
     full = triangle(np.concatenate((x[:, excited] / scale, y), axis=1))
-    r, target = full[:, : excited.size], full[:, excited.size :]
-    kept, dependent = _independent(r, [names[i] for i in excited], scale)
-    rows = triangle(np.concatenate((r[:, kept], target), axis=1))
-    r, target = rows[:, : len(kept)], rows[:, len(kept) :]
-    singular = np.linalg.svd(r, compute_uv=False)
-    columns = excited[kept]
-    whole = np.linalg.solve(r[: len(kept)], target[: len(kept)]) / scale[kept][:, None]
-    return Reduced(
-        names=tuple(names[i] for i in columns),
-        degree=np.asarray(degree)[columns],
-        scale=scale[kept],
-        r=r,
-        y=target,
-        samples=x.shape[0] / correlation_time(y - x[:, columns] @ whole),
+    whole = Reduced(
+        names=tuple(names[i] for i in excited),
+        degree=np.asarray(degree)[excited],
+        scale=scale,
+        r=full[:, : excited.size],
+        y=full[:, excited.size :],
+        samples=np.full(y.shape[1], float(x.shape[0])),
+        rank=excited.size,
+        condition=np.inf,
+        unexcited=tuple(names[i] for i in order[length <= 1e-300]),
+        dependent={},
+    )
+    out = coarser(whole, _DEPENDENT)
+    columns = [excited[whole.names.index(name)] for name in out.names]
+    best = np.linalg.solve(out.r[: out.rank], out.y[: out.rank]) / out.scale[:, None]
+    return replace(out, samples=x.shape[0] / correlation_time(y - x[:, columns] @ best))
+
+
+def coarser(reduced: Reduced, resolution: float) -> Reduced:
+    """The same without the candidates that differ from simpler ones by no more than a share of their length."""
+    kept, dependent = _independent(reduced.r, reduced.names, reduced.scale, resolution)
+    rows = triangle(np.concatenate((reduced.r[:, kept], reduced.y), axis=1))
+    singular = np.linalg.svd(rows[:, : len(kept)], compute_uv=False)
+    return replace(
+        reduced,
+        names=tuple(reduced.names[i] for i in kept),
+        degree=reduced.degree[kept],
+        scale=reduced.scale[kept],
+        r=rows[:, : len(kept)],
+        y=rows[:, len(kept) :],
         rank=len(kept),
         condition=float(singular[0] / max(singular[-1], 1e-300)),
-        unexcited=tuple(names[i] for i in order[length <= 1e-300]),
-        dependent=dependent,
+        dependent=reduced.dependent | dependent,
     )
 
 
@@ -152,12 +172,12 @@ def triangle(x: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.qr(x, mode="r"))
 
 
-def _independent(r: np.ndarray, names: Sequence[str], scale: np.ndarray) -> tuple[list[int], dict[str, dict[str, float]]]:
+def _independent(r: np.ndarray, names: Sequence[str], scale: np.ndarray, least: float) -> tuple[list[int], dict[str, dict[str, float]]]:
     """Columns of the triangle that simpler ones do not make up, and what makes up the others."""
     kept = list(range(len(names)))
     while True:
         beside = np.abs(np.diagonal(triangle(r[:, kept])))
-        lost = [kept[i] for i in np.flatnonzero(beside <= _DEPENDENT)]
+        lost = [kept[i] for i in np.flatnonzero(beside <= least)]
         if not lost:
             break
         kept = [i for i in kept if i not in lost]
@@ -166,21 +186,32 @@ def _independent(r: np.ndarray, names: Sequence[str], scale: np.ndarray) -> tupl
     for i in gone:
         before = [k for k in kept if k < i]
         share = np.linalg.lstsq(r[:, before], r[:, i], rcond=None)[0]
-        parts = {names[k]: float(s * scale[i] / scale[k]) for k, s in zip(before, share, strict=True) if abs(s) > 1e-6}
+        parts = {names[k]: float(s * scale[i] / scale[k]) for k, s in zip(before, share, strict=True) if abs(s) > max(1e-6, least)}
         dependent[names[i]] = parts
     return kept, dependent
 
 
-def find(reduced: Reduced, target: int, config: SearchConfig) -> Equation:
-    """The equation of one target.
-
-    Degrees are searched in turn, simplest first, until one explains the target exactly; otherwise the criterion, which knows how many
-    candidates each had to choose from, decides between them.
+def find(reduced: Reduced, target: int, config: SearchConfig) -> tuple[Equation, Reduced]:
+    """The equation of one target, and the candidates that it was searched in: fewer where noise hides what sets some apart.
 
     Args:
         reduced: candidates and targets.
         target: which target.
         config: how far the search goes.
+    """
+    fine = _search(reduced, target, config)
+    limit = min(config.resolution, fine.share)
+    if fine.share <= _NOISY:
+        return fine, reduced
+    coarse = coarser(reduced, limit)
+    return (fine, reduced) if coarse.rank == reduced.rank else (_search(coarse, target, config), coarse)
+
+
+def _search(reduced: Reduced, target: int, config: SearchConfig) -> Equation:
+    """The best equation.
+
+    Degrees are searched in turn, simplest first, until one explains the target exactly; otherwise the criterion, which knows how many
+    candidates each had to choose from, decides between them.
     """
     y = reduced.y[:, target]
     energy = float(y @ y)

@@ -89,6 +89,12 @@ class SymbolicHead(ClosedFormHead):
         """Memory [B, n_state] that past channels [B, T, nz] leave, oldest first."""
         return self.line.warmup(z.index_select(-1, self.features.index))
 
+    def parts(self, z: Tensor, axis: int) -> dict[str, np.ndarray]:
+        """Every term of one axis times its coefficient along measured channels [T, nz], [T] each."""
+        with torch.no_grad():
+            values = (self.basis(self.line.sequence(z.index_select(-1, self.features.index))) * self.coefficients[:, axis].to(z.dtype)).numpy()
+        return {term: values[:, j] for j, term in enumerate(self.library.terms) if float(self.coefficients[j, axis]) != 0.0}
+
     def solutions(self, samples: Samples) -> list[Solution]:
         """The equations that the extended BIC chooses; where free runs choose, then those of weaker and stronger penalties, and none.
 
@@ -101,8 +107,9 @@ class SymbolicHead(ClosedFormHead):
         found = [self._solution(reduced, self.config.search, steps, told)]
         if self.config.choose == "free_run":
             others = [self.config.search.model_copy(update={"gamma": gamma}) for gamma in _GAMMAS if gamma != self.config.search.gamma]
-            found += [self._solution(reduced, search, steps, told) for search in others]
-            none = {name: self._written(name, NOTHING, steps) for name in ACCELERATION}
+            tried = [self._solution(reduced, search, steps, told) for search in others]
+            found += [other for other in tried if not torch.equal(other.state["coefficients"], found[0].state["coefficients"])]
+            none = {name: self._written(name, NOTHING, reduced, steps) for name in ACCELERATION}
             notes = found[0].notes | {"parameters": 0, "coefficients": [], "equations": none}
             found.append(Solution({"kept": [0, 0, 0]}, {"coefficients": torch.zeros_like(self.coefficients)}, notes=notes))
         return found
@@ -138,11 +145,12 @@ class SymbolicHead(ClosedFormHead):
             steps, profile = best_delay(past, terms, self.features.names, self.line.channels, self.line.longest)
             seen.append(steps)
             reduced = self._reduced(past.delayed(steps, self.line.index.numpy()))
-            terms = [list(dict.fromkeys((*find(reduced, axis, self.config.search).terms, *simple))) for axis in range(3)]
+            terms = [list(dict.fromkeys((*find(reduced, axis, self.config.search)[0].terms, *simple))) for axis in range(3)]
         return seen[-1], {"delay": {"steps": seen[-1], "seconds": seen[-1] * past.step, "profile": profile.tolist()}}
 
     def _solution(self, reduced: Reduced, search: SearchConfig, steps: int, told: dict[str, Any]) -> Solution:
-        equations = [find(reduced, axis, search) for axis in range(3)]
+        found = [find(reduced, axis, search) for axis in range(3)]
+        equations = [equation for equation, _ in found]
         coefficients = torch.zeros_like(self.coefficients)
         for axis, equation in enumerate(equations):
             for term, value in zip(equation.terms, equation.values.tolist(), strict=True):
@@ -156,17 +164,14 @@ class SymbolicHead(ClosedFormHead):
             "terms": self.library.count,
             "parameters": len(table),
             "coefficients": [{"axis": c.axis, "term": c.term, "value": c.value, "standard_error": c.error} for c in table],
-            "rank": reduced.rank,
-            "condition": reduced.condition,
             "unexcited": list(reduced.unexcited),
-            "dependent": reduced.dependent,
-            "equations": {name: self._written(name, equation, steps) for name, equation in zip(ACCELERATION, equations, strict=True)},
+            "equations": {name: self._written(name, *pair, steps) for name, pair in zip(ACCELERATION, found, strict=True)},
             **told,
         }
         state = {"coefficients": coefficients, "line.steps": torch.full((1,), float(steps), dtype=torch.float64)}
         return Solution({"kept": [len(equation.terms) for equation in equations], "gamma": search.gamma}, state, table, notes)
 
-    def _written(self, name: str, equation: Equation, steps: int) -> dict[str, Any]:
+    def _written(self, name: str, equation: Equation, within: Reduced, steps: int) -> dict[str, Any]:
         """One equation in writing, with what the data say about it."""
         written = Written(name, equation.terms, equation.values.tolist(), self.features.names)
         late = f"; {', '.join(self.line.channels)}: {steps} steps earlier" if self.line.count else ""
@@ -177,6 +182,9 @@ class SymbolicHead(ClosedFormHead):
             "c": c_function(written, f"{name} in SI units, valid within the range of the training data{late}"),
             "error_share": equation.share,
             "exact": equation.exact,
+            "candidates": within.rank,
+            "condition": within.condition,
+            "same_as_simpler": within.dependent,
             "cannot_tell_apart": equation.alternatives,
             "undecided": equation.undecided,
         }
