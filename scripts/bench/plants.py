@@ -13,7 +13,8 @@ For each batch of trajectories (1, 64, 1024), thousands of trajectory steps per 
 
 The plain model is the same vessel in NumPy as textbooks write it: matrices M, C(nu), D(nu), R(psi) built at every call. Trajectories of
 the three that go one by one are timed on a few of them, since their time grows with the number. All of them end at the same place,
-which is checked. The ratios are what matters: every repetition measures all candidates in turn, and the best of each counts.
+which is checked. Times are of the processor, on one thread, so that other programs disturb them less. The ratios are what matters:
+every repetition measures all candidates in turn, and the best of each counts.
 """
 
 from __future__ import annotations
@@ -135,9 +136,9 @@ def one_by_one(single: Callable[..., np.ndarray], plain: PlainVessel, x: np.ndar
 
 
 def seconds(call: Callable[[], object]) -> float:
-    started = time.perf_counter()
+    started = time.process_time()
     call()
-    return time.perf_counter() - started
+    return time.process_time() - started
 
 
 def measure(name: str, steps: int, dt: float, repeats: int) -> None:

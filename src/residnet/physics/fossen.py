@@ -124,6 +124,7 @@ class Fossen3(nn.Module):
         self.register_buffer("damping", damping.reshape(3, len(terms)), persistent=False)
         self.register_buffer("response", torch.zeros(3, 0, dtype=torch.float64), persistent=False)
         self.compacted = False
+        self.gather: list[Tensor] = []
         self.response: Tensor
         self.mass: Tensor
         self.inverse: Tensor
@@ -142,7 +143,7 @@ class Fossen3(nn.Module):
         return self.terms(nu) @ self.damping.to(nu.dtype).T
 
     def compact(self) -> None:
-        """Write Coriolis force and drag as one product of terms and a matrix: the same to rounding, with a third of the operations."""
+        """Write Coriolis force, drag and tau as one product of terms and a matrix: the same to rounding, with a third of the operations."""
         m = self.mass
         cross = 0.5 * (m[1, 2] + m[2, 1])
         coriolis = {"v r": (0, -m[1, 1]), "r^2": (0, -cross), "u r": (1, m[0, 0]), "u v": (2, m[1, 1] - m[0, 0])}
@@ -152,8 +153,12 @@ class Fossen3(nn.Module):
         for column, (axis, value) in enumerate(coriolis.values()):
             force[axis, self.terms.count + column] = value
         force[2, -1] = cross
-        self.terms = TermLibrary(terms, VELOCITY)
-        self.response = -(self.inverse @ force)
+        library = TermLibrary(terms, VELOCITY)
+        # the forces are rows of their own behind [1, nu, |nu|]
+        forces = torch.zeros(library.depth, 3, dtype=torch.long)
+        forces[0] = torch.tensor([7, 8, 9])
+        self.gather = list(torch.cat((library.index, forces), dim=1))
+        self.response = torch.cat((-(self.inverse @ force), self.inverse), dim=1)
         self.compacted = True
 
     def forward(self, nu: Tensor, tau: Tensor) -> Tensor:
@@ -161,11 +166,11 @@ class Fossen3(nn.Module):
         if self.compacted:
             # terms as rows: gathering rows and a product of few long rows cost a third of gathering columns
             motion = nu.mT.contiguous()
-            base = torch.cat((torch.ones_like(motion[:1]), motion, motion.abs()))
-            rows = base.index_select(0, self.terms.index[0])
-            for depth in range(1, self.terms.depth):
-                rows = rows * base.index_select(0, self.terms.index[depth])
-            return (self.inverse.to(nu.dtype) @ tau.mT + self.response.to(nu.dtype) @ rows).mT
+            base = torch.cat((torch.ones_like(motion[:1]), motion, motion.abs(), tau.mT))
+            rows = base.index_select(0, self.gather[0])
+            for index in self.gather[1:]:
+                rows = rows * base.index_select(0, index)
+            return (self.response.to(nu.dtype) @ rows).mT
         force = tau - self.coriolis(nu) - self.drag(nu)
         return force @ self.inverse.to(nu.dtype).T
 

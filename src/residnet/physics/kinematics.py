@@ -49,8 +49,9 @@ class Planar(Kinematics):
 
     def rate(self, pose: Tensor, nu: Tensor) -> Tensor:
         """x_dot = u cos psi - v sin psi, y_dot = u sin psi + v cos psi, psi_dot = r."""
-        north, east = to_earth(nu[..., 0], nu[..., 1], pose[..., 2])
-        return torch.stack((north, east, nu[..., 2]), dim=-1)
+        u, v, r = torch.unbind(nu, dim=-1)
+        north, east = to_earth(u, v, pose[..., 2])
+        return torch.stack((north, east, r), dim=-1)
 
     def carried(self, north: Tensor, east: Tensor, pose: Tensor, nu: Tensor) -> tuple[Tensor, Tensor]:
         """Body components and their derivative: the vector turns by -r."""

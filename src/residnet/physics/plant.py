@@ -67,6 +67,7 @@ class HullPlant(Plant, ABC):
         self.weather = True
         self.n = len(kinematics.velocity)
         self.state = (*kinematics.pose, *kinematics.velocity, *actuators.state)
+        self.parts = [self.n, self.n, len(actuators.state)]
         self.commands = len(actuators.commands)
         forces = tuple(f"force_{axis}" for axis in kinematics.axes)
         self.inputs = (*actuators.commands, *forces, "current_north", "current_east", "force_north", "force_east")
@@ -85,7 +86,7 @@ class HullPlant(Plant, ABC):
         return self.actuators.demand(drive, steer)
 
     def in_calm_water(self) -> HullPlant:
-        """This plant without its exogenous inputs: no body or earth-fixed forces, current or wind; several times faster."""
+        """This plant without its exogenous inputs: no body or earth-fixed forces, current, wind or air resistance; faster."""
         self.weather = False
         self.inputs = self.actuators.commands
         return self
@@ -114,11 +115,11 @@ class HullPlant(Plant, ABC):
     def _rate(self, x: Tensor, w: Tensor, held: bool) -> Tensor:
         """x_dot; `held`: the actuators' forces are among the body forces already, and their states stand still."""
         n, c = self.n, self.commands
-        pose, nu, a = x[:, :n], x[:, n : 2 * n], x[:, 2 * n :]
-        command = w[:, :c]
+        pose, nu, a = torch.split(x, self.parts, dim=-1)
+        command = w.narrow(-1, 0, c)
         moving = torch.zeros_like(a) if held else self.actuators.rate(a, command)
         if not self.weather:
-            tau = w[:, c : c + n] if held else self.actuators.force(a, command, nu)
+            tau = w.narrow(-1, c, n) if held else self.actuators.force(a, command, nu)
             return torch.cat((self.kinematics.rate(pose, nu), self.acceleration(pose, nu, tau), moving), dim=-1)
         water, turned = self.kinematics.carried(w[:, c + n], w[:, c + n + 1], pose, nu)
         relative = nu - water
