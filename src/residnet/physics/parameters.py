@@ -48,6 +48,8 @@ Mass = Annotated[Parameter, AfterValidator(measured_in("kg"))]
 MassArm = Annotated[Parameter, AfterValidator(measured_in("kg m"))]
 Inertia = Annotated[Parameter, AfterValidator(measured_in("kg m^2"))]
 Length = Annotated[Parameter, AfterValidator(measured_in("m"))]
+Volume = Annotated[Parameter, AfterValidator(measured_in("m^3"))]
+MassDensity = Annotated[Parameter, AfterValidator(measured_in("kg/m^3"))]
 
 
 def above_zero(parameter: Parameter) -> Parameter:

@@ -13,9 +13,10 @@ from residnet.core.names import nearest
 from residnet.core.resources import config_folder
 from residnet.physics.abkowitz import AbkowitzConfig
 from residnet.physics.fossen import FossenConfig
+from residnet.physics.patrol import PatrolConfig
 
-VesselConfig = Annotated[FossenConfig | AbkowitzConfig, Field(discriminator="kind")]
-AnyVessel = FossenConfig | AbkowitzConfig
+AnyVessel = FossenConfig | AbkowitzConfig | PatrolConfig
+VesselConfig = Annotated[AnyVessel, Field(discriminator="kind")]
 
 
 def vessel_files() -> dict[str, Path]:

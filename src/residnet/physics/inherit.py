@@ -1,0 +1,62 @@
+"""Vessel files that say only what differs from another one: `base: patrol_p06`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from residnet.core.config import load_mapping
+from residnet.core.errors import ConfigError
+from residnet.core.names import nearest
+from residnet.core.resources import config_folder
+
+
+def with_base(data: Any, folder: Path | None) -> Any:
+    """Content of a vessel file laid over that of its `base`, which may have one of its own.
+
+    Sections are merged key by key; a section of another `kind` takes the place of the base's. `base` is the name of a file in
+    `configs/vessels`, or the path of a YAML file, looked for beside the file first.
+
+    Raises:
+        ValueError: where there is no such file, it cannot be read, or files name each other in a circle.
+    """
+    seen: list[Path] = []
+    layers = [data]
+    while isinstance(layers[-1], dict) and "base" in layers[-1]:
+        path = _file(layers[-1]["base"], folder)
+        if path in seen:
+            raise ValueError(f"base: {' and '.join(p.name for p in seen)} name each other in a circle")
+        seen.append(path)
+        folder = path.parent
+        try:
+            layers.append(load_mapping(path))
+        except ConfigError as error:
+            raise ValueError(f"base: {error}") from None
+    merged = layers[-1]
+    for layer in reversed(layers[:-1]):
+        merged = _laid_over({key: value for key, value in layer.items() if key != "base"}, merged)
+    return merged
+
+
+def _file(name: object, folder: Path | None) -> Path:
+    files = {path.stem: path for path in (config_folder() / "vessels").glob("*.yaml")}
+    if not isinstance(name, str):
+        raise ValueError(f"base: expected the name of a vessel or of its yaml file, given {name!r}")
+    if name in files:
+        return files[name].resolve()
+    path = Path(name)
+    beside = (folder / path) if folder is not None else path
+    for candidate in (beside, path):
+        if candidate.suffix in {".yaml", ".yml"} and candidate.is_file():
+            return candidate.resolve()
+    raise ValueError(f"base: no vessel '{name}'{nearest(name, files)}; or give the path of a vessel's yaml file")
+
+
+def _laid_over(upper: dict[str, Any], lower: dict[str, Any]) -> dict[str, Any]:
+    out = dict(lower)
+    for key, value in upper.items():
+        below = lower.get(key)
+        if isinstance(value, dict) and isinstance(below, dict) and value.get("kind", below.get("kind")) == below.get("kind"):
+            value = _laid_over(value, below)
+        out[key] = value
+    return out

@@ -1,0 +1,213 @@
+"""The 4-DOF patrol vessel: surge, sway, roll and yaw with roll restoring (document 004, section 5.2, as corrected in ERRATA 004)."""
+
+from __future__ import annotations
+
+from typing import Any, Literal, final
+
+import torch
+from pydantic import Field, ValidationInfo, field_validator, model_validator
+from torch import Tensor, nn
+
+from residnet.core.config import Config, MetresPerSecond
+from residnet.core.errors import ConfigError
+from residnet.physics.actuators.stern_rudders import FoilRuddersConfig, LinearRuddersConfig
+from residnet.physics.environment_wind import WindLoadsConfig
+from residnet.physics.inherit import with_base
+from residnet.physics.kinematics import Rolling
+from residnet.physics.mass import inverse_mass
+from residnet.physics.parameters import Inertia, Length, Mass, MassArm, MassDensity, Parameter, Volume, above_zero, dimension, unit_text
+from residnet.physics.plant import HullPlant
+from residnet.physics.terms import TermLibrary, parse_term
+
+MOTION = (*Rolling.velocity, "phi")
+"""What the terms are made of: surge, sway, roll and yaw velocities through the water, and the roll angle."""
+GRAVITY = 9.81
+
+
+class RollingBody(Config):
+    """Mass, moments of inertia about the body origin and centre of gravity (z down: above the origin is negative)."""
+
+    m: Mass
+    I_x: Inertia
+    I_z: Inertia
+    x_G: Length
+    z_G: Length
+
+    _positive = field_validator("m", "I_x", "I_z")(above_zero)
+
+
+class RollingAddedMass(Config):
+    """Hydrodynamic derivatives with respect to accelerations in sway, roll and yaw (SNAME)."""
+
+    X_udot: Mass
+    Y_vdot: Mass
+    Y_pdot: MassArm
+    Y_rdot: MassArm
+    K_vdot: MassArm
+    K_pdot: Inertia
+    K_rdot: Inertia
+    N_vdot: MassArm
+    N_pdot: Inertia
+    N_rdot: Inertia
+
+
+class HullForces(Config):
+    """Forces of the water on the hull as terms of (u, v, p, r, phi), with the sign that they act with: braking is negative."""
+
+    X: dict[str, Parameter] = Field(default_factory=dict)
+    Y: dict[str, Parameter] = Field(default_factory=dict)
+    K: dict[str, Parameter] = Field(default_factory=dict)
+    N: dict[str, Parameter] = Field(default_factory=dict)
+
+    def rows(self) -> tuple[dict[str, Parameter], ...]:
+        """X, Y, K, N."""
+        return self.X, self.Y, self.K, self.N
+
+    @model_validator(mode="after")
+    def _units(self) -> HullForces:
+        for axis, row in zip("XYKN", self.rows(), strict=True):
+            for term, parameter in row.items():
+                try:
+                    factors = parse_term(term, MOTION, functions=False)
+                except ConfigError as error:
+                    raise ValueError(f"{axis}: {error}") from None
+                if any(factor.power < 0 for factor in factors):
+                    raise ValueError(f"{axis}: term '{term}' is infinite at rest")
+                metres = (2 if axis in "KN" else 1) - sum(f.power for f in factors if f.name in "uv")
+                seconds = -2 + sum(f.power for f in factors if f.name != "phi")
+                if dimension(parameter.unit) != (metres, seconds):
+                    raise ValueError(f"{axis}.{term}: its unit must be {unit_text(metres, seconds)}, given '{parameter.unit}'")
+        return self
+
+
+class Hydrostatics(Config):
+    """Roll restoring K = -rho g V GM phi.
+
+    Attributes:
+        density: of the water.
+        volume: displaced.
+        GM: transverse metacentric height.
+    """
+
+    density: MassDensity
+    volume: Volume
+    GM: Length
+
+    _positive = field_validator("density", "volume", "GM")(above_zero)
+
+    @property
+    def stiffness(self) -> float:
+        """rho g V GM in N m per rad."""
+        return self.density.value * GRAVITY * self.volume.value * self.GM.value
+
+
+class PatrolConfig(Config):
+    """A vessel in surge, sway, roll and yaw, by its derivatives.
+
+    A file may name another one as `base` and give only what differs.
+
+    Attributes:
+        name: of the vessel, as its file is called.
+        description: one line for `residnet list vessels`.
+        length: of the hull, which manoeuvring indices are measured in.
+        speed: service speed, which trials start from.
+        actuators: rudders as foils in the propellers' race, or linear ones.
+        wind: coefficients of the hull above water; without them the vessel feels no wind.
+    """
+
+    kind: Literal["patrol"]
+    name: str
+    description: str
+    length: Length
+    speed: MetresPerSecond = Field(gt=0)
+    hydrostatics: Hydrostatics
+    rigid_body: RollingBody
+    added_mass: RollingAddedMass
+    forces: HullForces
+    actuators: FoilRuddersConfig | LinearRuddersConfig = Field(discriminator="kind")
+    wind: WindLoadsConfig | None = None
+
+    _positive = field_validator("length")(above_zero)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _base(cls, data: Any, info: ValidationInfo) -> Any:
+        return with_base(data, (info.context or {}).get("folder"))
+
+    def build(self) -> PatrolVessel:
+        """The plant.
+
+        Raises:
+            ConfigError: where the mass matrix is not positive definite or is singular.
+        """
+        return PatrolVessel(self)
+
+
+class PatrolHull(nn.Module):
+    """Acceleration of the hull. Inertia is that of the rigid body about the origin (eq. (5.12)); the water's Coriolis forces are
+    among the terms, as far as the source has them (X_vr). Buffers are float64; results take the dtype of the input.
+    """
+
+    def __init__(self, vessel: PatrolConfig) -> None:
+        super().__init__()
+        body, added = vessel.rigid_body, vessel.added_mass
+        m = body.m.value
+        along, down = m * body.x_G.value, m * body.z_G.value
+        mass = torch.tensor(
+            [
+                [m - added.X_udot.value, 0.0, 0.0, 0.0],
+                [0.0, m - added.Y_vdot.value, -(down + added.Y_pdot.value), along - added.Y_rdot.value],
+                [0.0, -(down + added.K_vdot.value), body.I_x.value - added.K_pdot.value, -added.K_rdot.value],
+                [0.0, along - added.N_vdot.value, -added.N_pdot.value, body.I_z.value - added.N_rdot.value],
+            ],
+            dtype=torch.float64,
+        )
+        # centripetal terms of the rigid body, (5.12), and the restoring moment, which (5.17) leaves out
+        inertia = {
+            "v r": (m, 0.0, 0.0, 0.0),
+            "r r": (along, 0.0, 0.0, 0.0),
+            "p r": (-down, 0.0, 0.0, 0.0),
+            "u r": (0.0, -m, down, -along),
+            "phi": (0.0, 0.0, -vessel.hydrostatics.stiffness, 0.0),
+        }
+        rows = vessel.forces.rows()
+        given = sorted({term for row in rows for term in row})
+        coefficients = [[row[term].value if term in row else 0.0 for row in rows] for term in given]
+        self.terms = TermLibrary([*inertia, *given], MOTION)
+        self.register_buffer("mass", mass, persistent=False)
+        self.register_buffer("inverse", inverse_mass(mass, vessel.name), persistent=False)
+        self.register_buffer("coefficients", torch.tensor([*inertia.values(), *coefficients], dtype=torch.float64), persistent=False)
+        self.mass: Tensor
+        self.inverse: Tensor
+        self.coefficients: Tensor
+
+    def load(self, phi: Tensor, nu: Tensor) -> Tensor:
+        """Forces [..., 4] in N, N, N m, N m of water, weight and rotation at roll phi [...] and velocities through the water nu [..., 4]."""
+        return self.terms(torch.cat((nu, phi.unsqueeze(-1)), dim=-1)) @ self.coefficients.to(nu.dtype)
+
+    def forward(self, phi: Tensor, nu: Tensor, tau: Tensor) -> Tensor:
+        """Acceleration nu_dot [..., 4] under the further forces tau [..., 4]."""
+        return (self.load(phi, nu) + tau) @ self.inverse.to(nu.dtype).T
+
+
+@final
+class PatrolVessel(HullPlant):
+    """The hull with rudders and propellers, in current, wind and external force.
+
+    State x [B, 8 + k]: x, y [m], phi, psi [rad], u, v [m/s] over ground, p, r [rad/s], then the rudder angle where it has a rate.
+    """
+
+    def __init__(self, vessel: PatrolConfig) -> None:
+        super().__init__(Rolling(), vessel.actuators.build(), vessel.wind.build() if vessel.wind is not None else None)
+        self.hull = PatrolHull(vessel)
+        self.speed = vessel.speed
+
+    def acceleration(self, pose: Tensor, nu: Tensor, tau: Tensor) -> Tensor:
+        """nu_dot [B, 4] at pose [B, 4] from velocities through the water [B, 4] and forces [B, 4]."""
+        return self.hull(pose[..., 2], nu, tau)
+
+    def approach(self, rows: int) -> Tensor:
+        """Straight ahead at service speed, [rows, nx]: the source's thrust compensates the resistance there."""
+        x = super().approach(rows)
+        x[:, self.state.index("u")] = self.speed
+        return x
