@@ -13,9 +13,10 @@ from residnet.core.names import nearest
 from residnet.core.resources import config_folder
 from residnet.physics.abkowitz import AbkowitzConfig
 from residnet.physics.fossen import FossenConfig
+from residnet.physics.nomoto import NomotoConfig, SecondOrderNomotoConfig, SideslipNomotoConfig
 from residnet.physics.patrol import PatrolConfig
 
-AnyVessel = FossenConfig | AbkowitzConfig | PatrolConfig
+AnyVessel = FossenConfig | AbkowitzConfig | PatrolConfig | NomotoConfig | SecondOrderNomotoConfig | SideslipNomotoConfig
 VesselConfig = Annotated[AnyVessel, Field(discriminator="kind")]
 
 

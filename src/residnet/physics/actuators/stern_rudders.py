@@ -1,4 +1,4 @@
-"""Rudders and propellers of the patrol vessel: rudders as foils in the race of the propellers, or linear in the angle (document 004, section 5.2.2.3)."""
+"""Rudders and propellers of the patrol vessel: foils in the race, or linear in the angle (document 004, section 5.2.2.3)."""
 
 from __future__ import annotations
 

@@ -1,0 +1,198 @@
+"""Nomoto's steering models at constant speed: first order, second order, and second order with sideslip (document 004, section 5.1)."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Annotated, Literal, NamedTuple, final
+
+import numpy as np
+import torch
+from pydantic import AfterValidator, Field, field_validator, model_validator
+from torch import Tensor
+
+from residnet.core.config import Config, MetresPerSecond
+from residnet.core.frames import to_earth
+from residnet.physics.abkowitz import SteeringGearConfig
+from residnet.physics.parameters import Length, Parameter, above_zero, measured_in
+from residnet.physics.plant import Plant
+
+Gain = Annotated[Parameter, AfterValidator(measured_in("1/s"))]
+TimeConstant = Annotated[Parameter, AfterValidator(measured_in("s"))]
+SwayGain = Annotated[Parameter, AfterValidator(measured_in("m/s"))]
+
+
+class LinearSteering(NamedTuple):
+    """z_dot = A z + b delta with z = (v, r, then `extra` internal states): A [k, k], b [k]."""
+
+    a: np.ndarray
+    b: np.ndarray
+    extra: tuple[str, ...] = ()
+
+
+class SteeringConfig(Config, ABC):
+    """What all steering models have.
+
+    Attributes:
+        name: of the vessel, as its file is called.
+        description: one line for `residnet list vessels`.
+        length: of the hull, which manoeuvring indices are measured in.
+        speed: u, which nothing changes.
+        K: yaw rate per rudder angle in a steady turn; K over the product of the time constants must be positive, so that a rudder
+            to starboard turns to starboard at first.
+        rudder: largest angle, rate and lag.
+    """
+
+    name: str
+    description: str
+    length: Length
+    speed: MetresPerSecond = Field(gt=0)
+    K: Gain
+    rudder: SteeringGearConfig
+
+    _positive = field_validator("length")(above_zero)
+
+    @abstractmethod
+    def steering(self) -> LinearSteering:
+        """The model in state space."""
+
+    @abstractmethod
+    def times(self) -> dict[str, float]:
+        """Time constants of the poles in s, by name."""
+
+    @model_validator(mode="after")
+    def _sense(self) -> SteeringConfig:
+        product = self.K.value
+        for name, time in self.times().items():
+            if time == 0:
+                raise ValueError(f"{name} must not be zero")
+            product /= time
+        if product <= 0:
+            raise ValueError(
+                "K over the time constants must be positive: a rudder to starboard turns to starboard (an unstable ship has K and a T negative)"
+            )
+        return self
+
+    @final
+    def build(self) -> SteeringVessel:
+        """The plant."""
+        return SteeringVessel(self)
+
+
+class NomotoConfig(SteeringConfig):
+    """T r_dot + r = K delta (document 004 eq. (5.9)); no sideslip."""
+
+    kind: Literal["nomoto"]
+    T: TimeConstant
+
+    def times(self) -> dict[str, float]:
+        """T."""
+        return {"T": self.T.value}
+
+    def steering(self) -> LinearSteering:
+        """r alone; v stays as it is."""
+        return LinearSteering(np.diag([0.0, -1.0 / self.T.value]), np.array([0.0, self.K.value / self.T.value]))
+
+
+class SecondOrderConfig(SteeringConfig, ABC):
+    """The three time constants of r/delta = K (1 + T3 s) / ((1 + T1 s)(1 + T2 s)), document 004 eq. (5.3)."""
+
+    T1: TimeConstant
+    T2: TimeConstant
+    T3: TimeConstant
+
+    @final
+    def times(self) -> dict[str, float]:
+        """T1 and T2."""
+        return {"T1": self.T1.value, "T2": self.T2.value}
+
+
+class SecondOrderNomotoConfig(SecondOrderConfig):
+    """T1 T2 r_ddot + (T1 + T2) r_dot + r = K (delta + T3 delta_dot) (document 004 eq. (5.5), ERRATA G12); no sideslip.
+
+    The internal state is q = r_dot - K T3 / (T1 T2) delta, which needs no derivative of the rudder angle.
+    """
+
+    kind: Literal["nomoto_second_order"]
+
+    def steering(self) -> LinearSteering:
+        """v, r and q."""
+        product, total = self.T1.value * self.T2.value, self.T1.value + self.T2.value
+        direct = self.K.value * self.T3.value / product
+        a = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0 / product, -total / product]])
+        return LinearSteering(a, np.array([0.0, direct, self.K.value / product - total / product * direct]), ("_yaw_lag",))
+
+
+class SideslipNomotoConfig(SecondOrderConfig):
+    """Second order in yaw and sway: M nu_dot + N(u) nu = b delta with nu = (v, r) (document 004 eq. (5.1)), given by its transfer functions
+    (5.3) and v/delta = K_v (1 + T_v s) / ((1 + T1 s)(1 + T2 s)), (5.4) as in ERRATA G12.
+
+    K_v and T_v belong to v, in m/s per rad and s.
+    """
+
+    kind: Literal["nomoto_sideslip"]
+    K_v: SwayGain
+    T_v: TimeConstant
+
+    @model_validator(mode="after")
+    def _two_states(self) -> SideslipNomotoConfig:
+        if self.K_v.value == 0 or self.T_v.value == self.T3.value:
+            raise ValueError("K_v must not be zero and T_v must differ from T3: sway would be no state of its own; use kind nomoto_second_order")
+        return self
+
+    def steering(self) -> LinearSteering:
+        """v and r, from the companion form of the common denominator."""
+        product, total = self.T1.value * self.T2.value, self.T1.value + self.T2.value
+        k, k_v = self.K.value, self.K_v.value
+        out = np.array([[k_v, k_v * self.T_v.value], [k, k * self.T3.value]])
+        companion = np.array([[0.0, 1.0], [-1.0 / product, -total / product]])
+        return LinearSteering(out @ companion @ np.linalg.inv(out), out @ np.array([0.0, 1.0 / product]))
+
+
+@final
+class SteeringVessel(Plant):
+    """A vessel that turns as its steering model says and keeps its speed.
+
+    State x [B, 6 + k]: x, y [m], psi [rad], u, v [m/s], r [rad/s], internal states of the model, then the rudder where it has a rate or lag.
+    Input: cmd_delta [rad].
+    """
+
+    def __init__(self, config: SteeringConfig) -> None:
+        super().__init__()
+        a, b, extra = config.steering()
+        self.speed, self.delta_max = config.speed, config.rudder.limit
+        self.servo = config.rudder.follow("delta", config.rudder.limit, config.rudder.rate)
+        self.free = 2 + len(extra)
+        self.state = ("x", "y", "psi", "u", "v", "r", *extra, *self.servo.state)
+        self.inputs = ("cmd_delta",)
+        self.commands = 1
+        self.register_buffer("a", torch.from_numpy(a), persistent=False)
+        self.register_buffer("b", torch.from_numpy(b), persistent=False)
+        self.a: Tensor
+        self.b: Tensor
+
+    def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
+        """Rudder angle [..., 1] as a share of its limit; the speed is constant whatever the drive."""
+        return (steer.clamp(-1.0, 1.0) * self.delta_max).unsqueeze(-1)
+
+    def delta(self, x: Tensor, w: Tensor) -> Tensor:
+        """Rudder angle [B]."""
+        return self.servo.value(x[:, 4 + self.free :], w[:, 0])
+
+    def rate(self, x: Tensor, w: Tensor) -> Tensor:
+        """x_dot [B, nx] under inputs w [B, 1]."""
+        z, rudder = x[:, 4 : 4 + self.free], x[:, 4 + self.free :]
+        turning = z @ self.a.to(x.dtype).T + self.delta(x, w).unsqueeze(-1) * self.b.to(x.dtype)
+        north, east = to_earth(x[:, 3], x[:, 4], x[:, 2])
+        pose = torch.stack((north, east, x[:, 5], torch.zeros_like(north)), dim=-1)
+        return torch.cat((pose, turning, self.servo.rate(rudder, w[:, 0])), dim=-1)
+
+    def settle(self, x: Tensor, w: Tensor, dt: float) -> Tensor:
+        """State [B, nx] with the rudder moved on by a step of dt seconds."""
+        split = 4 + self.free
+        return torch.cat((x[:, :split], self.servo.advance(x[:, split:], w[:, 0], dt)), dim=-1)
+
+    def approach(self, rows: int) -> Tensor:
+        """Straight ahead at its speed, [rows, nx]."""
+        x = super().approach(rows)
+        x[:, 3] = self.speed
+        return x
