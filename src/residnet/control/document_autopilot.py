@@ -1,0 +1,94 @@
+"""The predictive heading autopilot of document 004 (section 6.1.3, eqs. (6.3), (6.4), ERRATA 004)."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import final
+
+import torch
+from torch import Tensor, nn
+
+from residnet.control.base import Policy
+from residnet.core.errors import ConfigError
+from residnet.dynamics.base import Dynamics
+
+
+class Predictor(nn.Module, ABC):
+    """What heading error and yaw rate each of C rudder angles would lead to, a horizon ahead: a network, or a model that is simulated."""
+
+    @abstractmethod
+    def forward(self, x: Tensor, heading: Tensor, rudder: Tensor) -> tuple[Tensor, Tensor]:
+        """Heading errors and yaw rates [B, C] in rad and rad/s.
+
+        Args:
+            x: states [B, nx].
+            heading: reference [B] of now, which the error is measured from (the source's own listing does so, ERRATA G22).
+            rudder: candidates [C] in rad.
+        """
+
+
+@final
+class SimulatedPredictor(Predictor):
+    """Simulates a model of the vessel, the rudder command held over the horizon.
+
+    Args:
+        model: with the columns of the controlled vessel's state; its commands begin with the rudder angle.
+        state: names of these columns.
+        steps: of the model, which make the horizon.
+        others: its inputs beside the rudder command [m - 1], held over the horizon.
+    """
+
+    def __init__(self, model: Dynamics, state: Sequence[str], steps: int, others: Tensor | None = None) -> None:
+        super().__init__()
+        if steps < 1:
+            raise ConfigError(f"the predictor's horizon must be one step or more, given {steps}")
+        self.model = model
+        self.steps = steps
+        self.psi, self.r = state.index("psi"), state.index("r")
+        self.register_buffer("others", torch.zeros(0) if others is None else others, persistent=False)
+        self.others: Tensor
+
+    def forward(self, x: Tensor, heading: Tensor, rudder: Tensor) -> tuple[Tensor, Tensor]:
+        """Heading errors and yaw rates [B, C], all candidates of all rows in one batch."""
+        rows, candidates = x.shape[0], rudder.shape[0]
+        command = rudder.to(x.dtype).repeat(rows).unsqueeze(-1)
+        w = torch.cat((command, self.others.to(x.dtype).expand(rows * candidates, -1)), dim=-1)
+        ahead = x.repeat_interleave(candidates, dim=0)
+        memory = ahead[:, :0]
+        for _ in range(self.steps):
+            ahead, memory = self.model.step(ahead, w, memory)
+        error = heading.unsqueeze(-1) - ahead[:, self.psi].reshape(rows, candidates)
+        return error, ahead[:, self.r].reshape(rows, candidates)
+
+
+@final
+class DocumentAutopilot(Policy):
+    """delta = weight d_e + (1 - weight) d_r: of the candidates, d_e leads to the smallest heading error and d_r to the smallest yaw rate.
+
+    The source takes 41 candidates between -5 and 5 deg, weight 0.2 and a horizon of one step of 0.01 s. There the first choice saturates and
+    the second stops the yaw, so that it turns at 0.011 deg/s (ERRATA 004); a horizon of seconds repairs it.
+
+    Args:
+        predictor: of heading error and yaw rate.
+        limit: of the candidates in rad, either side.
+        candidates: how many, evenly spaced, both limits included; an odd number has the rudder amidships among them.
+        weight: of the choice for the heading error.
+    """
+
+    def __init__(self, predictor: Predictor, *, limit: float, candidates: int = 41, weight: float = 0.2) -> None:
+        super().__init__()
+        if limit <= 0 or candidates < 2 or not 0 <= weight <= 1:
+            raise ConfigError(f"document autopilot: limit > 0, candidates >= 2 and 0 <= weight <= 1, given {limit:g}, {candidates}, {weight:g}")
+        self.predictor = predictor
+        self.weight = weight
+        angles = limit * torch.linspace(-1.0, 1.0, candidates, dtype=torch.float64)
+        self.register_buffer("rudder", angles, persistent=False)
+        self.rudder: Tensor
+
+    def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Rudder command [B, 1] in rad from the state x [B, nx] and the reference heading [B, 1] in rad; it keeps no memory."""
+        error, rate = self.predictor(x, reference[:, 0], self.rudder)
+        rudder = self.rudder.to(x.dtype)
+        toward, calm = rudder[error.abs().argmin(-1)], rudder[rate.abs().argmin(-1)]
+        return (self.weight * toward + (1.0 - self.weight) * calm).unsqueeze(-1), s
