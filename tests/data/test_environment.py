@@ -146,3 +146,20 @@ def test_what_a_vessel_cannot_feel_is_one_line(disturbance: dict[str, Any], mess
     with pytest.raises(ConfigError, match=message) as caught:
         trials(disturbance=disturbance)
     assert "\n" not in str(caught.value)
+
+
+def test_dead_time_needs_the_plants_own_step(tmp_path: Path) -> None:
+    """Found when the config is read, not after the first step of a long run; the delay line itself enters no log."""
+    text = vessel_files()["example_rudder_boat"].read_text()
+    late = text.replace("    # dead_time: 0.2 s ", "    dead_time: 0.2 s  # ").replace("    # delay_step: 0.01 s ", "    delay_step: 0.02 s  # ")
+    path = tmp_path / "late.yaml"
+    path.write_text(late)
+    with pytest.raises(ConfigError, match=r"delay_step is 0.02 s, but the plant steps by 0.1 s") as caught:
+        trials(vessel=str(path))
+    assert "\n" not in str(caught.value)
+    config = trials(vessel=str(path), substeps=5)
+    log = simulate(config.draw()[:1], config)[0]
+    assert not [name for name in log.channels if name.startswith("_")]
+    # the rudder answers two samples after its command
+    assert log["delta"][:3].tolist() == [0.0, 0.0, 0.0]
+    assert log["delta"][3] > 0.01

@@ -62,6 +62,8 @@ class SimulatedTrials(Config):
     def _felt(self) -> SimulatedTrials:
         try:
             plant = load_vessel(self.vessel).build()
+            # actuators with dead time move by a step of their own
+            plant.settle(plant.approach(1), torch.zeros(1, len(plant.inputs), dtype=torch.float64), self.step / self.substeps)
             self.disturbance.check(plant, self.vessel)
             self.noise.check((*plant.state, *plant.inputs[: plant.commands], *self.disturbance.logged), self.step, self.vessel)
         except ConfigError as error:
