@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -60,14 +60,21 @@ def msd_rate(z: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def simulate(
-    rate: Callable[[Mapping[str, np.ndarray]], np.ndarray], states: tuple[str, ...], inputs: Inputs, seconds: float, step: float, within: int = 5
-) -> dict[str, np.ndarray]:
-    """States from rest, inputs and the exact rates at the samples, by RK4 with `within` steps to a sample and inputs as functions of time."""
+    rate: Callable[[Mapping[str, np.ndarray]], np.ndarray],
+    states: tuple[str, ...],
+    designs: Sequence[Inputs],
+    seconds: float,
+    step: float,
+    within: int = 1,
+) -> list[dict[str, np.ndarray]]:
+    """Logs of several designs at once: states from rest, inputs and the exact rates at the samples.
+
+    RK4 with `within` steps to a sample and inputs as functions of time; a jump at a sample belongs to the step that begins there.
+    """
     h = step / within
-    # the last stage of a step looks at the input just before the next sample, so that a jump there belongs to the next step
     stage = np.arange(round(seconds / step) * within)[:, None] * h + np.array([0.0, h / 2, h - 1e-12])
-    known = {name: signal(stage) for name, signal in inputs.items()}
-    x, path = np.zeros(len(states)), []
+    known = {name: np.stack([design[name](stage) for design in designs], axis=-1) for name in designs[0]}
+    x, path = np.zeros((len(states), len(designs))), []
 
     def f(x: np.ndarray, k: int, s: int) -> np.ndarray:
         return rate({**dict(zip(states, x, strict=True)), **{name: values[k, s] for name, values in known.items()}})
@@ -80,28 +87,52 @@ def simulate(
         c = f(x + h / 2 * b, k, 1)
         x = x + h / 6 * (a + 2 * b + 2 * c + f(x + h * c, k, 2))
     t = np.arange(len(path)) * step
-    out = {"t": t, **dict(zip(states, np.array(path).T, strict=True)), **{name: signal(t) for name, signal in inputs.items()}}
-    return out | {f"{name}_dot": value for name, value in zip(states, rate(out), strict=True)}
+    logs = []
+    for number, design in enumerate(designs):
+        log = {"t": t, **dict(zip(states, np.array(path)[..., number].T, strict=True)), **{name: signal(t) for name, signal in design.items()}}
+        logs.append(log | {f"{name}_dot": value for name, value in zip(states, rate(log), strict=True)})
+    return logs
 
 
-def multisine(seed: np.random.Generator, mean: float, amplitude: float, count: int = 4) -> Callable[[np.ndarray], np.ndarray]:
-    """A sum of sines with random periods between 5 s and 70 s and random phases."""
-    period = np.exp(seed.uniform(np.log(5), np.log(70), count))
+def multisine(
+    seed: np.random.Generator, mean: float, amplitude: float, periods: tuple[float, float] = (5.0, 70.0), count: int = 4
+) -> Callable[[np.ndarray], np.ndarray]:
+    """A sum of sines with random periods (in s), phases and shares."""
+    period = np.exp(seed.uniform(np.log(periods[0]), np.log(periods[1]), count))
     phase, share = seed.uniform(0, 2 * np.pi, count), seed.dirichlet(np.full(count, 3.0))
     return lambda t: mean + amplitude * (share * np.sin(2 * np.pi * np.asarray(t)[..., None] / period + phase)).sum(-1) * np.sqrt(count)
 
 
-def force_log(number: int, seconds: float = 300.0, step: float = 0.1) -> dict[str, np.ndarray]:
-    """A random multi-sine design of forces."""
+def force_logs(
+    count: int, seconds: float = 300.0, step: float = 0.1, periods: tuple[float, float] = (5.0, 70.0), first: int = 0
+) -> list[dict[str, np.ndarray]]:
+    """Random multi-sine designs of forces."""
+    designs = []
+    for number in range(first, first + count):
+        seed = np.random.default_rng(number)
+        ranges = {"tau_x": (2000, 4000), "tau_y": (0, 1500), "tau_n": (0, 2500)}
+        designs.append({name: multisine(seed, mean, amplitude, periods) for name, (mean, amplitude) in ranges.items()})
+    return simulate(force_rate, ("u", "v", "r"), designs, seconds, step)
+
+
+def jet_logs(count: int, seconds: float = 300.0, step: float = 0.1) -> list[dict[str, np.ndarray]]:
+    """Random multi-sine designs of motor speed (rpm) and nozzle angle (rad)."""
+    seeds = [np.random.default_rng(1000 + number) for number in range(count)]
+    designs = [{"rpm": multisine(seed, 1000, 500), "nozzle": multisine(seed, 0.0, 0.25)} for seed in seeds]
+    return simulate(jet_rate, ("u", "v", "r"), designs, seconds, step)
+
+
+def step_log(number: int, seconds: float = 300.0, step: float = 0.1, every: float = 10.0) -> dict[str, np.ndarray]:
+    """Forces that jump to random levels every so many seconds."""
     seed = np.random.default_rng(number)
-    inputs = {"tau_x": multisine(seed, 2000, 4000), "tau_y": multisine(seed, 0, 1500), "tau_n": multisine(seed, 0, 2500)}
-    return simulate(force_rate, ("u", "v", "r"), inputs, seconds, step)
+    count = round(seconds / every)
+    levels = {"tau_x": seed.uniform(-2000, 6000, count), "tau_y": seed.uniform(-1500, 1500, count), "tau_n": seed.uniform(-2500, 2500, count)}
 
+    def held(values: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+        return lambda t: values[np.minimum((np.asarray(t) + 1e-9) // every, count - 1).astype(int)]
 
-def jet_log(number: int, seconds: float = 300.0, step: float = 0.1) -> dict[str, np.ndarray]:
-    """A random multi-sine design of motor speed (rpm) and nozzle angle (rad)."""
-    seed = np.random.default_rng(1000 + number)
-    return simulate(jet_rate, ("u", "v", "r"), {"rpm": multisine(seed, 1000, 500), "nozzle": multisine(seed, 0.0, 0.25)}, seconds, step)
+    design = {name: held(values) for name, values in levels.items()}
+    return simulate(force_rate, ("u", "v", "r"), [design], seconds, step, within=5)[0]
 
 
 def msd_log(seconds: float = 50.0, step: float = 0.1, delay: float = 0.0) -> dict[str, np.ndarray]:
@@ -113,5 +144,5 @@ def msd_log(seconds: float = 50.0, step: float = 0.1, delay: float = 0.0) -> dic
     def late(t: np.ndarray) -> np.ndarray:
         return square(np.maximum(np.asarray(t) - delay, 0.0))
 
-    log = simulate(msd_rate, ("x", "w"), {"tau": late}, seconds, step)
+    log = simulate(msd_rate, ("x", "w"), [{"tau": late}], seconds, step, within=5)[0]
     return log | {"tau_late": log["tau"], "tau": square(log["t"])}

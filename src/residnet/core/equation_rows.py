@@ -73,7 +73,7 @@ class Weak(Estimator):
     """
 
     kind: Literal["weak"] = "weak"
-    window: Seconds = Field(default=4.0, gt=0.0)
+    window: Seconds = Field(default=2.0, gt=0.0)
     every: float = Field(default=0.05, gt=0.0, le=1.0)
 
     def rows(self, sampled: Rows, step: float, exact: np.ndarray) -> Rows:

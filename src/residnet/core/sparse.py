@@ -39,10 +39,10 @@ class SearchConfig(Config):
     """
 
     max_terms: int = Field(default=30, ge=1, le=80)
-    gamma: float = Field(default=0.5, ge=0.0, le=1.0)
+    gamma: float = Field(default=1.0, ge=0.0, le=1.0)
     precision: float = Field(default=1e-13, ge=1e-15, lt=1.0)
     swaps: int = Field(default=3, ge=1, le=3)
-    resolution: float = Field(default=1e-3, ge=0.0, lt=1.0)
+    resolution: float = Field(default=1e-2, ge=0.0, lt=1.0)
 
 
 @dataclass(frozen=True)

@@ -132,13 +132,14 @@ class Search:
         return best
 
     def refine(self, chosen: list[int], swaps: int) -> list[int]:
-        """Swaps until none betters the criterion: one for one, then two for one, three for two; every gain is trimmed backward."""
+        """Swaps until none betters the criterion, each k chosen columns for k others, k - 1 or (k = 0) one more; every gain is trimmed backward."""
         value = self.value(chosen)
         again = True
         while again and chosen:
             again = False
-            for out, into in ((1, 1), (2, 1), (3, 2))[:swaps]:
-                if out > len(chosen):
+            for out, into in ((1, 1), (0, 1), (2, 1), (2, 2), (3, 2)):
+                # an exact fit can only become shorter
+                if out > min(swaps, len(chosen)) or (into >= out and self.rule.exact(self.rss(chosen))):
                     continue
                 found = self._swapped(chosen, out, into)
                 if found is not None and found[0] < value - 1e-6:
