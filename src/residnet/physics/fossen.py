@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Literal, final
+from abc import ABC, abstractmethod
+from typing import Any, Literal, final
 
 import torch
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 from torch import Tensor, nn
 
 from residnet.core.config import Config
@@ -13,6 +14,7 @@ from residnet.core.errors import ConfigError
 from residnet.core.names import VELOCITY
 from residnet.physics.actuators import ActuatorsConfig
 from residnet.physics.environment_wind import WindLoadsConfig
+from residnet.physics.inherit import with_base
 from residnet.physics.kinematics import Planar
 from residnet.physics.mass import inverse_mass
 from residnet.physics.parameters import Inertia, Length, Mass, MassArm, Parameter, above_zero, dimension, unit_text
@@ -65,28 +67,41 @@ class Damping(Config):
         return self
 
 
-class FossenConfig(Config):
-    """A 3-DOF vessel: inertia, added mass, damping by terms, actuators.
+class HullConfig(Config, ABC):
+    """A 3-DOF vessel M nu_dot + C(nu) nu + D(nu) nu = tau; a file may name another one as `base` and give only what differs.
 
     Attributes:
         name: of the vessel, as its file is called.
         description: one line for `residnet list vessels`.
         length: of the hull, which manoeuvring indices are measured in.
+        scale: what M, C and D are all multiplied by: a true vessel beside the believed one of its `base` (document 002 eq. (4.2)).
         wind: coefficients of the hull above water; without them the vessel feels no wind.
     """
 
-    kind: Literal["fossen"] = "fossen"
     name: str
     description: str
     length: Length
-    rigid_body: RigidBody
-    added_mass: AddedMass
+    scale: float = Field(default=1.0, gt=0)
     damping: Damping
     actuators: ActuatorsConfig
     wind: WindLoadsConfig | None = None
 
     _positive = field_validator("length")(above_zero)
 
+    @model_validator(mode="before")
+    @classmethod
+    def _base(cls, data: Any, info: ValidationInfo) -> Any:
+        return with_base(data, (info.context or {}).get("folder"))
+
+    @abstractmethod
+    def mass_matrix(self) -> list[list[float]]:
+        """M [3, 3], without the scale."""
+
+    @abstractmethod
+    def coupling(self) -> float:
+        """What r is multiplied by in the sway momentum of C(nu), in kg m, without the scale."""
+
+    @final
     def build(self) -> FossenVessel:
         """The plant.
 
@@ -96,32 +111,73 @@ class FossenConfig(Config):
         return FossenVessel(self)
 
 
+class FossenConfig(HullConfig):
+    """A 3-DOF vessel: inertia, added mass, damping by terms, actuators."""
+
+    kind: Literal["fossen"] = "fossen"
+    rigid_body: RigidBody
+    added_mass: AddedMass
+
+    def mass_matrix(self) -> list[list[float]]:
+        """Rigid body and added mass."""
+        body, added = self.rigid_body, self.added_mass
+        m, arm = body.m.value, body.m.value * body.x_G.value
+        return [
+            [m - added.X_udot.value, 0.0, 0.0],
+            [0.0, m - added.Y_vdot.value, arm - added.Y_rdot.value],
+            [0.0, arm - added.N_vdot.value, body.I_z.value - added.N_rdot.value],
+        ]
+
+    def coupling(self) -> float:
+        """The mean of m23 and m32, which makes C that of the symmetric part of M (Fossen 2011 section 6.3)."""
+        mass = self.mass_matrix()
+        return 0.5 * (mass[1][2] + mass[2][1])
+
+
+class MassEntries(Config):
+    """Mass matrix with added mass; the entries that are not here are zero."""
+
+    m11: Mass
+    m22: Mass
+    m23: MassArm
+    m32: MassArm
+    m33: Inertia
+
+
+class MassMatrixConfig(HullConfig):
+    """A 3-DOF vessel whose mass matrix was identified as a whole, as that of milliAmpere (document 002 eqs. (2.3)-(2.6), appendix A)."""
+
+    kind: Literal["mass_matrix"]
+    mass: MassEntries
+
+    def mass_matrix(self) -> list[list[float]]:
+        """As given; it need not be symmetric."""
+        m = self.mass
+        return [[m.m11.value, 0.0, 0.0], [0.0, m.m22.value, m.m23.value], [0.0, m.m32.value, m.m33.value]]
+
+    def coupling(self) -> float:
+        """m23 alone, as (2.5) has it (ERRATA J4)."""
+        return self.mass.m23.value
+
+
 class Fossen3(nn.Module):
     """Acceleration of a vessel in surge, sway and yaw.
 
-    The Coriolis matrix is Fossen's skew form of the whole mass matrix, so inertia does no work. Buffers are float64;
-    results take the dtype of the input.
+    The Coriolis matrix is Fossen's skew form of the whole mass matrix, so inertia does no work where that is symmetric. Buffers are
+    float64; results take the dtype of the input.
     """
 
-    def __init__(self, vessel: FossenConfig) -> None:
+    def __init__(self, vessel: HullConfig) -> None:
         super().__init__()
-        body, added = vessel.rigid_body, vessel.added_mass
-        m, arm = body.m.value, body.m.value * body.x_G.value
-        mass = torch.tensor(
-            [
-                [m - added.X_udot.value, 0.0, 0.0],
-                [0.0, m - added.Y_vdot.value, arm - added.Y_rdot.value],
-                [0.0, arm - added.N_vdot.value, body.I_z.value - added.N_rdot.value],
-            ],
-            dtype=torch.float64,
-        )
+        mass = vessel.scale * torch.tensor(vessel.mass_matrix(), dtype=torch.float64)
+        self.coupling: float = vessel.scale * vessel.coupling()
         self.register_buffer("mass", mass, persistent=False)
         self.register_buffer("inverse", inverse_mass(mass, vessel.name), persistent=False)
         rows = (vessel.damping.X, vessel.damping.Y, vessel.damping.N)
         terms = sorted({term for row in rows for term in row})
         self.terms = TermLibrary(terms, VELOCITY)
         damping = torch.tensor([[row[t].value if t in row else 0.0 for t in terms] for row in rows], dtype=torch.float64)
-        self.register_buffer("damping", damping.reshape(3, len(terms)), persistent=False)
+        self.register_buffer("damping", vessel.scale * damping.reshape(3, len(terms)), persistent=False)
         self.register_buffer("response", torch.zeros(3, 0, dtype=torch.float64), persistent=False)
         self.compacted = False
         self.gather: list[Tensor] = []
@@ -134,7 +190,7 @@ class Fossen3(nn.Module):
         """C(nu) nu [..., 3] in N, N, N m for velocities nu [..., 3]."""
         mass = self.mass.to(nu.dtype)
         u, v, r = nu[..., 0], nu[..., 1], nu[..., 2]
-        a = mass[1, 1] * v + 0.5 * (mass[1, 2] + mass[2, 1]) * r
+        a = mass[1, 1] * v + self.coupling * r
         b = mass[0, 0] * u
         return torch.stack((-a * r, b * r, a * u - b * v), dim=-1)
 
@@ -142,11 +198,14 @@ class Fossen3(nn.Module):
         """D(nu) nu [..., 3] in N, N, N m for velocities nu [..., 3] through the water."""
         return self.terms(nu) @ self.damping.to(nu.dtype).T
 
+    def required(self, nu_dot: Tensor, nu: Tensor) -> Tensor:
+        """Forces [..., 3] that accelerate the vessel by nu_dot [..., 3] at velocities nu [..., 3] (document 002 eq. (2.10))."""
+        return nu_dot @ self.mass.to(nu.dtype).T + self.coriolis(nu) + self.drag(nu)
+
     def compact(self) -> None:
         """Write Coriolis force, drag and tau as one product of terms and a matrix: the same to rounding, with a third of the operations."""
-        m = self.mass
-        cross = 0.5 * (m[1, 2] + m[2, 1])
-        coriolis = {"v r": (0, -m[1, 1]), "r^2": (0, -cross), "u r": (1, m[0, 0]), "u v": (2, m[1, 1] - m[0, 0])}
+        m, cross = self.mass.tolist(), self.coupling
+        coriolis = {"v r": (0, -m[1][1]), "r^2": (0, -cross), "u r": (1, m[0][0]), "u v": (2, m[1][1] - m[0][0])}
         terms = [*self.terms.terms, *coriolis, "u r"]
         force = torch.zeros(3, len(terms), dtype=torch.float64)
         force[:, : self.terms.count] = self.damping
@@ -182,7 +241,7 @@ class FossenVessel(HullPlant):
     State x [B, 6 + k]: x, y [m], psi [rad], u, v [m/s] over ground, r [rad/s], then the actuators' states.
     """
 
-    def __init__(self, vessel: FossenConfig) -> None:
+    def __init__(self, vessel: HullConfig) -> None:
         super().__init__(Planar(), vessel.actuators.build(), vessel.wind.build() if vessel.wind is not None else None)
         self.hull = Fossen3(vessel)
 

@@ -21,7 +21,7 @@ def with_base(data: Any, folder: Path | None) -> Any:
         ValueError: where there is no such file, it cannot be read, or files name each other in a circle.
     """
     seen: list[Path] = []
-    layers = [data]
+    layers = [_frozen(data)]
     while isinstance(layers[-1], dict) and "base" in layers[-1]:
         path = _file(layers[-1]["base"], folder)
         if path in seen:
@@ -29,7 +29,7 @@ def with_base(data: Any, folder: Path | None) -> Any:
         seen.append(path)
         folder = path.parent
         try:
-            layers.append(load_mapping(path))
+            layers.append(_frozen(load_mapping(path)))
         except ConfigError as error:
             raise ValueError(f"base: {error}") from None
     merged = layers[-1]
@@ -50,6 +50,13 @@ def _file(name: object, folder: Path | None) -> Path:
         if candidate.suffix in {".yaml", ".yml"} and candidate.is_file():
             return candidate.resolve()
     raise ValueError(f"base: no vessel '{name}'{nearest(name, files)}; or give the path of a vessel's yaml file")
+
+
+def _frozen(data: Any) -> Any:
+    """The same with tuples for lists: what a validator of a whole model hands on is taken for Python, not for YAML, and lists are no tuples."""
+    if isinstance(data, dict):
+        return {key: _frozen(value) for key, value in data.items()}
+    return tuple(_frozen(value) for value in data) if isinstance(data, list) else data
 
 
 def _laid_over(upper: dict[str, Any], lower: dict[str, Any]) -> dict[str, Any]:

@@ -59,11 +59,11 @@ def above_zero(parameter: Parameter) -> Parameter:
     return parameter
 
 
-_BASE = {"kg": (0, 0), "m": (1, 0), "s": (0, 1), "rad": (0, 0), "N": (1, -2)}
+_BASE = {"kg": (0, 0), "m": (1, 0), "s": (0, 1), "rad": (0, 0), "N": (1, -2), "1": (0, 0), "-": (0, 0)}
 
 
-def dimension(unit: str) -> tuple[int, int] | None:
-    """Powers of metre and second in an SI unit of mass times these, for example (2, -1) for `kg m^2/s` or `N m s/rad`; None for any other."""
+def dimension(unit: str, mass: int = 1) -> tuple[int, int] | None:
+    """Powers of metre and second in an SI unit with `mass` times mass, for example (2, -1) for `kg m^2/s` or `N m s/rad`; None for any other."""
     metres = seconds = masses = 0
     for sign, name, power in re.findall(r"([/ ]?)([^/ ^]*)(?:\^([1-9]))?", unit.strip()):
         if not name:
@@ -73,13 +73,26 @@ def dimension(unit: str) -> tuple[int, int] | None:
         count = int(power or 1) * (-1 if sign == "/" else 1)
         metres, seconds = metres + count * _BASE[name][0], seconds + count * _BASE[name][1]
         masses += count * (name in ("kg", "N"))
-    return (metres, seconds) if masses == 1 else None
+    return (metres, seconds) if masses == mass else None
 
 
-def unit_text(metres: int, seconds: int) -> str:
-    """SI unit `kg m^a s^b` as text."""
+def of_dimension(mass: int, metres: int, seconds: int) -> Callable[[Parameter], Parameter]:
+    """Validator of a parameter in an SI unit of kilogram, metre and second to these powers."""
+
+    def check(parameter: Parameter) -> Parameter:
+        if dimension(parameter.unit, mass) != (metres, seconds):
+            raise ValueError(f"its unit must be {unit_text(metres, seconds, mass)}, given '{parameter.unit}'")
+        return parameter
+
+    return check
+
+
+def unit_text(metres: int, seconds: int, mass: int = 1) -> str:
+    """SI unit `kg^c m^a s^b` as text."""
 
     def powers(sign: int) -> list[str]:
-        return [name + (f"^{sign * p}" if sign * p > 1 else "") for name, p in (("m", metres), ("s", seconds)) if sign * p > 0]
+        given = (("kg", mass), ("m", metres), ("s", seconds))
+        return [name + (f"^{sign * p}" if sign * p > 1 else "") for name, p in given if sign * p > 0]
 
-    return " ".join(["kg", *powers(1)]) + "".join(f"/{name}" for name in powers(-1))
+    above = powers(1) or (["1"] if powers(-1) else ["-"])
+    return " ".join(above) + "".join(f"/{name}" for name in powers(-1))
