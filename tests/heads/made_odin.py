@@ -132,7 +132,7 @@ def step_log(number: int, seconds: float = 300.0, step: float = 0.1, every: floa
         return lambda t: values[np.minimum((np.asarray(t) + 1e-9) // every, count - 1).astype(int)]
 
     design = {name: held(values) for name, values in levels.items()}
-    return simulate(force_rate, ("u", "v", "r"), [design], seconds, step, within=5)[0]
+    return simulate(force_rate, ("u", "v", "r"), [design], seconds, step, within=2)[0]
 
 
 def msd_log(seconds: float = 50.0, step: float = 0.1, delay: float = 0.0) -> dict[str, np.ndarray]:
