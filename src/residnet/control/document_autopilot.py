@@ -82,7 +82,8 @@ class DocumentAutopilot(Policy):
             raise ConfigError(f"document autopilot: limit > 0, candidates >= 2 and 0 <= weight <= 1, given {limit:g}, {candidates}, {weight:g}")
         self.predictor = predictor
         self.weight = weight
-        angles = limit * torch.linspace(-1.0, 1.0, candidates, dtype=torch.float64)
+        # from whole numbers, so that amidships is zero and both sides are alike
+        angles = limit * (torch.arange(1 - candidates, candidates, 2, dtype=torch.float64) / (candidates - 1))
         self.register_buffer("rudder", angles, persistent=False)
         self.rudder: Tensor
 

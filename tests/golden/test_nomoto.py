@@ -1,0 +1,191 @@
+"""Nomoto's model and heading autopilots against golden runs of another implementation (golden/README.md, g5_nomoto).
+
+Neither the README nor ERRATA print the gains of `pd_*` and `timeopt_*` and the steps of `patrol_*`. They were read from the files: a linear
+fit of the unsaturated rows gives the gains to rounding (poles of 2 rad/s and damping 0.9 for `pd_tuned`; 6 and 6 s for the patrol vessel;
+layer and linear law of the time-optimal one), and only steps of 0.05 s (PD) and of 0.25 s (document's controller) give these rows.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from torch import Tensor
+
+from residnet.control import BangBangHeading, ClosedLoop, DocumentAutopilot, GivenReference, HeadingPID, Policy, SimulatedPredictor
+from residnet.dynamics.base import Dynamics
+from residnet.dynamics.nomoto import NomotoDynamics
+from residnet.dynamics.rollout import Rollout, Source
+from residnet.dynamics.simulated import TracedPlantDynamics
+from residnet.manoeuvres import Helm, Zigzag
+from residnet.manoeuvres.base import ScheduleSource
+from residnet.physics.nomoto import NomotoConfig, SteeringVessel
+from residnet.physics.patrol import PatrolConfig
+from residnet.physics.plant import Plant
+from residnet.physics.vessel import load_vessel
+
+GROUP = "g5_nomoto"
+GAIN, TIME = 3.47, 3.94
+LIMIT = float(np.radians(5.0))
+PATROL = {"P06": "patrol_p06", "HYB": "patrol_hyb", "MSS": "patrol_mss"}
+THRUST = 1960 * 7.71**2
+
+Heading = Callable[[np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Case:
+    """What flies: the model and its step, and the source of its rudder for the times of the steps."""
+
+    plant: Plant
+    model: Dynamics
+    source: Callable[[Tensor], Source]
+
+
+def nomoto(rate: str | None = None) -> SteeringVessel:
+    """The vessel of document 004, with a steering gear of `rate` deg/s where there is one."""
+    vessel = load_vessel("nomoto_oceanos")
+    assert isinstance(vessel, NomotoConfig)
+    assert (vessel.K.value, vessel.T.value) == (GAIN, TIME)
+    limited = vessel.rudder.model_copy(update={"rate": None if rate is None else float(np.radians(float(rate)))})
+    return vessel.model_copy(update={"rudder": limited}).build()
+
+
+def patrol(parameters: str) -> Plant:
+    """The patrol vessel with a rudder that stands at its command at once."""
+    vessel = load_vessel(PATROL[parameters])
+    assert isinstance(vessel, PatrolConfig)
+    immediate = vessel.actuators.model_copy(update={"rate": None})
+    return vessel.model_copy(update={"actuators": immediate}).build().in_calm_water()
+
+
+def follow(policy: Policy, heading: Heading, t: Tensor) -> Source:
+    """The policy towards a heading in rad at times t [T]."""
+    return ClosedLoop(policy, GivenReference(torch.from_numpy(heading(t.numpy()))[None, :, None]))
+
+
+def step_to(degrees: float) -> Heading:
+    return lambda t: np.full_like(t, np.radians(degrees))
+
+
+def approach(tau: float) -> Heading:
+    """30 deg (1 - exp(-t / tau)); a step where tau is zero."""
+    return (lambda t: np.radians(30.0) * (1.0 - np.exp(-t / tau))) if tau else step_to(30.0)
+
+
+def rudder_step(angle: str) -> Case:
+    plant = nomoto()
+    steer = np.radians(float(angle)) / plant.delta_max
+    return Case(plant, NomotoDynamics(plant, 0.01), lambda t: ScheduleSource(torch.ones_like(t)[None], steer * (t >= 1.0)[None], plant.demand))
+
+
+def zigzag(angle: str, heading: str, rate: str | None) -> Case:
+    plant = nomoto(rate)
+    manoeuvre = Zigzag(drive=1.0, steer=np.radians(float(angle)) / plant.delta_max, start=0.0, heading=float(np.radians(float(heading))))
+    return Case(plant, NomotoDynamics(plant, 0.01), lambda t: Zigzag.source([manoeuvre], Helm.of(plant), t))
+
+
+def document(horizon: str, tau: str) -> Case:
+    plant = nomoto()
+    predictor = SimulatedPredictor(NomotoDynamics(plant, float(horizon)), plant.state, 1)
+    policy = DocumentAutopilot(predictor, limit=LIMIT)
+    return Case(plant, NomotoDynamics(plant, 0.01), partial(follow, policy, approach(float(tau))))
+
+
+def tuned(heading: str | None = None) -> Case:
+    plant = nomoto()
+    policy = HeadingPID.placed(plant.state, gain=GAIN, time=TIME, frequency=2.0, damping=0.9, limit=LIMIT)
+    return Case(plant, NomotoDynamics(plant, 0.01), partial(follow, policy, step_to(float(heading or 30))))
+
+
+def time_optimal(heading: str | None = None) -> Case:
+    plant = nomoto()
+    policy = BangBangHeading(plant.state, gain=GAIN, time=TIME, limit=LIMIT)
+    return Case(plant, NomotoDynamics(plant, 0.01), partial(follow, policy, step_to(float(heading or 30))))
+
+
+def patrol_document(parameters: str, horizon: str, tau: str | None, spacing: float = 0.25) -> Case:
+    plant, h = patrol(parameters), float(horizon)
+    # whole steps of at most 0.25 s make both the spacing of the rows and the horizon
+    dt = min(spacing / np.ceil(spacing / 0.25 - 1e-9), h)
+    model = TracedPlantDynamics(plant, dt)
+    predictor = SimulatedPredictor(model, plant.state, round(h / dt), torch.tensor([THRUST], dtype=torch.float64))
+    return Case(plant, model, partial(follow, DocumentAutopilot(predictor, limit=LIMIT), approach(float(tau or 0))))
+
+
+def patrol_pd(parameters: str, heading: str) -> Case:
+    plant = patrol(parameters)
+    policy = HeadingPID(plant.state, kp=6.0, kd=6.0, limit=LIMIT)
+    return Case(plant, TracedPlantDynamics(plant, 0.05), partial(follow, policy, step_to(float(heading))))
+
+
+NUMBER = r"(\d+(?:\.\d+)?)"
+RUNS: dict[str, Callable[..., Case]] = {
+    rf"step{NUMBER}": rudder_step,
+    rf"zigzag_{NUMBER}_{NUMBER}(?:_rate{NUMBER})?": zigzag,
+    rf"docctrl_h{NUMBER}_tau{NUMBER}": document,
+    rf"pd_tuned_step{NUMBER}?": tuned,
+    rf"timeopt_step{NUMBER}?": time_optimal,
+    rf"patrol_(\w+)_docctrl_h{NUMBER}(?:_tau{NUMBER})?": patrol_document,
+    rf"patrol_(\w+)_pd_step{NUMBER}": patrol_pd,
+}
+
+
+def case_of(path: Path, **known: float) -> Case:
+    """Set-up that a name stands for; `spacing` of its rows in s where it is known."""
+    name = path.name.removesuffix(".csv.gz")
+    for pattern, make in RUNS.items():
+        if match := re.fullmatch(pattern, name):
+            return make(*match.groups(), **known) if make is patrol_document else make(*match.groups())
+    raise AssertionError(f"{name}: no run is written so")
+
+
+def fly(case: Case, steps: int) -> dict[str, np.ndarray]:
+    """Channels [T] of a run, with the rudder angle and the command that act from each time on."""
+    plant, dt = case.plant, case.model.dt
+    t = torch.arange(steps, dtype=torch.float64) * dt
+    x0 = plant.approach(1)
+    w = torch.zeros(1, steps, len(plant.inputs), dtype=torch.float64)
+    w[:, :, 1:] = THRUST
+    with torch.no_grad():
+        states, inputs, _ = Rollout(case.model, case.source(t))(x0, w, x0[:, :0])
+    out = dict(zip(plant.state, states[0, :-1].T.numpy(), strict=True))
+    out["delta_cmd"] = inputs[0, :, 0].numpy()
+    return {"delta": out["delta_cmd"], **out}
+
+
+def test_trajectory(golden_file: Path) -> None:
+    frame = pd.DataFrame(np.loadtxt(golden_file, delimiter=",", skiprows=1), columns=pd.read_csv(golden_file, nrows=0).columns)
+    case = case_of(golden_file, spacing=float(frame["t"].iloc[1]))
+    rows = np.rint(frame["t"].to_numpy() / case.model.dt).astype(int)
+    np.testing.assert_allclose(frame["t"], rows * case.model.dt, atol=1e-9)
+    simulated = fly(case, rows[-1] + 1)
+    for name in frame.columns.drop("t"):
+        truth = frame[name].to_numpy()
+        apart, allowed = np.abs(simulated[name][rows] - truth).max(), 1e-6 * np.ptp(truth) + 1e-12
+        assert apart <= allowed, f"{name} differs by {apart:.3g} (allowed {allowed:.3g})"
+
+
+def test_names_of_further_files_are_understood() -> None:
+    """Files are kept back for acceptance: names of the same pattern give the set-ups that golden/README.md describes."""
+    case = case_of(Path("zigzag_20_10_rate10.csv.gz"))
+    assert case.plant.state[-1] == "delta"
+    run = fly(case, 300)
+    assert float(np.abs(np.diff(run["delta"])).max()) == pytest.approx(np.radians(10.0) * 0.01)
+    assert set(np.round(np.degrees(run["delta_cmd"]), 9)) == {20.0, -20.0}
+    late = fly(case_of(Path("docctrl_h0.5_tau5.csv.gz")), 2)
+    assert late["delta"][0] == 0.0, "the reference begins at the heading"
+    assert case_of(Path("patrol_HYB_docctrl_h2.csv.gz")).model.dt == 0.25
+    assert case_of(Path("patrol_HYB_docctrl_h2.csv.gz"), spacing=0.5).model.dt == 0.25
+    assert case_of(Path("patrol_HYB_docctrl_h2.csv.gz"), spacing=0.1).model.dt == 0.1
+    assert case_of(Path("patrol_HYB_pd_step30.csv.gz")).model.dt == 0.05
+    assert np.degrees(fly(case_of(Path("step2.5.csv.gz")), 102)["delta"][99:]).tolist() == pytest.approx([0.0, 2.5, 2.5])
+    with pytest.raises(AssertionError, match="no run"):
+        case_of(Path("turn_5.csv.gz"))
