@@ -12,11 +12,14 @@ from residnet.core.errors import ConfigError
 from residnet.core.names import nearest
 from residnet.core.resources import config_folder
 from residnet.physics.abkowitz import AbkowitzConfig
-from residnet.physics.fossen import FossenConfig
+from residnet.physics.fossen import FossenConfig, MassMatrixConfig
 from residnet.physics.nomoto import NomotoConfig, SecondOrderNomotoConfig, SideslipNomotoConfig
+from residnet.physics.odin import OdinConfig
 from residnet.physics.patrol import PatrolConfig
 
-AnyVessel = FossenConfig | AbkowitzConfig | PatrolConfig | NomotoConfig | SecondOrderNomotoConfig | SideslipNomotoConfig
+AnyVessel = (
+    FossenConfig | MassMatrixConfig | AbkowitzConfig | OdinConfig | PatrolConfig | NomotoConfig | SecondOrderNomotoConfig | SideslipNomotoConfig
+)
 VesselConfig = Annotated[AnyVessel, Field(discriminator="kind")]
 
 

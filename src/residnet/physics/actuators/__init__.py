@@ -6,14 +6,16 @@ from typing import Annotated
 
 from pydantic import Field
 
+from residnet.physics.actuators.azimuth import AzimuthThrusters, AzimuthThrustersConfig
 from residnet.physics.actuators.base import ActuatorConfig, Actuators
 from residnet.physics.actuators.differential_thrust import DifferentialThrust, DifferentialThrustConfig
 from residnet.physics.actuators.forces import ForceCommands, ForceCommandsConfig
 from residnet.physics.actuators.rudder_propeller import RudderPropeller, RudderPropellerConfig
 from residnet.physics.actuators.thrusters import Thrusters, ThrustersConfig
+from residnet.physics.actuators.waterjet import WaterJets, WaterJetsConfig
 
 ActuatorsConfig = Annotated[
-    DifferentialThrustConfig | ForceCommandsConfig | RudderPropellerConfig | ThrustersConfig,
+    AzimuthThrustersConfig | DifferentialThrustConfig | ForceCommandsConfig | RudderPropellerConfig | ThrustersConfig | WaterJetsConfig,
     Field(discriminator="kind"),
 ]
 
@@ -21,6 +23,8 @@ __all__ = [
     "ActuatorConfig",
     "Actuators",
     "ActuatorsConfig",
+    "AzimuthThrusters",
+    "AzimuthThrustersConfig",
     "DifferentialThrust",
     "DifferentialThrustConfig",
     "ForceCommands",
@@ -29,4 +33,6 @@ __all__ = [
     "RudderPropellerConfig",
     "Thrusters",
     "ThrustersConfig",
+    "WaterJets",
+    "WaterJetsConfig",
 ]

@@ -1,0 +1,152 @@
+"""Azimuth thrusters: forces from revolutions and angles, and the allocation of wanted forces to them (document 002 eqs. (5.1), (5.2))."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, final
+
+import numpy as np
+import torch
+from pydantic import Field, model_validator
+from torch import Tensor
+
+from residnet.core.config import Config, Metres, Radians, RadiansPerSecond, RevRate, RevsPerSecond
+from residnet.physics.actuators.base import ActuatorConfig, Actuators
+from residnet.physics.actuators.servo import Servo, ServoConfig, Servos
+from residnet.physics.actuators.thrust_curve import CurveRange, require_range
+
+
+class PropellerShaftConfig(ServoConfig):
+    """Revolutions of either direction, and how fast they change (None for at once)."""
+
+    n_max: RevsPerSecond = Field(gt=0)
+    n_rate: RevRate | None = Field(default=None, gt=0)
+
+
+class AzimuthConfig(ServoConfig):
+    """Angle to either side of the bow, and how fast it turns (None for at once); it does not turn through its limit."""
+
+    limit: Radians = Field(default=3.141592653589793, gt=0)
+    rate: RadiansPerSecond | None = Field(default=None, gt=0)
+
+
+class PlaceConfig(Config):
+    """One thruster: what ends the names of its channels, and its place from the body origin, forward and to starboard."""
+
+    name: str = Field(pattern=r"^[a-z0-9][a-z0-9_]*$")
+    x: Metres
+    y: Metres = 0.0
+
+
+class AzimuthThrustersConfig(ActuatorConfig):
+    """Equal thrusters that turn; commands cmd_n_<name> [1/s], then cmd_alpha_<name> [rad] from the bow, clockwise.
+
+    Attributes:
+        places: of the thrusters.
+        thrust: coefficients c0, c1, ... of the force T = c0 + c1 n + c2 n^2 + ... in N, n in 1/s.
+        curve_range: revolutions (astern, ahead) that the curve was measured between; it must rise between +-n_max.
+    """
+
+    kind: Literal["azimuth_thrusters"]
+    places: Annotated[tuple[PlaceConfig, ...], Field(min_length=1)]
+    thrust: Annotated[tuple[float, ...], Field(min_length=2)]
+    curve_range: CurveRange | None = None
+    shaft: PropellerShaftConfig
+    azimuth: AzimuthConfig = AzimuthConfig()
+
+    @property
+    def n_max(self) -> float:
+        """Largest revolutions of either direction in 1/s."""
+        return self.shaft.n_max
+
+    @model_validator(mode="after")
+    def _consistent(self) -> AzimuthThrustersConfig:
+        names = [place.name for place in self.places]
+        if repeated := [name for name in names if names.count(name) > 1]:
+            raise ValueError(f"two thrusters are named '{repeated[0]}'")
+        require_range(self)
+        n = np.linspace(-self.n_max, self.n_max, 401)
+        falling = n[np.polynomial.Polynomial(self.thrust).deriv()(n) <= 0]
+        if len(falling):
+            raise ValueError(f"thrust falls with the revolutions at {falling[0] * 60:.0f} rpm: a force has no one speed there; lower n_max")
+        if len(self.places) == 1 or len({(place.x, place.y) for place in self.places}) == 1:
+            raise ValueError("thrusters at one place cannot make surge, sway and yaw independently; give two places")
+        return self
+
+    def build(self) -> AzimuthThrusters:
+        """The module."""
+        return AzimuthThrusters(self)
+
+
+@final
+class AzimuthThrusters(Actuators):
+    """Revolutions and angles of k thrusters -> tau [..., 3]."""
+
+    def __init__(self, config: AzimuthThrustersConfig) -> None:
+        super().__init__()
+        names = [place.name for place in config.places]
+        self.count = len(names)
+        shaft, azimuth = config.shaft, config.azimuth
+        servos: list[Servo] = [shaft.follow(f"n_{name}", shaft.n_max, shaft.n_rate) for name in names]
+        servos += [azimuth.follow(f"alpha_{name}", azimuth.limit, azimuth.rate) for name in names]
+        self.servos = Servos(servos)
+        self.state = self.servos.state
+        self.commands = (*(f"cmd_n_{name}" for name in names), *(f"cmd_alpha_{name}" for name in names))
+        self.n_max = shaft.n_max
+        self.coefficients = list(config.thrust)
+        # tau = map [3, 2k] of the components forward, then to starboard, of every thruster
+        one, zero = [1.0] * self.count, [0.0] * self.count
+        rows = [one + zero, zero + one, [-place.y for place in config.places] + [place.x for place in config.places]]
+        self.register_buffer("map", torch.tensor(rows, dtype=torch.float64), persistent=False)
+        self.map: Tensor
+        self.register_buffer("share", torch.linalg.pinv(self.map), persistent=False)
+        self.share: Tensor
+        self.strongest = float(self.thrust(torch.tensor(self.n_max, dtype=torch.float64)))
+
+    def thrust(self, n: Tensor) -> Tensor:
+        """Force [N] of one thruster along its axis at revolutions n [1/s], any shape (5.1)."""
+        out = torch.full_like(n, self.coefficients[-1])
+        for c in self.coefficients[-2::-1]:
+            out = c + n * out
+        return out
+
+    def revolutions(self, force: Tensor) -> Tensor:
+        """Revolutions n [1/s] within +-n_max that make a force [N], any shape; without gradient."""
+        low, high = torch.full_like(force, -self.n_max), torch.full_like(force, self.n_max)
+        for _ in range(52):
+            middle = 0.5 * (low + high)
+            short = self.thrust(middle) < force
+            low, high = torch.where(short, middle, low), torch.where(short, high, middle)
+        return 0.5 * (low + high)
+
+    def allocate(self, tau: Tensor) -> Tensor:
+        """Commands [..., 2k] that make forces tau [..., 3] with the least sum of squared thrusts; thrusts beyond the largest saturate."""
+        parts = tau @ self.share.to(tau.dtype).T
+        return self._commands(parts[..., : self.count], parts[..., self.count :])
+
+    def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
+        """Drive is surge force and steer the yaw moment, as shares of what the thrusters make together; each thruster saturates."""
+        zero = torch.zeros_like(drive)
+        lever = self.map[2].abs().sum() / 2.0
+        both = torch.stack((drive.clamp(-1, 1) * self.count, zero, steer.clamp(-1, 1) * lever.to(drive.dtype)), dim=-1)
+        return self.allocate(both * self.strongest)
+
+    def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
+        """tau [..., 3] in N, N, N m (5.2)."""
+        state = self.servos.value(a, command)
+        thrust, angle = self.thrust(state[..., : self.count]), state[..., self.count :]
+        parts = torch.cat((thrust * torch.cos(angle), thrust * torch.sin(angle)), dim=-1)
+        return parts @ self.map.to(parts.dtype).T
+
+    def rate(self, a: Tensor, command: Tensor) -> Tensor:
+        """Derivative [..., k] of the states."""
+        return self.servos.rate(a, command)
+
+    def advance(self, a: Tensor, command: Tensor, dt: float) -> Tensor:
+        """States [..., k] after a step of dt seconds."""
+        return self.servos.advance(a, command, dt)
+
+    def _commands(self, along: Tensor, across: Tensor) -> Tensor:
+        """Revolutions and angles from components [..., k]."""
+        size = torch.hypot(along, across)
+        angle = torch.where(size > 0, torch.atan2(across, along), torch.zeros_like(size))
+        return torch.cat((self.revolutions(size.clamp(max=self.strongest)), angle), dim=-1)

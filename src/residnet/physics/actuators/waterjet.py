@@ -1,0 +1,125 @@
+"""Water jets with a common nozzle angle and a common motor speed (document 000 eqs. (6.12)-(6.16), ERRATA H10-H16)."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, final
+
+import torch
+from pydantic import AfterValidator, Field, field_validator
+from torch import Tensor
+
+from residnet.core.config import Config, Metres, Radians, RadiansPerSecond, RevRate, RevsPerSecond
+from residnet.physics.actuators.base import ActuatorConfig, Actuators
+from residnet.physics.actuators.servo import ServoConfig, Servos
+from residnet.physics.parameters import Parameter, above_zero, of_dimension
+
+Force = Annotated[Parameter, AfterValidator(of_dimension(1, 1, -2))]
+ForcePerSpeed = Annotated[Parameter, AfterValidator(of_dimension(1, 0, -1))]
+ForcePerSquaredSpeed = Annotated[Parameter, AfterValidator(of_dimension(1, -1, 0))]
+Ratio = Annotated[Parameter, AfterValidator(of_dimension(0, 0, 0))]
+PerRevolutions = Annotated[Parameter, AfterValidator(of_dimension(0, 0, 1))]
+PerSquaredRevolutions = Annotated[Parameter, AfterValidator(of_dimension(0, 0, 2))]
+
+
+class SpeedCurve(Config):
+    """Thrust at the reference revolutions over the speed through the water in m/s: a0 + a1 u + a2 u^2."""
+
+    a0: Force
+    a1: ForcePerSpeed
+    a2: ForcePerSquaredSpeed
+
+
+class RevolutionsCurve(Config):
+    """Share of it at n revolutions per second: (r0 + r1 n + r2 n^2) / reference."""
+
+    r0: Ratio
+    r1: PerRevolutions
+    r2: PerSquaredRevolutions
+    reference: Ratio
+
+    _positive = field_validator("reference")(above_zero)
+
+
+class MotorConfig(ServoConfig):
+    """The motor of each jet: revolutions between zero and n_max, and how fast they may change (None for at once)."""
+
+    n_max: RevsPerSecond = Field(gt=0)
+    n_rate: RevRate | None = Field(default=None, gt=0)
+
+
+class NozzleConfig(ServoConfig):
+    """The nozzles: largest angle to either side, and how fast they turn (None for at once)."""
+
+    limit: Radians = Field(gt=0, lt=1.5707)
+    rate: RadiansPerSecond | None = Field(default=None, gt=0)
+
+
+class WaterJetsConfig(ActuatorConfig):
+    """Equal water jets that turn and run together; commands cmd_n [1/s] and cmd_nozzle [rad], whose thrust pushes to starboard where positive.
+
+    Attributes:
+        jets: how many there are.
+        x: place of the nozzles ahead of the body origin; negative astern.
+        speed, revolutions: the two parabolas whose product is the thrust of one jet (6.16); below some revolutions it may be negative (H15).
+    """
+
+    kind: Literal["water_jets"]
+    jets: int = Field(gt=0)
+    x: Metres
+    speed: SpeedCurve
+    revolutions: RevolutionsCurve
+    motor: MotorConfig
+    nozzle: NozzleConfig
+
+    def build(self) -> WaterJets:
+        """The module."""
+        return WaterJets(self)
+
+
+@final
+class WaterJets(Actuators):
+    """Motor speed and nozzle angle -> tau [..., 3]."""
+
+    commands = ("cmd_n", "cmd_nozzle")
+
+    def __init__(self, config: WaterJetsConfig) -> None:
+        super().__init__()
+        motor, nozzle = config.motor, config.nozzle
+        self.servos = Servos([motor.follow("n", motor.n_max, motor.n_rate), nozzle.follow("nozzle", nozzle.limit, nozzle.rate)])
+        self.state = self.servos.state
+        self.n_max = motor.n_max
+        self.angle = nozzle.limit
+        self.jets = float(config.jets)
+        self.x = config.x
+        speed, revolutions = config.speed, config.revolutions
+        self.a = [p.value for p in (speed.a0, speed.a1, speed.a2)]
+        self.c = [p.value / revolutions.reference.value for p in (revolutions.r0, revolutions.r1, revolutions.r2)]
+
+    def thrust(self, n: Tensor, u: Tensor) -> Tensor:
+        """Thrust [N] of one jet at revolutions n [1/s] and speed u [m/s], any shape (6.16)."""
+        a, c = self.a, self.c
+        return (a[0] + u * (a[1] + u * a[2])) * (c[0] + n * (c[1] + n * c[2]))
+
+    def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
+        """Commands [..., 2]: drive ahead is the share of the motor's revolutions (jets do not push astern), steer the yaw moment's sense."""
+        side = self.angle if self.x > 0 else -self.angle
+        return torch.stack((drive.clamp(0.0, 1.0) * self.n_max, steer.clamp(-1.0, 1.0) * side), dim=-1)
+
+    def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
+        """tau [..., 3] in N, N, N m (6.12)-(6.14)."""
+        state = self.servos.value(a, self._ahead(command))
+        total = self.jets * self.thrust(state[..., 0], nu[..., 0])
+        across = total * torch.sin(state[..., 1])
+        return torch.stack((total * torch.cos(state[..., 1]), across, self.x * across), dim=-1)
+
+    def rate(self, a: Tensor, command: Tensor) -> Tensor:
+        """Derivative [..., k] of the states."""
+        return self.servos.rate(a, self._ahead(command))
+
+    def advance(self, a: Tensor, command: Tensor, dt: float) -> Tensor:
+        """States [..., k] after a step of dt seconds."""
+        return self.servos.advance(a, self._ahead(command), dt)
+
+    def _ahead(self, command: Tensor) -> Tensor:
+        """Commands [..., 2] without negative revolutions."""
+        return torch.stack((command[..., 0].clamp(min=0.0), command[..., 1]), dim=-1)

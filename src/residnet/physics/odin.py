@@ -1,0 +1,129 @@
+"""The USV Odin: accelerations as terms of the velocities, and forces by their gains (document 000 eqs. (6.6)-(6.8), ERRATA H1-H5)."""
+
+from __future__ import annotations
+
+from typing import Any, Literal, final
+
+import torch
+from pydantic import Field, ValidationInfo, field_validator, model_validator
+from torch import Tensor, nn
+
+from residnet.core.config import Config
+from residnet.core.errors import ConfigError
+from residnet.core.names import VELOCITY
+from residnet.physics.actuators import ActuatorsConfig
+from residnet.physics.environment_wind import WindLoadsConfig
+from residnet.physics.inherit import with_base
+from residnet.physics.kinematics import Planar
+from residnet.physics.parameters import Length, Parameter, above_zero, dimension, of_dimension, unit_text
+from residnet.physics.plant import HullPlant
+from residnet.physics.terms import TermLibrary, parse_term
+
+
+class Gains(Config):
+    """Acceleration per force or moment on each axis: x, y in 1/kg, n in 1/(kg m^2)."""
+
+    x: Parameter
+    y: Parameter
+    n: Parameter
+
+    _linear = field_validator("x", "y")(of_dimension(-1, 0, 0))
+    _angular = field_validator("n")(of_dimension(-1, -2, 0))
+    _positive = field_validator("x", "y", "n")(above_zero)
+
+
+class AccelerationTerms(Config):
+    """Accelerations without force as terms of (u, v, r), with the sign that they act with: what brakes is negative."""
+
+    u: dict[str, Parameter] = Field(default_factory=dict)
+    v: dict[str, Parameter] = Field(default_factory=dict)
+    r: dict[str, Parameter] = Field(default_factory=dict)
+
+    def rows(self) -> tuple[dict[str, Parameter], ...]:
+        """Terms of u_dot, v_dot, r_dot."""
+        return self.u, self.v, self.r
+
+    @model_validator(mode="after")
+    def _units(self) -> AccelerationTerms:
+        for axis, row in zip(VELOCITY, self.rows(), strict=True):
+            for term, parameter in row.items():
+                try:
+                    factors = parse_term(term, VELOCITY, functions=False)
+                except ConfigError as error:
+                    raise ValueError(f"{axis}: {error}") from None
+                if any(factor.power < 0 for factor in factors):
+                    raise ValueError(f"{axis}: term '{term}' is infinite at rest")
+                metres = (axis != "r") - sum(factor.power for factor in factors if factor.name != "r")
+                seconds = -2 + sum(factor.power for factor in factors)
+                if dimension(parameter.unit, 0) != (metres, seconds):
+                    raise ValueError(f"{axis}.{term}: its unit must be {unit_text(metres, seconds, 0)}, given '{parameter.unit}'")
+        return self
+
+
+class OdinConfig(Config):
+    """A 3-DOF vessel known by its accelerations; a file may name another one as `base` and give only what differs.
+
+    Attributes:
+        name: of the vessel, as its file is called.
+        description: one line for `residnet list vessels`.
+        length: of the hull, which manoeuvring indices and the Froude number are measured with.
+        gains: acceleration per force.
+        terms: acceleration without force.
+        wind: coefficients of the hull above water; without them the vessel feels no wind.
+    """
+
+    kind: Literal["odin"]
+    name: str
+    description: str
+    length: Length
+    gains: Gains
+    terms: AccelerationTerms
+    actuators: ActuatorsConfig
+    wind: WindLoadsConfig | None = None
+
+    _positive = field_validator("length")(above_zero)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _base(cls, data: Any, info: ValidationInfo) -> Any:
+        return with_base(data, (info.context or {}).get("folder"))
+
+    def build(self) -> OdinVessel:
+        """The plant."""
+        return OdinVessel(self)
+
+
+class AccelerationHull(nn.Module):
+    """nu_dot = gain tau + terms of the velocities. Buffers are float64; results take the dtype of the input."""
+
+    def __init__(self, gains: Gains, terms: AccelerationTerms) -> None:
+        super().__init__()
+        rows = terms.rows()
+        used = sorted({term for row in rows for term in row})
+        self.terms = TermLibrary(used, VELOCITY)
+        coefficients = [[row[term].value if term in row else 0.0 for row in rows] for term in used]
+        self.register_buffer("coefficients", torch.tensor(coefficients, dtype=torch.float64).reshape(len(used), 3), persistent=False)
+        gain = [gains.x.value, gains.y.value, gains.n.value]
+        self.register_buffer("gain", torch.tensor(gain, dtype=torch.float64), persistent=False)
+        self.coefficients: Tensor
+        self.gain: Tensor
+
+    def forward(self, nu: Tensor, tau: Tensor) -> Tensor:
+        """Acceleration nu_dot [..., 3] from velocities through the water nu [..., 3] and forces tau [..., 3] in N, N, N m."""
+        return tau * self.gain.to(nu.dtype) + self.terms(nu) @ self.coefficients.to(nu.dtype)
+
+
+@final
+class OdinVessel(HullPlant):
+    """The hull with its actuators, in current and external force.
+
+    State x [B, 6 + k]: x, y [m], psi [rad], u, v [m/s] over ground, r [rad/s], then the actuators' states.
+    """
+
+    def __init__(self, vessel: OdinConfig) -> None:
+        super().__init__(Planar(), vessel.actuators.build(), vessel.wind.build() if vessel.wind is not None else None)
+        self.hull = AccelerationHull(vessel.gains, vessel.terms)
+
+    def acceleration(self, pose: Tensor, nu: Tensor, tau: Tensor) -> Tensor:
+        """nu_dot [B, 3] from velocities through the water [B, 3] and forces [B, 3]."""
+        return self.hull(nu, tau)
