@@ -33,7 +33,7 @@ class SearchConfig(Config):
         max_terms: most terms of an equation on the way of the search; the result usually has fewer.
         gamma: weight of the number of candidates in the extended BIC (Chen and Chen 2008), n ln(RSS) + k ln(n) + 2 gamma ln(J over k); 0 is BIC.
         precision: error relative to the target below which a fit counts as exact.
-        swaps: k of the largest swap of k terms for k - 1.
+        swaps: most terms that are taken out at once, for as many others or one less.
         resolution: share of its length by which a term must differ from simpler ones where the data are noisy (or the unexplained share of the
             target, if that is less). u|u| differs from u^2 by noise alone on a vessel that is at rest for a moment and never goes astern.
     """
@@ -105,7 +105,7 @@ NOTHING = Equation((), np.zeros(0), np.zeros(0), 1.0, False, 0.0, 0, {}, {})
 """The equation without terms."""
 
 
-def reduce(x: np.ndarray, y: np.ndarray, names: Sequence[str], degree: Sequence[int], *, effort: Sequence[float] = ()) -> Reduced:
+def reduce(x: np.ndarray, y: np.ndarray, names: Sequence[str], degree: Sequence[int], effort: Sequence[float] = ()) -> Reduced:
     """One QR factorisation of candidates and targets, with columns that simpler ones make up set aside.
 
     Args:

@@ -18,7 +18,8 @@ from residnet.core.sparse import NOTHING, Equation, Reduced, SearchConfig, find,
 from residnet.heads.base import ClosedFormHead, FeatureConfig, Features
 from residnet.heads.delay_line import DelayConfig, DelayLine, Past, best_delay
 from residnet.heads.equation_text import Written, c_function, latex, plain, sympy_text
-from residnet.physics.candidates import CandidatesConfig, rated
+from residnet.physics.candidates import Candidate, CandidatesConfig, rated
+from residnet.physics.symmetry import wrong_parity
 from residnet.physics.terms import TermLibrary, parse_term
 
 _GAMMAS = (0.0, 0.5, 1.0)
@@ -32,7 +33,10 @@ class SymbolicConfig(FeatureConfig):
         candidates: which terms the equations may have, by type.
         terms: the candidates by name instead.
         search: how far the search goes.
-        estimator: what a row of the regression is: a sample, a window of the weak form, or either behind instruments.
+        estimator: what a row of the regression is: a sample, a window of the weak form, or either behind instruments; terms that name no motion
+            count as free of measuring noise.
+        symmetric: leave out of each axis the terms that a vessel with port/starboard symmetry cannot have there, as far as the mirror images of
+            its channels are known.
         delay: inputs that act late.
         choose: what the length of the equations is chosen by: `one_step`, extended BIC of the accelerations; or `free_run`, error of free runs on
             validation data, between shorter and longer equations and none.
@@ -43,6 +47,7 @@ class SymbolicConfig(FeatureConfig):
     terms: tuple[str, ...] = ()
     search: SearchConfig = Field(default_factory=SearchConfig)
     estimator: EstimatorConfig = Field(default_factory=LeastSquares)
+    symmetric: bool = False
     delay: DelayConfig | None = None
     choose: Literal["one_step", "free_run"] = "one_step"
 
@@ -109,7 +114,7 @@ class SymbolicHead(ClosedFormHead):
             others = [self.config.search.model_copy(update={"gamma": gamma}) for gamma in _GAMMAS if gamma != self.config.search.gamma]
             tried = [self._solution(reduced, search, steps, told) for search in others]
             found += [other for other in tried if not torch.equal(other.state["coefficients"], found[0].state["coefficients"])]
-            none = {name: self._written(name, NOTHING, reduced, steps) for name in ACCELERATION}
+            none = {name: self._written(name, NOTHING, own, steps) for name, own in zip(ACCELERATION, reduced, strict=True)}
             notes = found[0].notes | {"parameters": 0, "coefficients": [], "equations": none}
             found.append(Solution({"kept": [0, 0, 0]}, {"coefficients": torch.zeros_like(self.coefficients)}, notes=notes))
         return found
@@ -123,15 +128,20 @@ class SymbolicHead(ClosedFormHead):
         step = step_of(group, t)
         return Past(chosen, target, stretches(group, t, step), step)
 
-    def _reduced(self, past: Past) -> Reduced:
-        """The candidates' regression, reduced to one QR factor."""
+    def _reduced(self, past: Past) -> list[Reduced]:
+        """The candidates' regression of each axis, reduced to its QR factor: one for all axes unless symmetry gives them candidates of their own."""
         with torch.no_grad():
             terms = self.basis(torch.from_numpy(past.chosen)).numpy()
         motions = self.config.candidates.motions
         exact = np.array([all(f.name not in motions for f in parse_term(c.term, self.features.names)) for c in self.candidates])
         rows = self.config.estimator.rows(Rows(terms, past.target, past.stretch), past.step, exact)
-        _, degree, effort = zip(*self.candidates, strict=True)
-        return reduce(rows.x, rows.y, self.library.terms, degree, effort=effort)
+        if not self.config.symmetric:
+            return [reduce(rows.x, rows.y, *_columns(self.candidates))] * 3
+        out = []
+        for axis in range(3):
+            own = [j for j, candidate in enumerate(self.candidates) if not wrong_parity(candidate.term, axis, self.features.names)]
+            out.append(reduce(rows.x[:, own], rows.y, *_columns([self.candidates[j] for j in own])))
+        return out
 
     def _delay(self, past: Past) -> tuple[int, dict[str, Any]]:
         """The delay in steps: that which fits best with the terms of degree one, then with those that are found at it, until it stays."""
@@ -145,11 +155,11 @@ class SymbolicHead(ClosedFormHead):
             steps, profile = best_delay(past, terms, self.features.names, self.line.channels, self.line.longest)
             seen.append(steps)
             reduced = self._reduced(past.delayed(steps, self.line.index.numpy()))
-            terms = [list(dict.fromkeys((*find(reduced, axis, self.config.search)[0].terms, *simple))) for axis in range(3)]
+            terms = [list(dict.fromkeys((*find(reduced[axis], axis, self.config.search)[0].terms, *simple))) for axis in range(3)]
         return seen[-1], {"delay": {"steps": seen[-1], "seconds": seen[-1] * past.step, "profile": profile.tolist()}}
 
-    def _solution(self, reduced: Reduced, search: SearchConfig, steps: int, told: dict[str, Any]) -> Solution:
-        found = [find(reduced, axis, search) for axis in range(3)]
+    def _solution(self, reduced: list[Reduced], search: SearchConfig, steps: int, told: dict[str, Any]) -> Solution:
+        found = [find(own, axis, search) for axis, own in enumerate(reduced)]
         equations = [equation for equation, _ in found]
         coefficients = torch.zeros_like(self.coefficients)
         for axis, equation in enumerate(equations):
@@ -164,7 +174,7 @@ class SymbolicHead(ClosedFormHead):
             "terms": self.library.count,
             "parameters": len(table),
             "coefficients": [{"axis": c.axis, "term": c.term, "value": c.value, "standard_error": c.error} for c in table],
-            "unexcited": list(reduced.unexcited),
+            "unexcited": list(dict.fromkeys(term for own in reduced for term in own.unexcited)),
             "equations": {name: self._written(name, *pair, steps) for name, pair in zip(ACCELERATION, found, strict=True)},
             **told,
         }
@@ -188,3 +198,8 @@ class SymbolicHead(ClosedFormHead):
             "cannot_tell_apart": equation.alternatives,
             "undecided": equation.undecided,
         }
+
+
+def _columns(candidates: Sequence[Candidate]) -> tuple[list[str], list[int], list[float]]:
+    """Terms, degrees and efforts."""
+    return [c.term for c in candidates], [c.degree for c in candidates], [c.effort for c in candidates]
