@@ -81,3 +81,20 @@ def test_in_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(notes["plsr"]["cross_validated_share"]) == 6
     assert "free_run_choice" not in notes["nomoto"]
     assert {"T", "K", "T_beta", "K_beta"} <= {entry["term"] for entry in notes["nomoto"]["coefficients"]}
+
+
+def test_what_lies_around_the_best_is_tried_while_it_gains() -> None:
+    own = model()
+
+    def at(value: float) -> Solution:
+        theta = torch.full((3, 1), value, dtype=torch.float64)
+        return Solution({"value": value}, {"theta": theta}, around=lambda: [at(value - 1.0), at(value + 1.0)])
+
+    def bench(candidate: HybridDynamics) -> float:
+        return abs(float(candidate.baseline.theta[0, 0]) - 4.2)  # type: ignore[index, operator]
+
+    best, notes = choose(own, own.baseline, [at(0.0), at(2.0)], bench)
+    assert best.choice == {"value": 4.0}
+    assert bench(own) == pytest.approx(0.2)
+    # each once, up to the first neighbours that do not gain
+    assert [entry["value"] for entry in notes["free_run_choice"]] == [0.0, 2.0, 1.0, 3.0, 4.0, 5.0]

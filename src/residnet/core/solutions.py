@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -50,9 +50,11 @@ class Solution:
         state: numbers of the module that was fitted, by name, as in its state_dict.
         table: the same with names and standard errors, where the fit knows them.
         notes: what else there is to say about the fit.
+        around: solutions near this one, made when free runs find it best, to be tried next; None where there are none.
     """
 
     choice: dict[str, Any]
     state: dict[str, Tensor]
     table: tuple[Coefficient, ...] = ()
     notes: dict[str, Any] = field(default_factory=dict)
+    around: Callable[[], Sequence[Solution]] | None = None

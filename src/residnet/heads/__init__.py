@@ -7,6 +7,7 @@ from typing import Annotated
 from pydantic import Field
 
 from residnet.heads.base import ClosedFormHead, ResidualHead
+from residnet.heads.kernel import KernelConfig
 from residnet.heads.lstm import LstmConfig
 from residnet.heads.mlp import MlpConfig
 from residnet.heads.plsr import PlsrConfig
@@ -14,6 +15,17 @@ from residnet.heads.ridge import RidgeConfig
 from residnet.heads.symbolic import SymbolicConfig
 from residnet.heads.zero import ZeroHead
 
-HeadConfig = Annotated[PlsrConfig | RidgeConfig | SymbolicConfig | MlpConfig | LstmConfig, Field(discriminator="kind")]
+HeadConfig = Annotated[PlsrConfig | RidgeConfig | KernelConfig | SymbolicConfig | MlpConfig | LstmConfig, Field(discriminator="kind")]
 
-__all__ = ["ClosedFormHead", "HeadConfig", "LstmConfig", "MlpConfig", "PlsrConfig", "ResidualHead", "RidgeConfig", "SymbolicConfig", "ZeroHead"]
+__all__ = [
+    "ClosedFormHead",
+    "HeadConfig",
+    "KernelConfig",
+    "LstmConfig",
+    "MlpConfig",
+    "PlsrConfig",
+    "ResidualHead",
+    "RidgeConfig",
+    "SymbolicConfig",
+    "ZeroHead",
+]

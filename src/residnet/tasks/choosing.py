@@ -14,7 +14,7 @@ from residnet.dynamics.hybrid import HybridDynamics
 def choose(
     model: HybridDynamics, part: nn.Module, solutions: Sequence[Solution], bench: Callable[[HybridDynamics], float]
 ) -> tuple[Solution, dict[str, Any]]:
-    """Fill a part of the model with the solution whose free run is best.
+    """Fill a part of the model with the solution whose free run is best; what lies around the best is tried for as long as it gains.
 
     Args:
         model: the model that runs.
@@ -25,11 +25,26 @@ def choose(
     Returns:
         The solution, and for fit.json the free-run error of each; empty where there was nothing to choose.
     """
-    errors = []
-    for solution in solutions if len(solutions) > 1 else ():
-        part.load_state_dict(solution.state, strict=False)
-        errors.append(bench(model))
-    best = min(range(len(errors)), key=errors.__getitem__, default=0)
-    part.load_state_dict(solutions[best].state, strict=False)
-    tried = [{**solution.choice, "validation": error} for solution, error in zip(solutions, errors, strict=False)]
-    return solutions[best], {"free_run_choice": tried} if tried else {}
+    tried: list[tuple[Solution, float]] = []
+
+    def attempt(batch: Sequence[Solution]) -> None:
+        for solution in batch:
+            part.load_state_dict(solution.state, strict=False)
+            tried.append((solution, bench(model)))
+
+    attempt(solutions if len(solutions) > 1 else ())
+    best = min(tried, key=_error, default=(solutions[0], 0.0))
+    while tried and best[0].around is not None:
+        seen = [solution.choice for solution, _ in tried]
+        attempt([solution for solution in best[0].around() if solution.choice not in seen])
+        further = min(tried, key=_error)
+        if further is best:
+            break
+        best = further
+    part.load_state_dict(best[0].state, strict=False)
+    told = [{**solution.choice, "validation": error} for solution, error in tried]
+    return best[0], {"free_run_choice": told} if told else {}
+
+
+def _error(tried: tuple[Solution, float]) -> float:
+    return tried[1]

@@ -1,0 +1,116 @@
+"""Kernel ridge regression (document 001 section 3.2, ERRATA M4, M5), kernel and penalty chosen jointly in free run or by axis."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal, NamedTuple, final
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from residnet.core.errors import FitError
+from residnet.core.samples import Samples
+from residnet.core.solutions import Solution
+from residnet.heads.base import ClosedFormHead, FeatureConfig, Features
+from residnet.heads.kernel_fit import Path
+from residnet.heads.kernel_functions import Polynomial, Rbf
+
+
+class KernelConfig(FeatureConfig):
+    """Kernel ridge regression of each residual on standardised features, without intercept.
+
+    Attributes:
+        kernel: `rbf` or `polynomial`.
+        penalties: candidates, for each sample: the document's lambda (scikit-learn's alpha) is penalty * samples.
+        choose: `free_run`, jointly: the setting of the kernel and one penalty for all axes by the error of free runs on validation data, then
+            the penalty of each axis in turn for as long as free runs gain, or no residual at all (document 001 section 4, second approach);
+            `one_step`: setting and penalty of each axis for itself by cross-validated errors of accelerations.
+        folds: folds of the cross-validation; a manoeuvre is never split between folds.
+    """
+
+    kind: Literal["kernel"] = "kernel"
+    kernel: Annotated[Rbf | Polynomial, Field(discriminator="kind")] = Field(default_factory=Rbf)
+    penalties: tuple[Annotated[float, Field(gt=0)], ...] = Field(default=(1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2), min_length=1)
+    choose: Literal["one_step", "free_run"] = "free_run"
+    folds: int = Field(default=5, ge=2)
+
+    def build(self, names: Sequence[str]) -> KernelHead:
+        """The module for channels `names`."""
+        return KernelHead(self, names)
+
+
+class _Pick(NamedTuple):
+    """Numbers of the kernel's setting and of the penalty, one of each for every axis."""
+
+    settings: tuple[int, ...]
+    penalties: tuple[int, ...]
+
+
+@final
+class KernelHead(ClosedFormHead):
+    """rho [..., 3] = f(standardised features), f in the space of a kernel."""
+
+    def __init__(self, config: KernelConfig, names: Sequence[str]) -> None:
+        super().__init__()
+        chosen = config.chosen(names)
+        self.features = Features(chosen, names, config.margin)
+        self.kernel = config.kernel.build(len(chosen))
+        self.penalties = tuple(sorted(config.penalties))
+        self.folds = config.folds
+        self.by_free_run = config.choose == "free_run"
+        self.register_buffer("effective", torch.zeros(3, dtype=torch.float64))
+        self.effective: Tensor
+
+    def calibrate(self, samples: Samples) -> None:
+        """Take scales and ranges of the features from the samples."""
+        self.features.calibrate(samples)
+
+    def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Residual [..., 3] at channels z [..., nz]; the memory is empty."""
+        return self.kernel(self.features(z)), s
+
+    def solutions(self, samples: Samples) -> list[Solution]:
+        """Of each axis the setting and penalty of the least cross-validated error; where free runs choose, then all joint ones, and no residual.
+
+        Raises:
+            FitError: with fewer manoeuvres than folds.
+        """
+        groups = torch.unique(samples.group)
+        if groups.numel() < self.folds:
+            raise FitError(f"{self.folds} folds need as many manoeuvres, the training data have {groups.numel()}; lower `folds`")
+        fold = torch.searchsorted(groups, samples.group) % self.folds
+        with torch.no_grad():
+            x = self.features(samples.z)
+            paths = self.kernel.paths(x, samples.target, fold, self.folds, [penalty * len(x) for penalty in self.penalties])
+        errors = torch.stack([path.errors for path in paths])
+        best = errors.flatten(0, 1).argmin(0)
+        count = len(self.penalties)
+        picks = [_Pick(tuple((best // count).tolist()), tuple((best % count).tolist()))]
+        notes = {"cross_validated_error": errors.tolist(), "samples": len(x)}
+        if not self.by_free_run:
+            return [self._solution(paths, picks[0], notes)]
+        picks += [_Pick((i,) * 3, (j,) * 3) for i in range(len(paths)) for j in range(count)]
+        nothing = {f"kernel.{name}": value for name, value in self.kernel.nothing().items()}
+        none = Solution({"penalty": []}, nothing | {"effective": torch.zeros(3, dtype=torch.float64)}, notes=notes)
+        return [*(self._solution(paths, pick, notes) for pick in picks), none]
+
+    def _solution(self, paths: Sequence[Path], pick: _Pick, notes: dict[str, Any]) -> Solution:
+        parts = list(enumerate(zip(pick.settings, pick.penalties, strict=True)))
+        coefficients = torch.stack([paths[i].coefficients[j, :, axis] for axis, (i, j) in parts], dim=1)
+        effective = torch.stack([paths[i].freedom[j] for _, (i, j) in parts])
+        said, state = self.kernel.chosen([paths[i] for i in pick.settings], coefficients)
+        choice = said | {"penalty": [self.penalties[j] for j in pick.penalties]}
+        told = notes | {"effective_parameters": effective.tolist()}
+
+        def around() -> list[Solution]:
+            moved = [(axis, j + step) for axis, (_, j) in parts for step in (-1, 1) if 0 <= j + step < len(self.penalties)]
+            near = [pick._replace(penalties=(*pick.penalties[:axis], j, *pick.penalties[axis + 1 :])) for axis, j in moved]
+            return [self._solution(paths, other, notes) for other in near]
+
+        return Solution(
+            choice,
+            {f"kernel.{name}": value for name, value in state.items()} | {"effective": effective},
+            notes=told,
+            around=around if self.by_free_run else None,
+        )

@@ -1,0 +1,112 @@
+"""Ridge regression on the features of a kernel: every penalty, and its cross-validation, from one decomposition."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+_ROWS = 8192
+"""Most rows of features that are held at a time."""
+
+
+@dataclass(frozen=True)
+class Path:
+    """Fits with each of C penalties.
+
+    Attributes:
+        coefficients: of the raw features, [C, P, 3].
+        errors: mean squared cross-validated errors [C, 3].
+        freedom: effective number of parameters, the trace of the smoother, [C].
+        sigma: of the kernel, where it has one.
+        points: samples that carry the function [P, F], where it has such.
+    """
+
+    coefficients: Tensor
+    errors: Tensor
+    freedom: Tensor
+    sigma: float = 0.0
+    points: Tensor = field(default_factory=lambda: torch.zeros(0))
+
+
+def dual_path(kernel: Tensor, y: Tensor, fold: Tensor, folds: int, penalties: Sequence[float]) -> Path:
+    """Kernel ridge regression alpha = (K + lambda I)^-1 Y (document 001 section 3.2, ERRATA M4) for every penalty lambda.
+
+    A left-out fold needs no refit: with the smoother H = K (K + lambda I)^-1 its errors are (I - H_ff)^-1 (Y - H Y)_f.
+
+    Args:
+        kernel: K of all samples with each other, [N, N].
+        y: targets [N, 3].
+        fold: number of each sample's fold [N].
+        folds: how many there are.
+        penalties: lambda, absolute, positive.
+    """
+    values, vectors = torch.linalg.eigh(kernel)
+    values = values.clamp(min=0.0)
+    projected = vectors.T @ y
+    members = [torch.nonzero(fold == f).squeeze(1) for f in range(folds)]
+    coefficients, errors, freedom = [], [], []
+    for penalty in penalties:
+        alpha = vectors @ (projected / (values + penalty)[:, None])
+        total = torch.zeros(y.shape[1], dtype=y.dtype)
+        for rows in members:
+            own = vectors[rows]
+            # I - H = lambda (K + lambda I)^-1, so the penalty cancels
+            left = torch.linalg.solve((own / (values + penalty)) @ own.T, alpha[rows])
+            total += left.square().sum(0)
+        coefficients.append(alpha)
+        errors.append(total / len(y))
+        freedom.append((values / (values + penalty)).sum())
+    return Path(torch.stack(coefficients), torch.stack(errors), torch.stack(freedom))
+
+
+def primal_path(
+    features: Callable[[Tensor], Tensor], whiten: Tensor, x: Tensor, y: Tensor, fold: Tensor, folds: int, penalties: Sequence[float]
+) -> Path:
+    """Ridge regression min |Y - Phi W w|^2 + lambda |w|^2 for every penalty lambda, from R factors of the folds.
+
+    Args:
+        features: raw features [n, P] of inputs [n, F].
+        whiten: W [P, Q], which makes the kernel the inner product of Phi W.
+        x: inputs [N, F].
+        y: targets [N, 3].
+        fold: number of each sample's fold [N].
+        folds: how many there are.
+        penalties: lambda, absolute, positive.
+
+    Returns:
+        The path; its coefficients are W w.
+    """
+    factors = [_factor(features, whiten, x[fold == f], y[fold == f]) for f in range(folds)]
+    errors = torch.zeros(len(penalties), y.shape[1], dtype=y.dtype)
+    for f, own in enumerate(factors):
+        weights, _ = _weights(_triangle(torch.cat([other for g, other in enumerate(factors) if g != f])), y.shape[1], penalties)
+        joined = torch.cat((weights, -torch.eye(y.shape[1], dtype=y.dtype).expand(len(penalties), -1, -1)), dim=1)
+        errors += (own @ joined).square().sum(1)
+    weights, freedom = _weights(_triangle(torch.cat(factors)), y.shape[1], penalties)
+    return Path(whiten @ weights, errors / len(y), freedom)
+
+
+def _factor(features: Callable[[Tensor], Tensor], whiten: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """R factor of [Phi W, Y], gathered in chunks."""
+    kept = torch.zeros(0, whiten.shape[1] + y.shape[1], dtype=y.dtype)
+    for begin in range(0, len(x), _ROWS):
+        rows = slice(begin, begin + _ROWS)
+        kept = _triangle(torch.cat((kept, torch.cat((features(x[rows]) @ whiten, y[rows]), dim=1))))
+    return kept
+
+
+def _triangle(rows: Tensor) -> Tensor:
+    return torch.linalg.qr(rows, mode="r")[1]
+
+
+def _weights(factor: Tensor, outputs: int, penalties: Sequence[float]) -> tuple[Tensor, Tensor]:
+    """Coefficients [C, Q, outputs] and effective numbers of parameters [C] from the R factor of [Phi W, Y]."""
+    count = factor.shape[1] - outputs
+    left, values, right = torch.linalg.svd(factor[:, :count], full_matrices=False)
+    projected = left.T @ factor[:, count:]
+    shrunk = [values / (values.square() + penalty) for penalty in penalties]
+    weights = torch.stack([right.T @ (share[:, None] * projected) for share in shrunk])
+    return weights, torch.stack([(values * share).sum() for share in shrunk])

@@ -1,0 +1,159 @@
+"""Kernel ridge regression against scikit-learn and explicit refits; Nystroem's method against its textbook form."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from made_samples import NAMES, channels, made
+from sklearn.kernel_ridge import KernelRidge
+from sklearn.linear_model import Ridge
+from sklearn.metrics.pairwise import rbf_kernel
+
+from residnet.heads import KernelConfig
+from residnet.heads.kernel import KernelHead
+from residnet.heads.kernel_functions import Polynomial, Rbf, spread_out
+
+SAMPLES = made(300)
+NEW = torch.from_numpy(channels(200, seed=9))
+
+
+def fitted(kernel: Rbf | Polynomial, penalties: tuple[float, ...], choose: Any = "one_step", folds: int = 5) -> tuple[KernelHead, dict[str, Any]]:
+    head = KernelConfig(kernel=kernel, penalties=penalties, choose=choose, folds=folds, margin=1.0).build(NAMES)
+    head.calibrate(SAMPLES)
+    return head, head.solve(SAMPLES)
+
+
+def answer(head: KernelHead, z: torch.Tensor) -> np.ndarray:
+    with torch.no_grad():
+        return head(z, z[:, :0])[0].numpy()  # type: ignore[no-any-return]
+
+
+def standardised(z: torch.Tensor) -> np.ndarray:
+    x, own = z.numpy(), SAMPLES.z.numpy()
+    reach = own.max(0) - own.min(0)
+    return (np.clip(x, own.min(0) - reach, own.max(0) + reach) - own.mean(0)) / own.std(0)  # type: ignore[no-any-return]
+
+
+@pytest.mark.parametrize("penalty", [1e-5, 1e-3, 1e-1])
+@pytest.mark.parametrize("sigma", [1.0, 10.0, 100.0])
+def test_radial_basis_functions_equal_scikit_learn(sigma: float, penalty: float) -> None:
+    head, notes = fitted(Rbf(sigma=(sigma,)), (penalty,))
+    truth = KernelRidge(kernel="rbf", gamma=1 / (2 * sigma), alpha=penalty * len(SAMPLES)).fit(standardised(SAMPLES.z), SAMPLES.target.numpy())
+    np.testing.assert_allclose(answer(head, SAMPLES.z), truth.predict(standardised(SAMPLES.z)), atol=1e-10)
+    np.testing.assert_allclose(answer(head, NEW), truth.predict(standardised(NEW)), atol=1e-10)
+    np.testing.assert_allclose(head.kernel.coefficients, truth.dual_coef_, atol=1e-10 * np.abs(truth.dual_coef_).max())
+    gram = rbf_kernel(standardised(SAMPLES.z), gamma=1 / (2 * sigma))
+    freedom = np.trace(gram @ np.linalg.inv(gram + penalty * len(SAMPLES) * np.eye(len(SAMPLES))))
+    assert notes["effective_parameters"] == pytest.approx([freedom] * 3, rel=1e-8)
+
+
+@pytest.mark.parametrize("penalty", [1e-5, 1e-3, 1e-1])
+@pytest.mark.parametrize(("degree", "slope", "constant"), [(1, 1.0, 1.0), (2, 1.0, 1.0), (3, 0.5, 2.0), (2, 0.3, 0.0)])
+def test_polynomials_equal_scikit_learn(degree: int, slope: float, constant: float, penalty: float) -> None:
+    head, _ = fitted(Polynomial(degree=degree, slope=slope, constant=constant), (penalty,))
+    truth = KernelRidge(kernel="poly", degree=degree, gamma=slope, coef0=constant, alpha=penalty * len(SAMPLES))
+    truth.fit(standardised(SAMPLES.z), SAMPLES.target.numpy())
+    np.testing.assert_allclose(answer(head, SAMPLES.z), truth.predict(standardised(SAMPLES.z)), atol=1e-10)
+    np.testing.assert_allclose(answer(head, NEW), truth.predict(standardised(NEW)), atol=1e-10)
+
+
+def test_the_linear_kernel_is_ridge_regression() -> None:
+    """Document 001 section 4: p = 1 is standard ridge regression, here with a constant that is penalised too."""
+    head, _ = fitted(Polynomial(degree=1), (1e-2,))
+    joined = np.concatenate((np.ones((len(SAMPLES), 1)), standardised(SAMPLES.z)), axis=1)
+    truth = Ridge(alpha=1e-2 * len(SAMPLES), fit_intercept=False, solver="cholesky").fit(joined, SAMPLES.target.numpy())
+    np.testing.assert_allclose(answer(head, SAMPLES.z), truth.predict(joined), atol=1e-10)
+
+
+@pytest.mark.parametrize("kernel", [Rbf(sigma=(3.0, 30.0)), Rbf(sigma=(3.0, 30.0), exact=100, landmarks=80), Polynomial(degree=2)])
+def test_cross_validation_equals_explicit_refits(kernel: Rbf | Polynomial) -> None:
+    penalties = (1e-6, 1e-3, 0.3)
+    head, notes = fitted(kernel, penalties, folds=4)
+    x, y = standardised(SAMPLES.z), SAMPLES.target.numpy()
+    fold = np.unique(SAMPLES.group.numpy(), return_inverse=True)[1] % 4
+    whole = {"rbf": refitted_rbf, "polynomial": refitted_polynomial}[kernel.kind]
+    for i, found in enumerate(notes["cross_validated_error"]):
+        error = np.zeros((3, 3))
+        for f in range(4):
+            for j, penalty in enumerate(penalties):
+                predicted = whole(head, kernel, i, x[fold != f], y[fold != f], x[fold == f], penalty * len(x))
+                error[j] += ((predicted - y[fold == f]) ** 2).sum(0)
+        np.testing.assert_allclose(found, error / len(x), rtol=1e-7)
+
+
+def refitted_rbf(head: KernelHead, kernel: Any, setting: int, x: np.ndarray, y: np.ndarray, new: np.ndarray, alpha: float) -> np.ndarray:
+    gamma = 1 / (2 * kernel.sigma[setting])
+    if len(SAMPLES) <= kernel.exact:
+        return KernelRidge(kernel="rbf", gamma=gamma, alpha=alpha).fit(x, y).predict(new)  # type: ignore[no-any-return]
+    points = head.kernel.points.numpy()  # type: ignore[operator, union-attr]
+    wide, own = rbf_kernel(x, points, gamma), rbf_kernel(points, gamma=gamma)
+    # min |y - wide c|^2 + alpha c' own c, stacked: the normal equations would lose half the digits
+    values, vectors = np.linalg.eigh(own)
+    root = np.sqrt(alpha * values.clip(0))[:, None] * vectors.T
+    coefficients = np.linalg.lstsq(np.concatenate((wide, root)), np.concatenate((y, np.zeros((len(points), 3)))), rcond=None)[0]
+    return rbf_kernel(new, points, gamma) @ coefficients  # type: ignore[no-any-return]
+
+
+def refitted_polynomial(head: KernelHead, kernel: Any, setting: int, x: np.ndarray, y: np.ndarray, new: np.ndarray, alpha: float) -> np.ndarray:
+    truth = KernelRidge(kernel="poly", degree=kernel.degree, gamma=1.0, coef0=1.0, alpha=alpha)
+    return truth.fit(x, y).predict(new)  # type: ignore[no-any-return]
+
+
+def test_landmarks_that_are_all_samples_give_the_exact_fit() -> None:
+    exact, _ = fitted(Rbf(sigma=(10.0,)), (1e-4,))
+    landmarks, _ = fitted(Rbf(sigma=(10.0,), exact=1, landmarks=300), (1e-4,))
+    assert len(landmarks.kernel.points) == 300  # type: ignore[arg-type]
+    np.testing.assert_allclose(answer(landmarks, NEW), answer(exact, NEW), atol=1e-7)
+    few, _ = fitted(Rbf(sigma=(10.0,), exact=1, landmarks=80), (1e-4,))
+    assert len(few.kernel.points) == 80  # type: ignore[arg-type]
+    apart = answer(few, NEW) - answer(exact, NEW)
+    assert np.sqrt(np.mean(apart**2)) < 0.05 * answer(exact, NEW).std()
+
+
+def test_landmarks_lie_apart_and_are_repeatable() -> None:
+    x = torch.cat((torch.zeros(500, 2, dtype=torch.float64), torch.eye(2, dtype=torch.float64) * 3))
+    chosen = spread_out(x, 10, seed=4)
+    assert torch.equal(chosen, spread_out(x, 10, seed=4))
+    # three different values and no more
+    assert len(torch.unique(x[chosen], dim=0)) == len(chosen) == 3
+
+
+def test_each_axis_takes_its_own_setting_by_one_step_errors() -> None:
+    target = SAMPLES.target.clone()
+    target[:, 1] = torch.randn(len(SAMPLES), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    head = KernelConfig(kernel=Rbf(sigma=(0.3, 30.0)), penalties=(1e-6, 10.0), choose="one_step").build(NAMES)
+    head.calibrate(SAMPLES)
+    (only,) = head.solutions(SAMPLES.with_target(target))
+    assert [only.choice["penalty"][0], only.choice["penalty"][1]] == [1e-6, 10.0]
+    assert only.choice["sigma"][0] == 30.0
+    error = torch.tensor(only.notes["cross_validated_error"])
+    for axis in range(3):
+        i, j = [0.3, 30.0].index(only.choice["sigma"][axis]), [1e-6, 10.0].index(only.choice["penalty"][axis])
+        assert error[i, j, axis] == error[..., axis].min()
+
+
+def test_free_runs_are_offered_joint_settings_then_single_steps_around_the_best() -> None:
+    head = KernelConfig(kernel=Rbf(sigma=(3.0, 30.0)), penalties=(1e-6, 1e-4, 1e-2)).build(NAMES)
+    head.calibrate(SAMPLES)
+    found = head.solutions(SAMPLES)
+    joint = [(s, p) for s in (3.0, 30.0) for p in (1e-6, 1e-4, 1e-2)]
+    assert [(s.choice["sigma"], s.choice["penalty"]) for s in found[1:-1]] == [([s] * 3, [p] * 3) for s, p in joint]
+    head.load_state_dict(found[-1].state, strict=False)
+    assert found[-1].choice == {"penalty": []}
+    assert np.abs(answer(head, NEW)).max() == 0.0
+    assert found[5].around is not None
+    near = list(found[5].around())
+    assert {tuple(s.choice["penalty"]) for s in near} == {
+        tuple(p if axis == k else 1e-4 for k in range(3)) for axis in range(3) for p in (1e-6, 1e-2)
+    }
+    assert all(s.choice["sigma"] == [30.0] * 3 for s in near)
+    # the axes whose penalty stays answer as before
+    head.load_state_dict(found[5].state, strict=False)
+    before = answer(head, NEW)
+    for solution in near:
+        head.load_state_dict(solution.state, strict=False)
+        changed = np.abs(answer(head, NEW) - before).max(0) > 1e-12
+        assert changed.tolist() == [p != 1e-4 for p in solution.choice["penalty"]]
