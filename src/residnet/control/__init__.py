@@ -6,15 +6,25 @@ from residnet.control.bang_bang import BangBangHeading
 from residnet.control.base import ClosedLoop, GivenReference, Policy, Reference
 from residnet.control.document_autopilot import DocumentAutopilot, Predictor, SimulatedPredictor
 from residnet.control.heading_pid import HeadingPID
+from residnet.control.pid import Allocated, FeedForward, HullFeedForward, MotionPID, MotionPIDConfig, NoFeedForward
+from residnet.control.reference_filter import ReferenceFilter, ReferenceFilterConfig
 
 __all__ = [
+    "Allocated",
     "BangBangHeading",
     "ClosedLoop",
     "DocumentAutopilot",
+    "FeedForward",
     "GivenReference",
     "HeadingPID",
+    "HullFeedForward",
+    "MotionPID",
+    "MotionPIDConfig",
+    "NoFeedForward",
     "Policy",
     "Predictor",
     "Reference",
+    "ReferenceFilter",
+    "ReferenceFilterConfig",
     "SimulatedPredictor",
 ]

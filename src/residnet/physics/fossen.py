@@ -180,7 +180,8 @@ class Fossen3(nn.Module):
         self.register_buffer("damping", vessel.scale * damping.reshape(3, len(terms)), persistent=False)
         self.register_buffer("response", torch.zeros(3, 0, dtype=torch.float64), persistent=False)
         self.compacted = False
-        self.gather: list[Tensor] = []
+        # not empty, so that TorchScript knows the type
+        self.gather = [torch.zeros(0, dtype=torch.long)]
         self.response: Tensor
         self.mass: Tensor
         self.inverse: Tensor
