@@ -9,6 +9,9 @@ import torch
 
 from residnet.core.config import load_config
 from residnet.core.errors import ConfigError
+from residnet.core.names import CHANNEL_UNITS
+from residnet.dynamics.rollout import Rollout
+from residnet.dynamics.simulated import PlantDynamics
 from residnet.physics.fossen import Fossen3, FossenConfig
 from residnet.physics.parameters import Parameter
 from residnet.physics.vessel import load_vessel, vessel_files
@@ -30,6 +33,47 @@ def test_every_vessel_file(name: str) -> None:
     assert rate.shape == x.shape
     assert bool(torch.isfinite(rate).all())
     assert plant.settle(x, w, 0.01).shape == x.shape
+    # what a log may hold has a unit; thrusters are named by the vessel file, so that no table can hold their channels
+    named_by_file = ("_", "n_", "alpha_", "cmd_n_", "cmd_alpha_")
+    logged = [name for name in (*plant.state, *plant.inputs[: plant.commands]) if not name.startswith(named_by_file)]
+    assert [name for name in logged if name not in CHANNEL_UNITS] == []
+    assert {"x", "y", "psi", "u", "v", "r"} <= set(plant.state)
+
+
+@pytest.mark.parametrize("name", vessel_files())
+def test_every_vessel_in_a_batch_with_gradients(name: str) -> None:
+    plant = load_vessel(name).build()
+    random = torch.Generator().manual_seed(0)
+    x = plant.approach(4)
+    x = x + 0.05 * torch.rand(x.shape, generator=random, dtype=torch.float64)
+    w = 0.1 * torch.rand(4, len(plant.inputs), generator=random, dtype=torch.float64)
+    w[:, : plant.commands] = plant.demand(torch.full((4,), 0.6, dtype=torch.float64), torch.linspace(-0.5, 0.4, 4, dtype=torch.float64))
+    # at rest, too, slopes stay finite
+    x[3] = 0.0
+    x.requires_grad_()
+    w.requires_grad_()
+    rate = plant.rate(x, w)
+    for slope in torch.autograd.grad(rate.sum(), (x, w), allow_unused=True):
+        assert slope is None or bool(torch.isfinite(slope).all())
+    for row in range(4):
+        torch.testing.assert_close(plant.rate(x[row : row + 1], w[row : row + 1])[0], rate[row], rtol=1e-9, atol=1e-12)
+        torch.testing.assert_close(plant.settle(x[row : row + 1], w[row : row + 1], 0.01)[0], plant.settle(x, w, 0.01)[row])
+
+
+@pytest.mark.parametrize("name", vessel_files())
+def test_every_vessel_turns_to_starboard_where_it_is_steered(name: str) -> None:
+    """From where trials start, at full drive, to one side and the other."""
+    vessel = load_vessel(name)
+    plant = vessel.build()
+    x = plant.approach(2)
+    drive, steer = torch.ones(2, dtype=torch.float64), torch.tensor([0.3, -0.3], dtype=torch.float64)
+    w = torch.zeros(2, 400, len(plant.inputs), dtype=torch.float64)
+    w[:, :, : plant.commands] = plant.demand(drive, steer)[:, None]
+    with torch.no_grad():
+        states, _, _ = Rollout(PlantDynamics(plant, 0.05))(x, w, x[:, :0])
+    turned = states[:, -1, plant.state.index("psi")]
+    assert float(turned[0]) > 0 > float(turned[1])
+    assert bool((states[:, -1, plant.state.index("u")] > 0).all())
 
 
 def test_calibrated_numbers_are_those_of_errata() -> None:
