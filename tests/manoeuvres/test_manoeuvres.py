@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+from pathlib import Path
+from tempfile import mkdtemp
 from typing import Any, get_args
 
 import numpy as np
@@ -11,6 +14,7 @@ from torch import Tensor
 
 from residnet.core.config import validate
 from residnet.core.errors import ConfigError
+from residnet.core.log import Log
 from residnet.data.simulate import SimulatedTrials, simulate
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import PlantDynamics
@@ -21,6 +25,7 @@ from residnet.manoeuvres import (
     Helm,
     Manoeuvre,
     ManoeuvreConfig,
+    Replay,
     StackedSource,
     ThreeTwoOneOne,
     Zigzag,
@@ -36,6 +41,15 @@ def kinds(union: Any) -> dict[str, Any]:
 FAMILIES, MANOEUVRES = kinds(FamilyConfig), kinds(ManoeuvreConfig)
 # what a family cannot do without; a new family whose fields have defaults beyond these needs no line here
 NEEDS: dict[str, Any] = {"count": 5, "heading": (0.2, 0.4), "drive": (0.3, 0.8), "steer": (-0.5, 0.4)}
+# of kinds that nothing draws at random
+EXAMPLES: dict[str, list[dict[str, Any]]] = {
+    "spiral": [{"drive": 0.5, "start": 2, "steady": {"window": 1.5, "tolerance": 0.05}}, {"drive": 0.6, "steers": [0.4, -0.4], "start": 1}],
+    "stopping": [{"drive": 0.6, "start": 8}, {"drive": 0.9, "astern": -0.5, "start": 11}],
+    "waypoints": [
+        {"drive": 0.7, "points": [[8, 0], [8, 10]], "acceptance": 2, "lookahead": 4},
+        {"drive": 0.5, "points": [[10, -5]], "acceptance": 2, "lookahead": 4},
+    ],
+}
 DURATION, DT = 15.0, 0.1
 
 
@@ -45,11 +59,34 @@ def family(kind: str) -> Any:
 
 
 def drawn(kind: str, seed: int = 0) -> list[Manoeuvre]:
+    if kind == "replay":
+        return replays()
+    if kind in EXAMPLES:
+        return [MANOEUVRES[kind](**example) for example in EXAMPLES[kind]]
     return family(kind).draw(np.random.default_rng(seed), DURATION)
 
 
-@pytest.fixture(params=FAMILIES)
+@lru_cache
+def replays() -> list[Manoeuvre]:
+    """Two recorded logs, flown from where they begin."""
+    folder = Path(mkdtemp())
+    out: list[Manoeuvre] = []
+    for i in range(2):
+        t = np.arange(0.0, DURATION, 0.25)
+        channels = {name: np.full(t.size, 0.1 * (i + j)) for j, name in enumerate(("x", "y", "psi", "u", "v", "r"))}
+        channels |= {"cmd_port": 20.0 + 5.0 * np.sin(t + i), "cmd_stbd": 15.0 * np.cos(t)}
+        Log(f"log{i}", t, channels).save(folder / f"log{i}.parquet")
+        out.append(Replay(log=folder / f"log{i}.parquet"))
+    return out
+
+
+@pytest.fixture(params=MANOEUVRES)
 def kind(request: pytest.FixtureRequest) -> str:
+    return request.param
+
+
+@pytest.fixture(params=FAMILIES)
+def random_kind(request: pytest.FixtureRequest) -> str:
     return request.param
 
 
@@ -75,12 +112,13 @@ def fly(plant: Plant, manoeuvres: list[Manoeuvre], dt: float = DT, seconds: floa
 
 
 def test_every_family_draws_a_manoeuvre_of_its_kind() -> None:
-    assert set(FAMILIES) == set(MANOEUVRES)
+    assert set(FAMILIES) | set(EXAMPLES) | {"replay"} == set(MANOEUVRES), "a kind without a family needs an example here"
     for kind in FAMILIES:
         assert {type(m) for m in drawn(kind)} == {MANOEUVRES[kind]}
 
 
-def test_draws_are_repeatable_by_seed(kind: str) -> None:
+def test_draws_are_repeatable_by_seed(random_kind: str) -> None:
+    kind = random_kind
     assert drawn(kind) == drawn(kind)
     if "count" in FAMILIES[kind].model_fields:
         assert drawn(kind) != drawn(kind, seed=1)
@@ -112,7 +150,7 @@ def test_a_batch_equals_single_flights(kind: str, plant: Plant) -> None:
 
 
 def test_all_kinds_side_by_side_equal_each_alone(plant: Plant) -> None:
-    groups = [drawn(kind)[:2] for kind in FAMILIES]
+    groups = [drawn(kind)[:2] for kind in MANOEUVRES]
     t = times()
     source = StackedSource([type(g[0]).source(g, Helm.of(plant), t) for g in groups], [2] * len(groups))
     x0 = torch.zeros(2 * len(groups), 8, dtype=torch.float64)
@@ -247,19 +285,6 @@ def test_simulated_trials_are_repeatable_and_split_whole() -> None:
             np.testing.assert_array_equal(a[name], b[name])
     with pytest.raises(ValueError, match="leaves a split empty"):
         trials(identification={"zigzag": 4}).splits(manoeuvres)
-
-
-def test_disturbance_has_the_spread_and_correlation_it_claims() -> None:
-    from residnet.data.simulate import Disturbance, _environment
-
-    config = Disturbance(force_x=30.0, force_y=20.0, force_n=10.0, correlation=2.0, current_north=0.3, current_east=-0.1)
-    w = _environment(config, load_vessel("wam_v_cal").build(), 400, 800, 0.1, np.random.default_rng(0))
-    assert (w[:, :, :2] == 0).all()
-    np.testing.assert_allclose(w[:, :, 5:7], np.broadcast_to([0.3, -0.1], (400, 800, 2)))
-    forces = w[:, :, 2:5]
-    np.testing.assert_allclose(forces.std((0, 1)), [30, 20, 10], rtol=0.02)
-    np.testing.assert_allclose(forces[:, 0].std(0), [30, 20, 10], rtol=0.12)
-    np.testing.assert_allclose((forces[:, 20:] * forces[:, :-20]).mean((0, 1)) / forces.var((0, 1)), np.exp(-1.0), atol=0.02)
 
 
 def test_sensor_noise_is_on_the_velocities_alone() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import groupby
 from typing import Literal
 
 import numpy as np
@@ -13,12 +12,11 @@ from pydantic import Field, field_validator, model_validator
 from residnet.core.config import Config, Seconds
 from residnet.core.errors import ConfigError
 from residnet.core.log import Log
-from residnet.core.names import CHANNEL_UNITS
 from residnet.data.environment import Disturbance
+from residnet.data.flying import Craft, Flight, Sea, fly
 from residnet.data.sensors import SensorNoise
-from residnet.dynamics.rollout import Rollout, Source
 from residnet.dynamics.simulated import PlantDynamics
-from residnet.manoeuvres import FamilyConfig, Helm, Manoeuvre, StackedSource
+from residnet.manoeuvres import FamilyConfig, Helm, Manoeuvre
 from residnet.physics.vessel import load_vessel
 
 
@@ -98,43 +96,17 @@ class SimulatedTrials(Config):
         return out
 
 
-def simulate(manoeuvres: Sequence[Manoeuvre], config: SimulatedTrials) -> list[Log]:
-    """Fly the manoeuvres in one batch and log them as sensors would.
+def fly_trials(manoeuvres: Sequence[Manoeuvre], config: SimulatedTrials) -> list[Flight]:
+    """Fly the manoeuvres in one batch: the motion itself, and the logs of it as sensors would measure it.
 
-    Channels: the plant's state (for the WAM-V x, y, psi, u, v, r, n_port, n_stbd) as its sensors measure it, the commands, and the
-    true wind where there is any. Float64.
+    Channels: the plant's state (for the WAM-V x, y, psi, u, v, r, n_port, n_stbd), the commands, and the true wind where there is any. Float64.
     """
     plant = load_vessel(config.vessel).build()
-    steps = round(config.duration / config.step)
-    t = torch.arange(steps, dtype=torch.float64) * config.step
-    runs = [list(members) for _, members in groupby(manoeuvres, key=lambda m: m.kind)]
-    sources = [type(members[0]).source(members, Helm.of(plant), t) for members in runs]
-    source: Source = StackedSource(sources, [len(members) for members in runs])
-    random = np.random.default_rng([config.seed, 3])
-    w = torch.from_numpy(config.disturbance.series(plant, len(manoeuvres), steps, config.step, config.seed, random))
-    source = config.disturbance.surround(source, plant, len(manoeuvres), config.step, config.seed)
-    start = plant.approach(len(manoeuvres))
-    with torch.no_grad():
-        states, inputs, _ = Rollout(PlantDynamics(plant, config.step, config.substeps), source)(start, w, start[:, :0])
-    x, acting = states[:, :-1].numpy(), inputs.numpy()
-    noise = random.standard_normal((len(manoeuvres), steps, 3)) * [config.noise.u, config.noise.v, config.noise.r]
-    time = t.numpy()
-    logs = []
-    count: dict[str, int] = {}
-    for i, manoeuvre in enumerate(manoeuvres):
-        count[manoeuvre.kind] = count.get(manoeuvre.kind, 0) + 1
-        clean = {name: x[i, :, j] for j, name in enumerate(plant.state) if not name.startswith("_")}
-        known = (*plant.inputs[: plant.commands], *config.disturbance.logged)
-        clean |= {name: acting[i, :, plant.inputs.index(name)] for name in known}
-        channels = config.noise.measured(clean, time, noise[i], (config.seed, 6, i))
-        logs.append(
-            Log(
-                name=f"{manoeuvre.kind}_{count[manoeuvre.kind]:02d}",
-                t=time.copy(),
-                channels=channels,
-                units={name: CHANNEL_UNITS.get(name, "-") for name in channels},
-                manoeuvre=manoeuvre.kind,
-                meta={"vessel": config.vessel, "demand": manoeuvre.model_dump(mode="json"), "seed": config.seed},
-            )
-        )
-    return logs
+    craft = Craft(config.vessel, PlantDynamics(plant, config.step, config.substeps), Helm.of(plant), plant.commands, plant.approach(1))
+    sea = Sea(plant, config.disturbance, config.noise, config.seed)
+    return fly(craft, manoeuvres, sea, config.duration, config.step, {"vessel": config.vessel})
+
+
+def simulate(manoeuvres: Sequence[Manoeuvre], config: SimulatedTrials) -> list[Log]:
+    """The logs of `fly_trials`."""
+    return [flight.log for flight in fly_trials(manoeuvres, config)]

@@ -70,7 +70,13 @@ class Rollout(nn.Module):
             acting, memory = self.source(x, w[:, k], k, memory)
             after, s = self.model.step(x, acting, s)
             if self.source.may_stop:
-                after = torch.where(self.source.finished(x, k, memory).unsqueeze(-1), x, after)
+                finished = self.source.finished(x, k, memory)
+                after = torch.where(finished.unsqueeze(-1), x, after)
+                if bool(finished.all()):
+                    # nothing moves any more
+                    states.extend([x] * (w.shape[1] - k))
+                    applied.extend([acting] * (w.shape[1] - k))
+                    break
             x = after
             states.append(x)
             applied.append(acting)

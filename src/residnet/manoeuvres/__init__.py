@@ -1,4 +1,4 @@
-"""Manoeuvres, one file each: the manoeuvre, its source of inputs, and the family that draws it at random."""
+"""Manoeuvres, one file each: the manoeuvre, its source of inputs, and where it is drawn at random the family that does so."""
 
 from __future__ import annotations
 
@@ -7,13 +7,35 @@ from typing import Annotated
 from pydantic import Field
 
 from residnet.manoeuvres.acceleration_deceleration import AccelerationDeceleration, AccelerationDecelerationFamily
-from residnet.manoeuvres.base import Helm, Manoeuvre, StackedSource
+from residnet.manoeuvres.base import Helm, Manoeuvre, StackedSource, Watched
 from residnet.manoeuvres.constant import ConstantFamily, ConstantInput
+from residnet.manoeuvres.excitation import MultiSine, MultiSineFamily, RandomSteps, RandomStepsFamily
+from residnet.manoeuvres.replay import Replay
+from residnet.manoeuvres.spiral import Spiral
+from residnet.manoeuvres.stopping import Stopping
 from residnet.manoeuvres.three_two_one_one import ThreeTwoOneOne, ThreeTwoOneOneFamily
+from residnet.manoeuvres.turning_circle import TurningCircle, TurningCircleFamily
+from residnet.manoeuvres.waypoints import Waypoints
 from residnet.manoeuvres.zigzag import Zigzag, ZigzagFamily
 
-ManoeuvreConfig = Annotated[ConstantInput | Zigzag | AccelerationDeceleration | ThreeTwoOneOne, Field(discriminator="kind")]
-FamilyConfig = Annotated[ConstantFamily | ZigzagFamily | AccelerationDecelerationFamily | ThreeTwoOneOneFamily, Field(discriminator="kind")]
+AnyManoeuvre = (
+    ConstantInput
+    | Zigzag
+    | TurningCircle
+    | AccelerationDeceleration
+    | ThreeTwoOneOne
+    | RandomSteps
+    | MultiSine
+    | Spiral
+    | Stopping
+    | Waypoints
+    | Replay
+)
+ManoeuvreConfig = Annotated[AnyManoeuvre, Field(discriminator="kind")]
+FamilyConfig = Annotated[
+    ConstantFamily | ZigzagFamily | TurningCircleFamily | AccelerationDecelerationFamily | ThreeTwoOneOneFamily | RandomStepsFamily | MultiSineFamily,
+    Field(discriminator="kind"),
+]
 
 __all__ = [
     "AccelerationDeceleration",
@@ -22,7 +44,15 @@ __all__ = [
     "Helm",
     "Manoeuvre",
     "ManoeuvreConfig",
+    "MultiSine",
+    "RandomSteps",
+    "Replay",
+    "Spiral",
     "StackedSource",
+    "Stopping",
     "ThreeTwoOneOne",
+    "TurningCircle",
+    "Watched",
+    "Waypoints",
     "Zigzag",
 ]

@@ -1,7 +1,8 @@
 """The interface of manoeuvres.
 
 A manoeuvre demands a normalised drive (mean thrust or revolutions) and steer (difference, or rudder) over time, open
-loop or by the heading that it sees. The vessel turns the two into its own commands, so one manoeuvre drives any plant.
+loop or by the motion that it sees. The vessel turns the two into its own commands, so one manoeuvre drives any plant and
+any learned model that has actuators. A manoeuvre with a stop condition ends its row of the rollout there.
 """
 
 from __future__ import annotations
@@ -9,19 +10,23 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal, final
+from typing import Any, Literal, final
 
 import torch
-from pydantic import Field
+from pydantic import Field, model_validator
 from torch import Tensor
 
-from residnet.core.config import Config, Seconds
+from residnet.core.config import Config, Radians, Seconds
 from residnet.core.errors import UsageError
+from residnet.core.log import Log
 from residnet.dynamics.rollout import Source
 from residnet.physics.plant import Plant
 
 Demand = Callable[[Tensor, Tensor], Tensor]
 """Turns drive [...] and steer [...] into commands [..., c], the first c columns of the inputs."""
+
+RUDDERS = ("cmd_delta", "delta")
+"""Names of the input that is a rudder angle."""
 
 
 @dataclass(frozen=True)
@@ -31,15 +36,17 @@ class Helm:
     Attributes:
         demand: turns its normalised demands into the vessel's commands.
         state: names of the columns of the vessel's state.
+        inputs: names of the columns of its inputs, commands first.
     """
 
     demand: Demand
     state: tuple[str, ...]
+    inputs: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, plant: Plant) -> Helm:
         """The helm of a plant."""
-        return cls(plant.demand, plant.state)
+        return cls(plant.demand, plant.state, plant.inputs)
 
     def column(self, name: str) -> int:
         """Column of a state.
@@ -50,6 +57,15 @@ class Helm:
         if name not in self.state:
             raise UsageError(f"the manoeuvre watches '{name}', which the vessel does not have; it has {', '.join(self.state)}")
         return self.state.index(name)
+
+    @property
+    def hard_over(self) -> float | None:
+        """Rudder angle of full steer in rad; None where the vessel has no rudder."""
+        name = next((name for name in RUDDERS if name in self.inputs), None)
+        if name is None:
+            return None
+        full = self.demand(torch.zeros(1, dtype=torch.float64), torch.ones(1, dtype=torch.float64))
+        return float(full[0, self.inputs.index(name)])
 
 
 @final
@@ -74,33 +90,103 @@ class StackedSource(Source):
         super().__init__()
         self.sources: Sequence[Source] = torch.nn.ModuleList(sources)  # type: ignore[assignment]
         self.rows = list(rows)
+        self.widths = [0] * len(self.rows)
+        self.may_stop = any(source.may_stop for source in sources)
 
     def initial(self, x: Tensor) -> Tensor:
         """Memories of all sources, padded to the widest, [B, k]."""
         parts = [source.initial(part) for source, part in zip(self.sources, x.split(self.rows), strict=True)]
-        width = max(part.shape[1] for part in parts)
-        return torch.cat([torch.nn.functional.pad(part, (0, width - part.shape[1])) for part in parts])
+        self.widths = [part.shape[1] for part in parts]
+        return torch.cat([torch.nn.functional.pad(part, (0, max(self.widths) - part.shape[1])) for part in parts])
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Inputs [B, m], each block of rows from its source."""
         inputs, memories = [], []
-        for source, xs, ws, ms in zip(self.sources, x.split(self.rows), w.split(self.rows), memory.split(self.rows), strict=True):
+        for source, xs, ws, ms in zip(self.sources, x.split(self.rows), w.split(self.rows), self._own(memory), strict=True):
             acting, after = source(xs, ws, k, ms)
             inputs.append(acting)
             # a source may need less memory than the widest of the batch
             memories.append(torch.nn.functional.pad(after, (0, memory.shape[1] - after.shape[1])))
         return torch.cat(inputs), torch.cat(memories)
 
+    def finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
+        """[B] bool, each block of rows by its source."""
+        parts = zip(self.sources, x.split(self.rows), self._own(memory), strict=True)
+        return torch.cat([source.finished(xs, k, ms) for source, xs, ms in parts])
+
+    def _own(self, memory: Tensor) -> list[Tensor]:
+        return [part[:, :width] for part, width in zip(memory.split(self.rows), self.widths, strict=True)]
+
+
+@final
+class Watched(Source):
+    """A source that remembers when its rows stopped: `stopped` [B] is the sample at which each did, -1 where it did not."""
+
+    def __init__(self, source: Source, rows: int) -> None:
+        super().__init__()
+        self.source = source
+        self.may_stop = source.may_stop
+        self.stopped = torch.full((rows,), -1)
+
+    def initial(self, x: Tensor) -> Tensor:
+        """Memory of the source inside."""
+        self.stopped = torch.full((x.shape[0],), -1)
+        return self.source.initial(x)
+
+    def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """Inputs [B, m] of the source inside."""
+        out: tuple[Tensor, Tensor] = self.source(x, w, k, memory)
+        return out
+
+    def finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
+        """Rows that have stopped now or before."""
+        now = self.source.finished(x, k, memory) & (self.stopped < 0)
+        self.stopped = torch.where(now, k, self.stopped)
+        return self.stopped >= 0
+
 
 class Manoeuvre(Config, ABC):
-    """One manoeuvre of normalised demands; `kind` names it in logs and metrics."""
+    """One manoeuvre of normalised demands; `kind` names it in logs and metrics.
+
+    Attributes:
+        name: of its log; the kind with a number where None.
+        duration: its length, or for a manoeuvre with a stop condition the time after which it has failed; that of the programme where None.
+    """
 
     kind: str
+    name: str | None = Field(default=None, pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")
+    duration: Seconds | None = Field(default=None, gt=0)
 
     @classmethod
     @abstractmethod
     def source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
         """The source that flies several manoeuvres of this kind side by side; t [T] are the times of the steps."""
+
+    @property
+    def goal(self) -> str | None:
+        """What the manoeuvre ends at, in words; None where it lasts as long as it is given time."""
+        return None
+
+    def lasts(self, duration: float) -> float:
+        """Seconds that the manoeuvre is given, in a programme of `duration`."""
+        return duration if self.duration is None else self.duration
+
+    def begin(self, x: Tensor, state: tuple[str, ...]) -> Tensor:
+        """State [nx] that the manoeuvre starts from, where trials of the vessel start from x [nx]."""
+        return x
+
+    def indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
+        """Manoeuvring indices by name, SI and rad (units in `indices.UNITS`); those that the log is too short for are left out.
+
+        Args:
+            log: what was flown: t, x, y, psi, u, v, r.
+            length: of the hull in m, for distances in lengths; None where unknown.
+        """
+        return {}
+
+    def limits(self, helm: Helm, length: float, speed: float) -> dict[str, float]:
+        """Largest values of indices that IMO resolution MSC.137(76) allows a ship of `length` [m] at approach `speed` [m/s], by index."""
+        return {}
 
 
 class Scheduled(Manoeuvre):
@@ -123,6 +209,56 @@ class Steering(Config):
     drive: float = Field(ge=-1, le=1)
     steer: float = Field(ge=-1, le=1)
     start: Seconds = Field(default=5.0, ge=0)
+
+
+class RudderSteering(Config):
+    """What manoeuvres share that a vessel with a rudder may also fly by the angle of it.
+
+    Attributes:
+        drive: held from the beginning, as the approach.
+        steer: share of full steer; positive turns to starboard.
+        rudder: the same as a rudder angle, for vessels that have one; instead of `steer`.
+        start: when the steering begins.
+    """
+
+    drive: float = Field(ge=-1, le=1)
+    steer: float | None = Field(default=None, ge=-1, le=1)
+    rudder: Radians | None = None
+    start: Seconds = Field(default=5.0, ge=0)
+
+    @model_validator(mode="after")
+    def _one(self) -> RudderSteering:
+        if (self.steer is None) == (self.rudder is None):
+            raise ValueError("give either steer (share of full steer, -1 to 1) or rudder (an angle such as '10 deg')")
+        return self
+
+    @property
+    def side(self) -> float:
+        """+1 where a positive demand is given, -1 where a negative one."""
+        return -1.0 if (self.steer if self.steer is not None else self.rudder or 0.0) < 0 else 1.0
+
+    def share(self, helm: Helm) -> float:
+        """Share of full steer on a vessel.
+
+        Raises:
+            UsageError: where an angle is asked of a vessel without rudder, or more than its largest.
+        """
+        return self.steer if self.steer is not None else rudder_share(self.rudder or 0.0, helm)
+
+
+def rudder_share(angle: float, helm: Helm) -> float:
+    """Share of full steer that commands a rudder angle [rad].
+
+    Raises:
+        UsageError: where the vessel has no rudder or one that does not go so far.
+    """
+    most = helm.hard_over
+    if most is None:
+        raise UsageError("the manoeuvre gives a rudder angle, but the vessel has no rudder; give steer, a share of full steer from -1 to 1")
+    share = angle / most
+    if abs(share) > 1.0 + 1e-9:
+        raise UsageError(f"the manoeuvre asks for {abs(angle) * 57.29578:.4g} deg of rudder, the vessel's goes to {most * 57.29578:.4g} deg")
+    return share
 
 
 Range = tuple[float, float]

@@ -1,0 +1,74 @@
+"""Line-of-sight guidance along straight legs between way-points."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import final
+
+import torch
+from torch import Tensor
+
+from residnet.control.base import Reference
+from residnet.core.errors import ConfigError
+
+
+@final
+class WaypointGuidance(Reference):
+    """Reference heading [B, 1] towards a point of the leg that lies a look-ahead distance before the vessel (T. I. Fossen, Handbook of
+    Marine Craft Hydrodynamics and Motion Control, section 12.3: psi_d = leg direction - atan(cross-track error / look-ahead)).
+
+    The leg changes when the vessel enters the circle of acceptance of its way-point, or has passed it; behind the last it has arrived.
+    Memory [B, 3]: number of the way-point that is steered for, and where the vessel began, which is the beginning of the first leg.
+
+    Args:
+        points: way-points (north, east) in m, in their order.
+        acceptance: radius of the circle in m.
+        lookahead: distance in m.
+        state: names of the vessel's state.
+    """
+
+    def __init__(self, points: Sequence[tuple[float, float]], acceptance: float, lookahead: float, state: Sequence[str]) -> None:
+        super().__init__()
+        if not points or acceptance <= 0 or lookahead <= 0:
+            raise ConfigError(
+                f"way-points: give at least one, acceptance and look-ahead above zero; given {len(points)}, {acceptance:g}, {lookahead:g}"
+            )
+        self.register_buffer("points", torch.tensor(points, dtype=torch.float64), persistent=False)
+        self.points: Tensor
+        self.acceptance, self.lookahead = acceptance, lookahead
+        self.x, self.y = state.index("x"), state.index("y")
+        self.n_state = 3
+        self.may_finish = True
+
+    def initial_state(self, x: Tensor) -> Tensor:
+        """The first way-point, from here."""
+        return torch.stack((torch.zeros_like(x[:, 0]), x[:, self.x], x[:, self.y]), dim=-1)
+
+    def leg(self, x: Tensor, number: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Direction [B] of the leg that ends at a way-point in rad, distance [B] still to go along it, and cross-track error [B] in m,
+        positive to starboard of it."""
+        points = self.points.to(x.dtype)
+        target = points[number.clamp(max=len(points) - 1)]
+        before = torch.where((number == 0).unsqueeze(-1), s[:, 1:3], points[(number - 1).clamp(0, len(points) - 1)])
+        along = target - before
+        direction = torch.atan2(along[:, 1], along[:, 0])
+        north, east = target[:, 0] - x[:, self.x], target[:, 1] - x[:, self.y]
+        ahead = north * torch.cos(direction) + east * torch.sin(direction)
+        return direction, ahead, north * torch.sin(direction) - east * torch.cos(direction)
+
+    def forward(self, x: Tensor, k: int, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Reference heading [B, 1] in rad and the memory."""
+        number = s[:, 0].long()
+        _, ahead, error = self.leg(x, number, s)
+        reached = (ahead <= 0) | (ahead * ahead + error * error <= self.acceptance**2)
+        number = (number + reached.long()).clamp(max=self.points.shape[0])
+        direction, _, error = self.leg(x, number, s)
+        heading = direction - torch.atan(error / self.lookahead)
+        return torch.remainder(heading + math.pi, 2.0 * math.pi).unsqueeze(-1) - math.pi, torch.cat(
+            (number.to(x.dtype).unsqueeze(-1), s[:, 1:]), dim=-1
+        )
+
+    def finished(self, x: Tensor, k: int, s: Tensor) -> Tensor:
+        """Rows behind their last way-point."""
+        return s[:, 0] >= self.points.shape[0]

@@ -1,0 +1,141 @@
+"""Random excitation over a band of frequencies: steps of random height and length, and sums of sines."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from typing import Annotated, Literal
+
+import numpy as np
+import torch
+from pydantic import AfterValidator, Field
+from torch import Tensor
+
+from residnet.core.config import Config, Hertz, Seconds
+from residnet.manoeuvres.base import Manoeuvre, Range, Scheduled
+
+
+def _ordered(band: tuple[float, float]) -> tuple[float, float]:
+    if not 0 < band[0] < band[1]:
+        raise ValueError(f"a band goes from a low to a higher frequency above zero, given {band[0]:g} Hz to {band[1]:g} Hz")
+    return band
+
+
+Band = Annotated[tuple[Hertz, Hertz], AfterValidator(_ordered)]
+"""Lowest and highest frequency."""
+
+
+class Excitation(Scheduled, ABC):
+    """What both kinds share.
+
+    Attributes:
+        drive: mean drive.
+        drive_amplitude: how far the drive goes to either side of it.
+        steer_amplitude: how far the steer goes to either side of zero.
+        band: frequencies that the demands excite.
+        seed: of everything random.
+        start: when they begin; before, the drive is held and the steer is zero.
+    """
+
+    drive: float = Field(ge=-1, le=1)
+    drive_amplitude: float = Field(default=0.0, ge=0, le=2)
+    steer_amplitude: float = Field(default=0.0, ge=0, le=1)
+    band: Band
+    seed: int = Field(default=0, ge=0)
+    start: Seconds = Field(default=5.0, ge=0)
+
+    @abstractmethod
+    def _wave(self, t: Tensor, which: int) -> Tensor:
+        """Wave [T] within +-1 of the drive (0) or steer (1) at times t [T] since the start."""
+
+    def demands(self, t: Tensor) -> tuple[Tensor, Tensor]:
+        """Drive and steer [T], clipped to +-1."""
+        active = t >= self.start - 1e-9
+        waves = [torch.where(active, self._wave((t - self.start).clamp(min=0.0), which), torch.zeros_like(t)) for which in (0, 1)]
+        return (self.drive + self.drive_amplitude * waves[0]).clamp(-1.0, 1.0), self.steer_amplitude * waves[1]
+
+
+class RandomSteps(Excitation):
+    """Drive and steer jump to levels uniform within their amplitudes; each is held for half a period of a random frequency of the band."""
+
+    kind: Literal["random_steps"] = "random_steps"
+
+    def _wave(self, t: Tensor, which: int) -> Tensor:
+        """Levels [T] within +-1."""
+        random = np.random.default_rng([self.seed, which])
+        span, times, levels = float(t[-1]), [0.0], [random.uniform(-1.0, 1.0)]
+        while times[-1] <= span:
+            times.append(times[-1] + 0.5 / random.uniform(*self.band))
+            levels.append(random.uniform(-1.0, 1.0))
+        index = torch.searchsorted(torch.tensor(times, dtype=t.dtype), t + 1e-9, right=True) - 1
+        return torch.tensor(levels, dtype=t.dtype)[index]
+
+
+class MultiSine(Excitation):
+    """Sums of sines at frequencies spread evenly in their logarithm over the band, drive and steer at frequencies of their own.
+
+    The phases are the ones with the flattest sum of some random draws, so that the amplitude is well used.
+
+    Attributes:
+        tones: frequencies of each of drive and steer.
+    """
+
+    kind: Literal["multi_sine"] = "multi_sine"
+    tones: int = Field(default=8, ge=2, le=200)
+
+    def _wave(self, t: Tensor, which: int) -> Tensor:
+        """Sum of sines [T], +-1 at most over ten periods of the lowest and clipped there beyond."""
+        frequencies = np.geomspace(*self.band, 2 * self.tones)[which::2]
+        random = np.random.default_rng([self.seed, which])
+        trial = np.arange(0.0, 10.0 / self.band[0], min(0.05 / self.band[1], 0.005 / self.band[0]))
+        angle = 2.0 * math.pi * trial[:, None] * frequencies
+        best, least = np.zeros(self.tones), math.inf
+        for _ in range(20):
+            phases = random.uniform(0.0, 2.0 * math.pi, self.tones)
+            peak = float(np.abs(np.sin(angle + phases).sum(axis=1)).max())
+            if peak < least:
+                best, least = phases, peak
+        argument = 2.0 * math.pi * t.unsqueeze(-1) * torch.from_numpy(frequencies).to(t.dtype) + torch.from_numpy(best).to(t.dtype)
+        return (torch.sin(argument).sum(-1) / least).clamp(-1.0, 1.0)
+
+
+class _Family(Config):
+    """What the families share; everything uniform in its range, the band as given."""
+
+    count: int = Field(ge=1)
+    drive: Range = (0.3, 0.7)
+    drive_amplitude: Range = (0.0, 0.3)
+    steer_amplitude: Range = (0.2, 1.0)
+    band: Band = (0.02, 0.2)
+    start: Seconds = 5.0
+
+    def _one(self, random: np.random.Generator) -> dict[str, float | int | tuple[float, float]]:
+        return {
+            "drive": float(random.uniform(*self.drive)),
+            "drive_amplitude": float(random.uniform(*self.drive_amplitude)),
+            "steer_amplitude": float(random.uniform(*self.steer_amplitude)),
+            "band": self.band,
+            "seed": int(random.integers(2**31)),
+            "start": self.start,
+        }
+
+
+class RandomStepsFamily(_Family):
+    """Random steps with means and amplitudes uniform in their ranges."""
+
+    kind: Literal["random_steps"] = "random_steps"
+
+    def draw(self, random: np.random.Generator, duration: float) -> list[Manoeuvre]:
+        """`count` manoeuvres."""
+        return [RandomSteps.model_validate(self._one(random)) for _ in range(self.count)]
+
+
+class MultiSineFamily(_Family):
+    """Multi-sines with means and amplitudes uniform in their ranges."""
+
+    kind: Literal["multi_sine"] = "multi_sine"
+    tones: int = Field(default=8, ge=2, le=200)
+
+    def draw(self, random: np.random.Generator, duration: float) -> list[Manoeuvre]:
+        """`count` manoeuvres."""
+        return [MultiSine.model_validate({**self._one(random), "tones": self.tones}) for _ in range(self.count)]

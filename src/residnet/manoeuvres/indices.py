@@ -1,0 +1,202 @@
+"""Manoeuvring indices from logged motion: crossings and peaks between samples, turning circle, zigzag, stopping.
+
+Definitions as in IMO resolution MSC.137(76) and ITTC procedure 7.5-02-06-01. All SI and rad; lengths also in hull lengths.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.optimize import brentq
+
+from residnet.core.errors import DataError
+from residnet.core.log import Log
+
+UNITS: dict[str, str] = {
+    "approach_speed": "m/s",
+    "advance": "m", "transfer": "m", "tactical_diameter": "m", "time_90": "s", "time_180": "s",
+    "steady_diameter": "m", "steady_speed": "m/s", "steady_speed_ratio": "-", "steady_drift_angle": "rad", "steady_yaw_rate": "rad/s",
+    "pull_out_yaw_rate": "rad/s",
+    "initial_turning_time": "s", "initial_turning_distance": "m",
+    "first_overshoot": "rad", "second_overshoot": "rad", "time_to_check_yaw": "s", "overshoot_width": "m",
+    "reach": "s", "period": "s", "largest_yaw_rate": "rad/s",
+    "track_reach": "m", "head_reach": "m", "lateral_deviation": "m", "stopping_time": "s",
+    "steers": "-", "yaw_rates": "rad/s", "loop_height": "rad/s",
+    "largest_cross_track_error": "m", "rms_cross_track_error": "m", "course_time": "s", "final_speed": "m/s",
+}  # fmt: skip
+"""Unit of each index."""
+
+IN_LENGTHS = {"advance", "transfer", "tactical_diameter", "steady_diameter", "initial_turning_distance", "overshoot_width"}
+IN_LENGTHS |= {"track_reach", "head_reach", "lateral_deviation"}
+
+_TURN = math.pi / 2
+
+
+class Track:
+    """Motion of a log as smooth functions of its time; samples at which a channel is empty are left out.
+
+    Raises:
+        DataError: where fewer than four samples hold all of x, y, psi, u, v, r.
+    """
+
+    def __init__(self, log: Log) -> None:
+        motion = log.stack(("x", "y", "psi", "u", "v", "r"))
+        whole = np.isfinite(motion).all(axis=1)
+        if whole.sum() < 4:
+            raise DataError(f"log {log.name}: {int(whole.sum())} samples hold x, y, psi, u, v and r together; indices need at least 4")
+        self.t: np.ndarray = log.t[whole] - log.t[0]
+        x, y, self.heading, self.u, self.v, self.r = motion[whole].T
+        self.psi = CubicSpline(self.t, self.heading)
+        self.x, self.y = CubicSpline(self.t, x), CubicSpline(self.t, y)
+        self.speed = np.hypot(self.u, self.v)
+        steps = np.hypot(np.diff(x), np.diff(y))
+        self.travelled = CubicSpline(self.t, np.concatenate(([0.0], np.cumsum(steps))))
+
+    @property
+    def end(self) -> float:
+        """Last time."""
+        return float(self.t[-1])
+
+    def approach(self, start: float) -> float:
+        """Speed at the last sample before or at the order at `start`."""
+        return float(self.speed[max(int(np.searchsorted(self.t, start + 1e-9)) - 1, 0)])
+
+    def crossing(self, level: float, after: float, sign: float = 1.0) -> float | None:
+        """First time after `after` at which sign * heading rises to sign * `level`; None where it does not."""
+        return first_crossing(lambda t: sign * (self.psi(t) - level), self.t, after)
+
+    def peak(self, begin: float, end: float, sign: float) -> tuple[float, float]:
+        """Time and value of the largest sign * heading within begin .. end."""
+        inside = self.t[(self.t > begin) & (self.t < end)]
+        times = np.concatenate(([begin], inside, [end]))
+        best = int(np.argmax(sign * self.psi(times)))
+        low, high = times[max(best - 1, 0)], times[min(best + 1, times.size - 1)]
+        rate = self.psi.derivative()
+        if best in (0, times.size - 1) or sign * rate(low) <= 0 or sign * rate(high) >= 0:
+            return float(times[best]), float(sign * self.psi(times[best]))
+        time = float(brentq(lambda at: float(rate(at)), low, high, xtol=1e-12))
+        return time, float(sign * self.psi(time))
+
+    def beside(self, time: float, origin: float) -> tuple[float, float]:
+        """Place at `time` ahead and to starboard of where the vessel was at `origin`, along the heading that it had there."""
+        north, east = float(self.x(time) - self.x(origin)), float(self.y(time) - self.y(origin))
+        c, s = math.cos(float(self.psi(origin))), math.sin(float(self.psi(origin)))
+        return north * c + east * s, east * c - north * s
+
+
+def first_crossing(function: Callable[[Any], Any], t: np.ndarray, after: float) -> float | None:
+    """First time after `after` at which a function rises through zero, between samples at t [T]; None where it does not."""
+    times = np.concatenate(([after], t[t > after]))
+    values = function(times)
+    rising = np.flatnonzero((values[:-1] < 0) & (values[1:] >= 0))
+    if rising.size == 0:
+        return None
+    i = int(rising[0])
+    return float(brentq(function, times[i], times[i + 1], xtol=1e-12)) if values[i + 1] > 0 else float(times[i + 1])
+
+
+def in_lengths(found: dict[str, Any], length: float | None) -> dict[str, Any]:
+    """Indices with the distances among them in hull lengths as well, `<index>_lengths`."""
+    if length is None:
+        return found
+    return found | {f"{name}_lengths": value / length for name, value in found.items() if name in IN_LENGTHS}
+
+
+def turning(log: Log, start: float, side: float, until: float, length: float | None) -> dict[str, Any]:
+    """Indices of a turning circle.
+
+    Advance is along, transfer and tactical diameter are across the heading at `start`, towards the turn. The steady turn is the last
+    half turn before the heading has changed by `until`, where that is a full turn or more; its drift angle is positive with the bow
+    inside the turn.
+
+    Args:
+        log: t, x, y, psi, u, v, r.
+        start: time of the helm order in s.
+        side: +1 to starboard, -1 to port.
+        until: heading change that ends the steady turn, rad.
+        length: of the hull in m.
+    """
+    track = Track(log)
+    if track.end <= start:
+        return {}
+    origin = float(track.psi(start))
+    found: dict[str, Any] = {"approach_speed": track.approach(start)}
+    quarter, half = (track.crossing(origin + side * angle, start, side) for angle in (_TURN, 2 * _TURN))
+    if quarter is not None:
+        ahead, across = track.beside(quarter, start)
+        found |= {"advance": ahead, "transfer": side * across, "time_90": quarter - start}
+    if half is not None:
+        found |= {"tactical_diameter": side * track.beside(half, start)[1], "time_180": half - start}
+    begin, end = (track.crossing(origin + side * angle, start, side) for angle in (until - math.pi, until))
+    if until >= 2 * math.pi - 1e-9 and begin is not None:
+        inside = (track.t >= begin) & (track.t <= (track.end if end is None else end))
+        speed, rate = float(track.speed[inside].mean()), float(np.abs(track.r[inside].mean()))
+        drift = np.arctan2(-side * track.v[inside], track.u[inside])
+        found |= {"steady_diameter": 2 * speed / rate, "steady_speed": speed, "steady_yaw_rate": rate, "steady_drift_angle": float(drift.mean())}
+        if found["approach_speed"] > 0:
+            found["steady_speed_ratio"] = speed / found["approach_speed"]
+    return in_lengths(found, length)
+
+
+def zigzag(log: Log, start: float, side: float, heading: float, length: float | None) -> dict[str, Any]:
+    """Indices of a zigzag.
+
+    An overshoot is how far the heading goes beyond its bound after a reversal. The time to check yaw is from the first reversal to the
+    peak of the heading; the overshoot width is how far the track moves on across the initial course after that reversal; the reach is the
+    time from the first execute until the heading is back on the initial course; the period is that of a whole cycle, from reversal to
+    reversal of the same side, mean over the log. The initial course is the heading that the log begins with.
+
+    Args:
+        log: t, x, y, psi, u, v, r.
+        start: time of the first execute in s.
+        side: of the first execute, +1 starboard, -1 port.
+        heading: change of heading at which the steering is reversed, rad.
+        length: of the hull in m.
+    """
+    track = Track(log)
+    if track.end <= start:
+        return {}
+    origin = float(track.heading[0])
+    reversals: list[float] = []
+    overshoots: list[tuple[float, float]] = []
+    now, towards = start, side
+    while (reversal := track.crossing(origin + towards * heading, now, towards)) is not None:
+        reversals.append(reversal)
+        back = track.crossing(origin + towards * heading, reversal + 1e-9, -towards)
+        if back is not None:
+            time, value = track.peak(reversal, back, towards)
+            overshoots.append((time, value - towards * origin - heading))
+        now, towards = reversal, -towards
+    found: dict[str, Any] = {"approach_speed": track.approach(start), "largest_yaw_rate": float(np.abs(track.r[track.t >= start]).max())}
+    if reversals:
+        found["initial_turning_time"] = reversals[0] - start
+        found["initial_turning_distance"] = float(track.travelled(reversals[0]) - track.travelled(start))
+        back = track.crossing(origin, reversals[0], -side)
+        found |= {} if back is None else {"reach": back - start}
+    found |= {name: value for name, (_, value) in zip(("first_overshoot", "second_overshoot"), overshoots, strict=False)}
+    if overshoots:
+        found["time_to_check_yaw"] = overshoots[0][0] - reversals[0]
+    if len(reversals) > 1:
+        times = np.linspace(reversals[0], reversals[1], 500)
+        aside = np.array([side * track.beside(time, start)[1] for time in times])
+        found["overshoot_width"] = float(aside.max() - aside[0])
+    if len(reversals) > 2:
+        found["period"] = float(np.mean(np.array(reversals[2:]) - np.array(reversals[:-2])))
+    return in_lengths(found, length)
+
+
+def stopping(log: Log, start: float, length: float | None) -> dict[str, Any]:
+    """Indices of a stopping trial from the order at `start` [s] to where the surge velocity is zero: along the track, ahead and across."""
+    track = Track(log)
+    surge = CubicSpline(track.t, track.u)
+    found: dict[str, Any] = {"approach_speed": track.approach(start)}
+    stop = first_crossing(lambda t: -surge(t), track.t, start)
+    if stop is None:
+        return found
+    ahead, across = track.beside(stop, start)
+    found |= {"track_reach": float(track.travelled(stop) - track.travelled(start)), "head_reach": ahead, "lateral_deviation": abs(across)}
+    return in_lengths(found | {"stopping_time": stop - start}, length)
