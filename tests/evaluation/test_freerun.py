@@ -174,8 +174,33 @@ def test_the_plant_itself_predicts_its_own_noise_free_trial() -> None:
     log = Log("trial", STEP * np.arange(count), channels)
     good = np.ones(count, dtype=bool)
     trial = prepared(log, truth[:, :6], np.zeros((count, 2)), good, np.zeros(count, dtype=int))
-    candidate = Candidate("truth", "truth", model, plant.state[6:], plant.inputs[:2], len(plant.inputs) - 2)
+    candidate = Candidate("truth", "truth", model, plant.state, plant.inputs[:2], len(plant.inputs) - 2)
     windows = [window(0, s, s + 30, nu=tuple(truth[s, 3:6])) for s in (0, 25, 50)]
     for w_, p in zip(windows, free_run([candidate], windows, [trial], STEP, LIMIT)["truth"], strict=True):
         np.testing.assert_allclose(p.states[:, 3:], truth[w_.start : w_.stop, 3:6], atol=1e-12)
         np.testing.assert_allclose(p.states[:, :3], truth[w_.start : w_.stop, :3], atol=2e-3)
+
+
+def test_a_vessel_that_rolls_starts_from_the_logs_roll_too() -> None:
+    """The truth of a 4-DOF vessel, whose state has phi and p among x, y, psi, u, v, r: its free run is the log itself."""
+    plant = load_vessel("patrol_p06").build()
+    model = PlantDynamics(plant, STEP, 2)
+    count = 200
+    w = torch.zeros(1, count, len(plant.inputs), dtype=torch.float64)
+    w[0, :, 0] = 0.1 * torch.sign(torch.sin(torch.arange(count) * 0.05))
+    w[0, :, 1] = 1e5
+    x, states = plant.approach(1), []
+    with torch.no_grad():
+        for k in range(count):
+            states.append(x[0])
+            x, _ = model.step(x, w[:, k], x[:, :0])
+    truth = torch.stack(states).numpy()
+    channels = dict(zip(plant.state, truth.T, strict=True)) | {name: w[0, :, i].numpy() for i, name in enumerate(plant.inputs[:2])}
+    log = Log("trial", STEP * np.arange(count), channels)
+    motion = log.stack(("x", "y", "psi", "u", "v", "r"))
+    trial = prepared(log, motion, np.zeros((count, 2)), np.ones(count, dtype=bool), np.zeros(count, dtype=int))
+    candidate = Candidate("truth", "truth", model, plant.state, plant.inputs[:2], len(plant.inputs) - 2)
+    windows = [window(0, s, s + 60, nu=tuple(motion[s, 3:])) for s in (0, 70, 130)]
+    for w_, p in zip(windows, free_run([candidate], windows, [trial], STEP, LIMIT)["truth"], strict=True):
+        np.testing.assert_allclose(p.states[:, 3:], motion[w_.start : w_.stop, 3:], atol=1e-12)
+    assert np.abs(log["phi"]).max() > 0.01

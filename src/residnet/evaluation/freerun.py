@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
+from residnet.core.names import STATE, VELOCITY
 from residnet.data.prepare import Prepared
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.hybrid import HybridDynamics
@@ -24,7 +25,7 @@ class Candidate:
         name: unique in a run.
         kind: zero, baseline, head, truth or ensemble.
         model: the dynamics; float64 parameters are run in float64.
-        states: channels of the log that continue the state after x, y, psi, u, v, r (a plant's actuators).
+        state: names of the columns of the model's state; what is not x, y, psi, u, v, r (roll, actuators) starts from the log's channel.
         inputs: channels of the log that make w; None for the prepared inputs.
         idle: inputs after those that are held at zero (disturbances that the model is not told about).
         reference: name of the model that this one is compared with, window by window; None for none.
@@ -33,7 +34,7 @@ class Candidate:
     name: str
     kind: str
     model: Dynamics
-    states: tuple[str, ...] = ()
+    state: tuple[str, ...] = STATE
     inputs: tuple[str, ...] | None = None
     idle: int = 0
     reference: str | None = None
@@ -85,7 +86,7 @@ def _run(
     with torch.no_grad():
         s = _memory(model, windows, logs, tables, dtype)
         states, _, _ = Rollout(model)(torch.from_numpy(x0).to(dtype), torch.from_numpy(ahead).to(dtype), s)
-    nu = states[:, :, 3:6].double().numpy()
+    nu = states[:, :, [candidate.state.index(name) for name in VELOCITY]].double().numpy()
     out = []
     for i, window in enumerate(windows):
         length = window.stop - window.start
@@ -122,8 +123,8 @@ def _inputs(candidate: Candidate, log: Prepared) -> np.ndarray:
 
 
 def _initial(candidate: Candidate, window: Window, log: Prepared) -> np.ndarray:
-    extra = log.log.stack(candidate.states)[window.start] if candidate.states else np.zeros(0)
-    return np.concatenate((log.y[window.start, :3], window.nu, extra))
+    known = dict(zip(STATE, (*log.y[window.start, :3], *window.nu), strict=True))
+    return np.array([known[name] if name in known else log.log[name][window.start] for name in candidate.state])
 
 
 def integrate(pose: np.ndarray, nu: np.ndarray, step: float) -> np.ndarray:

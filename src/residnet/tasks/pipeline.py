@@ -277,7 +277,7 @@ def candidates(fitted: Sequence[Fitted], data: MeasuredLogs | SimulatedTrials) -
             return out
         known = plant.inputs[: plant.commands]
         model = PlantDynamics(plant, data.step, data.substeps)
-        out.append(Candidate("truth", "truth", model, plant.state[6:], known, len(plant.inputs) - len(known), "baseline"))
+        out.append(Candidate("truth", "truth", model, plant.state, known, len(plant.inputs) - len(known), "baseline"))
     return out
 
 
