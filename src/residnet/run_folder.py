@@ -34,6 +34,7 @@ class RunFolder:
         self.data_quality = path / "data_quality.json"
         self.residuals = path / "residuals.parquet"
         self.limits = path / "limits.json"
+        self.goodness = path / "goodness.json"
 
     @classmethod
     def create(cls, path: Path, resolved: str, *, resume: bool) -> RunFolder:

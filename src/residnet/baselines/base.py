@@ -21,6 +21,10 @@ class Baseline(nn.Module, ABC):
     def forward(self, z: Tensor) -> Tensor:
         """nu_dot [..., 3] at channels z [..., nz] (see `residnet.physics.signals`)."""
 
+    @abstractmethod
+    def freedom(self) -> list[float]:
+        """Number of fitted parameters of each axis."""
+
 
 class IdentifiedConfig(Config, ABC):
     """A kind of baseline and how it is identified."""

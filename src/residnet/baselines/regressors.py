@@ -41,6 +41,10 @@ class RegressorBaseline(Baseline):
         weights = self.theta * self.allowed
         return self.library(z) @ weights.to(z.dtype).T
 
+    def freedom(self) -> list[float]:
+        """Coefficients of each axis that are not zero."""
+        return [float(count) for count in ((self.theta * self.allowed) != 0).sum(1)]
+
     def columns(self, axis: int) -> list[int]:
         """Numbers of the terms that an axis has."""
         return [j for j in range(self.library.count) if bool(self.allowed[axis, j] > 0)]

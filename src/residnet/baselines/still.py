@@ -21,6 +21,10 @@ class StillBaseline(Baseline):
         """Zeros [..., 3] for channels z [..., nz]."""
         return torch.zeros_like(z[..., :3])
 
+    def freedom(self) -> list[float]:
+        """None."""
+        return [0.0, 0.0, 0.0]
+
 
 class StillConfig(IdentifiedConfig):
     """No known part: the head learns the whole acceleration."""

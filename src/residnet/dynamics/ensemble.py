@@ -28,6 +28,10 @@ class MeanBaseline(Baseline):
             total = total + member(z)
         return total / len(self.members)
 
+    def freedom(self) -> list[float]:
+        """Those of all members."""
+        return _summed([member.freedom() for member in self.members])  # type: ignore[operator]
+
 
 @final
 class MeanHead(ResidualHead):
@@ -64,6 +68,14 @@ class MeanHead(ResidualHead):
         for member in self.members:
             memory.append(member.warmup(z))  # type: ignore[operator]
         return torch.cat(memory, dim=-1)
+
+    def freedom(self) -> list[float]:
+        """Those of all members."""
+        return _summed([member.freedom() for member in self.members])  # type: ignore[operator]
+
+
+def _summed(counts: Sequence[Sequence[float]]) -> list[float]:
+    return [sum(axis) for axis in zip(*counts, strict=True)]
 
 
 def mean_of(members: Sequence[HybridDynamics]) -> HybridDynamics:

@@ -60,6 +60,7 @@ class RunFiles:
         self.quality: Sequence[Row] = _json(path / "data_quality.json", [])
         self.provenance: Row = _json(path / "provenance.json", {})
         self.limits: Row = _json(path / "limits.json", {})
+        self.goodness: Row = _json(path / "goodness.json", {})
         resolved = path / "resolved.yaml"
         self.resolved_text = resolved.read_text() if resolved.is_file() else ""
         self.resolved: Row = yaml.safe_load(self.resolved_text) or {}

@@ -46,6 +46,10 @@ class ResidualHead(nn.Module, ABC):
         """Spread of the residual on the training samples, [3], float64: what a one-step loss is measured in; ones where a head keeps none."""
         return torch.ones(3, dtype=torch.float64)
 
+    def freedom(self) -> list[float]:
+        """Number of fitted parameters of each axis: all trained ones, which the axes share."""
+        return [float(sum(parameter.numel() for parameter in self.parameters()))] * 3
+
 
 class ClosedFormHead(ResidualHead):
     """A head whose parameters come from a closed-form solution."""
@@ -63,6 +67,11 @@ class ClosedFormHead(ResidualHead):
         first = self.solutions(samples)[0]
         self.load_state_dict(first.state, strict=False)
         return first.choice | first.notes
+
+    def freedom(self) -> list[float]:
+        """Number of fitted parameters of each axis: coefficients [J, 3] and intercepts [3] that are not zero, where a head says nothing else."""
+        fitted = [numbers.reshape(-1, 3) for name, numbers in self.named_buffers() if name in ("coefficients", "intercept")]
+        return [float((torch.cat(fitted)[:, axis] != 0).sum()) for axis in range(3)]
 
 
 class FeatureConfig(Config):

@@ -70,6 +70,10 @@ class KernelHead(ClosedFormHead):
         """Residual [..., 3] at channels z [..., nz]; the memory is empty."""
         return self.kernel(self.features(z)), s
 
+    def freedom(self) -> list[float]:
+        """Effective number of parameters of each axis, the trace of the smoother."""
+        return [float(count) for count in self.effective]
+
     def solutions(self, samples: Samples) -> list[Solution]:
         """Of each axis the setting and penalty of the least cross-validated error; where free runs choose, then all joint ones, and no residual.
 

@@ -23,6 +23,7 @@ from residnet.studies import draw_study
 from residnet.tasks.drifting import summary, through_currents
 from residnet.tasks.exporting import export_model
 from residnet.tasks.fit import FitConfig
+from residnet.tasks.goodness import write_goodness
 from residnet.tasks.pipeline import Fitted, Fitter, candidates, evaluate, prepare_logs, say, write_residuals
 from residnet.tasks.reporting import report_run
 from residnet.tasks.terms import write_terms
@@ -81,6 +82,7 @@ def run_fit(config: FitConfig, *, source: Path, overrides: Sequence[str], out: P
     write_limits(folder, config, limiting, [log for split in config.evaluation.splits for log in logs[split]])
     write_residuals(folder.residuals, fitter, fitted, logs["test"])
     write_terms(folder.path / "terms.parquet", fitted, logs["test"])
+    write_goodness(folder.goodness, config.name, fitted, logs, config.prepare.grid.step)
     if report:
         finish(folder, config)
     folder.write_provenance(config=source, overrides=overrides, seed=config.seed, files=files, started=started)
