@@ -7,6 +7,7 @@ from typing import Annotated
 from pydantic import Field
 
 from residnet.baselines.base import Baseline
+from residnet.baselines.believed import BelievedConfig
 from residnet.baselines.linear_steady import LinearSteadyConfig
 from residnet.baselines.nomoto import NomotoConfig, NomotoSideslipConfig
 from residnet.baselines.regressors import RegressorBaseline, RegressorsConfig
@@ -14,13 +15,14 @@ from residnet.baselines.still import StillConfig
 from residnet.core.solutions import Coefficient
 
 BaselineConfig = Annotated[
-    LinearSteadyConfig | NomotoConfig | NomotoSideslipConfig | RegressorsConfig | StillConfig,
+    BelievedConfig | LinearSteadyConfig | NomotoConfig | NomotoSideslipConfig | RegressorsConfig | StillConfig,
     Field(discriminator="kind"),
 ]
 
 __all__ = [
     "Baseline",
     "BaselineConfig",
+    "BelievedConfig",
     "Coefficient",
     "LinearSteadyConfig",
     "NomotoConfig",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import final
+from typing import Self, final
 
 from torch import Tensor, nn
 
@@ -28,6 +28,10 @@ class Baseline(nn.Module, ABC):
 
 class IdentifiedConfig(Config, ABC):
     """A kind of baseline and how it is identified."""
+
+    def resolved(self) -> Self:
+        """The same without references to files, as it is kept with a model."""
+        return self
 
     @abstractmethod
     def build(self, names: Sequence[str]) -> Baseline:

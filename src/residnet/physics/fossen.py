@@ -101,6 +101,11 @@ class HullConfig(Config, ABC):
     def coupling(self) -> float:
         """What r is multiplied by in the sway momentum of C(nu), in kg m, without the scale."""
 
+    def equations(self) -> tuple[tuple[str, ...], list[list[float]]]:
+        """nu_dot as terms of (u, v, r), and the coefficients of these, then of tau_x, tau_y, tau_n, on each axis."""
+        terms, response = Fossen3(self).products()
+        return terms, response.tolist()
+
     @final
     def build(self) -> FossenVessel:
         """The plant.
@@ -203,22 +208,26 @@ class Fossen3(nn.Module):
         """Forces [..., 3] that accelerate the vessel by nu_dot [..., 3] at velocities nu [..., 3] (document 002 eq. (2.10))."""
         return nu_dot @ self.mass.to(nu.dtype).T + self.coriolis(nu) + self.drag(nu)
 
-    def compact(self) -> None:
-        """Write Coriolis force, drag and tau as one product of terms and a matrix: the same to rounding, with a third of the operations."""
+    def products(self) -> tuple[tuple[str, ...], Tensor]:
+        """nu_dot as products: J terms of (u, v, r), and their coefficients with those of tau behind them, [3, J + 3]."""
         m, cross = self.mass.tolist(), self.coupling
         coriolis = {"v r": (0, -m[1][1]), "r^2": (0, -cross), "u r": (1, m[0][0]), "u v": (2, m[1][1] - m[0][0])}
-        terms = [*self.terms.terms, *coriolis, "u r"]
+        terms = (*self.terms.terms, *coriolis, "u r")
         force = torch.zeros(3, len(terms), dtype=torch.float64)
         force[:, : self.terms.count] = self.damping
         for column, (axis, value) in enumerate(coriolis.values()):
             force[axis, self.terms.count + column] = value
         force[2, -1] = cross
+        return terms, torch.cat((-(self.inverse @ force), self.inverse), dim=1)
+
+    def compact(self) -> None:
+        """Write Coriolis force, drag and tau as one product of terms and a matrix: the same to rounding, with a third of the operations."""
+        terms, self.response = self.products()
         library = TermLibrary(terms, VELOCITY)
         # the forces are rows of their own behind [1, nu, |nu|]
         forces = torch.zeros(library.depth, 3, dtype=torch.long)
         forces[0] = torch.tensor([7, 8, 9])
         self.gather = list(torch.cat((library.index, forces), dim=1))
-        self.response = torch.cat((-(self.inverse @ force), self.inverse), dim=1)
         self.compacted = True
 
     def forward(self, nu: Tensor, tau: Tensor) -> Tensor:

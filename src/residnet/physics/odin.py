@@ -88,6 +88,11 @@ class OdinConfig(Config):
     def _base(cls, data: Any, info: ValidationInfo) -> Any:
         return with_base(data, (info.context or {}).get("folder"))
 
+    def equations(self) -> tuple[tuple[str, ...], list[list[float]]]:
+        """nu_dot as terms of (u, v, r), and the coefficients of these, then of tau_x, tau_y, tau_n, on each axis."""
+        hull = AccelerationHull(self.gains, self.terms)
+        return hull.terms.terms, torch.cat((hull.coefficients.T, torch.diag(hull.gain)), dim=1).tolist()
+
     def build(self) -> OdinVessel:
         """The plant."""
         return OdinVessel(self)

@@ -142,7 +142,7 @@ class Fitter:
                 "name": name,
                 "role": role,
                 "signals": config.signals.resolved().model_dump(),
-                "baseline": baseline.model_dump(),
+                "baseline": baseline.resolved().model_dump(),
                 "head": config.heads[name].model_dump() if role == "head" else None,
                 "dt": config.prepare.grid.step,
                 "integrator": config.integrator,
