@@ -113,6 +113,11 @@ class TrainingConfig(Config):
         """Epochs of all stages together."""
         return self.one_step.epochs + sum(stage.epochs for stage in self.multi_step)
 
+    @property
+    def last_stage(self) -> int:
+        """Number of the last free-run stage."""
+        return len(self.multi_step)
+
     def stage(self, epoch: int) -> tuple[int, int]:
         """(stage, epoch within it); stage 0 is one-step, stage i the i-th free-run stage."""
         begin = 0

@@ -1,52 +1,38 @@
-"""The Lightning module that trains one head: stages, losses, free-run validation, and everything that a resumed run needs."""
+"""The Lightning module that trains one head: stages, losses, free-run validation."""
 
 from __future__ import annotations
 
 import copy
 import math
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, final
 
-import lightning as L
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from residnet.data.windows import WindowBatches, WindowStore
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.training.config import TrainingConfig
+from residnet.training.epochs import EpochTraining
 from residnet.training.losses import one_step_loss, rollout_loss
 
 Validate = Callable[[HybridDynamics], float]
 
 
-class HeadTraining(L.LightningModule):
-    """Trains `model.head` (and the baseline, where the config says so) and keeps the weights that validate best in free run.
-
-    Every epoch is seeded by (seed, epoch) alone, so that a run resumed at an epoch's end repeats the undisturbed one.
-    """
+@final
+class HeadTraining(EpochTraining):
+    """Trains `model.head` (and the baseline, where the config says so) and keeps the weights that validate best in free run."""
 
     def __init__(self, model: HybridDynamics, store: WindowStore, config: TrainingConfig, scales: Tensor, validate: Validate, seed: int) -> None:
-        super().__init__()
+        super().__init__(config, seed)
         self.model = model
         self.average = copy.deepcopy(model).requires_grad_(False) if config.average > 0 else None
         self.rollout = Rollout(model)
         self.store = store
-        self.settings = config
         self.scales = scales
         self.validate = validate
-        self.seed = seed
-        self.best_score = math.inf
-        self.best_state: dict[str, Tensor] = {}
-        self.without_gain = 0
-        self.stopped = False
-        self.history: list[dict[str, float]] = []
         self.batches = [self._batches(stage, length, batch) for stage, (length, batch) in enumerate(self._stages())]
-
-    @property
-    def epoch(self) -> int:
-        """Epochs finished; Lightning's own count is one behind while it restores a checkpoint."""
-        return len(self.history)
 
     def _stages(self) -> list[tuple[int, int]]:
         dt, config = self.model.dt, self.settings
@@ -80,7 +66,7 @@ class HeadTraining(L.LightningModule):
 
     def on_train_epoch_start(self) -> None:
         """Seed the epoch and set the stage's learning rate."""
-        torch.manual_seed((self.seed * 7_919 + self.epoch) % (2**63))
+        self.seed_epoch()
         stage, epoch = self.settings.stage(self.epoch)
         own = self.settings.one_step if stage == 0 else self.settings.multi_step[stage - 1]
         progress = 0.5 * (1 - math.cos(math.pi * epoch / max(own.epochs - 1, 1)))
@@ -135,60 +121,10 @@ class HeadTraining(L.LightningModule):
         for kept, new in zip(self.average.parameters(), self.model.parameters(), strict=True):
             kept.lerp_(new.detach(), 1.0 - decay)
 
-    def finish_epoch(self) -> None:
-        """Validate in free run; keep the best weights; stop early in the last stage. Called by the first callback of an epoch's end."""
-        stage, _ = self.settings.stage(self.epoch)
-        last = self.epoch + 1 == self.settings.epochs
-        entry = {"epoch": float(self.epoch), "stage": float(stage), "loss": sum(self._losses) / max(len(self._losses), 1)}
-        self._losses.clear()
-        if last or (self.epoch + 1) % self.settings.validate_every == 0:
-            model = self.model if self.average is None else self.average
-            score = self.validate(model)
-            entry["validation"] = score
-            if score < self.best_score:
-                self.best_score, self.without_gain = score, 0
-                self.best_state = {name: value.detach().clone() for name, value in model.state_dict().items()}
-            else:
-                self.without_gain += 1
-        self.history.append(entry)
-        logger = self.trainer.logger
-        if logger is not None:
-            logger.log_metrics({k: v for k, v in entry.items() if k != "epoch"}, step=self.epoch)
-        self.stopped = stage == len(self.settings.multi_step) and self.without_gain >= self.settings.patience
-        self.trainer.should_stop = self.stopped
-
-    def on_fit_start(self) -> None:
-        """Losses of the running epoch."""
-        self._losses: list[float] = []
-
-    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Beside weights and optimiser: the best weights, the curve, random state and thread count."""
-        checkpoint["residnet"] = {
-            "best_score": self.best_score,
-            "best_state": self.best_state,
-            "without_gain": self.without_gain,
-            "history": self.history,
-            "stopped": self.stopped,
-            "stage": self.settings.stage(self.epoch)[0],
-            "random": torch.get_rng_state(),
-            "threads": torch.get_num_threads(),
-        }
-
-    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Put back what `on_save_checkpoint` kept."""
-        self.restore(checkpoint["residnet"])
-
-    def restore(self, own: dict[str, Any]) -> None:
-        """Put back what a checkpoint kept of this module."""
-        self.best_score, self.best_state, self.without_gain = own["best_score"], own["best_state"], own["without_gain"]
-        self.history, self.stopped = own["history"], own["stopped"]
-        torch.set_rng_state(own["random"])
-        torch.set_num_threads(own["threads"])
-
-    @property
-    def finished(self) -> bool:
-        """Whether all epochs are done or training has stopped early."""
-        return self.stopped or self.epoch >= self.settings.epochs
+    def validated(self) -> tuple[nn.Module, float]:
+        """The averaged model, where there is one, and its free-run error."""
+        model = self.model if self.average is None else self.average
+        return model, self.validate(model)
 
 
 class EpochBatches:

@@ -1,4 +1,4 @@
-"""One trainer for all network heads: Lightning with checkpoints that survive a kill, TensorBoard and a progress line."""
+"""One trainer for all networks: Lightning with checkpoints that survive a kill, TensorBoard and a progress line."""
 
 from __future__ import annotations
 
@@ -17,15 +17,16 @@ from residnet.core.samples import Samples
 from residnet.data.windows import WindowStore
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.training.config import TrainingConfig
+from residnet.training.epochs import Epochs, EpochTraining
 from residnet.training.module import HeadTraining, Validate
 
 
-class FreeRunValidation(L.Callback):
+class FinishEpoch(L.Callback):
     """Lets the module finish its epoch before the checkpoint is written: Lightning runs callbacks before the module's own hook."""
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Validate."""
-        assert isinstance(pl_module, HeadTraining)
+        assert isinstance(pl_module, EpochTraining)
         pl_module.finish_epoch()
 
 
@@ -50,11 +51,11 @@ class ProgressLine(L.Callback):
         self.epochs = epochs
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Show epoch, loss and free-run errors."""
-        assert isinstance(pl_module, HeadTraining)
+        """Show epoch, loss and the best validation."""
+        assert isinstance(pl_module, EpochTraining)
         done, last = trainer.current_epoch + 1, pl_module.history[-1]
         text = f"  {self.name}: epoch {done}/{self.epochs}, stage {int(last['stage'])}, loss {last['loss']:.4g}"
-        text += f", best free-run error {pl_module.best_score:.4g}"
+        text += f", best validation {pl_module.best_score:.4g}"
         if sys.stderr.isatty():
             print(f"\r{text}\033[K", end="\n" if done == self.epochs or trainer.should_stop else "", file=sys.stderr, flush=True)
         elif done % max(self.epochs // 10, 1) == 0 or done == self.epochs:
@@ -106,7 +107,7 @@ def train(
     }
 
 
-def run_epochs(name: str, module: HeadTraining, config: TrainingConfig, folder: Path) -> None:
+def run_epochs(name: str, module: EpochTraining, config: Epochs, folder: Path) -> None:
     """Train a module to its last epoch, from its last checkpoint where there is one; Ctrl-C leaves one to resume from."""
     logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
     checkpoints = folder / "checkpoints" / name
@@ -118,7 +119,7 @@ def run_epochs(name: str, module: HeadTraining, config: TrainingConfig, folder: 
         max_epochs=config.epochs,
         gradient_clip_val=config.gradient_clip,
         logger=TensorBoardLogger(folder / "tensorboard", name=name, version=""),
-        callbacks=[FreeRunValidation(), KeepCheckpoint(last), ProgressLine(name, config.epochs)],
+        callbacks=[FinishEpoch(), KeepCheckpoint(last), ProgressLine(name, config.epochs)],
         enable_checkpointing=False,
         enable_progress_bar=False,
         enable_model_summary=False,
