@@ -1,0 +1,195 @@
+"""Reference filter and motion PID against SciPy and by hand; the ferry through the document's waypoints."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import solve_ivp
+from scipy.signal import lti, step
+
+from residnet.control import (
+    Allocated,
+    ClosedLoop,
+    GivenReference,
+    HullFeedForward,
+    MotionPID,
+    MotionPIDConfig,
+    ReferenceFilter,
+    ReferenceFilterConfig,
+)
+from residnet.core.config import load_config
+from residnet.core.errors import ConfigError
+from residnet.dynamics.rollout import Rollout
+from residnet.dynamics.simulated import PlantDynamics
+from residnet.physics.actuators import AzimuthThrusters
+from residnet.physics.fossen import FossenVessel
+from residnet.physics.vessel import load_vessel
+
+WAYPOINTS = ((0.0, -15.0, -1.5), (15.0, -15.0, 3.0), (15.0, 0.0, 0.0))
+
+
+def asked(guidance: ReferenceFilter, steps: int, start: torch.Tensor) -> torch.Tensor:
+    """References [B, T, 9]."""
+    s, out = guidance.initial_state(start), []
+    for k in range(steps):
+        reference, s = guidance(start, k, s)
+        out.append(reference)
+    return torch.stack(out, dim=1)
+
+
+def test_filter_against_its_transfer_function() -> None:
+    """(2.15) is (s + W)(s^2 + 2 D W s + W^2) (ERRATA J9)."""
+    w, d = 0.4, 0.7
+    config = ReferenceFilterConfig(waypoints=((10.0, 0.0, 0.0),), interval=40.0, frequency=(w, w, w), damping=(d, d, d))
+    x = torch.zeros(1, 6, dtype=torch.float64)
+    found = asked(config.build(0.05), 800, x)[0]
+    _, y = step(lti([w**3], np.polymul([1, w], [1, 2 * d * w, w**2])), T=0.05 * np.arange(800))
+    np.testing.assert_allclose(found[:, 0], 10 * y, atol=1e-6)
+    # straight north: body axes are earth axes
+    np.testing.assert_allclose(found[1:-1, 3], (found[2:, 0] - found[:-2, 0]) / 0.1, atol=2e-3)
+
+
+def test_body_velocity_and_acceleration_belong_to_the_pose() -> None:
+    """nu_d and its derivative are those of eta_d seen from the turning vessel (ERRATA J7), by differences."""
+    config = ReferenceFilterConfig(waypoints=WAYPOINTS, interval=10.0, frequency=(0.4, 0.5, 0.6))
+    dt = 0.01
+    x = torch.tensor([[3.0, 1.0, 0.4, 0, 0, 0]], dtype=torch.float64)
+    found = asked(config.build(dt), 3000, x)[0].numpy()
+    np.testing.assert_array_equal(found[0], [3.0, 1.0, 0.4, 0, 0, 0, 0, 0, 0])
+    eta, nu, nu_dot = found[:, :3], found[:, 3:6], found[:, 6:]
+    slope = (eta[2:] - eta[:-2]) / (2 * dt)
+    c, s = np.cos(eta[1:-1, 2]), np.sin(eta[1:-1, 2])
+    body = np.stack((c * slope[:, 0] + s * slope[:, 1], c * slope[:, 1] - s * slope[:, 0], slope[:, 2]), axis=1)
+    inside = np.ones(len(body), dtype=bool)
+    # at a new waypoint the third derivative jumps
+    inside[[998, 999, 1998, 1999]] = False
+    np.testing.assert_allclose(nu[1:-1][inside], body[inside], atol=1e-4)
+    np.testing.assert_allclose(nu_dot[1:-1][inside], ((nu[2:] - nu[:-2]) / (2 * dt))[inside], atol=2e-4)
+
+
+def test_headings_are_followed_as_written() -> None:
+    """From 0 to 180 deg clockwise and from 135 to -45 deg the other way (ERRATA J13): no wrapping."""
+    points = ((0.0, 0.0, np.pi), (0.0, 0.0, 0.75 * np.pi), (0.0, 0.0, -0.25 * np.pi))
+    config = ReferenceFilterConfig(waypoints=points, interval=60.0)
+    psi = asked(config.build(0.1), 1800, torch.zeros(1, 6, dtype=torch.float64))[0, :, 2].numpy()
+    assert psi[:600].min() >= 0
+    assert psi[599] == pytest.approx(np.pi, abs=0.01)
+    turning = psi[1205:]
+    assert (np.diff(turning)[turning[:-1] > 0] < 0).all()
+    assert -0.9 < turning.min() < -0.25 * np.pi
+    assert psi[-1] == pytest.approx(-0.25 * np.pi, abs=0.01)
+
+
+def test_one_config_for_each_row() -> None:
+    """Rows fly their own waypoints and bandwidths, and stay at their last one."""
+    short = ReferenceFilterConfig(waypoints=WAYPOINTS[:1], interval=10.0, frequency=(0.9, 0.9, 0.9))
+    long = ReferenceFilterConfig(waypoints=WAYPOINTS, interval=10.0)
+    x = torch.zeros(2, 6, dtype=torch.float64)
+    both = asked(ReferenceFilter([short, long], 0.1), 300, x)
+    for row, config in enumerate((short, long)):
+        torch.testing.assert_close(both[row], asked(config.build(0.1), 300, x[:1])[0], rtol=1e-12, atol=1e-12)
+    assert both[0, -1, 1] == pytest.approx(-15.0, abs=1e-3)
+    assert long.duration == 30.0
+
+
+@pytest.mark.parametrize(("intervals", "dt"), [((10.0,), 0.3), ((0.05,), 0.1), ((10.0, 20.0), 0.1)])
+def test_intervals_of_whole_steps(intervals: tuple[float, ...], dt: float) -> None:
+    configs = [ReferenceFilterConfig(waypoints=WAYPOINTS, interval=interval) for interval in intervals]
+    with pytest.raises(ConfigError, match="whole number of steps"):
+        ReferenceFilter(configs, dt)
+
+
+def test_units_of_waypoints_in_a_file(tmp_path: object) -> None:
+    text = "waypoints: [[15 m, -15, -90 deg]]\ninterval: 1 min\nfrequency: [0.2, 0.2, 0.4]\n"
+    file = tmp_path / "guidance.yaml"  # type: ignore[operator]
+    file.write_text(text)
+    config = load_config(file, [], ReferenceFilterConfig)
+    assert config.waypoints[0] == pytest.approx((15.0, -15.0, -np.pi / 2))
+    assert config.interval == 60.0
+    with pytest.raises(ConfigError, match="frequency"):
+        load_config(file, ["frequency=[0.2, 0, 0.4]"], ReferenceFilterConfig)
+
+
+GAINS = MotionPIDConfig(proportional=(190.0, 200.0, 900.0), integral=(6.0, 7.0, 45.0), derivative=(860.0, 910.0, 2700.0))
+
+
+def test_pid_by_hand() -> None:
+    """Two steps: error in the body frame, heading wrapped, the integral used before it is updated."""
+    x = torch.tensor([[1.0, 2.0, 3.0, 0.5, -0.1, 0.02, 7.0]], dtype=torch.float64)
+    reference = torch.tensor([[4.0, 1.0, -3.1, 0.6, 0.1, 0.0, 0.3, 0.2, 0.1]], dtype=torch.float64)
+    controller, dt = GAINS.build(0.1), 0.1
+    first, s = controller(x, reference, controller.initial_state(x))
+    second, s = controller(x, reference, s)
+    c, sn = np.cos(3.0), np.sin(3.0)
+    e = np.array([c * 3.0 + sn * -1.0, c * -1.0 - sn * 3.0, -6.1 + 2 * np.pi])
+    rest = np.array([190, 200, 900]) * e + np.array([860, 910, 2700]) * [0.1, 0.2, -0.02]
+    np.testing.assert_allclose(first[0], rest, rtol=1e-12)
+    np.testing.assert_allclose(second[0], rest + np.array([6, 7, 45]) * e * dt, rtol=1e-12)
+    np.testing.assert_allclose(s[0], 2 * dt * e, rtol=1e-12)
+    hull = ferry("milliampere").hull
+    forward = GAINS.build(dt, HullFeedForward(hull))(x, reference, controller.initial_state(x))[0] - first
+    np.testing.assert_allclose(hull(reference[:, 3:6], forward), reference[:, 6:9], rtol=1e-9, atol=1e-12)
+
+
+def ferry(name: str) -> FossenVessel:
+    plant = load_vessel(name).build()
+    assert isinstance(plant, FossenVessel)
+    return plant
+
+
+def test_the_exact_model_follows_without_feedback() -> None:
+    """Forces of the true hull's inverse, at once: the only error is that they are held over a step."""
+    plant = ferry("milliampere")
+    dt = 0.05
+    config = ReferenceFilterConfig(waypoints=((5.0, -3.0, 0.8),), interval=30.0)
+    guidance = config.build(dt)
+    none = MotionPIDConfig(proportional=(0.0, 0.0, 0.0))
+    controller = none.build(dt, HullFeedForward(plant.hull))
+    x0 = torch.zeros(1, len(plant.state), dtype=torch.float64)
+    # the plain hull: forces act through the body's inputs, as the thrusters would lag
+    wanted = asked(guidance, 600, x0)
+    tau = controller(x0.expand(600, -1), wanted[0], torch.zeros(600, 3, dtype=torch.float64))[0]
+
+    def rate(t: float, y: np.ndarray) -> np.ndarray:
+        held = torch.zeros(1, len(plant.inputs), dtype=torch.float64)
+        held[0, 3:6] = tau[min(int(t / dt + 1e-9), 599)]
+        with torch.no_grad():
+            return plant.rate(torch.from_numpy(y)[None], held)[0].numpy()
+
+    end = solve_ivp(rate, (0.0, 20.0), x0[0].numpy(), max_step=dt, rtol=1e-6).y[:3, -1]
+    np.testing.assert_allclose(end, wanted[0, 400, :3], atol=2e-3)
+
+
+def test_the_closed_loop_scripts() -> None:
+    """A controller has to leave Python: the same commands as TorchScript, after a memory of some steps."""
+    dt = 0.1
+    loop = ClosedLoop(GAINS.build(dt, HullFeedForward(ferry("milliampere").hull)), ReferenceFilterConfig(waypoints=WAYPOINTS).build(dt))
+    scripted = torch.jit.script(loop)
+    x, w = torch.randn(3, 12, dtype=torch.float64), torch.zeros(3, 5, dtype=torch.float64)
+    memory = again = loop.initial(x)
+    for k in range(4):
+        command, memory = loop(x, w, k, memory)
+        same, again = scripted(x, w, k, again)
+        torch.testing.assert_close(same, command, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(again, memory, rtol=1e-12, atol=1e-12)
+
+
+def test_allocated_to_azimuth_thrusters() -> None:
+    """The thrusters make the forces that the controller asks for, while they can; its integral brings the ferry to the point."""
+    plant = ferry("milliampere_azimuth")
+    assert isinstance(plant.actuators, AzimuthThrusters)
+    dt = 0.2
+    controller = MotionPID([GAINS], dt, HullFeedForward(ferry("milliampere").hull))
+    point = torch.zeros(1, 1, 9, dtype=torch.float64)
+    point[0, 0, :3] = torch.tensor([0.5, -0.3, 0.2], dtype=torch.float64)
+    x0 = plant.approach(1)
+    asked_for = controller(x0, point[:, 0], torch.zeros(1, 3, dtype=torch.float64))[0]
+    command = Allocated(controller, plant.actuators)(x0, point[:, 0], torch.zeros(1, 3, dtype=torch.float64))[0]
+    torch.testing.assert_close(plant.actuators.force(x0[:, 6:], command, x0[:, 3:6]), asked_for, rtol=1e-9, atol=1e-9)
+    w = torch.zeros(1, 600, len(plant.inputs), dtype=torch.float64)
+    w[..., plant.inputs.index("force_north")] = 40.0
+    loop = ClosedLoop(Allocated(controller, plant.actuators), GivenReference(point))
+    with torch.no_grad():
+        states, _, _ = Rollout(PlantDynamics(plant, dt), loop)(x0, w, x0[:, :0])
+    torch.testing.assert_close(states[0, -1, :3], point[0, 0, :3], atol=0.02, rtol=0)
