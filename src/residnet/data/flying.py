@@ -123,7 +123,7 @@ def fly(
     with torch.no_grad():
         states, inputs, _ = Rollout(craft.dynamics, watched)(start, w, craft.dynamics.initial_state(rows).to(w.dtype))
     noise = random.standard_normal((rows, steps, 3)) * [sea.noise.u, sea.noise.v, sea.noise.r]
-    names = _names(manoeuvres)
+    names = log_names(manoeuvres)
     out = []
     for i, manoeuvre in enumerate(manoeuvres):
         stopped = int(watched.stopped[i])
@@ -160,7 +160,7 @@ def _surroundings(sea: Sea, craft: Craft, rows: int, steps: int, step: float, ra
     return w
 
 
-def _names(manoeuvres: Sequence[Manoeuvre]) -> list[str]:
+def log_names(manoeuvres: Sequence[Manoeuvre]) -> list[str]:
     """Names of the logs: as given, else the kind with its number."""
     count: dict[str, int] = {}
     out = []

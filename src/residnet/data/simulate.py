@@ -102,9 +102,15 @@ def fly_trials(manoeuvres: Sequence[Manoeuvre], config: SimulatedTrials) -> list
     Channels: the plant's state (for the WAM-V x, y, psi, u, v, r, n_port, n_stbd), the commands, and the true wind where there is any. Float64.
     """
     plant = load_vessel(config.vessel).build()
-    craft = Craft(config.vessel, PlantDynamics(plant, config.step, config.substeps), Helm.of(plant), plant.commands, plant.approach(1))
+    craft = trials_craft(config)
     sea = Sea(plant, config.disturbance, config.noise, config.seed)
     return fly(craft, manoeuvres, sea, config.duration, config.step, {"vessel": config.vessel})
+
+
+def trials_craft(config: SimulatedTrials) -> Craft:
+    """The vessel of the trials."""
+    plant = load_vessel(config.vessel).build()
+    return Craft(config.vessel, PlantDynamics(plant, config.step, config.substeps), Helm.of(plant), plant.commands, plant.approach(1))
 
 
 def simulate(manoeuvres: Sequence[Manoeuvre], config: SimulatedTrials) -> list[Log]:

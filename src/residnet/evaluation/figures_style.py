@@ -24,6 +24,9 @@ _HEADS: tuple[tuple[str, Any], ...] = (
 # the plant lies on the head that comes near it and shows it through its gaps
 _ORDER = {"zero": 3, "baseline": 3, "truth": 5}
 MEASURED: dict[str, Any] = {"color": "black", "linestyle": "-", "linewidth": 0.7, "label": "measured", "zorder": 2}
+SOLID: dict[str, Any] = {"color": _BLUE, "linestyle": "-", "linewidth": 1.6, "zorder": 3}
+DASHED: dict[str, Any] = {"color": _ORANGE, "linestyle": (0, (4, 2)), "linewidth": 1.6, "zorder": 4}
+"""Two curves of equal rank, told apart by colour and by line."""
 MASKED: dict[str, Any] = {"color": "0.88", "linewidth": 0, "zorder": 0}
 
 # Any: matplotlib types the keys as a closed set of literals

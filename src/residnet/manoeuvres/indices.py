@@ -26,7 +26,8 @@ UNITS: dict[str, str] = {
     "reach": "s", "period": "s", "largest_yaw_rate": "rad/s",
     "track_reach": "m", "head_reach": "m", "lateral_deviation": "m", "stopping_time": "s",
     "steers": "-", "yaw_rates": "rad/s", "loop_height": "rad/s",
-    "largest_cross_track_error": "m", "rms_cross_track_error": "m", "course_time": "s", "final_speed": "m/s",
+    "largest_cross_track_error": "m", "rms_cross_track_error": "m", "course_time": "s",
+    "rmse_u": "m/s", "rmse_v": "m/s", "rmse_r": "rad/s", "position_error_end": "m", "heading_error_end": "rad",
 }  # fmt: skip
 """Unit of each index."""
 

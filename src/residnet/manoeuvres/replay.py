@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal, final
+from typing import Any, Literal, final
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ from torch import Tensor
 from residnet.core.config import ExistingPath
 from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
-from residnet.core.names import STATE, nearest
+from residnet.core.names import STATE, VELOCITY, nearest
 from residnet.dynamics.rollout import Source
 from residnet.manoeuvres.base import Helm, Manoeuvre
 
@@ -106,6 +106,19 @@ class Replay(Manoeuvre):
                 at = np.searchsorted(clock[known], t.numpy() + 1e-9, side="right") - 1
                 out[:, i] = values[known][at.clip(min=0)]
         return torch.from_numpy(out)
+
+    def indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
+        """How far the motion is from the recorded one: root mean square errors of u, v, r, and where it ends."""
+        clock = self.recorded.t - self.recorded.t[0]
+        errors: dict[str, np.ndarray] = {}
+        for name in STATE:
+            values = self.channel(name)
+            assert values is not None, "a replay does not begin without it"
+            known = np.isfinite(values)
+            errors[name] = log[name] - np.interp(log.t - log.t[0], clock[known], values[known])
+        found: dict[str, Any] = {f"rmse_{name}": float(np.sqrt(np.mean(errors[name] ** 2))) for name in VELOCITY}
+        away = float(np.hypot(errors["x"][-1], errors["y"][-1]))
+        return found | {"position_error_end": away, "heading_error_end": float(abs((errors["psi"][-1] + np.pi) % (2 * np.pi) - np.pi))}
 
     @classmethod
     def source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
