@@ -7,8 +7,9 @@ from typing import Annotated
 from pydantic import Field
 
 from residnet.tasks.actuators import ActuatorsTaskConfig
+from residnet.tasks.ferry_study import FerryStudyConfig
 from residnet.tasks.fit import FitConfig
 from residnet.tasks.simulate import SimulateConfig
 from residnet.tasks.study import StudyConfig
 
-TaskConfig = Annotated[FitConfig | SimulateConfig | StudyConfig | ActuatorsTaskConfig, Field(discriminator="task")]
+TaskConfig = Annotated[FitConfig | SimulateConfig | StudyConfig | ActuatorsTaskConfig | FerryStudyConfig, Field(discriminator="task")]

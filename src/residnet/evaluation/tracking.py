@@ -1,0 +1,72 @@
+"""How well a trajectory was followed and with how much effort (document 002 section 3.5)."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+import torch
+from torch import Tensor
+
+from residnet.core.frames import wrap
+
+
+@dataclass(frozen=True)
+class Tracking:
+    """Metrics of one run in closed loop; SI, angles in rad.
+
+    Attributes:
+        position_mae, position_mse: of the distance to the desired position in m, m^2 (4.6).
+        heading_mae, heading_mse: of the wrapped heading error in rad, rad^2 (4.7).
+        tau: mean |tau| commanded in surge, sway, yaw.
+        feedback: mean |tau_FB| in surge, sway, yaw.
+        energy: integral of |tau' nu| in J, surge and sway, then yaw.
+        iaew: integral of |e| times integral of power (3.18), position [m s J] and heading [rad s J].
+    """
+
+    position_mae: float
+    position_mse: float
+    heading_mae: float
+    heading_mse: float
+    tau: tuple[float, float, float]
+    feedback: tuple[float, float, float]
+    energy: tuple[float, float]
+    iaew: tuple[float, float]
+
+    def row(self) -> dict[str, float | list[float]]:
+        """For JSON."""
+        return {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()}
+
+
+def tracking(pose: Tensor, nu: Tensor, desired: Tensor, command: Tensor, feed_forward: Tensor, dt: float) -> Tracking:
+    """Metrics of a run.
+
+    Args:
+        pose: x, y, psi [T, 3].
+        nu: u, v, r [T, 3].
+        desired: eta_d [T, 3].
+        command: tau_c [T, 3].
+        feed_forward: its part tau_FF [T, 3].
+        dt: step in s.
+    """
+    position = (desired[:, :2] - pose[:, :2]).norm(dim=-1)
+    heading = wrap(desired[:, 2] - pose[:, 2]).abs()
+    work = command * nu
+    # the power of keeping the position and of keeping the heading are told apart (Table 4.13)
+    energy = [float(work[:, :2].sum(-1).abs().sum() * dt), float(work[:, 2].abs().sum() * dt)]
+    errors = [float(position.sum() * dt), float(heading.sum() * dt)]
+    tau, feedback = command.abs().mean(0).tolist(), (command - feed_forward).abs().mean(0).tolist()
+    return Tracking(
+        float(position.mean()),
+        float(position.square().mean()),
+        float(heading.mean()),
+        float(heading.square().mean()),
+        (tau[0], tau[1], tau[2]),
+        (feedback[0], feedback[1], feedback[2]),
+        (energy[0], energy[1]),
+        (errors[0] * energy[0], errors[1] * energy[1]),
+    )
+
+
+def mse(residual: Tensor) -> list[float]:
+    """Mean square of a residual [N, 3] by axis."""
+    return [float(value) for value in torch.mean(residual.square(), dim=0)]

@@ -1,0 +1,129 @@
+"""Models in force space: tau = F(nu_dot, nu), a believed hull and what was found to be missing in it (document 002 eqs. (3.19)-(3.27))."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import final
+
+import torch
+from torch import Tensor, nn
+
+from residnet.core.errors import ConfigError, FitError
+from residnet.core.frames import to_body
+from residnet.core.names import ACCELERATION, VELOCITY
+from residnet.physics.fossen import Fossen3
+from residnet.physics.terms import TermLibrary, parse_term
+
+MOTION = (*ACCELERATION, *VELOCITY)
+"""Channels of a force-space model: u_dot, v_dot, r_dot, u, v, r."""
+
+_CROSS = ("u v", "u r", "v r", "|u|v", "|u|r", "|v|u", "|v|r", "|r|u", "|r|v", "|u||v|", "|u||r|", "|v||r|")
+FERRY_TERMS: tuple[str, ...] = (
+    *MOTION,
+    *(f"{name}|{name}|" for name in VELOCITY),
+    *(f"{name}^3" for name in VELOCITY),
+    *(f"|{name}|" for name in VELOCITY),
+    *(f"{name}^2" for name in VELOCITY),
+    *_CROSS,
+)
+"""The 30 basis functions of document 002, (4.10)-(4.12)."""
+
+
+def order_of(term: str) -> int:
+    """beta of a basis function: how many channels are multiplied in it (document 002 section 4.3.4)."""
+    return max(sum(abs(factor.power) for factor in parse_term(term, MOTION)), 1)
+
+
+def column_scale(terms: Sequence[str], x: Tensor) -> Tensor:
+    """What the columns x [N, J] of basis functions are divided by, beta std(x) [J], so that higher orders weigh less (4.8), (4.9), ERRATA J15.
+
+    Raises:
+        FitError: where a column is constant.
+    """
+    std = x.std(0)
+    small = std <= 1e-9 * x.abs().amax(0).clamp(min=1e-300)
+    if bool(small.any()):
+        raise FitError(f"basis function '{terms[int(small.nonzero()[0, 0])]}' is constant over the samples; leave it out or give data that excite it")
+    return std * torch.tensor([order_of(term) for term in terms], dtype=x.dtype)
+
+
+class Correction(nn.Module):
+    """theta_0 + Theta' phi(nu_dot, nu): a force [..., 3] that is linear in basis functions."""
+
+    def __init__(self, terms: Sequence[str], coefficients: Tensor, intercept: Tensor) -> None:
+        super().__init__()
+        self.library = TermLibrary(terms, MOTION)
+        self.register_buffer("coefficients", coefficients.to(torch.float64))
+        self.register_buffer("intercept", intercept.to(torch.float64))
+        self.coefficients: Tensor
+        self.intercept: Tensor
+
+    def forward(self, nu_dot: Tensor, nu: Tensor) -> Tensor:
+        """Force [..., 3] at nu_dot [..., 3] and nu [..., 3]."""
+        basis = self.library(torch.cat((nu_dot, nu), dim=-1))
+        return basis @ self.coefficients.to(nu.dtype) + self.intercept.to(nu.dtype)
+
+
+@final
+class ForceModel(nn.Module):
+    """F_k = F_(k-1) + Theta phi on a believed hull; the chain of (3.26) is a list of corrections.
+
+    Attributes:
+        earth: a force constant in earth axes [2] (north, east) in N that acts on the vessel beside the thrusters.
+    """
+
+    def __init__(self, hull: Fossen3, corrections: Sequence[Correction] = (), earth: Tensor | None = None) -> None:
+        super().__init__()
+        self.hull = hull
+        self.corrections = nn.ModuleList(corrections)
+        self.register_buffer("earth", torch.zeros(2, dtype=torch.float64) if earth is None else earth)
+        self.earth: Tensor
+
+    def extended(self, correction: Correction, earth: Tensor | None = None) -> ForceModel:
+        """The next model of the chain."""
+        more = self.earth if earth is None else self.earth + earth
+        return ForceModel(self.hull, [*self.corrections, correction], more)
+
+    def forward(self, nu_dot: Tensor, nu: Tensor) -> Tensor:
+        """tau [..., 3] in N, N, N m that the motion needs in water at rest."""
+        tau = self.hull.required(nu_dot, nu)
+        for correction in self.corrections:
+            tau = tau + correction(nu_dot, nu)
+        return tau
+
+    def at_heading(self, nu_dot: Tensor, nu: Tensor, psi: Tensor) -> Tensor:
+        """tau [..., 3] that the thrusters have to give at heading psi [...] rad, against the force that is constant in earth axes."""
+        earth = self.earth.to(nu.dtype)
+        along, across = to_body(earth[0], earth[1], psi)
+        return self(nu_dot, nu) - torch.stack((along, across, torch.zeros_like(along)), dim=-1)
+
+    def residual(self, tau: Tensor, nu_dot: Tensor, nu: Tensor, psi: Tensor) -> Tensor:
+        """eps = tau - F(nu_dot, nu) [..., 3], what the model does not explain (3.20), (3.25)."""
+        return tau - self.at_heading(nu_dot, nu, psi)
+
+
+def augmented(mass: Tensor, terms: Sequence[str], coefficients: Tensor, who: str) -> tuple[Tensor, list[int]]:
+    """M + A [3, 3] of eps = A nu_dot + b(nu), and the numbers of the terms that make b.
+
+    Raises:
+        ConfigError: where a term is not affine in nu_dot with a constant factor.
+        FitError: where M + A has an eigenvalue whose real part is not positive, or is ill-conditioned: the model cannot run forward.
+    """
+    total, rest = mass.clone(), []
+    for j, term in enumerate(terms):
+        factors = parse_term(term, MOTION)
+        moving = [factor for factor in factors if factor.name in ACCELERATION]
+        if not moving:
+            rest.append(j)
+        elif len(factors) == 1 and not moving[0].magnitude and moving[0].power == 1 and not moving[0].function:
+            total[:, ACCELERATION.index(moving[0].name)] += coefficients[j]
+        else:
+            raise ConfigError(f"term '{term}': a force-space model that runs forward names accelerations only by themselves (u_dot, v_dot, r_dot)")
+    scale = mass.diagonal().abs().sqrt()
+    values, condition = torch.linalg.eigvals(total).real, float(torch.linalg.cond(total / torch.outer(scale, scale)))
+    if bool((values <= 0).any()) or not condition < 1e4:
+        raise FitError(
+            f"{who}: its mass matrix with the fitted accelerations has eigenvalues {[round(float(v), 1) for v in values]} and condition "
+            f"{condition:.1e}, it cannot run forward; give data with more acceleration, fewer terms, or a higher penalty or lower order"
+        )
+    return total, rest

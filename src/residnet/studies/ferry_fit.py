@@ -1,0 +1,205 @@
+"""Identification of the ferry's force residual from one flown course (document 002 chapter 4)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from residnet.control.anticipation import Lag
+from residnet.core.config import Config
+from residnet.core.errors import FitError
+from residnet.core.frames import to_body
+from residnet.evaluation.tracking import mse
+from residnet.heads.regressions import Fit, Regression, RegressionConfig
+from residnet.physics.force_model import FERRY_TERMS, MOTION, Correction, ForceModel, column_scale
+from residnet.physics.terms import TermLibrary, parse_term
+from residnet.training.lag import LagFit, fit_lag, followed
+
+
+class Published(Config):
+    """Figures of the document for one model, as printed where ERRATA does not say otherwise; they stand beside the run's own.
+
+    Attributes:
+        mse: of the residual on the test half in N^2, N^2, (N m)^2.
+        position_mae: m.
+        position_mse: m^2.
+        heading_mae: deg.
+        tau: mean |tau| in N, N, N m.
+        feedback: mean |tau_FB|.
+        crossing_position_mae, crossing_position_mse, crossing_heading_mae: the same of the operational crossing.
+    """
+
+    mse: tuple[float, float, float] | None = None
+    position_mae: float | None = None
+    position_mse: float | None = None
+    heading_mae: float | None = None
+    tau: tuple[float, float, float] | None = None
+    feedback: tuple[float, float, float] | None = None
+    crossing_position_mae: float | None = None
+    crossing_position_mse: float | None = None
+    crossing_heading_mae: float | None = None
+
+
+class FerryModelConfig(Config):
+    """One model of the residual.
+
+    Attributes:
+        fit: how its coefficients are found.
+        terms: its basis functions; the 30 of (4.12) unless given.
+        lag: fit the thrusters' lag with it, explain the force that followed the command, and lead the feed-forward by the lag.
+        earth: include forces that are constant in earth axes.
+        smooth: samples on either side of the window that noisy velocities and accelerations are smoothed over (cubic Savitzky-Golay), 0 for none;
+            the command is smoothed alike, so that both keep step.
+        on: the model whose remaining residual this one explains (3.26); empty for the believed hull.
+        fly: fly the course, and the crossing where there is one, with it as feed-forward.
+        published: the document's figures.
+    """
+
+    fit: RegressionConfig
+    terms: tuple[str, ...] = FERRY_TERMS
+    lag: bool = False
+    earth: bool = False
+    smooth: int = Field(default=0, ge=0)
+    on: str = ""
+    fly: bool = False
+    published: Published = Published()
+
+    def model_post_init(self, context: Any) -> None:
+        """Read the terms, so that a wrong one is found at once."""
+        for term in self.terms:
+            parse_term(term, MOTION)
+
+
+@dataclass(frozen=True)
+class FerryModel:
+    """A fitted model.
+
+    Attributes:
+        model: F = F_0 + corrections.
+        lag: of the thrusters, where it was fitted.
+        fit: coefficients.
+        test_mse: of the remaining residual on the test half, by axis; against the command, or for a lag-aware model against the followed command.
+        notes: what was chosen.
+    """
+
+    model: ForceModel
+    lag: Lag | None
+    fit: Fit
+    test_mse: list[float]
+    notes: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Record:
+    """What a controller logs, uniform in time.
+
+    Attributes:
+        t: [N] s; pose, nu, nu_dot, command: [N, 3]; fold: segment of each sample [N]; train: samples that identify [N] bool, the others test.
+    """
+
+    t: Tensor
+    pose: Tensor
+    nu: Tensor
+    nu_dot: Tensor
+    command: Tensor
+    fold: Tensor
+    train: Tensor
+
+    @property
+    def dt(self) -> float:
+        """Sampling interval."""
+        return float(self.t[1] - self.t[0])
+
+    def smoothed(self, half: int) -> Record:
+        """Velocities, accelerations and commands through the same cubic Savitzky-Golay window of 2 half + 1 samples."""
+        if half == 0:
+            return self
+        from scipy.signal import savgol_filter
+
+        def smooth(part: Tensor) -> Tensor:
+            return torch.from_numpy(savgol_filter(part.numpy(), 2 * half + 1, min(3, 2 * half), axis=0))
+
+        return Record(self.t, smooth(self.pose), smooth(self.nu), smooth(self.nu_dot), smooth(self.command), self.fold, self.train)
+
+
+def identify(config: FerryModelConfig, record: Record, base: ForceModel) -> FerryModel:
+    """Fit one model on the record's training samples.
+
+    Raises:
+        FitError: where the data do not determine it.
+    """
+    used = record.smoothed(config.smooth)
+    train = used.train
+    x = TermLibrary(config.terms, MOTION)(torch.cat((used.nu_dot, used.nu), dim=-1))
+    needed = base.at_heading(used.nu_dot, used.nu, used.pose[:, 2])
+    along, across = to_body(torch.ones(()), torch.zeros(()), used.pose[:, 2]), to_body(torch.zeros(()), torch.ones(()), used.pose[:, 2])
+    nothing = torch.zeros_like(along[0])
+    earthly = torch.stack((torch.stack((*along, nothing), dim=-1), torch.stack((*across, nothing), dim=-1)), dim=-1)
+    found: LagFit | None = None
+    force = used.command
+    if config.lag:
+        regressors = torch.cat((x, earthly[:, 0]), dim=-1) if config.earth else x
+        found = fit_lag(force, needed, regressors, used.dt, train)
+        force = followed(force, found.lag, used.dt)
+    y = force - needed
+    push = torch.zeros(2, dtype=torch.float64)
+    if config.earth:
+        push = constant_force(x[train], y[train], -earthly[train])
+        y = y + torch.einsum("nad,d->na", earthly, push)
+    data = Regression(config.terms, x[train], y[train], _scale(config, x[train]), _ranked(used.fold[train]), (x[~train], y[~train]))
+    fit = config.fit.fit(data)
+    model = base.extended(Correction(config.terms, fit.coefficients, fit.intercept), push)
+    notes = dict(fit.notes)
+    if found is not None:
+        notes["lag"] = {"frequency": found.lag.frequency, "damping": found.lag.damping, "delay": found.lag.delay}
+    if config.earth:
+        notes["earth"] = {"north": float(push[0]), "east": float(push[1])}
+    lag = found.lag if found is not None else None
+    return FerryModel(model, lag, fit, judged(model, lag, record), notes)
+
+
+def judged(model: ForceModel, lag: Lag | None, record: Record) -> list[float]:
+    """MSE of the residual that a model leaves on a record's test samples as they were logged, by axis; through its lag where it has one."""
+    force = record.command if lag is None else followed(record.command, lag, record.dt)
+    residual = model.residual(force, record.nu_dot, record.nu, record.pose[:, 2])
+    return mse(residual[~record.train])
+
+
+def _scale(config: FerryModelConfig, x: Tensor) -> Tensor:
+    finite = torch.nan_to_num(x)
+    return column_scale(config.terms, finite)
+
+
+def _ranked(fold: Tensor) -> Tensor:
+    return torch.unique(fold, return_inverse=True)[1]
+
+
+def constant_force(x: Tensor, y: Tensor, earthly: Tensor) -> Tensor:
+    """A force (north, east) [2] shared by the axes, beside regressors that each axis weighs by itself (partialled out).
+
+    Args:
+        x: regressors [N, J].
+        y: residual [N, 3].
+        earthly: what a unit of each force adds to the residual [N, 3, 2].
+
+    Raises:
+        FitError: where the vessel hardly turned, so that a constant of the body axes explains the same.
+    """
+    centred = torch.cat((torch.ones_like(x[:, :1]), (x - x.mean(0)) / x.std(0).clamp(min=1e-300)), dim=-1)
+    left, singular, _ = torch.linalg.svd(centred, full_matrices=False)
+    left = left[:, singular > 1e-7 * singular[0]]
+
+    def rest(part: Tensor) -> Tensor:
+        return part - left @ (left.T @ part)
+
+    weight = rest(y).std(0).clamp(min=1e-9)
+    design = torch.cat([torch.stack([rest(earthly[:, a, d]) for d in range(2)], dim=-1) / weight[a] for a in range(2)])
+    target = torch.cat([rest(y[:, a]) / weight[a] for a in range(2)])
+    own = float(torch.linalg.svdvals(design * weight[:2].mean())[-1]) / len(y) ** 0.5
+    if own < 0.02:
+        raise FitError("a force constant in earth axes does not show: the vessel kept its heading; give a run that turns, or leave earth out")
+    return torch.linalg.lstsq(design, target[:, None]).solution[:, 0]

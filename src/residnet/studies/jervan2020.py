@@ -1,0 +1,172 @@
+"""Document 002 chapter 4: tables of the ferry study, the published figure beside each of its own."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from residnet.control.anticipation import Lag
+from residnet.evaluation.tracking import mse
+from residnet.heads.regressions import table
+from residnet.physics.force_model import ForceModel
+from residnet.run_folder import RunFolder
+from residnet.studies.ferry_fit import FerryModel, Published, Record, identify
+from residnet.studies.ferry_runs import Flight
+
+if TYPE_CHECKING:
+    from residnet.tasks.ferry_study import FerryStudyConfig
+
+_DEG = 180.0 / math.pi
+AXES = ("surge", "sway", "yaw")
+
+
+@dataclass(frozen=True)
+class Study:
+    """Everything that was flown and fitted.
+
+    Attributes:
+        first: the course with the believed model, which identifies.
+        unmodelled: MSE of its residual on the test half.
+        models: fitted, by name.
+        courses, crossings: flights by model, `believed` first.
+    """
+
+    first: Flight
+    unmodelled: list[float]
+    models: dict[str, FerryModel]
+    courses: dict[str, Flight]
+    crossings: dict[str, Flight]
+
+
+def record_of(flight: Flight, interval: float) -> Record:
+    """The log of a course: a fold for each segment, the first half identifies."""
+    fold = torch.div(flight.t + 1e-9, interval, rounding_mode="floor").long()
+    train = torch.arange(len(flight.t)) < len(flight.t) // 2
+    return Record(flight.t, flight.seen[:, :3], flight.seen[:, 3:6], flight.seen[:, 6:], flight.command, fold, train)
+
+
+def study(config: FerryStudyConfig) -> Study:
+    """Fly with the believed model, identify, fly with what was found."""
+    ferry = config.ferry()
+    believed = ForceModel(ferry.believed.hull)
+    first = ferry.fly_course(config.course, [(believed, None)])[0]
+    record = record_of(first, config.course.interval)
+    residual = believed.residual(record.command, record.nu_dot, record.nu, record.pose[:, 2])
+    models: dict[str, FerryModel] = {}
+    for name, wanted in config.models.items():
+        models[name] = identify(wanted, record, models[wanted.on].model if wanted.on else believed)
+    flown: dict[str, tuple[ForceModel, Lag | None]] = {n: (m.model, m.lag) for n, m in models.items() if config.models[n].fly}
+    courses, crossings = {"believed": first}, {}
+    if flown:
+        courses |= dict(zip(flown, ferry.fly_course(config.course, list(flown.values())), strict=True))
+    if config.crossing is not None:
+        everyone = {"believed": (believed, None), **flown}
+        crossings = dict(zip(everyone, ferry.fly_crossing(config.crossing, list(everyone.values())), strict=True))
+    return Study(first, mse(residual[~record.train]), models, courses, crossings)
+
+
+def write(config: FerryStudyConfig, found: Study, folder: RunFolder) -> str:
+    """Write ferry.json, ferry.md, the models' tables and figures; returns the text of ferry.md."""
+    folder.write_json(folder.path / "ferry.json", _content(config, found))
+    parts = [config.description or config.name, residuals_text(config, found)]
+    parts += [tracking_text(config, flights, kind) for kind, flights in (("course", found.courses), ("crossing", found.crossings)) if flights]
+    text = "\n\n".join(parts) + "\n"
+    folder.write(folder.path / "ferry.md", text)
+    for name, model in found.models.items():
+        folder.write(folder.path / "models" / f"{name}.md", model_text(name, config.models[name].terms, model))
+    return text
+
+
+def _content(config: FerryStudyConfig, found: Study) -> dict[str, Any]:
+    rows = {
+        name: {
+            "test_mse": model.test_mse,
+            "share_left": [a / b for a, b in zip(model.test_mse, found.unmodelled, strict=True)],
+            "notes": model.notes,
+            "terms": list(config.models[name].terms),
+            "coefficients": model.fit.coefficients.tolist(),
+            "intercept": model.fit.intercept.tolist(),
+        }
+        for name, model in found.models.items()
+    }
+    return {
+        "schema": "residnet.ferry/1",
+        "run": config.name,
+        "unmodelled_test_mse": found.unmodelled,
+        "models": rows,
+        "course": {name: flight.tracking.row() for name, flight in found.courses.items()},
+        "crossing": {name: flight.tracking.row() for name, flight in found.crossings.items()},
+    }
+
+
+def residuals_text(config: FerryStudyConfig, found: Study) -> str:
+    """Table of the residual's MSE on the test half."""
+    lines = ["Residual force on the unseen half: MSE and share of the un-modelled residual's, published in brackets", ""]
+    lines += ["| model | surge N^2 | sway N^2 | yaw (N m)^2 | left % | chosen |", "|---|---|---|---|---|---|"]
+    base = config.published.mse
+    rows = [("believed", found.unmodelled, base, "")]
+    rows += [(name, model.test_mse, config.models[name].published.mse, _chosen(model.notes)) for name, model in found.models.items()]
+    for name, own, printed, chosen in rows:
+        cells = [_beside(own[a], printed[a] if printed else None) for a in range(3)]
+        shares = [_beside(100 * own[a] / found.unmodelled[a], 100 * printed[a] / base[a] if printed and base else None) for a in range(3)]
+        lines.append(f"| {name} | {' | '.join(cells)} | {' / '.join(shares)} | {chosen} |")
+    return "\n".join(lines)
+
+
+def tracking_text(config: FerryStudyConfig, flights: dict[str, Flight], kind: str) -> str:
+    """Table of a flight's metrics."""
+    lines = [f"Closed loop, {kind}: published in brackets", ""]
+    lines += ["| feed-forward | position MAE m | MSE m^2 | heading MAE deg | mean |τ| N, N, N m | mean |τ_FB| | energy J | IAEW position, heading |"]
+    lines += ["|---|---|---|---|---|---|---|---|"]
+    for name, flight in flights.items():
+        m = flight.tracking
+        said = config.published if name == "believed" else config.models[name].published
+        p = said if kind == "course" else _crossing(said)
+        tau = ", ".join(_beside(m.tau[a], p.tau[a] if p.tau else None) for a in range(3))
+        feedback = ", ".join(_beside(m.feedback[a], p.feedback[a] if p.feedback else None) for a in range(3))
+        energy, iaew = (", ".join(f"{value:.4g}" for value in pair) for pair in (m.energy, m.iaew))
+        cells = [
+            _beside(m.position_mae, p.position_mae),
+            _beside(m.position_mse, p.position_mse),
+            _beside(m.heading_mae * _DEG, p.heading_mae),
+            tau,
+            feedback,
+            energy,
+            iaew,
+        ]
+        lines.append(f"| {name} | {' | '.join(cells)} |")
+    return "\n".join(lines).replace("|τ|", "abs τ").replace("|τ_FB|", "abs τ_FB")
+
+
+def _crossing(said: Published) -> Published:
+    return Published(position_mae=said.crossing_position_mae, position_mse=said.crossing_position_mse, heading_mae=said.crossing_heading_mae)
+
+
+def model_text(name: str, terms: Sequence[str], model: FerryModel) -> str:
+    """The model for reading: coefficients in SI, and |Theta_pre|, which says how much each weighs."""
+    lines = [f"Residual force of model {name}: tau = F_believed(nu_dot, nu) + sum of coefficient x basis function", ""]
+    lines += [f"chosen: {_chosen(model.notes) or 'nothing'}", "", "| basis function | surge | sway | yaw | weight |", "|---|---|---|---|---|"]
+    weights = dict(zip(terms, model.fit.pre.abs().tolist(), strict=True))
+    for term, row in table(terms, model.fit):
+        weight = " / ".join(f"{value:.3f}" for value in weights[term]) if term in weights else ""
+        lines.append(f"| {term.replace('|', '&#124;')} | {row[0]:.4g} | {row[1]:.4g} | {row[2]:.4g} | {weight} |")
+    return "\n".join(lines) + "\n"
+
+
+def _beside(own: float, printed: float | None) -> str:
+    return f"{own:.4g}" if printed is None else f"{own:.4g} ({printed:.4g})"
+
+
+def _chosen(notes: dict[str, Any]) -> str:
+    def said(value: Any) -> str:
+        if isinstance(value, dict):
+            return ", ".join(f"{key} {said(part)}" for key, part in value.items())
+        if isinstance(value, list):
+            return "/".join(said(part) for part in value)
+        return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+    return "; ".join(f"{key} {said(value)}" for key, value in notes.items())

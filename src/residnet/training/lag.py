@@ -1,0 +1,98 @@
+"""Lag of actuators fitted together with a force residual: for each candidate lag the regression is linear (variable projection)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.linalg import expm
+from scipy.optimize import least_squares
+from scipy.signal import lfilter
+from torch import Tensor
+
+from residnet.control.anticipation import Lag
+from residnet.core.errors import FitError
+
+_LEAST, _MOST = np.array([0.2, 0.15, 0.0]), np.array([30.0, 3.0, 2.0])
+
+
+def followed(command: Tensor, lag: Lag, dt: float) -> Tensor:
+    """Force [N, c] that follows a command [N, c] sampled every dt seconds, taken as straight between samples; at rest before."""
+    u = _delayed(command.numpy(), lag.delay, dt)
+    w, z = lag.frequency, lag.damping
+    # exact for inputs that are straight lines between samples: one matrix exponential of the state, the input and its slope
+    a = np.zeros((4, 4))
+    a[0, 1] = 1.0
+    a[1] = [-w * w, -2 * z * w, w * w, 0.0]
+    a[2, 3] = 1.0
+    e = expm(a * dt)
+    step, held, slope = e[:2, :2], e[:2, 2], e[:2, 3] / dt
+    # x[k+1] = S x[k] + (h - g) u[k] + g u[k+1]; y = x[0] as a transfer function of order two
+    trace, determinant = np.trace(step), np.linalg.det(step)
+    g, b = slope, held - slope
+    # y = C (zI - S)^-1 (b + g z) u with C = [1, 0]: (z - s22) (b0 + g0 z) + s12 (b1 + g1 z)
+    s12, s22 = step[0, 1], step[1, 1]
+    numerator = [g[0], b[0] - s22 * g[0] + s12 * g[1], -s22 * b[0] + s12 * b[1]]
+    return torch.from_numpy(lfilter(numerator, [1.0, -trace, determinant], u, axis=0))
+
+
+def _delayed(u: np.ndarray, delay: float, dt: float) -> np.ndarray:
+    """u [N, c] `delay` seconds later, straight between samples, at rest before."""
+    k, share = int(delay / dt), delay / dt % 1.0
+    early = np.concatenate((np.zeros((k + 1, u.shape[1])), u))
+    out: np.ndarray = (1 - share) * early[1 : len(u) + 1] + share * early[: len(u)]
+    return out
+
+
+@dataclass(frozen=True)
+class LagFit:
+    """A lag with the share of the residual's variance that regression leaves under it."""
+
+    lag: Lag
+    left: tuple[float, float, float]
+    left_without: tuple[float, float, float]
+
+
+def fit_lag(command: Tensor, needed: Tensor, basis: Tensor, dt: float, use: Tensor | None = None) -> LagFit:
+    """The lag under which F_believed + basis explains the followed command best.
+
+    Args:
+        command: tau_c [N, 3], uniform in time, from rest on.
+        needed: F_believed(nu_dot, nu) [N, 3].
+        basis: regressors [N, J], without the constant.
+        dt: sampling interval in s.
+        use: samples to count [N] bool; None for all.
+
+    Raises:
+        FitError: where the command does not vary, or the search ends at a bound.
+    """
+    if bool((command.std(0) == 0).all()):
+        raise FitError("the command is constant: no lag shows in it; give a run with changing commands")
+    keep = torch.ones(len(command), dtype=torch.bool) if use is None else use
+    x = basis[keep] - basis[keep].mean(0)
+    q, r = torch.linalg.qr(x / x.std(0).clamp(min=1e-300))
+    q = q[:, r.diagonal().abs() > 1e-9 * r.diagonal().abs().max()]
+    variance = (command - needed)[keep].var(0).clamp(min=1e-300)
+
+    def left(force: Tensor) -> Tensor:
+        y = (force - needed)[keep]
+        y = y - y.mean(0)
+        return (y - q @ (q.T @ y)) / variance.sqrt()
+
+    def miss(p: np.ndarray) -> np.ndarray:
+        lag = Lag(frequency=float(p[0]), damping=float(p[1]), delay=float(p[2]))
+        return left(followed(command, lag, dt)).numpy().ravel()
+
+    starts = [np.array([w, 0.8, d]) for w in (1.0, 3.0, 8.0) for d in (0.05, 0.5)]
+    first = min(starts, key=lambda p: float(np.square(miss(p)).sum()))
+    found = least_squares(miss, first, bounds=(_LEAST, _MOST), x_scale=[1.0, 0.3, 0.1], diff_step=[1e-4] * 3, max_nfev=60)
+    p = found.x
+    at = [
+        name for name, value, low, high in zip(("frequency", "damping", "delay"), p, _LEAST, _MOST, strict=True) if value in (low, high) and value > 0
+    ]
+    if at:
+        raise FitError(f"the lag's {at[0]} ends at the bound of its search ({p[0]:.3g} rad/s, {p[1]:.3g}, {p[2]:.3g} s); the data do not show one")
+    lag = Lag(frequency=float(p[0]), damping=float(p[1]), delay=float(p[2]))
+    shares = [left(force).square().mean(0).tolist() for force in (followed(command, lag, dt), command)]
+    return LagFit(lag, (shares[0][0], shares[0][1], shares[0][2]), (shares[1][0], shares[1][1], shares[1][2]))
