@@ -6,7 +6,8 @@ from typing import Annotated
 
 from pydantic import Field
 
-from residnet.heads.base import ClosedFormHead, ResidualHead
+from residnet.heads.base import ClosedFormHead, EquationHead, ResidualHead
+from residnet.heads.genetic import GeneticConfig
 from residnet.heads.kernel import KernelConfig
 from residnet.heads.lstm import LstmConfig
 from residnet.heads.mlp import MlpConfig
@@ -15,10 +16,12 @@ from residnet.heads.ridge import RidgeConfig
 from residnet.heads.symbolic import SymbolicConfig
 from residnet.heads.zero import ZeroHead
 
-HeadConfig = Annotated[PlsrConfig | RidgeConfig | KernelConfig | SymbolicConfig | MlpConfig | LstmConfig, Field(discriminator="kind")]
+HeadConfig = Annotated[PlsrConfig | RidgeConfig | KernelConfig | SymbolicConfig | GeneticConfig | MlpConfig | LstmConfig, Field(discriminator="kind")]
 
 __all__ = [
     "ClosedFormHead",
+    "EquationHead",
+    "GeneticConfig",
     "HeadConfig",
     "KernelConfig",
     "LstmConfig",

@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from pydantic import Field
 from torch import Tensor, nn
@@ -72,6 +73,14 @@ class ClosedFormHead(ResidualHead):
         """Number of fitted parameters of each axis: coefficients [J, 3] and intercepts [3] that are not zero, where a head says nothing else."""
         fitted = [numbers.reshape(-1, 3) for name, numbers in self.named_buffers() if name in ("coefficients", "intercept")]
         return [float((torch.cat(fitted)[:, axis] != 0).sum()) for axis in range(3)]
+
+
+class EquationHead(ClosedFormHead):
+    """A closed-form head that is a sum of few terms."""
+
+    @abstractmethod
+    def parts(self, z: Tensor, axis: int) -> dict[str, np.ndarray]:
+        """Every term of one axis times its coefficient along measured channels [T, nz], [T] each."""
 
 
 class FeatureConfig(Config):

@@ -26,7 +26,7 @@ def latex(equation: Written) -> str:
     """LaTeX with six digits, names with more than one letter upright."""
     parts = [r" \, ".join([_number(abs(value)), *(_latex_factor(factor) for factor in _factors(term, equation))]) for term, value in _pairs(equation)]
     base, dot, _ = equation.name.rpartition("_dot")
-    left = rf"\dot{{{_latex_name(base)}}}" if dot else _latex_name(equation.name)
+    left = rf"\dot{{{latex_name(base)}}}" if dot else latex_name(equation.name)
     return f"{left} = " + _sum(parts, equation.values)
 
 
@@ -66,7 +66,8 @@ def _number(value: float) -> str:
     return rf"{digits} \cdot 10^{{{int(exponent)}}}" if exponent else digits
 
 
-def _latex_name(name: str) -> str:
+def latex_name(name: str) -> str:
+    """A channel in LaTeX, names with more than one letter upright."""
     head, _, foot = name.partition("_")
     greek = head in ("tau", "delta", "psi", "phi", "eta", "nu")
     symbol = f"\\{head}" if greek else head if len(head) == 1 else rf"\mathrm{{{head}}}"
@@ -100,7 +101,7 @@ _C: dict[str, Callable[[str], str]] = {
 
 
 def _latex_factor(factor: Factor) -> str:
-    name = _latex_name(factor.name)
+    name = latex_name(factor.name)
     symbol = f"|{name}|" if factor.magnitude else _LATEX[factor.function](name)
     if factor.power == 1:
         return symbol

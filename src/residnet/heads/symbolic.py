@@ -15,7 +15,7 @@ from residnet.core.names import ACCELERATION
 from residnet.core.samples import Samples
 from residnet.core.solutions import Coefficient, Solution
 from residnet.core.sparse import NOTHING, Equation, Reduced, SearchConfig, find, reduce
-from residnet.heads.base import ClosedFormHead, FeatureConfig, Features
+from residnet.heads.base import EquationHead, FeatureConfig, Features
 from residnet.heads.delay_line import DelayConfig, DelayLine, Past, best_delay
 from residnet.heads.equation_text import Written, c_function, latex, plain, sympy_text
 from residnet.physics.candidates import Candidate, CandidatesConfig, rated
@@ -57,7 +57,7 @@ class SymbolicConfig(FeatureConfig):
 
 
 @final
-class SymbolicHead(ClosedFormHead):
+class SymbolicHead(EquationHead):
     """rho [..., 3] = phi(features) coefficients, most of them zero; over the baseline `still` it is the equation of the acceleration itself."""
 
     def __init__(self, config: SymbolicConfig, names: Sequence[str]) -> None:

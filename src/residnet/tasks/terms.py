@@ -10,12 +10,12 @@ import torch
 
 from residnet.core.names import ACCELERATION
 from residnet.data.prepare import Prepared
-from residnet.heads.symbolic import SymbolicHead
+from residnet.heads.base import EquationHead
 from residnet.tasks.pipeline import Fitted
 
 
 def write_terms(file: Path, fitted: Sequence[Fitted], logs: Sequence[Prepared]) -> None:
-    """Terms of every symbolic head along the longest log, times their coefficients: columns model, log, axis, term, t, value.
+    """Terms of every head that is an equation along the longest log, times their coefficients: columns model, log, axis, term, t, value.
 
     The term `target` is what the baseline leaves of the measured acceleration, NaN where there is none. Nothing is written without such a head.
     """
@@ -26,7 +26,7 @@ def write_terms(file: Path, fitted: Sequence[Fitted], logs: Sequence[Prepared]) 
     parts: dict[str, list[np.ndarray]] = {"model": [], "log": [], "axis": [], "term": [], "t": [], "value": []}
     for f in fitted:
         head = f.model.to(torch.float64).head if f.spec.role == "head" else None
-        if not isinstance(head, SymbolicHead):
+        if not isinstance(head, EquationHead):
             continue
         with torch.no_grad():
             x, w = torch.from_numpy(np.nan_to_num(log.smooth)), torch.from_numpy(np.nan_to_num(log.w))

@@ -1,0 +1,236 @@
+"""Expressions in normal form: sums of products of channels and of functions of such sums, equal expressions being equal objects.
+
+Genetic programming breeds trees; what a tree means is the sum of products that it comes to, whose terms get a coefficient each (document 000
+sections 5.1.1 and 5.1.3). Here every product is a tuple of numbers of atoms, so that trees that mean the same share their columns and their fit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+Function = Literal["sum", "abs", "sin", "cos", "sqrt", "inv"]
+"""Functions of a sum: itself in brackets, magnitude, sine, cosine, and the protected square root and inverse (document 001 section 2.4)."""
+FUNCTIONS: tuple[Function, ...] = ("sum", "abs", "sin", "cos", "sqrt", "inv")
+
+Product = tuple[int, ...]
+"""Numbers of atoms, ascending, as often as their power; () is 1."""
+Sum = dict[Product, float]
+"""Products and what they are multiplied by."""
+ONE: Product = ()
+
+
+class Limits(NamedTuple):
+    """What an expression may be: terms of a sum, factors of a product, functions inside functions, whether sums are multiplied out."""
+
+    terms: int = 50
+    degree: int = 8
+    nesting: int = 2
+    expand: bool = True
+
+
+class TooLargeError(Exception):
+    """An expression beyond the limits; an individual that means it takes no part."""
+
+
+class Atom(NamedTuple):
+    """A channel, or a function of a sum of products: their factors and weights."""
+
+    channel: str
+    function: Function = "sum"
+    inner: tuple[tuple[Product, float], ...] = ()
+    nesting: int = 0
+
+
+class Algebra:
+    """Sums of products over named channels, kept in normal form: |a|^2 = a^2, |a b| = |a| |b|, cos(-a) = cos a, sin(-a) = -sin a."""
+
+    def __init__(self, channels: Sequence[str], limits: Limits = Limits()) -> None:  # noqa: B008 (immutable)
+        self.channels = tuple(channels)
+        self.limits = limits
+        self.atoms: list[Atom] = [Atom(name) for name in channels]
+        self._number: dict[Atom, int] = {atom: i for i, atom in enumerate(self.atoms)}
+        self._products: dict[tuple[Product, Product], Product] = {}
+
+    def channel(self, name: str) -> Sum:
+        """A channel alone."""
+        return {(self.channels.index(name),): 1.0}
+
+    def add(self, a: Sum, b: Sum, sign: float = 1.0) -> Sum:
+        """a + sign b.
+
+        Raises:
+            TooLargeError: beyond the limits.
+        """
+        out = dict(a)
+        for product, weight in b.items():
+            total = out.get(product, 0.0) + sign * weight
+            if total == 0.0:
+                out.pop(product, None)
+            else:
+                out[product] = total
+        return self._bounded(out)
+
+    def multiply(self, a: Sum, b: Sum) -> Sum:
+        """a b, multiplied out or as a product of brackets.
+
+        Raises:
+            TooLargeError: beyond the limits.
+        """
+        if not self.limits.expand:
+            a, b = self.bracket(a), self.bracket(b)
+        if len(a) * len(b) > 4 * self.limits.terms:
+            raise TooLargeError
+        out: Sum = {}
+        for p, weight in a.items():
+            for q, other in b.items():
+                product = self._product(p, q)
+                out[product] = out.get(product, 0.0) + weight * other
+        return self._bounded({product: weight for product, weight in out.items() if weight != 0.0})
+
+    def apply(self, function: Function, a: Sum) -> Sum:
+        """A function of a sum.
+
+        Raises:
+            TooLargeError: beyond the limits.
+        """
+        if all(product == ONE for product in a):
+            value = float(values_of(function, np.array([a.get(ONE, 0.0)]))[0])
+            return {ONE: value} if value else {}
+        if len(a) == 1 and function in ("abs", "sqrt", "inv"):
+            ((product, weight),) = a.items()
+            factor = float(values_of(function, np.array([weight]))[0])
+            parts = [self._function(function, {(atom,): 1.0}) for atom in product]
+            return {self._normal([atom for part in parts for atom in part]): factor}
+        return self._signed(function, a)
+
+    def bracket(self, a: Sum) -> Sum:
+        """A sum of several terms as one factor."""
+        if len(a) <= 1:
+            return a
+        lead = a[min(a)]
+        return {self._function("sum", {product: weight / lead for product, weight in a.items()}): lead}
+
+    def atom(self, function: Function, a: Sum) -> int:
+        """The number of a function of a sum in normal form."""
+        nesting = 1 + max([self.atoms[i].nesting for product in a for i in product], default=0)
+        atom = Atom("", function, tuple(sorted(a.items())), nesting)
+        if atom not in self._number:
+            self._number[atom] = len(self.atoms)
+            self.atoms.append(atom)
+        return self._number[atom]
+
+    def degree(self, product: Product) -> int:
+        """Factors of a product, with those inside its functions."""
+        return sum(max([self.degree(p) for p, _ in self.atoms[i].inner], default=1) + bool(self.atoms[i].nesting) for i in product)
+
+    def effort(self, product: Product) -> float:
+        """How complicated a product is among those of its degree."""
+        return len(set(product)) + sum(0.5 + 0.1 * len(self.atoms[i].inner) for i in product if self.atoms[i].inner)
+
+    def _signed(self, function: Function, a: Sum) -> Sum:
+        """With the first weight of the inner sum positive, where the function is even or odd."""
+        if a[min(a)] > 0:
+            return {self._function(function, a): 1.0}
+        turned = {product: -weight for product, weight in a.items()}
+        odd = function in ("sin", "inv")
+        return {self._function(function, turned): -1.0 if odd else 1.0}
+
+    def _function(self, function: Function, a: Sum) -> Product:
+        """The product that a function of a sum is; of one atom alone a simpler one where there is."""
+        ((first, weight),) = list(a.items())[:1]
+        if len(a) == 1 and len(first) == 1 and weight == 1.0 and (inner := self.atoms[first[0]]).inner:
+            if function == "abs" and inner.function in ("abs", "sqrt"):
+                return first
+            if function == "sqrt" and inner.function == "abs":
+                return self._function("sqrt", dict(inner.inner))
+            if function == "inv" and inner.function == "inv":
+                return self._function("sum", dict(inner.inner)) if len(inner.inner) > 1 else inner.inner[0][0]
+        nesting = 1 + max([self.atoms[i].nesting for product in a for i in product], default=0)
+        if nesting > self.limits.nesting:
+            raise TooLargeError
+        return (self.atom(function, a),)
+
+    def _product(self, p: Product, q: Product) -> Product:
+        key = (p, q)
+        if key not in self._products:
+            self._products[key] = self._normal([*p, *q])
+        return self._products[key]
+
+    def _normal(self, factors: list[int]) -> Product:
+        """Ascending, with squares of magnitudes as squares."""
+        out = sorted(factors)
+        for i in {i for i in out if self.atoms[i].function == "abs" and out.count(i) > 1}:
+            inner = self.atoms[i].inner
+            plain = inner[0][0] if len(inner) == 1 and inner[0][1] == 1.0 else self._function("sum", dict(inner))
+            pairs = out.count(i) // 2
+            out = [k for k in out if k != i] + [i] * (out.count(i) % 2) + list(plain) * (2 * pairs)
+        if len(out) > self.limits.degree:
+            raise TooLargeError
+        return tuple(sorted(out))
+
+    def _bounded(self, a: Sum) -> Sum:
+        if len(a) > self.limits.terms:
+            raise TooLargeError
+        return a
+
+    def values(self, products: Sequence[Product], data: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Values [P, N] of products at channels [N] each; infinite or not a number where they overflow."""
+        columns = Columns(self, data)
+        return columns.of(products)
+
+
+class Columns:
+    """Atoms along data, each worked out once."""
+
+    def __init__(self, algebra: Algebra, data: Mapping[str, np.ndarray]) -> None:
+        self.algebra = algebra
+        rows = [np.asarray(data[name], dtype=np.float64) for name in algebra.channels]
+        self._table = np.concatenate((np.ones((1, len(rows[0]))), np.stack(rows)))
+        self._row = {i: i + 1 for i in range(len(rows))}
+
+    def of(self, products: Sequence[Product]) -> np.ndarray:
+        """Values [P, N] of products."""
+        self._prepare({i for product in products for i in product})
+        depth = max([len(product) for product in products], default=0)
+        index = np.array([[self._row[i] for i in product] + [0] * (depth - len(product)) for product in products], dtype=np.intp)
+        out = np.ones((len(products), self._table.shape[1]))
+        with np.errstate(over="ignore", invalid="ignore"):
+            for d in range(depth):
+                out *= self._table[index[:, d]]
+        return out
+
+    def _prepare(self, wanted: set[int]) -> None:
+        missing = sorted(i for i in wanted if i not in self._row)
+        if not missing:
+            return
+        rows = []
+        for i in missing:
+            atom = self.algebra.atoms[i]
+            with np.errstate(over="ignore", invalid="ignore"):
+                inner = np.array([weight for _, weight in atom.inner]) @ self.of([product for product, _ in atom.inner])
+                rows.append(values_of(atom.function, inner))
+        for i, row in zip(missing, rows, strict=True):
+            self._row[i] = len(self._table)
+            self._table = np.concatenate((self._table, row[None]))
+
+
+def values_of(function: Function, x: np.ndarray) -> np.ndarray:
+    """A function of values."""
+    return np.asarray(_VALUES[function](x))
+
+
+def _inverse(x: np.ndarray) -> np.ndarray:
+    return np.where(x == 0.0, 0.0, 1.0 / np.where(x == 0.0, 1.0, x))
+
+
+_VALUES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "sum": lambda x: x,
+    "abs": np.abs,
+    "sin": np.sin,
+    "cos": np.cos,
+    "sqrt": lambda x: np.sqrt(np.abs(x)),
+    "inv": _inverse,
+}

@@ -1,0 +1,145 @@
+"""Equations bred by genetic programming: the documents' systems, and their writing read back."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import sympy
+import torch
+from made_odin import FORCE_TRUTH, MSD_TRUTH, force_logs, msd_log
+from made_samples import NAMES, made
+
+from residnet.baselines import StillConfig
+from residnet.core.expressions import Algebra, Limits, Sum
+from residnet.core.genetic import limits_of
+from residnet.core.names import ACCELERATION
+from residnet.core.samples import Samples
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.store import ModelSpec, load_model, save_model
+from residnet.heads.expression_library import ExpressionLibrary, tables
+from residnet.heads.expression_text import LATEX, SYMPY, C, term, total
+from residnet.heads.genetic import GeneticConfig, breed
+from residnet.physics.signals import SignalsConfig
+from residnet.physics.terms import TermLibrary
+
+FORCES = ("u", "v", "r", "tau_x", "tau_y", "tau_n")
+
+
+@pytest.fixture(autouse=True)
+def _deap() -> None:
+    pytest.importorskip("deap", reason="genetic programming needs the extra gp")
+
+
+def samples(log: dict[str, np.ndarray]) -> Samples:
+    z = torch.from_numpy(np.stack([log[name] for name in FORCES], axis=1))
+    target = torch.from_numpy(np.stack([log[name] for name in ACCELERATION], axis=1))
+    return Samples(z, target, torch.zeros(len(z), dtype=torch.long), torch.from_numpy(log["t"]), ("made",), FORCES)
+
+
+def test_force_equations_of_odin() -> None:
+    """Document 000 eqs. (6.6)-(6.8)."""
+    head = GeneticConfig.model_validate({"evolution": {"population": 1000}}).build(FORCES)
+    data = samples(force_logs(1)[0])
+    head.calibrate(data)
+    notes = head.solve(data)
+    for axis, truth in FORCE_TRUTH.items():
+        found = {c["term"]: c["value"] for c in notes["coefficients"] if c["axis"] == axis}
+        assert found == pytest.approx(truth, rel=1e-9)
+        assert notes["equations"][axis]["reached_goal"]
+        assert notes["equations"][axis]["error_share"] < 1e-10
+    assert set(head.names()) == {term for truth in FORCE_TRUTH.values() for term in truth}
+    with torch.no_grad():
+        out = head.sequence(data.z)
+    torch.testing.assert_close(out, data.target, rtol=1e-9, atol=1e-12)
+    parts = head.parts(data.z, 0)
+    assert list(parts) == [name for name in head.names() if name in FORCE_TRUTH["u_dot"]]
+    np.testing.assert_allclose(sum(parts.values()), data.target[:, 0], rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("final", [True, False])
+def test_mass_spring_damper(final: bool) -> None:
+    """Document 000 eq. (5.13); without a final choice the result may hold terms that do nothing."""
+    evolution = {"population": 500, "operators": ["+", "-", "*", "abs"], "tournament": 3, "depth": 7, "split": "sum"}
+    config = GeneticConfig.model_validate({"evolution": evolution} | ({} if final else {"final": None}))
+    log, names = msd_log(), ("x", "w", "tau")
+    algebra = Algebra(names, limits_of(config.evolution))
+    bred = breed(algebra, log, log["w_dot"], np.arange(len(log["t"])) % 50 < 35, config, seed=1)
+    found = {term(algebra, product): value for product, value in zip(bred.products, bred.values, strict=True)}
+    assert {name: found.pop(name) for name in MSD_TRUTH} == pytest.approx(MSD_TRUTH, rel=1e-6)
+    assert not (final and found)
+    assert all(abs(value) < 1e-6 for value in found.values())
+
+
+def test_saved_and_loaded_with_functions_of_sums(tmp_path: Path) -> None:
+    signals = SignalsConfig(inputs=("tau_x", "tau_n"))
+    config = GeneticConfig.model_validate({"evolution": {"population": 80, "generations": 3, "operators": ["+", "*", "abs", "sin", "/", "sqrt"]}})
+    head = config.build(NAMES)
+    head.calibrate(made())
+    head.solve(made())
+    model = HybridDynamics(signals.build(), StillConfig().build(NAMES), head, 0.1, "rk4")
+    spec = ModelSpec(
+        name="m", role="head", signals=signals, baseline=StillConfig(), head=config, dt=0.1, integrator="rk4", low=(0,) * 5, high=(1,) * 5
+    )
+    save_model(tmp_path / "m", spec, model)
+    _, loaded = load_model(tmp_path / "m")
+    again: Any = loaded.head
+    z = made().z[:50]
+    with torch.no_grad():
+        assert torch.equal(again.sequence(z), head.sequence(z))
+    assert again.names() == head.names()
+    assert json.loads((tmp_path / "m" / "model.json").read_text())["head"]["kind"] == "genetic"
+
+
+def expression(algebra: Algebra) -> Sum:
+    """-2 u |v + 3 sin(u r)| + sqrt(v) / (1 + cos(r)^2), not multiplied out, and a constant."""
+    u, v, r = (algebra.channel(name) for name in ("u", "v", "r"))
+    inside = algebra.add(v, algebra.apply("sin", algebra.multiply(u, r)), 3.0)
+    one: Sum = {(): 1.0}
+    cosine = algebra.apply("cos", r)
+    below = algebra.apply("inv", algebra.add(one, algebra.multiply(cosine, cosine)))
+    first = algebra.multiply(algebra.multiply(u, {(): -2.0}), algebra.apply("abs", inside))
+    return algebra.add(algebra.add(first, algebra.multiply(algebra.apply("sqrt", v), below)), {(): 0.25})
+
+
+def truth(u: np.ndarray, v: np.ndarray, r: np.ndarray) -> np.ndarray:
+    return np.asarray(-2 * u * np.abs(v + 3 * np.sin(u * r)) + np.sqrt(np.abs(v)) / (1 + np.cos(r) ** 2) + 0.25)
+
+
+def test_tables_and_writing_say_the_same() -> None:
+    algebra = Algebra(("u", "v", "r"), Limits(nesting=3))
+    meant = expression(algebra)
+    products, weights = list(meant), list(meant.values())
+    library = ExpressionLibrary(3)
+    library.load_state_dict(tables(algebra, products, 3))
+    z = np.random.default_rng(0).normal(size=(30, 3))
+    wanted = truth(*z.T)
+    for module in (library, torch.jit.script(library)):
+        with torch.no_grad():
+            np.testing.assert_allclose(module(torch.from_numpy(z)).numpy() @ weights, wanted, rtol=1e-12)
+    read, same = library.read(algebra.channels)
+    assert [term(read, p) for p in same] == [term(algebra, p) for p in products]
+    symbols = sympy.symbols("u v r")
+    called = sympy.lambdify(symbols, sympy.sympify(total(algebra, products, weights, SYMPY)), "numpy")
+    np.testing.assert_allclose(called(*z.T), wanted, rtol=1e-12)
+    written = total(algebra, products, weights, C)
+    functions = {"fabs": np.abs, "sin": np.sin, "cos": np.cos, "sqrt": np.sqrt}
+    for row, value in zip(z, wanted, strict=True):
+        text = written.replace("? 0.0 :", "and 0.0 or")
+        assert eval(text, {**functions, "u": row[0], "v": row[1], "r": row[2]}) == pytest.approx(value, rel=1e-12)
+    assert r"\sqrt{\left|v\right|}" in total(algebra, products, weights, LATEX)
+
+
+def test_terms_are_written_as_the_term_language_reads_them() -> None:
+    algebra = Algebra(("u", "rpm", "nozzle"))
+    u, rpm, nozzle = (algebra.channel(name) for name in algebra.channels)
+    multiply, apply = algebra.multiply, algebra.apply
+    made = [multiply(u, apply("abs", u)), multiply(multiply(rpm, rpm), apply("cos", nozzle)), apply("sqrt", u), apply("inv", rpm), {(): 1.0}]
+    products = [next(iter(a)) for a in made]
+    z = np.random.default_rng(0).normal(size=(20, 3))
+    library = TermLibrary([term(algebra, product) for product in products], algebra.channels)
+    own = algebra.values(products, dict(zip(algebra.channels, z.T, strict=True)))
+    np.testing.assert_allclose(library(torch.from_numpy(z)).numpy(), own.T, rtol=1e-12)
