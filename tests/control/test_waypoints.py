@@ -1,0 +1,57 @@
+"""Line-of-sight guidance: geometry of a leg, circle of acceptance, arrival."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from residnet.control.waypoints import WaypointGuidance
+from residnet.core.errors import ConfigError
+
+STATE = ("x", "y", "psi", "u", "v", "r")
+
+
+def at(*places: tuple[float, float]) -> torch.Tensor:
+    x = torch.zeros(len(places), 6, dtype=torch.float64)
+    x[:, :2] = torch.tensor(places, dtype=torch.float64)
+    return x
+
+
+@pytest.mark.parametrize("turn", [0.0, 1.0, 2.5, -2.0])
+def test_it_steers_for_a_point_ahead_on_the_leg(turn: float) -> None:
+    """A leg of any direction; 3 m to starboard of it with 4 m look-ahead: atan(3/4) to port of the leg's direction."""
+    end = (100 * math.cos(turn), 100 * math.sin(turn))
+    guidance = WaypointGuidance([end], 5.0, 4.0, STATE)
+    s = guidance.initial_state(at((0.0, 0.0)))
+    for aside in (3.0, 0.0, -3.0):
+        x = at((20 * math.cos(turn) - aside * math.sin(turn), 20 * math.sin(turn) + aside * math.cos(turn)))
+        heading, s = guidance(x, 0, s)
+        expected = turn - math.atan(aside / 4)
+        assert math.remainder(float(heading) - expected, 2 * math.pi) == pytest.approx(0.0, abs=1e-12)
+        _, ahead, error = guidance.leg(x, s[:, 0].long(), s)
+        assert float(ahead) == pytest.approx(80.0)
+        assert float(error) == pytest.approx(aside, abs=1e-12)
+
+
+def test_legs_change_in_the_circle_and_behind_the_point() -> None:
+    guidance = WaypointGuidance([(10.0, 0.0), (10.0, 20.0)], 2.0, 5.0, STATE)
+    x = at((7.9, 0.0), (8.1, 0.0), (10.1, 9.0))
+    s = guidance.initial_state(at((0.0, 0.0), (0.0, 0.0), (0.0, 0.0)))
+    heading, s = guidance(x, 0, s)
+    assert s[:, 0].tolist() == [0, 1, 1], "before the circle, inside, and past the point beside it"
+    # now along the second leg, to the east, with the vessel 1.9 m to the south of it
+    assert float(heading[1]) == pytest.approx(math.pi / 2 - math.atan(1.9 / 5))
+    assert guidance.finished(x, 0, s).tolist() == [False, False, False]
+    _, s = guidance(at((7.9, 0.0), (10.0, 18.5), (10.0, 25.0)), 1, s)
+    assert guidance.finished(x, 1, s).tolist() == [False, True, True]
+    # arrived once, arrived for good
+    _, s = guidance(at((7.9, 0.0), (0.0, 0.0), (0.0, 0.0)), 2, s)
+    assert guidance.finished(x, 2, s).tolist() == [False, True, True]
+
+
+def test_nonsense_is_refused() -> None:
+    for points, acceptance, lookahead in (([], 1.0, 1.0), ([(1.0, 1.0)], 0.0, 1.0), ([(1.0, 1.0)], 1.0, -1.0)):
+        with pytest.raises(ConfigError, match="way-points"):
+            WaypointGuidance(points, acceptance, lookahead, STATE)

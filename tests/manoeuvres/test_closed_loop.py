@@ -1,0 +1,168 @@
+"""Stop conditions, spirals and excitation: what ends when, and which frequencies are in a demand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from residnet.core.errors import UsageError
+from residnet.dynamics.base import Dynamics
+from residnet.dynamics.rollout import Rollout, Source
+from residnet.manoeuvres import Helm, MultiSine, RandomSteps, Spiral, StackedSource, TurningCircle, Watched, Zigzag
+from residnet.manoeuvres.steady import Steady, SteadyConfig
+
+DEG = math.pi / 180
+STATE = ("x", "y", "psi", "u", "v", "r")
+HELM = Helm(lambda drive, steer: torch.stack((30 * DEG * steer, drive), dim=-1), STATE, ("cmd_delta", "cmd_n"))
+
+
+class Nomoto(Dynamics):
+    """T r_dot + r = K (delta - r_0), exactly over a step, at 1 m/s; `offset` makes a vessel that pulls to one side."""
+
+    def __init__(self, gain: float = 0.4, time: float = 3.0, offset: float = 0.0, dt: float = 0.1) -> None:
+        super().__init__(dt, "euler")
+        self.gain, self.time, self.offset = gain, time, offset
+        self.steps = 0
+
+    def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
+        return x
+
+    def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        self.steps += 1
+        final, keep = self.gain * (w[:, 0] - self.offset), math.exp(-self.dt / self.time)
+        r = final + (x[:, 5] - final) * keep
+        psi = x[:, 2] + final * self.dt + (x[:, 5] - final) * self.time * (1 - keep)
+        out = x.clone()
+        out[:, 2], out[:, 5] = psi, r
+        out[:, 0], out[:, 1] = x[:, 0] + self.dt * torch.cos(psi), x[:, 1] + self.dt * torch.sin(psi)
+        return out, s
+
+
+def flown(source: Source, rows: int, steps: int, model: Nomoto | None = None) -> tuple[Tensor, Tensor, Tensor, Nomoto]:
+    model = model or Nomoto()
+    watched = Watched(source, rows)
+    x0 = torch.zeros(rows, 6, dtype=torch.float64)
+    x0[:, 3] = 1.0
+    with torch.no_grad():
+        x, w, _ = Rollout(model, watched)(x0, torch.zeros(rows, steps, 2, dtype=torch.float64), x0[:, :0])
+    return x, w, watched.stopped, model
+
+
+def times(steps: int, dt: float = 0.1) -> Tensor:
+    return torch.arange(steps, dtype=torch.float64) * dt
+
+
+def test_each_row_stops_on_its_own_and_the_loop_when_all_have() -> None:
+    circles = [TurningCircle(drive=1, steer=1.0, start=1), TurningCircle(drive=1, steer=-0.5, start=1, until=math.pi)]
+    zigzags = [Zigzag(drive=1, steer=0.5, heading=10 * DEG, start=1, reversals=3)]
+    t = times(2000)
+    source = StackedSource([TurningCircle.source(circles, HELM, t), Zigzag.source(zigzags, HELM, t)], [2, 1])
+    x, w, stopped, model = flown(source, 3, 2000)
+    assert x.shape == (3, 2001, 6)
+    assert w.shape == (3, 2000, 2)
+    assert model.steps == int(stopped.max()) + 1
+    for row, turned in ((0, 3 * math.pi), (1, -math.pi)):
+        k = int(stopped[row])
+        assert abs(float(x[row, k, 2])) >= abs(turned) > abs(float(x[row, k - 1, 2]))
+        assert torch.equal(x[row, k:], x[row, k].expand(2001 - k, -1)), "it stays where it stopped"
+    psi = x[2, :, 2]
+    k = int(stopped[2])
+    # starboard, port, starboard, then back to the initial course from starboard
+    assert float(psi[k]) <= 0 < float(psi[k - 1])
+    assert (torch.sign(w[2, : k + 1, 0]).diff() != 0).sum() == 4
+
+
+def test_what_is_not_reached_does_not_stop() -> None:
+    t = times(300)
+    _, _, stopped, _ = flown(TurningCircle.source([TurningCircle(drive=1, steer=0.01)], HELM, t), 1, 300)
+    assert stopped.tolist() == [-1]
+
+
+def test_pull_out_ends_when_the_yaw_rate_is_steady() -> None:
+    """After the turn r decays with T = 3 s; the running mean with the window's time constant follows until both are calm."""
+    circle = TurningCircle(drive=1, steer=1.0, start=1, until=math.pi, pull_out=True, steady=SteadyConfig(window=2.0, tolerance=0.01))
+    t = times(1500)
+    x, w, stopped, _ = flown(TurningCircle.source([circle], HELM, t), 1, 1500)
+    k = int(stopped)
+    turned = int(np.argmax(x[0, :, 2].numpy() >= math.pi))
+    assert float(w[0, turned - 1, 0]) == pytest.approx(30 * DEG)
+    assert float(w[0, turned : k + 1, 0].abs().max()) == 0
+    assert 2.0 < (k - turned) * 0.1 < 30.0
+    assert float(x[0, k, 5].abs()) < 0.03 * float(x[0, :, 5].abs().max())
+
+
+def test_steady_by_hand() -> None:
+    steady = Steady([SteadyConfig(window=1.0, tolerance=0.1)], 0.5)
+    memory = steady.initial(torch.tensor([0.0]))
+    seen = []
+    for r in (1.0, 1.0, 1.0, 1.0, 1.0, 1.0):
+        memory = steady(torch.tensor([r]), memory)
+        seen.append((round(float(memory[0, 0]), 4), bool(steady.reached(memory))))
+    # the mean halves its distance each step: within 0.1 from the fourth on, for a window of two steps
+    assert seen == [(0.5, False), (0.75, False), (0.875, False), (0.9375, False), (0.9688, True), (0.9844, True)]
+    assert not bool(steady.reached(steady.again(memory, torch.tensor([True]))))
+
+
+def test_spiral_of_a_linear_vessel_has_no_loop() -> None:
+    """Steady r = K (delta - offset) at every angle, up and down alike."""
+    spiral = Spiral(drive=1, rudders=tuple(a * DEG for a in (20, 5, 0, -5, -20, -5, 0, 5)), start=1, steady=SteadyConfig(window=5, tolerance=0.002))
+    t = times(6000)
+    x, w, stopped, _ = flown(Spiral.source([spiral], HELM, t), 1, 6000, Nomoto(offset=2 * DEG))
+    assert int(stopped) > 0
+    from residnet.core.log import Log
+
+    end = int(stopped) + 1
+    channels = {name: x[0, :end, i].numpy() for i, name in enumerate(STATE)}
+    channels |= {name: w[0, :end, i].numpy() for i, name in enumerate(HELM.inputs)}
+    found = spiral.indices(Log("made", t[:end].numpy(), channels))
+    assert found["yaw_rates"] == pytest.approx([0.4 * (a - 2) * DEG for a in (20, 5, 0, -5, -20, -5, 0, 5)], abs=0.01 * 0.4 * 22 * DEG)
+    assert found["loop_height"] < 0.01 * 0.4 * 22 * DEG
+
+
+@pytest.mark.parametrize("kind", [MultiSine, RandomSteps])
+def test_excitation_keeps_to_its_band_and_amplitude(kind: type[MultiSine] | type[RandomSteps]) -> None:
+    dt, span = 0.1, 4000.0
+    t = torch.arange(0.0, span, dt, dtype=torch.float64)
+    wave = kind(drive=0.5, drive_amplitude=0.2, steer_amplitude=0.6, band=(0.02, 0.2), seed=3, start=10.0)
+    drive, steer = (demand.numpy() for demand in wave.demands(t))
+    assert (drive[t < 9.99] == 0.5).all()
+    assert (steer[t < 9.99] == 0).all()
+    assert 0.18 < np.abs(drive - 0.5).max() <= 0.2 + 1e-12
+    assert 0.55 < np.abs(steer).max() <= 0.6 + 1e-12
+    for demand in (drive - drive.mean(), steer):
+        power, frequency = np.abs(np.fft.rfft(demand * np.hanning(t.numel()))) ** 2, np.fft.rfftfreq(t.numel(), dt)
+        inside = power[(frequency > 0.018) & (frequency < 0.22)].sum() / power.sum()
+        # steps have harmonics and a level of their own besides
+        assert inside > (0.99 if kind is MultiSine else 0.5)
+    assert abs(np.corrcoef(drive[200:], steer[200:])[0, 1]) < 0.1
+    other, _ = wave.model_copy(update={"seed": 4}).demands(t)
+    assert not np.array_equal(other.numpy(), drive)
+
+
+def test_steps_are_held_for_half_periods_of_the_band() -> None:
+    t = times(40000, 0.05)
+    _, steer = RandomSteps(drive=0.5, steer_amplitude=0.6, band=(0.05, 0.25), seed=1).demands(t)
+    edges = np.flatnonzero(np.diff(steer.numpy()) != 0)
+    holds = np.diff(edges) * 0.05
+    assert holds.min() >= 0.5 / 0.25 - 0.051
+    assert holds.max() <= 0.5 / 0.05 + 0.051
+
+
+def test_a_demand_does_not_depend_on_how_long_it_is_asked_for() -> None:
+    for kind in (RandomSteps, MultiSine):
+        wave = kind(drive=0.5, drive_amplitude=0.2, steer_amplitude=0.6, band=(0.05, 0.25), seed=1)
+        short, long = wave.demands(times(300)), wave.demands(times(900))
+        assert torch.equal(short[0], long[0][:300])
+        assert torch.equal(short[1], long[1][:300])
+
+
+def test_rudder_angles() -> None:
+    circle = TurningCircle(drive=1, rudder=-15 * DEG)
+    assert circle.share(HELM) == pytest.approx(-0.5)
+    assert circle.side == -1
+    with pytest.raises(UsageError, match="goes to 30 deg"):
+        TurningCircle(drive=1, rudder=31 * DEG).share(HELM)
