@@ -61,7 +61,12 @@ def _look(place: int, name: str) -> dict[str, Any]:
 
 
 def _recorded(flight: Flight) -> Log | None:
-    return flight.manoeuvre.recorded if isinstance(flight.manoeuvre, Replay) else None
+    """What a replay was recorded as, as far as it was flown; None for other manoeuvres."""
+    if not isinstance(flight.manoeuvre, Replay):
+        return None
+    log = flight.manoeuvre.recorded
+    length = int(np.searchsorted(log.t - log.t[0], flight.motion.t[-1], side="right"))
+    return Log(log.name, log.t[:length], {name: values[:length] for name, values in log.channels.items()}, log.units)
 
 
 def _tracks(crafts: Sequence[str], groups: Sequence[Sequence[Flight]]) -> Any:
