@@ -31,7 +31,7 @@ class KernelConfig(FeatureConfig):
 
     kind: Literal["kernel"] = "kernel"
     kernel: Annotated[Rbf | Polynomial, Field(discriminator="kind")] = Field(default_factory=Rbf)
-    penalties: tuple[Annotated[float, Field(gt=0)], ...] = Field(default=(1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2), min_length=1)
+    penalties: tuple[Annotated[float, Field(gt=0)], ...] = Field(default=(1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1), min_length=1)
     choose: Literal["one_step", "free_run"] = "free_run"
     folds: int = Field(default=5, ge=2)
 

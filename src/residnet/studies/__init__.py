@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-StudyName = Literal["woo2018"]
+StudyName = Literal["moreno2019", "woo2018"]
 
 
 def draw_study(name: StudyName, run: Path) -> list[Path]:
-    """Write a study's figures into the `figures` folder of a finished run; returns their paths."""
-    from residnet.studies import woo2018
+    """Write a study's tables and figures into the folder of a finished run; returns their paths."""
+    from residnet.studies import moreno2019, woo2018
 
-    studies = {"woo2018": woo2018.draw}
+    studies = {"moreno2019": moreno2019.draw, "woo2018": woo2018.draw}
     return studies[name](run)
