@@ -7,9 +7,14 @@ from typing import Annotated
 from pydantic import Field
 
 from residnet.tasks.actuators import ActuatorsTaskConfig
+from residnet.tasks.autopilot import AutopilotConfig
+from residnet.tasks.breeding import BreedingTaskConfig
 from residnet.tasks.ferry_study import FerryStudyConfig
 from residnet.tasks.fit import FitConfig
 from residnet.tasks.simulate import SimulateConfig
 from residnet.tasks.study import StudyConfig
 
-TaskConfig = Annotated[FitConfig | SimulateConfig | StudyConfig | ActuatorsTaskConfig | FerryStudyConfig, Field(discriminator="task")]
+TaskConfig = Annotated[
+    FitConfig | SimulateConfig | StudyConfig | ActuatorsTaskConfig | AutopilotConfig | FerryStudyConfig | BreedingTaskConfig,
+    Field(discriminator="task"),
+]

@@ -1,0 +1,43 @@
+"""A pupil flies while its teacher says what it would have done."""
+
+from __future__ import annotations
+
+from typing import final
+
+import torch
+from torch import Tensor
+
+from residnet.control.base import Policy, Reference
+from residnet.dynamics.rollout import Source
+
+
+@final
+class SideBySide(Source):
+    """The pupil's commands act; the teacher sees the same states with a memory of its own.
+
+    The pupil meets what its own commands lead to, so that it also learns the way back from its mistakes.
+
+    Attributes:
+        total: sum over steps of the mean squared difference of the commands, since `initial` was asked.
+    """
+
+    def __init__(self, pupil: Policy, teacher: Policy, reference: Reference) -> None:
+        super().__init__()
+        self.pupil, self.teacher, self.reference = pupil, teacher, reference
+        self.total = torch.zeros(())
+
+    def initial(self, x: Tensor) -> Tensor:
+        """Memories of guidance, pupil and teacher side by side."""
+        self.total = torch.zeros((), dtype=x.dtype)
+        return torch.cat([part.initial_state(x) for part in (self.reference, self.pupil, self.teacher)], dim=-1)
+
+    def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """Inputs [B, m] with the pupil's command."""
+        sizes = [self.reference.n_state, self.pupil.n_state, self.teacher.n_state]
+        guided, own, other = memory.split(sizes, dim=-1)
+        target, guided = self.reference(x, k, guided)
+        command, own = self.pupil(x, target, own)
+        with torch.no_grad():
+            shown, other = self.teacher(x.detach(), target, other)
+        self.total = self.total + (command - shown).square().mean()
+        return torch.cat((command, w[:, command.shape[-1] :]), dim=-1), torch.cat((guided, own, other), dim=-1)

@@ -1,0 +1,142 @@
+"""Task `autopilot`: train heading policies, tune their classical peers, and compare all of them over random vessels."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from residnet.control.controllers import AnyController, BangBangConfig, TunedConfig
+from residnet.core.config import Config, Radians, Seconds, dump_config
+from residnet.core.errors import ConfigError
+from residnet.core.names import nearest
+from residnet.physics.vessel import load_vessel
+from residnet.run_folder import RunFolder
+from residnet.training.autopilot_config import AutopilotTraining, SpreadConfig
+
+_Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
+
+
+class PolicyConfig(Config):
+    """A neural heading policy.
+
+    Attributes:
+        hidden: widths of the layers.
+        observer: bandwidth of the disturbance observer as a multiple of 1/T.
+        start: name of a linear peer whose kp and kd training starts from.
+        training: how it is trained.
+        imitate: name of a peer whose commands it learns to give; null to train it for fast changes without overshoot.
+    """
+
+    hidden: Annotated[tuple[int, ...], Field(min_length=1)] = (24, 24)
+    observer: float = Field(default=8.0, ge=1)
+    start: _Name | None = None
+    training: AutopilotTraining = AutopilotTraining()
+    imitate: _Name | None = None
+
+
+class StepTestConfig(Config):
+    """The one test of all controllers: a step of the reference without prefilter, from straight ahead.
+
+    Attributes:
+        heading: the step.
+        band: the change has settled at the last entry into it, either side.
+        overshoot: limit that peers are tuned under, and that policies are chosen by.
+        dt: step of simulation and controllers.
+        duration: of a flight.
+        plants: random vessels of the spread, beside its corners.
+        bias: constant rudder angle of the steady-error test.
+        bias_error: largest heading error there after `bias_time`.
+        bias_time: see above.
+    """
+
+    heading: Radians = Field(default=0.5235987755982988, gt=0, lt=3.1)
+    band: Radians = Field(default=0.017453292519943295, gt=0)
+    overshoot: Radians = Field(default=0.0017453292519943296, gt=0)
+    dt: Seconds = Field(default=0.02, gt=0)
+    duration: Seconds = Field(gt=0)
+    plants: int = Field(default=200, ge=1)
+    bias: Radians = Field(default=0.017453292519943295, ge=0)
+    bias_error: Radians = Field(default=0.0034906585039886592, gt=0)
+    bias_time: Seconds = Field(default=60.0, gt=0)
+
+
+class AutopilotConfig(Config):
+    """Heading policies trained through the vessel, beside tuned classical controllers.
+
+    Attributes:
+        name: of the run.
+        seed: of weights, batches and random vessels.
+        threads: of PyTorch.
+        vessel: name or file.
+        rudder: largest rudder angle that controllers may use.
+        turning_time: until the turn at that angle is steady.
+        spread: of vessels and disturbances, for training, tuning and comparison alike.
+        test: see there.
+        policies: by name.
+        peers: by name; gains that are left out are tuned.
+        floor: peer that knows the vessel exactly: the others are measured in multiples of its settling time.
+        tuning_points: candidates of each of four rounds of tuning.
+        safe: what an exported policy commands while its inputs are wrong: the last good command, or rudder amidships.
+    """
+
+    task: Literal["autopilot"]
+    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")
+    description: str = ""
+    seed: int = Field(default=0, ge=0)
+    threads: int = Field(default=1, ge=1)
+    vessel: str
+    rudder: Radians = Field(gt=0, lt=1.5)
+    turning_time: Seconds = Field(default=100.0, gt=0)
+    spread: SpreadConfig = SpreadConfig()
+    test: StepTestConfig
+    policies: dict[_Name, PolicyConfig] = Field(min_length=1)
+    peers: dict[_Name, AnyController] = Field(default_factory=dict)
+    floor: _Name | None = None
+    tuning_points: int = Field(default=256, ge=16)
+    safe: Literal["hold", "amidships"] = "amidships"
+
+    @field_validator("vessel")
+    @classmethod
+    def _vessel(cls, vessel: str) -> str:
+        try:
+            load_vessel(vessel)
+        except ConfigError as error:
+            raise ValueError(str(error)) from None
+        return vessel
+
+    @model_validator(mode="after")
+    def _names(self) -> AutopilotConfig:
+        if both := sorted(set(self.policies) & set(self.peers)):
+            raise ValueError(f"'{both[0]}' names a policy and a peer; names are unique in a run")
+        for name, policy in self.policies.items():
+            for key, peer in (("imitate", policy.imitate), ("start", policy.start)):
+                if peer is not None and peer not in self.peers:
+                    raise ValueError(f"policies.{name}.{key}: no peer '{peer}'{nearest(peer, self.peers)}")
+            if policy.start is not None and not isinstance(self.peers[policy.start], TunedConfig):
+                raise ValueError(f"policies.{name}.start: '{policy.start}' must be a linear controller (pd, pid or lqr)")
+        if self.floor is not None and not isinstance(self.peers.get(self.floor), BangBangConfig):
+            raise ValueError(f"floor: '{self.floor}' must name a peer of kind bang_bang")
+        return self
+
+    def check(self) -> None:
+        """Everything was checked when the config was read."""
+
+    def run(self, *, source: Path, overrides: Sequence[str], out: Path | None, resume: bool) -> RunFolder:
+        """Train, tune, compare, export.
+
+        Raises:
+            UsageError: where the folder exists.
+            FitError: where tuning or training fails.
+        """
+        from residnet.tasks.autopilot_run import run_autopilot
+
+        started = time.time()
+        folder = RunFolder.create(out or Path("runs") / self.name, dump_config(self), resume=resume)
+        run_autopilot(self, folder)
+        folder.write_provenance(config=source, overrides=overrides, seed=self.seed, files=[], started=started)
+        print(f"report: {folder.report}")
+        return folder

@@ -1,0 +1,159 @@
+"""Training a heading policy through the closed loop: the one time loop carries gradients through vessel and policy."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, final
+
+import torch
+from torch import Tensor, nn
+from torch.utils.data import DataLoader
+
+from residnet.control.base import ClosedLoop, GivenReference, Policy
+from residnet.control.imitation import SideBySide
+from residnet.control.policy import HeadingPolicy
+from residnet.control.steering import Measured, SteeredVessel
+from residnet.core.errors import FitError
+from residnet.core.frames import wrap
+from residnet.dynamics.rollout import Rollout
+from residnet.training.autopilot_config import AutopilotTraining, SpreadConfig
+from residnet.training.epochs import EpochTraining
+from residnet.training.trainer import run_epochs
+
+Score = Callable[[HeadingPolicy], float]
+
+
+@final
+class AutopilotFit(EpochTraining):
+    """Trains a policy on heading changes of varied vessels, drawn anew for every batch.
+
+    Args:
+        policy: what is trained, float32.
+        vessel: what it steers.
+        settings: of the training.
+        spread: of vessels, starts and disturbances.
+        score: of a policy, for the choice of the best epoch; less is better.
+        teacher: a controller to imitate; None to train for fast changes without overshoot.
+        seed: of the batches.
+    """
+
+    def __init__(
+        self,
+        policy: HeadingPolicy,
+        vessel: SteeredVessel,
+        settings: AutopilotTraining,
+        spread: SpreadConfig,
+        score: Score,
+        teacher: Policy | None,
+        seed: int,
+    ) -> None:
+        super().__init__(settings, seed)
+        self.policy = policy
+        self.vessel, self.spread, self.score, self.teacher = vessel, spread, score, teacher
+        self.model = vessel.model(settings.dt, settings.integrator).requires_grad_(False)
+        self.seen = Measured(policy, vessel.state, {"psi": spread.noise_psi, "r": spread.noise_r})
+        self.columns = vessel.column("psi"), vessel.column("r")
+
+    def train_dataloader(self) -> DataLoader[Tensor]:
+        """Numbers of batches: what is in them is drawn when they are used."""
+        return DataLoader(torch.arange(self.settings.steps), batch_size=None)  # type: ignore[arg-type]
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        """Adam."""
+        return torch.optim.Adam(self.policy.parameters(), lr=self.settings.learning_rate)
+
+    def on_train_epoch_start(self) -> None:
+        """Seed the epoch and set the learning rate."""
+        self.seed_epoch()
+        self.policy.dt = self.settings.dt
+        progress = 0.5 * (1 - math.cos(math.pi * self.epoch / max(self.settings.epochs - 1, 1)))
+        for group in self.trainer.optimizers[0].param_groups:
+            group["lr"] = self.settings.learning_rate * (1 - progress * (1 - self.settings.final))
+
+    def training_step(self, number: Tensor, batch_index: int) -> Tensor:
+        """Loss of one batch of heading changes."""
+        rows, steps = self.settings.batch, round(self.settings.horizon / self.settings.dt)
+        x, w, heading, variation, calm = self._draw(rows)
+        reference = GivenReference(heading[:, None, None])
+        w = w.unsqueeze(1).expand(-1, steps, -1)
+        if self.teacher is not None:
+            difference = SideBySide(self.seen, self.teacher, reference)
+            Rollout(self.model, difference)(x, w, variation)
+            loss = difference.total / (steps * self.policy.limit**2)
+        else:
+            states, inputs, _ = Rollout(self.model, ClosedLoop(self.seen, reference))(x, w, variation)
+            error = wrap(heading[:, None] - states[:, 1:, self.columns[0]])
+            loss = (
+                self.cost(error, heading, variation, calm)
+                + self.settings.smoothness * (inputs[:, :, 0].diff(dim=1) / self.policy.limit).square().mean()
+            )
+        self._losses.append(float(loss.detach()))
+        return loss
+
+    def _draw(self, rows: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """States [B, nx], inputs [B, m], headings [B], variations [B, 3], and which rows start straight ahead without disturbance [B]."""
+        spread = self.spread
+        low, high = spread.speed
+        x, w = self.vessel.start(low + (high - low) * torch.rand(rows))
+        heading = spread.heading * (2.0 * torch.rand(rows) - 1.0)
+        straight = torch.arange(rows) % 8 < 5
+        undisturbed = torch.rand(rows) < 0.5
+        x[:, self.columns[1]] = torch.where(straight, 0.0, self.policy.gain * self.policy.limit * (2.0 * torch.rand(rows) - 1.0))
+        bias = torch.where(undisturbed, 0.0, spread.bias * (2.0 * torch.rand(rows) - 1.0))
+        return x, w, heading, torch.cat((spread.draw(rows), bias.unsqueeze(1)), dim=1), straight & undisturbed
+
+    def cost(self, error: Tensor, heading: Tensor, variation: Tensor, calm: Tensor) -> Tensor:
+        """Time outside the band, absolute error and overshoot of errors [B, T] after changes of heading [B].
+
+        The share |e| / (|e| + band) counts time, so that small changes weigh as much as large ones. Where the start already turns or
+        something pushes, an overshoot may be unavoidable: it counts little there.
+        """
+        own, size = self.settings, error.abs()
+        outside = size / (size + own.band) + own.sharp * torch.sigmoid((size - own.band) * (5.0 / own.band))
+        relative = size / (heading.abs()[:, None] + 5.0 * own.band)
+        over = torch.relu(-error * heading.sign()[:, None] - own.margin) / own.band
+        over = over.amax(1) + 5.0 * over.mean(1) + 5.0 * over.amax(1).square()
+        slow = (variation[:, 1] / variation[:, 0]) ** own.slowest
+        weight = slow / slow.mean()
+        return (weight * (outside + 0.5 * relative).mean(1)).mean() + own.overshoot * (torch.where(calm, 1.0, 0.05) * over).mean()
+
+    def validated(self) -> tuple[nn.Module, float]:
+        """The policy and its score."""
+        score = self.score(self.policy)
+        self.policy.float()
+        return self.policy, score
+
+
+def train_autopilot(
+    name: str,
+    policy: HeadingPolicy,
+    vessel: SteeredVessel,
+    settings: AutopilotTraining,
+    spread: SpreadConfig,
+    score: Score,
+    seed: int,
+    folder: Path,
+    teacher: Policy | None = None,
+) -> dict[str, Any]:
+    """Train a policy and leave the weights that scored best in it; `checkpoints/<name>/last.ckpt` in the folder is resumed where it exists.
+
+    Returns:
+        What there is to say: the curve by epoch, the best score, the number of parameters.
+
+    Raises:
+        FitError: where no epoch gave a finite score.
+    """
+    fit = AutopilotFit(policy.float(), vessel, settings, spread, score, None if teacher is None else teacher.float(), seed)
+    run_epochs(name, fit, settings, folder)
+    if not fit.best_state:
+        raise FitError(f"policy {name}: no epoch gave a finite flight; lower the learning rate or the horizon")
+    policy.load_state_dict(fit.best_state)
+    policy.eval().requires_grad_(False)
+    return {
+        "parameters": sum(p.numel() for p in policy.parameters()),
+        "best_validation": fit.best_score,
+        "epochs": len(fit.history),
+        "curve": fit.history,
+    }

@@ -1,0 +1,95 @@
+"""How a heading policy is trained. No Lightning here: `residnet check` must stay quick."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import torch
+from pydantic import Field, model_validator
+from torch import Tensor
+
+from residnet.core.config import Config, Radians, RadiansPerSecond, Seconds
+
+Range = Annotated[tuple[float, float], Field(description="low and high multiple")]
+
+
+class SpreadConfig(Config):
+    """The range of vessels, starts and disturbances that a policy is trained for and controllers are compared over.
+
+    Attributes:
+        effect: of the rudder, as a multiple (K of Nomoto's model).
+        time: constants of sway and yaw, as a multiple (T of Nomoto's model).
+        speed: at the start, as a multiple of the service speed, thrust to match.
+        bias: largest constant angle that is added to the rudder's.
+        heading: largest change of heading.
+        noise_psi, noise_r: standard deviation of white sensor noise.
+    """
+
+    effect: Range = (0.8, 1.2)
+    time: Range = (0.8, 1.2)
+    speed: Range = (1.0, 1.0)
+    bias: Radians = Field(default=0.02, ge=0)
+    heading: Radians = Field(default=1.0, gt=0, lt=3.1)
+    noise_psi: Radians = Field(default=0.0, ge=0)
+    noise_r: RadiansPerSecond = Field(default=0.0, ge=0)
+
+    @model_validator(mode="after")
+    def _ordered(self) -> SpreadConfig:
+        for name in ("effect", "time", "speed"):
+            low, high = getattr(self, name)
+            if not 0 < low <= high:
+                raise ValueError(f"{name}: low and high must be positive and in order, given {low:g}, {high:g}")
+        return self
+
+    def draw(self, rows: int) -> Tensor:
+        """Effect and time [rows, 2], every second row at a corner of their ranges, where controllers fail first."""
+        low, high = torch.tensor([self.effect, self.time]).T
+        share = torch.rand(rows, 2)
+        return low + (high - low) * torch.where(torch.arange(rows)[:, None] % 2 == 0, share, share.round())
+
+    def corners(self) -> Tensor:
+        """Effect, time and zero bias [9, 3]: nominal first, then the ends and the middles between them."""
+        effects = (1.0, *self.effect)
+        times = (1.0, *self.time)
+        return torch.tensor([(effect, time, 0.0) for effect in effects for time in times], dtype=torch.float64)
+
+
+class AutopilotTraining(Config):
+    """Back-propagation through vessel and policy.
+
+    Attributes:
+        epochs: of `steps` batches each.
+        batch: heading changes per batch.
+        dt: step of the simulation in training; flights may take a finer one.
+        integrator: of the simulation in training.
+        horizon: length of each heading change.
+        learning_rate: of Adam; it falls to `final` of it along a cosine.
+        overshoot: weight of the overshoot against the time outside `band`.
+        margin: overshoot that costs nothing.
+        band: error at which half of the cost of a large error is left.
+        smoothness: weight of the squared changes of the command.
+    """
+
+    epochs: int = Field(default=20, ge=1)
+    steps: int = Field(default=15, ge=1)
+    batch: int = Field(default=256, ge=16)
+    dt: Seconds = Field(default=0.1, gt=0)
+    integrator: Annotated[str, Field(pattern="^(rk4|heun)$")] = "rk4"
+    horizon: Seconds = Field(default=10.0, gt=0)
+    learning_rate: float = Field(default=1e-2, gt=0)
+    final: float = Field(default=0.02, gt=0, le=1)
+    overshoot: float = Field(default=2.0, ge=0)
+    margin: Radians = Field(default=3.5e-4, ge=0)
+    band: Radians = Field(default=0.0175, gt=0)
+    sharp: float = Field(default=1.0, ge=0)
+    slowest: float = Field(default=4.0, ge=0)
+    smoothness: float = Field(default=0.0, ge=0)
+    gradient_clip: float = Field(default=1.0, gt=0)
+    patience: int = Field(default=1000, ge=1)
+    validate_every: int = Field(default=1, ge=1)
+
+    last_stage: int = Field(default=0, init=False, exclude=True)
+
+    def stage(self, epoch: int) -> tuple[int, int]:
+        """One stage only."""
+        return 0, epoch
