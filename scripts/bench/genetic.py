@@ -34,8 +34,11 @@ from residnet.core.expressions import Algebra
 from residnet.core.genetic import limits_of
 from residnet.heads.expression_text import term
 from residnet.heads.genetic import Bred, GeneticConfig, breed
+from residnet.physics.candidates import CandidatesConfig
 
 Log = dict[str, np.ndarray]
+Answer = tuple[dict[str, float], Bred, float]
+Setup = tuple[tuple[str, ...], CandidatesConfig, Mapping[str, Mapping[str, float]]]
 TABLE_51 = {"operators": ["+", "-", "*", "abs"], "tournament": 3, "depth": 7, "split": "sum", "goal": 1e-10}
 TABLE_61 = {"operators": ["+", "*", "abs"], "tournament": 5, "depth": 10, "generations": 30, "patience": 30, "goal": 1e-12}
 TABLE_62 = TABLE_61 | {"operators": ["+", "*", "abs", "sin", "cos"]}
@@ -73,14 +76,12 @@ def spring(_: int) -> None:
         print(f"sparse regression right {sum(right(f, MSD_TRUTH, 0.01) for f in ten)} of 10, {1e3 * sparse:.1f} ms: ratio {seconds / sparse:.0f}")
 
 
-def vessel(
-    label: str, designs: list[Log], setup: tuple[tuple[str, ...], object, Mapping[str, Mapping[str, float]]], evolution: Mapping[str, object]
-) -> None:
+def vessel(label: str, designs: list[Log], setup: Setup, evolution: Mapping[str, object]) -> None:
     names, space, truths = setup
     for number in range(len(designs) - 1):
         log, other = designs[number], designs[number + 1]
         started = time.process_time()
-        rival, *_ = regress(log, names, space, np.stack([log[axis] for axis in truths], axis=1))  # type: ignore[arg-type]
+        rival, *_ = regress(log, names, space, np.stack([log[axis] for axis in truths], axis=1))
         sparse = time.process_time() - started
         cells, total = [], 0.0
         for axis, truth in truths.items():

@@ -89,6 +89,15 @@ def test_functions_and_protected_division() -> None:
     assert found.reached
 
 
+def test_trees_with_a_term_twice_take_no_part_where_asked() -> None:
+    settings = {"generations": 0, "population": 60, "operators": ("+", "-")}
+    # a full tree of depth 2 is a sum of four of three channels
+    assert breed(NOISY, 1, **settings, first_depth=(2, 2))[1].fitted > 0
+    with pytest.raises(FitError, match="no individual"):
+        breed(NOISY, 1, **settings, first_depth=(2, 2), equal_terms="reject")
+    assert breed(NOISY, 1, **settings, first_depth=(0, 2), equal_terms="reject")[1].fitted > 0
+
+
 def test_same_seed_same_result_and_pythons_generator_is_left_alone() -> None:
     random.seed(5)
     wanted = random.random()
@@ -125,6 +134,7 @@ def test_bad_samples_are_told() -> None:
         ({"operators": ["abs"]}, "trees need one of"),
         ({"first_depth": [2, 12]}, "first_depth"),
         ({"population": 5, "elite": 5}, "elite"),
+        ({"equal_terms": "reject", "split": "gene"}, "reject goes with"),
     ],
 )
 def test_impossible_settings(config: dict[str, Any], message: str) -> None:

@@ -45,6 +45,8 @@ class EvolutionConfig(Config):
         genes: trees per individual (multigene form of document 001; there 5 of depth 3); of two crossovers one then exchanges whole trees.
         split: what gets a coefficient: every `gene`, every summand of the tree as it stands (`sum`, section 5.1.1), or every
             summand when it is multiplied out (`expand`, section 5.1.3).
+        equal_terms: what becomes of a tree in which a term stands twice: its terms are added (`merge`), or it takes no part (`reject`), as in
+            the document, whose Gram matrix is then singular (section 5.1.2).
         intercept: whether the constant always is a term.
         prune: share of the target's energy that a term must explain beside those before it (orthogonal least squares, section 5.1.4); 0 keeps all.
         max_terms: most terms of an individual; those with more take no part, nor those with products of more than `max_degree` factors.
@@ -68,6 +70,7 @@ class EvolutionConfig(Config):
     first_depth: tuple[int, int] = (1, 4)
     genes: int = Field(default=1, ge=1, le=20)
     split: Literal["gene", "sum", "expand"] = "expand"
+    equal_terms: Literal["merge", "reject"] = "merge"
     intercept: bool = False
     prune: float = Field(default=0.0, ge=0, lt=1)
     max_terms: int = Field(default=40, ge=1, le=200)
@@ -86,6 +89,8 @@ class EvolutionConfig(Config):
             raise ValueError("operators: trees need one of +, -, *, / at least")
         if not 0 <= self.first_depth[0] <= self.first_depth[1] <= self.depth:
             raise ValueError(f"first_depth: expected least <= largest <= depth ({self.depth}), given {list(self.first_depth)}")
+        if self.equal_terms == "reject" and self.split == "gene":
+            raise ValueError("equal_terms: a gene is one term whatever stands in it; reject goes with split sum or expand")
         if self.elite >= self.population:
             raise ValueError(f"elite: must leave room for offspring in a population of {self.population}, given {self.elite}")
         return self
@@ -284,11 +289,29 @@ class _Breeding:
         products: set[Product] = {ONE} if self.config.intercept else set()
         try:
             for tree in individual.trees:
+                if self.config.equal_terms == "reject" and self._repeats(tree):
+                    return None
                 meant = self._sum(tree)
                 products.update(self.algebra.bracket(meant) if self.config.split == "gene" else meant)
         except TooLargeError:
             return None
         return tuple(sorted(products)) if 0 < len(products) <= self.config.max_terms else None
+
+    def _repeats(self, tree: Any) -> bool:
+        """Whether a term stands twice among the branches at + and - from the root down."""
+        seen: set[Product] = set()
+        starts = [0]
+        while starts:
+            start = starts.pop()
+            branch = tree.searchSubtree(start)
+            if tree[start].name in ("add", "subtract"):
+                starts += [start + 1, tree.searchSubtree(start + 1).stop]
+                continue
+            meant = self._sum(tree[branch])
+            if not seen.isdisjoint(meant):
+                return True
+            seen.update(meant)
+        return False
 
     def _sum(self, tree: Sequence[Any]) -> Sum:
         """What a tree in prefix order comes to."""

@@ -129,7 +129,7 @@ class GeneticHead(EquationHead):
         algebra = Algebra(self.features.names, limits_of(self.config.evolution))
         z, target = self.features.guarded(samples.z).numpy(), samples.target.numpy()
         data = {name: z[:, i] for i, name in enumerate(self.features.names)}
-        train = ~_validating(samples.group.numpy(), self.config.validate_every)
+        train = ~validating(samples.group.numpy(), self.config.validate_every)
         bred = [breed(algebra, data, target[:, axis], train, self.config, 3 * self.config.seed + axis) for axis in range(3)]
         products = sorted({product for own in bred for product in own.products})
         weights = torch.zeros(len(products), 3, dtype=torch.float64)
@@ -150,8 +150,8 @@ class GeneticHead(EquationHead):
         return [Solution({"kept": [len(own.products) for own in bred]}, state | {"weights.values": weights}, table, notes)]
 
 
-def _validating(group: np.ndarray, every: int) -> np.ndarray:
-    """Which samples validate: whole manoeuvres where there are enough, else blocks of the record."""
+def validating(group: np.ndarray, every: int) -> np.ndarray:
+    """Which samples [N] validate, from the numbers of their manoeuvres: every so manieth where there are enough, else blocks of the record."""
     numbers = np.unique(group, return_inverse=True)[1]
     if numbers.max(initial=0) + 1 < every:
         numbers = np.arange(len(group)) * _BLOCKS // max(len(group), 1)
