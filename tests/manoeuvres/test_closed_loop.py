@@ -9,11 +9,18 @@ import pytest
 import torch
 from torch import Tensor
 
+from residnet.control.pid import MotionPIDConfig
 from residnet.core.errors import UsageError
+from residnet.data.environment import Disturbance
+from residnet.data.flying import Craft, Sea, fly
+from residnet.data.sensors import SensorNoise
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.rollout import Rollout, Source
-from residnet.manoeuvres import Helm, MultiSine, RandomSteps, Spiral, StackedSource, TurningCircle, Watched, Zigzag
+from residnet.dynamics.simulated import TracedPlantDynamics
+from residnet.manoeuvres import FourCorner, Helm, MultiSine, RandomSteps, Spiral, StackedSource, TurningCircle, Watched, Zigzag
+from residnet.manoeuvres.four_corner import SEGMENTS
 from residnet.manoeuvres.steady import Steady, SteadyConfig
+from residnet.physics.vessel import load_vessel
 
 DEG = math.pi / 180
 STATE = ("x", "y", "psi", "u", "v", "r")
@@ -166,3 +173,28 @@ def test_rudder_angles() -> None:
     assert circle.side == -1
     with pytest.raises(UsageError, match="goes to 30 deg"):
         TurningCircle(drive=1, rudder=31 * DEG).share(HELM)
+
+
+@pytest.mark.parametrize("vessel", ["milliampere", "milliampere_azimuth"])
+def test_four_corner_course_of_the_ferry(vessel: str) -> None:
+    """Gains from the ferry's own mass; it keeps near the filtered poses and comes back to where it began."""
+    plant = load_vessel(vessel).build()
+    mass, omega = plant.hull.mass.diagonal(), torch.tensor([0.26, 0.26, 0.4], dtype=torch.float64)  # type: ignore[union-attr, operator]
+    gains = [tuple((part).tolist()) for part in (mass * omega**2, 0.1 * mass * omega**3, 2 * mass * omega)]
+    control = MotionPIDConfig(proportional=gains[0], integral=gains[1], derivative=gains[2])
+    course = FourCorner(control=control)
+    assert course.lasts(10.0) == 720.0
+    craft = Craft(vessel, TracedPlantDynamics(plant, 0.2, 2), Helm.of(plant), plant.commands, plant.approach(1))
+    (flight,) = fly(craft, [course], Sea(plant, Disturbance(), SensorNoise(), 0), 10.0, 0.2)
+    motion = flight.motion
+    assert len(motion) == 3600
+    found = course.indices(motion)
+    assert found["mean_position_error"] < 1.0
+    assert found["mean_heading_error"] < 5 * DEG
+    # each segment ends near its pose, the ninth's turn goes the long way round as it is written
+    for i, (north, east, heading) in enumerate(SEGMENTS):
+        k = (i + 1) * 300 - 1
+        assert math.hypot(motion["x"][k] - north, motion["y"][k] - east) < 1.5
+        assert motion["psi"][k] == pytest.approx(heading, abs=8 * DEG)
+    with pytest.raises(UsageError, match="all three"):
+        FourCorner.source([course], HELM, times(2))

@@ -10,6 +10,7 @@ from residnet.manoeuvres.acceleration_deceleration import AccelerationDecelerati
 from residnet.manoeuvres.base import Helm, Manoeuvre, StackedSource, Watched
 from residnet.manoeuvres.constant import ConstantFamily, ConstantInput
 from residnet.manoeuvres.excitation import MultiSine, MultiSineFamily, RandomSteps, RandomStepsFamily
+from residnet.manoeuvres.four_corner import FourCorner
 from residnet.manoeuvres.replay import Replay
 from residnet.manoeuvres.spiral import Spiral
 from residnet.manoeuvres.stopping import Stopping
@@ -29,6 +30,7 @@ AnyManoeuvre = (
     | Spiral
     | Stopping
     | Waypoints
+    | FourCorner
     | Replay
 )
 ManoeuvreConfig = Annotated[AnyManoeuvre, Field(discriminator="kind")]
@@ -41,6 +43,7 @@ __all__ = [
     "AccelerationDeceleration",
     "ConstantInput",
     "FamilyConfig",
+    "FourCorner",
     "Helm",
     "Manoeuvre",
     "ManoeuvreConfig",

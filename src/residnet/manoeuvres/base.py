@@ -20,7 +20,8 @@ from residnet.core.config import Config, Radians, Seconds
 from residnet.core.errors import UsageError
 from residnet.core.log import Log
 from residnet.dynamics.rollout import Source
-from residnet.physics.plant import Plant
+from residnet.physics.actuators import AzimuthThrusters, ForceCommands
+from residnet.physics.plant import HullPlant, Plant
 
 Demand = Callable[[Tensor, Tensor], Tensor]
 """Turns drive [...] and steer [...] into commands [..., c], the first c columns of the inputs."""
@@ -37,16 +38,23 @@ class Helm:
         demand: turns its normalised demands into the vessel's commands.
         state: names of the columns of the vessel's state.
         inputs: names of the columns of its inputs, commands first.
+        forces: turns forces tau [..., 3] in surge, sway and yaw into its commands; None for a vessel that cannot make all three.
     """
 
     demand: Demand
     state: tuple[str, ...]
     inputs: tuple[str, ...] = ()
+    forces: Callable[[Tensor], Tensor] | None = None
 
     @classmethod
     def of(cls, plant: Plant) -> Helm:
         """The helm of a plant."""
-        return cls(plant.demand, plant.state, plant.inputs)
+        forces: Callable[[Tensor], Tensor] | None = None
+        if plant.inputs[: plant.commands] == ForceCommands.commands:
+            forces = torch.Tensor.clone
+        elif isinstance(plant, HullPlant) and isinstance(plant.actuators, AzimuthThrusters):
+            forces = plant.actuators.allocate
+        return cls(plant.demand, plant.state, plant.inputs, forces)
 
     def column(self, name: str) -> int:
         """Column of a state.

@@ -28,6 +28,7 @@ UNITS: dict[str, str] = {
     "steers": "-", "yaw_rates": "rad/s", "loop_height": "rad/s",
     "largest_cross_track_error": "m", "rms_cross_track_error": "m", "course_time": "s",
     "rmse_u": "m/s", "rmse_v": "m/s", "rmse_r": "rad/s", "position_error_end": "m", "heading_error_end": "rad",
+    "mean_position_error": "m", "mean_heading_error": "rad",
 }  # fmt: skip
 """Unit of each index."""
 

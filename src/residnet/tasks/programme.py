@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from functools import cached_property
 
 import numpy as np
@@ -196,18 +197,20 @@ class Programme(Config):
         # waves and forces do not reach a learned model
         calm = self.disturbance.model_copy(update={"waves": None})
         gear: GivenGear | PlantGear
+        forces: Callable[[Tensor], Tensor] | None = None
         if choice.inputs:
             gear, sea = GivenGear(choice.inputs, spec.signals.exogenous, step), Sea(None, calm, self.noise, self.seed)
         elif vessel is not None:
             plant = load_vessel(vessel).build()
             gear, sea = PlantGear(plant, step, self.substeps), Sea(plant, calm, self.noise, self.seed)
+            forces = Helm.of(plant).forces
         else:
             raise ConfigError("a model flies with actuators: name a vessel's in programme.model.actuators, or give programme.model.inputs")
         actuated = ActuatedDynamics(model.double(), spec.signals.columns, spec.hold, gear)
         self.noise.check((*actuated.state, *gear.inputs[: gear.commands], *self.disturbance.logged), step, name)
         if missing := [wanted for wanted in self.disturbance.logged if wanted not in gear.inputs]:
             raise ConfigError(f"disturbance.wind: model '{name}' and its actuators have no input '{missing[0]}'")
-        helm = Helm(gear.demand, actuated.state, gear.inputs)
+        helm = Helm(gear.demand, actuated.state, gear.inputs, forces)
         return Craft(name, actuated, helm, gear.commands, self._started(gear.approach(1), actuated.state, name)), sea
 
     def _started(self, x: Tensor, state: tuple[str, ...], who: str) -> Tensor:
