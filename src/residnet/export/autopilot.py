@@ -1,0 +1,178 @@
+"""A heading policy as TorchScript for a control loop: input checks and rate limits inside, never a command that is no number."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+import time
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from residnet import __version__
+from residnet.control.policy import MEMORY, HeadingPolicy
+from residnet.core.errors import ExportError
+
+MEASURED = ("psi", "u", "r")
+"""What an exported policy sees: heading [rad], speed [m/s], yaw rate [rad/s]."""
+PARITY_STEPS = 1000
+PARITY_TOLERANCE = 1e-4
+_METHODS = ["initial_state", "step"]
+
+
+class Limits(NamedTuple):
+    """Ranges [low, high] in which measurements are taken for good."""
+
+    psi: tuple[float, float]
+    u: tuple[float, float]
+    r: tuple[float, float]
+
+
+class ExportedPolicy(nn.Module):
+    """What a controller calls once per step; float32, SI and radians.
+
+    The memory s [B, 4] is that of the policy and the last command. `fault` tells that a measurement, the reference or the memory was no
+    number or out of range: then the command is the safe one, reached at the rudder's rate, and the policy's memory stays as it was.
+    """
+
+    def __init__(self, policy: HeadingPolicy, limits: Limits, safe: Literal["hold", "amidships"]) -> None:
+        super().__init__()
+        self.policy = policy
+        self.register_buffer("low", torch.tensor([limit[0] for limit in limits], dtype=torch.float32))
+        self.register_buffer("high", torch.tensor([limit[1] for limit in limits], dtype=torch.float32))
+        self.low: Tensor
+        self.high: Tensor
+        self.keep = 1.0 if safe == "hold" else 0.0
+        # a large number where the rudder has no rate: infinity times zero would be no number
+        self.travel = min(policy.rate * policy.dt, 2.0 * policy.limit)
+        self.limit = policy.limit
+
+    @torch.jit.export
+    def initial_state(self, y: Tensor) -> Tensor:
+        """Memory s [B, 4] at the first measurement y [B, 3], rudder amidships."""
+        good = self._good(y).unsqueeze(-1)
+        return torch.cat((self.policy.initial_state(torch.where(good, y, torch.zeros_like(y))), torch.zeros_like(y[:, :1])), dim=-1)
+
+    def _good(self, y: Tensor) -> Tensor:
+        return (torch.isfinite(y) & (y >= self.low) & (y <= self.high)).all(dim=-1)
+
+    @torch.jit.export
+    def step(self, y: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Rudder command [B, 1] in rad, memory [B, 4] and fault [B] from y [B, 3] = (psi, u, r), reference heading [B, 1] and memory."""
+        remembers = torch.isfinite(s).all(dim=-1, keepdim=True)
+        s = torch.where(remembers, s, torch.zeros_like(s))
+        good = (self._good(y) & torch.isfinite(reference[:, 0]) & (reference[:, 0].abs() <= self.high[0])).unsqueeze(-1)
+        y = torch.where(good, y, torch.zeros_like(y))
+        reference = torch.where(good, reference, torch.zeros_like(reference))
+        last = s[:, -1:].clamp(-self.limit, self.limit)
+        wish, memory = self.policy(y, reference, s[:, :-1])
+        wish = torch.where(good, wish, self.keep * last)
+        memory = torch.where(good, memory, s[:, :-1])
+        command = last + (wish - last).clamp(-self.travel, self.travel)
+        return command, torch.cat((memory, command), dim=-1), ~(good & remembers)[:, 0]
+
+    def forward(self, y: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """As `step`."""
+        return self.step(y, reference, s)
+
+
+def for_export(policy: HeadingPolicy, safe: Literal["hold", "amidships"]) -> ExportedPolicy:
+    """The policy in float32 with its checks: headings up to 1000 turns, speeds up to three times, yaw rates up to five times what it was trained at."""
+    policy = copy.deepcopy(policy).float().eval().requires_grad_(False)
+    policy.psi, policy.u, policy.r = range(3)
+    turn = 5.0 * policy.gain * policy.limit
+    return ExportedPolicy(policy, Limits((-2000.0 * math.pi, 2000.0 * math.pi), (0.0, 3.0 * policy.speed), (-turn, turn)), safe).eval()
+
+
+def export_autopilot(
+    name: str, policy: HeadingPolicy, file: Path, *, safe: Literal["hold", "amidships"], about: Mapping[str, Any], metrics: list[Mapping[str, Any]]
+) -> dict[str, Any]:
+    """Write a policy as TorchScript with its card, after a parity check.
+
+    Args:
+        name: of the policy.
+        policy: at the step that it shall run with.
+        file: where to write.
+        safe: command while inputs are wrong: the last one, or rudder amidships.
+        about: of the vessel and the training, for the card.
+        metrics: rows of metrics.json of this policy, for the card.
+
+    Returns:
+        The card.
+
+    Raises:
+        ExportError: where the exported module does not reproduce the policy, or a wrong input brings a command that is no number.
+    """
+    module = for_export(policy, safe)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", category=DeprecationWarning)
+        warnings.filterwarnings("ignore", category=FutureWarning)
+        warnings.filterwarnings("ignore", message=".*torch.jit.*")
+        scripted = torch.jit.freeze(torch.jit.script(module), preserved_attrs=_METHODS)
+        parity = check_parity(name, module, scripted)
+        card = _card(name, module, safe, parity, about, metrics)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        partial = file.with_name(file.name + ".partial")
+        torch.jit.save(scripted, str(partial), _extra_files={"card.json": json.dumps(card, indent=1)})
+        check_parity(name, module, torch.jit.load(str(partial)))
+        partial.replace(file)
+    return card
+
+
+def check_parity(name: str, module: ExportedPolicy, exported: Any) -> float:
+    """Largest difference of the command from the eager module over 1,000 steps, as a share of the rudder's limit; wrong inputs are among them.
+
+    Raises:
+        ExportError: where it exceeds 1e-4, a command is no number, or a wrong input raises no flag.
+    """
+    steps = torch.arange(PARITY_STEPS, dtype=torch.float32)
+    turn = float(module.high[2]) / 5.0
+    psi, r = 0.8 * torch.sin(0.01 * steps), turn * torch.cos(0.013 * steps)
+    y = torch.stack((psi, torch.full_like(psi, module.policy.speed), r), dim=-1).unsqueeze(1)
+    reference = (0.5 * torch.sign(torch.sin(0.004 * steps))).reshape(-1, 1, 1)
+    wrong = torch.arange(PARITY_STEPS) % 97 == 50
+    y[wrong, 0, 2] = torch.nan
+    mine, theirs = module.initial_state(y[0]), exported.initial_state(y[0])
+    worst = 0.0
+    with torch.no_grad():
+        for k in range(PARITY_STEPS):
+            a, mine, _ = module.step(y[k], reference[k], mine)
+            b, theirs, fault = exported.step(y[k], reference[k], theirs)
+            difference = float((a - b).abs().max()) / module.limit
+            if not math.isfinite(difference) or bool(fault[0]) != bool(wrong[k]):
+                raise ExportError(f"policy {name}: step {k} of the parity check gives the command {float(b[0, 0])} and the flag {bool(fault[0])}")
+            worst = max(worst, difference)
+    if worst > PARITY_TOLERANCE:
+        raise ExportError(f"policy {name}: the exported commands differ by {worst:.2g} of the rudder's limit; allowed {PARITY_TOLERANCE:g}")
+    return worst
+
+
+def _card(name: str, module: ExportedPolicy, safe: str, parity: float, about: Mapping[str, Any], metrics: list[Mapping[str, Any]]) -> dict[str, Any]:
+    policy = module.policy
+    return {
+        "schema": "residnet.policy_card/1",
+        "policy": name,
+        "measured": [
+            {"name": n, "unit": u, "range": [low, high]}
+            for n, u, low, high in zip(MEASURED, ("rad", "m/s", "rad/s"), module.low.tolist(), module.high.tolist(), strict=True)
+        ],
+        "reference": [{"name": "heading", "unit": "rad"}],
+        "command": [{"name": "cmd_delta", "unit": "rad", "limit": policy.limit, "rate": None if math.isinf(policy.rate) else policy.rate}],
+        "memory": [*MEMORY, "last_command"],
+        "dt": policy.dt,
+        "dtype": "float32",
+        "turning": {"K": policy.gain, "T": policy.time, "speed": policy.speed},
+        "fault": f"measurement, reference or memory no number or out of range: command {'held' if safe == 'hold' else 'amidships'}, flag set",
+        "frame": "NED; psi clockwise from north; delta > 0 turns to starboard",
+        **about,
+        "metrics": [dict(row) for row in metrics],
+        "parity": {"steps": PARITY_STEPS, "share_of_limit": parity},
+        "versions": {"residnet": __version__, "torch": torch.__version__},
+        "exported": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        "safety": "TorchScript is code that runs when loaded: load only files that you trust. The files under models/ hold numbers only.",
+    }

@@ -1,0 +1,126 @@
+"""The neural heading policy: symmetric, without steady error, exported with its checks."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from residnet.control.policy import HeadingPolicy
+from residnet.control.steering import SteeredPlant, fly
+from residnet.export.autopilot import ExportedPolicy, export_autopilot, for_export
+from residnet.physics.vessel import load_vessel
+
+LIMIT = math.radians(5)
+VESSEL = SteeredPlant(load_vessel("nomoto_oceanos").build())
+TURNING = VESSEL.turning(LIMIT, 60.0)
+
+
+def untrained(seed: int = 0, **settings: float) -> HeadingPolicy:
+    torch.manual_seed(seed)
+    policy = HeadingPolicy(VESSEL.state, turning=TURNING, limit=LIMIT, dt=0.05, **settings)
+    with torch.no_grad():
+        for parameter in policy.network.parameters():
+            parameter.copy_(0.1 * torch.randn_like(parameter))
+    return policy.requires_grad_(False)
+
+
+def test_turning_finds_nomotos_constants() -> None:
+    assert TURNING.gain == pytest.approx(3.47, rel=1e-6)
+    assert TURNING.time == pytest.approx(3.94, rel=1e-4)
+    assert TURNING.speed == 3.2
+
+
+def test_port_mirrors_starboard() -> None:
+    policy = untrained().double()
+    x = torch.randn(50, len(VESSEL.state), dtype=torch.float64) * 0.3
+    x[:, VESSEL.column("u")] = 3.2
+    mirrored = x.clone()
+    for name in ("psi", "r"):
+        mirrored[:, VESSEL.column(name)] *= -1
+    reference, s = torch.randn(50, 1, dtype=torch.float64), 0.05 * torch.randn(50, 3, dtype=torch.float64)
+    command, after = policy(x, reference, s)
+    other, other_after = policy(mirrored, -reference, -s)
+    assert torch.allclose(command, -other, atol=1e-12)
+    assert torch.allclose(after, -other_after, atol=1e-12)
+    assert command.abs().max() <= LIMIT
+
+
+@pytest.mark.parametrize("bias", [-2.0, 1.0])
+def test_a_constant_push_leaves_no_error_whatever_the_weights(bias: float) -> None:
+    flights = fly(VESSEL, untrained(), torch.tensor([0.2]), torch.tensor([[0.9, 1.1, math.radians(bias)]]), dt=0.05, duration=120.0)
+    assert abs(float(flights.error[0, -1])) < 1e-6
+    assert float(flights.inputs[0, -1, 0]) == pytest.approx(-math.radians(bias) / 0.9, rel=1e-4)
+
+
+def exported(tmp_path: Path, policy: HeadingPolicy) -> tuple[ExportedPolicy, object]:
+    file = tmp_path / "policy.pt"
+    card = export_autopilot("policy", policy, file, safe="amidships", about={}, metrics=[])
+    assert card["dt"] == 0.05
+    return for_export(policy, "amidships"), torch.jit.load(str(file))
+
+
+def test_exported_policy_gives_the_same_commands(tmp_path: Path) -> None:
+    _, module = exported(tmp_path, untrained())
+    policy = untrained().float()
+    x = torch.zeros(1, len(VESSEL.state))
+    x[:, VESSEL.column("u")] = 3.2
+    y = torch.tensor([[0.0, 3.2, 0.0]])
+    s, memory = policy.initial_state(x), module.initial_state(y)  # type: ignore[attr-defined]
+    for k in range(50):
+        x[:, VESSEL.column("psi")] = y[:, 0] = 0.004 * k
+        x[:, VESSEL.column("r")] = y[:, 2] = 0.08
+        command, s = policy(x, torch.tensor([[0.1]]), s)
+        theirs, memory, fault = module.step(y, torch.tensor([[0.1]]), memory)  # type: ignore[attr-defined]
+        assert torch.allclose(command, theirs, atol=1e-6)
+        assert not fault.any()
+
+
+WRONG = [
+    ([math.nan, 3.2, 0.0], 0.1),
+    ([0.0, math.inf, 0.0], 0.1),
+    ([0.0, 3.2, -math.inf], 0.1),
+    ([0.0, -1.0, 0.0], 0.1),
+    ([0.0, 3.2, 50.0], 0.1),
+    ([1e9, 3.2, 0.0], 0.1),
+    ([0.0, 3.2, 0.0], math.nan),
+    ([0.0, 3.2, 0.0], 1e9),
+]
+
+
+@pytest.mark.parametrize(("measured", "reference"), WRONG)
+@pytest.mark.parametrize("safe", ["hold", "amidships"])
+def test_wrong_inputs_bring_the_safe_command_and_a_flag(measured: list[float], reference: float, safe: str) -> None:
+    module = for_export(untrained(rate=0.2), safe)  # type: ignore[arg-type]
+    good = torch.tensor([[0.0, 3.2, 0.0]])
+    s = module.initial_state(good)
+    for _ in range(20):
+        last, s, _ = module.step(good, torch.tensor([[0.5]]), s)
+    command, after, fault = module.step(torch.tensor([measured]), torch.tensor([[reference]]), s)
+    assert fault.all()
+    expected = last if safe == "hold" else last - last.clamp(-0.2 * 0.05, 0.2 * 0.05)
+    assert torch.allclose(command, expected)
+    assert torch.equal(after[:, :3], s[:, :3])
+    again, _, fault = module.step(good, torch.tensor([[0.5]]), after)
+    assert torch.isfinite(again).all() and not fault.any()
+
+
+def test_a_spoilt_memory_is_given_up() -> None:
+    module = for_export(untrained(), "amidships")
+    s = torch.full((1, 4), math.nan)
+    command, after, fault = module.step(torch.tensor([[0.0, 3.2, 0.0]]), torch.tensor([[0.1]]), s)
+    assert fault.all() and torch.isfinite(command).all() and torch.isfinite(after).all()
+
+
+def test_commands_keep_the_rudders_rate() -> None:
+    module = for_export(untrained(rate=0.1), "hold")
+    s = module.initial_state(torch.tensor([[0.0, 3.2, 0.0]]))
+    last: Tensor = torch.zeros(1, 1)
+    for k in range(40):
+        command, s, _ = module.step(torch.tensor([[0.0, 3.2, 0.0]]), torch.tensor([[0.5 if k < 20 else -0.5]]), s)
+        assert float((command - last).abs()) <= 0.1 * 0.05 + 1e-7
+        last = command
+    assert float(last) < 0
