@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from pydantic import Field
 from torch import Tensor
 
 from residnet.control.anticipation import Lag
@@ -52,8 +51,7 @@ class FerryModelConfig(Config):
         terms: its basis functions; the 30 of (4.12) unless given.
         lag: fit the thrusters' lag with it, explain the force that followed the command, and lead the feed-forward by the lag.
         earth: include forces that are constant in earth axes.
-        smooth: samples on either side of the window that noisy velocities and accelerations are smoothed over (cubic Savitzky-Golay), 0 for none;
-            the command is smoothed alike, so that both keep step.
+        smooth: bring the noisy measurements into one motion first (see `residnet.data.motion_smoother`).
         on: the model whose remaining residual this one explains (3.26); empty for the believed hull.
         fly: fly the course, and the crossing where there is one, with it as feed-forward.
         published: the document's figures.
@@ -63,7 +61,7 @@ class FerryModelConfig(Config):
     terms: tuple[str, ...] = FERRY_TERMS
     lag: bool = False
     earth: bool = False
-    smooth: int = Field(default=0, ge=0)
+    smooth: bool = False
     on: str = ""
     fly: bool = False
     published: Published = Published()
@@ -98,7 +96,8 @@ class Record:
     """What a controller logs, uniform in time.
 
     Attributes:
-        t: [N] s; pose, nu, nu_dot, command: [N, 3]; fold: segment of each sample [N]; train: samples that identify [N] bool, the others test.
+        t: [N] s; pose, nu, nu_dot: [N, 3]; command: as sampled, and averaged over the steps around a sample, [N, 3]; fold: segment of each sample [N]; train: samples that identify [N] bool, the others test;
+        noise: standard deviations of pose, nu and nu_dot, nine.
     """
 
     t: Tensor
@@ -106,24 +105,23 @@ class Record:
     nu: Tensor
     nu_dot: Tensor
     command: Tensor
+    averaged: Tensor
     fold: Tensor
     train: Tensor
+    noise: tuple[float, ...]
 
     @property
     def dt(self) -> float:
         """Sampling interval."""
         return float(self.t[1] - self.t[0])
 
-    def smoothed(self, half: int) -> Record:
-        """Velocities, accelerations and commands through the same cubic Savitzky-Golay window of 2 half + 1 samples."""
-        if half == 0:
-            return self
-        from scipy.signal import savgol_filter
+    def smoothed(self) -> Record:
+        """With the motion that all measurements together make likeliest, under the noise that the sensors are known to have."""
+        from residnet.data.motion_smoother import smooth_motion
 
-        def smooth(part: Tensor) -> Tensor:
-            return torch.from_numpy(savgol_filter(part.numpy(), 2 * half + 1, min(3, 2 * half), axis=0))
-
-        return Record(self.t, smooth(self.pose), smooth(self.nu), smooth(self.nu_dot), smooth(self.command), self.fold, self.train)
+        seen = torch.cat((self.pose, self.nu, self.nu_dot), dim=-1)
+        motion = torch.from_numpy(smooth_motion(seen.numpy(), self.noise, self.dt))
+        return Record(self.t, motion[:, :3], motion[:, 3:6], motion[:, 6:], self.command, self.averaged, self.fold, self.train, self.noise)
 
 
 def identify(config: FerryModelConfig, record: Record, base: ForceModel) -> FerryModel:
@@ -132,7 +130,7 @@ def identify(config: FerryModelConfig, record: Record, base: ForceModel) -> Ferr
     Raises:
         FitError: where the data do not determine it.
     """
-    used = record.smoothed(config.smooth)
+    used = record.smoothed() if config.smooth else record
     train = used.train
     x = TermLibrary(config.terms, MOTION)(torch.cat((used.nu_dot, used.nu), dim=-1))
     needed = base.at_heading(used.nu_dot, used.nu, used.pose[:, 2])
@@ -143,8 +141,8 @@ def identify(config: FerryModelConfig, record: Record, base: ForceModel) -> Ferr
     force = used.command
     if config.lag:
         regressors = torch.cat((x, earthly[:, 0]), dim=-1) if config.earth else x
-        found = fit_lag(force, needed, regressors, used.dt, train)
-        force = followed(force, found.lag, used.dt)
+        found = fit_lag(used.averaged, needed, regressors, used.dt, train)
+        force = followed(used.averaged, found.lag, used.dt)
     y = force - needed
     push = torch.zeros(2, dtype=torch.float64)
     if config.earth:
@@ -164,7 +162,7 @@ def identify(config: FerryModelConfig, record: Record, base: ForceModel) -> Ferr
 
 def judged(model: ForceModel, lag: Lag | None, record: Record) -> list[float]:
     """MSE of the residual that a model leaves on a record's test samples as they were logged, by axis; through its lag where it has one."""
-    force = record.command if lag is None else followed(record.command, lag, record.dt)
+    force = record.command if lag is None else followed(record.averaged, lag, record.dt)
     residual = model.residual(force, record.nu_dot, record.nu, record.pose[:, 2])
     return mse(residual[~record.train])
 

@@ -58,11 +58,15 @@ class MotionNoise(Config):
     acceleration: quantity("m/s^2") = 0.0  # type: ignore[valid-type]
     yaw_acceleration: quantity("rad/s^2") = 0.0  # type: ignore[valid-type]
 
+    def spread(self) -> tuple[float, ...]:
+        """Of pose, velocities and accelerations, nine."""
+        linear, angular = (self.position, self.velocity, self.acceleration), (self.heading, self.yaw_rate, self.yaw_acceleration)
+        return tuple(value for a, b in zip(linear, angular, strict=True) for value in (a, a, b))
+
     def draw(self, shape: Sequence[int], seed: int) -> Tensor:
         """Noise [..., 9] on pose, velocities and accelerations, float64."""
-        spread = [self.position] * 2 + [self.heading] + [self.velocity] * 2 + [self.yaw_rate] + [self.acceleration] * 2 + [self.yaw_acceleration]
         generator = torch.Generator().manual_seed(seed)
-        return torch.randn(*shape, 9, generator=generator, dtype=torch.float64) * torch.tensor(spread, dtype=torch.float64)
+        return torch.randn(*shape, 9, generator=generator, dtype=torch.float64) * torch.tensor(self.spread(), dtype=torch.float64)
 
 
 class Disturbance(Config):
@@ -98,7 +102,10 @@ class Flight:
         t: [N] s.
         pose, nu, nu_dot: truth [N, 3].
         seen: measured pose, nu, nu_dot [N, 9].
-        command, acting: tau_c and the thrusters' force [N, 3].
+        command: tau_c at the samples [N, 3].
+        averaged: tau_c averaged over the steps around each sample [N, 3]: without the noise between samples that would fold down.
+        acting: the thrusters' force [N, 3].
+        desired: eta_d [N, 3].
         tracking: metrics over every step.
     """
 
@@ -108,6 +115,7 @@ class Flight:
     nu_dot: Tensor
     seen: Tensor
     command: Tensor
+    averaged: Tensor
     acting: Tensor
     desired: Tensor
     tracking: Tracking
@@ -188,9 +196,20 @@ class Ferry:
         command = w[:, :3]
         metrics = tracking(x[:, :3], x[:, 3:6], reference[:, :3], command, reference[:, 9:], self.loop.step)
         rate = self.true.rate(x, w)
-        every = slice(None, None, self.loop.every)
+        every, half = slice(None, None, self.loop.every), self.loop.every // 2
+        ends = torch.cat((command[:1].expand(half, 3), command, command[-1:].expand(half, 3)))
+        averaged = ends.unfold(0, 2 * half + 1, 1).mean(-1)
         seen = torch.cat((x[:, :6], rate[:, 3:6]), dim=-1) + noise
         t = torch.arange(len(x), dtype=torch.float64) * self.loop.step
         return Flight(
-            t[every], x[every, :3], x[every, 3:6], rate[every, 3:6], seen[every], command[every], x[every, 6:9], reference[every, :3], metrics
+            t[every],
+            x[every, :3],
+            x[every, 3:6],
+            rate[every, 3:6],
+            seen[every],
+            command[every],
+            averaged[every],
+            x[every, 6:9],
+            reference[every, :3],
+            metrics,
         )

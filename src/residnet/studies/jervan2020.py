@@ -15,7 +15,7 @@ from residnet.heads.regressions import table
 from residnet.physics.force_model import ForceModel
 from residnet.run_folder import RunFolder
 from residnet.studies.ferry_fit import FerryModel, Published, Record, identify
-from residnet.studies.ferry_runs import Flight
+from residnet.studies.ferry_runs import Flight, MotionNoise
 
 if TYPE_CHECKING:
     from residnet.tasks.ferry_study import FerryStudyConfig
@@ -42,11 +42,11 @@ class Study:
     crossings: dict[str, Flight]
 
 
-def record_of(flight: Flight, interval: float) -> Record:
+def record_of(flight: Flight, interval: float, noise: MotionNoise) -> Record:
     """The log of a course: a fold for each segment, the first half identifies."""
     fold = torch.div(flight.t + 1e-9, interval, rounding_mode="floor").long()
     train = torch.arange(len(flight.t)) < len(flight.t) // 2
-    return Record(flight.t, flight.seen[:, :3], flight.seen[:, 3:6], flight.seen[:, 6:], flight.command, fold, train)
+    return Record(flight.t, flight.seen[:, :3], flight.seen[:, 3:6], flight.seen[:, 6:], flight.command, flight.averaged, fold, train, noise.spread())
 
 
 def study(config: FerryStudyConfig) -> Study:
@@ -54,7 +54,7 @@ def study(config: FerryStudyConfig) -> Study:
     ferry = config.ferry()
     believed = ForceModel(ferry.believed.hull)
     first = ferry.fly_course(config.course, [(believed, None)])[0]
-    record = record_of(first, config.course.interval)
+    record = record_of(first, config.course.interval, config.noise or MotionNoise())
     residual = believed.residual(record.command, record.nu_dot, record.nu, record.pose[:, 2])
     models: dict[str, FerryModel] = {}
     for name, wanted in config.models.items():

@@ -14,7 +14,7 @@ from torch import Tensor
 from residnet.control.anticipation import Lag
 from residnet.core.errors import FitError
 
-_LEAST, _MOST = np.array([0.2, 0.15, 0.0]), np.array([30.0, 3.0, 2.0])
+_LEAST, _MOST = np.array([0.1, 0.1, 0.0]), np.array([30.0, 3.0, 2.0])
 
 
 def followed(command: Tensor, lag: Lag, dt: float) -> Tensor:
@@ -75,24 +75,26 @@ def fit_lag(command: Tensor, needed: Tensor, basis: Tensor, dt: float, use: Tens
     q = q[:, r.diagonal().abs() > 1e-9 * r.diagonal().abs().max()]
     variance = (command - needed)[keep].var(0).clamp(min=1e-300)
 
-    def left(force: Tensor) -> Tensor:
-        y = (force - needed)[keep]
+    def unexplained(y: Tensor) -> Tensor:
         y = y - y.mean(0)
-        return (y - q @ (q.T @ y)) / variance.sqrt()
+        return y - q @ (q.T @ y)
 
     def miss(p: np.ndarray) -> np.ndarray:
         lag = Lag(frequency=float(p[0]), damping=float(p[1]), delay=float(p[2]))
-        return left(followed(command, lag, dt)).numpy().ravel()
+        force = followed(command, lag, dt)[keep]
+        # in units of the followed force itself: a lag that lets nothing through would leave nothing to explain
+        out: np.ndarray = (unexplained(force - needed[keep]) / force.std(0).clamp(min=1e-300)).numpy().ravel()
+        return out
 
     starts = [np.array([w, 0.8, d]) for w in (1.0, 3.0, 8.0) for d in (0.05, 0.5)]
     first = min(starts, key=lambda p: float(np.square(miss(p)).sum()))
     found = least_squares(miss, first, bounds=(_LEAST, _MOST), x_scale=[1.0, 0.3, 0.1], diff_step=[1e-4] * 3, max_nfev=60)
     p = found.x
-    at = [
-        name for name, value, low, high in zip(("frequency", "damping", "delay"), p, _LEAST, _MOST, strict=True) if value in (low, high) and value > 0
-    ]
+    inside = [low * 1.02 < value < high * 0.98 or (low == 0.0 and value < 0.98 * high) for value, low, high in zip(p, _LEAST, _MOST, strict=True)]
+    at = [name for name, fine in zip(("frequency", "damping", "delay"), inside, strict=True) if not fine]
     if at:
         raise FitError(f"the lag's {at[0]} ends at the bound of its search ({p[0]:.3g} rad/s, {p[1]:.3g}, {p[2]:.3g} s); the data do not show one")
     lag = Lag(frequency=float(p[0]), damping=float(p[1]), delay=float(p[2]))
-    shares = [left(force).square().mean(0).tolist() for force in (followed(command, lag, dt), command)]
+    rests = [unexplained((force - needed)[keep]) for force in (followed(command, lag, dt), command)]
+    shares = [(rest.square().mean(0) / variance).tolist() for rest in rests]
     return LagFit(lag, (shares[0][0], shares[0][1], shares[0][2]), (shares[1][0], shares[1][1], shares[1][2]))
