@@ -98,3 +98,22 @@ def test_what_lies_around_the_best_is_tried_while_it_gains() -> None:
     assert bench(own) == pytest.approx(0.2)
     # each once, up to the first neighbours that do not gain
     assert [entry["value"] for entry in notes["free_run_choice"]] == [0.0, 2.0, 1.0, 3.0, 4.0, 5.0]
+
+
+def test_what_stands_alone_does_not_end_the_search() -> None:
+    """No residual at all may beat every shared setting, and yet lose to what lies around the best of them."""
+    own = model()
+
+    def at(value: float) -> Solution:
+        theta = torch.full((3, 1), value, dtype=torch.float64)
+        return Solution({"value": value}, {"theta": theta}, around=lambda: [at(value - 1.0), at(value + 1.0)])
+
+    def bench(candidate: HybridDynamics) -> float:
+        value = float(candidate.baseline.theta[0, 0])  # type: ignore[index, operator]
+        return 2.5 if value == 0.0 else abs(value - 7.2)
+
+    nothing = Solution({"value": None}, {"theta": torch.zeros(3, 1, dtype=torch.float64)})
+    best, notes = choose(own, own.baseline, [at(4.0), at(3.0), nothing], bench)
+    assert notes["free_run_choice"][2]["validation"] == 2.5 < notes["free_run_choice"][0]["validation"]
+    assert best.choice == {"value": 7.0}
+    assert float(own.baseline.theta[0, 0]) == 7.0  # type: ignore[index, operator]

@@ -33,14 +33,15 @@ def choose(
             tried.append((solution, bench(model)))
 
     attempt(solutions if len(solutions) > 1 else ())
-    best = min(tried, key=_error, default=(solutions[0], 0.0))
-    while tried and best[0].around is not None:
+    centre = _best(tried)
+    while centre is not None and centre[0].around is not None:
         seen = [solution.choice for solution, _ in tried]
-        attempt([solution for solution in best[0].around() if solution.choice not in seen])
-        further = min(tried, key=_error)
-        if further is best:
+        attempt([solution for solution in centre[0].around() if solution.choice not in seen])
+        further = _best(tried)
+        if further is centre:
             break
-        best = further
+        centre = further
+    best = min(tried, key=_error, default=(solutions[0], 0.0))
     part.load_state_dict(best[0].state, strict=False)
     told = [{**solution.choice, "validation": error} for solution, error in tried]
     return best[0], {"free_run_choice": told} if told else {}
@@ -48,3 +49,8 @@ def choose(
 
 def _error(tried: tuple[Solution, float]) -> float:
     return tried[1]
+
+
+def _best(tried: Sequence[tuple[Solution, float]]) -> tuple[Solution, float] | None:
+    """The best of those that others lie around; one that stands alone, such as no residual at all, does not end the search."""
+    return min((pair for pair in tried if pair[0].around is not None), key=_error, default=None)
