@@ -105,14 +105,17 @@ def test_wrong_inputs_bring_the_safe_command_and_a_flag(measured: list[float], r
     assert torch.allclose(command, expected)
     assert torch.equal(after[:, :3], s[:, :3])
     again, _, fault = module.step(good, torch.tensor([[0.5]]), after)
-    assert torch.isfinite(again).all() and not fault.any()
+    assert torch.isfinite(again).all()
+    assert not fault.any()
 
 
 def test_a_spoilt_memory_is_given_up() -> None:
     module = for_export(untrained(), "amidships")
     s = torch.full((1, 4), math.nan)
     command, after, fault = module.step(torch.tensor([[0.0, 3.2, 0.0]]), torch.tensor([[0.1]]), s)
-    assert fault.all() and torch.isfinite(command).all() and torch.isfinite(after).all()
+    assert fault.all()
+    assert torch.isfinite(command).all()
+    assert torch.isfinite(after).all()
 
 
 def test_commands_keep_the_rudders_rate() -> None:

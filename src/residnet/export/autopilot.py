@@ -7,7 +7,7 @@ import json
 import math
 import time
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -82,7 +82,7 @@ class ExportedPolicy(nn.Module):
 
 
 def for_export(policy: HeadingPolicy, safe: Literal["hold", "amidships"]) -> ExportedPolicy:
-    """The policy in float32 with its checks: headings up to 1000 turns, speeds up to three times, yaw rates up to five times what it was trained at."""
+    """The policy in float32 with its checks: headings up to 1000 turns, three times its speed, five times the steady turn at full rudder."""
     policy = copy.deepcopy(policy).float().eval().requires_grad_(False)
     policy.psi, policy.u, policy.r = range(3)
     turn = 5.0 * policy.gain * policy.limit
@@ -90,7 +90,13 @@ def for_export(policy: HeadingPolicy, safe: Literal["hold", "amidships"]) -> Exp
 
 
 def export_autopilot(
-    name: str, policy: HeadingPolicy, file: Path, *, safe: Literal["hold", "amidships"], about: Mapping[str, Any], metrics: list[Mapping[str, Any]]
+    name: str,
+    policy: HeadingPolicy,
+    file: Path,
+    *,
+    safe: Literal["hold", "amidships"],
+    about: Mapping[str, Any],
+    metrics: Sequence[Mapping[str, Any]],
 ) -> dict[str, Any]:
     """Write a policy as TorchScript with its card, after a parity check.
 
@@ -152,7 +158,9 @@ def check_parity(name: str, module: ExportedPolicy, exported: Any) -> float:
     return worst
 
 
-def _card(name: str, module: ExportedPolicy, safe: str, parity: float, about: Mapping[str, Any], metrics: list[Mapping[str, Any]]) -> dict[str, Any]:
+def _card(
+    name: str, module: ExportedPolicy, safe: str, parity: float, about: Mapping[str, Any], metrics: Sequence[Mapping[str, Any]]
+) -> dict[str, Any]:
     policy = module.policy
     return {
         "schema": "residnet.policy_card/1",

@@ -16,6 +16,8 @@ from residnet.control.steering import SteeredPlant, fly
 from residnet.control.tuning import TuningTask, tune
 from residnet.evaluation.autopilots import random_variations, row, step_flights, table
 from residnet.evaluation.metrics import SCHEMA
+from residnet.evaluation.report_autopilot import FLIGHTS, write_autopilot_report
+from residnet.export.autopilot import export_autopilot
 from residnet.physics.vessel import load_vessel
 from residnet.run_folder import RunFolder
 from residnet.tasks.autopilot import AutopilotConfig, PolicyConfig
@@ -53,7 +55,15 @@ def run_autopilot(config: AutopilotConfig, folder: RunFolder) -> None:
             "rows": rows,
         },
     )
-    series.to_parquet(folder.path / "flights.parquet")
+    series.to_parquet(folder.path / FLIGHTS)
+    for name in config.policies:
+        trained = controllers[name][1]
+        assert isinstance(trained, HeadingPolicy)
+        about = {"vessel": config.vessel, "spread": config.spread.model_dump(mode="json")}
+        own = [entry for entry in rows if entry["model"] == name]
+        export_autopilot(name, trained, folder.exports / f"{name}.pt", safe=config.safe, about=about, metrics=own)
+        print(f"exported: {folder.exports / f'{name}.pt'}")
+    write_autopilot_report(folder.path)
     print(table(rows, config.floor))
 
 
