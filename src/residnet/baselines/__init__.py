@@ -8,6 +8,7 @@ from pydantic import Field
 
 from residnet.baselines.base import Baseline
 from residnet.baselines.believed import BelievedConfig
+from residnet.baselines.equations import EquationsConfig
 from residnet.baselines.linear_steady import LinearSteadyConfig
 from residnet.baselines.nomoto import NomotoConfig, NomotoSideslipConfig
 from residnet.baselines.regressors import RegressorBaseline, RegressorsConfig
@@ -15,7 +16,7 @@ from residnet.baselines.still import StillConfig
 from residnet.core.solutions import Coefficient
 
 BaselineConfig = Annotated[
-    BelievedConfig | LinearSteadyConfig | NomotoConfig | NomotoSideslipConfig | RegressorsConfig | StillConfig,
+    BelievedConfig | EquationsConfig | LinearSteadyConfig | NomotoConfig | NomotoSideslipConfig | RegressorsConfig | StillConfig,
     Field(discriminator="kind"),
 ]
 
@@ -24,6 +25,7 @@ __all__ = [
     "BaselineConfig",
     "BelievedConfig",
     "Coefficient",
+    "EquationsConfig",
     "LinearSteadyConfig",
     "NomotoConfig",
     "NomotoSideslipConfig",

@@ -16,7 +16,8 @@ from residnet.core.genetic import EvolutionConfig, Found, evolve, limits_of
 from residnet.core.names import ACCELERATION
 from residnet.core.samples import Samples
 from residnet.core.solutions import Coefficient, Solution
-from residnet.core.sparse import Equation, SearchConfig, find, reduce
+from residnet.core.sparse import Equation, Reduced, SearchConfig, find, reduce
+from residnet.core.sparse_search import coefficients
 from residnet.heads.base import EquationHead, FeatureConfig, Features
 from residnet.heads.expression_library import ExpressionLibrary, Weights, tables
 from residnet.heads.expression_text import LATEX, PLAIN, SYMPY, c_function, term, total
@@ -47,13 +48,13 @@ class GeneticConfig(FeatureConfig):
 
 
 class Bred(NamedTuple):
-    """The equation of one axis: what the search found, and products with coefficients, their standard errors and the share left unexplained."""
+    """The equation of one axis: what the search found; products with coefficients and standard errors; and what the data say about them."""
 
     found: Found
     products: tuple[Product, ...]
     values: tuple[float, ...]
     errors: tuple[float, ...]
-    share: float
+    told: dict[str, Any]
 
 
 def breed(algebra: Algebra, data: Mapping[str, np.ndarray], target: np.ndarray, train: np.ndarray, config: GeneticConfig, seed: int) -> Bred:
@@ -74,18 +75,30 @@ def breed(algebra: Algebra, data: Mapping[str, np.ndarray], target: np.ndarray, 
     found = evolve(algebra, data, target, train, config.evolution, seed)
     values = algebra.values(found.terms, data).T
     names = [term(algebra, product) for product in found.terms]
-    if config.final is None:
-        scale = np.linalg.norm(values, axis=0)
-        best, *_ = np.linalg.lstsq(values / scale, target, rcond=None)
-        left = target - values / scale @ best
-        spread = np.sqrt(left @ left / max(len(target) - len(names), 1))
-        errors = spread * np.sqrt(np.diag(np.linalg.pinv((values / scale).T @ (values / scale))))
-        share = float(np.sqrt(left @ left / max(target @ target, 1e-300)))
-        return Bred(found, found.terms, tuple((best / scale).tolist()), tuple((errors / scale).tolist()), share)
     reduced = reduce(values, target[:, None], names, [algebra.degree(p) for p in found.terms], [algebra.effort(p) for p in found.terms])
-    equation: Equation = find(reduced, 0, config.final)[0]
+    equation, within = (_whole(reduced), reduced) if config.final is None else find(reduced, 0, config.final)
+    told = {
+        "error_share": equation.share,
+        "exact": equation.exact,
+        "candidates": within.rank,
+        "condition": within.condition,
+        "same_as_simpler": within.dependent,
+        "cannot_tell_apart": equation.alternatives,
+        "undecided": equation.undecided,
+    }
     products = tuple(found.terms[names.index(name)] for name in equation.terms)
-    return Bred(found, products, tuple(equation.values.tolist()), tuple(equation.errors.tolist()), equation.share)
+    return Bred(found, products, tuple(equation.values.tolist()), tuple(equation.errors.tolist()), told)
+
+
+def _whole(reduced: Reduced) -> Equation:
+    """All terms that the data tell apart, by least squares."""
+    y = reduced.y[:, 0]
+    best, inverse = coefficients(reduced.r, y)
+    left = y - reduced.r @ best
+    spread = np.sqrt(left @ left / max(float(reduced.samples[0]) - len(best), 1.0))
+    share = float(np.sqrt(left @ left / max(y @ y, 1e-300)))
+    errors = spread * np.sqrt(np.square(inverse).sum(axis=1))
+    return Equation(reduced.names, best / reduced.scale, errors / reduced.scale, share, share <= 1e-13, 0.0, 0, {}, {})
 
 
 @final
@@ -106,6 +119,10 @@ class GeneticHead(EquationHead):
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Residual [..., 3] at channels z [..., nz]; the memory is empty."""
         return self.library(self.features.guarded(z)) @ self.weights.values.to(z.dtype), s
+
+    def freedom(self) -> list[float]:
+        """Coefficients of each axis that are not zero."""
+        return [float(count) for count in (self.weights.values != 0).sum(0)]
 
     def parts(self, z: Tensor, axis: int) -> dict[str, np.ndarray]:
         """Every term of one axis times its coefficient along measured channels [T, nz], [T] each."""
@@ -144,6 +161,7 @@ class GeneticHead(EquationHead):
         notes = {
             "parameters": len(table),
             "coefficients": [{"axis": c.axis, "term": c.term, "value": c.value, "standard_error": c.error} for c in table],
+            "unexcited": [],
             "equations": {name: _written(algebra, name, own) for name, own in zip(ACCELERATION, bred, strict=True)},
         }
         state = {f"library.{name}": value for name, value in tables(algebra, products, self.config.evolution.nesting).items()}
@@ -166,7 +184,7 @@ def _written(algebra: Algebra, name: str, bred: Bred) -> dict[str, Any]:
         "latex": rf"\dot{{{base}}} = {total(algebra, bred.products, bred.values, LATEX)}",
         "sympy": total(algebra, bred.products, bred.values, SYMPY),
         "c": c_function(algebra, name, bred.products, bred.values),
-        "error_share": bred.share,
+        **bred.told,
         "bred_terms": len(bred.found.terms),
         "generation": bred.found.generation,
         "reached_goal": bred.found.reached,

@@ -1,0 +1,98 @@
+"""Equations that somebody published: accelerations as terms with given coefficients, scored beside what is identified here."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal, final
+
+import torch
+from pydantic import Field, model_validator
+from torch import Tensor
+
+from residnet.baselines.base import Baseline, IdentifiedConfig
+from residnet.core.errors import ConfigError, UsageError
+from residnet.core.names import CHANNEL_UNITS, VELOCITY, to_si
+from residnet.core.samples import Samples
+from residnet.core.solutions import Solution
+from residnet.physics.terms import TermLibrary, parse_term
+
+Row = dict[str, float]
+
+
+@final
+class EquationsBaseline(Baseline):
+    """nu_dot [..., 3] = theta [3, J] phi(z) [..., J], theta as given."""
+
+    def __init__(self, rows: Sequence[Row], names: Sequence[str]) -> None:
+        super().__init__()
+        terms = list(dict.fromkeys(term for row in rows for term in row))
+        self.library = TermLibrary(terms, names)
+        theta = [[row.get(term, 0.0) for term in terms] for row in rows]
+        self.register_buffer("theta", torch.tensor(theta, dtype=torch.float64).reshape(3, len(terms)))
+        self.theta: Tensor
+
+    def forward(self, z: Tensor) -> Tensor:
+        """nu_dot [..., 3] at channels z [..., nz]."""
+        return self.library(z) @ self.theta.to(z.dtype).T
+
+    def freedom(self) -> list[float]:
+        """Number of terms of each axis: they were fitted, if to other data (ERRATA E9 of document 000)."""
+        return [float(count) for count in (self.theta != 0).sum(1)]
+
+
+class EquationsConfig(IdentifiedConfig):
+    """Published equations of the accelerations, for example document 000 eqs. (6.24)-(6.32) and (7.2)-(7.7); nothing is identified.
+
+    Attributes:
+        u, v, r: coefficients of u_dot, v_dot, r_dot by term; a term that is left out is zero.
+        units: units in which the coefficients take channels, where not SI (document 000 has revolutions in rpm).
+        source: where they stand.
+    """
+
+    kind: Literal["equations"] = "equations"
+    u: Row = Field(default_factory=dict)
+    v: Row = Field(default_factory=dict)
+    r: Row = Field(default_factory=dict)
+    units: dict[str, str] = Field(default_factory=dict)
+    source: str = ""
+
+    @model_validator(mode="after")
+    def _any(self) -> EquationsConfig:
+        if not (self.u or self.v or self.r):
+            raise ValueError("no axis has a term; give coefficients by term under u, v or r")
+        for name, unit in self.units.items():
+            try:
+                to_si(unit, CHANNEL_UNITS.get(name))
+            except UsageError as error:
+                raise ValueError(f"units.{name}: {error}") from None
+        return self
+
+    def rows(self, names: Sequence[str]) -> list[Row]:
+        """Coefficients of each axis in SI, for channels `names`.
+
+        Raises:
+            ConfigError: where a term names a channel that the model lacks, or a function of one that is not in SI.
+        """
+        out: list[Row] = []
+        for axis, row in zip(VELOCITY, (self.u, self.v, self.r), strict=True):
+            own: Row = {}
+            for term, value in row.items():
+                for factor in parse_term(term, names):
+                    if factor.name not in self.units:
+                        continue
+                    if factor.function:
+                        raise ConfigError(
+                            f"baseline 'equations', {axis}, term '{term}': {factor.symbol} needs {factor.name} in SI; leave its unit out"
+                        )
+                    value /= to_si(self.units[factor.name]) ** factor.power
+                own[term] = value
+            out.append(own)
+        return out
+
+    def build(self, names: Sequence[str]) -> EquationsBaseline:
+        """The module with its numbers, for channels `names`."""
+        return EquationsBaseline(self.rows(names), names)
+
+    def solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
+        """Nothing to fit: one solution without numbers."""
+        return [Solution({}, {})]
