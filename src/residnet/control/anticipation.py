@@ -18,6 +18,8 @@ from residnet.physics.force_model import ForceModel
 
 _STEP = 0.05
 """Seconds between the points that the force's derivatives are taken from; the reference itself is known analytically there."""
+_MEND = 0.7
+"""How fast a miss of the needed force is made up for, in units of the lag's own frequency: the command's peaks grow with it."""
 
 
 class Lag(Config):
@@ -59,14 +61,14 @@ def derivatives(config: ReferenceFilterConfig, memory: Tensor, target: Tensor, t
     return Derivatives(pose, rate, change, jerk, snap)
 
 
-def led_force(model: ForceModel, motion: Derivatives, lag: Lag | None, ahead: float) -> Tensor:
-    """tau_c [..., 3] that makes lagging actuators give what the model needs for the motion.
+def needed_force(model: ForceModel, motion: Derivatives, lag: Lag | None, held: float) -> Tensor:
+    """What a model needs for the motion when a command given now takes effect, and its first and second derivative: [..., 9].
 
     Args:
         model: of the vessel.
         motion: desired.
-        lag: of the actuators; None commands the force itself.
-        ahead: how much earlier a command must come than its effect beside the lag's own delay, in s: half a step for one that is held.
+        lag: of the actuators; None commands the force itself, now and without derivatives.
+        held: seconds that a command is held; on average it comes late by half of them.
     """
 
     def force(h: float) -> Tensor:
@@ -74,33 +76,65 @@ def led_force(model: ForceModel, motion: Derivatives, lag: Lag | None, ahead: fl
         return model.at_heading(nu_dot, nu, psi)
 
     if lag is None:
-        return force(0.0)
-    at = lag.delay + ahead
+        now = force(0.0)
+        return torch.cat((now, torch.zeros_like(now), torch.zeros_like(now)), dim=-1)
+    at = lag.delay + 0.5 * held
     before, now, after = force(at - _STEP), force(at), force(at + _STEP)
-    first, second = (after - before) / (2 * _STEP), (after - 2 * now + before) / _STEP**2
-    return now + (2 * lag.damping / lag.frequency) * first + second / lag.frequency**2
+    return torch.cat((now, (after - before) / (2 * _STEP), (after - 2 * now + before) / _STEP**2), dim=-1)
 
 
 @final
 class Assisted(Policy):
-    """PID on a reference that brings its feed-forward along: [B, 12] = eta_d, nu_d, nu_dot_d, tau_FF (2.14)."""
+    """PID on a reference that brings along what a model needs, led by the lag of the actuators.
 
-    def __init__(self, feedback: MotionPID) -> None:
+    Reference [B, 18]: eta_d, nu_d, nu_dot_d, then `needed_force`. Memory [B, 15]: the integral of the PID, then of each axis the predicted
+    force of the actuators, its rate, and the integral and double integral of what it misses of the needed force.
+
+    The command is tau_p + 2 zeta / omega tau_p' + (tau'' + k1 e' + k2 e + k3 I + k4 II) / omega^2, e the miss: where the desired jerk jumps, the
+    needed force has a corner that no command follows, and the vessel would be left with a wrong velocity that the PID takes a minute to mend;
+    the integrals make up for it within seconds.
+
+    Args:
+        feedback: the PID, without feed-forward.
+        lags: of each row's actuators as its model has it; None commands the needed force itself.
+        dt: step in s.
+    """
+
+    def __init__(self, feedback: MotionPID, lags: Sequence[Lag | None], dt: float) -> None:
         super().__init__()
         self.feedback = feedback
-        self.n_state = feedback.n_state
+        self.n_state = feedback.n_state + 12
+        self.dt = dt
+        self.leads = any(lag is not None for lag in lags)
+        known = [lag or Lag(frequency=2.0, damping=1.0) for lag in lags]
+        self.led = torch.tensor([[lag is not None] for lag in lags])
+        self.frequency = torch.tensor([[lag.frequency] for lag in known], dtype=torch.float64)
+        self.damping = torch.tensor([[lag.damping] for lag in known], dtype=torch.float64)
+        self.gains = [factor * (_MEND * self.frequency) ** power for factor, power in ((4.0, 1), (6.0, 2), (4.0, 3), (1.0, 4))]
+        rows = [[[0.0, 1.0, 0.0], [-(w**2), -2 * z * w, w**2], [0.0, 0.0, 0.0]] for w, z in ((lag.frequency, lag.damping) for lag in known)]
+        self.step = torch.linalg.matrix_exp(torch.tensor(rows, dtype=torch.float64) * dt)
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Command tau [B, 3] and the integral [B, 3]."""
-        tau, s = self.feedback(x, reference[:, :9], s)
-        return tau + reference[:, 9:], s
+        """Command tau [B, 3] and the memory one step later."""
+        n = self.feedback.n_state
+        correction, integral = self.feedback(x, reference[:, :9], s[:, :n])
+        needed = reference[:, 9:12]
+        if not self.leads:
+            return needed + correction, torch.cat((integral, s[:, n:]), dim=-1)
+        force, rate, missed, twice = s[:, n:].unflatten(-1, (4, 3)).unbind(1)
+        error = needed - force
+        k1, k2, k3, k4 = self.gains
+        drive = reference[:, 15:18] + k1 * (reference[:, 12:15] - rate) + k2 * error + k3 * missed + k4 * twice
+        lead = force + (2 * self.damping / self.frequency) * rate + drive / self.frequency**2
+        state = self.step @ torch.stack((force, rate, lead), dim=1)
+        memory = torch.cat((integral, state[:, 0], state[:, 1], missed + self.dt * error, twice + self.dt * missed), dim=-1)
+        return torch.where(self.led, lead, needed) + correction, memory
 
 
-def reference_row(motion: Derivatives, forces: Sequence[Tensor] | Tensor) -> Tensor:
-    """[..., 12] for `Assisted` from the desired motion and the feed-forward [..., 3]."""
-    force = forces if isinstance(forces, Tensor) else torch.cat(list(forces))
+def reference_row(motion: Derivatives, needed: Tensor) -> Tensor:
+    """[..., 18] for `Assisted` from the desired motion and `needed_force` [..., 9]."""
     _, nu, nu_dot = motion.later(0.0)
-    return torch.cat((motion.pose, nu, nu_dot, force), dim=-1)
+    return torch.cat((motion.pose, nu, nu_dot, needed), dim=-1)
 
 
 def course(config: ReferenceFilterConfig, dt: float) -> Derivatives:

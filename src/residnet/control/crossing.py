@@ -9,7 +9,7 @@ import torch
 from pydantic import Field, model_validator
 from torch import Tensor
 
-from residnet.control.anticipation import Derivatives, Lag, derivatives, led_force, reference_row
+from residnet.control.anticipation import Derivatives, Lag, derivatives, needed_force, reference_row
 from residnet.control.base import Reference
 from residnet.control.reference_filter import ReferenceFilterConfig
 from residnet.core.config import Config, Metres, RadiansPerSecond, Seconds
@@ -50,7 +50,7 @@ class CrossingConfig(Config):
 
 @final
 class Crossing(Reference):
-    """Reference [B, 12] for `Assisted`: the filtered line-of-sight point and the feed-forward of each row's own model.
+    """Reference [B, 18] for `Assisted`: the filtered line-of-sight point and what each row's own model needs.
 
     Memory [B, 13]: the filter's nine, the number of the leg, the point and heading that were steered for last.
     """
@@ -87,7 +87,7 @@ class Crossing(Reference):
         return torch.cat((point, (heading + wrap(wanted - heading))[:, None]), dim=-1), leg
 
     def forward(self, x: Tensor, k: int, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Reference [B, 12] of step k and the memory one step later."""
+        """Reference [B, 18] of step k and the memory one step later."""
         old = s[:, 9].long()
         target, leg = self.target(x, s[:, 2], old)
         # where the point jumps (first step, change of leg, the stop) it has no rate
@@ -95,10 +95,8 @@ class Crossing(Reference):
         steady = (rate[:, :2].norm(dim=-1) < self.config.circle) & (leg == old)
         rate = torch.where(steady[:, None], rate, torch.zeros_like(rate))
         motion = derivatives(self.filter_config, s[:, :9], target, rate)
-        forces = [
-            led_force(model, Derivatives(*(part[i : i + 1] for part in motion)), lag, 0.5 * self.dt) for i, (model, lag) in enumerate(self.models)
-        ]
+        forces = [needed_force(model, Derivatives(*(part[i : i + 1] for part in motion)), lag, self.dt) for i, (model, lag) in enumerate(self.models)]
         error = torch.stack((s[:, :3] - target, s[:, 3:6], s[:, 6:9]), dim=-1)
         after = torch.einsum("aij,baj->bia", self.advance, error)
         memory = torch.cat((after[:, 0] + target, after[:, 1], after[:, 2], leg[:, None].to(s.dtype), target), dim=-1)
-        return reference_row(motion, forces), memory
+        return reference_row(motion, torch.cat(forces)), memory

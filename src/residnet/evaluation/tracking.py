@@ -37,7 +37,7 @@ class Tracking:
         return {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()}
 
 
-def tracking(pose: Tensor, nu: Tensor, desired: Tensor, command: Tensor, feed_forward: Tensor, dt: float) -> Tracking:
+def tracking(pose: Tensor, nu: Tensor, desired: Tensor, command: Tensor, feedback: Tensor, dt: float) -> Tracking:
     """Metrics of a run.
 
     Args:
@@ -45,7 +45,7 @@ def tracking(pose: Tensor, nu: Tensor, desired: Tensor, command: Tensor, feed_fo
         nu: u, v, r [T, 3].
         desired: eta_d [T, 3].
         command: tau_c [T, 3].
-        feed_forward: its part tau_FF [T, 3].
+        feedback: its part tau_FB [T, 3].
         dt: step in s.
     """
     position = (desired[:, :2] - pose[:, :2]).norm(dim=-1)
@@ -54,14 +54,14 @@ def tracking(pose: Tensor, nu: Tensor, desired: Tensor, command: Tensor, feed_fo
     # the power of keeping the position and of keeping the heading are told apart (Table 4.13)
     energy = [float(work[:, :2].sum(-1).abs().sum() * dt), float(work[:, 2].abs().sum() * dt)]
     errors = [float(position.sum() * dt), float(heading.sum() * dt)]
-    tau, feedback = command.abs().mean(0).tolist(), (command - feed_forward).abs().mean(0).tolist()
+    tau, fed = command.abs().mean(0).tolist(), feedback.abs().mean(0).tolist()
     return Tracking(
         float(position.mean()),
         float(position.square().mean()),
         float(heading.mean()),
         float(heading.square().mean()),
         (tau[0], tau[1], tau[2]),
-        (feedback[0], feedback[1], feedback[2]),
+        (fed[0], fed[1], fed[2]),
         (energy[0], energy[1]),
         (errors[0] * energy[0], errors[1] * energy[1]),
     )

@@ -96,7 +96,12 @@ class Record:
     """What a controller logs, uniform in time.
 
     Attributes:
-        t: [N] s; pose, nu, nu_dot: [N, 3]; command: as sampled, and averaged over the steps around a sample, [N, 3]; fold: segment of each sample [N]; train: samples that identify [N] bool, the others test;
+        t: [N] s.
+        pose, nu, nu_dot: as measured [N, 3].
+        command: tau_c as sampled [N, 3].
+        averaged: tau_c averaged over the steps around a sample [N, 3].
+        fold: segment of each sample [N].
+        train: samples that identify [N] bool; the others test.
         noise: standard deviations of pose, nu and nu_dot, nine.
     """
 

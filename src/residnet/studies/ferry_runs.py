@@ -10,7 +10,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from residnet.control.anticipation import Assisted, Lag, course, led_force, reference_row
+from residnet.control.anticipation import Assisted, Lag, course, needed_force, reference_row
 from residnet.control.base import ClosedLoop, GivenReference, Reference
 from residnet.control.crossing import Crossing, CrossingConfig
 from residnet.control.pid import Gain, MotionPID, MotionPIDConfig, NoFeedForward
@@ -154,22 +154,22 @@ class Ferry:
     def fly_course(self, config: ReferenceFilterConfig, models: Sequence[tuple[ForceModel, Lag | None]]) -> list[Flight]:
         """The course with each model as feed-forward, all in one batch."""
         motion = course(config, self.loop.step)
-        rows = [reference_row(motion, led_force(model, motion, lag, 0.5 * self.loop.step)) for model, lag in models]
-        return self._fly(GivenReference(torch.stack(rows)), len(motion.pose), len(models))
+        rows = [reference_row(motion, needed_force(model, motion, lag, self.loop.step)) for model, lag in models]
+        return self._fly(GivenReference(torch.stack(rows)), len(motion.pose), [lag for _, lag in models])
 
     def fly_crossing(self, config: CrossingConfig, models: Sequence[tuple[ForceModel, Lag | None]]) -> list[Flight]:
         """The crossing with each model as feed-forward, all in one batch."""
-        return self._fly(Crossing(config, self.loop.step, models), round(config.duration / self.loop.step), len(models))
+        return self._fly(Crossing(config, self.loop.step, models), round(config.duration / self.loop.step), [lag for _, lag in models])
 
-    def _fly(self, guidance: Reference, steps: int, rows: int) -> list[Flight]:
-        step = self.loop.step
+    def _fly(self, guidance: Reference, steps: int, lags: Sequence[Lag | None]) -> list[Flight]:
+        step, rows = self.loop.step, len(lags)
         pid = self.loop.pid(self.believed.hull.mass)
         w = torch.zeros(rows, steps, len(self.true.inputs), dtype=torch.float64)
         if self.disturbance != Disturbance():
             w[:, :, self.true.inputs.index("force_north")] = self.disturbance.north
             w[:, :, self.true.inputs.index("force_east")] = self.disturbance.east
         noise = (self.noise or MotionNoise()).draw((rows, steps), self.seed)
-        loop = ClosedLoop(Assisted(pid), guidance)
+        loop = ClosedLoop(Assisted(pid, lags, step), guidance)
         source: Source = Sensed(loop, noise[..., :6]) if self.noise is not None else loop
         x0 = torch.zeros(rows, len(self.true.state), dtype=torch.float64)
         with torch.no_grad():
@@ -178,11 +178,11 @@ class Ferry:
             if not bool(torch.isfinite(states).all()):
                 raise DataError("the ferry left all bounds in closed loop: with these gains and models the loop is unstable")
             references = self._replay(guidance, states, noise[..., :6])
-            return [self._flight(states[i], inputs[i], references[i], noise[i]) for i in range(rows)]
+            return [self._flight(states[i], inputs[i], references[i], noise[i], pid) for i in range(rows)]
 
     @staticmethod
     def _replay(guidance: Reference, states: Tensor, noise: Tensor) -> Tensor:
-        """The references [B, T, 12] that were followed."""
+        """The references [B, T, 18] that were followed."""
         if isinstance(guidance, GivenReference):
             return guidance.values
         seen = torch.cat((states[..., :6] + noise, states[..., 6:]), dim=-1)
@@ -192,9 +192,12 @@ class Ferry:
             out.append(reference)
         return torch.stack(out, dim=1)
 
-    def _flight(self, x: Tensor, w: Tensor, reference: Tensor, noise: Tensor) -> Flight:
+    def _flight(self, x: Tensor, w: Tensor, reference: Tensor, noise: Tensor, pid: MotionPID) -> Flight:
         command = w[:, :3]
-        metrics = tracking(x[:, :3], x[:, 3:6], reference[:, :3], command, reference[:, 9:], self.loop.step)
+        seen_state = torch.cat((x[:, :6] + noise[:, :6], x[:, 6:]), dim=-1)
+        error = pid.error(seen_state, reference)
+        feedback, _ = pid(seen_state, reference[:, :9], (error.cumsum(0) - error) * self.loop.step)
+        metrics = tracking(x[:, :3], x[:, 3:6], reference[:, :3], command, feedback, self.loop.step)
         rate = self.true.rate(x, w)
         every, half = slice(None, None, self.loop.every), self.loop.every // 2
         ends = torch.cat((command[:1].expand(half, 3), command, command[-1:].expand(half, 3)))

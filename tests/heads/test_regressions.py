@@ -1,0 +1,106 @@
+"""Regressions of forces: NIPALS against the kernel algorithm and scikit-learn, the others against scikit-learn, and what they refuse."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from pydantic import TypeAdapter
+from sklearn.cross_decomposition import PLSRegression
+from sklearn.linear_model import LinearRegression, Ridge
+
+from residnet.core.errors import FitError
+from residnet.heads.nipals import nipals
+from residnet.heads.plsr import pls_path
+from residnet.heads.regressions import Fit, Regression, RegressionConfig, segments
+
+TERMS = tuple("abcdef")
+
+
+def made(n: int = 240, noise: float = 0.1, seed: int = 0) -> Regression:
+    """Correlated columns of unlike scales, six folds; the outputs depend on four of the six."""
+    random = np.random.default_rng(seed)
+    latent = random.normal(size=(n, 4))
+    x = (latent @ random.normal(size=(4, 6)) + 0.3 * random.normal(size=(n, 6))) * [1, 10, 0.1, 1, 5, 0.5] + [0, 3, 1, 0, -2, 0]
+    y = x[:, :4] @ (random.normal(size=(4, 3)) / np.array([1, 10, 0.1, 1])[:, None]) + noise * random.normal(size=(n, 3)) + [1, 2, 3]
+    fold = torch.arange(n) * 6 // n
+    test = tuple(torch.from_numpy(part[:60]) for part in (x, y))
+    x_t = torch.from_numpy(x)
+    return Regression(TERMS, x_t, torch.from_numpy(y), x_t.std(0), fold, (test[0], test[1]))
+
+
+def fitted(data: Regression, **config: Any) -> Fit:
+    return TypeAdapter(RegressionConfig).validate_python(config).fit(data)
+
+
+def test_nipals_kernel_algorithm_and_scikit_learn_are_one() -> None:
+    data = made()
+    e, f, *_ = data.standardised
+    printed, kernel = nipals(e, f, 6), pls_path(e.T @ e, e.T @ f, 6)
+    torch.testing.assert_close(printed, kernel, rtol=1e-7, atol=1e-8)
+    for order in (1, 3, 6):
+        other = PLSRegression(order, tol=1e-24, max_iter=20_000).fit(data.x.numpy(), data.y.numpy())
+        mine = fitted(data, kind="plsr", order=order, algorithm="nipals")
+        np.testing.assert_allclose(mine.predict(data.x).numpy(), other.predict(data.x.numpy()), rtol=1e-6, atol=1e-7)
+
+
+def test_full_order_is_least_squares() -> None:
+    data = made()
+    reference = LinearRegression().fit(data.x.numpy(), data.y.numpy())
+    for config in ({"kind": "plsr", "order": 6}, {"kind": "ols"}):
+        np.testing.assert_allclose(fitted(data, **config).coefficients.numpy(), reference.coef_.T, rtol=1e-7, atol=1e-9)
+        np.testing.assert_allclose(fitted(data, **config).intercept.numpy(), reference.intercept_, rtol=1e-7)
+
+
+def test_ridge_is_scikit_learns() -> None:
+    data = made()
+    e, f, *_ = data.standardised
+    reference = Ridge(alpha=0.01 * len(e), fit_intercept=False).fit(e.numpy(), f.numpy())
+    np.testing.assert_allclose(fitted(data, kind="ridge", penalty=0.01).pre.numpy(), reference.coef_.T, rtol=1e-8)
+
+
+@pytest.mark.parametrize("kind", ["plsr", "surface", "ridge", "lasso", "elastic_net"])
+def test_what_is_chosen_predicts_unseen_data(kind: str) -> None:
+    found, unseen = fitted(made(noise=0.3), kind=kind), made(noise=0.3, seed=0)
+    left = (unseen.y - found.predict(unseen.x)).var(0) / unseen.y.var(0)
+    assert float(left.max()) < 0.2
+
+
+def test_the_documents_own_choice_is_at_least_as_good_on_the_half_that_it_saw() -> None:
+    data = made(noise=1.0)
+    assert data.test is not None
+
+    def error(choose: str) -> torch.Tensor:
+        assert data.test is not None
+        return (data.test[1] - fitted(data, kind="surface", choose=choose).predict(data.test[0])).square().mean(0)
+
+    assert bool((error("test") <= error("least") + 1e-9).all())
+
+
+def test_collinear_columns_are_named() -> None:
+    data = made()
+    x = data.x.clone()
+    x[:, 4] = 2 * x[:, 1] + 1
+    with pytest.raises(FitError, match="b, e are collinear"):
+        fitted(Regression(TERMS, x, data.y, x.std(0), data.fold), kind="ols")
+
+
+def test_clear_errors() -> None:
+    data = made()
+    spoiled = data.x.clone()
+    spoiled[7, 2] = torch.nan
+    with pytest.raises(FitError, match="'c' is not finite at sample 7"):
+        Regression(TERMS, spoiled, data.y, data.scale, data.fold)
+    with pytest.raises(FitError, match="5 samples do not determine 6"):
+        Regression(TERMS, data.x[:5], data.y[:5], data.scale, data.fold[:5])
+    single = Regression(TERMS, data.x, data.y, data.scale, torch.zeros_like(data.fold))
+    for kind in ("plsr", "surface", "ridge", "lasso"):
+        with pytest.raises(FitError, match="one run or segment only"):
+            fitted(single, kind=kind)
+    assert fitted(single, kind="plsr", order=2).notes["order"] == 2
+
+
+def test_segments() -> None:
+    assert segments(torch.tensor([0.0, 5.0, 9.9, 10.0, 31.0]), 10.0).tolist() == [0, 0, 0, 1, 2]
