@@ -76,12 +76,14 @@ class Fit:
         intercept: [3].
         pre: Theta_pre [J, 3], coefficients of the scaled variables (3.11).
         notes: what was chosen.
+        surface: errors of all models that the choice was made from, where a surface analysis made it.
     """
 
     coefficients: Tensor
     intercept: Tensor
     pre: Tensor
     notes: dict[str, Any] = field(default_factory=dict)
+    surface: Surface | None = None
 
     @classmethod
     def from_pre(cls, data: Regression, pre: Tensor, notes: dict[str, Any]) -> Fit:
@@ -180,7 +182,7 @@ class SurfaceRegression(RegressionKind):
             pre[kept, axis] = pls_path(e.T @ e, e.T @ f, order)[-1, :, 0]
             coefficients[kept, axis] = pre[kept, axis] / std[kept] * spread
         notes = {"order": [order for order, _ in picks], "terms": [count for _, count in picks]}
-        return Fit(coefficients, data.y.mean(0) - data.x.mean(0) @ coefficients, pre, notes)
+        return Fit(coefficients, data.y.mean(0) - data.x.mean(0) @ coefficients, pre, notes, found)
 
 
 @final

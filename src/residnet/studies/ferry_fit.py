@@ -167,9 +167,13 @@ def identify(config: FerryModelConfig, record: Record, base: ForceModel) -> Ferr
 
 def judged(model: ForceModel, lag: Lag | None, record: Record) -> list[float]:
     """MSE of the residual that a model leaves on a record's test samples as they were logged, by axis; through its lag where it has one."""
+    return mse(remaining(model, lag, record)[~record.train])
+
+
+def remaining(model: ForceModel, lag: Lag | None, record: Record) -> Tensor:
+    """The residual [N, 3] that a model leaves along a record as it was logged; through its lag where it has one."""
     force = record.command if lag is None else followed(record.averaged, lag, record.dt)
-    residual = model.residual(force, record.nu_dot, record.nu, record.pose[:, 2])
-    return mse(residual[~record.train])
+    return model.residual(force, record.nu_dot, record.nu, record.pose[:, 2])
 
 
 def _scale(config: FerryModelConfig, x: Tensor) -> Tensor:

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import torch
 
 from residnet.control.anticipation import Lag
+from residnet.core.errors import FitError
+from residnet.evaluation.figures_force import draw_surface, draw_weights
+from residnet.evaluation.still_fits import Verdict, still_fits
 from residnet.evaluation.tracking import mse
-from residnet.heads.regressions import table
+from residnet.heads.regressions import SurfaceRegression, table
 from residnet.physics.force_model import ForceModel
 from residnet.run_folder import RunFolder
-from residnet.studies.ferry_fit import FerryModel, Published, Record, identify
+from residnet.studies.ferry_fit import FerryModel, Published, Record, identify, remaining
+from residnet.studies.ferry_forward import as_vessel_lines, export_feed_forward, forward_equations
 from residnet.studies.ferry_runs import Flight, MotionNoise
 
 if TYPE_CHECKING:
@@ -22,6 +26,20 @@ if TYPE_CHECKING:
 
 _DEG = 180.0 / math.pi
 AXES = ("surge", "sway", "yaw")
+
+
+@dataclass(frozen=True)
+class Update:
+    """A model on a vessel that has changed.
+
+    Attributes:
+        verdict: whether it still fits there.
+        before, after: the course there with it, and with what was identified again from that log; the same where it still fits.
+    """
+
+    verdict: Verdict
+    before: Flight
+    after: Flight
 
 
 @dataclass(frozen=True)
@@ -33,6 +51,7 @@ class Study:
         unmodelled: MSE of its residual on the test half.
         models: fitted, by name.
         courses, crossings: flights by model, `believed` first.
+        later: what became of each flown model on the vessel as it is later.
     """
 
     first: Flight
@@ -40,6 +59,7 @@ class Study:
     models: dict[str, FerryModel]
     courses: dict[str, Flight]
     crossings: dict[str, Flight]
+    later: dict[str, Update]
 
 
 def record_of(flight: Flight, interval: float, noise: MotionNoise) -> Record:
@@ -66,7 +86,33 @@ def study(config: FerryStudyConfig) -> Study:
     if config.crossing is not None:
         everyone = {"believed": (believed, None), **flown}
         crossings = dict(zip(everyone, ferry.fly_crossing(config.crossing, list(everyone.values())), strict=True))
-    return Study(first, mse(residual[~record.train]), models, courses, crossings)
+    later = update(config, models, record, believed) if config.later is not None else {}
+    return Study(first, mse(residual[~record.train]), models, courses, crossings, later)
+
+
+def update(config: FerryStudyConfig, models: dict[str, FerryModel], record: Record, believed: ForceModel) -> dict[str, Update]:
+    """Fly the changed vessel with each model that flies, judge it on that log, and where it no longer fits identify it again from it."""
+    ferry = config.ferry(config.later)
+    known = {name: model for name, model in models.items() if config.models[name].fly}
+    flights = ferry.fly_course(config.course, [(model.model, model.lag) for model in known.values()])
+    out: dict[str, Update] = {}
+    for (name, model), flight in zip(known.items(), flights, strict=True):
+        log = record_of(flight, config.course.interval, config.noise or MotionNoise())
+        then, now = remaining(model.model, model.lag, record)[~record.train], remaining(model.model, model.lag, log)
+        verdict = still_fits(config.check_fit, then, now, log.command, log.fold)
+        out[name] = Update(verdict, flight, flight)
+        if not verdict.fits:
+            again = identify(config.models[name], log, believed)
+            out[name] = Update(verdict, flight, ferry.fly_course(config.course, [(again.model, again.lag)])[0])
+    return out
+
+
+def later_text(later: dict[str, Update]) -> str:
+    """What became of the models on the changed vessel."""
+    lines = ["The vessel as it is later: position MAE m with the model, and after the update", ""]
+    for name, one in later.items():
+        lines.append(f"- {name}: {one.verdict.text()}; {one.before.tracking.position_mae:.4g} m, then {one.after.tracking.position_mae:.4g} m")
+    return "\n".join(lines)
 
 
 def write(config: FerryStudyConfig, found: Study, folder: RunFolder) -> str:
@@ -74,11 +120,33 @@ def write(config: FerryStudyConfig, found: Study, folder: RunFolder) -> str:
     folder.write_json(folder.path / "ferry.json", _content(config, found))
     parts = [config.description or config.name, residuals_text(config, found)]
     parts += [tracking_text(config, flights, kind) for kind, flights in (("course", found.courses), ("crossing", found.crossings)) if flights]
+    parts += [later_text(found.later)] if found.later else []
     text = "\n\n".join(parts) + "\n"
     folder.write(folder.path / "ferry.md", text)
     for name, model in found.models.items():
+        keep_model(config, found, name, folder)
         folder.write(folder.path / "models" / f"{name}.md", model_text(name, config.models[name].terms, model))
     return text
+
+
+def keep_model(config: FerryStudyConfig, found: Study, name: str, folder: RunFolder) -> None:
+    """Write a model's weights as a picture, its feed-forward as TorchScript, and where it can run forward its equations."""
+    model = found.models[name]
+    draw_weights(config.models[name].terms, model.fit.pre, f"Weights of the basis functions in {name}", folder.figures / f"weights_{name}.png")
+    motion = torch.cat((found.first.nu_dot, found.first.nu), dim=-1)
+    ranges = list(zip(motion.amin(0).tolist(), motion.amax(0).tolist(), strict=True))
+    export_feed_forward(model.model, model.notes.get("lag"), ranges, folder.exports / f"{name}_feed_forward.pt")
+    try:
+        lines = as_vessel_lines(forward_equations(config.believed, model.model, f"model {name}"), f"run {config.name}, model {name}")
+    except FitError as error:
+        lines = f"# {error}\n"
+    folder.write(folder.path / "models" / f"{name}_forward.yaml", lines)
+    if isinstance(config.models[name].fit, SurfaceRegression) and model.fit.surface is not None:
+        picks = {
+            "chosen": list(zip(model.notes["order"], model.notes["terms"], strict=True)),
+            "least": [model.fit.surface.least(a) for a in range(3)],
+        }
+        draw_surface(model.fit.surface.error, found.unmodelled, picks, folder.figures / f"surface_{name}.png")
 
 
 def _content(config: FerryStudyConfig, found: Study) -> dict[str, Any]:
@@ -100,6 +168,10 @@ def _content(config: FerryStudyConfig, found: Study) -> dict[str, Any]:
         "models": rows,
         "course": {name: flight.tracking.row() for name, flight in found.courses.items()},
         "crossing": {name: flight.tracking.row() for name, flight in found.crossings.items()},
+        "later": {
+            name: {"verdict": asdict(one.verdict), "before": one.before.tracking.row(), "after": one.after.tracking.row()}
+            for name, one in found.later.items()
+        },
     }
 
 

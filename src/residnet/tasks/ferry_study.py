@@ -14,6 +14,7 @@ from residnet.control.reference_filter import ReferenceFilterConfig
 from residnet.core.config import Config, dump_config
 from residnet.core.errors import ConfigError
 from residnet.core.names import nearest
+from residnet.evaluation.still_fits import StillFitsConfig
 from residnet.run_folder import RunFolder
 from residnet.studies.ferry_fit import FerryModelConfig, Published
 from residnet.studies.ferry_runs import Disturbance, Ferry, LoopConfig, MotionNoise
@@ -35,6 +36,8 @@ class FerryStudyConfig(Config):
         disturbance: constant in earth axes.
         models: by name, each after those that it stands on.
         published: the document's figures for the believed model.
+        later: a vessel that the true one has become; models that fly are judged on its log and identified again where they no longer fit.
+        check_fit: when a model no longer fits.
         seed: of the noise.
     """
 
@@ -50,6 +53,8 @@ class FerryStudyConfig(Config):
     disturbance: Disturbance = Disturbance()
     models: dict[_Name, FerryModelConfig] = Field(min_length=1)
     published: Published = Published()
+    later: str | None = None
+    check_fit: StillFitsConfig = StillFitsConfig()
     seed: int = Field(default=0, ge=0)
 
     @model_validator(mode="after")
@@ -67,14 +72,16 @@ class FerryStudyConfig(Config):
             raise ValueError("course: at least four waypoints; half of them identify, segment by segment, and half test")
         try:
             self.ferry()
+            if self.later is not None:
+                self.ferry(self.later)
             self.course.build(self.loop.step)
         except ConfigError as error:
             raise ValueError(str(error)) from None
         return self
 
-    def ferry(self) -> Ferry:
+    def ferry(self, true: str | None = None) -> Ferry:
         """The plant in its loop."""
-        return Ferry.of(self.true, self.believed, self.loop, self.disturbance, self.noise, self.seed)
+        return Ferry.of(true or self.true, self.believed, self.loop, self.disturbance, self.noise, self.seed)
 
     def check(self) -> None:
         """Everything was checked when the config was read."""
