@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
@@ -17,12 +17,10 @@ from residnet.evaluation.tracking import mse
 from residnet.heads.regressions import SurfaceRegression, table
 from residnet.physics.force_model import ForceModel
 from residnet.run_folder import RunFolder
+from residnet.studies.ferry_config import FerrySettings
 from residnet.studies.ferry_fit import FerryModel, Published, Record, identify, remaining
 from residnet.studies.ferry_forward import as_vessel_lines, export_feed_forward, forward_equations
 from residnet.studies.ferry_runs import Flight, MotionNoise
-
-if TYPE_CHECKING:
-    from residnet.tasks.ferry_study import FerryStudyConfig
 
 _DEG = 180.0 / math.pi
 AXES = ("surge", "sway", "yaw")
@@ -69,7 +67,7 @@ def record_of(flight: Flight, interval: float, noise: MotionNoise) -> Record:
     return Record(flight.t, flight.seen[:, :3], flight.seen[:, 3:6], flight.seen[:, 6:], flight.command, flight.averaged, fold, train, noise.spread())
 
 
-def study(config: FerryStudyConfig) -> Study:
+def study(config: FerrySettings) -> Study:
     """Fly with the believed model, identify, fly with what was found."""
     ferry = config.ferry()
     believed = ForceModel(ferry.believed.hull)
@@ -90,7 +88,7 @@ def study(config: FerryStudyConfig) -> Study:
     return Study(first, mse(residual[~record.train]), models, courses, crossings, later)
 
 
-def update(config: FerryStudyConfig, models: dict[str, FerryModel], record: Record, believed: ForceModel) -> dict[str, Update]:
+def update(config: FerrySettings, models: dict[str, FerryModel], record: Record, believed: ForceModel) -> dict[str, Update]:
     """Fly the changed vessel with each model that flies, judge it on that log, and where it no longer fits identify it again from it."""
     ferry = config.ferry(config.later)
     known = {name: model for name, model in models.items() if config.models[name].fly}
@@ -115,7 +113,7 @@ def later_text(later: dict[str, Update]) -> str:
     return "\n".join(lines)
 
 
-def write(config: FerryStudyConfig, found: Study, folder: RunFolder) -> str:
+def write(config: FerrySettings, found: Study, folder: RunFolder) -> str:
     """Write ferry.json, ferry.md, the models' tables and figures; returns the text of ferry.md."""
     folder.write_json(folder.path / "ferry.json", _content(config, found))
     parts = [config.description or config.name, residuals_text(config, found)]
@@ -129,7 +127,7 @@ def write(config: FerryStudyConfig, found: Study, folder: RunFolder) -> str:
     return text
 
 
-def keep_model(config: FerryStudyConfig, found: Study, name: str, folder: RunFolder) -> None:
+def keep_model(config: FerrySettings, found: Study, name: str, folder: RunFolder) -> None:
     """Write a model's weights as a picture, its feed-forward as TorchScript, and where it can run forward its equations."""
     model = found.models[name]
     draw_weights(config.models[name].terms, model.fit.pre, f"Weights of the basis functions in {name}", folder.figures / f"weights_{name}.png")
@@ -149,7 +147,7 @@ def keep_model(config: FerryStudyConfig, found: Study, name: str, folder: RunFol
         draw_surface(model.fit.surface.error, found.unmodelled, picks, folder.figures / f"surface_{name}.png")
 
 
-def _content(config: FerryStudyConfig, found: Study) -> dict[str, Any]:
+def _content(config: FerrySettings, found: Study) -> dict[str, Any]:
     rows = {
         name: {
             "test_mse": model.test_mse,
@@ -175,7 +173,7 @@ def _content(config: FerryStudyConfig, found: Study) -> dict[str, Any]:
     }
 
 
-def residuals_text(config: FerryStudyConfig, found: Study) -> str:
+def residuals_text(config: FerrySettings, found: Study) -> str:
     """Table of the residual's MSE on the test half."""
     lines = ["Residual force on the unseen half: MSE and share of the un-modelled residual's, published in brackets", ""]
     lines += ["| model | surge N^2 | sway N^2 | yaw (N m)^2 | left % | chosen |", "|---|---|---|---|---|---|"]
@@ -189,7 +187,7 @@ def residuals_text(config: FerryStudyConfig, found: Study) -> str:
     return "\n".join(lines)
 
 
-def tracking_text(config: FerryStudyConfig, flights: dict[str, Flight], kind: str) -> str:
+def tracking_text(config: FerrySettings, flights: dict[str, Flight], kind: str) -> str:
     """Table of a flight's metrics."""
     lines = [f"Closed loop, {kind}: published in brackets", ""]
     lines += ["| feed-forward | position MAE m | MSE m^2 | heading MAE deg | mean |τ| N, N, N m | mean |τ_FB| | energy J | IAEW position, heading |"]
