@@ -15,7 +15,8 @@ from residnet.dynamics.rollout import Source
 class SideBySide(Source):
     """The pupil's commands act; the teacher sees the same states with a memory of its own.
 
-    The pupil meets what its own commands lead to, so that it also learns the way back from its mistakes.
+    The pupil meets what its own commands lead to, so that it also learns the way back from its mistakes. States carry no gradient: the pupil
+    shall command as the teacher does, not come to where they agree.
 
     Attributes:
         total: sum over steps of the mean squared difference of the commands, since `initial` was asked.
@@ -36,8 +37,9 @@ class SideBySide(Source):
         sizes = [self.reference.n_state, self.pupil.n_state, self.teacher.n_state]
         guided, own, other = memory.split(sizes, dim=-1)
         target, guided = self.reference(x, k, guided)
-        command, own = self.pupil(x, target, own)
+        x = x.detach()
+        command, own = self.pupil(x, target, own.detach())
         with torch.no_grad():
-            shown, other = self.teacher(x.detach(), target, other)
+            shown, other = self.teacher(x, target, other)
         self.total = self.total + (command - shown).square().mean()
-        return torch.cat((command, w[:, command.shape[-1] :]), dim=-1), torch.cat((guided, own, other), dim=-1)
+        return torch.cat((command.detach(), w[:, command.shape[-1] :]), dim=-1), torch.cat((guided, own, other), dim=-1)

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from residnet.control.controllers import AnyController, BangBangConfig, TunedConfig
+from residnet.control.controllers import AnyController, BangBangConfig
 from residnet.core.config import Config, Radians, Seconds, dump_config
 from residnet.core.errors import ConfigError
 from residnet.core.names import nearest
@@ -26,14 +26,12 @@ class PolicyConfig(Config):
     Attributes:
         hidden: widths of the layers.
         observer: bandwidth of the disturbance observer as a multiple of 1/T.
-        start: name of a linear peer whose kp and kd training starts from.
         training: how it is trained.
         imitate: name of a peer whose commands it learns to give; null to train it for fast changes without overshoot.
     """
 
     hidden: Annotated[tuple[int, ...], Field(min_length=1)] = (24, 24)
     observer: float = Field(default=8.0, ge=1)
-    start: _Name | None = None
     training: AutopilotTraining = AutopilotTraining()
     imitate: _Name | None = None
 
@@ -113,11 +111,8 @@ class AutopilotConfig(Config):
         if both := sorted(set(self.policies) & set(self.peers)):
             raise ValueError(f"'{both[0]}' names a policy and a peer; names are unique in a run")
         for name, policy in self.policies.items():
-            for key, peer in (("imitate", policy.imitate), ("start", policy.start)):
-                if peer is not None and peer not in self.peers:
-                    raise ValueError(f"policies.{name}.{key}: no peer '{peer}'{nearest(peer, self.peers)}")
-            if policy.start is not None and not isinstance(self.peers[policy.start], TunedConfig):
-                raise ValueError(f"policies.{name}.start: '{policy.start}' must be a linear controller (pd, pid or lqr)")
+            if policy.imitate is not None and policy.imitate not in self.peers:
+                raise ValueError(f"policies.{name}.imitate: no peer '{policy.imitate}'{nearest(policy.imitate, self.peers)}")
         if self.floor is not None and not isinstance(self.peers.get(self.floor), BangBangConfig):
             raise ValueError(f"floor: '{self.floor}' must name a peer of kind bang_bang")
         return self

@@ -39,9 +39,7 @@ def run_autopilot(config: AutopilotConfig, folder: RunFolder) -> None:
         controllers[name] = ("floor" if name == config.floor else "classical", built)
     for name, wanted in config.policies.items():
         teacher = None if wanted.imitate is None else controllers[wanted.imitate][1]
-        gains = None if wanted.start is None else notes[wanted.start]["gains"]
-        law = None if gains is None else (gains["kp"], gains["kd"])
-        policy, notes[name] = _policy(name, wanted, steering, config, folder, teacher, law)
+        policy, notes[name] = _policy(name, wanted, steering, config, folder, teacher)
         controllers = {name: ("policy", policy), **controllers}
     folder.write_json(folder.path / "controllers.json", {"schema": "residnet.controllers/1", "turning": vars(turning), "controllers": notes})
     rows, series = _compare(controllers, vessel, config)
@@ -93,7 +91,6 @@ def _policy(
     config: AutopilotConfig,
     folder: RunFolder,
     teacher: Policy | None,
-    law: tuple[float, float] | None,
 ) -> tuple[HeadingPolicy, dict[str, Any]]:
     torch.manual_seed(config.seed)
     policy = HeadingPolicy(
@@ -104,7 +101,6 @@ def _policy(
         rate=steering.vessel.rate,
         hidden=wanted.hidden,
         observer=wanted.observer,
-        law=law,
     )
     started = time.time()
     notes = _stored(policy, name, folder)

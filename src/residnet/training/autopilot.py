@@ -9,7 +9,6 @@ from typing import Any, final
 
 import torch
 from torch import Tensor, nn
-from torch.utils.data import DataLoader
 
 from residnet.control.base import ClosedLoop, GivenReference, Policy
 from residnet.control.imitation import SideBySide
@@ -56,9 +55,9 @@ class AutopilotFit(EpochTraining):
         self.seen = Measured(policy, vessel.state, {"psi": spread.noise_psi, "r": spread.noise_r})
         self.columns = vessel.column("psi"), vessel.column("r")
 
-    def train_dataloader(self) -> DataLoader[Tensor]:
-        """Numbers of batches: what is in them is drawn when they are used."""
-        return DataLoader(torch.arange(self.settings.steps), batch_size=None)  # type: ignore[arg-type]
+    def train_dataloader(self) -> range:
+        """Numbers of batches: what is in them is drawn when they are used. (A loader of PyTorch would draw random numbers of its own.)"""
+        return range(self.settings.steps)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """Adam."""
@@ -72,7 +71,7 @@ class AutopilotFit(EpochTraining):
         for group in self.trainer.optimizers[0].param_groups:
             group["lr"] = self.settings.learning_rate * (1 - progress * (1 - self.settings.final))
 
-    def training_step(self, number: Tensor, batch_index: int) -> Tensor:
+    def training_step(self, number: int, batch_index: int) -> Tensor:
         """Loss of one batch of heading changes."""
         rows, steps = self.settings.batch, round(self.settings.horizon / self.settings.dt)
         x, w, heading, variation, calm = self._draw(rows)

@@ -1,0 +1,75 @@
+"""Training a heading policy: through the vessel, by imitation, and resumed to the same weights."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+
+from residnet.control.controllers import PdConfig, Steering
+from residnet.control.policy import HeadingPolicy
+from residnet.control.steering import SteeredPlant, fly
+from residnet.physics.vessel import load_vessel
+from residnet.training.autopilot import train_autopilot
+from residnet.training.autopilot_config import AutopilotTraining, SpreadConfig
+
+DEG = math.pi / 180
+VESSEL = SteeredPlant(load_vessel("nomoto_oceanos").build())
+TURNING = VESSEL.turning(5 * DEG, 60.0)
+SETTINGS = AutopilotTraining(epochs=2, steps=3, batch=32, dt=0.2, horizon=6.0)
+
+
+def fresh() -> HeadingPolicy:
+    torch.manual_seed(0)
+    return HeadingPolicy(VESSEL.state, turning=TURNING, limit=5 * DEG, dt=0.2, hidden=(8,))
+
+
+def settling(policy: HeadingPolicy) -> float:
+    policy.dt = 0.05
+    flights = fly(VESSEL, policy, torch.tensor([30 * DEG]), torch.tensor([[1.0, 1.0, 0.0]]), dt=0.05, duration=15.0)
+    return float(flights.absolute_error()[0] + 100.0 * flights.overshoot()[0])
+
+
+def test_training_steers_better(tmp_path: Path) -> None:
+    policy = fresh()
+    before = settling(policy)
+    notes = train_autopilot("p", policy, VESSEL, SETTINGS.model_copy(update={"epochs": 5}), SpreadConfig(), settling, 0, tmp_path)
+    assert settling(policy) < before - 0.02
+    assert settling(policy) == pytest.approx(notes["best_validation"])
+    assert (tmp_path / "tensorboard" / "p").is_dir()
+
+
+def test_resumed_training_ends_with_the_same_weights(tmp_path: Path) -> None:
+    whole, parts = fresh(), fresh()
+    train_autopilot("p", whole, VESSEL, SETTINGS, SpreadConfig(), settling, 0, tmp_path / "whole")
+
+    def stopped(policy: HeadingPolicy) -> float:
+        if len(scores) == 1:
+            raise RuntimeError("killed")
+        scores.append(settling(policy))
+        return scores[-1]
+
+    scores: list[float] = []
+    with pytest.raises(RuntimeError, match="killed"):
+        train_autopilot("p", parts, VESSEL, SETTINGS, SpreadConfig(), stopped, 0, tmp_path / "parts")
+    again = fresh()
+    train_autopilot("p", again, VESSEL, SETTINGS, SpreadConfig(), settling, 0, tmp_path / "parts")
+    for mine, theirs in zip(whole.state_dict().values(), again.state_dict().values(), strict=True):
+        assert torch.equal(mine, theirs)
+
+
+def test_a_pupil_comes_near_its_teacher(tmp_path: Path) -> None:
+    teacher = PdConfig(kp=3.0, damping_time=2.5).build(Steering(VESSEL, TURNING, 5 * DEG, 0.2))
+    policy = fresh()
+
+    def difference(policy: HeadingPolicy) -> float:
+        policy.dt = 0.05
+        both = [fly(VESSEL, p, torch.tensor([30 * DEG]), torch.tensor([[1.0, 1.0, 0.0]]), dt=0.05, duration=12.0) for p in (policy, teacher)]
+        return float((both[0].inputs - both[1].inputs).square().mean().sqrt()) / DEG
+
+    before = difference(policy)
+    settings = SETTINGS.model_copy(update={"epochs": 6, "steps": 10, "learning_rate": 0.02})
+    train_autopilot("p", policy, VESSEL, settings, SpreadConfig(effect=(1.0, 1.0), time=(1.0, 1.0), bias=0.0), difference, 0, tmp_path, teacher)
+    assert difference(policy) < 0.5 * before
