@@ -29,9 +29,9 @@ def test_yaml_is_read(number: int, tmp_path: Path) -> None:
     if "task" in content:
         # the logs are the reader's own
         content["data"]["split"]["root"] = str(tmp_path)
-        validate(content, TaskConfig, "README")
+        assert validate(content, TaskConfig, "README").task == content["task"]
     else:
-        load_config(path, [], VesselConfig).build()
+        assert load_config(path, [], VesselConfig).build().commands > 0
 
 
 def test_both_kinds_of_file_are_shown() -> None:
