@@ -1,0 +1,101 @@
+"""Courses round buoys, each with a side to pass and a radius to keep: arcs and their common tangents (document 004 sections 6.1.4.2, 6.2.4.2)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+from residnet.core.config import Config, Metres
+from residnet.core.errors import ConfigError
+
+Side = Literal["clockwise", "counter_clockwise"]
+
+
+class BuoyConfig(Config):
+    """A buoy.
+
+    Attributes:
+        north, east: where it is.
+        round: how it is rounded, seen from above: clockwise leaves it to starboard.
+        radius: of the circle that the vessel must stay outside of.
+    """
+
+    north: Metres
+    east: Metres
+    round: Side
+    radius: Metres
+
+
+class Piece(NamedTuple):
+    """A part of a course: a straight line where `turn` is 0, else an arc to starboard (+1) or port (-1) about a centre.
+
+    Attributes:
+        length: in m.
+        north, east, heading: of its beginning, in m and rad.
+        turn: see above.
+        radius: of an arc in m.
+    """
+
+    length: float
+    north: float
+    east: float
+    heading: float
+    turn: int
+    radius: float
+
+
+class Feasibility(NamedTuple):
+    """Whether a vessel can follow a buoy's circle: by number, the radius asked for and the smallest possible one, in m."""
+
+    buoy: int
+    radius: float
+    smallest: float
+
+    @property
+    def possible(self) -> bool:
+        """Whether the circle is no tighter than the vessel turns."""
+        return self.radius >= self.smallest
+
+
+def feasibility(buoys: Sequence[BuoyConfig], smallest: float) -> list[Feasibility]:
+    """Each buoy's radius beside the vessel's smallest turning radius in m (ERRATA 004 G18: both printed courses ask for less)."""
+    return [Feasibility(number + 1, buoy.radius, smallest) for number, buoy in enumerate(buoys)]
+
+
+def widened(buoys: Sequence[BuoyConfig], smallest: float) -> list[BuoyConfig]:
+    """The buoys with radii that the vessel can follow."""
+    return [buoy.model_copy(update={"radius": max(buoy.radius, smallest)}) for buoy in buoys]
+
+
+def course_round(start: tuple[float, float], buoys: Sequence[BuoyConfig]) -> list[Piece]:
+    """The taut course from a point round the buoys in their order, to the last one's circle: tangents and arcs in turn.
+
+    Raises:
+        ConfigError: where the start lies in the first circle, or circles overlap so that no tangent joins them.
+    """
+    if not buoys:
+        raise ConfigError("a course needs at least one buoy")
+    signs = [1 if buoy.round == "clockwise" else -1 for buoy in buoys]
+    lines: list[tuple[float, float, float, float]] = []
+    north, east, radius, sign = start[0], start[1], 0.0, 0
+    for number, (buoy, side) in enumerate(zip(buoys, signs, strict=True), start=1):
+        along, across = buoy.north - north, buoy.east - east
+        # the tangent from circle 0 to circle 1: the centres' line in its own frame is (length, s1 r1 - s0 r0)
+        offset = side * buoy.radius - sign * radius
+        square = along**2 + across**2 - offset**2
+        if square <= 0:
+            raise ConfigError(f"buoy {number}: its circle of {buoy.radius:.4g} m overlaps what comes before it: no tangent joins them")
+        heading = math.atan2(across, along) - math.atan2(offset, math.sqrt(square))
+        begin = (north + sign * radius * math.sin(heading), east - sign * radius * math.cos(heading))
+        lines.append((*begin, heading, math.sqrt(square)))
+        north, east, radius, sign = buoy.north, buoy.east, buoy.radius, side
+    pieces: list[Piece] = []
+    for number, (line_north, line_east, heading, length) in enumerate(lines):
+        if number > 0:
+            before, side = lines[number - 1], signs[number - 1]
+            turned = (side * (heading - before[2])) % (2.0 * math.pi)
+            end = (before[0] + before[3] * math.cos(before[2]), before[1] + before[3] * math.sin(before[2]))
+            pieces.append(Piece(turned * buoys[number - 1].radius, *end, before[2], side, buoys[number - 1].radius))
+        pieces.append(Piece(length, line_north, line_east, heading, 0, 0.0))
+    return pieces
