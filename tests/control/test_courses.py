@@ -13,12 +13,12 @@ from residnet.control.dubins import dubins_length, shortest_course
 from residnet.core.errors import ConfigError
 
 TABLE_6_3 = [
-    BuoyConfig(north=50, east=30, round="clockwise", radius=10),
-    BuoyConfig(north=100, east=20, round="counter_clockwise", radius=10),
-    BuoyConfig(north=50, east=80, round="clockwise", radius=10),
-    BuoyConfig(north=80, east=120, round="counter_clockwise", radius=10),
-    BuoyConfig(north=20, east=120, round="counter_clockwise", radius=10),
-    BuoyConfig(north=0, east=0, round="counter_clockwise", radius=10),
+    BuoyConfig(north=50, east=30, leave_to="port", radius=10),
+    BuoyConfig(north=100, east=20, leave_to="starboard", radius=10),
+    BuoyConfig(north=50, east=80, leave_to="port", radius=10),
+    BuoyConfig(north=80, east=120, leave_to="starboard", radius=10),
+    BuoyConfig(north=20, east=120, leave_to="starboard", radius=10),
+    BuoyConfig(north=0, east=0, leave_to="starboard", radius=10),
 ]
 
 
@@ -61,20 +61,42 @@ def test_a_course_through_points_in_line_is_straight() -> None:
     assert shortest_course((0.0, 0.0, 0.0), [(30.0, 0.0), (60.0, 0.0)], 5.0, 2.0) == pytest.approx(55.0, rel=1e-3)
 
 
-def test_the_pieces_of_a_course_join_and_touch_every_circle_on_its_side() -> None:
+def test_the_pieces_of_a_course_join_and_leave_every_buoy_on_its_side_outside_its_circle() -> None:
     pieces = course_round((0.0, 0.0), TABLE_6_3)
-    for piece, after in itertools.pairwise(pieces):
-        end = flown(np.array([piece.north, piece.east, piece.heading]), piece.turn, piece.length, piece.radius or 1.0)
-        assert end[:2] == pytest.approx([after.north, after.east], abs=1e-9)
-        assert math.cos(end[2] - after.heading) == pytest.approx(1.0)
-    lines = [piece for piece in pieces if piece.turn == 0]
-    assert len(lines) == len(TABLE_6_3)
-    for line, buoy in zip(lines, TABLE_6_3, strict=True):
-        end = flown(np.array([line.north, line.east, line.heading]), 0, line.length, 1.0)
-        north, east = buoy.north - end[0], buoy.east - end[1]
-        to_starboard = east * math.cos(line.heading) - north * math.sin(line.heading)
-        assert to_starboard == pytest.approx(10.0 if buoy.round == "clockwise" else -10.0)
-        assert math.hypot(north, east) == pytest.approx(10.0)
+    track = []
+    for piece, after in itertools.zip_longest(pieces, pieces[1:]):
+        pose = np.array([piece.north, piece.east, piece.heading])
+        assert piece.turn == 0 or piece.length < 1.2 * math.pi * piece.radius
+        track += [flown(pose, piece.turn, share * piece.length, piece.radius or 1.0) for share in np.linspace(0.0, 1.0, 400)]
+        if after is not None:
+            assert track[-1][:2] == pytest.approx([after.north, after.east], abs=1e-9)
+            assert math.cos(track[-1][2] - after.heading) == pytest.approx(1.0)
+    poses = np.array(track)
+    passed = -1
+    assert len(pieces) == 2 * len(TABLE_6_3) - 1
+    for buoy in TABLE_6_3[:-1]:
+        line = np.array([buoy.north, buoy.east]) - poses[:, :2]
+        distance = np.hypot(*line.T)
+        assert distance.min() >= 10.0 - 1e-6
+        near = passed + 1 + int(distance[passed + 1 :].argmin())
+        to_starboard = line[near, 1] * math.cos(poses[near, 2]) - line[near, 0] * math.sin(poses[near, 2])
+        assert (to_starboard > 0) == (buoy.leave_to == "starboard")
+        assert near > passed
+        passed = near
+
+
+def test_a_buoy_in_the_bend_is_rounded_on_its_circle() -> None:
+    bend = [BuoyConfig(north=100, east=0, leave_to="starboard", radius=10), BuoyConfig(north=100, east=100, leave_to="starboard", radius=10)]
+    pieces = course_round((0.0, -10.0), bend)
+    assert [piece.turn for piece in pieces] == [0, 1, 0]
+    assert sum(piece.length for piece in pieces) == pytest.approx(100.0 + 0.5 * math.pi * 10.0 + 100.0)
+
+
+def test_a_buoy_that_the_course_turns_away_from_is_left_at_a_distance() -> None:
+    aside = [BuoyConfig(north=50, east=30, leave_to="starboard", radius=10), BuoyConfig(north=100, east=10, leave_to="port", radius=10)]
+    pieces = course_round((0.0, 0.0), aside)
+    assert [piece.turn for piece in pieces] == [0]
+    assert pieces[0].length == pytest.approx(100.0)
 
 
 def test_printed_radii_are_too_tight_for_five_degrees_of_rudder() -> None:
@@ -86,6 +108,6 @@ def test_printed_radii_are_too_tight_for_five_degrees_of_rudder() -> None:
 
 
 def test_circles_that_overlap_have_no_crossing_tangent() -> None:
-    near = BuoyConfig(north=50, east=45, round="counter_clockwise", radius=10)
+    near = BuoyConfig(north=50, east=45, leave_to="starboard", radius=10)
     with pytest.raises(ConfigError, match="buoy 2"):
         course_round((0.0, 0.0), [TABLE_6_3[0], near])

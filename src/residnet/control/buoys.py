@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 from residnet.core.config import Config, Metres
 from residnet.core.errors import ConfigError
 
-Side = Literal["clockwise", "counter_clockwise"]
+Side = Literal["starboard", "port"]
 
 
 class BuoyConfig(Config):
@@ -17,13 +17,14 @@ class BuoyConfig(Config):
 
     Attributes:
         north, east: where it is.
-        round: how it is rounded, seen from above: clockwise leaves it to starboard.
+        leave_to: the side of the vessel that it passes on; rounded to starboard, it is left to starboard. Document 004 plots x to the right
+            and y upwards: its "counter-clockwise" is a turn from x towards y, to starboard with x north and y east.
         radius: of the circle that the vessel must stay outside of.
     """
 
     north: Metres
     east: Metres
-    round: Side
+    leave_to: Side
     radius: Metres
 
 
@@ -69,17 +70,39 @@ def widened(buoys: Sequence[BuoyConfig], smallest: float) -> list[BuoyConfig]:
 
 
 def course_round(start: tuple[float, float], buoys: Sequence[BuoyConfig]) -> list[Piece]:
-    """The taut course from a point round the buoys in their order, to the last one's circle: tangents and arcs in turn.
+    """The taut course from a point past the buoys in their order, to the last one's circle: tangents and arcs in turn.
+
+    A buoy that the course turns away from is left on its side at a distance: the course is drawn without it.
 
     Raises:
         ConfigError: where the start lies in the first circle, or circles overlap so that no tangent joins them.
     """
     if not buoys:
         raise ConfigError("a course needs at least one buoy")
-    signs = [1 if buoy.round == "clockwise" else -1 for buoy in buoys]
+    left = list(enumerate(buoys, start=1))
+    while True:
+        pieces = _tangents(start, left)
+        arcs = [piece.length / piece.radius for piece in pieces if piece.turn != 0]
+        away = [i for i, arc in enumerate(arcs) if arc > math.pi and not _bends_round(start, left, i)]
+        if not away:
+            return pieces
+        del left[max(away, key=lambda i: arcs[i])]
+
+
+def _bends_round(start: tuple[float, float], buoys: Sequence[tuple[int, BuoyConfig]], place: int) -> bool:
+    """Whether the line from the point before a buoy over it to the next one bends towards the side that it is left on."""
+    own, after = buoys[place][1], buoys[place + 1][1]
+    north, east = start if place == 0 else (buoys[place - 1][1].north, buoys[place - 1][1].east)
+    bend = (own.north - north) * (after.east - own.east) - (own.east - east) * (after.north - own.north)
+    return (bend > 0) == (own.leave_to == "starboard")
+
+
+def _tangents(start: tuple[float, float], buoys: Sequence[tuple[int, BuoyConfig]]) -> list[Piece]:
+    """The course that touches every circle of numbered buoys."""
+    signs = [1 if buoy.leave_to == "starboard" else -1 for _, buoy in buoys]
     lines: list[tuple[float, float, float, float]] = []
     north, east, radius, sign = start[0], start[1], 0.0, 0
-    for number, (buoy, side) in enumerate(zip(buoys, signs, strict=True), start=1):
+    for (number, buoy), side in zip(buoys, signs, strict=True):
         along, across = buoy.north - north, buoy.east - east
         # the tangent from circle 0 to circle 1: the centres' line in its own frame is (length, s1 r1 - s0 r0)
         offset = side * buoy.radius - sign * radius
@@ -96,6 +119,6 @@ def course_round(start: tuple[float, float], buoys: Sequence[BuoyConfig]) -> lis
             before, side = lines[number - 1], signs[number - 1]
             turned = (side * (heading - before[2])) % (2.0 * math.pi)
             end = (before[0] + before[3] * math.cos(before[2]), before[1] + before[3] * math.sin(before[2]))
-            pieces.append(Piece(turned * buoys[number - 1].radius, *end, before[2], side, buoys[number - 1].radius))
+            pieces.append(Piece(turned * buoys[number - 1][1].radius, *end, before[2], side, buoys[number - 1][1].radius))
         pieces.append(Piece(length, line_north, line_east, heading, 0, 0.0))
     return pieces
