@@ -67,7 +67,12 @@ class AutopilotTraining(Config):
         overshoot: weight of the overshoot against the time outside `band`.
         margin: overshoot that costs nothing.
         band: error at which half of the cost of a large error is left.
+        sharp: weight of the time outside the band itself, beside what smoothly counts near it.
+        slowest: slow vessels weigh more, by this power of time over effect: the slowest decides the worst case.
         smoothness: weight of the squared changes of the command.
+        gradient_clip: largest norm of the gradient.
+        patience: stop when this many validations in a row bring nothing better.
+        validate_every: epochs between validations.
     """
 
     epochs: int = Field(default=20, ge=1)
@@ -88,7 +93,10 @@ class AutopilotTraining(Config):
     patience: int = Field(default=1000, ge=1)
     validate_every: int = Field(default=1, ge=1)
 
-    last_stage: int = Field(default=0, init=False, exclude=True)
+    @property
+    def last_stage(self) -> int:
+        """The only one."""
+        return 0
 
     def stage(self, epoch: int) -> tuple[int, int]:
         """One stage only."""
