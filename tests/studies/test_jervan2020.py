@@ -22,7 +22,11 @@ from residnet.studies.ferry_runs import MotionNoise
 from residnet.studies.jervan2020 import Study, record_of, study
 from residnet.tasks.ferry_study import FerryStudyConfig
 
-CONFIGS = sorted((Path(residnet.__file__).parents[2] / "configs" / "studies" / "jervan2020").glob("*.yaml"))
+CONFIGS = [
+    path
+    for path in sorted((Path(residnet.__file__).parents[2] / "configs" / "studies" / "jervan2020").glob("*.yaml"))
+    if "task: ferry_study" in path.read_text()
+]
 SHORT = ["course.interval=20", "~models.surface"]
 
 
