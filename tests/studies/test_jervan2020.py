@@ -49,7 +49,7 @@ def hull(name: str) -> Any:
 
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
 def test_every_table_has_a_valid_config(path: Path) -> None:
-    load_config(path, [], FerryStudyConfig)
+    assert load_config(path, [], FerryStudyConfig).task == "ferry_study"
 
 
 def test_the_lag_and_the_missing_half_are_found_and_flown(short: Study) -> None:
