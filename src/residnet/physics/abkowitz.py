@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Literal, final
 
 import torch
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 from torch import Tensor, nn
 
 from residnet.core.config import Config, MetresPerSecond, Radians, RadiansPerSecond, RevRate, RevsPerSecond
@@ -15,9 +15,10 @@ from residnet.physics.actuators.servo import ServoConfig, Servos
 from residnet.physics.environment_wind import WindLoadsConfig
 from residnet.physics.kinematics import Planar
 from residnet.physics.mass import inverse_mass
-from residnet.physics.parameters import Density, Length, above_zero
+from residnet.physics.parameters import Density
 from residnet.physics.plant import HullPlant
 from residnet.physics.terms import TermLibrary, parse_term
+from residnet.physics.vessel_file import VesselFile
 
 SERIES = ("du", "v", "r", "delta", "dn")
 """What the terms are made of: u - U0, sway, yaw rate, rudder angle, n - n0."""
@@ -75,7 +76,7 @@ class Derivatives(Config):
         return self.X, self.Y, self.N
 
 
-class AbkowitzConfig(Config):
+class AbkowitzConfig(VesselFile):
     """A vessel given by its hydrodynamic derivatives: M nu_dot = sum of terms in (du, v, r, delta, dn).
 
     Attributes:
@@ -97,9 +98,6 @@ class AbkowitzConfig(Config):
     """
 
     kind: Literal["abkowitz"]
-    name: str
-    description: str
-    length: Length
     units: Literal["prime", "si"]
     speed: MetresPerSecond = Field(gt=0)
     density: Density = Field(default=1025.0, gt=0)
@@ -111,8 +109,6 @@ class AbkowitzConfig(Config):
     rudder: SteeringGearConfig
     shaft: ShaftConfig | None = None
     wind: WindLoadsConfig | None = None
-
-    _positive = field_validator("length")(above_zero)
 
     @model_validator(mode="after")
     def _consistent(self) -> AbkowitzConfig:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any, Literal, final
+from typing import Literal, final
 
 import torch
-from pydantic import Field, ValidationInfo, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 from torch import Tensor, nn
 
 from residnet.core.config import Config
@@ -14,12 +14,12 @@ from residnet.core.errors import ConfigError
 from residnet.core.names import VELOCITY
 from residnet.physics.actuators import ActuatorsConfig
 from residnet.physics.environment_wind import WindLoadsConfig
-from residnet.physics.inherit import with_base
 from residnet.physics.kinematics import Planar
 from residnet.physics.mass import inverse_mass
 from residnet.physics.parameters import Inertia, Length, Mass, MassArm, Parameter, above_zero, dimension, unit_text
 from residnet.physics.plant import HullPlant
 from residnet.physics.terms import TermLibrary, parse_term
+from residnet.physics.vessel_file import VesselFile
 
 
 class RigidBody(Config):
@@ -67,31 +67,18 @@ class Damping(Config):
         return self
 
 
-class HullConfig(Config, ABC):
+class HullConfig(VesselFile, ABC):
     """A 3-DOF vessel M nu_dot + C(nu) nu + D(nu) nu = tau; a file may name another one as `base` and give only what differs.
 
     Attributes:
-        name: of the vessel, as its file is called.
-        description: one line for `residnet list vessels`.
-        length: of the hull, which manoeuvring indices are measured in.
         scale: what M, C and D are all multiplied by: a true vessel beside the believed one of its `base` (document 002 eq. (4.2)).
         wind: coefficients of the hull above water; without them the vessel feels no wind.
     """
 
-    name: str
-    description: str
-    length: Length
     scale: float = Field(default=1.0, gt=0)
     damping: Damping
     actuators: ActuatorsConfig
     wind: WindLoadsConfig | None = None
-
-    _positive = field_validator("length")(above_zero)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _base(cls, data: Any, info: ValidationInfo) -> Any:
-        return with_base(data, (info.context or {}).get("folder"))
 
     @abstractmethod
     def mass_matrix(self) -> list[list[float]]:

@@ -7,14 +7,15 @@ from typing import Annotated, Literal, NamedTuple, final
 
 import numpy as np
 import torch
-from pydantic import AfterValidator, Field, field_validator, model_validator
+from pydantic import AfterValidator, Field, model_validator
 from torch import Tensor
 
-from residnet.core.config import Config, MetresPerSecond
+from residnet.core.config import MetresPerSecond
 from residnet.core.frames import to_earth
 from residnet.physics.abkowitz import SteeringGearConfig
-from residnet.physics.parameters import Length, Parameter, above_zero, measured_in
+from residnet.physics.parameters import Parameter, measured_in
 from residnet.physics.plant import Plant
+from residnet.physics.vessel_file import VesselFile
 
 Gain = Annotated[Parameter, AfterValidator(measured_in("1/s"))]
 TimeConstant = Annotated[Parameter, AfterValidator(measured_in("s"))]
@@ -29,27 +30,19 @@ class LinearSteering(NamedTuple):
     extra: tuple[str, ...] = ()
 
 
-class SteeringConfig(Config, ABC):
+class SteeringConfig(VesselFile, ABC):
     """What all steering models have.
 
     Attributes:
-        name: of the vessel, as its file is called.
-        description: one line for `residnet list vessels`.
-        length: of the hull, which manoeuvring indices are measured in.
         speed: u, which nothing changes.
         K: yaw rate per rudder angle in a steady turn; K over the product of the time constants must be positive, so that a rudder
             to starboard turns to starboard at first.
         rudder: largest angle, rate and lag.
     """
 
-    name: str
-    description: str
-    length: Length
     speed: MetresPerSecond = Field(gt=0)
     K: Gain
     rudder: SteeringGearConfig
-
-    _positive = field_validator("length")(above_zero)
 
     @abstractmethod
     def steering(self) -> LinearSteering:

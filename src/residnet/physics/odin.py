@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, final
+from typing import Literal, final
 
 import torch
-from pydantic import Field, ValidationInfo, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 from torch import Tensor, nn
 
 from residnet.core.config import Config
@@ -13,11 +13,11 @@ from residnet.core.errors import ConfigError
 from residnet.core.names import VELOCITY
 from residnet.physics.actuators import ActuatorsConfig
 from residnet.physics.environment_wind import WindLoadsConfig
-from residnet.physics.inherit import with_base
 from residnet.physics.kinematics import Planar
-from residnet.physics.parameters import Length, Parameter, above_zero, dimension, of_dimension, unit_text
+from residnet.physics.parameters import Parameter, above_zero, dimension, of_dimension, unit_text
 from residnet.physics.plant import HullPlant
 from residnet.physics.terms import TermLibrary, parse_term
+from residnet.physics.vessel_file import VesselFile
 
 
 class Gains(Config):
@@ -60,7 +60,7 @@ class AccelerationTerms(Config):
         return self
 
 
-class OdinConfig(Config):
+class OdinConfig(VesselFile):
     """A 3-DOF vessel known by its accelerations; a file may name another one as `base` and give only what differs.
 
     Attributes:
@@ -73,20 +73,10 @@ class OdinConfig(Config):
     """
 
     kind: Literal["odin"]
-    name: str
-    description: str
-    length: Length
     gains: Gains
     terms: AccelerationTerms
     actuators: ActuatorsConfig
     wind: WindLoadsConfig | None = None
-
-    _positive = field_validator("length")(above_zero)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _base(cls, data: Any, info: ValidationInfo) -> Any:
-        return with_base(data, (info.context or {}).get("folder"))
 
     def equations(self) -> tuple[tuple[str, ...], list[list[float]]]:
         """nu_dot as terms of (u, v, r), and the coefficients of these, then of tau_x, tau_y, tau_n, on each axis."""

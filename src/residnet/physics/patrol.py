@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, final
+from typing import Literal, final
 
 import torch
-from pydantic import Field, ValidationInfo, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 from torch import Tensor, nn
 
 from residnet.core.config import Config, MetresPerSecond
 from residnet.core.errors import ConfigError
 from residnet.physics.actuators.stern_rudders import FoilRuddersConfig, LinearRuddersConfig
 from residnet.physics.environment_wind import WindLoadsConfig
-from residnet.physics.inherit import with_base
 from residnet.physics.kinematics import Rolling
 from residnet.physics.mass import inverse_mass
 from residnet.physics.parameters import Inertia, Length, Mass, MassArm, MassDensity, Parameter, Volume, above_zero, dimension, unit_text
 from residnet.physics.plant import HullPlant
 from residnet.physics.terms import TermLibrary, parse_term
+from residnet.physics.vessel_file import VesselFile
 
 MOTION = (*Rolling.velocity, "phi")
 """What the terms are made of: surge, sway, roll and yaw velocities through the water, and the roll angle."""
@@ -101,24 +101,16 @@ class Hydrostatics(Config):
         return self.density.value * GRAVITY * self.volume.value * self.GM.value
 
 
-class PatrolConfig(Config):
+class PatrolConfig(VesselFile):
     """A vessel in surge, sway, roll and yaw, by its derivatives.
 
-    A file may name another one as `base` and give only what differs.
-
     Attributes:
-        name: of the vessel, as its file is called.
-        description: one line for `residnet list vessels`.
-        length: of the hull, which manoeuvring indices are measured in.
         speed: service speed, which trials start from.
         actuators: rudders as foils in the propellers' race, or linear ones.
         wind: coefficients of the hull above water; without them the vessel feels no wind.
     """
 
     kind: Literal["patrol"]
-    name: str
-    description: str
-    length: Length
     speed: MetresPerSecond = Field(gt=0)
     hydrostatics: Hydrostatics
     rigid_body: RollingBody
@@ -126,13 +118,6 @@ class PatrolConfig(Config):
     forces: HullForces
     actuators: FoilRuddersConfig | LinearRuddersConfig = Field(discriminator="kind")
     wind: WindLoadsConfig | None = None
-
-    _positive = field_validator("length")(above_zero)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _base(cls, data: Any, info: ValidationInfo) -> Any:
-        return with_base(data, (info.context or {}).get("folder"))
 
     def build(self) -> PatrolVessel:
         """The plant.

@@ -1,14 +1,48 @@
-"""Vessel files that say only what differs from another one: `base: patrol_p06`."""
+"""What every vessel file has, and files that say only what differs from another one: `base: patrol_p06`."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import Any
 
-from residnet.core.config import load_mapping
+from pydantic import ValidationInfo, field_validator, model_validator
+
+from residnet.core.config import Config, load_mapping
 from residnet.core.errors import ConfigError
 from residnet.core.names import nearest
 from residnet.core.resources import config_folder
+from residnet.physics.parameters import Length, above_zero
+from residnet.physics.plant import Plant
+
+
+class VesselFile(Config, ABC):
+    """A vessel of any kind; a file may name another one of its kind as `base` and give only what differs.
+
+    Attributes:
+        name: of the vessel, as its file is called.
+        description: one line for `residnet list vessels`.
+        length: of the hull, which manoeuvring indices are measured in.
+    """
+
+    name: str
+    description: str
+    length: Length
+
+    _positive_length = field_validator("length")(above_zero)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _base(cls, data: Any, info: ValidationInfo) -> Any:
+        return with_base(data, (info.context or {}).get("folder"))
+
+    @abstractmethod
+    def build(self) -> Plant:
+        """The plant.
+
+        Raises:
+            ConfigError: where the parameters make no plant, for example a singular mass matrix.
+        """
 
 
 def with_base(data: Any, folder: Path | None) -> Any:
