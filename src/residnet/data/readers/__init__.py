@@ -8,7 +8,8 @@ from pydantic import Field
 
 from residnet.data.readers.base import LogReader
 from residnet.data.readers.canonical import CanonicalConfig, CanonicalReader
-from residnet.data.readers.table import ChannelMap, CsvConfig, ParquetConfig, TableReader, TimeColumn
+from residnet.data.readers.channel_map import ChannelMap
+from residnet.data.readers.table import CsvConfig, ParquetConfig, TableReader, TimeColumn
 
 ReaderConfig = Annotated[CsvConfig | ParquetConfig | CanonicalConfig, Field(discriminator="kind")]
 """Config of any reader; its `kind` says which."""

@@ -6,7 +6,6 @@ Everything foreign is converted here, once: units to SI, signs and frames to NED
 from __future__ import annotations
 
 import csv
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -18,28 +17,12 @@ from pydantic import Field, field_validator
 from residnet.core.config import Config
 from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
-from residnet.core.names import CHANNEL_UNITS, nearest, si_unit, to_si
-from residnet.data.readers.base import LogReader, provenance, require_file, require_increasing, require_samples, require_values, unwrap
+from residnet.core.names import nearest, si_unit, to_si
+from residnet.data.readers.base import LogReader, provenance, require_file, require_increasing, require_samples, require_values
+from residnet.data.readers.channel_map import ChannelMap, factor
 
 if TYPE_CHECKING:
     import pandas as pd
-
-Frame = Literal["as_measured", "ned", "enu", "body_fsd", "body_fpu"]
-
-_SAME = (1.0, 0.0)
-_FLIP = (-1.0, 0.0)
-_FROM_EAST = (-1.0, math.pi / 2.0)
-_EARTH = ("x", "y", "psi", "wind_dir", "current_north", "current_east")
-_FORWARD = ("u", "p", "phi", "u_dot", "tau_x")
-_SIDEWAYS_OR_DOWN = ("v", "r", "v_dot", "r_dot", "tau_y", "tau_n")
-# frame -> channel -> (factor, offset [SI]) that brings the channel to residnet's frame.
-# x and y have no entry in enu: "x" there means east to some and the north column to others, so the map must name the north column itself.
-_FRAMES: dict[str, dict[str, tuple[float, float]]] = {
-    "ned": dict.fromkeys(_EARTH, _SAME),
-    "enu": {"psi": _FROM_EAST, "wind_dir": _FROM_EAST},
-    "body_fsd": dict.fromkeys((*_FORWARD, *_SIDEWAYS_OR_DOWN), _SAME),
-    "body_fpu": {**dict.fromkeys(_FORWARD, _SAME), **dict.fromkeys(_SIDEWAYS_OR_DOWN, _FLIP)},
-}
 
 
 class TimeColumn(Config):
@@ -51,25 +34,8 @@ class TimeColumn(Config):
     @field_validator("unit")
     @classmethod
     def _measures_time(cls, unit: str) -> str:
-        _factor(unit, "s")
+        factor(unit, "s")
         return unit
-
-
-class ChannelMap(Config):
-    """One channel of a foreign table.
-
-    Attributes:
-        column: name of the column, as the file's header has it.
-        unit: its unit, for example `deg/s`.
-        sign: -1 turns the column around before anything else.
-        frame: `as_measured` (nothing to convert), `ned`, `body_fsd` (forward, starboard, down), `enu` (angles counter-clockwise from east) or
-            `body_fpu` (forward, port, up).
-    """
-
-    column: str
-    unit: str
-    sign: Literal[1, -1] = 1
-    frame: Frame = "as_measured"
 
 
 class _TableConfig(Config, ABC):
@@ -86,18 +52,7 @@ class _TableConfig(Config, ABC):
     @classmethod
     def _fits_names(cls, channels: dict[str, ChannelMap]) -> dict[str, ChannelMap]:
         for name, entry in channels.items():
-            if name == "t" or name.startswith("mask:"):
-                raise ValueError(f"'{name}' cannot name a channel; time has its own key `time`")
-            try:
-                _factor(entry.unit, CHANNEL_UNITS.get(name))
-            except ValueError as error:
-                raise ValueError(f"channel {name}: {error}") from error
-            if entry.frame != "as_measured" and name not in _FRAMES[entry.frame]:
-                fitting = ", ".join(frame for frame, table in _FRAMES.items() if name in table) or "none"
-                raise ValueError(
-                    f"channel {name}: frame '{entry.frame}' says nothing about it (frames that do: {fitting}); "
-                    "map the column that already holds this quantity, with sign: -1 where it points the other way"
-                )
+            entry.require_fit(name)
         return channels
 
     @abstractmethod
@@ -163,7 +118,7 @@ class TableReader(LogReader):
         channels = {}
         for (name, entry), raw in zip(maps.items(), values[1:], strict=True):
             require_values(path, name, entry.column, raw[kept])
-            channels[name] = _convert(name, entry, raw[kept])
+            channels[name] = entry.convert(name, raw[kept])
         manoeuvre = path.resolve().parent.name if self._config.manoeuvre == "folder" else self._config.manoeuvre
         units = {name: si_unit(entry.unit) for name, entry in maps.items()}
         return Log(path.stem, t, channels, units, manoeuvre or "unknown", meta=provenance(path, len(table), len(table) - kept.size))
@@ -198,21 +153,6 @@ class TableReader(LogReader):
         first, last = np.flatnonzero(known)[[0, -1]]
         inside = np.arange(t.size)
         return np.flatnonzero(clock & (inside >= first) & (inside <= last))
-
-
-def _factor(unit: str, expected: str | None) -> float:
-    """`to_si` for validators: pydantic adds the key path to a ValueError only."""
-    try:
-        return to_si(unit, expected)
-    except UsageError as error:
-        raise ValueError(str(error)) from error
-
-
-def _convert(name: str, entry: ChannelMap, raw: np.ndarray) -> np.ndarray:
-    """One column [T] in residnet's unit, sign and frame."""
-    factor, offset = _FRAMES[entry.frame][name] if entry.frame != "as_measured" else _SAME
-    values = factor * entry.sign * to_si(entry.unit) * raw + offset
-    return unwrap(values) if name == "psi" else values
 
 
 def _positions(path: Path, header: Sequence[str], columns: Sequence[str], hint: str = "") -> list[int]:
