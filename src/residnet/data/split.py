@@ -55,7 +55,7 @@ class SplitConfig(Config):
         if not root.is_dir():
             raise ConfigError(f"split: root {root} is not a folder; correct `root`")
         where = "split" if self.file is None else str(self.file)
-        files = {name: _matches(root, wanted, f"{where}: {name}") for name, wanted in patterns.items()}
+        files = {name: matches(root, wanted, f"{where}: {name}") for name, wanted in patterns.items()}
         _require_distinct(files, where)
         return files
 
@@ -72,7 +72,7 @@ def _from_file(file: Path) -> dict[str, tuple[str, ...]]:
     return {name: tuple(content[name]) for name in SPLITS}
 
 
-def _matches(root: Path, patterns: Sequence[str], where: str) -> list[Path]:
+def matches(root: Path, patterns: Sequence[str], where: str) -> list[Path]:
     """Files of all patterns, each once."""
     found: dict[Path, None] = {}
     for pattern in patterns:

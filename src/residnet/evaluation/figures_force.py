@@ -40,6 +40,7 @@ def draw_surface(error: Tensor, unmodelled: Sequence[float], chosen: Mapping[str
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=3)
         bar = figure.colorbar(image, ax=panels, ticks=[-1, -0.5, 0, 0.5])
         bar.ax.set_yticklabels(["10 %", "32 %", "100 %", "316 %"])
+        bar.set_label("share of the mean square residual")
         save(
             figure,
             path,
@@ -71,4 +72,5 @@ def draw_weights(terms: Sequence[str], pre: Tensor, title: str, path: Path) -> N
             axes.set_ylabel(_AXES[axis])
             axes.grid(axis="x", visible=False)
         panels[-1].set_xticks(range(len(terms)), list(terms), rotation=90)
+        figure.supylabel("magnitude of the scaled coefficient [-]", fontsize=9)
         save(figure, path, title, "Magnitude of the coefficients of scaled basis functions: how much each weighs in the model.")

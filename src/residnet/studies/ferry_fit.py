@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -43,33 +43,41 @@ class Published(Config):
     crossing_heading_mae: float | None = None
 
 
-class FerryModelConfig(Config):
-    """One model of the residual.
+class ResidualModelConfig(Config):
+    """One model of a residual force.
 
     Attributes:
         fit: how its coefficients are found.
         terms: its basis functions; the 30 of (4.12) unless given.
-        lag: fit the thrusters' lag with it, explain the force that followed the command, and lead the feed-forward by the lag.
+        lag: fit the thrusters' lag with it and explain the force that followed the command.
         earth: include forces that are constant in earth axes.
-        smooth: bring the noisy measurements into one motion first (see `residnet.data.motion_smoother`).
-        on: the model whose remaining residual this one explains (3.26); empty for the believed hull.
-        fly: fly the course, and the crossing where there is one, with it as feed-forward.
-        published: the document's figures.
     """
 
     fit: RegressionConfig
     terms: tuple[str, ...] = FERRY_TERMS
     lag: bool = False
     earth: bool = False
-    smooth: bool = False
-    on: str = ""
-    fly: bool = False
-    published: Published = Published()
 
     def model_post_init(self, context: Any) -> None:
         """Read the terms, so that a wrong one is found at once."""
         for term in self.terms:
             parse_term(term, MOTION)
+
+
+class FerryModelConfig(ResidualModelConfig):
+    """One model of the ferry's residual; with `lag` its feed-forward is led by the lag.
+
+    Attributes:
+        smooth: bring the noisy measurements into one motion first (see `residnet.data.motion_smoother`).
+        on: the model whose remaining residual this one explains (3.26); empty for the believed hull.
+        fly: fly the course, and the crossing where there is one, with it as feed-forward.
+        published: the document's figures.
+    """
+
+    smooth: bool = False
+    on: str = ""
+    fly: bool = False
+    published: Published = Published()
 
 
 @dataclass(frozen=True)
@@ -103,6 +111,7 @@ class Record:
         fold: segment of each sample [N].
         train: samples that identify [N] bool; the others test.
         noise: standard deviations of pose, nu and nu_dot, nine.
+        runs: lengths of the runs that stand one after another; empty for one.
     """
 
     t: Tensor
@@ -114,6 +123,7 @@ class Record:
     fold: Tensor
     train: Tensor
     noise: tuple[float, ...]
+    runs: tuple[int, ...] = ()
 
     @property
     def dt(self) -> float:
@@ -126,16 +136,25 @@ class Record:
 
         seen = torch.cat((self.pose, self.nu, self.nu_dot), dim=-1)
         motion = torch.from_numpy(smooth_motion(seen.numpy(), self.noise, self.dt))
-        return Record(self.t, motion[:, :3], motion[:, 3:6], motion[:, 6:], self.command, self.averaged, self.fold, self.train, self.noise)
+        return replace(self, pose=motion[:, :3], nu=motion[:, 3:6], nu_dot=motion[:, 6:])
 
 
 def identify(config: FerryModelConfig, record: Record, base: ForceModel) -> FerryModel:
-    """Fit one model on the record's training samples.
+    """Fit one model on the record's training samples and judge it on the others, as they were logged.
 
     Raises:
         FitError: where the data do not determine it.
     """
-    used = record.smoothed() if config.smooth else record
+    model, lag, fit, notes = fit_model(config, record.smoothed() if config.smooth else record, base)
+    return FerryModel(model, lag, fit, judged(model, lag, record), notes)
+
+
+def fit_model(config: ResidualModelConfig, used: Record, base: ForceModel) -> tuple[ForceModel, Lag | None, Fit, dict[str, Any]]:
+    """One model from a record's training samples: F = F_base + correction, the lag, the coefficients, and what was chosen.
+
+    Raises:
+        FitError: where the data do not determine it.
+    """
     train = used.train
     x = TermLibrary(config.terms, MOTION)(torch.cat((used.nu_dot, used.nu), dim=-1))
     needed = base.at_heading(used.nu_dot, used.nu, used.pose[:, 2])
@@ -146,8 +165,8 @@ def identify(config: FerryModelConfig, record: Record, base: ForceModel) -> Ferr
     force = used.command
     if config.lag:
         regressors = torch.cat((x, earthly[:, 0]), dim=-1) if config.earth else x
-        found = fit_lag(used.averaged, needed, regressors, used.dt, train)
-        force = followed(used.averaged, found.lag, used.dt)
+        found = fit_lag(used.averaged, needed, regressors, used.dt, train, used.runs)
+        force = followed(used.averaged, found.lag, used.dt, used.runs)
     y = force - needed
     push = torch.zeros(2, dtype=torch.float64)
     if config.earth:
@@ -161,8 +180,7 @@ def identify(config: FerryModelConfig, record: Record, base: ForceModel) -> Ferr
         notes["lag"] = {"frequency": found.lag.frequency, "damping": found.lag.damping, "delay": found.lag.delay}
     if config.earth:
         notes["earth"] = {"north": float(push[0]), "east": float(push[1])}
-    lag = found.lag if found is not None else None
-    return FerryModel(model, lag, fit, judged(model, lag, record), notes)
+    return model, found.lag if found is not None else None, fit, notes
 
 
 def judged(model: ForceModel, lag: Lag | None, record: Record) -> list[float]:
@@ -172,11 +190,11 @@ def judged(model: ForceModel, lag: Lag | None, record: Record) -> list[float]:
 
 def remaining(model: ForceModel, lag: Lag | None, record: Record) -> Tensor:
     """The residual [N, 3] that a model leaves along a record as it was logged; through its lag where it has one."""
-    force = record.command if lag is None else followed(record.averaged, lag, record.dt)
+    force = record.command if lag is None else followed(record.averaged, lag, record.dt, record.runs)
     return model.residual(force, record.nu_dot, record.nu, record.pose[:, 2])
 
 
-def _scale(config: FerryModelConfig, x: Tensor) -> Tensor:
+def _scale(config: ResidualModelConfig, x: Tensor) -> Tensor:
     finite = torch.nan_to_num(x)
     return column_scale(config.terms, finite)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -14,13 +13,14 @@ from residnet.core.errors import FitError
 from residnet.evaluation.figures_force import draw_surface, draw_weights
 from residnet.evaluation.still_fits import Verdict, still_fits
 from residnet.evaluation.tracking import mse
-from residnet.heads.regressions import SurfaceRegression, table
+from residnet.heads.regressions import SurfaceRegression
 from residnet.physics.force_model import ForceModel
 from residnet.run_folder import RunFolder
 from residnet.studies.ferry_config import FerrySettings
 from residnet.studies.ferry_fit import FerryModel, Published, Record, identify, remaining
 from residnet.studies.ferry_forward import as_vessel_lines, export_feed_forward, forward_equations
 from residnet.studies.ferry_runs import Flight, MotionNoise
+from residnet.studies.ferry_text import coefficients_text, notes_text
 
 _DEG = 180.0 / math.pi
 AXES = ("surge", "sway", "yaw")
@@ -123,7 +123,10 @@ def write(config: FerrySettings, found: Study, folder: RunFolder) -> str:
     folder.write(folder.path / "ferry.md", text)
     for name, model in found.models.items():
         keep_model(config, found, name, folder)
-        folder.write(folder.path / "models" / f"{name}.md", model_text(name, config.models[name].terms, model))
+        folder.write(
+            folder.path / "models" / f"{name}.md",
+            coefficients_text(f"Residual force of model {name}", config.models[name].terms, model.fit, model.notes),
+        )
     return text
 
 
@@ -179,7 +182,7 @@ def residuals_text(config: FerrySettings, found: Study) -> str:
     lines += ["| model | surge N^2 | sway N^2 | yaw (N m)^2 | left % | chosen |", "|---|---|---|---|---|---|"]
     base = config.published.mse
     rows = [("believed", found.unmodelled, base, "")]
-    rows += [(name, model.test_mse, config.models[name].published.mse, _chosen(model.notes)) for name, model in found.models.items()]
+    rows += [(name, model.test_mse, config.models[name].published.mse, notes_text(model.notes)) for name, model in found.models.items()]
     for name, own, printed, chosen in rows:
         cells = [_beside(own[a], printed[a] if printed else None) for a in range(3)]
         shares = [_beside(100 * own[a] / found.unmodelled[a], 100 * printed[a] / base[a] if printed and base else None) for a in range(3)]
@@ -216,27 +219,5 @@ def _crossing(said: Published) -> Published:
     return Published(position_mae=said.crossing_position_mae, position_mse=said.crossing_position_mse, heading_mae=said.crossing_heading_mae)
 
 
-def model_text(name: str, terms: Sequence[str], model: FerryModel) -> str:
-    """The model for reading: coefficients in SI, and |Theta_pre|, which says how much each weighs."""
-    lines = [f"Residual force of model {name}: tau = F_believed(nu_dot, nu) + sum of coefficient x basis function", ""]
-    lines += [f"chosen: {_chosen(model.notes) or 'nothing'}", "", "| basis function | surge | sway | yaw | weight |", "|---|---|---|---|---|"]
-    weights = dict(zip(terms, model.fit.pre.abs().tolist(), strict=True))
-    for term, row in table(terms, model.fit):
-        weight = " / ".join(f"{value:.3f}" for value in weights[term]) if term in weights else ""
-        lines.append(f"| {term.replace('|', '&#124;')} | {row[0]:.4g} | {row[1]:.4g} | {row[2]:.4g} | {weight} |")
-    return "\n".join(lines) + "\n"
-
-
 def _beside(own: float, printed: float | None) -> str:
     return f"{own:.4g}" if printed is None else f"{own:.4g} ({printed:.4g})"
-
-
-def _chosen(notes: dict[str, Any]) -> str:
-    def said(value: Any) -> str:
-        if isinstance(value, dict):
-            return ", ".join(f"{key} {said(part)}" for key, part in value.items())
-        if isinstance(value, list):
-            return "/".join(said(part) for part in value)
-        return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-    return "; ".join(f"{key} {said(value)}" for key, value in notes.items())

@@ -11,10 +11,11 @@ from residnet.tasks.autopilot import AutopilotConfig
 from residnet.tasks.breeding import BreedingTaskConfig
 from residnet.tasks.ferry_study import FerryStudyConfig
 from residnet.tasks.fit import FitConfig
+from residnet.tasks.force_residual import ForceResidualConfig
 from residnet.tasks.simulate import SimulateConfig
 from residnet.tasks.study import StudyConfig
 
 TaskConfig = Annotated[
-    FitConfig | SimulateConfig | StudyConfig | ActuatorsTaskConfig | AutopilotConfig | FerryStudyConfig | BreedingTaskConfig,
+    FitConfig | SimulateConfig | StudyConfig | ActuatorsTaskConfig | AutopilotConfig | FerryStudyConfig | ForceResidualConfig | BreedingTaskConfig,
     Field(discriminator="task"),
 ]

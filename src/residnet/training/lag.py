@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,8 +18,13 @@ from residnet.core.errors import FitError
 _LEAST, _MOST = np.array([0.1, 0.1, 0.0]), np.array([30.0, 3.0, 2.0])
 
 
-def followed(command: Tensor, lag: Lag, dt: float) -> Tensor:
-    """Force [N, c] that follows a command [N, c] sampled every dt seconds, taken as straight between samples; at rest before."""
+def followed(command: Tensor, lag: Lag, dt: float, runs: Sequence[int] = ()) -> Tensor:
+    """Force [N, c] that follows a command [N, c] sampled every dt seconds, taken as straight between samples; at rest before.
+
+    `runs` are the lengths of several runs that stand one after another, each at rest before; empty for one.
+    """
+    if len(runs) > 1:
+        return torch.cat([followed(part, lag, dt) for part in command.split(list(runs))])
     u = _delayed(command.numpy(), lag.delay, dt)
     w, z = lag.frequency, lag.damping
     # exact for inputs that are straight lines between samples: one matrix exponential of the state, the input and its slope
@@ -54,7 +60,7 @@ class LagFit:
     left_without: tuple[float, float, float]
 
 
-def fit_lag(command: Tensor, needed: Tensor, basis: Tensor, dt: float, use: Tensor | None = None) -> LagFit:
+def fit_lag(command: Tensor, needed: Tensor, basis: Tensor, dt: float, use: Tensor | None = None, runs: Sequence[int] = ()) -> LagFit:
     """The lag under which F_believed + basis explains the followed command best.
 
     Args:
@@ -63,6 +69,7 @@ def fit_lag(command: Tensor, needed: Tensor, basis: Tensor, dt: float, use: Tens
         basis: regressors [N, J], without the constant.
         dt: sampling interval in s.
         use: samples to count [N] bool; None for all.
+        runs: lengths of the runs that stand one after another; empty for one.
 
     Raises:
         FitError: where the command does not vary, or the search ends at a bound.
@@ -81,7 +88,7 @@ def fit_lag(command: Tensor, needed: Tensor, basis: Tensor, dt: float, use: Tens
 
     def miss(p: np.ndarray) -> np.ndarray:
         lag = Lag(frequency=float(p[0]), damping=float(p[1]), delay=float(p[2]))
-        force = followed(command, lag, dt)[keep]
+        force = followed(command, lag, dt, runs)[keep]
         # in units of the followed force itself: a lag that lets nothing through would leave nothing to explain
         out: np.ndarray = (unexplained(force - needed[keep]) / force.std(0).clamp(min=1e-300)).numpy().ravel()
         return out
@@ -95,6 +102,6 @@ def fit_lag(command: Tensor, needed: Tensor, basis: Tensor, dt: float, use: Tens
     if at:
         raise FitError(f"the lag's {at[0]} ends at the bound of its search ({p[0]:.3g} rad/s, {p[1]:.3g}, {p[2]:.3g} s); the data do not show one")
     lag = Lag(frequency=float(p[0]), damping=float(p[1]), delay=float(p[2]))
-    rests = [unexplained((force - needed)[keep]) for force in (followed(command, lag, dt), command)]
+    rests = [unexplained((force - needed)[keep]) for force in (followed(command, lag, dt, runs), command)]
     shares = [(rest.square().mean(0) / variance).tolist() for rest in rests]
     return LagFit(lag, (shares[0][0], shares[0][1], shares[0][2]), (shares[1][0], shares[1][1], shares[1][2]))
