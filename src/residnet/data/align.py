@@ -63,12 +63,24 @@ def align(log: Log, config: GridConfig) -> Log:
     return _resampled(log, config, grid)
 
 
+def onto(log: Log, config: GridConfig, times: np.ndarray) -> Log:
+    """The log at given times [G], increasing, in s on its clock, by the rules of `align`; NaN before its first sample and after its last.
+
+    The length that is averaged over is the config's step.
+    """
+    out = _resampled(log, config, times)
+    margin = _ON_GRID * config.step
+    outside = (times < log.t[0] - margin) | (times > log.t[-1] + margin)
+    channels = {name: np.where(outside, np.nan, values) for name, values in out.channels.items()}
+    return out.replace(channels=channels, masks={})
+
+
 def _resampled(log: Log, config: GridConfig, grid: np.ndarray) -> Log:
     usual = float(np.median(np.diff(log.t)))
     longest = config.longest_gap if config.longest_gap is not None else 3.0 * usual
     gap = np.diff(log.t) > longest * (1.0 + _ON_GRID)
     averaged = config.step >= 2.0 * usual * (1.0 - _ON_GRID)
-    half = np.minimum(0.5 * config.step, np.minimum(grid - grid[0], np.maximum(log.t[-1] - grid, 0.0))) if averaged else np.zeros_like(grid)
+    half = np.minimum(0.5 * config.step, np.maximum(np.minimum(grid - log.t[0], log.t[-1] - grid), 0.0)) if averaged else np.zeros_like(grid)
     smooth, held = _Reach(log.t, grid, half, gap), _Reach(log.t, grid, np.zeros_like(grid), gap)
     names = tuple(log.channels)
     continuous = np.stack([unwrap(log[name]) if log.units[name] == "rad" else log[name] for name in names], axis=-1)

@@ -12,10 +12,19 @@ from residnet.tasks.breeding import BreedingTaskConfig
 from residnet.tasks.ferry_study import FerryStudyConfig
 from residnet.tasks.fit import FitConfig
 from residnet.tasks.force_residual import ForceResidualConfig
+from residnet.tasks.import_logs import ImportConfig
 from residnet.tasks.simulate import SimulateConfig
 from residnet.tasks.study import StudyConfig
 
 TaskConfig = Annotated[
-    FitConfig | SimulateConfig | StudyConfig | ActuatorsTaskConfig | AutopilotConfig | FerryStudyConfig | ForceResidualConfig | BreedingTaskConfig,
+    FitConfig
+    | ImportConfig
+    | SimulateConfig
+    | StudyConfig
+    | ActuatorsTaskConfig
+    | AutopilotConfig
+    | FerryStudyConfig
+    | ForceResidualConfig
+    | BreedingTaskConfig,
     Field(discriminator="task"),
 ]

@@ -10,8 +10,9 @@ from residnet.data.readers.base import LogReader
 from residnet.data.readers.canonical import CanonicalConfig, CanonicalReader
 from residnet.data.readers.channel_map import ChannelMap
 from residnet.data.readers.table import CsvConfig, ParquetConfig, TableReader, TimeColumn
+from residnet.data.readers.topic_folder import TopicFolderConfig
 
-ReaderConfig = Annotated[CsvConfig | ParquetConfig | CanonicalConfig, Field(discriminator="kind")]
+ReaderConfig = Annotated[CsvConfig | ParquetConfig | CanonicalConfig | TopicFolderConfig, Field(discriminator="kind")]
 """Config of any reader; its `kind` says which."""
 
 __all__ = [
@@ -24,4 +25,5 @@ __all__ = [
     "ReaderConfig",
     "TableReader",
     "TimeColumn",
+    "TopicFolderConfig",
 ]

@@ -1,0 +1,142 @@
+"""A recording: many series, each with its own clock, before they become one log."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from residnet.core.errors import UsageError
+from residnet.core.names import nearest
+
+Level = Literal["note", "will mislead", "fatal"]
+Remark = dict[str, Any]
+
+
+def remark(level: Level, code: str, text: str, **figures: float) -> Remark:
+    """One thing noticed on the way in, as `Log.meta["findings"]` holds it: level, code, text, figures (SI)."""
+    return {"level": level, "code": code, "text": text, "figures": figures}
+
+
+@dataclass(frozen=True)
+class Series:
+    """One topic, message type or table.
+
+    Attributes:
+        name: topic or table, as its source names it.
+        kind: message type, for example `sensor_msgs/msg/NavSatFix`; empty where the source has none.
+        fields: path -> values [T], float64, in the source's units; NaN where a cell is empty.
+        stamp: time [T] in s by the sender's clock (header stamp), from the recording's epoch; None where messages carry none.
+        arrival: time [T] in s by the recorder's clock, from the same epoch; None where the source has none.
+        sender: who sent each row [T] (frame id, node or instance), where the source says.
+        remarks: what was noticed while reading.
+    """
+
+    name: str
+    kind: str
+    fields: dict[str, np.ndarray]
+    stamp: np.ndarray | None = None
+    arrival: np.ndarray | None = None
+    sender: np.ndarray | None = None
+    remarks: tuple[Remark, ...] = ()
+
+    def __len__(self) -> int:
+        return int(self.clock.size)
+
+    @property
+    def clock(self) -> np.ndarray:
+        """Time [T] in s: the stamp where there is one, else the arrival."""
+        known = self.stamp if self.stamp is not None else self.arrival
+        return np.zeros(0) if known is None else known
+
+    @cached_property
+    def _by_key(self) -> dict[str, str]:
+        return {key_of(path): path for path in reversed(self.fields)}
+
+    def has(self, path: str) -> bool:
+        """Whether there is a field of this path; `pose.position.x`, `pose/position/x` and `pose_position_x` are the same."""
+        return path in self.fields or key_of(path) in self._by_key
+
+    def __getitem__(self, path: str) -> np.ndarray:
+        """Values [T] of one field.
+
+        Raises:
+            UsageError: where there is none.
+        """
+        name = path if path in self.fields else self._by_key.get(key_of(path))
+        if name is None:
+            raise UsageError(f"topic {self.name}: no field '{path}'{nearest(path, self.fields)}")
+        return self.fields[name]
+
+    def where(self, keep: np.ndarray) -> Series:
+        """The rows at which `keep` ([T] bool, or indices) points."""
+        stamp, arrival, sender = (None if part is None else part[keep] for part in (self.stamp, self.arrival, self.sender))
+        fields = {path: values[keep] for path, values in self.fields.items()}
+        return dataclasses.replace(self, fields=fields, stamp=stamp, arrival=arrival, sender=sender)
+
+    def of_sender(self, sender: str) -> Series:
+        """The rows of one sender.
+
+        Raises:
+            UsageError: where no row has this sender.
+        """
+        known = [] if self.sender is None else [str(name) for name in dict.fromkeys(self.sender.tolist())]
+        if self.sender is None or sender not in known:
+            raise UsageError(f"topic {self.name}: no rows of sender '{sender}'{nearest(sender, known)}")
+        return self.where(self.sender == sender)
+
+    def noting(self, *remarks: Remark) -> Series:
+        """The series with further remarks."""
+        return dataclasses.replace(self, remarks=(*self.remarks, *remarks))
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What one file or folder holds.
+
+    Attributes:
+        path: where it lies.
+        series: by name.
+        epoch: Unix time in whole ns that all times count from; None where times count from a start that nobody knows.
+        files: files that were read.
+        remarks: what was noticed about the recording as a whole.
+        listed: names of series that the source holds and that were not asked for.
+    """
+
+    path: Path
+    series: dict[str, Series]
+    epoch: int | None = None
+    files: tuple[Path, ...] = ()
+    remarks: tuple[Remark, ...] = ()
+    listed: tuple[str, ...] = field(default=())
+
+    def __getitem__(self, topic: str | None) -> Series:
+        """One series; None names the only one. A leading slash may be left out.
+
+        Raises:
+            UsageError: where there is no such series, or several and none was named.
+        """
+        if topic is None:
+            if len(self.series) == 1:
+                return next(iter(self.series.values()))
+            raise UsageError(f"{self.path}: holds {len(self.series)} topics, name one with `topic` ({', '.join(list(self.series)[:12])})")
+        name = same_topic(topic, self.series)
+        if name is None:
+            raise UsageError(f"{self.path}: no topic '{topic}'{nearest(topic, (*self.series, *self.listed))}")
+        return self.series[name]
+
+
+def same_topic(topic: str, names: Iterable[str]) -> str | None:
+    """The one of `names` that means `topic`, a leading slash aside; None where there is none."""
+    return next((name for name in names if name.strip("/") == topic.strip("/")), None)
+
+
+def key_of(path: str) -> str:
+    """A field's path with every separator as one underscore: exporters write `pose.position.x`, `pose/position/x` or `pose_position_x`."""
+    return re.sub(r"[./\[\]_]+", "_", path).strip("_").removeprefix("field_")

@@ -1,0 +1,199 @@
+"""Reader of a folder that holds one csv file per topic, as tools export ROS bags."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import Any, Literal, final
+
+import numpy as np
+from pydantic import Field
+
+from residnet.core.errors import DataError, UsageError
+from residnet.data.readers.composed import RecordingConfig, Wanted
+from residnet.data.readers.files import progress, total_size
+from residnet.data.readers.recording import Recording, Remark, Series, key_of, remark
+from residnet.data.readers.stamps import Stamps, parse_numbers, parse_texts
+
+_ENDINGS = (".csv", ".tsv", ".txt")
+_ARRIVAL = ("time", "Time", "t", "timestamp", "rosbagTimestamp", "%time", "stamp", "date")
+_SECONDS, _NANOSECONDS = ("secs", "sec"), ("nsecs", "nanosec")
+_CHUNK = 200_000
+
+
+@final
+class TopicFolderConfig(RecordingConfig):
+    """A folder of csv files, one per topic, each with its own clock; a topic is named by its path below the folder, without the ending.
+
+    Attributes:
+        time: columns that may hold the arrival time, in order; every file is searched for them.
+        delimiter: between cells.
+    """
+
+    kind: Literal["csv_topics"] = "csv_topics"
+    time: tuple[str, ...] = Field(default=_ARRIVAL, min_length=1)
+    delimiter: str = Field(default=",", min_length=1, max_length=1)
+
+    def load(self, path: Path, wanted: Wanted) -> Recording:
+        """See `RecordingConfig.load`; unwanted topics of a small folder are read too, so that what is wrong with them is said."""
+        return load_folder(path, wanted, self.time, self.delimiter)
+
+
+def load_folder(path: Path, wanted: Wanted = lambda name: True, time: tuple[str, ...] = _ARRIVAL, delimiter: str = ",") -> Recording:
+    """The recording in a folder of csv files.
+
+    Raises:
+        UsageError: where the folder is missing.
+        DataError: where it holds no csv file, or none of them has a time.
+    """
+    if not path.is_dir():
+        raise UsageError(f"{path}: no such folder" if not path.exists() else f"{path}: is a file; a folder with one csv per topic was expected")
+    files = sorted(file for file in path.rglob("*") if file.suffix.lower() in _ENDINGS and file.is_file())
+    if not files:
+        raise DataError(f"{path}: holds no csv file")
+    size = total_size(files)
+    raw, remarks, done = {}, [], 0
+    with progress(path.name, size, size) as advance:
+        for file in files:
+            name = file.relative_to(path).with_suffix("").as_posix()
+            table, said = _read(file, name, time, delimiter)
+            remarks += said
+            done += file.stat().st_size
+            advance(done)
+            if table is not None:
+                raw[name] = table
+    if not raw:
+        raise DataError(f"{path}: none of {len(files)} csv files holds a topic ({remarks[0]['text']})")
+    dated = [stamps for table in raw.values() for stamps in (table.arrival, table.stamp) if stamps is not None and stamps.absolute]
+    epoch = min((int(stamps.ns.min()) for stamps in dated), default=None)
+    whole = None if epoch is None else epoch // 10**9 * 10**9
+    return Recording(path, {name: table.series(name, whole) for name, table in raw.items()}, whole, tuple(files), tuple(remarks))
+
+
+@final
+class _Table:
+    """One csv as read: times as whole ns, fields as float64."""
+
+    def __init__(
+        self, arrival: Stamps | None, stamp: Stamps | None, fields: dict[str, np.ndarray], sender: np.ndarray | None, said: list[Remark]
+    ) -> None:
+        self.arrival, self.stamp, self.fields, self.sender, self.said = arrival, stamp, fields, sender, said
+
+    def series(self, name: str, epoch: int | None) -> Series:
+        """With times in s from the epoch."""
+
+        def seconds(stamps: Stamps | None) -> np.ndarray | None:
+            if stamps is None:
+                return None
+            return (stamps.ns - (epoch if stamps.absolute and epoch is not None else 0)) * 1e-9
+
+        remarks = [*self.said]
+        for stamps in (self.arrival, self.stamp):
+            remarks += [{**one, "text": f"topic {name}: {one['text']}"} for one in (stamps.remarks if stamps is not None else ())]
+        return Series(name, "", self.fields, seconds(self.stamp), seconds(self.arrival), self.sender, tuple(remarks))
+
+
+def _read(file: Path, name: str, time: tuple[str, ...], delimiter: str) -> tuple[_Table | None, list[Remark]]:
+    """One topic; None and a remark where the file holds none."""
+    import pandas as pd
+
+    if not file.stat().st_size:
+        return None, [remark("note", "empty_topic", f"topic {name}: the file is empty")]
+    try:
+        with file.open(newline="", encoding="utf-8-sig") as stream:
+            header = [cell.strip() for cell in next(csv.reader(stream, delimiter="\t" if file.suffix.lower() == ".tsv" else delimiter), [])]
+        clock = next((column for column in time if column in header), None)
+        stamp = _stamp_columns(header)
+        if clock is None and stamp is None:
+            text = f"topic {name}: no column for time (looked for {', '.join(time)} and a header stamp); the file is left out"
+            return None, [remark("note", "no_time", text)]
+        sep = "\t" if file.suffix.lower() == ".tsv" else delimiter
+        texts = {header.index(clock): str} if clock is not None else {}
+        chunks = pd.read_csv(
+            file,
+            sep=sep,
+            header=None,
+            skiprows=1,
+            names=list(range(len(header))),
+            index_col=False,
+            dtype=texts,
+            encoding="utf-8-sig",
+            chunksize=_CHUNK,
+        )
+        numbers, words, spoilt = _collect(chunks, header, clock)
+    except (UnicodeDecodeError, pd.errors.ParserError) as error:
+        return None, [remark("will mislead", "unreadable", f"topic {name}: not a regular UTF-8 table ({' '.join(str(error).split())}); left out")]
+    rows = len(next(iter({**numbers, **words}.values())))
+    if not rows:
+        return None, [remark("note", "empty_topic", f"topic {name}: the file has a header and no rows")]
+    try:
+        arrival = None if clock is None else parse_texts(words.pop(clock))
+        stamped = None if stamp is None else _stamps(numbers, stamp)
+    except DataError as error:
+        return None, [remark("will mislead", "no_time", f"topic {name}: {error}; the file is left out")]
+    sender = next((words[column] for column in header if column in words and key_of(column).endswith("frame_id")), None)
+    said = [_not_numbers(name, column, cells) for column, cells in words.items() if not key_of(column).endswith("frame_id")]
+    for column, cells in spoilt.items():
+        text = f"topic {name}: column '{column}' holds {cells} cells that are not numbers; they count as missing"
+        said.append(remark("will mislead", "not_numbers", text, cells=cells))
+    taken = {*(stamp or ()), clock}
+    return _Table(arrival, stamped, {column: values for column, values in numbers.items() if column not in taken}, sender, said), []
+
+
+def _collect(chunks: Any, header: list[str], clock: str | None) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict[str, int]]:
+    """Columns of numbers (float64, whole stamps int64), columns of text, and how many cells of a column of numbers are none."""
+    import pandas as pd
+
+    pieces: list[list[np.ndarray]] = [[] for _ in header]
+    text = [column == clock for column in header]
+    for chunk in chunks:
+        for i in range(len(header)):
+            cells = chunk[i]
+            if not text[i] and pd.api.types.is_bool_dtype(cells.dtype):
+                cells = cells.astype(np.float64)
+            text[i] |= not pd.api.types.is_numeric_dtype(cells.dtype)
+            pieces[i].append(cells.to_numpy())
+    numbers, words, spoilt = {}, {}, {}
+    for i, column in enumerate(header):
+        joined = np.concatenate(pieces[i]) if pieces[i] else np.zeros(0)
+        pieces[i] = []
+        values = pd.to_numeric(pd.Series(joined), errors="coerce") if text[i] and column != clock else None
+        if values is not None and 2 * values.notna().sum() > pd.Series(joined).notna().sum():
+            numbers[column] = values.to_numpy(dtype=np.float64)
+            spoilt[column] = int(pd.Series(joined).notna().sum() - values.notna().sum())
+        elif text[i]:
+            words[column] = joined
+        else:
+            whole = joined.dtype.kind in "iu" and key_of(column).rsplit("_", 1)[-1] in (*_SECONDS, *_NANOSECONDS)
+            numbers[column] = joined if whole else joined.astype(np.float64)
+    return numbers, words, spoilt
+
+
+def _stamp_columns(header: list[str]) -> tuple[str, str] | None:
+    """Columns of a header stamp's seconds and nanoseconds."""
+    keys = {key_of(column): column for column in header}
+    for seconds, rest in zip(_SECONDS, _NANOSECONDS, strict=True):
+        for prefix in ("header_stamp_", "stamp_"):
+            if prefix + seconds in keys and prefix + rest in keys:
+                return keys[prefix + seconds], keys[prefix + rest]
+    return None
+
+
+def _stamps(numbers: dict[str, np.ndarray], columns: tuple[str, str]) -> Stamps | None:
+    """A header stamp from its two columns; None where it is empty."""
+    if any(column not in numbers for column in columns):
+        return None
+    seconds, rest = (numbers[column] for column in columns)
+    if not np.isfinite(seconds).all() or not np.isfinite(rest).all() or not seconds.any():
+        return None
+    ns = seconds.astype(np.int64) * 10**9 + rest.astype(np.int64)
+    dated = parse_numbers(seconds.astype(np.float64)).absolute
+    return Stamps(ns, dated, dated)
+
+
+def _not_numbers(name: str, column: str, cells: np.ndarray) -> Remark:
+    first = str(next((cell for cell in cells if isinstance(cell, str)), ""))
+    kind = "structures" if first.startswith(("{", "[", "(")) else "text"
+    shown = first if len(first) <= 40 else first[:37] + "..."
+    text = f"topic {name}: column '{column}' holds {kind} ('{shown}'), not numbers; it is left out"
+    return remark("note", "not_numbers", text, rows=float(len(cells)))

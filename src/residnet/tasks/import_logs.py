@@ -1,0 +1,111 @@
+"""Task `import`: recordings of any format to canonical logs, with what was noticed on the way in."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field
+
+from residnet.core.config import Config, ConfigPath, dump_config
+from residnet.core.errors import ConfigError, UsageError
+from residnet.core.log import Log
+from residnet.core.names import nearest
+from residnet.data.readers import ReaderConfig
+from residnet.data.readers.files import files_of
+from residnet.run_folder import RunFolder
+
+
+class ImportConfig(Config):
+    """Recordings read once and kept as logs/<name>.parquet; findings.json says what was noticed and mended.
+
+    Attributes:
+        name: of the run.
+        reader: how the recordings are read.
+        root: folder that `logs` start from; the current folder where not given.
+        logs: files, folders (for readers of folders) or patterns such as `raw_*`.
+    """
+
+    task: Literal["import"]
+    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")
+    description: str = ""
+    reader: ReaderConfig
+    root: ConfigPath | None = None
+    logs: tuple[str, ...] = Field(min_length=1)
+
+    def check(self) -> None:
+        """What reading the config does not show: that every pattern matches.
+
+        Raises:
+            ConfigError: where one does not, or two recordings would have one name.
+        """
+        self._paths()
+
+    def run(self, *, source: Path, overrides: Sequence[str], out: Path | None, resume: bool) -> RunFolder:
+        """Read, write logs and findings, print one line for each log and each finding above a note.
+
+        Raises:
+            UsageError: where the run folder exists or a recording, topic or package is missing.
+            DataError: where a recording cannot be used; those before it have been written.
+        """
+        started = time.time()
+        paths = self._paths()
+        folder = RunFolder.create(out or Path("runs") / self.name, dump_config(self), resume=resume)
+        reader = self.reader.build()
+        findings: dict[str, Any] = {}
+        for path in paths:
+            log = reader.read(path)
+            _write(log, folder)
+            findings[log.name] = log.meta.get("findings", [])
+            print("\n".join(_lines(log)), flush=True)
+        folder.write_json(folder.path / "findings.json", findings)
+        folder.write_provenance(
+            config=source, overrides=overrides, seed=0, files=[file for path in paths for file in files_of(path)], started=started
+        )
+        print(f"{folder.path}: {len(paths)} log{'s' if len(paths) > 1 else ''} in {folder.path / 'logs'}, findings in findings.json")
+        return folder
+
+    def _paths(self) -> list[Path]:
+        root = self.root or Path.cwd()
+        found: dict[str, Path] = {}
+        for pattern in self.logs:
+            matches = [root / pattern] if (root / pattern).exists() else _globbed(root, pattern)
+            if not matches:
+                near = nearest(pattern, (path.name for path in root.iterdir())) if root.is_dir() else f"; there is no folder {root}"
+                raise ConfigError(f"logs: '{pattern}' matches nothing in {root}{near}")
+            for path in matches:
+                name = path.name if path.is_dir() else path.stem
+                if found.setdefault(name, path) != path:
+                    raise ConfigError(f"logs: {found[name]} and {path} would both be the log '{name}'; rename one of them")
+        return list(found.values())
+
+
+def _globbed(root: Path, pattern: str) -> list[Path]:
+    try:
+        return sorted(root.glob(pattern))
+    except (ValueError, NotImplementedError) as error:
+        raise ConfigError(f"logs: '{pattern}' is not a pattern relative to {root} ({error}); set `root` instead") from error
+
+
+def _write(log: Log, folder: RunFolder) -> None:
+    place = folder.path / "logs" / f"{log.name}.parquet"
+    place.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        log.save(place)
+    except OSError as error:
+        raise UsageError(f"{place}: cannot be written ({error.strerror})") from error
+
+
+def _lines(log: Log) -> list[str]:
+    """What is printed of one log."""
+    findings = log.meta.get("findings", [])
+    usual = (log.t[-1] - log.t[0]) / (len(log) - 1)
+    lost = sum(int(mask.sum()) for reason, mask in log.masks.items() if reason.startswith("hard:"))
+    head = (
+        f"{log.name}: {len(log)} samples, step {usual:.4g} s, {log.t[-1] - log.t[0]:.1f} s, {len(log.channels)} channels ({', '.join(log.channels)})"
+    )
+    notes = sum(one["level"] == "note" for one in findings)
+    loud = [f"{log.name}: {one['level']}: {one['text']}" for one in findings if one["level"] != "note"]
+    return [f"{head}, {lost} samples in gaps, {notes} notes", *loud]
