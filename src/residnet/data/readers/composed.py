@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from pathlib import Path
 from typing import final
 
@@ -17,10 +16,8 @@ from residnet.data.readers.compose import Plan, compose
 from residnet.data.readers.files import digest
 from residnet.data.readers.messages import standard_plan
 from residnet.data.readers.quantities import ClockConfig, Derived, FieldMap, HeadingConfig, OfTopic, PositionConfig, Uniform, VelocityConfig
-from residnet.data.readers.recording import Recording, same_topic
-
-Wanted = Callable[[str], bool]
-"""Whether a series of this name is to be read."""
+from residnet.data.readers.recording import Recording
+from residnet.data.readers.wanted import CLOCK_ONLY, EVERYTHING, Wanted
 
 
 class RecordingConfig(Config, ABC):
@@ -102,13 +99,13 @@ class RecordingReader(LogReader):
         return log.replace(name=name, manoeuvre=manoeuvre or "unknown", meta=meta)
 
     def _wanted(self) -> Wanted:
+        """What the config names; everything where standard messages may add to it."""
         config = self._config
         if config.standard_messages:
-            return lambda name: True
-        named = [*config.channels.values(), config.position, config.heading, config.velocity, config.clock]
-        topics = [getattr(one, "topic", None) for one in named if one is not None and not isinstance(one, Derived | Uniform)]
-        topics += list(config.delays)
-        if any(topic is None for topic, one in zip(topics, named, strict=False) if not isinstance(one, OfTopic)):
-            return lambda name: True
-        listed = [topic for topic in topics if topic is not None]
-        return lambda name: any(same_topic(topic, [name]) is not None for topic in listed)
+            return EVERYTHING
+        named = [(entry.topic, entry.field) for entry in config.channels.values()]
+        for source in (config.position, config.heading, config.velocity):
+            if source is not None and not isinstance(source, Derived):
+                named += [(source.topic, field) for field in source.fields]
+        clock = [(config.clock.topic, CLOCK_ONLY)] if isinstance(config.clock, OfTopic) and config.clock.topic is not None else []
+        return Wanted([*named, *clock])

@@ -8,6 +8,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Protocol
 
+from residnet.core.errors import UsageError
+
 # recordings below this size are read before a bar would be seen, bytes
 _LARGE = 50_000_000
 
@@ -61,3 +63,8 @@ def progress(what: str, size: int, total: float) -> Iterator[Advance]:
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(what, total=total)
         yield lambda done: bar.update(task, completed=done)
+
+
+def missing_package(extra: str, package: str, what: str) -> UsageError:
+    """The error for a format whose package is not installed."""
+    return UsageError(f'{what} needs the package {package}, which is not installed; install it with: pip install "residnet[{extra}]"')

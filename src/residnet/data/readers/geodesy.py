@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from residnet.core.errors import UsageError
+from residnet.data.readers.files import missing_package
 
 
 def tangent_plane(latitude: np.ndarray, longitude: np.ndarray, latitude_0: float, longitude_0: float) -> tuple[np.ndarray, np.ndarray]:
@@ -24,9 +24,7 @@ def tangent_plane(latitude: np.ndarray, longitude: np.ndarray, latitude_0: float
     try:
         from pyproj import Transformer
     except ImportError as error:
-        raise UsageError(
-            'latitude and longitude need the package pyproj, which is not installed; install it with: pip install "residnet[geo]"'
-        ) from error
+        raise missing_package("geo", "pyproj", "a position in latitude and longitude") from error
     origin = f"+lat_0={float(np.degrees(latitude_0))!r} +lon_0={float(np.degrees(longitude_0))!r} +h_0=0"
     plane = Transformer.from_pipeline(f"+proj=pipeline +step +proj=cart +ellps=WGS84 +step +proj=topocentric +ellps=WGS84 {origin}")
     known = np.isfinite(latitude) & np.isfinite(longitude)

@@ -10,9 +10,11 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import ClassVar, final
 
+import numpy as np
+
 from residnet.core.names import CHANNEL_UNITS
 from residnet.data.readers.compose import Plan
-from residnet.data.readers.quantities import FieldMap, Geodetic, Local, Quaternion
+from residnet.data.readers.quantities import Angle, FieldMap, Geodetic, Local, Quaternion
 from residnet.data.readers.recording import Recording, Series, key_of
 
 _WORLD = ("map", "odom", "earth", "world", "enu", "ned")
@@ -23,6 +25,7 @@ class Message(ABC):
 
     types: ClassVar[tuple[str, ...]]
     signature: ClassVar[tuple[str, ...]]
+    said: ClassVar[str] = "REP-103 (ENU, forward-left-up) to NED, forward-starboard-down"
 
     def fits(self, one: Series) -> bool:
         """Whether a series holds messages of this kind."""
@@ -174,8 +177,36 @@ class Joints(Message):
         return Plan(channels)
 
 
+@final
+class Named(Message):
+    """A table without a type whose fields bear the names of residnet's channels: they are taken to be in SI, NED and body axes."""
+
+    types = ()
+    signature = ()
+    said = "by its names, taken to be in SI, NED and body axes"
+    _enough: ClassVar[int] = 3
+
+    def fits(self, one: Series) -> bool:
+        """See `Message.fits`."""
+        return not one.kind and len(self._names(one)) >= self._enough
+
+    def plan(self, one: Series) -> Plan:
+        """See `Message.plan`."""
+        names = self._names(one)
+        heading = Angle(topic=one.name, field="psi") if "psi" in names else None
+        position = Local(topic=one.name, north="x", east="y") if {"x", "y"} <= set(names) else None
+        taken = {"psi", *(("x", "y") if position else ())}
+        plain = [name for name in names if name not in taken]
+        channels = {name: FieldMap(topic=one.name, field=name, unit=CHANNEL_UNITS[name], hold=name.startswith("cmd_")) for name in plain}
+        return Plan(channels, position, heading)
+
+    @staticmethod
+    def _names(one: Series) -> list[str]:
+        return [name for name in one.fields if name in CHANNEL_UNITS and name != "t" and one[name].size and not np.isnan(one[name]).all()]
+
+
 # in the order in which they are asked: the one that says most first
-MESSAGES: tuple[Message, ...] = (Odometry(), Pose(), Twist(), Imu(), Fix(), Wrench(), Joints(), Number())
+MESSAGES: tuple[Message, ...] = (Odometry(), Pose(), Twist(), Imu(), Fix(), Wrench(), Joints(), Number(), Named())
 
 
 def standard_plan(recording: Recording, declared: Plan) -> Plan:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from residnet.core.errors import DataError, UsageError
+from residnet.core.errors import DataError
 from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS, si_unit, to_si
 from residnet.data.readers.base import unwrap
@@ -239,8 +239,3 @@ def _from_first_circle(psi: np.ndarray) -> np.ndarray:
 
 def _moved(lever: Lever, what: str = "x, y") -> tuple[str, ...]:
     return () if lever == Lever() else (f"{what}: moved to the vessel's centre from ({lever.x:g}, {lever.y:g}) m in body axes",)
-
-
-def missing(extra: str, package: str, what: str) -> UsageError:
-    """The error for a format whose package is not installed."""
-    return UsageError(f'{what} needs the package {package}, which is not installed; install it with: pip install "residnet[{extra}]"')

@@ -72,6 +72,11 @@ class Geodetic(Config):
         factor(unit, "rad")
         return unit
 
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Fields that are read."""
+        return self.latitude, self.longitude
+
 
 @final
 class Local(Config):
@@ -98,6 +103,11 @@ class Local(Config):
         factor(unit, "m")
         return unit
 
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Fields that are read."""
+        return self.north, self.east
+
 
 PositionConfig = Annotated[Geodetic | Local, Field(discriminator="kind")]
 """Where x and y come from."""
@@ -119,6 +129,11 @@ class Quaternion(Config):
     field: str
     frame: Literal["ned", "enu"]
     roll: bool = False
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Fields that are read."""
+        return (self.field,)
 
 
 @final
@@ -145,6 +160,11 @@ class Angle(Config):
     def _angle(cls, unit: str) -> str:
         factor(unit, "rad")
         return unit
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Fields that are read."""
+        return (self.field,)
 
 
 HeadingConfig = Annotated[Quaternion | Angle, Field(discriminator="kind")]
@@ -192,6 +212,11 @@ class EarthFixed(Config):
         factor(unit, "m/s")
         return unit
 
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Fields that are read."""
+        return self.north, self.east
+
 
 @final
 class CourseSpeed(Config):
@@ -213,6 +238,11 @@ class CourseSpeed(Config):
     course_unit: str = "deg"
     speed_unit: str = "m/s"
     antenna: Lever = Field(default_factory=Lever)
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Fields that are read."""
+        return self.course, self.speed
 
 
 VelocityConfig = Annotated[Derived | EarthFixed | CourseSpeed, Field(discriminator="kind")]

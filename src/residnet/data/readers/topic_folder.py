@@ -10,10 +10,11 @@ import numpy as np
 from pydantic import Field
 
 from residnet.core.errors import DataError, UsageError
-from residnet.data.readers.composed import RecordingConfig, Wanted
+from residnet.data.readers.composed import RecordingConfig
 from residnet.data.readers.files import progress, total_size
 from residnet.data.readers.recording import Recording, Remark, Series, key_of, remark
 from residnet.data.readers.stamps import Stamps, parse_numbers, parse_texts
+from residnet.data.readers.wanted import EVERYTHING, Wanted
 
 _ENDINGS = (".csv", ".tsv", ".txt")
 _ARRIVAL = ("time", "Time", "t", "timestamp", "rosbagTimestamp", "%time", "stamp", "date")
@@ -39,7 +40,7 @@ class TopicFolderConfig(RecordingConfig):
         return load_folder(path, wanted, self.time, self.delimiter)
 
 
-def load_folder(path: Path, wanted: Wanted = lambda name: True, time: tuple[str, ...] = _ARRIVAL, delimiter: str = ",") -> Recording:
+def load_folder(path: Path, wanted: Wanted = EVERYTHING, time: tuple[str, ...] = _ARRIVAL, delimiter: str = ",") -> Recording:
     """The recording in a folder of csv files.
 
     Raises:
@@ -68,6 +69,20 @@ def load_folder(path: Path, wanted: Wanted = lambda name: True, time: tuple[str,
     epoch = min((int(stamps.ns.min()) for stamps in dated), default=None)
     whole = None if epoch is None else epoch // 10**9 * 10**9
     return Recording(path, {name: table.series(name, whole) for name, table in raw.items()}, whole, tuple(files), tuple(remarks))
+
+
+def is_topic_folder(path: Path) -> bool:
+    """Whether a folder's csv files are topics of one recording, and not logs of their own: stamped headers, or headers that differ."""
+    if not path.is_dir():
+        return False
+    heads = []
+    for file in sorted(file for file in path.rglob("*") if file.suffix.lower() in _ENDINGS and file.is_file())[:200]:
+        with file.open("rb") as stream:
+            heads.append(stream.readline(10_000).decode("utf-8", errors="replace").strip())
+    full = [head for head in heads if head]
+    stamped = any(_stamp_columns(head.split(",")) is not None for head in full)
+    timed = [head for head in full if set(head.split(",")) & set(_ARRIVAL)]
+    return stamped or (len(timed) > 1 and 2 * len(timed) > len(full) and len(set(timed)) > 1)
 
 
 @final

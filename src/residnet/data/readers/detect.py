@@ -1,0 +1,90 @@
+"""Which reader a file needs, by its content first and its ending second, where no config says so."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from residnet.core.errors import UsageError
+from residnet.core.log import Log
+from residnet.data.readers.base import LogReader, require_file
+from residnet.data.readers.canonical import CanonicalConfig
+from residnet.data.readers.clocks import settle
+from residnet.data.readers.composed import RecordingConfig
+from residnet.data.readers.hdf5 import Hdf5Config, is_hdf5
+from residnet.data.readers.mat import MatConfig
+from residnet.data.readers.recording import Recording
+from residnet.data.readers.rosbag import RosbagConfig
+from residnet.data.readers.topic_folder import TopicFolderConfig, is_topic_folder
+from residnet.data.readers.wanted import EVERYTHING
+
+_MCAP = b"\x89MCAP0\r\n"
+_SQLITE = b"SQLite format 3\x00"
+_MAT5 = b"MATLAB 5.0"
+
+
+@dataclass(frozen=True)
+class Format:
+    """A format of recordings: how it is recognised, and the reader's config with everything left to standard messages."""
+
+    name: str
+    fits: Callable[[Path, bytes], bool]
+    config: Callable[[], RecordingConfig]
+
+
+# in the order in which they are asked: content that cannot be mistaken first, endings last
+FORMATS: tuple[Format, ...] = (
+    Format("ROS 2 bag", lambda path, head: path.is_dir() and (path / "metadata.yaml").is_file(), RosbagConfig),
+    Format("folder of csv files", lambda path, head: is_topic_folder(path), TopicFolderConfig),
+    Format("ROS 1 bag", lambda path, head: head.startswith(b"#ROSBAG"), RosbagConfig),
+    Format("MCAP", lambda path, head: head.startswith(_MCAP), RosbagConfig),
+    Format("ROS 2 bag (SQLite)", lambda path, head: head.startswith(_SQLITE) and path.suffix == ".db3", RosbagConfig),
+    Format("MATLAB", lambda path, head: head.startswith(_MAT5) or path.suffix.lower() == ".mat", MatConfig),
+    Format("HDF5", lambda path, head: is_hdf5(path), Hdf5Config),
+)
+
+
+def format_of(path: Path) -> Format | None:
+    """The format of a recording; None where it is none that describes itself (a csv table, a foreign Parquet file, anything else).
+
+    Raises:
+        UsageError: where there is nothing at `path`.
+    """
+    head = b""
+    if not path.is_dir():
+        require_file(path)
+        with path.open("rb") as stream:
+            head = stream.read(1024)
+    return next((one for one in FORMATS if one.fits(path, head)), None)
+
+
+def reader_for(path: Path) -> LogReader:
+    """A reader for a file or folder that describes itself.
+
+    Raises:
+        UsageError: where there is nothing at `path`, or it needs a channel map.
+    """
+    if Log.recognises(path):
+        return CanonicalConfig().build()
+    return _config_for(path).build()
+
+
+def recording_for(path: Path) -> Recording:
+    """Everything that a file or folder holds, its clocks settled, before it is composed to a log.
+
+    Raises:
+        UsageError: where there is nothing at `path`, or its format describes no channels.
+        DataError: where it cannot be read.
+    """
+    return settle(_config_for(path).load(path, EVERYTHING), {}, None)
+
+
+def _config_for(path: Path) -> RecordingConfig:
+    one = format_of(path)
+    if one is None:
+        known = ", ".join(dict.fromkeys(entry.name for entry in FORMATS))
+        raise UsageError(
+            f"{path}: does not say what its columns are; give a channel map with --config (formats that need none: {known}, canonical Parquet)"
+        )
+    return one.config()

@@ -1,0 +1,177 @@
+"""One simulated trial, written in the formats that boats record, by the libraries of those formats."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pandas as pd
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_typestore
+from scipy.io import savemat
+
+from residnet.core.log import Log
+
+EPOCH = 1_744_362_945
+COMMANDS = ("cmd_port", "cmd_stbd")
+
+
+def trial(seconds: float = 40.0, step: float = 0.1) -> Log:
+    """A manoeuvre with two full turns: closed forms, every channel exact, clock on whole ns."""
+    t = np.arange(round(seconds / step) + 1) * round(step * 1e9) * 1e-9
+    psi = 0.4 + 0.35 * t - 0.3 * np.sin(0.4 * t)
+    u, v = 1.2 + 0.2 * np.sin(0.5 * t), 0.1 * np.cos(0.4 * t)
+    channels = {
+        "x": 12.0 + 9.0 * np.sin(0.3 * t),
+        "y": -7.0 + 9.0 * np.cos(0.3 * t),
+        "psi": psi,
+        "u": u,
+        "v": v,
+        "r": 0.35 - 0.12 * np.cos(0.4 * t),
+        "cmd_port": np.where(np.sin(0.7 * t) > 0, 3.0, -2.0),
+        "cmd_stbd": np.where(np.cos(0.6 * t) > 0, 4.0, 1.0),
+    }
+    return Log("trial", t, channels)
+
+
+def csv(log: Log, folder: Path) -> Path:
+    """A table with every digit."""
+    path = folder / "trial.csv"
+    pd.DataFrame({"t": log.t, **log.channels}).to_csv(path, index=False, float_format="%.17g")
+    return path
+
+
+def parquet(log: Log, folder: Path) -> Path:
+    """A foreign table."""
+    path = folder / "trial.parquet"
+    pd.DataFrame({"t": log.t, **log.channels}).to_parquet(path)
+    return path
+
+
+def mat5(log: Log, folder: Path) -> Path:
+    """A struct in a file of MATLAB 5 to 7."""
+    path = folder / "trial.mat"
+    savemat(path, {"trial": {"t": log.t, **log.channels}, "note": "sea trial"})
+    return path
+
+
+def mat73(log: Log, folder: Path) -> Path:
+    """The same struct as MATLAB 7.3 writes it: HDF5 behind a header of 512 bytes, vectors as rows of one."""
+    path = folder / "trial.mat"
+    with h5py.File(path, "w", userblock_size=512) as file:
+        group = file.create_group("trial")
+        group.attrs["MATLAB_class"] = np.bytes_("struct")
+        for name, values in {"t": log.t, **log.channels}.items():
+            group.create_dataset(name, data=values[None, :]).attrs["MATLAB_class"] = np.bytes_("double")
+    with path.open("r+b") as stream:
+        stream.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM")
+    return path
+
+
+def hdf5(log: Log, folder: Path) -> Path:
+    """Datasets in a group."""
+    path = folder / "trial.h5"
+    with h5py.File(path, "w") as file:
+        for name, values in {"t": log.t, **log.channels}.items():
+            file.create_dataset(f"run/{name}", data=values)
+    return path
+
+
+def hdf5_table(log: Log, folder: Path) -> Path:
+    """One table of named columns."""
+    path = folder / "trial.hdf5"
+    with h5py.File(path, "w") as file:
+        file.create_dataset("table", data=pd.DataFrame({"t": log.t, **log.channels}).to_records(index=False))
+    return path
+
+
+def topics(log: Log, folder: Path) -> Path:
+    """One csv per topic, by REP-103, arrivals in local time two hours ahead of the header stamps."""
+    path = folder / "trial"
+    path.mkdir()
+    ns = _stamps(log)
+    stamp = {"header_stamp_secs": ns // 10**9, "header_stamp_nsecs": ns % 10**9}
+    late = ns + 7200 * 10**9 + 1_000_000
+    time = [f"{pd.Timestamp(int(s), unit='s'):%Y/%m/%d %H:%M:%S}.{int(rest)}" for s, rest in zip(late // 10**9, late % 10**9, strict=True)]
+    pose = {f"pose_pose_position_{k}": v for k, v in zip("xyz", (log["y"], log["x"], 0.0 * log["x"]), strict=True)}
+    pose |= {f"pose_pose_orientation_{k}": v for k, v in zip("xyzw", _quaternion(log), strict=True)}
+    twist = {"twist_twist_linear_x": log["u"], "twist_twist_linear_y": -log["v"], "twist_twist_angular_z": -log["r"]}
+    pd.DataFrame({"time": time, **stamp, **pose, **twist}).to_csv(path / "odometry.csv", index=False, float_format="%.17g")
+    for name in COMMANDS:
+        pd.DataFrame({"time": time, **stamp, "data": log[name]}).to_csv(path / f"{name}.csv", index=False, float_format="%.17g")
+    return path
+
+
+def bag1(log: Log, folder: Path) -> Path:
+    """ROS 1 bag."""
+    path = folder / "trial.bag"
+    store = get_typestore(Stores.ROS1_NOETIC)
+    with Writer1(path) as writer:
+        _messages(log, writer, store, lambda name, kind: writer.add_connection(name, kind, typestore=store), store.serialize_ros1)
+    return path
+
+
+def bag2(log: Log, folder: Path) -> Path:
+    """ROS 2 bag in SQLite."""
+    return _bag2(log, folder / "trial", StoragePlugin.SQLITE3)
+
+
+def bag2_mcap(log: Log, folder: Path) -> Path:
+    """ROS 2 bag in MCAP."""
+    return _bag2(log, folder / "trial", StoragePlugin.MCAP)
+
+
+def mcap(log: Log, folder: Path) -> Path:
+    """The MCAP file alone."""
+    found = next(_bag2(log, folder / "whole", StoragePlugin.MCAP).glob("*.mcap"))
+    return found.rename(folder / "trial.mcap")
+
+
+def _bag2(log: Log, path: Path, plugin: StoragePlugin) -> Path:
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    with Writer2(path, version=9, storage_plugin=plugin) as writer:
+        _messages(log, writer, store, lambda name, kind: writer.add_connection(name, kind, typestore=store), store.serialize_cdr)
+    return path
+
+
+def _messages(log: Log, writer: Any, store: Any, connect: Callable[[str, str], Any], serialize: Callable[[Any, str], Any]) -> None:
+    """Odometry by REP-103 with header stamps, commands as std_msgs/Float64 at the arrival of the odometry."""
+    odometry, number = "nav_msgs/msg/Odometry", "std_msgs/msg/Float64"
+    types = store.types
+    pose = connect("/odometry", odometry)
+    commands = {name: connect(f"/{name}", number) for name in COMMANDS}
+    ns = _stamps(log)
+    qx, qy, qz, qw = _quaternion(log)
+    vector, none = types["geometry_msgs/msg/Vector3"], np.zeros(36)
+    header_type = types["std_msgs/msg/Header"]
+    for i, at in enumerate(ns.tolist()):
+        time = types["builtin_interfaces/msg/Time"](sec=at // 10**9, nanosec=at % 10**9)
+        extra = {"seq": i} if "seq" in header_type.__dataclass_fields__ else {}
+        point = types["geometry_msgs/msg/Point"](x=log["y"][i], y=log["x"][i], z=0.0)
+        turned = types["geometry_msgs/msg/Quaternion"](x=qx[i], y=qy[i], z=qz[i], w=qw[i])
+        twist = types["geometry_msgs/msg/Twist"](linear=vector(log["u"][i], -log["v"][i], 0.0), angular=vector(0.0, 0.0, -log["r"][i]))
+        message = types[odometry](
+            header=header_type(stamp=time, frame_id="odom", **extra),
+            child_frame_id="base_link",
+            pose=types["geometry_msgs/msg/PoseWithCovariance"](types["geometry_msgs/msg/Pose"](point, turned), none),
+            twist=types["geometry_msgs/msg/TwistWithCovariance"](twist, none),
+        )
+        writer.write(pose, at, serialize(message, odometry))
+        for name, connection in commands.items():
+            writer.write(connection, at, serialize(types[number](data=log[name][i]), number))
+
+
+def _stamps(log: Log) -> np.ndarray:
+    """Unix time in ns."""
+    return EPOCH * 10**9 + np.rint(log.t * 1e9).astype(np.int64)
+
+
+def _quaternion(log: Log) -> tuple[np.ndarray, ...]:
+    """Of the heading, counter-clockwise from east; its sign flips wherever the wrapped yaw does."""
+    yaw = np.remainder(np.pi / 2 - log["psi"] + np.pi, 2 * np.pi) - np.pi
+    return 0.0 * yaw, 0.0 * yaw, np.sin(yaw / 2), np.cos(yaw / 2)
