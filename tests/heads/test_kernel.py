@@ -12,6 +12,7 @@ from sklearn.kernel_ridge import KernelRidge
 from sklearn.linear_model import Ridge
 from sklearn.metrics.pairwise import rbf_kernel
 
+from residnet.core.errors import ConfigError, FitError
 from residnet.heads import KernelConfig
 from residnet.heads.kernel import KernelHead
 from residnet.heads.kernel_functions import Polynomial, Rbf, spread_out
@@ -157,3 +158,31 @@ def test_free_runs_are_offered_joint_settings_then_single_steps_around_the_best(
         head.load_state_dict(solution.state, strict=False)
         changed = np.abs(answer(head, NEW) - before).max(0) > 1e-12
         assert changed.tolist() == [p != 1e-4 for p in solution.choice["penalty"]]
+
+
+def test_terms_are_features_too() -> None:
+    first, second = NAMES[0], NAMES[1]
+    terms = (f"{first}|{first}|", f"{first} {second}")
+    head = KernelConfig(kernel=Polynomial(), penalties=(1e-3,), choose="one_step", terms=terms, margin=1.0).build(NAMES)
+    head.calibrate(SAMPLES)
+    head.solve(SAMPLES)
+    low, high = SAMPLES.z.numpy().min(0), SAMPLES.z.numpy().max(0)
+
+    def columns(z: torch.Tensor) -> np.ndarray:
+        x = np.clip(z.numpy(), 2 * low - high, 2 * high - low)
+        return np.column_stack((x, x[:, 0] * np.abs(x[:, 0]), x[:, 0] * x[:, 1]))
+
+    own = columns(SAMPLES.z)
+    truth = KernelRidge(kernel="poly", degree=2, gamma=1.0, coef0=1.0, alpha=1e-3 * len(SAMPLES))
+    truth.fit((own - own.mean(0)) / own.std(0), SAMPLES.target.numpy())
+    np.testing.assert_allclose(answer(head, NEW), truth.predict((columns(NEW) - own.mean(0)) / own.std(0)), atol=1e-10)
+    scripted = torch.jit.script(head)
+    np.testing.assert_array_equal(scripted(NEW, NEW[:, :0])[0], answer(head, NEW))
+
+
+def test_terms_that_say_nothing_are_refused() -> None:
+    head = KernelConfig(terms=("1",)).build(NAMES)
+    with pytest.raises(FitError, match="'1' is constant"):
+        head.calibrate(SAMPLES)
+    with pytest.raises(ConfigError, match="torque"):
+        KernelConfig(terms=("torque^2",)).build(NAMES)

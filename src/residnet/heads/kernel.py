@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, NamedTuple, final
 
 import torch
 from pydantic import Field
-from torch import Tensor
+from torch import Tensor, nn
 
 from residnet.core.errors import FitError
 from residnet.core.samples import Samples
@@ -15,6 +15,7 @@ from residnet.core.solutions import Solution
 from residnet.heads.base import ClosedFormHead, FeatureConfig, Features
 from residnet.heads.kernel_fit import Path
 from residnet.heads.kernel_functions import Polynomial, Rbf
+from residnet.physics.terms import TermLibrary
 
 
 class KernelConfig(FeatureConfig):
@@ -22,6 +23,8 @@ class KernelConfig(FeatureConfig):
 
     Attributes:
         kernel: `rbf` or `polynomial`.
+        terms: further features, made of the others, such as `n|n|`: the kernel of degree p has products of these too. A polynomial of low degree in
+            the revolutions is a poor thrust.
         penalties: candidates, for each sample: the document's lambda (scikit-learn's alpha) is penalty * samples.
         choose: `free_run`, jointly: the setting of the kernel and one penalty for all axes by the error of free runs on validation data, then
             the penalty of each axis in turn for as long as free runs gain, or no residual at all (document 001 section 4, second approach);
@@ -31,6 +34,7 @@ class KernelConfig(FeatureConfig):
 
     kind: Literal["kernel"] = "kernel"
     kernel: Annotated[Rbf | Polynomial, Field(discriminator="kind")] = Field(default_factory=Rbf)
+    terms: tuple[str, ...] = ()
     penalties: tuple[Annotated[float, Field(gt=0)], ...] = Field(default=(1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1), min_length=1)
     choose: Literal["one_step", "free_run"] = "free_run"
     folds: int = Field(default=5, ge=2)
@@ -48,6 +52,38 @@ class _Pick(NamedTuple):
 
 
 @final
+class TermFeatures(nn.Module):
+    """Terms of guarded channels [..., F], standardised on the training data: [..., J]."""
+
+    def __init__(self, terms: Sequence[str], channels: Sequence[str]) -> None:
+        super().__init__()
+        self.library = TermLibrary(terms, channels)
+        self.count = self.library.count
+        self.register_buffer("mean", torch.zeros(self.count, dtype=torch.float64))
+        self.register_buffer("std", torch.ones(self.count, dtype=torch.float64))
+        self.mean: Tensor
+        self.std: Tensor
+
+    def calibrate(self, channels: Tensor) -> None:
+        """Take mean and spread from the training samples of the channels [N, F].
+
+        Raises:
+            FitError: where a term is constant.
+        """
+        values = self.library(channels)
+        std = values.std(0, correction=0)
+        for term, still in zip(self.library.terms, (std <= 1e-9 * (1 + values.mean(0).abs())).tolist(), strict=True):
+            if still:
+                raise FitError(f"feature '{term}' is constant over the training samples; leave it out of `terms`")
+        self.mean.copy_(values.mean(0))
+        self.std.copy_(std)
+
+    def forward(self, channels: Tensor) -> Tensor:
+        """Standardised terms [..., J]."""
+        return (self.library(channels) - self.mean.to(channels.dtype)) / self.std.to(channels.dtype)
+
+
+@final
 class KernelHead(ClosedFormHead):
     """rho [..., 3] = f(standardised features), f in the space of a kernel."""
 
@@ -55,7 +91,8 @@ class KernelHead(ClosedFormHead):
         super().__init__()
         chosen = config.chosen(names)
         self.features = Features(chosen, names, config.margin)
-        self.kernel = config.kernel.build(len(chosen))
+        self.terms = TermFeatures(config.terms, chosen)
+        self.kernel = config.kernel.build(len(chosen) + self.terms.count)
         self.penalties = tuple(sorted(config.penalties))
         self.folds = config.folds
         self.by_free_run = config.choose == "free_run"
@@ -65,10 +102,17 @@ class KernelHead(ClosedFormHead):
     def calibrate(self, samples: Samples) -> None:
         """Take scales and ranges of the features from the samples."""
         self.features.calibrate(samples)
+        if self.terms.count:
+            self.terms.calibrate(self.features.guarded(samples.z))
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Residual [..., 3] at channels z [..., nz]; the memory is empty."""
-        return self.kernel(self.features(z)), s
+        return self.kernel(self.columns(z)), s
+
+    def columns(self, z: Tensor) -> Tensor:
+        """Standardised features and terms [..., F + J]."""
+        x = self.features(z)
+        return x if self.terms.count == 0 else torch.cat((x, self.terms(self.features.guarded(z))), dim=-1)
 
     def freedom(self) -> list[float]:
         """Effective number of parameters of each axis, the trace of the smoother."""
@@ -85,7 +129,7 @@ class KernelHead(ClosedFormHead):
             raise FitError(f"{self.folds} folds need as many manoeuvres, the training data have {groups.numel()}; lower `folds`")
         fold = torch.searchsorted(groups, samples.group) % self.folds
         with torch.no_grad():
-            x = self.features(samples.z)
+            x = self.columns(samples.z)
             paths = self.kernel.paths(x, samples.target, fold, self.folds, [penalty * len(x) for penalty in self.penalties])
         errors = torch.stack([path.errors for path in paths])
         best = errors.flatten(0, 1).argmin(0)
