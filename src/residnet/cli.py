@@ -85,14 +85,17 @@ def evaluate(
 def export(
     folder: RunPath,
     model: Annotated[str, typer.Option("--model", metavar="NAME", help="Name of the model; 'selected' for the one chosen on validation data.")],
-    file_format: Annotated[Literal["torchscript"], typer.Option("--format", help="File format.")] = "torchscript",
+    file_format: Annotated[
+        Literal["torchscript", "feed_forward"],
+        typer.Option("--format", help="torchscript: the model; feed_forward: tau = F(nu_dot, nu) of a model in force space."),
+    ] = "torchscript",
     out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="File to write; RUN/exports/<model>.pt where not given.")] = None,
 ) -> None:
     """Export a model for controllers, after a parity check."""
     from residnet.tasks.exporting import export_model
 
     _limit_threads()
-    print(export_model(folder, model, out))
+    print(export_model(folder, model, out, file_format))
 
 
 @app.command()

@@ -13,11 +13,12 @@ from residnet.baselines.believed import BelievedConfig
 from residnet.control.anticipation import Derivatives, Lag, course, needed_force
 from residnet.core.config import load_config
 from residnet.core.errors import ConfigError, FitError
+from residnet.export.feed_forward import export_feed_forward
 from residnet.physics.force_model import ForceModel
 from residnet.physics.fossen import FossenVessel
 from residnet.physics.vessel import load_vessel
 from residnet.studies.ferry_fit import constant_force, identify
-from residnet.studies.ferry_forward import export_feed_forward, forward_equations
+from residnet.studies.ferry_forward import forward_equations
 from residnet.studies.ferry_runs import MotionNoise
 from residnet.studies.jervan2020 import Study, record_of, study
 from residnet.tasks.ferry_study import FerryStudyConfig

@@ -25,6 +25,10 @@ class Baseline(nn.Module, ABC):
     def freedom(self) -> list[float]:
         """Number of fitted parameters of each axis."""
 
+    def mass(self) -> Tensor | None:
+        """Inertia [3, 3] between forces and accelerations, float64; None where a baseline knows no forces."""
+        return None
+
 
 class IdentifiedConfig(Config, ABC):
     """A kind of baseline and how it is identified."""

@@ -68,6 +68,13 @@ class BelievedBaseline(Baseline):
         """None: nothing was fitted."""
         return [0.0, 0.0, 0.0]
 
+    def mass(self) -> Tensor | None:
+        """Inertia [3, 3]: the inverse of what the forces do to the accelerations; None where that has none."""
+        columns = [self.library.terms.index(name) for name in FORCE_CHANNELS if name in self.library.terms]
+        by_force = self.theta[:, columns].to(torch.float64)
+        invertible = len(columns) == len(FORCE_CHANNELS) and float(torch.linalg.cond(by_force / by_force.abs().amax(0))) < 1e6
+        return torch.linalg.inv(by_force) if invertible else None
+
 
 class BelievedConfig(IdentifiedConfig):
     """The hull of a vessel file with its parameters as they are; nothing is identified.

@@ -81,5 +81,5 @@ def _summed(counts: Sequence[Sequence[float]]) -> list[float]:
 def mean_of(members: Sequence[HybridDynamics]) -> HybridDynamics:
     """The mean of models with the same signals, step and integrator."""
     first = members[0]
-    baseline, head = MeanBaseline([member.baseline for member in members]), MeanHead([member.head for member in members])
+    baseline, head = MeanBaseline([member.head.carried(member.baseline) for member in members]), MeanHead([member.head for member in members])
     return HybridDynamics(first.signals, baseline, head, first.dt, first.integrator)

@@ -1,4 +1,4 @@
-"""The hybrid model: nu_dot = baseline + residual, in acceleration space (document 003 eq. (19))."""
+"""The hybrid model: nu_dot = baseline + residual in acceleration space (document 003 eq. (19)), or through the head's mass in force space."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class HybridDynamics(Dynamics):
 
     def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
         """x_dot [B, 6] from what the step holds fixed: p = signals.prepare(w) and the residual rho [B, 3]."""
-        nu_dot = self.baseline(self.signals(x, p)) + rho
+        nu_dot = self.head.accelerations(self.baseline(self.signals(x, p)), rho)
         return torch.cat((self.kinematics(x), nu_dot), dim=-1)
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
@@ -34,6 +34,11 @@ class HybridDynamics(Dynamics):
         p = self.signals.prepare(w)
         rho, s = self.head(self.signals(x, p), s)
         return self.integrate(x, p, rho), s
+
+    def one_step(self, z: Tensor) -> Tensor:
+        """nu_dot [B, T, 3] along measured channels [B, T, nz], the head's memory empty at first (teacher forcing)."""
+        known, rho = self.baseline(z), self.head.sequence(z)
+        return self.head.accelerations(known, rho)
 
     def warmup(self, y_history: Tensor, w_history: Tensor) -> Tensor:
         """Memory [B, n_state] that a measured past leaves.

@@ -17,7 +17,7 @@ from residnet.core.names import VELOCITY, nearest
 from residnet.dynamics.base import Integrator
 from residnet.dynamics.ensemble import mean_of
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.heads import HeadConfig, ZeroHead
+from residnet.heads import ForceHead, HeadConfig, ZeroHead
 from residnet.physics.signals import SignalsConfig
 
 
@@ -58,7 +58,10 @@ class ModelSpec(Config):
             return mean_of([member.build() for member in self.members])
         signals = self.signals.build()
         head = ZeroHead() if self.head is None else self.head.build(signals.names)
-        return HybridDynamics(signals, self.baseline.build(signals.names), head, self.dt, self.integrator)
+        known = self.baseline.build(signals.names)
+        if isinstance(head, ForceHead):
+            head.stand_on(known.mass())
+        return HybridDynamics(signals, known, head, self.dt, self.integrator)
 
     @property
     def ranges(self) -> dict[str, tuple[float, float]]:
@@ -101,5 +104,3 @@ def load_model(folder: Path) -> tuple[ModelSpec, HybridDynamics]:
 def model_names(folder: Path) -> Sequence[str]:
     """Names of the models in a run's `models` folder."""
     return sorted(path.parent.name for path in folder.glob("*/model.json"))
-
-

@@ -7,6 +7,7 @@ from typing import Annotated
 from pydantic import Field
 
 from residnet.heads.base import ClosedFormHead, EquationHead, ResidualHead
+from residnet.heads.force import ForceHead
 from residnet.heads.genetic import GeneticConfig
 from residnet.heads.kernel import KernelConfig
 from residnet.heads.lstm import LstmConfig
@@ -21,6 +22,7 @@ HeadConfig = Annotated[PlsrConfig | RidgeConfig | KernelConfig | SymbolicConfig 
 __all__ = [
     "ClosedFormHead",
     "EquationHead",
+    "ForceHead",
     "GeneticConfig",
     "HeadConfig",
     "KernelConfig",

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from residnet.core.config import Config
 from residnet.core.errors import ConfigError
-from residnet.core.names import nearest
+from residnet.core.names import ACCELERATION, nearest
 from residnet.core.samples import Samples
 from residnet.core.solutions import Solution
 
@@ -35,6 +35,18 @@ class ResidualHead(nn.Module, ABC):
     def sequence(self, z: Tensor) -> Tensor:
         """Residuals [B, T, 3] along measured channels [B, T, nz], from an empty memory (teacher forcing)."""
         return self.forward(z, z[..., :0])[0]
+
+    def accelerations(self, known: Tensor, rho: Tensor) -> Tensor:
+        """nu_dot [..., 3] from what the baseline says of it and this head's residual, [..., 3] each."""
+        return known + rho
+
+    def lacking(self, of: Samples, known: Tensor) -> Samples:
+        """Samples whose target is what the baseline's accelerations `known` [N, 3] leave, in the space that this head lives in."""
+        return of.with_target(of.target - known)
+
+    def carried(self, baseline: nn.Module) -> nn.Module:
+        """The baseline as this head leaves it, so that nu_dot is its acceleration plus the residual."""
+        return baseline
 
     def warmup(self, z: Tensor) -> Tensor:
         """Memory [B, n_state] that past channels [B, T, nz] leave, oldest first; zeros where T = 0."""
@@ -102,6 +114,8 @@ class FeatureConfig(Config):
             ConfigError: where a feature is no channel.
         """
         for name in self.features:
+            if name in ACCELERATION and name not in names:
+                raise ConfigError(f"head feature '{name}' is an acceleration: only a residual in force space knows it (plsr or ridge, space: force)")
             if name not in names:
                 raise ConfigError(f"head feature '{name}' is not a channel of the model{nearest(name, names)}")
         return self.features or tuple(names)

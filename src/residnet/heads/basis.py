@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import torch
-from pydantic import Field
+from pydantic import Field, model_validator
 from torch import Tensor
 
 from residnet.core.errors import FitError
+from residnet.core.names import ACCELERATION
 from residnet.core.samples import Samples
 from residnet.core.solutions import Solution
 from residnet.heads.base import ClosedFormHead, FeatureConfig, Features
@@ -20,18 +21,28 @@ class BasisConfig(FeatureConfig):
     """Which basis functions.
 
     Attributes:
+        space: what the residual is: `acceleration`, what the baseline leaves of nu_dot; or `force`, tau - F(nu_dot, nu) of a baseline of kind
+            believed, whose features are accelerations and velocities and whose terms are affine in the accelerations.
         terms: basis functions by name (see `residnet.physics.terms`), in units of each feature's spread; empty: all products of the features up
-            to `degree` and x|x| of the velocities.
+            to `degree` and x|x| of the velocities, or in force space the thirty of document 002 (4.12).
         degree: highest degree of the products where `terms` is empty.
         choose: what the complexity is chosen by: `free_run`, error of free runs on validation data, which may find that no residual at all
             is best; or `one_step`, cross-validated error of accelerations.
         folds: folds of the cross-validation; a manoeuvre is never split between folds.
     """
 
+    space: Literal["acceleration", "force"] = "acceleration"
     terms: tuple[str, ...] = ()
     degree: int = Field(default=2, ge=1, le=4)
     choose: Literal["one_step", "free_run"] = "free_run"
     folds: int = Field(default=5, ge=2)
+
+    @model_validator(mode="after")
+    def _space(self) -> Self:
+        named = [term for term in self.terms if any(name in term for name in ACCELERATION)]
+        if self.space == "acceleration" and named:
+            raise ValueError(f"terms: '{named[0]}' names an acceleration, which only a residual in force space may (space: force)")
+        return self
 
 
 class BasisHead(ClosedFormHead):
@@ -66,7 +77,7 @@ class BasisHead(ClosedFormHead):
         """Moments of basis functions and target by fold.
 
         Raises:
-            FitError: with fewer manoeuvres than folds, or fewer samples than basis functions.
+            FitError: with fewer manoeuvres than folds, fewer samples than basis functions, or one that is not finite.
         """
         groups = torch.unique(samples.group)
         if groups.numel() < self.folds:
@@ -74,7 +85,13 @@ class BasisHead(ClosedFormHead):
         if len(samples) <= self.library.count:
             raise FitError(f"{len(samples)} samples do not determine {self.library.count} basis functions; give more data or fewer terms")
         fold = torch.searchsorted(groups, samples.group) % self.folds
-        return FoldMoments.gather(self.basis(samples.z), samples.target, fold, self.folds)
+        chosen = [samples.names.index(name) for name in self.features.names]
+        _require_finite(samples.z[:, chosen], self.features.names, "channel")
+        x = self.basis(samples.z)
+        _require_finite(x, self.library.terms, "basis function")
+        # a column that varies by rounding alone gets no coefficient instead of a huge one
+        constant = x.std(0) <= 1e-9 * x.abs().amax(0)
+        return FoldMoments.gather(x.masked_fill(constant, 0.0), samples.target, fold, self.folds)
 
     def solution(
         self, choice: dict[str, Any], coefficients: Tensor, mean_x: Tensor, mean_y: Tensor, moments: FoldMoments, notes: dict[str, Any] | None = None
@@ -90,6 +107,13 @@ class BasisHead(ClosedFormHead):
     def coefficient_table(self) -> dict[str, list[float]]:
         """Basis function -> its coefficients (u, v, r axis), for features in units of their spread; for the report."""
         return dict(zip(self.library.terms, self.coefficients.tolist(), strict=True))
+
+
+def _require_finite(values: Tensor, names: Sequence[str], what: str) -> None:
+    bad = ~torch.isfinite(values)
+    if bool(bad.any()):
+        row, column = (int(part[0]) for part in bad.nonzero(as_tuple=True))
+        raise FitError(f"{what} '{names[column]}' is not finite at sample {row}; mask or repair the log")
 
 
 class FoldMoments:

@@ -11,7 +11,9 @@ from torch import Tensor
 
 from residnet.core.samples import Samples
 from residnet.core.solutions import Solution
+from residnet.heads.base import ClosedFormHead
 from residnet.heads.basis import BasisConfig, BasisHead
+from residnet.heads.force import in_space
 
 
 def pls_path(xx: Tensor, xy: Tensor, orders: int) -> Tensor:
@@ -73,9 +75,9 @@ class PlsrConfig(BasisConfig):
     order: int | None = Field(default=None, ge=1)
     max_order: int = Field(default=40, ge=1)
 
-    def build(self, names: Sequence[str]) -> PlsrHead:
+    def build(self, names: Sequence[str]) -> ClosedFormHead:
         """The module for channels `names`."""
-        return PlsrHead(self, names)
+        return in_space(self, names, lambda own, channels: PlsrHead(self.model_validate(own), channels))
 
 
 @final

@@ -11,7 +11,9 @@ from torch import Tensor
 
 from residnet.core.samples import Samples
 from residnet.core.solutions import Solution
+from residnet.heads.base import ClosedFormHead
 from residnet.heads.basis import BasisConfig, BasisHead
+from residnet.heads.force import in_space
 
 
 class RidgeConfig(BasisConfig):
@@ -25,9 +27,9 @@ class RidgeConfig(BasisConfig):
     kind: Literal["ridge"] = "ridge"
     penalties: tuple[float, ...] = Field(default=(1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0), min_length=1)
 
-    def build(self, names: Sequence[str]) -> RidgeHead:
+    def build(self, names: Sequence[str]) -> ClosedFormHead:
         """The module for channels `names`."""
-        return RidgeHead(self, names)
+        return in_space(self, names, lambda own, channels: RidgeHead(self.model_validate(own), channels))
 
 
 @final

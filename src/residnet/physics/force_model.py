@@ -102,23 +102,35 @@ class ForceModel(nn.Module):
         return tau - self.at_heading(nu_dot, nu, psi)
 
 
-def augmented(mass: Tensor, terms: Sequence[str], coefficients: Tensor, who: str) -> tuple[Tensor, list[int]]:
+def accelerating(terms: Sequence[str], names: Sequence[str] = MOTION) -> dict[int, int]:
+    """Numbers of the terms that are an acceleration, each with its axis; the others are free of accelerations.
+
+    Raises:
+        ConfigError: where a term is not affine in nu_dot with a constant factor.
+    """
+    out: dict[int, int] = {}
+    for j, term in enumerate(terms):
+        factors = parse_term(term, names)
+        moving = [factor for factor in factors if factor.name in ACCELERATION]
+        if not moving:
+            continue
+        if len(factors) > 1 or moving[0].magnitude or moving[0].power != 1 or moving[0].function:
+            raise ConfigError(f"term '{term}': a force-space model that runs forward names accelerations only by themselves (u_dot, v_dot, r_dot)")
+        out[j] = ACCELERATION.index(moving[0].name)
+    return out
+
+
+def augmented(mass: Tensor, terms: Sequence[str], coefficients: Tensor, who: str, names: Sequence[str] = MOTION) -> tuple[Tensor, list[int]]:
     """M + A [3, 3] of eps = A nu_dot + b(nu), and the numbers of the terms that make b.
 
     Raises:
         ConfigError: where a term is not affine in nu_dot with a constant factor.
         FitError: where M + A has an eigenvalue whose real part is not positive, or is ill-conditioned: the model cannot run forward.
     """
-    total, rest = mass.clone(), []
-    for j, term in enumerate(terms):
-        factors = parse_term(term, MOTION)
-        moving = [factor for factor in factors if factor.name in ACCELERATION]
-        if not moving:
-            rest.append(j)
-        elif len(factors) == 1 and not moving[0].magnitude and moving[0].power == 1 and not moving[0].function:
-            total[:, ACCELERATION.index(moving[0].name)] += coefficients[j]
-        else:
-            raise ConfigError(f"term '{term}': a force-space model that runs forward names accelerations only by themselves (u_dot, v_dot, r_dot)")
+    moving = accelerating(terms, names)
+    total, rest = mass.clone(), [j for j in range(len(terms)) if j not in moving]
+    for j, axis in moving.items():
+        total[:, axis] += coefficients[j]
     scale = mass.diagonal().abs().sqrt()
     values, condition = torch.linalg.eigvals(total).real, float(torch.linalg.cond(total / torch.outer(scale, scale)))
     if bool((values <= 0).any()) or not condition < 1e4:

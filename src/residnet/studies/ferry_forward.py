@@ -1,19 +1,15 @@
-"""Force-space models that run forward in time, and as TorchScript for a controller's feed-forward (document 002 eqs. (3.22), (3.24))."""
+"""Force-space models that run forward in time (document 002 eq. (3.22))."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from residnet.baselines.believed import BelievedConfig, HullEquations
-from residnet.core.errors import ExportError
 from residnet.core.names import VELOCITY
-from residnet.physics.force_model import MOTION, Correction, ForceModel, augmented
+from residnet.physics.force_model import Correction, ForceModel, augmented
 from residnet.physics.signals import FORCE_CHANNELS
 
 
@@ -48,56 +44,6 @@ def forward_equations(believed: str, model: ForceModel, who: str) -> HullEquatio
         table[term] = table.get(term, torch.zeros(3, dtype=torch.float64)) - inverse @ force
     by_axis = [{term: float(value[axis]) for term, value in table.items() if float(value[axis]) != 0.0} for axis in range(3)]
     return HullEquations(u=by_axis[0], v=by_axis[1], r=by_axis[2])
-
-
-class ExportedFeedForward(nn.Module):
-    """tau [B, 3] = F(nu_dot [B, 3], nu [B, 3]), float64, SI."""
-
-    def __init__(self, model: ForceModel) -> None:
-        super().__init__()
-        self.model = model
-
-    def forward(self, nu_dot: Tensor, nu: Tensor) -> Tensor:
-        """What the motion needs."""
-        force: Tensor = self.model(nu_dot, nu)
-        return force
-
-
-def export_feed_forward(model: ForceModel, lag: dict[str, float] | None, ranges: Sequence[tuple[float, float]], file: Path) -> None:
-    """Write F(nu_dot, nu) as TorchScript with its card.
-
-    Args:
-        model: of the vessel.
-        lag: of the thrusters, for the card; None where it was not fitted.
-        ranges: of nu_dot and nu in the training data, six.
-        file: where to write.
-
-    Raises:
-        ExportError: where the exported module differs from the model.
-    """
-    import warnings
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        scripted: Any = torch.jit.freeze(torch.jit.script(ExportedFeedForward(model).eval()))
-        low, high = torch.tensor(ranges, dtype=torch.float64).T
-        motion = low + torch.rand(200, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * (high - low)
-        with torch.no_grad():
-            mine, theirs = model(motion[:, :3], motion[:, 3:]), scripted(motion[:, :3], motion[:, 3:])
-        share = float(((mine - theirs).abs().amax(0) / (mine.amax(0) - mine.amin(0))).max())
-        if not share < 1e-9:
-            raise ExportError(f"{file.name}: the exported feed-forward differs from the model by {share:.1e} of its range; allowed 1e-9")
-        card = {
-            "schema": "residnet.feed_forward/1",
-            "arguments": {"nu_dot": ["u_dot m/s^2", "v_dot m/s^2", "r_dot rad/s^2"], "nu": ["u m/s", "v m/s", "r rad/s"]},
-            "returns": ["tau_x N", "tau_y N", "tau_n N m"],
-            "training_range": {name: list(limits) for name, limits in zip(MOTION, ranges, strict=True)},
-            "thruster_lag": lag,
-            "parity_share_of_range": share,
-            "safety": "TorchScript is code that runs when loaded: load only files that you trust.",
-        }
-        file.parent.mkdir(parents=True, exist_ok=True)
-        torch.jit.save(scripted, str(file), _extra_files={"card.json": json.dumps(card, indent=1)})
 
 
 def as_vessel_lines(equations: HullEquations, who: str) -> str:

@@ -13,12 +13,13 @@ from residnet.core.errors import FitError
 from residnet.evaluation.figures_force import draw_surface, draw_weights
 from residnet.evaluation.still_fits import Verdict, still_fits
 from residnet.evaluation.tracking import mse
+from residnet.export.feed_forward import export_feed_forward
 from residnet.heads.regressions import SurfaceRegression
 from residnet.physics.force_model import ForceModel
 from residnet.run_folder import RunFolder
 from residnet.studies.ferry_config import FerrySettings
 from residnet.studies.ferry_fit import FerryModel, Published, Record, identify, remaining
-from residnet.studies.ferry_forward import as_vessel_lines, export_feed_forward, forward_equations
+from residnet.studies.ferry_forward import as_vessel_lines, forward_equations
 from residnet.studies.ferry_runs import Flight, MotionNoise
 from residnet.studies.ferry_text import coefficients_text, notes_text
 

@@ -17,7 +17,7 @@ from residnet.data.simulate import SimulatedTrials
 from residnet.data.sources import DataConfig, MeasuredLogs
 from residnet.dynamics.base import Integrator
 from residnet.evaluation.config import EvaluationConfig
-from residnet.heads import HeadConfig
+from residnet.heads import ForceHead, HeadConfig
 from residnet.physics.signals import SignalsConfig
 from residnet.studies import StudyName
 from residnet.training.config import TrainingConfig
@@ -105,6 +105,13 @@ class FitConfig(Config):
                 part.build(names)
             except ConfigError as error:
                 raise ValueError(f"{key}: {error}") from None
+        for key, config in self.heads.items():
+            head, below = config.build(names), baselines[self.base_of.get(key, "baseline")].build(names)
+            try:
+                if isinstance(head, ForceHead):
+                    head.stand_on(below.mass())
+            except ConfigError as error:
+                raise ValueError(f"heads.{key}: {error}") from None
         if self.current is not None:
             _known("current.baseline", (self.current.baseline,), baselines, "baseline")
             if not isinstance(baselines[self.current.baseline].build(names), RegressorBaseline):

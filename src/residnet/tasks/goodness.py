@@ -48,7 +48,7 @@ def _residuals(model: HybridDynamics, log: Prepared) -> list[np.ndarray]:
     with torch.no_grad():
         x, w = torch.from_numpy(np.nan_to_num(log.smooth))[None], torch.from_numpy(np.nan_to_num(log.recorded))[None]
         z = model.signals(x, model.signals.prepare(w))
-        said = (model.baseline(z) + model.head.sequence(z))[0].numpy()
+        said = model.one_step(z)[0].numpy()
     return [log.nu_dot[a:b] - said[a:b] for a, b in _bounds(log)]
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from residnet.baselines import Baseline, BaselineConfig, Coefficient, RegressorBaseline, StillConfig
-from residnet.core.errors import DataError
+from residnet.core.errors import DataError, FitError
 from residnet.core.log import Log
 from residnet.core.names import ACCELERATION, VELOCITY
 from residnet.core.samples import Samples
@@ -186,11 +186,14 @@ class Fitter:
         torch.manual_seed(seed)
         model = spec.build()
         model.baseline.load_state_dict(copy.deepcopy(baseline.baseline.state_dict()))
-        residual = self.residual(baseline, self.samples)
+        residual = self.residual(model, self.samples)
         started = time.perf_counter()
         if isinstance(model.head, ClosedFormHead):
             model.head.calibrate(residual)
-            chosen, tried = choose(model, model.head, model.head.solutions(residual), self.bench)
+            try:
+                chosen, tried = choose(model, model.head, model.head.solutions(residual), self.bench)
+            except FitError as error:
+                raise FitError(f"head {name}: {error}") from None
             notes = chosen.choice | chosen.notes | tried
         else:
             notes = self._train(name, model, residual, seed)
@@ -203,10 +206,10 @@ class Fitter:
         model = mean_of([copy.deepcopy(member.model).to(torch.float64) for member in members])
         return self._keep(Fitted(spec, model, {"members": [member.spec.name for member in members], "validation": self.bench(model)}))
 
-    def residual(self, baseline: HybridDynamics, of: Samples) -> Samples:
-        """Samples whose target is what the baseline leaves of the acceleration (document 003 eq. (19))."""
+    def residual(self, model: HybridDynamics, of: Samples) -> Samples:
+        """Samples whose target is what a model's baseline leaves of the acceleration (document 003 (19)) or the force (document 002 (3.20))."""
         with torch.no_grad():
-            return of.with_target(of.target - baseline.baseline(of.z))
+            return model.head.lacking(of, model.baseline(of.z))
 
     def _train(self, name: str, model: HybridDynamics, residual: Samples, seed: int) -> dict[str, Any]:
         from residnet.training.trainer import train
@@ -241,7 +244,8 @@ def write_residuals(file: Path, fitter: Fitter, fitted: Sequence[Fitted], logs: 
             with torch.no_grad():
                 x, w = torch.from_numpy(np.nan_to_num(log.smooth))[None], torch.from_numpy(np.nan_to_num(log.w))[None]
                 z = model.signals(x, model.signals.prepare(w))
-                said, known = model.head.sequence(z)[0].numpy(), model.baseline(z)[0].numpy()
+                known = model.baseline(z)[0].numpy()
+                said = model.one_step(z)[0].numpy() - known
             pairs.append(np.stack((log.nu_dot - known, said), axis=-1)[log.good])
         joined = np.concatenate(pairs)
         joined = joined[:: max(len(joined) // most, 1)]

@@ -21,7 +21,7 @@ def one_step_loss(model: HybridDynamics, y: Tensor, w: Tensor, nu_dot: Tensor, g
         spread: of the residual, [3].
     """
     z = model.signals(y, model.signals.prepare(w))
-    error = (nu_dot - model.baseline(z) - model.head.sequence(z)) / spread
+    error = (nu_dot - model.one_step(z)) / spread
     weight = good.to(error.dtype).unsqueeze(-1)
     return (error.square() * weight).sum() / (3.0 * weight.sum()).clamp(min=1.0)
 

@@ -1,0 +1,86 @@
+"""Export of a force-space model as a controller's feed-forward tau = F(nu_dot, nu) (document 002 eq. (3.24)), as TorchScript."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, final
+
+import torch
+from torch import Tensor, nn
+
+from residnet.core.errors import ExportError, UsageError
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.store import ModelSpec
+from residnet.heads import ForceHead
+from residnet.physics.force_model import MOTION
+from residnet.physics.signals import FORCE_CHANNELS
+
+
+@final
+class RequiredForce(nn.Module):
+    """tau [B, 3] = F(nu_dot [B, 3], nu [B, 3]) of a hybrid model in force space: M (nu_dot - nu_dot_0 without forces) + eps, float64, SI."""
+
+    def __init__(self, baseline: nn.Module, head: ForceHead) -> None:
+        super().__init__()
+        self.baseline, self.head = baseline, head
+
+    def forward(self, nu_dot: Tensor, nu: Tensor) -> Tensor:
+        """What the motion needs."""
+        z = torch.cat((nu, torch.zeros_like(nu)), dim=-1)
+        known: Tensor = self.baseline(z)
+        force: Tensor = (nu_dot - known) @ self.head.mass.to(nu.dtype).T + self.head.force(nu_dot, z)
+        return force
+
+
+def required_force(spec: ModelSpec, model: HybridDynamics) -> tuple[RequiredForce, list[tuple[float, float]]]:
+    """The feed-forward of a model, with the ranges of nu_dot and nu that it was fitted on.
+
+    Raises:
+        UsageError: where the model is not in force space, or its inputs are not the forces.
+    """
+    head = model.head
+    if not isinstance(head, ForceHead):
+        raise UsageError(f"model {spec.name}: no residual in force space, so no feed-forward; fit a head of kind plsr or ridge with space: force")
+    if spec.signals.columns != FORCE_CHANNELS:
+        raise UsageError(f"model {spec.name}: a feed-forward needs the inputs {', '.join(FORCE_CHANNELS)}, in this order, and no others")
+    model = model.to(torch.float64)
+    ranges = list(zip((*head.lowest.tolist(), *spec.low[:3]), (*head.highest.tolist(), *spec.high[:3]), strict=True))
+    return RequiredForce(model.baseline, head).eval().requires_grad_(False), ranges
+
+
+def export_feed_forward(model: nn.Module, lag: dict[str, float] | None, ranges: Sequence[tuple[float, float]], file: Path) -> None:
+    """Write F(nu_dot, nu) as TorchScript with its card.
+
+    Args:
+        model: tau [B, 3] from nu_dot and nu [B, 3].
+        lag: of the thrusters, for the card; None where it was not fitted.
+        ranges: of nu_dot and nu in the training data, six.
+        file: where to write.
+
+    Raises:
+        ExportError: where the exported module differs from the model.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        scripted: Any = torch.jit.freeze(torch.jit.script(model.eval()))
+        low, high = torch.tensor(ranges, dtype=torch.float64).T
+        motion = low + torch.rand(200, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * (high - low)
+        with torch.no_grad():
+            mine, theirs = model(motion[:, :3], motion[:, 3:]), scripted(motion[:, :3], motion[:, 3:])
+        share = float(((mine - theirs).abs().amax(0) / (mine.amax(0) - mine.amin(0))).max())
+        if not share < 1e-9:
+            raise ExportError(f"{file.name}: the exported feed-forward differs from the model by {share:.1e} of its range; allowed 1e-9")
+        card = {
+            "schema": "residnet.feed_forward/1",
+            "arguments": {"nu_dot": ["u_dot m/s^2", "v_dot m/s^2", "r_dot rad/s^2"], "nu": ["u m/s", "v m/s", "r rad/s"]},
+            "returns": ["tau_x N", "tau_y N", "tau_n N m"],
+            "training_range": {name: list(limits) for name, limits in zip(MOTION, ranges, strict=True)},
+            "thruster_lag": lag,
+            "parity_share_of_range": share,
+            "safety": "TorchScript is code that runs when loaded: load only files that you trust.",
+        }
+        file.parent.mkdir(parents=True, exist_ok=True)
+        torch.jit.save(scripted, str(file), _extra_files={"card.json": json.dumps(card, indent=1)})

@@ -1,0 +1,148 @@
+"""Residuals in force space: eps = tau - F(nu_dot, nu) of a believed hull (document 002 (3.19)-(3.24)), affine in nu_dot to run forward."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import final
+
+import torch
+from torch import Tensor, nn
+
+from residnet.core.errors import ConfigError, FitError
+from residnet.core.names import ACCELERATION
+from residnet.core.samples import Samples
+from residnet.core.solutions import Solution
+from residnet.heads.base import ClosedFormHead
+from residnet.heads.basis import BasisConfig, BasisHead
+from residnet.physics.force_model import FERRY_TERMS, MOTION, accelerating, augmented
+
+
+def in_space(config: BasisConfig, names: Sequence[str], make: Callable[[BasisConfig, Sequence[str]], BasisHead]) -> ClosedFormHead:
+    """A head of basis functions in the space that its config names.
+
+    Raises:
+        ConfigError: where a term is not understood, or in force space not affine in the accelerations.
+    """
+    if config.space == "acceleration":
+        return make(config, names)
+    own = config.model_copy(update={"features": config.features or MOTION, "terms": config.terms or FERRY_TERMS})
+    return ForceHead(make(own, (*ACCELERATION, *names)))
+
+
+@final
+class ForceHead(ClosedFormHead):
+    """eps = A nu_dot + b(z), a force, by a head of basis functions over accelerations and channels.
+
+    Every stage of the integrator solves (M + A) nu_dot = tau - C nu - D nu - b: with the believed baseline's acceleration nu_dot_0 this is
+    nu_dot = (M + A)^-1 M nu_dot_0 - (M + A)^-1 b, of which b is evaluated once per step.
+    """
+
+    def __init__(self, inner: BasisHead) -> None:
+        super().__init__()
+        self.inner = inner
+        self.seen = inner.features.names
+        self.moving = accelerating(inner.library.terms, self.seen)
+        self.register_buffer("mass", torch.eye(3, dtype=torch.float64))
+        self.register_buffer("inverse", torch.eye(3, dtype=torch.float64))
+        self.register_buffer("gain", torch.eye(3, dtype=torch.float64))
+        self.register_buffer("lowest", torch.zeros(3, dtype=torch.float64))
+        self.register_buffer("highest", torch.zeros(3, dtype=torch.float64))
+        self.mass: Tensor
+        self.inverse: Tensor
+        self.gain: Tensor
+        self.lowest: Tensor
+        self.highest: Tensor
+
+    def stand_on(self, mass: Tensor | None) -> None:
+        """Take the believed mass [3, 3].
+
+        Raises:
+            ConfigError: where the baseline has none.
+        """
+        if mass is None:
+            raise ConfigError("space: force needs a baseline that knows its mass and the forces on it; set its kind to 'believed'")
+        self.mass.copy_(mass)
+        self.inverse.copy_(torch.linalg.inv(mass))
+
+    def lacking(self, of: Samples, known: Tensor) -> Samples:
+        """Samples over accelerations and channels whose target is the lack-of-fit tau - F(nu_dot, nu) = M (nu_dot_0 - nu_dot) (3.20)."""
+        force = (known - of.target) @ self.mass.T
+        return Samples(torch.cat((of.target, of.z), dim=-1), force, of.group, of.t, of.kinds, (*ACCELERATION, *of.names))
+
+    def calibrate(self, samples: Samples) -> None:
+        """Take scales and ranges of the features from the samples; accelerations are solved for and never held."""
+        self.inner.calibrate(samples)
+        moved = samples.z[:, :3]
+        self.lowest.copy_(moved.amin(0))
+        self.highest.copy_(moved.amax(0))
+        for place, name in enumerate(self.seen):
+            if name in ACCELERATION:
+                self.inner.features.low[place], self.inner.features.high[place] = -torch.inf, torch.inf
+
+    def solutions(self, samples: Samples) -> list[Solution]:
+        """Those of the basis functions that can run forward.
+
+        Raises:
+            FitError: where none can, or the data do not determine any.
+        """
+        found, refused = [], list[FitError]()
+        for solution in self.inner.solutions(samples):
+            try:
+                found.append(self._carried(solution))
+            except FitError as error:
+                refused.append(error)
+        if refused and not any(bool(solution.state["inner.coefficients"].any()) for solution in found):
+            raise refused[0]
+        return found
+
+    def _carried(self, solution: Solution) -> Solution:
+        """A solution with the mass that it makes, in the names of this head's numbers."""
+        coefficients = solution.state["coefficients"].clone()
+        for j, axis in self.moving.items():
+            coefficients[j] /= self.inner.features.std[self.seen.index(ACCELERATION[axis])]
+        total, _ = augmented(self.mass, self.inner.library.terms, coefficients, "residual in force space", self.seen)
+        inverse = torch.linalg.inv(total)
+        state = {f"inner.{name}": value for name, value in solution.state.items()} | {"inverse": inverse, "gain": inverse @ self.mass}
+        return Solution(solution.choice, state, notes=solution.notes | {"space": "force", "augmented_mass": total.tolist()})
+
+    def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """What the residual's part without accelerations does to nu_dot, -(M + A)^-1 b [..., 3], at channels z [..., nz]; the memory is empty."""
+        b, s = self.inner(torch.cat((torch.zeros_like(z[..., :3]), z), dim=-1), s)
+        return -(b @ self.inverse.to(z.dtype).T), s
+
+    def accelerations(self, known: Tensor, rho: Tensor) -> Tensor:
+        """nu_dot [..., 3] from the believed one and the residual's part without accelerations [..., 3]."""
+        return known @ self.gain.to(known.dtype).T + rho
+
+    def force(self, nu_dot: Tensor, z: Tensor) -> Tensor:
+        """eps [..., 3] in N, N, N m at accelerations [..., 3] and channels z [..., nz]."""
+        out: Tensor = self.inner(torch.cat((nu_dot, z), dim=-1), z[..., :0])[0]
+        return out
+
+    def carried(self, baseline: nn.Module) -> nn.Module:
+        """The baseline with the mass that this head gives it."""
+        return CarriedBaseline(baseline, self.gain)
+
+    def freedom(self) -> list[float]:
+        """Number of fitted parameters of each axis."""
+        return self.inner.freedom()
+
+
+@final
+class CarriedBaseline(nn.Module):
+    """A baseline's acceleration [..., 3] under another mass: (M + A)^-1 M nu_dot_0."""
+
+    def __init__(self, baseline: nn.Module, gain: Tensor) -> None:
+        super().__init__()
+        self.baseline = baseline
+        self.register_buffer("gain", gain.clone())
+        self.gain: Tensor
+
+    def forward(self, z: Tensor) -> Tensor:
+        """nu_dot [..., 3] at channels z [..., nz]."""
+        known: Tensor = self.baseline(z)
+        return known @ self.gain.to(z.dtype).T
+
+    def freedom(self) -> list[float]:
+        """The baseline's."""
+        return self.baseline.freedom()  # type: ignore[operator]
