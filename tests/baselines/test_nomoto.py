@@ -16,7 +16,6 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.heads import ZeroHead
 from residnet.physics.signals import SignalsConfig
-from residnet.tasks.pipeline import moved
 
 NAMES = ("u", "v", "r", "n", "delta")
 LAGS = {"T_u": 8.0, "K_u": 0.09, "b_u": -0.02, "T": 4.0, "K": 0.3, "b": 0.01}
@@ -111,11 +110,15 @@ def test_parameters_follow_moved_coefficients() -> None:
     with torch.no_grad():
         baseline.theta[2, terms.index("r")] = -0.5
         baseline.theta[2, terms.index("delta")] = 0.4
-    after = {(c.axis, c.term): c.value for c in moved(table, baseline)}
+    errors = torch.full((baseline.movable().numel(),), 0.125, dtype=torch.float64)
+    restated = baseline.restated(table, errors)
+    after = {(c.axis, c.term): c.value for c in restated}
     assert after["r_dot", "T"] == pytest.approx(2.0)
     assert after["r_dot", "K"] == pytest.approx(0.8)
     assert after["r_dot", "r"] == -0.5
-    assert [c.error for c in moved(table, baseline)] == [c.error for c in table]
+    before = [c.error for c in table if c.ratio is not None]
+    assert [c.error for c in restated if c.ratio is not None] == before
+    assert [c.error for c in restated if (c.axis, c.term) == ("r_dot", "r")] == [0.125]
 
 
 def test_other_channels_and_manoeuvres() -> None:

@@ -48,7 +48,7 @@ def smoothed() -> list[Prepared]:
 def test_free_runs_on_fresh_data_improve_on_biased_least_squares(smoothed: list[Prepared], terms: Sequence[str]) -> None:
     model, known, store = fitted(terms, smoothed)
     before, start = free_run_error(copy.deepcopy(model)), theta_of(model).detach().clone()
-    notes = refit(model, known, store, RefitConfig(horizon=8.0, every=4.0, prior=1e-4), SCALES)
+    notes = refit(model, known, store, RefitConfig(horizon=8.0, every=4.0, prior=1e-4), SCALES).notes
     assert notes["cost_after"] < notes["cost_before"]
     assert notes["iterations"] >= 1
     after = free_run_error(model)
@@ -65,7 +65,7 @@ def test_a_strong_prior_holds_least_squares(smoothed: list[Prepared]) -> None:
 
 def test_windows_are_laid_every_so_often(smoothed: list[Prepared]) -> None:
     model, known, store = fitted(LINEAR, smoothed)
-    notes = refit(model, known, store, RefitConfig(horizon=8.0, every=4.0, iterations=1), SCALES)
+    notes = refit(model, known, store, RefitConfig(horizon=8.0, every=4.0, iterations=1), SCALES).notes
     steps, every, count = 80, 40, 0
     for log in smoothed:
         for k in range(0, len(log) - steps, every):
@@ -99,9 +99,15 @@ def windy() -> tuple[HybridDynamics, module._Problem]:
         start=torch.from_numpy(random.normal(size=count) * 0.1),
         pull=torch.from_numpy(random.uniform(0, 0.1, size=count)),
         active=active,
+        believed=torch.from_numpy(random.normal(size=count) * 0.1),
+        belief=torch.from_numpy(random.uniform(0, 50, size=count)),
+        count=7.0,
         robust=0.05,
     )
     return model, problem
+
+
+LEVEL = torch.tensor(0.3, dtype=torch.float64)
 
 
 def with_step(model: HybridDynamics, problem: module._Problem, place: int, step: float) -> float:
@@ -110,14 +116,14 @@ def with_step(model: HybridDynamics, problem: module._Problem, place: int, step:
     assert isinstance(other.baseline, RegressorBaseline)
     with torch.no_grad():
         other.baseline.theta.view(-1)[problem.active[place]] += step
-    return float(module._cost(other, problem, other.baseline))
+    return float(module._level(other, problem) + module._prior_cost(problem, other.baseline, problem.share(LEVEL)))
 
 
 def test_normal_equations_hold_half_the_gradient_of_the_cost() -> None:
     """With m the mean square error of a window, d sqrt(m + c^2) = dm / (2 sqrt(m + c^2)); the prior's d (t'Pt) = 2 P t: half of both is returned."""
     model, problem = windy()
     assert isinstance(model.baseline, RegressorBaseline)
-    hessian, gradient = module._normal_equations(model, problem, model.baseline)
+    hessian, gradient = module._normal_equations(model, problem, model.baseline, LEVEL)
     step = 1e-5
     central = [(with_step(model, problem, i, step) - with_step(model, problem, i, -step)) / (2 * step) for i in range(len(gradient))]
     torch.testing.assert_close(2.0 * gradient, torch.tensor(central, dtype=torch.float64), rtol=1e-6, atol=1e-8)
@@ -135,9 +141,15 @@ def test_hessian_is_half_that_of_the_cost_where_the_errors_vanish() -> None:
         for k in range(problem.w.shape[1]):
             x = module._euler(model, x, model.signals.prepare(problem.w[:, k]))
             exact.append(x[:, 3:])
-    fields = {**vars(problem), "nu": torch.stack(exact, dim=1), "precision": 0 * problem.precision, "pull": 0 * problem.pull}
+    fields = {
+        **vars(problem),
+        "nu": torch.stack(exact, dim=1),
+        "precision": 0 * problem.precision,
+        "pull": 0 * problem.pull,
+        "belief": 0 * problem.belief,
+    }
     perfect = module._Problem(**fields)
-    hessian, gradient = module._normal_equations(model, perfect, model.baseline)
+    hessian, gradient = module._normal_equations(model, perfect, model.baseline, LEVEL)
     torch.testing.assert_close(gradient, torch.zeros_like(gradient), rtol=0, atol=1e-14)
     step = 3e-6
     centre = with_step(model, perfect, 0, 0.0)
@@ -190,6 +202,6 @@ def test_nothing_moves_from_the_truth_without_noise() -> None:
     model, known, store = fitted(QUADRATIC, logs)
     with torch.no_grad():
         theta_of(model).copy_(theta_of(truth()))
-    notes = refit(model, known, store, RefitConfig(horizon=8.0, every=4.0, robust=1e-3), SCALES)
+    notes = refit(model, known, store, RefitConfig(horizon=8.0, every=4.0, robust=1e-3), SCALES).notes
     assert notes["cost_after"] <= notes["cost_before"] < 0.05
     assert free_run_error(model) < 0.05

@@ -6,17 +6,18 @@ from typing import Annotated
 
 from pydantic import Field
 
-from residnet.baselines.base import Baseline
+from residnet.baselines.base import Baseline, ParametricBaseline
 from residnet.baselines.believed import BelievedConfig
 from residnet.baselines.equations import EquationsConfig
 from residnet.baselines.linear_steady import LinearSteadyConfig
+from residnet.baselines.mmg import MMGBaseline, MMGConfig
 from residnet.baselines.nomoto import NomotoConfig, NomotoSideslipConfig
 from residnet.baselines.regressors import RegressorBaseline, RegressorsConfig
 from residnet.baselines.still import StillConfig
 from residnet.core.solutions import Coefficient
 
 BaselineConfig = Annotated[
-    BelievedConfig | EquationsConfig | LinearSteadyConfig | NomotoConfig | NomotoSideslipConfig | RegressorsConfig | StillConfig,
+    BelievedConfig | EquationsConfig | LinearSteadyConfig | MMGConfig | NomotoConfig | NomotoSideslipConfig | RegressorsConfig | StillConfig,
     Field(discriminator="kind"),
 ]
 
@@ -27,8 +28,11 @@ __all__ = [
     "Coefficient",
     "EquationsConfig",
     "LinearSteadyConfig",
+    "MMGBaseline",
+    "MMGConfig",
     "NomotoConfig",
     "NomotoSideslipConfig",
+    "ParametricBaseline",
     "RegressorBaseline",
     "RegressorsConfig",
     "StillConfig",

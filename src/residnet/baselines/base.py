@@ -30,6 +30,42 @@ class Baseline(nn.Module, ABC):
         return None
 
 
+class ParametricBaseline(Baseline, ABC):
+    """A baseline of which all that was fitted stands in `theta`, so that its parameters can be moved through free runs and drawn at random.
+
+    Args:
+        theta: numbers of any shape, kept as the parameter `theta`; the P of them that may move are named by `movable`.
+    """
+
+    def __init__(self, theta: Tensor) -> None:
+        super().__init__()
+        self.theta = nn.Parameter(theta, requires_grad=False)
+
+    @abstractmethod
+    def movable(self) -> Tensor:
+        """Numbers of the parameters, in theta flattened, that may move, [P]."""
+
+    @abstractmethod
+    def sensitivity(self, z: Tensor) -> Tensor:
+        """Derivative of nu_dot with respect to the movable parameters at channels z [B, nz], [B, 3, P]."""
+
+    @abstractmethod
+    def information(self, samples: Samples) -> Tensor:
+        """Information that a sample's accelerations hold about the movable parameters, mean over the samples, [P, P]."""
+
+    @abstractmethod
+    def belief(self) -> tuple[Tensor, Tensor]:
+        """Mean [P] and precision [P] of what is thought of the movable parameters before any trial; zero precision where nothing is."""
+
+    @abstractmethod
+    def asymmetry(self, samples: Samples) -> Tensor:
+        """Information [P] about those movable parameters that a mirror-symmetric vessel cannot have; zero for all others."""
+
+    @abstractmethod
+    def restated(self, table: Sequence[Coefficient], errors: Tensor) -> list[Coefficient]:
+        """The table of coefficients as theta is now, with standard errors [P] of the movable parameters; errors of ratios stay as they were."""
+
+
 class IdentifiedConfig(Config, ABC):
     """A kind of baseline and how it is identified."""
 

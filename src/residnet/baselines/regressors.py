@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Annotated, Literal, final
 
 import torch
 from pydantic import Field, model_validator
-from torch import Tensor, nn
+from torch import Tensor
 
-from residnet.baselines.base import Baseline, IdentifiedConfig, of_manoeuvres
+from residnet.baselines.base import Baseline, IdentifiedConfig, ParametricBaseline, of_manoeuvres
 from residnet.baselines.sets import Roles, SetName, expand, merged
 from residnet.core.least_squares import LinearFit, solve_path
 from residnet.core.names import VELOCITY
 from residnet.core.samples import Samples
 from residnet.core.solutions import Coefficient, Solution
+from residnet.physics.symmetry import wrong_parity
 from residnet.physics.terms import TermLibrary
 
 RowTerms = dict[Literal["u", "v", "r"], tuple[str, ...]]
@@ -22,19 +24,18 @@ Penalty = Annotated[float, Field(ge=0)]
 
 
 @final
-class RegressorBaseline(Baseline):
+class RegressorBaseline(ParametricBaseline):
     """nu_dot [..., 3] = theta [3, J] phi(z) [..., J]; a term that an axis does not have keeps a zero."""
 
     def __init__(self, rows: Sequence[Sequence[str]], names: Sequence[str], held: Sequence[tuple[int, str]] = ()) -> None:
         """From the terms of each axis; `held`: (axis, term) of coefficients that a refit through rollouts must leave as they are."""
-        super().__init__()
         terms = list(dict.fromkeys(term for row in rows for term in row))
+        super().__init__(torch.zeros(3, len(terms), dtype=torch.float64))
         self.library = TermLibrary(terms, names)
         allowed = torch.tensor([[term in row for term in terms] for row in rows], dtype=torch.float64)
         self.register_buffer("allowed", allowed, persistent=False)
         self.allowed: Tensor
         self.held = tuple((axis, terms.index(term)) for axis, term in held)
-        self.theta = nn.Parameter(torch.zeros(3, len(terms), dtype=torch.float64), requires_grad=False)
 
     def forward(self, z: Tensor) -> Tensor:
         """nu_dot [..., 3] at channels z [..., nz]."""
@@ -55,6 +56,52 @@ class RegressorBaseline(Baseline):
         for axis, column in self.held:
             free[axis, column] = False
         return torch.nonzero(free.flatten()).squeeze(1)
+
+    def sensitivity(self, z: Tensor) -> Tensor:
+        """d nu_dot / d theta [B, 3, P]: each coefficient moves its own axis by its term."""
+        free = self.movable()
+        axis, column = free // self.library.count, free % self.library.count
+        out = torch.zeros(z.shape[0], 3, free.numel(), dtype=z.dtype)
+        out[:, axis, torch.arange(free.numel())] = self.library(z)[:, column]
+        return out
+
+    def information(self, samples: Samples) -> Tensor:
+        """Mean information of a sample [P, P], by the variance that least squares leaves of each axis."""
+        phi, variance = self._residual(samples)
+        gram = phi.T @ phi / len(samples)
+        free = self.movable()
+        return torch.block_diag(*[gram / variance[axis] for axis in range(3)])[free][:, free]
+
+    def belief(self) -> tuple[Tensor, Tensor]:
+        """Nothing is thought before."""
+        none = torch.zeros(self.movable().numel(), dtype=torch.float64)
+        return none, none
+
+    def asymmetry(self, samples: Samples) -> Tensor:
+        """Mean information of a sample [P] about terms of the wrong parity."""
+        phi, variance = self._residual(samples)
+        odd = [[float(wrong_parity(term, axis, samples.names)) for term in self.library.terms] for axis in range(3)]
+        pull = torch.tensor(odd, dtype=torch.float64) * phi.square().mean(0) / variance[:, None]
+        return pull.flatten()[self.movable()]
+
+    def restated(self, table: Sequence[Coefficient], errors: Tensor) -> list[Coefficient]:
+        """Coefficients and ratios as theta is now; a ratio keeps its error."""
+        terms = self.library.terms
+        rows = {f"{name}_dot": dict(zip(terms, self.theta[axis].tolist(), strict=True)) for axis, name in enumerate(VELOCITY)}
+        names = [(f"{VELOCITY[i // len(terms)]}_dot", terms[i % len(terms)]) for i in self.movable().tolist()]
+        known = dict(zip(names, errors.tolist(), strict=True))
+        return [
+            replace(c, value=c.ratio.of(rows[c.axis]))
+            if c.ratio is not None
+            else replace(c, value=rows[c.axis][c.term], error=known.get((c.axis, c.term), c.error))
+            for c in table
+        ]
+
+    def _residual(self, samples: Samples) -> tuple[Tensor, Tensor]:
+        """Terms [N, J], and the variance [3] of what they leave."""
+        phi = self.library(samples.z)
+        left = samples.target - phi @ (self.theta * self.allowed).detach().T
+        return phi, left.square().mean(0)
 
     def solved(self, fits: Sequence[tuple[Sequence[str], LinearFit]], choice: dict[str, float]) -> Solution:
         """A solution from the fit of each axis: its terms, and coefficients [J, 1] with their errors."""

@@ -100,6 +100,7 @@ def quantity(si: str) -> Any:
 
 Seconds = Annotated[float, Quantity("s")]
 Metres = Annotated[float, Quantity("m")]
+Kilograms = Annotated[float, Quantity("kg")]
 MetresPerSecond = Annotated[float, Quantity("m/s")]
 Radians = Annotated[float, Quantity("rad")]
 RadiansPerSecond = Annotated[float, Quantity("rad/s")]

@@ -7,17 +7,17 @@ import json
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from residnet.baselines import Baseline, BaselineConfig, Coefficient, RegressorBaseline, StillConfig
+from residnet.baselines import BaselineConfig, Coefficient, ParametricBaseline, StillConfig
 from residnet.core.errors import DataError, FitError
 from residnet.core.log import Log
-from residnet.core.names import ACCELERATION, VELOCITY
+from residnet.core.names import ACCELERATION
 from residnet.core.samples import Samples
 from residnet.data.prepare import Prepared, envelope, prepare, samples
 from residnet.data.simulate import SimulatedTrials
@@ -113,11 +113,12 @@ class Bench:
 
 @dataclass(frozen=True)
 class Fitted:
-    """A model with what there is to say about its fit."""
+    """A model with what there is to say about its fit, and where free runs told it the covariance [P, P] of what its baseline may move."""
 
     spec: ModelSpec
     model: HybridDynamics
     notes: dict[str, Any]
+    covariance: torch.Tensor | None = None
 
 
 class Fitter:
@@ -163,15 +164,17 @@ class Fitter:
         model = spec.build()
         started = time.perf_counter()
         chosen, tried = choose(model, model.baseline, spec.baseline.solutions(model.baseline, self.samples), self.bench)
-        table = list(chosen.table)
+        table, covariance = list(chosen.table), None
         notes: dict[str, Any] = {"samples": len(self.samples), **chosen.choice, **tried, "least_squares": self.bench(model)}
         if name in self.config.refit:
             scales = torch.from_numpy(self.config.evaluation.scales.array())
-            notes["refit"] = refit(model, self.samples, WindowStore.gather(self.train, torch.float64), self.config.refit[name], scales)
-            table = moved(table, model.baseline)
+            refitted = refit(model, self.samples, WindowStore.gather(self.train, torch.float64), self.config.refit[name], scales)
+            assert isinstance(model.baseline, ParametricBaseline)
+            notes["refit"], covariance = refitted.notes, refitted.covariance
+            table = model.baseline.restated(table, refitted.errors)
         notes |= {"coefficients": [_row(entry) for entry in table], "validation": self.bench(model)}
         notes["seconds"] = round(time.perf_counter() - started, 1)
-        return self._keep(Fitted(spec, model, notes))
+        return self._keep(Fitted(spec, model, notes, covariance))
 
     def head(self, name: str, baseline: HybridDynamics) -> Fitted:
         """One head on top of a baseline; taken from the run folder where it is finished there."""
@@ -260,14 +263,6 @@ def write_residuals(file: Path, fitter: Fitter, fitted: Sequence[Fitted], logs: 
 
 def _row(entry: Coefficient) -> dict[str, Any]:
     return {"axis": entry.axis, "term": entry.term, "value": entry.value, "standard_error": entry.error}
-
-
-def moved(table: Sequence[Coefficient], baseline: Baseline) -> list[Coefficient]:
-    """The least-squares table with the coefficients as a refit left them; standard errors stay those of least squares."""
-    if not isinstance(baseline, RegressorBaseline):
-        return list(table)
-    rows = {f"{name}_dot": dict(zip(baseline.library.terms, baseline.theta[axis].tolist(), strict=True)) for axis, name in enumerate(VELOCITY)}
-    return [replace(c, value=c.ratio.of(rows[c.axis]) if c.ratio is not None else rows[c.axis][c.term]) for c in table]
 
 
 def candidates(fitted: Sequence[Fitted], data: MeasuredLogs | SimulatedTrials) -> list[Candidate]:

@@ -1,8 +1,8 @@
-"""Refitting a baseline's coefficients through rollouts: Gauss-Newton on free-run errors with forward sensitivities.
+"""Refitting a baseline's parameters through rollouts: Gauss-Newton on free-run errors with forward sensitivities.
 
 Least squares on derivatives weighs every instant alike and ignores how errors add up; this minimises what a free run is
 judged by. The least-squares solution and its information matrix stand as the prior, so that directions which the
-free runs do not see stay where the derivatives put them.
+free runs do not see stay where the derivatives put them; a baseline that holds beliefs about its parameters adds them.
 """
 
 from __future__ import annotations
@@ -14,17 +14,16 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from residnet.baselines.regressors import RegressorBaseline
+from residnet.baselines import ParametricBaseline
 from residnet.core.config import Config, Seconds
 from residnet.core.errors import FitError
 from residnet.core.samples import Samples
 from residnet.data.windows import WindowStore
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.physics.symmetry import wrong_parity
 
 
 class RefitConfig(Config):
-    """Gauss-Newton refit of a baseline that is linear in its coefficients.
+    """Gauss-Newton refit of a baseline's parameters.
 
     Attributes:
         horizon: length of the free runs.
@@ -32,6 +31,8 @@ class RefitConfig(Config):
         prior: weight of the least-squares solution, as a share of its own information.
         asymmetric: shrinks terms that a mirror-symmetric vessel cannot have towards zero; 0 for no such knowledge.
         robust: windows whose error (in units of the scales) is far above this count by their error and not by its square.
+        correlation: time over which errors of a free run hang together; the logs hold so many independent errors, which says how much beliefs
+            weigh beside them, and how large the standard errors are.
         iterations: at most.
     """
 
@@ -40,27 +41,56 @@ class RefitConfig(Config):
     prior: float = Field(default=1e-2, ge=0)
     asymmetric: float = Field(default=0.0, ge=0)
     robust: float = Field(default=0.05, gt=0)
+    correlation: Seconds = Field(default=10.0, gt=0)
     iterations: int = Field(default=10, ge=1)
 
 
 @dataclass(frozen=True)
+class Refitted:
+    """What a refit hands back.
+
+    Attributes:
+        covariance: of the movable parameters, [P, P].
+        notes: cost before and after, iterations, windows, horizon, independent errors.
+    """
+
+    covariance: Tensor
+    notes: dict[str, Any]
+
+    @property
+    def errors(self) -> Tensor:
+        """Standard errors [P]."""
+        return self.covariance.diagonal().clamp(min=0.0).sqrt()
+
+
+@dataclass(frozen=True)
 class _Problem:
-    """Windows x0 [B, 6], w [B, T, m], measured nu [B, T, 3], weights [B, T, 3] (0 or 1/scale); prior precision [P, P] about theta0 [P],
-    pull to zero [P]."""
+    """Windows x0 [B, 6], w [B, T, m], measured nu [B, T, 3], weights [B, T, 3] (0 or 1/scale); numbers of the movable parameters [P]; precision
+    [P, P] about where least squares put them [P], pull to zero [P]; beliefs, mean and precision [P]; count of independent errors per channel."""
 
     x0: Tensor
     w: Tensor
     nu: Tensor
     weight: Tensor
+    active: Tensor
     precision: Tensor
     start: Tensor
     pull: Tensor
-    active: Tensor
+    believed: Tensor
+    belief: Tensor
+    count: float
     robust: float
 
+    def share(self, level: Tensor) -> Tensor:
+        """What one unit of minus the logarithm of a probability costs, where errors are at `level` (in units of the scales).
 
-def refit(model: HybridDynamics, samples: Samples, store: WindowStore, config: RefitConfig, scales: Tensor) -> dict[str, Any]:
-    """Move the coefficients of `model.baseline` to the minimum; float64.
+        The cost is that level itself, of which the probability falls with the power of three times the number of independent errors.
+        """
+        return level / (6.0 * self.count)
+
+
+def refit(model: HybridDynamics, samples: Samples, store: WindowStore, config: RefitConfig, scales: Tensor) -> Refitted:
+    """Move the parameters of `model.baseline` to the minimum; float64.
 
     Args:
         model: a baseline without a head, fitted by least squares.
@@ -69,48 +99,54 @@ def refit(model: HybridDynamics, samples: Samples, store: WindowStore, config: R
         config: settings.
         scales: of the velocities, [3].
 
-    Returns:
-        Cost before and after, iterations, windows.
-
     Raises:
-        FitError: where the first free runs are not finite or no step lowers the cost.
+        FitError: where the first free runs are not finite.
     """
     baseline = model.baseline
-    if not isinstance(baseline, RegressorBaseline):
-        raise FitError("a refit through rollouts needs a baseline of kind 'regressors', 'linear_steady', 'nomoto' or 'nomoto_sideslip'")
+    if not isinstance(baseline, ParametricBaseline):
+        raise FitError("a refit through rollouts needs a baseline of kind 'regressors', 'linear_steady', 'mmg', 'nomoto' or 'nomoto_sideslip'")
     problem = _problem(model, baseline, samples, store, config, scales)
-    theta = baseline.theta
-    cost = first = _cost(model, problem, baseline)
+    level = first = _level(model, problem)
     if not torch.isfinite(first):
         raise FitError("the least-squares baseline diverges within the refit's horizon; shorten `horizon` or raise the baseline's ridge")
     damping, count = 1e-3, 0
+    hessian, gradient = _normal_equations(model, problem, baseline, level)
     for _ in range(config.iterations):
-        hessian, gradient = _normal_equations(model, problem, baseline)
-        kept, improved = theta.detach().clone(), False
+        share = problem.share(level)
+        cost = level + _prior_cost(problem, baseline, share)
+        kept, improved = baseline.theta.detach().clone(), False
         for _attempt in range(8):
             step = torch.linalg.solve(hessian + damping * torch.diag(hessian.diagonal()), gradient)
-            with torch.no_grad():
-                flat = kept.flatten()
-                flat[problem.active] -= step
-                theta.copy_(flat.reshape(theta.shape))
-            trial = _cost(model, problem, baseline)
+            _place(baseline, kept.flatten()[problem.active] - step, problem.active)
+            reached = _level(model, problem)
+            trial = reached + _prior_cost(problem, baseline, share)
             if torch.isfinite(trial) and trial < cost:
                 improved = True
                 break
             damping *= 10
         if not improved:
-            with torch.no_grad():
-                theta.copy_(kept)
+            _place(baseline, kept.flatten()[problem.active], problem.active)
             break
-        gain, cost, damping = float(cost - trial), trial, max(damping / 10, 1e-8)
+        gain, level, damping = float(cost - trial), reached, max(damping / 10, 1e-8)
         count += 1
+        hessian, gradient = _normal_equations(model, problem, baseline, level)
         if gain < 2e-4 * float(cost):
             break
-    return {"cost_before": float(first), "cost_after": float(cost), "iterations": count, "windows": len(problem.x0), "horizon": config.horizon}
+    covariance = problem.share(level) * torch.linalg.pinv(hessian, hermitian=True)
+    notes = {"cost_before": float(first), "cost_after": float(level), "iterations": count, "windows": len(problem.x0), "horizon": config.horizon}
+    return Refitted(covariance, notes | {"independent_errors": round(problem.count, 1)})
+
+
+def _place(baseline: ParametricBaseline, values: Tensor, active: Tensor) -> None:
+    """Set the movable parameters."""
+    with torch.no_grad():
+        flat = baseline.theta.detach().clone().flatten()
+        flat[active] = values
+        baseline.theta.copy_(flat.reshape(baseline.theta.shape))
 
 
 def _problem(
-    model: HybridDynamics, baseline: RegressorBaseline, samples: Samples, store: WindowStore, config: RefitConfig, scales: Tensor
+    model: HybridDynamics, baseline: ParametricBaseline, samples: Samples, store: WindowStore, config: RefitConfig, scales: Tensor
 ) -> _Problem:
     steps, every = round(config.horizon / model.dt), max(round(config.every / model.dt), 1)
     starts = store.starts(steps + 1)
@@ -121,24 +157,21 @@ def _problem(
     usable = take(store.usable, starts + 1, steps).to(scales.dtype).unsqueeze(-1)
     # r comes from a gyro, which a frozen position does not disturb
     weight = torch.cat((usable, usable, torch.ones_like(usable)), dim=-1) / scales
-    phi = baseline.library(samples.z)
-    residual = samples.target - phi @ (baseline.theta * baseline.allowed).T
-    variance = residual.square().mean(0)
-    gram = phi.T @ phi / len(samples)
     active = baseline.movable()
-    precision = config.prior * torch.block_diag(*[gram / variance[axis] for axis in range(3)])
-    terms = baseline.library.terms
-    odd = torch.tensor([[float(wrong_parity(term, axis, samples.names)) for term in terms] for axis in range(3)], dtype=scales.dtype)
-    pull = config.asymmetric * odd * phi.square().mean(0) / variance[:, None]
+    covered = (starts[:, None] + torch.arange(1, steps + 1)).unique().numel()
+    believed, belief = baseline.belief()
     return _Problem(
         store.y[starts],
         take(store.w, starts, steps),
         take(store.y, starts + 1, steps)[:, :, 3:],
         weight,
-        precision[active][:, active],
-        baseline.theta.detach().flatten()[active].clone(),
-        pull.flatten()[active],
         active,
+        config.prior * baseline.information(samples),
+        baseline.theta.detach().flatten()[active].clone(),
+        config.asymmetric * baseline.asymmetry(samples),
+        believed,
+        belief,
+        max(covered * model.dt / config.correlation, 1.0),
         config.robust,
     )
 
@@ -148,20 +181,21 @@ def _window_cost(error: Tensor) -> Tensor:
     return error.square().mean((1, 2))
 
 
-def _prior_cost(problem: _Problem, baseline: RegressorBaseline) -> Tensor:
+def _prior_cost(problem: _Problem, baseline: ParametricBaseline, share: Tensor) -> Tensor:
     theta = baseline.theta.detach().flatten()[problem.active]
-    moved = theta - problem.start
-    return moved @ problem.precision @ moved + (problem.pull * theta.square()).sum()
+    moved, off = theta - problem.start, theta - problem.believed
+    return moved @ problem.precision @ moved + (problem.pull * theta.square()).sum() + share * (problem.belief * off.square()).sum()
 
 
 @torch.no_grad()
-def _cost(model: HybridDynamics, problem: _Problem, baseline: RegressorBaseline) -> Tensor:
+def _level(model: HybridDynamics, problem: _Problem) -> Tensor:
+    """Mean error of the windows, in units of the scales."""
     x, total = problem.x0, []
     for k in range(problem.w.shape[1]):
         x = _euler(model, x, model.signals.prepare(problem.w[:, k]))
         total.append(x[:, 3:])
     error = (torch.stack(total, dim=1) - problem.nu) * problem.weight
-    return torch.sqrt(_window_cost(error) + problem.robust**2).mean() + _prior_cost(problem, baseline)
+    return torch.sqrt(_window_cost(error) + problem.robust**2).mean()
 
 
 def _euler(model: HybridDynamics, x: Tensor, p: Tensor) -> Tensor:
@@ -172,23 +206,18 @@ def _euler(model: HybridDynamics, x: Tensor, p: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def _normal_equations(model: HybridDynamics, problem: _Problem, baseline: RegressorBaseline) -> tuple[Tensor, Tensor]:
+def _normal_equations(model: HybridDynamics, problem: _Problem, baseline: ParametricBaseline, level: Tensor) -> tuple[Tensor, Tensor]:
     """Gauss-Newton Hessian [P, P] and half the gradient [P] of the robust cost."""
     batch, steps = problem.w.shape[:2]
     count, dt = int(problem.active.numel()), model.dt
-    terms = baseline.library.count
-    axis, column = problem.active // terms, problem.active % terms
     x = problem.x0
     sensitivity = torch.zeros(batch, 4, count, dtype=x.dtype)
     hessian = torch.zeros(batch, count, count, dtype=x.dtype)
     gradient = torch.zeros(batch, count, dtype=x.dtype)
     square = torch.zeros(batch, dtype=x.dtype)
-    place = torch.arange(count)
     for k in range(steps):
         p = model.signals.prepare(problem.w[:, k])
-        slopes = _slopes(model, x, p)
-        change = dt * slopes @ sensitivity
-        change[:, axis, place] += dt * baseline.library(model.signals(x, p))[:, column]
+        change = dt * (_slopes(model, x, p) @ sensitivity + baseline.sensitivity(model.signals(x, p)))
         moved = sensitivity[:, 1:] + change
         heading = sensitivity[:, :1] + 0.5 * dt * (moved[:, 2:] + sensitivity[:, 3:])
         sensitivity = torch.cat((heading, moved), dim=1)
@@ -200,9 +229,10 @@ def _normal_equations(model: HybridDynamics, problem: _Problem, baseline: Regres
         square += error.square().sum(1)
     weight = 0.5 / torch.sqrt(square / (3 * steps) + problem.robust**2) / (3 * steps * batch)
     theta = baseline.theta.flatten()[problem.active]
-    prior = problem.precision + torch.diag(problem.pull)
-    total = torch.einsum("b,bij->ij", weight, hessian) + prior
-    return total, weight @ gradient + problem.precision @ (theta - problem.start) + problem.pull * theta
+    belief = problem.share(level) * problem.belief
+    total = torch.einsum("b,bij->ij", weight, hessian) + problem.precision + torch.diag(problem.pull + belief)
+    prior = problem.precision @ (theta - problem.start) + problem.pull * theta + belief * (theta - problem.believed)
+    return total, weight @ gradient + prior
 
 
 def _slopes(model: HybridDynamics, x: Tensor, p: Tensor) -> Tensor:
@@ -214,5 +244,3 @@ def _slopes(model: HybridDynamics, x: Tensor, p: Tensor) -> Tensor:
     repeated, inputs = x.repeat(4, 1), p.repeat(4, 1)
     slopes = torch.func.jvp(lambda state: model.baseline(model.signals(state, inputs)), (repeated,), (tangent.reshape(-1, x.shape[1]),))[1]
     return slopes.reshape(4, batch, 3).permute(1, 2, 0)
-
-

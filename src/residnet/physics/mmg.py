@@ -1,0 +1,209 @@
+"""The MMG standard model of a ship with one propeller and one rudder: hull, propeller and rudder apart, and what each does to the others.
+
+Source: Yasukawa and Yoshimura, Introduction of MMG standard method for ship maneuvering predictions, J Mar Sci Technol 20 (2015) 37-52.
+Starting values of the hull's linear derivatives: Kijima et al., On the manoeuvring performance of a ship with the parameter of loading
+condition, J SNAJ 168 (1990).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple, final
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+
+from residnet.core.config import Config, Kilograms, Metres
+from residnet.physics.parameters import Density, SquareMetres
+
+_WAKE_SLOPE = 2.0
+# keeps the drift angle defined for a ship at rest; (m/s)^2
+_STILL = 1e-6
+
+
+class MMGHull(Config):
+    """Particulars of the hull; the body's origin is amidships, where u and v are measured.
+
+    Attributes:
+        length: between perpendiculars.
+        beam, draught: of the hull.
+        mass: of the displaced water.
+        gyration: radius of gyration about the centre of gravity, as a share of the length.
+        x_G: centre of gravity ahead of midship.
+        density: of the water.
+    """
+
+    length: Metres = Field(gt=0)
+    beam: Metres = Field(gt=0)
+    draught: Metres = Field(gt=0)
+    mass: Kilograms = Field(gt=0)
+    gyration: float = Field(default=0.25, gt=0, lt=1)
+    x_G: Metres = 0.0
+    density: Density = Field(default=1000.0, gt=0)
+
+    @property
+    def block(self) -> float:
+        """Block coefficient."""
+        return self.mass / (self.density * self.length * self.beam * self.draught)
+
+
+class MMGPropeller(Config):
+    """A propeller that turns ahead.
+
+    Attributes:
+        diameter: of it.
+        x: its place ahead of midship, as a share of the length.
+        thrust: K_T = k_0 + k_1 J + k_2 J^2 in open water.
+    """
+
+    diameter: Metres = Field(gt=0)
+    x: float = -0.48
+    thrust: tuple[float, float, float]
+
+
+class MMGRudder(Config):
+    """A rudder in the propeller's race.
+
+    Attributes:
+        area: of the movable part.
+        aspect: span squared over area.
+        x: its place ahead of midship, as a share of the length.
+        race: share of its span that stands in the race, diameter over span.
+    """
+
+    area: SquareMetres = Field(gt=0)
+    aspect: float = Field(gt=0)
+    x: float = -0.5
+    race: float = Field(gt=0, le=1)
+
+    @property
+    def lift(self) -> float:
+        """Slope of the normal force, Fujii's formula."""
+        return 6.13 * self.aspect / (2.25 + self.aspect)
+
+
+class Belief(NamedTuple):
+    """What is thought of a parameter before any trial: `mean`, standard deviation `sd`, and what the parameter is."""
+
+    mean: float
+    sd: float
+    meaning: str
+
+
+def usual_beliefs(hull: MMGHull) -> dict[str, Belief]:
+    """Every parameter of the model, dimensionless, as one would expect of a merchant ship with these particulars.
+
+    Linear hull derivatives by Kijima's formulas; those of higher order are thought to be near zero, so that the trials speak for themselves.
+    """
+    k = 2.0 * hull.draught / hull.length
+    fullness = hull.block * hull.beam / hull.length
+    mass = 2.0 * hull.mass / (hull.density * hull.length**2 * hull.draught)
+    return {
+        "m_x": Belief(0.022, 0.01, "added mass in surge"),
+        "m_y": Belief(0.2, 0.06, "added mass in sway"),
+        "J_z": Belief(0.011, 0.004, "added moment of inertia in yaw"),
+        "R_0": Belief(0.02, 0.01, "resistance straight ahead"),
+        "X_vv": Belief(0.0, 0.1, "surge force of drift"),
+        "X_vr": Belief(0.0, 0.1, "surge force of drift in a turn, beyond the added mass's"),
+        "X_rr": Belief(0.0, 0.03, "surge force of turning"),
+        "X_vvvv": Belief(0.5, 0.5, "surge force of large drift"),
+        "Y_0": Belief(0.0, 0.005, "sway force of asymmetry"),
+        "Y_v": Belief(-(0.5 * math.pi * k + 1.4 * fullness), 0.15, "sway force of drift"),
+        "Y_r": Belief(mass + 0.022 - 1.5 * fullness, 0.06, "sway force of turning"),
+        "Y_vvv": Belief(-1.0, 1.0, "sway force of large drift"),
+        "Y_vvr": Belief(0.0, 0.8, "sway force of large drift and turning"),
+        "Y_vrr": Belief(0.0, 0.5, "sway force of drift and fast turning"),
+        "Y_rrr": Belief(0.0, 0.05, "sway force of fast turning"),
+        "N_0": Belief(0.0, 0.002, "yaw moment of asymmetry"),
+        "N_v": Belief(-k, 0.05, "yaw moment of drift"),
+        "N_r": Belief(-0.54 * k + k * k, 0.02, "yaw moment of turning"),
+        "N_vvv": Belief(0.0, 0.3, "yaw moment of large drift"),
+        "N_vvr": Belief(0.0, 0.3, "yaw moment of large drift and turning"),
+        "N_vrr": Belief(0.0, 0.1, "yaw moment of drift and fast turning"),
+        "N_rrr": Belief(0.0, 0.02, "yaw moment of fast turning"),
+        "t_P": Belief(0.22, 0.03, "thrust deduction"),
+        "w_P0": Belief(0.4, 0.06, "wake fraction straight ahead"),
+        "C_2p": Belief(1.3, 0.25, "inflow far aside over inflow straight ahead, drift towards port or turn to starboard"),
+        "C_2n": Belief(1.1, 0.25, "the same, drift towards starboard or turn to port"),
+        "t_R": Belief(0.35, 0.15, "steering resistance deduction"),
+        "a_H": Belief(0.3, 0.2, "sway force that the rudder raises on the hull, over its own"),
+        "x_H": Belief(-0.45, 0.1, "where that force acts, lengths ahead of midship"),
+        "gamma_p": Belief(0.5, 0.2, "flow straightening, inflow from port"),
+        "gamma_n": Belief(0.5, 0.2, "flow straightening, inflow from starboard"),
+        "l_R": Belief(-0.8, 0.3, "where the rudder feels the turning, lengths ahead of midship"),
+        "epsilon": Belief(1.05, 0.2, "wake at the propeller over wake at the rudder"),
+        "kappa": Belief(0.5, 0.1, "how much of the race's acceleration reaches the rudder"),
+    }
+
+
+PARAMETERS = tuple(usual_beliefs(MMGHull(length=1.0, beam=0.2, draught=0.1, mass=10.0)))
+"""Names of the parameters, in the order of the columns of theta."""
+
+
+@final
+class MMGForces(nn.Module):
+    """Accelerations of the ship.
+
+    Holds ahead, propeller turning ahead. Hull forces are divided by rho/2 L d U^2, moments by rho/2 L^2 d U^2, with v' = v/U and r' = r L/U.
+
+    Args:
+        hull, propeller, rudder: particulars.
+        columns: of u, v, r, propeller revolutions and rudder angle among the channels z.
+    """
+
+    def __init__(self, hull: MMGHull, propeller: MMGPropeller, rudder: MMGRudder, columns: tuple[int, int, int, int, int]) -> None:
+        super().__init__()
+        self.columns = list(columns)
+        self.length = float(hull.length)
+        self.pressed = 0.5 * hull.density * hull.length * hull.draught
+        self.mass, self.x_G = float(hull.mass), float(hull.x_G)
+        self.inertia = hull.mass * ((hull.gyration * hull.length) ** 2 + hull.x_G**2)
+        self.density, self.diameter, self.x_P = float(hull.density), float(propeller.diameter), propeller.x
+        self.k0, self.k1, self.k2 = propeller.thrust
+        self.area, self.lift, self.x_R, self.race = float(rudder.area), rudder.lift, rudder.x, rudder.race
+
+    def forward(self, z: Tensor, theta: Tensor) -> Tensor:
+        """nu_dot [..., 3] at channels z [..., nz] with parameters theta [..., 34] (see `PARAMETERS`)."""
+        (
+            m_x, m_y, J_z, R_0, X_vv, X_vr, X_rr, X_vvvv, Y_0, Y_v, Y_r, Y_vvv, Y_vvr, Y_vrr, Y_rrr, N_0, N_v, N_r, N_vvv, N_vvr, N_vrr, N_rrr,
+            t_P, w_P0, C_2p, C_2n, t_R, a_H, x_H, gamma_p, gamma_n, l_R, epsilon, kappa,
+        ) = theta.unbind(-1)  # fmt: skip
+        chosen = [z[..., c] for c in self.columns]
+        u, v, r, n, delta = chosen[0], chosen[1], chosen[2], chosen[3], chosen[4]
+        speed = torch.sqrt(u * u + v * v + _STILL)
+        a, b = v / speed, r * self.length / speed
+        # hull
+        pressure = self.pressed * speed * speed
+        x_hull = pressure * (-R_0 * (u / speed) ** 2 + X_vv * a * a + X_vr * a * b + X_rr * b * b + X_vvvv * a**4)
+        y_hull = pressure * (Y_0 + Y_v * a + Y_r * b + Y_vvv * a**3 + Y_vvr * a * a * b + Y_vrr * a * b * b + Y_rrr * b**3)
+        n_hull = N_0 + N_v * a + N_r * b + N_vvv * a**3 + N_vvr * a * a * b + N_vrr * a * b * b + N_rrr * b**3
+        n_hull = pressure * self.length * n_hull
+        # propeller: inflow changes with its drift angle, to both sides differently
+        aside = -a - self.x_P * b
+        side = torch.where(aside > 0, C_2p, C_2n)
+        inflow = u * (1 - w_P0) * (1 + (1 - torch.exp(-_WAKE_SLOPE * aside.abs())) * (side - 1))
+        nd = n * self.diameter
+        loading = self.k0 * nd * nd + self.k1 * nd * inflow + self.k2 * inflow * inflow
+        thrust = self.density * self.diameter**2 * loading
+        # rudder: partly in the race
+        raced = torch.sqrt(torch.clamp(inflow * inflow + 8.0 / math.pi * loading, min=_STILL))
+        squared = self.race * (inflow + kappa * (raced - inflow)) ** 2 + (1 - self.race) * inflow * inflow
+        along = epsilon * torch.sqrt(squared + _STILL)
+        cross = -a - l_R * b
+        across = speed * torch.where(cross > 0, gamma_p, gamma_n) * cross
+        angle = delta - torch.atan2(across, along)
+        normal = 0.5 * self.density * self.area * (along * along + across * across) * self.lift * torch.sin(angle)
+        x_rudder = -(1 - t_R) * normal * torch.sin(delta)
+        y_rudder = -(1 + a_H) * normal * torch.cos(delta)
+        n_rudder = -(self.x_R + a_H * x_H) * self.length * normal * torch.cos(delta)
+        # rigid body and added mass
+        scale = self.pressed * self.length
+        mass_x, mass_y = self.mass + m_x * scale, self.mass + m_y * scale
+        inertia = self.inertia + J_z * scale * self.length**2
+        arm = self.x_G * self.mass
+        surge = x_hull + (1 - t_P) * thrust + x_rudder + mass_y * v * r + arm * r * r
+        sway = y_hull + y_rudder - mass_x * u * r
+        yaw = n_hull + n_rudder - arm * u * r
+        determinant = mass_y * inertia - arm * arm
+        return torch.stack((surge / mass_x, (inertia * sway - arm * yaw) / determinant, (mass_y * yaw - arm * sway) / determinant), dim=-1)

@@ -1,0 +1,123 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import solve_ivp
+from torch import Tensor
+
+from residnet.baselines import MMGBaseline, MMGConfig
+from residnet.core.errors import ConfigError
+from residnet.core.samples import Samples
+from residnet.physics.mmg import PARAMETERS, usual_beliefs
+
+NAMES = ("u", "v", "r", "n", "delta")
+TANKER = {
+    "kind": "mmg",
+    "hull": {"length": "7 m", "beam": "1.27 m", "draught": "0.46 m", "mass": "3270 kg", "x_G": "0.244 m"},
+    "propeller": {"diameter": "0.216 m", "thrust": [0.2931, -0.2753, -0.1385]},
+    "rudder": {"area": 0.0539, "aspect": 1.827, "race": 0.626},
+}
+# KVLCC2 as Yasukawa and Yoshimura (2015) print it, tables 3 and 4; their flow straightening is the other way round in sign of the drift
+PUBLISHED = {
+    "m_x": 0.022, "m_y": 0.223, "J_z": 0.011, "R_0": 0.022, "X_vv": -0.040, "X_vr": 0.002, "X_rr": 0.011, "X_vvvv": 0.771,
+    "Y_v": -0.315, "Y_r": 0.083, "Y_vvv": -1.607, "Y_vvr": 0.379, "Y_vrr": -0.391, "Y_rrr": 0.008,
+    "N_v": -0.137, "N_r": -0.049, "N_vvv": -0.030, "N_vvr": -0.294, "N_vrr": 0.055, "N_rrr": -0.013,
+    "t_P": 0.220, "w_P0": 0.35, "C_2p": 1.6, "C_2n": 1.1, "t_R": 0.387, "a_H": 0.312, "x_H": -0.464,
+    "gamma_p": 0.640, "gamma_n": 0.395, "l_R": -0.710, "epsilon": 1.09, "kappa": 0.50, "Y_0": 0.0, "N_0": 0.0,
+}  # fmt: skip
+
+
+def built(**beliefs: tuple[float, float]) -> MMGBaseline:
+    return MMGConfig.model_validate({**TANKER, "beliefs": beliefs}).build(NAMES)
+
+
+def published() -> MMGBaseline:
+    return built(**{name: (value, 0.0) for name, value in PUBLISHED.items()})
+
+
+def channels(rows: int, seed: int = 0) -> Tensor:
+    random = np.random.default_rng(seed)
+    low, high = [0.5, -0.2, -0.06, 9.0, -0.6], [1.2, 0.2, 0.06, 11.0, 0.6]
+    return torch.from_numpy(random.uniform(low, high, size=(rows, 5)))
+
+
+def test_the_published_tanker_turns_as_published() -> None:
+    """35 degrees of rudder: simulated advance, tactical diameter and steady speed of Yasukawa and Yoshimura (2015), within their figures' reading."""
+    baseline = published()
+
+    def rate(t: float, y: np.ndarray) -> list[float]:
+        x, _, psi, u, v, r = y.tolist()
+        del x
+        with torch.no_grad():
+            change = baseline(torch.tensor([u, v, r, 10.4, math.radians(min(15.8 * t, 35.0))], dtype=torch.float64)).tolist()
+        return [u * math.cos(psi) - v * math.sin(psi), u * math.sin(psi) + v * math.cos(psi), r, *change]
+
+    path = solve_ivp(rate, (0, 220), [0, 0, 0, 1.179, 0, 0], max_step=0.5, rtol=1e-8)
+    heading = path.y[2]
+    advance, diameter = path.y[0][np.argmax(heading >= math.pi / 2)] / 7.0, path.y[1][np.argmax(heading >= math.pi)] / 7.0
+    assert advance == pytest.approx(3.2, abs=0.15)
+    assert diameter == pytest.approx(3.2, abs=0.2)
+    assert math.hypot(path.y[3][-1], path.y[4][-1]) / 1.179 == pytest.approx(0.34, abs=0.06)
+
+
+def test_a_symmetric_ship_mirrors() -> None:
+    baseline = built(C_2p=(1.3, 0.1), C_2n=(1.3, 0.1))
+    z = channels(50)
+    mirrored = z * torch.tensor([1.0, -1.0, -1.0, 1.0, -1.0], dtype=torch.float64)
+    with torch.no_grad():
+        torch.testing.assert_close(baseline(mirrored), baseline(z) * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
+
+
+def test_signs_and_resistance() -> None:
+    baseline = published()
+    with torch.no_grad():
+        ahead, starboard, coasting = baseline(torch.tensor([[0.5, 0, 0, 10.0, 0], [1.0, 0, 0, 10.0, 0.3], [1.0, 0, 0, 0.0, 0]], dtype=torch.float64))
+        still = baseline(torch.zeros(1, 5, dtype=torch.float64))
+    assert ahead[0] > 0
+    assert starboard[2] > 0 > starboard[1], "a rudder to starboard turns to starboard and pushes the stern to port"
+    assert coasting[0] < 0
+    assert float(still.abs().max()) < 1e-6
+
+
+def test_sensitivities_are_those_of_forward_differentiation() -> None:
+    baseline, z = built(), channels(7)
+    theta = baseline.theta.detach()
+    exact = torch.stack([torch.func.jvp(lambda t: baseline.forces(z, t), (theta,), (d,))[1] for d in torch.eye(len(PARAMETERS)).double()], dim=-1)
+    torch.testing.assert_close(baseline.sensitivity(z), exact, rtol=1e-6, atol=1e-7)
+
+
+def test_every_parameter_matters() -> None:
+    slopes = built().sensitivity(channels(200))
+    assert bool((slopes.abs().amax((0, 1)) > 0).all())
+
+
+def test_accelerations_of_a_known_ship_move_the_beliefs_to_it() -> None:
+    truth, config = published(), MMGConfig.model_validate({**TANKER, "correlation": 1})
+    z = channels(4000, 3)
+    with torch.no_grad():
+        target = truth(z) + 1e-5 * torch.from_numpy(np.random.default_rng(4).normal(size=(4000, 3)))
+    samples = Samples(z, target, torch.zeros(4000, dtype=torch.long), torch.arange(4000) * 0.1, ("zigzag",), NAMES)
+    baseline = config.build(NAMES)
+    table = {c.term: c for c in config.fit(baseline, samples)}
+    fresh = channels(200, 5)
+    with torch.no_grad():
+        worst = (baseline(fresh) - truth(fresh)).abs().amax(0) / truth(fresh).std(0)
+    assert float(worst.max()) < 2e-3
+    for name in ("N_v", "N_r", "Y_v", "w_P0", "C_2p"):
+        assert abs(table[name].value - PUBLISHED[name]) < 5 * table[name].error + 1e-3, name
+        assert table[name].error < 0.5 * usual_beliefs(config.hull)[name].sd
+
+
+def test_a_fixed_parameter_stays() -> None:
+    baseline = built(t_P=(0.2, 0.0))
+    assert baseline.movable().numel() == len(PARAMETERS) - 1
+    assert baseline.sensitivity(channels(3)).shape == (3, 3, len(PARAMETERS) - 1)
+    assert baseline.belief()[0].shape == (len(PARAMETERS) - 1,)
+
+
+def test_config_names_what_is_wrong() -> None:
+    with pytest.raises(ValueError, match="Y_w"):
+        built(Y_w=(0.0, 1.0))
+    with pytest.raises(ConfigError, match="'delta'"):
+        MMGConfig.model_validate(TANKER).build(("u", "v", "r", "n"))
