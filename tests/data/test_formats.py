@@ -116,11 +116,17 @@ def test_truncated_files_end_in_one_line(write: Writer, tmp_path: Path) -> None:
     whole = path.read_bytes()
     for share in (0.0, 0.1, 0.5, 0.99):
         path.write_bytes(whole[: int(share * len(whole))])
-        try:
-            reader_for(path).read(path)
-        except (UsageError, DataError) as error:
-            assert "\n" not in str(error)
-            assert path.name in str(error)
+        said = outcome(path)
+        assert said is None or ("\n" not in said and path.name in said)
+
+
+def outcome(path: Path) -> str | None:
+    """What reading ends in: None for a log, else the error's text; anything but residnet's own errors passes through."""
+    try:
+        reader_for(path).read(path)
+    except (UsageError, DataError) as error:
+        return str(error)
+    return None
 
 
 @pytest.mark.parametrize(
