@@ -13,6 +13,7 @@ from residnet.tasks.ferry_study import FerryStudyConfig
 from residnet.tasks.fit import FitConfig
 from residnet.tasks.force_residual import ForceResidualConfig
 from residnet.tasks.import_logs import ImportConfig
+from residnet.tasks.sea_trial import SeaTrialTaskConfig
 from residnet.tasks.simulate import SimulateConfig
 from residnet.tasks.study import StudyConfig
 
@@ -25,6 +26,7 @@ TaskConfig = Annotated[
     | AutopilotConfig
     | FerryStudyConfig
     | ForceResidualConfig
-    | BreedingTaskConfig,
+    | BreedingTaskConfig
+    | SeaTrialTaskConfig,
     Field(discriminator="task"),
 ]
