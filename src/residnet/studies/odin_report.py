@@ -92,7 +92,7 @@ def _parameters(study: PhaseStudy) -> str:
     whole = {"m - X_udot": -known["X_udot"], "m - Y_vdot": -known["Y_vdot"], "I_z - N_rdot": known["I_z"] - known["N_rdot"]}
     for name, value in whole.items():
         mass = next(iter(study.standard.values())).mass if name.startswith("m") else 0.0
-        cells = [f"{fit.sums[name][0]:.5g} ± {fit.sums[name][1]:.2g}" for fit in study.standard.values()]
+        cells = [_sum(fit, name) for fit in study.standard.values()]
         lines.append(f"| {name} | {mass + value:.5g} | {' | '.join(cells)} | |")
     return "\n".join(lines)
 
@@ -106,6 +106,11 @@ def _estimate(fit: StandardFit, number: int) -> str:
     return f"{fit.values[number]:.4g} ± {fit.errors[number]:.2g}"
 
 
+def _sum(fit: StandardFit, name: str) -> str:
+    value, error = fit.sums[name]
+    return f"{value:.5g} at its bound" if error == 0.0 else f"{value:.5g} ± {error:.2g}"
+
+
 def _notes(standard: Mapping[str, StandardFit]) -> str:
     """What the data leave open, and whether every start leads to the same place."""
     lines = []
@@ -113,6 +118,7 @@ def _notes(standard: Mapping[str, StandardFit]) -> str:
         same = sum(cost <= fit.cost[0] * (1 + 1e-6) for cost in fit.cost)
         left = f"only combinations of {', '.join(fit.undetermined)} are determined" if fit.undetermined else "every parameter is determined"
         lines.append(f"- {_WORDS[where]}: {left}; condition of the rest {fit.condition:.2g}; {same} of {len(fit.cost)} starts end at the least error")
+    lines.append("- standard errors know the scatter and memory of the residuals, not what the filter, the waves or a wrong structure shift")
     return "\n".join(lines)
 
 
