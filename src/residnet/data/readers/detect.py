@@ -2,26 +2,34 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from residnet.core.errors import UsageError
 from residnet.core.log import Log
+from residnet.data.readers.ardupilot import ArduPilotConfig
 from residnet.data.readers.base import LogReader, require_file
 from residnet.data.readers.canonical import CanonicalConfig
 from residnet.data.readers.clocks import settle
 from residnet.data.readers.composed import RecordingConfig
 from residnet.data.readers.hdf5 import Hdf5Config, is_hdf5
 from residnet.data.readers.mat import MatConfig
+from residnet.data.readers.nmea import NmeaConfig
 from residnet.data.readers.recording import Recording
 from residnet.data.readers.rosbag import RosbagConfig
 from residnet.data.readers.topic_folder import TopicFolderConfig, is_topic_folder
+from residnet.data.readers.ulog import UlogConfig
 from residnet.data.readers.wanted import EVERYTHING
 
 _MCAP = b"\x89MCAP0\r\n"
 _SQLITE = b"SQLite format 3\x00"
 _MAT5 = b"MATLAB 5.0"
+_ULOG = b"ULog\x01\x12\x35"
+_DATAFLASH = b"\xa3\x95\x80"
+# a sentence with its checksum at the start of a line, or behind a time
+_NMEA = re.compile(rb"(?m)^[^$!\n]{0,40}[$!][A-Z]{2}[A-Z]{3},[\x20-\x7e]*\*[0-9A-Fa-f]{2}\s*$")
 
 
 @dataclass(frozen=True)
@@ -40,6 +48,9 @@ FORMATS: tuple[Format, ...] = (
     Format("ROS 1 bag", lambda path, head: head.startswith(b"#ROSBAG"), RosbagConfig),
     Format("MCAP", lambda path, head: head.startswith(_MCAP), RosbagConfig),
     Format("ROS 2 bag (SQLite)", lambda path, head: head.startswith(_SQLITE) and path.suffix == ".db3", RosbagConfig),
+    Format("PX4 ULog", lambda path, head: head.startswith(_ULOG), UlogConfig),
+    Format("ArduPilot log", lambda path, head: head.startswith(_DATAFLASH), ArduPilotConfig),
+    Format("NMEA 0183", lambda path, head: _NMEA.search(head) is not None, NmeaConfig),
     Format("MATLAB", lambda path, head: head.startswith(_MAT5) or path.suffix.lower() == ".mat", MatConfig),
     Format("HDF5", lambda path, head: is_hdf5(path), Hdf5Config),
 )

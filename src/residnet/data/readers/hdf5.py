@@ -40,6 +40,8 @@ class Hdf5Config(RecordingConfig):
 
 def is_hdf5(path: Path) -> bool:
     """Whether a file starts as HDF5 does, at once or behind MATLAB's header of 512 bytes."""
+    if not path.is_file():
+        return False
     with path.open("rb") as stream:
         head = stream.read(520)
     return head.startswith(_SIGNATURE) or head[512:520] == _SIGNATURE

@@ -6,7 +6,6 @@ A topic's message type decides where the source has types; a table without one i
 from __future__ import annotations
 
 import dataclasses
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import ClassVar, final
 
@@ -14,28 +13,12 @@ import numpy as np
 
 from residnet.core.names import CHANNEL_UNITS
 from residnet.data.readers.compose import Plan
-from residnet.data.readers.quantities import Angle, FieldMap, Geodetic, Local, Quaternion
+from residnet.data.readers.message import Message
+from residnet.data.readers.messages_marine import MARINE
+from residnet.data.readers.quantities import Angle, Derived, FieldMap, Geodetic, Local, Quaternion
 from residnet.data.readers.recording import Recording, Series, key_of
 
 _WORLD = ("map", "odom", "earth", "world", "enu", "ned")
-
-
-class Message(ABC):
-    """A kind of message: what it is called, what it looks like, what it adds to a plan."""
-
-    types: ClassVar[tuple[str, ...]]
-    signature: ClassVar[tuple[str, ...]]
-    said: ClassVar[str] = "REP-103 (ENU, forward-left-up) to NED, forward-starboard-down"
-
-    def fits(self, one: Series) -> bool:
-        """Whether a series holds messages of this kind."""
-        if one.kind:
-            return one.kind.rsplit("/", 1)[-1] in self.types
-        return all(one.has(field) for field in self.signature)
-
-    @abstractmethod
-    def plan(self, one: Series) -> Plan:
-        """What a series of this kind says of the vessel."""
 
 
 def _body(one: Series, prefix: str) -> dict[str, FieldMap]:
@@ -206,7 +189,7 @@ class Named(Message):
 
 
 # in the order in which they are asked: the one that says most first
-MESSAGES: tuple[Message, ...] = (Odometry(), Pose(), Twist(), Imu(), Fix(), Wrench(), Joints(), Number(), Named())
+MESSAGES: tuple[Message, ...] = (Odometry(), Pose(), Twist(), Imu(), Fix(), Wrench(), *MARINE, Joints(), Number(), Named())
 
 
 def standard_plan(recording: Recording, declared: Plan) -> Plan:
@@ -221,18 +204,29 @@ def standard_plan(recording: Recording, declared: Plan) -> Plan:
                 said.append(
                     f"{', '.join(taken)}: {type(message).__name__} of {one.name}, REP-103 (ENU, forward-left-up) to NED, forward-starboard-down"
                 )
+    if plan.heading is None and "psi" not in plan.channels and declared.velocity is None:
+        # without a heading an earth-fixed velocity has no components in the body
+        plan = dataclasses.replace(plan, velocity=None)
     return dataclasses.replace(plan, said=(*declared.said, *said))
 
 
 def _joined(plan: Plan, offered: Plan) -> tuple[Plan, Sequence[str]]:
     """A plan with what it lacks of another, and the names of that."""
     given = set(plan.channels) | ({"x", "y"} if plan.position else set()) | ({"psi"} if plan.heading else set())
-    given |= {"u", "v", "r"} if plan.velocity else set()
+    given |= {"u", "v"} if plan.velocity else set()
+    given |= {"r"} if isinstance(plan.velocity, Derived) else set()
     new = {name: entry for name, entry in offered.channels.items() if name not in given}
     position = offered.position if not {"x", "y"} & given else None
     heading = offered.heading if "psi" not in given else None
-    taken = [*(["x", "y"] if position else []), *(["psi"] if heading else []), *new]
-    joined = dataclasses.replace(plan, channels={**plan.channels, **new}, position=plan.position or position, heading=plan.heading or heading)
+    velocity = offered.velocity if not {"u", "v"} & (given | set(new)) else None
+    taken = [*(["x", "y"] if position else []), *(["psi"] if heading else []), *(["u", "v"] if velocity else []), *new]
+    joined = dataclasses.replace(
+        plan,
+        channels={**plan.channels, **new},
+        position=plan.position or position,
+        heading=plan.heading or heading,
+        velocity=plan.velocity or velocity,
+    )
     return joined, taken
 
 

@@ -1,0 +1,129 @@
+"""Marine electronics and autopilots: NMEA 0183, PX4 and ArduPilot logs give the trial back to what their digits hold."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import written_recorders
+from written_logs import EPOCH, trial
+from written_recorders import ORIGIN
+
+from residnet.core.config import validate
+from residnet.core.errors import DataError, UsageError
+from residnet.core.log import Log
+from residnet.data.readers import ReaderConfig
+from residnet.data.readers.detect import format_of, reader_for
+
+
+def read(path: Path, **config: Any) -> Log:
+    return validate(config, ReaderConfig, "test").build().read(path)
+
+
+def codes(log: Log) -> set[str]:
+    return {finding["code"] for finding in log.meta["findings"]}
+
+
+def test_sentences_of_a_receiver_and_a_compass(tmp_path: Path) -> None:
+    log = trial(20.0)
+    path = written_recorders.nmea(log, tmp_path)
+    origin = {"latitude": f"{ORIGIN[0]} deg", "longitude": f"{ORIGIN[1]} deg"}
+    got = read(path, kind="nmea", position={"kind": "geodetic", "topic": "RMC", "origin": origin})
+    assert set(got.channels) == {"x", "y", "psi", "u", "v", "r"}
+    assert got.meta["start_utc"] == "2025-04-11T09:15:45.000000000Z"
+    np.testing.assert_allclose(got.t, log.t, atol=1e-6)
+    # 1e-7 minutes are 0.2 mm
+    for name in ("x", "y"):
+        np.testing.assert_allclose(got[name], log[name], atol=1e-3)
+    for name in ("psi", "u", "v", "r"):
+        np.testing.assert_allclose(got[name], log[name], atol=1e-5, err_msg=name)
+    assert "estimated_times" in codes(got)
+
+
+def test_sentences_that_fail_their_checksum_or_have_no_fix(tmp_path: Path) -> None:
+    path = written_recorders.nmea(trial(5.0), tmp_path)
+    lines = path.read_text().splitlines()
+    lines[30] = lines[30].replace(",A,", ",V,", 1)[:-2] + "00"
+    lines[33] = "$GPRMC,091546.10,V,,,,,,,110425,,,N*77"
+    lines.insert(10, "garbage \x00")
+    path.write_text("\n".join(lines))
+    got = reader_for(path).read(path)
+    assert "bad_lines" in codes(got)
+    assert len(got) in (49, 50)
+    path.write_text("nothing here\n")
+    with pytest.raises(DataError, match="no NMEA 0183 sentence"):
+        read(path, kind="nmea")
+
+
+def test_a_loggers_own_times_come_first_where_every_line_has_one(tmp_path: Path) -> None:
+    log = trial(10.0)
+    got = reader_for(path := written_recorders.nmea(log, tmp_path, prefix=True)).read(path)
+    assert "estimated_times" not in codes(got)
+    np.testing.assert_allclose(got["psi"], log["psi"], atol=1e-5)
+    np.testing.assert_allclose(got["x"] - got["x"][0], log["x"] - log["x"][0], atol=2e-3)
+
+
+def test_past_midnight(tmp_path: Path) -> None:
+    path = tmp_path / "a.nmea"
+    path.write_text(
+        "\n".join(f"$GPGGA,{moment},6326.0,N,01025.0,E,4,12,0.8,43.8,M,,M,," for moment in ("235958.00", "235959.00", "000000.00", "000001.00"))
+    )
+    got = read(path, kind="nmea")
+    np.testing.assert_allclose(np.diff(got.t), 1.0)
+    assert "undated" in codes(got)
+
+
+def test_px4(tmp_path: Path) -> None:
+    log = trial(20.0)
+    got = reader_for(path := written_recorders.ulog(log, tmp_path)).read(path)
+    assert set(got.channels) == {"x", "y", "psi", "phi", "u", "v", "r", "p"}
+    assert got.meta["epoch"] == pytest.approx(EPOCH, abs=1e-6)
+    np.testing.assert_allclose(got.t, log.t, atol=1e-9)
+    for name in ("psi", "r"):
+        np.testing.assert_allclose(got[name], log[name], atol=1e-9)
+    for name in ("x", "y", "u", "v"):
+        np.testing.assert_allclose(got[name], log[name], atol=2e-6, err_msg=name)
+    assert "quaternion_flips" in codes(got)
+    exact = read(path, kind="ulog", standard_messages=False, channels={"x": {"topic": "vehicle_local_position", "field": "exact_x", "unit": "m"}})
+    np.testing.assert_allclose(exact["x"], log["x"], atol=1e-12)
+    assert exact.meta["topics_not_used"] == ["vehicle_angular_velocity", "vehicle_attitude", "vehicle_gps_position"]
+
+
+def test_ardupilot(tmp_path: Path) -> None:
+    log = trial(20.0)
+    got = reader_for(path := written_recorders.ardupilot(log, tmp_path)).read(path)
+    assert set(got.channels) == {"x", "y", "psi", "phi", "u", "v", "r", "p"}
+    assert got.meta["epoch"] == pytest.approx(EPOCH, abs=2e-3)
+    np.testing.assert_allclose(got.t, log.t, atol=1e-9)
+    for name in ("x", "y", "r"):
+        np.testing.assert_allclose(got[name], log[name], atol=1e-9)
+    # the attitude has single precision, in degrees
+    for name in ("psi", "u", "v"):
+        np.testing.assert_allclose(got[name], log[name], atol=2e-6, err_msg=name)
+
+
+@pytest.mark.parametrize(
+    ("write", "name"), [(written_recorders.nmea, "NMEA 0183"), (written_recorders.ulog, "PX4 ULog"), (written_recorders.ardupilot, "ArduPilot log")]
+)
+def test_known_by_content_and_clear_when_damaged(write: Callable[[Log, Path], Path], name: str, tmp_path: Path) -> None:
+    path = write(trial(3.0), tmp_path).rename(tmp_path / "recording")
+    found = format_of(path)
+    assert found is not None
+    assert found.name == name
+    whole = path.read_bytes()
+    for share in (0.02, 0.3, 0.9):
+        path.write_bytes(whole[: int(share * len(whole))])
+        said = outcome(path)
+        assert said is None or ("\n" not in said and "recording" in said)
+
+
+def outcome(path: Path) -> str | None:
+    """What reading ends in: None for a log, else the error's text; anything but residnet's own errors passes through."""
+    try:
+        reader_for(path).read(path)
+    except (UsageError, DataError) as error:
+        return str(error)
+    return None
