@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +15,13 @@ from residnet.control.anticipation import Derivatives, Lag, course, needed_force
 from residnet.core.config import load_config
 from residnet.core.errors import ConfigError, FitError
 from residnet.export.feed_forward import export_feed_forward
-from residnet.physics.force_model import ForceModel
+from residnet.physics.force_model import FERRY_TERMS, ForceModel
 from residnet.physics.fossen import FossenVessel
 from residnet.physics.vessel import load_vessel
+from residnet.run_folder import RunFolder
 from residnet.studies.ferry_fit import constant_force, identify
-from residnet.studies.ferry_forward import forward_equations
+from residnet.studies.ferry_forward import forward_equations, missing_coefficients
+from residnet.studies.ferry_report import write
 from residnet.studies.ferry_runs import MotionNoise
 from residnet.studies.jervan2020 import Study, record_of, study
 from residnet.tasks.ferry_study import FerryStudyConfig
@@ -79,6 +82,42 @@ def test_a_fitted_model_runs_forward_as_the_true_ferry(short: Study) -> None:
     with torch.no_grad():
         nu_dot = model(torch.cat((nu, acting), dim=-1))
     torch.testing.assert_close(nu_dot, short.first.nu_dot[half], rtol=0, atol=2e-3)
+
+
+def test_what_the_believed_hull_lacks_stands_beside_what_was_found() -> None:
+    """ERRATA J19: minus half of the believed model, which its own table misprints in the cross terms."""
+    truth = missing_coefficients("milliampere_half", "milliampere")
+    expected = {"u_dot": [-1194.83, 0, 0], "v_dot": [0, -1266.96, -14.07], "r_dot": [0, -31.19, -2534.45], "u": [-13.82, 0, 0], "r^2": [31.19, 0, 0]}
+    expected |= {
+        "u v": [0, 0, -72.13],
+        "u r": [0, -1194.83, -31.19],
+        "v r": [1266.96, 0, 0],
+        "|v|r": [0, 286.07, -60.98],
+        "|r|v": [0, -770.19, 168.41],
+    }
+    for term, values in expected.items():
+        assert truth[term] == pytest.approx(values, abs=0.006)
+    assert set(truth) <= set(FERRY_TERMS)
+
+
+def test_feed_forward_alone_and_a_model_that_cannot_run_forward(tmp_path: Path) -> None:
+    found = study(config("operation", *SHORT, "~crossing", "feed_forward_alone=true", "models.case={fit: {kind: plsr, order: 1}, fly: true}"))
+    alone = found.alone
+    assert list(alone) == ["believed", "lag_ridge", "case"]
+    assert not any(bool(flight.feedback.any()) for flight in alone.values())
+    # the thrusters give what is asked for, and half a ferry moves about twice as much
+    assert alone["lag_ridge"].tracking.motion_mse[0] < 0.02 * alone["believed"].tracking.motion_mse[0]
+    assert alone["believed"].tracking.position_mae > 10 * found.courses["believed"].tracking.position_mae
+    upside_down = found.models["case"].model.corrections[0]
+    upside_down.coefficients[:3] -= 5000.0 * torch.eye(3)
+    wanted = config("operation", *SHORT, "~crossing", "feed_forward_alone=true", "models.case={fit: {kind: plsr, order: 1}, fly: true}")
+    folder = RunFolder.create(tmp_path / "run", "", resume=False)
+    text = write(wanted, found, folder)
+    assert "Cannot run forward in time:\n\n- model case: its mass matrix" in text
+    assert {path.name for path in (tmp_path / "run" / "models").glob("*.yaml")} == {"lag_ridge_forward.yaml"}
+    assert {path.name for path in folder.figures.glob("*.png")} >= {"errors_course.png", "forces_course.png", "errors_feed_forward_alone.png"}
+    row = json.loads((tmp_path / "run" / "ferry.json").read_text())["course"]["lag_ridge"]
+    assert row["power"][0] * float(found.first.t[-1]) == pytest.approx(row["energy"][0], rel=0.01)
 
 
 def test_exported_feed_forward_is_the_model(short: Study, tmp_path: Path) -> None:

@@ -33,6 +33,9 @@ def draw_surface(error: Tensor, unmodelled: Sequence[float], chosen: Mapping[str
             for (name, picks), mark in zip(chosen.items(), ("x", "o", "s"), strict=False):
                 order, count = picks[axis]
                 axes.plot(count, order, mark, color="#D55E00", fillstyle="none", label=name, markersize=7)
+            # room for marks at the edge
+            axes.set_xlim(0.5, share.shape[1] + 0.5)
+            axes.set_ylim(-0.5, share.shape[0] + 1.5)
             axes.set_title(_AXES[axis], loc="left")
             axes.set_xlabel("basis functions")
             axes.grid(visible=False)
@@ -40,7 +43,7 @@ def draw_surface(error: Tensor, unmodelled: Sequence[float], chosen: Mapping[str
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=3)
         bar = figure.colorbar(image, ax=panels, ticks=[-1, -0.5, 0, 0.5])
         bar.ax.set_yticklabels(["10 %", "32 %", "100 %", "316 %"])
-        bar.set_label("share of the mean square residual")
+        bar.set_label("share of the MSE that is left")
         save(
             figure,
             path,

@@ -21,6 +21,15 @@ _HEADS: tuple[tuple[str, Any], ...] = (
     (_PURPLE, (0, (4, 1, 1, 1))),
     (_SKY, (0, (2, 1))),
 )
+FAMILY: tuple[dict[str, Any], ...] = (
+    {"color": _ORANGE, "linestyle": "--"},
+    {"color": _BLUE, "linestyle": "-"},
+    {"color": _VERMILLION, "linestyle": (0, (6, 1.5))},
+    {"color": _PURPLE, "linestyle": (0, (4, 1, 1, 1))},
+    {"color": _GREEN, "linestyle": "-."},
+    {"color": _SKY, "linestyle": (0, (2, 1))},
+)
+"""Curves of a family, the reference first."""
 # the plant lies on the head that comes near it and shows it through its gaps
 _ORDER = {"zero": 3, "baseline": 3, "truth": 5}
 MEASURED: dict[str, Any] = {"color": "black", "linestyle": "-", "linewidth": 0.7, "label": "measured", "zorder": 2}

@@ -30,6 +30,7 @@ class FerrySettings(Config):
         crossing: an operational crossing that is flown too; null for none.
         noise: on what is measured; null for none.
         disturbance: constant in earth axes.
+        feed_forward_alone: fly the course without feedback too (Table 4.8).
         models: by name, each after those that it stands on.
         published: the document's figures for the believed model.
         later: a vessel that the true one has become; models that fly are judged on its log and identified again where they no longer fit.
@@ -46,6 +47,7 @@ class FerrySettings(Config):
     crossing: CrossingConfig | None = None
     noise: MotionNoise | None = None
     disturbance: Disturbance = Disturbance()
+    feed_forward_alone: bool = False
     models: dict[_Name, FerryModelConfig] = Field(min_length=1)
     published: Published = Published()
     later: str | None = None

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
+from pydantic import Field
 from torch import Tensor
 
 from residnet.control.anticipation import Lag
@@ -29,7 +30,10 @@ class Published(Config):
         heading_mae: deg.
         tau: mean |tau| in N, N, N m.
         feedback: mean |tau_FB|.
+        alone: MSE of u, v, r and their derivatives against the desired ones without feedback, in (m/s)^2, (rad/s)^2 and per second squared.
         crossing_position_mae, crossing_position_mse, crossing_heading_mae: the same of the operational crossing.
+        crossing_power: mean power of keeping position and heading in the crossing in W.
+        coefficients: Theta by basis function, surge, sway and yaw.
     """
 
     mse: tuple[float, float, float] | None = None
@@ -41,6 +45,9 @@ class Published(Config):
     crossing_position_mae: float | None = None
     crossing_position_mse: float | None = None
     crossing_heading_mae: float | None = None
+    alone: tuple[float, float, float, float, float, float] | None = None
+    crossing_power: tuple[float, float] | None = None
+    coefficients: dict[str, tuple[float, float, float]] = Field(default_factory=dict)
 
 
 class ResidualModelConfig(Config):

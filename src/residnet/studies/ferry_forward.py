@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from residnet.baselines.believed import BelievedConfig, HullEquations
-from residnet.core.names import VELOCITY
-from residnet.physics.force_model import Correction, ForceModel, augmented
+from residnet.core.names import ACCELERATION, VELOCITY
+from residnet.physics.force_model import FERRY_TERMS, MOTION, Correction, ForceModel, augmented
 from residnet.physics.signals import FORCE_CHANNELS
+from residnet.physics.terms import parse_term
 
 
 def forward_equations(believed: str, model: ForceModel, who: str) -> HullEquations:
@@ -44,6 +46,36 @@ def forward_equations(believed: str, model: ForceModel, who: str) -> HullEquatio
         table[term] = table.get(term, torch.zeros(3, dtype=torch.float64)) - inverse @ force
     by_axis = [{term: float(value[axis]) for term, value in table.items() if float(value[axis]) != 0.0} for axis in range(3)]
     return HullEquations(u=by_axis[0], v=by_axis[1], r=by_axis[2])
+
+
+def missing_coefficients(true: str, believed: str) -> dict[str, list[float]]:
+    """What a believed hull lacks to the true one, by basis function: the residual's own coefficients (surge, sway, yaw) (ERRATA J19)."""
+    parts = [_force_coefficients(name) for name in (true, believed)]
+    nothing = torch.zeros(3, dtype=torch.float64)
+    out: dict[str, list[float]] = {}
+    for key in dict.fromkeys((*parts[1], *parts[0])):
+        apart = parts[0].get(key, nothing) - parts[1].get(key, nothing)
+        # what is equal in both differs by rounding
+        apart = torch.where(apart.abs() > 1e-9 * (1 + parts[0].get(key, nothing).abs()), apart, nothing)
+        if bool(apart.any()):
+            out[key] = apart.tolist()
+    return out
+
+
+def _force_coefficients(vessel: str) -> dict[str, Tensor]:
+    """F(nu_dot, nu) of a vessel's hull by basis function, [3] each, those of document 002 under its names."""
+    names = {_factors(term): term for term in FERRY_TERMS}
+    rows = BelievedConfig(vessel=vessel).equations().rows()
+    columns = {
+        term: torch.tensor([row.get(term, 0.0) for row in rows], dtype=torch.float64) for term in dict.fromkeys(t for row in rows for t in row)
+    }
+    mass = torch.linalg.inv(torch.stack([columns[name] for name in FORCE_CHANNELS], dim=1))
+    out = {name: mass[:, axis] for axis, name in enumerate(ACCELERATION)}
+    return out | {names.get(_factors(term), term): -mass @ column for term, column in columns.items() if term not in FORCE_CHANNELS}
+
+
+def _factors(term: str) -> tuple[Any, ...]:
+    return tuple(sorted(parse_term(term, MOTION)))
 
 
 def as_vessel_lines(equations: HullEquations, who: str) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import final
 
 import torch
@@ -104,6 +104,7 @@ class Flight:
         seen: measured pose, nu, nu_dot [N, 9].
         command: tau_c at the samples [N, 3].
         averaged: tau_c averaged over the steps around each sample [N, 3]: without the noise between samples that would fold down.
+        feedback: tau_FB [N, 3].
         acting: the thrusters' force [N, 3].
         desired: eta_d [N, 3].
         tracking: metrics over every step.
@@ -116,6 +117,7 @@ class Flight:
     seen: Tensor
     command: Tensor
     averaged: Tensor
+    feedback: Tensor
     acting: Tensor
     desired: Tensor
     tracking: Tracking
@@ -150,6 +152,10 @@ class Ferry:
         if disturbance == Disturbance():
             plants[0].in_calm_water()
         return cls(plants[0], plants[1], loop, disturbance, noise, seed)
+
+    def without_feedback(self) -> Ferry:
+        """The same with the feed-forward alone."""
+        return replace(self, loop=self.loop.model_copy(update={"frequency": (0.0, 0.0, 0.0)}))
 
     def fly_course(self, config: ReferenceFilterConfig, models: Sequence[tuple[ForceModel, Lag | None]]) -> list[Flight]:
         """The course with each model as feed-forward, all in one batch."""
@@ -197,8 +203,8 @@ class Ferry:
         seen_state = torch.cat((x[:, :6] + noise[:, :6], x[:, 6:]), dim=-1)
         error = pid.error(seen_state, reference)
         feedback, _ = pid(seen_state, reference[:, :9], (error.cumsum(0) - error) * self.loop.step)
-        metrics = tracking(x[:, :3], x[:, 3:6], reference[:, :3], command, feedback, self.loop.step)
         rate = self.true.rate(x, w)
+        metrics = tracking(x[:, :3], torch.cat((x[:, 3:6], rate[:, 3:6]), dim=-1), reference[:, :9], command, feedback, self.loop.step)
         every, half = slice(None, None, self.loop.every), self.loop.every // 2
         ends = torch.cat((command[:1].expand(half, 3), command, command[-1:].expand(half, 3)))
         averaged = ends.unfold(0, 2 * half + 1, 1).mean(-1)
@@ -212,6 +218,7 @@ class Ferry:
             seen[every],
             command[every],
             averaged[every],
+            feedback[every],
             x[every, 6:9],
             reference[every, :3],
             metrics,

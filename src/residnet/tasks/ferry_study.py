@@ -29,7 +29,8 @@ class FerryStudyConfig(FerrySettings):
         """
         import torch
 
-        from residnet.studies.jervan2020 import study, write
+        from residnet.studies.ferry_report import write
+        from residnet.studies.jervan2020 import study
 
         started = time.time()
         torch.set_num_threads(1)
