@@ -13,6 +13,7 @@ from sklearn.linear_model import Ridge
 from sklearn.metrics.pairwise import rbf_kernel
 
 from residnet.core.errors import ConfigError, FitError
+from residnet.core.samples import Samples
 from residnet.heads import KernelConfig
 from residnet.heads.kernel import KernelHead
 from residnet.heads.kernel_functions import Polynomial, Rbf, spread_out
@@ -186,3 +187,36 @@ def test_terms_that_say_nothing_are_refused() -> None:
         head.calibrate(SAMPLES)
     with pytest.raises(ConfigError, match="torque"):
         KernelConfig(terms=("torque^2",)).build(NAMES)
+
+
+def test_recursion_is_a_free_run_of_one_velocity() -> None:
+    """Against a loop over single samples, with scikit-learn's own fits."""
+    random, step, names = np.random.default_rng(3), 0.2, ("u", "v", "r", "n")
+    z, rates = np.zeros((60, 4)), np.zeros((60, 3))
+    z[:, 3] = random.normal(size=60)
+    for k in range(59):
+        rates[k] = [-0.3 * z[k, 0] + z[k, 3], -0.5 * z[k, 1] + 0.2 * z[k, 0], -z[k, 2] + 0.4 * z[k, 1]] + 0.05 * random.normal(size=3)
+        z[k + 1, :3] = z[k, :3] + step * rates[k]
+    group = np.repeat([0, 1], 30)
+    t = step * np.concatenate((np.arange(30), np.arange(30)))
+    made_here = Samples(torch.from_numpy(z), torch.from_numpy(rates), torch.from_numpy(group), torch.from_numpy(t), ("a", "b"), names)
+    penalties = (1e-3, 1.0)
+    head = KernelConfig(kernel=Rbf(sigma=(2.0, 20.0)), penalties=penalties, choose="recursion", folds=2, margin=100.0).build(names)
+    head.calibrate(made_here)
+    notes = head.solve(made_here)
+    mean, std = z.mean(0), z.std(0)
+    for i, sigma in enumerate((2.0, 20.0)):
+        for j, penalty in enumerate(penalties):
+            model = KernelRidge(kernel="rbf", gamma=1 / (2 * sigma), alpha=penalty * 60).fit((z - mean) / std, rates)
+            for axis in range(3):
+                errors = []
+                for start in (0, 30):
+                    x = z[start, axis]
+                    for k in range(start, start + 29):
+                        own = z[k].copy()
+                        own[axis] = x
+                        x = x + step * model.predict(((own - mean) / std)[None])[0, axis]
+                        errors.append((x - z[k + 1, axis]) ** 2)
+                assert notes["recursion_error"][i][j][axis] == pytest.approx(np.mean(errors), rel=1e-6)
+    flat = np.array(notes["recursion_error"]).reshape(4, 3).argmin(0)
+    assert notes["penalty"] == [penalties[k % 2] for k in flat]

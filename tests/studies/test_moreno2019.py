@@ -12,7 +12,7 @@ import pytest
 from residnet.core.errors import UsageError
 from residnet.studies import draw_study
 
-MODELS = ("zero", "baseline", "rbf_joint", "rbf_each", "p1_joint", "p1_each", "p2_joint", "p2_each", "symbolic")
+MODELS = ("zero", "baseline", "rbf_joint", "rbf_each", "p1_joint", "p1_each", "p2_joint", "p2_each", "symbolic", "gptips")
 COLUMNS = ("u", "v", "r", "psi", "x", "y")
 
 
@@ -67,5 +67,5 @@ def test_tables_hold_the_errors_of_the_records(tmp_path: Path) -> None:
 
 
 def test_a_run_without_a_model_of_the_study_says_which(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="'symbolic' is absent"):
+    with pytest.raises(UsageError, match="'gptips' is absent"):
         draw_study("moreno2019", made(tmp_path, MODELS[:-1]))

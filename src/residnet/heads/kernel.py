@@ -15,6 +15,7 @@ from residnet.core.solutions import Solution
 from residnet.heads.base import ClosedFormHead, FeatureConfig, Features
 from residnet.heads.kernel_fit import Path
 from residnet.heads.kernel_functions import Polynomial, Rbf
+from residnet.heads.kernel_recursion import Recursion
 from residnet.physics.terms import TermLibrary
 
 
@@ -28,7 +29,8 @@ class KernelConfig(FeatureConfig):
         penalties: candidates, for each sample: the document's lambda (scikit-learn's alpha) is penalty * samples.
         choose: `free_run`, jointly: the setting of the kernel and one penalty for all axes by the error of free runs on validation data, then
             the penalty of each axis in turn for as long as free runs gain, or no residual at all (document 001 section 4, second approach);
-            `one_step`: setting and penalty of each axis for itself by cross-validated errors of accelerations.
+            `one_step`: setting and penalty of each axis for itself by cross-validated errors of accelerations; `recursion`: of each axis for
+            itself by the error of its own velocity in free run along the training records, the other velocities as measured (first approach).
         folds: folds of the cross-validation; a manoeuvre is never split between folds.
     """
 
@@ -36,7 +38,7 @@ class KernelConfig(FeatureConfig):
     kernel: Annotated[Rbf | Polynomial, Field(discriminator="kind")] = Field(default_factory=Rbf)
     terms: tuple[str, ...] = ()
     penalties: tuple[Annotated[float, Field(gt=0)], ...] = Field(default=(1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1), min_length=1)
-    choose: Literal["one_step", "free_run"] = "free_run"
+    choose: Literal["one_step", "recursion", "free_run"] = "free_run"
     folds: int = Field(default=5, ge=2)
 
     def build(self, names: Sequence[str]) -> KernelHead:
@@ -96,6 +98,7 @@ class KernelHead(ClosedFormHead):
         self.penalties = tuple(sorted(config.penalties))
         self.folds = config.folds
         self.by_free_run = config.choose == "free_run"
+        self.by_recursion = config.choose == "recursion"
         self.register_buffer("effective", torch.zeros(3, dtype=torch.float64))
         self.effective: Tensor
 
@@ -119,10 +122,10 @@ class KernelHead(ClosedFormHead):
         return [float(count) for count in self.effective]
 
     def solutions(self, samples: Samples) -> list[Solution]:
-        """Of each axis the setting and penalty of the least cross-validated error; where free runs choose, then all joint ones, and no residual.
+        """Of each axis the setting and penalty of the least error; where free runs choose, then all joint ones, and no residual.
 
         Raises:
-            FitError: with fewer manoeuvres than folds.
+            FitError: with fewer manoeuvres than folds, or where a recursion finds no samples that follow each other.
         """
         groups = torch.unique(samples.group)
         if groups.numel() < self.folds:
@@ -132,16 +135,32 @@ class KernelHead(ClosedFormHead):
             x = self.columns(samples.z)
             paths = self.kernel.paths(x, samples.target, fold, self.folds, [penalty * len(x) for penalty in self.penalties])
         errors = torch.stack([path.errors for path in paths])
-        best = errors.flatten(0, 1).argmin(0)
+        judged = self._recursion(paths, samples) if self.by_recursion else errors
+        best = judged.flatten(0, 1).argmin(0)
         count = len(self.penalties)
         picks = [_Pick(tuple((best // count).tolist()), tuple((best % count).tolist()))]
-        notes = {"cross_validated_error": errors.tolist(), "samples": len(x)}
+        notes = {"cross_validated_error": errors.tolist(), "samples": len(x)} | ({"recursion_error": judged.tolist()} if self.by_recursion else {})
         if not self.by_free_run:
             return [self._solution(paths, picks[0], notes)]
         picks += [_Pick((i,) * 3, (j,) * 3) for i in range(len(paths)) for j in range(count)]
         nothing = {f"kernel.{name}": value for name, value in self.kernel.nothing().items()}
         none = Solution({"penalty": []}, nothing | {"effective": torch.zeros(3, dtype=torch.float64)}, notes=notes)
         return [*(self._solution(paths, pick, notes) for pick in picks), none]
+
+    def _recursion(self, paths: Sequence[Path], samples: Samples) -> Tensor:
+        """Mean square errors of each velocity in free run of its own, [settings, penalties, 3]."""
+        recursion = Recursion(samples)
+        out = torch.zeros(len(paths), len(self.penalties), 3, dtype=torch.float64)
+        for i, path in enumerate(paths):
+            for axis in range(3):
+                weights = path.coefficients[:, :, axis]
+
+                def predicted(z: Tensor, path: Path = path, weights: Tensor = weights) -> Tensor:
+                    return torch.einsum("cgp,cp->cg", self.kernel.along(path, self.columns(z)), weights)
+
+                with torch.no_grad():
+                    out[i, :, axis] = recursion.errors(axis, predicted, len(self.penalties))
+        return out
 
     def _solution(self, paths: Sequence[Path], pick: _Pick, notes: dict[str, Any]) -> Solution:
         parts = list(enumerate(zip(pick.settings, pick.penalties, strict=True)))

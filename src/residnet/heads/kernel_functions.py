@@ -32,6 +32,10 @@ class Kernel(nn.Module, ABC):
         """Fits of targets [N, 3] at features [N, F] with absolute penalties, one path for each setting of the kernel."""
 
     @abstractmethod
+    def along(self, path: Path, x: Tensor) -> Tensor:
+        """Raw features [..., P] that the coefficients of a path belong to, at features [..., F]."""
+
+    @abstractmethod
     def chosen(self, paths: Sequence[Path], coefficients: Tensor) -> tuple[dict[str, Any], dict[str, Tensor]]:
         """What there is to say of the path that each axis takes, and the state with coefficients [P, 3]."""
 
@@ -83,6 +87,10 @@ class RbfKernel(Kernel):
 
             out.append(replace(primal_path(features, whiten, x, y, fold, folds, penalties), sigma=sigma, points=points))
         return out
+
+    def along(self, path: Path, x: Tensor) -> Tensor:
+        """The kernel between x and the points that carry the function."""
+        return torch.exp(-squared_distances(x, path.points) / (2 * path.sigma))
 
     def chosen(self, paths: Sequence[Path], coefficients: Tensor) -> tuple[dict[str, Any], dict[str, Tensor]]:
         """Sigma of each axis, and the points, gamma and coefficients."""
@@ -143,6 +151,10 @@ class PolynomialKernel(Kernel):
     def paths(self, x: Tensor, y: Tensor, fold: Tensor, folds: int, penalties: Sequence[float]) -> list[Path]:
         """A single path, exact for any number of samples."""
         return [primal_path(self.products, torch.eye(len(self.coefficients), dtype=torch.float64), x, y, fold, folds, penalties)]
+
+    def along(self, path: Path, x: Tensor) -> Tensor:
+        """The products."""
+        return self.products(x)
 
     def chosen(self, paths: Sequence[Path], coefficients: Tensor) -> tuple[dict[str, Any], dict[str, Tensor]]:
         """Nothing to say; the coefficients."""

@@ -30,7 +30,8 @@ _NAMES = {
     "p1_each": "polynomial p = 1, each for itself",
     "p2_joint": "polynomial p = 2, together",
     "p2_each": "polynomial p = 2, each for itself",
-    "symbolic": "symbolic regression",
+    "symbolic": "symbolic regression, sparse",
+    "gptips": "symbolic regression, GPTIPS settings",
     "zero": "velocities held",
 }
 _SHOWN = {"baseline": "#E69F00", "rbf_joint": "#0072B2", "p2_joint": "#D55E00"}
