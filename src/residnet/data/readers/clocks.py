@@ -23,17 +23,20 @@ _TELLING = 0.1
 _FEW, _NEAR = 0.01, 1.0
 
 
-def settle(recording: Recording, delays: Mapping[str, float], zone: float | None = None) -> Recording:
+def settle(recording: Recording, delays: Mapping[str, float | None], zone: float | None = None) -> Recording:
     """The recording with one clock for all: offsets removed, rows of every series in order.
 
     Args:
         recording: as read.
-        delays: topic -> time in s by which its rows are older than their time says; they are moved back by it.
+        delays: topic -> time in s by which its rows are older than their time says; they are moved back by it. None takes the usual latency of
+            the topics that have stamps and arrivals, for one that has arrivals only.
         zone: time by which the recorder's clock is ahead of UTC, s; None estimates it from topics with stamp and arrival.
     """
     series = {name: _plausible(one) for name, one in recording.series.items()}
     offsets = {name: _offset(one) for name, one in series.items() if one.stamp is not None and one.arrival is not None and len(one)}
     shift, remarks = _recorder(offsets, zone)
+    late = [float(np.median(series[name].arrival - series[name].stamp)) - shift for name in offsets]  # type: ignore[operator]
+    usual = max(0.0, float(np.median(late))) if late else 0.0
     out = {}
     for name, one in series.items():
         arrival = None if one.arrival is None else one.arrival - shift
@@ -41,7 +44,7 @@ def settle(recording: Recording, delays: Mapping[str, float], zone: float | None
         if name in offsets:
             one = one.noting(*_latency(one, offsets[name] - shift))
         delay = next((seconds for topic, seconds in delays.items() if same_topic(topic, [name])), 0.0)
-        out[name] = _moved(_ordered(one), delay)
+        out[name] = _moved(_ordered(one), (usual if one.stamp is None else 0.0) if delay is None else delay)
     return dataclasses.replace(recording, series=out, remarks=(*recording.remarks, *remarks))
 
 

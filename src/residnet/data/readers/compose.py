@@ -13,6 +13,7 @@ import numpy as np
 from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS
+from residnet.data.readers.agreement import agreement
 from residnet.data.readers.motion import at_centre, body_velocity, centre_velocity, derive_motion
 from residnet.data.readers.parts import Part, channel_parts, heading_part, position_part, present, velocity_part
 from residnet.data.readers.quantities import (
@@ -76,7 +77,9 @@ def compose(recording: Recording, plan: Plan, clock: ClockConfig, longest_gap: f
     states = [values[name] for name in _STATE if name in values]
     lost = np.isnan(np.stack(states)).any(axis=0) if states else np.zeros(len(t), dtype=bool)
     masks = {"hard:gap": lost} if lost.any() else {}
-    return Log(recording.path.stem, t, values, units, masks=masks, meta=_meta(recording, plan, parts, times))
+    log = Log(recording.path.stem, t, values, units, masks=masks, meta=_meta(recording, plan, parts, times))
+    seen = agreement(recording, log, float(times[0]), log.meta["topics_not_used"])
+    return log.replace(meta={**log.meta, "findings": [*log.meta["findings"], *seen]})
 
 
 def _parts(recording: Recording, plan: Plan, longest_gap: float) -> list[Part]:

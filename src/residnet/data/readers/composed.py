@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from pathlib import Path
-from typing import final
+from typing import Literal, final
 
 from pydantic import Field, model_validator
 
@@ -30,7 +30,8 @@ class RecordingConfig(Config, ABC):
         velocity: source of u and v (and r) where they are not channels.
         standard_messages: standard messages of ROS map themselves to what is not declared, by REP-103 (ENU, forward-left-up).
         clock: the log's clock.
-        delays: topic -> time in s by which what it says is older than its time says.
+        delays: topic -> time in s by which what it says is older than its time says; `estimated` takes, for a topic without header stamps, the usual
+            latency of those that have them.
         zone: time by which the recorder's clock is ahead of UTC, s; null estimates it where topics have stamps and arrivals.
         longest_gap: longest step that is interpolated across, s; slow topics may always step over three of their usual steps.
         manoeuvre: kind of manoeuvre of every recording, `folder` takes the name of the folder it lies in, null says that nobody knows.
@@ -42,7 +43,7 @@ class RecordingConfig(Config, ABC):
     velocity: VelocityConfig | None = None
     standard_messages: bool = True
     clock: ClockConfig = Field(default_factory=OfTopic)
-    delays: dict[str, Seconds] = Field(default_factory=dict)
+    delays: dict[str, Seconds | Literal["estimated"]] = Field(default_factory=dict)
     zone: Seconds | None = None
     longest_gap: Seconds = Field(default=1.0, gt=0.0)
     manoeuvre: str | None = None
@@ -87,7 +88,8 @@ class RecordingReader(LogReader):
             DataError: where the contents cannot be used.
         """
         config = self._config
-        recording = settle(config.load(path, self._wanted()), config.delays, config.zone)
+        delays = {topic: None if delay == "estimated" else delay for topic, delay in config.delays.items()}
+        recording = settle(config.load(path, self._wanted()), delays, config.zone)
         plan = Plan(config.channels, config.position, config.heading, config.velocity)
         if config.standard_messages:
             plan = standard_plan(recording, plan)
