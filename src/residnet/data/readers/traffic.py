@@ -55,7 +55,10 @@ def publishers(one: Series, step: np.ndarray) -> list[Remark]:
     short = float((step < 0.2 * step.mean()).mean())
     for path, values in one.fields.items():
         leaps, returns, width = _returns(values)
-        if (short > 0.15 and returns > 0.05 and returns > 0.3 * leaps) or (returns > 0.3 and returns > 0.8 * leaps and width > 0.05):
+        bursts = short > 0.15 and returns > 0.05 and returns > 0.3 * leaps
+        mixed = short > 0.05 and returns > 0.2 and returns > 0.35 * leaps and width > 0.05
+        in_turns = returns > 0.3 and returns > 0.8 * leaps and width > 0.05
+        if bursts or mixed or in_turns:
             text = (
                 f"topic {one.name}: several publishers seem to write to it: field {path} leaps away and straight back in {returns:.0%} of the rows, "
                 f"{short:.0%} of the steps are shorter than a fifth of the mean; do not use it unless the source tells its senders apart"
