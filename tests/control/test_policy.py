@@ -41,13 +41,14 @@ def test_port_mirrors_starboard() -> None:
     mirrored = x.clone()
     for name in ("psi", "r"):
         mirrored[:, VESSEL.column(name)] *= -1
-    reference, s = torch.randn(50, 1, dtype=torch.float64), 0.05 * torch.randn(50, 4, dtype=torch.float64)
-    mirrored_s = s * torch.tensor([-1.0, -1.0, -1.0, 1.0], dtype=torch.float64)
+    sign = torch.tensor([-1.0] * 4 + [1.0] * 5, dtype=torch.float64)
+    reference = torch.randn(50, 1, dtype=torch.float64)
+    s = policy.initial_state(x) + 0.01 * torch.randn(50, 9, dtype=torch.float64)
+    mirrored_s = s * sign
     command, after = policy(x, reference, s)
     other, other_after = policy(mirrored, -reference, mirrored_s)
     assert torch.allclose(command, -other, atol=1e-12)
-    assert torch.allclose(after[:, :3], -other_after[:, :3], atol=1e-12)
-    assert torch.allclose(after[:, 3], other_after[:, 3], atol=1e-12)
+    assert torch.allclose(after, sign * other_after, atol=1e-12)
     assert command.abs().max() <= LIMIT
 
 
@@ -105,7 +106,7 @@ def test_wrong_inputs_bring_the_safe_command_and_a_flag(measured: list[float], r
     assert fault.all()
     expected = last if safe == "hold" else last - last.clamp(-0.2 * 0.05, 0.2 * 0.05)
     assert torch.allclose(command, expected)
-    assert torch.equal(after[:, :4], s[:, :4])
+    assert torch.equal(after[:, :9], s[:, :9])
     again, _, fault = module.step(good, torch.tensor([[0.5]]), after)
     assert torch.isfinite(again).all()
     assert not fault.any()
@@ -113,7 +114,7 @@ def test_wrong_inputs_bring_the_safe_command_and_a_flag(measured: list[float], r
 
 def test_a_spoilt_memory_is_given_up() -> None:
     module = for_export(untrained(), "amidships")
-    s = torch.full((1, 5), math.nan)
+    s = torch.full((1, 10), math.nan)
     command, after, fault = module.step(torch.tensor([[0.0, 3.2, 0.0]]), torch.tensor([[0.1]]), s)
     assert fault.all()
     assert torch.isfinite(command).all()

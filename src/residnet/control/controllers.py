@@ -11,6 +11,7 @@ from pydantic import Field
 from torch import Tensor
 
 from residnet.control.bang_bang import BangBangHeading
+from residnet.control.bang_bang_rate import RatedBangBangHeading
 from residnet.control.base import Policy
 from residnet.control.document_autopilot import DocumentAutopilot, SimulatedPredictor
 from residnet.control.heading_pid import HeadingPID
@@ -153,12 +154,15 @@ class LqrConfig(TunedConfig):
 
 
 class BangBangConfig(ControllerConfig):
-    """Time-optimal control of T r_dot + r = K delta, which knows the vessel exactly: the floor."""
+    """Time-optimal control of T r_dot + r = K delta, which knows the vessel and its rudder's rate exactly: the floor."""
 
     kind: Literal["bang_bang"] = "bang_bang"
 
     def build(self, steering: Steering) -> Policy:
         """The controller."""
+        vessel, turning = steering.vessel, steering.turning
+        if vessel.rate is not None:
+            return RatedBangBangHeading(vessel.state, gain=turning.gain, time=turning.time, limit=steering.limit, rate=vessel.rate, dt=steering.dt)
         return BangBangHeading(steering.vessel.state, gain=steering.turning.gain, time=steering.turning.time, limit=steering.limit)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import final
 
@@ -14,7 +14,7 @@ from residnet.control.base import ClosedLoop, GivenReference, Policy
 from residnet.control.turning import Turning, measure_turning
 from residnet.core.frames import wrap
 from residnet.dynamics.base import Dynamics
-from residnet.dynamics.rollout import Rollout
+from residnet.dynamics.rollout import Rollout, Source
 from residnet.dynamics.varied import VariedPlant
 from residnet.physics.plant import HullPlant, Plant
 
@@ -34,7 +34,11 @@ class SteeredVessel(ABC):
 
     @abstractmethod
     def model(self, dt: float, integrator: str = "rk4") -> Dynamics:
-        """Steps of dt seconds; its memory s [B, 3] is the variation of each row (`dynamics.varied.VARIATION`)."""
+        """Steps of dt seconds; the first columns of its memory are the variation of each row (`dynamics.varied.VARIATION`)."""
+
+    def memory(self, variation: Tensor) -> Tensor:
+        """Of `model`, for variations [B, 3]."""
+        return variation
 
     @abstractmethod
     def start(self, speed: Tensor) -> tuple[Tensor, Tensor]:
@@ -50,7 +54,7 @@ class SteeredVessel(ABC):
         """K and T at the service speed, from the answer to a held rudder angle [rad]."""
         x, w = self.start(torch.ones(1, dtype=torch.float64))
         variation = torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64)
-        return measure_turning(self.model(dt), x, w, variation, (self.column("u"), self.column("r")), angle, duration)
+        return measure_turning(self.model(dt), x, w, self.memory(variation), (self.column("u"), self.column("r")), angle, duration)
 
 
 @final
@@ -88,7 +92,8 @@ class NominalSteering(Dynamics):
         super().__init__(dt, "rk4")
         self.inner = vessel.model(dt)
         self.others = vessel.start(torch.ones(1, dtype=torch.float64))[1][0, 1:]
-        self.register_buffer("nominal", torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64), persistent=False)
+        nominal = torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64)
+        self.register_buffer("nominal", vessel.memory(nominal), persistent=False)
         self.nominal: Tensor
 
     def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
@@ -139,25 +144,32 @@ class Measured(Policy):
 
 @dataclass(frozen=True)
 class Flights:
-    """B heading changes of T steps: states [B, T+1, nx], inputs [B, T, m], reference [B] in rad, and the step in s."""
+    """B heading changes of T steps: states [B, T+1, nx] and their names, inputs [B, T, m], reference [B] in rad, and the step in s."""
 
     states: Tensor
     inputs: Tensor
     heading: Tensor
     dt: float
-    psi: int
-    r: int
+    names: tuple[str, ...]
+
+    def of(self, name: str) -> Tensor:
+        """A state [B, T+1]."""
+        return self.states[:, :, self.names.index(name)]
 
     @property
     def error(self) -> Tensor:
         """Reference less heading [B, T+1], wrapped."""
-        return wrap(self.heading[:, None] - self.states[:, :, self.psi])
+        return wrap(self.heading[:, None] - self.of("psi"))
 
     def settled(self, band: float) -> Tensor:
-        """Time [B] of the last entry into +-band [rad]; the flight's length where it is outside at the end."""
-        outside = self.error.abs() > band
-        last = outside.shape[1] - outside.flip(1).to(torch.int64).argmax(1)
-        return torch.where(outside.any(1), last, 0) * self.dt
+        """Time [B] of the last entry into +-band [rad], between samples along a straight line; the flight's length where it ends outside."""
+        size = self.error.abs()
+        outside = ~(size <= band)
+        inside = outside.flip(1).to(torch.int64).argmax(1)
+        last = (size.shape[1] - 1 - inside).unsqueeze(1)
+        before, after = (size.gather(1, k.clamp(max=size.shape[1] - 1))[:, 0] for k in (last, last + 1))
+        share = torch.where(inside > 0, (before - band) / (before - after).clamp(min=1e-12), 0.0)
+        return torch.where(outside.any(1), last[:, 0] + share, 0.0) * self.dt
 
     def overshoot(self) -> Tensor:
         """Largest heading beyond the reference [B] in rad, seen from the first heading; zero where there is none."""
@@ -167,6 +179,18 @@ class Flights:
     def absolute_error(self) -> Tensor:
         """Integral of |error| [B] in rad s."""
         return self.error[:, :-1].abs().sum(1) * self.dt
+
+    def effort(self) -> Tensor:
+        """Integral of the squared rudder command [B] in rad^2 s: the control energy."""
+        return self.inputs[:, :, 0].square().sum(1) * self.dt
+
+    def rms(self, name: str, start: float = 0.0) -> Tensor:
+        """Root of the mean square [B] of a state from a time [s] on."""
+        return self.of(name)[:, round(start / self.dt) :].square().mean(1).sqrt()
+
+    def rudder_rms(self, start: float = 0.0) -> Tensor:
+        """Root of the mean square [B] of the rudder command in rad from a time [s] on."""
+        return self.inputs[:, round(start / self.dt) :, 0].square().mean(1).sqrt()
 
     def travel(self) -> Tensor:
         """How far the rudder command travels [B] in rad, from amidships on."""
@@ -183,20 +207,23 @@ def fly(
     dt: float,
     duration: float,
     speed: Tensor | None = None,
-    weather: Mapping[str, float] | None = None,
+    weather: Mapping[str, float | Tensor] | None = None,
+    surround: Callable[[Source], Source] | None = None,
 ) -> Flights:
     """Heading changes [B] in rad from straight ahead of vessels varied by [B, 3], float64, without gradients.
 
     Args:
         speed: multiples [B] of the service speed.
-        weather: exogenous inputs by name, SI.
+        weather: exogenous inputs by name, SI, for all rows or [B].
+        surround: what adds to the inputs of the closed loop, for example waves.
     """
     heading, variation = heading.double(), variation.double()
     x, w = vessel.start(torch.ones_like(heading) if speed is None else speed.double())
     for name, value in (weather or {}).items():
         w[:, vessel.inputs.index(name)] = value
     steps = round(duration / dt)
-    loop = Rollout(vessel.model(dt), ClosedLoop(policy.double(), GivenReference(heading[:, None, None])))
+    loop: Source = ClosedLoop(policy.double(), GivenReference(heading[:, None, None]))
     with torch.no_grad():
-        states, inputs, _ = loop(x, w.unsqueeze(1).expand(-1, steps, -1), variation)
-    return Flights(states, inputs, heading, dt, vessel.column("psi"), vessel.column("r"))
+        free = Rollout(vessel.model(dt), loop if surround is None else surround(loop))
+        states, inputs, _ = free(x, w.unsqueeze(1).expand(-1, steps, -1), vessel.memory(variation))
+    return Flights(states, inputs, heading, dt, vessel.state)

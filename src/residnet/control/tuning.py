@@ -68,7 +68,7 @@ class LinearRows(Policy):
         return wish.clamp(-self.limit, self.limit), torch.where(winding, s, s + self.dt * error)
 
 
-def tune(config: TunedConfig, steering: Steering, task: TuningTask, points: int = 400, rounds: int = 4) -> Tuned:
+def tune(config: TunedConfig, steering: Steering, task: TuningTask, points: int = 400, rounds: int = 6) -> Tuned:
     """Search the missing parameters on grids, each a fifth of the one before around the best so far.
 
     Raises:

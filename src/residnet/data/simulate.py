@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 import torch
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
 from residnet.core.config import Config, Seconds
 from residnet.core.errors import ConfigError
@@ -17,7 +17,7 @@ from residnet.data.flying import Craft, Flight, Sea, fly
 from residnet.data.sensors import SensorNoise
 from residnet.dynamics.simulated import PlantDynamics
 from residnet.manoeuvres import FamilyConfig, Helm, Manoeuvre
-from residnet.physics.vessel import load_vessel
+from residnet.physics.vessel import VesselName, load_vessel
 
 
 class SimulatedTrials(Config):
@@ -36,7 +36,7 @@ class SimulatedTrials(Config):
     """
 
     kind: Literal["simulated"] = "simulated"
-    vessel: str
+    vessel: VesselName
     trials: tuple[FamilyConfig, ...] = Field(min_length=1)
     duration: Seconds = Field(default=60.0, gt=0)
     step: Seconds = Field(default=0.05, gt=0)
@@ -46,15 +46,6 @@ class SimulatedTrials(Config):
     identification: dict[str, int]
     validation: dict[str, int]
     seed: int = Field(default=0, ge=0)
-
-    @field_validator("vessel")
-    @classmethod
-    def _vessel(cls, vessel: str) -> str:
-        try:
-            load_vessel(vessel)
-        except ConfigError as error:
-            raise ValueError(str(error)) from None
-        return vessel
 
     @model_validator(mode="after")
     def _felt(self) -> SimulatedTrials:

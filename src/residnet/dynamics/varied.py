@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+import math
+from collections.abc import Sequence
 from typing import final
 
 import torch
@@ -9,6 +12,7 @@ from torch import Tensor
 
 from residnet.core.errors import ConfigError
 from residnet.dynamics.base import Dynamics
+from residnet.dynamics.hybrid import HybridDynamics
 from residnet.physics.plant import Plant
 
 VARIATION = ("effect", "time", "bias")
@@ -63,3 +67,59 @@ class VariedPlant(Dynamics):
         p = self.plant.prepare(self._felt(x, angle), held)
         moved = self.integrate(x, p, torch.cat((angle, 1.0 / s[:, 1:2] - 1.0), dim=-1))
         return self.plant.settle(moved, w, self.dt), s
+
+
+@final
+class VariedModel(Dynamics):
+    """A learned model of a hull behind a rudder that follows its command at a rate, each row with its own variation.
+
+    State x [B, 6 or 7]: x, y, psi, u, v, r, and the rudder angle where it has a rate. Memory s [B, 3 + k]: the variation, then the head's.
+    `effect` multiplies the rudder angle that the model is given, `time` divides what a step changes in sway and yaw.
+
+    Args:
+        model: of the hull.
+        dt: step in s.
+        take: for each input of the model its column of w; the rudder's command is the first of w.
+        mean: whether the model's inputs are means over the step.
+        rate: of the rudder in rad/s; None where it stands at its command at once.
+
+    Raises:
+        ConfigError: where the model has a memory and steps of another length.
+    """
+
+    def __init__(self, model: HybridDynamics, dt: float, take: Sequence[int], mean: bool, rate: float | None) -> None:
+        super().__init__(dt, model.integrator)
+        if model.n_state > 0 and not math.isclose(model.dt, dt, rel_tol=1e-9):
+            raise ConfigError(f"the learned model has a memory and steps of {model.dt:g} s; give the policy's training this dt, not {dt:g} s")
+        # one for each precision: policies are trained in single and flown in double
+        self.models = tuple(copy.deepcopy(model).to(dtype).eval().requires_grad_(False) for dtype in (torch.float32, torch.float64))
+        for own in self.models:
+            own.dt = dt
+        self.n_state = len(VARIATION) + model.n_state
+        self.take, self.mean = list(take), mean
+        self.travel = None if rate is None else rate * dt
+
+    def initial_state(self, batch: int) -> Tensor:
+        """The model itself, without a past, [batch, 3 + k]."""
+        return torch.tensor([1.0, 1.0] + [0.0] * (self.n_state - 2)).expand(batch, -1)
+
+    def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
+        """x_dot [B, 6] of the model at a stage, as if it were not varied; steps do not need it."""
+        return self._of(x).rate(x[:, :6], p, rho)
+
+    def _of(self, x: Tensor) -> HybridDynamics:
+        return self.models[1 if x.dtype == torch.float64 else 0]
+
+    def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """State and memory one step later under the commands w [B, m]."""
+        command, angle = w[:, :1], x[:, 6:]
+        if self.travel is None:
+            stands = after = command
+        else:
+            stands, after = angle, angle + (command - angle).clamp(-self.travel, self.travel)
+        felt = (0.5 * (stands + after) if self.mean else stands) * s[:, :1] + s[:, 2:3]
+        given = torch.cat((felt, w[:, 1:]), dim=1)[:, self.take]
+        moved, memory = self._of(x).step(x[:, :6], given, s[:, 3:])
+        slowed = x[:, 4:6] + (moved[:, 4:] - x[:, 4:6]) / s[:, 1:2]
+        parts = (moved[:, :4], slowed) if self.travel is None else (moved[:, :4], slowed, after)
+        return torch.cat(parts, dim=1), torch.cat((s[:, :3], memory), dim=1)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from residnet.evaluation.figures_style import RC, collect, legend_above, new_figure, save
@@ -44,26 +45,28 @@ def draw_responses(path: Path, series: pd.DataFrame, names: Sequence[str], headi
         save(figure, path, f"Step responses of {name}", caption)
 
 
-def draw_distributions(path: Path, rows: Sequence[dict[str, Any]], names: Sequence[str], name: str) -> None:
-    """Settling time and overshoot over random vessels: mean, 95th percentile and largest."""
+def draw_distributions(path: Path, plants: pd.DataFrame, names: Sequence[str], name: str) -> None:
+    """Settling time, overshoot, rudder travel and energy over random vessels, as the share of them that stays below a value."""
     import matplotlib
 
-    random = {row["model"]: row for row in rows if row["protocol"] == "random"}
+    quantities = (
+        ("settling", 1.0, "settling time [s]"),
+        ("overshoot", 180.0 / math.pi, "overshoot [deg]"),
+        ("travel", 180.0 / math.pi, "rudder travel [deg]"),
+        ("energy", (180.0 / math.pi) ** 2, "control energy [deg$^2$ s]"),
+    )
     with matplotlib.rc_context(RC):
-        figure = new_figure(0.9 + 0.32 * len(names))
-        left, right = figure.subplots(1, 2, sharey=True)
-        for axis, quantity, scale, text in ((left, "settling", 1.0, "settling time [s]"), (right, "overshoot", 180.0 / math.pi, "overshoot [deg]")):
+        figure = new_figure(4.6)
+        axes = figure.subplots(2, 2, sharey=True).flatten()
+        handles: dict[str, Any] = {}
+        for axis, (quantity, scale, text) in zip(axes, quantities, strict=True):
             for place, controller in enumerate(names):
-                found = {key: scale * value for key, value in random[controller][quantity].items()}
-                colour = _COLOURS[place % len(_COLOURS)]
-                axis.plot([found["mean"], found["max"]], [place, place], color=colour, linewidth=1.0)
-                axis.plot(found["mean"], place, "o", color=colour, markersize=5)
-                axis.plot(found["p95"], place, "|", color=colour, markersize=9)
-            axis.set(xlabel=text, yticks=range(len(names)), yticklabels=names)
-        left.invert_yaxis()
-        save(
-            figure,
-            path,
-            f"Random vessels of {name}",
-            "Over random vessels of the spread: mean (dot), 95th percentile (bar), largest (end of the line).",
-        )
+                found = plants.loc[plants["controller"] == controller, quantity].sort_values().to_numpy() * scale
+                share = (np.arange(len(found)) + 1.0) / len(found)
+                axis.step(found, share, where="post", color=_COLOURS[place % len(_COLOURS)], linewidth=1.2, label=controller)
+            axis.set(xlabel=text, ylim=(0.0, 1.02))
+        for axis in (axes[0], axes[2]):
+            axis.set(ylabel="share of vessels")
+        collect(handles, axes[0])
+        legend_above(figure, handles)
+        save(figure, path, f"Random vessels of {name}", f"Share of {len(plants) // len(names)} random vessels of the spread that stay below a value.")

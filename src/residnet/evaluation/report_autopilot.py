@@ -12,12 +12,14 @@ from typing import Any
 import pandas as pd
 
 from residnet.core.config import load_mapping
-from residnet.evaluation.autopilots import table
+from residnet.evaluation.autopilots import effort_table, table
 from residnet.evaluation.figures import read_figures
 from residnet.evaluation.figures_autopilot import draw_distributions, draw_responses
 
 FLIGHTS = "flights.parquet"
 """By this file an autopilot's run folder is known."""
+PLANTS = "plants.parquet"
+"""What each random vessel gave."""
 
 _STYLE = (
     "body{margin:0 auto;max-width:60rem;padding:1rem;font:1rem/1.5 system-ui,sans-serif;color:#1a1f24}"
@@ -32,13 +34,30 @@ def write_autopilot_report(run: Path) -> Path:
     names = list(dict.fromkeys(row["model"] for row in metrics["rows"]))
     test = config["test"]
     draw_responses(run / "figures" / "responses.png", pd.read_parquet(run / FLIGHTS), names, test["heading"], test["band"], config["name"])
-    draw_distributions(run / "figures" / "distributions.png", metrics["rows"], names, config["name"])
+    draw_distributions(run / "figures" / "distributions.png", pd.read_parquet(run / PLANTS), names, config["name"])
     controllers = json.loads((run / "controllers.json").read_text())
     path = run / "report.html"
     partial = path.with_name(path.name + ".partial")
     partial.write_text(_page(run, config, metrics, controllers), encoding="utf-8")
     partial.replace(path)
     return path
+
+
+def _effort(test: dict[str, Any]) -> str:
+    """What the table of effort means."""
+    text = (
+        f"Effort over the {test['plants']} random vessels, mean and 95th percentile: integral of the absolute heading error, travel of the rudder "
+        "command, and its energy, the integral of its square."
+    )
+    if test.get("wind"):
+        text += f" Wind: largest error after {test['bias_time']:g} s in {test['wind']:g} m/s from eight directions."
+    if sea := test.get("sea"):
+        text += (
+            f" Sea: roots of mean squares over {test['sea_time']:g} s after the step in waves of {sea['significant_height']:g} m significant height "
+            f"and {sea['peak_period']:g} s peak period that travel towards {math.degrees(sea['direction']):.3g} deg ({sea['spectrum']['kind']}), "
+            f"mean over eight realisations, on a course of {math.degrees(test['heading']):.3g} deg."
+        )
+    return text
 
 
 def _page(run: Path, config: dict[str, Any], metrics: dict[str, Any], controllers: dict[str, Any]) -> str:
@@ -58,7 +77,8 @@ def _page(run: Path, config: dict[str, Any], metrics: dict[str, Any], controller
     return (
         f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>{title}: residnet report</title><style>{_STYLE}</style></head><body>'
         f"<h1>{title}</h1><p>{html.escape(str(config.get('description') or ''))}</p><p>{html.escape(definition)}</p>"
-        f"<pre>{html.escape(table(metrics['rows'], metrics['floor']))}</pre>{figures}"
+        f"<pre>{html.escape(table(metrics['rows'], metrics['floor']))}</pre>"
+        f"<p>{html.escape(_effort(test))}</p><pre>{html.escape(effort_table(metrics['rows']))}</pre>{figures}"
         f"<h2>Controllers</h2><pre>{html.escape(json.dumps(controllers, indent=1))}</pre>"
         f"<h2>Configuration</h2><pre>{html.escape((run / 'resolved.yaml').read_text())}</pre></body></html>"
     )

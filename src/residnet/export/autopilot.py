@@ -36,7 +36,7 @@ class Limits(NamedTuple):
 class ExportedPolicy(nn.Module):
     """What a controller calls once per step; float32, SI and radians.
 
-    The memory s [B, 5] is that of the policy and the last command. `fault` tells that a measurement, the reference or the memory was no
+    The memory s [B, 10] is that of the policy and the last command. `fault` tells that a measurement, the reference or the memory was no
     number or out of range: then the command is the safe one, reached at the rudder's rate, and the policy's memory stays as it was.
     """
 
@@ -54,7 +54,7 @@ class ExportedPolicy(nn.Module):
 
     @torch.jit.export
     def initial_state(self, y: Tensor) -> Tensor:
-        """Memory s [B, 5] at the first measurement y [B, 3], rudder amidships."""
+        """Memory s [B, 10] at the first measurement y [B, 3], rudder amidships."""
         good = self._good(y).unsqueeze(-1)
         return torch.cat((self.policy.initial_state(torch.where(good, y, torch.zeros_like(y))), torch.zeros_like(y[:, :1])), dim=-1)
 
@@ -63,7 +63,7 @@ class ExportedPolicy(nn.Module):
 
     @torch.jit.export
     def step(self, y: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Rudder command [B, 1] in rad, memory [B, 5] and fault [B] from y [B, 3] = (psi, u, r), reference heading [B, 1] and memory."""
+        """Rudder command [B, 1] in rad, memory [B, 10] and fault [B] from y [B, 3] = (psi, u, r), reference heading [B, 1] and memory."""
         remembers = torch.isfinite(s).all(dim=-1, keepdim=True)
         s = torch.where(remembers, s, torch.zeros_like(s))
         good = (self._good(y) & torch.isfinite(reference[:, 0]) & (reference[:, 0].abs() <= self.high[0])).unsqueeze(-1)
@@ -84,7 +84,7 @@ class ExportedPolicy(nn.Module):
 def for_export(policy: HeadingPolicy, safe: Literal["hold", "amidships"]) -> ExportedPolicy:
     """The policy in float32 with its checks: headings up to 1000 turns, three times its speed, five times the steady turn at full rudder."""
     policy = copy.deepcopy(policy).float().eval().requires_grad_(False)
-    policy.psi, policy.u, policy.r = range(3)
+    policy.read_from(MEASURED)
     turn = 5.0 * policy.gain * policy.limit
     return ExportedPolicy(policy, Limits((-2000.0 * math.pi, 2000.0 * math.pi), (0.0, 3.0 * policy.speed), (-turn, turn)), safe).eval()
 

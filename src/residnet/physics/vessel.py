@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from residnet.core.config import load_config
 from residnet.core.errors import ConfigError
@@ -41,3 +41,15 @@ def load_vessel(name: str) -> AnyVessel:
     if path.suffix in {".yaml", ".yml"}:
         return load_config(path, [], VesselConfig)
     raise ConfigError(f"no vessel '{name}'{nearest(name, files)}; or give the path of a vessel's yaml file")
+
+
+def _loadable(name: str) -> str:
+    try:
+        load_vessel(name)
+    except ConfigError as error:
+        raise ValueError(str(error)) from None
+    return name
+
+
+VesselName = Annotated[str, AfterValidator(_loadable)]
+"""In a config: name or path of a vessel file, read once to see that it is right."""

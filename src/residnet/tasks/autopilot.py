@@ -7,17 +7,31 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
 from residnet.control.controllers import AnyController, BangBangConfig
-from residnet.core.config import Config, Radians, Seconds, dump_config
-from residnet.core.errors import ConfigError
+from residnet.core.config import Config, MetresPerSecond, Radians, Seconds, dump_config
 from residnet.core.names import nearest
-from residnet.physics.vessel import load_vessel
+from residnet.data.environment import Disturbance, WindField
+from residnet.physics.environment_waves import WavesConfig
+from residnet.physics.vessel import VesselName, load_vessel
 from residnet.run_folder import RunFolder
+from residnet.tasks.learned import chosen_model
 from residnet.training.autopilot_config import AutopilotTraining, SpreadConfig
 
 _Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
+
+
+class LearnedConfig(Config):
+    """A model of the vessel that an earlier run (task `fit`) identified from logs.
+
+    Attributes:
+        run: folder of that run.
+        model: name of the model; `selected` is the one chosen on validation data.
+    """
+
+    run: Path
+    model: str = "selected"
 
 
 class PolicyConfig(Config):
@@ -27,12 +41,14 @@ class PolicyConfig(Config):
         hidden: widths of the layers.
         observer: bandwidth of the disturbance observer as a multiple of 1/T.
         training: how it is trained.
+        learned: a learned model to train on instead of the vessel itself; the policy is then compared on the vessel.
         imitate: name of a peer whose commands it learns to give; null to train it for fast changes without overshoot.
     """
 
     hidden: Annotated[tuple[int, ...], Field(min_length=1)] = (24, 24)
     observer: float = Field(default=8.0, ge=1)
     training: AutopilotTraining = AutopilotTraining()
+    learned: LearnedConfig | None = None
     imitate: _Name | None = None
 
 
@@ -49,6 +65,9 @@ class StepTestConfig(Config):
         bias: constant rudder angle of the steady-error test.
         bias_error: largest heading error there after `bias_time`.
         bias_time: see above.
+        wind: mean wind speed of the same test in wind, from eight directions and without bias; null for none.
+        sea: waves in which the course is kept after the step; null for none.
+        sea_time: how long, counted from the end of the step's flight.
     """
 
     heading: Radians = Field(default=0.5235987755982988, gt=0, lt=3.1)
@@ -60,6 +79,13 @@ class StepTestConfig(Config):
     bias: Radians = Field(default=0.017453292519943295, ge=0)
     bias_error: Radians = Field(default=0.0034906585039886592, gt=0)
     bias_time: Seconds = Field(default=60.0, gt=0)
+    wind: MetresPerSecond | None = Field(default=None, gt=0)
+    sea: WavesConfig | None = None
+    sea_time: Seconds = Field(default=120.0, gt=0)
+
+    def weather(self) -> Disturbance:
+        """What the vessel must be able to feel."""
+        return Disturbance(wind=None if self.wind is None else WindField(speed=self.wind, direction=0.0), waves=self.sea)
 
 
 class AutopilotConfig(Config):
@@ -86,7 +112,7 @@ class AutopilotConfig(Config):
     description: str = ""
     seed: int = Field(default=0, ge=0)
     threads: int = Field(default=1, ge=1)
-    vessel: str
+    vessel: VesselName
     rudder: Radians = Field(gt=0, lt=1.5)
     turning_time: Seconds = Field(default=100.0, gt=0)
     spread: SpreadConfig = SpreadConfig()
@@ -96,15 +122,6 @@ class AutopilotConfig(Config):
     floor: _Name | None = None
     tuning_points: int = Field(default=256, ge=16)
     safe: Literal["hold", "amidships"] = "amidships"
-
-    @field_validator("vessel")
-    @classmethod
-    def _vessel(cls, vessel: str) -> str:
-        try:
-            load_vessel(vessel)
-        except ConfigError as error:
-            raise ValueError(str(error)) from None
-        return vessel
 
     @model_validator(mode="after")
     def _names(self) -> AutopilotConfig:
@@ -117,18 +134,35 @@ class AutopilotConfig(Config):
             raise ValueError(f"floor: '{self.floor}' must name a peer of kind bang_bang")
         return self
 
+    @model_validator(mode="after")
+    def _felt(self) -> AutopilotConfig:
+        plant = load_vessel(self.vessel).build()
+        self.test.weather().check(plant, self.vessel)
+        for name in self.spread.needs():
+            if name not in plant.inputs:
+                raise ValueError(f"spread: vessel '{self.vessel}' has no input '{name}'; it has {', '.join(plant.inputs)}")
+        return self
+
     def check(self) -> None:
-        """Everything was checked when the config was read."""
+        """Whether the runs of learned models are there.
+
+        Raises:
+            UsageError: where one is not.
+        """
+        for policy in self.policies.values():
+            if policy.learned is not None:
+                chosen_model(policy.learned.run, policy.learned.model)
 
     def run(self, *, source: Path, overrides: Sequence[str], out: Path | None, resume: bool) -> RunFolder:
         """Train, tune, compare, export.
 
         Raises:
-            UsageError: where the folder exists.
+            UsageError: where the folder exists, or the run of a learned model is missing.
             FitError: where tuning or training fails.
         """
         from residnet.tasks.autopilot_run import run_autopilot
 
+        self.check()
         started = time.time()
         folder = RunFolder.create(out or Path("runs") / self.name, dump_config(self), resume=resume)
         run_autopilot(self, folder)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from functools import cached_property
 
@@ -21,9 +20,10 @@ from residnet.data.sensors import SensorNoise
 from residnet.dynamics.actuated import ActuatedDynamics
 from residnet.dynamics.gear import GivenGear, InputShare, PlantGear
 from residnet.dynamics.simulated import TracedPlantDynamics
-from residnet.dynamics.store import load_model, model_names
+from residnet.dynamics.store import load_model
 from residnet.manoeuvres import FamilyConfig, Helm, Manoeuvre, ManoeuvreConfig, Replay
 from residnet.physics.vessel import load_vessel
+from residnet.tasks.learned import chosen_model
 
 STEP = 0.05
 
@@ -56,14 +56,7 @@ class ModelChoice(Config):
         Raises:
             UsageError: where the folder holds no such model.
         """
-        names = model_names(self.run / "models")
-        if self.name != "selected" and self.name in names:
-            return self.name
-        metrics = self.run / "metrics.json"
-        selected = str(json.loads(metrics.read_text())["selected"]) if self.name == "selected" and metrics.is_file() else ""
-        if selected not in names:
-            raise UsageError(f"{self.run}: no model '{self.name}'{nearest(self.name, names) if names else '; not the folder of a finished fit'}")
-        return selected
+        return chosen_model(self.run, self.name)
 
 
 class Programme(Config):

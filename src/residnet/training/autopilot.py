@@ -14,12 +14,10 @@ from residnet.control.base import ClosedLoop, GivenReference, Policy
 from residnet.control.imitation import SideBySide
 from residnet.control.policy import HeadingPolicy
 from residnet.control.steering import Measured, SteeredVessel
-from residnet.core.errors import FitError
 from residnet.core.frames import wrap
 from residnet.dynamics.rollout import Rollout
 from residnet.training.autopilot_config import AutopilotTraining, SpreadConfig
-from residnet.training.epochs import EpochTraining
-from residnet.training.trainer import run_epochs
+from residnet.training.epochs import EpochTraining, run_epochs
 
 Score = Callable[[HeadingPolicy], float]
 
@@ -79,10 +77,10 @@ class AutopilotFit(EpochTraining):
         w = w.unsqueeze(1).expand(-1, steps, -1)
         if self.teacher is not None:
             difference = SideBySide(self.seen, self.teacher, reference)
-            Rollout(self.model, difference)(x, w, variation)
+            Rollout(self.model, difference)(x, w, self.vessel.memory(variation))
             loss = difference.total / (steps * self.policy.limit**2)
         else:
-            states, inputs, _ = Rollout(self.model, ClosedLoop(self.seen, reference))(x, w, variation)
+            states, inputs, _ = Rollout(self.model, ClosedLoop(self.seen, reference))(x, w, self.vessel.memory(variation))
             error = wrap(heading[:, None] - states[:, 1:, self.columns[0]])
             loss = (
                 self.cost(error, heading, variation, calm)
@@ -98,25 +96,28 @@ class AutopilotFit(EpochTraining):
         x, w = self.vessel.start(low + (high - low) * torch.rand(rows))
         heading = spread.heading * (2.0 * torch.rand(rows) - 1.0)
         straight = torch.arange(rows) % 8 < 5
-        undisturbed = torch.rand(rows) < 0.5
+        undisturbed = torch.rand(rows) >= spread.disturbed
         x[:, self.columns[1]] = torch.where(straight, 0.0, self.policy.gain * self.policy.limit * (2.0 * torch.rand(rows) - 1.0))
         bias = torch.where(undisturbed, 0.0, spread.bias * (2.0 * torch.rand(rows) - 1.0))
+        for name, values in spread.draw_weather(rows).items() if spread.weather else ():
+            w[:, self.vessel.inputs.index(name)] = torch.where(undisturbed, 0.0, values)
         return x, w, heading, torch.cat((spread.draw(rows), bias.unsqueeze(1)), dim=1), straight & undisturbed
 
     def cost(self, error: Tensor, heading: Tensor, variation: Tensor, calm: Tensor) -> Tensor:
         """Time outside the band, absolute error and overshoot of errors [B, T] after changes of heading [B].
 
         The share |e| / (|e| + band) counts time, so that small changes weigh as much as large ones. Where the start already turns or
-        something pushes, an overshoot may be unavoidable: it counts little there.
+        something pushes, the vessel cannot be known in time and an overshoot may be unavoidable: these count little.
         """
         own, size = self.settings, error.abs()
         outside = size / (size + own.band) + own.sharp * torch.sigmoid((size - own.band) * (5.0 / own.band))
         relative = size / (heading.abs()[:, None] + 5.0 * own.band)
         over = torch.relu(-error * heading.sign()[:, None] - own.margin) / own.band
-        over = over.amax(1) + 5.0 * over.mean(1) + 5.0 * over.amax(1).square()
-        slow = (variation[:, 1] / variation[:, 0]) ** own.slowest
+        most = over.amax(1)
+        over = torch.where(calm, most + 5.0 * over.mean(1) + 5.0 * most.square(), 0.05 * most)
+        slow = (variation[:, 1] / variation[:, 0]) ** own.slowest * torch.where(calm, 1.0, 0.25)
         weight = slow / slow.mean()
-        return (weight * (outside + 0.5 * relative).mean(1)).mean() + own.overshoot * (torch.where(calm, 1.0, 0.05) * over).mean()
+        return (weight * (outside + 0.5 * relative).mean(1)).mean() + own.overshoot * over.mean()
 
     def validated(self) -> tuple[nn.Module, float]:
         """The policy and its score."""
@@ -145,14 +146,4 @@ def train_autopilot(
         FitError: where no epoch gave a finite score.
     """
     fit = AutopilotFit(policy.float(), vessel, settings, spread, score, None if teacher is None else teacher.float(), seed)
-    run_epochs(name, fit, settings, folder)
-    if not fit.best_state:
-        raise FitError(f"policy {name}: no epoch gave a finite flight; lower the learning rate or the horizon")
-    policy.load_state_dict(fit.best_state)
-    policy.eval().requires_grad_(False)
-    return {
-        "parameters": sum(p.numel() for p in policy.parameters()),
-        "best_validation": fit.best_score,
-        "epochs": len(fit.history),
-        "curve": fit.history,
-    }
+    return run_epochs(name, fit, policy, policy, folder)

@@ -8,7 +8,7 @@ import torch
 from pydantic import Field, model_validator
 from torch import Tensor
 
-from residnet.core.config import Config, Radians, RadiansPerSecond, Seconds
+from residnet.core.config import Config, MetresPerSecond, Radians, RadiansPerSecond, Seconds
 
 Range = Annotated[tuple[float, float], Field(description="low and high multiple")]
 
@@ -20,7 +20,10 @@ class SpreadConfig(Config):
         effect: of the rudder, as a multiple (K of Nomoto's model).
         time: constants of sway and yaw, as a multiple (T of Nomoto's model).
         speed: at the start, as a multiple of the service speed, thrust to match.
+        disturbed: share of the training's changes of heading that start under a bias, wind or current.
         bias: largest constant angle that is added to the rudder's.
+        wind: slowest and fastest mean wind in training, from any direction, for vessels with wind coefficients; null for none.
+        current: fastest current in training, in any direction.
         heading: largest change of heading.
         noise_psi, noise_r: standard deviation of white sensor noise.
     """
@@ -28,7 +31,10 @@ class SpreadConfig(Config):
     effect: Range = (0.8, 1.2)
     time: Range = (0.8, 1.2)
     speed: Range = (1.0, 1.0)
+    disturbed: float = Field(default=0.5, ge=0, le=1)
     bias: Radians = Field(default=0.02, ge=0)
+    wind: tuple[MetresPerSecond, MetresPerSecond] | None = None
+    current: MetresPerSecond = Field(default=0.0, ge=0)
     heading: Radians = Field(default=1.0, gt=0, lt=3.1)
     noise_psi: Radians = Field(default=0.0, ge=0)
     noise_r: RadiansPerSecond = Field(default=0.0, ge=0)
@@ -39,7 +45,28 @@ class SpreadConfig(Config):
             low, high = getattr(self, name)
             if not 0 < low <= high:
                 raise ValueError(f"{name}: low and high must be positive and in order, given {low:g}, {high:g}")
+        if self.wind is not None and not 0 <= self.wind[0] <= self.wind[1]:
+            raise ValueError(f"wind: slowest and fastest must be in order and not negative, given {self.wind[0]:g}, {self.wind[1]:g}")
         return self
+
+    @property
+    def weather(self) -> bool:
+        """Whether there is wind or current."""
+        return self.wind is not None or self.current > 0
+
+    def needs(self) -> tuple[str, ...]:
+        """Inputs that a vessel must have for it."""
+        return (*(("wind_speed", "wind_dir") if self.wind is not None else ()), *(("current_north", "current_east") if self.current > 0 else ()))
+
+    def draw_weather(self, rows: int) -> dict[str, Tensor]:
+        """Inputs of a vessel by name, each [rows]."""
+        drawn, around = torch.rand(2, rows), 2.0 * torch.pi * torch.rand(2, rows)
+        out: dict[str, Tensor] = {}
+        if self.wind is not None:
+            out |= {"wind_speed": self.wind[0] + (self.wind[1] - self.wind[0]) * drawn[0], "wind_dir": around[0]}
+        if self.current > 0:
+            out |= {"current_north": self.current * drawn[1] * torch.cos(around[1]), "current_east": self.current * drawn[1] * torch.sin(around[1])}
+        return out
 
     def draw(self, rows: int) -> Tensor:
         """Effect and time [rows, 2], every second row at a corner of their ranges, where controllers fail first."""

@@ -1,14 +1,21 @@
-"""What every training has in common: epochs that repeat themselves when resumed, the best state so far, the curve, early stopping."""
+"""One trainer for all networks: epochs that repeat themselves when resumed, the best state so far, early stopping, TensorBoard, progress."""
 
 from __future__ import annotations
 
+import logging
 import math
+import sys
+import warnings
 from abc import ABC, abstractmethod
+from pathlib import Path
 from typing import Any, Protocol
 
 import lightning as L
 import torch
+from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor, nn
+
+from residnet.core.errors import FitError
 
 
 class Epochs(Protocol):
@@ -120,3 +127,99 @@ class EpochTraining(L.LightningModule, ABC):
         self.history, self.stopped = own["history"], own["stopped"]
         torch.set_rng_state(own["random"])
         torch.set_num_threads(own["threads"])
+
+
+class FinishEpoch(L.Callback):
+    """Lets the module finish its epoch before the checkpoint is written: Lightning runs callbacks before the module's own hook."""
+
+    def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Validate."""
+        assert isinstance(pl_module, EpochTraining)
+        pl_module.finish_epoch()
+
+
+class KeepCheckpoint(L.Callback):
+    """Writes `last.ckpt` after every epoch, whole or not at all."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Write beside the old one, then put it in place."""
+        partial = self.path.with_suffix(".partial")
+        trainer.save_checkpoint(partial)
+        partial.replace(self.path)
+
+
+class ProgressLine(L.Callback):
+    """One line that is rewritten on a terminal; a line every tenth of the epochs elsewhere."""
+
+    def __init__(self, name: str, epochs: int) -> None:
+        self.name = name
+        self.epochs = epochs
+
+    def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Show epoch, loss and the best validation."""
+        assert isinstance(pl_module, EpochTraining)
+        done, last = trainer.current_epoch + 1, pl_module.history[-1]
+        text = f"  {self.name}: epoch {done}/{self.epochs}, stage {int(last['stage'])}, loss {last['loss']:.4g}"
+        text += f", best validation {pl_module.best_score:.4g}"
+        if sys.stderr.isatty():
+            print(f"\r{text}\033[K", end="\n" if done == self.epochs or trainer.should_stop else "", file=sys.stderr, flush=True)
+        elif done % max(self.epochs // 10, 1) == 0 or done == self.epochs:
+            print(text, file=sys.stderr, flush=True)
+
+
+def run_epochs(name: str, module: EpochTraining, model: nn.Module, trained: nn.Module, folder: Path) -> dict[str, Any]:
+    """Train to the last epoch, from the last checkpoint where there is one, and leave the best state in the model; Ctrl-C can be resumed.
+
+    Args:
+        name: of what is trained; `checkpoints/<name>/last.ckpt` in the folder is resumed where it exists.
+        module: that trains it.
+        model: that is validated; it ends frozen, with the weights that scored best.
+        trained: its part whose parameters are counted.
+        folder: of the run.
+
+    Returns:
+        What there is to say: the curve by epoch, the best score, the number of parameters.
+
+    Raises:
+        FitError: where no epoch gave a finite validation.
+    """
+    logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
+    settings: Epochs = module.settings
+    checkpoints = folder / "checkpoints" / name
+    checkpoints.mkdir(parents=True, exist_ok=True)
+    last = checkpoints / "last.ckpt"
+    trainer = L.Trainer(
+        accelerator="cpu",
+        devices=1,
+        max_epochs=settings.epochs,
+        gradient_clip_val=settings.gradient_clip,
+        logger=TensorBoardLogger(folder / "tensorboard", name=name, version=""),
+        callbacks=[FinishEpoch(), KeepCheckpoint(last), ProgressLine(name, settings.epochs)],
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        num_sanity_val_steps=0,
+        log_every_n_steps=10**9,
+    )
+    if last.is_file():
+        module.restore(torch.load(last, weights_only=True)["residnet"])
+    # killed between the last epoch and the model's file: there is nothing left to train
+    if not module.finished:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            trainer.fit(module, ckpt_path=str(last) if last.is_file() else None, weights_only=True)
+    if trainer.interrupted:
+        raise KeyboardInterrupt
+    if not module.best_state:
+        raise FitError(f"{name}: no epoch gave a finite free run in validation; lower the learning rate or the horizon")
+    model.load_state_dict(module.best_state)
+    model.eval().requires_grad_(False)
+    return {
+        "parameters": sum(p.numel() for p in trained.parameters()),
+        "best_validation": module.best_score,
+        "epochs": len(module.history),
+        "curve": module.history,
+    }

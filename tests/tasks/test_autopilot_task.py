@@ -1,0 +1,125 @@
+"""The task `autopilot` from config to report: what is written, what the rows say, and a policy that learned on a learned model."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+import torch
+import yaml
+from tiny import call
+
+TRAINING = {"epochs": 1, "steps": 2, "batch": 32, "dt": "0.1 s", "horizon": "6 s", "learning_rate": 1e-3}
+SMALL: dict[str, Any] = {
+    "task": "autopilot",
+    "name": "small",
+    "vessel": "nomoto_oceanos",
+    "rudder": "5 deg",
+    "turning_time": "40 s",
+    "test": {"dt": "0.05 s", "duration": "12 s", "plants": 6, "bias_time": "60 s"},
+    "policies": {"policy": {"hidden": [6], "training": TRAINING}},
+    "peers": {"pd": {"kind": "pd"}, "bang_bang": {"kind": "bang_bang"}},
+    "floor": "bang_bang",
+    "tuning_points": 16,
+}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("autopilot")
+    config = folder / "small.yaml"
+    config.write_text(yaml.safe_dump(SMALL))
+    with pytest.MonkeyPatch.context() as patch:
+        assert call(patch, "run", config, "--out", folder / "run") == 0
+    return folder / "run"
+
+
+def rows(run: Path) -> dict[tuple[str, str], dict[str, Any]]:
+    return {(row["model"], row["protocol"]): row for row in json.loads((run / "metrics.json").read_text())["rows"]}
+
+
+def test_every_controller_flies_every_test(run: Path) -> None:
+    found = rows(run)
+    assert set(found) == {(name, test) for name in ("policy", "pd", "bang_bang") for test in ("nominal", "corners", "random", "bias")}
+    assert {found[(name, "nominal")]["kind"] for name in ("policy", "pd", "bang_bang")} == {"policy", "classical", "floor"}
+    assert found[("policy", "random")]["n"] == 6
+
+
+def test_the_floor_is_the_time_optimal_change(run: Path) -> None:
+    """Entry of the time-optimal manoeuvre into +-1 deg from its closed form: full rudder until t1, then full counter-rudder."""
+    gain, time, limit, change, band = 3.47, 3.94, math.radians(5), math.radians(30), math.radians(1)
+    steady = gain * limit
+    grid = torch.arange(0.0, 12.0, 1e-4, dtype=torch.float64)
+    rate = steady * (1 - torch.exp(-grid / time))
+    turned = steady * grid - time * rate
+    stopping = time * (rate - steady * torch.log1p(rate / steady))
+    switch = int(torch.argmin((turned + stopping - change).abs()))
+    after = grid[: 20 * 10_000]
+    coast = turned[switch] - steady * after + time * (rate[switch] + steady) * (1 - torch.exp(-after / time))
+    entry = float(grid[switch] + after[int(torch.argmax((coast >= change - band).to(torch.int64)))])
+    # a switch that comes up to a step late enters earlier, by as much at most
+    assert entry - 0.08 < rows(run)[("bang_bang", "nominal")]["settling"]["max"] < entry + 0.02
+
+
+def test_a_row_agrees_with_the_random_vessels_it_sums_up(run: Path) -> None:
+    plants = pd.read_parquet(run / "plants.parquet")
+    for name in ("policy", "pd"):
+        own, row = plants[plants["controller"] == name], rows(run)[(name, "random")]
+        for quantity in ("settling", "overshoot", "iae", "travel", "energy"):
+            assert own[quantity].mean() == pytest.approx(row[quantity]["mean"])
+            assert own[quantity].max() == pytest.approx(row[quantity]["max"])
+
+
+def test_the_flights_say_what_the_rows_say(run: Path) -> None:
+    series = pd.read_parquet(run / "flights.parquet")
+    nominal = series[(series["controller"] == "policy") & (series["effect"] == 1) & (series["time"] == 1)]
+    error = (math.radians(30) - nominal["psi"]).abs()
+    late = nominal["t"][error > math.radians(1)].max()
+    settling = rows(run)[("policy", "nominal")]["settling"]["max"]
+    assert late <= settling <= late + 0.05
+    # the error falls from 30 deg without overshoot to speak of: its integral by the trapezoid of the series
+    area = float((0.5 * (error[1:].to_numpy() + error[:-1].to_numpy()) * 0.05).sum())
+    assert rows(run)[("policy", "nominal")]["iae"]["max"] == pytest.approx(area, rel=0.02)
+
+
+def test_the_report_holds_tables_and_figures(run: Path) -> None:
+    text = (run / "report.html").read_text()
+    assert text.count("<img") == 2
+    for words in ("bang_bang", "IAE", "energy", "Linear peers are tuned"):
+        assert words in text
+    assert (run / "exports" / "policy.pt").is_file()
+
+
+def test_reporting_again_draws_the_same_report(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = (run / "report.html").read_text()
+    (run / "report.html").unlink()
+    assert call(monkeypatch, "report", run) == 0
+    assert (run / "report.html").read_text() == before
+
+
+def check(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, config: dict[str, Any]) -> int:
+    path = tmp_path / "wrong.yaml"
+    path.write_text(yaml.safe_dump(config))
+    return call(monkeypatch, "check", path)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"test": {**SMALL["test"], "wind": "10 m/s"}}, "no input 'wind_speed'"),
+        ({"spread": {"current": 0.5}}, "no input 'current_north'"),
+        ({"vessel": "nomoto_oceanus"}, "nomoto_oceanos"),
+        ({"floor": "pd"}, "kind bang_bang"),
+        ({"policies": {"policy": {"imitate": "pdd"}}}, "no peer 'pdd'"),
+        ({"policies": {"policy": {"learned": {"run": "nowhere"}}}}, "no such folder"),
+    ],
+)
+def test_wrong_configs_are_said_in_a_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], change: dict[str, Any], words: str
+) -> None:
+    assert check(tmp_path, monkeypatch, {**SMALL, **change}) == 2
+    assert words in capsys.readouterr().err
