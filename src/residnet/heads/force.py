@@ -15,6 +15,7 @@ from residnet.core.solutions import Solution
 from residnet.heads.base import ClosedFormHead
 from residnet.heads.basis import BasisConfig, BasisHead
 from residnet.physics.force_model import FERRY_TERMS, MOTION, accelerating, augmented
+from residnet.physics.signals import FORCE_CHANNELS
 
 
 def in_space(config: BasisConfig, names: Sequence[str], make: Callable[[BasisConfig, Sequence[str]], BasisHead]) -> ClosedFormHead:
@@ -42,6 +43,7 @@ class ForceHead(ClosedFormHead):
         self.inner = inner
         self.seen = inner.features.names
         self.moving = accelerating(inner.library.terms, self.seen)
+        self.still: list[str] = []
         self.register_buffer("mass", torch.eye(3, dtype=torch.float64))
         self.register_buffer("inverse", torch.eye(3, dtype=torch.float64))
         self.register_buffer("gain", torch.eye(3, dtype=torch.float64))
@@ -72,6 +74,8 @@ class ForceHead(ClosedFormHead):
     def calibrate(self, samples: Samples) -> None:
         """Take scales and ranges of the features from the samples; accelerations are solved for and never held."""
         self.inner.calibrate(samples)
+        varying = dict(zip(samples.names, samples.z.std(0).tolist(), strict=True))
+        self.still = [name for name in FORCE_CHANNELS if varying.get(name, 0.0) <= 1e-9]
         moved = samples.z[:, :3]
         self.lowest.copy_(moved.amin(0))
         self.highest.copy_(moved.amax(0))
@@ -103,7 +107,11 @@ class ForceHead(ClosedFormHead):
         total, _ = augmented(self.mass, self.inner.library.terms, coefficients, "residual in force space", self.seen)
         inverse = torch.linalg.inv(total)
         state = {f"inner.{name}": value for name, value in solution.state.items()} | {"inverse": inverse, "gain": inverse @ self.mass}
-        return Solution(solution.choice, state, notes=solution.notes | {"space": "force", "augmented_mass": total.tolist()})
+        notes = solution.notes | {"space": "force", "augmented_mass": total.tolist()}
+        if self.still:
+            # its equation of motion then holds up to a factor, and only the penalty and free runs keep that near one
+            notes["forces_that_never_vary"] = self.still
+        return Solution(solution.choice, state, notes=notes)
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """What the residual's part without accelerations does to nu_dot, -(M + A)^-1 b [..., 3], at channels z [..., nz]; the memory is empty."""

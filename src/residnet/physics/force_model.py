@@ -29,6 +29,10 @@ FERRY_TERMS: tuple[str, ...] = (
 """The 30 basis functions of document 002, (4.10)-(4.12)."""
 
 
+_WORST_CONDITION = 100.0
+"""Of a mass in units of the believed one: beyond it an axis has a hundredth of the mass that another has, and none in truth."""
+
+
 def order_of(term: str) -> int:
     """beta of a basis function: how many channels are multiplied in it (document 002 section 4.3.4)."""
     return max(sum(abs(factor.power) for factor in parse_term(term, MOTION)), 1)
@@ -131,9 +135,10 @@ def augmented(mass: Tensor, terms: Sequence[str], coefficients: Tensor, who: str
     total, rest = mass.clone(), [j for j in range(len(terms)) if j not in moving]
     for j, axis in moving.items():
         total[:, axis] += coefficients[j]
+    # in units of the believed masses, so that an axis that has lost its mass shows
     scale = mass.diagonal().abs().sqrt()
     values, condition = torch.linalg.eigvals(total).real, float(torch.linalg.cond(total / torch.outer(scale, scale)))
-    if bool((values <= 0).any()) or not condition < 1e4:
+    if bool((values <= 0).any()) or not condition < _WORST_CONDITION:
         raise FitError(
             f"{who}: its mass matrix with the fitted accelerations has eigenvalues {[round(float(v), 1) for v in values]} and condition "
             f"{condition:.1e}, it cannot run forward; give data with more acceleration, fewer terms, or a higher penalty or lower order"
