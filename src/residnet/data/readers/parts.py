@@ -65,7 +65,15 @@ class Part:
         from residnet.data.align import GridConfig, onto
 
         gap = max(self.longest_gap, _USUAL_GAP * self.step)
-        return onto(self.log, GridConfig(step=step, held=self.held, longest_gap=gap), times).channels
+        if times.size == self.log.t.size and np.array_equal(times, self.log.t):
+            return dict(self.log.channels)
+        out: dict[str, np.ndarray] = {}
+        # one by one: aligning needs several copies of what it aligns
+        for name, values in self.log.channels.items():
+            alone = self.log.replace(channels={name: values})
+            held = (name,) if name in self.held else ()
+            out.update(onto(alone, GridConfig(step=step, held=held, longest_gap=gap), times).channels)
+        return out
 
 
 def channel_parts(recording: Recording, channels: Mapping[str, FieldMap], longest_gap: float) -> list[Part]:
