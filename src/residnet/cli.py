@@ -59,11 +59,12 @@ def check(
 def inspect(
     logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="Logs: canonical Parquet, or anything that the config's reader reads.")],
     config: Annotated[Path | None, typer.Option("--config", metavar="CONFIG", help="A run whose channel map reads these logs.")] = None,
+    file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the findings to a file as JSON, too.")] = None,
 ) -> None:
-    """Look at logs as a doctor would: channels, rates, gaps, jumps, frames, excitation. Exit 1 where a fit would be misled."""
+    """Look at logs as a doctor would: clocks, gaps, jumps, frames, lags, copies, excitation. Exit 1 where a fit would be misled."""
     from residnet.tasks.inspection import inspect_logs
 
-    if inspect_logs(logs, config):
+    if inspect_logs(logs, config, file):
         raise typer.Exit(1)
 
 

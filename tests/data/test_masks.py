@@ -10,7 +10,7 @@ from pydantic import TypeAdapter
 from residnet.core.config import validate
 from residnet.core.errors import ConfigError, UsageError
 from residnet.core.log import Log
-from residnet.data.masks import Frozen, Gap, InputJump, Jump, MaskConfig, Missing, Outlier, apply_masks, hard_mask, scored, segments
+from residnet.data.masks import Frozen, Gap, Hampel, InputJump, Jump, MaskConfig, Missing, Outlier, apply_masks, hard_mask, scored, segments
 
 
 def log_of(t: np.ndarray | None = None, **channels: object) -> Log:
@@ -91,6 +91,48 @@ def test_the_rule_of_document_002_taken_literally_never_fires() -> None:
     assert Outlier(channels=("u",)).apply(log_of(u=np.append(window, np.zeros(10))))[5]
 
 
+def hampel_by_loop(values: np.ndarray, sigmas: float, samples: int) -> np.ndarray:
+    """The rule of the Hampel mask, sample by sample, for finite values; odd reflection beyond the ends."""
+    half, size = samples // 2, values.size
+
+    def at(i: int) -> float:
+        return 2 * values[0] - values[-i] if i < 0 else 2 * values[-1] - values[2 * size - 2 - i] if i >= size else values[i]
+
+    bent = [values[i] - np.median([(at(i - k) + at(i + k)) / 2 for k in range(1, 2 * half + 1)]) for i in range(size)]
+    mirrored = [[bent[abs(j)] if j < size else bent[2 * size - 2 - j] for j in range(i - half, i + half + 1)] for i in range(size)]
+    medians = [np.median(window) for window in mirrored]
+    spreads = [1.4826 * np.median(np.abs(np.array(window) - median)) for window, median in zip(mirrored, medians, strict=True)]
+    distances = [abs(b - median) for b, median in zip(bent, medians, strict=True)]
+    floor = max(1.4826 * np.median(distances), 2.0 * np.quantile([d for d in distances if d > 0], 0.1))
+    return np.array([d > sigmas * max(floor, s, abs(m)) for d, s, m in zip(distances, spreads, medians, strict=True)])
+
+
+def test_hampel_equals_an_independent_loop_on_random_logs() -> None:
+    rng = np.random.default_rng(4)
+    for samples in (7, 11):
+        for _ in range(20):
+            u = np.cumsum(rng.normal(size=120)) + rng.normal(size=120)
+            u[rng.choice(120, 4)] += rng.normal(0.0, 20.0, 4)
+            found = Hampel(channels=("u",), sigmas=4.0, samples=samples).apply(log_of(u=u))
+            np.testing.assert_array_equal(found, hampel_by_loop(u, 4.0, samples))
+
+
+def test_hampel_finds_outliers_in_groups_where_the_moving_rule_is_blind_and_leaves_motion_alone() -> None:
+    rng = np.random.default_rng(5)
+    t = np.arange(4000) * 0.1
+    motion = np.sin(0.3 * t) + 3.0 * t
+    u = motion + rng.normal(0.0, 0.02, t.size)
+    assert Hampel(channels=("u",)).apply(log_of(u=u)).sum() == 0
+    assert Hampel(channels=("u",)).apply(log_of(u=motion)).sum() == 0
+    bad = np.array([500, 501, 502, 1700, 1702, 3000])
+    u[bad] += 0.5
+    found = Hampel(channels=("u",)).apply(log_of(u=u))
+    assert np.flatnonzero(found).tolist() == bad.tolist()
+    assert not Outlier(channels=("u",)).apply(log_of(u=u))[bad].all()
+    turned = np.angle(np.exp(1j * (0.4 * t)))
+    assert not Hampel(channels=("psi",)).apply(log_of(psi=turned)).any()
+
+
 def test_outliers_beside_missing_samples() -> None:
     u = np.sin(np.arange(100) * 0.1)
     u[50], u[49] = 10.0, np.nan
@@ -131,7 +173,7 @@ def test_a_log_without_hard_masks_is_one_piece() -> None:
 def test_configs_read_quantities_and_refuse_nonsense() -> None:
     rule = validate({"kind": "frozen", "after": "500 ms"}, MaskConfig, "test")
     assert rule == Frozen(after=0.5)
-    assert {"frozen", "gap", "nan", "jump", "outlier", "input_jump"} == set(
+    assert {"frozen", "gap", "nan", "jump", "outlier", "hampel", "input_jump"} == set(
         TypeAdapter(MaskConfig).json_schema()["discriminator"]["mapping"],
     )
     for faulty in ({"kind": "gap"}, {"kind": "gap", "longest": 0}, {"kind": "gaps", "longest": 1}, {"kind": "outlier", "channels": []}):

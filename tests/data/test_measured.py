@@ -86,12 +86,15 @@ def test_the_doctor_finds_the_known_illnesses(logs: dict[str, list[Log]]) -> Non
     lags, gyro, freezes = [], {}, []
     for log in itertools.chain(*logs.values()):
         report = inspect(log)
-        assert not report.misled, report.lines()
+        assert not any(finding.level == "fatal" for finding in report.findings), report.lines()
         (frames,) = report.find("frames")
-        assert frames.figures["coherence"] > 0.97
+        assert (frames.level, frames.figures["coherence"] > 0.97) == ("note", True)
+        trailing = [finding for name in "uv" for finding in report.find(f"follows_{name}") if finding.level == "will mislead"]
+        assert all("trails" in finding.text for finding in trailing)
+        assert trailing or log.manoeuvre == "berthing"
         lags += [finding.figures["lag"] for name in "uv" for finding in report.find(f"follows_{name}")]
         gyro[log.name] = np.degrees(report.find("yaw_drift")[0].figures["end"])
-        freezes += [finding.figures["share"] for finding in report.find("frozen")]
+        freezes += [finding.figures["share"] for finding in report.find("frozen") if finding.text.startswith("position")]
     assert np.median(lags) == pytest.approx(0.62, abs=0.05)
     assert gyro.pop("random_31-Jul-2020_12_48_39") == pytest.approx(29.3, abs=0.2)
     assert max(abs(drift) for drift in gyro.values()) < 13.0

@@ -212,5 +212,28 @@ def test_inspect(csv_logs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest
     table = pd.read_csv(path)
     table["col_psi"] = -table["col_psi"]
     table.to_csv(path, index=False)
-    assert call(monkeypatch, "inspect", path, "--config", config) == 1
-    assert "error" in capsys.readouterr().out
+    found = csv_logs / "found.json"
+    assert call(monkeypatch, "inspect", path, "--config", config, "--json", found) == 1
+    assert "will mislead: x, y rates against R(psi) [u, v]" in capsys.readouterr().out
+    content = json.loads(found.read_text())
+    assert (content["schema"], content["misled"], content["logs"][0]["source"]) == ("residnet.inspection/1", True, str(path))
+    assert "frames" in {finding["code"] for finding in content["logs"][0]["findings"] if finding["level"] == "will mislead"}
+
+
+def test_inspect_drafts_a_channel_map_for_a_table_that_nobody_described(
+    csv_logs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = csv_logs / "logs" / "zigzag" / "train1.csv"
+    table = pd.read_csv(path)
+    table.columns = [name.removeprefix("col_").replace("psi", "Heading [deg]") for name in table.columns]
+    table["Heading [deg]"] = np.degrees(table["Heading [deg]"])
+    table.assign(mode="auto", spare=np.nan).to_csv(path, index=False)
+    assert call(monkeypatch, "inspect", path) == 0
+    text = capsys.readouterr().out
+    assert "1 columns hold nothing: spare" in text
+    assert "1 columns hold text: mode" in text
+    assert "coherence 1.000" in text
+    draft = yaml.safe_load(text[text.index("reader:") :])["reader"]
+    assert draft["time"] == {"column": "time", "unit": "s"}
+    assert draft["channels"]["psi"] == {"column": "Heading [deg]", "unit": "deg"}
+    assert list(draft["channels"])[:6] == ["x", "y", "psi", "u", "v", "r"]

@@ -66,7 +66,7 @@ def test_inspect_reads_them(trials: Path, monkeypatch: pytest.MonkeyPatch, capsy
     assert len(logs) == 3
     assert call(monkeypatch, "inspect", *logs) == 0
     text = capsys.readouterr().out
-    assert all(f"{path.stem}: info: 10 channels, 300 samples, manoeuvre three_two_one_one" in text for path in logs)
+    assert all(f"{path.stem}: note: 10 channels, 300 samples, manoeuvre three_two_one_one" in text for path in logs)
     assert "coherence 1.000" in text
 
 

@@ -20,6 +20,8 @@ from residnet.core.config import Config, Seconds
 from residnet.core.log import Log
 from residnet.data.readers.base import unwrap
 
+# standard deviations of a Gaussian in its median absolute deviation
+_SIGMA = 1.4826
 HARD = "hard:"
 RATE = "rate:"
 
@@ -62,7 +64,7 @@ class Frozen(Mask):
 
     def apply(self, log: Log) -> np.ndarray:
         """[T] bool; see `Mask.apply`."""
-        starts, stops = _true_runs((np.diff(log.stack(self.channels), axis=0) == 0.0).all(axis=1))
+        starts, stops = true_runs((np.diff(log.stack(self.channels), axis=0) == 0.0).all(axis=1))
         long = stops - starts >= self.samples
         starts, last = starts[long], stops[long]
         # half a step of margin keeps `after` a whole number of samples in spite of rounding in t
@@ -153,6 +155,29 @@ class Outlier(Mask):
 
 
 @final
+class Hampel(Mask):
+    """Samples that stand out of their neighbours by more than `sigmas` robust standard deviations (Hampel filter; Pearson, 2002).
+
+    What is looked at is the distance of a sample from the median of the straight lines between its neighbours on either side, up to `samples` away,
+    so that a moving channel is judged as one at rest; it is bad where that lies far from its running median over `samples`. The robust deviation is
+    1.4826 times the median absolute deviation of those neighbours, and at least that of the whole channel. A few bad samples move neither median,
+    where they move average and deviation of the rule of document 002 (`outlier`).
+    """
+
+    kind: Literal["hampel"] = "hampel"
+    channels: tuple[str, ...] = Field(min_length=1)
+    sigmas: float = Field(default=6.0, gt=0.0)
+    samples: int = Field(default=11, ge=5)
+
+    def apply(self, log: Log) -> np.ndarray:
+        """[T] bool; see `Mask.apply`."""
+        bad = np.zeros(len(log), dtype=bool)
+        for name in self.channels:
+            bad |= far_from_median(unwrap(log[name]) if log.units[name] == "rad" else log[name], self.sigmas, self.samples)
+        return bad
+
+
+@final
 class InputJump(Mask):
     """Steps of more than `limit` (SI, per sample) in any of `channels`, from `before` to `after` seconds around each.
 
@@ -174,7 +199,7 @@ class InputJump(Mask):
         return _cover(len(log), starts, np.searchsorted(log.t, log.t[landed] + self.after + margin, side="right"))
 
 
-MaskConfig = Annotated[Frozen | Gap | Missing | Jump | Outlier | InputJump, Field(discriminator="kind")]
+MaskConfig = Annotated[Frozen | Gap | Missing | Jump | Outlier | Hampel | InputJump, Field(discriminator="kind")]
 """Any masking rule; its `kind` says which."""
 
 
@@ -215,6 +240,36 @@ def steps_above(log: Log, channel: str, limit: float) -> np.ndarray:
     return np.flatnonzero(np.abs(np.diff(values)) > limit) + 1
 
 
+def far_from_median(values: np.ndarray, sigmas: float, samples: int) -> np.ndarray:
+    """[T] bool: known values [T] that stand out of their `samples` (made odd) neighbours, by the rule of `Hampel`."""
+    out = np.zeros(values.size, dtype=bool)
+    at, half = np.flatnonzero(np.isfinite(values)), samples // 2
+    reach = 2 * half
+    if at.size <= 2 * reach:
+        return out
+    known = values[at]
+    padded = np.pad(known, reach, mode="reflect", reflect_type="odd")
+    # how far a sample lies from the straight lines between its neighbours on both sides
+    pairs = [0.5 * (padded[reach - k : known.size + reach - k] + padded[reach + k : known.size + reach + k]) for k in range(1, reach + 1)]
+    bent = known - np.median(np.stack(pairs), axis=0)
+    windows = np.lib.stride_tricks.sliding_window_view(np.pad(bent, half, mode="reflect"), 2 * half + 1)
+    median = np.median(windows, axis=1)
+    distance = np.abs(bent - median)
+    spread = _SIGMA * np.median(np.abs(windows - median[:, None]), axis=1)
+    # a coarse channel flickers by single steps of its resolution, a spread at the level of rounding is none
+    resolution = 2.0 * float(np.quantile(distance[distance > 0.0], 0.1)) if distance.any() else 0.0
+    floor = max(_SIGMA * float(np.median(distance)), resolution, 1e-9 * float(np.abs(known).max()))
+    # what a smooth channel bends by anyhow is no outlier where it stops bending
+    out[at] = distance > sigmas * np.maximum(np.maximum(floor, spread), np.abs(median))
+    return out
+
+
+def true_runs(flags: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """First index and index past the last of every run of True in flags [T]."""
+    edges = np.diff(np.concatenate(([0], flags.astype(np.int8), [0])))
+    return np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
+
+
 def _any(log: Log, names: Sequence[str]) -> np.ndarray:
     return np.logical_or.reduce([log.masks[name] for name in names], axis=0) if names else np.zeros(len(log), dtype=bool)
 
@@ -222,12 +277,6 @@ def _any(log: Log, names: Sequence[str]) -> np.ndarray:
 def _step(t: np.ndarray) -> float:
     """The usual time step in s."""
     return float(np.median(np.diff(t))) if t.size > 1 else 0.0
-
-
-def _true_runs(flags: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """First index and index past the last of every run of True in flags [T]."""
-    edges = np.diff(np.concatenate(([0], flags.astype(np.int8), [0])))
-    return np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
 
 
 def _cover(size: int, starts: np.ndarray, stops: np.ndarray) -> np.ndarray:

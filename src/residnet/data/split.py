@@ -131,7 +131,7 @@ def check_leaks(logs: Mapping[str, Sequence[Log]], rows: int = 100) -> None:
     common = sorted(set.intersection(*(set(log.channels) for _, log in flat)))
     if not common:
         return
-    hashes = [_row_hashes(log, common) for _, log in flat]
+    hashes = [np.unique(row_hashes(log, common)) for _, log in flat]
     owner = np.repeat(np.arange(len(flat)), [h.size for h in hashes])
     _, row = np.unique(np.concatenate(hashes), return_inverse=True)
     holds = coo_array((np.ones(row.size), (row, owner))).tocsr()
@@ -146,8 +146,8 @@ def check_leaks(logs: Mapping[str, Sequence[Log]], rows: int = 100) -> None:
         )
 
 
-def _row_hashes(log: Log, channels: Sequence[str]) -> np.ndarray:
-    """Distinct row hashes of a log, uint64."""
+def row_hashes(log: Log, channels: Sequence[str]) -> np.ndarray:
+    """Hash of each row of some channels, uint64 [T]."""
     import pandas as pd
 
     columns = {}
@@ -155,4 +155,4 @@ def _row_hashes(log: Log, channels: Sequence[str]) -> np.ndarray:
         values = log[name]
         # unwrapping a copied stretch from another start leaves rounding in the heading
         columns[name] = np.round(np.remainder(values, 2.0 * np.pi), 9) if log.units[name] == "rad" else values + 0.0
-    return np.unique(pd.util.hash_pandas_object(pd.DataFrame(columns), index=False).to_numpy())
+    return np.asarray(pd.util.hash_pandas_object(pd.DataFrame(columns), index=False).to_numpy())

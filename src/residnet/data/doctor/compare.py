@@ -1,0 +1,153 @@
+"""What the data doctor sees between logs: copies, overlaps, runs that were cut into files, the same commands, ranges not covered."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+
+from residnet.core.log import Log
+from residnet.core.names import VELOCITY
+from residnet.data.doctor.findings import Finding, Level, share_of, show
+from residnet.data.doctor.signals import MEASURED, noise_of
+from residnet.data.masks import true_runs
+from residnet.data.split import row_hashes
+
+# so many rows in a row that two logs share are no chance
+_COPIED = 20
+_EPOCH = 1e8
+_OUTSIDE = 0.25
+
+
+def comparison_findings(logs: Sequence[Log], splits: Mapping[str, str] | None = None) -> list[Finding]:
+    """Findings between logs.
+
+    Args:
+        logs: all logs that are looked at together.
+        splits: log's name -> its split, where a config says.
+    """
+    given = splits or {}
+    found = list(_copies(logs, given))
+    for a, b in itertools.permutations(logs, 2):
+        found += _continued(a, b, given)
+    for a, b in itertools.combinations(logs, 2):
+        found += [*_overlapping(a, b), *_same_commands(a, b, given)]
+    return [*found, *_ranges(logs, given)]
+
+
+def _copies(logs: Sequence[Log], splits: Mapping[str, str]) -> Iterator[Finding]:
+    """Stretches that two logs, or two places of one log, have in common."""
+    names = [name for name in VELOCITY if all(name in log.channels for log in logs)]
+    names = names if len(names) > 1 else sorted(set.intersection(*(set(log.channels) for log in logs)))
+    if not names:
+        return
+    hashes = [row_hashes(log, names) for log in logs]
+    owner = np.repeat(np.arange(len(logs)), [part.size for part in hashes])
+    row = np.concatenate([np.arange(part.size) for part in hashes])
+    joined = np.concatenate(hashes)
+    _, inverse, count = np.unique(joined, return_inverse=True, return_counts=True)
+    # rows that stand in many places are those of a vessel at rest
+    shared = np.flatnonzero((count[inverse] > 1) & (count[inverse] <= 2 * len(logs)))
+    if shared.size < _COPIED:
+        return
+    order = shared[np.argsort(inverse[shared], kind="stable")]
+    pairs: dict[tuple[int, int, int], list[int]] = {}
+    for _, members in itertools.groupby(order.tolist(), key=lambda i: int(inverse[i])):
+        for i, j in itertools.combinations(sorted(members), 2):
+            pairs.setdefault((int(owner[i]), int(owner[j]), int(row[j] - row[i])), []).append(int(row[i]))
+    for (i, j, offset), rows in sorted(pairs.items()):
+        if i == j and offset == 1:
+            continue
+        flags = np.zeros(len(logs[i]) + 1, dtype=bool)
+        flags[rows] = True
+        starts, stops = true_runs(flags)
+        longest = int((stops - starts).max(initial=0))
+        if longest >= _COPIED:
+            yield _copy(logs[i], logs[j], int(starts[np.argmax(stops - starts)]), offset, longest, splits)
+
+
+def _copy(a: Log, b: Log, start: int, offset: int, count: int, splits: Mapping[str, str]) -> Finding:
+    figures = {"rows": float(count), "first": float(start), "offset": float(offset)}
+    if a is b:
+        text = f"{a.name}: rows {start} to {start + count - 1} stand again from row {start + offset} on"
+        return Finding("will mislead", "repeated_block", text, figures, "delete one of the copies")
+    leak = splits.get(a.name) != splits.get(b.name)
+    across = f" ({splits[a.name]} and {splits[b.name]})" if leak and a.name in splits and b.name in splits else ""
+    level: Level = "fatal" if across else "will mislead"
+    if count >= max(len(a), len(b)) - 1:
+        return Finding(level, "duplicate_log", f"{a.name} and {b.name} are the same{across}", figures, "leave one of them out")
+    part, whole, first = (b, a, start) if len(b) - count < len(a) - count else (a, b, start + offset)
+    share = share_of(count / len(part))
+    text = f"{part.name} is in {share} a copy of rows {first} to {first + count - 1} of {whole.name}{across}"
+    return Finding(level, "copied_part", text, figures, "leave it out, or keep both in one split")
+
+
+def _continued(a: Log, b: Log, splits: Mapping[str, str]) -> Iterator[Finding]:
+    """A log that goes on where another ended: one run, cut into files."""
+    states = [name for name in ("x", "y", "u", "v", "r") if name in a.channels and name in b.channels]
+    if len(states) < 4 or len(a) < 20 or len(b) < 20:
+        return
+    step = float(np.median(np.diff(a.t)))
+    pause = float(b.t[0] - a.t[-1])
+    on_time = abs(a.t[-1]) > 2.0 * step and 0.0 < pause < 3.0 * step and abs(b.t[0]) > 2.0 * step
+    if not on_time and abs(b.t[0] - a.t[0]) > 1e-9 and b.t[0] > 2.0 * step:
+        return
+    for name in states:
+        ends = np.array([a[name][-3:].mean(), b[name][:3].mean()])
+        change = np.abs(np.diff(a[name]))
+        usual = float(np.median(change[np.isfinite(change)])) + noise_of(a[name]) + noise_of(b[name]) if np.isfinite(change).any() else 0.0
+        if not np.isfinite(ends).all() or abs(ends[1] - ends[0]) > (30.0 if on_time else 8.0) * max(float(usual), 1e-12):
+            return
+    if not on_time and float(np.hypot(a["u"][-1], a["v"][-1])) < 0.2 * float(np.nanquantile(np.hypot(a["u"], a["v"]), 0.9)):
+        # where both are at rest nothing tells one quay from another
+        return
+    torn = a.name in splits and b.name in splits and splits[a.name] != splits[b.name]
+    text = (
+        f"{b.name} goes on where {a.name} ends, {pause:.2f} s later: one run, cut into files" if on_time else f"{b.name} goes on where {a.name} ends"
+    )
+    text += f"; they stand in {splits[a.name]} and {splits[b.name]}" if torn else ""
+    action = "keep them in one split" if torn or not splits else ""
+    yield Finding("will mislead" if torn else "note", "continued", text, {"pause": pause}, action)
+
+
+def _overlapping(a: Log, b: Log) -> Iterator[Finding]:
+    first, last = max(a.t[0], b.t[0]), min(a.t[-1], b.t[-1])
+    if min(a.t[0], b.t[0]) > _EPOCH and last > first:
+        text = f"{a.name} and {b.name} overlap in time for {last - first:.1f} s"
+        yield Finding(
+            "note", "overlapping", text, {"seconds": float(last - first)}, "two vessels, or two recordings of one run? keep them in one split"
+        )
+
+
+def _same_commands(a: Log, b: Log, splits: Mapping[str, str]) -> Iterator[Finding]:
+    names = [name for name in a.channels if name in b.channels and name not in MEASURED and not name.startswith(("wind", "current"))]
+    size = min(len(a), len(b))
+    moving = [name for name in names if float(np.nanstd(a[name][:size])) > 1e-9]
+    if not moving or size < 50:
+        return
+    if all(np.allclose(a[name][:size], b[name][:size], rtol=1e-6, atol=1e-9, equal_nan=True) for name in moving):
+        torn = a.name in splits and b.name in splits and splits[a.name] != splits[b.name]
+        text = f"{a.name} and {b.name} have the same commands ({', '.join(moving)}) over {size} samples"
+        text += f" and stand in {splits[a.name]} and {splits[b.name]}" if torn else ""
+        yield Finding("note", "same_commands", text, {"samples": size}, "repeats show how far the vessel repeats itself; keep them in one split")
+
+
+def _ranges(logs: Sequence[Log], splits: Mapping[str, str]) -> Iterator[Finding]:
+    """How much of the test logs lies outside what the training logs cover."""
+    train = [log for log in logs if splits.get(log.name) == "train"]
+    others = [log for log in logs if splits.get(log.name) in ("validation", "test")]
+    if not train or not others:
+        return
+    for name in (name for name in train[0].channels if name not in ("x", "y", "psi") and all(name in log.channels for log in (*train, *others))):
+        known = np.concatenate([log[name] for log in train])
+        low, high = float(np.nanmin(known)), float(np.nanmax(known))
+        margin = 0.02 * (high - low)
+        for log in others:
+            values = log[name][np.isfinite(log[name])]
+            share = float(((values < low - margin) | (values > high + margin)).mean())
+            if share > 0.01:
+                text = f"{name} of {log.name} ({splits[log.name]}) lies outside the training range {show(low, log.units[name])} to "
+                text += f"{show(high, log.units[name])} for {share_of(share)} of the time"
+                level: Level = "will mislead" if share > _OUTSIDE else "note"
+                yield Finding(level, "extrapolation", text, {"share": share}, "add training logs that go there, or do not trust the model there")
