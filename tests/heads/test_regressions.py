@@ -87,6 +87,32 @@ def test_collinear_columns_are_named() -> None:
         fitted(Regression(TERMS, x, data.y, x.std(0), data.fold), kind="ols")
 
 
+@pytest.mark.parametrize("apart", [0.0, 1e-13, 1e-9])
+@pytest.mark.parametrize(
+    "config",
+    [
+        {"kind": "plsr", "order": 8},
+        {"kind": "plsr", "order": 8, "algorithm": "nipals"},
+        {"kind": "surface", "choose": "least"},
+        {"kind": "surface"},
+        {"kind": "ridge"},
+        {"kind": "lasso"},
+    ],
+    ids=lambda config: "_".join(map(str, config.values())),
+)
+def test_collinear_columns_make_no_garbage(config: dict[str, Any], apart: float) -> None:
+    """Two columns that are others, or all but: coefficients stay of the size that they have without them, and so do the predictions."""
+    data = made()
+    noise = apart * torch.from_numpy(np.random.default_rng(1).normal(size=(len(data.x), 2)))
+    more = torch.stack((data.x[:, 0], data.x[:, 1] / 10 - data.x[:, 2]), dim=1) + noise
+    x = torch.cat((data.x, more), dim=1)
+    both = Regression((*TERMS, "a_again", "of_b_and_c"), x, data.y, x.std(0), data.fold)
+    plain, found = fitted(Regression(TERMS, data.x, data.y, data.scale, data.fold), kind="ols"), fitted(both, **config)
+    assert float(found.coefficients.abs().max()) < 5 * float(plain.coefficients.abs().max())
+    left = (plain.predict(data.x) - data.y).std(0)
+    assert bool(((found.predict(x) - data.y).std(0) < 1.5 * left).all())
+
+
 def test_clear_errors() -> None:
     data = made()
     spoiled = data.x.clone()

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from residnet.core.errors import FitError
+from residnet.heads.plsr import LEAST_ENERGY
 
 
 def nipals(e: Tensor, f: Tensor, orders: int, tolerance: float = 1e-12, iterations: int = 50_000) -> Tensor:
@@ -22,7 +23,7 @@ def nipals(e: Tensor, f: Tensor, orders: int, tolerance: float = 1e-12, iteratio
         FitError: where an iteration does not converge.
     """
     e, f = e.clone(), f.clone()
-    energy = float(f.square().sum())
+    energy, largest = float(f.square().sum()), float(e.square().sum(0).max())
     weights: list[Tensor] = []
     loadings: list[Tensor] = []
     outputs: list[Tensor] = []
@@ -42,6 +43,8 @@ def nipals(e: Tensor, f: Tensor, orders: int, tolerance: float = 1e-12, iteratio
                 break
         else:
             raise FitError(f"NIPALS: latent variable {len(path) + 1} did not converge in {iterations} iterations; use the kernel algorithm (plsr)")
+        if float(t @ t) <= LEAST_ENERGY * largest:
+            break
         p = e.T @ t / (t @ t)
         e, f = e - torch.outer(t, p), f - torch.outer(t, q)
         weights.append(w)

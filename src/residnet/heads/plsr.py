@@ -15,6 +15,9 @@ from residnet.heads.base import ClosedFormHead
 from residnet.heads.basis import BasisConfig, BasisHead
 from residnet.heads.force import in_space
 
+LEAST_ENERGY = 1e-13
+"""Least energy of a latent variable in units of a column's: below it are rounding and columns that are sums of others, without a meaning."""
+
 
 def pls_path(xx: Tensor, xy: Tensor, orders: int) -> Tensor:
     """Regression coefficients of PLS2 for every order up to `orders`, [A, J, K], by the kernel algorithm of Dayal and MacGregor (1997).
@@ -22,7 +25,7 @@ def pls_path(xx: Tensor, xy: Tensor, orders: int) -> Tensor:
     Args:
         xx: X'X of centred, scaled columns [J, J].
         xy: X'Y [J, K].
-        orders: number of latent variables; the path ends early where nothing is left to explain.
+        orders: number of latent variables; the path ends early where nothing is left to explain, or to explain it with.
     """
     j, k = xy.shape
     weights: list[Tensor] = []
@@ -41,7 +44,7 @@ def pls_path(xx: Tensor, xy: Tensor, orders: int) -> Tensor:
         for p_old, r_old in zip(loadings, rotations, strict=True):
             r = r - (p_old @ w) * r_old
         energy = r @ xx @ r
-        if float(energy) <= 0:
+        if float(energy) <= LEAST_ENERGY * float(xx.diagonal().max()):
             break
         p = xx @ r / energy
         q = rest.T @ r / energy

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from residnet.core.errors import FitError
 from residnet.heads.basis import FoldMoments
+from residnet.heads.plsr import LEAST_ENERGY
 
 
 @dataclass(frozen=True)
@@ -127,6 +128,7 @@ class _Problems:
         rest, b = covariance.clone(), torch.zeros_like(covariance)
         least = 1e-26 * covariance.square().sum(1)
         steps = int(order.max())
+        least_energy = LEAST_ENERGY * float(self.gram.diagonal(dim1=1, dim2=2).max())
         loadings, rotations = covariance.new_zeros(steps, *covariance.shape), covariance.new_zeros(steps, *covariance.shape)
         for step in range(steps):
             first = int((order <= step).sum())
@@ -138,7 +140,7 @@ class _Problems:
                 r = w - (known * rotations[:step, :, :, first:]).sum(0)
             image = (self.gram @ r) * mask[:, first:]
             energy = (r * image).sum(1, keepdim=True)
-            alive = (c.square().sum(1, keepdim=True) > least[:, None, first:]) & (energy > 1e-14)
+            alive = (c.square().sum(1, keepdim=True) > least[:, None, first:]) & (energy > least_energy)
             share = torch.where(alive, (r * covariance[:, :, first:]).sum(1, keepdim=True) / energy, torch.zeros_like(energy))
             p = torch.where(alive, image / energy, torch.zeros_like(image))
             b[:, :, first:] += r * share
