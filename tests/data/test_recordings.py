@@ -339,3 +339,33 @@ def test_what_is_missing_is_named(tmp_path: Path) -> None:
     assert {entry["code"] for entry in log.meta["findings"]} >= {"missing_channels", "empty_topic", "empty_columns", "not_numbers"}
     with pytest.raises(UsageError, match="is a file"):
         read(place / "gyro.csv", channels={"r": field("gyro", "rad/s")})
+
+
+def test_a_topic_cut_short_in_the_middle_of_a_row(tmp_path: Path) -> None:
+    t = EPOCH + 0.1 * np.arange(200)
+    time = [f"{pd.Timestamp(s, unit='s'):%Y-%m-%d %H:%M:%S.%f}" for s in t]
+    place = folder(tmp_path, gyro={"time": time, "data": t - EPOCH})
+    text = (place / "gyro.csv").read_text()
+    (place / "gyro.csv").write_text(text[: text.rindex(":") - 3])
+    log = read(place, channels={"r": field("gyro", "rad/s")})
+    assert len(log) == 199
+    assert "cut_short" in {entry["code"] for entry in log.meta["findings"]}
+
+
+def test_chunks_of_a_topic_give_the_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ns = EPOCH * 10**9 + 70_533_347 * np.arange(2000)
+    values = np.sin(np.arange(2000.0))
+    cells = [f"{v!r}" if i % 500 else "lost" for i, v in enumerate(values.tolist())]
+    place = folder(tmp_path, gyro={"time": printed(ns, "unpadded"), "data": cells, "header_frame_id": ["bow"] * 2000})
+    whole = read(place, channels={"r": field("gyro", "rad/s")})
+    monkeypatch.setattr("residnet.data.readers.topic_folder._CHUNK", 300)
+    monkeypatch.setattr("residnet.data.readers.topic_folder.LARGE", 0)
+    pieces = read(place, channels={"r": field("gyro", "rad/s")})
+    np.testing.assert_array_equal(pieces.t, whole.t)
+    np.testing.assert_array_equal(pieces["r"], whole["r"])
+    assert (
+        {entry["code"] for entry in pieces.meta["findings"]}
+        == {entry["code"] for entry in whole.meta["findings"]}
+        >= {"not_numbers", "unpadded_fraction"}
+    )
+    assert np.isnan(whole["r"]).sum() == 4

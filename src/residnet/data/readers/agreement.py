@@ -35,7 +35,7 @@ def agreement(recording: Recording, log: Log, start: float, idle: Iterable[str])
 
 def _rates(log: Log) -> dict[str, np.ndarray]:
     """Velocities of the log by name, in body and earth axes."""
-    out = {name: log[name] for name in ("u", "v", "r") if name in log.channels}
+    out: dict[str, np.ndarray] = {name: log[name] for name in ("u", "v", "r") if name in log.channels}
     if {"u", "v", "psi"} <= set(log.channels):
         c, s = np.cos(log["psi"]), np.sin(log["psi"])
         out["north velocity"], out["east velocity"] = c * log["u"] - s * log["v"], s * log["u"] + c * log["v"]

@@ -29,12 +29,14 @@ class Stamps:
         absolute: whether the source gave dates or Unix time.
         zoned: whether the source named its time zone (Unix time is UTC).
         remarks: what was noticed.
+        unpadded: whether fractions are whole numbers without their leading zeros.
     """
 
     ns: np.ndarray
     absolute: bool
     zoned: bool
     remarks: tuple[Remark, ...] = ()
+    unpadded: bool = False
 
 
 def parse_numbers(values: np.ndarray, factor: float | None = None) -> Stamps:
@@ -56,11 +58,12 @@ def parse_numbers(values: np.ndarray, factor: float | None = None) -> Stamps:
     return Stamps(np.rint(values * (factor * _NS)).astype(np.int64), False, False)
 
 
-def parse_texts(texts: np.ndarray) -> Stamps:
+def parse_texts(texts: np.ndarray, unpadded: bool | None = None) -> Stamps:
     """Times from text [T]: dates with or without a zone, or plain numbers, one style throughout.
 
     A fraction of a second printed as an integer without its leading zeros (`09.70533347` for 9.070533347 s) is recognised by the whole column: it
-    makes time run backwards where the padded reading does not, or no fraction at all starts with a zero.
+    makes time run backwards where the padded reading does not, or no fraction at all starts with a zero. `unpadded` says what an earlier part of the
+    column was found to be.
 
     Raises:
         DataError: naming the first cell that is no time.
@@ -80,13 +83,16 @@ def parse_texts(texts: np.ndarray) -> Stamps:
     if bad.size:
         raise DataError(f"'{texts[bad[0]]}' in row {int(bad[0]) + 1} is no time ({bad.size} such cells)")
     whole = _whole(parts, dated)
-    fraction, remarks = _fractions(parts["fraction"], whole)
+    fraction, remarks = _fractions(parts["fraction"], whole, unpadded)
+    lost_zeros = bool(remarks) or bool(unpadded)
     if not dated:
         fraction = np.where(column.str.strip().str.startswith("-").to_numpy(dtype=bool), -fraction, fraction)
         scale = next((s for s in _SCALES if whole.size and _EPOCH_FROM * s <= abs(int(np.median(whole))) <= _EPOCH_TO * s), None)
-        return Stamps(whole * (_NS // (scale or 1)) + fraction // (scale or 1), scale is not None, scale is not None, remarks)
+        return Stamps(
+            whole * (_NS // (scale or 1)) + fraction // (scale or 1), scale is not None, scale is not None, remarks, bool(remarks) or bool(unpadded)
+        )
     zone = parts["zone"].dropna()
-    return Stamps(whole * _NS + fraction, True, len(zone) > 0, remarks)
+    return Stamps(whole * _NS + fraction, True, len(zone) > 0, remarks, lost_zeros)
 
 
 def _whole(parts: object, dated: bool) -> np.ndarray:
@@ -116,7 +122,7 @@ def _zone_seconds(zone: str) -> int:
     return (1 if zone[0] == "+" else -1) * (3600 * int(digits[:2]) + 60 * int(digits[2:]))
 
 
-def _fractions(column: object, whole: np.ndarray) -> tuple[np.ndarray, tuple[Remark, ...]]:
+def _fractions(column: object, whole: np.ndarray, known: bool | None) -> tuple[np.ndarray, tuple[Remark, ...]]:
     """Fractions of the unit in ns [T] int64."""
     import pandas as pd
 
@@ -128,11 +134,13 @@ def _fractions(column: object, whole: np.ndarray) -> tuple[np.ndarray, tuple[Rem
     longest = int(length.max(initial=0))
     if longest not in (3, 6, 9) or (length == longest).all():
         return padded, ()
+    if known is False:
+        return padded, ()
     unpadded = value * 10 ** (9 - longest)
     back = [int((np.diff(whole * _NS + part) < 0).sum()) for part in (padded, unpadded)]
     zeros = int((digits.str.startswith("0") & (length > 1)).sum())
     # one fraction in ten starts with a zero where zeros are printed
-    if back[1] >= back[0] and (back[0] > 0 or zeros > 0 or whole.size < 100):
+    if known is None and back[1] >= back[0] and (back[0] > 0 or zeros > 0 or whole.size < 100):
         return padded, ()
     unit = {3: "ms", 6: "us", 9: "ns"}[longest]
     changed = int((padded != unpadded).sum())

@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal, final
+from typing import Literal, final
 
 import numpy as np
 from pydantic import Field
 
 from residnet.core.errors import DataError, UsageError
+from residnet.data.readers.cells import NANOSECONDS, SECONDS, Cells, names_sender
 from residnet.data.readers.composed import RecordingConfig
 from residnet.data.readers.files import progress, total_size
 from residnet.data.readers.recording import Recording, Remark, Series, key_of, remark
-from residnet.data.readers.stamps import Stamps, parse_numbers, parse_texts
+from residnet.data.readers.spool import LARGE
+from residnet.data.readers.stamps import Stamps, parse_numbers
 from residnet.data.readers.wanted import EVERYTHING, Wanted
 
 _ENDINGS = (".csv", ".tsv", ".txt")
 _ARRIVAL = ("time", "Time", "t", "timestamp", "rosbagTimestamp", "%time", "stamp", "date")
-_SECONDS, _NANOSECONDS = ("secs", "sec"), ("nsecs", "nanosec")
 _CHUNK = 200_000
 
 
@@ -53,11 +55,16 @@ def load_folder(path: Path, wanted: Wanted = EVERYTHING, time: tuple[str, ...] =
     if not files:
         raise DataError(f"{path}: holds no csv file")
     size = total_size(files)
-    raw, remarks, done = {}, [], 0
+    raw, remarks, listed, done = {}, [], [], 0
+    # what is wrong with other topics too is worth a look where that costs little
+    take = EVERYTHING if size < LARGE else wanted
     with progress(path.name, size, size) as advance:
         for file in files:
             name = file.relative_to(path).with_suffix("").as_posix()
-            table, said = _read(file, name, time, delimiter)
+            if not take(name):
+                listed.append(name)
+                continue
+            table, said = _read(file, name, time, delimiter, take)
             remarks += said
             done += file.stat().st_size
             advance(done)
@@ -68,7 +75,7 @@ def load_folder(path: Path, wanted: Wanted = EVERYTHING, time: tuple[str, ...] =
     dated = [stamps for table in raw.values() for stamps in (table.arrival, table.stamp) if stamps is not None and stamps.absolute]
     epoch = min((int(stamps.ns.min()) for stamps in dated), default=None)
     whole = None if epoch is None else epoch // 10**9 * 10**9
-    return Recording(path, {name: table.series(name, whole) for name, table in raw.items()}, whole, tuple(files), tuple(remarks))
+    return Recording(path, {name: table.series(name, whole) for name, table in raw.items()}, whole, tuple(files), tuple(remarks), tuple(listed))
 
 
 def is_topic_folder(path: Path) -> bool:
@@ -108,86 +115,80 @@ class _Table:
         return Series(name, "", self.fields, seconds(self.stamp), seconds(self.arrival), self.sender, tuple(remarks))
 
 
-def _read(file: Path, name: str, time: tuple[str, ...], delimiter: str) -> tuple[_Table | None, list[Remark]]:
+def _read(file: Path, name: str, time: tuple[str, ...], delimiter: str, wanted: Wanted) -> tuple[_Table | None, list[Remark]]:
     """One topic; None and a remark where the file holds none."""
     import pandas as pd
 
     if not file.stat().st_size:
         return None, [remark("note", "empty_topic", f"topic {name}: the file is empty")]
+    sep = "\t" if file.suffix.lower() == ".tsv" else delimiter
     try:
         with file.open(newline="", encoding="utf-8-sig") as stream:
-            header = [cell.strip() for cell in next(csv.reader(stream, delimiter="\t" if file.suffix.lower() == ".tsv" else delimiter), [])]
+            header = [cell.strip() for cell in next(csv.reader(stream, delimiter=sep), [])]
         clock = next((column for column in time if column in header), None)
         stamp = _stamp_columns(header)
         if clock is None and stamp is None:
             text = f"topic {name}: no column for time (looked for {', '.join(time)} and a header stamp); the file is left out"
             return None, [remark("note", "no_time", text)]
-        sep = "\t" if file.suffix.lower() == ".tsv" else delimiter
-        texts = {header.index(clock): str} if clock is not None else {}
-        chunks = pd.read_csv(
-            file,
-            sep=sep,
-            header=None,
-            skiprows=1,
-            names=list(range(len(header))),
-            index_col=False,
-            dtype=texts,
-            encoding="utf-8-sig",
-            chunksize=_CHUNK,
-        )
-        numbers, words, spoilt = _collect(chunks, header, clock)
+        columns = _columns(file, header, sep, clock, lambda column: column in (stamp or ()) or names_sender(column) or wanted.field(name, column))
     except (UnicodeDecodeError, pd.errors.ParserError) as error:
         return None, [remark("will mislead", "unreadable", f"topic {name}: not a regular UTF-8 table ({' '.join(str(error).split())}); left out")]
-    rows = len(next(iter({**numbers, **words}.values())))
-    if not rows:
-        return None, [remark("note", "empty_topic", f"topic {name}: the file has a header and no rows")]
-    try:
-        arrival = None if clock is None else parse_texts(words.pop(clock))
-        stamped = None if stamp is None else _stamps(numbers, stamp)
     except DataError as error:
         return None, [remark("will mislead", "no_time", f"topic {name}: {error}; the file is left out")]
-    sender = next((words[column] for column in header if column in words and key_of(column).endswith("frame_id")), None)
-    said = [_not_numbers(name, column, cells) for column, cells in words.items() if not key_of(column).endswith("frame_id")]
-    for column, cells in spoilt.items():
-        text = f"topic {name}: column '{column}' holds {cells} cells that are not numbers; they count as missing"
-        said.append(remark("will mislead", "not_numbers", text, cells=cells))
-    taken = {*(stamp or ()), clock}
-    return _Table(arrival, stamped, {column: values for column, values in numbers.items() if column not in taken}, sender, said), []
+    if not any(one.rows for one in columns.values()):
+        return None, [remark("note", "empty_topic", f"topic {name}: the file has a header and no rows")]
+    return _table(name, columns, clock, stamp), []
 
 
-def _collect(chunks: Any, header: list[str], clock: str | None) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict[str, int]]:
-    """Columns of numbers (float64, whole stamps int64), columns of text, and how many cells of a column of numbers are none."""
+def _columns(file: Path, header: list[str], sep: str, clock: str | None, wanted: Callable[[str], bool]) -> dict[str, Cells]:
+    """The columns of a file that are wanted, and its time, chunk by chunk.
+
+    Raises:
+        DataError: where a cell of the time column is no time.
+    """
     import pandas as pd
 
-    pieces: list[list[np.ndarray]] = [[] for _ in header]
-    text = [column == clock for column in header]
+    kept = {i: Cells(column, is_time=column == clock) for i, column in enumerate(header) if column == clock or wanted(column)}
+    chunks = pd.read_csv(
+        file,
+        sep=sep,
+        header=None,
+        skiprows=1,
+        names=list(range(len(header))),
+        usecols=list(kept),
+        index_col=False,
+        dtype={header.index(clock): str} if clock is not None else {},
+        encoding="utf-8-sig",
+        chunksize=_CHUNK,
+    )
     for chunk in chunks:
-        for i in range(len(header)):
-            cells = chunk[i]
-            if not text[i] and pd.api.types.is_bool_dtype(cells.dtype):
-                cells = cells.astype(np.float64)
-            text[i] |= not pd.api.types.is_numeric_dtype(cells.dtype)
-            pieces[i].append(cells.to_numpy())
-    numbers, words, spoilt = {}, {}, {}
-    for i, column in enumerate(header):
-        joined = np.concatenate(pieces[i]) if pieces[i] else np.zeros(0)
-        pieces[i] = []
-        values = pd.to_numeric(pd.Series(joined), errors="coerce") if text[i] and column != clock else None
-        if values is not None and 2 * values.notna().sum() > pd.Series(joined).notna().sum():
-            numbers[column] = values.to_numpy(dtype=np.float64)
-            spoilt[column] = int(pd.Series(joined).notna().sum() - values.notna().sum())
-        elif text[i]:
-            words[column] = joined
-        else:
-            whole = joined.dtype.kind in "iu" and key_of(column).rsplit("_", 1)[-1] in (*_SECONDS, *_NANOSECONDS)
-            numbers[column] = joined if whole else joined.astype(np.float64)
-    return numbers, words, spoilt
+        for i, one in kept.items():
+            one.add(chunk[i])
+    return {one.name: one for one in kept.values()}
+
+
+def _table(name: str, columns: dict[str, Cells], clock: str | None, stamp: tuple[str, str] | None) -> _Table:
+    """Times and fields from the columns of a file."""
+    arrival = None if clock is None else columns[clock].times()
+    rows = None if arrival is None else len(arrival.ns)
+    numbers = {column: one.numbers()[:rows] for column, one in columns.items() if one.numeric}
+    stamped = None if stamp is None else _stamps(numbers, stamp)
+    sender = next((one.words()[:rows] for column, one in columns.items() if not one.numeric and names_sender(column)), None)
+    said = [one.remark(name) for column, one in columns.items() if not one.numeric and not names_sender(column) and column != clock]
+    if clock is not None and columns[clock].cut:
+        said.append(remark("note", "cut_short", f"topic {name}: the last row is cut short; left out", rows=1.0))
+    for column, one in columns.items():
+        if one.numeric and one.spoilt:
+            text = f"topic {name}: column '{column}' holds {one.spoilt} cells that are not numbers; they count as missing"
+            said.append(remark("will mislead", "not_numbers", text, cells=one.spoilt))
+    taken = {*(stamp or ()), clock}
+    return _Table(arrival, stamped, {column: values for column, values in numbers.items() if column not in taken}, sender, said)
 
 
 def _stamp_columns(header: list[str]) -> tuple[str, str] | None:
     """Columns of a header stamp's seconds and nanoseconds."""
     keys = {key_of(column): column for column in header}
-    for seconds, rest in zip(_SECONDS, _NANOSECONDS, strict=True):
+    for seconds, rest in zip(SECONDS, NANOSECONDS, strict=True):
         for prefix in ("header_stamp_", "stamp_"):
             if prefix + seconds in keys and prefix + rest in keys:
                 return keys[prefix + seconds], keys[prefix + rest]
@@ -204,11 +205,3 @@ def _stamps(numbers: dict[str, np.ndarray], columns: tuple[str, str]) -> Stamps 
     ns = seconds.astype(np.int64) * 10**9 + rest.astype(np.int64)
     dated = parse_numbers(seconds.astype(np.float64)).absolute
     return Stamps(ns, dated, dated)
-
-
-def _not_numbers(name: str, column: str, cells: np.ndarray) -> Remark:
-    first = str(next((cell for cell in cells if isinstance(cell, str)), ""))
-    kind = "structures" if first.startswith(("{", "[", "(")) else "text"
-    shown = first if len(first) <= 40 else first[:37] + "..."
-    text = f"topic {name}: column '{column}' holds {kind} ('{shown}'), not numbers; it is left out"
-    return remark("note", "not_numbers", text, rows=float(len(cells)))
