@@ -77,6 +77,12 @@ def test_channel_maps_of_topics(write: Writer, tmp_path: Path) -> None:
     assert_same(validate(config, ReaderConfig, "test").build().read(path), log)
 
 
+@pytest.mark.parametrize("write", [*TREES, *BAGS])
+def test_one_config_reads_any_of_them(write: Writer, tmp_path: Path) -> None:
+    log = trial()
+    assert_same(validate({"kind": "auto"}, ReaderConfig, "test").build().read(write(log, tmp_path)), log)
+
+
 @pytest.mark.parametrize("write", BAGS)
 def test_only_what_is_wanted_is_kept(write: Writer, tmp_path: Path) -> None:
     path = write(trial(), tmp_path)

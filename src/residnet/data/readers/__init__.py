@@ -10,6 +10,7 @@ from residnet.data.readers.ardupilot import ArduPilotConfig
 from residnet.data.readers.base import LogReader
 from residnet.data.readers.canonical import CanonicalConfig, CanonicalReader
 from residnet.data.readers.channel_map import ChannelMap
+from residnet.data.readers.detect import AutoConfig
 from residnet.data.readers.hdf5 import Hdf5Config
 from residnet.data.readers.mat import MatConfig
 from residnet.data.readers.nmea import NmeaConfig
@@ -28,13 +29,15 @@ ReaderConfig = Annotated[
     | Hdf5Config
     | NmeaConfig
     | UlogConfig
-    | ArduPilotConfig,
+    | ArduPilotConfig
+    | AutoConfig,
     Field(discriminator="kind"),
 ]
 """Config of any reader; its `kind` says which."""
 
 __all__ = [
     "ArduPilotConfig",
+    "AutoConfig",
     "CanonicalConfig",
     "CanonicalReader",
     "ChannelMap",

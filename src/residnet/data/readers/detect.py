@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal, final
 
 from residnet.core.errors import UsageError
 from residnet.core.log import Log
@@ -21,7 +22,7 @@ from residnet.data.readers.recording import Recording
 from residnet.data.readers.rosbag import RosbagConfig
 from residnet.data.readers.topic_folder import TopicFolderConfig, is_topic_folder
 from residnet.data.readers.ulog import UlogConfig
-from residnet.data.readers.wanted import EVERYTHING
+from residnet.data.readers.wanted import EVERYTHING, Wanted
 
 _MCAP = b"\x89MCAP0\r\n"
 _SQLITE = b"SQLite format 3\x00"
@@ -54,6 +55,17 @@ FORMATS: tuple[Format, ...] = (
     Format("MATLAB", lambda path, head: head.startswith(_MAT5) or path.suffix.lower() == ".mat", MatConfig),
     Format("HDF5", lambda path, head: is_hdf5(path), Hdf5Config),
 )
+
+
+@final
+class AutoConfig(RecordingConfig):
+    """Any recording that describes itself, by its content and ending; the other kinds have settings of their own."""
+
+    kind: Literal["auto"] = "auto"
+
+    def load(self, path: Path, wanted: Wanted) -> Recording:
+        """See `RecordingConfig.load`."""
+        return _config_for(path).load(path, wanted)
 
 
 def format_of(path: Path) -> Format | None:
