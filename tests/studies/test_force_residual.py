@@ -162,6 +162,15 @@ def test_lag_of_the_thrusters_is_told_by_the_actual_forces(tmp_path: Path) -> No
     assert all(found.forces[axis]["explained_with_lag"] > 0.99 for axis in ("surge", "sway", "yaw"))
 
 
+def test_a_model_that_is_not_determined_is_set_aside_and_said(tmp_path: Path) -> None:
+    log(tmp_path, "one", missing=1.0, psi=np.zeros(3000))
+    settings = config(tmp_path, models={"ridge": {"fit": {"kind": "ridge"}}, "earth": {"fit": {"kind": "ridge"}, "earth": True}})
+    found = force_study(settings)
+    assert list(found.final) == ["ridge"]
+    text = write(settings, found, RunFolder.create(tmp_path / "run", "", resume=False))
+    assert "Not determined by these logs:\n\n- model earth: a force constant in earth axes does not show" in text
+
+
 def test_data_that_determine_nothing_are_clear_errors(tmp_path: Path) -> None:
     log(tmp_path, "one", missing=1.0, seconds=120.0, v=np.zeros(1200))
     with pytest.raises(FitError, match=r"model ridge: basis function 'v_dot' is constant"):

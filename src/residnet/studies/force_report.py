@@ -26,6 +26,8 @@ def write(config: ForceSettings, found: ForceStudy, folder: RunFolder) -> str:
     groups = list(dict.fromkeys(row["force"] for row in found.rows))
     parts += [group_text(config, found, [row for row in found.rows if row["force"] == group]) for group in groups]
     parts.append(_verdict(found, groups))
+    if found.failed:
+        parts.append("Not determined by these logs:\n\n" + "\n".join(f"- {why}" for why in found.failed.values()))
     text = "\n\n".join(parts) + "\n"
     folder.write(folder.path / "force_residual.md", text)
     for name, model in found.final.items():
@@ -199,6 +201,7 @@ def _content(config: ForceSettings, found: ForceStudy) -> dict[str, Any]:
         "forces": found.forces,
         "acceleration": measured.acceleration,
         "rows": found.rows,
+        "failed": found.failed,
         "models": {
             name: {
                 "folds": found.judged[name].notes,

@@ -56,6 +56,7 @@ class ForceStudy:
         measured: the logs.
         judged: by model.
         final: by model.
+        failed: why a model is not among them: the logs do not determine it.
         rows: of the tables, zero and the believed model first in each.
         forces: commanded against actual.
         blocks: what the intervals resample; None without intervals.
@@ -64,28 +65,33 @@ class ForceStudy:
     measured: Measured
     judged: dict[str, Judged]
     final: dict[str, Final]
+    failed: dict[str, str]
     rows: list[dict[str, Any]]
     forces: dict[str, Any]
     blocks: Blocks | None
 
 
 def force_study(config: ForceSettings) -> ForceStudy:
-    """Read the logs, fit and judge every model.
+    """Read the logs, fit and judge every model; one that the logs do not determine is set aside with the reason.
 
     Raises:
-        ResidnetError: where a log cannot be used or a model is not determined.
+        ResidnetError: where a log cannot be used or no model is determined.
     """
     measured = read_measured(config)
     believed = ForceModel(config.hull())
-    judged, final = {}, {}
+    judged, final, failed = dict[str, Judged](), dict[str, Final](), dict[str, str]()
     for name, wanted in config.models.items():
         try:
-            judged[name] = cross_validate(wanted, measured, believed, config.validation.gap)
+            errors = cross_validate(wanted, measured, believed, config.validation.gap)
             model, _, fit, notes = fit_model(wanted, _for(wanted, measured, measured.record), believed)
         except FitError as error:
-            raise FitError(f"model {name}: {error}") from None
+            failed[name] = f"model {name}: {error}"
+            continue
+        judged[name] = errors
         final[name] = Final(fit, notes, _forward(config, model, name))
-    return ForceStudy(measured, judged, final, table(config, measured, judged, believed), compare_forces(measured), measured.blocks())
+    if not final:
+        raise FitError(next(iter(failed.values())))
+    return ForceStudy(measured, judged, final, failed, table(config, measured, judged, believed), compare_forces(measured), measured.blocks())
 
 
 def _for(wanted: MeasuredModelConfig, measured: Measured, record: Record) -> Record:
@@ -131,8 +137,8 @@ def unmodelled(measured: Measured, believed: ForceModel, force: str) -> Tensor:
 def table(config: ForceSettings, measured: Measured, judged: Mapping[str, Judged], believed: ForceModel) -> list[dict[str, Any]]:
     """Rows of all models by the force that judges them; every group begins with `zero` and `believed` on the same samples."""
     groups: dict[str, list[str]] = {}
-    for name, wanted in config.models.items():
-        groups.setdefault(judge(wanted), []).append(name)
+    for name in judged:
+        groups.setdefault(judge(config.models[name]), []).append(name)
     segments, parts = measured.segments(), measured.blocks()
 
     def by_segment(error: Tensor) -> np.ndarray:
