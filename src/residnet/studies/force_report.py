@@ -84,8 +84,8 @@ def acceleration_text(config: ForceSettings, found: Mapping[str, Any]) -> str:
 def group_text(config: ForceSettings, found: ForceStudy, rows: Sequence[Mapping[str, Any]]) -> str:
     """Table of the models that are judged on one force."""
     lines = [f"Residual of the {rows[0]['force']} force; in brackets the share that the document's model of that kind left, in other trials", ""]
-    lines += ["| model | MSE N^2, N^2, (N m)^2 | % of zero | % of the believed model's | mean over axes less believed, % of zero [95 %] | chosen |"]
-    lines += ["|---|---|---|---|---|---|"]
+    titles = ["model", "MSE N^2, N^2, (N m)^2", "% of zero", "% of the believed model's", "mean over axes less believed, % of zero [95 %]"]
+    lines += [f"| {' | '.join([*titles, 'segments below believed %', 'chosen'])} |", "|---|---|---|---|---|---|---|"]
     base = next(row for row in rows if row["model"] == "believed")["mse"]
     for row in rows:
         wanted = config.models.get(row["model"])
@@ -96,8 +96,9 @@ def group_text(config: ForceSettings, found: ForceStudy, rows: Sequence[Mapping[
             left.append(own if published is None else f"{own} ({100 * published[1][axis] / published[0][axis]:.0f})")
         mse, zero = " / ".join(f"{v:.4g}" for v in row["mse"]), " / ".join(f"{100 * v:.0f}" for v in row["of_zero"])
         apart = "" if "minus_believed" not in row else _interval(row["minus_believed"])
+        below = "" if "minus_believed" not in row else f"{100 * row['minus_believed']['segments_below'][3]:.0f}"
         notes = "" if wanted is None else notes_text(found.final[row["model"]].notes)
-        lines.append(f"| {row['model']} | {mse} | {zero} | {' / '.join(left)} | {apart} | {notes} |")
+        lines.append(f"| {row['model']} | {mse} | {zero} | {' / '.join(left)} | {apart} | {below} | {notes} |")
     return "\n".join(lines)
 
 
@@ -117,12 +118,14 @@ def _verdict(found: ForceStudy, groups: Sequence[str]) -> str:
         lines.append(f"- {group} force: the believed model beats no force on {_where(better(known, 'zero'))}")
         winners = {row["model"]: better(row, "believed") for row in fits if any(better(row, "believed"))}
         whole = [name for name, where in winners.items() if where[3]]
+        gains = [row["minus_believed"]["mean"][3] for row in fits if row["model"] in whole]
+        most = f"; the most by {-100 * min(gains):.1f} % of zero's mean square" if gains else ""
         if not whole:
             lines.append(
                 f"  - NONE of the {len(fits)} regressions beats a residual of zero: every interval of the mean over axes reaches to zero or above"
             )
         else:
-            lines.append(f"  - {len(whole)} of {len(fits)} regressions beat a residual of zero in the mean over axes: {', '.join(whole)}")
+            lines.append(f"  - {len(whole)} of {len(fits)} regressions beat a residual of zero in the mean over axes: {', '.join(whole)}{most}")
         single = [f"{name} ({_where(where[:3])})" for name, where in winners.items() if any(where[:3])]
         if single:
             lines.append(f"  - axis by axis: {', '.join(single)}; of these {3 * len(fits)} comparisons one in forty would come out so by chance")

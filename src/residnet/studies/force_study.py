@@ -164,9 +164,9 @@ def table(config: ForceSettings, measured: Measured, judged: Mapping[str, Judged
 
 
 def _apart(apart: np.ndarray, parts: Blocks | None) -> dict[str, Any]:
-    """Difference of errors [W, 3] in units of zero's mean square error, by axis and as the mean over axes, with 95 % intervals."""
+    """Difference of errors [W, 3] in units of zero's mean square error, by axis and their mean: 95 % intervals, share of segments below."""
     columns = np.concatenate((apart, apart.mean(1, keepdims=True)), axis=1)
-    return {"mean": columns.mean(0).tolist(), "ci95": intervals(columns, parts)}
+    return {"mean": columns.mean(0).tolist(), "ci95": intervals(columns, parts), "segments_below": (columns < 0).mean(0).tolist()}
 
 
 def better(row: Mapping[str, Any], than: str) -> list[bool]:
