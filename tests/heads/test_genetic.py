@@ -24,8 +24,9 @@ from residnet.core.samples import Samples
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec, load_model, save_model
 from residnet.heads.expression_library import ExpressionLibrary, tables
-from residnet.heads.expression_text import LATEX, SYMPY, C, term, total
+from residnet.heads.expression_text import term, total
 from residnet.heads.genetic import GeneticConfig, breed
+from residnet.heads.notation import LATEX, SYMPY, C
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.terms import TermLibrary
 

@@ -274,7 +274,7 @@ def test_text_and_latex() -> None:
     _, notes = fitted(FORCE, samples(log, FORCES))
     assert notes["equations"]["u_dot"]["text"] == "u_dot = -0.0101 u + 0.0002026 tau_x - 0.0492 u |u| + 1 v r"
     latex = notes["equations"]["u_dot"]["latex"]
-    assert latex == r"\dot{u} = -0.0101 \, u + 0.0002026 \, \tau_{\mathrm{x}} - 0.0492 \, u \, |u| + 1 \, v \, r"
+    assert latex == r"\dot{u} = -0.0101 \, u + 0.0002026 \, \tau_{\mathrm{x}} - 0.0492 \, u \, \left|u\right| + 1 \, v \, r"
     assert r"4.78 \cdot 10^{-5} \, \tau_{\mathrm{n}}" in notes["equations"]["r_dot"]["latex"]
 
 

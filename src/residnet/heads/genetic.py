@@ -20,7 +20,8 @@ from residnet.core.sparse import Equation, Reduced, SearchConfig, find, reduce
 from residnet.core.sparse_search import coefficients
 from residnet.heads.base import EquationHead, FeatureConfig, Features
 from residnet.heads.expression_library import ExpressionLibrary, Weights, tables
-from residnet.heads.expression_text import LATEX, PLAIN, SYMPY, c_function, term, total
+from residnet.heads.expression_text import c_function, term, total
+from residnet.heads.notation import LATEX, PLAIN, SYMPY, latex_left
 
 _BLOCKS = 8
 
@@ -178,10 +179,9 @@ def validating(group: np.ndarray, every: int) -> np.ndarray:
 
 def _written(algebra: Algebra, name: str, bred: Bred) -> dict[str, Any]:
     """One equation in writing, with the course of its search."""
-    base = name.removesuffix("_dot")
     return {
         "text": f"{name} = {total(algebra, bred.products, bred.values, PLAIN)}",
-        "latex": rf"\dot{{{base}}} = {total(algebra, bred.products, bred.values, LATEX)}",
+        "latex": f"{latex_left(name)} = {total(algebra, bred.products, bred.values, LATEX)}",
         "sympy": total(algebra, bred.products, bred.values, SYMPY),
         "c": c_function(algebra, name, bred.products, bred.values),
         **bred.told,
