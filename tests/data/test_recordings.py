@@ -337,8 +337,8 @@ def test_what_is_missing_is_named(tmp_path: Path) -> None:
     log = read(place, channels={"r": field("gyro", "rad/s"), "delta": field("rudder", "rad", required=False)})
     assert list(log.channels) == ["r"]
     assert {entry["code"] for entry in log.meta["findings"]} >= {"missing_channels", "empty_topic", "empty_columns", "not_numbers"}
-    with pytest.raises(UsageError, match="is a file"):
-        read(place / "gyro.csv", channels={"r": field("gyro", "rad/s")})
+    with pytest.raises(UsageError, match="no such file"):
+        read(tmp_path / "ran", channels={"r": field("gyro", "rad/s")})
 
 
 def test_a_topic_cut_short_in_the_middle_of_a_row(tmp_path: Path) -> None:
@@ -369,3 +369,29 @@ def test_chunks_of_a_topic_give_the_whole(tmp_path: Path, monkeypatch: pytest.Mo
         >= {"not_numbers", "unpadded_fraction"}
     )
     assert np.isnan(whole["r"]).sum() == 4
+
+
+def test_one_table_with_dates_latitudes_and_a_compass(tmp_path: Path) -> None:
+    t = 0.2 * np.arange(400)
+    truth = circle(t)
+    # of curvature of WGS 84 at the origin
+    radii = 6_386_688.0, 6_395_290.0 * np.cos(np.radians(63.4411))
+    table = {
+        "time": [f"{pd.Timestamp(EPOCH + s, unit='s'):%Y-%m-%dT%H:%M:%S.%f}+01:00" for s in t],
+        "lat": 63.4411 + np.degrees(truth["x"] / radii[0]),
+        "lon": 10.4198 + np.degrees(truth["y"] / radii[1]),
+        "compass": np.degrees(truth["psi"]) % 360,
+    }
+    path = tmp_path / "run.csv"
+    pd.DataFrame(table).to_csv(path, index=False)
+    log = read(
+        path,
+        position={"kind": "geodetic", "latitude": "lat", "longitude": "lon", "origin": {"latitude": "63.4411 deg", "longitude": "10.4198 deg"}},
+        heading={"kind": "angle", "field": "compass", "unit": "deg"},
+        velocity={"kind": "derived"},
+        clock={"kind": "uniform", "step": "0.2 s"},
+    )
+    assert log.name == "run"
+    assert log.meta["epoch"] == pytest.approx(EPOCH - 3600)
+    np.testing.assert_allclose(log["u"], 2.0, atol=2e-4)
+    np.testing.assert_allclose(log["r"], 0.1, atol=1e-5)

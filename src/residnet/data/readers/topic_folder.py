@@ -10,7 +10,8 @@ from typing import Literal, final
 import numpy as np
 from pydantic import Field
 
-from residnet.core.errors import DataError, UsageError
+from residnet.core.errors import DataError
+from residnet.data.readers.base import require_file
 from residnet.data.readers.cells import NANOSECONDS, SECONDS, Cells, names_sender
 from residnet.data.readers.composed import RecordingConfig
 from residnet.data.readers.files import progress, total_size
@@ -26,7 +27,9 @@ _CHUNK = 200_000
 
 @final
 class TopicFolderConfig(RecordingConfig):
-    """A folder of csv files, one per topic, each with its own clock; a topic is named by its path below the folder, without the ending.
+    """A folder of csv files, one per topic, each with its own clock, or one csv file with dates, latitudes, quaternions.
+
+    A topic is named by its path below the folder, without the ending.
 
     Attributes:
         time: columns that may hold the arrival time, in order; every file is searched for them.
@@ -43,15 +46,18 @@ class TopicFolderConfig(RecordingConfig):
 
 
 def load_folder(path: Path, wanted: Wanted = EVERYTHING, time: tuple[str, ...] = _ARRIVAL, delimiter: str = ",") -> Recording:
-    """The recording in a folder of csv files.
+    """The recording in a folder of csv files, or in one such file.
 
     Raises:
-        UsageError: where the folder is missing.
+        UsageError: where there is nothing at `path`.
         DataError: where it holds no csv file, or none of them has a time.
     """
-    if not path.is_dir():
-        raise UsageError(f"{path}: no such folder" if not path.exists() else f"{path}: is a file; a folder with one csv per topic was expected")
-    files = sorted(file for file in path.rglob("*") if file.suffix.lower() in _ENDINGS and file.is_file())
+    if path.is_file():
+        files, root = [path], path.parent
+    elif path.is_dir():
+        files, root = sorted(file for file in path.rglob("*") if file.suffix.lower() in _ENDINGS and file.is_file()), path
+    else:
+        require_file(path)
     if not files:
         raise DataError(f"{path}: holds no csv file")
     size = total_size(files)
@@ -60,7 +66,7 @@ def load_folder(path: Path, wanted: Wanted = EVERYTHING, time: tuple[str, ...] =
     take = EVERYTHING if size < LARGE else wanted
     with progress(path.name, size, size) as advance:
         for file in files:
-            name = file.relative_to(path).with_suffix("").as_posix()
+            name = file.relative_to(root).with_suffix("").as_posix()
             if not take(name):
                 listed.append(name)
                 continue
