@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import io
+import os
+import sys
 from array import array
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal, final
 
@@ -48,8 +51,7 @@ def load_ardupilot(path: Path, wanted: Wanted = EVERYTHING) -> Recording:
     listed: set[str] = set()
     size = path.stat().st_size
     try:
-        # pymavlink prints what it skips
-        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+        with _silence():
             reader = DFReader_binary(str(path))
         with progress(path.name, size, 100.0) as advance:
             _collect(reader, columns, listed, wanted, advance)
@@ -70,9 +72,10 @@ def load_ardupilot(path: Path, wanted: Wanted = EVERYTHING) -> Recording:
 
 
 def _collect(reader: Any, columns: dict[str, _Columns], listed: set[str], wanted: Wanted, advance: Any) -> None:
-    count = 0
+    count, quiet = 0, io.StringIO()
     while True:
-        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+        # what cannot be parsed is skipped, and printed
+        with contextlib.redirect_stdout(quiet), contextlib.redirect_stderr(quiet):
             message = reader.recv_msg()
         if message is None:
             return
@@ -92,6 +95,24 @@ def _collect(reader: Any, columns: dict[str, _Columns], listed: set[str], wanted
         if name not in columns:
             columns[name] = _Columns(kind, message, lambda path, name=name: wanted.field(name, path))
         columns[name].add(message)
+
+
+@contextlib.contextmanager
+def _silence() -> Iterator[None]:
+    """Keeps the indexer of pymavlink, which is compiled, from printing every byte that it skips."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    kept = [(number, os.dup(number)) for number in (1, 2)]
+    with Path(os.devnull).open("wb") as nowhere:
+        for number, _ in kept:
+            os.dup2(nowhere.fileno(), number)
+        try:
+            with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+                yield
+        finally:
+            for number, copy in kept:
+                os.dup2(copy, number)
+                os.close(copy)
 
 
 @final

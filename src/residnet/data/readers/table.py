@@ -247,6 +247,7 @@ def _read_csv(path: Path, columns: Sequence[str], delimiter: str, decimal: str) 
         where = _positions(path, header, columns, hint)
         # one column more than the header: cells beyond it would shift or vanish silently (a decimal comma in a comma table does that)
         wide, size = len(header), max(1, path.stat().st_size)
+        cut = check_lines(path, delimiter, wide)
         with path.open("rb") as stream_of_bytes:
             pieces = pd.read_csv(
                 stream_of_bytes,
@@ -262,14 +263,15 @@ def _read_csv(path: Path, columns: Sequence[str], delimiter: str, decimal: str) 
                 encoding="utf-8-sig",
                 chunksize=_PIECE,
             )
-            for table in pieces:
+            for table, last in _with_last(pieces):
                 beyond = np.flatnonzero(table[wide].notna().to_numpy())
                 if beyond.size:
                     raise DataError(
                         f"{path}: line {int(table.index[beyond[0]]) + 2} has more cells than the {wide} columns of the header "
                         f"({beyond.size} such lines); check `delimiter` and `decimal`"
                     )
-                yield table[where], min(1.0, stream_of_bytes.tell() / size)
+                kept = table[where]
+                yield kept.iloc[:-1] if last and cut else kept, min(1.0, stream_of_bytes.tell() / size)
     except UnicodeDecodeError as error:
         raise DataError(f"{path}: not UTF-8 text (byte {error.start}); save the file as UTF-8") from error
     except pd.errors.EmptyDataError:
@@ -280,17 +282,29 @@ def _read_csv(path: Path, columns: Sequence[str], delimiter: str, decimal: str) 
         ) from error
 
 
+def _with_last(pieces: Iterable[pd.DataFrame]) -> Iterator[tuple[pd.DataFrame, bool]]:
+    """Each piece, and whether it is the last."""
+    held: pd.DataFrame | None = None
+    for piece in pieces:
+        if held is not None:
+            yield held, False
+        held = piece
+    if held is not None:
+        yield held, True
+
+
 def _read_parquet(path: Path, columns: Sequence[str]) -> Pieces:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     try:
         _positions(path, pq.read_schema(path).names, columns)
-        with pq.ParquetFile(path) as file:
+        with pq.ParquetFile(path, page_checksum_verification=True) as file:
             rows, read = max(1, file.metadata.num_rows), 0
             for batch in file.iter_batches(batch_size=_PIECE, columns=sorted(set(columns))):
                 read += batch.num_rows
                 table = pa.Table.from_batches([batch]).to_pandas(ignore_metadata=True)
                 yield table[list(columns)], read / rows
-    except (pa.ArrowException, OSError) as error:
-        raise DataError(f"{path}: not a readable Parquet file ({str(error).splitlines()[0]})") from error
+    except (pa.ArrowException, OSError, ValueError, TypeError, LookupError, ArithmeticError, MemoryError) as error:
+        # damaged metadata reaches every layer of the library
+        raise DataError(f"{path}: not a readable Parquet file ({(str(error) or type(error).__name__).splitlines()[0]})") from error
