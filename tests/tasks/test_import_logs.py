@@ -1,0 +1,68 @@
+"""Task `import`: recordings become canonical logs with their findings; what does not match stops before any work."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from tiny import call
+
+from residnet.core.log import Log
+from residnet.data.readers import CanonicalConfig
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "data"))
+import written_logs
+
+
+def config(folder: Path, **keys: object) -> Path:
+    path = folder / "import.yaml"
+    content = {"task": "import", "name": "trials", "root": str(folder), "logs": ["rec_*"], "reader": {"kind": "auto"}, **keys}
+    path.write_text(yaml.safe_dump(content))
+    return path
+
+
+def recorded(folder: Path, name: str, seconds: float) -> Log:
+    log = written_logs.trial(seconds)
+    made = written_logs.topics(log, folder)
+    made.rename(folder / name)
+    return log
+
+
+def test_recordings_of_different_length_become_canonical_logs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    logs = {name: recorded(tmp_path, name, seconds) for name, seconds in (("rec_a", 20.0), ("rec_b", 7.5))}
+    assert call(monkeypatch, "run", config(tmp_path), "--out", tmp_path / "run") == 0
+    printed = capsys.readouterr().out
+    assert "rec_b: 76 samples" in printed
+    for name, log in logs.items():
+        read = CanonicalConfig().build().read(tmp_path / "run" / "logs" / f"{name}.parquet")
+        np.testing.assert_allclose(read.t, log.t, atol=1e-9)
+        np.testing.assert_allclose(read["psi"], log["psi"], atol=1e-9)
+    findings = json.loads((tmp_path / "run" / "findings.json").read_text())
+    assert {entry["code"] for entry in findings["rec_a"]} >= {"time_zone", "topic_rate"}
+    assert set(findings["rec_a"][0]) == {"level", "code", "text", "figures"}
+    inputs = json.loads((tmp_path / "run" / "provenance.json").read_text())["inputs"]
+    assert {Path(path).name for path in inputs} == {"odometry.csv", "cmd_port.csv", "cmd_stbd.csv"}
+
+
+def test_what_does_not_match_stops_before_any_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    recorded(tmp_path, "rec_a", 2.0)
+    for keys, words in [({"logs": ["raw_*"]}, "'raw_*' matches nothing"), ({"logs": ["/rec_*"]}, "set `root` instead"), ({"logs": []}, "logs")]:
+        assert call(monkeypatch, "run", config(tmp_path, **keys), "--out", tmp_path / "run") == 2
+        said = capsys.readouterr().err
+        assert words in said
+        assert said.count("\n") == 1
+        assert not (tmp_path / "run").exists()
+
+
+def test_two_recordings_of_one_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    for day in ("monday", "tuesday"):
+        (tmp_path / day).mkdir()
+        recorded(tmp_path / day, "rec_a", 2.0)
+    assert call(monkeypatch, "check", config(tmp_path, logs=["*/rec_a"])) == 2
+    assert "would both be the log 'rec_a'" in capsys.readouterr().err
