@@ -141,7 +141,7 @@ def test_validates_so_often_and_after_the_last_epoch(logs: list[Prepared], tmp_p
 
 
 def test_no_finite_free_run_is_one_line(logs: list[Prepared], tmp_path: Path) -> None:
-    with pytest.raises(FitError, match="head mlp: no epoch gave a finite free run") as caught:
+    with pytest.raises(FitError, match="mlp: no epoch gave a finite free run") as caught:
         trained(logs, tmp_path, Scripted([math.nan]))
     assert "\n" not in str(caught.value)
 

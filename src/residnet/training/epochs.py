@@ -214,7 +214,7 @@ def run_epochs(name: str, module: EpochTraining, model: nn.Module, trained: nn.M
     if trainer.interrupted:
         raise KeyboardInterrupt
     if not module.best_state:
-        raise FitError(f"{name}: no epoch gave a finite free run in validation; lower the learning rate or the horizon")
+        raise FitError(f"{name}: no epoch gave a finite free run on the validation data; lower the learning rate or the horizon")
     model.load_state_dict(module.best_state)
     model.eval().requires_grad_(False)
     return {

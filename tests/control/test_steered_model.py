@@ -1,0 +1,67 @@
+"""A learned model that is Nomoto's own, steered beside the plant: with any variation both move alike."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from made_models import nomoto_model
+
+from residnet.control.controllers import PdConfig, Steering
+from residnet.control.steered_model import SteeredModel
+from residnet.control.steering import SteeredPlant, fly
+from residnet.core.errors import ConfigError
+from residnet.dynamics.rollout import Rollout
+from residnet.physics.vessel import load_vessel
+
+DEG = math.pi / 180
+GAIN, TIME = 3.47, 3.94
+VARIED = torch.tensor([[1.0, 1.0, 0.0], [0.8, 1.2, 0.5 * DEG], [1.2, 0.8, -DEG]], dtype=torch.float64)
+
+
+def pair(name: str) -> tuple[SteeredPlant, SteeredModel]:
+    vessel = SteeredPlant(load_vessel(name).build())
+    spec, model = nomoto_model(GAIN, TIME, 0.1)
+    return vessel, SteeredModel(model, spec.signals.columns, spec.hold, vessel)
+
+
+@pytest.mark.parametrize("name", ["nomoto_oceanos", "nomoto_oceanos_rate10"])
+def test_a_perfect_model_flies_as_its_vessel(name: str) -> None:
+    vessel, learned = pair(name)
+    flights = []
+    for steered in (vessel, learned):
+        pd = PdConfig(kp=3.0, damping_time=1.5).build(Steering(steered, vessel.turning(5 * DEG, 60.0), 5 * DEG, 0.01))
+        flights.append(fly(steered, pd, torch.tensor([0.5, 0.3, -0.4]), VARIED, dt=0.01, duration=8.0))
+    # the model divides what a step changes by `time`, which is of first order in the step
+    assert float((flights[0].of("psi") - flights[1].of("psi")).abs().max()) < 1e-3
+    assert float((flights[0].inputs - flights[1].inputs).abs().max()) < 0.1 * DEG
+
+
+def test_turning_is_that_of_the_model() -> None:
+    turning = pair("nomoto_oceanos")[1].turning(5 * DEG, 60.0)
+    assert turning.gain == pytest.approx(GAIN, rel=1e-6)
+    assert turning.time == pytest.approx(TIME, rel=1e-3)
+
+
+def test_gradients_pass_through_the_model_in_single_precision() -> None:
+    _, learned = pair("nomoto_oceanos_rate10")
+    model = learned.model(0.1)
+    x, w = learned.start(torch.ones(3))
+    command = torch.full((3, 20, 1), 0.02, requires_grad=True)
+    states, _, _ = Rollout(model, None)(x, command, learned.memory(VARIED.float()))
+    states[:, -1, 2].sum().backward()
+    assert states.dtype == torch.float32
+    # heading per rad of rudder that is held grows with the time that is left
+    assert command.grad is not None
+    assert bool((command.grad[:, 1] > command.grad[:, 10]).all())
+    assert w.shape == (3, 1)
+
+
+def test_a_model_without_rudder_is_refused() -> None:
+    _, model = nomoto_model(GAIN, TIME, 0.1)
+    vessel = SteeredPlant(load_vessel("nomoto_oceanos").build())
+    with pytest.raises(ConfigError, match="driven by 'delta'"):
+        SteeredModel(model, ("n_port",), "start", vessel)
+    with pytest.raises(ConfigError, match="does not command"):
+        SteeredModel(model, ("delta", "n"), "start", vessel)

@@ -1,0 +1,85 @@
+"""The C++ program of `scripts/autopilot_cpp`: built as the README says, it steers as Python does."""
+
+from __future__ import annotations
+
+import csv
+import math
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+import torch
+
+from residnet.control.policy import HeadingPolicy
+from residnet.control.steering import SteeredPlant
+from residnet.export.autopilot import export_autopilot
+from residnet.physics.vessel import load_vessel
+
+SOURCE = Path(__file__).parents[2] / "scripts" / "autopilot_cpp"
+GAIN, TIME, SPEED, DT, HEADING = 3.47, 3.94, 3.2, 0.02, math.radians(30)
+
+pytestmark = [
+    pytest.mark.skipif(shutil.which("cmake") is None, reason="cmake is not installed"),
+    pytest.mark.skipif(shutil.which("c++") is None and shutil.which("g++") is None, reason="no C++ compiler is installed"),
+]
+
+
+@pytest.fixture(scope="module")
+def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    build = tmp_path_factory.mktemp("build")
+    for words in (
+        ["cmake", "-S", str(SOURCE), "-B", str(build), f"-DCMAKE_PREFIX_PATH={torch.utils.cmake_prefix_path}", "-DCMAKE_BUILD_TYPE=Debug"],
+        ["cmake", "--build", str(build)],
+    ):
+        done = subprocess.run(words, capture_output=True, text=True)
+        assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
+    return build / "autopilot"
+
+
+@pytest.fixture(scope="module")
+def policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    vessel = SteeredPlant(load_vessel("nomoto_oceanos").build())
+    limit = math.radians(5)
+    torch.manual_seed(0)
+    own = HeadingPolicy(vessel.state, turning=vessel.turning(limit, 60.0), limit=limit, dt=DT)
+    with torch.no_grad():
+        own.network[-1].weight.copy_(0.05 * torch.randn_like(own.network[-1].weight))  # type: ignore[union-attr, arg-type, operator]
+    file = tmp_path_factory.mktemp("policy") / "policy.pt"
+    export_autopilot("policy", own.requires_grad_(False), file, safe="amidships", about={}, metrics=[])
+    return file
+
+
+def test_it_steers_as_python_does(program: Path, policy: Path, tmp_path: Path) -> None:
+    seconds, track = 8.0, tmp_path / "track.csv"
+    words = [str(program), str(policy), str(track), *map(repr, (GAIN, TIME, SPEED, DT, HEADING, seconds))]
+    said = subprocess.run(words, capture_output=True, text=True, check=True).stdout
+    assert "median step" in said
+    module = torch.jit.load(str(policy))
+    psi = r = 0.0
+    decay = math.exp(-DT / TIME)
+    y, reference = torch.tensor([[0.0, SPEED, 0.0]]), torch.tensor([[HEADING]])
+    s = module.initial_state(y)
+    with track.open() as lines:
+        theirs = list(csv.DictReader(lines))
+    assert len(theirs) == round(seconds / DT)
+    for row in theirs:
+        y[0, 0], y[0, 2] = psi, r
+        command, s, _ = module.step(y, reference, s)
+        delta = float(command)
+        for name, mine in (("psi", psi), ("r", r), ("delta", delta)):
+            assert float(row[name]) == pytest.approx(mine, abs=1e-4)
+        assert row["fault"] == "0"
+        steady = GAIN * delta
+        psi += steady * DT + (r - steady) * TIME * (1.0 - decay)
+        r = steady + (r - steady) * decay
+    assert psi == pytest.approx(HEADING, abs=math.radians(0.1))
+
+
+def test_wrong_calls_end_with_a_line(program: Path, policy: Path, tmp_path: Path) -> None:
+    none = subprocess.run([str(program)], capture_output=True, text=True)
+    assert none.returncode == 2
+    assert "usage" in none.stderr
+    missing = subprocess.run([str(program), "nothing.pt", str(tmp_path / "t.csv"), *["1"] * 6], capture_output=True, text=True)
+    assert missing.returncode == 1
+    assert missing.stderr.startswith("autopilot: ")
