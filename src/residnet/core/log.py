@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import mmap
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,16 @@ from residnet.core.errors import DataError, UsageError
 from residnet.core.names import CHANNEL_UNITS, nearest
 
 SCHEMA = "residnet.log/1"
+_PIECE = 500_000
+
+
+def forget_pages(values: np.ndarray) -> None:
+    """Give back the memory of a read-only array that lies in a file; it is read again when it is next used. Other arrays stay as they are."""
+    owner: Any = values
+    while isinstance(owner, np.ndarray):
+        owner = owner.base
+    if isinstance(owner, mmap.mmap) and not values.flags.writeable:
+        owner.madvise(mmap.MADV_DONTNEED)
 
 
 @dataclass(frozen=True)
@@ -81,8 +92,13 @@ class Log:
 
         columns = {"t": self.t, **self.channels, **{f"mask:{reason}": mask for reason, mask in self.masks.items()}}
         about = {"schema": SCHEMA, "name": self.name, "manoeuvre": self.manoeuvre, "units": self.units, "meta": self.meta}
-        table = pa.table(columns).replace_schema_metadata({"residnet": json.dumps(about)})
-        pq.write_table(table, path)
+        schema = pa.table({name: values[:0] for name, values in columns.items()}).schema.with_metadata({"residnet": json.dumps(about)})
+        with pq.ParquetWriter(path, schema) as writer:
+            # piece by piece: the columns of a large log lie on disk
+            for start in range(0, max(1, len(self)), _PIECE):
+                writer.write_table(pa.table({name: values[start : start + _PIECE] for name, values in columns.items()}, schema=schema))
+                for values in columns.values():
+                    forget_pages(values)
 
     @staticmethod
     def recognises(path: Path) -> bool:

@@ -46,12 +46,11 @@ class Spool:
             ) from error
 
     def finish(self) -> list[np.ndarray]:
-        """The columns [T]; the spool is empty then."""
+        """The columns [T], read-only where they lie on disk; the spool is empty then."""
         out = []
         for file in self._files:
             file.flush()
-            # changes stay in memory, so that the arrays are like any other
-            out.append(np.asarray(np.memmap(file, dtype=np.float64, mode="c")) if file.tell() else np.zeros(0))
+            out.append(np.asarray(np.memmap(file, dtype=np.float64, mode="r")) if file.tell() else np.zeros(0))
             file.close()
         for i, parts in enumerate([] if self._files else self._parts):
             out.append(parts[0] if len(parts) == 1 else np.concatenate(parts) if parts else np.zeros(0))
