@@ -121,6 +121,13 @@ def test_folds_are_stretches_of_one_log_with_a_gap_and_whole_logs_of_three(tmp_p
     assert bool((record.fold[ends] != record.fold[ends - 1]).all())
 
 
+def test_a_log_that_stands_twice_is_refused(tmp_path: Path) -> None:
+    log(tmp_path, "one", missing=1.0, seconds=60.0)
+    log(tmp_path, "copy", missing=1.0, seconds=60.0)
+    with pytest.raises(DataError, match="identical rows"):
+        read_measured(config(tmp_path))
+
+
 def test_acceleration_of_an_offset_sensor_is_calibrated(tmp_path: Path) -> None:
     log(tmp_path, "one", missing=1.0)
     found = read_measured(config(tmp_path)).acceleration

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from residnet.core.errors import DataError, FitError
 from residnet.data.prepare import Prepared, prepare
+from residnet.data.split import check_leaks
 from residnet.evaluation.bootstrap import Blocks, blocks, intervals
 from residnet.studies.ferry_fit import Record
 from residnet.studies.force_config import FoldsConfig, ForceSettings
@@ -97,7 +98,10 @@ def read_measured(config: ForceSettings) -> Measured:
         ResidnetError: where a log cannot be read or holds nothing to learn from.
     """
     reader = config.data.reader.build()
-    logs = [prepare(reader.read(path), "all", config.channels.columns(), config.prepare) for path in config.data.files()]
+    recorded = [reader.read(path) for path in config.data.files()]
+    # a log that stands twice would be learned from where it is judged
+    check_leaks({log.name: [log] for log in recorded})
+    logs = [prepare(log, "all", config.channels.columns(), config.prepare) for log in recorded]
     for log in logs:
         if not log.good.any():
             raise DataError(f"log {log.log.name}: no stretch is as long as the derivative's window; leave it out or shorten prepare.derivative")
