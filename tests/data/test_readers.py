@@ -109,8 +109,8 @@ ROWS = "t,u,v\n0,1,2\n1,1,2\n"
         ("t,u,v\n0,1,2\n\n1,1,2\n1,1,2\n1,1,2\n", DataError, ["repeats from line 4 (1 s) to line 5", "2 such steps"]),
         ("t,u,v\n0,1,2\n2,1,2\n1,1,2\n", DataError, ["runs backwards from line 3 (2 s) to line 4 (1 s)"]),
         ("t,u,v\n0,1,2\n,1,2\n2,1,2\n", DataError, ["line 3 has measurements but no time"]),
-        ("t,u,v\n0,1,5,2\n1,1,2\n", DataError, ["line 2 has more cells", "decimal"]),
-        ("t,u,v\n0,1,2\n1,1,2,3,4\n", DataError, ["not a regular table", "3 columns"]),
+        ("t,u,v\n0,1,5,2\n1,1,2\n", DataError, ["line 2 has 4 cells, the header 3", "decimal"]),
+        ("t,u,v\n0,1,2\n1,1,2,3,4\n", DataError, ["line 3 has 5 cells, the header 3"]),
     ],
 )
 def test_faulty_tables(tmp_path: Path, text: str, error: type[Exception], words: list[str]) -> None:

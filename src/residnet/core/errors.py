@@ -8,9 +8,12 @@ from __future__ import annotations
 
 
 class ResidnetError(Exception):
-    """Base of all errors that residnet raises on purpose."""
+    """Base of all errors that residnet raises on purpose; whatever a message quotes from a file, it stays one printable line."""
 
     exit_code: int = 1
+
+    def __init__(self, message: str = "") -> None:
+        super().__init__("".join(char if char.isprintable() else " " if char.isspace() else f"\\x{ord(char):02x}" for char in message))
 
 
 class UsageError(ResidnetError):

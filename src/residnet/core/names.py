@@ -111,9 +111,15 @@ def units() -> tuple[str, ...]:
     return tuple(_UNITS)
 
 
+def shown(text: object, most: int = 60) -> str:
+    """What a message quotes from a file, cut to a length that people read."""
+    whole = str(text)
+    return whole if len(whole) <= most else f"{whole[: most - 3]}..."
+
+
 def nearest(name: str, valid: Iterable[str]) -> str:
     """Text `; did you mean 'x'?` or, where nothing is near, the valid names; for error messages."""
-    names = sorted(set(valid))
+    names = sorted({shown(other) for other in valid})
     close = difflib.get_close_matches(name, names, n=1, cutoff=0.6)
     if close:
         return f"; did you mean '{close[0]}'?"

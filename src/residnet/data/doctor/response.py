@@ -134,12 +134,12 @@ def _answer(log: Log, steer: np.ndarray) -> _Answer | None:
 
 
 def _reach(r: np.ndarray, step: float) -> int:
-    """Samples after which the yaw rate has forgotten what it was: half of that is as far as a shift can be told."""
+    """Samples after which the yaw rate has forgotten what it was: as far as a shift can be told."""
     known = np.nan_to_num(r - np.nanmean(r))
     power = np.abs(np.fft.rfft(known, 2 * known.size)) ** 2
     memory = np.fft.irfft(power)[: known.size]
-    below = np.flatnonzero(memory < 0.3 * memory[0])
-    return max(min(int(below[0]) if below.size else known.size, known.size // 8, round(20.0 / step)), 3)
+    below = np.flatnonzero(memory < 0.0)
+    return max(min(int(below[0]) if below.size else known.size, known.size // 8, round(30.0 / step)), 3)
 
 
 def _fit(x: np.ndarray, y: np.ndarray) -> tuple[float, float, float]:

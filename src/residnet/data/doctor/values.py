@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -16,6 +17,8 @@ from residnet.data.masks import true_runs
 _FROZEN = 5
 # after a receiver's freeze its filter needs so long to recover, s
 _RECOVERY = 2.0
+# an angle that is held for less than this is held by nobody's harm, rad
+_FELT = math.radians(0.1)
 # levels between the 5th and the 95th percentile below which a resolution is felt
 _FEWEST_LEVELS = 50
 
@@ -136,11 +139,13 @@ def _held(log: Log, names: Sequence[str]) -> np.ndarray:
         return out
     # share of equal neighbours where the channel runs: a coarse one stands still for some samples by nature
     chance = min(float((stops - starts)[~long].sum()) / outside, 0.99)
-    least = _FROZEN if chance <= 0.0 else max(_FROZEN, int(np.ceil(np.log(1e-4 / same.size) / np.log(chance))))
+    # two channels that hold together are never chance
+    least = _FROZEN if chance <= 0.0 or len(names) > 1 else max(_FROZEN, int(np.ceil(np.log(1e-4 / same.size) / np.log(chance))))
+    limit = 0.15 if len(names) > 1 else 1e-3
     for start, stop in zip(starts, stops, strict=True):
         run = slice(start, stop + 1)
         # the last digits of a noisy channel never rest, whatever the vessel does
-        if stop - start >= least and ((chance < 1e-3 and _noisy(log[names[0]])) or _moves(log, names, run)):
+        if stop - start >= least and ((chance < limit and _noisy(log[names[0]])) or _moves(log, names, run)):
             out[start : stop + 1] = True
     return out
 
@@ -161,7 +166,7 @@ def _moves(log: Log, names: Sequence[str], run: slice) -> bool:
     noise = np.hypot.reduce([noise_of(log[name]) for name in rates if name != "psi"]) * dt / np.sqrt(count if len(names) == 1 else 1)
     steps = np.abs(np.diff(log[names[0]]))
     resolution = float(np.quantile(steps[steps > 0.0], 0.1)) if (steps > 0.0).any() else 0.0
-    return bool(moved > max(4.0 * noise, 3.0 * resolution))
+    return bool(moved > max(4.0 * noise, 3.0 * resolution, _FELT if names[0] in ("psi", "phi") else 0.0))
 
 
 def _noisy(values: np.ndarray) -> bool:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import csv
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, final
 
@@ -17,10 +17,12 @@ from pydantic import Field, field_validator
 from residnet.core.config import Config
 from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
-from residnet.core.names import nearest, si_unit, to_si
+from residnet.core.names import nearest, shown, si_unit, to_si
 from residnet.data.readers.base import LogReader, provenance, require_file, require_increasing, require_samples, require_values
 from residnet.data.readers.channel_map import ChannelMap, factor
 from residnet.data.readers.files import progress
+from residnet.data.readers.lines import check_lines
+from residnet.data.readers.recording import remark
 from residnet.data.readers.spool import LARGE, Spool
 
 if TYPE_CHECKING:
@@ -118,16 +120,20 @@ class TableReader(LogReader):
         columns = [self._config.time.column, *(entry.column for entry in maps.values())]
         size = path.stat().st_size
         rows = _Rows(path, self._config, self._row, on_disk=size > LARGE)
-        read = 0
+        read, cut = 0, False
         with progress(path.name, size, 1.0) as advance:
             for piece, share in self._load(path, columns):
+                cut |= bool(piece.attrs.get("cut"))
                 rows.add([self._numbers(path, piece.iloc[:, i], column, read) for i, column in enumerate(columns)], read)
                 read += len(piece)
                 advance(share)
         t, channels = rows.finish()
         manoeuvre = path.resolve().parent.name if self._config.manoeuvre == "folder" else self._config.manoeuvre
         units = {name: si_unit(entry.unit) for name, entry in maps.items()}
-        return Log(path.stem, t, channels, units, manoeuvre or "unknown", meta=provenance(path, read, read - t.size))
+        meta = provenance(path, read + cut, read + cut - t.size)
+        if cut:
+            meta["findings"] = [remark("note", "cut_line", "the file ends within its last line, which is left out")]
+        return Log(path.stem, t, channels, units, manoeuvre or "unknown", meta=meta)
 
     def _numbers(self, path: Path, column: pd.Series, name: str, first: int) -> np.ndarray:
         """Cells of one column as float64 [T], NaN where empty; `first` is the index of the first row."""
@@ -141,7 +147,7 @@ class TableReader(LogReader):
         if bad.size:
             i = int(bad[0])
             raise DataError(
-                f"{path}: {self._row(first + i)}, column '{name}': '{column.iloc[i]}' is not a finite number ({bad.size} such cells in "
+                f"{path}: {self._row(first + i)}, column '{name}': '{shown(column.iloc[i])}' is not a finite number ({bad.size} such cells in "
                 f"{len(column)} rows); leave cells without a measurement empty, and check `delimiter` and `decimal`"
             )
         return values
@@ -271,15 +277,17 @@ def _read_csv(path: Path, columns: Sequence[str], delimiter: str, decimal: str) 
                         f"({beyond.size} such lines); check `delimiter` and `decimal`"
                     )
                 kept = table[where]
-                yield kept.iloc[:-1] if last and cut else kept, min(1.0, stream_of_bytes.tell() / size)
+                if last and cut:
+                    kept = kept.iloc[:-1]
+                    kept.attrs["cut"] = True
+                yield kept, min(1.0, stream_of_bytes.tell() / size)
     except UnicodeDecodeError as error:
         raise DataError(f"{path}: not UTF-8 text (byte {error.start}); save the file as UTF-8") from error
     except pd.errors.EmptyDataError:
         return
     except pd.errors.ParserError as error:
-        raise DataError(
-            f"{path}: not a regular table, its header has {len(header)} columns ({' '.join(str(error).split())}); check `delimiter` and `decimal`"
-        ) from error
+        said = shown(" ".join(str(error).split()), 200)
+        raise DataError(f"{path}: not a regular table, its header has {len(header)} columns ({said}); check `delimiter` and `decimal`") from error
 
 
 def _with_last(pieces: Iterable[pd.DataFrame]) -> Iterator[tuple[pd.DataFrame, bool]]:
@@ -307,4 +315,4 @@ def _read_parquet(path: Path, columns: Sequence[str]) -> Pieces:
                 yield table[list(columns)], read / rows
     except (pa.ArrowException, OSError, ValueError, TypeError, LookupError, ArithmeticError, MemoryError) as error:
         # damaged metadata reaches every layer of the library
-        raise DataError(f"{path}: not a readable Parquet file ({(str(error) or type(error).__name__).splitlines()[0]})") from error
+        raise DataError(f"{path}: not a readable Parquet file ({shown(str(error) or type(error).__name__, 200)})") from error

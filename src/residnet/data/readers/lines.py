@@ -1,0 +1,124 @@
+"""The lines of a text table before anything parses them: as many cells in each as in the header, no zero bytes, a last line that is whole.
+
+A parser fills short lines with nothing and reads on; cells that slipped by one column would be numbers like any other.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from residnet.core.errors import DataError
+
+_BLOCK = 1 << 18
+_TAIL = 1 << 16
+_NEWLINE, _RETURN, _QUOTE = 0x0A, b"\r", b'"'
+
+
+def check_lines(path: Path, delimiter: str, wide: int) -> bool:
+    """Look at every line below the header, `wide` cells each; blank lines do not count.
+
+    Returns:
+        Whether the last line must be left out because the file was cut within it: it has no end, and too few cells or a last cell shorter than any
+        in that column shortly before.
+
+    Raises:
+        DataError: where a line has more or fewer cells than the header, or a byte is zero.
+    """
+    cut, line = _cut_short(path, delimiter, wide), 0
+    for block, last in _blocks(path):
+        if b"\x00" in block:
+            at = line + block[: block.index(b"\x00")].count(b"\n") + 1
+            raise DataError(f"{path}: line {at} holds a zero byte, which no text has; the file is damaged or not UTF-8, write it again")
+        cells, blank = _quoted(block, delimiter) if _QUOTE in block else _counted(block, delimiter, wide)
+        odd = (cells != wide) & ~blank
+        odd[: max(1 - line, 0)] = False
+        if last and cut:
+            odd[-1:] = False
+        if odd.any():
+            at = int(np.argmax(odd))
+            raise DataError(
+                f"{path}: line {line + at + 1} has {cells[at]} cells, the header {wide} ({int(odd.sum())} such lines nearby); "
+                "check `delimiter` and `decimal`, or delete the damaged lines"
+            )
+        line += cells.size
+    return cut
+
+
+def _blocks(path: Path) -> Iterator[tuple[bytes, bool]]:
+    """Blocks of whole lines with line ends of one byte, and whether it is the last."""
+    with path.open("rb") as stream:
+        rest = b""
+        while True:
+            block = stream.read(_BLOCK)
+            text = rest + block
+            if _RETURN in text:
+                # the other half of a line end may stand in the next block
+                held = text.endswith(_RETURN) and bool(block)
+                text, tail = (text[:-1], _RETURN) if held else (text, b"")
+                text = text.replace(b"\r\n", b"\n").replace(_RETURN, b"\n")
+            else:
+                tail = b""
+            if not block:
+                if text:
+                    yield text, True
+                return
+            # an open quote takes its line ends along
+            end = text.rfind(b"\n") + 1 if text.count(_QUOTE) % 2 == 0 else 0
+            if end:
+                yield text[:end], False
+            rest = text[end:] + tail
+
+
+def _counted(block: bytes, delimiter: str, wide: int) -> tuple[np.ndarray, np.ndarray]:
+    """Cells of each line, and whether it is blank."""
+    values = np.frombuffer(block, dtype=np.uint8)
+    # the usual block: every so many marks one is the end of a line, the others are delimiters
+    marks = values[np.flatnonzero((values == _NEWLINE) | (values == ord(delimiter)))]
+    if marks.size % wide == 0 and block.endswith(b"\n") and wide > 1:
+        rows = marks.reshape(-1, wide)
+        if bool((rows[:, -1] == _NEWLINE).all()) and int((marks == _NEWLINE).sum()) == rows.shape[0]:
+            return np.full(rows.shape[0], wide, dtype=np.int64), np.zeros(rows.shape[0], dtype=bool)
+    ends = np.flatnonzero(values == _NEWLINE)
+    if not ends.size or ends[-1] != values.size - 1:
+        ends = np.append(ends, values.size)
+    between = np.searchsorted(np.flatnonzero(values == ord(delimiter)), ends)
+    starts = np.append(0, ends[:-1] + 1)
+    cells = np.diff(np.append(0, between)) + 1
+    # only lines without a delimiter can be blank
+    blank = np.zeros(cells.size, dtype=bool)
+    for i in np.flatnonzero(cells == 1):
+        blank[i] = not block[starts[i] : ends[i]].strip()
+    return cells, blank
+
+
+def _quoted(block: bytes, delimiter: str) -> tuple[np.ndarray, np.ndarray]:
+    """The same where quotes may hold delimiters; line ends within quotes make no new line."""
+    try:
+        rows = list(csv.reader(io.StringIO(block.decode("utf-8", errors="replace"), newline=""), delimiter=delimiter, skipinitialspace=True))
+    except csv.Error:
+        # a cell of more than 128 kB: an open quote has swallowed the lines after it
+        return np.zeros(1, dtype=np.int64), np.zeros(1, dtype=bool)
+    cells = np.array([len(row) for row in rows], dtype=np.int64)
+    return cells, np.array([not row or (len(row) == 1 and not row[0].strip()) for row in rows], dtype=bool)
+
+
+def _cut_short(path: Path, delimiter: str, wide: int) -> bool:
+    """Whether the file ends within its last line."""
+    with path.open("rb") as stream:
+        size = stream.seek(0, io.SEEK_END)
+        stream.seek(max(0, size - _TAIL))
+        tail = stream.read()
+    if not tail or tail.endswith((b"\n", b"\r")):
+        return False
+    lines = [line for line in tail.replace(_RETURN, b"\n").split(b"\n") if line.strip()]
+    last, before = lines[-1].split(delimiter.encode()), [line.split(delimiter.encode()) for line in lines[-51:-1]]
+    # the first of several lines may itself be cut, by the tail, or be the header
+    known = [len(cells[-1].strip()) for cells in before[1:] if len(cells) == wide and cells[-1].strip()]
+    if size <= _TAIL and len(lines) < 2:
+        return False
+    return len(last) < wide or (bool(known) and len(last) == wide and len(last[-1].strip()) < min(known))
