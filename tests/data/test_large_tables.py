@@ -12,7 +12,7 @@ import pytest
 from residnet.core.config import validate
 from residnet.core.errors import DataError
 from residnet.core.log import Log
-from residnet.data.readers import LogReader, ReaderConfig, table
+from residnet.data.readers import LogReader, ReaderConfig, lines, table
 
 
 def reader(kind: str = "csv") -> LogReader:
@@ -66,6 +66,7 @@ def test_faults_are_named_by_their_line_in_any_piece(tmp_path: Path, monkeypatch
 
 
 def test_a_large_table_does_not_lie_in_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lines, "_BLOCK", 1 << 16)
     rng = np.random.default_rng(0)
     peaks = []
     for rows in (20_000, 80_000):
