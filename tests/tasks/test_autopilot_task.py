@@ -123,3 +123,78 @@ def test_wrong_configs_are_said_in_a_line(
 ) -> None:
     assert check(tmp_path, monkeypatch, {**SMALL, **change}) == 2
     assert words in capsys.readouterr().err
+
+
+IDENTIFIED: dict[str, Any] = {
+    "task": "fit",
+    "name": "identified",
+    "data": {
+        "kind": "simulated",
+        "vessel": "nomoto_oceanos",
+        "duration": 40,
+        "substeps": 1,
+        "step": 0.1,
+        "trials": [{"kind": "zigzag", "count": 12, "heading": ["10 deg", "20 deg"], "steer": [0.05, 0.14], "start": 2}],
+        "noise": {"u": 0.01, "v": 0.01, "r": "0.1 deg/s"},
+        "identification": {"zigzag": 10},
+        "validation": {"zigzag": 2},
+    },
+    "prepare": {"grid": {"step": 0.1}, "derivative": {"kind": "savitzky_golay", "window": 1.1, "order": 2}},
+    "signals": {"inputs": ["cmd_delta"]},
+    "baseline": {"kind": "regressors", "terms": {"u": ["u"], "v": ["v"], "r": ["r", "cmd_delta"]}},
+    "heads": {"ridge": {"kind": "ridge", "terms": ["r", "cmd_delta", "r|r|"]}},
+    "evaluation": {"protocols": {"manoeuvre": {"kind": "manoeuvre"}}, "selection": "manoeuvre", "scales": {"u": 0.3, "v": 0.3, "r": 0.2}},
+}
+
+
+def test_a_policy_that_learned_on_an_identified_model_steers_the_vessel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Noisy logs, a fit, a policy trained on the fitted model: on the vessel it settles as the one that was trained there."""
+    (tmp_path / "fit.yaml").write_text(yaml.safe_dump(IDENTIFIED))
+    assert call(monkeypatch, "run", tmp_path / "fit.yaml", "--out", tmp_path / "fitted") == 0
+    training = {**TRAINING, "steps": 1}
+    learned = {"run": str(tmp_path / "fitted"), "model": "baseline"}
+    policies = {"on_vessel": {"hidden": [6], "training": training}, "on_model": {"hidden": [6], "training": training, "learned": learned}}
+    config = tmp_path / "learned.yaml"
+    peers = {"bang_bang": {"kind": "bang_bang"}}
+    config.write_text(yaml.safe_dump({**SMALL, "policies": policies, "peers": peers, "test": {**SMALL["test"], "plants": 2}}))
+    assert call(monkeypatch, "run", config, "--out", tmp_path / "run") == 0
+    found = rows(tmp_path / "run")
+    for protocol in ("nominal", "corners", "random"):
+        mine, theirs = (found[(name, protocol)]["settling"]["mean"] for name in ("on_model", "on_vessel"))
+        assert mine == pytest.approx(theirs, rel=0.05)
+        assert mine != theirs
+    card = {"card.json": ""}
+    torch.jit.load(str(tmp_path / "run" / "exports" / "on_model.pt"), _extra_files=card)
+    about = json.loads(card["card.json"])
+    assert about["learned"] == {"run": str(tmp_path / "fitted"), "model": "baseline"}
+    assert about["turning"]["K"] == pytest.approx(3.47, rel=0.05)
+    assert about["turning"]["K"] != pytest.approx(3.47, rel=1e-6)
+
+
+def test_wind_and_sea_are_flown_by_vessels_that_feel_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = tmp_path / "patrol.yaml"
+    sea = {"significant_height": 1.0, "peak_period": "7 s", "direction": "165 deg", "hull": {"length": 51.5, "breadth": 7.7, "draught": 2.3}}
+    config.write_text(
+        yaml.safe_dump(
+            {
+                **SMALL,
+                "vessel": "patrol_p06_wind",
+                "turning_time": "60 s",
+                "spread": {"wind": [0, 10], "current": 0.5},
+                "test": {"dt": "0.25 s", "duration": "30 s", "plants": 2, "overshoot": "2 deg", "wind": 10, "sea": sea, "sea_time": "30 s"},
+                "policies": {"policy": {"hidden": [6], "training": {**TRAINING, "dt": "0.25 s", "steps": 1, "horizon": "5 s"}}},
+                "peers": {"pd": {"kind": "pd", "kp": 0.6, "damping_time": "8 s"}},
+                "floor": None,
+            }
+        )
+    )
+    assert call(monkeypatch, "run", config, "--out", tmp_path / "run") == 0
+    found = rows(tmp_path / "run")
+    # PD stands where its rudder balances the wind; the policy takes the push away
+    assert found[("policy", "wind")]["error_end"] < math.radians(0.2) < found[("pd", "wind")]["error_end"]
+    for name in ("policy", "pd"):
+        assert 0 < found[(name, "sea")]["heel_rms"]["mean"] < math.radians(20)
+        assert 0 < found[(name, "sea")]["rudder_rms"]["max"] <= math.radians(5)
+    text = (tmp_path / "run" / "report.html").read_text()
+    assert "165 deg (jonswap)" in text
+    assert "10 m/s from eight directions" in text
