@@ -60,7 +60,7 @@ def load_bag(path: Path, wanted: Wanted = EVERYTHING) -> Recording:
         with AnyReader([path], default_typestore=store) as reader:
             return _read(path, reader, wanted)
     except AnyReaderError as error:
-        raise DataError(f"{path}: not a readable bag ({' '.join(str(error).split())})") from error
+        raise DataError(f"{path}: not a readable bag ({' '.join(str(error).split())[:200]})") from error
     except DataError:
         raise
     # a damaged bag fails in many ways inside rosbags and SQLite, none of them a fault of residnet

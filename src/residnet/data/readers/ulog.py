@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 from pathlib import Path
 from typing import Any, Literal, final
 
@@ -43,7 +45,9 @@ def load_ulog(path: Path, wanted: Wanted = EVERYTHING) -> Recording:
     except ImportError as error:
         raise missing_package("px4", "pyulog", "a PX4 flight log") from error
     try:
-        log = ULog(str(path), None, disable_str_exceptions=True)
+        # pyulog prints what it finds damaged, which the remarks say below
+        with contextlib.redirect_stdout(io.StringIO()):
+            log = ULog(str(path), None, disable_str_exceptions=True)
     # pyulog fails in its own ways on damaged bytes
     except Exception as error:
         raise DataError(f"{path}: damaged or not a ULog file ({type(error).__name__}: {' '.join(str(error).split())[:200]})") from error
