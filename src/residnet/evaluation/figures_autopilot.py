@@ -62,8 +62,10 @@ def draw_distributions(path: Path, plants: pd.DataFrame, names: Sequence[str], n
         for axis, (quantity, scale, text) in zip(axes, quantities, strict=True):
             for place, controller in enumerate(names):
                 found = plants.loc[plants["controller"] == controller, quantity].sort_values().to_numpy() * scale
-                share = (np.arange(len(found)) + 1.0) / len(found)
-                axis.step(found, share, where="post", color=_COLOURS[place % len(_COLOURS)], linewidth=1.2, label=controller)
+                share = np.arange(len(found) + 1) / len(found)
+                axis.step(
+                    np.concatenate((found[:1], found)), share, where="post", color=_COLOURS[place % len(_COLOURS)], linewidth=1.2, label=controller
+                )
             axis.set(xlabel=text, ylim=(0.0, 1.02))
         for axis in (axes[0], axes[2]):
             axis.set(ylabel="share of vessels")
