@@ -44,6 +44,7 @@ class CourseGuidance(Reference):
         self.spacing, self.length, self.lookahead = course.step, course.length, lookahead
         self.x, self.y, self.psi = state.index("x"), state.index("y"), state.index("psi")
         self.u, self.v = state.index("u"), state.index("v")
+        self.least = _LEAST
         self.n_state = 1
         self.may_finish = True
 
@@ -66,12 +67,12 @@ class CourseGuidance(Reference):
         """Reference [B, 3] and memory."""
         place = s[:, 0]
         ahead, aside = self.error(x, place)
-        closeness = (1.0 - self.at(place)[:, 5] * aside).clamp(min=_LEAST)
+        closeness = (1.0 - self.at(place)[:, 5] * aside).clamp(min=self.least)
         place = place + (ahead / closeness).clamp(0.0, self.lookahead)
         known = self.at(place)
         _, aside = self.error(x, place)
         speed = torch.sqrt(x[:, self.u].square() + x[:, self.v].square())
-        closeness = (1.0 - known[:, 5] * aside).clamp(min=_LEAST)
+        closeness = (1.0 - known[:, 5] * aside).clamp(min=self.least)
         back = torch.atan(aside / self.lookahead)
         drift = known[:, 2] - known[:, 3]
         away = torch.remainder(x[:, self.psi] + drift - known[:, 2] + math.pi, 2.0 * math.pi) - math.pi

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 from scipy.optimize import Bounds, minimize
 
 from residnet.control.turns import Array, Turn
@@ -22,6 +23,8 @@ TurnMaker = Callable[[Array, Array], list[Turn]]
 _GRID = np.radians(np.array([2, *range(10, 311, 10)], dtype=float))
 _CLOSE = math.radians(1.5)
 _POINTS = 90
+_GUESSES = ((1.05, 0.2), (1.15, 0.3), (0.0, 1.0), (0.5, 0.5))
+"""What the search begins from: circles as a multiple, and turning radii by which legs are shortened."""
 _DIFFERENCE = 1e-5
 _ROUNDS = 60
 _TOLERANCE = 1e-3
@@ -67,22 +70,20 @@ class Course:
 
 
 class _Family:
-    """Turns of every angle, between those of a grid."""
+    """Turns of every angle, by cubic splines through some; one turn alone stands for all."""
 
-    def __init__(self, grid: Array, turns: Sequence[Turn]) -> None:
-        self.grid = grid
-        share = np.linspace(0.0, 1.0, _POINTS if len(grid) > 1 else 10 * _POINTS)
+    def __init__(self, turns: Sequence[Turn]) -> None:
+        share = np.linspace(0.0, 1.0, _POINTS if len(turns) > 1 else 10 * _POINTS)
         own = [np.linspace(0.0, 1.0, len(turn.track)) for turn in turns]
-        self.tracks = np.array([[np.interp(share, t, turn.track[:, i]) for i in range(2)] for t, turn in zip(own, turns, strict=True)])
-        self.lengths = np.array([_length(turn.track) for turn in turns])
+        tracks = np.array([[np.interp(share, t, turn.track[:, i]) for t, turn in zip(own, turns, strict=True)] for i in range(2)])
+        lengths = np.array([_length(turn.track) for turn in turns])
+        self.rows = np.concatenate((tracks.transpose(1, 2, 0).reshape(len(turns), -1), lengths[:, None]), axis=1)
+        self.spline = CubicSpline(np.array([turn.angle for turn in turns]), self.rows) if len(turns) > 1 else None
 
     def __call__(self, angle: float) -> tuple[Array, float]:
         """Track [N, 2] to starboard in the turn's own frame and its length in m."""
-        if len(self.grid) == 1:
-            return self.tracks[0].T, float(self.lengths[0])
-        i = int(np.clip(np.searchsorted(self.grid, angle) - 1, 0, len(self.grid) - 2))
-        share = (angle - self.grid[i]) / (self.grid[i + 1] - self.grid[i])
-        return ((1 - share) * self.tracks[i] + share * self.tracks[i + 1]).T, float((1 - share) * self.lengths[i] + share * self.lengths[i + 1])
+        row = self.rows[0] if self.spline is None else self.spline(angle)
+        return row[:-1].reshape(-1, 2), float(row[-1])
 
 
 def _length(track: Array) -> float:
@@ -114,7 +115,7 @@ class _Problem:
     def __init__(self, start: Array, heading: float | None, marks: Sequence[Mark], goal: Mark, make: TurnMaker, scale: float) -> None:
         self.start, self.heading, self.marks, self.goal, self.scale, self.make = start, heading, marks, goal, scale, make
         self.radii = np.array([max(mark.clearance, 0.0) for mark in marks] + [0.0] * (heading is not None))
-        every = {radius: _Family(_GRID, make(_GRID, np.full(len(_GRID), radius))) for radius in set(self.radii.tolist())}
+        every = {radius: _Family(make(_GRID, np.full(len(_GRID), radius))) for radius in set(self.radii.tolist())}
         self.families = [every[radius] for radius in self.radii.tolist()]
 
     def angles(self, z: Array) -> Array:
@@ -128,13 +129,13 @@ class _Problem:
         grids = [np.maximum(angle, 2.5 * _CLOSE) + _CLOSE * np.arange(-2, 3) for angle in self.angles(z)]
         if grids:
             turns = self.make(np.concatenate(grids), np.repeat(self.radii, 5))
-            self.families = [_Family(grid, turns[5 * i : 5 * i + 5]) for i, grid in enumerate(grids)]
+            self.families = [_Family(turns[5 * i : 5 * i + 5]) for i in range(len(grids))]
 
     def fix(self, z: Array) -> list[Turn]:
         """The turns of the angles of z alone; only legs are left to change."""
         angles = self.angles(z)
         turns = self.make(angles, self.radii) if len(angles) else []
-        self.families = [_Family(np.array([turn.angle]), [turn]) for turn in turns]
+        self.families = [_Family([turn]) for turn in turns]
         return turns
 
     def beginning(self, z: Array) -> tuple[Array, float, Array]:
@@ -207,22 +208,31 @@ def plan(
     Raises:
         ConfigError: where marks lie too close together for the vessel's turns.
     """
+    n = len(marks)
     problem = _Problem(np.array(start), heading, marks, goal, make, scale)
-    z = _guess(np.array(start), marks, goal, scale)
     low = np.array([mark.clearance for mark in marks]) / scale
     high = np.array([np.inf if mark.clearance > 0 else -mark.clearance for mark in marks]) / scale
-    z = _shortest(problem, z, low, high, fixed=False)
+    tries = [_shortest(problem, _guess(np.array(start), marks, goal, scale, wide, short), low, high, fixed=False) for wide, short in _GUESSES]
+    z = min(tries, key=lambda z: problem.length(z) + 100.0 * float(_missed(problem.results(z), low, high).max()))
     problem.narrow(z)
     z = _shortest(problem, z, low, high, fixed=False)
     turns = problem.fix(z)
+    z[2::2] = [turn.angle for turn in turns[:n]]
+    if heading is not None:
+        z[0] = heading + math.copysign(turns[-1].angle, math.remainder(float(z[0]) - heading, 2.0 * math.pi))
     z = _shortest(problem, z, low, high, fixed=True)
-    n = len(marks)
     found = problem.results(z)
-    missed = np.concatenate((np.maximum(low - found[:n], found[:n] - high), np.abs(found[n:])))
+    missed = _missed(found, low, high)
     if float(missed.max()) > _TOLERANCE:
         worst = (*marks, goal)[min(int(missed.argmax()), n)].number
         raise ConfigError(f"no course found that passes mark {worst} as asked for with this vessel's turns; move it, or allow more rudder")
     return _composed(problem, z, turns, step, beyond)
+
+
+def _missed(found: Array, low: Array, high: Array) -> Array:
+    """How far clearances lie outside their limits and the end of the course from the goal, in turning radii."""
+    n = len(low)
+    return np.concatenate((np.maximum(np.maximum(low - found[:n], found[:n] - high), 0.0), np.abs(found[n:])))
 
 
 def _shortest(problem: _Problem, z: Array, low: Array, high: Array, *, fixed: bool) -> Array:
@@ -247,7 +257,9 @@ def _shortest(problem: _Problem, z: Array, low: Array, high: Array, *, fixed: bo
         for kind, sign, rows, shift in kinds
         if len(rows)
     ]
-    found: Array = minimize(
+    # its types know no constraints with Jacobians
+    solve: Any = minimize
+    found: Array = solve(
         lambda z: both(z)[0][0],
         z,
         jac=lambda z: both(z)[1][0],
@@ -259,17 +271,18 @@ def _shortest(problem: _Problem, z: Array, low: Array, high: Array, *, fixed: bo
     return found
 
 
-def _guess(start: Array, marks: Sequence[Mark], goal: Mark, scale: float) -> Array:
-    """Tangents of the circles about the marks, or of points, as far as there are any."""
+def _guess(start: Array, marks: Sequence[Mark], goal: Mark, scale: float, wide: float, short: float) -> Array:
+    """Tangents of circles about the marks, wider than they are or, where they are entered, a share of the turning radius."""
     points = np.array([start, *[(mark.north, mark.east) for mark in (*marks, goal)]])
     legs = np.diff(points, axis=0)
     sizes = np.hypot(*legs.T)
-    radii = np.array([0.0, *[mark.turn * 1.1 * max(mark.clearance, 0.0) for mark in marks], goal.turn * max(goal.clearance, 0.0)])
+    circles = [mark.turn * wide * (mark.clearance if mark.clearance > 0 else scale) for mark in marks]
+    radii = np.array([0.0, *circles, goal.turn * max(goal.clearance, 0.0)])
     aside = np.arcsin(np.clip(np.diff(radii) / sizes, -0.99, 0.99))
     headings = np.arctan2(legs[:, 1], legs[:, 0]) - aside
     angles = (np.array([mark.turn for mark in marks]) * np.diff(headings)) % (2.0 * math.pi)
     z = np.zeros(2 + 2 * len(marks))
-    z[0], z[1::2], z[2::2] = headings[0], np.maximum(sizes * np.cos(aside) / scale - 0.3, 0.0), np.clip(angles, _GRID[0], _GRID[-1])
+    z[0], z[1::2], z[2::2] = headings[0], np.maximum(sizes * np.cos(aside) / scale - short, 0.0), np.clip(angles, _GRID[0], _GRID[-1])
     return z
 
 

@@ -51,16 +51,21 @@ def dubins_length(start: np.ndarray, end: np.ndarray, radius: float) -> np.ndarr
 
 
 def shortest_course(
-    start: tuple[float, float, float], points: Sequence[tuple[float, float]], acceptance: float, radius: float, places: int = 24, headings: int = 36
+    start: tuple[float, float, float | None],
+    points: Sequence[tuple[float, float]],
+    acceptance: float,
+    radius: float,
+    places: int = 24,
+    headings: int = 36,
 ) -> float:
-    """Length in m of the shortest path from a pose that enters the circles of acceptance of way-points in their order.
+    """Length in m of the shortest path from a pose (heading None: any) that enters the circles of acceptance of way-points in their order.
 
     Dynamic programming over `places` on each circle and `headings` there: an upper bound of the shortest, which falls as both grow.
     """
-    poses = np.array([start], dtype=float)
-    cost = np.zeros(1)
     angle = np.linspace(0.0, _TURN, places, endpoint=False)
     course = np.linspace(-math.pi, math.pi, headings, endpoint=False)
+    poses = np.array([(start[0], start[1], heading) for heading in (course if start[2] is None else (start[2],))])
+    cost = np.zeros(len(poses))
     for north, east in points:
         if acceptance > 0:
             spots = np.stack((north + acceptance * np.cos(angle), east + acceptance * np.sin(angle)), axis=-1)

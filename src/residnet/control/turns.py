@@ -47,7 +47,8 @@ class TurnReference(Reference):
     """For `Following`: the rudder held at an angle until counter-rudder stops the turn at the new heading, as Nomoto's model stops.
 
     At a yaw rate r the rudder at -d stops the turn within T r - T K d ln(1 + r / (K d)) of heading. Until then the vessel turns as it does;
-    from then on it follows that model. Memory [B, 2]: yaw rate [rad/s] where the stop began, and the time [s] since, below zero before.
+    from then on it follows that model, to the heading where that ends: within half a step's turn of the one asked for. Memory [B, 3]: yaw
+    rate [rad/s] where the stop began, the time [s] since, below zero before, and the heading [rad] where it ends.
 
     Args:
         angles: heading changes [B] in rad, positive, from a heading of zero.
@@ -60,11 +61,11 @@ class TurnReference(Reference):
     def __init__(self, angles: Tensor, rudder: Tensor, turning: Turning, columns: tuple[int, int, int], dt: float) -> None:
         super().__init__()
         self.angles, self.rudder, self.turning, self.columns, self.dt = angles, rudder, turning, columns, dt
-        self.n_state = 2
+        self.n_state = 3
 
     def initial_state(self, x: Tensor) -> Tensor:
         """Not stopping."""
-        return torch.tensor([[0.0, -1.0]], dtype=x.dtype).expand(x.shape[0], -1)
+        return torch.tensor([[0.0, -1.0, 0.0]], dtype=x.dtype).expand(x.shape[0], -1)
 
     def forward(self, x: Tensor, k: int, s: Tensor) -> tuple[Tensor, Tensor]:
         """Reference [B, 3] of `following.FOLLOWED` and memory."""
@@ -72,21 +73,23 @@ class TurnReference(Reference):
         # K and T as they are at the present speed
         ratio = u / self.turning.speed
         time, full = self.turning.time / ratio, self.turning.gain * self.rudder * ratio
-        rate, since = s.unbind(-1)
+        rate, since, end = s.unbind(-1)
         # the middle of the step decides
         left = self.angles - psi - 0.5 * self.dt * r
-        begins = (since < 0) & (left <= time * (r - full * torch.log1p(r.clamp(min=0.0) / full)))
-        rate, since = torch.where(begins, r, rate), torch.where(begins, torch.zeros_like(since), since)
+        stopping = time * (r - full * torch.log1p(r.clamp(min=0.0) / full))
+        begins = (since < 0) & (left <= stopping)
+        rate, end = torch.where(begins, r, rate), torch.where(begins, psi + stopping, end)
+        since = torch.where(begins, torch.zeros_like(since), since)
         planned = ((rate + full) * torch.exp(-since / time) - full).clamp(min=0.0)
-        heading = self.angles - time * (planned - full * torch.log1p(planned / full))
+        heading = end - time * (planned - full * torch.log1p(planned / full))
         braking = torch.stack((heading, planned, torch.where(planned > 0, -self.rudder, 0.0)), dim=-1)
         stops = since >= 0
         reference = torch.where(stops.unsqueeze(-1), braking, torch.stack((psi, r, self.rudder), dim=-1))
-        return reference, torch.stack((rate, torch.where(stops, since + self.dt, since)), dim=-1)
+        return reference, torch.stack((rate, torch.where(stops, since + self.dt, since), end), dim=-1)
 
 
 def make_turns(vessel: SteeredVessel, turning: Turning, angles: Array, rudder: Array, limit: float, dt: float) -> list[Turn]:
-    """Turns of the nominal vessel, each with a rudder angle held until it has to be stopped.
+    """Turns of the nominal vessel, each with a rudder angle held until it has to be stopped; their own angles say what came of those asked for.
 
     Args:
         vessel: that turns.
@@ -112,7 +115,7 @@ def make_turns(vessel: SteeredVessel, turning: Turning, angles: Array, rudder: A
     tracks = (states[:, :, place] - states[:, :1, place]).numpy()
     headings, commands = states[:, :, columns[0]].numpy(), torch.cat((inputs[:, :, 0], inputs[:, -1:, 0]), dim=1).numpy()
     turned = []
-    for i, angle in enumerate(change.tolist()):
+    for i, angle in enumerate(headings[:, -1].tolist()):
         # from where on the heading stays
         end = min(int(np.flatnonzero(np.abs(headings[i] - angle) > _STEADY)[-1]) + 2, steps + 1)
         turned.append(Turn(angle, tracks[i, :end], headings[i, :end], commands[i, :end]))

@@ -7,6 +7,7 @@ from pathlib import Path
 from residnet.evaluation.figures import write_figures
 from residnet.evaluation.report import write_report
 from residnet.evaluation.report_autopilot import FLIGHTS, write_autopilot_report
+from residnet.evaluation.report_course import TRACKS, write_course_report
 from residnet.run_folder import RunFolder
 
 
@@ -19,5 +20,7 @@ def report_run(path: Path) -> Path:
     folder = RunFolder.open(path)
     if (folder.path / FLIGHTS).is_file():
         return write_autopilot_report(folder.path)
+    if (folder.path / TRACKS).is_file():
+        return write_course_report(folder.path)
     write_figures(folder.path)
     return write_report(folder.path)

@@ -9,6 +9,7 @@ from pydantic import Field
 from residnet.tasks.actuators import ActuatorsTaskConfig
 from residnet.tasks.autopilot import AutopilotConfig
 from residnet.tasks.breeding import BreedingTaskConfig
+from residnet.tasks.course import CourseTaskConfig
 from residnet.tasks.ferry_study import FerryStudyConfig
 from residnet.tasks.fit import FitConfig
 from residnet.tasks.force_residual import ForceResidualConfig
@@ -24,6 +25,7 @@ TaskConfig = Annotated[
     | StudyConfig
     | ActuatorsTaskConfig
     | AutopilotConfig
+    | CourseTaskConfig
     | FerryStudyConfig
     | ForceResidualConfig
     | BreedingTaskConfig

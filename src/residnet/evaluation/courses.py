@@ -1,0 +1,158 @@
+"""What flights along courses say: time against the shortest possible, cross-track error, and how every buoy was passed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from residnet.control.courses import PlannedCourse, Protocol
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class CourseFlight:
+    """One vessel along one course, until it ended.
+
+    Attributes:
+        track: north, east [N, 2] in m.
+        heading: [N] in rad.
+        rudder: command [N] in rad.
+        speed: [N] in m/s.
+        cross_track: [N] in m, positive to starboard of the plan.
+        dt: step in s.
+        finished: whether the end was reached in the time given.
+    """
+
+    track: Array
+    heading: Array
+    rudder: Array
+    speed: Array
+    cross_track: Array
+    dt: float
+    finished: bool
+
+
+@dataclass(frozen=True)
+class Pass:
+    """How a buoy was passed.
+
+    Attributes:
+        distance: smallest distance on the whole course after the start has been left, in m.
+        side: that the buoy lay on when it was nearest, in its turn.
+        time: of that, in s.
+    """
+
+    distance: float
+    side: str
+    time: float
+
+
+def passes(flight: CourseFlight, places: Sequence[tuple[float, float]], within: Sequence[float]) -> list[Pass]:
+    """How each buoy at (north, east) was passed, one after the other.
+
+    Args:
+        places: of the buoys.
+        within: radii in m; a vessel that starts in a circle first leaves it.
+    """
+    found: list[Pass] = []
+    begin = 0
+    for i, ((north, east), radius) in enumerate(zip(places, within, strict=True)):
+        away = np.array([north, east]) - flight.track
+        distance = np.hypot(*away.T)
+        outside = np.flatnonzero(distance > radius)
+        left = int(outside[0]) if len(outside) else len(distance) - 1
+        begin = min(max(begin, left), len(distance) - 1)
+        # its turn lasts until the next buoy is nearer
+        following = np.hypot(*(np.array(places[i + 1]) - flight.track).T) if i + 1 < len(places) else np.full(len(distance), np.inf)
+        reached = (
+            np.flatnonzero(distance[begin:] <= distance[begin:].min() + 1e-9)[0] if i + 1 == len(places) else _first_dip(distance, following, begin)
+        )
+        near = begin + int(reached)
+        step = flight.track[min(near + 1, len(distance) - 1)] - flight.track[max(near - 1, 0)]
+        starboard = step[0] * away[near, 1] - step[1] * away[near, 0] > 0
+        found.append(Pass(float(distance[left:].min()), "starboard" if starboard else "port", near * flight.dt))
+        begin = near
+    return found
+
+
+def _first_dip(distance: Array, following: Array, begin: int) -> int:
+    """Where the distance is smallest before the next buoy is nearer for good; samples from `begin` on."""
+    here, there = distance[begin:], following[begin:]
+    nearer = np.flatnonzero(here < there)
+    if len(nearer) == 0:
+        return int(here.argmin())
+    # one stay on this side of the middle line
+    first = int(nearer[0])
+    gone = np.flatnonzero(here[first:] >= there[first:])
+    last = first + int(gone[0]) if len(gone) else len(here)
+    return first + int(here[first:last].argmin())
+
+
+def row(model: str, kind: str, guidance: str, planned: PlannedCourse, flight: CourseFlight, acceptance: float, speed: float) -> dict[str, Any]:
+    """A row of metrics.json.
+
+    `ratio` is course time over the floor's length at the service speed; `ratio_turning` takes the speed that the vessel keeps in its
+    smallest turn, for vessels that slow down.
+    """
+    places = [(buoy.north, buoy.east) for buoy in planned.buoys]
+    radii = [acceptance if planned.protocol == "enter" else buoy.radius for buoy in planned.buoys]
+    seen = passes(flight, places, radii)
+    time = (len(flight.track) - 1) * flight.dt
+    out: dict[str, Any] = {"model": model, "kind": kind, "guidance": guidance, "split": "simulated", "protocol": planned.protocol}
+    out |= {
+        "finished": flight.finished,
+        "course_time": time,
+        "floor_time": planned.floor / speed,
+        "ratio": time * speed / planned.floor,
+        "ratio_turning": time * planned.steady.speed / planned.floor,
+        "cross_track_rms": float(np.sqrt(np.mean(flight.cross_track**2))),
+        "cross_track_max": float(np.abs(flight.cross_track).max()),
+        "travel": float(abs(flight.rudder[0]) + np.abs(np.diff(flight.rudder)).sum()),
+        "distances": [one.distance for one in seen],
+    }
+    if planned.protocol == "enter":
+        return out | {"entered": int(sum(one.distance <= radius for one, radius in zip(seen, radii, strict=True))), "n": len(seen)}
+    right = [one.side == buoy.leave_to for one, buoy in zip(seen, planned.buoys, strict=True)]
+    clear = [one.distance >= radius for one, radius in zip(seen, radii, strict=True)]
+    return out | {
+        "right_side": sum(right),
+        "clear": sum(clear),
+        "clearance": min(s.distance - r for s, r in zip(seen, radii, strict=True)),
+        "n": len(seen),
+    }
+
+
+_TITLES: Mapping[Protocol, str] = {
+    "enter": "Every buoy's circle of acceptance to be entered",
+    "sides": "Every buoy to be passed on its side, outside its circle",
+}
+
+
+def table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """The comparison as text."""
+    lines = []
+    for protocol, title in _TITLES.items():
+        own = [row for row in rows if row["protocol"] == protocol]
+        if not own:
+            continue
+        buoys = "entered" if protocol == "enter" else "side/clear"
+        heads = (buoys, "margin m", "xte rms m", "max m", "rudder deg")
+        lines += [
+            f"{title}; shortest possible {own[0]['floor_time']:.2f} s",
+            f"{'controller':12s} {'guidance':14s} {'time s':>8s} {'ratio':>7s} {'turning':>8s} " + " ".join(f"{head:>11s}" for head in heads),
+        ]
+        for one in own:
+            passed = f"{one['entered']}/{one['n']}" if protocol == "enter" else f"{one['right_side']}/{one['clear']}/{one['n']}"
+            margin = f"{one['clearance']:.3f}" if protocol == "sides" else ""
+            late = "" if one["finished"] else "  (did not finish)"
+            lines.append(
+                f"{one['model']:12s} {one['guidance']:14s} {one['course_time']:8.2f} {one['ratio']:7.4f} {one['ratio_turning']:8.4f} "
+                f"{passed:>11s} {margin:>11s} {one['cross_track_rms']:11.3f} {one['cross_track_max']:11.3f} {math.degrees(one['travel']):11.1f}{late}"
+            )
+    return "\n".join(lines)

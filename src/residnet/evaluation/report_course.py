@@ -1,0 +1,73 @@
+"""The report of a course run: one self-contained HTML file, from the run folder alone."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from residnet.core.config import load_mapping
+from residnet.evaluation.courses import table
+from residnet.evaluation.figures import read_figures
+from residnet.evaluation.figures_courses import draw_histories, draw_tracks
+
+TRACKS = "tracks.parquet"
+"""By this file a course's run folder is known."""
+COURSES = "courses.parquet"
+"""The plans."""
+
+_STYLE = (
+    "body{margin:0 auto;max-width:60rem;padding:1rem;font:1rem/1.5 system-ui,sans-serif;color:#1a1f24}"
+    "pre{background:#f4f6f8;padding:.8rem;overflow-x:auto;font-size:.8rem}img{width:100%}figcaption{color:#59636e}"
+)
+_ASKED = {"enter": "Every buoy's circle of acceptance is entered.", "sides": "Every buoy is passed on its side, outside its circle."}
+
+
+def write_course_report(run: Path) -> Path:
+    """Draw figures and write `report.html` from metrics.json, tracks.parquet and courses.parquet; returns the report's path."""
+    metrics = json.loads((run / "metrics.json").read_text())
+    config = load_mapping(run / "resolved.yaml")
+    wanted = config["course"]
+    tracks, plans = pd.read_parquet(run / TRACKS), pd.read_parquet(run / COURSES)
+    smallest = metrics["smallest"]["radius"]
+    for protocol in config["protocols"]:
+        radii = [wanted["acceptance"] if protocol == "enter" else max(buoy["radius"], smallest) for buoy in wanted["buoys"]]
+        own, plan = tracks[tracks["protocol"] == protocol], plans[plans["protocol"] == protocol]
+        draw_tracks(run / "figures" / f"{protocol}_tracks.png", own, plan, wanted["buoys"], radii, wanted["start"], _ASKED[protocol])
+        draw_histories(run / "figures" / f"{protocol}_time.png", own, metrics["rudder"], _ASKED[protocol])
+    path = run / "report.html"
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(_page(run, config, metrics), encoding="utf-8")
+    partial.replace(path)
+    return path
+
+
+def _page(run: Path, config: dict[str, Any], metrics: dict[str, Any]) -> str:
+    title, steady = html.escape(config["name"]), metrics["smallest"]
+    limits = [f"buoy {one['buoy']}: {one['radius']:.4g} m" for one in metrics["feasibility"] if not one["possible"]]
+    widened = (
+        f"Tighter circles cannot be followed ({', '.join(limits)}); they are widened to that radius. " if limits else "Every circle can be followed. "
+    )
+    words = (
+        f"At {math.degrees(metrics['rudder']):.3g} deg of rudder the vessel turns with a radius of {steady['radius']:.2f} m, "
+        f"at {steady['speed']:.3g} m/s. {widened}The shortest possible course is that of bounded curvature at this radius (Dubins). "
+        f"Ratio: course time over its length at the service speed of {metrics['speed']:.3g} m/s; turning: at the speed kept in the smallest turn. "
+        "Side/clear: buoys left on their side, and outside their circles. Cross-track error from the plan, which a flight by line of sight does not "
+        "follow."
+    )
+    figures = "".join(
+        f'<figure><img alt="{html.escape(f.title)}" src="data:image/png;base64,{base64.b64encode(f.path.read_bytes()).decode("ascii")}">'
+        f"<figcaption><b>{html.escape(f.title)}.</b> {html.escape(f.caption)}</figcaption></figure>"
+        for f in read_figures(run)
+    )
+    return (
+        f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>{title}: residnet report</title><style>{_STYLE}</style></head><body>'
+        f"<h1>{title}</h1><p>{html.escape(str(config.get('description') or ''))}</p><p>{html.escape(words)}</p>"
+        f"<pre>{html.escape(table(metrics['rows']))}</pre>{figures}"
+        f"<h2>Configuration</h2><pre>{html.escape((run / 'resolved.yaml').read_text())}</pre></body></html>"
+    )

@@ -1,0 +1,211 @@
+"""A heading policy and the guidance of a planned course as one TorchScript module: measurements in, rudder out."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+import time
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from torch import Tensor, nn
+
+from residnet import __version__
+from residnet.control.course_guidance import CourseGuidance
+from residnet.control.course_plan import Course
+from residnet.control.following import Following
+from residnet.control.policy import HeadingPolicy
+from residnet.core.errors import ExportError
+
+MEASURED = ("x", "y", "psi", "u", "v", "r")
+"""What the exported module sees: north and east [m], heading [rad], surge and sway velocity [m/s], yaw rate [rad/s]."""
+PARITY_STEPS = 1000
+PARITY_TOLERANCE = 1e-4
+_METHODS = ["initial_state", "step"]
+_FAR = 1e3
+"""How many look-ahead distances outside the course's own extent a position is taken for good."""
+
+
+class ExportedCourse(nn.Module):
+    """What a controller calls once per step; float32, SI and radians.
+
+    The memory s is that of the guidance (place along the course), of the policy, and the last command. `fault` tells that a measurement or the
+    memory was no number or out of range: then the command is the safe one, reached at the rudder's rate, and the memory stays as it was.
+    `arrived` tells that the course has ended; commands go on along its last leg.
+    """
+
+    def __init__(self, policy: HeadingPolicy, guidance: CourseGuidance, safe: Literal["hold", "amidships"]) -> None:
+        super().__init__()
+        policy = copy.deepcopy(policy).float().eval().requires_grad_(False)
+        policy.read_from(MEASURED)
+        rate = None if math.isinf(policy.rate) else policy.rate
+        self.follower = Following(policy, MEASURED, limit=policy.limit, dt=policy.dt, rate=rate)
+        self.guidance = copy.deepcopy(guidance).float()
+        self.guidance.x, self.guidance.y, self.guidance.psi, self.guidance.u, self.guidance.v = range(5)
+        north, east = self.guidance.table[:, 0], self.guidance.table[:, 1]
+        far = _FAR * guidance.lookahead
+        turn, fast = 5.0 * policy.gain * policy.limit, 3.0 * policy.speed
+        circles = 2000.0 * math.pi
+        low = [float(north.min()) - far, float(east.min()) - far, -circles, 0.0, -fast, -turn]
+        high = [float(north.max()) + far, float(east.max()) + far, circles, fast, fast, turn]
+        self.register_buffer("low", torch.tensor(low, dtype=torch.float32))
+        self.register_buffer("high", torch.tensor(high, dtype=torch.float32))
+        self.low: Tensor
+        self.high: Tensor
+        self.keep = 1.0 if safe == "hold" else 0.0
+        self.travel, self.limit, self.dt, self.speed = self.follower.travel, policy.limit, policy.dt, policy.speed
+
+    @torch.jit.export
+    def initial_state(self, y: Tensor) -> Tensor:
+        """Memory [B, n] at the first measurement y [B, 6]: the beginning of the course, rudder amidships."""
+        y = torch.where(self._good(y).unsqueeze(-1), y, torch.zeros_like(y))
+        return torch.cat((self.guidance.initial_state(y), self.follower.initial_state(y), torch.zeros_like(y[:, :1])), dim=-1)
+
+    def _good(self, y: Tensor) -> Tensor:
+        return (torch.isfinite(y) & (y >= self.low) & (y <= self.high)).all(dim=-1)
+
+    @torch.jit.export
+    def step(self, y: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Rudder command [B, 1] in rad, memory [B, n], fault [B] and arrived [B] from y [B, 6] = `MEASURED` and the memory."""
+        remembers = torch.isfinite(s).all(dim=-1, keepdim=True)
+        s = torch.where(remembers, s, torch.zeros_like(s))
+        good = self._good(y).unsqueeze(-1)
+        y = torch.where(good, y, torch.zeros_like(y))
+        last = s[:, -1:].clamp(-self.limit, self.limit)
+        reference, place = self.guidance(y, 0, s[:, :1])
+        wish, memory = self.follower(y, reference, s[:, 1:-1])
+        wish = torch.where(good, wish, self.keep * last)
+        command = last + (wish - last).clamp(-self.travel, self.travel)
+        after = torch.where(good, torch.cat((place, memory), dim=-1), s[:, :-1])
+        arrived = after[:, 0] >= self.guidance.length
+        return command, torch.cat((after, command), dim=-1), ~(good & remembers)[:, 0], arrived
+
+    def forward(self, y: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """As `step`."""
+        return self.step(y, s)
+
+
+def export_course(
+    name: str,
+    policy: HeadingPolicy,
+    guidance: CourseGuidance,
+    course: Course,
+    file: Path,
+    *,
+    safe: Literal["hold", "amidships"],
+    about: Mapping[str, Any],
+    metrics: Sequence[Mapping[str, Any]],
+) -> dict[str, Any]:
+    """Write policy and guidance as TorchScript with a card, after a parity check.
+
+    Args:
+        name: of the policy.
+        policy: at the step that it shall run with.
+        guidance: of the course.
+        course: that parity is checked along.
+        file: where to write.
+        safe: command while inputs are wrong: the last one, or rudder amidships.
+        about: of the vessel and the course, for the card.
+        metrics: rows of metrics.json of this policy, for the card.
+
+    Returns:
+        The card.
+
+    Raises:
+        ExportError: where the exported module does not reproduce the policy and the guidance, or a wrong input brings a command that is no number.
+    """
+    module = ExportedCourse(policy, guidance, safe).eval()
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", category=DeprecationWarning)
+        warnings.filterwarnings("ignore", category=FutureWarning)
+        warnings.filterwarnings("ignore", message=".*torch.jit.*")
+        scripted = torch.jit.freeze(torch.jit.script(module), preserved_attrs=_METHODS)
+        parity = check_parity(name, module, scripted, course)
+        card = _card(name, module, policy, course, safe, parity, about, metrics)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        partial = file.with_name(file.name + ".partial")
+        torch.jit.save(scripted, str(partial), _extra_files={"card.json": json.dumps(card, indent=1)})
+        check_parity(name, module, torch.jit.load(str(partial)), course)
+        partial.replace(file)
+    return card
+
+
+def check_parity(name: str, module: ExportedCourse, exported: Any, course: Course) -> float:
+    """Largest difference of the command from the eager module along the course, as a share of the rudder's limit; wrong inputs are among them.
+
+    The vessel is put beside the course, off its heading, at varying speed, and moves on at the service speed.
+
+    Raises:
+        ExportError: where it exceeds 1e-4, a command is no number, or a wrong input raises no flag.
+    """
+    steps = torch.arange(PARITY_STEPS, dtype=torch.float32)
+    at = (steps * module.dt * module.speed / course.step).long().clamp(max=len(course.track) - 1)
+    track, heading = torch.from_numpy(course.track).float()[at], torch.from_numpy(course.heading).float()[at]
+    aside = 0.1 * module.guidance.lookahead
+    y = torch.stack(
+        (
+            track[:, 0] + aside * torch.sin(0.02 * steps),
+            track[:, 1] + aside * torch.cos(0.017 * steps),
+            heading + 0.2 * torch.sin(0.03 * steps),
+            module.speed * (1.0 + 0.1 * torch.sin(0.01 * steps)),
+            0.02 * module.speed * torch.cos(0.02 * steps),
+            0.1 * module.high[5] * torch.sin(0.013 * steps),
+        ),
+        dim=-1,
+    ).unsqueeze(1)
+    wrong = torch.arange(PARITY_STEPS) % 97 == 50
+    y[wrong, 0, 1] = torch.nan
+    mine, theirs = module.initial_state(y[0]), exported.initial_state(y[0])
+    worst = 0.0
+    with torch.no_grad():
+        for k in range(PARITY_STEPS):
+            a, mine, _, _ = module.step(y[k], mine)
+            b, theirs, fault, _ = exported.step(y[k], theirs)
+            difference = float((a - b).abs().max()) / module.limit
+            if not math.isfinite(difference) or bool(fault[0]) != bool(wrong[k]):
+                raise ExportError(f"course of {name}: step {k} of the parity check gives the command {float(b[0, 0])} and the flag {bool(fault[0])}")
+            worst = max(worst, difference)
+    if worst > PARITY_TOLERANCE:
+        raise ExportError(f"course of {name}: the exported commands differ by {worst:.2g} of the rudder's limit; allowed {PARITY_TOLERANCE:g}")
+    return worst
+
+
+def _card(
+    name: str,
+    module: ExportedCourse,
+    policy: HeadingPolicy,
+    course: Course,
+    safe: str,
+    parity: float,
+    about: Mapping[str, Any],
+    metrics: Sequence[Mapping[str, Any]],
+) -> dict[str, Any]:
+    units = ("m", "m", "rad", "m/s", "m/s", "rad/s")
+    return {
+        "schema": "residnet.course_card/1",
+        "policy": name,
+        "measured": [
+            {"name": n, "unit": u, "range": [low, high]}
+            for n, u, low, high in zip(MEASURED, units, module.low.tolist(), module.high.tolist(), strict=True)
+        ],
+        "start": {"north": float(course.track[0, 0]), "east": float(course.track[0, 1]), "heading": float(course.heading[0])},
+        "length": course.length,
+        "lookahead": module.guidance.lookahead,
+        "command": [{"name": "cmd_delta", "unit": "rad", "limit": policy.limit, "rate": None if math.isinf(policy.rate) else policy.rate}],
+        "memory": ["place", "rudder", *(f"policy_{i}" for i in range(policy.n_state)), "last_command"],
+        "dt": policy.dt,
+        "dtype": "float32",
+        "turning": {"K": policy.gain, "T": policy.time, "speed": policy.speed},
+        "fault": f"measurement or memory no number or out of range: command {'held' if safe == 'hold' else 'amidships'}, flag set",
+        "frame": "NED; psi clockwise from north; delta > 0 turns to starboard",
+        **about,
+        "metrics": [dict(row) for row in metrics],
+        "parity": {"steps": PARITY_STEPS, "share_of_limit": parity},
+        "versions": {"residnet": __version__, "torch": torch.__version__},
+        "exported": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        "safety": "TorchScript is code that runs when loaded: load only files that you trust. The files under models/ hold numbers only.",
+    }

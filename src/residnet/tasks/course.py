@@ -1,0 +1,81 @@
+"""Task `course`: fly a trained heading policy and its peers along a course past buoys."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from residnet.control.controllers import AnyController
+from residnet.control.courses import BuoyCourseConfig, Protocol
+from residnet.core.config import Config, ExistingPath, Seconds, dump_config
+from residnet.run_folder import RunFolder
+
+_Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
+
+
+class CourseTaskConfig(Config):
+    """A course past buoys, flown by a policy, by peers of its autopilot run, and by line of sight from way-point to way-point.
+
+    Attributes:
+        name: of the run.
+        threads: of PyTorch.
+        autopilot: folder of a finished autopilot run, or the config of one, which is then carried out first, in this run's own folder.
+            Vessel, rudder, policy and tuned peers come from there.
+        policy: its name there.
+        peers: names there.
+        others: further controllers, for example the document's law with another horizon.
+        course: see there.
+        protocols: that are flown.
+        line_of_sight: also without a plan: the heading of the line of sight to each way-point's leg, as the source did it.
+        dt: step of simulation and controllers.
+        duration: after which a flight that has not ended is given up.
+        safe: what the exported policy commands while its inputs are wrong: the last good command, or rudder amidships.
+    """
+
+    task: Literal["course"]
+    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")
+    description: str = ""
+    threads: int = Field(default=1, ge=1)
+    autopilot: ExistingPath
+    policy: _Name = "policy"
+    peers: tuple[_Name, ...] = ("pid",)
+    others: dict[_Name, AnyController] = Field(default_factory=dict)
+    course: BuoyCourseConfig
+    protocols: tuple[Protocol, ...] = Field(default=("enter", "sides"), min_length=1)
+    line_of_sight: bool = True
+    dt: Seconds = Field(default=0.02, gt=0)
+    duration: Seconds = Field(gt=0)
+    safe: Literal["hold", "amidships"] = "amidships"
+
+    def check(self) -> None:
+        """The autopilot's run folder or config.
+
+        Raises:
+            UsageError: where it is a folder of something else, or of an unfinished run.
+            ConfigError: where it is no config of an autopilot, or has no such policy or peer.
+        """
+        from residnet.tasks.course_run import autopilot_of
+
+        autopilot_of(self)
+
+    def run(self, *, source: Path, overrides: Sequence[str], out: Path | None, resume: bool) -> RunFolder:
+        """Train where there is no trained policy yet, plan, fly, compare, export.
+
+        Raises:
+            UsageError: where the folder exists.
+            ConfigError: where no course fits the vessel's turns.
+            FitError: where training fails.
+        """
+        from residnet.tasks.course_run import run_course
+
+        self.check()
+        started = time.time()
+        folder = RunFolder.create(out or Path("runs") / self.name, dump_config(self), resume=resume)
+        run_course(self, folder, resume=resume)
+        folder.write_provenance(config=source, overrides=overrides, seed=0, files=[], started=started)
+        print(f"report: {folder.report}")
+        return folder
