@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from residnet.evaluation import report_equations, report_goodness, report_limits
+from residnet.evaluation import report_doctor, report_equations, report_goodness, report_limits
 from residnet.evaluation import report_tables as tables
 from residnet.evaluation.figures import FigureFile, read_figures
 from residnet.evaluation.report_text import cautions, fitted_on, verdict
@@ -67,6 +67,7 @@ def _context(run: RunFiles, findings: Sequence[Finding], figures: Sequence[Figur
         "has_baseline": run.baseline is not None,
         "fitted_on": fitted_on(run),
         "quality": tables.quality(run),
+        "doctor": report_doctor.section(run),
         "good": report_limits.section(run),
         "baselines": _coefficients(run),
         "heads": tables.heads(run),

@@ -61,6 +61,7 @@ class RunFiles:
         self.provenance: Row = _json(path / "provenance.json", {})
         self.limits: Row = _json(path / "limits.json", {})
         self.goodness: Row = _json(path / "goodness.json", {})
+        self.doctor: Row = _json(path / "doctor.json", {})
         resolved = path / "resolved.yaml"
         self.resolved_text = resolved.read_text() if resolved.is_file() else ""
         self.resolved: Row = yaml.safe_load(self.resolved_text) or {}

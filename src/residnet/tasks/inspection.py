@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,6 +20,10 @@ from residnet.data.masks import Mask
 from residnet.data.readers.base import LogReader
 from residnet.data.readers.composed import RecordingConfig
 from residnet.data.readers.detect import format_of, reader_for
+from residnet.run_folder import RunFolder
+
+if TYPE_CHECKING:
+    from residnet.tasks.fit import FitConfig
 
 # regressors that move together so closely leave their coefficients to the noise
 _ILL = 1e6
@@ -75,6 +80,18 @@ def inspect_logs(paths: Sequence[Path], config: Path | None, file: Path | None =
     if file is not None:
         _write(file, content)
     return bool(content["misled"])
+
+
+def write_inspection(folder: RunFolder, splits: Mapping[str, Sequence[Log]], config: FitConfig) -> None:
+    """doctor.json of a fit: what the doctor finds in the logs of all splits as the run's masks leave them."""
+    logs = [log for members in splits.values() for log in members]
+    reports = [inspect(log, config.signals.columns, config.prepare.masks) for log in logs]
+    names = {log.name: split for split, members in splits.items() for log in members}
+    content = inspection(reports, inspect_together(logs, config.signals.columns, names))
+    folder.write_json(folder.path / "doctor.json", content)
+    loud = sum(report.misled for report in reports)
+    if loud:
+        print(f"  the data doctor says of {loud} of {len(logs)} logs that they would mislead a fit: see the report", file=sys.stderr)
 
 
 def _write(file: Path, content: dict[str, Any]) -> None:

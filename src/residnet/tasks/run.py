@@ -24,6 +24,7 @@ from residnet.tasks.drifting import summary, through_currents
 from residnet.tasks.exporting import export_model
 from residnet.tasks.fit import FitConfig
 from residnet.tasks.goodness import write_goodness
+from residnet.tasks.inspection import write_inspection
 from residnet.tasks.pipeline import Fitted, Fitter, candidates, evaluate, prepare_logs, say, write_residuals
 from residnet.tasks.reporting import report_run
 from residnet.tasks.terms import write_terms
@@ -49,7 +50,9 @@ def run_fit(config: FitConfig, *, source: Path, overrides: Sequence[str], out: P
     folder = RunFolder.create(out or Path("runs") / config.name, dump_config(config), resume=resume)
     folder.write_provenance(config=source, overrides=overrides, seed=config.seed, files=files, started=started)
     say(f"{config.name}: reading logs")
-    logs = prepare_logs(read_logs(config.data), config)
+    read = read_logs(config.data)
+    write_inspection(folder, read, config)
+    logs = prepare_logs(read, config)
     say("  " + ", ".join(f"{split} {len(members)} logs" for split, members in logs.items()))
     if config.current is not None:
         logs, currents = through_currents(logs, config, config.current)

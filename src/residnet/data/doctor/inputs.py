@@ -104,12 +104,23 @@ def _excursions(log: Log, name: str) -> Iterator[Finding]:
     low, high = (float(value) for value in np.quantile(known, (0.01, 0.99)))
     beyond = np.maximum(low - known, known - high)
     far = (away > 0.25 * max(high - low, 1e-12)) & (beyond > 0.25 * max(high - low, 1e-12)) & (away > 8.0 * noise_of(known))
+    far = _abrupt(known, away, far)
     starts, _ = true_runs(far)
-    if starts.size > 1:
+    if starts.size:
         furthest = show(float(known[far][np.argmax(away[far])]), log.units[name])
         text = f"{name} leaves its range for a moment {starts.size} times ({int(far.sum())} samples), to {furthest}"
         figures = {"count": starts.size, "samples": far.sum(), "t": float(log.t[starts[0]])}
         yield Finding("will mislead", "outliers", text, figures, f"mask them (kind: hampel, channels: [{name}])", far)
+
+
+def _abrupt(values: np.ndarray, away: np.ndarray, far: np.ndarray) -> np.ndarray:
+    """The excursions among far [T] that go and come within a step or two; an actuator takes its time."""
+    change = np.abs(np.diff(values, prepend=values[0], append=values[-1]))
+    out = far.copy()
+    for start, stop in zip(*true_runs(far), strict=True):
+        edges = change[max(start - 1, 0) : start + 1].max(), change[stop : stop + 2].max()
+        out[start:stop] = min(edges) > 0.5 * away[start:stop].max()
+    return out
 
 
 def _stuck(log: Log, inputs: Sequence[str]) -> Iterator[Finding]:
