@@ -112,6 +112,18 @@ def test_matlab_matrix_datenum_and_nested_struct(tmp_path: Path) -> None:
     assert log.meta["start_utc"].startswith("2024-04-10T06:00:00.0")
 
 
+def test_several_experiments_in_one_file(tmp_path: Path) -> None:
+    from scipy.io import savemat
+
+    logs = {"first": trial(20.0), "second": trial(12.5)}
+    path = tmp_path / "trial.mat"
+    savemat(path, {name: {"t": log.t, **log.channels} for name, log in logs.items()})
+    for name, log in logs.items():
+        assert_same(validate({"kind": "mat", "table": name}, ReaderConfig, "test").build().read(path), log)
+    both = reader_for(path).read(path)
+    assert "several_tables" in {finding["code"] for finding in both.meta["findings"]}
+
+
 @pytest.mark.parametrize("write", [*TREES, *BAGS])
 def test_truncated_files_end_in_one_line(write: Writer, tmp_path: Path) -> None:
     path = write(trial(), tmp_path)

@@ -43,6 +43,7 @@ class Plan:
         heading: source of psi.
         velocity: source of u, v (and r) where no channels are.
         said: what was decided without being asked, for the log's meta.
+        remarks: what was noticed while deciding.
     """
 
     channels: Mapping[str, FieldMap] = field(default_factory=dict)
@@ -50,6 +51,7 @@ class Plan:
     heading: HeadingConfig | None = None
     velocity: VelocityConfig | None = None
     said: tuple[str, ...] = ()
+    remarks: tuple[Remark, ...] = ()
 
 
 def compose(recording: Recording, plan: Plan, clock: ClockConfig, longest_gap: float) -> Log:
@@ -163,7 +165,7 @@ def _lever(position: PositionConfig | None) -> Lever:
 
 
 def _meta(recording: Recording, plan: Plan, parts: Sequence[Part], times: np.ndarray) -> dict[str, Any]:
-    remarks: list[Remark] = list(recording.remarks)
+    remarks: list[Remark] = [*recording.remarks, *plan.remarks]
     topics: dict[str, Any] = {}
     for one in recording.series.values():
         seen = traffic(one)

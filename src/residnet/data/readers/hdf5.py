@@ -28,14 +28,16 @@ class Hdf5Config(RecordingConfig):
 
     Attributes:
         time: which dataset of a group (or column of a table) holds time.
+        table: the only group or table that is read, where a file holds several experiments; null reads all.
     """
 
     kind: Literal["hdf5"] = "hdf5"
     time: TreeTime = Field(default_factory=TreeTime)
+    table: str | None = Field(default=None, min_length=1)
 
     def load(self, path: Path, wanted: Wanted) -> Recording:
         """See `RecordingConfig.load`."""
-        return load_hdf5(path, wanted, self.time)
+        return load_hdf5(path, wanted if self.table is None else Wanted([(self.table, "")]), self.time)
 
 
 def is_hdf5(path: Path) -> bool:

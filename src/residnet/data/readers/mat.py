@@ -24,14 +24,16 @@ class MatConfig(RecordingConfig):
 
     Attributes:
         time: which variable of a struct (or of the workspace) holds time.
+        table: the only struct that is read, where a file holds several experiments; null reads all.
     """
 
     kind: Literal["mat"] = "mat"
     time: TreeTime = Field(default_factory=TreeTime)
+    table: str | None = Field(default=None, min_length=1)
 
     def load(self, path: Path, wanted: Wanted) -> Recording:
         """See `RecordingConfig.load`."""
-        return load_mat(path, wanted, self.time)
+        return load_mat(path, wanted if self.table is None else Wanted([(self.table, "")]), self.time)
 
 
 def load_mat(path: Path, wanted: Wanted = EVERYTHING, time: TreeTime | None = None) -> Recording:

@@ -16,7 +16,7 @@ from residnet.data.readers.compose import Plan
 from residnet.data.readers.message import Message
 from residnet.data.readers.messages_marine import MARINE
 from residnet.data.readers.quantities import Angle, Derived, FieldMap, Geodetic, Local, Quaternion
-from residnet.data.readers.recording import Recording, Series, key_of
+from residnet.data.readers.recording import Recording, Series, key_of, remark
 
 _WORLD = ("map", "odom", "earth", "world", "enu", "ned")
 
@@ -194,9 +194,15 @@ MESSAGES: tuple[Message, ...] = (Odometry(), Pose(), Twist(), Imu(), Fix(), Wren
 
 def standard_plan(recording: Recording, declared: Plan) -> Plan:
     """The declared plan with what standard messages add to it, the ones that say most first, then the busiest topic of each kind."""
-    plan, said = declared, []
+    plan, said, remarks = declared, [], []
     for message in MESSAGES:
         fitting = [one for one in recording.series.values() if len(one) > 1 and message.fits(one)]
+        alike = [one.name for one in fitting if isinstance(message, Named) and {"x", "y", "psi"} <= set(one.fields)]
+        if len(alike) > 1:
+            text = (
+                f"{len(alike)} tables hold positions and headings ({', '.join(alike[:6])}): several experiments? name one with `table`, or map fields"
+            )
+            remarks.append(remark("will mislead", "several_tables", text, tables=len(alike)))
         for one in sorted(fitting, key=lambda one: (-len(one), one.name)):
             offered = message.plan(one)
             plan, taken = _joined(plan, offered)
@@ -207,7 +213,7 @@ def standard_plan(recording: Recording, declared: Plan) -> Plan:
     if plan.heading is None and "psi" not in plan.channels and declared.velocity is None:
         # without a heading an earth-fixed velocity has no components in the body
         plan = dataclasses.replace(plan, velocity=None)
-    return dataclasses.replace(plan, said=(*declared.said, *said))
+    return dataclasses.replace(plan, said=(*declared.said, *said), remarks=(*declared.remarks, *remarks))
 
 
 def _joined(plan: Plan, offered: Plan) -> tuple[Plan, Sequence[str]]:
