@@ -153,7 +153,7 @@ def tracking_text(config: FerrySettings, flights: dict[str, Flight], kind: str) 
     for name, flight in flights.items():
         m = flight.tracking
         said = config.published if name == "believed" else config.models[name].published
-        p = {"course": said, "crossing": _crossing(said)}.get(kind, Published())
+        p = {"course": said.model_copy(update={"crossing_power": None}), "crossing": _crossing(said)}.get(kind, Published())
         tau = ", ".join(_beside(m.tau[a], p.tau[a] if p.tau else None) for a in range(3))
         feedback = ", ".join(_beside(m.feedback[a], p.feedback[a] if p.feedback else None) for a in range(3))
         energy, iaew = (", ".join(f"{value:.4g}" for value in pair) for pair in (m.energy, m.iaew))
