@@ -7,8 +7,12 @@ import torch
 from residnet.core.errors import DataError
 from residnet.core.log import Log
 from residnet.core.names import STATE
-from residnet.data.prepare import PrepareConfig, Prepared, prepare
+from residnet.data.prepare import PrepareConfig, Prepared, prepare, samples
 from residnet.data.windows import WindowStore
+from residnet.evaluation.freerun import FreeRun, Prediction
+from residnet.evaluation.metrics import window_errors
+from residnet.evaluation.protocol import Windows
+from residnet.physics.signals import SignalsConfig
 
 STEP = 0.1
 
@@ -48,3 +52,33 @@ def test_windows_begin_where_told() -> None:
     assert torch.equal(store.depth[rows], torch.full((3,), 5))
     with pytest.raises(DataError, match="beginning"):
         store.beginnings(60, 5)
+
+
+@pytest.mark.parametrize("kind", ["hampel", "outlier"])
+def test_masked_outliers_reach_neither_fits_nor_scores_nor_the_start_of_a_window(kind: str) -> None:
+    """From the rule to least squares, training windows, free-run windows and errors."""
+    t = STEP * np.arange(400)
+    u = 2.0 + 0.3 * np.sin(0.4 * t) + 1e-3 * np.random.default_rng(0).standard_normal(400)
+    bad = np.array([0, 57, 200, 311]) if kind == "outlier" else np.array([57, 200, 311])
+    spiked = u.copy()
+    spiked[bad] += 0.5
+    zeros = {name: np.zeros(400) for name in STATE}
+    log = Log("spiked", t, {**zeros, "u": spiked, "n": np.ones(400)}, manoeuvre="made")
+    derivative = {"kind": "savitzky_golay", "window": 0.5, "order": 2}
+    config = PrepareConfig.model_validate({"grid": {"step": STEP}, "derivative": derivative, "masks": [{"kind": kind, "channels": ["u"]}]})
+    found = prepare(log, "train", ("n",), config)
+    assert np.isin(bad, np.flatnonzero(~found.usable)).all()
+    assert (~found.usable).sum() <= bad.size + 4
+    assert not found.good[bad].any()
+    signals = SignalsConfig(inputs=("n",)).build()
+    learned = samples([found], signals)
+    # pieces end at an outlier, so that no derivative holds it
+    assert float((learned.column("u") - 2.0).abs().max()) < 0.35
+    assert float(learned.target[:, 0].abs().max()) < 0.2
+    store = WindowStore.gather([found])
+    assert not store.usable[bad].any()
+    windows = Windows(length=10.0, first=5.7).windows(found, 0, STEP)
+    assert windows[0].start == 58
+    perfect = [Prediction(np.stack([*[np.zeros(400)] * 3, u, np.zeros(400), np.zeros(400)], axis=1)[w.start : w.stop], False) for w in windows]
+    errors = window_errors(FreeRun("T10", "train", windows, {"truth": perfect}), "truth", [found])
+    np.testing.assert_allclose(errors["rmse"], 0.0, atol=1e-12)

@@ -73,8 +73,9 @@ def _rest(log: Log) -> Iterator[Finding]:
         slow = 0.1 * float(np.nanpercentile(speed, 95))
         share = float(np.mean(speed[np.isfinite(speed)] <= slow))
         if share > 0.05:
-            text = f"slower than {show(slow, 'm/s')} (a tenth of its speed) for {share_of(share)} of the time: little to learn there"
-            yield Finding("note", "slow", text, {"share": share})
+            text = f"the vessel stands almost still (slower than {show(slow, 'm/s')}, a tenth of its speed) for {share_of(share)} of the time"
+            action = "there is little to learn there"
+            yield Finding("note", "slow", text, {"share": share}, action)
 
 
 def _band(log: Log, name: str) -> float:

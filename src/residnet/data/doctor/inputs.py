@@ -140,7 +140,7 @@ def _stuck(log: Log, inputs: Sequence[str]) -> Iterator[Finding]:
             run = slice(start, stop + 1)
             seconds = float(log.t[stop] - log.t[start])
             apart = np.abs(wanted[run] - done[run]) > _APART * span
-            if seconds >= _STUCK and float(np.ptp(wanted[run])) > _APART * span and float(apart.mean()) > 0.3 and seconds > worst[0]:
+            if seconds >= _STUCK and float(np.ptp(wanted[run])) > _APART * span and float(apart.mean()) > 0.1 and seconds > worst[0]:
                 worst = (seconds, int(start), int(stop))
         if worst[0] > 0.0:
             at = np.zeros(len(log), dtype=bool)

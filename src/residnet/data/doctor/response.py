@@ -40,7 +40,7 @@ def response_findings(log: Log, inputs: Sequence[str]) -> Iterator[Finding]:
         text = f"the yaw rate answers {name} {-answer.lag:.2f} s before it is given "
         text += f"(a yaw model leaves {answer.better:.1f} times less with the inputs shifted)"
         yield Finding("will mislead", "acausal", text, figures, "the clocks of inputs and motion differ: shift one of them")
-    elif answer.sure < -_SURE and answer.best_sure < 0.0 and answer.worth > _WORTH:
+    elif answer.sure < -_SURE and answer.worth > _WORTH and (answer.better < _BETTER or answer.best_sure < 0.0):
         text = f"positive {name} turns the vessel to port (yaw acceleration {answer.effect:.3g} per unit, {-answer.sure:.0f} standard errors)"
         action = "turn it in the channel map (sign: -1), and check the sign of r and psi"
         yield Finding("will mislead", "rudder_sign", text, figures, action)
