@@ -21,7 +21,7 @@ from residnet.dynamics.rollout import Rollout
 Array = NDArray[np.float64]
 _TAIL = 4.0
 """Time constants that are flown after the planned end of a turn."""
-_STEADY = math.radians(0.3)
+_STEADY = math.radians(0.8)
 """A turn ends where the heading stays as near to the new one."""
 
 

@@ -1,0 +1,77 @@
+"""Fly an exported course (policy and guidance in one module) on Nomoto's model in C++ and in Python: the same track, and how long a step takes.
+
+python scripts/autopilot_cpp/compare_course.py RUN/exports/policy_enter.pt BUILD/course [--seconds 250]
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import math
+import statistics
+import subprocess
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+
+COLUMNS = ("x", "y", "psi", "r", "delta")
+
+
+def fly(module: Any, card: dict[str, Any], seconds: float) -> tuple[list[tuple[float, ...]], float]:
+    """`COLUMNS` by step until the course ends, and the median time of a step in microseconds."""
+    k, constant, speed, dt = card["turning"]["K"], card["turning"]["T"], card["turning"]["speed"], card["dt"]
+    x, y, psi, r = card["start"]["north"], card["start"]["east"], card["start"]["heading"], 0.0
+    decay, half = math.exp(-dt / constant), math.exp(-0.5 * dt / constant)
+    track, taken = [], []
+    with torch.inference_mode():
+        memory = module.initial_state(torch.tensor([[x, y, psi, speed, 0.0, r]]))
+        for _ in range(round(seconds / dt)):
+            seen = torch.tensor([[x, y, psi, speed, 0.0, r]])
+            begin = time.perf_counter()
+            command, memory, _, arrived = module.step(seen, memory)
+            delta = float(command)
+            taken.append(1e6 * (time.perf_counter() - begin))
+            track.append((x, y, psi, r, delta))
+            if bool(arrived):
+                break
+            steady = k * delta
+            middle = psi + steady * 0.5 * dt + (r - steady) * constant * (1.0 - half)
+            after = psi + steady * dt + (r - steady) * constant * (1.0 - decay)
+            x += speed * dt / 6.0 * (math.cos(psi) + 4.0 * math.cos(middle) + math.cos(after))
+            y += speed * dt / 6.0 * (math.sin(psi) + 4.0 * math.sin(middle) + math.sin(after))
+            psi, r = after, steady + (r - steady) * decay
+    return track, statistics.median(taken[10:])
+
+
+def main() -> None:
+    """Compare and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("course", type=Path)
+    parser.add_argument("program", type=Path)
+    parser.add_argument("--seconds", type=float, default=250.0)
+    given = parser.parse_args()
+    torch.set_num_threads(1)
+    extra = {"card.json": ""}
+    module = torch.jit.load(str(given.course), _extra_files=extra)
+    card = json.loads(extra["card.json"])
+    turning, start = card["turning"], card["start"]
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "track.csv"
+        numbers = (turning["K"], turning["T"], turning["speed"], card["dt"], start["north"], start["east"], start["heading"], given.seconds)
+        words = [str(given.program), str(given.course), str(file), *(repr(number) for number in numbers)]
+        print(subprocess.run(words, capture_output=True, text=True, check=True).stdout.rstrip())
+        with file.open() as lines:
+            theirs = [tuple(float(row[name]) for name in COLUMNS) for row in csv.DictReader(lines)]
+    mine, median = fly(module, card, given.seconds)
+    if len(mine) != len(theirs):
+        raise SystemExit(f"Python took {len(mine)} steps, the C++ program {len(theirs)}")
+    worst = max(abs(a - b) for one, other in zip(mine, theirs, strict=True) for a, b in zip(one, other, strict=True))
+    print(f"TorchScript in Python: median step {median:.1f} us, largest difference of the track from the C++ program {worst:.2g}")
+
+
+if __name__ == "__main__":
+    main()
