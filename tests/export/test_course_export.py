@@ -1,0 +1,85 @@
+"""Policy and guidance as one TorchScript module: the same as in the loop, and safe whatever comes in."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from residnet.control.course_guidance import CourseGuidance
+from residnet.control.course_plan import Course
+from residnet.control.following import Following
+from residnet.control.policy import HeadingPolicy
+from residnet.control.turning import Turning
+from residnet.export.course import MEASURED, export_course
+
+LIMIT = math.radians(5)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[torch.jit.ScriptModule, Following, CourseGuidance, dict[str, object]]:
+    torch.manual_seed(0)
+    policy = HeadingPolicy(MEASURED, turning=Turning(3.47, 3.94, 3.2), limit=LIMIT, dt=0.02, rate=0.2, hidden=(8,)).eval().requires_grad_(False)
+    angle = np.linspace(0.0, 2.0, 1001)
+    track = 30.0 * np.stack((np.sin(angle), 1.0 - np.cos(angle)), axis=-1)
+    course = Course(0.06, track, angle, angle, np.full(len(angle), 0.03), 50.0)
+    guidance = CourseGuidance(course, 10.0, MEASURED)
+    file = Path(tmp_path_factory.mktemp("course")) / "course.pt"
+    card = export_course("policy", policy, guidance, course, file, safe="hold", about={"vessel": "x"}, metrics=[])
+    extra = {"card.json": ""}
+    loaded = torch.jit.load(str(file), _extra_files=extra)
+    assert json.loads(extra["card.json"])["start"] == card["start"] == {"north": 0.0, "east": 0.0, "heading": 0.0}
+    return loaded, Following(policy, MEASURED, limit=LIMIT, dt=0.02, rate=0.2), guidance.float(), card
+
+
+def test_it_commands_what_guidance_and_policy_command(made: tuple[torch.jit.ScriptModule, Following, CourseGuidance, dict[str, object]]) -> None:
+    loaded, follower, guidance, _ = made
+    y = torch.tensor([[0.1, 0.3, 0.05, 3.2, 0.01, 0.02]])
+    s, place, memory, last = loaded.initial_state(y), torch.zeros(1, 1), follower.initial_state(y), 0.0
+    for k in range(200):
+        y = torch.tensor([[0.064 * k, 0.3 + 0.001 * k, 0.002 * k, 3.2, 0.01, 0.1 * math.sin(0.1 * k)]])
+        command, s, fault, arrived = loaded.step(y, s)
+        reference, place = guidance(y, k, place)
+        wish, memory = follower(y, reference, memory)
+        # the rudder's rate is inside
+        last += min(max(float(wish) - last, -0.2 * 0.02), 0.2 * 0.02)
+        assert float(command) == pytest.approx(last, abs=1e-6)
+        assert not bool(fault)
+        assert not bool(arrived)
+
+
+@pytest.mark.parametrize(("place", "value"), [(0, math.nan), (1, math.inf), (2, 1e9), (3, -5.0), (4, math.nan), (5, 1e3)])
+def test_wrong_input_raises_the_flag_and_holds_the_command(
+    made: tuple[torch.jit.ScriptModule, Following, CourseGuidance, dict[str, object]], place: int, value: float
+) -> None:
+    loaded = made[0]
+    y = torch.tensor([[0.1, 0.3, 0.05, 3.2, 0.01, 0.02]])
+    command, s, _, _ = loaded.step(y, loaded.initial_state(y))
+    wrong = y.clone()
+    wrong[0, place] = value
+    held, after, fault, _ = loaded.step(wrong, s)
+    assert bool(fault)
+    assert float(held) == float(command)
+    assert torch.equal(after, s)
+    assert not bool(loaded.step(y, after)[2])
+
+
+def test_a_memory_that_is_no_number_is_forgotten(made: tuple[torch.jit.ScriptModule, Following, CourseGuidance, dict[str, object]]) -> None:
+    loaded = made[0]
+    y = torch.tensor([[0.1, 0.3, 0.05, 3.2, 0.01, 0.02]])
+    command, after, fault, _ = loaded.step(y, torch.full_like(loaded.initial_state(y), math.nan))
+    assert bool(fault)
+    assert math.isfinite(float(command))
+    assert bool(torch.isfinite(after).all())
+
+
+def test_it_arrives(made: tuple[torch.jit.ScriptModule, Following, CourseGuidance, dict[str, object]]) -> None:
+    loaded = made[0]
+    y = torch.tensor([[30 * math.sin(1.7), 30 - 30 * math.cos(1.7), 1.7, 3.2, 0.0, 0.1]])
+    s = loaded.initial_state(y)
+    s[:, 0] = 49.0
+    assert bool(loaded.step(y, s)[3])
