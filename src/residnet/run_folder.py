@@ -35,6 +35,7 @@ class RunFolder:
         self.residuals = path / "residuals.parquet"
         self.limits = path / "limits.json"
         self.goodness = path / "goodness.json"
+        self.booklet = path / "booklet.json"
 
     @classmethod
     def create(cls, path: Path, resolved: str, *, resume: bool) -> RunFolder:

@@ -139,7 +139,7 @@ def test_hessian_is_half_that_of_the_cost_where_the_errors_vanish() -> None:
     x, exact = problem.x0, []
     with torch.no_grad():
         for k in range(problem.w.shape[1]):
-            x = module._euler(model, x, model.signals.prepare(problem.w[:, k]))
+            x = module._ahead(model, x, model.signals.prepare(problem.w[:, k]))
             exact.append(x[:, 3:])
     fields = {
         **vars(problem),

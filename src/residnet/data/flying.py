@@ -32,7 +32,7 @@ class Craft:
         dynamics: a plant or a learned model, stepping as the logs do.
         helm: of it.
         commands: how many of its inputs are commands.
-        start: state [1, nx] that trials start from, float64.
+        start: state [1, nx] that trials start from, or one for each, [B, nx]; float64.
     """
 
     name: str
@@ -119,7 +119,8 @@ def fly(
     if sea.plant is not None:
         source = sea.disturbance.surround(source, sea.plant, rows, step, sea.seed)
     watched = Watched(source, rows)
-    start = torch.stack([manoeuvre.begin(craft.start[0], craft.helm.state) for manoeuvre in manoeuvres])
+    starts = craft.start.expand(rows, -1)
+    start = torch.stack([manoeuvre.begin(x, craft.helm.state) for manoeuvre, x in zip(manoeuvres, starts, strict=True)])
     with torch.no_grad():
         states, inputs, _ = Rollout(craft.dynamics, watched)(start, w, craft.dynamics.initial_state(rows).to(w.dtype))
     noise = random.standard_normal((rows, steps, 3)) * [sea.noise.u, sea.noise.v, sea.noise.r]

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from residnet.evaluation import figures_errors, figures_terms, figures_tracks
+from residnet.evaluation import figures_booklet, figures_errors, figures_terms, figures_tracks
 from residnet.evaluation.figures_style import RC, save
 from residnet.evaluation.run_reader import RunFiles
 
@@ -68,6 +68,7 @@ def read_figures(run: Path) -> list[FigureFile]:
 def _figures(run: RunFiles) -> Iterator[tuple[str, str, str, Any]]:
     yield from _of_runs(run)
     yield from _of_errors(run)
+    yield from figures_booklet.of_booklet(run)
     yield from figures_terms.of_terms(run)
     yield from _of_training(run)
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from residnet.evaluation import report_doctor, report_equations, report_goodness, report_limits
+from residnet.evaluation import report_booklet, report_doctor, report_equations, report_goodness, report_limits
 from residnet.evaluation import report_tables as tables
 from residnet.evaluation.figures import FigureFile, read_figures
 from residnet.evaluation.report_text import cautions, fitted_on, verdict
@@ -73,6 +73,7 @@ def _context(run: RunFiles, findings: Sequence[Finding], figures: Sequence[Figur
         "heads": tables.heads(run),
         "equations": report_equations.section(run),
         "goodness": report_goodness.section(run),
+        "booklet": report_booklet.section(run),
         "protocols": [entry for entry in protocols if entry["table"] is not None],
         "figures": [{"title": f.title, "caption": f.caption, "name": f.path.name, "data": _embedded(f.path)} for f in figures],
         "checks": CHECKS,

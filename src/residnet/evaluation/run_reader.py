@@ -62,6 +62,7 @@ class RunFiles:
         self.limits: Row = _json(path / "limits.json", {})
         self.goodness: Row = _json(path / "goodness.json", {})
         self.doctor: Row = _json(path / "doctor.json", {})
+        self.booklet: Row = _json(path / "booklet.json", {})
         resolved = path / "resolved.yaml"
         self.resolved_text = resolved.read_text() if resolved.is_file() else ""
         self.resolved: Row = yaml.safe_load(self.resolved_text) or {}

@@ -136,6 +136,9 @@ def turning(log: Log, start: float, side: float, until: float, length: float | N
     begin, end = (track.crossing(origin + side * angle, start, side) for angle in (until - math.pi, until))
     if until >= 2 * math.pi - 1e-9 and begin is not None:
         inside = (track.t >= begin) & (track.t <= (track.end if end is None else end))
+    else:
+        inside = np.zeros(0, dtype=bool)
+    if inside.any():
         speed, rate = float(track.speed[inside].mean()), float(np.abs(track.r[inside].mean()))
         drift = np.arctan2(-side * track.v[inside], track.u[inside])
         found |= {"steady_diameter": 2 * speed / rate, "steady_speed": speed, "steady_yaw_rate": rate, "steady_drift_angle": float(drift.mean())}

@@ -155,6 +155,7 @@ class MMGForces(nn.Module):
     def __init__(self, hull: MMGHull, propeller: MMGPropeller, rudder: MMGRudder, columns: tuple[int, int, int, int, int]) -> None:
         super().__init__()
         self.columns = list(columns)
+        self.wake_slope, self.still = _WAKE_SLOPE, _STILL
         self.length = float(hull.length)
         self.pressed = 0.5 * hull.density * hull.length * hull.draught
         self.mass, self.x_G = float(hull.mass), float(hull.x_G)
@@ -171,7 +172,7 @@ class MMGForces(nn.Module):
         ) = theta.unbind(-1)  # fmt: skip
         chosen = [z[..., c] for c in self.columns]
         u, v, r, n, delta = chosen[0], chosen[1], chosen[2], chosen[3], chosen[4]
-        speed = torch.sqrt(u * u + v * v + _STILL)
+        speed = torch.sqrt(u * u + v * v + self.still)
         a, b = v / speed, r * self.length / speed
         # hull
         pressure = self.pressed * speed * speed
@@ -182,14 +183,14 @@ class MMGForces(nn.Module):
         # propeller: inflow changes with its drift angle, to both sides differently
         aside = -a - self.x_P * b
         side = torch.where(aside > 0, C_2p, C_2n)
-        inflow = u * (1 - w_P0) * (1 + (1 - torch.exp(-_WAKE_SLOPE * aside.abs())) * (side - 1))
+        inflow = u * (1 - w_P0) * (1 + (1 - torch.exp(-self.wake_slope * aside.abs())) * (side - 1))
         nd = n * self.diameter
         loading = self.k0 * nd * nd + self.k1 * nd * inflow + self.k2 * inflow * inflow
         thrust = self.density * self.diameter**2 * loading
         # rudder: partly in the race
-        raced = torch.sqrt(torch.clamp(inflow * inflow + 8.0 / math.pi * loading, min=_STILL))
+        raced = torch.sqrt(torch.clamp(inflow * inflow + 8.0 / math.pi * loading, min=self.still))
         squared = self.race * (inflow + kappa * (raced - inflow)) ** 2 + (1 - self.race) * inflow * inflow
-        along = epsilon * torch.sqrt(squared + _STILL)
+        along = epsilon * torch.sqrt(squared + self.still)
         cross = -a - l_R * b
         across = speed * torch.where(cross > 0, gamma_p, gamma_n) * cross
         angle = delta - torch.atan2(across, along)

@@ -16,6 +16,7 @@ from residnet.data.prepare import PrepareConfig
 from residnet.data.simulate import SimulatedTrials
 from residnet.data.sources import DataConfig, MeasuredLogs
 from residnet.dynamics.base import Integrator
+from residnet.evaluation.booklet import BookletConfig
 from residnet.evaluation.config import EvaluationConfig
 from residnet.heads import ForceHead, HeadConfig
 from residnet.physics.signals import SignalsConfig
@@ -61,6 +62,7 @@ class FitConfig(Config):
         ensembles: models whose mean acceleration makes another model, by its name.
         training: of network heads by the name of the head; the defaults where absent.
         evaluation: protocols and scales.
+        booklet: standard manoeuvres by one of the refitted baselines, with intervals; null for none.
         export: TorchScript.
     """
 
@@ -83,6 +85,7 @@ class FitConfig(Config):
     ensembles: dict[str, Annotated[tuple[str, ...], Field(min_length=2)]] = Field(default_factory=dict)
     training: dict[str, TrainingConfig] = Field(default_factory=dict)
     evaluation: EvaluationConfig
+    booklet: BookletConfig | None = None
     export: ExportConfig = ExportConfig()
 
     @model_validator(mode="after")
@@ -97,6 +100,9 @@ class FitConfig(Config):
         _known("base_of", self.base_of, self.heads, "head")
         _known("base_of", self.base_of.values(), baselines, "baseline")
         _known("refit", self.refit, baselines, "baseline")
+        if self.booklet is not None:
+            _known("booklet.model", (self.booklet.model,), self.refit, "refitted baseline")
+            self.booklet.rudder()
         _known("ensembles", (name for members in self.ensembles.values() for name in members), single, "model")
         _known("export.models", self.export.models, ("selected", *models), "model")
         names = self.signals.build().names

@@ -20,6 +20,7 @@ from residnet.evaluation.metrics import SCHEMA, find
 from residnet.evaluation.repeats import repeatability
 from residnet.run_folder import RunFolder
 from residnet.studies import draw_study
+from residnet.tasks.booklet import write_booklet
 from residnet.tasks.drifting import summary, through_currents
 from residnet.tasks.exporting import export_model
 from residnet.tasks.fit import FitConfig
@@ -86,6 +87,8 @@ def run_fit(config: FitConfig, *, source: Path, overrides: Sequence[str], out: P
     write_residuals(folder.residuals, fitter, fitted, logs["test"])
     write_terms(folder.path / "terms.parquet", fitted, logs["test"])
     write_goodness(folder.goodness, config.name, fitted, logs, config.prepare.grid.step)
+    if config.booklet is not None:
+        say("  " + write_booklet(folder, config.booklet, by_name[config.booklet.model], logs, fitter.limit))
     if report:
         finish(folder, config)
     folder.write_provenance(config=source, overrides=overrides, seed=config.seed, files=files, started=started)

@@ -82,11 +82,12 @@ class _Problem:
     robust: float
 
     def share(self, level: Tensor) -> Tensor:
-        """What one unit of minus the logarithm of a probability costs, where errors are at `level` (in units of the scales).
+        """Half of what one unit of minus the logarithm of a probability costs, where the cost is `level`.
 
-        The cost is that level itself, of which the probability falls with the power of three times the number of independent errors.
+        With c the mean square error of three channels of so many independent errors each, that logarithm grows by 3 N / 2c for each unit of c,
+        and the cost sqrt(c + robust^2) by 1 / (2 cost).
         """
-        return level / (6.0 * self.count)
+        return (level.square() - self.robust**2).clamp(min=1e-12) / (6.0 * self.count * level)
 
 
 def refit(model: HybridDynamics, samples: Samples, store: WindowStore, config: RefitConfig, scales: Tensor) -> Refitted:
@@ -192,24 +193,43 @@ def _level(model: HybridDynamics, problem: _Problem) -> Tensor:
     """Mean error of the windows, in units of the scales."""
     x, total = problem.x0, []
     for k in range(problem.w.shape[1]):
-        x = _euler(model, x, model.signals.prepare(problem.w[:, k]))
+        x = _ahead(model, x, model.signals.prepare(problem.w[:, k]))
         total.append(x[:, 3:])
     error = (torch.stack(total, dim=1) - problem.nu) * problem.weight
     return torch.sqrt(_window_cost(error) + problem.robust**2).mean()
 
 
-def _euler(model: HybridDynamics, x: Tensor, p: Tensor) -> Tensor:
-    # the sensitivities are those of this scheme; at the steps of logs its error is far below the model's
+def _ahead(model: HybridDynamics, x: Tensor, p: Tensor) -> Tensor:
+    """State one step later; of an Euler scheme with the mean yaw rate for the heading."""
+    if len(model.nodes) > 1:
+        return model.integrate(x, p, torch.zeros_like(x[:, :3]))
     nu = x[:, 3:] + model.dt * model.baseline(model.signals(x, p))
     psi = x[:, 2] + 0.5 * model.dt * (nu[:, 2] + x[:, 5])
     return torch.cat((x[:, :2], psi[:, None], nu), dim=-1)
+
+
+def _carried(model: HybridDynamics, baseline: ParametricBaseline, x: Tensor, p: Tensor, s: Tensor) -> Tensor:
+    """Sensitivities of (psi, u, v, r) to the parameters one step later, [B, 4, P], from s [B, 4, P] at the states x: the scheme's own derivative."""
+    change, total = torch.zeros_like(s), torch.zeros_like(s)
+    place = x
+    for node, weight in zip(model.nodes, model.weights, strict=True):
+        here = s + node * model.dt * change
+        if node > 0.0:
+            place = x + node * model.dt * model.rate(place, p, torch.zeros_like(x[:, :3]))
+        nu = _slopes(model, place, p) @ here + baseline.sensitivity(model.signals(place, p))
+        change = torch.cat((here[:, 3:], nu), dim=1)
+        total = total + weight * change
+    after = s + model.dt * total
+    if len(model.nodes) == 1:
+        after = torch.cat((s[:, :1] + 0.5 * model.dt * (after[:, 3:] + s[:, 3:]), after[:, 1:]), dim=1)
+    return after
 
 
 @torch.no_grad()
 def _normal_equations(model: HybridDynamics, problem: _Problem, baseline: ParametricBaseline, level: Tensor) -> tuple[Tensor, Tensor]:
     """Gauss-Newton Hessian [P, P] and half the gradient [P] of the robust cost."""
     batch, steps = problem.w.shape[:2]
-    count, dt = int(problem.active.numel()), model.dt
+    count = int(problem.active.numel())
     x = problem.x0
     sensitivity = torch.zeros(batch, 4, count, dtype=x.dtype)
     hessian = torch.zeros(batch, count, count, dtype=x.dtype)
@@ -217,13 +237,10 @@ def _normal_equations(model: HybridDynamics, problem: _Problem, baseline: Parame
     square = torch.zeros(batch, dtype=x.dtype)
     for k in range(steps):
         p = model.signals.prepare(problem.w[:, k])
-        change = dt * (_slopes(model, x, p) @ sensitivity + baseline.sensitivity(model.signals(x, p)))
-        moved = sensitivity[:, 1:] + change
-        heading = sensitivity[:, :1] + 0.5 * dt * (moved[:, 2:] + sensitivity[:, 3:])
-        sensitivity = torch.cat((heading, moved), dim=1)
-        x = _euler(model, x, p)
+        sensitivity = _carried(model, baseline, x, p, sensitivity)
+        x = _ahead(model, x, p)
         error = (x[:, 3:] - problem.nu[:, k]) * problem.weight[:, k]
-        seen = moved * problem.weight[:, k].unsqueeze(-1)
+        seen = sensitivity[:, 1:] * problem.weight[:, k].unsqueeze(-1)
         hessian += seen.transpose(1, 2) @ seen
         gradient += (seen * error.unsqueeze(-1)).sum(1)
         square += error.square().sum(1)

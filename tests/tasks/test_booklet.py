@@ -1,0 +1,108 @@
+"""The manoeuvring booklet of a fit, on simulated zigzags of the rudder boat whose own indices are known."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from tiny import call
+
+CONFIG = """
+task: fit
+name: booklet
+data:
+  kind: simulated
+  vessel: example_rudder_boat
+  seed: 1
+  trials:
+    - {kind: zigzag, count: 10, heading: [10 deg, 20 deg], drive: [0.6, 0.8]}
+  duration: 40 s
+  step: 0.2 s
+  noise: {u: 0.01, v: 0.01, r: 0.1 deg/s}
+  identification: {zigzag: 6}
+  validation: {zigzag: 2}
+prepare:
+  grid: {step: 0.2 s}
+  derivative: {kind: savitzky_golay, window: 1.4 s, order: 2}
+signals: {inputs: [n, delta]}
+integrator: heun
+baseline: {kind: regressors, ridge: 1.0e-6, sets: [fossen]}
+refit: {baseline: {horizon: 10 s, every: 10 s, iterations: 3}}
+evaluation:
+  protocols: {T10: {kind: windows, length: 10 s}}
+  selection: T10
+  scales: {u: 0.5, v: 0.2, r: 5 deg/s}
+booklet:
+  model: baseline
+  length: 6 m
+  scale: 4
+  inputs: {n: {drive: 20}, delta: {steer: 30 deg, rate: 20 deg/s}}
+  initial: {u: 4 m/s}
+  duration: 60 s
+  draws: 20
+  manoeuvres:
+    - {kind: turning_circle, name: circle, until: 360 deg, rudder: 25 deg, drive: 0.8, start: 0 s}
+    - {kind: zigzag, name: ten_ten, rudder: 10 deg, heading: 10 deg, drive: 0.8, start: 0 s, reversals: 2}
+"""
+
+
+def write(folder: Path, **changes: Any) -> Path:
+    config = yaml.safe_load(CONFIG)
+    config["booklet"] |= changes
+    path = folder / "booklet.yaml"
+    path.write_text(yaml.safe_dump(config))
+    return path
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("booklet")
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        assert call(monkeypatch, "run", write(folder), "--out", folder / "run") == 0
+    return folder / "run"
+
+
+def test_pages_hold_values_within_intervals_and_limits(run: Path) -> None:
+    booklet = json.loads((run / "booklet.json").read_text())
+    pages = {page["name"]: page for page in booklet["pages"]}
+    assert booklet["draws"] == 20
+    circle, zigzag = pages["circle"]["indices"], pages["ten_ten"]["indices"]
+    for found in (*circle.values(), *zigzag.values()):
+        low, high = found["interval"]
+        assert low <= high
+    assert circle["advance"]["interval"][0] < circle["advance"]["value"] < circle["advance"]["interval"][1]
+    assert circle["advance"]["lengths"] == pytest.approx(circle["advance"]["value"] / 6.0)
+    assert circle["advance"]["ship"] == pytest.approx(4.0 * circle["advance"]["value"])
+    assert circle["time_90"]["ship"] == pytest.approx(2.0 * circle["time_90"]["value"])
+    assert zigzag["initial_turning_distance"]["limit"] == pytest.approx(2.5 * 24.0)
+    assert zigzag["first_overshoot"]["kept"] in (True, False)
+
+
+def test_measured_zigzags_are_repeated(run: Path) -> None:
+    booklet = json.loads((run / "booklet.json").read_text())
+    repeated = [page for page in booklet["pages"] if page["split"]]
+    assert {page["split"] for page in repeated} == {"validation", "test"}
+    assert len(repeated) == 6
+    apart = [page["indices"]["first_overshoot"]["difference"] for page in repeated]
+    # the form of the model is nearly the plant's: what is left is noise
+    assert max(map(abs, apart)) < 0.05, apart
+
+
+def test_the_report_shows_it(run: Path) -> None:
+    text = (run / "report.html").read_text()
+    assert "Manoeuvring booklet" in text
+    assert "tactical diameter" in text
+    assert len(list((run / "figures").glob("*booklet*.png"))) == 3
+
+
+def test_the_model_must_have_been_refitted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    assert call(monkeypatch, "check", write(tmp_path, model="other")) == 2
+    assert "booklet.model: no refitted baseline is named 'other'" in capsys.readouterr().err
+
+
+def test_a_manoeuvre_that_does_not_end_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    assert call(monkeypatch, "run", write(tmp_path, duration="3 s"), "--out", tmp_path / "run") == 1
+    assert "circle: timed out after 2.8 s before a heading change of 360 deg; give more duration" in capsys.readouterr().err
