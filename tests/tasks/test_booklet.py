@@ -86,9 +86,11 @@ def test_measured_zigzags_are_repeated(run: Path) -> None:
     repeated = [page for page in booklet["pages"] if page["split"]]
     assert {page["split"] for page in repeated} == {"validation", "test"}
     assert len(repeated) == 6
-    apart = [page["indices"]["first_overshoot"]["difference"] for page in repeated]
-    # the form of the model is nearly the plant's: what is left is noise
-    assert max(map(abs, apart)) < 0.05, apart
+    for page in repeated:
+        found = page["indices"]
+        # the form of the model is nearly the plant's: what is left is within one sample's turning
+        assert abs(found["first_overshoot"]["difference"]) < 0.2 * found["largest_yaw_rate"]["measured"], page["name"]
+        assert found["first_overshoot"]["measured"] > 0.02
 
 
 def test_the_report_shows_it(run: Path) -> None:
