@@ -39,7 +39,7 @@ booklet:
   model: baseline
   length: 6 m
   scale: 4
-  inputs: {n: {drive: 20}, delta: {steer: 30 deg, rate: 20 deg/s}}
+  inputs: {n: {drive: 20}, delta: {steer: 30 deg, rate: 25 deg/s}}
   initial: {u: 4 m/s}
   duration: 60 s
   draws: 20
@@ -88,8 +88,9 @@ def test_measured_zigzags_are_repeated(run: Path) -> None:
     assert len(repeated) == 6
     for page in repeated:
         found = page["indices"]
-        # the form of the model is nearly the plant's: what is left is within one sample's turning
-        assert abs(found["first_overshoot"]["difference"]) < 0.2 * found["largest_yaw_rate"]["measured"], page["name"]
+        # the form of the model is nearly the plant's: what is left is within the turning of one sample
+        # and of the gear's response (0.2 s each), which a rate alone leaves out
+        assert abs(found["first_overshoot"]["difference"]) < 0.4 * found["largest_yaw_rate"]["measured"], page["name"]
         assert found["first_overshoot"]["measured"] > 0.02
 
 
