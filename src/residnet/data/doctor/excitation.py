@@ -109,7 +109,7 @@ def conditioning(columns: np.ndarray, names: Sequence[str]) -> tuple[float, list
     """Condition number of columns [N, k], centred and scaled, and the up to three names that move together most."""
     scaled = (columns - columns.mean(axis=0)) / np.maximum(columns.std(axis=0), np.finfo(float).tiny)
     _, singular, directions = np.linalg.svd(scaled, full_matrices=False)
-    condition = float(singular[0] / max(singular[-1], np.finfo(float).tiny))
+    condition = float(singular[0] / max(singular[-1], 1e-16 * singular[0], np.finfo(float).tiny))
     return condition, [names[i] for i in np.argsort(-np.abs(directions[-1]))[:3] if abs(directions[-1][i]) > 0.2]
 
 
