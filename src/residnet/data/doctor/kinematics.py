@@ -23,7 +23,7 @@ _SECTIONS = 20
 _MOST_CAUSES = 4
 # a cause must lower the sum of squares by this many variances of the noise, and be this many standard errors from nothing
 _WORTH = 60.0
-_SURE = 5.0
+_SURE = 3.5
 
 
 @dataclass(frozen=True)
