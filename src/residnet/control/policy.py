@@ -78,7 +78,7 @@ class HeadingPolicy(Policy):
         # errors per rad that full rudder answers, share of the rudder's braking that is counted on, relative damping, and how much less braking
         # is counted on while the rudder's effect is unknown; logarithms, since all are positive
         steep = 250.0 if rate is None else min(250.0, 2.0 / (self.swing**2 * turning.gain * limit / turning.time))
-        self.law = nn.Parameter(torch.tensor([steep, 0.98, 0.95, 0.2]).log())
+        self.law = nn.Parameter(torch.tensor([steep, 0.98, 0.92, 0.2]).log())
 
     def read_from(self, state: Sequence[str]) -> None:
         """Take heading, speed and yaw rate from a state with these names, for a vessel other than the one that it was trained on."""
