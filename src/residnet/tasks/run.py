@@ -26,7 +26,7 @@ from residnet.tasks.exporting import export_model
 from residnet.tasks.fit import FitConfig
 from residnet.tasks.goodness import write_goodness
 from residnet.tasks.inspection import write_inspection
-from residnet.tasks.pipeline import Fitted, Fitter, candidates, evaluate, prepare_logs, say, write_residuals
+from residnet.tasks.pipeline import Fitted, Fitter, PreparedSplits, candidates, evaluate, prepare_logs, say, write_residuals
 from residnet.tasks.reporting import report_run
 from residnet.tasks.terms import write_terms
 
@@ -50,6 +50,18 @@ def run_fit(config: FitConfig, *, source: Path, overrides: Sequence[str], out: P
     files = input_files(config.data)
     folder = RunFolder.create(out or Path("runs") / config.name, dump_config(config), resume=resume)
     folder.write_provenance(config=source, overrides=overrides, seed=config.seed, files=files, started=started)
+    logs = _prepared(config, folder)
+    fitter = Fitter(config, logs, folder)
+    fitted = _fitted(config, fitter)
+    _judged(config, folder, fitter, fitted, logs)
+    if report:
+        finish(folder, config)
+    folder.write_provenance(config=source, overrides=overrides, seed=config.seed, files=files, started=started)
+    return folder
+
+
+def _prepared(config: FitConfig, folder: RunFolder) -> PreparedSplits:
+    """Logs read, looked at by the doctor and prepared, through the water where they ran in currents."""
     say(f"{config.name}: reading logs")
     read = read_logs(config.data)
     write_inspection(folder, read, config)
@@ -60,7 +72,11 @@ def run_fit(config: FitConfig, *, source: Path, overrides: Sequence[str], out: P
         folder.write_json(folder.path / "currents.json", currents)
         say(f"  {summary(currents)}")
     write_data_quality(folder, logs)
-    fitter = Fitter(config, logs, folder)
+    return logs
+
+
+def _fitted(config: FitConfig, fitter: Fitter) -> list[Fitted]:
+    """Zero, baselines, heads and ensembles, in this order."""
     baselines = {name: fitter.baseline(name) for name in ("baseline", *config.baselines)}
     fitted = [fitter.zero(), *baselines.values()]
     for name, known in baselines.items():
@@ -74,6 +90,11 @@ def run_fit(config: FitConfig, *, source: Path, overrides: Sequence[str], out: P
     for name, members in config.ensembles.items():
         fitted.append(fitter.ensemble(name, [by_name[member] for member in members]))
         say(f"  {name}: validation free-run error {fitted[-1].notes['validation']:.4f}")
+    return fitted
+
+
+def _judged(config: FitConfig, folder: RunFolder, fitter: Fitter, fitted: Sequence[Fitted], logs: PreparedSplits) -> None:
+    """Free runs of all models, and everything that is written of them."""
     say("  free runs")
     models = candidates(fitted, config.data)
     table: list[dict[str, Any]] = []
@@ -81,18 +102,14 @@ def run_fit(config: FitConfig, *, source: Path, overrides: Sequence[str], out: P
     for split in config.evaluation.splits:
         found, limiting[split] = evaluate(models, logs[split], config.evaluation, config.prepare.grid.step, fitter.limit, folder)
         table += found
-    selected = select(table, fitted, config.evaluation.selection)
-    write_metrics(folder, config, table, selected)
+    write_metrics(folder, config, table, select(table, fitted, config.evaluation.selection))
     write_limits(folder, config, limiting, [log for split in config.evaluation.splits for log in logs[split]])
     write_residuals(folder.residuals, fitter, fitted, logs["test"])
     write_terms(folder.path / "terms.parquet", fitted, logs["test"])
     write_goodness(folder.goodness, config.name, fitted, logs, config.prepare.grid.step)
     if config.booklet is not None:
-        say("  " + write_booklet(folder, config.booklet, by_name[config.booklet.model], logs, fitter.limit))
-    if report:
-        finish(folder, config)
-    folder.write_provenance(config=source, overrides=overrides, seed=config.seed, files=files, started=started)
-    return folder
+        named = next(f for f in fitted if f.spec.name == config.booklet.model)
+        say("  " + write_booklet(folder, config.booklet, named, logs, fitter.limit))
 
 
 def select(table: Sequence[dict[str, Any]], fitted: Sequence[Fitted], protocol: str) -> str:
