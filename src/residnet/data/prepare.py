@@ -140,5 +140,3 @@ def envelope(logs: Sequence[Prepared]) -> tuple[np.ndarray, np.ndarray]:
     """Lowest and highest measured velocities and inputs, [3 + m] each, over the usable samples of logs."""
     joined = np.concatenate([np.concatenate((p.y[p.usable, 3:], p.w[p.usable]), axis=1) for p in logs])
     return joined.min(0), joined.max(0)
-
-

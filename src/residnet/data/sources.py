@@ -50,5 +50,3 @@ def input_files(config: MeasuredLogs | SimulatedTrials) -> list[Path]:
     if isinstance(config, SimulatedTrials):
         return []
     return [path for paths in config.split.resolve().values() for path in paths]
-
-
