@@ -309,11 +309,14 @@ def _composed(problem: _Problem, z: Array, turns: Sequence[Turn], step: float, b
 def _sampled(parts: Sequence[tuple[Array, Array, Array]], beyond: float, step: float) -> Course:
     track, heading, rudder = (np.concatenate([part[i] for part in parts]) for i in range(3))
     moved = np.hypot(*np.diff(track, axis=0).T)
-    distinct = np.concatenate(([True], moved > 1e-9))
+    # where parts meet, what the next one asks for holds
+    distinct = np.concatenate((moved > 1e-9, [True]))
     track, heading, rudder = track[distinct], heading[distinct], rudder[distinct]
     along = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(track, axis=0).T))))
     at = step * np.arange(math.floor(along[-1] / step) + 1)
     points = np.stack([np.interp(at, along, track[:, i]) for i in range(2)], axis=-1)
     direction = np.unwrap(np.arctan2(*np.gradient(points, axis=0).T[::-1]))
     direction += 2.0 * math.pi * round((heading[0] - direction[0]) / (2.0 * math.pi))
-    return Course(step, points, direction, np.interp(at, along, heading), np.interp(at, along, rudder), float(along[-1]) - beyond)
+    # a command stands until the next
+    held = rudder[np.searchsorted(along, at, side="right") - 1]
+    return Course(step, points, direction, np.interp(at, along, heading), held, float(along[-1]) - beyond)

@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 
 from residnet.control.base import Reference
+from residnet.control.line_of_sight import LineOfSight
 from residnet.core.errors import ConfigError
 
 
 @final
 class WaypointGuidance(Reference):
-    """Reference heading [B, 1] towards a point of the leg that lies a look-ahead distance before the vessel (T. I. Fossen, Handbook of
-    Marine Craft Hydrodynamics and Motion Control, section 12.3: psi_d = leg direction - atan(cross-track error / look-ahead)).
+    """Reference heading [B, 1]: the leg's direction and the angle by which a law of the line of sight steers back to it.
 
     The leg changes when the vessel enters the circle of acceptance of its way-point, or has passed it; behind the last it has arrived.
     Memory [B, 3]: number of the way-point that is steered for, and where the vessel began, which is the beginning of the first leg.
@@ -24,19 +24,17 @@ class WaypointGuidance(Reference):
     Args:
         points: way-points (north, east) in m, in their order.
         acceptance: radius of the circle in m.
-        lookahead: distance in m.
+        sight: law of the line of sight.
         state: names of the vessel's state.
     """
 
-    def __init__(self, points: Sequence[tuple[float, float]], acceptance: float, lookahead: float, state: Sequence[str]) -> None:
+    def __init__(self, points: Sequence[tuple[float, float]], acceptance: float, sight: LineOfSight, state: Sequence[str]) -> None:
         super().__init__()
-        if not points or acceptance <= 0 or lookahead <= 0:
-            raise ConfigError(
-                f"way-points: give at least one, acceptance and look-ahead above zero; given {len(points)}, {acceptance:g}, {lookahead:g}"
-            )
+        if not points or acceptance <= 0:
+            raise ConfigError(f"way-points: give at least one, and a circle of acceptance above zero; given {len(points)}, {acceptance:g} m")
         self.register_buffer("points", torch.tensor(points, dtype=torch.float64), persistent=False)
         self.points: Tensor
-        self.acceptance, self.lookahead = acceptance, lookahead
+        self.acceptance, self.sight = acceptance, sight
         self.x, self.y = state.index("x"), state.index("y")
         self.n_state = 3
         self.may_finish = True
@@ -64,7 +62,7 @@ class WaypointGuidance(Reference):
         reached = (ahead <= 0) | (ahead * ahead + error * error <= self.acceptance**2)
         number = (number + reached.long()).clamp(max=self.points.shape[0])
         direction, _, error = self.leg(x, number, s)
-        heading = direction - torch.atan(error / self.lookahead)
+        heading = direction + self.sight(error)
         return torch.remainder(heading + math.pi, 2.0 * math.pi).unsqueeze(-1) - math.pi, torch.cat(
             (number.to(x.dtype).unsqueeze(-1), s[:, 1:]), dim=-1
         )

@@ -12,6 +12,7 @@ from pydantic import Field
 from torch import Tensor
 
 from residnet.control.heading_pid import HeadingPID
+from residnet.control.line_of_sight import LookAhead
 from residnet.control.waypoints import WaypointGuidance
 from residnet.core.config import Metres, Seconds
 from residnet.core.log import Log
@@ -52,7 +53,7 @@ class Waypoints(Manoeuvre):
     def indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
         """Cross-track errors from the leg that was sailed, and the time that the course took."""
         x = torch.from_numpy(np.nan_to_num(log.stack(("x", "y"))))
-        guidance = WaypointGuidance(self.points, self.acceptance, self.lookahead, ("x", "y"))
+        guidance = WaypointGuidance(self.points, self.acceptance, LookAhead(self.lookahead), ("x", "y"))
         s = guidance.initial_state(x[:1])
         errors = []
         for k in range(len(log)):
@@ -76,7 +77,7 @@ class WaypointSource(Source):
         super().__init__()
         for name in ("x", "y", "psi", "r"):
             helm.column(name)
-        self.guidance = WaypointGuidance(manoeuvre.points, manoeuvre.acceptance, manoeuvre.lookahead, helm.state)
+        self.guidance = WaypointGuidance(manoeuvre.points, manoeuvre.acceptance, LookAhead(manoeuvre.lookahead), helm.state)
         self.autopilot = HeadingPID(helm.state, kp=manoeuvre.gain, kd=manoeuvre.rate_gain, limit=1.0)
         self.drive = manoeuvre.drive
         self.demand = helm.demand

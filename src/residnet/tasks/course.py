@@ -5,12 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from residnet.control.controllers import AnyController
 from residnet.control.courses import BuoyCourseConfig, Protocol
+from residnet.control.line_of_sight import AnyLineOfSight
 from residnet.core.config import Config, ExistingPath, Seconds, dump_config
 from residnet.run_folder import RunFolder
 
@@ -30,7 +31,8 @@ class CourseTaskConfig(Config):
         others: further controllers, for example the document's law with another horizon.
         course: see there.
         protocols: that are flown.
-        line_of_sight: also without a plan: the heading of the line of sight to each way-point's leg, as the source did it.
+        line_of_sight: laws that are also flown without a plan, on straight legs from way-point to way-point, as the source did it; for the
+            protocol `enter`.
         dt: step of simulation and controllers.
         duration: after which a flight that has not ended is given up.
         safe: what the exported policy commands while its inputs are wrong: the last good command, or rudder amidships.
@@ -46,10 +48,17 @@ class CourseTaskConfig(Config):
     others: dict[_Name, AnyController] = Field(default_factory=dict)
     course: BuoyCourseConfig
     protocols: tuple[Protocol, ...] = Field(default=("enter", "sides"), min_length=1)
-    line_of_sight: bool = True
+    line_of_sight: tuple[AnyLineOfSight, ...] = ()
     dt: Seconds = Field(default=0.02, gt=0)
     duration: Seconds = Field(gt=0)
     safe: Literal["hold", "amidships"] = "amidships"
+
+    @model_validator(mode="after")
+    def _laws_differ(self) -> Self:
+        kinds = [law.kind for law in self.line_of_sight]
+        if len(set(kinds)) < len(kinds):
+            raise ValueError(f"line_of_sight: each kind once, given {', '.join(kinds)}")
+        return self
 
     def check(self) -> None:
         """The autopilot's run folder or config.

@@ -16,6 +16,7 @@ from residnet.control.controllers import AnyController, Steering
 from residnet.control.course_guidance import CourseGuidance
 from residnet.control.courses import PlannedCourse, plan_course, report_feasibility, smallest_turn
 from residnet.control.following import Following
+from residnet.control.line_of_sight import AnyLineOfSight
 from residnet.control.policy import HeadingPolicy
 from residnet.control.steering import SteeredPlant
 from residnet.control.turning import Turning
@@ -87,8 +88,9 @@ def run_course(config: CourseTaskConfig, folder: RunFolder, *, resume: bool) -> 
         say(f"{protocol}: planned {planned.course.length:.1f} m, shortest possible {planned.floor:.1f} m")
         plans.append(_plan_table(planned))
         for name, (kind, law) in controllers.items():
-            for guidance in ("course", "line_of_sight") if config.line_of_sight and protocol == "enter" else ("course",):
-                flight = fly_course(config, planned, steering, law.double(), guidance)
+            for sight in (None, *(config.line_of_sight if protocol == "enter" else ())):
+                flight = fly_course(config, planned, steering, law.double(), sight)
+                guidance = "course" if sight is None else sight.kind
                 rows.append(row(name, kind, guidance, planned, flight, config.course.acceptance, steering.turning.speed))
                 tracks.append(_track_table(name, guidance, protocol, flight))
         _export(config, folder, planned, steering, trained, autopilot, [entry for entry in rows if entry["protocol"] == protocol])
@@ -145,15 +147,15 @@ def load_policy(run: Path, name: str, steering: Steering) -> HeadingPolicy:
     return policy.eval().requires_grad_(False).double()
 
 
-def fly_course(config: CourseTaskConfig, planned: PlannedCourse, steering: Steering, law: Policy, guidance: str) -> CourseFlight:
-    """One flight of the nominal vessel from the plan's first point and heading."""
+def fly_course(config: CourseTaskConfig, planned: PlannedCourse, steering: Steering, law: Policy, sight: AnyLineOfSight | None) -> CourseFlight:
+    """One flight of the nominal vessel from the plan's first point and heading; under a line of sight on the legs from buoy to buoy instead."""
     vessel, wanted = steering.vessel, config.course
     plan = CourseGuidance(planned.course, wanted.lookahead, vessel.state)
     reference: Reference = plan
     policy: Policy = Following(law, vessel.state, limit=steering.limit, dt=config.dt, rate=vessel.rate)
-    if guidance == "line_of_sight":
+    if sight is not None:
         points = [(buoy.north, buoy.east) for buoy in planned.buoys]
-        reference, policy = WaypointGuidance(points, wanted.acceptance, wanted.lookahead, vessel.state), law
+        reference, policy = WaypointGuidance(points, wanted.acceptance, sight.build(), vessel.state), law
     x, w = vessel.start(torch.ones(1, dtype=torch.float64))
     place = [vessel.column("x"), vessel.column("y")]
     x[:, place] = torch.tensor([wanted.start], dtype=torch.float64)

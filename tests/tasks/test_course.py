@@ -1,0 +1,109 @@
+"""The task `course` from config to report and export: two way-points, flown by a hardly trained policy, a PD and the document's law."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+import yaml
+from tiny import call
+
+AUTOPILOT: dict[str, Any] = {
+    "task": "autopilot",
+    "name": "small",
+    "vessel": "nomoto_oceanos",
+    "rudder": "5 deg",
+    "turning_time": "40 s",
+    "test": {"dt": "0.1 s", "duration": "8 s", "plants": 1, "bias_time": "10 s"},
+    "policies": {
+        "policy": {"hidden": [6], "training": {"epochs": 1, "steps": 1, "batch": 16, "dt": "0.1 s", "horizon": "4 s", "learning_rate": 1e-3}}
+    },
+    "peers": {"pd": {"kind": "pd"}, "bang_bang": {"kind": "bang_bang"}},
+    "floor": "bang_bang",
+    "tuning_points": 16,
+}
+COURSE: dict[str, Any] = {
+    "task": "course",
+    "name": "bend",
+    "autopilot": "autopilot.yaml",
+    "peers": ["pd"],
+    "others": {"document": {"kind": "document", "horizon": "2 s"}},
+    "course": {
+        "buoys": [
+            {"north": 50.0, "east": 30.0, "leave_to": "port", "radius": 10.0},
+            {"north": 100.0, "east": 20.0, "leave_to": "starboard", "radius": 12.0},
+        ],
+        "acceptance": 4.0,
+        "lookahead": 10.0,
+    },
+    "line_of_sight": [{"kind": "lookahead", "distance": 10.0}, {"kind": "enclosure", "radius": 12.0}],
+    "dt": "0.1 s",
+    "duration": "60 s",
+}
+FLIGHTS = {("enter", "course"), ("enter", "lookahead"), ("enter", "enclosure"), ("sides", "course")}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("course")
+    (folder / "autopilot.yaml").write_text(yaml.safe_dump(AUTOPILOT))
+    config = folder / "course.yaml"
+    config.write_text(yaml.safe_dump(COURSE))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        assert call(patch, "run", config, "--out", folder / "run") == 0
+    return folder / "run"
+
+
+def metrics(run: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((run / "metrics.json").read_text())
+    return found
+
+
+def test_every_controller_flies_every_protocol_and_guidance(run: Path) -> None:
+    rows = metrics(run)["rows"]
+    assert {(row["model"], row["protocol"], row["guidance"]) for row in rows} == {
+        (name, *flight) for name in ("policy", "pd", "document") for flight in FLIGHTS
+    }
+    assert len(rows) == 12
+
+
+def test_the_tuned_pd_passes_as_asked(run: Path) -> None:
+    """Against the straight lines between the points, which no course through circles of 4 m can cut by more than 16 m."""
+    own = {(row["protocol"], row["guidance"]): row for row in metrics(run)["rows"] if row["model"] == "pd"}
+    straight = math.hypot(50.0, 30.0) + math.hypot(50.0, 10.0)
+    assert own[("enter", "course")]["finished"]
+    assert own[("enter", "course")]["entered"] == own[("enter", "enclosure")]["entered"] == 2
+    assert own[("sides", "course")]["right_side"] == own[("sides", "course")]["clear"] == 2
+    assert straight - 4 * 4 < own[("enter", "course")]["course_time"] * metrics(run)["speed"] < straight
+
+
+def test_an_impossible_radius_is_reported_with_the_smallest(run: Path) -> None:
+    """Nomoto's vessel turns with U / (K delta)."""
+    found = metrics(run)
+    smallest = found["speed"] / (3.47 * math.radians(5))
+    assert [one["possible"] for one in found["feasibility"]] == [False, True]
+    assert found["feasibility"][0]["smallest"] == pytest.approx(smallest, rel=1e-3)
+
+
+def test_the_tracks_say_what_the_rows_say(run: Path) -> None:
+    tracks = pd.read_parquet(run / "tracks.parquet")
+    for row in metrics(run)["rows"]:
+        own = tracks[(tracks["controller"] == row["model"]) & (tracks["protocol"] == row["protocol"]) & (tracks["guidance"] == row["guidance"])]
+        assert own["t"].iloc[-1] == pytest.approx(row["course_time"], abs=0.11)
+        assert np.sqrt((own["cross_track"] ** 2).mean()) == pytest.approx(row["cross_track_rms"], rel=1e-6)
+        away = np.hypot(own["north"] - 100.0, own["east"] - 20.0).min()
+        assert away == pytest.approx(row["distances"][1], abs=1e-6)
+
+
+def test_report_and_exports_are_there(run: Path) -> None:
+    report = (run / "report.html").read_text()
+    assert "enclosure" in report and "10.57" in report
+    for protocol in ("enter", "sides"):
+        torch.jit.load(str(run / "exports" / f"policy_{protocol}.pt"))
