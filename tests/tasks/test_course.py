@@ -104,6 +104,7 @@ def test_the_tracks_say_what_the_rows_say(run: Path) -> None:
 
 def test_report_and_exports_are_there(run: Path) -> None:
     report = (run / "report.html").read_text()
-    assert "enclosure" in report and "10.57" in report
+    assert "enclosure" in report
+    assert "10.57" in report
     for protocol in ("enter", "sides"):
         torch.jit.load(str(run / "exports" / f"policy_{protocol}.pt"))
