@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import copy
-import json
 import math
 import time
-import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -17,6 +15,7 @@ from torch import Tensor, nn
 from residnet import __version__
 from residnet.control.policy import MEMORY, HeadingPolicy
 from residnet.core.errors import ExportError
+from residnet.export.scripting import write_scripted
 
 MEASURED = ("psi", "u", "r")
 """What an exported policy sees: heading [rad], speed [m/s], yaw rate [rad/s]."""
@@ -115,19 +114,13 @@ def export_autopilot(
         ExportError: where the exported module does not reproduce the policy, or a wrong input brings a command that is no number.
     """
     module = for_export(policy, safe)
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", category=DeprecationWarning)
-        warnings.filterwarnings("ignore", category=FutureWarning)
-        warnings.filterwarnings("ignore", message=".*torch.jit.*")
-        scripted = torch.jit.freeze(torch.jit.script(module), preserved_attrs=_METHODS)
-        parity = check_parity(name, module, scripted)
-        card = _card(name, module, safe, parity, about, metrics)
-        file.parent.mkdir(parents=True, exist_ok=True)
-        partial = file.with_name(file.name + ".partial")
-        torch.jit.save(scripted, str(partial), _extra_files={"card.json": json.dumps(card, indent=1)})
-        check_parity(name, module, torch.jit.load(str(partial)))
-        partial.replace(file)
-    return card
+    return write_scripted(
+        file,
+        module,
+        _METHODS,
+        lambda exported: check_parity(name, module, exported),
+        lambda parity: _card(name, module, safe, parity, about, metrics),
+    )
 
 
 def check_parity(name: str, module: ExportedPolicy, exported: Any) -> float:

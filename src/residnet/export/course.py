@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import copy
-import json
 import math
 import time
-import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -20,6 +18,7 @@ from residnet.control.course_plan import Course
 from residnet.control.following import Following
 from residnet.control.policy import HeadingPolicy
 from residnet.core.errors import ExportError
+from residnet.export.scripting import write_scripted
 
 MEASURED = ("x", "y", "psi", "u", "v", "r")
 """What the exported module sees: north and east [m], heading [rad], surge and sway velocity [m/s], yaw rate [rad/s]."""
@@ -119,19 +118,13 @@ def export_course(
         ExportError: where the exported module does not reproduce the policy and the guidance, or a wrong input brings a command that is no number.
     """
     module = ExportedCourse(policy, guidance, safe).eval()
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", category=DeprecationWarning)
-        warnings.filterwarnings("ignore", category=FutureWarning)
-        warnings.filterwarnings("ignore", message=".*torch.jit.*")
-        scripted = torch.jit.freeze(torch.jit.script(module), preserved_attrs=_METHODS)
-        parity = check_parity(name, module, scripted, course)
-        card = _card(name, module, policy, course, safe, parity, about, metrics)
-        file.parent.mkdir(parents=True, exist_ok=True)
-        partial = file.with_name(file.name + ".partial")
-        torch.jit.save(scripted, str(partial), _extra_files={"card.json": json.dumps(card, indent=1)})
-        check_parity(name, module, torch.jit.load(str(partial)), course)
-        partial.replace(file)
-    return card
+    return write_scripted(
+        file,
+        module,
+        _METHODS,
+        lambda exported: check_parity(name, module, exported, course),
+        lambda parity: _card(name, module, policy, course, safe, parity, about, metrics),
+    )
 
 
 def check_parity(name: str, module: ExportedCourse, exported: Any, course: Course) -> float:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, final
@@ -14,6 +12,7 @@ from torch import Tensor, nn
 from residnet.core.errors import ExportError, UsageError
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
+from residnet.export.scripting import write_scripted
 from residnet.heads import ForceHead
 from residnet.physics.force_model import MOTION
 from residnet.physics.signals import FORCE_CHANNELS
@@ -63,17 +62,21 @@ def export_feed_forward(model: nn.Module, lag: dict[str, float] | None, ranges: 
     Raises:
         ExportError: where the exported module differs from the model.
     """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        scripted: Any = torch.jit.freeze(torch.jit.script(model.eval()))
+    model = model.eval()
+
+    def check(exported: Any) -> float:
+        """Largest difference at random motions within the training ranges, as a share of each force's range."""
         low, high = torch.tensor(ranges, dtype=torch.float64).T
         motion = low + torch.rand(200, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * (high - low)
         with torch.no_grad():
-            mine, theirs = model(motion[:, :3], motion[:, 3:]), scripted(motion[:, :3], motion[:, 3:])
+            mine, theirs = model(motion[:, :3], motion[:, 3:]), exported(motion[:, :3], motion[:, 3:])
         share = float(((mine - theirs).abs().amax(0) / (mine.amax(0) - mine.amin(0))).max())
         if not share < 1e-9:
             raise ExportError(f"{file.name}: the exported feed-forward differs from the model by {share:.1e} of its range; allowed 1e-9")
-        card = {
+        return share
+
+    def card(share: float) -> dict[str, Any]:
+        return {
             "schema": "residnet.feed_forward/1",
             "arguments": {"nu_dot": ["u_dot m/s^2", "v_dot m/s^2", "r_dot rad/s^2"], "nu": ["u m/s", "v m/s", "r rad/s"]},
             "returns": ["tau_x N", "tau_y N", "tau_n N m"],
@@ -82,5 +85,5 @@ def export_feed_forward(model: nn.Module, lag: dict[str, float] | None, ranges: 
             "parity_share_of_range": share,
             "safety": "TorchScript is code that runs when loaded: load only files that you trust.",
         }
-        file.parent.mkdir(parents=True, exist_ok=True)
-        torch.jit.save(scripted, str(file), _extra_files={"card.json": json.dumps(card, indent=1)})
+
+    write_scripted(file, model, (), check, card)

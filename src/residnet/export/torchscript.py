@@ -6,9 +6,7 @@ is code: load only files that you trust.
 
 from __future__ import annotations
 
-import json
 import time
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -22,6 +20,7 @@ from residnet.core.names import STATE
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.store import ModelSpec
+from residnet.export.scripting import write_scripted
 
 PARITY_STEPS = 1000
 PARITY_TOLERANCE = 1e-5
@@ -84,20 +83,13 @@ def export_torchscript(spec: ModelSpec, model: HybridDynamics, file: Path, metri
         ExportError: where the exported module does not reproduce the model.
     """
     model = model.to(torch.float32).eval().requires_grad_(False)
-    with warnings.catch_warnings():
-        # TorchScript still works in torch 2.13 but announces its end; this file is the only place that depends on it
-        warnings.filterwarnings("ignore", category=DeprecationWarning)
-        warnings.filterwarnings("ignore", category=FutureWarning)
-        warnings.filterwarnings("ignore", message=".*torch.jit.*")
-        scripted = torch.jit.freeze(torch.jit.script(ExportedModel(model, spec).eval()), preserved_attrs=_METHODS)
-        parity = check_parity(spec, model, scripted)
-        card = make_card(spec, model, metrics, parity)
-        file.parent.mkdir(parents=True, exist_ok=True)
-        partial = file.with_name(file.name + ".partial")
-        torch.jit.save(scripted, str(partial), _extra_files={"card.json": json.dumps(card, indent=1)})
-        check_parity(spec, model, torch.jit.load(str(partial)))
-        partial.replace(file)
-    return card
+    return write_scripted(
+        file,
+        ExportedModel(model, spec).eval(),
+        _METHODS,
+        lambda exported: check_parity(spec, model, exported),
+        lambda parity: make_card(spec, model, metrics, parity),
+    )
 
 
 def check_parity(spec: ModelSpec, model: HybridDynamics, exported: Any) -> dict[str, float]:
