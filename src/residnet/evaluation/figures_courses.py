@@ -48,7 +48,7 @@ def draw_tracks(
     with matplotlib.rc_context(RC):
         figure = new_figure(6.6)
         axes = figure.subplots()
-        axes.plot(plan["east"], plan["north"], color="0.75", linewidth=4.0, label="plan", zorder=1)
+        axes.plot(plan["east"], plan["north"], color="0.75", linewidth=6.0, label="plan", zorder=1)
         flights = tracks[["controller", "guidance"]].drop_duplicates().itertuples(index=False)
         for place, (controller, guidance) in enumerate(flights):
             own = tracks[(tracks["controller"] == controller) & (tracks["guidance"] == guidance)]
@@ -57,7 +57,8 @@ def draw_tracks(
                 own["north"],
                 color=_COLOURS[place % len(_COLOURS)],
                 linestyle=_LINES[guidance],
-                linewidth=1.2,
+                # flights that coincide show beside each other
+                linewidth=max(3.2 - 0.9 * place, 1.0),
                 label=_label(controller, guidance),
                 zorder=3,
             )
