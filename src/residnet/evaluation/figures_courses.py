@@ -16,6 +16,7 @@ _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#
 _LINES: dict[str, Any] = {"course": "-", "lookahead": (0, (4, 1.5)), "enclosure": (0, (1, 1))}
 _WORDS = {"course": "", "lookahead": ", look-ahead", "enclosure": ", enclosure"}
 _DEG = 180.0 / math.pi
+_AROUND = 0.3
 
 
 def _label(controller: str, guidance: str) -> str:
@@ -50,7 +51,9 @@ def draw_tracks(
         axes = figure.subplots()
         axes.plot(plan["east"], plan["north"], color="0.75", linewidth=6.0, label="plan", zorder=1)
         flights = tracks[["controller", "guidance"]].drop_duplicates().itertuples(index=False)
-        for place, (controller, guidance) in enumerate(flights):
+        controllers = tracks["controller"].drop_duplicates().tolist()
+        for controller, guidance in flights:
+            place = controllers.index(controller)
             own = tracks[(tracks["controller"] == controller) & (tracks["guidance"] == guidance)]
             axes.plot(
                 own["east"],
@@ -62,6 +65,7 @@ def draw_tracks(
                 label=_label(controller, guidance),
                 zorder=3,
             )
+        _frame(axes, plan)
         for number, (buoy, radius) in enumerate(zip(buoys, radii, strict=True), start=1):
             axes.add_patch(Circle((buoy["east"], buoy["north"]), radius, facecolor="0.93", edgecolor="0.45", linestyle=":", linewidth=0.9, zorder=0))
             axes.plot(buoy["east"], buoy["north"], "o", color="black", markersize=3.5, zorder=4)
@@ -74,7 +78,15 @@ def draw_tracks(
         collect(handles, axes)
         legend_above(figure, handles)
         caption = f"{text} S and P: the side that a buoy is left on; dotted: circles of the buoys; triangle: start."
+        caption += " A track that leaves the picture has lost the course."
         save(figure, path, "Tracks: " + text.rstrip("."), caption)
+
+
+def _frame(axes: Any, plan: pd.DataFrame) -> None:
+    """The plan and a third of its size around it: what leaves this has lost the course."""
+    edge = _AROUND * max(float(np.ptp(plan["north"])), float(np.ptp(plan["east"])))
+    axes.set_xlim(float(plan["east"].min()) - edge, float(plan["east"].max()) + edge)
+    axes.set_ylim(float(plan["north"].min()) - edge, float(plan["north"].max()) + edge)
 
 
 def draw_histories(path: Path, tracks: pd.DataFrame, limit: float, text: str) -> None:
