@@ -53,3 +53,19 @@ def test_other_manoeuvres_are_refused() -> None:
     against = log.replace(channels={"psi": -log["psi"], "delta": log["delta"]})
     with pytest.raises(DataError, match="sign of delta"):
         steered_zigzag(against, "delta")
+
+
+@pytest.mark.parametrize("every", [1, 2, 3])
+def test_where_the_rudder_left_does_not_hang_on_the_grid(every: int) -> None:
+    """The order of the closed form: the rudder of the made zigzag leaves at the very sample that is the first beyond the heading."""
+    log = zigzag_log(math.radians(20), math.radians(10), 1.0)
+    t, psi, delta = log.t, log["psi"] - log["psi"][0], log["delta"]
+    turns = [k for k in range(60, t.size - 1) if abs(delta[k]) == pytest.approx(math.radians(20)) and abs(delta[k + 1]) < abs(delta[k]) - 1e-6]
+    expected = float(np.mean(np.abs(psi[turns])))
+    assert len(turns) > 2
+    coarse = log.replace(t=t[::every], channels={name: log[name][::every] for name in ("psi", "delta")})
+    assert math.degrees(steered_zigzag(coarse, "delta").leaves) == pytest.approx(math.degrees(expected), abs=0.03)
+    rates = np.abs(np.gradient(psi, t))[turns]
+    assert steered_zigzag(coarse, "delta").turning == pytest.approx(float(rates.mean()), rel=0.02)
+    if every == 1:
+        assert steered_zigzag(coarse, "delta").leaves > steered_zigzag(coarse, "delta").heading

@@ -52,8 +52,11 @@ def write_booklet(folder: RunFolder, config: BookletConfig, fitted: Fitted, logs
         craft = _craft(config, fitted, shares)
         craft = replace(craft, start=torch.cat([_began(craft, log) for log, _ in repeated]))
         zigzags = [_like(config, shares, log) for log, _ in repeated]
-        for (log, split), flights in zip(repeated, _flown(craft, config, fitted, zigzags), strict=True):
-            pages.append(_page(craft, config, flights, limit, (log, split)))
+        flown = _flown(
+            craft, config, fitted, [_acted(config, zigzag, log, craft.dynamics.dt) for zigzag, (log, _) in zip(zigzags, repeated, strict=True)]
+        )
+        for measured, zigzag, flights in zip(repeated, zigzags, flown, strict=True):
+            pages.append(_page(craft, config, [replace(flight, manoeuvre=zigzag) for flight in flights], limit, measured))
     folder.write_json(folder.booklet, contents(config.model, config.length, config.scale, config.draws, config.level, pages))
     pd.concat([_frame(page, config.rudder()) for page in pages]).to_parquet(folder.booklet.with_suffix(".parquet"), index=False)
     return f"booklet: {len(config.manoeuvres)} manoeuvres, {len(repeated)} measured zigzags repeated, {config.draws} draws each"
@@ -137,6 +140,15 @@ def _like(config: BookletConfig, shares: Mapping[str, InputShare], log: Log) -> 
         start=steered.start,
         duration=float(log.t[-1] - log.t[0]),
     )
+
+
+def _acted(config: BookletConfig, zigzag: Zigzag, log: Log, step: float) -> Zigzag:
+    """The zigzag with reversals where the rudder of the log left its side: the gear moves at once, the trial's did after its order took effect.
+
+    A bound on the heading is seen at the next step, on average half a step of `step` seconds late.
+    """
+    steered = steered_zigzag(log, config.rudder())
+    return zigzag.model_copy(update={"heading": steered.leaves - 0.5 * step * steered.turning})
 
 
 def sound(flight: Flight, limit: np.ndarray) -> bool:
