@@ -22,7 +22,9 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.heads import ZeroHead
 from residnet.physics.signals import SignalsConfig
 from residnet.training import refit as module
+from residnet.training.offsets import Offsets, OffsetsConfig
 from residnet.training.refit import RefitConfig, refit
+from residnet.training.sensitivities import ahead
 
 
 def fitted(terms: Sequence[str], logs: Sequence[Prepared]) -> tuple[HybridDynamics, Samples, WindowStore]:
@@ -103,33 +105,63 @@ def windy() -> tuple[HybridDynamics, module._Problem]:
         belief=torch.from_numpy(random.uniform(0, 50, size=count)),
         count=7.0,
         robust=0.05,
+        log=torch.tensor([0, 0, 1, 3, 3]),
+        speed=0.4,
     )
     return model, problem
+
+
+def offsets_of(value: float) -> Offsets:
+    """Of four logs, one of which has no window."""
+    begun = Offsets.begin(OffsetsConfig(u=0.02, r=0.01), 4, SCALES, 0.4)
+    return begun.moved(value * torch.from_numpy(np.random.default_rng(8).normal(size=(4, 2))))
+
+
+NONE = Offsets.begin(None, 4, SCALES, 0.4)
 
 
 LEVEL = torch.tensor(0.3, dtype=torch.float64)
 
 
-def with_step(model: HybridDynamics, problem: module._Problem, place: int, step: float) -> float:
+def with_step(model: HybridDynamics, problem: module._Problem, place: int, step: float, offsets: Offsets = NONE) -> float:
     """Cost with one coefficient moved."""
     other = copy.deepcopy(model)
     assert isinstance(other.baseline, RegressorBaseline)
     with torch.no_grad():
         other.baseline.theta.view(-1)[problem.active[place]] += step
-    return float(module._level(other, problem) + module._prior_cost(problem, other.baseline, problem.share(LEVEL)))
+    return float(module._level(other, problem, offsets) + module._prior_cost(problem, other.baseline, problem.share(LEVEL), offsets))
 
 
 def test_normal_equations_hold_half_the_gradient_of_the_cost() -> None:
     """With m the mean square error of a window, d sqrt(m + c^2) = dm / (2 sqrt(m + c^2)); the prior's d (t'Pt) = 2 P t: half of both is returned."""
     model, problem = windy()
     assert isinstance(model.baseline, RegressorBaseline)
-    hessian, gradient = module._normal_equations(model, problem, model.baseline, LEVEL)
+    arrow = module._normal_equations(model, problem, model.baseline, LEVEL, NONE)
+    hessian, gradient = arrow.shared, arrow.gradient
     step = 1e-5
     central = [(with_step(model, problem, i, step) - with_step(model, problem, i, -step)) / (2 * step) for i in range(len(gradient))]
     torch.testing.assert_close(2.0 * gradient, torch.tensor(central, dtype=torch.float64), rtol=1e-6, atol=1e-8)
     assert float(gradient.abs().min()) > 1e-4, "every coefficient is seen"
     torch.testing.assert_close(hessian, hessian.T)
     assert float(torch.linalg.eigvalsh(hessian)[0]) > 0
+
+
+def test_normal_equations_hold_the_gradient_and_the_curvature_of_offsets() -> None:
+    model, problem = windy()
+    assert isinstance(model.baseline, RegressorBaseline)
+    offsets = offsets_of(0.03)
+    share = problem.share(LEVEL)
+    arrow = module._normal_equations(model, problem, model.baseline, LEVEL, offsets)
+    assert float(arrow.own[2].abs().max()) == 0.0, "a log without a window says nothing"
+    believing, step = arrow.believing(offsets, share), 1e-5
+    for log in range(4):
+        for axis in range(2):
+            one = torch.zeros(4, 2, dtype=torch.float64)
+            one[log, axis] = step
+            central = (with_step(model, problem, 0, 0.0, offsets.moved(-one)) - with_step(model, problem, 0, 0.0, offsets.moved(one))) / (2 * step)
+            assert 2.0 * float(believing.slope[log, axis]) == pytest.approx(central, rel=1e-6, abs=1e-8)
+    central = [(with_step(model, problem, i, step, offsets) - with_step(model, problem, i, -step, offsets)) / (2 * step) for i in range(3)]
+    torch.testing.assert_close(2.0 * believing.gradient[:3], torch.tensor(central, dtype=torch.float64), rtol=1e-6, atol=1e-8)
 
 
 def test_hessian_is_half_that_of_the_cost_where_the_errors_vanish() -> None:
@@ -139,7 +171,7 @@ def test_hessian_is_half_that_of_the_cost_where_the_errors_vanish() -> None:
     x, exact = problem.x0, []
     with torch.no_grad():
         for k in range(problem.w.shape[1]):
-            x = module._ahead(model, x, model.signals.prepare(problem.w[:, k]))
+            x = ahead(model, x, model.signals.prepare(problem.w[:, k]))
             exact.append(x[:, 3:])
     fields = {
         **vars(problem),
@@ -149,7 +181,8 @@ def test_hessian_is_half_that_of_the_cost_where_the_errors_vanish() -> None:
         "belief": 0 * problem.belief,
     }
     perfect = module._Problem(**fields)
-    hessian, gradient = module._normal_equations(model, perfect, model.baseline, LEVEL)
+    arrow = module._normal_equations(model, perfect, model.baseline, LEVEL, NONE)
+    hessian, gradient = arrow.shared, arrow.gradient
     torch.testing.assert_close(gradient, torch.zeros_like(gradient), rtol=0, atol=1e-14)
     step = 3e-6
     centre = with_step(model, perfect, 0, 0.0)

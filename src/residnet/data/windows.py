@@ -26,6 +26,7 @@ class WindowStore:
         good: samples whose derivative may be learned from [N].
         reach: samples from here to the end of the stretch, itself included, [N]; 0 where there is none.
         depth: samples since the stretch began, [N].
+        log: number of the log, in the order gathered, [N].
     """
 
     y: Tensor
@@ -36,6 +37,7 @@ class WindowStore:
     good: Tensor
     reach: Tensor
     depth: Tensor
+    log: Tensor
 
     @classmethod
     def gather(cls, logs: Sequence[Prepared], dtype: torch.dtype = torch.float32) -> WindowStore:
@@ -63,6 +65,7 @@ class WindowStore:
             flags([p.good for p in logs]),
             torch.from_numpy(reach),
             torch.from_numpy(depth),
+            torch.from_numpy(np.repeat(np.arange(len(logs)), [len(p) for p in logs])),
         )
 
     def starts(self, length: int, share: float = 0.5) -> Tensor:

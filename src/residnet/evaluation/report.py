@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from residnet.evaluation import report_booklet, report_doctor, report_equations, report_goodness, report_limits
+from residnet.evaluation import report_booklet, report_doctor, report_equations, report_goodness, report_limits, report_offsets
 from residnet.evaluation import report_tables as tables
 from residnet.evaluation.figures import FigureFile, read_figures
 from residnet.evaluation.report_text import cautions, fitted_on, verdict
@@ -87,7 +87,15 @@ def _context(run: RunFiles, findings: Sequence[Finding], figures: Sequence[Figur
 def _coefficients(run: RunFiles) -> list[dict[str, Any]]:
     """Tables of identified coefficients, the first baseline's first."""
     names = [run.baseline or "baseline", *(model for model, kind in run.kinds.items() if kind == "further")]
-    found = [{"name": name, "table": tables.baseline_parameters(run, name), "refitted": bool(run.fit(name).get("refit"))} for name in names]
+    found = [
+        {
+            "name": name,
+            "table": tables.baseline_parameters(run, name),
+            "refitted": bool(run.fit(name).get("refit")),
+            "offsets": report_offsets.section(run, name),
+        }
+        for name in names
+    ]
     return [entry for entry in found if entry["table"] is not None]
 
 

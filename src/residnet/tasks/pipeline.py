@@ -171,6 +171,8 @@ class Fitter:
             refitted = refit(model, self.samples, WindowStore.gather(self.train, torch.float64), self.config.refit[name], scales)
             assert isinstance(model.baseline, ParametricBaseline)
             notes["refit"], covariance = refitted.notes, refitted.covariance
+            if refitted.offsets.axes:
+                notes["offsets"] = refitted.offsets.table([p.log.name for p in self.train])
             table = model.baseline.restated(table, refitted.errors)
         notes |= {"coefficients": [_row(entry) for entry in table], "validation": self.bench(model)}
         notes["seconds"] = round(time.perf_counter() - started, 1)

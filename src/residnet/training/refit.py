@@ -7,7 +7,7 @@ free runs do not see stay where the derivatives put them; a baseline that holds 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -20,6 +20,8 @@ from residnet.core.errors import FitError
 from residnet.core.samples import Samples
 from residnet.data.windows import WindowStore
 from residnet.dynamics.hybrid import HybridDynamics
+from residnet.training.offsets import Arrow, Offsets, OffsetsConfig, with_spread
+from residnet.training.sensitivities import Shifted, ahead, carried
 
 
 class RefitConfig(Config):
@@ -33,6 +35,8 @@ class RefitConfig(Config):
         robust: windows whose error (in units of the scales) is far above this count by their error and not by its square.
         correlation: time over which errors of a free run hang together; the logs hold so many independent errors, which says how much beliefs
             weigh beside them, and how large the standard errors are.
+        offsets: accelerations that each log has for itself (trim, rudder zero, carriage), estimated with the parameters and left out of the model;
+            null where all logs are of exactly the same vessel. The least-squares prior does not know them: give it little weight.
         iterations: at most.
     """
 
@@ -42,6 +46,7 @@ class RefitConfig(Config):
     asymmetric: float = Field(default=0.0, ge=0)
     robust: float = Field(default=0.05, gt=0)
     correlation: Seconds = Field(default=10.0, gt=0)
+    offsets: OffsetsConfig | None = None
     iterations: int = Field(default=10, ge=1)
 
 
@@ -50,12 +55,14 @@ class Refitted:
     """What a refit hands back.
 
     Attributes:
-        covariance: of the movable parameters, [P, P].
+        covariance: of the movable parameters, [P, P]; what offsets leave open is in it.
         notes: cost before and after, iterations, windows, horizon, independent errors.
+        offsets: of each log in the store.
     """
 
     covariance: Tensor
     notes: dict[str, Any]
+    offsets: Offsets
 
     @property
     def errors(self) -> Tensor:
@@ -66,7 +73,8 @@ class Refitted:
 @dataclass(frozen=True)
 class _Problem:
     """Windows x0 [B, 6], w [B, T, m], measured nu [B, T, 3], weights [B, T, 3] (0 or 1/scale); numbers of the movable parameters [P]; precision
-    [P, P] about where least squares put them [P], pull to zero [P]; beliefs, mean and precision [P]; count of independent errors per channel."""
+    [P, P] about where least squares put them [P], pull to zero [P]; beliefs, mean and precision [P]; count of independent errors per channel; log
+    of each window [B]; speed at which offsets are what they are said to be."""
 
     x0: Tensor
     w: Tensor
@@ -80,6 +88,8 @@ class _Problem:
     belief: Tensor
     count: float
     robust: float
+    log: Tensor
+    speed: float
 
     def share(self, level: Tensor) -> Tensor:
         """Half of what one unit of minus the logarithm of a probability costs, where the cost is `level`.
@@ -107,35 +117,50 @@ def refit(model: HybridDynamics, samples: Samples, store: WindowStore, config: R
     if not isinstance(baseline, ParametricBaseline):
         raise FitError("a refit through rollouts needs a baseline of kind 'regressors', 'linear_steady', 'mmg', 'nomoto' or 'nomoto_sideslip'")
     problem = _problem(model, baseline, samples, store, config, scales)
-    level = first = _level(model, problem)
+    # spreads that are to be estimated start from what moves a velocity by its scale while errors hang together
+    offsets = Offsets.begin(config.offsets, int(store.log.max()) + 1, scales / config.correlation, problem.speed)
+    level = first = _level(model, problem, offsets)
     if not torch.isfinite(first):
         raise FitError("the least-squares baseline diverges within the refit's horizon; shorten `horizon` or raise the baseline's ridge")
     damping, count = 1e-3, 0
-    hessian, gradient = _normal_equations(model, problem, baseline, level)
+    arrow = _normal_equations(model, problem, baseline, level, offsets)
     for _ in range(config.iterations):
-        share = problem.share(level)
-        cost = level + _prior_cost(problem, baseline, share)
-        kept, improved = baseline.theta.detach().clone(), False
-        for _attempt in range(8):
-            step = torch.linalg.solve(hessian + damping * torch.diag(hessian.diagonal()), gradient)
-            _place(baseline, kept.flatten()[problem.active] - step, problem.active)
-            reached = _level(model, problem)
-            trial = reached + _prior_cost(problem, baseline, share)
-            if torch.isfinite(trial) and trial < cost:
-                improved = True
-                break
-            damping *= 10
-        if not improved:
-            _place(baseline, kept.flatten()[problem.active], problem.active)
+        offsets = with_spread(offsets, arrow, problem.share(level))
+        step = _descend(model, problem, baseline, arrow, offsets, level, damping)
+        if step is None:
             break
-        gain, level, damping = float(cost - trial), reached, max(damping / 10, 1e-8)
+        level, offsets, damping, gain = step
         count += 1
-        hessian, gradient = _normal_equations(model, problem, baseline, level)
-        if gain < 2e-4 * float(cost):
+        arrow = _normal_equations(model, problem, baseline, level, offsets)
+        if gain < 2e-4:
             break
-    covariance = problem.share(level) * torch.linalg.pinv(hessian, hermitian=True)
+    share = problem.share(level)
+    believing = arrow.believing(offsets, share)
+    inverse = torch.linalg.pinv(believing.reduced()[0], hermitian=True)
     notes = {"cost_before": float(first), "cost_after": float(level), "iterations": count, "windows": len(problem.x0), "horizon": config.horizon}
-    return Refitted(covariance, notes | {"independent_errors": round(problem.count, 1)})
+    error = (share * believing.variances(inverse)).clamp(min=0.0).sqrt()
+    return Refitted(share * inverse, notes | {"independent_errors": round(problem.count, 1)}, replace(offsets, error=error))
+
+
+def _descend(
+    model: HybridDynamics, problem: _Problem, baseline: ParametricBaseline, arrow: Arrow, offsets: Offsets, level: Tensor, damping: float
+) -> tuple[Tensor, Offsets, float, float] | None:
+    """One step of Levenberg and Marquardt: level, offsets and damping after it, and its gain as a share of the cost; None where nothing gains."""
+    share = problem.share(level)
+    believing = arrow.believing(offsets, share)
+    cost = level + _prior_cost(problem, baseline, share, offsets)
+    kept = baseline.theta.detach().flatten()[problem.active].clone()
+    for _attempt in range(8):
+        step, own = believing.damped(damping).solve()
+        _place(baseline, kept - step, problem.active)
+        moved = offsets.moved(own)
+        reached = _level(model, problem, moved)
+        trial = reached + _prior_cost(problem, baseline, share, moved)
+        if torch.isfinite(trial) and trial < cost:
+            return reached, moved, max(damping / 10, 1e-8), float(cost - trial) / float(cost)
+        damping *= 10
+    _place(baseline, kept, problem.active)
+    return None
 
 
 def _place(baseline: ParametricBaseline, values: Tensor, active: Tensor) -> None:
@@ -155,6 +180,7 @@ def _problem(
     if starts.numel() == 0:
         raise FitError(f"no training log holds a free run of {config.horizon:g} s for the refit; shorten `horizon`")
     take = store.take
+    nu = take(store.y, starts + 1, steps)[:, :, 3:]
     usable = take(store.usable, starts + 1, steps).to(scales.dtype).unsqueeze(-1)
     # r comes from a gyro, which a frozen position does not disturb
     weight = torch.cat((usable, usable, torch.ones_like(usable)), dim=-1) / scales
@@ -164,7 +190,7 @@ def _problem(
     return _Problem(
         store.y[starts],
         take(store.w, starts, steps),
-        take(store.y, starts + 1, steps)[:, :, 3:],
+        nu,
         weight,
         active,
         config.prior * baseline.information(samples),
@@ -174,6 +200,8 @@ def _problem(
         belief,
         max(covered * model.dt / config.correlation, 1.0),
         config.robust,
+        store.log[starts],
+        float(nu[:, :, :2].square().sum(2).mean().sqrt()),
     )
 
 
@@ -182,54 +210,41 @@ def _window_cost(error: Tensor) -> Tensor:
     return error.square().mean((1, 2))
 
 
-def _prior_cost(problem: _Problem, baseline: ParametricBaseline, share: Tensor) -> Tensor:
+def _prior_cost(problem: _Problem, baseline: ParametricBaseline, share: Tensor, offsets: Offsets) -> Tensor:
     theta = baseline.theta.detach().flatten()[problem.active]
     moved, off = theta - problem.start, theta - problem.believed
-    return moved @ problem.precision @ moved + (problem.pull * theta.square()).sum() + share * (problem.belief * off.square()).sum()
+    believed = (problem.belief * off.square()).sum() + offsets.unlikely()
+    return moved @ problem.precision @ moved + (problem.pull * theta.square()).sum() + share * believed
+
+
+def _shifted(model: HybridDynamics, problem: _Problem, offsets: Offsets) -> tuple[HybridDynamics, ParametricBaseline | Shifted]:
+    """The model with the offset of its log in every window, and its baseline."""
+    assert isinstance(model.baseline, ParametricBaseline)
+    if not offsets.axes:
+        return model, model.baseline
+    baseline = Shifted(model.baseline, offsets.accelerations()[problem.log], offsets.axes, offsets.speed)
+    return HybridDynamics(model.signals, baseline, model.head, model.dt, model.integrator), baseline
 
 
 @torch.no_grad()
-def _level(model: HybridDynamics, problem: _Problem) -> Tensor:
+def _level(model: HybridDynamics, problem: _Problem, offsets: Offsets) -> Tensor:
     """Mean error of the windows, in units of the scales."""
     x, total = problem.x0, []
+    shifted, _ = _shifted(model, problem, offsets)
     for k in range(problem.w.shape[1]):
-        x = _ahead(model, x, model.signals.prepare(problem.w[:, k]))
+        x = ahead(shifted, x, model.signals.prepare(problem.w[:, k]))
         total.append(x[:, 3:])
     error = (torch.stack(total, dim=1) - problem.nu) * problem.weight
     return torch.sqrt(_window_cost(error) + problem.robust**2).mean()
 
 
-def _ahead(model: HybridDynamics, x: Tensor, p: Tensor) -> Tensor:
-    """State one step later; of an Euler scheme with the mean yaw rate for the heading."""
-    if len(model.nodes) > 1:
-        return model.integrate(x, p, torch.zeros_like(x[:, :3]))
-    nu = x[:, 3:] + model.dt * model.baseline(model.signals(x, p))
-    psi = x[:, 2] + 0.5 * model.dt * (nu[:, 2] + x[:, 5])
-    return torch.cat((x[:, :2], psi[:, None], nu), dim=-1)
-
-
-def _carried(model: HybridDynamics, baseline: ParametricBaseline, x: Tensor, p: Tensor, s: Tensor) -> Tensor:
-    """Sensitivities of (psi, u, v, r) to the parameters one step later, [B, 4, P], from s [B, 4, P] at the states x: the scheme's own derivative."""
-    change, total = torch.zeros_like(s), torch.zeros_like(s)
-    place = x
-    for node, weight in zip(model.nodes, model.weights, strict=True):
-        here = s + node * model.dt * change
-        if node > 0.0:
-            place = x + node * model.dt * model.rate(place, p, torch.zeros_like(x[:, :3]))
-        nu = _slopes(model, place, p) @ here + baseline.sensitivity(model.signals(place, p))
-        change = torch.cat((here[:, 3:], nu), dim=1)
-        total = total + weight * change
-    after = s + model.dt * total
-    if len(model.nodes) == 1:
-        after = torch.cat((s[:, :1] + 0.5 * model.dt * (after[:, 3:] + s[:, 3:]), after[:, 1:]), dim=1)
-    return after
-
-
 @torch.no_grad()
-def _normal_equations(model: HybridDynamics, problem: _Problem, baseline: ParametricBaseline, level: Tensor) -> tuple[Tensor, Tensor]:
-    """Gauss-Newton Hessian [P, P] and half the gradient [P] of the robust cost."""
+def _normal_equations(model: HybridDynamics, problem: _Problem, baseline: ParametricBaseline, level: Tensor, offsets: Offsets) -> Arrow:
+    """Gauss-Newton Hessian and half the gradient of the robust cost, as yet without what is believed of the offsets."""
     batch, steps = problem.w.shape[:2]
-    count = int(problem.active.numel())
+    shared, logs = int(problem.active.numel()), len(offsets.value)
+    count = shared + len(offsets.axes)
+    shifted, movable = _shifted(model, problem, offsets)
     x = problem.x0
     sensitivity = torch.zeros(batch, 4, count, dtype=x.dtype)
     hessian = torch.zeros(batch, count, count, dtype=x.dtype)
@@ -237,8 +252,8 @@ def _normal_equations(model: HybridDynamics, problem: _Problem, baseline: Parame
     square = torch.zeros(batch, dtype=x.dtype)
     for k in range(steps):
         p = model.signals.prepare(problem.w[:, k])
-        sensitivity = _carried(model, baseline, x, p, sensitivity)
-        x = _ahead(model, x, p)
+        sensitivity = carried(shifted, movable, x, p, sensitivity)
+        x = ahead(shifted, x, p)
         error = (x[:, 3:] - problem.nu[:, k]) * problem.weight[:, k]
         seen = sensitivity[:, 1:] * problem.weight[:, k].unsqueeze(-1)
         hessian += seen.transpose(1, 2) @ seen
@@ -247,17 +262,9 @@ def _normal_equations(model: HybridDynamics, problem: _Problem, baseline: Parame
     weight = 0.5 / torch.sqrt(square / (3 * steps) + problem.robust**2) / (3 * steps * batch)
     theta = baseline.theta.flatten()[problem.active]
     belief = problem.share(level) * problem.belief
-    total = torch.einsum("b,bij->ij", weight, hessian) + problem.precision + torch.diag(problem.pull + belief)
+    total = torch.einsum("b,bij->ij", weight, hessian[:, :shared, :shared]) + problem.precision + torch.diag(problem.pull + belief)
     prior = problem.precision @ (theta - problem.start) + problem.pull * theta + belief * (theta - problem.believed)
-    return total, weight @ gradient + prior
-
-
-def _slopes(model: HybridDynamics, x: Tensor, p: Tensor) -> Tensor:
-    """Derivative of nu_dot with respect to (psi, u, v, r), [B, 3, 4], by forward differentiation along the four directions at once."""
-    batch = x.shape[0]
-    tangent = torch.zeros(4, batch, x.shape[1], dtype=x.dtype)
-    for direction in range(4):
-        tangent[direction, :, 2 + direction] = 1.0
-    repeated, inputs = x.repeat(4, 1), p.repeat(4, 1)
-    slopes = torch.func.jvp(lambda state: model.baseline(model.signals(state, inputs)), (repeated,), (tangent.reshape(-1, x.shape[1]),))[1]
-    return slopes.reshape(4, batch, 3).permute(1, 2, 0)
+    weighted, slope = weight[:, None, None] * hessian[:, :, shared:], weight[:, None] * gradient[:, shared:]
+    own = torch.zeros(logs, count, len(offsets.axes), dtype=x.dtype).index_add_(0, problem.log, weighted)
+    slopes = torch.zeros_like(offsets.value).index_add_(0, problem.log, slope)
+    return Arrow(total, own[:, :shared], own[:, shared:], weight @ gradient[:, :shared] + prior, slopes)
