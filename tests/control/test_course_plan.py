@@ -17,7 +17,7 @@ from residnet.control.following import Following
 from residnet.control.heading_pid import HeadingPID
 from residnet.control.steering import SteeredPlant
 from residnet.control.turning import Turning
-from residnet.control.turns import make_turns, steady_turn
+from residnet.control.turns import TurnMaker, steady_turn
 from residnet.core.errors import ConfigError
 from residnet.dynamics.rollout import Rollout
 from residnet.physics.vessel import load_vessel
@@ -29,7 +29,7 @@ BUOYS = (
     BuoyConfig(north=100, east=20, leave_to="starboard", radius=10),
     BuoyConfig(north=50, east=80, leave_to="port", radius=10),
 )
-WANTED = BuoyCourseConfig(buoys=BUOYS, acceptance=3.4, lookahead=12.0)
+WANTED = BuoyCourseConfig(buoys=BUOYS, acceptance=3.4, lookahead=12.0, planning_dt=0.2)
 
 
 @pytest.fixture(scope="module")
@@ -52,14 +52,31 @@ def test_the_steady_turn_is_that_of_the_model(vessel: SteeredPlant) -> None:
 
 def test_turns_take_the_time_of_full_rudder_and_counter_rudder(vessel: SteeredPlant) -> None:
     """T r_dot + r = K delta from rest to rest: K d (t1 - t2) turned, t2 = T ln(2 - exp(-t1 / T))."""
-    dt = 0.02
-    for turn in make_turns(vessel, TURNING, np.radians([40.0, 120.0]), np.full(2, 0.9 * LIMIT), LIMIT, dt):
-        first = np.count_nonzero(turn.rudder > 0.0) * dt
-        rate = 3.47 * 0.9 * LIMIT
-        back = 3.94 * math.log(2.0 - math.exp(-first / 3.94))
-        assert turn.angle == pytest.approx(rate * (first - back), abs=rate * dt)
-        assert turn.heading[-1] == pytest.approx(turn.angle, abs=math.radians(0.85))
-        assert np.hypot(*np.diff(turn.track, axis=0).T) == pytest.approx(3.2 * dt, rel=1e-3)
+    make = TurnMaker(vessel, TURNING, 0.05)
+    holds = np.array([[3.0, 9.0], [5.03, 12.0]])
+    for side, row in zip((1, -1), make(holds, 0.9 * LIMIT * np.array([1, -1]), [make.straight] * 2, 4.0), strict=True):
+        for turn in row:
+            counter = 3.94 * math.log(2.0 - math.exp(-turn.hold / 3.94))
+            assert turn.times[-1] == pytest.approx(turn.hold + counter, abs=1e-3)
+            angle = side * 3.47 * 0.9 * LIMIT * (turn.hold - counter)
+            assert turn.heading[-1] == pytest.approx(angle, abs=1e-4)
+            # straight on behind it
+            track, heading = turn.along(np.array([0.0, 4.0]))
+            assert heading == pytest.approx(angle, abs=1e-4)
+            assert track[0] == pytest.approx(turn.track[-1], abs=1e-9)
+            assert track[1] - track[0] == pytest.approx(3.2 * 4.0 * np.array([math.cos(angle), math.sin(angle)]), abs=2e-3)
+
+
+def test_a_turn_that_follows_a_turn_begins_with_its_yaw(vessel: SteeredPlant) -> None:
+    """Nomoto's heading from a yaw rate r0: r0 T (1 - e) + K d (t - T (1 - e)), e = exp(-t / T)."""
+    make = TurnMaker(vessel, TURNING, 0.05)
+    begin = make.straight.copy()
+    begin[vessel.column("r")], begin[vessel.column("psi")] = -0.1, 2.0
+    turn = make(np.array([[6.0]]), np.array([LIMIT]), [begin], 1.0)[0][0]
+    faded = 1.0 - math.exp(-6.0 / 3.94)
+    held = int(np.searchsorted(turn.times, 6.0))
+    assert turn.times[held] == pytest.approx(6.0)
+    assert turn.heading[held] == pytest.approx(-0.1 * 3.94 * faded + 3.47 * LIMIT * (6.0 - 3.94 * faded), abs=1e-5)
 
 
 def test_no_part_of_a_plan_is_tighter_than_the_vessel_turns_and_buoys_stay_outside(vessel: SteeredPlant) -> None:
@@ -118,3 +135,35 @@ def test_a_vessel_beside_the_course_comes_back_to_it(vessel: SteeredPlant) -> No
     end = states[:, -1]
     radius = torch.hypot(end[:, vessel.column("x")], end[:, vessel.column("y")] - 15.0)
     assert radius.tolist() == pytest.approx([15.0, 15.0], abs=0.05)
+
+
+def test_a_vessel_that_sways_and_rolls_follows_turns_that_join_each_other() -> None:
+    patrol = SteeredPlant(load_vessel("patrol_p06_linear").build())
+    turning = patrol.turning(LIMIT, 300.0, 0.1)
+    wanted = BuoyCourseConfig(
+        buoys=(
+            BuoyConfig(north=500, east=300, leave_to="port", radius=100),
+            BuoyConfig(north=1000, east=200, leave_to="starboard", radius=100),
+            BuoyConfig(north=700, east=700, leave_to="port", radius=100),
+        ),
+        acceptance=51.5,
+        lookahead=100.0,
+        planning_dt=0.5,
+        turning_time=200.0,
+    )
+    planned = plan_course(wanted, "enter", patrol, turning, LIMIT, smallest_turn(wanted, patrol, LIMIT))
+    assert np.ptp(np.sign(planned.course.rudder)) == 2.0
+    law = HeadingPID.placed(patrol.state, gain=turning.gain, time=turning.time, frequency=0.8, damping=1.0, limit=LIMIT)
+    follower = Following(law, patrol.state, limit=LIMIT, dt=0.1, rate=patrol.rate)
+    guidance = CourseGuidance(planned.course, wanted.lookahead, patrol.state)
+    x, w = patrol.start(torch.ones(1, dtype=torch.float64))
+    x[:, patrol.column("psi")] = float(planned.course.heading[0])
+    nominal = torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64)
+    with torch.no_grad():
+        states, _, _ = Rollout(patrol.model(0.1), ClosedLoop(follower, guidance))(x, w.unsqueeze(1).expand(-1, 2500, -1), nominal)
+    place, aside = torch.zeros(1, 1, dtype=torch.float64), []
+    for state in states[0, ::5]:
+        _, place = guidance(state[None], 0, place)
+        aside.append(abs(float(guidance.error(state[None], place[:, 0])[1])))
+    assert float(place) >= planned.course.length
+    assert max(aside) < 0.5

@@ -7,15 +7,15 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
 from pydantic import Field
 
 from residnet.control.buoys import BuoyConfig, course_round, feasibility, widened
-from residnet.control.course_plan import Course, Mark, plan
+from residnet.control.course_plan import Course, plan
+from residnet.control.course_search import Mark
 from residnet.control.dubins import shortest_course
 from residnet.control.steering import SteeredVessel
 from residnet.control.turning import Turning
-from residnet.control.turns import SteadyTurn, Turn, make_turns, steady_turn
+from residnet.control.turns import SteadyTurn, TurnMaker, steady_turn
 from residnet.core.config import Config, Metres, Radians, Seconds
 
 Protocol = Literal["enter", "sides"]
@@ -91,19 +91,14 @@ def plan_course(
         ConfigError: where there is none.
     """
     buoys = tuple(widened(config.buoys, steady.radius))
-    marks = _to_enter(config) if protocol == "enter" else _to_pass(config, buoys)
     hardest = config.share * limit
-
-    def make(angles: np.ndarray, radii: np.ndarray) -> list[Turn]:
-        # a wide circle needs less rudder
-        rudder = np.minimum(hardest, hardest * steady.radius / np.maximum(radii, 1e-9))
-        return make_turns(vessel, turning, angles, np.where(radii > 0, rudder, hardest), limit, config.planning_dt)
-
-    course = plan(config.start, config.heading, marks[:-1], marks[-1], make, steady.radius, 0.1 * turning.speed, 5.0 * config.lookahead)
+    marks = _to_enter(config, hardest) if protocol == "enter" else _to_pass(config, buoys, hardest, steady.radius)
+    make = TurnMaker(vessel, turning, config.planning_dt)
+    course = plan(config.start, config.heading, marks[:-1], marks[-1], make, steady, 0.1 * turning.speed, 5.0 * config.lookahead)
     return PlannedCourse(protocol, course, buoys, steady, _floor(config, protocol, buoys, steady))
 
 
-def _to_enter(config: BuoyCourseConfig) -> list[Mark]:
+def _to_enter(config: BuoyCourseConfig, rudder: float) -> list[Mark]:
     """Turns where the line from way-point to way-point bends; one that the line enters anyway needs none."""
     depth = -(1.0 - config.reach) * config.acceptance
     places = [config.start, *((buoy.north, buoy.east) for buoy in config.buoys)]
@@ -117,12 +112,12 @@ def _to_enter(config: BuoyCourseConfig) -> list[Mark]:
         inside = 0 <= along[0] * across[0] + along[1] * across[1] <= along[0] ** 2 + along[1] ** 2
         if inside and abs(offset) <= -depth * math.hypot(*along):
             continue
-        marks.append(Mark(number, *here, -1 if offset > 0 else 1, depth))
+        marks.append(Mark(number, *here, -1 if offset > 0 else 1, depth, rudder))
         before = here
-    return [*marks, Mark(left[-1], *places[-1], 1, depth)]
+    return [*marks, Mark(left[-1], *places[-1], 1, depth, rudder)]
 
 
-def _to_pass(config: BuoyCourseConfig, buoys: tuple[BuoyConfig, ...]) -> list[Mark]:
+def _to_pass(config: BuoyCourseConfig, buoys: tuple[BuoyConfig, ...], rudder: float, smallest: float) -> list[Mark]:
     """Turns where the taut course bends round a circle."""
     arcs = [piece for piece in course_round(config.start, buoys) if piece.turn != 0]
     marks = []
@@ -133,7 +128,9 @@ def _to_pass(config: BuoyCourseConfig, buoys: tuple[BuoyConfig, ...]) -> list[Ma
             (arc.north - arc.turn * arc.radius * math.sin(arc.heading), arc.east + arc.turn * arc.radius * math.cos(arc.heading)) for arc in arcs
         ]
         if number == len(buoys) or any(math.hypot(n - buoy.north, e - buoy.east) < 1e-6 * buoy.radius + 1e-9 for n, e in centres):
-            marks.append(Mark(number, buoy.north, buoy.east, sign, (1.0 + config.margin) * buoy.radius))
+            # a wide circle needs less rudder
+            needed = rudder * min(1.0, smallest / buoy.radius)
+            marks.append(Mark(number, buoy.north, buoy.east, sign, (1.0 + config.margin) * buoy.radius, needed))
     return marks
 
 

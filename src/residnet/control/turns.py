@@ -1,125 +1,126 @@
-"""Turns as a vessel makes them: the track, heading and rudder of heading changes at a given rudder angle, from straight ahead to straight ahead."""
+"""Turns as a vessel makes them: rudder held, then counter-rudder until the yaw stops, then amidships; from any motion that it comes with."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import final
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from scipy.interpolate import CubicSpline, PPoly
 
-from residnet.control.base import ClosedLoop, Reference
-from residnet.control.following import Following
-from residnet.control.heading_pid import HeadingPID
 from residnet.control.steering import SteeredVessel
 from residnet.control.turning import Turning
 from residnet.dynamics.rollout import Rollout
 
 Array = NDArray[np.float64]
-_TAIL = 4.0
-"""Time constants that are flown after the planned end of a turn."""
-_STEADY = math.radians(0.8)
-"""A turn ends where the heading stays as near to the new one."""
+_COUNTER = 1.5
+"""Time constants within which counter-rudder stops a turn; T ln 2 by Nomoto's model."""
 
 
 @dataclass(frozen=True)
 class Turn:
-    """A turn to starboard from the origin, heading north; a turn to port is its mirror image.
+    """A turn from the origin, heading north at the beginning, and the leg behind it with the rudder amidships.
 
     Attributes:
-        angle: by which the heading changes, in rad.
+        rudder: angle held in rad, positive to starboard; then the same to the other side.
+        hold: for how long, in s.
+        times: samples of the turn [N] in s; the last is where the counter-rudder ends and the leg begins.
         track: north, east [N, 2] in m.
-        heading: [N] in rad.
-        rudder: command [N] in rad.
+        heading: [N] in rad, not wrapped.
+        leg: states of the vessel [nx] by the time in s since the leg began.
+        columns: of north, east and heading in those.
     """
 
-    angle: float
+    rudder: float
+    hold: float
+    times: Array
     track: Array
     heading: Array
-    rudder: Array
+    leg: PPoly
+    columns: tuple[int, int, int]
+
+    def along(self, times: Array) -> tuple[Array, Array]:
+        """Track [M, 2] and heading [M] of the leg at times [M] in s since it began."""
+        states = self.leg(times)
+        return states[:, list(self.columns[:2])], states[:, self.columns[2]]
 
 
 @final
-class TurnReference(Reference):
-    """For `Following`: the rudder held at an angle until counter-rudder stops the turn at the new heading, as Nomoto's model stops.
+class TurnMaker:
+    """Turns of the nominal vessel: rudder held, counter-rudder until the yaw stops, rudder amidships.
 
-    At a yaw rate r the rudder at -d stops the turn within T r - T K d ln(1 + r / (K d)) of heading. Until then the vessel turns as it does;
-    from then on it follows that model, to the heading where that ends: within half a step's turn of the one asked for. Memory [B, 3]: yaw
-    rate [rad/s] where the stop began, the time [s] since, below zero before, and the heading [rad] where it ends.
-
-    Args:
-        angles: heading changes [B] in rad, positive, from a heading of zero.
-        rudder: angles [B] in rad, positive.
-        turning: K and T.
-        columns: of psi, u and r in the state.
-        dt: step in s.
-    """
-
-    def __init__(self, angles: Tensor, rudder: Tensor, turning: Turning, columns: tuple[int, int, int], dt: float) -> None:
-        super().__init__()
-        self.angles, self.rudder, self.turning, self.columns, self.dt = angles, rudder, turning, columns, dt
-        self.n_state = 3
-
-    def initial_state(self, x: Tensor) -> Tensor:
-        """Not stopping."""
-        return torch.tensor([[0.0, -1.0, 0.0]], dtype=x.dtype).expand(x.shape[0], -1)
-
-    def forward(self, x: Tensor, k: int, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Reference [B, 3] of `following.FOLLOWED` and memory."""
-        psi, u, r = (x[:, column] for column in self.columns)
-        # K and T as they are at the present speed
-        ratio = u / self.turning.speed
-        time, full = self.turning.time / ratio, self.turning.gain * self.rudder * ratio
-        rate, since, end = s.unbind(-1)
-        # the middle of the step decides
-        left = self.angles - psi - 0.5 * self.dt * r
-        stopping = time * (r - full * torch.log1p(r.clamp(min=0.0) / full))
-        begins = (since < 0) & (left <= stopping)
-        rate, end = torch.where(begins, r, rate), torch.where(begins, psi + stopping, end)
-        since = torch.where(begins, torch.zeros_like(since), since)
-        planned = ((rate + full) * torch.exp(-since / time) - full).clamp(min=0.0)
-        heading = end - time * (planned - full * torch.log1p(planned / full))
-        braking = torch.stack((heading, planned, torch.where(planned > 0, -self.rudder, 0.0)), dim=-1)
-        stops = since >= 0
-        reference = torch.where(stops.unsqueeze(-1), braking, torch.stack((psi, r, self.rudder), dim=-1))
-        return reference, torch.stack((rate, torch.where(stops, since + self.dt, since), end), dim=-1)
-
-
-def make_turns(vessel: SteeredVessel, turning: Turning, angles: Array, rudder: Array, limit: float, dt: float) -> list[Turn]:
-    """Turns of the nominal vessel, each with a rudder angle held until it has to be stopped; their own angles say what came of those asked for.
+    The three follow from simulations that begin where they do, so that what comes of a turn changes smoothly with its time.
 
     Args:
         vessel: that turns.
         turning: its K and T.
-        angles: heading changes [B] in rad, positive.
-        rudder: angles [B] in rad.
-        limit: of the rudder in rad.
-        dt: step of the simulation in s.
+        dt: step of the simulations in s.
     """
-    change, held = torch.as_tensor(angles, dtype=torch.float64), torch.as_tensor(rudder, dtype=torch.float64)
-    # a vessel that slows down turns at down to two thirds of its first rate
-    duration = 1.2 * float((change / (turning.gain * held)).max()) + _TAIL * turning.time
-    steps = math.ceil(duration / dt)
-    columns = (vessel.column("psi"), vessel.column("u"), vessel.column("r"))
-    law = HeadingPID.placed(vessel.state, gain=turning.gain, time=turning.time, frequency=4.0 / turning.time, damping=1.0, limit=limit)
-    follower = Following(law, vessel.state, limit=limit, dt=dt, rate=vessel.rate)
-    loop = Rollout(vessel.model(dt), ClosedLoop(follower, TurnReference(change, held, turning, columns, dt)))
-    x, w = vessel.start(torch.ones(len(change), dtype=torch.float64))
-    nominal = torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64).expand(len(change), -1)
-    with torch.no_grad():
-        states, inputs, _ = loop(x, w.unsqueeze(1).expand(-1, steps, -1), nominal)
-    place = [vessel.column("x"), vessel.column("y")]
-    tracks = (states[:, :, place] - states[:, :1, place]).numpy()
-    headings, commands = states[:, :, columns[0]].numpy(), torch.cat((inputs[:, :, 0], inputs[:, -1:, 0]), dim=1).numpy()
-    turned = []
-    for i, angle in enumerate(headings[:, -1].tolist()):
-        # from where on the heading stays
-        end = min(int(np.flatnonzero(np.abs(headings[i] - angle) > _STEADY)[-1]) + 2, steps + 1)
-        turned.append(Turn(angle, tracks[i, :end], headings[i, :end], commands[i, :end]))
-    return turned
+
+    def __init__(self, vessel: SteeredVessel, turning: Turning, dt: float) -> None:
+        self.vessel, self.turning, self.dt = vessel, turning, dt
+        self.columns = (vessel.column("x"), vessel.column("y"), vessel.column("psi"))
+        self.loop = Rollout(vessel.model(dt))
+        x, self.inputs = vessel.start(torch.ones(1, dtype=torch.float64))
+        self.straight: Array = x[0].numpy()
+
+    def __call__(self, holds: Array, rudder: Array, begin: Sequence[Array], leg: float) -> list[list[Turn]]:
+        """Turns of n rudder angles, each held for K times.
+
+        Args:
+            holds: [n, K] in s.
+            rudder: [n] in rad, positive to starboard.
+            begin: state [nx] that each begins with; its place and heading do not matter.
+            leg: how much of the leg behind is simulated, in s.
+        """
+        n, k = holds.shape
+        x = np.stack(begin)
+        x[:, list(self.columns)] = 0.0
+        held = self._phase(x, rudder, float(holds.max()))
+        rows = np.repeat(np.arange(n), k)
+        countered = self._phase(_of_rows(held, holds.ravel(), rows), -rudder[rows], _COUNTER * self.turning.time)
+        stops = self._stops(countered, np.sign(rudder)[rows])
+        rows = np.arange(n * k)
+        left = self._phase(_of_rows(countered, stops, rows), np.zeros(n * k), leg)
+        turns = []
+        for row, (hold, stop) in enumerate(zip(holds.ravel(), stops, strict=True)):
+            first, then = np.linspace(0.0, hold, len(held.x)), np.linspace(0.0, stop, len(countered.x))
+            states = np.concatenate((held(first)[:-1, row // k], countered(then)[:, row]))
+            times = np.concatenate((first[:-1], hold + then))
+            after = PPoly(left.c[:, :, row], left.x)
+            turns.append(
+                Turn(float(rudder[row // k]), hold, times, states[:, list(self.columns[:2])], states[:, self.columns[2]], after, self.columns)
+            )
+        return [turns[k * i : k * i + k] for i in range(n)]
+
+    def _phase(self, x: Array, rudder: Array, duration: float) -> CubicSpline:
+        """States [B, nx] by the time from x [B, nx] on, under rudder angles [B]."""
+        steps = max(math.ceil(duration / self.dt), 3)
+        w = self.inputs.unsqueeze(1).repeat(len(x), steps, 1)
+        w[:, :, 0] = torch.from_numpy(rudder).unsqueeze(-1)
+        nominal = torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64).expand(len(x), -1)
+        with torch.no_grad():
+            states, _, _ = self.loop(torch.from_numpy(x), w, nominal)
+        return CubicSpline(self.dt * np.arange(steps + 1), states.transpose(0, 1).numpy())
+
+    def _stops(self, countered: CubicSpline, side: Array) -> Array:
+        """Times [B] at which the yaw towards a side has stopped; the end where it does not."""
+        yaw = countered(countered.x)[:, :, self.vessel.column("r")] * side
+        after, rows = np.argmax(yaw <= 0.0, axis=0), np.arange(len(side))
+        before = np.maximum(after - 1, 0)
+        share = yaw[before, rows] / np.maximum(yaw[before, rows] - yaw[after, rows], 1e-12)
+        stops = countered.x[before] + np.where(after > 0, share, 0.0) * self.dt
+        return np.where(yaw[-1] > 0, countered.x[-1], stops)
+
+
+def _of_rows(states: CubicSpline, times: Array, rows: NDArray[np.intp]) -> Array:
+    """States [M, nx] of rows [M] at times [M]."""
+    found: Array = states(times)[np.arange(len(times)), rows]
+    return found
 
 
 @dataclass(frozen=True)
