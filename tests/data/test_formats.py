@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 import written_logs
-from written_logs import COMMANDS, EPOCH, trial
+from written_logs import COMMANDS, EPOCH, outcome, trial
 
 from residnet.core.config import validate
-from residnet.core.errors import DataError, UsageError
+from residnet.core.errors import UsageError
 from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS
 from residnet.data.readers import ReaderConfig
@@ -136,15 +136,6 @@ def test_truncated_files_end_in_one_line(write: Writer, tmp_path: Path) -> None:
         path.write_bytes(whole[: int(share * len(whole))])
         said = outcome(path)
         assert said is None or ("\n" not in said and path.name in said)
-
-
-def outcome(path: Path) -> str | None:
-    """What reading ends in: None for a log, else the error's text; anything but residnet's own errors passes through."""
-    try:
-        reader_for(path).read(path)
-    except (UsageError, DataError) as error:
-        return str(error)
-    return None
 
 
 @pytest.mark.parametrize(

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 import written_recorders
-from written_logs import EPOCH, trial
+from written_logs import EPOCH, outcome, trial
 from written_recorders import ORIGIN
 
 from residnet.core.config import validate
-from residnet.core.errors import DataError, UsageError
+from residnet.core.errors import DataError
 from residnet.core.log import Log
 from residnet.data.readers import ReaderConfig
 from residnet.data.readers.detect import format_of, reader_for
@@ -118,12 +118,3 @@ def test_known_by_content_and_clear_when_damaged(write: Callable[[Log, Path], Pa
         path.write_bytes(whole[: int(share * len(whole))])
         said = outcome(path)
         assert said is None or ("\n" not in said and "recording" in said)
-
-
-def outcome(path: Path) -> str | None:
-    """What reading ends in: None for a log, else the error's text; anything but residnet's own errors passes through."""
-    try:
-        reader_for(path).read(path)
-    except (UsageError, DataError) as error:
-        return str(error)
-    return None

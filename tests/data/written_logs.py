@@ -15,7 +15,9 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 from scipy.io import savemat
 
+from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
+from residnet.data.readers.detect import reader_for
 
 EPOCH = 1_744_362_945
 COMMANDS = ("cmd_port", "cmd_stbd")
@@ -175,3 +177,12 @@ def _quaternion(log: Log) -> tuple[np.ndarray, ...]:
     """Of the heading, counter-clockwise from east; its sign flips wherever the wrapped yaw does."""
     yaw = np.remainder(np.pi / 2 - log["psi"] + np.pi, 2 * np.pi) - np.pi
     return 0.0 * yaw, 0.0 * yaw, np.sin(yaw / 2), np.cos(yaw / 2)
+
+
+def outcome(path: Path) -> str | None:
+    """What reading ends in: None for a log, else the error's text; anything but residnet's own errors passes through."""
+    try:
+        reader_for(path).read(path)
+    except (UsageError, DataError) as error:
+        return str(error)
+    return None

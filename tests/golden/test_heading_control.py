@@ -14,9 +14,9 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 import torch
+from golden_tables import table
 from torch import Tensor
 
 from residnet.control import BangBangHeading, ClosedLoop, DocumentAutopilot, GivenReference, HeadingPID, Policy, SimulatedPredictor
@@ -162,7 +162,7 @@ def fly(case: Case, steps: int) -> dict[str, np.ndarray]:
 
 
 def test_trajectory(golden_file: Path) -> None:
-    frame = pd.DataFrame(np.loadtxt(golden_file, delimiter=",", skiprows=1), columns=pd.read_csv(golden_file, nrows=0).columns)
+    frame = table(golden_file)
     case = case_of(golden_file, spacing=float(frame["t"].iloc[1]))
     rows = np.rint(frame["t"].to_numpy() / case.model.dt).astype(int)
     np.testing.assert_allclose(frame["t"], rows * case.model.dt, atol=1e-9)

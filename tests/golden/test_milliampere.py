@@ -14,6 +14,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from golden_tables import table, tensor
 from torch import Tensor
 
 from residnet.control import ClosedLoop, HullFeedForward, MotionPID, MotionPIDConfig, Reference, ReferenceFilter, ReferenceFilterConfig
@@ -85,17 +86,6 @@ def case_of(path: Path) -> Flight | OpenLoop:
 def vessel(scale: float) -> FossenVessel:
     config = load_config(vessel_files()["milliampere"], [f"scale={scale}", *UNLIMITED], MassMatrixConfig)
     return config.build()
-
-
-@cache
-def table(path: Path) -> pd.DataFrame:
-    names = pd.read_csv(path, nrows=0).columns
-    # every digit counts: not pandas' fast parser
-    return pd.DataFrame(np.loadtxt(path, delimiter=",", skiprows=1), columns=names)
-
-
-def tensor(frame: pd.DataFrame, *columns: str) -> Tensor:
-    return torch.tensor(frame[list(columns)].to_numpy(), dtype=torch.float64)
 
 
 @cache

@@ -14,6 +14,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from golden_tables import table, tensor
 from scipy.signal import square
 from torch import Tensor
 
@@ -94,17 +95,6 @@ def commands(path: Path) -> Inputs:
     vessel, design = case_of(path)
     units = np.array([1 / 60, 1.0]) if vessel == "odin_jets" else np.ones(3)
     return lambda t: np.stack(DESIGNS[design](t), axis=-1) * units
-
-
-@cache
-def table(path: Path) -> pd.DataFrame:
-    names = pd.read_csv(path, nrows=0).columns
-    # every digit counts: not pandas' fast parser
-    return pd.DataFrame(np.loadtxt(path, delimiter=",", skiprows=1), columns=names)
-
-
-def tensor(frame: pd.DataFrame, *columns: str) -> Tensor:
-    return torch.tensor(frame[list(columns)].to_numpy(), dtype=torch.float64)
 
 
 def plant_of(path: Path) -> OdinVessel:

@@ -9,9 +9,9 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 import torch
+from golden_tables import table
 
 from residnet.dynamics.rollout import Rollout, Source
 from residnet.dynamics.simulated import PlantDynamics, TracedPlantDynamics
@@ -94,13 +94,6 @@ def source_of(runs: list[Run], plant: PatrolVessel, t: torch.Tensor) -> Source:
     if zigzags:
         sources.append(Zigzag.source(zigzags, Helm.of(plant), t))
     return StackedSource(sources, [count for count in (len(steps), len(zigzags)) if count])
-
-
-@cache
-def table(path: Path) -> pd.DataFrame:
-    names = pd.read_csv(path, nrows=0).columns
-    # every digit counts: not pandas' fast parser
-    return pd.DataFrame(np.loadtxt(path, delimiter=",", skiprows=1), columns=names)
 
 
 @cache

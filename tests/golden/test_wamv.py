@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import pytest
 import torch
+from golden_tables import table, tensor
 from scipy.linalg import expm
 
 from residnet.baselines.regressors import RegressorBaseline
@@ -74,17 +74,6 @@ def on_plant(function: Any) -> Any:
 def on_linear(function: Any) -> Any:
     function.only = is_linear
     return function
-
-
-@cache
-def table(path: Path) -> pd.DataFrame:
-    names = pd.read_csv(path, nrows=0).columns
-    # every digit counts: not pandas' fast parser
-    return pd.DataFrame(np.loadtxt(path, delimiter=",", skiprows=1), columns=names)
-
-
-def tensor(frame: pd.DataFrame, *columns: str) -> torch.Tensor:
-    return torch.tensor(frame[list(columns)].to_numpy(), dtype=torch.float64)
 
 
 @cache

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from pydantic import Field
@@ -99,6 +100,18 @@ class Equation:
     searched: int
     alternatives: dict[str, list[str]]
     undecided: dict[str, float]
+
+    def told(self, within: Reduced) -> dict[str, Any]:
+        """What the data say about it, among the candidates that were searched: for fit.json."""
+        return {
+            "error_share": self.share,
+            "exact": self.exact,
+            "candidates": within.rank,
+            "condition": within.condition,
+            "same_as_simpler": within.dependent,
+            "cannot_tell_apart": self.alternatives,
+            "undecided": self.undecided,
+        }
 
 
 NOTHING = Equation((), np.zeros(0), np.zeros(0), 1.0, False, 0.0, 0, {}, {})

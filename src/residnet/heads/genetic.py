@@ -78,17 +78,8 @@ def breed(algebra: Algebra, data: Mapping[str, np.ndarray], target: np.ndarray, 
     names = [term(algebra, product) for product in found.terms]
     reduced = reduce(values, target[:, None], names, [algebra.degree(p) for p in found.terms], [algebra.effort(p) for p in found.terms])
     equation, within = (_whole(reduced), reduced) if config.final is None else find(reduced, 0, config.final)
-    told = {
-        "error_share": equation.share,
-        "exact": equation.exact,
-        "candidates": within.rank,
-        "condition": within.condition,
-        "same_as_simpler": within.dependent,
-        "cannot_tell_apart": equation.alternatives,
-        "undecided": equation.undecided,
-    }
     products = tuple(found.terms[names.index(name)] for name in equation.terms)
-    return Bred(found, products, tuple(equation.values.tolist()), tuple(equation.errors.tolist()), told)
+    return Bred(found, products, tuple(equation.values.tolist()), tuple(equation.errors.tolist()), equation.told(within))
 
 
 def _whole(reduced: Reduced) -> Equation:

@@ -190,13 +190,7 @@ class SymbolicHead(EquationHead):
             "latex": latex(written),
             "sympy": sympy_text(written),
             "c": c_function(written, f"{name} in SI units, valid within the range of the training data{late}"),
-            "error_share": equation.share,
-            "exact": equation.exact,
-            "candidates": within.rank,
-            "condition": within.condition,
-            "same_as_simpler": within.dependent,
-            "cannot_tell_apart": equation.alternatives,
-            "undecided": equation.undecided,
+            **equation.told(within),
         }
 
 

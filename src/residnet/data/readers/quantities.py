@@ -4,10 +4,23 @@ from __future__ import annotations
 
 from typing import Annotated, Literal, final
 
-from pydantic import Field, field_validator
+from pydantic import AfterValidator, Field
 
 from residnet.core.config import Config, Metres, Radians, Seconds
 from residnet.data.readers.channel_map import Conversion, factor
+
+
+def _converts(si: str) -> AfterValidator:
+    def known(unit: str) -> str:
+        factor(unit, si)
+        return unit
+
+    return AfterValidator(known)
+
+
+AngleUnit = Annotated[str, _converts("rad")]
+LengthUnit = Annotated[str, _converts("m")]
+SpeedUnit = Annotated[str, _converts("m/s")]
 
 
 @final
@@ -62,15 +75,9 @@ class Geodetic(Config):
     topic: str | None = None
     latitude: str = "latitude"
     longitude: str = "longitude"
-    unit: str = "deg"
+    unit: AngleUnit = "deg"
     origin: Origin | None = None
     antenna: Lever = Field(default_factory=Lever)
-
-    @field_validator("unit")
-    @classmethod
-    def _angle(cls, unit: str) -> str:
-        factor(unit, "rad")
-        return unit
 
     @property
     def fields(self) -> tuple[str, ...]:
@@ -94,14 +101,8 @@ class Local(Config):
     topic: str | None = None
     north: str
     east: str
-    unit: str = "m"
+    unit: LengthUnit = "m"
     antenna: Lever = Field(default_factory=Lever)
-
-    @field_validator("unit")
-    @classmethod
-    def _length(cls, unit: str) -> str:
-        factor(unit, "m")
-        return unit
 
     @property
     def fields(self) -> tuple[str, ...]:
@@ -151,15 +152,9 @@ class Angle(Config):
     kind: Literal["angle"] = "angle"
     topic: str | None = None
     field: str
-    unit: str = "rad"
+    unit: AngleUnit = "rad"
     frame: Literal["ned", "enu"] = "ned"
     offset: Radians = 0.0
-
-    @field_validator("unit")
-    @classmethod
-    def _angle(cls, unit: str) -> str:
-        factor(unit, "rad")
-        return unit
 
     @property
     def fields(self) -> tuple[str, ...]:
@@ -203,14 +198,8 @@ class EarthFixed(Config):
     topic: str | None = None
     north: str
     east: str
-    unit: str = "m/s"
+    unit: SpeedUnit = "m/s"
     antenna: Lever = Field(default_factory=Lever)
-
-    @field_validator("unit")
-    @classmethod
-    def _speed(cls, unit: str) -> str:
-        factor(unit, "m/s")
-        return unit
 
     @property
     def fields(self) -> tuple[str, ...]:
@@ -235,8 +224,8 @@ class CourseSpeed(Config):
     topic: str | None = None
     course: str
     speed: str
-    course_unit: str = "deg"
-    speed_unit: str = "m/s"
+    course_unit: AngleUnit = "deg"
+    speed_unit: SpeedUnit = "m/s"
     antenna: Lever = Field(default_factory=Lever)
 
     @property
