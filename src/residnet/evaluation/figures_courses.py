@@ -13,8 +13,8 @@ import pandas as pd
 from residnet.evaluation.figures_style import RC, collect, legend_above, new_figure, save
 
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#7F7F7F")
-_LINES: dict[str, Any] = {"course": "-", "lookahead": (0, (4, 1.5)), "enclosure": (0, (1, 1))}
-_WORDS = {"course": "", "lookahead": ", look-ahead", "enclosure": ", enclosure"}
+_LINES: dict[str, Any] = {"course": "-", "lookahead": (0, (4, 1.5)), "enclosure": (0, (1, 1)), "integral": (0, (4, 1, 1, 1))}
+_WORDS = {"course": "", "lookahead": ", look-ahead", "enclosure": ", enclosure", "integral": ", integral"}
 _DEG = 180.0 / math.pi
 _AROUND = 0.3
 

@@ -20,6 +20,8 @@ TRACKS = "tracks.parquet"
 """By this file a course's run folder is known."""
 COURSES = "courses.parquet"
 """The plans."""
+SPREAD = "spread.parquet"
+"""One line for each flight of the spread, where there is one."""
 
 _STYLE = (
     "body{margin:0 auto;max-width:60rem;padding:1rem;font:1rem/1.5 system-ui,sans-serif;color:#1a1f24}"
