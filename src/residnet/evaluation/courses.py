@@ -98,7 +98,8 @@ def row(model: str, kind: str, guidance: str, planned: PlannedCourse, flight: Co
     """A row of metrics.json.
 
     `ratio` is course time over the floor's length at the service speed; `ratio_turning` takes the speed that the vessel keeps in its
-    smallest turn, for vessels that slow down.
+    smallest turn, for vessels that slow down. `margin` is how far inside the circle that was entered least, or outside the one that was passed
+    most closely.
     """
     places = [(buoy.north, buoy.east) for buoy in planned.buoys]
     radii = [acceptance if planned.protocol == "enter" else buoy.radius for buoy in planned.buoys]
@@ -114,6 +115,7 @@ def row(model: str, kind: str, guidance: str, planned: PlannedCourse, flight: Co
         "cross_track_rms": float(np.sqrt(np.mean(flight.cross_track**2))),
         "cross_track_max": float(np.abs(flight.cross_track).max()),
         "travel": float(abs(flight.rudder[0]) + np.abs(np.diff(flight.rudder)).sum()),
+        "tightest_turn": _tightest(flight),
         "distances": [one.distance for one in seen],
     }
     if planned.protocol == "enter":
@@ -123,7 +125,14 @@ def row(model: str, kind: str, guidance: str, planned: PlannedCourse, flight: Co
     right = sum(one.side == buoy.leave_to for one, buoy in zip(seen, planned.buoys, strict=True))
     outside = [one.distance - radius for one, radius in zip(seen, radii, strict=True)]
     clear = sum(margin >= 0 for margin in outside)
-    return out | {"right_side": right, "clear": clear, "passed": right == clear == len(seen), "margin": min(outside), "n": len(seen)}
+    passed = {"right_side": right, "clear": clear, "clearance": min(outside)}
+    return out | passed | {"passed": right == clear == len(seen), "margin": min(outside), "n": len(seen)}
+
+
+def _tightest(flight: CourseFlight) -> float:
+    """Smallest radius in m that the vessel turned with, by its speed and yaw rate."""
+    rate = np.abs(np.diff(flight.heading)) / flight.dt
+    return float((flight.speed[:-1] / np.maximum(rate, 1e-9)).min())
 
 
 def spread_row(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -166,14 +175,15 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _nominal_lines(rows: Sequence[Mapping[str, Any]], passed: str) -> list[str]:
-    heads = (passed, "margin m", "xte rms m", "max m", "rudder deg")
+    heads = (passed, "margin m", "tightest m", "xte rms m", "max m", "rudder deg")
     lines = [f"{'controller':12s} {'guidance':14s} {'time s':>8s} {'ratio':>7s} {'turning':>8s} " + " ".join(f"{head:>11s}" for head in heads)]
     for one in rows:
         buoys = f"{one['entered']}/{one['n']}" if one["protocol"] == "enter" else f"{one['right_side']}/{one['clear']}/{one['n']}"
         late = "" if one["finished"] else "  (did not finish)"
         lines.append(
             f"{one['model']:12s} {one['guidance']:14s} {one['course_time']:8.2f} {one['ratio']:7.4f} {one['ratio_turning']:8.4f} "
-            f"{buoys:>11s} {one['margin']:11.3f} {one['cross_track_rms']:11.3f} {one['cross_track_max']:11.3f} {math.degrees(one['travel']):11.1f}{late}"
+            f"{buoys:>11s} {one['margin']:11.3f} {one['tightest_turn']:11.2f} {one['cross_track_rms']:11.3f} {one['cross_track_max']:11.3f} "
+            f"{math.degrees(one['travel']):11.1f}{late}"
         )
     return lines
 

@@ -32,9 +32,9 @@ _FAR = 1e3
 class ExportedCourse(nn.Module):
     """What a controller calls once per step; float32, SI and radians.
 
-    The memory s is that of the guidance (place along the course, and the drift where it is estimated), of the policy, and the last command. `fault` tells that a measurement or the
-    memory was no number or out of range: then the command is the safe one, reached at the rudder's rate, and the memory stays as it was.
-    `arrived` tells that the course has ended; commands go on along its last leg.
+    The memory s is that of the guidance (place along the course, and the drift where it is estimated), of the policy, and the last command.
+    `fault` tells that a measurement or the memory was no number or out of range: then the command is the safe one, reached at the rudder's
+    rate, and the memory stays as it was. `arrived` tells that the course has ended; commands go on along its last leg.
     """
 
     def __init__(self, policy: HeadingPolicy, guidance: CourseGuidance, safe: Literal["hold", "amidships"]) -> None:

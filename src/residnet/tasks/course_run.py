@@ -110,7 +110,9 @@ def run_course(config: CourseTaskConfig, folder: RunFolder, *, resume: bool) -> 
         "cross_track_rms": "m",
         "cross_track_max": "m",
         "distances": "m",
+        "clearance": "m",
         "margin": "m",
+        "tightest_turn": "m",
         "travel": "rad",
     }
     shown = {
@@ -224,7 +226,5 @@ def _export(
 
     file = folder.exports / f"{config.policy}_{planned.protocol}.pt"
     about = {"vessel": autopilot.vessel, "course": config.course.model_dump(mode="json"), "protocol": planned.protocol}
-    export_course(
-        config.policy, trained, _guidance(config, planned, steering), planned.course, file, safe=config.safe, about=about, metrics=rows
-    )
+    export_course(config.policy, trained, _guidance(config, planned, steering), planned.course, file, safe=config.safe, about=about, metrics=rows)
     print(f"exported: {file}")
