@@ -50,7 +50,7 @@ COURSE: dict[str, Any] = {
     ],
     "legs_change": "wheel_over",
     "spread": {"flights": 2, "effect": [1.0, 1.0], "time": [1.0, 1.0]},
-    "dt": "0.1 s",
+    "dt": "0.2 s",
     "duration": "42 s",
 }
 FLIGHTS = {("enter", "course"), ("enter", "lookahead"), ("enter", "enclosure"), ("enter", "integral"), ("sides", "course")}
@@ -91,9 +91,9 @@ def test_a_spread_of_equal_vessels_is_the_nominal_flight(run: Path) -> None:
     assert len(each) == 30
     for nominal, spread in zip(rows_of(run, "simulated"), rows_of(run, "spread"), strict=True):
         own = each[(each["model"] == nominal["model"]) & (each["guidance"] == nominal["guidance"]) & (each["protocol"] == nominal["protocol"])]
-        assert own["course_time"].tolist() == pytest.approx([nominal["course_time"]] * 2, abs=0.11)
-        assert spread["ratio"] == pytest.approx(nominal["ratio"], abs=2e-3)
-        assert spread["ratio_worst"] == pytest.approx(nominal["ratio"], abs=2e-3)
+        assert own["course_time"].tolist() == pytest.approx([nominal["course_time"]] * 2, abs=0.21)
+        assert spread["ratio"] == pytest.approx(nominal["ratio"], abs=6e-3)
+        assert spread["ratio_worst"] == pytest.approx(nominal["ratio"], abs=6e-3)
         assert spread["margin_worst"] == pytest.approx(nominal["margin"], abs=0.05)
         assert spread["finished"] == float(nominal["finished"])
 
@@ -120,7 +120,7 @@ def test_the_tracks_say_what_the_rows_say(run: Path) -> None:
     tracks = pd.read_parquet(run / "tracks.parquet")
     for row in rows_of(run, "simulated"):
         own = tracks[(tracks["controller"] == row["model"]) & (tracks["protocol"] == row["protocol"]) & (tracks["guidance"] == row["guidance"])]
-        assert own["t"].iloc[-1] == pytest.approx(row["course_time"], abs=0.11)
+        assert own["t"].iloc[-1] == pytest.approx(row["course_time"], abs=0.21)
         assert np.sqrt((own["cross_track"] ** 2).mean()) == pytest.approx(row["cross_track_rms"], rel=1e-6)
         away = np.hypot(own["north"] - 100.0, own["east"] - 20.0).min()
         assert away == pytest.approx(row["distances"][1], abs=1e-6)
