@@ -69,11 +69,13 @@ def test_legs_change_at_the_wheel_over_on_the_leg_but_in_the_circle_beside_it() 
     guidance = WaypointGuidance([(100.0, 0.0), (100.0, 100.0)], 3.4, LookAhead(10.0), STATE, over)
     before = float(over(torch.tensor([0.5 * math.pi], dtype=torch.float64)))
     assert before > 3.4
-    x = torch.zeros(5, 6, dtype=torch.float64)
+    x = torch.zeros(6, 6, dtype=torch.float64)
     # short of it, there, there but aside of the leg, in the circle; and the last way-point has no wheel-over
-    x[:, 0] = torch.tensor([99.9 - before, 100.1 - before, 100.1 - before, 97.0, 100.0])
-    x[:, 1] = torch.tensor([0.0, 0.0, 3.0, 0.0, 96.5])
-    s = torch.zeros(5, 3, dtype=torch.float64)
+    x[:, 0] = torch.tensor([99.9 - before, 100.1 - before, 100.1 - before, 97.0, 100.0, 100.1 - before])
+    x[:, 1] = torch.tensor([0.0, 0.0, 3.0, 0.0, 96.5, 0.0])
+    # there, on the leg, but at a crab angle
+    x[5, 2] = 0.15
+    s = torch.zeros(6, 3, dtype=torch.float64)
     s[4, 0] = 1.0
     _, s = guidance(x, 0, s)
-    assert s[:, 0].tolist() == [0.0, 1.0, 0.0, 1.0, 1.0]
+    assert s[:, 0].tolist() == [0.0, 1.0, 0.0, 1.0, 1.0, 0.0]

@@ -15,7 +15,7 @@ from residnet.control.wheel_over import WheelOver
 from residnet.core.errors import ConfigError
 
 _ON_LEG = 0.4
-"""Share of the circle of acceptance that the vessel is within of its leg where the wheel-over counts."""
+"""Share of the circle of acceptance that a vessel may be set off its leg by, at the wheel-over and on from there, for the turn to count on."""
 
 
 @final
@@ -23,7 +23,8 @@ class WaypointGuidance(Reference):
     """Reference heading [B, 1]: the leg's direction and the angle by which a law of the line of sight steers back to it.
 
     The leg changes when the vessel enters the circle of acceptance of its way-point, or has passed it; with a wheel-over, before that, where
-    the vessel has come onto its leg. Behind the last way-point it has arrived.
+    the vessel runs along its leg: its cross-track error, and what its heading aside of the leg would add on the way, are small against the
+    circle. A crab angle is such a heading, by as much as the current will set the vessel. Behind the last way-point it has arrived.
     Memory [B, 3 + that of the law]: number of the way-point that is steered for, and where the vessel began, which is the beginning of the
     first leg.
 
@@ -50,7 +51,7 @@ class WaypointGuidance(Reference):
         self.points: Tensor
         self.acceptance, self.sight, self.wheel_over = acceptance, sight, wheel_over
         self.on_leg = _ON_LEG * acceptance
-        self.x, self.y = state.index("x"), state.index("y")
+        self.x, self.y, self.psi = state.index("x"), state.index("y"), state.index("psi")
         self.n_state = 3 + sight.n_state
         self.may_finish = True
 
@@ -78,8 +79,9 @@ class WaypointGuidance(Reference):
         reached = (ahead <= 0) | (ahead * ahead + error * error <= self.acceptance**2)
         if self.wheel_over is not None:
             change = self.leg(x, number + 1, s)[0] - direction
-            turning = ahead <= self.wheel_over(torch.remainder(change + math.pi, 2.0 * math.pi) - math.pi)
-            reached = reached | (turning & (error.abs() <= self.on_leg) & (number < len(self.points) - 1))
+            before = self.wheel_over(torch.remainder(change + math.pi, 2.0 * math.pi) - math.pi)
+            aside = error.abs() + before * torch.sin(x[:, self.psi] - direction).abs()
+            reached = reached | ((ahead <= before) & (aside <= self.on_leg) & (number < len(self.points) - 1))
         number = (number + reached.long()).clamp(max=self.points.shape[0])
         direction, _, error = self.leg(x, number, s)
         angle, memory = self.sight(error, direction, s[:, 3:])
