@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -38,6 +39,17 @@ from residnet.tasks.pipeline import say
 
 _KEPT = 0.1
 """Seconds between the stored samples of a track."""
+_UNITS = {
+    "course_time": "s",
+    "floor_time": "s",
+    "cross_track_rms": "m",
+    "cross_track_max": "m",
+    "distances": "m",
+    "clearance": "m",
+    "margin": "m",
+    "tightest_turn": "m",
+    "travel": "rad",
+}
 
 
 def autopilot_of(config: CourseTaskConfig) -> AutopilotConfig:
@@ -78,59 +90,77 @@ def run_course(config: CourseTaskConfig, folder: RunFolder, *, resume: bool) -> 
         if not one["possible"]:
             say(f"buoy {one['buoy']}: {one['radius']:.4g} m cannot be followed; the smallest radius possible is {one['smallest']:.2f} m")
     trained = load_policy(run, config.policy, steering)
-    controllers: dict[str, tuple[str, Policy]] = {config.policy: ("policy", trained)}
-    reader: TypeAdapter[AnyController] = TypeAdapter(AnyController)
-    for name in config.peers:
-        controllers[name] = ("classical", reader.validate_python(notes["controllers"][name]["config"]).build(steering))
-    controllers |= {name: ("classical", other.build(steering)) for name, other in config.others.items()}
-    rows: list[dict[str, Any]] = []
-    tracks, plans, spread = [], [], []
+    controllers = {config.policy: trained, **_peers(config, notes["controllers"], steering)}
+    done = _Flown([], [], [])
+    plans = []
     for protocol in config.protocols:
         planned = plan_course(config.course, protocol, vessel, steering.turning, steering.limit, steady)
         say(f"{protocol}: planned {planned.course.length:.1f} m, shortest possible {planned.floor:.1f} m")
         plans.append(_plan_table(planned))
-        for name, (kind, law) in controllers.items():
+        for name in controllers:
             for sight in (None, *(config.line_of_sight if protocol == "enter" else ())):
-                guidance = "course" if sight is None else sight.kind
-                steered = _steered(config, planned, steering, law.double(), sight)
-                for vessels in (NOMINAL, *(() if config.spread is None else (config.spread.draw(),))):
-                    flights = fly(steering, *steered, planned, config.course.lookahead, config.duration, vessels)
-                    flown = [row(name, kind, guidance, planned, one, config.course.acceptance, steering.turning.speed) for one in flights]
-                    if vessels is NOMINAL:
-                        rows += flown
-                        tracks.append(_track_table(name, guidance, protocol, flights[0]))
-                    else:
-                        rows.append(spread_row(flown))
-                        spread.append(_spread_table(flown, vessels))
-        own = [entry for entry in rows if entry["protocol"] == protocol and entry["model"] == config.policy]
+                _fly(config, planned, steering, name, controllers[name], sight, done)
+        own = [entry for entry in done.rows if entry["protocol"] == protocol and entry["model"] == config.policy]
         _export(config, folder, planned, steering, trained, autopilot, own)
-    units = {
-        "course_time": "s",
-        "floor_time": "s",
-        "cross_track_rms": "m",
-        "cross_track_max": "m",
-        "distances": "m",
-        "clearance": "m",
-        "margin": "m",
-        "tightest_turn": "m",
-        "travel": "rad",
-    }
     shown = {
         "schema": SCHEMA,
         "run": config.name,
-        "channels": units,
+        "channels": _UNITS,
         "speed": steering.turning.speed,
         "rudder": steering.limit,
         "smallest": vars(steady),
         "feasibility": feasible,
     }
-    folder.write_json(folder.metrics, shown | {"rows": rows})
-    pd.concat(tracks, ignore_index=True).to_parquet(folder.path / TRACKS)
+    folder.write_json(folder.metrics, shown | {"rows": done.rows})
+    pd.concat(done.tracks, ignore_index=True).to_parquet(folder.path / TRACKS)
     pd.concat(plans, ignore_index=True).to_parquet(folder.path / COURSES)
-    if spread:
-        pd.concat(spread, ignore_index=True).to_parquet(folder.path / SPREAD)
+    if done.spread:
+        pd.concat(done.spread, ignore_index=True).to_parquet(folder.path / SPREAD)
     write_course_report(folder.path)
-    print(table(rows))
+    print(table(done.rows))
+
+
+class _Flown(NamedTuple):
+    """Rows of metrics.json, tracks of nominal flights, and flights of the spread."""
+
+    rows: list[dict[str, Any]]
+    tracks: list[pd.DataFrame]
+    spread: list[pd.DataFrame]
+
+
+def _peers(config: CourseTaskConfig, tuned: Mapping[str, Any], steering: Steering) -> dict[str, Policy]:
+    """Peers as the autopilot run tuned them, then the others."""
+    reader: TypeAdapter[AnyController] = TypeAdapter(AnyController)
+    peers = {name: reader.validate_python(tuned[name]["config"]) for name in config.peers}
+    return {name: law.build(steering).double() for name, law in (peers | config.others).items()}
+
+
+def _fly(
+    config: CourseTaskConfig,
+    planned: PlannedCourse,
+    steering: Steering,
+    name: str,
+    law: Policy,
+    sight: AnyLineOfSight | None,
+    done: _Flown,
+) -> None:
+    """The nominal flight, then those of the spread, of one controller under one guidance."""
+    kind = "policy" if name == config.policy else "classical"
+    guidance = "course" if sight is None else sight.kind
+    steered = _steered(config, planned, steering, law, sight)
+
+    def flown(vessels: Vessels) -> tuple[list[CourseFlight], list[dict[str, Any]]]:
+        flights = fly(steering, *steered, planned, config.course.lookahead, config.duration, vessels)
+        return flights, [row(name, kind, guidance, planned, one, config.course.acceptance, steering.turning.speed) for one in flights]
+
+    flights, rows = flown(NOMINAL)
+    done.rows.extend(rows)
+    done.tracks.append(_track_table(name, guidance, planned.protocol, flights[0]))
+    if config.spread is not None:
+        vessels = config.spread.draw()
+        rows = flown(vessels)[1]
+        done.rows.append(spread_row(rows))
+        done.spread.append(_spread_table(rows, vessels))
 
 
 def load_policy(run: Path, name: str, steering: Steering) -> HeadingPolicy:
