@@ -77,5 +77,7 @@ def test_legs_change_at_the_wheel_over_on_the_leg_but_in_the_circle_beside_it() 
     x[5, 2] = 0.15
     s = torch.zeros(6, 3, dtype=torch.float64)
     s[4, 0] = 1.0
+    compiled = torch.jit.script(guidance)(x, 0, s)[1]
     _, s = guidance(x, 0, s)
+    assert torch.equal(compiled, s)
     assert s[:, 0].tolist() == [0.0, 1.0, 0.0, 1.0, 1.0, 0.0]
