@@ -48,10 +48,10 @@ class WheelOver(nn.Module):
 
     def forward(self, change: Tensor) -> Tensor:
         """Distance [B] in m for changes of course [B] in rad, within +-pi."""
-        along = change.abs() * ((_ANGLES - 1) / math.pi)
-        before = along.floor().clamp(max=_ANGLES - 2)
-        number, share = before.long(), along - before
         table = self.table.to(change.dtype)
+        along = change.abs() * (float(table.shape[0] - 1) / math.pi)
+        before = along.floor().clamp(max=float(table.shape[0] - 2))
+        number, share = before.long(), along - before
         return (1.0 - share) * table[number] + share * table[number + 1]
 
 
