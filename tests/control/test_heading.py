@@ -117,6 +117,14 @@ def test_document_law_mixes_two_choices() -> None:
     assert np.degrees(command[:, 0].numpy()).tolist() == pytest.approx([0.2 * 1.5 + 0.8 * 1.25, 1.0])
 
 
+def test_document_law_takes_the_shorter_way_round() -> None:
+    """A vessel that has turned once around, under a heading within +-pi."""
+    policy = DocumentAutopilot(Linear(), limit=LIMIT)
+    x = torch.cat((at(0.0, np.radians(0.6)), at(2 * np.pi, np.radians(0.6)), at(-4 * np.pi, np.radians(0.6))))
+    command, _ = policy(x, heading(*[np.radians(3.1)] * 3), x[:, :0])
+    assert command[:, 0].tolist() == pytest.approx([float(command[0, 0])] * 3)
+
+
 def test_document_autopilot_creeps_as_errata_says() -> None:
     """With the source's horizon of one step it turns at 0.011 deg/s; with 2 s it arrives."""
     plant = load_vessel("nomoto_oceanos").build()

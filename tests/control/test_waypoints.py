@@ -9,7 +9,7 @@ import pytest
 import torch
 from pydantic import ValidationError
 
-from residnet.control.line_of_sight import EnclosureConfig, LookAheadConfig
+from residnet.control.line_of_sight import EnclosureConfig, IntegralLookAheadConfig, LookAheadConfig
 from residnet.control.waypoints import WaypointGuidance
 from residnet.core.errors import ConfigError
 
@@ -26,7 +26,7 @@ def at(*places: tuple[float, float]) -> torch.Tensor:
 def test_it_steers_for_a_point_ahead_on_the_leg(turn: float) -> None:
     """A leg of any direction; 3 m to starboard of it with 4 m look-ahead: atan(3/4) to port of the leg's direction."""
     end = (100 * math.cos(turn), 100 * math.sin(turn))
-    guidance = WaypointGuidance([end], 5.0, LookAheadConfig(distance=4.0).build(), STATE)
+    guidance = WaypointGuidance([end], 5.0, LookAheadConfig(distance=4.0).build(0.1), STATE)
     s = guidance.initial_state(at((0.0, 0.0)))
     for aside in (3.0, 0.0, -3.0):
         x = at((20 * math.cos(turn) - aside * math.sin(turn), 20 * math.sin(turn) + aside * math.cos(turn)))
@@ -42,7 +42,7 @@ def test_it_steers_for_a_point_ahead_on_the_leg(turn: float) -> None:
 def test_it_steers_for_where_a_circle_about_the_vessel_meets_the_leg(turn: float) -> None:
     """The point is found here from the quadratic equation of a circle and a line, its root further along the leg."""
     radius, leg = 5.0, 100 * np.array([math.cos(turn), math.sin(turn)])
-    guidance = WaypointGuidance([tuple(leg)], 2.0, EnclosureConfig(radius=radius).build(), STATE)
+    guidance = WaypointGuidance([tuple(leg)], 2.0, EnclosureConfig(radius=radius).build(0.1), STATE)
     s = guidance.initial_state(at((0.0, 0.0)))
     for place in ([20.0, 3.0], [21.0, 0.0], [22.0, -3.0], [23.0, 4.9], [24.0, -4.9]):
         vessel = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]]) @ np.array(place)
@@ -57,7 +57,7 @@ def test_it_steers_for_where_a_circle_about_the_vessel_meets_the_leg(turn: float
 
 
 def test_legs_change_in_the_circle_and_behind_the_point() -> None:
-    guidance = WaypointGuidance([(10.0, 0.0), (10.0, 20.0)], 2.0, LookAheadConfig(distance=5.0).build(), STATE)
+    guidance = WaypointGuidance([(10.0, 0.0), (10.0, 20.0)], 2.0, LookAheadConfig(distance=5.0).build(0.1), STATE)
     x = at((7.9, 0.0), (8.1, 0.0), (10.1, 9.0))
     s = guidance.initial_state(at((0.0, 0.0), (0.0, 0.0), (0.0, 0.0)))
     heading, s = guidance(x, 0, s)
@@ -75,7 +75,7 @@ def test_legs_change_in_the_circle_and_behind_the_point() -> None:
 def test_nonsense_is_refused() -> None:
     for points, acceptance in (([], 1.0), ([(1.0, 1.0)], 0.0)):
         with pytest.raises(ConfigError, match="way-points"):
-            WaypointGuidance(points, acceptance, LookAheadConfig(distance=1.0).build(), STATE)
-    for config, key in ((LookAheadConfig, "distance"), (EnclosureConfig, "radius")):
+            WaypointGuidance(points, acceptance, LookAheadConfig(distance=1.0).build(0.1), STATE)
+    for config, key in ((LookAheadConfig, "distance"), (EnclosureConfig, "radius"), (IntegralLookAheadConfig, "gain")):
         with pytest.raises(ValidationError, match="greater than 0"):
-            config(**{key: 0.0})
+            config(**{"distance": 1.0, "gain": 1.0, key: 0.0})

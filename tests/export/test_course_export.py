@@ -12,6 +12,7 @@ import torch
 
 from residnet.control.course_guidance import CourseGuidance
 from residnet.control.course_plan import Course
+from residnet.control.drift import DriftEstimate
 from residnet.control.following import Following
 from residnet.control.policy import HeadingPolicy
 from residnet.control.turning import Turning
@@ -20,14 +21,16 @@ from residnet.export.course import MEASURED, export_course
 LIMIT = math.radians(5)
 
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[torch.jit.ScriptModule, Following, CourseGuidance, dict[str, object]]:
+@pytest.fixture(scope="module", params=[None, DriftEstimate(10.0, 0.8, 0.02)], ids=["plain", "integral"])
+def made(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[torch.jit.ScriptModule, Following, CourseGuidance, dict[str, object]]:
     torch.manual_seed(0)
     policy = HeadingPolicy(MEASURED, turning=Turning(3.47, 3.94, 3.2), limit=LIMIT, dt=0.02, rate=0.2, hidden=(8,)).eval().requires_grad_(False)
     angle = np.linspace(0.0, 2.0, 1001)
     track = 30.0 * np.stack((np.sin(angle), 1.0 - np.cos(angle)), axis=-1)
     course = Course(0.06, track, angle, angle, np.full(len(angle), 0.03), 50.0)
-    guidance = CourseGuidance(course, 10.0, MEASURED)
+    guidance = CourseGuidance(course, 10.0, MEASURED, request.param)
     file = Path(tmp_path_factory.mktemp("course")) / "course.pt"
     card = export_course("policy", policy, guidance, course, file, safe="hold", about={"vessel": "x"}, metrics=[])
     extra = {"card.json": ""}
@@ -37,9 +40,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[torch.jit.ScriptModu
 
 
 def test_it_commands_what_guidance_and_policy_command(made: tuple[torch.jit.ScriptModule, Following, CourseGuidance, dict[str, object]]) -> None:
-    loaded, follower, guidance, _ = made
+    loaded, follower, guidance, card = made
     y = torch.tensor([[0.1, 0.3, 0.05, 3.2, 0.01, 0.02]])
-    s, place, memory, last = loaded.initial_state(y), torch.zeros(1, 1), follower.initial_state(y), 0.0
+    s, place, memory, last = loaded.initial_state(y), guidance.initial_state(y), follower.initial_state(y), 0.0
     for k in range(200):
         y = torch.tensor([[0.064 * k, 0.3 + 0.001 * k, 0.002 * k, 3.2, 0.01, 0.1 * math.sin(0.1 * k)]])
         command, s, fault, arrived = loaded.step(y, s)
@@ -50,6 +53,7 @@ def test_it_commands_what_guidance_and_policy_command(made: tuple[torch.jit.Scri
         assert float(command) == pytest.approx(last, abs=1e-6)
         assert not bool(fault)
         assert not bool(arrived)
+    assert len(card["memory"]) == s.shape[1]
 
 
 @pytest.mark.parametrize(("place", "value"), [(0, math.nan), (1, math.inf), (2, 1e9), (3, -5.0), (4, math.nan), (5, 1e3)])

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from residnet.control.base import Reference
 from residnet.control.course_plan import Course
+from residnet.control.drift import DriftEstimate
 from residnet.core.errors import ConfigError
 
 _LEAST = 0.3
@@ -25,15 +26,19 @@ class CourseGuidance(Reference):
     Line of sight on a curved path: heading_d = heading of the course - atan(e / look-ahead), e the cross-track error, positive to starboard,
     where the vessel makes way along the course's own tangent. Yaw rate and rudder are those of the course at the present speed, so that
     turns begin before the arc does. The place along the course moves by one Newton step of the nearest point each time, never back.
-    Memory [B, 1]: place along the course in m.
+
+    With an estimate of the drift D, heading_d = heading of the course - atan(e / look-ahead + D across), and the yaw rate counts what D says
+    of the speed over ground; D turns with respect to the course in its bends.
+    Memory [B, 1 or 3]: place along the course in m, and D.
 
     Args:
         course: to follow.
         lookahead: distance in m.
         state: names of the vessel's state.
+        drift: integral action against a steady current, at the same look-ahead; None for none.
     """
 
-    def __init__(self, course: Course, lookahead: float, state: Sequence[str]) -> None:
+    def __init__(self, course: Course, lookahead: float, state: Sequence[str], drift: DriftEstimate | None = None) -> None:
         super().__init__()
         if lookahead <= 0:
             raise ConfigError(f"look-ahead must be above zero, given {lookahead:g} m")
@@ -45,7 +50,8 @@ class CourseGuidance(Reference):
         self.x, self.y, self.psi = state.index("x"), state.index("y"), state.index("psi")
         self.u, self.v = state.index("u"), state.index("v")
         self.least = _LEAST
-        self.n_state = 1
+        self.drift = drift
+        self.n_state = 1 if drift is None else 3
         self.may_finish = True
 
     def at(self, place: Tensor) -> Tensor:
@@ -71,15 +77,22 @@ class CourseGuidance(Reference):
         place = place + (ahead / closeness).clamp(0.0, self.lookahead)
         known = self.at(place)
         _, aside = self.error(x, place)
+        direction, heading = known[:, 2], known[:, 3]
+        slope, memory = aside / self.lookahead, s[:, 1:]
+        across, along = torch.zeros_like(aside), torch.zeros_like(aside)
+        if self.drift is not None:
+            across, along = self.drift.across(direction, memory), self.drift.along(direction, memory)
+            memory = self.drift(aside, direction, memory)
+        slope = slope + across
         speed = torch.sqrt(x[:, self.u].square() + x[:, self.v].square())
+        stream = speed / torch.sqrt(1.0 + across.square())
+        away = torch.remainder(x[:, self.psi] - heading + math.pi, 2.0 * math.pi) - math.pi
         closeness = (1.0 - known[:, 5] * aside).clamp(min=self.least)
-        back = torch.atan(aside / self.lookahead)
-        drift = known[:, 2] - known[:, 3]
-        away = torch.remainder(x[:, self.psi] + drift - known[:, 2] + math.pi, 2.0 * math.pi) - math.pi
-        progress = speed * torch.cos(away).clamp(min=0.0) / closeness
-        returning = speed * torch.sin(away) * self.lookahead / (self.lookahead**2 + aside.square())
-        reference = torch.stack((known[:, 3] - back, known[:, 6] * progress - returning, known[:, 4]), dim=-1)
-        return reference, place.unsqueeze(-1)
+        progress = (speed * torch.cos(away) + stream * along).clamp(min=0.0) / closeness
+        sliding = (speed * torch.sin(away) + stream * across) / self.lookahead - along * known[:, 5] * progress
+        rate = known[:, 6] * progress - sliding / (1.0 + slope.square())
+        reference = torch.stack((heading - torch.atan(slope), rate, known[:, 4]), dim=-1)
+        return reference, torch.cat((place.unsqueeze(-1), memory), dim=-1)
 
     def finished(self, x: Tensor, k: int, s: Tensor) -> Tensor:
         """Rows behind the end of the course."""

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from residnet.control.base import Policy
 from residnet.core.errors import ConfigError
+from residnet.core.frames import wrap
 from residnet.dynamics.base import Dynamics
 
 
@@ -91,5 +92,5 @@ class DocumentAutopilot(Policy):
         """Rudder command [B, 1] in rad from the state x [B, nx] and the reference heading [B, 1] in rad; it keeps no memory."""
         error, rate = self.predictor(x, reference[:, 0], self.rudder)
         rudder = self.rudder.to(x.dtype)
-        toward, calm = rudder[error.abs().argmin(-1)], rudder[rate.abs().argmin(-1)]
+        toward, calm = rudder[wrap(error).abs().argmin(-1)], rudder[rate.abs().argmin(-1)]
         return (self.weight * toward + (1.0 - self.weight) * calm).unsqueeze(-1), s

@@ -9,15 +9,21 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from residnet.core.config import Config, Metres
+from residnet.control.drift import DriftEstimate
+from residnet.core.config import Config, Metres, MetresPerSecond
 
 
 class LineOfSight(nn.Module, ABC):
     """The angle between a leg and the course that is steered."""
 
+    def __init__(self) -> None:
+        super().__init__()
+        self.n_state = 0
+
     @abstractmethod
-    def forward(self, error: Tensor) -> Tensor:
-        """Angle [B] in rad, added to the leg's direction, from the cross-track error [B] in m, positive to starboard of the leg."""
+    def forward(self, error: Tensor, direction: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Angle [B] in rad, added to the leg's direction [B] in rad, from the cross-track error [B] in m, positive to starboard of the leg;
+        and the memory [B, n_state], zeros at the start."""
 
 
 @final
@@ -33,9 +39,9 @@ class LookAhead(LineOfSight):
         super().__init__()
         self.distance = distance
 
-    def forward(self, error: Tensor) -> Tensor:
+    def forward(self, error: Tensor, direction: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Angle [B]; never a right angle."""
-        return -torch.atan(error / self.distance)
+        return -torch.atan(error / self.distance), s
 
 
 @final
@@ -52,9 +58,32 @@ class Enclosure(LineOfSight):
         super().__init__()
         self.radius = radius
 
-    def forward(self, error: Tensor) -> Tensor:
+    def forward(self, error: Tensor, direction: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Angle [B]; a right angle from the radius on."""
-        return -torch.asin((error / self.radius).clamp(-1.0, 1.0))
+        return -torch.asin((error / self.radius).clamp(-1.0, 1.0)), s
+
+
+@final
+class IntegralLookAhead(LineOfSight):
+    """As `LookAhead`, turned further by the crab angle that a steady current asks for: -atan(error / distance + D).
+
+    Memory [B, 2]: of `DriftEstimate`, whose D across the leg this is.
+
+    Args:
+        distance: along the leg in m.
+        gain: of the estimate in m/s.
+        dt: step of the guidance in s.
+    """
+
+    def __init__(self, distance: float, gain: float, dt: float) -> None:
+        super().__init__()
+        self.drift = DriftEstimate(distance, gain, dt)
+        self.distance = distance
+        self.n_state = 2
+
+    def forward(self, error: Tensor, direction: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Angle [B]; never a right angle."""
+        return -torch.atan(error / self.distance + self.drift.across(direction, s)), self.drift(error, direction, s)
 
 
 class LookAheadConfig(Config):
@@ -67,8 +96,8 @@ class LookAheadConfig(Config):
     kind: Literal["lookahead"] = "lookahead"
     distance: Metres = Field(gt=0)
 
-    def build(self) -> LineOfSight:
-        """The law."""
+    def build(self, dt: float) -> LineOfSight:
+        """The law, for steps of dt seconds."""
         return LookAhead(self.distance)
 
 
@@ -82,9 +111,26 @@ class EnclosureConfig(Config):
     kind: Literal["enclosure"] = "enclosure"
     radius: Metres = Field(gt=0)
 
-    def build(self) -> LineOfSight:
-        """The law."""
+    def build(self, dt: float) -> LineOfSight:
+        """The law, for steps of dt seconds."""
         return Enclosure(self.radius)
 
 
-AnyLineOfSight = Annotated[LookAheadConfig | EnclosureConfig, Field(discriminator="kind")]
+class IntegralLookAheadConfig(Config):
+    """Look-ahead-based line of sight with integral action against a steady current.
+
+    Attributes:
+        distance: along the leg.
+        gain: sigma of the integral action, below speed less current; a quarter of the speed returns to a leg without overshoot.
+    """
+
+    kind: Literal["integral"] = "integral"
+    distance: Metres = Field(gt=0)
+    gain: MetresPerSecond = Field(gt=0)
+
+    def build(self, dt: float) -> LineOfSight:
+        """The law, for steps of dt seconds."""
+        return IntegralLookAhead(self.distance, self.gain, dt)
+
+
+AnyLineOfSight = Annotated[LookAheadConfig | EnclosureConfig | IntegralLookAheadConfig, Field(discriminator="kind")]

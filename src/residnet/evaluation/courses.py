@@ -98,7 +98,8 @@ def row(model: str, kind: str, guidance: str, planned: PlannedCourse, flight: Co
     """A row of metrics.json.
 
     `ratio` is course time over the floor's length at the service speed; `ratio_turning` takes the speed that the vessel keeps in its
-    smallest turn, for vessels that slow down.
+    smallest turn, for vessels that slow down. `margin` is how far inside the circle that was entered least, or outside the one that was passed
+    most closely.
     """
     places = [(buoy.north, buoy.east) for buoy in planned.buoys]
     radii = [acceptance if planned.protocol == "enter" else buoy.radius for buoy in planned.buoys]
@@ -114,17 +115,43 @@ def row(model: str, kind: str, guidance: str, planned: PlannedCourse, flight: Co
         "cross_track_rms": float(np.sqrt(np.mean(flight.cross_track**2))),
         "cross_track_max": float(np.abs(flight.cross_track).max()),
         "travel": float(abs(flight.rudder[0]) + np.abs(np.diff(flight.rudder)).sum()),
+        "tightest_turn": _tightest(flight),
         "distances": [one.distance for one in seen],
     }
     if planned.protocol == "enter":
-        return out | {"entered": int(sum(one.distance <= radius for one, radius in zip(seen, radii, strict=True))), "n": len(seen)}
-    right = [one.side == buoy.leave_to for one, buoy in zip(seen, planned.buoys, strict=True)]
-    clear = [one.distance >= radius for one, radius in zip(seen, radii, strict=True)]
+        inside = [radius - one.distance for one, radius in zip(seen, radii, strict=True)]
+        entered = sum(margin >= 0 for margin in inside)
+        return out | {"entered": entered, "passed": entered == len(seen), "margin": min(inside), "n": len(seen)}
+    right = sum(one.side == buoy.leave_to for one, buoy in zip(seen, planned.buoys, strict=True))
+    outside = [one.distance - radius for one, radius in zip(seen, radii, strict=True)]
+    clear = sum(margin >= 0 for margin in outside)
+    passed = {"right_side": right, "clear": clear, "clearance": min(outside)}
+    return out | passed | {"passed": right == clear == len(seen), "margin": min(outside), "n": len(seen)}
+
+
+def _tightest(flight: CourseFlight) -> float:
+    """Smallest radius in m that the vessel turned with, by its speed and yaw rate."""
+    rate = np.abs(np.diff(flight.heading)) / flight.dt
+    return float((flight.speed[:-1] / np.maximum(rate, 1e-9)).min())
+
+
+def spread_row(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """A row of metrics.json for many flights of one controller under one guidance, from their own rows.
+
+    `passed` and `finished` are shares of the flights; flights that were given up count with the time until then.
+    """
+    ratio, margin = (np.array([row[name] for row in rows]) for name in ("ratio", "margin"))
+    out = {name: rows[0][name] for name in ("model", "kind", "guidance", "protocol", "floor_time")}
     return out | {
-        "right_side": sum(right),
-        "clear": sum(clear),
-        "clearance": min(s.distance - r for s, r in zip(seen, radii, strict=True)),
-        "n": len(seen),
+        "split": "spread",
+        "n": len(rows),
+        "passed": float(np.mean([row["passed"] for row in rows])),
+        "finished": float(np.mean([row["finished"] for row in rows])),
+        "ratio": float(np.median(ratio)),
+        "ratio_worst": float(ratio.max()),
+        "margin": float(np.median(margin)),
+        "margin_worst": float(margin.min()),
+        "cross_track_rms": float(np.median([row["cross_track_rms"] for row in rows])),
     }
 
 
@@ -135,24 +162,40 @@ _TITLES: Mapping[Protocol, str] = {
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """The comparison as text."""
+    """The comparison as text: the nominal flights, then those of the spread."""
     lines = []
     for protocol, title in _TITLES.items():
         own = [row for row in rows if row["protocol"] == protocol]
         if not own:
             continue
-        buoys = "entered" if protocol == "enter" else "side/clear"
-        heads = (buoys, "margin m", "xte rms m", "max m", "rudder deg")
-        lines += [
-            f"{title}; shortest possible {own[0]['floor_time']:.2f} s",
-            f"{'controller':12s} {'guidance':14s} {'time s':>8s} {'ratio':>7s} {'turning':>8s} " + " ".join(f"{head:>11s}" for head in heads),
-        ]
-        for one in own:
-            passed = f"{one['entered']}/{one['n']}" if protocol == "enter" else f"{one['right_side']}/{one['clear']}/{one['n']}"
-            margin = f"{one['clearance']:.3f}" if protocol == "sides" else ""
-            late = "" if one["finished"] else "  (did not finish)"
-            lines.append(
-                f"{one['model']:12s} {one['guidance']:14s} {one['course_time']:8.2f} {one['ratio']:7.4f} {one['ratio_turning']:8.4f} "
-                f"{passed:>11s} {margin:>11s} {one['cross_track_rms']:11.3f} {one['cross_track_max']:11.3f} {math.degrees(one['travel']):11.1f}{late}"
-            )
+        lines.append(f"{title}; shortest possible {own[0]['floor_time']:.2f} s")
+        lines += _nominal_lines([row for row in own if row["split"] == "simulated"], "entered" if protocol == "enter" else "side/clear")
+        lines += _spread_lines([row for row in own if row["split"] == "spread"])
     return "\n".join(lines)
+
+
+def _nominal_lines(rows: Sequence[Mapping[str, Any]], passed: str) -> list[str]:
+    heads = (passed, "margin m", "tightest m", "xte rms m", "max m", "rudder deg")
+    lines = [f"{'controller':12s} {'guidance':14s} {'time s':>8s} {'ratio':>7s} {'turning':>8s} " + " ".join(f"{head:>11s}" for head in heads)]
+    for one in rows:
+        buoys = f"{one['entered']}/{one['n']}" if one["protocol"] == "enter" else f"{one['right_side']}/{one['clear']}/{one['n']}"
+        late = "" if one["finished"] else "  (did not finish)"
+        lines.append(
+            f"{one['model']:12s} {one['guidance']:14s} {one['course_time']:8.2f} {one['ratio']:7.4f} {one['ratio_turning']:8.4f} "
+            f"{buoys:>11s} {one['margin']:11.3f} {one['tightest_turn']:11.2f} {one['cross_track_rms']:11.3f} {one['cross_track_max']:11.3f} "
+            f"{math.degrees(one['travel']):11.1f}{late}"
+        )
+    return lines
+
+
+def _spread_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    if not rows:
+        return []
+    heads = ("passed %", "finished %", "ratio", "worst", "margin m", "worst m", "xte rms m")
+    lines = [f"{rows[0]['n']} vessels and currents; medians", f"{'controller':12s} {'guidance':14s} " + " ".join(f"{head:>10s}" for head in heads)]
+    for one in rows:
+        lines.append(
+            f"{one['model']:12s} {one['guidance']:14s} {100 * one['passed']:10.1f} {100 * one['finished']:10.1f} {one['ratio']:10.4f} "
+            f"{one['ratio_worst']:10.4f} {one['margin']:10.3f} {one['margin_worst']:10.3f} {one['cross_track_rms']:10.3f}"
+        )
+    return lines

@@ -13,8 +13,8 @@ import pandas as pd
 from residnet.evaluation.figures_style import RC, collect, legend_above, new_figure, save
 
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#7F7F7F")
-_LINES: dict[str, Any] = {"course": "-", "lookahead": (0, (4, 1.5)), "enclosure": (0, (1, 1))}
-_WORDS = {"course": "", "lookahead": ", look-ahead", "enclosure": ", enclosure"}
+_LINES: dict[str, Any] = {"course": "-", "lookahead": (0, (4, 1.5)), "enclosure": (0, (1, 1)), "integral": (0, (4, 1, 1, 1))}
+_WORDS = {"course": "", "lookahead": ", look-ahead", "enclosure": ", enclosure", "integral": ", integral"}
 _DEG = 180.0 / math.pi
 _AROUND = 0.3
 
@@ -124,3 +124,36 @@ def draw_histories(path: Path, tracks: pd.DataFrame, limit: float, text: str) ->
         collect(handles, panels[0])
         legend_above(figure, handles)
         save(figure, path, "Time histories: " + text.rstrip("."), f"{text} Flights along the plan; dotted: limit of the rudder.")
+
+
+def draw_spread(path: Path, flights: pd.DataFrame, text: str) -> None:
+    """Course time of every flight of the spread, over the shortest possible, by controller and guidance.
+
+    Args:
+        path: of the picture.
+        flights: of one protocol, with model, guidance, ratio, passed, finished.
+        text: what the course asks for.
+    """
+    import matplotlib
+
+    kinds = list(flights[["model", "guidance"]].drop_duplicates().itertuples(index=False, name=None))
+    controllers = flights["model"].drop_duplicates().tolist()
+    with matplotlib.rc_context(RC):
+        figure = new_figure(1.2 + 0.32 * len(kinds))
+        axes = figure.subplots()
+        for line, (controller, guidance) in enumerate(kinds):
+            own = flights[(flights["model"] == controller) & (flights["guidance"] == guidance) & flights["finished"]]
+            colour = _COLOURS[controllers.index(controller) % len(_COLOURS)]
+            beside = line + 0.5 * (np.arange(len(own)) / max(len(own) - 1, 1) - 0.5)
+            face = [colour if passed else "none" for passed in own["passed"]]
+            axes.scatter(own["ratio"], beside, s=14, facecolors=face, edgecolors=colour, linewidths=0.8, zorder=3)
+            if len(own) > 0:
+                axes.plot([own["ratio"].median()] * 2, [line - 0.38, line + 0.38], color="black", linewidth=1.2, zorder=4)
+        axes.set(xlabel="course time over the shortest possible, in water at rest", ylim=(len(kinds) - 0.5, -0.5))
+        axes.set_yticks(range(len(kinds)), [_label(*kind) for kind in kinds])
+        axes.grid(axis="y", visible=False)
+        given_up = len(flights) - int(flights["finished"].sum())
+        caption = f"{text} One point for each vessel and current, filled where all buoys were passed as asked; bar: median."
+        if given_up:
+            caption += f" {given_up} of {len(flights)} flights did not finish and are left out."
+        save(figure, path, "Spread: " + text.rstrip("."), caption)

@@ -14,12 +14,14 @@ import pandas as pd
 from residnet.core.config import load_mapping
 from residnet.evaluation.courses import table
 from residnet.evaluation.figures import read_figures
-from residnet.evaluation.figures_courses import draw_histories, draw_tracks
+from residnet.evaluation.figures_courses import draw_histories, draw_spread, draw_tracks
 
 TRACKS = "tracks.parquet"
 """By this file a course's run folder is known."""
 COURSES = "courses.parquet"
 """The plans."""
+SPREAD = "spread.parquet"
+"""One line for each flight of the spread, where there is one."""
 
 _STYLE = (
     "body{margin:0 auto;max-width:60rem;padding:1rem;font:1rem/1.5 system-ui,sans-serif;color:#1a1f24}"
@@ -29,7 +31,7 @@ _ASKED = {"enter": "Every buoy's circle of acceptance is entered.", "sides": "Ev
 
 
 def write_course_report(run: Path) -> Path:
-    """Draw figures and write `report.html` from metrics.json, tracks.parquet and courses.parquet; returns the report's path."""
+    """Draw figures and write `report.html` from metrics.json and the tables beside it; returns the report's path."""
     metrics = json.loads((run / "metrics.json").read_text())
     config = load_mapping(run / "resolved.yaml")
     wanted = config["course"]
@@ -40,11 +42,29 @@ def write_course_report(run: Path) -> Path:
         own, plan = tracks[tracks["protocol"] == protocol], plans[plans["protocol"] == protocol]
         draw_tracks(run / "figures" / f"{protocol}_tracks.png", own, plan, wanted["buoys"], radii, wanted["start"], _ASKED[protocol])
         draw_histories(run / "figures" / f"{protocol}_time.png", own, metrics["rudder"], _ASKED[protocol])
+    if (run / SPREAD).is_file():
+        every = pd.read_parquet(run / SPREAD)
+        for protocol in config["protocols"]:
+            draw_spread(run / "figures" / f"{protocol}_spread.png", every[every["protocol"] == protocol], _ASKED[protocol])
     path = run / "report.html"
     partial = path.with_name(path.name + ".partial")
     partial.write_text(_page(run, config, metrics), encoding="utf-8")
     partial.replace(path)
     return path
+
+
+def _spread_words(config: dict[str, Any]) -> str:
+    spread = config.get("spread")
+    if spread is None:
+        return ""
+    (low, high), (quick, slow) = spread["effect"], spread["time"]
+    bias = f", a rudder bias of at most {math.degrees(spread['bias']):.3g} deg" if spread["bias"] > 0 else ""
+    return (
+        f"Spread: {spread['flights']} vessels with {low:g} to {high:g} times the rudder's effect, {quick:g} to {slow:g} times the time "
+        f"constants{bias}, "
+        f"in currents of {spread['current']:g} m/s from all directions, which ratios of course times do not allow for; passed: share of the flights "
+        "that passed all buoys as asked."
+    )
 
 
 def _page(run: Path, config: dict[str, Any], metrics: dict[str, Any]) -> str:
@@ -58,7 +78,8 @@ def _page(run: Path, config: dict[str, Any], metrics: dict[str, Any]) -> str:
         f"at {steady['speed']:.3g} m/s. {widened}The shortest possible course is that of bounded curvature at this radius (Dubins). "
         f"Ratio: course time over its length at the service speed of {metrics['speed']:.3g} m/s; turning: at the speed kept in the smallest turn. "
         "Side/clear: buoys left on their side, and outside their circles. Cross-track error from the plan, which a flight by line of sight does not "
-        "follow."
+        "follow. Margin: how far inside the circle that is entered least, or outside the one that is passed most closely. Tightest: radius of the "
+        "tightest turn of a flight. " + _spread_words(config)
     )
     figures = "".join(
         f'<figure><img alt="{html.escape(f.title)}" src="data:image/png;base64,{base64.b64encode(f.path.read_bytes()).decode("ascii")}">'

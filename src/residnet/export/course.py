@@ -32,9 +32,9 @@ _FAR = 1e3
 class ExportedCourse(nn.Module):
     """What a controller calls once per step; float32, SI and radians.
 
-    The memory s is that of the guidance (place along the course), of the policy, and the last command. `fault` tells that a measurement or the
-    memory was no number or out of range: then the command is the safe one, reached at the rudder's rate, and the memory stays as it was.
-    `arrived` tells that the course has ended; commands go on along its last leg.
+    The memory s is that of the guidance (place along the course, and the drift where it is estimated), of the policy, and the last command.
+    `fault` tells that a measurement or the memory was no number or out of range: then the command is the safe one, reached at the rudder's
+    rate, and the memory stays as it was. `arrived` tells that the course has ended; commands go on along its last leg.
     """
 
     def __init__(self, policy: HeadingPolicy, guidance: CourseGuidance, safe: Literal["hold", "amidships"]) -> None:
@@ -75,8 +75,8 @@ class ExportedCourse(nn.Module):
         good = self._good(y).unsqueeze(-1)
         y = torch.where(good, y, torch.zeros_like(y))
         last = s[:, -1:].clamp(-self.limit, self.limit)
-        reference, place = self.guidance(y, 0, s[:, :1])
-        wish, memory = self.follower(y, reference, s[:, 1:-1])
+        reference, place = self.guidance(y, 0, s[:, : self.guidance.n_state])
+        wish, memory = self.follower(y, reference, s[:, self.guidance.n_state : -1])
         wish = torch.where(good, wish, self.keep * last)
         command = last + (wish - last).clamp(-self.travel, self.travel)
         after = torch.where(good, torch.cat((place, memory), dim=-1), s[:, :-1])
@@ -178,6 +178,7 @@ def _card(
     metrics: Sequence[Mapping[str, Any]],
 ) -> dict[str, Any]:
     units = ("m", "m", "rad", "m/s", "m/s", "rad/s")
+    names = ("place", "drift_north", "drift_east")[: module.guidance.n_state]
     return {
         "schema": "residnet.course_card/1",
         "policy": name,
@@ -189,7 +190,7 @@ def _card(
         "length": course.length,
         "lookahead": module.guidance.lookahead,
         "command": [{"name": "cmd_delta", "unit": "rad", "limit": policy.limit, "rate": None if math.isinf(policy.rate) else policy.rate}],
-        "memory": ["place", "rudder", *(f"policy_{i}" for i in range(policy.n_state)), "last_command"],
+        "memory": [*names, "rudder", *(f"policy_{i}" for i in range(policy.n_state)), "last_command"],
         "dt": policy.dt,
         "dtype": "float32",
         "turning": {"K": policy.gain, "T": policy.time, "speed": policy.speed},

@@ -12,8 +12,9 @@ from pydantic import Field, model_validator
 from residnet.control.controllers import AnyController
 from residnet.control.courses import BuoyCourseConfig, Protocol
 from residnet.control.line_of_sight import AnyLineOfSight
-from residnet.core.config import Config, ExistingPath, Seconds, dump_config
+from residnet.core.config import Config, ExistingPath, MetresPerSecond, Seconds, dump_config
 from residnet.run_folder import RunFolder
+from residnet.tasks.course_flights import CourseSpreadConfig
 
 _Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
 
@@ -31,8 +32,11 @@ class CourseTaskConfig(Config):
         others: further controllers, for example the document's law with another horizon.
         course: see there.
         protocols: that are flown.
+        integral: gain of integral action against a steady current in the guidance along the plan; null for none.
         line_of_sight: laws that are also flown without a plan, on straight legs from way-point to way-point, as the source did it; for the
             protocol `enter`.
+        legs_change: where they do: in the circle of acceptance, as in the source, or at the wheel-over before it.
+        spread: of vessels and currents that all fly the course too, beside the nominal vessel in water at rest; null for none.
         dt: step of simulation and controllers.
         duration: after which a flight that has not ended is given up.
         safe: what the exported policy commands while its inputs are wrong: the last good command, or rudder amidships.
@@ -48,7 +52,10 @@ class CourseTaskConfig(Config):
     others: dict[_Name, AnyController] = Field(default_factory=dict)
     course: BuoyCourseConfig
     protocols: tuple[Protocol, ...] = Field(default=("enter", "sides"), min_length=1)
+    integral: MetresPerSecond | None = Field(default=None, gt=0)
     line_of_sight: tuple[AnyLineOfSight, ...] = ()
+    legs_change: Literal["circle", "wheel_over"] = "circle"
+    spread: CourseSpreadConfig | None = None
     dt: Seconds = Field(default=0.02, gt=0)
     duration: Seconds = Field(gt=0)
     safe: Literal["hold", "amidships"] = "amidships"
@@ -85,6 +92,6 @@ class CourseTaskConfig(Config):
         started = time.time()
         folder = RunFolder.create(out or Path("runs") / self.name, dump_config(self), resume=resume)
         run_course(self, folder, resume=resume)
-        folder.write_provenance(config=source, overrides=overrides, seed=0, files=[], started=started)
+        folder.write_provenance(config=source, overrides=overrides, seed=self.spread.seed if self.spread else 0, files=[], started=started)
         print(f"report: {folder.report}")
         return folder

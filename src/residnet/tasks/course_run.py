@@ -3,39 +3,53 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 import torch
 from pydantic import TypeAdapter
 
-from residnet.control.base import ClosedLoop, Policy, Reference
+from residnet.control.base import Policy, Reference
 from residnet.control.controllers import AnyController, Steering
 from residnet.control.course_guidance import CourseGuidance
 from residnet.control.courses import PlannedCourse, plan_course, report_feasibility, smallest_turn
+from residnet.control.drift import DriftEstimate
 from residnet.control.following import Following
 from residnet.control.line_of_sight import AnyLineOfSight
 from residnet.control.policy import HeadingPolicy
 from residnet.control.steering import SteeredPlant
 from residnet.control.turning import Turning
 from residnet.control.waypoints import WaypointGuidance
+from residnet.control.wheel_over import WheelOver
 from residnet.core.config import load_config
 from residnet.core.errors import ConfigError, UsageError
 from residnet.core.names import nearest
-from residnet.dynamics.rollout import Rollout
-from residnet.evaluation.courses import CourseFlight, row, table
+from residnet.evaluation.courses import CourseFlight, row, spread_row, table
 from residnet.evaluation.metrics import SCHEMA
-from residnet.evaluation.report_course import COURSES, TRACKS, write_course_report
+from residnet.evaluation.report_course import COURSES, SPREAD, TRACKS, write_course_report
 from residnet.physics.vessel import load_vessel
 from residnet.run_folder import RunFolder
 from residnet.tasks.autopilot import AutopilotConfig
 from residnet.tasks.course import CourseTaskConfig
+from residnet.tasks.course_flights import NOMINAL, Vessels, fly
 from residnet.tasks.pipeline import say
 
 _KEPT = 0.1
 """Seconds between the stored samples of a track."""
+_UNITS = {
+    "course_time": "s",
+    "floor_time": "s",
+    "cross_track_rms": "m",
+    "cross_track_max": "m",
+    "distances": "m",
+    "clearance": "m",
+    "margin": "m",
+    "tightest_turn": "m",
+    "travel": "rad",
+}
 
 
 def autopilot_of(config: CourseTaskConfig) -> AutopilotConfig:
@@ -76,47 +90,77 @@ def run_course(config: CourseTaskConfig, folder: RunFolder, *, resume: bool) -> 
         if not one["possible"]:
             say(f"buoy {one['buoy']}: {one['radius']:.4g} m cannot be followed; the smallest radius possible is {one['smallest']:.2f} m")
     trained = load_policy(run, config.policy, steering)
-    controllers: dict[str, tuple[str, Policy]] = {config.policy: ("policy", trained)}
-    reader: TypeAdapter[AnyController] = TypeAdapter(AnyController)
-    for name in config.peers:
-        controllers[name] = ("classical", reader.validate_python(notes["controllers"][name]["config"]).build(steering))
-    controllers |= {name: ("classical", other.build(steering)) for name, other in config.others.items()}
-    rows: list[dict[str, Any]] = []
-    tracks, plans = [], []
+    controllers = {config.policy: trained, **_peers(config, notes["controllers"], steering)}
+    done = _Flown([], [], [])
+    plans = []
     for protocol in config.protocols:
         planned = plan_course(config.course, protocol, vessel, steering.turning, steering.limit, steady)
         say(f"{protocol}: planned {planned.course.length:.1f} m, shortest possible {planned.floor:.1f} m")
         plans.append(_plan_table(planned))
-        for name, (kind, law) in controllers.items():
+        for name in controllers:
             for sight in (None, *(config.line_of_sight if protocol == "enter" else ())):
-                flight = fly_course(config, planned, steering, law.double(), sight)
-                guidance = "course" if sight is None else sight.kind
-                rows.append(row(name, kind, guidance, planned, flight, config.course.acceptance, steering.turning.speed))
-                tracks.append(_track_table(name, guidance, protocol, flight))
-        _export(config, folder, planned, steering, trained, autopilot, [entry for entry in rows if entry["protocol"] == protocol])
-    units = {
-        "course_time": "s",
-        "floor_time": "s",
-        "cross_track_rms": "m",
-        "cross_track_max": "m",
-        "distances": "m",
-        "clearance": "m",
-        "travel": "rad",
-    }
+                _fly(config, planned, steering, name, controllers[name], sight, done)
+        own = [entry for entry in done.rows if entry["protocol"] == protocol and entry["model"] == config.policy]
+        _export(config, folder, planned, steering, trained, autopilot, own)
     shown = {
         "schema": SCHEMA,
         "run": config.name,
-        "channels": units,
+        "channels": _UNITS,
         "speed": steering.turning.speed,
         "rudder": steering.limit,
         "smallest": vars(steady),
         "feasibility": feasible,
     }
-    folder.write_json(folder.metrics, shown | {"rows": rows})
-    pd.concat(tracks, ignore_index=True).to_parquet(folder.path / TRACKS)
+    folder.write_json(folder.metrics, shown | {"rows": done.rows})
+    pd.concat(done.tracks, ignore_index=True).to_parquet(folder.path / TRACKS)
     pd.concat(plans, ignore_index=True).to_parquet(folder.path / COURSES)
+    if done.spread:
+        pd.concat(done.spread, ignore_index=True).to_parquet(folder.path / SPREAD)
     write_course_report(folder.path)
-    print(table(rows))
+    print(table(done.rows))
+
+
+class _Flown(NamedTuple):
+    """Rows of metrics.json, tracks of nominal flights, and flights of the spread."""
+
+    rows: list[dict[str, Any]]
+    tracks: list[pd.DataFrame]
+    spread: list[pd.DataFrame]
+
+
+def _peers(config: CourseTaskConfig, tuned: Mapping[str, Any], steering: Steering) -> dict[str, Policy]:
+    """Peers as the autopilot run tuned them, then the others."""
+    reader: TypeAdapter[AnyController] = TypeAdapter(AnyController)
+    peers = {name: reader.validate_python(tuned[name]["config"]) for name in config.peers}
+    return {name: law.build(steering).double() for name, law in (peers | config.others).items()}
+
+
+def _fly(
+    config: CourseTaskConfig,
+    planned: PlannedCourse,
+    steering: Steering,
+    name: str,
+    law: Policy,
+    sight: AnyLineOfSight | None,
+    done: _Flown,
+) -> None:
+    """The nominal flight, then those of the spread, of one controller under one guidance."""
+    kind = "policy" if name == config.policy else "classical"
+    guidance = "course" if sight is None else sight.kind
+    steered = _steered(config, planned, steering, law, sight)
+
+    def flown(vessels: Vessels) -> tuple[list[CourseFlight], list[dict[str, Any]]]:
+        flights = fly(steering, *steered, planned, config.course.lookahead, config.duration, vessels)
+        return flights, [row(name, kind, guidance, planned, one, config.course.acceptance, steering.turning.speed) for one in flights]
+
+    flights, rows = flown(NOMINAL)
+    done.rows.extend(rows)
+    done.tracks.append(_track_table(name, guidance, planned.protocol, flights[0]))
+    if config.spread is not None:
+        vessels = config.spread.draw()
+        rows = flown(vessels)[1]
+        done.rows.append(spread_row(rows))
+        done.spread.append(_spread_table(rows, vessels))
 
 
 def load_policy(run: Path, name: str, steering: Steering) -> HeadingPolicy:
@@ -147,40 +191,31 @@ def load_policy(run: Path, name: str, steering: Steering) -> HeadingPolicy:
     return policy.eval().requires_grad_(False).double()
 
 
-def fly_course(config: CourseTaskConfig, planned: PlannedCourse, steering: Steering, law: Policy, sight: AnyLineOfSight | None) -> CourseFlight:
-    """One flight of the nominal vessel from the plan's first point and heading; under a line of sight on the legs from buoy to buoy instead."""
-    vessel, wanted = steering.vessel, config.course
-    plan = CourseGuidance(planned.course, wanted.lookahead, vessel.state)
-    reference: Reference = plan
-    policy: Policy = Following(law, vessel.state, limit=steering.limit, dt=config.dt, rate=vessel.rate)
-    if sight is not None:
-        points = [(buoy.north, buoy.east) for buoy in planned.buoys]
-        reference, policy = WaypointGuidance(points, wanted.acceptance, sight.build(), vessel.state), law
-    x, w = vessel.start(torch.ones(1, dtype=torch.float64))
-    place = [vessel.column("x"), vessel.column("y")]
-    x[:, place] = torch.tensor([wanted.start], dtype=torch.float64)
-    x[:, vessel.column("psi")] = float(planned.course.heading[0])
-    steps = round(config.duration / config.dt)
-    nominal = torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64)
-    with torch.no_grad():
-        states, inputs, _ = Rollout(vessel.model(config.dt), ClosedLoop(policy, reference))(x, w.unsqueeze(1).expand(-1, steps, -1), nominal)
-    moving = (states[0].diff(dim=0)[:, place].abs().sum(dim=-1) > 0).nonzero()
-    last = int(moving[-1]) + 1
-    flown = states[0, : last + 1]
-    nearest_place, errors = torch.zeros(1, 1, dtype=torch.float64), []
-    for k in range(last + 1):
-        _, nearest_place = plan(flown[k : k + 1], k, nearest_place)
-        errors.append(float(plan.error(flown[k : k + 1], nearest_place[:, 0])[1]))
-    speed = torch.hypot(flown[:, vessel.column("u")], flown[:, vessel.column("v")])
-    return CourseFlight(
-        flown[:, place].numpy(),
-        flown[:, vessel.column("psi")].numpy(),
-        inputs[0, : last + 1, 0].numpy(),
-        speed.numpy(),
-        np.array(errors),
-        config.dt,
-        last < steps,
-    )
+def _guidance(config: CourseTaskConfig, planned: PlannedCourse, steering: Steering) -> CourseGuidance:
+    """Along the plan."""
+    lookahead = config.course.lookahead
+    drift = None if config.integral is None else DriftEstimate(lookahead, config.integral, steering.dt)
+    return CourseGuidance(planned.course, lookahead, steering.vessel.state, drift)
+
+
+def _steered(
+    config: CourseTaskConfig, planned: PlannedCourse, steering: Steering, law: Policy, sight: AnyLineOfSight | None
+) -> tuple[Policy, Reference]:
+    """Controller and guidance along the plan, or under a line of sight on the legs from buoy to buoy instead."""
+    vessel = steering.vessel
+    if sight is None:
+        return Following(law, vessel.state, limit=steering.limit, dt=steering.dt, rate=vessel.rate), _guidance(config, planned, steering)
+    points, acceptance = [(buoy.north, buoy.east) for buoy in planned.buoys], config.course.acceptance
+    over = WheelOver(steering.turning, steering.limit, acceptance, rate=vessel.rate) if config.legs_change == "wheel_over" else None
+    return law, WaypointGuidance(points, acceptance, sight.build(steering.dt), vessel.state, over)
+
+
+def _spread_table(rows: list[dict[str, Any]], vessels: Vessels) -> pd.DataFrame:
+    """One line for each flight."""
+    kept = ("model", "guidance", "protocol", "finished", "passed", "course_time", "ratio", "margin", "cross_track_rms")
+    columns = {"effect": vessels.variation[:, 0], "time": vessels.variation[:, 1], "bias": vessels.variation[:, 2]}
+    columns |= {"current_north": vessels.current[:, 0], "current_east": vessels.current[:, 1]}
+    return pd.DataFrame({name: [one[name] for one in rows] for name in kept} | {name: values.numpy() for name, values in columns.items()})
 
 
 def _track_table(name: str, guidance: str, protocol: str, flight: CourseFlight) -> pd.DataFrame:
@@ -221,7 +256,5 @@ def _export(
 
     file = folder.exports / f"{config.policy}_{planned.protocol}.pt"
     about = {"vessel": autopilot.vessel, "course": config.course.model_dump(mode="json"), "protocol": planned.protocol}
-    own = [entry for entry in rows if entry["model"] == config.policy]
-    guided = CourseGuidance(planned.course, config.course.lookahead, steering.vessel.state)
-    export_course(config.policy, trained, guided, planned.course, file, safe=config.safe, about=about, metrics=own)
+    export_course(config.policy, trained, _guidance(config, planned, steering), planned.course, file, safe=config.safe, about=about, metrics=rows)
     print(f"exported: {file}")
