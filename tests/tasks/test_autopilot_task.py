@@ -129,6 +129,16 @@ def test_reporting_again_draws_the_same_report(run: Path, monkeypatch: pytest.Mo
     assert (run / "report.html").read_text() == before
 
 
+def test_a_policy_is_exported_by_its_name(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "there" / "pilot.pt"
+    assert call(monkeypatch, "export", run, "--model", "policy", "--out", out) == 0
+    assert torch.jit.load(str(out)).initial_state(torch.tensor([[0.0, 3.2, 0.0]])).shape == (1, 10)
+    assert call(monkeypatch, "export", run, "--model", "polcy") == 2
+    assert "did you mean 'policy'" in capsys.readouterr().err
+    assert call(monkeypatch, "evaluate", run, "--logs", tmp_path) == 2
+    assert "task 'autopilot' has no models to free-run" in capsys.readouterr().err
+
+
 def check(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, config: dict[str, Any]) -> int:
     path = tmp_path / "wrong.yaml"
     path.write_text(yaml.safe_dump(config))
@@ -142,6 +152,9 @@ def check(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, config: dict[str, Any
         ({"spread": {"current": 0.5}}, "no input 'current_north'"),
         ({"vessel": "nomoto_oceanus"}, "nomoto_oceanos"),
         ({"floor": "pd"}, "kind bang_bang"),
+        ({"rudder": "60 deg"}, "0.6109 rad at most"),
+        ({"policies": {"policy": {"hidden": [0]}}}, "hidden"),
+        ({"predictive": {"pd": {"horizon": "2 s"}}}, "'pd' names two controllers"),
         ({"policies": {"policy": {"imitate": "pdd"}}}, "no peer 'pdd'"),
         ({"policies": {"policy": {"learned": {"run": "nowhere"}}}}, "no such folder"),
     ],

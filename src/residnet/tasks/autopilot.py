@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
+import torch
 from pydantic import Field, model_validator
 
 from residnet.control.controllers import AnyController, BangBangConfig
@@ -20,6 +21,7 @@ from residnet.tasks.learned import chosen_model
 from residnet.training.autopilot_config import AutopilotTraining, SpreadConfig
 from residnet.training.predictor_config import PredictorTraining
 
+_Units = Annotated[int, Field(ge=1)]
 _Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
 
 
@@ -46,7 +48,7 @@ class PolicyConfig(Config):
         imitate: name of a peer whose commands it learns to give; null to train it for fast changes without overshoot.
     """
 
-    hidden: Annotated[tuple[int, ...], Field(min_length=1)] = (24, 24)
+    hidden: Annotated[tuple[_Units, ...], Field(min_length=1)] = (24, 24)
     observer: float = Field(default=8.0, ge=1)
     training: AutopilotTraining = AutopilotTraining()
     learned: LearnedConfig | None = None
@@ -68,7 +70,7 @@ class PredictiveConfig(Config):
     horizon: Seconds = Field(gt=0)
     candidates: int = Field(default=41, ge=3)
     weight: float = Field(default=0.2, ge=0, le=1)
-    hidden: Annotated[tuple[Annotated[int, Field(ge=1)], ...], Field(min_length=1)] = (20,)
+    hidden: Annotated[tuple[_Units, ...], Field(min_length=1)] = (20,)
     linear: bool = False
     training: PredictorTraining = PredictorTraining()
 
@@ -161,6 +163,10 @@ class AutopilotConfig(Config):
     @model_validator(mode="after")
     def _felt(self) -> AutopilotConfig:
         plant = load_vessel(self.vessel).build()
+        one = torch.ones(1, dtype=torch.float64)
+        most = float(plant.demand(one, one)[0, 0])
+        if self.rudder > (1.0 + 1e-6) * most:
+            raise ValueError(f"rudder: vessel '{self.vessel}' has {most:.4g} rad at most, given {self.rudder:.4g}")
         self.test.weather().check(plant, self.vessel)
         for name in self.spread.needs():
             if name not in plant.inputs:
