@@ -121,6 +121,45 @@ def test_a_spoilt_memory_is_given_up() -> None:
     assert torch.isfinite(after).all()
 
 
+@pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf, 1e38, -1e30, 1e6, -40.0])
+@pytest.mark.parametrize("place", range(10))
+def test_a_memory_out_of_range_brings_the_safe_command_and_a_flag(place: int, wrong: float) -> None:
+    module = for_export(untrained(rate=0.2), "amidships")
+    good, reference = torch.tensor([[0.0, 3.2, 0.05]]), torch.tensor([[0.5]])
+    s = module.initial_state(good)
+    for _ in range(20):
+        last, s, fault = module.step(good, reference, s)
+        assert not fault.any()
+    spoilt = s.clone()
+    spoilt[0, place] = wrong
+    command, after, fault = module.step(good, reference, spoilt)
+    assert fault.all()
+    # towards amidships at the rudder's rate, from where the last command was if that is known
+    kept = {True: 0.0, False: max(-LIMIT, min(LIMIT, wrong))}[math.isnan(wrong)] if place == 9 else float(last)
+    assert float(command) == pytest.approx(kept - max(-0.01, min(0.01, kept)), abs=1e-7)
+    # the memory begins anew, and the next step is as good as ever
+    assert torch.allclose(after[:, :9], module.initial_state(good)[:, :9])
+    again, _, fault = module.step(good, reference, after)
+    assert not fault.any()
+    assert torch.isfinite(again).all()
+
+
+def test_no_flight_leaves_the_memory_s_range() -> None:
+    """Flights of all corners under bias, hard turns at a third of the speed and at three times: what is remembered is never taken for wrong."""
+    module = for_export(untrained(rate=0.2), "amidships")
+    torch.manual_seed(1)
+    rows = 64
+    y = torch.zeros(rows, 3)
+    y[:, 1] = torch.linspace(0.0, 9.5, rows)
+    s = module.initial_state(y)
+    top = float(module.high[2])
+    for k in range(400):
+        y[:, 2] = (0.98 * top * torch.sin(torch.tensor(0.05 * k)) * torch.rand(rows)).clamp(-top, top)
+        y[:, 0] = 3.0 * torch.randn(rows)
+        _, s, fault = module.step(y, torch.randn(rows, 1), s)
+        assert not fault.any()
+
+
 def test_commands_keep_the_rudders_rate() -> None:
     module = for_export(untrained(rate=0.1), "hold")
     s = module.initial_state(torch.tensor([[0.0, 3.2, 0.0]]))

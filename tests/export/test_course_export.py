@@ -81,6 +81,25 @@ def test_a_memory_that_is_no_number_is_forgotten(made: tuple[torch.jit.ScriptMod
     assert bool(torch.isfinite(after).all())
 
 
+@pytest.mark.parametrize("value", [1e38, -1e30, 1e12, -math.inf])
+@pytest.mark.parametrize("place", range(11))
+def test_a_memory_out_of_range_is_forgotten_too(
+    made: tuple[torch.jit.ScriptModule, Following, CourseGuidance, dict[str, object]], place: int, value: float
+) -> None:
+    loaded = made[0]
+    y = torch.tensor([[0.1, 0.3, 0.05, 3.2, 0.01, 0.02]])
+    command, s, _, _ = loaded.step(y, loaded.initial_state(y))
+    spoilt = s.clone()
+    spoilt[0, place] = value
+    held, after, fault, _ = loaded.step(y, spoilt)
+    assert bool(fault)
+    assert float(held) == float(command)
+    assert torch.equal(after[:, :-1], loaded.initial_state(y)[:, :-1])
+    again, _, fault, _ = loaded.step(y, after)
+    assert not bool(fault)
+    assert math.isfinite(float(again))
+
+
 def test_it_arrives(made: tuple[torch.jit.ScriptModule, Following, CourseGuidance, dict[str, object]]) -> None:
     loaded = made[0]
     y = torch.tensor([[30 * math.sin(1.7), 30 - 30 * math.cos(1.7), 1.7, 3.2, 0.0, 0.1]])

@@ -22,6 +22,7 @@ SMALL: dict[str, Any] = {
     "turning_time": "40 s",
     "test": {"dt": "0.05 s", "duration": "12 s", "plants": 6, "bias_time": "60 s"},
     "policies": {"policy": {"hidden": [6], "training": TRAINING}},
+    "predictive": {"mlp": {"horizon": "2 s", "hidden": [8], "linear": True, "training": {"states": 300, "epochs": 20, "batch": 20}}},
     "peers": {"pd": {"kind": "pd"}, "bang_bang": {"kind": "bang_bang"}},
     "floor": "bang_bang",
     "tuning_points": 16,
@@ -44,9 +45,36 @@ def rows(run: Path) -> dict[tuple[str, str], dict[str, Any]]:
 
 def test_every_controller_flies_every_test(run: Path) -> None:
     found = rows(run)
-    assert set(found) == {(name, test) for name in ("policy", "pd", "bang_bang") for test in ("nominal", "corners", "random", "bias")}
+    assert set(found) == {(name, test) for name in ("policy", "mlp", "pd", "bang_bang") for test in ("nominal", "corners", "random", "bias")}
     assert {found[(name, "nominal")]["kind"] for name in ("policy", "pd", "bang_bang")} == {"policy", "classical", "floor"}
+    assert found[("mlp", "nominal")]["kind"] == "predictive"
     assert found[("policy", "random")]["n"] == 6
+
+
+def test_the_document_s_autopilot_says_how_well_it_predicts(run: Path) -> None:
+    notes = json.loads((run / "controllers.json").read_text())["controllers"]["mlp"]
+    assert 0 < notes["rms_heading"] < math.radians(2)
+    assert notes["config"]["hidden"] == [8]
+    assert (run / "models" / "mlp" / "weights.safetensors").is_file()
+
+
+def test_a_pupil_is_chosen_by_how_like_its_teacher_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The score of an imitation is the root mean square of the commands' difference: recomputed from the flights it is what the notes say."""
+    config = tmp_path / "pupil.yaml"
+    # a teacher that is slower than the policy's start: a choice by settling time would leave the start
+    peers = {"slow": {"kind": "pd", "kp": 3.0, "damping_time": "1.6 s"}}
+    training = {**TRAINING, "epochs": 3, "steps": 10, "dt": "0.05 s", "horizon": "4 s", "learning_rate": 0.05}
+    policies = {"pupil": {"hidden": [12], "imitate": "slow", "training": training}}
+    config.write_text(yaml.safe_dump({**SMALL, "policies": policies, "peers": peers, "predictive": {}, "floor": None}))
+    assert call(monkeypatch, "run", config, "--out", tmp_path / "run") == 0
+    fit = json.loads((tmp_path / "run" / "models" / "pupil" / "fit.json").read_text())
+    assert fit["best_validation"] == min(entry["validation"] for entry in fit["curve"])
+    series = pd.read_parquet(tmp_path / "run" / "flights.parquet")
+    pupil, teacher = (series[series["controller"] == name].set_index(["effect", "time", "t"])["rudder"] for name in ("pupil", "slow"))
+    # the teacher beside the pupil sees the pupil's flight, in flights.parquet its own: the same up to what the two do differently
+    apart = float((pupil - teacher).pow(2).mean() ** 0.5)
+    assert apart == pytest.approx(fit["best_validation"], rel=0.6)
+    assert fit["best_validation"] < 0.8 * fit["curve"][0]["validation"]
 
 
 def test_the_floor_is_the_time_optimal_change(run: Path) -> None:
@@ -101,6 +129,16 @@ def test_reporting_again_draws_the_same_report(run: Path, monkeypatch: pytest.Mo
     assert (run / "report.html").read_text() == before
 
 
+def test_a_policy_is_exported_by_its_name(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "there" / "pilot.pt"
+    assert call(monkeypatch, "export", run, "--model", "policy", "--out", out) == 0
+    assert torch.jit.load(str(out)).initial_state(torch.tensor([[0.0, 3.2, 0.0]])).shape == (1, 10)
+    assert call(monkeypatch, "export", run, "--model", "polcy") == 2
+    assert "did you mean 'policy'" in capsys.readouterr().err
+    assert call(monkeypatch, "evaluate", run, "--logs", tmp_path) == 2
+    assert "task 'autopilot' has no models to free-run" in capsys.readouterr().err
+
+
 def check(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, config: dict[str, Any]) -> int:
     path = tmp_path / "wrong.yaml"
     path.write_text(yaml.safe_dump(config))
@@ -114,6 +152,9 @@ def check(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, config: dict[str, Any
         ({"spread": {"current": 0.5}}, "no input 'current_north'"),
         ({"vessel": "nomoto_oceanus"}, "nomoto_oceanos"),
         ({"floor": "pd"}, "kind bang_bang"),
+        ({"rudder": "60 deg"}, "0.6109 rad at most"),
+        ({"policies": {"policy": {"hidden": [0]}}}, "hidden"),
+        ({"predictive": {"pd": {"horizon": "2 s"}}}, "'pd' names two controllers"),
         ({"policies": {"policy": {"imitate": "pdd"}}}, "no peer 'pdd'"),
         ({"policies": {"policy": {"learned": {"run": "nowhere"}}}}, "no such folder"),
     ],

@@ -78,3 +78,29 @@ def test_a_pupil_comes_near_its_teacher(tmp_path: Path) -> None:
     settings = SETTINGS.model_copy(update={"epochs": 5, "steps": 10, "learning_rate": 0.03, "dt": 0.05})
     train_autopilot("p", policy, VESSEL, settings, SpreadConfig(effect=(1.0, 1.0), time=(1.0, 1.0), bias=0.0), difference, 0, tmp_path, teacher)
     assert difference(policy) < 0.5 * before
+
+
+def test_training_that_only_harms_leaves_the_start(tmp_path: Path) -> None:
+    policy = fresh()
+    start = {name: value.clone() for name, value in policy.state_dict().items()}
+    before = settling(policy)
+    wild = SETTINGS.model_copy(update={"epochs": 1, "learning_rate": 0.3})
+    notes = train_autopilot("p", policy, VESSEL, wild, SpreadConfig(), settling, 0, tmp_path)
+    assert notes["curve"][0]["validation"] > before == pytest.approx(notes["best_validation"])
+    for name, value in policy.state_dict().items():
+        assert torch.equal(value.float(), start[name].float())
+
+
+def test_a_gradient_that_is_no_number_is_left_out(tmp_path: Path) -> None:
+    """A flight whose gradient overflows must not spoil the weights."""
+    policy = fresh()
+    spoilt = [True]
+
+    def once(gradient: torch.Tensor) -> torch.Tensor:
+        return gradient * math.nan if spoilt and spoilt.pop() else gradient
+
+    policy.law.register_hook(once)
+    notes = train_autopilot("p", policy, VESSEL, SETTINGS, SpreadConfig(), settling, 0, tmp_path)
+    assert not spoilt
+    assert all(math.isfinite(entry["validation"]) for entry in notes["curve"])
+    assert notes["curve"][0]["validation"] != notes["curve"][1]["validation"]

@@ -13,7 +13,7 @@ from torch import Tensor
 from residnet.control.bang_bang import BangBangHeading
 from residnet.control.bang_bang_rate import RatedBangBangHeading
 from residnet.control.base import Policy
-from residnet.control.document_autopilot import DocumentAutopilot, SimulatedPredictor
+from residnet.control.document_autopilot import DocumentAutopilot, Predictor, SimulatedPredictor
 from residnet.control.heading_pid import HeadingPID
 from residnet.control.steering import NominalSteering, SteeredVessel
 from residnet.control.turning import Turning
@@ -180,16 +180,19 @@ class DocumentConfig(ControllerConfig):
     candidates: int = Field(default=41, ge=3)
     weight: float = Field(default=0.2, ge=0, le=1)
 
-    def build(self, steering: Steering) -> Policy:
-        """The controller; long horizons are predicted in steps of at most a twentieth of T."""
+    def predictor(self, steering: Steering) -> SimulatedPredictor:
+        """The nominal vessel; long horizons are predicted in steps of at most a twentieth of T."""
         steps = math.ceil(self.horizon / max(steering.turning.time / 20.0, steering.dt))
         model = NominalSteering(steering.vessel, self.horizon / steps)
-        return DocumentAutopilot(
-            SimulatedPredictor(model, steering.vessel.state, steps, model.others),
-            limit=steering.limit,
-            candidates=self.candidates,
-            weight=self.weight,
-        )
+        return SimulatedPredictor(model, steering.vessel.state, steps, model.others)
+
+    def law(self, predictor: Predictor, steering: Steering) -> DocumentAutopilot:
+        """The controller with some predictor of this horizon."""
+        return DocumentAutopilot(predictor, limit=steering.limit, candidates=self.candidates, weight=self.weight)
+
+    def build(self, steering: Steering) -> Policy:
+        """The controller with the exact predictor."""
+        return self.law(self.predictor(steering), steering)
 
 
 AnyController = Annotated[PdConfig | PidConfig | LqrConfig | BangBangConfig | DocumentConfig, Field(discriminator="kind")]

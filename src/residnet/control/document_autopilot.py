@@ -64,6 +64,61 @@ class SimulatedPredictor(Predictor):
 
 
 @final
+class NetworkPredictor(Predictor):
+    """A perceptron with one output for each rudder angle: how heading and yaw rate change over the horizon (sections 6.1.2 and 6.2.2).
+
+    What moves the vessel goes in: velocities, heel, and the rudder's angle where it takes time to move. Where the vessel is and heads changes
+    nothing in calm water, so that the heading error itself passes through. With linear layers, as in the source's listing, the map is affine:
+    exact for Nomoto's model, and no more than a tangent to the 4-DOF vessel (ERRATA G21).
+
+    Args:
+        state: names of the columns of x.
+        candidates: how many rudder angles.
+        hidden: widths of the layers.
+        linear: without activations.
+    """
+
+    def __init__(self, state: Sequence[str], *, candidates: int, hidden: Sequence[int], linear: bool = False) -> None:
+        super().__init__()
+        self.psi, self.r = state.index("psi"), state.index("r")
+        self.take = [place for place, name in enumerate(state) if name not in ("x", "y", "psi")]
+        layers: list[nn.Module] = []
+        width = len(self.take)
+        for units in hidden:
+            layers += [nn.Linear(width, units), *([] if linear else [nn.Tanh()])]
+            width = units
+        self.network = nn.Sequential(*layers, nn.Linear(width, 2 * candidates))
+        self.register_buffer("centre", torch.zeros(len(self.take)))
+        self.register_buffer("spread", torch.ones(len(self.take)))
+        self.register_buffer("offset", torch.zeros(2, candidates))
+        self.register_buffer("scale", torch.ones(2, 1))
+        self.centre: Tensor
+        self.spread: Tensor
+        self.offset: Tensor
+        self.scale: Tensor
+
+    def calibrate(self, x: Tensor, change: Tensor) -> None:
+        """Take the scales from states [S, nx] and their changes [S, 2, C]."""
+        seen = x[:, self.take]
+        self.centre.copy_(seen.mean(0))
+        spread = seen.std(0)
+        # what does not vary says nothing; Nomoto's speed is one
+        self.spread.copy_(torch.where(spread > 1e-9 * (1.0 + self.centre.abs()), spread, 1.0))
+        self.offset.copy_(change.mean(0))
+        self.scale.copy_((change - change.mean(0)).square().mean((0, 2)).sqrt().unsqueeze(-1).clamp(min=1e-12))
+
+    def changes(self, x: Tensor) -> Tensor:
+        """Changes of heading and yaw rate [B, 2, C] over the horizon from states x [B, nx]."""
+        out: Tensor = self.network((x[:, self.take] - self.centre) / self.spread)
+        return out.reshape(len(x), 2, -1) * self.scale + self.offset
+
+    def forward(self, x: Tensor, heading: Tensor, rudder: Tensor) -> tuple[Tensor, Tensor]:
+        """Heading errors and yaw rates [B, C]; the angles are those that it was trained for."""
+        change = self.changes(x)
+        return (heading - x[:, self.psi]).unsqueeze(-1) - change[:, 0], x[:, self.r].unsqueeze(-1) + change[:, 1]
+
+
+@final
 class DocumentAutopilot(Policy):
     """delta = weight d_e + (1 - weight) d_r: of the candidates, d_e leads to the smallest heading error and d_r to the smallest yaw rate.
 

@@ -77,7 +77,8 @@ class HeadingPolicy(Policy):
         self.network = nn.Sequential(*layers, last)
         # errors per rad that full rudder answers, share of the rudder's braking that is counted on, relative damping, and how much less braking
         # is counted on while the rudder's effect is unknown; logarithms, since all are positive
-        steep = 250.0 if rate is None else min(250.0, 2.0 / (self.swing**2 * turning.gain * limit / turning.time))
+        # as steep as the rudder's swing allows, and full rudder for no less than a tenth of a degree
+        steep = 250.0 if rate is None else min(600.0, 2.0 / (self.swing**2 * turning.gain * limit / turning.time))
         self.law = nn.Parameter(torch.tensor([steep, 0.98, 0.92, 0.2]).log())
 
     def read_from(self, state: Sequence[str]) -> None:

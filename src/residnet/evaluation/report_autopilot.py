@@ -31,10 +31,10 @@ def write_autopilot_report(run: Path) -> Path:
     """Draw figures and write `report.html` from metrics.json, controllers.json and flights.parquet; returns the report's path."""
     metrics = json.loads((run / "metrics.json").read_text())
     config = load_mapping(run / "resolved.yaml")
-    names = list(dict.fromkeys(row["model"] for row in metrics["rows"]))
+    kinds = {row["model"]: row["kind"] for row in metrics["rows"]}
     test = config["test"]
-    draw_responses(run / "figures" / "responses.png", pd.read_parquet(run / FLIGHTS), names, test["heading"], test["band"], config["name"])
-    draw_distributions(run / "figures" / "distributions.png", pd.read_parquet(run / PLANTS), names, config["name"])
+    draw_responses(run / "figures" / "responses.png", pd.read_parquet(run / FLIGHTS), kinds, test["heading"], test["band"], config["name"])
+    draw_distributions(run / "figures" / "distributions.png", pd.read_parquet(run / PLANTS), kinds, config["name"])
     controllers = json.loads((run / "controllers.json").read_text())
     path = run / "report.html"
     partial = path.with_name(path.name + ".partial")

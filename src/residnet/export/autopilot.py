@@ -32,11 +32,40 @@ class Limits(NamedTuple):
     r: tuple[float, float]
 
 
+def memory_limits(policy: HeadingPolicy, turn: float) -> list[tuple[float, float]]:
+    """Ranges [low, high] of an exported policy's memory, by `MEMORY` and the last command: what its own steps can lead to, and some room.
+
+    Args:
+        policy: see there.
+        turn: fastest yaw rate [rad/s] that is taken for good.
+    """
+    angle, variance = 1.001 * policy.limit, 2.0 * policy.prior
+    # at a third of the speed the rudder that a turn stands for is three times as large
+    share = 4.0 * turn / (policy.gain * policy.limit) + 2.0
+    ranges = {
+        "rudder": angle,
+        "yaw_rate": 1.001 * turn,
+        "turning": share,
+        "push": angle,
+        "effect": 3.0,
+        "damping": 3.0,
+        "effect_variance": variance,
+        "covariance": variance,
+        "damping_variance": variance,
+    }
+    signed = [(-ranges[name], ranges[name]) for name in MEMORY]
+    return [
+        *((0.0, high) if name in ("effect", "damping") else (low, high) for name, (low, high) in zip(MEMORY, signed, strict=True)),
+        (-angle, angle),
+    ]
+
+
 class ExportedPolicy(nn.Module):
     """What a controller calls once per step; float32, SI and radians.
 
     The memory s [B, 10] is that of the policy and the last command. `fault` tells that a measurement, the reference or the memory was no
-    number or out of range: then the command is the safe one, reached at the rudder's rate, and the policy's memory stays as it was.
+    number or out of range: then the command is the safe one, reached at the rudder's rate. The policy's memory stays as it was; where it was
+    wrong itself, it is forgotten and begins anew.
     """
 
     def __init__(self, policy: HeadingPolicy, limits: Limits, safe: Literal["hold", "amidships"]) -> None:
@@ -46,6 +75,16 @@ class ExportedPolicy(nn.Module):
         self.register_buffer("high", torch.tensor([limit[1] for limit in limits], dtype=torch.float32))
         self.low: Tensor
         self.high: Tensor
+        kept = memory_limits(policy, limits.r[1])
+        self.register_buffer("memory_low", torch.tensor([limit[0] for limit in kept], dtype=torch.float32))
+        self.register_buffer("memory_high", torch.tensor([limit[1] for limit in kept], dtype=torch.float32))
+        self.memory_low: Tensor
+        self.memory_high: Tensor
+        # the memory of `initial_state` at r = 0, and what it gains with r
+        self.register_buffer("begin", torch.tensor([0.0, 0.0, 0.0, 0.0, 1.0, 1.0, policy.prior, 0.0, policy.prior, 0.0]))
+        self.register_buffer("begin_turn", torch.tensor([0.0, 1.0, 1.0 / (policy.gain * policy.limit), *[0.0] * 7]))
+        self.begin: Tensor
+        self.begin_turn: Tensor
         self.keep = 1.0 if safe == "hold" else 0.0
         # a large number where the rudder has no rate: infinity times zero would be no number
         self.travel = min(policy.rate * policy.dt, 2.0 * policy.limit)
@@ -63,17 +102,19 @@ class ExportedPolicy(nn.Module):
     @torch.jit.export
     def step(self, y: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Rudder command [B, 1] in rad, memory [B, 10] and fault [B] from y [B, 3] = (psi, u, r), reference heading [B, 1] and memory."""
-        remembers = torch.isfinite(s).all(dim=-1, keepdim=True)
-        s = torch.where(remembers, s, torch.zeros_like(s))
         good = (self._good(y) & torch.isfinite(reference[:, 0]) & (reference[:, 0].abs() <= self.high[0])).unsqueeze(-1)
         y = torch.where(good, y, torch.zeros_like(y))
         reference = torch.where(good, reference, torch.zeros_like(reference))
-        last = s[:, -1:].clamp(-self.limit, self.limit)
+        last = torch.nan_to_num(s[:, -1:]).clamp(-self.limit, self.limit)
+        # comparisons with what is no number are false
+        remembers = ((s >= self.memory_low) & (s <= self.memory_high)).all(dim=-1, keepdim=True)
+        s = torch.where(remembers, s, self.begin + self.begin_turn * y[:, 2:])
+        good = good & remembers
         wish, memory = self.policy(y, reference, s[:, :-1])
         wish = torch.where(good, wish, self.keep * last)
         memory = torch.where(good, memory, s[:, :-1])
         command = last + (wish - last).clamp(-self.travel, self.travel)
-        return command, torch.cat((memory, command), dim=-1), ~(good & remembers)[:, 0]
+        return command, torch.cat((memory, command), dim=-1), ~good[:, 0]
 
     def forward(self, y: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """As `step`."""

@@ -18,6 +18,7 @@ from residnet.control.course_plan import Course
 from residnet.control.following import Following
 from residnet.control.policy import HeadingPolicy
 from residnet.core.errors import ExportError
+from residnet.export.autopilot import memory_limits
 from residnet.export.scripting import write_scripted
 
 MEASURED = ("x", "y", "psi", "u", "v", "r")
@@ -34,7 +35,8 @@ class ExportedCourse(nn.Module):
 
     The memory s is that of the guidance (place along the course, and the drift where it is estimated), of the policy, and the last command.
     `fault` tells that a measurement or the memory was no number or out of range: then the command is the safe one, reached at the rudder's
-    rate, and the memory stays as it was. `arrived` tells that the course has ended; commands go on along its last leg.
+    rate, and the memory stays as it was; where it was wrong itself, it is forgotten and the course begins anew. `arrived` tells that the course
+    has ended; commands go on along its last leg.
     """
 
     def __init__(self, policy: HeadingPolicy, guidance: CourseGuidance, safe: Literal["hold", "amidships"]) -> None:
@@ -55,6 +57,16 @@ class ExportedCourse(nn.Module):
         self.register_buffer("high", torch.tensor(high, dtype=torch.float32))
         self.low: Tensor
         self.high: Tensor
+        # relative to the course's motion: rudder and yaw rate may differ by twice their ranges
+        kept = memory_limits(policy, 2.0 * turn)
+        # the place goes on beyond the end, as long as the controller does
+        angle, anywhere = 1.001 * policy.limit, 1e9
+        drift = [(-1.01, 1.01)] * (guidance.n_state - 1)
+        ranges = [(-anywhere, anywhere), *drift, (-angle, angle), (-2.0 * angle, 2.0 * angle), *kept[1:]]
+        self.register_buffer("memory_low", torch.tensor([limit[0] for limit in ranges], dtype=torch.float32))
+        self.register_buffer("memory_high", torch.tensor([limit[1] for limit in ranges], dtype=torch.float32))
+        self.memory_low: Tensor
+        self.memory_high: Tensor
         self.keep = 1.0 if safe == "hold" else 0.0
         self.travel, self.limit, self.dt, self.speed = self.follower.travel, policy.limit, policy.dt, policy.speed
 
@@ -70,18 +82,20 @@ class ExportedCourse(nn.Module):
     @torch.jit.export
     def step(self, y: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Rudder command [B, 1] in rad, memory [B, n], fault [B] and arrived [B] from y [B, 6] = `MEASURED` and the memory."""
-        remembers = torch.isfinite(s).all(dim=-1, keepdim=True)
-        s = torch.where(remembers, s, torch.zeros_like(s))
         good = self._good(y).unsqueeze(-1)
         y = torch.where(good, y, torch.zeros_like(y))
-        last = s[:, -1:].clamp(-self.limit, self.limit)
+        last = torch.nan_to_num(s[:, -1:]).clamp(-self.limit, self.limit)
+        # comparisons with what is no number are false
+        remembers = ((s >= self.memory_low) & (s <= self.memory_high)).all(dim=-1, keepdim=True)
+        s = torch.where(remembers, s, self.initial_state(y))
+        good = good & remembers
         reference, place = self.guidance(y, 0, s[:, : self.guidance.n_state])
         wish, memory = self.follower(y, reference, s[:, self.guidance.n_state : -1])
         wish = torch.where(good, wish, self.keep * last)
         command = last + (wish - last).clamp(-self.travel, self.travel)
         after = torch.where(good, torch.cat((place, memory), dim=-1), s[:, :-1])
         arrived = after[:, 0] >= self.guidance.length
-        return command, torch.cat((after, command), dim=-1), ~(good & remembers)[:, 0], arrived
+        return command, torch.cat((after, command), dim=-1), ~good[:, 0], arrived
 
     def forward(self, y: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """As `step`."""

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
+import torch
 from pydantic import Field, model_validator
 
 from residnet.control.controllers import AnyController, BangBangConfig
@@ -18,7 +19,9 @@ from residnet.physics.vessel import VesselName, load_vessel
 from residnet.run_folder import RunFolder
 from residnet.tasks.learned import chosen_model
 from residnet.training.autopilot_config import AutopilotTraining, SpreadConfig
+from residnet.training.predictor_config import PredictorTraining
 
+_Units = Annotated[int, Field(ge=1)]
 _Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
 
 
@@ -45,11 +48,31 @@ class PolicyConfig(Config):
         imitate: name of a peer whose commands it learns to give; null to train it for fast changes without overshoot.
     """
 
-    hidden: Annotated[tuple[int, ...], Field(min_length=1)] = (24, 24)
+    hidden: Annotated[tuple[_Units, ...], Field(min_length=1)] = (24, 24)
     observer: float = Field(default=8.0, ge=1)
     training: AutopilotTraining = AutopilotTraining()
     learned: LearnedConfig | None = None
     imitate: _Name | None = None
+
+
+class PredictiveConfig(Config):
+    """The autopilot of document 004 as it stands there: a perceptron that predicts what each rudder angle leads to, and the law (6.4).
+
+    Attributes:
+        horizon: of the prediction; the source's 0.01 s cannot settle (ERRATA 004).
+        candidates: rudder angles.
+        weight: of the choice for the heading error.
+        hidden: widths of the layers; the source has 20 for Nomoto's model and 30 for the 4-DOF vessel.
+        linear: without activations, as in the source's listing.
+        training: of the perceptron.
+    """
+
+    horizon: Seconds = Field(gt=0)
+    candidates: int = Field(default=41, ge=3)
+    weight: float = Field(default=0.2, ge=0, le=1)
+    hidden: Annotated[tuple[_Units, ...], Field(min_length=1)] = (20,)
+    linear: bool = False
+    training: PredictorTraining = PredictorTraining()
 
 
 class StepTestConfig(Config):
@@ -101,6 +124,7 @@ class AutopilotConfig(Config):
         spread: of vessels and disturbances, for training, tuning and comparison alike.
         test: see there.
         policies: by name.
+        predictive: the document's own autopilots, by name.
         peers: by name; gains that are left out are tuned.
         floor: peer that knows the vessel exactly: the others are measured in multiples of its settling time.
         tuning_points: candidates of each of four rounds of tuning.
@@ -118,6 +142,7 @@ class AutopilotConfig(Config):
     spread: SpreadConfig = SpreadConfig()
     test: StepTestConfig
     policies: dict[_Name, PolicyConfig] = Field(min_length=1)
+    predictive: dict[_Name, PredictiveConfig] = Field(default_factory=dict)
     peers: dict[_Name, AnyController] = Field(default_factory=dict)
     floor: _Name | None = None
     tuning_points: int = Field(default=256, ge=16)
@@ -125,8 +150,9 @@ class AutopilotConfig(Config):
 
     @model_validator(mode="after")
     def _names(self) -> AutopilotConfig:
-        if both := sorted(set(self.policies) & set(self.peers)):
-            raise ValueError(f"'{both[0]}' names a policy and a peer; names are unique in a run")
+        names = [*self.policies, *self.predictive, *self.peers]
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise ValueError(f"'{twice[0]}' names two controllers; names are unique in a run")
         for name, policy in self.policies.items():
             if policy.imitate is not None and policy.imitate not in self.peers:
                 raise ValueError(f"policies.{name}.imitate: no peer '{policy.imitate}'{nearest(policy.imitate, self.peers)}")
@@ -137,6 +163,10 @@ class AutopilotConfig(Config):
     @model_validator(mode="after")
     def _felt(self) -> AutopilotConfig:
         plant = load_vessel(self.vessel).build()
+        one = torch.ones(1, dtype=torch.float64)
+        most = float(plant.demand(one, one)[0, 0])
+        if self.rudder > (1.0 + 1e-6) * most:
+            raise ValueError(f"rudder: vessel '{self.vessel}' has {most:.4g} rad at most, given {self.rudder:.4g}")
         self.test.weather().check(plant, self.vessel)
         for name in self.spread.needs():
             if name not in plant.inputs:

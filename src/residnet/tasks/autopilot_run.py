@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-import json
+import math
 import time
 from typing import Any
 
 import torch
 
-from residnet.control.base import Policy
+from residnet.control.base import ClosedLoop, Policy
 from residnet.control.controllers import AnyController, Steering, TunedConfig
+from residnet.control.imitation import SideBySide
 from residnet.control.policy import HeadingPolicy
 from residnet.control.steered_model import SteeredModel
-from residnet.control.steering import SteeredPlant
+from residnet.control.steering import SteeredPlant, fly
 from residnet.control.tuning import TuningTask, tune
 from residnet.core.errors import ConfigError
+from residnet.dynamics.rollout import Source
 from residnet.dynamics.store import load_model
 from residnet.evaluation.autopilots import QUANTITIES, effort_table, step_flights, table
 from residnet.evaluation.metrics import SCHEMA
@@ -24,8 +26,10 @@ from residnet.physics.vessel import load_vessel
 from residnet.run_folder import RunFolder
 from residnet.tasks.autopilot import AutopilotConfig, PolicyConfig
 from residnet.tasks.autopilot_compare import compare
+from residnet.tasks.autopilot_predictive import predictive
 from residnet.tasks.learned import chosen_model
 from residnet.tasks.pipeline import say
+from residnet.tasks.trained import store_weights, stored_weights
 from residnet.training.autopilot import train_autopilot
 
 
@@ -38,12 +42,16 @@ def run_autopilot(config: AutopilotConfig, folder: RunFolder) -> None:
     steering = Steering(vessel, turning, config.rudder, config.test.dt)
     controllers: dict[str, tuple[str, Policy]] = {}
     notes: dict[str, Any] = {}
+    complete: dict[str, AnyController] = {}
     for name, peer in config.peers.items():
-        built, notes[name] = _peer(name, peer, steering, config)
-        controllers[name] = ("floor" if name == config.floor else "classical", built)
+        complete[name], notes[name] = _peer(name, peer, steering, config)
+        controllers[name] = ("floor" if name == config.floor else "classical", complete[name].build(steering))
+    for name, own in config.predictive.items():
+        built, notes[name] = predictive(name, own, steering, config.seed, folder)
+        controllers[name] = ("predictive", built)
     for name, wanted in config.policies.items():
-        teacher = None if wanted.imitate is None else controllers[wanted.imitate][1]
         school = _school(name, wanted, steering, config)
+        teacher = None if wanted.imitate is None else complete[wanted.imitate]
         policy, notes[name] = _policy(name, wanted, school, config, folder, teacher)
         policy.read_from(vessel.state)
         controllers = {name: ("policy", policy), **controllers}
@@ -67,23 +75,24 @@ def run_autopilot(config: AutopilotConfig, folder: RunFolder) -> None:
         learned = config.policies[name].learned
         about = {"vessel": config.vessel, "spread": config.spread.model_dump(mode="json")}
         about |= {} if learned is None else {"learned": learned.model_dump(mode="json")}
-        own = [entry for entry in rows if entry["model"] == name]
-        export_autopilot(name, trained, folder.exports / f"{name}.pt", safe=config.safe, about=about, metrics=own)
+        found = [entry for entry in rows if entry["model"] == name]
+        export_autopilot(name, trained, folder.exports / f"{name}.pt", safe=config.safe, about=about, metrics=found)
         print(f"exported: {folder.exports / f'{name}.pt'}")
     write_autopilot_report(folder.path)
     print(table(rows, config.floor), effort_table(rows), sep="\n")
 
 
-def _peer(name: str, peer: AnyController, steering: Steering, config: AutopilotConfig) -> tuple[Policy, dict[str, Any]]:
+def _peer(name: str, peer: AnyController, steering: Steering, config: AutopilotConfig) -> tuple[AnyController, dict[str, Any]]:
+    """A peer with all its gains, and what there is to say about it."""
     if not isinstance(peer, TunedConfig):
-        return peer.build(steering), {"config": peer.model_dump(mode="json")}
+        return peer, {"config": peer.model_dump(mode="json")}
     test = config.test
     task = TuningTask(test.heading, config.spread.corners(), test.overshoot, test.band, test.duration, test.bias, test.bias_error, test.bias_time)
     started = time.time()
     tuned = tune(peer, steering, task, config.tuning_points)
     say(f"  tuned {name}: " + ", ".join(f"{k} {v:.4g}" for k, v in (tuned.parameters | tuned.gains).items()) + f", worst {tuned.settling:.2f} s")
     complete = peer.model_copy(update=tuned.parameters)
-    return complete.build(steering), {
+    return complete, {
         "config": complete.model_dump(mode="json"),
         "gains": tuned.gains,
         "worst_settling": tuned.settling,
@@ -119,7 +128,7 @@ def _policy(
     steering: Steering,
     config: AutopilotConfig,
     folder: RunFolder,
-    teacher: Policy | None,
+    teacher: AnyController | None,
 ) -> tuple[HeadingPolicy, dict[str, Any]]:
     torch.manual_seed(config.seed)
     policy = HeadingPolicy(
@@ -132,14 +141,15 @@ def _policy(
         observer=wanted.observer,
     )
     started = time.time()
-    notes = _stored(policy, name, folder)
+    notes = stored_weights(policy, name, folder)
     if notes is None:
         say(f"  training {name}")
-        notes = train_autopilot(
-            name, policy, steering.vessel, wanted.training, config.spread, _Score(steering, config), config.seed, folder.path, teacher
-        )
+        # a controller with a memory knows its step: one teaches at the step of training, its like is compared at that of flights
+        shown = None if teacher is None else teacher.build(steering._replace(dt=wanted.training.dt))
+        score = _Score(steering, config) if teacher is None else _Unlikeness(steering, config, teacher.build(steering))
+        notes = train_autopilot(name, policy, steering.vessel, wanted.training, config.spread, score, config.seed, folder.path, shown)
         notes |= {"seconds": round(time.time() - started, 1), "imitates": wanted.imitate}
-        _store(policy, name, folder, notes)
+        store_weights(policy, name, folder, notes)
     policy.dt = steering.dt
     say(f"  {name}: score {notes['best_validation']:.3f} after {notes['seconds']:.0f} s")
     return policy.double(), {key: value for key, value in notes.items() if key != "curve"}
@@ -160,23 +170,22 @@ class _Score:
         return float(settled.mean() + 2.0 * settled.max() + 0.5 * test.duration * beyond.amax())
 
 
-def _store(policy: HeadingPolicy, name: str, folder: RunFolder, notes: dict[str, Any]) -> None:
-    from safetensors.torch import save_file
+class _Unlikeness:
+    """Root mean square of the difference between the commands of a policy and of its teacher, which sees what the policy flies; radians."""
 
-    place = folder.models / name
-    place.mkdir(parents=True, exist_ok=True)
-    save_file({key: value.contiguous() for key, value in policy.state_dict().items()}, place / "weights.safetensors")
-    folder.write_json(place / "fit.json", notes)
+    def __init__(self, steering: Steering, config: AutopilotConfig, teacher: Policy) -> None:
+        self.steering, self.test, self.corners, self.teacher = steering, config.test, config.spread.corners(), teacher.double()
 
+    def __call__(self, policy: HeadingPolicy) -> float:
+        test, rows = self.test, len(self.corners)
+        policy.dt = test.dt
+        beside: list[SideBySide] = []
 
-def _stored(policy: HeadingPolicy, name: str, folder: RunFolder) -> dict[str, Any] | None:
-    """Weights and notes of a policy that an interrupted run had finished."""
-    from safetensors.torch import load_file
+        def watched(source: Source) -> Source:
+            assert isinstance(source, ClosedLoop)
+            beside.append(SideBySide(source.policy, self.teacher, source.reference))
+            return beside[0]
 
-    place = folder.models / name
-    if not (place / "fit.json").is_file():
-        return None
-    policy.load_state_dict(load_file(place / "weights.safetensors"))
-    policy.eval().requires_grad_(False)
-    notes: dict[str, Any] = json.loads((place / "fit.json").read_text())
-    return notes
+        heading = torch.full((rows,), test.heading)
+        flights = fly(self.steering.vessel, policy, heading, self.corners, dt=test.dt, duration=test.duration, surround=watched)
+        return math.sqrt(float(beside[0].total) / flights.inputs.shape[1])

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
+from residnet.core.config import load_mapping
 from residnet.core.errors import UsageError
 from residnet.core.names import nearest
 from residnet.dynamics.store import load_model, model_names
@@ -21,6 +23,9 @@ def export_model(path: Path, name: str, out: Path | None, form: str = "torchscri
     """
     folder = RunFolder.open(path)
     content = folder.read_metrics()
+    policies = load_mapping(folder.resolved).get("policies")
+    if policies is not None:
+        return _exported_policy(folder, name, list(policies), out, form)
     chosen = str(content["selected"]) if name == "selected" else name
     if chosen not in model_names(folder.models):
         raise UsageError(f"{path}: no model '{name}'{nearest(name, ['selected', *model_names(folder.models)])}")
@@ -34,3 +39,23 @@ def export_model(path: Path, name: str, out: Path | None, form: str = "torchscri
     file = out or folder.exports / f"{chosen}.pt"
     export_torchscript(spec, model, file, rows)
     return file
+
+
+def _exported_policy(folder: RunFolder, name: str, policies: list[str], out: Path | None, form: str) -> Path:
+    """A policy of an autopilot run: exported and checked when the run ended, so that a copy is all there is to do.
+
+    Raises:
+        UsageError: where there is no such policy, or another form is asked for.
+    """
+    if name not in policies:
+        raise UsageError(f"{folder.path}: no policy '{name}'{nearest(name, policies)}")
+    if form != "torchscript":
+        raise UsageError(f"{folder.path}: policies are exported as torchscript, not as {form}")
+    file = folder.exports / f"{name}.pt"
+    if not file.is_file():
+        raise UsageError(f"{file}: no such file; the run writes it at its end")
+    if out is None:
+        return file
+    out.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(file, out)
+    return out

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from residnet.core.config import dump_config, load_config
-from residnet.core.errors import DataError
+from residnet.core.config import dump_config, load_config, load_mapping
+from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
 from residnet.data.prepare import prepare
 from residnet.data.readers import CanonicalConfig
@@ -32,6 +32,9 @@ def evaluate_external(run: Path, paths: Sequence[Path], out: Path | None) -> Run
     """
     started = time.time()
     source = RunFolder.open(run)
+    task = load_mapping(source.resolved).get("task")
+    if task != "fit":
+        raise UsageError(f"{run}: a run of task '{task}' has no models to free-run on logs; give a run of task 'fit'")
     config = load_config(source.resolved, [], FitConfig)
     torch.set_num_threads(config.threads)
     files = log_files(paths)

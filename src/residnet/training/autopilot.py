@@ -61,6 +61,14 @@ class AutopilotFit(EpochTraining):
         """Adam."""
         return torch.optim.Adam(self.policy.parameters(), lr=self.settings.learning_rate)
 
+    def on_fit_start(self) -> None:
+        """Score the start too: training is kept where it brings something."""
+        super().on_fit_start()
+        if not self.history:
+            model, score = self.validated()
+            if math.isfinite(score):
+                self.best_score, self.best_state = score, {name: value.detach().clone() for name, value in model.state_dict().items()}
+
     def on_train_epoch_start(self) -> None:
         """Seed the epoch and set the learning rate."""
         self.seed_epoch()
@@ -88,6 +96,12 @@ class AutopilotFit(EpochTraining):
             )
         self._losses.append(float(loss.detach()))
         return loss
+
+    def on_after_backward(self) -> None:
+        """Leave out a batch whose gradient is no number: through hundreds of steps of a saturated loop a single flight's can overflow."""
+        given = [p.grad for p in self.policy.parameters() if p.grad is not None]
+        if not all(bool(torch.isfinite(grad).all()) for grad in given):
+            self.trainer.optimizers[0].zero_grad()
 
     def _draw(self, rows: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """States [B, nx], inputs [B, m], headings [B], variations [B, 3], and which rows start straight ahead without disturbance [B]."""

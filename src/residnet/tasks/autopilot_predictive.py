@@ -1,0 +1,48 @@
+"""The document's own autopilots of an autopilot run: data, training and controller (document 004 sections 6.1.1 to 6.1.3)."""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Any
+
+import torch
+
+from residnet.control.base import Policy
+from residnet.control.controllers import DocumentConfig, Steering
+from residnet.control.document_autopilot import NetworkPredictor
+from residnet.run_folder import RunFolder
+from residnet.tasks.autopilot import PredictiveConfig
+from residnet.tasks.pipeline import say
+from residnet.tasks.trained import store_weights, stored_weights
+from residnet.training.predictor import train_predictor
+
+
+def predictive(name: str, wanted: PredictiveConfig, steering: Steering, seed: int, folder: RunFolder) -> tuple[Policy, dict[str, Any]]:
+    """A trained controller, and what there is to say about it.
+
+    Args:
+        name: of the controller.
+        wanted: its config.
+        steering: the vessel in calm water, and the limit of the rudder.
+        seed: of weights, states and batches.
+        folder: of the run.
+
+    Raises:
+        FitError: where training fails.
+    """
+    law = DocumentConfig(horizon=wanted.horizon, candidates=wanted.candidates, weight=wanted.weight)
+    exact = law.predictor(steering)
+    torch.manual_seed(seed)
+    network = NetworkPredictor(steering.vessel.state, candidates=wanted.candidates, hidden=wanted.hidden, linear=wanted.linear).double()
+    controller = law.law(network, steering)
+    notes = stored_weights(network, name, folder)
+    if notes is None:
+        started = time.time()
+        say(f"  training {name}")
+        notes = train_predictor(name, network, steering.vessel, exact, controller.rudder, wanted.training, seed, folder.path)
+        notes["seconds"] = round(time.time() - started, 1)
+        store_weights(network, name, folder, notes)
+    degrees = [math.degrees(notes[key]) for key in ("rms_heading", "rms_yaw_rate")]
+    say(f"  {name}: predicts {wanted.horizon:g} s ahead within {degrees[0]:.2g} deg and {degrees[1]:.2g} deg/s (rms), {notes['seconds']:.0f} s")
+    return controller, {"config": wanted.model_dump(mode="json")} | {key: value for key, value in notes.items() if key != "curve"}

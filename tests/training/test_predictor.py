@@ -1,0 +1,83 @@
+"""The predictor of document 004's autopilot: its data, its training, and the controller that stands on it."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+
+from residnet.control.controllers import DocumentConfig, Steering
+from residnet.control.document_autopilot import NetworkPredictor
+from residnet.control.steering import SteeredPlant, fly
+from residnet.physics.vessel import load_vessel
+from residnet.training.predictor import simulate_answers, train_predictor
+from residnet.training.predictor_config import PredictorTraining
+
+DEG = math.pi / 180
+LIMIT = 5 * DEG
+GAIN, TIME = 3.47, 3.94
+VESSEL = SteeredPlant(load_vessel("nomoto_oceanos").build())
+STEERING = Steering(VESSEL, VESSEL.turning(LIMIT, 60.0), LIMIT, 0.1)
+SETTINGS = PredictorTraining(states=1000, epochs=40, batch=50)
+
+
+def trained(folder: Path, horizon: float, *, linear: bool, hidden: tuple[int, ...] = (20,)) -> tuple[NetworkPredictor, dict[str, float]]:
+    law = DocumentConfig(horizon=horizon)
+    torch.manual_seed(0)
+    network = NetworkPredictor(VESSEL.state, candidates=41, hidden=hidden, linear=linear)
+    angles = law.law(network, STEERING).rudder
+    return network, train_predictor("mlp", network, VESSEL, law.predictor(STEERING), angles, SETTINGS, 0, folder)
+
+
+def test_answers_are_nomotos_closed_form() -> None:
+    """T r_dot + r = K delta from the yaw rate r0 under a held angle, for every state and angle of the data."""
+    law, horizon = DocumentConfig(horizon=2.0), 2.0
+    angles = torch.linspace(-LIMIT, LIMIT, 41, dtype=torch.float64)
+    x, change = simulate_answers(VESSEL, law.predictor(STEERING), angles, SETTINGS, 50, 3)
+    start, steady = x[:, VESSEL.column("r"), None], GAIN * angles[None, :]
+    decay = 1 - math.exp(-horizon / TIME)
+    torch.testing.assert_close(change[:, 1], (steady - start) * decay, rtol=1e-4, atol=1e-7)
+    torch.testing.assert_close(change[:, 0], steady * horizon + (start - steady) * TIME * decay, rtol=1e-4, atol=1e-7)
+    # the states fill what random angles lead to, on both sides
+    assert float(start.min()) < -0.3 * GAIN * LIMIT < 0.3 * GAIN * LIMIT < float(start.max())
+
+
+def test_a_linear_network_finds_nomotos_affine_map(tmp_path: Path) -> None:
+    """ERRATA G21: layers without activation are exact here; the network's slope with the yaw rate is that of the closed form."""
+    network, notes = trained(tmp_path, 2.0, linear=True)
+    assert notes["rms_heading"] < 0.01 * DEG
+    assert notes["rms_yaw_rate"] < 0.01 * DEG
+    x = torch.zeros(2, len(VESSEL.state), dtype=torch.float64)
+    x[:, VESSEL.column("u")] = 3.2
+    x[1, VESSEL.column("r")] = 0.1
+    heading = torch.tensor([0.5, 0.5], dtype=torch.float64)
+    error, rate = network(x, heading, torch.zeros(41))
+    decay = math.exp(-2.0 / TIME)
+    assert float(rate[1, 20] - rate[0, 20]) == pytest.approx(0.1 * decay, rel=0.01)
+    assert float(error[0, 20] - error[1, 20]) == pytest.approx(0.1 * TIME * (1 - decay), rel=0.01)
+    assert (tmp_path / "tensorboard" / "mlp").is_dir()
+
+
+def test_the_trained_law_steers_as_the_exact_one(tmp_path: Path) -> None:
+    """The same law (6.4) with the network and with the simulated vessel, 30 deg: both settle, at the same time within 5 %."""
+    network, _ = trained(tmp_path, 3.0, linear=False)
+    law = DocumentConfig(horizon=3.0)
+    nominal = torch.tensor([[1.0, 1.0, 0.0]])
+    flights = [
+        fly(VESSEL, controller, torch.tensor([30 * DEG]), nominal, dt=0.1, duration=40.0)
+        for controller in (law.build(STEERING), law.law(network, STEERING))
+    ]
+    exact, learned = (float(flight.settled(DEG)[0]) for flight in flights)
+    assert exact < 35.0
+    assert learned == pytest.approx(exact, rel=0.05)
+
+
+def test_the_document_s_law_turns_the_short_way() -> None:
+    """From 170 deg to -170 deg the bow goes through south."""
+    law = DocumentConfig(horizon=6.0).build(STEERING)
+    x, _ = VESSEL.start(torch.ones(1, dtype=torch.float64))
+    x[:, VESSEL.column("psi")] = 170 * DEG
+    command, _ = law(x, torch.tensor([[-170 * DEG]], dtype=torch.float64), x[:, :0])
+    assert float(command) > 0
