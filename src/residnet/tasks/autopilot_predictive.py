@@ -11,6 +11,7 @@ import torch
 from residnet.control.base import Policy
 from residnet.control.controllers import DocumentConfig, Steering
 from residnet.control.document_autopilot import NetworkPredictor
+from residnet.core.errors import UsageError
 from residnet.run_folder import RunFolder
 from residnet.tasks.autopilot import PredictiveConfig
 from residnet.tasks.pipeline import say
@@ -31,11 +32,9 @@ def predictive(name: str, wanted: PredictiveConfig, steering: Steering, seed: in
     Raises:
         FitError: where training fails.
     """
-    law = DocumentConfig(horizon=wanted.horizon, candidates=wanted.candidates, weight=wanted.weight)
-    exact = law.predictor(steering)
     torch.manual_seed(seed)
-    network = NetworkPredictor(steering.vessel.state, candidates=wanted.candidates, hidden=wanted.hidden, linear=wanted.linear).double()
-    controller = law.law(network, steering)
+    law, network = _untrained(wanted, steering)
+    exact, controller = law.predictor(steering), law.law(network, steering)
     notes = stored_weights(network, name, folder)
     if notes is None:
         started = time.time()
@@ -46,3 +45,20 @@ def predictive(name: str, wanted: PredictiveConfig, steering: Steering, seed: in
     degrees = [math.degrees(notes[key]) for key in ("rms_heading", "rms_yaw_rate")]
     say(f"  {name}: predicts {wanted.horizon:g} s ahead within {degrees[0]:.2g} deg and {degrees[1]:.2g} deg/s (rms), {notes['seconds']:.0f} s")
     return controller, {"config": wanted.model_dump(mode="json")} | {key: value for key, value in notes.items() if key != "curve"}
+
+
+def load_predictive(name: str, wanted: PredictiveConfig, steering: Steering, folder: RunFolder) -> Policy:
+    """The controller that a finished run trained.
+
+    Raises:
+        UsageError: where the run lacks it.
+    """
+    law, network = _untrained(wanted, steering)
+    if stored_weights(network, name, folder) is None:
+        raise UsageError(f"{folder.path}: no trained '{name}' (models/{name}/weights.safetensors)")
+    return law.law(network, steering)
+
+
+def _untrained(wanted: PredictiveConfig, steering: Steering) -> tuple[DocumentConfig, NetworkPredictor]:
+    law = DocumentConfig(horizon=wanted.horizon, candidates=wanted.candidates, weight=wanted.weight)
+    return law, NetworkPredictor(steering.vessel.state, candidates=wanted.candidates, hidden=wanted.hidden, linear=wanted.linear).double()

@@ -28,7 +28,7 @@ class CourseTaskConfig(Config):
         autopilot: folder of a finished autopilot run, or the config of one, which is then carried out first, in this run's own folder.
             Vessel, rudder, policy and tuned peers come from there.
         policy: its name there.
-        peers: names there.
+        peers: names of tuned peers and of the document's own autopilots there.
         others: further controllers, for example the document's law with another horizon.
         course: see there.
         protocols: that are flown.

@@ -33,6 +33,7 @@ from residnet.evaluation.report_course import COURSES, SPREAD, TRACKS, write_cou
 from residnet.physics.vessel import load_vessel
 from residnet.run_folder import RunFolder
 from residnet.tasks.autopilot import AutopilotConfig
+from residnet.tasks.autopilot_predictive import load_predictive
 from residnet.tasks.course import CourseTaskConfig
 from residnet.tasks.course_flights import NOMINAL, Vessels, fly
 from residnet.tasks.pipeline import say
@@ -65,8 +66,8 @@ def autopilot_of(config: CourseTaskConfig) -> AutopilotConfig:
     if config.policy not in autopilot.policies:
         raise ConfigError(f"policy: '{config.policy}' is none of {given}{nearest(config.policy, autopilot.policies)}")
     for name in config.peers:
-        if name not in autopilot.peers:
-            raise ConfigError(f"peers: '{name}' is none of {given}{nearest(name, autopilot.peers)}")
+        if name not in (known := {**autopilot.peers, **autopilot.predictive}):
+            raise ConfigError(f"peers: '{name}' is none of {given}{nearest(name, known)}")
     if taken := sorted({config.policy, *config.peers} & set(config.others)):
         raise ConfigError(f"others: '{taken[0]}' is a policy or peer already; names are unique in a run")
     return autopilot
@@ -90,7 +91,7 @@ def run_course(config: CourseTaskConfig, folder: RunFolder, *, resume: bool) -> 
         if not one["possible"]:
             say(f"buoy {one['buoy']}: {one['radius']:.4g} m cannot be followed; the smallest radius possible is {one['smallest']:.2f} m")
     trained = load_policy(run, config.policy, steering)
-    controllers = {config.policy: trained, **_peers(config, notes["controllers"], steering)}
+    controllers = {config.policy: trained, **_peers(config, autopilot, RunFolder.open(run), notes["controllers"], steering)}
     done = _Flown([], [], [])
     plans = []
     for protocol in config.protocols:
@@ -128,11 +129,17 @@ class _Flown(NamedTuple):
     spread: list[pd.DataFrame]
 
 
-def _peers(config: CourseTaskConfig, tuned: Mapping[str, Any], steering: Steering) -> dict[str, Policy]:
-    """Peers as the autopilot run tuned them, then the others."""
+def _peers(config: CourseTaskConfig, autopilot: AutopilotConfig, run: RunFolder, tuned: Mapping[str, Any], steering: Steering) -> dict[str, Policy]:
+    """Peers as the autopilot run tuned or trained them, then the others."""
     reader: TypeAdapter[AnyController] = TypeAdapter(AnyController)
-    peers = {name: reader.validate_python(tuned[name]["config"]) for name in config.peers}
-    return {name: law.build(steering).double() for name, law in (peers | config.others).items()}
+    built: dict[str, Policy] = {}
+    for name in config.peers:
+        if name in autopilot.predictive:
+            built[name] = load_predictive(name, autopilot.predictive[name], steering, run)
+        else:
+            built[name] = reader.validate_python(tuned[name]["config"]).build(steering)
+    built |= {name: law.build(steering) for name, law in config.others.items()}
+    return {name: law.double() for name, law in built.items()}
 
 
 def _fly(
