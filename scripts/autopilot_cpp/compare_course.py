@@ -47,6 +47,21 @@ def fly(module: Any, card: dict[str, Any], seconds: float) -> tuple[list[tuple[f
     return track, statistics.median(taken[10:])
 
 
+def eager(run: Path, card: dict[str, Any]) -> Any:
+    """Policy and guidance of a course run without compilation, planned again: the same operations, called one by one from Python."""
+    from residnet.core.config import load_config
+    from residnet.export.course import ExportedCourse
+    from residnet.run_folder import RunFolder
+    from residnet.tasks.course import CourseTaskConfig
+    from residnet.tasks.course_run import load_policy, plan_for, ready
+
+    folder = RunFolder.open(run)
+    config = load_config(folder.resolved, [], CourseTaskConfig)
+    known = ready(config, folder)
+    _, guidance = plan_for(config, known, card["protocol"])
+    return ExportedCourse(load_policy(known.run.path, config.policy, known.steering), guidance, config.safe).eval()
+
+
 def main() -> None:
     """Compare and print."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -66,11 +81,12 @@ def main() -> None:
         print(subprocess.run(words, capture_output=True, text=True, check=True).stdout.rstrip())
         with file.open() as lines:
             theirs = [tuple(float(row[name]) for name in COLUMNS) for row in csv.DictReader(lines)]
-    mine, median = fly(module, card, given.seconds)
-    if len(mine) != len(theirs):
-        raise SystemExit(f"Python took {len(mine)} steps, the C++ program {len(theirs)}")
-    worst = max(abs(a - b) for one, other in zip(mine, theirs, strict=True) for a, b in zip(one, other, strict=True))
-    print(f"TorchScript in Python: median step {median:.1f} us, largest difference of the track from the C++ program {worst:.2g}")
+    for name, own in (("eager Python", eager(given.course.parent.parent, card)), ("TorchScript in Python", module)):
+        mine, median = fly(own, card, given.seconds)
+        if len(mine) != len(theirs):
+            raise SystemExit(f"{name} took {len(mine)} steps, the C++ program {len(theirs)}")
+        worst = max(abs(a - b) for one, other in zip(mine, theirs, strict=True) for a, b in zip(one, other, strict=True))
+        print(f"{name}: median step {median:.1f} us, largest difference of the track from the C++ program {worst:.2g}")
 
 
 if __name__ == "__main__":

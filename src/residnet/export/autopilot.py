@@ -195,27 +195,35 @@ def check_parity(name: str, module: ExportedPolicy, exported: Any) -> float:
 def _card(
     name: str, module: ExportedPolicy, safe: str, parity: float, about: Mapping[str, Any], metrics: Sequence[Mapping[str, Any]]
 ) -> dict[str, Any]:
-    policy = module.policy
     return {
         "schema": "residnet.policy_card/1",
         "policy": name,
-        "measured": [
-            {"name": n, "unit": u, "range": [low, high]}
-            for n, u, low, high in zip(MEASURED, ("rad", "m/s", "rad/s"), module.low.tolist(), module.high.tolist(), strict=True)
-        ],
+        "measured": measured_entries(MEASURED, ("rad", "m/s", "rad/s"), module.low, module.high),
         "reference": [{"name": "heading", "unit": "rad"}],
-        "command": [{"name": "cmd_delta", "unit": "rad", "limit": policy.limit, "rate": None if math.isinf(policy.rate) else policy.rate}],
         "memory": [*MEMORY, "last_command"],
+        "fault": f"measurement, reference or memory no number or out of range: command {'held' if safe == 'hold' else 'amidships'}, flag set",
+        **policy_entries(module.policy),
+        **about,
+        "metrics": [dict(row) for row in metrics],
+        "parity": {"steps": PARITY_STEPS, "share_of_limit": parity},
+    }
+
+
+def measured_entries(names: Sequence[str], units: Sequence[str], low: Tensor, high: Tensor) -> list[dict[str, Any]]:
+    """Of a card: names, units and ranges of what an exported controller sees."""
+    return [{"name": n, "unit": u, "range": [a, b]} for n, u, a, b in zip(names, units, low.tolist(), high.tolist(), strict=True)]
+
+
+def policy_entries(policy: HeadingPolicy) -> dict[str, Any]:
+    """What the cards of all exported heading policies say."""
+    return {
+        "command": [{"name": "cmd_delta", "unit": "rad", "limit": policy.limit, "rate": None if math.isinf(policy.rate) else policy.rate}],
         "dt": policy.dt,
         "dtype": "float32",
         "hidden": [layer.out_features for layer in policy.network if isinstance(layer, nn.Linear)][:-1],
         "observer": policy.observer,
         "turning": {"K": policy.gain, "T": policy.time, "speed": policy.speed},
-        "fault": f"measurement, reference or memory no number or out of range: command {'held' if safe == 'hold' else 'amidships'}, flag set",
         "frame": "NED; psi clockwise from north; delta > 0 turns to starboard",
-        **about,
-        "metrics": [dict(row) for row in metrics],
-        "parity": {"steps": PARITY_STEPS, "share_of_limit": parity},
         "versions": {"residnet": __version__, "torch": torch.__version__},
         "exported": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         "safety": "TorchScript is code that runs when loaded: load only files that you trust. The files under models/ hold numbers only.",

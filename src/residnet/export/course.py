@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import math
-import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -12,13 +11,12 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
-from residnet import __version__
 from residnet.control.course_guidance import CourseGuidance
 from residnet.control.course_plan import Course
 from residnet.control.following import Following
 from residnet.control.policy import HeadingPolicy
 from residnet.core.errors import ExportError
-from residnet.export.autopilot import memory_limits
+from residnet.export.autopilot import measured_entries, memory_limits, policy_entries
 from residnet.export.scripting import write_scripted
 
 MEASURED = ("x", "y", "psi", "u", "v", "r")
@@ -191,29 +189,18 @@ def _card(
     about: Mapping[str, Any],
     metrics: Sequence[Mapping[str, Any]],
 ) -> dict[str, Any]:
-    units = ("m", "m", "rad", "m/s", "m/s", "rad/s")
     names = ("place", "drift_north", "drift_east")[: module.guidance.n_state]
     return {
         "schema": "residnet.course_card/1",
         "policy": name,
-        "measured": [
-            {"name": n, "unit": u, "range": [low, high]}
-            for n, u, low, high in zip(MEASURED, units, module.low.tolist(), module.high.tolist(), strict=True)
-        ],
+        "measured": measured_entries(MEASURED, ("m", "m", "rad", "m/s", "m/s", "rad/s"), module.low, module.high),
         "start": {"north": float(course.track[0, 0]), "east": float(course.track[0, 1]), "heading": float(course.heading[0])},
         "length": course.length,
         "lookahead": module.guidance.lookahead,
-        "command": [{"name": "cmd_delta", "unit": "rad", "limit": policy.limit, "rate": None if math.isinf(policy.rate) else policy.rate}],
         "memory": [*names, "rudder", *(f"policy_{i}" for i in range(policy.n_state)), "last_command"],
-        "dt": policy.dt,
-        "dtype": "float32",
-        "turning": {"K": policy.gain, "T": policy.time, "speed": policy.speed},
         "fault": f"measurement or memory no number or out of range: command {'held' if safe == 'hold' else 'amidships'}, flag set",
-        "frame": "NED; psi clockwise from north; delta > 0 turns to starboard",
+        **policy_entries(policy),
         **about,
         "metrics": [dict(row) for row in metrics],
         "parity": {"steps": PARITY_STEPS, "share_of_limit": parity},
-        "versions": {"residnet": __version__, "torch": torch.__version__},
-        "exported": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-        "safety": "TorchScript is code that runs when loaded: load only files that you trust. The files under models/ hold numbers only.",
     }

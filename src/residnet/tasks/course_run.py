@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,13 +14,14 @@ from pydantic import TypeAdapter
 from residnet.control.base import Policy, Reference
 from residnet.control.controllers import AnyController, Steering
 from residnet.control.course_guidance import CourseGuidance
-from residnet.control.courses import PlannedCourse, plan_course, report_feasibility, smallest_turn
+from residnet.control.courses import PlannedCourse, Protocol, plan_course, report_feasibility, smallest_turn
 from residnet.control.drift import DriftEstimate
 from residnet.control.following import Following
 from residnet.control.line_of_sight import AnyLineOfSight
 from residnet.control.policy import HeadingPolicy
 from residnet.control.steering import SteeredPlant
 from residnet.control.turning import Turning
+from residnet.control.turns import SteadyTurn
 from residnet.control.waypoints import WaypointGuidance
 from residnet.control.wheel_over import WheelOver
 from residnet.core.config import load_config
@@ -73,36 +73,72 @@ def autopilot_of(config: CourseTaskConfig) -> AutopilotConfig:
     return autopilot
 
 
+class Ready(NamedTuple):
+    """What courses are planned and flown with.
+
+    Attributes:
+        autopilot: config of the autopilot run.
+        run: its folder.
+        steering: vessel, K and T, rudder limit and step.
+        steady: the smallest turn.
+        controllers: configs of its peers as tuned, by name.
+    """
+
+    autopilot: AutopilotConfig
+    run: RunFolder
+    steering: Steering
+    steady: SteadyTurn
+    controllers: dict[str, Any]
+
+
+def ready(config: CourseTaskConfig, folder: RunFolder) -> Ready:
+    """From the finished run of the autopilot: the one that is given, or the one in the course's own folder.
+
+    Raises:
+        UsageError: where it is not finished.
+    """
+    autopilot = autopilot_of(config)
+    run = RunFolder.open(config.autopilot if config.autopilot.is_dir() else folder.path / "autopilot")
+    notes = json.loads((run.path / "controllers.json").read_text())
+    steering = Steering(SteeredPlant(load_vessel(autopilot.vessel).build()), Turning(**notes["turning"]), autopilot.rudder, config.dt)
+    return Ready(autopilot, run, steering, smallest_turn(config.course, steering.vessel, steering.limit), notes["controllers"])
+
+
+def plan_for(config: CourseTaskConfig, known: Ready, protocol: Protocol) -> tuple[PlannedCourse, CourseGuidance]:
+    """The plan of a protocol, and the guidance along it.
+
+    Raises:
+        ConfigError: where no course fits the vessel's turns.
+    """
+    steering = known.steering
+    planned = plan_course(config.course, protocol, steering.vessel, steering.turning, steering.limit, known.steady)
+    return planned, _guidance(config, planned, steering)
+
+
 def run_course(config: CourseTaskConfig, folder: RunFolder, *, resume: bool) -> None:
     """Train, plan, fly, draw, report, export."""
-    autopilot = autopilot_of(config)
-    run = config.autopilot
-    if not run.is_dir():
-        run = folder.path / "autopilot"
-        if not (run / "metrics.json").is_file():
-            autopilot.run(source=config.autopilot, overrides=[], out=run, resume=resume)
+    if not config.autopilot.is_dir() and not (folder.path / "autopilot" / "metrics.json").is_file():
+        autopilot_of(config).run(source=config.autopilot, overrides=[], out=folder.path / "autopilot", resume=resume)
     torch.set_num_threads(config.threads)
-    vessel = SteeredPlant(load_vessel(autopilot.vessel).build())
-    notes = json.loads((run / "controllers.json").read_text())
-    steering = Steering(vessel, Turning(**notes["turning"]), autopilot.rudder, config.dt)
-    steady = smallest_turn(config.course, vessel, steering.limit)
+    known = ready(config, folder)
+    steering, steady = known.steering, known.steady
     feasible = report_feasibility(config.course, steady)
     for one in feasible:
         if not one["possible"]:
             say(f"buoy {one['buoy']}: {one['radius']:.4g} m cannot be followed; the smallest radius possible is {one['smallest']:.2f} m")
-    trained = load_policy(run, config.policy, steering)
-    controllers = {config.policy: trained, **_peers(config, autopilot, RunFolder.open(run), notes["controllers"], steering)}
+    trained = load_policy(known.run.path, config.policy, steering)
+    controllers = {config.policy: trained, **_peers(config, known)}
     done = _Flown([], [], [])
     plans = []
     for protocol in config.protocols:
-        planned = plan_course(config.course, protocol, vessel, steering.turning, steering.limit, steady)
+        planned, guided = plan_for(config, known, protocol)
         say(f"{protocol}: planned {planned.course.length:.1f} m, shortest possible {planned.floor:.1f} m")
         plans.append(_plan_table(planned))
         for name in controllers:
             for sight in (None, *(config.line_of_sight if protocol == "enter" else ())):
                 _fly(config, planned, steering, name, controllers[name], sight, done)
         own = [entry for entry in done.rows if entry["protocol"] == protocol and entry["model"] == config.policy]
-        _export(config, folder, planned, steering, trained, autopilot, own)
+        _export(config, folder, planned, guided, trained, known.autopilot, own)
     shown = {
         "schema": SCHEMA,
         "run": config.name,
@@ -129,16 +165,16 @@ class _Flown(NamedTuple):
     spread: list[pd.DataFrame]
 
 
-def _peers(config: CourseTaskConfig, autopilot: AutopilotConfig, run: RunFolder, tuned: Mapping[str, Any], steering: Steering) -> dict[str, Policy]:
+def _peers(config: CourseTaskConfig, known: Ready) -> dict[str, Policy]:
     """Peers as the autopilot run tuned or trained them, then the others."""
     reader: TypeAdapter[AnyController] = TypeAdapter(AnyController)
     built: dict[str, Policy] = {}
     for name in config.peers:
-        if name in autopilot.predictive:
-            built[name] = load_predictive(name, autopilot.predictive[name], steering, run)
+        if name in known.autopilot.predictive:
+            built[name] = load_predictive(name, known.autopilot.predictive[name], known.steering, known.run)
         else:
-            built[name] = reader.validate_python(tuned[name]["config"]).build(steering)
-    built |= {name: law.build(steering) for name, law in config.others.items()}
+            built[name] = reader.validate_python(known.controllers[name]["config"]).build(known.steering)
+    built |= {name: law.build(known.steering) for name, law in config.others.items()}
     return {name: law.double() for name, law in built.items()}
 
 
@@ -254,7 +290,7 @@ def _export(
     config: CourseTaskConfig,
     folder: RunFolder,
     planned: PlannedCourse,
-    steering: Steering,
+    guided: CourseGuidance,
     trained: HeadingPolicy,
     autopilot: AutopilotConfig,
     rows: list[dict[str, Any]],
@@ -263,5 +299,5 @@ def _export(
 
     file = folder.exports / f"{config.policy}_{planned.protocol}.pt"
     about = {"vessel": autopilot.vessel, "course": config.course.model_dump(mode="json"), "protocol": planned.protocol}
-    export_course(config.policy, trained, _guidance(config, planned, steering), planned.course, file, safe=config.safe, about=about, metrics=rows)
+    export_course(config.policy, trained, guided, planned.course, file, safe=config.safe, about=about, metrics=rows)
     print(f"exported: {file}")
