@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import html
 import json
 import math
 from pathlib import Path
@@ -13,18 +11,13 @@ import pandas as pd
 
 from residnet.core.config import load_mapping
 from residnet.evaluation.autopilots import effort_table, table
-from residnet.evaluation.figures import read_figures
 from residnet.evaluation.figures_autopilot import draw_distributions, draw_responses
+from residnet.evaluation.page import Part, write_page
 
 FLIGHTS = "flights.parquet"
 """By this file an autopilot's run folder is known."""
 PLANTS = "plants.parquet"
 """What each random vessel gave."""
-
-_STYLE = (
-    "body{margin:0 auto;max-width:60rem;padding:1rem;font:1rem/1.5 system-ui,sans-serif;color:#1a1f24}"
-    "pre{background:#f4f6f8;padding:.8rem;overflow-x:auto;font-size:.8rem}img{width:100%}figcaption{color:#59636e}"
-)
 
 
 def write_autopilot_report(run: Path) -> Path:
@@ -36,11 +29,8 @@ def write_autopilot_report(run: Path) -> Path:
     draw_responses(run / "figures" / "responses.png", pd.read_parquet(run / FLIGHTS), kinds, test["heading"], test["band"], config["name"])
     draw_distributions(run / "figures" / "distributions.png", pd.read_parquet(run / PLANTS), kinds, config["name"])
     controllers = json.loads((run / "controllers.json").read_text())
-    path = run / "report.html"
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(_page(run, config, metrics, controllers), encoding="utf-8")
-    partial.replace(path)
-    return path
+    shown = [Part(_definition(config), table(metrics["rows"], metrics["floor"])), Part(_effort(test), effort_table(metrics["rows"]))]
+    return write_page(run, shown, [Part("", json.dumps(controllers, indent=1), "Controllers")])
 
 
 def _effort(test: dict[str, Any]) -> str:
@@ -60,25 +50,12 @@ def _effort(test: dict[str, Any]) -> str:
     return text
 
 
-def _page(run: Path, config: dict[str, Any], metrics: dict[str, Any], controllers: dict[str, Any]) -> str:
-    test, title = config["test"], html.escape(config["name"])
-    definition = (
+def _definition(config: dict[str, Any]) -> str:
+    test = config["test"]
+    return (
         f"One definition for all controllers: step of {math.degrees(test['heading']):.3g} deg without prefilter, rudder within "
         f"{math.degrees(config['rudder']):.3g} deg, settled at the last entry into {math.degrees(test['band']):.3g} deg. Worst: over the corners of "
         f"the spread; random: mean over {test['plants']} vessels drawn from it; overshoot: the largest over both; bias: largest error after "
         f"{test['bias_time']:g} s under {math.degrees(test['bias']):.3g} deg of constant rudder bias. Linear peers are tuned for the least worst "
         f"settling time with at most {math.degrees(test['overshoot']):.3g} deg of overshoot at these corners."
-    )
-    figures = "".join(
-        f'<figure><img alt="{html.escape(f.title)}" src="data:image/png;base64,{base64.b64encode(f.path.read_bytes()).decode("ascii")}">'
-        f"<figcaption><b>{html.escape(f.title)}.</b> {html.escape(f.caption)}</figcaption></figure>"
-        for f in read_figures(run)
-    )
-    return (
-        f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>{title}: residnet report</title><style>{_STYLE}</style></head><body>'
-        f"<h1>{title}</h1><p>{html.escape(str(config.get('description') or ''))}</p><p>{html.escape(definition)}</p>"
-        f"<pre>{html.escape(table(metrics['rows'], metrics['floor']))}</pre>"
-        f"<p>{html.escape(_effort(test))}</p><pre>{html.escape(effort_table(metrics['rows']))}</pre>{figures}"
-        f"<h2>Controllers</h2><pre>{html.escape(json.dumps(controllers, indent=1))}</pre>"
-        f"<h2>Configuration</h2><pre>{html.escape((run / 'resolved.yaml').read_text())}</pre></body></html>"
     )

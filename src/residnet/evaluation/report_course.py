@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import html
 import json
 import math
 from pathlib import Path
@@ -13,8 +11,8 @@ import pandas as pd
 
 from residnet.core.config import load_mapping
 from residnet.evaluation.courses import table
-from residnet.evaluation.figures import read_figures
 from residnet.evaluation.figures_courses import draw_histories, draw_spread, draw_tracks
+from residnet.evaluation.page import Part, write_page
 
 TRACKS = "tracks.parquet"
 """By this file a course's run folder is known."""
@@ -23,10 +21,6 @@ COURSES = "courses.parquet"
 SPREAD = "spread.parquet"
 """One line for each flight of the spread, where there is one."""
 
-_STYLE = (
-    "body{margin:0 auto;max-width:60rem;padding:1rem;font:1rem/1.5 system-ui,sans-serif;color:#1a1f24}"
-    "pre{background:#f4f6f8;padding:.8rem;overflow-x:auto;font-size:.8rem}img{width:100%}figcaption{color:#59636e}"
-)
 _ASKED = {"enter": "Every buoy's circle of acceptance is entered.", "sides": "Every buoy is passed on its side, outside its circle."}
 
 
@@ -46,11 +40,7 @@ def write_course_report(run: Path) -> Path:
         every = pd.read_parquet(run / SPREAD)
         for protocol in config["protocols"]:
             draw_spread(run / "figures" / f"{protocol}_spread.png", every[every["protocol"] == protocol], _ASKED[protocol])
-    path = run / "report.html"
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(_page(run, config, metrics), encoding="utf-8")
-    partial.replace(path)
-    return path
+    return write_page(run, [Part(_words(config, metrics), table(metrics["rows"]))])
 
 
 def _spread_words(config: dict[str, Any]) -> str:
@@ -67,28 +57,17 @@ def _spread_words(config: dict[str, Any]) -> str:
     )
 
 
-def _page(run: Path, config: dict[str, Any], metrics: dict[str, Any]) -> str:
-    title, steady = html.escape(config["name"]), metrics["smallest"]
+def _words(config: dict[str, Any], metrics: dict[str, Any]) -> str:
+    steady = metrics["smallest"]
     limits = [f"buoy {one['buoy']}: {one['radius']:.4g} m" for one in metrics["feasibility"] if not one["possible"]]
     widened = (
         f"Tighter circles cannot be followed ({', '.join(limits)}); they are widened to that radius. " if limits else "Every circle can be followed. "
     )
-    words = (
+    return (
         f"At {math.degrees(metrics['rudder']):.3g} deg of rudder the vessel turns with a radius of {steady['radius']:.2f} m, "
         f"at {steady['speed']:.3g} m/s. {widened}The shortest possible course is that of bounded curvature at this radius (Dubins). "
         f"Ratio: course time over its length at the service speed of {metrics['speed']:.3g} m/s; turning: at the speed kept in the smallest turn. "
         "Side/clear: buoys left on their side, and outside their circles. Cross-track error from the plan, which a flight by line of sight does not "
         "follow. Margin: how far inside the circle that is entered least, or outside the one that is passed most closely. Tightest: radius of the "
         "tightest turn of a flight. " + _spread_words(config)
-    )
-    figures = "".join(
-        f'<figure><img alt="{html.escape(f.title)}" src="data:image/png;base64,{base64.b64encode(f.path.read_bytes()).decode("ascii")}">'
-        f"<figcaption><b>{html.escape(f.title)}.</b> {html.escape(f.caption)}</figcaption></figure>"
-        for f in read_figures(run)
-    )
-    return (
-        f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>{title}: residnet report</title><style>{_STYLE}</style></head><body>'
-        f"<h1>{title}</h1><p>{html.escape(str(config.get('description') or ''))}</p><p>{html.escape(words)}</p>"
-        f"<pre>{html.escape(table(metrics['rows']))}</pre>{figures}"
-        f"<h2>Configuration</h2><pre>{html.escape((run / 'resolved.yaml').read_text())}</pre></body></html>"
     )

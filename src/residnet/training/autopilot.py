@@ -73,9 +73,8 @@ class AutopilotFit(EpochTraining):
         """Seed the epoch and set the learning rate."""
         self.seed_epoch()
         self.policy.dt = self.settings.dt
-        progress = 0.5 * (1 - math.cos(math.pi * self.epoch / max(self.settings.epochs - 1, 1)))
         for group in self.trainer.optimizers[0].param_groups:
-            group["lr"] = self.settings.learning_rate * (1 - progress * (1 - self.settings.final))
+            group["lr"] = self.settings.rate(self.epoch)
 
     def training_step(self, number: int, batch_index: int) -> Tensor:
         """Loss of one batch of heading changes."""

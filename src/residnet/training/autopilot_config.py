@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 from torch import Tensor
 
 from residnet.core.config import Config, MetresPerSecond, Radians, RadiansPerSecond, Seconds
+from residnet.training.one_stage import OneStage
 
 Range = Annotated[tuple[float, float], Field(description="low and high multiple")]
 
@@ -81,50 +82,31 @@ class SpreadConfig(Config):
         return torch.tensor([(effect, time, 0.0) for effect in effects for time in times], dtype=torch.float64)
 
 
-class AutopilotTraining(Config):
+class AutopilotTraining(OneStage):
     """Back-propagation through vessel and policy.
 
     Attributes:
-        epochs: of `steps` batches each.
+        steps: batches of an epoch.
         batch: heading changes per batch.
         dt: step of the simulation in training; flights may take a finer one.
         integrator: of the simulation in training.
         horizon: length of each heading change.
-        learning_rate: of Adam; it falls to `final` of it along a cosine.
         overshoot: weight of the overshoot against the time outside `band`.
         margin: overshoot that costs nothing.
         band: error at which half of the cost of a large error is left.
         sharp: weight of the time outside the band itself, beside what smoothly counts near it.
         slowest: slow vessels weigh more, by this power of time over effect: the slowest decides the worst case.
         smoothness: weight of the squared changes of the command.
-        gradient_clip: largest norm of the gradient.
-        patience: stop when this many validations in a row bring nothing better.
-        validate_every: epochs between validations.
     """
 
-    epochs: int = Field(default=20, ge=1)
     steps: int = Field(default=15, ge=1)
     batch: int = Field(default=256, ge=16)
     dt: Seconds = Field(default=0.1, gt=0)
     integrator: Annotated[str, Field(pattern="^(rk4|heun)$")] = "rk4"
     horizon: Seconds = Field(default=10.0, gt=0)
-    learning_rate: float = Field(default=1e-2, gt=0)
-    final: float = Field(default=0.02, gt=0, le=1)
     overshoot: float = Field(default=2.0, ge=0)
     margin: Radians = Field(default=3.5e-4, ge=0)
     band: Radians = Field(default=0.0175, gt=0)
     sharp: float = Field(default=1.0, ge=0)
     slowest: float = Field(default=4.0, ge=0)
     smoothness: float = Field(default=0.0, ge=0)
-    gradient_clip: float = Field(default=1.0, gt=0)
-    patience: int = Field(default=1000, ge=1)
-    validate_every: int = Field(default=1, ge=1)
-
-    @property
-    def last_stage(self) -> int:
-        """The only one."""
-        return 0
-
-    def stage(self, epoch: int) -> tuple[int, int]:
-        """One stage only."""
-        return 0, epoch

@@ -88,9 +88,8 @@ class PredictorFit(EpochTraining):
         """Seed the epoch, shuffle, and set the learning rate."""
         self.seed_epoch()
         self.order = torch.randperm(len(self.train_answers.x)).split(self.settings.batch)
-        progress = 0.5 * (1 - math.cos(math.pi * self.epoch / max(self.settings.epochs - 1, 1)))
         for group in self.trainer.optimizers[0].param_groups:
-            group["lr"] = self.settings.learning_rate * (1 - progress * (1 - self.settings.final))
+            group["lr"] = self.settings.rate(self.epoch)
 
     def training_step(self, number: int, batch_index: int) -> Tensor:
         """Mean squared error of one batch of states."""

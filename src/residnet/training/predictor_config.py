@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from residnet.core.config import Config, Seconds
+from residnet.core.config import Seconds
+from residnet.training.one_stage import OneStage
 
 
-class PredictorTraining(Config):
+class PredictorTraining(OneStage):
     """Supervised: from states that the vessel comes through under random rudder angles to what each angle leads to (document 004, 6.1.1, 6.2.1).
 
     Attributes:
@@ -15,12 +16,7 @@ class PredictorTraining(Config):
         wander: longest time under random rudder angles before a state is taken, from straight ahead at service speed.
         hold: mean time between these angles.
         scatter: noise that is added to these states, as a share of each channel's standard deviation.
-        epochs: through all states.
         batch: states.
-        learning_rate: of Adam; it falls to `final` of it along a cosine.
-        gradient_clip: largest norm of the gradient.
-        patience: stop when this many validations in a row bring nothing better.
-        validate_every: epochs between validations.
     """
 
     states: int = Field(default=4000, ge=100)
@@ -32,14 +28,3 @@ class PredictorTraining(Config):
     learning_rate: float = Field(default=2e-2, gt=0)
     final: float = Field(default=0.01, gt=0, le=1)
     gradient_clip: float = Field(default=10.0, gt=0)
-    patience: int = Field(default=1000, ge=1)
-    validate_every: int = Field(default=1, ge=1)
-
-    @property
-    def last_stage(self) -> int:
-        """The only one."""
-        return 0
-
-    def stage(self, epoch: int) -> tuple[int, int]:
-        """One stage only."""
-        return 0, epoch
