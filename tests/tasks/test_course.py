@@ -41,6 +41,7 @@ COURSE: dict[str, Any] = {
         ],
         "acceptance": 4.0,
         "lookahead": 10.0,
+        "planning_dt": "0.2 s",
     },
     "integral": 0.2,
     "line_of_sight": [

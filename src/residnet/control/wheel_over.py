@@ -12,7 +12,8 @@ from torch import Tensor, nn
 from residnet.control.turning import Turning
 
 _ANGLES = 181
-_SAMPLES = 400
+_SAMPLES = 100
+_DISTANCES = 400
 
 
 @final
@@ -38,7 +39,7 @@ class WheelOver(nn.Module):
         radius = turning.speed / (turning.gain * limit)
         # an arc without lag, then the lag
         farthest = math.sqrt(within * (2.0 * radius + within)) + turning.speed * turning.time
-        distance = np.linspace(0.0, farthest, _SAMPLES)
+        distance = np.linspace(0.0, farthest, _DISTANCES)
         missed = np.stack([np.hypot(distance[:, None] - track[:, 0], track[:, 1]).min(axis=1) for track in tracks])
         found = np.where((distance <= reach[:, None]) & (missed <= within), distance, 0.0).max(axis=1)
         even = np.linspace(0.0, math.pi, _ANGLES)
@@ -59,7 +60,7 @@ def _turns(turning: Turning, limit: float) -> tuple[np.ndarray, np.ndarray, np.n
     """Heading changes [N] in rad from 0 to past pi, where the lines before and after each turn meet [N] in m from its beginning, and its track
     [N, M, 2] in m, ahead and aside."""
     full, time = turning.gain * limit, turning.time
-    held = np.concatenate(([0.0], np.geomspace(1e-3 * time, math.pi / full + 2.0 * time, 4 * _ANGLES)))[:, None]
+    held = np.concatenate(([0.0], np.geomspace(1e-3 * time, math.pi / full + 2.0 * time, 2 * _ANGLES)))[:, None]
     first = full * (1.0 - np.exp(-held / time))
     share = np.linspace(0.0, 1.0, _SAMPLES)[None, :]
     # over, then back until the yaw has stopped
