@@ -60,7 +60,7 @@ def _turns(turning: Turning, limit: float) -> tuple[np.ndarray, np.ndarray, np.n
     """Heading changes [N] in rad from 0 to past pi, where the lines before and after each turn meet [N] in m from its beginning, and its track
     [N, M, 2] in m, ahead and aside."""
     full, time = turning.gain * limit, turning.time
-    held = np.concatenate(([0.0], np.geomspace(1e-3 * time, math.pi / full + 2.0 * time, 2 * _ANGLES)))[:, None]
+    held = np.concatenate(([0.0], np.geomspace(1e-3 * time, math.pi / full + 2.0 * time, 4 * _ANGLES)))[:, None]
     first = full * (1.0 - np.exp(-held / time))
     share = np.linspace(0.0, 1.0, _SAMPLES)[None, :]
     # over, then back until the yaw has stopped
