@@ -4,18 +4,14 @@
 //
 // SI and radians. Writes t,x,y,psi,r,delta,fault per step until the course ends; prints the first ten step times and the median of the others in
 // microseconds, and when the course ended.
-#include <ATen/Parallel.h>
-#include <torch/script.h>
-
-#include <algorithm>
-#include <chrono>
 #include <cmath>
 #include <cstdio>
 #include <cstdlib>
 #include <exception>
 #include <fstream>
 #include <iomanip>
-#include <vector>
+
+#include "stepping.hpp"
 
 int main(int argc, char** argv) {
   if (argc != 11) {
@@ -23,13 +19,8 @@ int main(int argc, char** argv) {
     return 2;
   }
   try {
-    at::set_num_threads(1);
-    // the profiling executor compiles during the first calls, which would break the control period
-    torch::jit::getProfilingMode() = false;
-    torch::jit::setGraphExecutorOptimize(false);
     c10::InferenceMode guard;
-    torch::jit::Module module = torch::jit::load(argv[1]);
-    module.eval();
+    torch::jit::Module module = load_for_steps(argv[1]);
     const double gain = std::atof(argv[3]), time = std::atof(argv[4]), speed = std::atof(argv[5]), dt = std::atof(argv[6]);
     const int steps = static_cast<int>(std::lround(std::atof(argv[10]) / dt));
     std::ofstream track(argv[2]);
@@ -50,19 +41,19 @@ int main(int argc, char** argv) {
     measure();
     torch::Tensor memory = module.get_method("initial_state")({seen}).toTensor();
     auto step = module.get_method("step");
-    std::vector<double> taken;
+    StepTimes times;
     bool arrived = false;
     int k = 0;
     for (; k < steps && !arrived; ++k) {
       measure();
-      const auto begin = std::chrono::steady_clock::now();
+      times.begin();
       const auto answer = step({seen, memory});
       const auto& parts = answer.toTupleRef().elements();
       const double delta = parts[0].toTensor().item<float>();
       memory = parts[1].toTensor();
       const bool fault = parts[2].toTensor().item<bool>();
       arrived = parts[3].toTensor().item<bool>();
-      taken.push_back(std::chrono::duration<double, std::micro>(std::chrono::steady_clock::now() - begin).count());
+      times.end();
       track << k * dt << ',' << x << ',' << y << ',' << psi << ',' << r << ',' << delta << ',' << fault << '\n';
       // exact for a rudder that is held over the step; the position by Simpson's rule
       const double steady = gain * delta, half = std::exp(-0.5 * dt / time);
@@ -73,13 +64,8 @@ int main(int argc, char** argv) {
       psi = after;
       r = steady + (r - steady) * decay;
     }
-    std::printf("%s after %.2f s\nfirst ten steps [us]:", arrived ? "arrived" : "not arrived", (k - 1) * dt);
-    for (int i = 0; i < std::min<int>(10, k); ++i) std::printf(" %.0f", taken[i]);
-    std::vector<double> warm(taken.begin() + std::min<int>(10, k), taken.end());
-    if (!warm.empty()) {
-      std::nth_element(warm.begin(), warm.begin() + warm.size() / 2, warm.end());
-      std::printf("\nmedian step [us]: %.1f\n", warm[warm.size() / 2]);
-    }
+    std::printf("%s after %.2f s\n", arrived ? "arrived" : "not arrived", (k - 1) * dt);
+    times.print();
   } catch (const std::exception& error) {
     std::fprintf(stderr, "course: %s\n", error.what());
     return 1;
