@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,6 +23,8 @@ _GUESSES = ((1.05, 0.2), (1.15, 0.3), (0.0, 1.0), (0.5, 0.5))
 _WIDE = np.radians(np.array([0, *range(10, 341, 10)], dtype=float))
 _NARROW = np.radians([8.0, 4.0, 2.0, 2.0, 1.0, 1.0, 1.0, 1.0])
 """Turned angles between the turns that are tried, round for round."""
+_FAR = 0.1
+"""Turning radii by which a mark may be missed before turns are made from the motion that they begin with."""
 _TOLERANCE = 1e-3
 """Of clearances, as a share of the vessel's turning radius."""
 _SETTLED = 3e-4
@@ -105,7 +107,8 @@ class _Search:
         return Problem(self.asked, [Family([turn], self.asked.unit) for turn in made], self.make.turning.speed)
 
     def begin(self, guesses: Sequence[tuple[Array, Array]]) -> tuple[Array, Array]:
-        """Times and rudder angles of the best course of turns from straight ahead, searched for from each guess."""
+        """Times and rudder angles of the best course of turns from straight ahead: searched for from each guess, and mark by mark where none of
+        these passes all marks."""
         problems: dict[bytes, Problem] = {}
         tries = []
         for z, rudder in guesses:
@@ -115,7 +118,30 @@ class _Search:
             problem = problems[rudder.tobytes()]
             z = quickest(problem, z, math.inf)
             tries.append((problem.cost(z), z, rudder))
-        return min(tries, key=lambda one: one[0])[1:]
+        _, z, rudder = min(tries, key=lambda one: one[0])
+        problem = problems[rudder.tobytes()]
+        if float(problem.missed(z).max()) > _FAR:
+            z = min((z, self._grown(problem, guesses[0][0], rudder)), key=problem.cost)
+        return z, rudder
+
+    def _grown(self, whole: Problem, guess: Array, rudder: Array) -> Array:
+        """Times of a course that is searched for to the first mark, then on to the next, and so on."""
+        asked, first = self.asked, self.asked.first
+        marks = (*asked.marks, asked.goal)
+        z = guess[: 2 + 2 * first]
+        for k, (mark, after) in enumerate(zip(marks, (*marks[1:], None), strict=True)):
+            problem = Problem(replace(asked, marks=marks[:k], goal=mark), whole.families[: first + k], whole.straight)
+            z = quickest(problem, z, math.inf)
+            if after is None:
+                break
+            line = np.array([after.north - mark.north, after.east - mark.east])
+            size = math.hypot(*line)
+            aside = (after.turn * max(after.clearance, 0.0) - mark.turn * max(mark.clearance, 0.0)) / size
+            heading = math.atan2(line[1], line[0]) - math.asin(min(max(aside, -0.99), 0.99))
+            angle = (mark.turn * (heading - problem.legs(z)[1])) % (2.0 * math.pi)
+            hold = _holds(np.array([min(angle, _WIDE[-1])]), abs(float(rudder[first + k])), self.make.turning)[0] / asked.unit
+            z = np.array([*z[:-1], max(z[-1] - 0.5, 0.0), hold, max(size / asked.radius - 0.5, 0.0)])
+        return z
 
     def chain(self, z: Array, rudder: Array) -> list[Turn]:
         """The turns of z, each from the motion at the end of the leg before it."""
