@@ -90,6 +90,20 @@ def test_no_part_of_a_plan_is_tighter_than_the_vessel_turns_and_buoys_stay_outsi
     assert planned.floor <= planned.course.length <= 1.06 * planned.floor
 
 
+def test_a_given_heading_lengthens_the_shortest_course_past_sides(vessel: SteeredPlant) -> None:
+    """Along the first leg it changes nothing; away from it the vessel has to come round, pi R and more."""
+    steady = smallest_turn(WANTED, vessel, LIMIT)
+    free = plan_course(WANTED, "sides", vessel, TURNING, LIMIT, steady)
+    along = float(free.course.heading[0])
+    onward, away = (
+        plan_course(WANTED.model_copy(update={"heading": heading}), "sides", vessel, TURNING, LIMIT, steady) for heading in (along, along + math.pi)
+    )
+    assert onward.floor == pytest.approx(free.floor, rel=2e-3)
+    assert onward.course.length == pytest.approx(free.course.length, rel=0.02)
+    assert away.floor > free.floor + math.pi * steady.radius
+    assert away.floor < away.course.length < 1.15 * away.floor
+
+
 def test_circles_of_acceptance_are_entered(vessel: SteeredPlant) -> None:
     steady = smallest_turn(WANTED, vessel, LIMIT)
     planned = plan_course(WANTED.model_copy(update={"heading": 0.0}), "enter", vessel, TURNING, LIMIT, steady)

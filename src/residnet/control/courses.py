@@ -7,12 +7,13 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
 from pydantic import Field
 
 from residnet.control.buoys import BuoyConfig, course_round, feasibility, widened
 from residnet.control.course_plan import Course, plan
 from residnet.control.course_search import Mark
-from residnet.control.dubins import shortest_course
+from residnet.control.dubins import dubins_length, shortest_course
 from residnet.control.steering import SteeredVessel
 from residnet.control.turning import Turning
 from residnet.control.turns import SteadyTurn, TurnMaker, steady_turn
@@ -136,6 +137,11 @@ def _to_pass(config: BuoyCourseConfig, buoys: tuple[BuoyConfig, ...], rudder: fl
 
 def _floor(config: BuoyCourseConfig, protocol: Protocol, buoys: tuple[BuoyConfig, ...], steady: SteadyTurn) -> float:
     if protocol == "sides":
-        return sum(piece.length for piece in course_round(config.start, buoys))
+        line, *others = course_round(config.start, buoys)
+        onto = line.length
+        if config.heading is not None:
+            end = (line.north + line.length * math.cos(line.heading), line.east + line.length * math.sin(line.heading), line.heading)
+            onto = float(dubins_length(np.array([*config.start, config.heading]), np.array(end), steady.radius))
+        return onto + sum(piece.length for piece in others)
     points = [(buoy.north, buoy.east) for buoy in config.buoys]
     return shortest_course((*config.start, config.heading), points, config.acceptance, steady.radius)
