@@ -202,18 +202,19 @@ def outcome(path: Path, kind: str) -> Log | None:
     return log
 
 
-def require_original(log: Log) -> None:
-    """Every sample is the one that was written for its time, or missing."""
-    assert log.t.size >= 2
-    assert (np.diff(log.t) > 0.0).all()
-    shift = None
+def foreign(log: Log) -> list[str]:
+    """What is not as it was written: times out of order or of no row, and samples that are neither their row's nor missing."""
+    found = [] if log.t.size >= 2 and bool((np.diff(log.t) > 0.0).all()) else ["times"]
     for i, t in enumerate(log.t):
         row = TRUTH.get(f"{t:.6f}")
-        assert row is not None, f"no row was written at t = {t!r}"
+        if row is None:
+            found.append(f"no row was written at t = {t!r}")
+            continue
         for column, name in enumerate(COLUMNS[1:], start=1):
             value = log[name][i]
-            assert np.isnan(value) or value == pytest.approx(row[column], abs=1e-9), (name, t, value, row[column])
-    assert shift is None
+            if not (np.isnan(value) or abs(value - row[column]) <= 1e-9):
+                found.append(f"{name} at {t}: {value}, written {row[column]}")
+    return found
 
 
 @pytest.fixture(scope="module")
@@ -234,8 +235,7 @@ def test_damaged_text_gives_the_samples_as_written_or_one_clear_line(folder: Pat
     path = folder / "table.csv"
     path.write_bytes(data)
     log = outcome(path, "csv")
-    if log is not None:
-        require_original(log)
+    assert log is None or foreign(log) == []
 
 
 def written_parquet(table: pa.Table) -> bytes:
@@ -290,8 +290,7 @@ def test_damaged_parquet_gives_the_samples_as_written_or_one_clear_line(folder: 
     path.write_bytes(bytes(data))
     log = outcome(path, "parquet")
     # flags are numbers to whoever maps them, and microseconds of an epoch are no time that was written
-    if log is not None and not (how == "types" and kind in ("bools", "stamps")):
-        require_original(log)
+    assert log is None or (how == "types" and kind in ("bools", "stamps")) or foreign(log) == []
 
 
 def test_undamaged_tables_come_out_whole(folder: Path) -> None:
@@ -302,9 +301,8 @@ def test_undamaged_tables_come_out_whole(folder: Path) -> None:
         log = outcome(path, "csv")
         assert log is not None
         assert len(log) == ROWS
-        require_original(log)
-    with pytest.raises(AssertionError):
-        require_original(log.replace(channels={**log.channels, "u": np.roll(log["u"], 1)}))
+        assert foreign(log) == []
+    assert foreign(log.replace(channels={**log.channels, "u": np.roll(log["u"], 1)})) != []
 
 
 @pytest.mark.parametrize("cut", [1, 3, 8, 20])
@@ -314,6 +312,6 @@ def test_a_file_that_ends_within_its_last_line_loses_that_line(folder: Path, cut
     log = outcome(path, "csv")
     assert log is not None
     assert len(log) == ROWS - 1
-    require_original(log)
+    assert foreign(log) == []
     assert log.meta["rows_dropped"] == 1
     assert [finding.code for finding in inspect(log).findings if "left out" in finding.text] == ["cut_line"]

@@ -100,6 +100,33 @@ def test_a_memory_out_of_range_is_forgotten_too(
     assert math.isfinite(float(again))
 
 
+@pytest.mark.parametrize("place", [-1.0, 1e3, 1e9])
+def test_a_place_off_the_course_is_forgotten(made: tuple[torch.jit.ScriptModule, Following, CourseGuidance, dict[str, object]], place: float) -> None:
+    loaded = made[0]
+    y = torch.tensor([[0.1, 0.3, 0.05, 3.2, 0.01, 0.02]])
+    s = loaded.initial_state(y)
+    s[0, 0] = place
+    _, after, fault, _ = loaded.step(y, s)
+    assert bool(fault)
+    assert float(after[0, 0]) == 0.0
+
+
+def test_far_behind_the_end_it_still_steers_along_the_last_leg(
+    made: tuple[torch.jit.ScriptModule, Following, CourseGuidance, dict[str, object]],
+) -> None:
+    loaded, guidance = made[0], made[2]
+    end = guidance.table[-1].tolist()
+    ahead = 500.0
+    y = torch.tensor([[end[0] + ahead * math.cos(end[2]), end[1] + ahead * math.sin(end[2]), end[3], 3.2, 0.0, 0.0]])
+    s = loaded.initial_state(y)
+    s[0, 0] = 58.0
+    for _ in range(200):
+        _, s, fault, arrived = loaded.step(y, s)
+        assert not bool(fault)
+    assert bool(arrived)
+    assert float(s[0, 0]) == pytest.approx(guidance.farthest, rel=1e-5)
+
+
 def test_it_arrives(made: tuple[torch.jit.ScriptModule, Following, CourseGuidance, dict[str, object]]) -> None:
     loaded = made[0]
     y = torch.tensor([[30 * math.sin(1.7), 30 - 30 * math.cos(1.7), 1.7, 3.2, 0.0, 0.1]])

@@ -47,6 +47,7 @@ class CourseGuidance(Reference):
         self.register_buffer("table", torch.from_numpy(np.stack(columns, axis=-1)), persistent=False)
         self.table: Tensor
         self.spacing, self.length, self.lookahead = course.step, course.length, lookahead
+        self.farthest = course.step * (len(course.track) - 1)
         self.x, self.y, self.psi = state.index("x"), state.index("y"), state.index("psi")
         self.u, self.v = state.index("u"), state.index("v")
         self.least = _LEAST
@@ -74,7 +75,7 @@ class CourseGuidance(Reference):
         place = s[:, 0]
         ahead, aside = self.error(x, place)
         closeness = (1.0 - self.at(place)[:, 5] * aside).clamp(min=self.least)
-        place = place + (ahead / closeness).clamp(0.0, self.lookahead)
+        place = (place + (ahead / closeness).clamp(0.0, self.lookahead)).clamp(max=self.farthest)
         known = self.at(place)
         _, aside = self.error(x, place)
         direction, heading = known[:, 2], known[:, 3]

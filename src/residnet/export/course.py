@@ -57,10 +57,9 @@ class ExportedCourse(nn.Module):
         self.high: Tensor
         # relative to the course's motion: rudder and yaw rate may differ by twice their ranges
         kept = memory_limits(policy, 2.0 * turn)
-        # the place goes on beyond the end, as long as the controller does
-        angle, anywhere = 1.001 * policy.limit, 1e9
+        angle = 1.001 * policy.limit
         drift = [(-1.01, 1.01)] * (guidance.n_state - 1)
-        ranges = [(-anywhere, anywhere), *drift, (-angle, angle), (-2.0 * angle, 2.0 * angle), *kept[1:]]
+        ranges = [(0.0, 1.001 * guidance.farthest), *drift, (-angle, angle), (-2.0 * angle, 2.0 * angle), *kept[1:]]
         self.register_buffer("memory_low", torch.tensor([limit[0] for limit in ranges], dtype=torch.float32))
         self.register_buffer("memory_high", torch.tensor([limit[1] for limit in ranges], dtype=torch.float32))
         self.memory_low: Tensor
