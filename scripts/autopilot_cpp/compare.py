@@ -44,8 +44,8 @@ def fly(
 
 def eager(policy: Any) -> Any:
     """The policy without compilation: the same operations, called one by one from Python."""
-    from residnet.control.policy import HeadingPolicy
-    from residnet.control.turning import Turning
+    from residnet.control.heading.policy import HeadingPolicy
+    from residnet.control.heading.turning import Turning
     from residnet.export.autopilot import ExportedPolicy, Limits
 
     card = policy["card"]

@@ -51,7 +51,7 @@ def eager(run: Path, card: dict[str, Any]) -> Any:
     """Policy and guidance of a course run without compilation, planned again: the same operations, called one by one from Python."""
     from residnet.core.config import load_config
     from residnet.export.course import ExportedCourse
-    from residnet.run_folder import RunFolder
+    from residnet.runs.folder import RunFolder
     from residnet.tasks.course import CourseTaskConfig
     from residnet.tasks.course_run import load_policy, plan_for, ready
 

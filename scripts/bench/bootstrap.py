@@ -14,7 +14,7 @@ import time
 import numpy as np
 from scipy.signal import lfilter
 
-from residnet.evaluation.residual_series import block_interval, independent_interval
+from residnet.judge.residual_series import block_interval, independent_interval
 
 
 def main() -> None:

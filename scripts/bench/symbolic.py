@@ -35,14 +35,14 @@ import torch
 from made_odin import FORCE_TRUTH, JET_TRUTH, MSD_TRUTH, force_logs, jet_logs, msd_log, step_log
 from scipy.stats import norm
 
-from residnet.core.delay import delay_profile
 from residnet.core.names import ACCELERATION
 from residnet.core.samples import Samples
-from residnet.core.sparse import SearchConfig, find, reduce
 from residnet.data.derivatives import SavitzkyGolay
 from residnet.heads import SymbolicConfig
 from residnet.physics.candidates import CandidatesConfig
 from residnet.physics.terms import TermLibrary
+from residnet.regression.delay import delay_profile
+from residnet.regression.sparse import SearchConfig, find, reduce
 
 Log = dict[str, np.ndarray]
 Truth = Mapping[str, Mapping[str, float]]

@@ -9,15 +9,15 @@ import pytest
 import torch
 
 from residnet.control.base import ClosedLoop
-from residnet.control.buoys import BuoyConfig
-from residnet.control.course_guidance import CourseGuidance
-from residnet.control.course_plan import Course
-from residnet.control.courses import BuoyCourseConfig, plan_course, report_feasibility, smallest_turn
-from residnet.control.following import Following
-from residnet.control.heading_pid import HeadingPID
-from residnet.control.steering import SteeredPlant
-from residnet.control.turning import Turning
-from residnet.control.turns import TurnMaker, steady_turn
+from residnet.control.courses.buoys import BuoyConfig
+from residnet.control.courses.config import BuoyCourseConfig, plan_course, report_feasibility, smallest_turn
+from residnet.control.courses.course_plan import Course
+from residnet.control.courses.turns import TurnMaker, steady_turn
+from residnet.control.guidance.course_guidance import CourseGuidance
+from residnet.control.heading.following import Following
+from residnet.control.heading.heading_pid import HeadingPID
+from residnet.control.heading.steering import SteeredPlant
+from residnet.control.heading.turning import Turning
 from residnet.core.errors import ConfigError
 from residnet.dynamics.rollout import Rollout
 from residnet.physics.vessel import load_vessel

@@ -8,8 +8,8 @@ import math
 import numpy as np
 import pytest
 
-from residnet.control.buoys import BuoyConfig, course_round, feasibility, widened
-from residnet.control.dubins import dubins_length, shortest_course
+from residnet.control.courses.buoys import BuoyConfig, course_round, feasibility, widened
+from residnet.control.courses.dubins import dubins_length, shortest_course
 from residnet.core.errors import ConfigError
 
 TABLE_6_3 = [

@@ -10,14 +10,14 @@ import torch
 from scipy.optimize import brentq
 
 from residnet.control.base import ClosedLoop, Policy, Reference
-from residnet.control.course_guidance import CourseGuidance
-from residnet.control.course_plan import Course
-from residnet.control.drift import DriftEstimate
-from residnet.control.following import Following
-from residnet.control.heading_pid import HeadingPID
-from residnet.control.line_of_sight import IntegralLookAhead, LineOfSight, LookAhead
-from residnet.control.steering import SteeredPlant
-from residnet.control.waypoints import WaypointGuidance
+from residnet.control.courses.course_plan import Course
+from residnet.control.guidance.course_guidance import CourseGuidance
+from residnet.control.guidance.drift import DriftEstimate
+from residnet.control.guidance.line_of_sight import IntegralLookAhead, LineOfSight, LookAhead
+from residnet.control.guidance.waypoints import WaypointGuidance
+from residnet.control.heading.following import Following
+from residnet.control.heading.heading_pid import HeadingPID
+from residnet.control.heading.steering import SteeredPlant
 from residnet.core.errors import ConfigError
 from residnet.dynamics.carried import Carried
 from residnet.dynamics.rollout import Rollout

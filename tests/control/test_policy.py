@@ -9,8 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from residnet.control.policy import HeadingPolicy
-from residnet.control.steering import SteeredPlant, fly
+from residnet.control.heading.policy import HeadingPolicy
+from residnet.control.heading.steering import SteeredPlant, fly
 from residnet.export.autopilot import ExportedPolicy, export_autopilot, for_export
 from residnet.physics.vessel import load_vessel
 

@@ -10,9 +10,9 @@ import torch
 from scipy.integrate import solve_ivp
 from scipy.optimize import linprog
 
-from residnet.control.bang_bang_rate import RatedBangBangHeading
-from residnet.control.controllers import BangBangConfig, Steering
-from residnet.control.steering import Flights, SteeredPlant, fly
+from residnet.control.heading.bang_bang_rate import RatedBangBangHeading
+from residnet.control.heading.controllers import BangBangConfig, Steering
+from residnet.control.heading.steering import Flights, SteeredPlant, fly
 from residnet.physics.vessel import load_vessel
 
 DEG = math.pi / 180

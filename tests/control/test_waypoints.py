@@ -9,8 +9,8 @@ import pytest
 import torch
 from pydantic import ValidationError
 
-from residnet.control.line_of_sight import EnclosureConfig, IntegralLookAheadConfig, LookAheadConfig
-from residnet.control.waypoints import WaypointGuidance
+from residnet.control.guidance.line_of_sight import EnclosureConfig, IntegralLookAheadConfig, LookAheadConfig
+from residnet.control.guidance.waypoints import WaypointGuidance
 from residnet.core.errors import ConfigError
 
 STATE = ("x", "y", "psi", "u", "v", "r")

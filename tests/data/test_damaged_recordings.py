@@ -14,7 +14,7 @@ import written_recorders
 from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
 from residnet.data.readers import ArduPilotConfig, Hdf5Config, MatConfig, NmeaConfig, RosbagConfig, TopicFolderConfig, UlogConfig
-from residnet.data.readers.composed import RecordingConfig
+from residnet.data.readers.composing.composed import RecordingConfig
 
 CASES: list[tuple[Callable[[Log, Path], Path], RecordingConfig]] = [
     (written_logs.mat5, MatConfig()),

@@ -12,8 +12,8 @@ from scipy.signal import lfilter
 
 from residnet.core.config import validate
 from residnet.core.errors import ConfigError
-from residnet.data.environment import Disturbance, WindField, gusty_wind, ornstein_uhlenbeck
-from residnet.data.simulate import SimulatedTrials, simulate
+from residnet.data.simulated.environment import Disturbance, WindField, gusty_wind, ornstein_uhlenbeck
+from residnet.data.simulated.trials import SimulatedTrials, simulate
 from residnet.physics.vessel import load_vessel, vessel_files
 
 TRIALS: dict[str, Any] = {

@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 
 from residnet.core.errors import DataError
-from residnet.data.environment import Disturbance, WindField
-from residnet.data.flying import Craft, Sea, fly, log_names
-from residnet.data.sensors import SensorNoise
+from residnet.data.simulated.environment import Disturbance, WindField
+from residnet.data.simulated.flying import Craft, Sea, fly, log_names
+from residnet.data.simulated.sensors import SensorNoise
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.simulated import PlantDynamics
 from residnet.manoeuvres import ConstantInput, Helm, Manoeuvre, TurningCircle, Zigzag
-from residnet.physics.environment_waves import Box, JonswapSpectrum, WavesConfig
+from residnet.physics.environment.waves import Box, JonswapSpectrum, WavesConfig
 from residnet.physics.vessel import load_vessel
 
 STEP = 0.1

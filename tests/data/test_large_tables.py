@@ -12,7 +12,8 @@ import pytest
 from residnet.core.config import validate
 from residnet.core.errors import DataError
 from residnet.core.log import Log
-from residnet.data.readers import LogReader, ReaderConfig, lines, table
+from residnet.data.readers import LogReader, ReaderConfig
+from residnet.data.readers.tables import lines, table
 
 
 def reader(kind: str = "csv") -> LogReader:

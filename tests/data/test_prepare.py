@@ -9,9 +9,9 @@ from residnet.core.log import Log
 from residnet.core.names import STATE
 from residnet.data.prepare import PrepareConfig, Prepared, prepare, samples
 from residnet.data.windows import WindowStore
-from residnet.evaluation.freerun import FreeRun, Prediction
-from residnet.evaluation.metrics import window_errors
-from residnet.evaluation.protocol import Windows
+from residnet.judge.freerun import FreeRun, Prediction
+from residnet.judge.metrics import window_errors
+from residnet.judge.protocol import Windows
 from residnet.physics.signals import SignalsConfig
 
 STEP = 0.1

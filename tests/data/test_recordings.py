@@ -13,11 +13,11 @@ from residnet.core.config import validate
 from residnet.core.errors import ConfigError, DataError, UsageError
 from residnet.core.log import Log
 from residnet.data.readers import ReaderConfig
-from residnet.data.readers.clocks import settle
-from residnet.data.readers.geodesy import tangent_plane
+from residnet.data.readers.composing.clocks import settle
+from residnet.data.readers.composing.geodesy import tangent_plane
+from residnet.data.readers.composing.traffic import traffic
 from residnet.data.readers.recording import Recording, Series
 from residnet.data.readers.stamps import parse_numbers, parse_texts
-from residnet.data.readers.traffic import traffic
 
 EPOCH = 1_700_000_000
 RNG = np.random.default_rng(7)
@@ -358,8 +358,8 @@ def test_chunks_of_a_topic_give_the_whole(tmp_path: Path, monkeypatch: pytest.Mo
     cells = [f"{v!r}" if i % 500 else "lost" for i, v in enumerate(values.tolist())]
     place = folder(tmp_path, gyro={"time": printed(ns, "unpadded"), "data": cells, "header_frame_id": ["bow"] * 2000})
     whole = read(place, channels={"r": field("gyro", "rad/s")})
-    monkeypatch.setattr("residnet.data.readers.topic_folder._CHUNK", 300)
-    monkeypatch.setattr("residnet.data.readers.topic_folder.LARGE", 0)
+    monkeypatch.setattr("residnet.data.readers.recorders.topic_folder._CHUNK", 300)
+    monkeypatch.setattr("residnet.data.readers.recorders.topic_folder.LARGE", 0)
     pieces = read(place, channels={"r": field("gyro", "rad/s")})
     np.testing.assert_array_equal(pieces.t, whole.t)
     np.testing.assert_array_equal(pieces["r"], whole["r"])

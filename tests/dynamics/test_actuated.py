@@ -14,11 +14,11 @@ from residnet.baselines import StillConfig
 from residnet.core.config import validate
 from residnet.core.errors import ConfigError
 from residnet.data.align import GridConfig
-from residnet.data.environment import Disturbance
-from residnet.data.flying import Craft, Flight, Sea, fly
 from residnet.data.prepare import PrepareConfig, prepare, samples
-from residnet.data.sensors import SensorNoise
-from residnet.data.simulate import SimulatedTrials, simulate
+from residnet.data.simulated.environment import Disturbance
+from residnet.data.simulated.flying import Craft, Flight, Sea, fly
+from residnet.data.simulated.sensors import SensorNoise
+from residnet.data.simulated.trials import SimulatedTrials, simulate
 from residnet.dynamics.actuated import ActuatedDynamics
 from residnet.dynamics.gear import GivenGear, InputShare, PlantGear
 from residnet.dynamics.hybrid import HybridDynamics

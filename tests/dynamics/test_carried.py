@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from residnet.control.steering import SteeredPlant
+from residnet.control.heading.steering import SteeredPlant
 from residnet.core.frames import to_body
 from residnet.dynamics.carried import Carried
 from residnet.dynamics.rollout import Rollout

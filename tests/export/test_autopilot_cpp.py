@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from residnet.control.policy import HeadingPolicy
-from residnet.control.steering import SteeredPlant
+from residnet.control.heading.policy import HeadingPolicy
+from residnet.control.heading.steering import SteeredPlant
 from residnet.export.autopilot import export_autopilot
 from residnet.physics.vessel import load_vessel
 

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import torch
 
-from residnet.control.course_guidance import CourseGuidance
-from residnet.control.course_plan import Course
-from residnet.control.drift import DriftEstimate
-from residnet.control.following import Following
-from residnet.control.policy import HeadingPolicy
-from residnet.control.turning import Turning
+from residnet.control.courses.course_plan import Course
+from residnet.control.guidance.course_guidance import CourseGuidance
+from residnet.control.guidance.drift import DriftEstimate
+from residnet.control.heading.following import Following
+from residnet.control.heading.policy import HeadingPolicy
+from residnet.control.heading.turning import Turning
 from residnet.export.course import MEASURED, export_course
 
 LIMIT = math.radians(5)

@@ -17,8 +17,6 @@ from made_odin import FORCE_TRUTH, MSD_TRUTH, force_logs, msd_log
 from made_samples import NAMES, made
 
 from residnet.baselines import StillConfig
-from residnet.core.expressions import Algebra, Limits, Sum
-from residnet.core.genetic import limits_of
 from residnet.core.names import ACCELERATION
 from residnet.core.samples import Samples
 from residnet.dynamics.hybrid import HybridDynamics
@@ -26,9 +24,11 @@ from residnet.dynamics.store import ModelSpec, load_model, save_model
 from residnet.heads.expression_library import ExpressionLibrary, tables
 from residnet.heads.expression_text import term, total
 from residnet.heads.genetic import GeneticConfig, breed
-from residnet.heads.notation import LATEX, SYMPY, C
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.terms import TermLibrary
+from residnet.regression.expressions import Algebra, Limits, Sum
+from residnet.regression.genetic import limits_of
+from residnet.regression.notation import LATEX, SYMPY, C
 
 FORCES = ("u", "v", "r", "tau_x", "tau_y", "tau_n")
 

@@ -9,11 +9,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from residnet.control.pid import MotionPIDConfig
+from residnet.control.motion.pid import MotionPIDConfig
 from residnet.core.errors import UsageError
-from residnet.data.environment import Disturbance
-from residnet.data.flying import Craft, Sea, fly
-from residnet.data.sensors import SensorNoise
+from residnet.data.simulated.environment import Disturbance
+from residnet.data.simulated.flying import Craft, Sea, fly
+from residnet.data.simulated.sensors import SensorNoise
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.rollout import Rollout, Source
 from residnet.dynamics.simulated import TracedPlantDynamics

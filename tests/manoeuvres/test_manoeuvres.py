@@ -15,7 +15,7 @@ from torch import Tensor
 from residnet.core.config import validate
 from residnet.core.errors import ConfigError
 from residnet.core.log import Log
-from residnet.data.simulate import SimulatedTrials, simulate
+from residnet.data.simulated.trials import SimulatedTrials, simulate
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import PlantDynamics
 from residnet.manoeuvres import (

@@ -11,7 +11,7 @@ from scipy.integrate import quad
 
 from residnet.core.config import validate
 from residnet.core.errors import ConfigError
-from residnet.physics.environment_waves import GRAVITY, IttcSpectrum, JonswapSpectrum, Spectrum, Waves, WavesConfig
+from residnet.physics.environment.waves import GRAVITY, IttcSpectrum, JonswapSpectrum, Spectrum, Waves, WavesConfig
 
 SEA: dict[str, Any] = {
     "significant_height": 1.2,

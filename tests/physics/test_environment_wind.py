@@ -10,7 +10,7 @@ import torch
 
 from residnet.core.config import load_config, validate
 from residnet.core.errors import ConfigError
-from residnet.physics.environment_wind import SymmetricWindConfig, TabulatedWindConfig, WindLoads, WindLoadsConfig
+from residnet.physics.environment.wind import SymmetricWindConfig, TabulatedWindConfig, WindLoads, WindLoadsConfig
 from residnet.physics.fossen import FossenConfig
 from residnet.physics.vessel import load_vessel, vessel_files
 

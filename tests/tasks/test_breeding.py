@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 from tiny import call
 
 from residnet.core.config import load_config
-from residnet.studies.halvorsen2019 import NoiseConfig, RecordConfig
+from residnet.documents.halvorsen2019.breeding import NoiseConfig, RecordConfig
 from residnet.tasks.breeding import BreedingTaskConfig
 
 STUDIES = Path(__file__).parents[2] / "configs" / "studies" / "halvorsen2019"

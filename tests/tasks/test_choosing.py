@@ -12,10 +12,10 @@ import yaml
 from tiny import TINY, call
 
 from residnet.baselines import RegressorsConfig
-from residnet.core.solutions import Solution
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.heads import ZeroHead
 from residnet.physics.signals import SignalsConfig
+from residnet.regression.solutions import Solution
 from residnet.tasks.choosing import choose
 
 

@@ -126,7 +126,7 @@ def csv_logs(tmp_path: Path, trial_logs: list[Log]) -> Path:
 
 @pytest.fixture(scope="session")
 def trial_logs() -> list[Log]:
-    from residnet.data.simulate import SimulatedTrials, simulate
+    from residnet.data.simulated.trials import SimulatedTrials, simulate
     from residnet.manoeuvres import ThreeTwoOneOne
 
     flown = [ThreeTwoOneOne(drive=d, steer=s, unit=u, start=2) for d, s, u in ((0.3, 0.5, 2), (0.8, 0.8, 3), (0.5, 0.6, 2.5), (0.6, 0.7, 2))]

@@ -15,7 +15,7 @@ import yaml
 from tiny import TINY, call
 
 from residnet.dynamics.store import load_model
-from residnet.evaluation.figures import read_figures
+from residnet.report.figures.fit import read_figures
 
 FEATURES = ["u", "v", "r", "tau_x", "tau_n"]
 

@@ -12,7 +12,7 @@ import yaml
 from tiny import call
 
 from residnet.core.config import load_config
-from residnet.data.simulate import SimulatedTrials, simulate
+from residnet.data.simulated.trials import SimulatedTrials, simulate
 from residnet.tasks.fit import FitConfig
 
 FERRY: dict[str, Any] = {

@@ -8,14 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import written_logs
 import yaml
 from tiny import call
 
 from residnet.core.log import Log
 from residnet.data.readers import CanonicalConfig
-
-sys.path.insert(0, str(Path(__file__).parent.parent / "data"))
-import written_logs
 
 
 def config(folder: Path, **keys: object) -> Path:

@@ -12,9 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from residnet import __version__, run_folder
+import residnet.runs.folder as folder_module
+from residnet import __version__
 from residnet.core.errors import UsageError
-from residnet.run_folder import RunFolder, git_revision, sha256
+from residnet.runs.folder import RunFolder, git_revision, sha256
 
 
 def one_line(wanted: str, path: Path, resolved: str = "a: 1\n", *, resume: bool = False) -> None:
@@ -119,7 +120,7 @@ def test_provenance_names_every_input_by_its_hash(tmp_path: Path, monkeypatch: p
 
 
 def test_revision_is_that_of_git(monkeypatch: pytest.MonkeyPatch) -> None:
-    here = Path(run_folder.__file__).parent
+    here = Path(folder_module.__file__).parent
     told = subprocess.run(["git", "rev-parse", "HEAD"], cwd=here, capture_output=True, text=True, check=False)
     expected = told.stdout.strip() if told.returncode == 0 else None
     found = git_revision()

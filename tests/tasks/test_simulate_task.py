@@ -14,7 +14,7 @@ from tiny import TINY, call
 
 from residnet.core.log import Log
 from residnet.data.readers import CanonicalConfig
-from residnet.data.simulate import SimulatedTrials, simulate
+from residnet.data.simulated.trials import SimulatedTrials, simulate
 from residnet.tasks import load_task
 
 DATA: dict[str, Any] = copy.deepcopy(TINY["data"])  # type: ignore[assignment]

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from residnet.control.controllers import PdConfig, Steering
-from residnet.control.policy import HeadingPolicy
-from residnet.control.steering import SteeredPlant, fly
+from residnet.control.heading.controllers import PdConfig, Steering
+from residnet.control.heading.policy import HeadingPolicy
+from residnet.control.heading.steering import SteeredPlant, fly
 from residnet.physics.vessel import load_vessel
 from residnet.training.autopilot import train_autopilot
 from residnet.training.autopilot_config import AutopilotTraining, SpreadConfig

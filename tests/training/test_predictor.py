@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from residnet.control.controllers import DocumentConfig, Steering
-from residnet.control.document_autopilot import NetworkPredictor
-from residnet.control.steering import SteeredPlant, fly
+from residnet.control.heading.controllers import DocumentConfig, Steering
+from residnet.control.heading.document_autopilot import NetworkPredictor
+from residnet.control.heading.steering import SteeredPlant, fly
 from residnet.physics.vessel import load_vessel
 from residnet.training.predictor import simulate_answers, train_predictor
 from residnet.training.predictor_config import PredictorTraining

@@ -14,7 +14,7 @@ from residnet.baselines.mmg import MMGBaseline, MMGConfig
 from residnet.baselines.nomoto import NomotoConfig, NomotoSideslipConfig
 from residnet.baselines.regressors import RegressorBaseline, RegressorsConfig
 from residnet.baselines.still import StillConfig
-from residnet.core.solutions import Coefficient
+from residnet.regression.solutions import Coefficient
 
 BaselineConfig = Annotated[
     BelievedConfig | EquationsConfig | LinearSteadyConfig | MMGConfig | NomotoConfig | NomotoSideslipConfig | RegressorsConfig | StillConfig,

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from residnet.core.config import Config
 from residnet.core.errors import ConfigError, FitError
 from residnet.core.samples import Samples
-from residnet.core.solutions import Coefficient, Solution
+from residnet.regression.solutions import Coefficient, Solution
 
 
 class Baseline(nn.Module, ABC):

@@ -14,12 +14,12 @@ from residnet.core.config import Config
 from residnet.core.errors import ConfigError
 from residnet.core.names import VELOCITY
 from residnet.core.samples import Samples
-from residnet.core.solutions import Solution
 from residnet.physics.fossen import HullConfig
 from residnet.physics.odin import OdinConfig
 from residnet.physics.signals import FORCE_CHANNELS
 from residnet.physics.terms import TermLibrary, parse_term
 from residnet.physics.vessel import load_vessel
+from residnet.regression.solutions import Solution
 
 Row = dict[str, float]
 

@@ -13,8 +13,8 @@ from residnet.baselines.base import Baseline, IdentifiedConfig
 from residnet.core.errors import ConfigError, UsageError
 from residnet.core.names import CHANNEL_UNITS, VELOCITY, to_si
 from residnet.core.samples import Samples
-from residnet.core.solutions import Solution
 from residnet.physics.terms import TermLibrary, parse_term
+from residnet.regression.solutions import Solution
 
 Row = dict[str, float]
 

@@ -12,9 +12,9 @@ from residnet.baselines.base import Baseline, IdentifiedConfig, require
 from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.config import Seconds
 from residnet.core.errors import FitError
-from residnet.core.least_squares import LinearFit, solve
 from residnet.core.samples import Samples
-from residnet.core.solutions import Coefficient, Solution
+from residnet.regression.least_squares import LinearFit, solve
+from residnet.regression.solutions import Coefficient, Solution
 
 
 class LinearSteadyConfig(IdentifiedConfig):

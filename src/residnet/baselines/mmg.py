@@ -13,8 +13,8 @@ from residnet.baselines.base import Baseline, IdentifiedConfig, ParametricBaseli
 from residnet.core.errors import FitError
 from residnet.core.names import VELOCITY, nearest
 from residnet.core.samples import Samples
-from residnet.core.solutions import Coefficient, Solution
 from residnet.physics.mmg import PARAMETERS, Belief, MMGForces, MMGHull, MMGPropeller, MMGRudder, usual_beliefs
+from residnet.regression.solutions import Coefficient, Solution
 
 _MOST_SAMPLES = 4000
 # of a difference quotient, in standard deviations

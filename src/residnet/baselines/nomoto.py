@@ -10,10 +10,10 @@ import torch
 from residnet.baselines.base import Baseline, IdentifiedConfig, of_manoeuvres, require
 from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.errors import FitError
-from residnet.core.least_squares import LinearFit, solve
 from residnet.core.names import VELOCITY
 from residnet.core.samples import Samples
-from residnet.core.solutions import Coefficient, Ratio, Solution
+from residnet.regression.least_squares import LinearFit, solve
+from residnet.regression.solutions import Coefficient, Ratio, Solution
 
 
 class _SteeringConfig(IdentifiedConfig):

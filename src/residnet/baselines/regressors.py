@@ -12,12 +12,12 @@ from torch import Tensor
 
 from residnet.baselines.base import Baseline, IdentifiedConfig, ParametricBaseline, of_manoeuvres
 from residnet.baselines.sets import Roles, SetName, expand, merged
-from residnet.core.least_squares import LinearFit, solve_path
 from residnet.core.names import VELOCITY
 from residnet.core.samples import Samples
-from residnet.core.solutions import Coefficient, Solution
 from residnet.physics.symmetry import wrong_parity
 from residnet.physics.terms import TermLibrary
+from residnet.regression.least_squares import LinearFit, solve_path
+from residnet.regression.solutions import Coefficient, Solution
 
 RowTerms = dict[Literal["u", "v", "r"], tuple[str, ...]]
 Penalty = Annotated[float, Field(ge=0)]

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from residnet.baselines.base import Baseline, IdentifiedConfig
 from residnet.core.samples import Samples
-from residnet.core.solutions import Solution
+from residnet.regression.solutions import Solution
 
 
 @final

@@ -10,7 +10,7 @@ from pydantic import Field
 from residnet.core.config import Config
 from residnet.core.log import Log
 from residnet.data.readers import ReaderConfig
-from residnet.data.simulate import SimulatedTrials, simulate
+from residnet.data.simulated.trials import SimulatedTrials, simulate
 from residnet.data.split import SplitConfig, check_leaks
 
 Splits = dict[str, list[Log]]

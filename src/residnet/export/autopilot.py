@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from residnet import __version__
-from residnet.control.policy import MEMORY, HeadingPolicy
+from residnet.control.heading.policy import MEMORY, HeadingPolicy
 from residnet.core.errors import ExportError
 from residnet.export.scripting import write_scripted
 

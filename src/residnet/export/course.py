@@ -11,10 +11,10 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
-from residnet.control.course_guidance import CourseGuidance
-from residnet.control.course_plan import Course
-from residnet.control.following import Following
-from residnet.control.policy import HeadingPolicy
+from residnet.control.courses.course_plan import Course
+from residnet.control.guidance.course_guidance import CourseGuidance
+from residnet.control.heading.following import Following
+from residnet.control.heading.policy import HeadingPolicy
 from residnet.core.errors import ExportError
 from residnet.export.autopilot import measured_entries, memory_limits, policy_entries
 from residnet.export.scripting import write_scripted

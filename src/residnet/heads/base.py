@@ -15,7 +15,7 @@ from residnet.core.config import Config
 from residnet.core.errors import ConfigError
 from residnet.core.names import ACCELERATION, nearest
 from residnet.core.samples import Samples
-from residnet.core.solutions import Solution
+from residnet.regression.solutions import Solution
 
 
 class ResidualHead(nn.Module, ABC):

@@ -12,9 +12,9 @@ from torch import Tensor
 from residnet.core.errors import FitError
 from residnet.core.names import ACCELERATION
 from residnet.core.samples import Samples
-from residnet.core.solutions import Solution
 from residnet.heads.base import ClosedFormHead, FeatureConfig, Features
 from residnet.physics.terms import TermLibrary, polynomial_terms
+from residnet.regression.solutions import Solution
 
 
 class BasisConfig(FeatureConfig):

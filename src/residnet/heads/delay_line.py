@@ -11,10 +11,10 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from residnet.core.config import Config
-from residnet.core.delay import delay_profile
 from residnet.core.errors import ConfigError
 from residnet.core.names import nearest
 from residnet.physics.terms import TermLibrary, parse_term
+from residnet.regression.delay import delay_profile
 
 
 class DelayConfig(Config):

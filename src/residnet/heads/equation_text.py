@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from residnet.heads.notation import LATEX, PLAIN, SYMPY, C, Style, c_body, latex_left, signed_sum
 from residnet.physics.terms import Factor, parse_term
+from residnet.regression.notation import LATEX, PLAIN, SYMPY, C, Style, c_body, latex_left, signed_sum
 
 
 class Written(NamedTuple):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from residnet.core.expressions import Algebra, Product
-from residnet.heads.notation import PLAIN, C, Style, c_body, signed_sum
+from residnet.regression.expressions import Algebra, Product
+from residnet.regression.notation import PLAIN, C, Style, c_body, signed_sum
 
 
 def term(algebra: Algebra, product: Product, style: Style = PLAIN) -> str:

@@ -11,11 +11,11 @@ from torch import Tensor, nn
 from residnet.core.errors import ConfigError, FitError
 from residnet.core.names import ACCELERATION
 from residnet.core.samples import Samples
-from residnet.core.solutions import Solution
 from residnet.heads.base import ClosedFormHead
 from residnet.heads.basis import BasisConfig, BasisHead
 from residnet.physics.force_model import FERRY_TERMS, MOTION, accelerating, augmented
 from residnet.physics.signals import FORCE_CHANNELS
+from residnet.regression.solutions import Solution
 
 
 def in_space(config: BasisConfig, names: Sequence[str], make: Callable[[BasisConfig, Sequence[str]], BasisHead]) -> ClosedFormHead:

@@ -11,17 +11,17 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from residnet.core.expressions import Algebra, Product
-from residnet.core.genetic import EvolutionConfig, Found, evolve, limits_of
 from residnet.core.names import ACCELERATION
 from residnet.core.samples import Samples
-from residnet.core.solutions import Coefficient, Solution
-from residnet.core.sparse import Equation, Reduced, SearchConfig, find, reduce
-from residnet.core.sparse_search import coefficients
 from residnet.heads.base import EquationHead, FeatureConfig, Features
 from residnet.heads.expression_library import ExpressionLibrary, Weights, tables
 from residnet.heads.expression_text import c_function, term, total
-from residnet.heads.notation import LATEX, PLAIN, SYMPY, latex_left
+from residnet.regression.expressions import Algebra, Product
+from residnet.regression.genetic import EvolutionConfig, Found, evolve, limits_of
+from residnet.regression.notation import LATEX, PLAIN, SYMPY, latex_left
+from residnet.regression.solutions import Coefficient, Solution
+from residnet.regression.sparse import Equation, Reduced, SearchConfig, find, reduce
+from residnet.regression.sparse_search import coefficients
 
 _BLOCKS = 8
 

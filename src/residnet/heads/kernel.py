@@ -11,12 +11,12 @@ from torch import Tensor, nn
 
 from residnet.core.errors import FitError
 from residnet.core.samples import Samples
-from residnet.core.solutions import Solution
 from residnet.heads.base import ClosedFormHead, FeatureConfig, Features
-from residnet.heads.kernel_fit import Path
-from residnet.heads.kernel_functions import Polynomial, Rbf
-from residnet.heads.kernel_recursion import Recursion
 from residnet.physics.terms import TermLibrary
+from residnet.regression.kernel_fit import Path
+from residnet.regression.kernel_functions import Polynomial, Rbf
+from residnet.regression.kernel_recursion import Recursion
+from residnet.regression.solutions import Solution
 
 
 class KernelConfig(FeatureConfig):

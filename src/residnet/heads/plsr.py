@@ -10,10 +10,10 @@ from pydantic import Field
 from torch import Tensor
 
 from residnet.core.samples import Samples
-from residnet.core.solutions import Solution
 from residnet.heads.base import ClosedFormHead
 from residnet.heads.basis import BasisConfig, BasisHead
 from residnet.heads.force import in_space
+from residnet.regression.solutions import Solution
 
 LEAST_ENERGY = 1e-13
 """Least energy of a latent variable in units of a column's: below it are rounding and columns that are sums of others, without a meaning."""

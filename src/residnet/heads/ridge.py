@@ -10,10 +10,10 @@ from pydantic import Field
 from torch import Tensor
 
 from residnet.core.samples import Samples
-from residnet.core.solutions import Solution
 from residnet.heads.base import ClosedFormHead
 from residnet.heads.basis import BasisConfig, BasisHead
 from residnet.heads.force import in_space
+from residnet.regression.solutions import Solution
 
 
 class RidgeConfig(BasisConfig):

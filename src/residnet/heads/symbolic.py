@@ -10,17 +10,17 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from residnet.core.equation_rows import EstimatorConfig, LeastSquares, Rows, step_of, stretches
 from residnet.core.names import ACCELERATION
 from residnet.core.samples import Samples
-from residnet.core.solutions import Coefficient, Solution
-from residnet.core.sparse import NOTHING, Equation, Reduced, SearchConfig, find, reduce
 from residnet.heads.base import EquationHead, FeatureConfig, Features
 from residnet.heads.delay_line import DelayConfig, DelayLine, Past, best_delay
 from residnet.heads.equation_text import Written, c_function, latex, plain, sympy_text
 from residnet.physics.candidates import Candidate, CandidatesConfig, rated
 from residnet.physics.symmetry import wrong_parity
 from residnet.physics.terms import TermLibrary, parse_term
+from residnet.regression.equation_rows import EstimatorConfig, LeastSquares, Rows, step_of, stretches
+from residnet.regression.solutions import Coefficient, Solution
+from residnet.regression.sparse import NOTHING, Equation, Reduced, SearchConfig, find, reduce
 
 _GAMMAS = (0.0, 0.5, 1.0)
 _MOST_DELAYS = 6

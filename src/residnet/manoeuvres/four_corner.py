@@ -11,8 +11,8 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from residnet.control.pid import MotionPIDConfig
-from residnet.control.reference_filter import ReferenceFilterConfig, Waypoint
+from residnet.control.motion.pid import MotionPIDConfig
+from residnet.control.motion.reference_filter import ReferenceFilterConfig, Waypoint
 from residnet.core.config import RadiansPerSecond, Seconds
 from residnet.core.errors import UsageError
 from residnet.core.log import Log

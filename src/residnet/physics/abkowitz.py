@@ -12,7 +12,7 @@ from residnet.core.config import Config, MetresPerSecond, Radians, RadiansPerSec
 from residnet.core.errors import ConfigError
 from residnet.physics.actuators.base import Actuators
 from residnet.physics.actuators.servo import ServoConfig, Servos
-from residnet.physics.environment_wind import WindLoadsConfig
+from residnet.physics.environment.wind import WindLoadsConfig
 from residnet.physics.kinematics import Planar
 from residnet.physics.mass import inverse_mass
 from residnet.physics.parameters import Density

@@ -13,7 +13,7 @@ from residnet.core.config import Config
 from residnet.core.errors import ConfigError
 from residnet.core.names import VELOCITY
 from residnet.physics.actuators import ActuatorsConfig
-from residnet.physics.environment_wind import WindLoadsConfig
+from residnet.physics.environment.wind import WindLoadsConfig
 from residnet.physics.kinematics import Planar
 from residnet.physics.mass import inverse_mass
 from residnet.physics.parameters import Inertia, Length, Mass, MassArm, Parameter, above_zero, dimension, unit_text

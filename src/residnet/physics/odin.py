@@ -12,7 +12,7 @@ from residnet.core.config import Config
 from residnet.core.errors import ConfigError
 from residnet.core.names import VELOCITY
 from residnet.physics.actuators import ActuatorsConfig
-from residnet.physics.environment_wind import WindLoadsConfig
+from residnet.physics.environment.wind import WindLoadsConfig
 from residnet.physics.kinematics import Planar
 from residnet.physics.parameters import Parameter, above_zero, dimension, of_dimension, unit_text
 from residnet.physics.plant import HullPlant

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from residnet.core.config import Config, MetresPerSecond
 from residnet.core.errors import ConfigError
 from residnet.physics.actuators.stern_rudders import FoilRuddersConfig, LinearRuddersConfig
-from residnet.physics.environment_wind import WindLoadsConfig
+from residnet.physics.environment.wind import WindLoadsConfig
 from residnet.physics.kinematics import Rolling
 from residnet.physics.mass import inverse_mass
 from residnet.physics.parameters import Inertia, Length, Mass, MassArm, MassDensity, Parameter, Volume, above_zero, dimension, unit_text

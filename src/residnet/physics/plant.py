@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from residnet.physics.actuators import Actuators
-from residnet.physics.environment_wind import WIND_INPUTS, WindLoads
+from residnet.physics.environment.wind import WIND_INPUTS, WindLoads
 from residnet.physics.kinematics import Kinematics
 
 

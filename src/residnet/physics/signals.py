@@ -15,7 +15,7 @@ from residnet.core.errors import ConfigError
 from residnet.core.frames import to_body
 from residnet.core.names import CHANNEL_UNITS, STATE, VELOCITY, nearest
 from residnet.physics.actuators import DifferentialThrustConfig
-from residnet.physics.environment_wind import WIND_INPUTS
+from residnet.physics.environment.wind import WIND_INPUTS
 from residnet.physics.fossen import FossenConfig
 from residnet.physics.vessel import load_vessel
 

@@ -15,7 +15,7 @@ from residnet.core.config import Config, ExistingPath, dump_config
 from residnet.core.errors import DataError, UsageError
 from residnet.core.names import nearest, to_si
 from residnet.physics.actuators.identify import StepAnswer, ThrottleMap, ThrustFit, fit_step, fit_throttle, fit_thrust
-from residnet.run_folder import RunFolder
+from residnet.runs.folder import RunFolder
 
 
 class Column(Config):
@@ -140,7 +140,7 @@ class ActuatorsTaskConfig(Config):
         text = vessel_lines(self, throttle, step, thrust)
         folder.write(folder.path / "actuators.yaml", text)
         folder.write_json(folder.path / "actuators.json", _numbers(throttle, step, thrust))
-        from residnet.evaluation.figures_actuators import draw_actuators
+        from residnet.report.figures.actuators import draw_actuators
 
         draw_actuators(folder.figures / "actuators.png", self, logs, throttle, step, thrust)
         folder.write_provenance(config=source, overrides=overrides, seed=0, files=self.files(), started=started)

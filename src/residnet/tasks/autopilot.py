@@ -10,14 +10,14 @@ from typing import Annotated, Literal
 import torch
 from pydantic import Field, model_validator
 
-from residnet.control.controllers import AnyController, BangBangConfig
+from residnet.control.heading.controllers import AnyController, BangBangConfig
 from residnet.core.config import Config, MetresPerSecond, Radians, Seconds, dump_config
 from residnet.core.names import nearest
-from residnet.data.environment import Disturbance, WindField
-from residnet.physics.environment_waves import WavesConfig
+from residnet.data.simulated.environment import Disturbance, WindField
+from residnet.dynamics.learned import chosen_model
+from residnet.physics.environment.waves import WavesConfig
 from residnet.physics.vessel import VesselName, load_vessel
-from residnet.run_folder import RunFolder
-from residnet.tasks.learned import chosen_model
+from residnet.runs.folder import RunFolder
 from residnet.training.autopilot_config import AutopilotTraining, SpreadConfig
 from residnet.training.predictor_config import PredictorTraining
 

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from residnet.control.base import Policy
-from residnet.control.steering import Flights, SteeredPlant, fly
-from residnet.evaluation.autopilots import measure, random_variations, row, sea_flights, sea_row, step_flights, wind_flights
+from residnet.control.heading.steering import Flights, SteeredPlant, fly
+from residnet.judge.autopilots import measure, random_variations, row, sea_flights, sea_row, step_flights, wind_flights
 from residnet.physics.vessel import load_vessel
 from residnet.tasks.autopilot import AutopilotConfig
 

@@ -9,13 +9,13 @@ from typing import Any
 import torch
 
 from residnet.control.base import Policy
-from residnet.control.controllers import DocumentConfig, Steering
-from residnet.control.document_autopilot import NetworkPredictor
+from residnet.control.heading.controllers import DocumentConfig, Steering
+from residnet.control.heading.document_autopilot import NetworkPredictor
 from residnet.core.errors import UsageError
-from residnet.run_folder import RunFolder
+from residnet.runs.folder import RunFolder
+from residnet.runs.trained import store_weights, stored_weights
 from residnet.tasks.autopilot import PredictiveConfig
 from residnet.tasks.pipeline import say
-from residnet.tasks.trained import store_weights, stored_weights
 from residnet.training.predictor import train_predictor
 
 

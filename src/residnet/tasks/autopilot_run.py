@@ -9,27 +9,27 @@ from typing import Any
 import torch
 
 from residnet.control.base import ClosedLoop, Policy
-from residnet.control.controllers import AnyController, Steering, TunedConfig
-from residnet.control.imitation import SideBySide
-from residnet.control.policy import HeadingPolicy
-from residnet.control.steered_model import SteeredModel
-from residnet.control.steering import SteeredPlant, fly
-from residnet.control.tuning import TuningTask, tune
+from residnet.control.heading.controllers import AnyController, Steering, TunedConfig
+from residnet.control.heading.imitation import SideBySide
+from residnet.control.heading.policy import HeadingPolicy
+from residnet.control.heading.steered_model import SteeredModel
+from residnet.control.heading.steering import SteeredPlant, fly
+from residnet.control.heading.tuning import TuningTask, tune
 from residnet.core.errors import ConfigError
+from residnet.dynamics.learned import chosen_model
 from residnet.dynamics.rollout import Source
 from residnet.dynamics.store import load_model
-from residnet.evaluation.autopilots import QUANTITIES, effort_table, step_flights, table
-from residnet.evaluation.metrics import SCHEMA
-from residnet.evaluation.report_autopilot import FLIGHTS, PLANTS, write_autopilot_report
 from residnet.export.autopilot import export_autopilot
+from residnet.judge.autopilots import QUANTITIES, effort_table, step_flights, table
+from residnet.judge.metrics import SCHEMA
 from residnet.physics.vessel import load_vessel
-from residnet.run_folder import RunFolder
+from residnet.report.autopilot import FLIGHTS, PLANTS, write_autopilot_report
+from residnet.runs.folder import RunFolder
+from residnet.runs.trained import store_weights, stored_weights
 from residnet.tasks.autopilot import AutopilotConfig, PolicyConfig
 from residnet.tasks.autopilot_compare import compare
 from residnet.tasks.autopilot_predictive import predictive
-from residnet.tasks.learned import chosen_model
 from residnet.tasks.pipeline import say
-from residnet.tasks.trained import store_weights, stored_weights
 from residnet.training.autopilot import train_autopilot
 
 

@@ -13,17 +13,17 @@ from residnet.baselines import ParametricBaseline
 from residnet.core.errors import ConfigError, DataError
 from residnet.core.log import Log
 from residnet.core.names import VELOCITY, nearest
-from residnet.data.environment import Disturbance
-from residnet.data.flying import Craft, Flight, Sea, fly
 from residnet.data.prepare import Prepared
-from residnet.data.sensors import SensorNoise
+from residnet.data.simulated.environment import Disturbance
+from residnet.data.simulated.flying import Craft, Flight, Sea, fly
+from residnet.data.simulated.sensors import SensorNoise
 from residnet.dynamics.actuated import ActuatedDynamics
 from residnet.dynamics.drawn import DrawnDynamics
 from residnet.dynamics.gear import GivenGear, InputShare
-from residnet.evaluation.booklet import BookletConfig, Page, contents
+from residnet.judge.booklet import BookletConfig, Page, contents
 from residnet.manoeuvres import Helm, Manoeuvre, Zigzag
 from residnet.manoeuvres.recognise import steered_zigzag
-from residnet.run_folder import RunFolder
+from residnet.runs.folder import RunFolder
 from residnet.tasks.pipeline import Fitted
 
 _PARAMETER = "model.baseline.theta"

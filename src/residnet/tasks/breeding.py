@@ -10,9 +10,9 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, ValidationError, model_validator
 
 from residnet.core.config import Config, dump_config
+from residnet.documents.halvorsen2019.breeding import NoiseConfig, RecordConfig, Trial, as_text, attempt, draw
 from residnet.heads.genetic import GeneticConfig
-from residnet.run_folder import RunFolder
-from residnet.studies.halvorsen2019 import NoiseConfig, RecordConfig, Trial, as_text, attempt, draw
+from residnet.runs.folder import RunFolder
 
 Value = int | float | str
 Matrix = tuple[tuple[float | None, ...], ...]
@@ -90,7 +90,7 @@ class BreedingTaskConfig(Config):
         Raises:
             UsageError: where it is not installed.
         """
-        from residnet.core.genetic import require_deap
+        from residnet.regression.genetic import require_deap
 
         require_deap()
 

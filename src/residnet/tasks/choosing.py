@@ -7,8 +7,8 @@ from typing import Any
 
 from torch import nn
 
-from residnet.core.solutions import Solution
 from residnet.dynamics.hybrid import HybridDynamics
+from residnet.regression.solutions import Solution
 
 
 def choose(

@@ -9,11 +9,11 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from residnet.control.controllers import AnyController
-from residnet.control.courses import BuoyCourseConfig, Protocol
-from residnet.control.line_of_sight import AnyLineOfSight
+from residnet.control.courses.config import BuoyCourseConfig, Protocol
+from residnet.control.guidance.line_of_sight import AnyLineOfSight
+from residnet.control.heading.controllers import AnyController
 from residnet.core.config import Config, ExistingPath, MetresPerSecond, Seconds, dump_config
-from residnet.run_folder import RunFolder
+from residnet.runs.folder import RunFolder
 from residnet.tasks.course_flights import CourseSpreadConfig
 
 _Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]

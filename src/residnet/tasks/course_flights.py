@@ -11,13 +11,13 @@ from pydantic import Field, model_validator
 from torch import Tensor
 
 from residnet.control.base import ClosedLoop, Policy, Reference
-from residnet.control.controllers import Steering
-from residnet.control.course_guidance import CourseGuidance
-from residnet.control.courses import PlannedCourse
+from residnet.control.courses.config import PlannedCourse
+from residnet.control.guidance.course_guidance import CourseGuidance
+from residnet.control.heading.controllers import Steering
 from residnet.core.config import Config, MetresPerSecond, Radians
 from residnet.dynamics.carried import Carried
 from residnet.dynamics.rollout import Rollout
-from residnet.evaluation.courses import CourseFlight
+from residnet.judge.courses import CourseFlight
 
 
 class Vessels(NamedTuple):

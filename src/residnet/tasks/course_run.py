@@ -12,26 +12,26 @@ import torch
 from pydantic import TypeAdapter
 
 from residnet.control.base import Policy, Reference
-from residnet.control.controllers import AnyController, Steering
-from residnet.control.course_guidance import CourseGuidance
-from residnet.control.courses import PlannedCourse, Protocol, plan_course, report_feasibility, smallest_turn
-from residnet.control.drift import DriftEstimate
-from residnet.control.following import Following
-from residnet.control.line_of_sight import AnyLineOfSight
-from residnet.control.policy import HeadingPolicy
-from residnet.control.steering import SteeredPlant
-from residnet.control.turning import Turning
-from residnet.control.turns import SteadyTurn
-from residnet.control.waypoints import WaypointGuidance
-from residnet.control.wheel_over import WheelOver
+from residnet.control.courses.config import PlannedCourse, Protocol, plan_course, report_feasibility, smallest_turn
+from residnet.control.courses.turns import SteadyTurn
+from residnet.control.guidance.course_guidance import CourseGuidance
+from residnet.control.guidance.drift import DriftEstimate
+from residnet.control.guidance.line_of_sight import AnyLineOfSight
+from residnet.control.guidance.waypoints import WaypointGuidance
+from residnet.control.guidance.wheel_over import WheelOver
+from residnet.control.heading.controllers import AnyController, Steering
+from residnet.control.heading.following import Following
+from residnet.control.heading.policy import HeadingPolicy
+from residnet.control.heading.steering import SteeredPlant
+from residnet.control.heading.turning import Turning
 from residnet.core.config import load_config
 from residnet.core.errors import ConfigError, UsageError
 from residnet.core.names import nearest
-from residnet.evaluation.courses import CourseFlight, row, spread_row, table
-from residnet.evaluation.metrics import SCHEMA
-from residnet.evaluation.report_course import COURSES, SPREAD, TRACKS, write_course_report
+from residnet.judge.courses import CourseFlight, row, spread_row, table
+from residnet.judge.metrics import SCHEMA
 from residnet.physics.vessel import load_vessel
-from residnet.run_folder import RunFolder
+from residnet.report.course import COURSES, SPREAD, TRACKS, write_course_report
+from residnet.runs.folder import RunFolder
 from residnet.tasks.autopilot import AutopilotConfig
 from residnet.tasks.autopilot_predictive import load_predictive
 from residnet.tasks.course import CourseTaskConfig

@@ -11,7 +11,7 @@ from residnet.core.names import nearest
 from residnet.dynamics.store import load_model, model_names
 from residnet.export.feed_forward import export_feed_forward, required_force
 from residnet.export.torchscript import export_torchscript
-from residnet.run_folder import RunFolder
+from residnet.runs.folder import RunFolder
 
 
 def export_model(path: Path, name: str, out: Path | None, form: str = "torchscript") -> Path:

@@ -14,9 +14,9 @@ from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
 from residnet.data.prepare import prepare
 from residnet.data.readers import CanonicalConfig
-from residnet.data.simulate import SimulatedTrials
+from residnet.data.simulated.trials import SimulatedTrials
 from residnet.dynamics.store import load_model, model_names
-from residnet.run_folder import RunFolder
+from residnet.runs.folder import RunFolder
 from residnet.tasks.fit import FitConfig
 from residnet.tasks.inspection import log_files
 from residnet.tasks.pipeline import Fitted, candidates, evaluate, require_window, say

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Literal, final
 
 from residnet.core.config import dump_config
-from residnet.run_folder import RunFolder
-from residnet.studies.ferry_config import FerrySettings
+from residnet.documents.jervan2020.ferry_config import FerrySettings
+from residnet.runs.folder import RunFolder
 
 
 @final
@@ -29,8 +29,8 @@ class FerryStudyConfig(FerrySettings):
         """
         import torch
 
-        from residnet.studies.ferry_report import write
-        from residnet.studies.jervan2020 import study
+        from residnet.documents.jervan2020.ferry_report import write
+        from residnet.documents.jervan2020.ferry_study import study
 
         started = time.time()
         torch.set_num_threads(1)

@@ -13,14 +13,14 @@ from residnet.core.config import Config
 from residnet.core.errors import ConfigError
 from residnet.core.names import nearest
 from residnet.data.prepare import PrepareConfig
-from residnet.data.simulate import SimulatedTrials
+from residnet.data.simulated.trials import SimulatedTrials
 from residnet.data.sources import DataConfig, MeasuredLogs
+from residnet.documents import StudyName
 from residnet.dynamics.base import Integrator
-from residnet.evaluation.booklet import BookletConfig
-from residnet.evaluation.config import EvaluationConfig
 from residnet.heads import ForceHead, HeadConfig
+from residnet.judge.booklet import BookletConfig
+from residnet.judge.config import EvaluationConfig
 from residnet.physics.signals import SignalsConfig
-from residnet.studies import StudyName
 from residnet.training.config import TrainingConfig
 from residnet.training.current import CurrentConfig
 from residnet.training.refit import RefitConfig

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Literal, final
 
 from residnet.core.config import dump_config
-from residnet.run_folder import RunFolder
-from residnet.studies.force_config import ForceSettings
+from residnet.documents.jervan2020.force_config import ForceSettings
+from residnet.runs.folder import RunFolder
 
 
 @final
@@ -34,8 +34,8 @@ class ForceResidualConfig(ForceSettings):
         """
         import torch
 
-        from residnet.studies.force_report import write
-        from residnet.studies.force_study import force_study
+        from residnet.documents.jervan2020.force_report import write
+        from residnet.documents.jervan2020.force_study import force_study
 
         started = time.time()
         torch.set_num_threads(1)

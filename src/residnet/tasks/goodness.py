@@ -10,8 +10,8 @@ import torch
 
 from residnet.data.prepare import Prepared
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.evaluation.goodness import OneStep, content, table
-from residnet.run_folder import RunFolder
+from residnet.judge.goodness import OneStep, content, table
+from residnet.runs.folder import RunFolder
 from residnet.tasks.pipeline import Fitted
 from residnet.tasks.references import references
 

@@ -15,7 +15,7 @@ from residnet.core.log import Log
 from residnet.core.names import nearest
 from residnet.data.readers import ReaderConfig
 from residnet.data.readers.files import files_of
-from residnet.run_folder import RunFolder
+from residnet.runs.folder import RunFolder
 
 
 class ImportConfig(Config):

@@ -18,9 +18,9 @@ from residnet.data.doctor.draft import draft_map
 from residnet.data.doctor.excitation import conditioning
 from residnet.data.masks import Mask
 from residnet.data.readers.base import LogReader
-from residnet.data.readers.composed import RecordingConfig
+from residnet.data.readers.composing.composed import RecordingConfig
 from residnet.data.readers.detect import format_of, reader_for
-from residnet.run_folder import RunFolder
+from residnet.runs.folder import RunFolder
 
 if TYPE_CHECKING:
     from residnet.tasks.fit import FitConfig

@@ -20,22 +20,22 @@ from residnet.core.log import Log
 from residnet.core.names import ACCELERATION
 from residnet.core.samples import Samples
 from residnet.data.prepare import Prepared, envelope, prepare, samples
-from residnet.data.simulate import SimulatedTrials
+from residnet.data.simulated.trials import SimulatedTrials
 from residnet.data.sources import MeasuredLogs
 from residnet.data.windows import WindowStore
 from residnet.dynamics.ensemble import mean_of
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.simulated import PlantDynamics
 from residnet.dynamics.store import ModelSpec, load_model, save_model
-from residnet.evaluation.config import EvaluationConfig
-from residnet.evaluation.freerun import Candidate, FreeRun, free_run
-from residnet.evaluation.limits import limits
-from residnet.evaluation.metrics import rows, window_errors
-from residnet.evaluation.protocol import all_windows
-from residnet.evaluation.rollout_files import write_rollouts
 from residnet.heads import ClosedFormHead
+from residnet.judge.config import EvaluationConfig
+from residnet.judge.freerun import Candidate, FreeRun, free_run
+from residnet.judge.limits import limits
+from residnet.judge.metrics import rows, window_errors
+from residnet.judge.protocol import all_windows
+from residnet.judge.rollout_files import write_rollouts
 from residnet.physics.vessel import load_vessel
-from residnet.run_folder import RunFolder
+from residnet.runs.folder import RunFolder
 from residnet.tasks.choosing import choose
 from residnet.tasks.fit import FitConfig
 from residnet.tasks.references import references

@@ -12,18 +12,18 @@ from torch import Tensor
 from residnet.core.config import Config, ExistingPath, Metres, Quantity, Seconds
 from residnet.core.errors import ConfigError, UsageError
 from residnet.core.names import CHANNEL_UNITS, nearest
-from residnet.data.environment import Disturbance
-from residnet.data.flying import Craft, Flight, Sea, fly, log_names, source_of
 from residnet.data.readers import ReaderConfig
-from residnet.data.readers.canonical import CanonicalConfig
-from residnet.data.sensors import SensorNoise
+from residnet.data.readers.tables.canonical import CanonicalConfig
+from residnet.data.simulated.environment import Disturbance
+from residnet.data.simulated.flying import Craft, Flight, Sea, fly, log_names, source_of
+from residnet.data.simulated.sensors import SensorNoise
 from residnet.dynamics.actuated import ActuatedDynamics
 from residnet.dynamics.gear import GivenGear, InputShare, PlantGear
+from residnet.dynamics.learned import chosen_model
 from residnet.dynamics.simulated import TracedPlantDynamics
 from residnet.dynamics.store import load_model
 from residnet.manoeuvres import FamilyConfig, Helm, Manoeuvre, ManoeuvreConfig, Replay
 from residnet.physics.vessel import load_vessel
-from residnet.tasks.learned import chosen_model
 
 STEP = 0.05
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from residnet.evaluation.figures import write_figures
-from residnet.evaluation.report import write_report
-from residnet.evaluation.report_autopilot import FLIGHTS, write_autopilot_report
-from residnet.evaluation.report_course import TRACKS, write_course_report
-from residnet.run_folder import RunFolder
+from residnet.report.autopilot import FLIGHTS, write_autopilot_report
+from residnet.report.course import TRACKS, write_course_report
+from residnet.report.figures.fit import write_figures
+from residnet.report.page import write_report
+from residnet.runs.folder import RunFolder
 
 
 def report_run(path: Path) -> Path:

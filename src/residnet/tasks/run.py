@@ -15,11 +15,11 @@ from residnet.core.config import dump_config
 from residnet.core.names import STATE, si_unit
 from residnet.data.prepare import Prepared
 from residnet.data.sources import input_files, read_logs
-from residnet.evaluation.limits import SCHEMA as LIMITS
-from residnet.evaluation.metrics import SCHEMA, find
-from residnet.evaluation.repeats import repeatability
-from residnet.run_folder import RunFolder
-from residnet.studies import draw_study
+from residnet.documents import draw_study
+from residnet.judge.limits import SCHEMA as LIMITS
+from residnet.judge.metrics import SCHEMA, find
+from residnet.judge.repeats import repeatability
+from residnet.runs.folder import RunFolder
 from residnet.tasks.booklet import write_booklet
 from residnet.tasks.drifting import summary, through_currents
 from residnet.tasks.exporting import export_model

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Literal, final
 
 from residnet.core.config import dump_config
-from residnet.run_folder import RunFolder
-from residnet.studies.odin_phases import PhasesSettings
+from residnet.documents.halvorsen2019.odin_phases import PhasesSettings
+from residnet.runs.folder import RunFolder
 
 
 @final
@@ -29,8 +29,8 @@ class SeaTrialTaskConfig(PhasesSettings):
         """
         import torch
 
-        from residnet.studies.odin_phases import study
-        from residnet.studies.odin_report import write
+        from residnet.documents.halvorsen2019.odin_phases import study
+        from residnet.documents.halvorsen2019.odin_report import write
 
         started = time.time()
         torch.set_num_threads(1)

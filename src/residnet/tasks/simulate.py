@@ -12,11 +12,11 @@ from pydantic import Field, model_validator
 
 from residnet.core.config import Config, dump_config
 from residnet.core.errors import DataError
-from residnet.data.flying import Craft, Flight
-from residnet.data.simulate import SimulatedTrials, fly_trials, trials_craft
+from residnet.data.simulated.flying import Craft, Flight
+from residnet.data.simulated.trials import SimulatedTrials, fly_trials, trials_craft
 from residnet.manoeuvres import Replay
 from residnet.physics.vessel import load_vessel
-from residnet.run_folder import RunFolder
+from residnet.runs.folder import RunFolder
 from residnet.tasks.programme import Programme
 
 _PRINTED = 24
@@ -59,8 +59,8 @@ class SimulateConfig(Config):
             UsageError: where the folder exists or something cannot fly the manoeuvres.
             DataError: where a manoeuvre of the list did not reach its stop condition; everything has been written by then.
         """
-        from residnet.evaluation.figures_flights import draw_flights
-        from residnet.evaluation.index_table import contents, index_rows, table
+        from residnet.judge.index_table import contents, index_rows, table
+        from residnet.report.figures.flights import draw_flights
 
         started = time.time()
         self.check()

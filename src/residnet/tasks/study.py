@@ -14,7 +14,7 @@ from pydantic import Field, model_validator
 
 from residnet.core.config import Config, ExistingPath, dump_config, load_config
 from residnet.core.names import nearest
-from residnet.run_folder import RunFolder
+from residnet.runs.folder import RunFolder
 from residnet.tasks.fit import FitConfig
 
 _Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
@@ -97,7 +97,7 @@ class StudyConfig(Config):
     def _write(self, folder: RunFolder, seconds: dict[tuple[str, int], float]) -> None:
         import numpy as np
 
-        from residnet.evaluation.comparison import Variant, as_text, draw, table, window_nrmse
+        from residnet.report.comparison import Variant, as_text, draw, table, window_nrmse
 
         found = {
             (variant, seed): window_nrmse(folder.path / "variants" / f"{variant}.{seed}", self.model, self.split)

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor, nn
 
 from residnet.control.base import ClosedLoop, GivenReference, Policy
-from residnet.control.imitation import SideBySide
-from residnet.control.policy import HeadingPolicy
-from residnet.control.steering import Measured, SteeredVessel
+from residnet.control.heading.imitation import SideBySide
+from residnet.control.heading.policy import HeadingPolicy
+from residnet.control.heading.steering import Measured, SteeredVessel
 from residnet.core.frames import wrap
 from residnet.dynamics.rollout import Rollout
 from residnet.training.autopilot_config import AutopilotTraining, SpreadConfig

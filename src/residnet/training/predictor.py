@@ -9,8 +9,8 @@ from typing import Any, NamedTuple, final
 import torch
 from torch import Tensor, nn
 
-from residnet.control.document_autopilot import NetworkPredictor, SimulatedPredictor
-from residnet.control.steering import SteeredVessel
+from residnet.control.heading.document_autopilot import NetworkPredictor, SimulatedPredictor
+from residnet.control.heading.steering import SteeredVessel
 from residnet.dynamics.rollout import Rollout
 from residnet.training.epochs import EpochTraining, run_epochs
 from residnet.training.predictor_config import PredictorTraining

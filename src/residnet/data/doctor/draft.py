@@ -15,7 +15,7 @@ from residnet.core.config import validate
 from residnet.core.errors import DataError, UsageError
 from residnet.core.names import CHANNEL_UNITS, to_si, units
 from residnet.data.readers.base import LogReader, require_file
-from residnet.data.readers.table import CsvConfig, ParquetConfig
+from residnet.data.readers.tables.table import CsvConfig, ParquetConfig
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -6,18 +6,18 @@ from typing import Annotated
 
 from pydantic import Field
 
-from residnet.data.readers.ardupilot import ArduPilotConfig
 from residnet.data.readers.base import LogReader
-from residnet.data.readers.canonical import CanonicalConfig, CanonicalReader
-from residnet.data.readers.channel_map import ChannelMap
 from residnet.data.readers.detect import AutoConfig
-from residnet.data.readers.hdf5 import Hdf5Config
-from residnet.data.readers.mat import MatConfig
-from residnet.data.readers.nmea import NmeaConfig
-from residnet.data.readers.rosbag import RosbagConfig
-from residnet.data.readers.table import CsvConfig, ParquetConfig, TableReader, TimeColumn
-from residnet.data.readers.topic_folder import TopicFolderConfig
-from residnet.data.readers.ulog import UlogConfig
+from residnet.data.readers.recorders.ardupilot import ArduPilotConfig
+from residnet.data.readers.recorders.hdf5 import Hdf5Config
+from residnet.data.readers.recorders.mat import MatConfig
+from residnet.data.readers.recorders.nmea import NmeaConfig
+from residnet.data.readers.recorders.rosbag import RosbagConfig
+from residnet.data.readers.recorders.topic_folder import TopicFolderConfig
+from residnet.data.readers.recorders.ulog import UlogConfig
+from residnet.data.readers.tables.canonical import CanonicalConfig, CanonicalReader
+from residnet.data.readers.tables.channel_map import ChannelMap
+from residnet.data.readers.tables.table import CsvConfig, ParquetConfig, TableReader, TimeColumn
 
 ReaderConfig = Annotated[
     CsvConfig

@@ -10,19 +10,19 @@ from typing import Literal, final
 
 from residnet.core.errors import UsageError
 from residnet.core.log import Log
-from residnet.data.readers.ardupilot import ArduPilotConfig
 from residnet.data.readers.base import LogReader, require_file
-from residnet.data.readers.canonical import CanonicalConfig
-from residnet.data.readers.clocks import settle
-from residnet.data.readers.composed import RecordingConfig
-from residnet.data.readers.hdf5 import Hdf5Config, is_hdf5
-from residnet.data.readers.mat import MatConfig
-from residnet.data.readers.nmea import NmeaConfig
+from residnet.data.readers.composing.clocks import settle
+from residnet.data.readers.composing.composed import RecordingConfig
+from residnet.data.readers.composing.wanted import EVERYTHING, Wanted
+from residnet.data.readers.recorders.ardupilot import ArduPilotConfig
+from residnet.data.readers.recorders.hdf5 import Hdf5Config, is_hdf5
+from residnet.data.readers.recorders.mat import MatConfig
+from residnet.data.readers.recorders.nmea import NmeaConfig
+from residnet.data.readers.recorders.rosbag import RosbagConfig
+from residnet.data.readers.recorders.topic_folder import TopicFolderConfig, is_topic_folder
+from residnet.data.readers.recorders.ulog import UlogConfig
 from residnet.data.readers.recording import Recording
-from residnet.data.readers.rosbag import RosbagConfig
-from residnet.data.readers.topic_folder import TopicFolderConfig, is_topic_folder
-from residnet.data.readers.ulog import UlogConfig
-from residnet.data.readers.wanted import EVERYTHING, Wanted
+from residnet.data.readers.tables.canonical import CanonicalConfig
 
 _MCAP = b"\x89MCAP0\r\n"
 _SQLITE = b"SQLite format 3\x00"

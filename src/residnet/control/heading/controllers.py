@@ -1,0 +1,198 @@
+"""Classical heading controllers as configs: gains given, or left out to be tuned."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from typing import Annotated, Literal, NamedTuple
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from residnet.control.base import Policy
+from residnet.control.heading.bang_bang import BangBangHeading
+from residnet.control.heading.bang_bang_rate import RatedBangBangHeading
+from residnet.control.heading.document_autopilot import DocumentAutopilot, Predictor, SimulatedPredictor
+from residnet.control.heading.heading_pid import HeadingPID
+from residnet.control.heading.steering import NominalSteering, SteeredVessel
+from residnet.control.heading.turning import Turning
+from residnet.core.config import Config, Seconds
+from residnet.core.errors import ConfigError
+
+
+class Steering(NamedTuple):
+    """What a controller is built for: the vessel, its K and T, the rudder's limit [rad] and the controller's step [s]."""
+
+    vessel: SteeredVessel
+    turning: Turning
+    limit: float
+    dt: float
+
+
+class Axis(NamedTuple):
+    """Range of a parameter that tuning searches, by its logarithm."""
+
+    low: float
+    high: float
+
+
+class ControllerConfig(Config, ABC):
+    """A heading controller."""
+
+    @abstractmethod
+    def build(self, steering: Steering) -> Policy:
+        """The controller.
+
+        Raises:
+            ConfigError: where a gain is missing that tuning should have filled in.
+        """
+
+
+class TunedConfig(ControllerConfig, ABC):
+    """A linear law kp e - kd r + ki I whose missing parameters are tuned."""
+
+    @abstractmethod
+    def parameters(self) -> dict[str, float | None]:
+        """Parameters by name; None where they are to be tuned."""
+
+    @abstractmethod
+    def axes(self, turning: Turning) -> dict[str, Axis]:
+        """Where tuning searches."""
+
+    @abstractmethod
+    def gains(self, parameters: dict[str, Tensor], turning: Turning) -> tuple[Tensor, Tensor, Tensor]:
+        """kp, kd, ki of parameters, any shape."""
+
+    def build(self, steering: Steering) -> Policy:
+        """A PID controller with these gains."""
+        missing = [name for name, value in self.parameters().items() if value is None]
+        if missing:
+            raise ConfigError(f"controller without {', '.join(missing)}: tune it first or give them")
+        given = {name: torch.tensor(value or 0.0, dtype=torch.float64) for name, value in self.parameters().items()}
+        kp, kd, ki = (float(gain) for gain in self.gains(given, steering.turning))
+        return HeadingPID(steering.vessel.state, kp=kp, kd=kd, ki=ki, limit=steering.limit, dt=steering.dt if ki > 0 else None)
+
+
+class PdConfig(TunedConfig):
+    """Proportional and derivative action on the heading error.
+
+    Attributes:
+        kp: rad of rudder per rad of error.
+        damping_time: kd/kp.
+    """
+
+    kind: Literal["pd"] = "pd"
+    kp: float | None = Field(default=None, gt=0)
+    damping_time: Seconds | None = Field(default=None, gt=0)
+
+    def parameters(self) -> dict[str, float | None]:
+        """kp and damping_time."""
+        return {"kp": self.kp, "damping_time": self.damping_time}
+
+    def axes(self, turning: Turning) -> dict[str, Axis]:
+        """Two decades of kp, damping within a tenth to twice T."""
+        return {"kp": Axis(0.3, 60.0), "damping_time": Axis(0.05 * turning.time, 2.0 * turning.time)}
+
+    def gains(self, parameters: dict[str, Tensor], turning: Turning) -> tuple[Tensor, Tensor, Tensor]:
+        """As given."""
+        return parameters["kp"], parameters["kp"] * parameters["damping_time"], torch.zeros_like(parameters["kp"])
+
+
+class PidConfig(TunedConfig):
+    """As PD, with integral action that stops while the rudder is saturated.
+
+    Attributes:
+        kp: rad of rudder per rad of error.
+        damping_time: kd/kp.
+        integral_time: kp/ki.
+    """
+
+    kind: Literal["pid"] = "pid"
+    kp: float | None = Field(default=None, gt=0)
+    damping_time: Seconds | None = Field(default=None, gt=0)
+    integral_time: Seconds | None = Field(default=None, gt=0)
+
+    def parameters(self) -> dict[str, float | None]:
+        """kp, damping_time, integral_time."""
+        return {"kp": self.kp, "damping_time": self.damping_time, "integral_time": self.integral_time}
+
+    def axes(self, turning: Turning) -> dict[str, Axis]:
+        """As PD; the integral takes T to 50 T."""
+        pd = PdConfig().axes(turning)
+        return {**pd, "integral_time": Axis(turning.time, 50.0 * turning.time)}
+
+    def gains(self, parameters: dict[str, Tensor], turning: Turning) -> tuple[Tensor, Tensor, Tensor]:
+        """As given."""
+        kp = parameters["kp"]
+        return kp, kp * parameters["damping_time"], kp / parameters["integral_time"]
+
+
+class LqrConfig(TunedConfig):
+    """Linear-quadratic regulator of T r_dot + r = K delta: the integral of heading_weight e^2 + rate_weight (T r)^2 + delta^2 is least.
+
+    The Riccati equation of this model has the solution kp = sqrt(heading_weight), (1 + K kd)^2 = 1 + K^2 T^2 rate_weight + 2 K T kp.
+    """
+
+    kind: Literal["lqr"] = "lqr"
+    heading_weight: float | None = Field(default=None, gt=0)
+    rate_weight: float | None = Field(default=None, ge=0)
+
+    def parameters(self) -> dict[str, float | None]:
+        """heading_weight, rate_weight."""
+        return {"heading_weight": self.heading_weight, "rate_weight": self.rate_weight}
+
+    def axes(self, turning: Turning) -> dict[str, Axis]:
+        """Both weights over decades."""
+        return {"heading_weight": Axis(0.1, 3600.0), "rate_weight": Axis(1e-3, 3600.0)}
+
+    def gains(self, parameters: dict[str, Tensor], turning: Turning) -> tuple[Tensor, Tensor, Tensor]:
+        """kp and kd of the weights."""
+        kp = parameters["heading_weight"].sqrt()
+        square = 1.0 + (turning.gain * turning.time) ** 2 * parameters["rate_weight"] + 2.0 * turning.gain * turning.time * kp
+        return kp, (square.sqrt() - 1.0) / turning.gain, torch.zeros_like(kp)
+
+
+class BangBangConfig(ControllerConfig):
+    """Time-optimal control of T r_dot + r = K delta, which knows the vessel and its rudder's rate exactly: the floor."""
+
+    kind: Literal["bang_bang"] = "bang_bang"
+
+    def build(self, steering: Steering) -> Policy:
+        """The controller."""
+        vessel, turning = steering.vessel, steering.turning
+        if vessel.rate is not None:
+            return RatedBangBangHeading(vessel.state, gain=turning.gain, time=turning.time, limit=steering.limit, rate=vessel.rate, dt=steering.dt)
+        return BangBangHeading(steering.vessel.state, gain=steering.turning.gain, time=steering.turning.time, limit=steering.limit)
+
+
+class DocumentConfig(ControllerConfig):
+    """The predictive law of document 004 with an exact predictor of the nominal vessel.
+
+    Attributes:
+        horizon: of the prediction; the source's 0.01 s cannot settle (ERRATA 004).
+        candidates: rudder angles.
+        weight: of the choice for the heading error.
+    """
+
+    kind: Literal["document"] = "document"
+    horizon: Seconds = Field(gt=0)
+    candidates: int = Field(default=41, ge=3)
+    weight: float = Field(default=0.2, ge=0, le=1)
+
+    def predictor(self, steering: Steering) -> SimulatedPredictor:
+        """The nominal vessel; long horizons are predicted in steps of at most a twentieth of T."""
+        steps = math.ceil(self.horizon / max(steering.turning.time / 20.0, steering.dt))
+        model = NominalSteering(steering.vessel, self.horizon / steps)
+        return SimulatedPredictor(model, steering.vessel.state, steps, model.others)
+
+    def law(self, predictor: Predictor, steering: Steering) -> DocumentAutopilot:
+        """The controller with some predictor of this horizon."""
+        return DocumentAutopilot(predictor, limit=steering.limit, candidates=self.candidates, weight=self.weight)
+
+    def build(self, steering: Steering) -> Policy:
+        """The controller with the exact predictor."""
+        return self.law(self.predictor(steering), steering)
+
+
+AnyController = Annotated[PdConfig | PidConfig | LqrConfig | BangBangConfig | DocumentConfig, Field(discriminator="kind")]

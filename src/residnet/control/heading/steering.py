@@ -1,0 +1,229 @@
+"""Vessels as heading controllers see them, and flights: heading changes of many varied vessels at once."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import final
+
+import torch
+from torch import Tensor
+
+from residnet.control.base import ClosedLoop, GivenReference, Policy
+from residnet.control.heading.turning import Turning, measure_turning
+from residnet.core.frames import wrap
+from residnet.dynamics.base import Dynamics
+from residnet.dynamics.rollout import Rollout, Source
+from residnet.dynamics.varied import VariedPlant
+from residnet.physics.plant import HullPlant, Plant
+
+
+class SteeredVessel(ABC):
+    """A vessel whose first command is the rudder angle.
+
+    Attributes:
+        state: names of the columns of x.
+        inputs: names of the columns of w.
+        rate: of the rudder in rad/s; None where it stands at its command at once.
+    """
+
+    state: tuple[str, ...]
+    inputs: tuple[str, ...]
+    rate: float | None
+
+    @abstractmethod
+    def model(self, dt: float, integrator: str = "rk4") -> Dynamics:
+        """Steps of dt seconds; the first columns of its memory are the variation of each row (`dynamics.varied.VARIATION`)."""
+
+    def memory(self, variation: Tensor) -> Tensor:
+        """Of `model`, for variations [B, 3]."""
+        return variation
+
+    @abstractmethod
+    def start(self, speed: Tensor) -> tuple[Tensor, Tensor]:
+        """States [B, nx] and inputs [B, m] of straight courses at multiples [B] of the service speed."""
+
+    @final
+    def column(self, name: str) -> int:
+        """Of a state."""
+        return self.state.index(name)
+
+    @final
+    def turning(self, angle: float, duration: float, dt: float = 0.02) -> Turning:
+        """K and T at the service speed, from the answer to a held rudder angle [rad]."""
+        x, w = self.start(torch.ones(1, dtype=torch.float64))
+        variation = torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64)
+        return measure_turning(self.model(dt), x, w, self.memory(variation), (self.column("u"), self.column("r")), angle, duration)
+
+
+@final
+class SteeredPlant(SteeredVessel):
+    """A simulated vessel; in calm water, or in the weather [inputs by name] given."""
+
+    def __init__(self, plant: Plant, *, calm: bool = True) -> None:
+        if calm and isinstance(plant, HullPlant):
+            plant = plant.in_calm_water()
+        self.plant = plant
+        self.state, self.inputs = plant.state, plant.inputs
+        self.rate = _rudder_rate(plant)
+
+    def model(self, dt: float, integrator: str = "rk4") -> Dynamics:
+        """The plant, varied."""
+        return VariedPlant(self.plant, dt, integrator)
+
+    def start(self, speed: Tensor) -> tuple[Tensor, Tensor]:
+        """Thrust goes with the square of the speed."""
+        x = self.plant.approach(len(speed)).to(speed.dtype).clone()
+        x[:, self.column("u")] *= speed
+        command = self.plant.demand(speed.square(), torch.zeros_like(speed))
+        return x, torch.cat((command, command.new_zeros(len(speed), len(self.inputs) - command.shape[1])), dim=1)
+
+
+@final
+class NominalSteering(Dynamics):
+    """The vessel as it is without variation, with the memory that predictors expect: none.
+
+    Attributes:
+        others: inputs beside the rudder command at service speed [m - 1].
+    """
+
+    def __init__(self, vessel: SteeredVessel, dt: float) -> None:
+        super().__init__(dt, "rk4")
+        self.inner = vessel.model(dt)
+        self.others = vessel.start(torch.ones(1, dtype=torch.float64))[1][0, 1:]
+        nominal = torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64)
+        self.register_buffer("nominal", vessel.memory(nominal), persistent=False)
+        self.nominal: Tensor
+
+    def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
+        """Of the vessel; steps do not need it."""
+        return self.inner.rate(x, p, rho)
+
+    def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """State [B, nx] after a step."""
+        return self.inner.step(x, w, self.nominal.to(x.dtype).expand(x.shape[0], -1))[0], s
+
+
+def _rudder_rate(plant: Plant) -> float | None:
+    """Of the steering gear [rad/s], by what it does in a short time when asked for a small and a large angle."""
+    if "delta" not in plant.state:
+        return None
+    column, dt = plant.state.index("delta"), 1e-3
+    x, w = plant.approach(1), torch.zeros(1, len(plant.inputs), dtype=torch.float64)
+    w[:, 0] = 1.0
+    return float(plant.settle(x, w, dt)[0, column]) / dt
+
+
+@final
+class Measured(Policy):
+    """A controller that sees the state through noisy sensors.
+
+    Args:
+        policy: the controller.
+        state: names of the columns of x.
+        noise: standard deviation of white noise by name, SI.
+    """
+
+    def __init__(self, policy: Policy, state: tuple[str, ...], noise: Mapping[str, float]) -> None:
+        super().__init__()
+        self.policy = policy
+        self.n_state = policy.n_state
+        self.register_buffer("spread", torch.tensor([noise.get(name, 0.0) for name in state]), persistent=False)
+        self.spread: Tensor
+
+    def initial_state(self, x: Tensor) -> Tensor:
+        """Of the controller."""
+        return self.policy.initial_state(x)
+
+    def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """As the controller, with noise on what it sees."""
+        command: tuple[Tensor, Tensor] = self.policy(x + torch.randn_like(x) * self.spread.to(x.dtype), reference, s)
+        return command
+
+
+@dataclass(frozen=True)
+class Flights:
+    """B heading changes of T steps: states [B, T+1, nx] and their names, inputs [B, T, m], reference [B] in rad, and the step in s."""
+
+    states: Tensor
+    inputs: Tensor
+    heading: Tensor
+    dt: float
+    names: tuple[str, ...]
+
+    def of(self, name: str) -> Tensor:
+        """A state [B, T+1]."""
+        return self.states[:, :, self.names.index(name)]
+
+    @property
+    def error(self) -> Tensor:
+        """Reference less heading [B, T+1], wrapped."""
+        return wrap(self.heading[:, None] - self.of("psi"))
+
+    def settled(self, band: float) -> Tensor:
+        """Time [B] of the last entry into +-band [rad], between samples along a straight line; the flight's length where it ends outside."""
+        size = self.error.abs()
+        outside = ~(size <= band)
+        inside = outside.flip(1).to(torch.int64).argmax(1)
+        last = (size.shape[1] - 1 - inside).unsqueeze(1)
+        before, after = (size.gather(1, k.clamp(max=size.shape[1] - 1))[:, 0] for k in (last, last + 1))
+        share = torch.where(inside > 0, (before - band) / (before - after).clamp(min=1e-12), 0.0)
+        return torch.where(outside.any(1), last[:, 0] + share, 0.0) * self.dt
+
+    def overshoot(self) -> Tensor:
+        """Largest heading beyond the reference [B] in rad, seen from the first heading; zero where there is none."""
+        error = self.error
+        return (-error * error[:, :1].sign()).amax(1).clamp(min=0.0)
+
+    def absolute_error(self) -> Tensor:
+        """Integral of |error| [B] in rad s."""
+        return self.error[:, :-1].abs().sum(1) * self.dt
+
+    def effort(self) -> Tensor:
+        """Integral of the squared rudder command [B] in rad^2 s: the control energy."""
+        return self.inputs[:, :, 0].square().sum(1) * self.dt
+
+    def rms(self, name: str, start: float = 0.0) -> Tensor:
+        """Root of the mean square [B] of a state from a time [s] on."""
+        return self.of(name)[:, round(start / self.dt) :].square().mean(1).sqrt()
+
+    def rudder_rms(self, start: float = 0.0) -> Tensor:
+        """Root of the mean square [B] of the rudder command in rad from a time [s] on."""
+        return self.inputs[:, round(start / self.dt) :, 0].square().mean(1).sqrt()
+
+    def travel(self) -> Tensor:
+        """How far the rudder command travels [B] in rad, from amidships on."""
+        command = self.inputs[:, :, 0]
+        return command[:, 0].abs() + command.diff(dim=1).abs().sum(1)
+
+
+def fly(
+    vessel: SteeredVessel,
+    policy: Policy,
+    heading: Tensor,
+    variation: Tensor,
+    *,
+    dt: float,
+    duration: float,
+    speed: Tensor | None = None,
+    weather: Mapping[str, float | Tensor] | None = None,
+    surround: Callable[[Source], Source] | None = None,
+) -> Flights:
+    """Heading changes [B] in rad from straight ahead of vessels varied by [B, 3], float64, without gradients.
+
+    Args:
+        speed: multiples [B] of the service speed.
+        weather: exogenous inputs by name, SI, for all rows or [B].
+        surround: what adds to the inputs of the closed loop, for example waves.
+    """
+    heading, variation = heading.double(), variation.double()
+    x, w = vessel.start(torch.ones_like(heading) if speed is None else speed.double())
+    for name, value in (weather or {}).items():
+        w[:, vessel.inputs.index(name)] = value
+    steps = round(duration / dt)
+    loop: Source = ClosedLoop(policy.double(), GivenReference(heading[:, None, None]))
+    with torch.no_grad():
+        free = Rollout(vessel.model(dt), loop if surround is None else surround(loop))
+        states, inputs, _ = free(x, w.unsqueeze(1).expand(-1, steps, -1), vessel.memory(variation))
+    return Flights(states, inputs, heading, dt, vessel.state)

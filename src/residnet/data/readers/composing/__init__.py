@@ -1,0 +1,1 @@
+"""From the topics of a recording to one log on one clock."""

@@ -1,0 +1,190 @@
+"""Messages of PX4, ArduPilot and NMEA 0183 that map themselves; all three speak NED, and forward-right-down in the body."""
+
+from __future__ import annotations
+
+from typing import ClassVar, final
+
+from residnet.data.readers.composing.compose import Plan
+from residnet.data.readers.composing.quantities import Angle, CourseSpeed, EarthFixed, FieldMap, Geodetic, Local, Quaternion
+from residnet.data.readers.messages.message import Message
+from residnet.data.readers.recording import Series
+
+_SAID = "already in NED and forward-starboard-down"
+
+
+@final
+class Px4LocalPosition(Message):
+    """PX4 vehicle_local_position: the navigation filter's position and velocity."""
+
+    types = ("vehicle_local_position",)
+    said: ClassVar[str] = _SAID
+
+    def plan(self, one: Series) -> Plan:
+        """See `Message.plan`."""
+        velocity = EarthFixed(topic=one.name, north="vx", east="vy") if one.has("vx") else None
+        return Plan({}, Local(topic=one.name, north="x", east="y"), None, velocity)
+
+
+@final
+class Px4Attitude(Message):
+    """PX4 vehicle_attitude."""
+
+    types = ("vehicle_attitude",)
+    said: ClassVar[str] = _SAID
+
+    def plan(self, one: Series) -> Plan:
+        """See `Message.plan`."""
+        return Plan({}, None, Quaternion(topic=one.name, field="q", frame="ned", roll=True))
+
+
+@final
+class Px4AngularVelocity(Message):
+    """PX4 vehicle_angular_velocity."""
+
+    types = ("vehicle_angular_velocity",)
+    said: ClassVar[str] = _SAID
+
+    def plan(self, one: Series) -> Plan:
+        """See `Message.plan`."""
+        return Plan({name: FieldMap(topic=one.name, field=f"xyz[{axis}]", unit="rad/s") for name, axis in (("r", 2), ("p", 0))})
+
+
+@final
+class Px4Gps(Message):
+    """PX4 vehicle_gps_position and sensor_gps: the receiver's fix."""
+
+    types = ("vehicle_gps_position", "sensor_gps")
+    said: ClassVar[str] = _SAID
+
+    def plan(self, one: Series) -> Plan:
+        """See `Message.plan`."""
+        names = ("lat", "lon") if one.has("lat") else ("latitude_deg", "longitude_deg")
+        velocity = EarthFixed(topic=one.name, north="vel_n_m_s", east="vel_e_m_s") if one.has("vel_n_m_s") else None
+        return Plan({}, Geodetic(topic=one.name, latitude=names[0], longitude=names[1]), None, velocity)
+
+
+@final
+class ArduPilotFilter(Message):
+    """ArduPilot XKF1, NKF1: the navigation filter's position and velocity."""
+
+    types = ("XKF1", "NKF1")
+    said: ClassVar[str] = _SAID
+
+    def plan(self, one: Series) -> Plan:
+        """See `Message.plan`."""
+        return Plan({}, Local(topic=one.name, north="PN", east="PE"), None, EarthFixed(topic=one.name, north="VN", east="VE"))
+
+
+@final
+class ArduPilotAttitude(Message):
+    """ArduPilot ATT."""
+
+    types = ("ATT",)
+    said: ClassVar[str] = _SAID
+
+    def plan(self, one: Series) -> Plan:
+        """See `Message.plan`."""
+        return Plan({"phi": FieldMap(topic=one.name, field="Roll", unit="deg")}, None, Angle(topic=one.name, field="Yaw", unit="deg"))
+
+
+@final
+class ArduPilotImu(Message):
+    """ArduPilot IMU."""
+
+    types = ("IMU",)
+    said: ClassVar[str] = _SAID
+
+    def plan(self, one: Series) -> Plan:
+        """See `Message.plan`."""
+        return Plan({name: FieldMap(topic=one.name, field=field, unit="rad/s") for name, field in (("r", "GyrZ"), ("p", "GyrX"))})
+
+
+@final
+class ArduPilotGps(Message):
+    """ArduPilot GPS: the receiver's fix, course and speed."""
+
+    types = ("GPS",)
+    said: ClassVar[str] = _SAID
+
+    def plan(self, one: Series) -> Plan:
+        """See `Message.plan`."""
+        return Plan({}, Geodetic(topic=one.name, latitude="Lat", longitude="Lng"), None, CourseSpeed(topic=one.name, course="GCrs", speed="Spd"))
+
+
+@final
+class NmeaFix(Message):
+    """NMEA GGA, GNS, RMC, GLL: latitude and longitude; RMC has course and speed too."""
+
+    types = ("GGA", "GNS", "RMC", "GLL")
+    said: ClassVar[str] = _SAID
+
+    def plan(self, one: Series) -> Plan:
+        """See `Message.plan`."""
+        course = CourseSpeed(topic=one.name, course="true_course", speed="spd_over_grnd", speed_unit="kn") if one.has("spd_over_grnd") else None
+        return Plan({}, Geodetic(topic=one.name), None, course)
+
+
+@final
+class NmeaCourse(Message):
+    """NMEA VTG: course and speed over ground."""
+
+    types = ("VTG",)
+    said: ClassVar[str] = _SAID
+
+    def plan(self, one: Series) -> Plan:
+        """See `Message.plan`."""
+        return Plan({}, None, None, CourseSpeed(topic=one.name, course="true_track", speed="spd_over_grnd_kts", speed_unit="kn"))
+
+
+@final
+class NmeaHeading(Message):
+    """NMEA HDT: true heading."""
+
+    types = ("HDT",)
+    said: ClassVar[str] = _SAID
+
+    def plan(self, one: Series) -> Plan:
+        """See `Message.plan`."""
+        return Plan({}, None, Angle(topic=one.name, field="heading", unit="deg"))
+
+
+@final
+class NmeaRateOfTurn(Message):
+    """NMEA ROT: rate of turn, positive to starboard."""
+
+    types = ("ROT",)
+    said: ClassVar[str] = _SAID
+
+    def plan(self, one: Series) -> Plan:
+        """See `Message.plan`."""
+        return Plan({"r": FieldMap(topic=one.name, field="rate_of_turn", unit="deg/s")})
+
+
+@final
+class NmeaRudder(Message):
+    """NMEA RSA: rudder angle, negative where the bow turns to port."""
+
+    types = ("RSA",)
+    said: ClassVar[str] = _SAID
+
+    def plan(self, one: Series) -> Plan:
+        """See `Message.plan`."""
+        return Plan({"delta": FieldMap(topic=one.name, field=next(iter(one.fields)), unit="deg")})
+
+
+MARINE: tuple[Message, ...] = (
+    Px4LocalPosition(),
+    Px4Attitude(),
+    Px4AngularVelocity(),
+    Px4Gps(),
+    ArduPilotFilter(),
+    ArduPilotAttitude(),
+    ArduPilotImu(),
+    ArduPilotGps(),
+    NmeaFix(),
+    NmeaCourse(),
+    NmeaHeading(),
+    NmeaRateOfTurn(),
+    NmeaRudder(),
+)
+"""In the order in which they are asked: the one that says most of each system first."""

@@ -1,0 +1,33 @@
+"""What a kind of message must say to map itself."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import ClassVar
+
+from residnet.data.readers.composing.compose import Plan
+from residnet.data.readers.recording import Series
+
+
+class Message(ABC):
+    """A kind of message.
+
+    Attributes:
+        types: names of the message's type, without its package.
+        signature: fields that tell it where the source has no types; none where it is known by its type only.
+        said: how its frames become residnet's, for the log's meta.
+    """
+
+    types: ClassVar[tuple[str, ...]]
+    signature: ClassVar[tuple[str, ...]] = ()
+    said: ClassVar[str] = "REP-103 (ENU, forward-left-up) to NED, forward-starboard-down"
+
+    def fits(self, one: Series) -> bool:
+        """Whether a series holds messages of this kind."""
+        if one.kind:
+            return one.kind.rsplit("/", 1)[-1] in self.types
+        return bool(self.signature) and all(one.has(field) for field in self.signature)
+
+    @abstractmethod
+    def plan(self, one: Series) -> Plan:
+        """What a series of this kind says of the vessel."""

@@ -1,0 +1,137 @@
+"""Reader of ArduPilot's onboard logs (.bin), through the package pymavlink."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import sys
+from array import array
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Literal, final
+
+import numpy as np
+
+from residnet.core.errors import DataError, UsageError
+from residnet.data.readers.base import require_file
+from residnet.data.readers.composing.composed import RecordingConfig
+from residnet.data.readers.composing.wanted import EVERYTHING, Wanted
+from residnet.data.readers.files import missing_package, progress
+from residnet.data.readers.recording import Recording, Series
+
+_REPORT_EVERY = 5000
+_DATED = 100_000_000.0
+
+
+@final
+class ArduPilotConfig(RecordingConfig):
+    """ArduPilot dataflash log; a series is named by its message (`ATT`, `GPS`, the second instance `GPS_1`), fields bear ArduPilot's names."""
+
+    kind: Literal["ardupilot"] = "ardupilot"
+
+    def load(self, path: Path, wanted: Wanted) -> Recording:
+        """See `RecordingConfig.load`."""
+        return load_ardupilot(path, wanted)
+
+
+def load_ardupilot(path: Path, wanted: Wanted = EVERYTHING) -> Recording:
+    """The recording in a .bin file, on the boot clock (TimeUS); dated by the receiver's GPS time where it logged one.
+
+    Raises:
+        UsageError: where the file is missing, nothing in it is wanted, or pymavlink is not installed.
+        DataError: where it cannot be read.
+    """
+    require_file(path)
+    try:
+        from pymavlink.DFReader import DFReader_binary
+    except ImportError as error:
+        raise missing_package("ardupilot", "pymavlink", "an ArduPilot log") from error
+    columns: dict[str, _Columns] = {}
+    listed: set[str] = set()
+    size = path.stat().st_size
+    try:
+        with _silence():
+            reader = DFReader_binary(str(path))
+        with progress(path.name, size, 100.0) as advance:
+            _collect(reader, columns, listed, wanted, advance)
+        base = float(reader.clock.timebase or 0.0)
+    # pymavlink fails in its own ways on damaged bytes
+    except Exception as error:
+        raise DataError(f"{path}: damaged or not an ArduPilot log ({type(error).__name__}: {' '.join(str(error).split())[:200]})") from error
+    if not columns:
+        if listed:
+            raise UsageError(f"{path}: none of its messages is wanted (it holds {', '.join(sorted(listed))})")
+        raise DataError(f"{path}: holds no message with a time; is it an ArduPilot .bin log?")
+    start = min(one.time[0] for one in columns.values())
+    boot = round(base * 1e6) * 1000 if base > _DATED else None
+    epoch = None if boot is None else (boot + start) // 10**9 * 10**9
+    origin = 0 if boot is None or epoch is None else epoch - boot
+    series = {name: one.series(name, origin) for name, one in sorted(columns.items())}
+    return Recording(path, series, epoch, (path,), (), tuple(sorted(listed - set(series))))
+
+
+def _collect(reader: Any, columns: dict[str, _Columns], listed: set[str], wanted: Wanted, advance: Any) -> None:
+    count, quiet = 0, io.StringIO()
+    while True:
+        # what cannot be parsed is skipped, and printed
+        with contextlib.redirect_stdout(quiet), contextlib.redirect_stderr(quiet):
+            message = reader.recv_msg()
+        if message is None:
+            return
+        count += 1
+        if count % _REPORT_EVERY == 0:
+            advance(reader.percent)
+        fields = message.get_fieldnames()
+        if not fields or fields[0] != "TimeUS":
+            continue
+        kind = message.get_type()
+        instance = message.fmt.instance_field
+        number = int(getattr(message, instance)) if instance in fields else 0
+        name = f"{kind}_{number}" if number else kind
+        listed.add(name)
+        if not wanted(name):
+            continue
+        if name not in columns:
+            columns[name] = _Columns(kind, message, lambda path, name=name: wanted.field(name, path))
+        columns[name].add(message)
+
+
+@contextlib.contextmanager
+def _silence() -> Iterator[None]:
+    """Keeps the indexer of pymavlink, which is compiled, from printing every byte that it skips."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    kept = [(number, os.dup(number)) for number in (1, 2)]
+    with Path(os.devnull).open("wb") as nowhere:
+        for number, _ in kept:
+            os.dup2(nowhere.fileno(), number)
+        try:
+            with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+                yield
+        finally:
+            for number, copy in kept:
+                os.dup2(copy, number)
+                os.close(copy)
+
+
+@final
+class _Columns:
+    """Messages of one kind: time in ns since boot, numbers row by row."""
+
+    def __init__(self, kind: str, message: Any, wanted: Any) -> None:
+        self._kind = kind
+        fields = [field for field in message.get_fieldnames() if field != "TimeUS" and wanted(field)]
+        self._names = [field for field in fields if isinstance(getattr(message, field), int | float)]
+        self.time, self._rows = array("q"), array("d")
+
+    def add(self, message: Any) -> None:
+        """One more message."""
+        self.time.append(int(message.TimeUS) * 1000)
+        self._rows.extend([getattr(message, name) for name in self._names])
+
+    def series(self, name: str, origin: int) -> Series:
+        """With times in s from `origin` (ns since boot)."""
+        rows = np.frombuffer(self._rows, dtype=np.float64).reshape(len(self.time), len(self._names))
+        t = (np.frombuffer(self.time, dtype=np.int64) - origin) * 1e-9
+        return Series(name, f"ardupilot/{self._kind}", {field: rows[:, i] for i, field in enumerate(self._names)}, t)

@@ -1,0 +1,104 @@
+"""Reader of HDF5 files, through h5py; MATLAB 7.3 files are HDF5 too."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, final
+
+import numpy as np
+from pydantic import Field
+
+from residnet.core.errors import DataError
+from residnet.data.readers.base import require_file
+from residnet.data.readers.composing.composed import RecordingConfig
+from residnet.data.readers.composing.wanted import EVERYTHING, Wanted
+from residnet.data.readers.files import missing_package
+from residnet.data.readers.recorders.tree import TreeTime, Vector, tree_recording
+from residnet.data.readers.recording import Recording
+
+if TYPE_CHECKING:
+    import h5py
+
+_SIGNATURE = b"\x89HDF\r\n\x1a\n"
+
+
+@final
+class Hdf5Config(RecordingConfig):
+    """HDF5 file: datasets in groups, or tables of named columns.
+
+    Attributes:
+        time: which dataset of a group (or column of a table) holds time.
+        table: the only group or table that is read, where a file holds several experiments; null reads all.
+    """
+
+    kind: Literal["hdf5"] = "hdf5"
+    time: TreeTime = Field(default_factory=TreeTime)
+    table: str | None = Field(default=None, min_length=1)
+
+    def load(self, path: Path, wanted: Wanted) -> Recording:
+        """See `RecordingConfig.load`."""
+        return load_hdf5(path, wanted if self.table is None else Wanted([(self.table, "")]), self.time)
+
+
+def is_hdf5(path: Path) -> bool:
+    """Whether a file starts as HDF5 does, at once or behind MATLAB's header of 512 bytes."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as stream:
+        head = stream.read(520)
+    return head.startswith(_SIGNATURE) or head[512:520] == _SIGNATURE
+
+
+def load_hdf5(path: Path, wanted: Wanted = EVERYTHING, time: TreeTime | None = None, what: str = "an HDF5 file") -> Recording:
+    """The recording in an HDF5 file.
+
+    Raises:
+        UsageError: where the file is missing, has no time, or h5py is not installed.
+        DataError: where it cannot be read.
+    """
+    require_file(path)
+    try:
+        import h5py
+    except ImportError as error:
+        raise missing_package("hdf5", "h5py", what) from error
+    leaves: dict[str, Vector] = {}
+    try:
+        with h5py.File(path, "r") as file:
+            found: list[h5py.Dataset] = []
+            file.visititems(lambda name, node: found.append(node) if isinstance(node, h5py.Dataset) and not name.startswith("#") else None)
+            for dataset in found:
+                leaves.update(_vectors(dataset))
+            return tree_recording(path, leaves, time or TreeTime(), wanted)
+    except (OSError, RuntimeError, KeyError, ValueError) as error:
+        raise DataError(f"{path}: damaged or not an HDF5 file ({' '.join(str(error).split())[:200]})") from error
+
+
+def _vectors(dataset: h5py.Dataset) -> dict[str, Vector]:
+    """Arrays of one dataset by path, not yet read; a table gives one for each column."""
+    name = dataset.name.strip("/")
+    if dataset.dtype.names:
+        plain = [column for column in dataset.dtype.names if dataset.ndim == 1 and not dataset.dtype[column].shape]
+        return {f"{name}/{column}": _Column(dataset, column) for column in plain}
+    if dataset.ndim == 0 or dataset.size == 0 or dataset.attrs.get("MATLAB_class") in (b"char", b"cell"):
+        return {}
+    return {name: _plain(dataset[()]) if dataset.dtype.kind in "SO" and dataset.ndim == 1 else dataset}
+
+
+@final
+class _Column:
+    """One column of a table, read when it is asked for."""
+
+    def __init__(self, dataset: h5py.Dataset, name: str) -> None:
+        self._dataset, self._name = dataset, name
+        self.shape, self.size, self.dtype = dataset.shape, dataset.size, dataset.dtype[name]
+
+    def __array__(self, dtype: Any = None, copy: Any = None) -> np.ndarray:
+        values = _plain(self._dataset.fields(self._name)[()])
+        return values if dtype is None else values.astype(dtype)
+
+
+def _plain(values: np.ndarray) -> np.ndarray:
+    """Bytes as text, everything else as it is."""
+    if values.dtype.kind in "SO" and values.ndim == 1:
+        return np.array([v.decode(errors="replace") if isinstance(v, bytes) else str(v) for v in values], dtype=object)
+    return values

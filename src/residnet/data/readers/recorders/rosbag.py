@@ -1,0 +1,194 @@
+"""Reader of ROS 1 bags, ROS 2 bags (SQLite, MCAP) and plain MCAP files, through the package rosbags; no ROS is needed."""
+
+from __future__ import annotations
+
+import dataclasses
+from array import array
+from collections.abc import Callable, Iterator
+from operator import attrgetter
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, final
+
+import numpy as np
+
+from residnet.core.errors import DataError, UsageError
+from residnet.data.readers.base import require_file
+from residnet.data.readers.composing.composed import RecordingConfig
+from residnet.data.readers.composing.wanted import EVERYTHING, Wanted
+from residnet.data.readers.files import files_of, missing_package, progress, total_size
+from residnet.data.readers.recording import Recording, Remark, Series, remark
+
+if TYPE_CHECKING:
+    from rosbags.highlevel import AnyReader
+    from rosbags.interfaces import Connection
+
+# arrays of more elements are pictures, clouds and 6 x 6 covariances, no channels
+_ELEMENTS = 16
+_REPORT_EVERY = 5000
+
+
+@final
+class RosbagConfig(RecordingConfig):
+    """ROS 1 bag, ROS 2 bag (a folder with metadata.yaml, .db3 or .mcap), or plain MCAP file with ROS 2 messages."""
+
+    kind: Literal["rosbag"] = "rosbag"
+
+    def load(self, path: Path, wanted: Wanted) -> Recording:
+        """See `RecordingConfig.load`."""
+        return load_bag(path, wanted)
+
+
+def load_bag(path: Path, wanted: Wanted = EVERYTHING) -> Recording:
+    """The recording in a bag, message by message; memory grows with the numbers kept, not with the file.
+
+    Raises:
+        UsageError: where the bag is missing or rosbags is not installed.
+        DataError: where it cannot be read.
+    """
+    try:
+        from rosbags.highlevel import AnyReader, AnyReaderError
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise missing_package("ros", "rosbags", "a ROS bag or MCAP file") from error
+    if path.is_dir():
+        if not (path / "metadata.yaml").is_file():
+            raise UsageError(f"{path}: is a folder without metadata.yaml, a ROS 2 bag has one")
+    else:
+        require_file(path)
+    store = None if path.suffix == ".bag" else get_typestore(Stores.LATEST)
+    try:
+        with AnyReader([path], default_typestore=store) as reader:
+            return _read(path, reader, wanted)
+    except AnyReaderError as error:
+        raise DataError(f"{path}: not a readable bag ({' '.join(str(error).split())[:200]})") from error
+    except DataError:
+        raise
+    # a damaged bag fails in many ways inside rosbags and SQLite, none of them a fault of residnet
+    except Exception as error:
+        raise DataError(f"{path}: damaged or not a bag ({type(error).__name__}: {' '.join(str(error).split())[:200]})") from error
+
+
+def _read(path: Path, reader: AnyReader, wanted: Wanted) -> Recording:
+    chosen = [one for one in reader.connections if wanted(one.topic)]
+    left = tuple(sorted({one.topic for one in reader.connections} - {one.topic for one in chosen}))
+    if not chosen:
+        raise UsageError(f"{path}: none of its topics is wanted (it holds {', '.join(left) or 'none'})")
+    columns: dict[str, _Columns] = {}
+    failed: dict[str, str] = {}
+    files = tuple(files_of(path))
+    start, span = reader.start_time, max(1, reader.end_time - reader.start_time)
+    with progress(path.name, total_size(files), 1.0) as advance:
+        for count, (connection, arrival, raw) in enumerate(reader.messages(connections=chosen)):
+            if count % _REPORT_EVERY == 0:
+                advance((arrival - start) / span)
+            name = connection.topic
+            if name in failed:
+                continue
+            if name not in columns:
+                shared = sum(one.topic == name for one in chosen) > 1
+                columns[name] = _Columns(name, connection.msgtype, wanted=wanted, by_connection=shared)
+            try:
+                columns[name].add(reader.deserialize(raw, connection.msgtype), arrival, connection)
+            except Exception as error:
+                failed[name] = f"{type(error).__name__}: {' '.join(str(error).split())[:120]}"
+    remarks: list[Remark] = []
+    for name, why in failed.items():
+        kept = len(columns.pop(name).arrival)
+        text = f"topic {name}: message {kept + 1} cannot be read ({why}); the topic is left out"
+        remarks.append(remark("will mislead", "unreadable", text, rows=kept))
+    silent = sorted({one.topic for one in chosen} - set(columns) - set(failed))
+    remarks += [remark("note", "empty_topic", f"topic {name}: holds no messages") for name in silent]
+    epoch = int(min((min(one.arrival) for one in columns.values()), default=0)) // 10**9 * 10**9
+    return Recording(path, {name: one.series(epoch) for name, one in sorted(columns.items())}, epoch, files, tuple(remarks), left)
+
+
+@final
+class _Columns:
+    """Messages of one topic as they come: times as whole ns, numbers row by row."""
+
+    def __init__(self, name: str, kind: str, *, wanted: Wanted, by_connection: bool) -> None:
+        self.name, self.kind, self._wanted, self._by_connection = name, kind, wanted, by_connection
+        self.arrival, self._stamp, self._sender = array("q"), array("q"), array("H")
+        self._senders: dict[str, int] = {}
+        self._rows = array("d")
+        self._leaves: _Leaves | None = None
+
+    def add(self, message: Any, arrival: int, connection: Connection) -> None:
+        """One more message."""
+        if self._leaves is None:
+            self._leaves = _Leaves(message, lambda path: self._wanted.field(self.name, path))
+        self._rows.extend(self._leaves.numbers(message))
+        header = getattr(message, "header", None)
+        stamp = getattr(header, "stamp", None)
+        self._stamp.append(0 if stamp is None else stamp.sec * 10**9 + stamp.nanosec)
+        sender = _caller(connection) if self._by_connection else getattr(header, "frame_id", "")
+        self._sender.append(self._senders.setdefault(sender, len(self._senders)))
+        self.arrival.append(arrival)
+
+    def series(self, epoch: int) -> Series:
+        """The topic, times in s from the epoch (ns)."""
+        assert self._leaves is not None
+        names = self._leaves.names
+        rows = np.frombuffer(self._rows, dtype=np.float64).reshape(len(self.arrival), len(names))
+        stamps = np.frombuffer(self._stamp, dtype=np.int64)
+        sender = None
+        if len(self._senders) > 1 or (self._senders and next(iter(self._senders))):
+            sender = np.array(list(self._senders), dtype=object)[np.frombuffer(self._sender, dtype=np.uint16)]
+        remarks = []
+        if stamps.any() and not stamps.all():
+            text = f"topic {self.name}: {int((stamps == 0).sum())} of {stamps.size} header stamps are zero; arrival times are used"
+            remarks.append(remark("will mislead", "empty_stamps", text, rows=int((stamps == 0).sum())))
+        stamp = (stamps - epoch) * 1e-9 if stamps.all() else None
+        arrival = (np.frombuffer(self.arrival, dtype=np.int64) - epoch) * 1e-9
+        return Series(self.name, self.kind, {name: rows[:, i] for i, name in enumerate(names)}, stamp, arrival, sender, tuple(remarks))
+
+
+@final
+class _Leaves:
+    """The numbers in a message: their paths, and the way to them; the first message of a topic decides."""
+
+    def __init__(self, message: Any, wanted: Callable[[str], bool]) -> None:
+        scalars: list[str] = []
+        arrays: list[tuple[str, int]] = []
+        for path, value in _walk(message, ""):
+            if not wanted(path) and not (isinstance(value, np.ndarray) and value.size <= _ELEMENTS):
+                continue
+            if isinstance(value, int | float | bool):
+                scalars.append(path)
+            elif isinstance(value, np.ndarray) and value.dtype.kind in "biuf" and 0 < value.size <= _ELEMENTS:
+                arrays.append((path, value.size))
+        joints = list(message.name) if type(message).__name__.endswith("JointState") else None
+        self.names = [*scalars, *(f"{path}.{_element(path, i, joints)}" for path, size in arrays for i in range(size))]
+        self._scalars: Callable[[Any], Any] | None = attrgetter(*scalars) if scalars else None
+        self._single = len(scalars) == 1
+        self._arrays = [(attrgetter(path), size) for path, size in arrays]
+
+    def numbers(self, message: Any) -> list[float]:
+        """Their values."""
+        out: list[float] = []
+        if self._scalars is not None:
+            out = [self._scalars(message)] if self._single else list(self._scalars(message))
+        for way, size in self._arrays:
+            values = way(message)
+            out += values.tolist() if values.size == size else [*values.tolist(), *[np.nan] * size][:size]
+        return out
+
+
+def _element(path: str, i: int, joints: list[str] | None) -> str:
+    return joints[i] if joints is not None and path in ("position", "velocity", "effort") and i < len(joints) else str(i)
+
+
+def _walk(message: Any, prefix: str) -> Iterator[tuple[str, Any]]:
+    """Paths and values of a message's leaves, the stamp aside."""
+    for entry in dataclasses.fields(message):
+        if entry.name == "__msgtype__" or (not prefix and entry.name == "header"):
+            continue
+        value = getattr(message, entry.name)
+        if dataclasses.is_dataclass(value):
+            yield from _walk(value, f"{prefix}{entry.name}.")
+        else:
+            yield prefix + entry.name, value
+
+
+def _caller(connection: Connection) -> str:
+    return getattr(connection.ext, "callerid", None) or f"connection {connection.id}"

@@ -1,0 +1,1 @@
+"""Readers of tables: foreign ones through a channel map, and canonical logs."""

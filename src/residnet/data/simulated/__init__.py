@@ -1,0 +1,1 @@
+"""Simulated trials: a plant, manoeuvres, disturbances and sensors."""

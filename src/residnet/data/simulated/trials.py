@@ -1,0 +1,109 @@
+"""Simulated sea trials: a plant, a programme of manoeuvres, disturbances and sensors, all in one batch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+import torch
+from pydantic import Field, model_validator
+
+from residnet.core.config import Config, Seconds
+from residnet.core.errors import ConfigError
+from residnet.core.log import Log
+from residnet.data.simulated.environment import Disturbance
+from residnet.data.simulated.flying import Craft, Flight, Sea, fly
+from residnet.data.simulated.sensors import SensorNoise
+from residnet.dynamics.simulated import PlantDynamics
+from residnet.manoeuvres import FamilyConfig, Helm, Manoeuvre
+from residnet.physics.vessel import VesselName, load_vessel
+
+
+class SimulatedTrials(Config):
+    """A programme of sea trials on a simulated vessel, from rest (a model that only holds near its service speed starts there).
+
+    Attributes:
+        vessel: name of a vessel of residnet, or path of a vessel file.
+        trials: families of manoeuvres; what is random in them is drawn by `seed`.
+        duration: of each manoeuvre.
+        step: sampling interval of the logs.
+        substeps: steps of the plant within one sampling interval.
+        identification: number of manoeuvres of each kind that models may be fitted on, drawn by `seed`; kinds that are not named
+            are for identification altogether. The rest is the test set.
+        validation: how many of those are kept back to choose between models.
+        seed: of everything random in the data (the run's own seed moves only the training).
+    """
+
+    kind: Literal["simulated"] = "simulated"
+    vessel: VesselName
+    trials: tuple[FamilyConfig, ...] = Field(min_length=1)
+    duration: Seconds = Field(default=60.0, gt=0)
+    step: Seconds = Field(default=0.05, gt=0)
+    substeps: int = Field(default=5, ge=1)
+    noise: SensorNoise = SensorNoise()
+    disturbance: Disturbance = Disturbance()
+    identification: dict[str, int]
+    validation: dict[str, int]
+    seed: int = Field(default=0, ge=0)
+
+    @model_validator(mode="after")
+    def _felt(self) -> SimulatedTrials:
+        try:
+            plant = load_vessel(self.vessel).build()
+            # actuators with dead time move by a step of their own
+            plant.settle(plant.approach(1), torch.zeros(1, len(plant.inputs), dtype=torch.float64), self.step / self.substeps)
+            self.disturbance.check(plant, self.vessel)
+            self.noise.check((*plant.state, *plant.inputs[: plant.commands], *self.disturbance.logged), self.step, self.vessel)
+        except ConfigError as error:
+            raise ValueError(str(error)) from None
+        return self
+
+    def draw(self) -> list[Manoeuvre]:
+        """The manoeuvres, by family."""
+        random = np.random.default_rng([self.seed, 1])
+        return [manoeuvre for family in self.trials for manoeuvre in family.draw(random, self.duration)]
+
+    def splits(self, manoeuvres: Sequence[Manoeuvre]) -> list[str]:
+        """`train`, `validation` or `test` of each manoeuvre; whole manoeuvres only.
+
+        Raises:
+            ValueError: where a split asks for more manoeuvres than there are.
+        """
+        random = np.random.default_rng([self.seed, 2])
+        out = ["train"] * len(manoeuvres)
+        for kind, count in self.identification.items():
+            members = [i for i, manoeuvre in enumerate(manoeuvres) if manoeuvre.kind == kind]
+            kept = self.validation.get(kind, 0)
+            if not 0 < count < len(members) or not 0 <= kept < count:
+                raise ValueError(
+                    f"{count} of {len(members)} '{kind}' manoeuvres for identification, {kept} of them for validation: leaves a split empty"
+                )
+            order = random.permutation(members)
+            for i in order[:kept]:
+                out[i] = "validation"
+            for i in order[count:]:
+                out[i] = "test"
+        return out
+
+
+def fly_trials(manoeuvres: Sequence[Manoeuvre], config: SimulatedTrials) -> list[Flight]:
+    """Fly the manoeuvres in one batch: the motion itself, and the logs of it as sensors would measure it.
+
+    Channels: the plant's state (for the WAM-V x, y, psi, u, v, r, n_port, n_stbd), the commands, and the true wind where there is any. Float64.
+    """
+    plant = load_vessel(config.vessel).build()
+    craft = trials_craft(config)
+    sea = Sea(plant, config.disturbance, config.noise, config.seed)
+    return fly(craft, manoeuvres, sea, config.duration, config.step, {"vessel": config.vessel})
+
+
+def trials_craft(config: SimulatedTrials) -> Craft:
+    """The vessel of the trials."""
+    plant = load_vessel(config.vessel).build()
+    return Craft(config.vessel, PlantDynamics(plant, config.step, config.substeps), Helm.of(plant), plant.commands, plant.approach(1))
+
+
+def simulate(manoeuvres: Sequence[Manoeuvre], config: SimulatedTrials) -> list[Log]:
+    """The logs of `fly_trials`."""
+    return [flight.log for flight in fly_trials(manoeuvres, config)]

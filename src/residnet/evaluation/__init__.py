@@ -1,1 +1,0 @@
-"""Free-run evaluation: protocols, the evaluator, metrics, figures and the report."""

@@ -1,0 +1,1 @@
+"""Free-run evaluation: protocols, the evaluator and metrics."""

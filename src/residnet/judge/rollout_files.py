@@ -1,0 +1,51 @@
+"""The stored rollouts: `rollouts/<split>/<log>.parquet`, from which anyone can recompute the metrics."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from residnet.core.names import STATE
+from residnet.data.prepare import Prepared
+from residnet.judge.freerun import FreeRun
+
+_ORDER = ("u", "v", "r", "psi", "x", "y")
+
+
+def write_rollouts(folder: Path, runs: Sequence[FreeRun], logs: Sequence[Prepared]) -> None:
+    """One file per log of a split; `runs` are the protocols of that split.
+
+    Columns: protocol, model, window, t (s, the log's clock), usable, diverged, then u, v, r, psi, x, y as measured and with
+    `_hat` as predicted (SI, rad).
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    folder.mkdir(parents=True, exist_ok=True)
+    for number, log in enumerate(logs):
+        parts: dict[str, list[np.ndarray]] = {name: [] for name in ("protocol", "model", "window", "t", "usable", "diverged")}
+        measured: list[np.ndarray] = []
+        predicted: list[np.ndarray] = []
+        for run in runs:
+            own = [i for i, window in enumerate(run.windows) if window.log == number]
+            for model, predictions in run.predictions.items():
+                for place, i in enumerate(own):
+                    rows = slice(run.windows[i].start, run.windows[i].stop)
+                    length = rows.stop - rows.start
+                    labels: dict[str, object] = {"protocol": run.protocol, "model": model, "window": place, "diverged": predictions[i].diverged}
+                    for key, label in labels.items():
+                        parts[key].append(np.full(length, label))
+                    parts["t"].append(log.log.t[rows])
+                    parts["usable"].append(log.usable[rows])
+                    measured.append(log.y[rows])
+                    predicted.append(predictions[i].states)
+        if not measured:
+            continue
+        columns = {name: np.concatenate(values) for name, values in parts.items()}
+        y, y_hat = np.concatenate(measured), np.concatenate(predicted)
+        columns |= {name: y[:, STATE.index(name)] for name in _ORDER}
+        columns |= {f"{name}_hat": y_hat[:, STATE.index(name)] for name in _ORDER}
+        table = pa.table({name: pa.array(values) for name, values in columns.items()})
+        pq.write_table(table, folder / f"{log.log.name}.parquet", compression="zstd")

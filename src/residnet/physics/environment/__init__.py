@@ -1,0 +1,1 @@
+"""The environment that acts on a vessel: wind and waves."""

@@ -1,0 +1,1 @@
+"""Estimators from arrays to coefficients; nothing here knows of vessels."""

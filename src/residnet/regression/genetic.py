@@ -1,0 +1,338 @@
+"""Genetic programming of equations as document 000 does it (chapters 4 and 5), on the library DEAP.
+
+Individuals are trees over channels and operators. What a tree comes to is taken apart at + and - into terms, products multiplied out first where
+`split` says so; each term gets a coefficient by least squares, and the mean square error that is left is the fitness. Tournaments choose parents,
+one-point crossover and uniform mutation make the next generation within a limit of depth, and the search stops early on validation samples.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from types import ModuleType
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from residnet.core.config import Config
+from residnet.core.errors import FitError, UsageError
+from residnet.regression.expressions import ONE, Algebra, Function, Limits, Product, Sum, TooLargeError
+from residnet.regression.genetic_fitness import Fitness, Terms
+
+Operator = Literal["+", "-", "*", "/", "abs", "sin", "cos", "sqrt"]
+_NAMES = {"+": "add", "-": "subtract", "*": "multiply", "/": "divide", "abs": "abs", "sin": "sin", "cos": "cos", "sqrt": "sqrt"}
+_BINARY = ("+", "-", "*", "/")
+
+
+class EvolutionConfig(Config):
+    """How a population is bred; the defaults are Table 6.1's but for the population.
+
+    Attributes:
+        population: number of individuals.
+        generations: most generations after the first.
+        operators: of the trees; `/` is 0 at a divisor of 0 and `sqrt` takes the magnitude (document 001 section 2.4).
+        one: whether trees may also hold the number 1.
+        constants: range of random constants in trees; None for none. A term's factor is fitted, so that they only matter within functions.
+        tournament: individuals among which a parent is the best.
+        crossover: share of an offspring generation from one-point crossover.
+        mutation: share from uniform mutation, which puts a full tree of depth 0 to 2 in a node's place; the rest is copied.
+        depth: highest depth of a tree.
+        first_depth: least and largest depth of the first trees, half of them full, half grown.
+        genes: trees per individual (multigene form of document 001; there 5 of depth 3); of two crossovers one then exchanges whole trees.
+        split: what gets a coefficient: every `gene`, every summand of the tree as it stands (`sum`, section 5.1.1), or every
+            summand when it is multiplied out (`expand`, section 5.1.3).
+        equal_terms: what becomes of a tree in which a term stands twice: its terms are added (`merge`), or it takes no part (`reject`), as in
+            the document, whose Gram matrix is then singular (section 5.1.2).
+        intercept: whether the constant always is a term.
+        prune: share of the target's energy that a term must explain beside those before it (orthogonal least squares, section 5.1.4); 0 keeps all.
+        max_terms: most terms of an individual; those with more take no part, nor those with products of more than `max_degree` factors.
+        max_degree: most factors of a term.
+        nesting: most functions within functions; bars of a magnitude and brackets count.
+        elite: how many of the best go over unchanged.
+        goal: mean square error over the target's mean square, in training and validation, at which the search ends.
+        patience: generations without a better validation error after which it ends.
+        rows: most training samples that the search looks at, evenly thinned; coefficients in the result are fitted to all.
+    """
+
+    population: int = Field(default=500, ge=2, le=100_000)
+    generations: int = Field(default=30, ge=0, le=10_000)
+    operators: tuple[Operator, ...] = ("+", "*", "abs")
+    one: bool = False
+    constants: tuple[float, float] | None = None
+    tournament: int = Field(default=5, ge=1)
+    crossover: float = Field(default=0.5, ge=0, le=1)
+    mutation: float = Field(default=0.3, ge=0, le=1)
+    depth: int = Field(default=10, ge=1, le=17)
+    first_depth: tuple[int, int] = (1, 4)
+    genes: int = Field(default=1, ge=1, le=20)
+    split: Literal["gene", "sum", "expand"] = "expand"
+    equal_terms: Literal["merge", "reject"] = "merge"
+    intercept: bool = False
+    prune: float = Field(default=0.0, ge=0, lt=1)
+    max_terms: int = Field(default=40, ge=1, le=200)
+    max_degree: int = Field(default=8, ge=1, le=20)
+    nesting: int = Field(default=2, ge=0, le=5)
+    elite: int = Field(default=1, ge=0)
+    goal: float = Field(default=1e-12, ge=0, lt=1)
+    patience: int = Field(default=10, ge=1)
+    rows: int = Field(default=600, ge=20)
+
+    @model_validator(mode="after")
+    def _possible(self) -> EvolutionConfig:
+        if self.crossover + self.mutation > 1:
+            raise ValueError(f"crossover and mutation are shares of the offspring; together at most 1, given {self.crossover} + {self.mutation}")
+        if not set(self.operators) & set(_BINARY):
+            raise ValueError("operators: trees need one of +, -, *, / at least")
+        if not 0 <= self.first_depth[0] <= self.first_depth[1] <= self.depth:
+            raise ValueError(f"first_depth: expected least <= largest <= depth ({self.depth}), given {list(self.first_depth)}")
+        if self.equal_terms == "reject" and self.split == "gene":
+            raise ValueError("equal_terms: a gene is one term whatever stands in it; reject goes with split sum or expand")
+        if self.elite >= self.population:
+            raise ValueError(f"elite: must leave room for offspring in a population of {self.population}, given {self.elite}")
+        return self
+
+
+@dataclass(frozen=True)
+class Generation:
+    """The best individual of one generation: its relative mean square errors and number of terms."""
+
+    train: float
+    validation: float
+    terms: int
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a search found.
+
+    Attributes:
+        terms: of the individual of the least validation error among the best of each generation.
+        train: its mean square error over the target's mean square on the training samples that the search looked at.
+        validation: the same on all validation samples.
+        generation: when it appeared; 0 is the first population.
+        reached: whether both errors came below the goal.
+        history: the best individual of each generation.
+        fitted: how many different sets of terms were fitted.
+    """
+
+    terms: Terms
+    train: float
+    validation: float
+    generation: int
+    reached: bool
+    history: tuple[Generation, ...]
+    fitted: int
+
+
+class Individual:
+    """Trees and, once it is known, minus the training error; DEAP's tournament reads `fitness`."""
+
+    __slots__ = ("fitness", "terms", "trees", "validation")
+
+    def __init__(self, trees: list[Any]) -> None:
+        self.trees = trees
+        self.fitness = -np.inf
+        self.validation = np.inf
+        self.terms: Terms = ()
+
+    def copy(self) -> Individual:
+        """The same trees in lists of their own."""
+        return Individual([tree.__class__(tree) for tree in self.trees])
+
+
+def require_deap() -> ModuleType:
+    """DEAP's genetic programming.
+
+    Raises:
+        UsageError: where it is not installed.
+    """
+    try:
+        from deap import gp
+    except ImportError as error:
+        raise UsageError("genetic programming needs the library DEAP, which is not installed; install it with: pip install 'residnet[gp]'") from error
+    module: ModuleType = gp
+    return module
+
+
+def limits_of(config: EvolutionConfig) -> Limits:
+    """What the terms of a search may be."""
+    return Limits(config.max_terms, config.max_degree, config.nesting, config.split == "expand")
+
+
+def evolve(algebra: Algebra, data: Mapping[str, np.ndarray], target: np.ndarray, train: np.ndarray, config: EvolutionConfig, seed: int) -> Found:
+    """Search the equation of one target.
+
+    Args:
+        algebra: of the channels, within `limits_of` the config.
+        data: channels [N] by name.
+        target: what the equation is to give, [N].
+        train: which samples [N] train; the others validate.
+        config: how to breed.
+        seed: of all random choices.
+
+    Raises:
+        FitError: without training or validation samples, with values that are not finite, or where no individual could be fitted.
+        UsageError: where DEAP is not installed.
+    """
+    require_deap()
+    for name, values in [*((name, data[name]) for name in algebra.channels), ("the target", target)]:
+        if not np.isfinite(values).all():
+            raise FitError(f"genetic programming: {name} is not finite in all samples; mask those")
+    if not 0 < train.sum() < len(train):
+        raise FitError(f"genetic programming: needs samples to train and to validate, given {int(train.sum())} of {len(train)} to train")
+    chosen = np.sort(np.concatenate((_thinned(np.flatnonzero(train), config.rows), np.flatnonzero(~train))))
+    fitness = Fitness(algebra, {name: data[name][chosen] for name in algebra.channels}, target[chosen], train[chosen], config.prune)
+    with _seeded(seed):
+        return _Breeding(algebra, fitness, config).run()
+
+
+def _thinned(indices: np.ndarray, most: int) -> np.ndarray:
+    return indices[np.unique(np.linspace(0, len(indices) - 1, min(most, len(indices))).round().astype(int))]
+
+
+@contextmanager
+def _seeded(seed: int) -> Iterator[None]:
+    """DEAP draws from Python's own generator; what stood in it is put back."""
+    state = random.getstate()
+    random.seed(seed)
+    try:
+        yield
+    finally:
+        random.setstate(state)
+
+
+class _Breeding:
+    """One search."""
+
+    def __init__(self, algebra: Algebra, fitness: Fitness, config: EvolutionConfig) -> None:
+        self.gp = require_deap()
+        self.algebra, self.fitness, self.config = algebra, fitness, config
+        self.set = self._primitives()
+        self.meaning = _meanings(algebra)
+        limit = self.gp.staticLimit(key=lambda tree: tree.height, max_value=config.depth)
+        self.mate = limit(self.gp.cxOnePoint)
+        self.mutate = limit(partial(self.gp.mutUniform, expr=partial(self.gp.genFull, min_=0, max_=2), pset=self.set))
+
+    def run(self) -> Found:
+        """Generation after generation until the goal, the patience's end or the last one."""
+        low, high = self.config.first_depth
+        tree = partial(self.gp.genHalfAndHalf, self.set, low, high)
+        first = [Individual([self.gp.PrimitiveTree(tree()) for _ in range(self.config.genes)]) for _ in range(self.config.population)]
+        population = self._rated(first)
+        best, when, history, reached = population[0], 0, [self._told(population[0])], False
+        for generation in range(self.config.generations + 1):
+            reached = max(-best.fitness, best.validation) <= self.config.goal
+            if reached or generation == self.config.generations or generation - when >= self.config.patience:
+                break
+            population = self._rated([*population[: self.config.elite], *self._offspring(population)])
+            history.append(self._told(population[0]))
+            if population[0].validation < best.validation:
+                best, when = population[0], generation + 1
+        if not best.terms:
+            raise FitError("genetic programming: no individual has terms that the data tell apart; give a larger population or other operators")
+        return Found(best.terms, -best.fitness, best.validation, when, reached, tuple(history), self.fitness.fitted)
+
+    def _told(self, best: Individual) -> Generation:
+        return Generation(-best.fitness, best.validation, len(best.terms))
+
+    def _primitives(self) -> Any:
+        made = self.gp.PrimitiveSet("main", 0)
+        for operator in self.config.operators:
+            made.addPrimitive(None, 2 if operator in _BINARY else 1, name=_NAMES[operator])
+        for name in self.algebra.channels:
+            made.addTerminal(None, name=f"channel {name}")
+        if self.config.one:
+            made.addTerminal(1.0)
+        if self.config.constants is not None:
+            made.addEphemeralConstant(f"constant {self.config.constants}", partial(random.uniform, *self.config.constants))
+        return made
+
+    def _offspring(self, population: Sequence[Individual]) -> list[Individual]:
+        """From parents by tournament: crossover, mutation or a copy."""
+        from deap import tools
+
+        wanted = self.config.population - self.config.elite
+        parents = tools.selTournament(population, 2 * wanted, self.config.tournament)
+        out = []
+        for one, two in zip(parents[::2], parents[1::2], strict=True):
+            draw = random.random()
+            child = one.copy()
+            if draw < self.config.crossover:
+                self._cross(child, two.copy())
+            elif draw < self.config.crossover + self.config.mutation:
+                place = random.randrange(len(child.trees))
+                (child.trees[place],) = self.mutate(child.trees[place])
+            out.append(child)
+        return out
+
+    def _cross(self, child: Individual, other: Individual) -> None:
+        """One-point crossover of a tree of each; with several genes every other time an exchange of whole ones."""
+        here, there = random.randrange(len(child.trees)), random.randrange(len(other.trees))
+        if len(child.trees) > 1 and random.random() < 0.5:
+            child.trees[here] = other.trees[there]
+        else:
+            child.trees[here], _ = self.mate(child.trees[here], other.trees[there])
+
+    def _rated(self, individuals: list[Individual]) -> list[Individual]:
+        """With fitness, best first; of equals the one of fewer terms."""
+        results = self.fitness.of([self._terms(individual) for individual in individuals])
+        for individual, (train, validation, terms) in zip(individuals, results, strict=True):
+            individual.fitness, individual.validation, individual.terms = -train, validation, terms
+        return sorted(individuals, key=lambda i: (-i.fitness, len(i.terms)))
+
+    def _terms(self, individual: Individual) -> Terms | None:
+        """Its terms; None beyond the limits or without any."""
+        products: set[Product] = {ONE} if self.config.intercept else set()
+        try:
+            for tree in individual.trees:
+                if self.config.equal_terms == "reject" and self._repeats(tree):
+                    return None
+                meant = self._sum(tree)
+                products.update(self.algebra.bracket(meant) if self.config.split == "gene" else meant)
+        except TooLargeError:
+            return None
+        return tuple(sorted(products)) if 0 < len(products) <= self.config.max_terms else None
+
+    def _repeats(self, tree: Any) -> bool:
+        """Whether a term stands twice among the branches at + and - from the root down."""
+        seen: set[Product] = set()
+        starts = [0]
+        while starts:
+            start = starts.pop()
+            branch = tree.searchSubtree(start)
+            if tree[start].name in ("add", "subtract"):
+                starts += [start + 1, tree.searchSubtree(start + 1).stop]
+                continue
+            meant = self._sum(tree[branch])
+            if not seen.isdisjoint(meant):
+                return True
+            seen.update(meant)
+        return False
+
+    def _sum(self, tree: Sequence[Any]) -> Sum:
+        """What a tree in prefix order comes to."""
+        stack: list[Sum] = []
+        for node in reversed(tree):
+            if node.arity == 2:
+                stack.append(self.meaning[node.name](stack.pop(), stack.pop()))
+            elif node.arity == 1:
+                stack.append(self.meaning[node.name](stack.pop()))
+            else:
+                name = node.value
+                stack.append(self.algebra.channel(name.removeprefix("channel ")) if isinstance(name, str) else {ONE: float(name)})
+        return stack[0]
+
+
+def _meanings(algebra: Algebra) -> dict[str, Callable[..., Sum]]:
+    out: dict[str, Callable[..., Sum]] = {
+        "add": algebra.add,
+        "subtract": partial(algebra.add, sign=-1.0),
+        "multiply": algebra.multiply,
+        "divide": lambda a, b: algebra.multiply(a, algebra.apply("inv", b)),
+    }
+    functions: tuple[Function, ...] = ("abs", "sin", "cos", "sqrt")
+    return out | {function: partial(algebra.apply, function) for function in functions}

@@ -1,0 +1,1 @@
+"""Reports: pages, tables, texts and figures, from the run folder alone."""

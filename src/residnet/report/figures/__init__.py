@@ -1,0 +1,1 @@
+"""Figures, one file per topic, drawn from a run folder."""

@@ -1,0 +1,79 @@
+"""Pictures of force-space models: the surface of errors, and how much each basis function weighs (document 002 Figures 4.6, 4.20, 4.25)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from torch import Tensor
+
+from residnet.report.figures.style import RC, new_figure, save
+
+_AXES = ("surge", "sway", "yaw")
+
+
+def draw_surface(error: Tensor, unmodelled: Sequence[float], chosen: Mapping[str, Sequence[tuple[int, int]]], path: Path) -> None:
+    """Share of the un-modelled MSE over model order and number of basis functions.
+
+    Args:
+        error: [3, A, J + 1], NaN where there is no model.
+        unmodelled: MSE of the residual by axis.
+        chosen: name of a choice -> its (order, count) of each axis.
+        path: PNG file.
+    """
+    from matplotlib import rc_context
+
+    with rc_context(RC):
+        figure = new_figure(2.9)
+        panels = figure.subplots(1, 3, sharey=True)
+        for axis, axes in enumerate(panels):
+            share = error[axis].numpy() / unmodelled[axis]
+            image = axes.imshow(np.log10(share), origin="lower", aspect="auto", cmap="viridis", vmin=-1.2, vmax=0.5, extent=_extent(share))
+            for (name, picks), mark in zip(chosen.items(), ("x", "o", "s"), strict=False):
+                order, count = picks[axis]
+                axes.plot(count, order, mark, color="#D55E00", fillstyle="none", label=name, markersize=7)
+            # room for marks at the edge
+            axes.set_xlim(0.5, share.shape[1] + 0.5)
+            axes.set_ylim(-0.5, share.shape[0] + 1.5)
+            axes.set_title(_AXES[axis], loc="left")
+            axes.set_xlabel("basis functions")
+            axes.grid(visible=False)
+        panels[0].set_ylabel("model order")
+        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=3)
+        bar = figure.colorbar(image, ax=panels, ticks=[-1, -0.5, 0, 0.5])
+        bar.ax.set_yticklabels(["10 %", "32 %", "100 %", "316 %"])
+        bar.set_label("share of the MSE that is left")
+        save(
+            figure,
+            path,
+            "Surface analysis",
+            "Share of the un-modelled residual's mean square that is left, by model order and number of basis functions.",
+        )
+
+
+def _extent(share: np.ndarray) -> tuple[float, float, float, float]:
+    return (-0.5, share.shape[1] - 0.5, 0.5, share.shape[0] + 0.5)
+
+
+def draw_weights(terms: Sequence[str], pre: Tensor, title: str, path: Path) -> None:
+    """|Theta_pre|: coefficients of basis functions and outputs in units of their spread.
+
+    Args:
+        terms: names of the basis functions.
+        pre: [J, 3].
+        title: of the picture.
+        path: PNG file.
+    """
+    from matplotlib import rc_context
+
+    with rc_context(RC):
+        figure = new_figure(4.6)
+        panels = figure.subplots(3, 1, sharex=True)
+        for axis, axes in enumerate(panels):
+            axes.bar(range(len(terms)), pre[:, axis].abs().numpy(), color="#0072B2")
+            axes.set_ylabel(_AXES[axis])
+            axes.grid(axis="x", visible=False)
+        panels[-1].set_xticks(range(len(terms)), list(terms), rotation=90)
+        figure.supylabel("magnitude of the scaled coefficient [-]", fontsize=9)
+        save(figure, path, title, "Magnitude of the coefficients of scaled basis functions: how much each weighs in the model.")

@@ -1,0 +1,230 @@
+"""Force residuals on measured logs: a log with a known answer must give it, one without must be said to have none."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+import yaml
+
+import residnet
+from residnet.core.config import load_config
+from residnet.core.errors import ConfigError, DataError, FitError, UsageError
+from residnet.documents.jervan2020.force_config import ForceSettings
+from residnet.documents.jervan2020.force_data import compare_accelerations, read_measured
+from residnet.documents.jervan2020.force_report import write
+from residnet.documents.jervan2020.force_study import better, force_study
+from residnet.physics.force_model import FERRY_TERMS
+from residnet.runs.folder import RunFolder
+from residnet.tasks.force_residual import ForceResidualConfig
+
+CONFIG = Path(residnet.__file__).parents[2] / "configs" / "studies" / "jervan2020" / "measured.yaml"
+STEP = 0.1
+OFFSET = 0.05
+
+
+def motion(seed: int, seconds: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """t [T], nu and nu_dot [T, 3]: sums of slow sines, different for every seed."""
+    random = np.random.default_rng(seed)
+    t = STEP * np.arange(round(seconds / STEP))
+    omega, phase = random.uniform(0.1, 0.5, (3, 6)), random.uniform(0, 2 * np.pi, (3, 6))
+    size = np.array([0.3, 0.15, 0.05])[:, None] / np.sqrt(6) * 1.4
+    angle = omega[..., None] * t + phase[..., None]
+    return t, (size[..., None] * np.sin(angle)).sum(1).T, (size[..., None] * omega[..., None] * np.cos(angle)).sum(1).T
+
+
+def log(folder: Path, name: str, *, missing: float, seed: int = 0, seconds: float = 300.0, noise: float = 2.0, **spoil: Any) -> None:
+    """A csv like the measured ones: tau = F_believed + missing (500 u_dot + 80 v|v| on surge and sway) + noise."""
+    hull = load_config(CONFIG, [f"data.root={folder}"], ForceResidualConfig).hull()
+    t, nu, nu_dot = motion(seed, seconds)
+    with torch.no_grad():
+        force = hull.required(torch.from_numpy(nu_dot), torch.from_numpy(nu)).numpy()
+    random = np.random.default_rng(seed + 100)
+    extra = np.stack((500 * nu_dot[:, 0], 300 * nu[:, 1] * np.abs(nu[:, 1]), 400 * nu_dot[:, 2]), axis=1)
+    force = force + missing * extra + noise * random.standard_normal(force.shape)
+    psi = np.cumsum(nu[:, 2]) * STEP
+    x = np.cumsum(nu[:, 0] * np.cos(psi) - nu[:, 1] * np.sin(psi)) * STEP
+    y = np.cumsum(nu[:, 0] * np.sin(psi) + nu[:, 1] * np.cos(psi)) * STEP
+    columns: dict[str, Any] = {"t": t, "north": x, "east": y, "psi": psi, "u": nu[:, 0], "v": nu[:, 1], "r": nu[:, 2]}
+    columns |= {"udot": nu_dot[:, 0] + OFFSET, "vdot": nu_dot[:, 1], "rdot": nu_dot[:, 2]}
+    for axis, letter in enumerate("xyn"):
+        columns[f"tau_{letter}_est"] = columns[f"tau_{letter}_cmd"] = force[:, axis]
+    folder.mkdir(exist_ok=True)
+    pd.DataFrame({**columns, **spoil}).to_csv(folder / f"{name}.csv", index=False)
+
+
+def config(folder: Path, *overrides: str, models: dict[str, Any] | None = None) -> ForceSettings:
+    content = yaml.safe_load(CONFIG.read_text())
+    content["models"] = models or {"ridge": {"fit": {"kind": "ridge"}}}
+    content["data"]["root"] = str(folder)
+    file = folder / "config.yaml"
+    file.write_text(yaml.safe_dump(content))
+    found: ForceSettings = load_config(file, list(overrides), ForceResidualConfig)
+    return found
+
+
+def rows(found: Any) -> dict[str, Any]:
+    return {row["model"]: row for row in found.rows}
+
+
+def test_what_the_hull_lacks_is_found_and_said(tmp_path: Path) -> None:
+    log(tmp_path, "one", missing=1.0)
+    settings = config(tmp_path, models={"ridge": {"fit": {"kind": "ridge"}}, "plsr": {"fit": {"kind": "plsr"}}})
+    found = force_study(settings)
+    for name in ("ridge", "plsr"):
+        assert better(rows(found)[name], "believed") == [True] * 4
+        assert better(rows(found)[name], "zero")[3]
+    left = rows(found)["ridge"]["mse"]
+    # noise of 2 N is all that is left
+    assert all(2.0 < value < 8.0 for value in left)
+    coefficients = dict(zip(FERRY_TERMS, found.final["ridge"].fit.coefficients.tolist(), strict=True))
+    assert coefficients["u_dot"][0] == pytest.approx(500, rel=0.05)
+    assert coefficients["r_dot"][2] == pytest.approx(400, rel=0.05)
+    text = write(settings, found, RunFolder.create(tmp_path / "run", "", resume=False))
+    assert "2 of 2 regressions beat a residual of zero" in text
+    assert {path.name for path in (tmp_path / "run" / "figures").glob("*.png")} >= {"scores.png", "forces_one.png", "residual_one.png"}
+
+
+def test_a_residual_of_noise_is_said_to_be_none(tmp_path: Path) -> None:
+    log(tmp_path, "one", missing=0.0, noise=20.0)
+    settings = config(tmp_path, models={"ols": {"fit": {"kind": "ols"}}, "surface": {"fit": {"kind": "surface"}}})
+    found = force_study(settings)
+    assert [row["model"] for row in found.rows] == ["zero", "believed", "ols", "surface"]
+    assert not any(any(better(rows(found)[name], "believed")) for name in ("ols", "surface"))
+    assert better(rows(found)["believed"], "zero")[3]
+    text = write(settings, found, RunFolder.create(tmp_path / "run", "", resume=False))
+    assert "NONE of the 2 regressions beats a residual of zero" in text
+
+
+def test_folds_are_stretches_of_one_log_with_a_gap_and_whole_logs_of_three(tmp_path: Path) -> None:
+    log(tmp_path, "one", missing=1.0)
+    measured = read_measured(config(tmp_path))
+    record, test = measured.split(2, 5.0)
+    assert measured.parts == "stretches"
+    near = torch.nn.functional.max_pool1d(test.double()[None, None], 101, 1, 50)[0, 0] > 0
+    assert not bool((near & record.train).any())
+    assert int((~near & ~record.train).sum()) == int((~measured.good & ~near).sum())
+    for number, name in enumerate(("two", "three")):
+        log(tmp_path, name, missing=1.0, seed=number + 1, seconds=100.0)
+    measured = read_measured(config(tmp_path))
+    record, test = measured.split(0, 5.0)
+    assert (measured.names, measured.parts) == (("one", "three", "two"), "logs")
+    assert bool(test[: record.runs[0]].any())
+    assert not bool(test[record.runs[0] :].any())
+    assert not bool(record.train[: record.runs[0]].any())
+    # no segment reaches across logs
+    ends = torch.tensor(record.runs).cumsum(0)[:-1]
+    assert bool((record.fold[ends] != record.fold[ends - 1]).all())
+
+
+def test_a_log_that_stands_twice_is_refused(tmp_path: Path) -> None:
+    log(tmp_path, "one", missing=1.0, seconds=60.0)
+    log(tmp_path, "copy", missing=1.0, seconds=60.0)
+    with pytest.raises(DataError, match="identical rows"):
+        read_measured(config(tmp_path))
+
+
+def test_acceleration_of_an_offset_sensor_is_calibrated(tmp_path: Path) -> None:
+    log(tmp_path, "one", missing=1.0)
+    found = read_measured(config(tmp_path)).acceleration
+    assert found["surge"]["offset"] == pytest.approx(OFFSET, abs=1e-4)
+    assert found["surge"]["offset_ci95"][0] <= OFFSET <= found["surge"]["offset_ci95"][1] + 1e-6
+    assert found["sway"]["offset"] == pytest.approx(0.0, abs=1e-4)
+    measured = read_measured(config(tmp_path, "acceleration=measured"))
+    truth = torch.from_numpy(motion(0, 300.0)[2])
+    torch.testing.assert_close(measured.record.nu_dot[measured.good], truth[measured.good], rtol=0, atol=1e-4)
+
+
+def test_outliers_and_gaps_are_left_out(tmp_path: Path) -> None:
+    _, nu, _ = motion(0, 300.0)
+    u = nu[:, 0].copy()
+    u[700] += 3.0
+    v = nu[:, 1].copy()
+    v[1500:1600] = np.nan
+    log(tmp_path, "one", missing=1.0, u=u, v=v)
+    measured = read_measured(config(tmp_path))
+    assert not bool(measured.good[700])
+    assert not bool(measured.good[1500:1600].any())
+    assert measured.masked["one"]["outlier"] > 0
+    assert bool(torch.isfinite(measured.record.command).all())
+    left = rows(force_study(config(tmp_path)))["ridge"]["mse"]
+    assert all(value < 8.0 for value in left)
+
+
+def test_lag_of_the_thrusters_is_told_by_the_actual_forces(tmp_path: Path) -> None:
+    log(tmp_path, "one", missing=0.0, noise=0.0)
+    table = pd.read_csv(tmp_path / "one.csv")
+    late = 5
+    for letter in "xyn":
+        table[f"tau_{letter}_est"] = table[f"tau_{letter}_cmd"].shift(late, fill_value=0.0)
+    table.to_csv(tmp_path / "one.csv", index=False)
+    found = force_study(config(tmp_path, models={"ridge": {"fit": {"kind": "ridge"}}}))
+    lag = found.forces["lag"]
+    # half a second, as a delay and what the second-order lag adds to it
+    assert lag["delay"] + 2 * lag["damping"] / lag["frequency"] == pytest.approx(0.5, abs=0.05)
+    assert all(found.forces[axis]["explained_with_lag"] > 0.99 for axis in ("surge", "sway", "yaw"))
+
+
+def test_a_model_that_is_not_determined_is_set_aside_and_said(tmp_path: Path) -> None:
+    log(tmp_path, "one", missing=1.0, psi=np.zeros(3000))
+    settings = config(tmp_path, models={"ridge": {"fit": {"kind": "ridge"}}, "earth": {"fit": {"kind": "ridge"}, "earth": True}})
+    found = force_study(settings)
+    assert list(found.final) == ["ridge"]
+    text = write(settings, found, RunFolder.create(tmp_path / "run", "", resume=False))
+    assert "Not determined by these logs:\n\n- model earth: a force constant in earth axes does not show" in text
+
+
+def test_data_that_determine_nothing_are_clear_errors(tmp_path: Path) -> None:
+    log(tmp_path, "one", missing=1.0, seconds=120.0, v=np.zeros(1200))
+    with pytest.raises(FitError, match=r"model ridge: basis function 'v_dot' is constant"):
+        force_study(config(tmp_path))
+    log(tmp_path, "one", missing=1.0, seconds=300.0)
+    twice = {"ols": {"fit": {"kind": "ols"}, "terms": ["u", "v", "u v", "v u"]}}
+    with pytest.raises(FitError, match="model ols: basis functions u v, v u are collinear"):
+        force_study(config(tmp_path, models=twice))
+    with pytest.raises(FitError, match="one run or segment only"):
+        force_study(config(tmp_path, "validation.segment=1000"))
+    log(tmp_path, "one", missing=1.0, seconds=12.0)
+    with pytest.raises((FitError, DataError), match=r"samples do not determine|nothing left to learn"):
+        force_study(config(tmp_path, "validation.segment=2"))
+    log(tmp_path, "one", missing=1.0, seconds=300.0, tau_x_est=np.full(3000, np.nan))
+    with pytest.raises(DataError, match="holds no number"):
+        force_study(config(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("models.ridge.lag=true", "set force to 'commanded'"),
+        ("models.ridge.fit={kind: surface, choose: test}", "judge a model choose it"),
+        ("models.ridge.terms=[u_dott]", "u_dott"),
+        ("models.zero={fit: {kind: ols}}", "cannot name a model"),
+        ("believed=nomoto_mariner", "a believed hull needs"),
+        ("~channels.acceleration", "needs channels.acceleration"),
+        ("validation.gap=0", "at least one step"),
+        ("prepare.hold=mean", "leave it out"),
+    ],
+)
+def test_refused_configs(tmp_path: Path, override: str, said: str) -> None:
+    overrides = [override, "acceleration=measured"] if override.startswith("~") else [override]
+    with pytest.raises(ConfigError, match=said):
+        config(tmp_path, *overrides)
+    with pytest.raises(ConfigError, match="matches no file"):
+        config(tmp_path, "data.logs=[none_*.csv]").data.files()
+
+
+def test_a_missing_channel_is_named(tmp_path: Path) -> None:
+    log(tmp_path, "one", missing=1.0)
+    with pytest.raises(UsageError, match="no channel 'acting_tau'"):
+        read_measured(config(tmp_path, "channels.actual=[acting_tau, acting_tau_y, acting_tau_n]"))
+
+
+def test_comparison_of_accelerations_without_segments_has_no_interval() -> None:
+    a = torch.randn(50, 3, dtype=torch.float64)
+    assert compare_accelerations(a, a + 1, torch.zeros(50))["yaw"] == pytest.approx(
+        {"offset": 1.0, "offset_ci95": None, "rms_without_offset": 0.0, "rms": float(a[:, 2].std()), "correlation": 1.0}, abs=1e-9
+    )

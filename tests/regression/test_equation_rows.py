@@ -1,0 +1,114 @@
+"""Rows of the weak form and of instruments against sums written out, closed forms, and bias that must go."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from residnet.core.errors import ConfigError, FitError
+from residnet.regression.equation_rows import Instruments, LeastSquares, Rows, Weak, correlation_time, step_of, stretches
+
+NONE_EXACT = np.zeros(2, dtype=bool)
+
+
+def record(n: int = 200) -> Rows:
+    random = np.random.default_rng(0)
+    return Rows(random.normal(size=(n, 2)), random.normal(size=(n, 1)), np.repeat([0, 1, 2], [n // 2, n // 10, n - n // 2 - n // 10]))
+
+
+def test_windows_are_weighted_sums_within_stretches() -> None:
+    sampled = record()
+    rows = Weak(window=2.5, every=0.2).rows(sampled, 0.1, NONE_EXACT)
+    place = -1 + 2 * np.arange(1, 26) / 26
+    weight = (1 - place**2) ** 2
+    weight /= weight.sum()
+    expected_x, expected_y, expected = [], [], []
+    # stretches of 100, 20 and 80 samples: the second is shorter than a window
+    for start, stop, number in ((0, 100, 0), (120, 200, 2)):
+        for k in range(start, stop - 25 + 1, 5):
+            expected_x.append(weight @ sampled.x[k : k + 25])
+            expected_y.append(weight @ sampled.y[k : k + 25])
+            expected.append(number)
+    np.testing.assert_allclose(rows.x, expected_x, atol=1e-14)
+    np.testing.assert_allclose(rows.y, expected_y, atol=1e-14)
+    assert rows.stretch.tolist() == expected
+
+
+def test_windows_over_central_differences_are_integrals_by_parts() -> None:
+    """Sum of w x_dot over a window equals minus the sum of the weights' own differences times x: no derivative of the record is left."""
+    step, size = 0.1, 30
+    x = np.random.default_rng(1).normal(size=100)
+    rate = (x[2:] - x[:-2]) / (2 * step)
+    rows = Weak(window=size * step, every=1 / size).rows(Rows(np.ones((98, 1)), rate[:, None], np.zeros(98, dtype=int)), step, NONE_EXACT[:1])
+    place = np.linspace(-1, 1, size + 2)
+    weight = np.concatenate(([0.0, 0.0], (1 - place[1:-1] ** 2) ** 2, [0.0, 0.0]))
+    weight /= weight.sum()
+    slope = (weight[2:] - weight[:-2]) / (2 * step)
+    by_parts = [-(slope @ x[k : k + size + 2]) for k in range(len(rows.y))]
+    np.testing.assert_allclose(rows.y[:, 0], by_parts, atol=1e-12)
+
+
+def test_instruments_are_two_stage_least_squares() -> None:
+    sampled = record()
+    rows = Instruments(lag=0.3).rows(sampled, 0.1, np.array([False, True]))
+    now = [i for i in range(6, 200) if sampled.stretch[i] == sampled.stretch[i - 6]]
+    x, y = sampled.x[now], sampled.y[now, 0]
+    z = np.column_stack([sampled.x[[i - 3 for i in now]], sampled.x[[i - 6 for i in now], 0], x[:, 1]])
+    project = z @ np.linalg.inv(z.T @ z) @ z.T
+    truth = np.linalg.solve(x.T @ project @ x, x.T @ project @ y)
+    np.testing.assert_allclose(np.linalg.lstsq(rows.x, rows.y[:, 0], rcond=None)[0], truth, rtol=1e-9)
+
+
+def test_instruments_take_away_the_bias_of_noisy_regressors() -> None:
+    random = np.random.default_rng(3)
+    n = 20000
+    state = np.zeros(n)
+    for k in range(1, n):
+        state[k] = 0.98 * state[k - 1] + random.normal()
+    noisy = state + 0.5 * state.std() * random.normal(size=n)
+    sampled = Rows(noisy[:, None], (2.0 * state + 0.1 * random.normal(size=n))[:, None], np.zeros(n, dtype=int))
+    plain, lagged = (
+        np.linalg.lstsq(rows.x, rows.y, rcond=None)[0].item() for rows in (sampled, Instruments(lag=0.2).rows(sampled, 0.1, NONE_EXACT[:1]))
+    )
+    # a noise of half the deviation leaves 1 / (1 + 0.25) of the coefficient
+    assert plain == pytest.approx(1.6, rel=0.02)
+    assert lagged == pytest.approx(2.0, rel=0.02)
+
+
+def test_correlation_time_of_known_noise() -> None:
+    random = np.random.default_rng(0)
+    white = random.normal(size=(20000, 1))
+    assert correlation_time(white)[0] == pytest.approx(1.0, abs=0.1)
+    for phi in (0.5, 0.9):
+        noise = np.zeros((20000, 2))
+        for k in range(1, 20000):
+            noise[k] = phi * noise[k - 1] + random.normal(size=2)
+        np.testing.assert_allclose(correlation_time(noise), (1 + phi) / (1 - phi), rtol=0.15)
+    # samples that take turns say more than independent ones; nothing below one is claimed
+    assert correlation_time(np.tile([[1.0], [-1.0]], (500, 1)))[0] == 1.0
+
+
+def test_stretches_end_at_gaps_and_manoeuvres() -> None:
+    t = np.array([0.0, 0.1, 0.2, 0.5, 0.6, 0.0, 0.1])
+    group = np.array([0, 0, 0, 0, 0, 1, 1])
+    assert step_of(group, t) == pytest.approx(0.1)
+    assert stretches(group, t, 0.1).tolist() == [0, 0, 0, 1, 1, 2, 2]
+
+
+def test_least_squares_takes_samples_as_they_are() -> None:
+    sampled = record()
+    assert LeastSquares().rows(sampled, 0.0, NONE_EXACT) is sampled
+
+
+def test_what_cannot_be_done_is_one_line() -> None:
+    sampled = record(100)
+    with pytest.raises(FitError, match="no unbroken stretch of samples is 9 s long"):
+        Weak(window=9.0).rows(sampled, 0.1, NONE_EXACT)
+    with pytest.raises(ConfigError, match="holds 2 samples"):
+        Weak(window=0.2).rows(sampled, 0.1, NONE_EXACT)
+    with pytest.raises(ConfigError, match="less than one step"):
+        Instruments(lag=0.04).rows(sampled, 0.1, NONE_EXACT)
+    with pytest.raises(FitError, match="0 samples have a past of 8 s"):
+        Instruments(lag=4.0).rows(sampled, 0.1, NONE_EXACT)
+    with pytest.raises(FitError, match="no manoeuvre has two samples"):
+        step_of(np.array([0, 1, 2]), np.zeros(3))

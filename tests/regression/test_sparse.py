@@ -1,0 +1,214 @@
+"""Sparse regression against planted equations, scikit-learn's orthogonal matching pursuit, and the best of all subsets."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from math import comb, log
+
+import numpy as np
+import pytest
+from sklearn.linear_model import OrthogonalMatchingPursuit
+
+from residnet.core.errors import FitError
+from residnet.regression.sparse import Equation, SearchConfig, coarser, find, reduce
+from residnet.regression.sparse_search import Criterion, Search, swap_table
+
+
+def named(count: int) -> list[str]:
+    return [f"c{i}" for i in range(count)]
+
+
+def solve(x: np.ndarray, y: np.ndarray, **config: float) -> Equation:
+    return find(reduce(x, y[:, None], named(x.shape[1]), [1] * x.shape[1]), 0, SearchConfig(**config))[0]
+
+
+def planted(seed: int, rows: int = 300, columns: int = 30, noise: float = 0.0) -> tuple[np.ndarray, np.ndarray, dict[str, float]]:
+    """Correlated columns of very different sizes, and a target of four of them."""
+    random = np.random.default_rng(seed)
+    x = (
+        random.normal(size=(rows, columns))
+        @ (np.eye(columns) + 0.5 * random.normal(size=(columns, columns)))
+        * 10.0 ** random.uniform(-3, 5, columns)
+    )
+    chosen = random.choice(columns, 4, replace=False)
+    values = random.uniform(0.5, 2.0, 4) * random.choice([-1, 1], 4) / x[:, chosen].std(0)
+    y = x[:, chosen] @ values
+    return x, y + noise * y.std() * random.normal(size=rows), {f"c{i}": float(v) for i, v in zip(chosen, values, strict=True)}
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_a_planted_equation_is_found_exactly(seed: int) -> None:
+    x, y, truth = planted(seed)
+    equation = solve(x, y)
+    assert equation.exact
+    assert dict(zip(equation.terms, equation.values, strict=True)) == pytest.approx(truth, rel=1e-9)
+    assert not equation.alternatives
+    assert not equation.undecided
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_a_planted_equation_is_found_in_noise_with_honest_errors(seed: int) -> None:
+    x, y, truth = planted(seed, rows=2000, noise=0.2)
+    equation = solve(x, y)
+    assert set(equation.terms) == set(truth)
+    assert equation.share == pytest.approx(0.2 / np.sqrt(1.04), rel=0.1)
+    deviation = np.array([v - truth[t] for t, v in zip(equation.terms, equation.values, strict=True)]) / equation.errors
+    assert np.abs(deviation).max() < 4.0
+    # the textbook formula on the columns that were found
+    own = x[:, [int(term[1:]) for term in equation.terms]]
+    left = y - own @ equation.values
+    textbook = np.sqrt(np.diag(np.linalg.inv(own.T @ own)) * (left @ left) / (len(y) - 4))
+    np.testing.assert_allclose(equation.errors, textbook, rtol=0.1)
+
+
+def test_standard_errors_grow_with_the_correlation_of_the_noise() -> None:
+    random = np.random.default_rng(0)
+    x = np.cumsum(random.normal(size=(4000, 3)), axis=0)
+    x -= x.mean(0)
+    noise = np.zeros(4000)
+    for k in range(1, 4000):
+        noise[k] = 0.9 * noise[k - 1] + random.normal()
+    white = solve(x, x[:, 0] + random.normal(size=4000) * noise.std())
+    coloured = solve(x, x[:, 0] + noise)
+    # (1 + phi) / (1 - phi) = 19 samples say what one does
+    assert coloured.errors[0] / white.errors[0] == pytest.approx(np.sqrt(19), rel=0.3)
+
+
+@pytest.mark.parametrize("terms", [1, 3, 6])
+def test_forward_regression_is_orthogonal_matching_pursuit_on_orthogonal_columns(terms: int) -> None:
+    random = np.random.default_rng(terms)
+    x = np.linalg.qr(random.normal(size=(200, 20)))[0]
+    y = x @ random.normal(size=20) + 0.1 * random.normal(size=200)
+    other = OrthogonalMatchingPursuit(n_nonzero_coefs=terms, fit_intercept=False).fit(x, y)
+    search = Search(x, y, Criterion(200, 20, 1.0, float(y @ y), 1e-13), terms)
+    chosen = search.forward()
+    assert set(chosen) == set(np.flatnonzero(other.coef_))
+    np.testing.assert_allclose(np.linalg.lstsq(x[:, sorted(chosen)], y, rcond=None)[0], other.coef_[sorted(chosen)], atol=1e-12)
+
+
+def test_forward_regression_is_never_worse_than_matching_pursuit_at_its_first_two_terms() -> None:
+    """It takes the column that lessens the error most, pursuit the one most alike to what is left."""
+    for seed in range(20):
+        x, y, _ = planted(seed, columns=12, noise=0.3)
+        unit = x / np.linalg.norm(x, axis=0)
+        other = OrthogonalMatchingPursuit(n_nonzero_coefs=2, fit_intercept=False).fit(unit, y)
+        search = Search(unit, y, Criterion(300, 12, 1.0, float(y @ y), 1e-13), 2)
+        assert search.rss(search.forward()) <= search.rss(list(np.flatnonzero(other.coef_))) * (1 + 1e-12)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_the_search_finds_the_best_of_all_subsets(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    x = random.normal(size=(60, 9)) @ (np.eye(9) + random.normal(size=(9, 9)))
+    x /= np.linalg.norm(x, axis=0)
+    y = x[:, :3] @ [1.0, -1.0, 1.0] + 0.05 * random.normal(size=60)
+    rule = Criterion(60, 9, 0.5, float(y @ y), 1e-13)
+    search = Search(x, y, rule, 9)
+    everything = [list(chosen) for k in range(10) for chosen in combinations(range(9), k)]
+    best = min(everything, key=search.value)
+    value, chosen = search.start()
+    assert search.value(search.refine(chosen, 3)) == pytest.approx(search.value(best), abs=1e-6)
+    assert value >= search.value(best) - 1e-9
+
+
+def test_swaps_repair_a_wrong_start() -> None:
+    """c0 = c1 + c2 nearly: greedy steps begin with it, two for one and three for two lead back."""
+    random = np.random.default_rng(1)
+    x = random.normal(size=(300, 8))
+    x[:, 0] = x[:, 1] + x[:, 2] + 0.05 * random.normal(size=300)
+    x /= np.linalg.norm(x, axis=0)
+    y = x[:, 1] + x[:, 2]
+    search = Search(x, y, Criterion(300, 8, 1.0, float(y @ y), 1e-13), 8)
+    assert search.forward()[0] == 0
+    assert sorted(search.refine([0, 4, 5], 3)) == [1, 2]
+
+
+def test_criterion_is_the_formula() -> None:
+    rule = Criterion(100.0, 20, 0.5, 50.0, 1e-13)
+    assert float(rule.value(2.0, 3)) == pytest.approx(100 * log(2.0 / 50.0) + 3 * log(100) + log(comb(20, 3)))
+
+
+def test_swap_table_equals_refits() -> None:
+    x, y, _ = planted(3, columns=7, noise=0.5)
+    unit = x / np.linalg.norm(x, axis=0)
+    table = swap_table(unit, y, [1, 4, 5])
+    for row, gone in enumerate((1, 4, 5)):
+        for j in (0, 2, 3, 6, gone):
+            own = unit[:, [c for c in (1, 4, 5) if c != gone] + [j]]
+            left = y - own @ np.linalg.lstsq(own, y, rcond=None)[0]
+            assert table[row, j] == pytest.approx(left @ left, rel=1e-9)
+
+
+def test_columns_that_simpler_ones_make_up_are_set_aside_and_told() -> None:
+    random = np.random.default_rng(0)
+    a, b, c = np.abs(random.normal(size=(3, 100)))
+    levels = random.choice([1.0, 3.0], 100)
+    x = np.stack((a * np.abs(a), a**2, b, np.ones(100), levels, levels**2, np.zeros(100), c), axis=1)
+    names = ["a|a|", "a^2", "b", "1", "n", "n^2", "v", "c"]
+    reduced = reduce(x, (2 * a**2 + levels**2 - b)[:, None], names, [2, 2, 1, 0, 1, 2, 1, 1], effort=[1.5, 1.0, 1, 0, 1, 1, 1, 1])
+    assert reduced.names == ("1", "b", "n", "c", "a^2")
+    assert reduced.unexcited == ("v",)
+    assert reduced.dependent == {"a|a|": pytest.approx({"a^2": 1.0}), "n^2": pytest.approx({"1": -3.0, "n": 4.0})}
+    equation = find(reduced, 0, SearchConfig())[0]
+    assert dict(zip(equation.terms, equation.values, strict=True)) == pytest.approx({"1": -3.0, "n": 4.0, "b": -1.0, "a^2": 2.0})
+
+
+def test_noise_does_not_set_columns_apart() -> None:
+    """A vessel that never goes astern, with a sensor that says it did: u^2 and u|u| must not both be taken."""
+    random = np.random.default_rng(2)
+    u = np.concatenate((np.zeros(100), random.uniform(0.5, 2.0, 900))) + 0.01 * random.normal(size=1000)
+    w = random.normal(size=1000)
+    y = -u * np.abs(u) + w + 0.05 * random.normal(size=1000)
+    x = np.stack((u, np.abs(u), u**2, u * np.abs(u), w), axis=1)
+    reduced = reduce(x, y[:, None], ["u", "|u|", "u^2", "u|u|", "w"], [1, 1, 2, 2, 1], effort=[1, 1.5, 1, 1.5, 1])
+    assert reduced.rank == 5
+    equation, within = find(reduced, 0, SearchConfig())
+    assert equation.terms == ("w", "u^2")
+    assert set(within.dependent) == {"|u|", "u|u|"}
+    assert coarser(reduced, 0.0).rank == 5
+
+
+def test_terms_that_the_data_cannot_tell_apart_are_named() -> None:
+    random = np.random.default_rng(0)
+    a = random.normal(size=200)
+    x = np.stack((a, a + 0.05 * random.normal(size=200), random.normal(size=200)), axis=1)
+    equation = solve(x, a + 2 * x[:, 2] + 0.5 * random.normal(size=200))
+    assert len(equation.terms) == 2
+    assert equation.alternatives == {next(t for t in equation.terms if t != "c2"): [next(t for t in ("c0", "c1") if t not in equation.terms)]}
+
+
+def test_what_the_data_leave_open_is_named_instead_of_taken() -> None:
+    """A true but weak term: left out, and said to be possible; a candidate that is surely absent is not."""
+    random = np.random.default_rng(4)
+    x = random.normal(size=(400, 3))
+    x[:, 1] = x[:, 0] + 0.1 * x[:, 1]
+    equation = solve(x, x[:, 0] + 0.5 * x[:, 1] + 0.8 * random.normal(size=400))
+    assert len(equation.terms) == 1
+    assert {"c0", "c1"} - set(equation.terms) <= set(equation.undecided)
+    assert equation.undecided.get("c2", 0.0) < 0.15
+
+
+def test_pure_noise_gives_no_terms() -> None:
+    found = [len(solve(np.random.default_rng(s).normal(size=(500, 40)), np.random.default_rng(100 + s).normal(size=500)).terms) for s in range(20)]
+    assert sum(found) <= 1
+
+
+def test_a_target_of_zero_has_no_terms() -> None:
+    equation = solve(np.random.default_rng(0).normal(size=(50, 5)), np.zeros(50))
+    assert equation.terms == ()
+    assert equation.exact
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "message"),
+    [
+        (np.zeros((20, 2)), np.ones((20, 1)), "every candidate term is zero"),
+        (np.ones((3, 5)), np.ones((3, 1)), "3 samples do not determine 5 candidates"),
+        (np.full((20, 2), np.nan), np.ones((20, 1)), "term 'c0' is not finite"),
+        (np.ones((20, 2)), np.full((20, 1), np.inf), "the target is not finite"),
+    ],
+)
+def test_errors_are_one_line(x: np.ndarray, y: np.ndarray, message: str) -> None:
+    with pytest.raises(FitError, match=message) as caught:
+        reduce(x, y, named(x.shape[1]), [1] * x.shape[1])
+    assert "\n" not in str(caught.value)

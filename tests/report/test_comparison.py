@@ -1,0 +1,78 @@
+"""Tables of variants against sums by hand, and the picture that they make."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from made_run import made_run
+
+from residnet.core.errors import DataError
+from residnet.judge.bootstrap import blocks, intervals
+from residnet.report.comparison import Variant, as_text, draw, table, window_nrmse
+
+KEYS = {"T30": tuple((f"log{i // 3}", i % 3) for i in range(18))}
+
+
+def variants(shift: float, seeds: int = 3, draw: int = 0) -> list[Variant]:
+    random = np.random.default_rng(draw)
+    level = random.uniform(0.1, 0.3, 18)
+    plain = level + random.normal(0, 0.01, (seeds, 18))
+    other = level + shift + random.normal(0, 0.01, (seeds, 18))
+    return [Variant("recipe", (), {"T30": plain}, (10.0,) * seeds), Variant("other", ("a=1",), {"T30": other}, (20.0,) * seeds)]
+
+
+def test_rows_are_means_over_windows_and_seeds() -> None:
+    chosen = variants(0.05)
+    recipe, other = table(chosen, KEYS, "recipe")
+    errors = chosen[1].errors["T30"]
+    assert other["nrmse_mean"] == pytest.approx(errors.mean())
+    assert other["nrmse_sd"] == pytest.approx(np.std([errors[s].mean() for s in range(3)], ddof=1))
+    assert other["nrmse_range"] == pytest.approx([errors.mean(1).min(), errors.mean(1).max()])
+    apart = errors.mean(0) - chosen[0].errors["T30"].mean(0)
+    assert other["difference"] == pytest.approx(apart.mean())
+    (expected,) = intervals(apart[:, None], blocks([i // 3 for i in range(18)]))
+    assert other["difference_ci95"] == expected
+    assert recipe["difference"] == 0.0
+    assert recipe["difference_ci95"] is None
+    assert (other["windows"], other["seeds"], other["seconds"]) == (18, 3, 20.0)
+
+
+def test_pairing_sees_what_the_spread_of_windows_hides() -> None:
+    """Windows differ by 0.2, the variants by 0.01: the paired interval covers the difference as often as it says, and is far from zero."""
+    covered = resolved = 0
+    for draw_ in range(100):
+        low, high = table(variants(0.01, draw=draw_), KEYS, "recipe")[1]["difference_ci95"]
+        covered += low < 0.01 < high
+        resolved += low > 0
+    assert 87 <= covered <= 100
+    assert resolved > 80
+
+
+def test_one_seed_has_no_spread() -> None:
+    rows = table(variants(0.05, seeds=1), KEYS, "recipe")
+    assert rows[1]["nrmse_sd"] is None
+    assert "(" not in as_text(rows, "recipe").splitlines()[2]
+
+
+def test_text_and_picture(tmp_path: Path) -> None:
+    rows = table(variants(0.05), KEYS, "recipe")
+    lines = as_text(rows, "recipe").splitlines()
+    assert [line.split("|")[1].strip() for line in lines[2:]] == ["recipe", "other"]
+    assert "`a=1`" in lines[3]
+    assert {line.count("|") for line in lines} == {6}
+    draw(rows, "recipe", tmp_path / "study.png")
+    from PIL import Image
+
+    image = Image.open(tmp_path / "study.png")
+    assert image.width > 600
+    assert image.info["Title"]
+
+
+def test_a_run_without_the_model(tmp_path: Path) -> None:
+    run = made_run(tmp_path / "made")
+    with pytest.raises(DataError, match="no model 'gru'"):
+        window_nrmse(run, "gru", "test")
+    with pytest.raises(DataError, match="split 'train'"):
+        window_nrmse(run, "selected", "train")

@@ -1,0 +1,329 @@
+"""The report: its numbers are those of metrics.json, it stands alone, and what a folder lacks is left out."""
+
+from __future__ import annotations
+
+import html
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pytest
+from made_run import DEG, LEVEL, made_run, metrics, residuals, row, write_json
+
+from residnet.core.errors import DataError, UsageError
+from residnet.dynamics.store import ModelSpec, save_model
+from residnet.report.figures.fit import write_figures
+from residnet.report.page import write_report
+from residnet.report.tables import change, number, term_unit
+
+_VOID = {"meta", "img", "br", "hr", "link"}
+
+
+class Page(HTMLParser):
+    """Tables as lists of lines of cell texts, and whether every tag is closed where it should be."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.tables: list[list[list[str]]] = []
+        self.sources: list[str] = []
+        self.feed(text)
+        assert self.open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        if tag not in _VOID:
+            self.open.append(tag)
+        self.sources += [value or "" for name, value in attrs if name in ("src", "href")]
+        if tag == "table":
+            self.tables.append([])
+        elif tag == "tr":
+            self.tables[-1].append([])
+        elif tag in ("td", "th"):
+            self.tables[-1][-1].append("")
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if "td" in self.open or "th" in self.open:
+            self.tables[-1][-1][-1] += ("|" if "small" in self.open else "") + data
+
+    def table(self, corner: str, first: str) -> dict[str, list[str]]:
+        """Cells by the label of their line, of the table with that corner and that label in its first line."""
+        for table in self.tables:
+            lines = {line[0]: line[1:] for line in table}
+            if table[0][0] == corner and first in lines:
+                return lines
+        raise AssertionError(f"no table {corner} with {first}")
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    return made_run(tmp_path / "made")
+
+
+def test_free_run_numbers_are_those_of_metrics(run: Path) -> None:
+    text = write_report(run).read_text()
+    cells = Page(text).table("model", "plsr (selected)")
+    # train and test of u, v, r, then nrmse with its interval, position, heading, diverged; the protocol that selects comes first
+    assert cells["plsr (selected)"][:6] == ["0.0320|−60 %", "0.0400|−60 %", "0.0240|−40 %", "0.0300|−40 %", "0.458|−50 %", "0.573|−50 %"]
+    assert row("plsr", "test", "whole")["nrmse"]["mean"] == pytest.approx(0.08)
+    assert cells["plsr (selected)"][7] == "0.0800|0.0720–0.0880"
+    assert cells["plsr (selected)"][9] == "0.40"
+    assert cells["plsr (selected)"][11] == number(DEG * LEVEL["plsr"][2], 2)
+    assert cells["plsr (selected)"][13] == "0/6"
+    assert cells["mlp"][3] == "0.0510|+2 %"
+    assert cells["baseline"][1] == "0.100"
+    assert 'class="bad">0.0510' in text
+
+
+def test_manoeuvres_stand_apart(run: Path) -> None:
+    cells = Page(write_report(run).read_text()).table("manoeuvre, model", "turning: baseline")
+    assert cells["turning: baseline"][1] == "0.110"
+    assert cells["zigzag: baseline"][1] == "0.120"
+
+
+def test_verdict(run: Path) -> None:
+    page = html.unescape(write_report(run).read_text())
+    verdict = re.search(r'<section class="verdict".*?</section>', page, re.DOTALL)
+    assert verdict is not None
+    for part in (
+        "Model plsr (chosen on validation data) was free-run over 6 whole manoeuvres that no fit has seen (protocol whole).",
+        "surge u 0.0400 m/s (0.0360 to 0.0440), 60 % below the baseline",
+        "yaw rate r 0.573 deg/s (0.516 to 0.630), 50 % below the baseline",
+        "surge u 0.0200 m/s (attained: 75 % of the possible reduction)",
+        "position is off by 0.40 m and the heading by 0.57 deg on average (baseline: 1.0 m, 1.1 deg)",
+        "No free run of any model diverged on test data.",
+    ):
+        assert part in verdict[0]
+    assert "Before you use it" not in page
+
+
+def test_bad_news_is_told(run: Path) -> None:
+    content = metrics()
+    for line in content["rows"]:
+        if line["model"] == "plsr" and line["split"] == "test" and line["manoeuvre"] == "all":
+            line["diverged"] = 2
+            line["rmse"] = line["rmse"] | {"v": 0.06}
+            line["nrmse"] = line["nrmse"] | {"mean": 0.3}
+    write_json(run / "metrics.json", content)
+    page = html.unescape(write_report(run).read_text())
+    assert "DIVERGED on test data, counted with the error of held velocities: plsr 2 of 6 (T30), plsr 2 of 6 (whole)." in page
+    assert "plsr is worse than the baseline in sway v" in page
+    assert "times its training error" in page
+    assert "20 % ABOVE the baseline" in page
+
+
+def test_parameters_heads_data_and_provenance(run: Path) -> None:
+    text = write_report(run).read_text()
+    page = Page(text)
+    terms = page.table("term", "u′: u")
+    assert terms["u′: u"] == ["−0.914", "0.076", "12", "1/s"]
+    assert terms["r′: v|v|"] == ["0.50", "0.10", "5.0", "rad/m²"]
+    heads = page.table("head", "plsr (selected)")
+    assert heads["plsr (selected)"][1:3] == ["23 basis functions; order 7 (latent variables)", "72"]
+    assert heads["mlp"][2] == "1\u2009347"
+    quality = page.table("split, manoeuvre", "test: zigzag")
+    assert quality["test: zigzag"] == ["3", "180", "1800", "97.5", "95.0", "frozen 2.5 %", "1.50", "0.200", "5.73"]
+    for part in ("9.8.7", "abc123", "f00d", "torch 2.13.0", "fitted on 2400 samples", "selection: whole"):
+        assert part in text
+
+
+def limits_file() -> dict[str, Any]:
+    """Contents of limits.json for the protocol that selects."""
+    paired = {"to": "baseline", "nrmse_mean": -0.02, "ci95": [-0.03, -0.01], "excludes_zero": True, "ratio": 0.8, "worse": False}
+    bands = [{"by": "wind", "low": 1.0, "high": 2.5, "windows": 4, "models": {"plsr": {"nrmse_mean": 0.08, "difference": paired}}}]
+    worst = [{"log": "zigzag_02", "manoeuvre": "zigzag", "t": 12.5, "nrmse": 0.3, "rmse": {"u": 0.1, "v": 0.2, "r": 0.01}, "position_error_end": 4.2}]
+    kinematics = {"windows": 6, "position_mean": 0.37, "position_rms": 0.47, "heading_mean": 1.35 / DEG, "heading_rms": 1.8 / DEG}
+    part = {"kinematics": kinematics, "bands": bands, "worst": {"plsr": worst}}
+    tolerance = {"command_share_of_range": 0.05, "start": {"u": 0.125, "v": 0.0625, "r": 0.0625}}
+    motion = {"u": 0.04, "v": 0.02, "r": 1 / DEG, "position": 2.0, "heading": 5 / DEG, "nrmse": 0.2}
+    repeats = {"tolerance": tolerance, "pairs": 3, "logs": 2, **motion, "manoeuvres": {"zigzag": {"pairs": 3, **motion}}}
+    return {"schema": "residnet.limits/1", "run": "made", "splits": {"test": {"whole": part}}, "repeatability": {"whole": repeats}}
+
+
+def compared(change: dict[str, float]) -> dict[str, Any]:
+    """metrics.json whose heads are compared with the baseline; `change` is the ratio of plsr by kind of manoeuvre."""
+    content = metrics()
+    for line in content["rows"]:
+        ratio = change.get(line["manoeuvre"], 0.8) if line["model"] == "plsr" else 0.9
+        apart = line["nrmse"]["mean"] * (1 - 1 / ratio)
+        span = [1.5 * apart, 0.5 * apart] if line["manoeuvre"] == "all" else None
+        found = {"to": "baseline", "nrmse_mean": apart, "ci95": span, "excludes_zero": span is not None, "ratio": ratio, "worse": ratio > 1.05}
+        line["difference"] = found if line["kind"] == "head" else None
+        line["ci95_blocks"] = {"of": "logs", "count": 6}
+    return content
+
+
+def test_how_good_where_it_fails_and_what_limits_it(run: Path) -> None:
+    write_json(run / "metrics.json", compared({"turning": 1.2}))
+    write_json(run / "limits.json", limits_file())
+    text = write_report(run).read_text()
+    cells = Page(text).table("windows of", "all")
+    # plsr has 0.08, 0.8 times its reference, so that has 0.1
+    assert cells["all"] == ["6", "0.0800", "0.100", "−20 %", "−0.0200", "−0.0300 to −0.0100"]
+    assert cells["turning"] == ["6", "0.0880", "0.0733", "+20 %", "+0.0147", "–"]
+    assert cells["wind 1.0 to 2.5 m/s"] == ["4", "0.0800", "0.100", "−20 %", "−0.0200", "−0.0300 to −0.0100"]
+    worst = Page(text).table("worst windows", "zigzag_02 (zigzag)")
+    assert worst["zigzag_02 (zigzag)"] == ["12.5", "0.300", "0.100", "0.200", "0.573", "4.2"]
+    page = html.unescape(text)
+    for part in (
+        "plsr: NRMSE 0.0800, 95 % interval 0.0720 to 0.0880 (bootstrap of 6 blocks: whole logs).",
+        "Against baseline over the same windows: −0.0200 (−20 %), paired 95 % interval −0.0300 to −0.0100, without zero: better.",
+        "end 0.37 m and 1.4 deg from the measured pose on average (root mean square 0.47 m, 1.8 deg)",
+        "3 pairs of stretches (zigzag 3) in 2 of the logs of all splits have commands within 5 % of their range",
+        "differ by u 0.0400 m/s, v 0.0200 m/s, r 1.00 deg/s (root mean square), 2.0 m and 5.0 deg at the end",
+        "an NRMSE of 0.141 and 1.4 m",
+        "Protocol whole: worse by more than 5 % in NRMSE on test data: plsr against baseline (turning +20 %).",
+    ):
+        assert part in page
+
+
+def test_no_repeats_no_reference_and_no_interval_are_said(run: Path) -> None:
+    content = compared({})
+    for line in content["rows"]:
+        line |= {"difference": None, "ci95_blocks": None, "nrmse_mean_ci95": None, "rmse_ci95": dict.fromkeys("uvr")}
+    write_json(run / "metrics.json", content)
+    found = limits_file()
+    found["repeatability"]["whole"] = {"tolerance": found["repeatability"]["whole"]["tolerance"], "pairs": 0, "logs": 0}
+    write_json(run / "limits.json", found)
+    write_figures(run)
+    text = html.unescape(write_report(run).read_text())
+    assert "plsr: NRMSE 0.0800; too few logs for an interval." in text
+    assert "hold no two stretches as long as a window" in text
+    assert "worse by more than 5 %" not in text
+
+
+def test_standard_errors_of_a_refitted_baseline_are_named(run: Path) -> None:
+    note = "values and standard errors are those after the refit through rollouts"
+    assert note not in write_report(run).read_text()
+    path = run / "models" / "baseline" / "fit.json"
+    write_json(path, json.loads(path.read_text()) | {"refit": {"iterations": 3}})
+    assert note in write_report(run).read_text()
+
+
+def test_accelerations_of_logs_stand_log_by_log(run: Path) -> None:
+    path = run / "models" / "baseline" / "fit.json"
+    own = {"standard_error": 1.0e-4, "spread": 4.0e-4, "speed": 0.9}
+    values = {("first", "v_dot"): -5.5e-4, ("first", "r_dot"): 1.5e-4, ("second", "v_dot"): 0.0, ("second", "r_dot"): 3.0e-4}
+    offsets = [{"log": log, "axis": axis, "value": value} | own for (log, axis), value in values.items()]
+    assert "Accelerations of each training log" not in write_report(run).read_text()
+    write_json(path, json.loads(path.read_text()) | {"refit": {"iterations": 3}, "offsets": offsets})
+    text = write_report(run).read_text()
+    cells = Page(text).table("log", "first")
+    assert cells["first"] == ["−0.00055", "0.00010", "0.00015", "0.00010"]
+    assert cells["second"] == ["0", "0.00010", "0.00030", "0.00010"]
+    assert "v′ [m/s²], spread 0.00040, at 0.90 m/s" in text
+    assert text.count('class="weak">0.00015') == 1
+    assert 'class="weak">0.00030' not in text
+
+
+def test_the_file_stands_alone_and_nothing_in_it_runs(run: Path) -> None:
+    residuals().to_parquet(run / "residuals.parquet")
+    figures = write_figures(run)
+    path = write_report(run)
+    assert path == run / "report.html"
+    text = path.read_text()
+    assert "<script" not in text
+    assert "&lt;script&gt;" in text
+    assert '<meta name="viewport"' in text
+    page = Page(text)
+    assert all(source.startswith(("data:image/png;base64,", "#")) for source in page.sources)
+    assert sum(source.startswith("data:") for source in page.sources) == len(figures) == 8
+    assert not re.search(r"url\(|@import|https?://", text)
+    assert not list(run.glob("*.partial"))
+    path.unlink()
+    assert write_report(run).read_text() == text
+
+
+def test_physical_sanity_is_shown_where_models_can_be_loaded(run: Path) -> None:
+    spec = ModelSpec.model_validate(
+        {
+            "schema": "residnet.model/1",
+            "name": "plsr",
+            "role": "baseline",
+            "signals": {"inputs": ["n", "delta"]},
+            "baseline": {"kind": "regressors", "terms": ["u", "v", "r", "n", "delta"]},
+            "dt": 0.5,
+            "integrator": "euler",
+            "low": [0.0, -0.2, -0.1, 0.0, -0.6],
+            "high": [1.0, 0.2, 0.1, 10.0, 0.6],
+        }
+    )
+    model = spec.build()
+    # surge that feeds itself
+    model.baseline.theta.data[0, 0] = 0.3
+    save_model(run / "models" / "plsr", spec, model)
+    page = html.unescape(write_report(run).read_text())
+    assert "Physical sanity" in page
+    assert "plsr, damping: not damped (wrong sign or none): u at rest, v at rest, r at rest, u at cruise" in page
+
+
+def test_a_folder_of_evaluate_has_other_splits_and_no_models(tmp_path: Path) -> None:
+    folder = made_run(tmp_path / "other", split="external")
+    for path in (folder / "models").rglob("*.json"):
+        path.unlink()
+    write_json(folder / "metrics.json", metrics(("external",), ("zero", "baseline", "plsr")))
+    write_figures(folder)
+    text = write_report(folder).read_text()
+    page = Page(text)
+    assert page.table("model", "plsr (selected)")["plsr (selected)"][0] == "0.0400|−60 %"
+    assert "that no fit has seen" in text
+    for absent in ("Baseline parameters", "Residual heads", "Physical sanity", "simulated plant", "side by side"):
+        assert absent not in text
+
+
+def test_metrics_alone_make_a_report(tmp_path: Path) -> None:
+    content = metrics(("validation",), ("plsr",))
+    content["rows"] = [{key: value for key, value in line.items() if key != "manoeuvre"} for line in content["rows"] if line["manoeuvre"] == "all"]
+    write_json(tmp_path / "metrics.json", content)
+    text = write_report(tmp_path).read_text()
+    Page(text)
+    assert "of the validation data (not unseen: read with care)" in text
+    assert "Provenance" not in text
+
+
+def test_folders_that_cannot_be_read_are_refused_by_name(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"no metrics\.json"):
+        write_report(tmp_path)
+    (tmp_path / "metrics.json").write_text("{")
+    with pytest.raises(DataError, match="not readable as JSON"):
+        write_report(tmp_path)
+    (tmp_path / "metrics.json").write_text("{}")
+    with pytest.raises(DataError, match="holds no rows"):
+        write_report(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0.031849, "0.0318"), (12.34, "12.3"), (1234.0, "1234"), (0.0, "0"), (-0.5, "−0.500"), (1.2e-7, "1.20e−07"), (None, "–"), (float("nan"), "–")],
+)
+def test_rounding(value: float | None, text: str) -> None:
+    assert number(value) == text
+
+
+def test_changes() -> None:
+    assert change(0.5, 1.0) == "−50 %"
+    assert change(1.02, 1.0) == "+2 %"
+    assert change(0.9999, 1.0) == "0 %"
+    assert change(1.0, 0.0) == ""
+
+
+@pytest.mark.parametrize(
+    ("axis", "term", "unit"),
+    [
+        ("u_dot", "u", "1/s"),
+        ("u_dot", "u|u|", "1/m"),
+        ("u_dot", "1", "m/s²"),
+        ("u_dot", "tau_x", "m/(s²·N)"),
+        ("r_dot", "tau_n", "rad/(s²·N·m)"),
+        ("v_dot", "u r", "1/rad"),
+        ("r_dot", "n^2 delta", "-"),
+        ("v_dot", "wind_v|wind_v|", "1/m"),
+        ("v_dot", "lever", ""),
+    ],
+)
+def test_units_of_coefficients(axis: str, term: str, unit: str) -> None:
+    assert term_unit(axis, term) == unit

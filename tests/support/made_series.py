@@ -1,0 +1,30 @@
+"""Autoregressive residuals of unit variance, and how often an interval holds what is true of them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.signal import lfilter
+
+from residnet.judge.residual_series import block_interval, independent_interval
+
+
+def autoregressive(phi: float, count: int, length: int, seed: int) -> np.ndarray:
+    """[count, length], the beginning left out."""
+    noise = np.random.default_rng(seed).normal(size=(count, length + 300))
+    return lfilter([1.0], [1.0, -phi], noise, axis=1)[:, 300:] * math.sqrt(1 - phi**2)  # type: ignore[no-any-return]
+
+
+def coverage(phi: float, count: int, length: int, seed: int) -> dict[str, float]:
+    """Share of intervals that hold the truth: of the mean absolute residual and of the mean, by blocks and as if samples were independent."""
+    series = autoregressive(phi, count, length, seed)
+    truth = math.sqrt(2 / math.pi)
+    held = {"mae": 0, "mean": 0, "mae independent": 0, "mean independent": 0}
+    for row in series:
+        for name, values, level in (("mae", np.abs(row), truth), ("mean", row, 0.0)):
+            found = block_interval([values])
+            low, high = independent_interval(values)
+            held[name] += found.low <= level <= found.high
+            held[f"{name} independent"] += low <= level <= high
+    return {name: number / count for name, number in held.items()}
