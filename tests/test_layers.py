@@ -1,4 +1,6 @@
-"""The order of the house, read from the imports of every file: nothing imports upwards, nothing imports in circles."""
+"""The order of the house, read from the imports of every file: nothing imports upwards, nothing
+imports in circles.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +46,9 @@ MODULES = {module_of(path): path for path in FILES}
 
 
 def imports(path: Path, *, at_load: bool = False) -> set[str]:
-    """Modules that a file imports, anywhere or only when it is itself imported; `from residnet import x` names the module x where there is one."""
+    """Modules that a file imports, anywhere or only when it is itself imported; `from residnet
+    import x` names the module x where there is one.
+    """
     found: set[str] = set()
     tree = ast.parse(path.read_text())
     nodes = loaded(tree) if at_load else list(ast.walk(tree))
@@ -81,7 +85,9 @@ def package(module: str) -> str | None:
 def test_nothing_imports_upwards(module: str) -> None:
     own = package(module)
     if own is None:
-        assert not [name for name in imports(MODULES[module], at_load=True) if package(name)], "residnet itself is a lazy face"
+        assert not [name for name in imports(MODULES[module], at_load=True) if package(name)], (
+            "residnet itself is a lazy face"
+        )
         return
     assert own in RANK, f"{module} has no place in the order: {LAYERS}"
     for target in sorted(imports(MODULES[module])):
@@ -89,16 +95,25 @@ def test_nothing_imports_upwards(module: str) -> None:
         if other is None or other == own:
             continue
         assert other in RANK, f"{module} imports {target}, which has no place in the order"
-        assert RANK[other] < RANK[own] or (own, other) in ALLOWED, f"{module} imports {target}: {own} stands below {other} or beside it"
+        assert RANK[other] < RANK[own] or (own, other) in ALLOWED, (
+            f"{module} imports {target}: {own} stands below {other} or beside it"
+        )
 
 
 def test_no_circles() -> None:
-    """Between modules, as they import each other when loaded; a package's own face counts as its __init__."""
-    graph = {module: {name for name in imports(path, at_load=True) if name in MODULES and name != module} for module, path in MODULES.items()}
+    """Between modules, as they import each other when loaded; a package's own face counts as its
+    __init__.
+    """
+    graph = {
+        module: {name for name in imports(path, at_load=True) if name in MODULES and name != module}
+        for module, path in MODULES.items()
+    }
     done: set[str] = set()
 
     def visit(module: str, trail: list[str]) -> None:
-        assert module not in trail, "imports in a circle: " + " -> ".join([*trail[trail.index(module) :], module])
+        assert module not in trail, "imports in a circle: " + " -> ".join(
+            [*trail[trail.index(module) :], module]
+        )
         if module not in done:
             for target in sorted(graph[module]):
                 visit(target, [*trail, module])
@@ -109,14 +124,20 @@ def test_no_circles() -> None:
 
 
 def test_packages_import_each_other_one_way_only() -> None:
-    pairs = {(package(m), package(target)) for m, path in MODULES.items() for target in imports(path)}
+    pairs = {
+        (package(m), package(target)) for m, path in MODULES.items() for target in imports(path)
+    }
     pairs = {(a, b) for a, b in pairs if a and b and a != b}
     assert not {(a, b) for a, b in pairs if (b, a) in pairs}
 
 
 @pytest.mark.parametrize("module", sorted(MODULES))
 def test_lightning_is_imported_by_training_only(module: str) -> None:
-    heavy = {name for name in imports(MODULES[module]) if name.split(".")[0] in ("lightning", "pytorch_lightning")}
+    heavy = {
+        name
+        for name in imports(MODULES[module])
+        if name.split(".")[0] in ("lightning", "pytorch_lightning")
+    }
     assert not heavy or package(module) == "training"
 
 
@@ -129,8 +150,21 @@ def test_core_needs_no_other_part_of_the_house() -> None:
 def test_the_reader_of_imports_sees_what_is_there(tmp_path: Path) -> None:
     file = tmp_path / "made.py"
     file.write_text(
-        "import numpy as np\nfrom residnet.core import names\nfrom residnet.core.errors import ConfigError\n"
-        "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import torch\ndef f():\n    import lightning\n"
+        "import numpy as np\nfrom residnet.core import names\nfrom residnet.core.errors import"
+        " ConfigError\nfrom typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import torch\ndef"
+        " f():\n    import lightning\n"
     )
-    assert imports(file) == {"numpy", "residnet.core.names", "residnet.core.errors", "typing", "torch", "lightning"}
-    assert imports(file, at_load=True) == {"numpy", "residnet.core.names", "residnet.core.errors", "typing"}
+    assert imports(file) == {
+        "numpy",
+        "residnet.core.names",
+        "residnet.core.errors",
+        "typing",
+        "torch",
+        "lightning",
+    }
+    assert imports(file, at_load=True) == {
+        "numpy",
+        "residnet.core.names",
+        "residnet.core.errors",
+        "typing",
+    }

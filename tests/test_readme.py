@@ -1,4 +1,6 @@
-"""What README.md shows is valid: its YAML is read by the program, its commands name files and options that exist."""
+"""What README.md shows is valid: its YAML is read by the program, its commands name files and
+options that exist.
+"""
 
 from __future__ import annotations
 
@@ -39,16 +41,24 @@ def test_both_kinds_of_file_are_shown() -> None:
 
 
 @pytest.mark.parametrize("command", RUNS)
-def test_commands_name_what_exists(command: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_commands_name_what_exists(
+    command: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     words = shlex.split(command)
     path = ROOT / words[0]
     assert path.is_file(), f"README names {words[0]}"
     overrides = [value for flag, value in itertools.pairwise(words) if flag == "-s"]
     vessel = tmp_path / "my_boat.yaml"
     vessel.write_text(next(block for block in BLOCKS if "task:" not in block))
-    made = [text.replace("my_boat.yaml", str(vessel)).replace("seed=K", "seed=1") for text in overrides if "=runs/" not in text]
+    made = [
+        text.replace("my_boat.yaml", str(vessel)).replace("seed=K", "seed=1")
+        for text in overrides
+        if "=runs/" not in text
+    ]
     (tmp_path / "esso_osaka").mkdir()
-    (tmp_path / "esso_osaka" / "split.yaml").write_text("train: [a.csv]\nvalidation: [b.csv]\ntest: [c.csv]\n")
+    (tmp_path / "esso_osaka" / "split.yaml").write_text(
+        "train: [a.csv]\nvalidation: [b.csv]\ntest: [c.csv]\n"
+    )
     monkeypatch.setenv("RESIDNET_DATA", str(tmp_path))
     load_task(path, made)
 

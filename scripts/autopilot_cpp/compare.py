@@ -1,4 +1,5 @@
-"""Fly an exported policy on Nomoto's model in C++ and in Python: the same track, and how long a step takes.
+"""Fly an exported policy on Nomoto's model in C++ and in Python: the same track, and how long a
+step takes.
 
 python scripts/autopilot_cpp/compare.py RUN/exports/policy.pt BUILD/autopilot [--seconds 40]
 """
@@ -62,7 +63,11 @@ def eager(policy: Any) -> Any:
     )
     own.load_state_dict(state)
     limits = [tuple(entry["range"]) for entry in card["measured"]]
-    return ExportedPolicy(own.eval().requires_grad_(False), Limits(*limits), "hold" if "held" in card["fault"] else "amidships").eval()
+    return ExportedPolicy(
+        own.eval().requires_grad_(False),
+        Limits(*limits),
+        "hold" if "held" in card["fault"] else "amidships",
+    ).eval()
 
 
 def main() -> None:
@@ -81,18 +86,38 @@ def main() -> None:
     card = json.loads(extra["card.json"])
     weights = given.policy.parent.parent / "models" / card["policy"] / "weights.safetensors"
     plain = eager({"card": card, "state": load_file(weights)})
-    k, t, speed, dt = card["turning"]["K"], card["turning"]["T"], card["turning"]["speed"], card["dt"]
+    k, t, speed, dt = (
+        card["turning"]["K"],
+        card["turning"]["T"],
+        card["turning"]["speed"],
+        card["dt"],
+    )
     heading, steps = math.radians(given.heading), round(given.seconds / dt)
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "track.csv"
-        words = [str(given.program), str(given.policy), str(file), *(repr(v) for v in (k, t, speed, dt, heading, given.seconds))]
+        words = [
+            str(given.program),
+            str(given.policy),
+            str(file),
+            *(repr(v) for v in (k, t, speed, dt, heading, given.seconds)),
+        ]
         print(subprocess.run(words, capture_output=True, text=True, check=True).stdout.rstrip())
         with file.open() as lines:
-            theirs = [(float(row["psi"]), float(row["r"]), float(row["delta"])) for row in csv.DictReader(lines)]
+            theirs = [
+                (float(row["psi"]), float(row["r"]), float(row["delta"]))
+                for row in csv.DictReader(lines)
+            ]
     for name, policy in (("eager Python", plain), ("TorchScript in Python", compiled)):
         mine, median = fly(policy, k, t, speed, dt, heading, steps)
-        worst = max(abs(a - b) for one, other in zip(mine, theirs, strict=True) for a, b in zip(one, other, strict=True))
-        print(f"{name}: median step {median:.1f} us, largest difference of the track from the C++ program {worst:.2g}")
+        worst = max(
+            abs(a - b)
+            for one, other in zip(mine, theirs, strict=True)
+            for a, b in zip(one, other, strict=True)
+        )
+        print(
+            f"{name}: median step {median:.1f} us, largest difference of the track from the C++"
+            f" program {worst:.2g}"
+        )
 
 
 if __name__ == "__main__":

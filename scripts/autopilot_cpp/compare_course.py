@@ -1,6 +1,8 @@
-"""Fly an exported course (policy and guidance in one module) on Nomoto's model in C++ and in Python: the same track, and how long a step takes.
+"""Fly an exported course (policy and guidance in one module) on Nomoto's model in C++ and in
+Python: the same track, and how long a step takes.
 
-python scripts/autopilot_cpp/compare_course.py RUN/exports/policy_enter.pt BUILD/course [--seconds 250]
+python scripts/autopilot_cpp/compare_course.py RUN/exports/policy_enter.pt BUILD/course [--seconds
+250]
 """
 
 from __future__ import annotations
@@ -23,7 +25,12 @@ COLUMNS = ("x", "y", "psi", "r", "delta")
 
 def fly(module: Any, card: dict[str, Any], seconds: float) -> tuple[list[tuple[float, ...]], float]:
     """`COLUMNS` by step until the course ends, and the median time of a step in microseconds."""
-    k, constant, speed, dt = card["turning"]["K"], card["turning"]["T"], card["turning"]["speed"], card["dt"]
+    k, constant, speed, dt = (
+        card["turning"]["K"],
+        card["turning"]["T"],
+        card["turning"]["speed"],
+        card["dt"],
+    )
     x, y, psi, r = card["start"]["north"], card["start"]["east"], card["start"]["heading"], 0.0
     decay, half = math.exp(-dt / constant), math.exp(-0.5 * dt / constant)
     track, taken = [], []
@@ -48,7 +55,9 @@ def fly(module: Any, card: dict[str, Any], seconds: float) -> tuple[list[tuple[f
 
 
 def eager(run: Path, card: dict[str, Any]) -> Any:
-    """Policy and guidance of a course run without compilation, planned again: the same operations, called one by one from Python."""
+    """Policy and guidance of a course run without compilation, planned again: the same operations,
+    called one by one from Python.
+    """
     from residnet.core.config import load_config
     from residnet.export.course import ExportedCourse
     from residnet.runs.folder import RunFolder
@@ -59,7 +68,9 @@ def eager(run: Path, card: dict[str, Any]) -> Any:
     config = load_config(folder.resolved, [], CourseTaskConfig)
     known = ready(config, folder)
     _, guidance = plan_for(config, known, card["protocol"])
-    return ExportedCourse(load_policy(known.run.path, config.policy, known.steering), guidance, config.safe).eval()
+    return ExportedCourse(
+        load_policy(known.run.path, config.policy, known.steering), guidance, config.safe
+    ).eval()
 
 
 def main() -> None:
@@ -76,17 +87,41 @@ def main() -> None:
     turning, start = card["turning"], card["start"]
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "track.csv"
-        numbers = (turning["K"], turning["T"], turning["speed"], card["dt"], start["north"], start["east"], start["heading"], given.seconds)
-        words = [str(given.program), str(given.course), str(file), *(repr(number) for number in numbers)]
+        numbers = (
+            turning["K"],
+            turning["T"],
+            turning["speed"],
+            card["dt"],
+            start["north"],
+            start["east"],
+            start["heading"],
+            given.seconds,
+        )
+        words = [
+            str(given.program),
+            str(given.course),
+            str(file),
+            *(repr(number) for number in numbers),
+        ]
         print(subprocess.run(words, capture_output=True, text=True, check=True).stdout.rstrip())
         with file.open() as lines:
             theirs = [tuple(float(row[name]) for name in COLUMNS) for row in csv.DictReader(lines)]
-    for name, own in (("eager Python", eager(given.course.parent.parent, card)), ("TorchScript in Python", module)):
+    for name, own in (
+        ("eager Python", eager(given.course.parent.parent, card)),
+        ("TorchScript in Python", module),
+    ):
         mine, median = fly(own, card, given.seconds)
         if len(mine) != len(theirs):
             raise SystemExit(f"{name} took {len(mine)} steps, the C++ program {len(theirs)}")
-        worst = max(abs(a - b) for one, other in zip(mine, theirs, strict=True) for a, b in zip(one, other, strict=True))
-        print(f"{name}: median step {median:.1f} us, largest difference of the track from the C++ program {worst:.2g}")
+        worst = max(
+            abs(a - b)
+            for one, other in zip(mine, theirs, strict=True)
+            for a, b in zip(one, other, strict=True)
+        )
+        print(
+            f"{name}: median step {median:.1f} us, largest difference of the track from the C++"
+            f" program {worst:.2g}"
+        )
 
 
 if __name__ == "__main__":

@@ -1,19 +1,22 @@
-"""Steps per second of a plant, side by side with the ways that vessel simulators usually step one, in one process on one thread.
+"""Steps per second of a plant, side by side with the ways that vessel simulators usually step one,
+in one process on one thread.
 
-    python scripts/bench/plants.py [--steps 200] [--step 0.05] [--repeats 3] [--vessels wam_v_cal,wam_v_vrx]
+    python scripts/bench/plants.py [--steps 200] [--step 0.05] [--repeats 3] [--vessels
+    wam_v_cal,wam_v_vrx]
 
 For each batch of trajectories (1, 64, 1024), thousands of trajectory steps per second of
 
     residnet         Rollout of PlantDynamics with all exogenous inputs (RK4)
     calm             the same without exogenous inputs, which the plain model does not have either
     traced           the same, its step recorded as TorchScript
-    solve_ivp        scipy.integrate.solve_ivp, RK45 with its default tolerances, max_step = step, held inputs, a trajectory at a time
-    own RK4          the plain model stepped by its own RK4 loop, a trajectory at a time
-    own Euler        likewise by explicit Euler
+    solve_ivp        scipy.integrate.solve_ivp, RK45 with its default tolerances, max_step = step,
+    held inputs, a trajectory at a time own RK4          the plain model stepped by its own RK4
+    loop, a trajectory at a time own Euler        likewise by explicit Euler
 
-The plain model is the same vessel in NumPy as textbooks write it: matrices M, C(nu), D(nu), R(psi) built at every call. Trajectories of
-the three that go one by one are timed on a few of them, since their time grows with the number. All of them end at the same place,
-which is checked. Times are of the processor, on one thread, so that other programs disturb them less. The ratios are what matters:
+The plain model is the same vessel in NumPy as textbooks write it: matrices M, C(nu), D(nu), R(psi)
+built at every call. Trajectories of the three that go one by one are timed on a few of them, since
+their time grows with the number. All of them end at the same place, which is checked. Times are of
+the processor, on one thread, so that other programs disturb them less. The ratios are what matters:
 every repetition measures all candidates in turn, and the best of each counts.
 """
 
@@ -51,12 +54,20 @@ class PlainVessel:
     def __init__(self, vessel: FossenConfig) -> None:
         body, added, self.damping = vessel.rigid_body, vessel.added_mass, vessel.damping
         if not isinstance(vessel.actuators, DifferentialThrustConfig):
-            raise UsageError(f"{vessel.name}: the plain model knows two thrusters (differential_thrust) only")
+            raise UsageError(
+                f"{vessel.name}: the plain model knows two thrusters (differential_thrust) only"
+            )
         self.act = vessel.actuators
         m, arm = body.m.value, body.m.value * body.x_G.value
-        self.m11, self.m22, self.m33 = m - added.X_udot.value, m - added.Y_vdot.value, body.I_z.value - added.N_rdot.value
+        self.m11, self.m22, self.m33 = (
+            m - added.X_udot.value,
+            m - added.Y_vdot.value,
+            body.I_z.value - added.N_rdot.value,
+        )
         self.m23, self.m32 = arm - added.Y_rdot.value, arm - added.N_vdot.value
-        self.inverse = np.linalg.inv(np.array([[self.m11, 0, 0], [0, self.m22, self.m23], [0, self.m32, self.m33]]))
+        self.inverse = np.linalg.inv(
+            np.array([[self.m11, 0, 0], [0, self.m22, self.m23], [0, self.m32, self.m33]])
+        )
 
     def coefficient(self, axis: str, term: str) -> float:
         row = getattr(self.damping, axis)
@@ -93,7 +104,9 @@ class PlainVessel:
                 [0.0, self.n[0] * abs(u), self.n[1] + self.n[2] * abs(r)],
             ]
         )
-        rotation = np.array([[np.cos(psi), -np.sin(psi), 0.0], [np.sin(psi), np.cos(psi), 0.0], [0.0, 0.0, 1.0]])
+        rotation = np.array(
+            [[np.cos(psi), -np.sin(psi), 0.0], [np.sin(psi), np.cos(psi), 0.0], [0.0, 0.0, 1.0]]
+        )
         nu_dot = self.inverse @ (tau - coriolis @ nu - drag @ nu)
         return np.concatenate((rotation @ nu, nu_dot))
 
@@ -131,7 +144,9 @@ def rolled(model: Dynamics, x: torch.Tensor, w: torch.Tensor) -> torch.Tensor:
         return Rollout(model)(x, w, x[:, :0])[0]
 
 
-def one_by_one(single: Callable[..., np.ndarray], plain: PlainVessel, x: np.ndarray, n: np.ndarray, dt: float) -> list[np.ndarray]:
+def one_by_one(
+    single: Callable[..., np.ndarray], plain: PlainVessel, x: np.ndarray, n: np.ndarray, dt: float
+) -> list[np.ndarray]:
     return [single(plain, x, revolutions, dt) for revolutions in n]
 
 
@@ -148,25 +163,52 @@ def measure(name: str, steps: int, dt: float, repeats: int) -> None:
         raise UsageError(f"{name}: the plain model is a 3-DOF vessel of kind fossen")
     plain = PlainVessel(vessel).prepared()
     full, calm = vessel.build(), vessel.build().in_calm_water()
-    models = {"residnet": PlantDynamics(full, dt), "calm": PlantDynamics(calm, dt), "traced": TracedPlantDynamics(calm, dt)}
+    models = {
+        "residnet": PlantDynamics(full, dt),
+        "calm": PlantDynamics(calm, dt),
+        "traced": TracedPlantDynamics(calm, dt),
+    }
     steer = torch.linspace(-0.5, 0.5, max(BATCHES), dtype=torch.float64)
-    turning = torch.sign(torch.sin(2 * torch.pi * torch.arange(steps, dtype=torch.float64) * dt / 8.0 + 1e-9))
-    demand = full.demand(torch.full((max(BATCHES), steps), 0.6, dtype=torch.float64), steer[:, None] * turning)
+    turning = torch.sign(
+        torch.sin(2 * torch.pi * torch.arange(steps, dtype=torch.float64) * dt / 8.0 + 1e-9)
+    )
+    demand = full.demand(
+        torch.full((max(BATCHES), steps), 0.6, dtype=torch.float64), steer[:, None] * turning
+    )
     x = torch.zeros(max(BATCHES), 8, dtype=torch.float64)
     x[:, 3] = 1.0
     # the plain model has no shafts: it plays back the revolutions that the plant's shafts had
     n = rolled(models["calm"], x, demand)[:, :-1, 6:8].numpy()
-    w = {"residnet": torch.cat((demand, torch.zeros(*demand.shape[:2], len(full.inputs) - 2, dtype=torch.float64)), dim=-1)}
+    w = {
+        "residnet": torch.cat(
+            (demand, torch.zeros(*demand.shape[:2], len(full.inputs) - 2, dtype=torch.float64)),
+            dim=-1,
+        )
+    }
     w |= {"calm": demand, "traced": demand}
     singles = {"solve_ivp": by_solve_ivp, "own RK4": by_own_rk4, "own Euler": by_own_euler}
     start = x[0, :6].numpy()
-    ends = {kind: rolled(model, x[:2], w[kind][:2])[0, -1, :6].numpy() for kind, model in models.items()}
+    ends = {
+        kind: rolled(model, x[:2], w[kind][:2])[0, -1, :6].numpy() for kind, model in models.items()
+    }
     ends |= {kind: single(plain, start, n[0], dt) for kind, single in singles.items()}
-    for kind, allowed in (("calm", 1e-9), ("traced", 1e-9), ("own RK4", 1e-9), ("solve_ivp", 0.05), ("own Euler", 0.5)):
+    for kind, allowed in (
+        ("calm", 1e-9),
+        ("traced", 1e-9),
+        ("own RK4", 1e-9),
+        ("solve_ivp", 0.05),
+        ("own Euler", 0.5),
+    ):
         difference = float(np.abs(ends[kind] - ends["residnet"]).max())
         if difference > allowed:
-            raise SystemExit(f"{name}: {kind} ends {difference:.2g} away from residnet (allowed {allowed:g}): not the same model")
-    print(f"{name}, {steps} steps of {dt:g} s; thousand trajectory steps per second, and times solve_ivp")
+            raise SystemExit(
+                f"{name}: {kind} ends {difference:.2g} away from residnet (allowed {allowed:g}):"
+                " not the same model"
+            )
+    print(
+        f"{name}, {steps} steps of {dt:g} s; thousand trajectory steps per second, and times"
+        " solve_ivp"
+    )
     print(f"{'batch':>6} " + " ".join(f"{kind:>18}" for kind in (*models, *singles)))
     for batch in BATCHES:
         some = min(batch, ONE_BY_ONE)
@@ -180,11 +222,18 @@ def measure(name: str, steps: int, dt: float, repeats: int) -> None:
             for kind, (call, trajectories) in calls.items():
                 best[kind] = min(best[kind], seconds(call) / trajectories)
         rate = {kind: steps / spent / 1e3 for kind, spent in best.items()}
-        print(f"{batch:>6} " + " ".join(f"{value:9.2f} ({value / rate['solve_ivp']:5.1f}x)" for value in rate.values()))
+        print(
+            f"{batch:>6} "
+            + " ".join(
+                f"{value:9.2f} ({value / rate['solve_ivp']:5.1f}x)" for value in rate.values()
+            )
+        )
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--steps", type=int, default=200)
     parser.add_argument("--step", type=float, default=0.05, help="seconds")
     parser.add_argument("--repeats", type=int, default=3)

@@ -1,4 +1,5 @@
-"""Import of a large csv table through a channel map, beside plain pandas.read_csv of the same file, in one process.
+"""Import of a large csv table through a channel map, beside plain pandas.read_csv of the same file,
+in one process.
 
 python scripts/bench/readers.py [ROWS] [CHANNELS]
 """
@@ -41,11 +42,16 @@ def shortest(call: Callable[[], object], repeats: int = 3) -> float:
 
 def main() -> None:
     """Print both times and their ratio."""
-    rows, channels = int(sys.argv[1]) if len(sys.argv) > 1 else 1_000_000, int(sys.argv[2]) if len(sys.argv) > 2 else 12
+    rows, channels = (
+        int(sys.argv[1]) if len(sys.argv) > 1 else 1_000_000,
+        (int(sys.argv[2]) if len(sys.argv) > 2 else 12),
+    )
     config = {
         "kind": "csv",
         "time": {"column": "t"},
-        "channels": {n: {"column": n, "unit": u} for n, u in zip(NAMES[:channels], UNITS, strict=False)},
+        "channels": {
+            n: {"column": n, "unit": u} for n, u in zip(NAMES[:channels], UNITS, strict=False)
+        },
     }
     reader = validate(config, ReaderConfig, "benchmark").build()
     with tempfile.TemporaryDirectory() as folder:
@@ -53,7 +59,10 @@ def main() -> None:
         written(path, rows, channels)
         plain = shortest(lambda: pd.read_csv(path))
         ours = shortest(lambda: reader.read(path))
-    print(f"{rows} rows x {channels} channels: pandas.read_csv {plain:.2f} s, import to a canonical log {ours:.2f} s, ratio {ours / plain:.2f}")
+    print(
+        f"{rows} rows x {channels} channels: pandas.read_csv {plain:.2f} s, import to a canonical"
+        f" log {ours:.2f} s, ratio {ours / plain:.2f}"
+    )
 
 
 if __name__ == "__main__":

@@ -1,18 +1,24 @@
 """Equations recovered from simulated logs: how often, how exactly, and how fast, on one thread.
 
-    python scripts/bench/symbolic.py [--parts exact,steps,spring,noise,velocities,delay] [--designs 10]
+    python scripts/bench/symbolic.py [--parts exact,steps,spring,noise,velocities,delay] [--designs
+    10]
 
-    exact        all six equations of Odin (document 000 eqs. (6.6)-(6.8), (6.21)-(6.23)) from random multi-sine designs, 300 s at 10 Hz,
+    exact        all six equations of Odin (document 000 eqs. (6.6)-(6.8), (6.21)-(6.23)) from
+    random multi-sine designs, 300 s at 10 Hz,
                  accelerations given; a coefficient counts within 1 %
-    steps        the three water-jet equations from the golden runs jetA* (two-level steps and a ramp); needs RESIDNET_GOLDEN
-    spring       the mass-spring-damper (5.13), 50 s at 10 Hz, without and with noise of amplitude 0.1 on the acceleration
-    noise        the force model with noise of 0.3 standard deviations on the accelerations, on records of several lengths and rates; t is what
-                 the smallest true term, linear drag in surge, is worth in standard errors when the structure is known (Cramer-Rao bound);
-                 "possible" is how often an efficient estimate of that term alone would pass plain BIC, the structure beside it given
-    velocities   the force model from velocities alone with 1 % noise, forces in steps: estimators side by side
-    delay        a delay of 0.5 s, 10 % noise on all channels: one profile from moments, and a regression for every shift as the document does
+    steps        the three water-jet equations from the golden runs jetA* (two-level steps and a
+    ramp); needs RESIDNET_GOLDEN spring       the mass-spring-damper (5.13), 50 s at 10 Hz, without
+    and with noise of amplitude 0.1 on the acceleration noise        the force model with noise of
+    0.3 standard deviations on the accelerations, on records of several lengths and rates; t is what
+                 the smallest true term, linear drag in surge, is worth in standard errors when the
+                 structure is known (Cramer-Rao bound); "possible" is how often an efficient
+                 estimate of that term alone would pass plain BIC, the structure beside it given
+    velocities   the force model from velocities alone with 1 % noise, forces in steps: estimators
+    side by side delay        a delay of 0.5 s, 10 % noise on all channels: one profile from
+    moments, and a regression for every shift as the document does
 
-Truth and designs stand in tests/heads/made_odin.py. Times are of the wall, of the terms' values, factorisation and search together.
+Truth and designs stand in tests/heads/made_odin.py. Times are of the wall, of the terms' values,
+factorisation and search together.
 """
 
 from __future__ import annotations
@@ -46,22 +52,40 @@ from residnet.regression.sparse import SearchConfig, find, reduce
 
 Log = dict[str, np.ndarray]
 Truth = Mapping[str, Mapping[str, float]]
-FORCES, JETS, SPRING = ("u", "v", "r", "tau_x", "tau_y", "tau_n"), ("u", "v", "r", "rpm", "nozzle"), ("x", "w", "tau")
+FORCES, JETS, SPRING = (
+    ("u", "v", "r", "tau_x", "tau_y", "tau_n"),
+    ("u", "v", "r", "rpm", "nozzle"),
+    ("x", "w", "tau"),
+)
 FORCE = CandidatesConfig(input_degree=2, coupling=("u", "v", "r"))
-JET = CandidatesConfig(inputs=("rpm",), input_degree=2, coupling=("u",), coupling_degree=2, angles=("nozzle",))
+JET = CandidatesConfig(
+    inputs=("rpm",), input_degree=2, coupling=("u",), coupling_degree=2, angles=("nozzle",)
+)
 MSD = CandidatesConfig(motions=("x", "w"), input_degree=2, coupling=("x", "w"))
 
 
-def regress(log: Log, names: tuple[str, ...], space: CandidatesConfig, targets: np.ndarray) -> tuple[list[dict[str, float]], list[Any], float]:
+def regress(
+    log: Log, names: tuple[str, ...], space: CandidatesConfig, targets: np.ndarray
+) -> tuple[list[dict[str, float]], list[Any], float]:
     """Coefficients of each target, the equations, and the seconds that it took."""
     started = time.perf_counter()
     candidates = space.candidates(names)
     z = torch.from_numpy(np.stack([log[name] for name in names], axis=1))
     values = TermLibrary([c.term for c in candidates], names)(z).numpy()
-    reduced = reduce(values, targets, [c.term for c in candidates], [c.degree for c in candidates], effort=[c.effort for c in candidates])
+    reduced = reduce(
+        values,
+        targets,
+        [c.term for c in candidates],
+        [c.degree for c in candidates],
+        effort=[c.effort for c in candidates],
+    )
     equations = [find(reduced, k, SearchConfig())[0] for k in range(targets.shape[1])]
     seconds = time.perf_counter() - started
-    return [dict(zip(e.terms, map(float, e.values), strict=True)) for e in equations], equations, seconds
+    return (
+        [dict(zip(e.terms, map(float, e.values), strict=True)) for e in equations],
+        equations,
+        seconds,
+    )
 
 
 def accelerations(log: Log) -> np.ndarray:
@@ -69,7 +93,9 @@ def accelerations(log: Log) -> np.ndarray:
 
 
 def right(found: Mapping[str, float], truth: Mapping[str, float], within: float = np.inf) -> bool:
-    return set(found) == set(truth) and all(abs(found[term] / value - 1) <= within for term, value in truth.items())
+    return set(found) == set(truth) and all(
+        abs(found[term] / value - 1) <= within for term, value in truth.items()
+    )
 
 
 def exact(count: int) -> None:
@@ -79,30 +105,60 @@ def exact(count: int) -> None:
         b, _, seconds_b = regress(jet, JETS, JET, accelerations(jet))
         pairs = list(zip(a + b, [*FORCE_TRUTH.values(), *JET_TRUTH.values()], strict=True))
         good += all(right(found, truth, 0.01) for found, truth in pairs)
-        worst = max([worst, *(abs(found.get(t, 0.0) / v - 1) for found, truth in pairs for t, v in truth.items())])
+        worst = max(
+            [
+                worst,
+                *(
+                    abs(found.get(t, 0.0) / v - 1)
+                    for found, truth in pairs
+                    for t, v in truth.items()
+                ),
+            ]
+        )
         times.append(seconds_a + seconds_b)
-    print(f"exact       all six equations right in {good} of {count} designs; largest coefficient error {100 * worst:.1e} %;")
-    print(f"            all six together {np.median(times):.2f} s (median), {max(times):.2f} s (slowest)")
+    print(
+        f"exact       all six equations right in {good} of {count} designs; largest coefficient"
+        f" error {100 * worst:.1e} %;"
+    )
+    print(
+        f"            all six together {np.median(times):.2f} s (median), {max(times):.2f} s"
+        " (slowest)"
+    )
 
 
 def steps(_: int) -> None:
-    for file in sorted(Path(os.environ.get("RESIDNET_GOLDEN", "/nowhere")).glob("g2_odin/jetA*.csv.gz")):
+    for file in sorted(
+        Path(os.environ.get("RESIDNET_GOLDEN", "/nowhere")).glob("g2_odin/jetA*.csv.gz")
+    ):
         frame = pd.read_csv(file)
         log = {name: np.array(frame[name]) for name in frame}
-        found, equations, seconds = regress(log, JETS, JET, np.stack([log["du"], log["dv"], log["dr"]], axis=1))
+        found, equations, seconds = regress(
+            log, JETS, JET, np.stack([log["du"], log["dv"], log["dr"]], axis=1)
+        )
         good = [right(f, truth, 0.01) for f, truth in zip(found, JET_TRUTH.values(), strict=True)]
         shares = ", ".join(f"{e.share:.0e}" for e in equations)
-        print(f"steps       {file.name}: {sum(good)} of 3 equations right, in {seconds:.2f} s; unexplained {shares}")
+        print(
+            f"steps       {file.name}: {sum(good)} of 3 equations right, in {seconds:.2f} s;"
+            f" unexplained {shares}"
+        )
 
 
 def spring(_: int) -> None:
     log = msd_log()
     found, _, seconds = regress(log, SPRING, MSD, log["w_dot"][:, None])
-    print(f"spring      noise-free {'right' if right(found[0], MSD_TRUTH, 0.01) else 'WRONG'} in {1e3 * seconds:.1f} ms", end="; ")
-    noisy = [log["w_dot"] + 0.1 * np.random.default_rng(seed).uniform(-1, 1, len(log["t"])) for seed in range(20)]
+    print(
+        f"spring      noise-free {'right' if right(found[0], MSD_TRUTH, 0.01) else 'WRONG'} in"
+        f" {1e3 * seconds:.1f} ms",
+        end="; ",
+    )
+    noisy = [
+        log["w_dot"] + 0.1 * np.random.default_rng(seed).uniform(-1, 1, len(log["t"]))
+        for seed in range(20)
+    ]
     runs = [regress(log, SPRING, MSD, y[:, None]) for y in noisy]
     print(
-        f"amplitude 0.1: structure right in {sum(right(f[0], MSD_TRUTH) for f, _, _ in runs)} of 20, {1e3 * np.median([s for *_, s in runs]):.1f} ms"
+        f"amplitude 0.1: structure right in {sum(right(f[0], MSD_TRUTH) for f, _, _ in runs)} of"
+        f" 20, {1e3 * np.median([s for *_, s in runs]):.1f} ms"
     )
 
 
@@ -120,18 +176,27 @@ def noise(_: int) -> None:
         for number, log in enumerate(force_logs(15, *args)):
             y = accelerations(log)
             sigma = 0.3 * y.std(axis=0)
-            found, equations, seconds = regress(log, FORCES, FORCE, y + sigma * np.random.default_rng(number).normal(size=y.shape))
-            hits = np.array([right(f, truth) for f, truth in zip(found, FORCE_TRUTH.values(), strict=True)])
+            found, equations, seconds = regress(
+                log, FORCES, FORCE, y + sigma * np.random.default_rng(number).normal(size=y.shape)
+            )
+            hits = np.array(
+                [right(f, truth) for f, truth in zip(found, FORCE_TRUTH.values(), strict=True)]
+            )
             good, each = good + int(hits.all()), each + hits
             named += int("u" not in found[0] and "u" in equations[0].undecided)
-            own = np.stack([log["tau_x"], log["v"] * log["r"], log["u"], log["u"] * np.abs(log["u"])], axis=1)
+            own = np.stack(
+                [log["tau_x"], log["v"] * log["r"], log["u"], log["u"] * np.abs(log["u"])], axis=1
+            )
             worth.append(0.0101 / (sigma[0] * np.sqrt(np.linalg.inv(own.T @ own)[2, 2])))
             times.append(seconds)
-        print(f"noise       {label}: all three right in {good} of 15 (surge {each[0]}, sway {each[1]}, yaw {each[2]}), {np.median(times):.2f} s;")
+        print(
+            f"noise       {label}: all three right in {good} of 15 (surge {each[0]}, sway"
+            f" {each[1]}, yaw {each[2]}), {np.median(times):.2f} s;"
+        )
         possible = float(norm.sf(np.sqrt(np.log(len(log["t"]))) - np.array(worth)).sum())
         print(
-            f"            t of the weakest term {np.median(worth):.1f} (median), possible {possible:.1f} of 15; "
-            f"left out but named as undecided {named} times"
+            f"            t of the weakest term {np.median(worth):.1f} (median), possible"
+            f" {possible:.1f} of 15; left out but named as undecided {named} times"
         )
 
 
@@ -142,28 +207,48 @@ ESTIMATORS: dict[str, tuple[float, dict[str, Any]]] = {
     "weak form, 2 s": (0.0, {"kind": "weak", "window": "2 s"}),
     "weak form, 4 s": (0.0, {"kind": "weak", "window": "4 s"}),
     "instruments, 0.5 s behind": (0.0, {"kind": "instruments", "lag": "0.5 s"}),
-    "weak form 2 s, instruments 2 s behind": (0.0, {"kind": "instruments", "lag": "2 s", "window": "2 s"}),
+    "weak form 2 s, instruments 2 s behind": (
+        0.0,
+        {"kind": "instruments", "lag": "2 s", "window": "2 s"},
+    ),
 }
 
 
 def measured(log: Log, seed: int, window: float, *, masked: bool) -> Samples:
-    """Noisy velocities, differentiated in pieces that end at jumps of the inputs where these are masked."""
+    """Noisy velocities, differentiated in pieces that end at jumps of the inputs where these are
+    masked.
+    """
     random, step = np.random.default_rng(seed), float(log["t"][1])
-    nu = np.stack([log[name] + 0.01 * log[name].std() * random.normal(size=len(log["t"])) for name in "uvr"], axis=1)
+    nu = np.stack(
+        [log[name] + 0.01 * log[name].std() * random.normal(size=len(log["t"])) for name in "uvr"],
+        axis=1,
+    )
     forces = np.stack([log[name] for name in FORCES[3:]], axis=1)
     jumps = np.flatnonzero((np.diff(forces, axis=0) != 0).any(axis=1))
     bad = np.zeros(len(nu), dtype=bool)
     if masked:
         bad[jumps] = bad[jumps + 1] = True
     pieces = np.where(bad, -1, np.cumsum(np.append(0, np.diff(bad.astype(int)) != 0)))
-    smooth, rate, good = SavitzkyGolay(window=max(window, 3 * step), order=2).derive(nu, step, pieces)
+    smooth, rate, good = SavitzkyGolay(window=max(window, 3 * step), order=2).derive(
+        nu, step, pieces
+    )
     z = torch.from_numpy(np.concatenate((smooth, forces), axis=1)[good])
-    return Samples(z, torch.from_numpy(rate[good]), torch.zeros(len(z), dtype=torch.long), torch.from_numpy(log["t"][good]), ("made",), FORCES)
+    return Samples(
+        z,
+        torch.from_numpy(rate[good]),
+        torch.zeros(len(z), dtype=torch.long),
+        torch.from_numpy(log["t"][good]),
+        ("made",),
+        FORCES,
+    )
 
 
 def velocities(_: int) -> None:
     logs = [step_log(number, 900.0, 0.02, 15.0) for number in range(3)]
-    print("velocities  1 % noise, forces in steps of 15 s, 900 s at 50 Hz, three records: equations right of 9; largest coefficient error in %")
+    print(
+        "velocities  1 % noise, forces in steps of 15 s, 900 s at 50 Hz, three records: equations"
+        " right of 9; largest coefficient error in %"
+    )
     print(f"            {'':40s}{'jumps masked':>22s}{'not masked':>22s}{'seconds':>9s}")
     for label, (window, estimator) in ESTIMATORS.items():
         cells, taken = [], []
@@ -171,15 +256,21 @@ def velocities(_: int) -> None:
             good, errors = 0, []
             for number, log in enumerate(logs):
                 data = measured(log, number, window, masked=masked)
-                head = SymbolicConfig.model_validate({"candidates": FORCE.model_dump(), "estimator": estimator}).build(FORCES)
+                head = SymbolicConfig.model_validate(
+                    {"candidates": FORCE.model_dump(), "estimator": estimator}
+                ).build(FORCES)
                 head.calibrate(data)
                 started = time.perf_counter()
                 notes = head.solve(data)
                 taken.append(time.perf_counter() - started)
                 for axis, truth in FORCE_TRUTH.items():
-                    found = {c["term"]: c["value"] for c in notes["coefficients"] if c["axis"] == axis}
+                    found = {
+                        c["term"]: c["value"] for c in notes["coefficients"] if c["axis"] == axis
+                    }
                     good += right(found, truth)
-                    errors += [100 * abs(found.get(term, 0.0) / value - 1) for term, value in truth.items()]
+                    errors += [
+                        100 * abs(found.get(term, 0.0) / value - 1) for term, value in truth.items()
+                    ]
             cells.append(f"{good} of 9, {max(errors):6.1f}")
         print(f"            {label:40s}{cells[0]:>22s}{cells[1]:>22s}{np.median(taken):9.2f}")
 
@@ -191,9 +282,15 @@ def delay(_: int) -> None:
     delay_profile(one[:, None], one[:, None], one, np.zeros(len(one), dtype=int), longest)
     for seed in range(20):
         random = np.random.default_rng(seed)
-        z = {name: log[name] + 0.1 * np.ptp(log[name]) * random.uniform(-1, 1, len(one)) for name in (*SPRING, "w_dot")}
+        z = {
+            name: log[name] + 0.1 * np.ptp(log[name]) * random.uniform(-1, 1, len(one))
+            for name in (*SPRING, "w_dot")
+        }
         started = time.perf_counter()
-        held, moved = np.stack((z["x"], z["w"], one), axis=1), np.stack((one, one, z["tau"]), axis=1)
+        held, moved = (
+            np.stack((z["x"], z["w"], one), axis=1),
+            np.stack((one, one, z["tau"]), axis=1),
+        )
         profile = delay_profile(held, moved, z["w_dot"], np.zeros(len(one), dtype=int), longest)
         middle = time.perf_counter()
         errors = [_refit(z, shift, longest) for shift in range(longest + 1)]
@@ -204,30 +301,53 @@ def delay(_: int) -> None:
         same = max(same, float(np.abs(profile.rss / errors - 1).max()))
     fast, slow = (1e3 * np.median(t) for t in times)
     count, ratio = longest + 1, slow / fast
-    print(f"delay       0.5 s found in {hits[0]} of 20 by the profile in {fast:.2f} ms, in {hits[1]} of 20 by {count} regressions in {slow:.2f} ms;")
+    print(
+        f"delay       0.5 s found in {hits[0]} of 20 by the profile in {fast:.2f} ms, in {hits[1]}"
+        f" of 20 by {count} regressions in {slow:.2f} ms;"
+    )
     print(f"            ratio {ratio:.1f}; residual sums of squares differ by {same:.0e} at most")
     started = time.perf_counter()
     for shift in range(longest + 1):
-        now = {"x": z["x"][longest:], "w": z["w"][longest:], "tau": z["tau"][longest - shift : len(one) - shift]}
+        now = {
+            "x": z["x"][longest:],
+            "w": z["w"][longest:],
+            "tau": z["tau"][longest - shift : len(one) - shift],
+        }
         regress(now, SPRING, MSD, z["w_dot"][longest:, None])
-    print(f"            the document's way, the whole search anew for each shift: {1e3 * (time.perf_counter() - started):.0f} ms")
+    print(
+        "            the document's way, the whole search anew for each shift:"
+        f" {1e3 * (time.perf_counter() - started):.0f} ms"
+    )
 
 
 def _refit(z: Log, shift: int, longest: int) -> float:
     end = len(z["x"])
-    x = np.stack((z["x"][longest:], z["w"][longest:], z["tau"][longest - shift : end - shift]), axis=1)
+    x = np.stack(
+        (z["x"][longest:], z["w"][longest:], z["tau"][longest - shift : end - shift]), axis=1
+    )
     left = z["w_dot"][longest:] - x @ np.linalg.lstsq(x, z["w_dot"][longest:], rcond=None)[0]
     return float(left @ left)
 
 
-PARTS: dict[str, Callable[[int], None]] = {"exact": exact, "steps": steps, "spring": spring, "noise": noise, "velocities": velocities, "delay": delay}
+PARTS: dict[str, Callable[[int], None]] = {
+    "exact": exact,
+    "steps": steps,
+    "spring": spring,
+    "noise": noise,
+    "velocities": velocities,
+    "delay": delay,
+}
 
 
 def main() -> None:
     """Read the options and print each part as it is done."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--parts", default=",".join(PARTS), help="which parts, separated by commas")
-    parser.add_argument("--designs", type=int, default=10, help="random designs of the part `exact`")
+    parser.add_argument(
+        "--designs", type=int, default=10, help="random designs of the part `exact`"
+    )
     options = parser.parse_args()
     torch.set_num_threads(1)
     for part in options.parts.split(","):

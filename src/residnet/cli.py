@@ -1,4 +1,5 @@
-"""The command line. Imports stay inside the commands: `residnet --help` must not wait for PyTorch."""
+"""The command line. Imports stay inside the commands: `residnet --help` must not wait for PyTorch.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +14,10 @@ from residnet.core.errors import ResidnetError
 
 app = typer.Typer(
     name="residnet",
-    help="Models of real vessels: an identified baseline, learned residuals, free-run validation, export for controllers.",
+    help=(
+        "Models of real vessels: an identified baseline, learned residuals, free-run validation,"
+        " export for controllers."
+    ),
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -22,7 +26,12 @@ app = typer.Typer(
 
 Overrides = Annotated[
     list[str] | None,
-    typer.Option("-s", "--set", metavar="KEY=VALUE", help="Override a key of the config, or take one away with ~KEY; may be repeated."),
+    typer.Option(
+        "-s",
+        "--set",
+        metavar="KEY=VALUE",
+        help="Override a key of the config, or take one away with ~KEY; may be repeated.",
+    ),
 ]
 RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a finished run.")]
 
@@ -31,8 +40,13 @@ RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a finish
 def run(
     config: Annotated[Path, typer.Argument(metavar="CONFIG", help="YAML file of one run.")],
     overrides: Overrides = None,
-    out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Run folder; runs/<name> where not given.")] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Continue an interrupted run in its folder.")] = False,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="DIR", help="Run folder; runs/<name> where not given."),
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Continue an interrupted run in its folder.")
+    ] = False,
 ) -> None:
     """Carry out a run: fit, evaluate, report and export, or any other task."""
     from residnet.tasks import load_task
@@ -57,11 +71,27 @@ def check(
 
 @app.command()
 def inspect(
-    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="Logs: canonical Parquet, or anything that the config's reader reads.")],
-    config: Annotated[Path | None, typer.Option("--config", metavar="CONFIG", help="A run whose channel map reads these logs.")] = None,
-    file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the findings to a file as JSON, too.")] = None,
+    logs: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="LOG...",
+            help="Logs: canonical Parquet, or anything that the config's reader reads.",
+        ),
+    ],
+    config: Annotated[
+        Path | None,
+        typer.Option(
+            "--config", metavar="CONFIG", help="A run whose channel map reads these logs."
+        ),
+    ] = None,
+    file: Annotated[
+        Path | None,
+        typer.Option("--json", metavar="FILE", help="Write the findings to a file as JSON, too."),
+    ] = None,
 ) -> None:
-    """Look at logs as a doctor would: clocks, gaps, jumps, frames, lags, copies, excitation. Exit 1 where a fit would be misled."""
+    """Look at logs as a doctor would: clocks, gaps, jumps, frames, lags, copies, excitation. Exit 1
+    where a fit would be misled.
+    """
     from residnet.tasks.inspection import inspect_logs
 
     if inspect_logs(logs, config, file):
@@ -71,9 +101,21 @@ def inspect(
 @app.command()
 def evaluate(
     folder: RunPath,
-    logs: Annotated[list[Path], typer.Option("--logs", metavar="PATH", help="Logs to predict: files or folders; may be repeated.")],
-    out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Where results go; RUN/external-<time> where not given.")] = None,
-    more: Annotated[list[Path] | None, typer.Argument(metavar="[PATH]...", help="Further logs.")] = None,
+    logs: Annotated[
+        list[Path],
+        typer.Option(
+            "--logs", metavar="PATH", help="Logs to predict: files or folders; may be repeated."
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", metavar="DIR", help="Where results go; RUN/external-<time> where not given."
+        ),
+    ] = None,
+    more: Annotated[
+        list[Path] | None, typer.Argument(metavar="[PATH]...", help="Further logs.")
+    ] = None,
 ) -> None:
     """Free-run a finished run's models on other logs."""
     from residnet.tasks.external import evaluate_external
@@ -85,12 +127,30 @@ def evaluate(
 @app.command()
 def export(
     folder: RunPath,
-    model: Annotated[str, typer.Option("--model", metavar="NAME", help="Name of the model; 'selected' for the one chosen on validation data.")],
+    model: Annotated[
+        str,
+        typer.Option(
+            "--model",
+            metavar="NAME",
+            help="Name of the model; 'selected' for the one chosen on validation data.",
+        ),
+    ],
     file_format: Annotated[
         Literal["torchscript", "feed_forward"],
-        typer.Option("--format", help="torchscript: the model; feed_forward: tau = F(nu_dot, nu) of a model in force space."),
+        typer.Option(
+            "--format",
+            help=(
+                "torchscript: the model; feed_forward: tau = F(nu_dot, nu) of a model in force"
+                " space."
+            ),
+        ),
     ] = "torchscript",
-    out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="File to write; RUN/exports/<model>.pt where not given.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", metavar="FILE", help="File to write; RUN/exports/<model>.pt where not given."
+        ),
+    ] = None,
 ) -> None:
     """Export a model for controllers, after a parity check."""
     from residnet.tasks.exporting import export_model
@@ -110,7 +170,10 @@ def report(folder: RunPath) -> None:
 
 @app.command(name="list")
 def list_names(
-    what: Annotated[Literal["vessels", "heads", "manoeuvres", "readers", "tasks", "baselines"], typer.Argument(help="What to list.")],
+    what: Annotated[
+        Literal["vessels", "heads", "manoeuvres", "readers", "tasks", "baselines"],
+        typer.Argument(help="What to list."),
+    ],
 ) -> None:
     """List what there is to choose from."""
     from residnet.tasks.catalogue import catalogue
@@ -126,14 +189,19 @@ def _limit_threads() -> None:
 
 
 def main() -> None:
-    """Entry point: one line on standard error and an exit code for every error that a user can cause."""
+    """Entry point: one line on standard error and an exit code for every error that a user can
+    cause.
+    """
     try:
         app(standalone_mode=True)
     except ResidnetError as error:
         print(f"residnet: {error}", file=sys.stderr)
         sys.exit(error.exit_code)
     except KeyboardInterrupt:
-        print("residnet: interrupted; continue the run with the same command and --resume", file=sys.stderr)
+        print(
+            "residnet: interrupted; continue the run with the same command and --resume",
+            file=sys.stderr,
+        )
         sys.exit(130)
     except BrokenPipeError:
         sys.exit(0)

@@ -1,4 +1,6 @@
-"""The given hull as a baseline: the accelerations of the plant, kept without its file, and exported."""
+"""The given hull as a baseline: the accelerations of the plant, kept without its file, and
+exported.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,9 @@ HULLS = ("milliampere", "odin_forces", "odin_jets", "wam_v_cal", "example_rudder
 
 def channels(seed: int = 0) -> torch.Tensor:
     generator = torch.Generator().manual_seed(seed)
-    return torch.randn(50, 6, dtype=torch.float64, generator=generator) * torch.tensor([2, 0.5, 0.4, 500, 200, 300], dtype=torch.float64)
+    return torch.randn(50, 6, dtype=torch.float64, generator=generator) * torch.tensor(
+        [2, 0.5, 0.4, 500, 200, 300], dtype=torch.float64
+    )
 
 
 def believed(**changes: object) -> ModelSpec:
@@ -41,7 +45,9 @@ def test_the_accelerations_of_the_plant(name: str) -> None:
     plant, z = load_vessel(name).build(), channels()
     assert isinstance(plant, HullPlant)
     baseline = BelievedConfig(vessel=name).build(NAMES)
-    torch.testing.assert_close(baseline(z), plant.acceleration(z[:, :3], z[:, :3], z[:, 3:]), rtol=1e-12, atol=1e-13)
+    torch.testing.assert_close(
+        baseline(z), plant.acceleration(z[:, :3], z[:, :3], z[:, 3:]), rtol=1e-12, atol=1e-13
+    )
 
 
 def test_the_factor_is_that_of_the_matrices() -> None:
@@ -50,12 +56,21 @@ def test_the_factor_is_that_of_the_matrices() -> None:
     half = load_vessel("milliampere_half").build()
     assert isinstance(half, HullPlant)
     baseline = BelievedConfig(vessel="milliampere", scale=0.5).build(NAMES)
-    torch.testing.assert_close(baseline(z), half.acceleration(z[:, :3], z[:, :3], z[:, 3:]), rtol=1e-12, atol=1e-13)
+    torch.testing.assert_close(
+        baseline(z), half.acceleration(z[:, :3], z[:, :3], z[:, 3:]), rtol=1e-12, atol=1e-13
+    )
     coasting = z * torch.tensor([1, 1, 1, 0, 0, 0], dtype=torch.float64)
-    torch.testing.assert_close(baseline(coasting), BelievedConfig(vessel="milliampere").build(NAMES)(coasting), rtol=1e-12, atol=1e-13)
+    torch.testing.assert_close(
+        baseline(coasting),
+        BelievedConfig(vessel="milliampere").build(NAMES)(coasting),
+        rtol=1e-12,
+        atol=1e-13,
+    )
 
 
-def test_a_stored_model_needs_no_vessel_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stored_model_needs_no_vessel_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     copy = tmp_path / "mine.yaml"
     copy.write_text(vessel_files()["milliampere"].read_text())
     spec = believed(vessel=str(copy))
@@ -78,17 +93,28 @@ def test_export(tmp_path: Path) -> None:
     assert json.loads(extra["card.json"])["baseline"]["kind"] == "believed"
     x, w = torch.tensor([[0.0, 0, 0.3, 1.0, 0.1, 0.05]]), torch.tensor([[200.0, 10, -30]])
     after = module.step(x, w, module.initial_state(1))[0]
-    torch.testing.assert_close(after.double(), spec.build().step(x.double(), w.double(), x[:, :0].double())[0], rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(
+        after.double(),
+        spec.build().step(x.double(), w.double(), x[:, :0].double())[0],
+        rtol=1e-5,
+        atol=1e-6,
+    )
 
 
 def test_forces_made_by_thrusters() -> None:
-    """With thrusters the revolutions are the inputs, and the channels of force are made from them."""
+    """With thrusters the revolutions are the inputs, and the channels of force are made from them.
+    """
     signals = SignalsConfig(inputs=("n_port", "n_stbd"), forces="wam_v_cal").build()
-    baseline, plant = BelievedConfig(vessel="wam_v_cal").build(signals.names), load_vessel("wam_v_cal").build()
+    baseline, plant = (
+        BelievedConfig(vessel="wam_v_cal").build(signals.names),
+        load_vessel("wam_v_cal").build(),
+    )
     x, w = torch.randn(5, 6, dtype=torch.float64), torch.randn(5, 2, dtype=torch.float64) * 20
     full = torch.zeros(5, len(plant.inputs), dtype=torch.float64)
     rate = plant.rate(torch.cat((x, w), dim=1), full)[:, 3:6]
-    torch.testing.assert_close(baseline(signals(x, signals.prepare(w))), rate, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(
+        baseline(signals(x, signals.prepare(w))), rate, rtol=1e-12, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize(

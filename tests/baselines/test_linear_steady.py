@@ -31,8 +31,17 @@ def trials(settled: float = 400.0, noise: float = 0.0) -> Samples:
     for k in range(2):
         square = np.sign(np.sin(2 * np.pi * time / (20 + 7 * k)))
         parts.append(("zigzag", np.stack((np.full(steps, 300.0), 250 * square), axis=1)))
-        parts.append(("three_two_one_one", np.stack((np.full(steps, 200.0), 150 * np.sign(np.sin(0.9 * time + k**2) + 0.3)), axis=1)))
-        parts.append(("acceleration_deceleration", np.stack((300 + 200 * square, np.zeros(steps)), axis=1)))
+        parts.append(
+            (
+                "three_two_one_one",
+                np.stack(
+                    (np.full(steps, 200.0), 150 * np.sign(np.sin(0.9 * time + k**2) + 0.3)), axis=1
+                ),
+            )
+        )
+        parts.append(
+            ("acceleration_deceleration", np.stack((300 + 200 * square, np.zeros(steps)), axis=1))
+        )
     block = np.zeros((6, 6))
     block[:3, :3], block[:3, 3:5], block[:3, 5] = A, B, C
     step = expm(block * dt)
@@ -59,16 +68,25 @@ def test_a_linear_system_is_found_exactly() -> None:
     found = by_name(config.fit(baseline, trials()))
     truth = {("u", "u"): A[0, 0], ("u", "tau_x"): B[0, 0], ("u", "1"): C[0]}
     for i, axis in ((1, "v"), (2, "r")):
-        truth |= {(axis, "v"): A[i, 1], (axis, "r"): A[i, 2], (axis, "tau_n"): B[i, 1], (axis, "1"): C[i]}
+        truth |= {
+            (axis, "v"): A[i, 1],
+            (axis, "r"): A[i, 2],
+            (axis, "tau_n"): B[i, 1],
+            (axis, "1"): C[i],
+        }
     assert set(found) == set(truth)
     for key, value in truth.items():
         assert found[key] == pytest.approx(value, rel=1e-4, abs=1e-8), key
     z = torch.from_numpy(np.random.default_rng(1).normal(size=(20, 5)) * [1, 0.3, 0.3, 300, 200])
-    np.testing.assert_allclose(baseline(z), z[:, :3].numpy() @ A.T + z[:, 3:].numpy() @ B.T + C, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(
+        baseline(z), z[:, :3].numpy() @ A.T + z[:, 3:].numpy() @ B.T + C, rtol=1e-4, atol=1e-6
+    )
 
 
 def test_steady_states_of_the_fit_are_phi_tau_plus_bias() -> None:
-    """A Phi + B = 0 and A Phi_bias + C = 0: the baseline stands still exactly where the constant manoeuvres settled."""
+    """A Phi + B = 0 and A Phi_bias + C = 0: the baseline stands still exactly where the constant
+    manoeuvres settled.
+    """
     config = LinearSteadyConfig(settled=400.0)
     baseline = config.build(NAMES)
     config.fit(baseline, trials())
@@ -92,7 +110,15 @@ def test_errors_of_the_fit_cover_the_truth() -> None:
     config = LinearSteadyConfig(settled=400.0)
     for entry in config.fit(config.build(NAMES), trials(noise=0.02)):
         i = "uvr".index(entry.axis[0])
-        truth = C[i] if entry.term == "1" else A[i, "uvr".index(entry.term)] if entry.term in "uvr" else B[i, ("tau_x", "tau_n").index(entry.term)]
+        truth = (
+            C[i]
+            if entry.term == "1"
+            else (
+                A[i, "uvr".index(entry.term)]
+                if entry.term in "uvr"
+                else B[i, ("tau_x", "tau_n").index(entry.term)]
+            )
+        )
         assert abs(entry.value - truth) < 5 * entry.error + 1e-9
 
 

@@ -14,11 +14,18 @@ from residnet.physics.mmg import PARAMETERS, usual_beliefs
 NAMES = ("u", "v", "r", "n", "delta")
 TANKER = {
     "kind": "mmg",
-    "hull": {"length": "7 m", "beam": "1.27 m", "draught": "0.46 m", "mass": "3270 kg", "x_G": "0.244 m"},
+    "hull": {
+        "length": "7 m",
+        "beam": "1.27 m",
+        "draught": "0.46 m",
+        "mass": "3270 kg",
+        "x_G": "0.244 m",
+    },
     "propeller": {"diameter": "0.216 m", "thrust": [0.2931, -0.2753, -0.1385]},
     "rudder": {"area": 0.0539, "aspect": 1.827, "race": 0.626},
 }
-# KVLCC2 as Yasukawa and Yoshimura (2015) print it, tables 3 and 4; their flow straightening is the other way round in sign of the drift
+# KVLCC2 as Yasukawa and Yoshimura (2015) print it, tables 3 and 4; their flow straightening is the
+# other way round in sign of the drift
 PUBLISHED = {
     "m_x": 0.022, "m_y": 0.223, "J_z": 0.011, "R_0": 0.022, "X_vv": -0.040, "X_vr": 0.002, "X_rr": 0.011, "X_vvvv": 0.771,
     "Y_v": -0.315, "Y_r": 0.083, "Y_vvv": -1.607, "Y_vvr": 0.379, "Y_vrr": -0.391, "Y_rrr": 0.008,
@@ -43,19 +50,33 @@ def channels(rows: int, seed: int = 0) -> Tensor:
 
 
 def test_the_published_tanker_turns_as_published() -> None:
-    """35 degrees of rudder: simulated advance, tactical diameter and steady speed of Yasukawa and Yoshimura (2015), within their figures' reading."""
+    """35 degrees of rudder: simulated advance, tactical diameter and steady speed of Yasukawa and
+    Yoshimura (2015), within their figures' reading.
+    """
     baseline = published()
 
     def rate(t: float, y: np.ndarray) -> list[float]:
         x, _, psi, u, v, r = y.tolist()
         del x
         with torch.no_grad():
-            change = baseline(torch.tensor([u, v, r, 10.4, math.radians(min(15.8 * t, 35.0))], dtype=torch.float64)).tolist()
-        return [u * math.cos(psi) - v * math.sin(psi), u * math.sin(psi) + v * math.cos(psi), r, *change]
+            change = baseline(
+                torch.tensor(
+                    [u, v, r, 10.4, math.radians(min(15.8 * t, 35.0))], dtype=torch.float64
+                )
+            ).tolist()
+        return [
+            u * math.cos(psi) - v * math.sin(psi),
+            u * math.sin(psi) + v * math.cos(psi),
+            r,
+            *change,
+        ]
 
     path = solve_ivp(rate, (0, 220), [0, 0, 0, 1.179, 0, 0], max_step=0.5, rtol=1e-8)
     heading = path.y[2]
-    advance, diameter = path.y[0][np.argmax(heading >= math.pi / 2)] / 7.0, path.y[1][np.argmax(heading >= math.pi)] / 7.0
+    advance, diameter = (
+        path.y[0][np.argmax(heading >= math.pi / 2)] / 7.0,
+        path.y[1][np.argmax(heading >= math.pi)] / 7.0,
+    )
     assert advance == pytest.approx(3.2, abs=0.15)
     assert diameter == pytest.approx(3.2, abs=0.2)
     assert math.hypot(path.y[3][-1], path.y[4][-1]) / 1.179 == pytest.approx(0.34, abs=0.06)
@@ -66,16 +87,25 @@ def test_a_symmetric_ship_mirrors() -> None:
     z = channels(50)
     mirrored = z * torch.tensor([1.0, -1.0, -1.0, 1.0, -1.0], dtype=torch.float64)
     with torch.no_grad():
-        torch.testing.assert_close(baseline(mirrored), baseline(z) * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
+        torch.testing.assert_close(
+            baseline(mirrored), baseline(z) * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
+        )
 
 
 def test_signs_and_resistance() -> None:
     baseline = published()
     with torch.no_grad():
-        ahead, starboard, coasting = baseline(torch.tensor([[0.5, 0, 0, 10.0, 0], [1.0, 0, 0, 10.0, 0.3], [1.0, 0, 0, 0.0, 0]], dtype=torch.float64))
+        ahead, starboard, coasting = baseline(
+            torch.tensor(
+                [[0.5, 0, 0, 10.0, 0], [1.0, 0, 0, 10.0, 0.3], [1.0, 0, 0, 0.0, 0]],
+                dtype=torch.float64,
+            )
+        )
         still = baseline(torch.zeros(1, 5, dtype=torch.float64))
     assert ahead[0] > 0
-    assert starboard[2] > 0 > starboard[1], "a rudder to starboard turns to starboard and pushes the stern to port"
+    assert starboard[2] > 0 > starboard[1], (
+        "a rudder to starboard turns to starboard and pushes the stern to port"
+    )
     assert coasting[0] < 0
     assert float(still.abs().max()) < 1e-6
 
@@ -83,7 +113,13 @@ def test_signs_and_resistance() -> None:
 def test_sensitivities_are_those_of_forward_differentiation() -> None:
     baseline, z = built(), channels(7)
     theta = baseline.theta.detach()
-    exact = torch.stack([torch.func.jvp(lambda t: baseline.forces(z, t), (theta,), (d,))[1] for d in torch.eye(len(PARAMETERS)).double()], dim=-1)
+    exact = torch.stack(
+        [
+            torch.func.jvp(lambda t: baseline.forces(z, t), (theta,), (d,))[1]
+            for d in torch.eye(len(PARAMETERS)).double()
+        ],
+        dim=-1,
+    )
     torch.testing.assert_close(baseline.sensitivity(z), exact, rtol=1e-6, atol=1e-7)
 
 
@@ -97,7 +133,9 @@ def test_accelerations_of_a_known_ship_move_the_beliefs_to_it() -> None:
     z = channels(4000, 3)
     with torch.no_grad():
         target = truth(z) + 1e-5 * torch.from_numpy(np.random.default_rng(4).normal(size=(4000, 3)))
-    samples = Samples(z, target, torch.zeros(4000, dtype=torch.long), torch.arange(4000) * 0.1, ("zigzag",), NAMES)
+    samples = Samples(
+        z, target, torch.zeros(4000, dtype=torch.long), torch.arange(4000) * 0.1, ("zigzag",), NAMES
+    )
     baseline = config.build(NAMES)
     table = {c.term: c for c in config.fit(baseline, samples)}
     fresh = channels(200, 5)
@@ -127,4 +165,6 @@ def test_it_runs_as_torchscript() -> None:
     baseline, z = built(), channels(5)
     with torch.no_grad():
         torch.testing.assert_close(torch.jit.script(baseline)(z), baseline(z))
-        torch.testing.assert_close(torch.jit.script(baseline)(z.float()), baseline(z).float(), rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(
+            torch.jit.script(baseline)(z.float()), baseline(z).float(), rtol=1e-4, atol=1e-5
+        )

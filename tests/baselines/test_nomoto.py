@@ -1,4 +1,6 @@
-"""Nomoto's models: parameters of known lags, their errors, step responses in closed form, what a refit may move."""
+"""Nomoto's models: parameters of known lags, their errors, step responses in closed form, what a
+refit may move.
+"""
 
 from __future__ import annotations
 
@@ -36,23 +38,43 @@ def made(noise: float = 0.0, count: int = 600, groups: int = 12, seed: int = 0) 
     )
     target += noise * rng.normal(size=target.shape) * [0.05, 0.02, 0.02]
     group = torch.arange(count) * groups // count
-    return Samples(torch.from_numpy(z), torch.from_numpy(target), group, torch.zeros(count), ("zigzag",) * groups, NAMES)
+    return Samples(
+        torch.from_numpy(z),
+        torch.from_numpy(target),
+        group,
+        torch.zeros(count),
+        ("zigzag",) * groups,
+        NAMES,
+    )
 
 
 def test_parameters_of_known_lags_are_exact() -> None:
     config = NomotoSideslipConfig()
-    found = {c.term: c.value for c in config.fit(config.build(NAMES), made()) if c.ratio is not None}
+    found = {
+        c.term: c.value for c in config.fit(config.build(NAMES), made()) if c.ratio is not None
+    }
     assert found == pytest.approx(LAGS | SLIP, rel=1e-9)
     config2 = NomotoConfig()
-    found = {c.term: c.value for c in config2.fit(config2.build(NAMES), made()) if c.ratio is not None}
+    found = {
+        c.term: c.value for c in config2.fit(config2.build(NAMES), made()) if c.ratio is not None
+    }
     assert found == pytest.approx(LAGS, rel=1e-9)
 
 
 def test_errors_of_parameters_are_their_spread() -> None:
-    """T, K and b of many repetitions spread as the standard errors of one say: ratios need the coefficients' covariance."""
+    """T, K and b of many repetitions spread as the standard errors of one say: ratios need the
+    coefficients' covariance.
+    """
     config = NomotoSideslipConfig()
     baseline = config.build(NAMES)
-    runs = [{c.term: (c.value, c.error) for c in config.fit(baseline, made(1.0, seed=seed, groups=40)) if c.ratio is not None} for seed in range(60)]
+    runs = [
+        {
+            c.term: (c.value, c.error)
+            for c in config.fit(baseline, made(1.0, seed=seed, groups=40))
+            if c.ratio is not None
+        }
+        for seed in range(60)
+    ]
     for name in LAGS | SLIP:
         values = np.array([run[name][0] for run in runs])
         claimed = np.sqrt(np.mean([run[name][1] ** 2 for run in runs]))
@@ -67,7 +89,9 @@ def hybrid(config: NomotoConfig | NomotoSideslipConfig) -> HybridDynamics:
 
 
 def test_step_response_in_closed_form() -> None:
-    """r = (K delta + b)(1 - exp(-t/T)); u likewise; side slip at constant speed follows r through its own lag."""
+    """r = (K delta + b)(1 - exp(-t/T)); u likewise; side slip at constant speed follows r through
+    its own lag.
+    """
     model = hybrid(NomotoSideslipConfig())
     n = 8.0
     speed = LAGS["K_u"] * n + LAGS["b_u"]
@@ -94,9 +118,14 @@ def test_first_order_model_lets_sway_die_out_with_t() -> None:
 
 
 def test_a_refit_may_not_move_what_nothing_determines() -> None:
-    """The decay of sway is no observation: a refit would make it grow where sway is left unexplained."""
+    """The decay of sway is no observation: a refit would make it grow where sway is left
+    unexplained.
+    """
     baseline = NomotoConfig().build(NAMES)
-    movable = {(int(i) // baseline.library.count, baseline.library.terms[int(i) % baseline.library.count]) for i in baseline.movable()}
+    movable = {
+        (int(i) // baseline.library.count, baseline.library.terms[int(i) % baseline.library.count])
+        for i in baseline.movable()
+    }
     assert movable == {(0, "u"), (0, "n"), (0, "1"), (2, "r"), (2, "delta"), (2, "1")}
     assert len(NomotoSideslipConfig().build(NAMES).movable()) == 9
 
@@ -123,7 +152,9 @@ def test_parameters_follow_moved_coefficients() -> None:
 
 def test_other_channels_and_manoeuvres() -> None:
     samples = made()
-    renamed = dataclasses.replace(samples, names=("u", "v", "r", "tau_x", "tau_n"), kinds=("turning", "zigzag") * 6)
+    renamed = dataclasses.replace(
+        samples, names=("u", "v", "r", "tau_x", "tau_n"), kinds=("turning", "zigzag") * 6
+    )
     spoiled = renamed.target.clone()
     spoiled[samples.group % 2 == 0] = 99.0
     config = NomotoConfig(drive="tau_x", steer="tau_n", manoeuvres=("zigzag",))

@@ -37,26 +37,34 @@ def made(noise: float = 0.0, count: int = 400, groups: int = 8) -> Samples:
     target = accelerations(z) + noise * rng.normal(size=(count, 3))
     group = torch.arange(count) * groups // count
     kinds = tuple("zigzag" if g % 2 else "constant" for g in range(groups))
-    return Samples(torch.from_numpy(z), torch.from_numpy(target), group, torch.zeros(count), kinds, NAMES)
+    return Samples(
+        torch.from_numpy(z), torch.from_numpy(target), group, torch.zeros(count), kinds, NAMES
+    )
 
 
 def test_exact_coefficients_from_noise_free_samples() -> None:
     config = RegressorsConfig(terms={axis: tuple(row) for axis, row in TRUTH.items()})  # type: ignore[misc]
     baseline = config.build(NAMES)
     table = config.fit(baseline, made())
-    assert [(entry.axis, entry.term) for entry in table] == [(f"{axis}_dot", term) for axis, row in TRUTH.items() for term in row]
+    assert [(entry.axis, entry.term) for entry in table] == [
+        (f"{axis}_dot", term) for axis, row in TRUTH.items() for term in row
+    ]
     for entry in table:
         assert entry.value == pytest.approx(TRUTH[entry.axis[0]][entry.term], rel=1e-10)
         assert entry.error < 1e-10 * max(abs(entry.value), 1.0)
     z = np.random.default_rng(1).normal(size=(2, 30, 5)) * [1, 0.3, 0.3, 300, 200]
     out = baseline(torch.from_numpy(z))
-    np.testing.assert_allclose(out.reshape(-1, 3), accelerations(z.reshape(-1, 5)), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(
+        out.reshape(-1, 3), accelerations(z.reshape(-1, 5)), rtol=1e-9, atol=1e-12
+    )
     assert baseline(torch.from_numpy(z).float()).dtype == torch.float32
 
 
 def test_terms_of_all_axes_and_the_linear_default() -> None:
     assert RegressorsConfig().build(NAMES).library.terms == ("1", *NAMES)
-    config = RegressorsConfig(terms=("u", "u|u|", "v r", "tau_x", "v", "|u|v", "u r", "r", "r|r|", "tau_n", "1"))
+    config = RegressorsConfig(
+        terms=("u", "u|u|", "v r", "tau_x", "v", "|u|v", "u r", "r", "r|r|", "tau_n", "1")
+    )
     baseline = config.build(NAMES)
     for entry in config.fit(baseline, made()):
         assert entry.value == pytest.approx(TRUTH[entry.axis[0]].get(entry.term, 0.0), abs=1e-10)
@@ -82,7 +90,9 @@ def test_only_the_chosen_manoeuvres() -> None:
     samples = made()
     spoiled = samples.target.clone()
     spoiled[(samples.group % 2) == 0] = 99.0
-    config = RegressorsConfig(terms={axis: tuple(row) for axis, row in TRUTH.items()}, manoeuvres=("zigzag",))  # type: ignore[misc]
+    config = RegressorsConfig(
+        terms={axis: tuple(row) for axis, row in TRUTH.items()}, manoeuvres=("zigzag",)
+    )  # type: ignore[misc]
     for entry in config.fit(config.build(NAMES), samples.with_target(spoiled)):
         assert entry.value == pytest.approx(TRUTH[entry.axis[0]][entry.term], rel=1e-9)
     other = RegressorsConfig(manoeuvres=("turning",))

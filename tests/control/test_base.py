@@ -40,7 +40,9 @@ def test_a_controller_flies_in_the_one_time_loop() -> None:
     x0 = torch.tensor([[0.0], [2.0]], dtype=torch.float64)
     w = torch.zeros(2, 5, 2, dtype=torch.float64)
     w[:, :, 1] = 0.1
-    states, inputs, _ = Rollout(Integrator(), ClosedLoop(Half(), GivenReference(reference)))(x0, w, x0[:, :0])
+    states, inputs, _ = Rollout(Integrator(), ClosedLoop(Half(), GivenReference(reference)))(
+        x0, w, x0[:, :0]
+    )
     for row in range(2):
         x, c = float(x0[row]), 0.0
         for k in range(5):

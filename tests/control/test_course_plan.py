@@ -1,4 +1,6 @@
-"""Planned courses and guidance along them, against closed forms of Nomoto's model and geometry of their own."""
+"""Planned courses and guidance along them, against closed forms of Nomoto's model and geometry of
+their own.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,12 @@ import torch
 
 from residnet.control.base import ClosedLoop
 from residnet.control.courses.buoys import BuoyConfig
-from residnet.control.courses.config import BuoyCourseConfig, plan_course, report_feasibility, smallest_turn
+from residnet.control.courses.config import (
+    BuoyCourseConfig,
+    plan_course,
+    report_feasibility,
+    smallest_turn,
+)
 from residnet.control.courses.course_plan import Course
 from residnet.control.courses.turns import TurnMaker, steady_turn
 from residnet.control.guidance.course_guidance import CourseGuidance
@@ -51,10 +58,13 @@ def test_the_steady_turn_is_that_of_the_model(vessel: SteeredPlant) -> None:
 
 
 def test_turns_take_the_time_of_full_rudder_and_counter_rudder(vessel: SteeredPlant) -> None:
-    """T r_dot + r = K delta from rest to rest: K d (t1 - t2) turned, t2 = T ln(2 - exp(-t1 / T))."""
+    """T r_dot + r = K delta from rest to rest: K d (t1 - t2) turned, t2 = T ln(2 - exp(-t1 / T)).
+    """
     make = TurnMaker(vessel, TURNING, 0.05)
     holds = np.array([[3.0, 9.0], [5.03, 12.0]])
-    for side, row in zip((1, -1), make(holds, 0.9 * LIMIT * np.array([1, -1]), [make.straight] * 2, 4.0), strict=True):
+    for side, row in zip(
+        (1, -1), make(holds, 0.9 * LIMIT * np.array([1, -1]), [make.straight] * 2, 4.0), strict=True
+    ):
         for turn in row:
             counter = 3.94 * math.log(2.0 - math.exp(-turn.hold / 3.94))
             assert turn.times[-1] == pytest.approx(turn.hold + counter, abs=1e-3)
@@ -64,7 +74,9 @@ def test_turns_take_the_time_of_full_rudder_and_counter_rudder(vessel: SteeredPl
             track, heading = turn.along(np.array([0.0, 4.0]))
             assert heading == pytest.approx(angle, abs=1e-4)
             assert track[0] == pytest.approx(turn.track[-1], abs=1e-9)
-            assert track[1] - track[0] == pytest.approx(3.2 * 4.0 * np.array([math.cos(angle), math.sin(angle)]), abs=2e-3)
+            assert track[1] - track[0] == pytest.approx(
+                3.2 * 4.0 * np.array([math.cos(angle), math.sin(angle)]), abs=2e-3
+            )
 
 
 def test_a_turn_that_follows_a_turn_begins_with_its_yaw(vessel: SteeredPlant) -> None:
@@ -76,10 +88,14 @@ def test_a_turn_that_follows_a_turn_begins_with_its_yaw(vessel: SteeredPlant) ->
     faded = 1.0 - math.exp(-6.0 / 3.94)
     held = int(np.searchsorted(turn.times, 6.0))
     assert turn.times[held] == pytest.approx(6.0)
-    assert turn.heading[held] == pytest.approx(-0.1 * 3.94 * faded + 3.47 * LIMIT * (6.0 - 3.94 * faded), abs=1e-5)
+    assert turn.heading[held] == pytest.approx(
+        -0.1 * 3.94 * faded + 3.47 * LIMIT * (6.0 - 3.94 * faded), abs=1e-5
+    )
 
 
-def test_no_part_of_a_plan_is_tighter_than_the_vessel_turns_and_buoys_stay_outside(vessel: SteeredPlant) -> None:
+def test_no_part_of_a_plan_is_tighter_than_the_vessel_turns_and_buoys_stay_outside(
+    vessel: SteeredPlant,
+) -> None:
     steady = smallest_turn(WANTED, vessel, LIMIT)
     planned = plan_course(WANTED, "sides", vessel, TURNING, LIMIT, steady)
     inside = planned.course.track[: int(planned.course.length / planned.course.step)]
@@ -91,12 +107,17 @@ def test_no_part_of_a_plan_is_tighter_than_the_vessel_turns_and_buoys_stay_outsi
 
 
 def test_a_given_heading_lengthens_the_shortest_course_past_sides(vessel: SteeredPlant) -> None:
-    """Along the first leg it changes nothing; away from it the vessel has to come round, pi R and more."""
+    """Along the first leg it changes nothing; away from it the vessel has to come round, pi R and
+    more.
+    """
     steady = smallest_turn(WANTED, vessel, LIMIT)
     free = plan_course(WANTED, "sides", vessel, TURNING, LIMIT, steady)
     along = float(free.course.heading[0])
     onward, away = (
-        plan_course(WANTED.model_copy(update={"heading": heading}), "sides", vessel, TURNING, LIMIT, steady) for heading in (along, along + math.pi)
+        plan_course(
+            WANTED.model_copy(update={"heading": heading}), "sides", vessel, TURNING, LIMIT, steady
+        )
+        for heading in (along, along + math.pi)
     )
     assert onward.floor == pytest.approx(free.floor, rel=2e-3)
     assert onward.course.length == pytest.approx(free.course.length, rel=0.02)
@@ -106,7 +127,9 @@ def test_a_given_heading_lengthens_the_shortest_course_past_sides(vessel: Steere
 
 def test_circles_of_acceptance_are_entered(vessel: SteeredPlant) -> None:
     steady = smallest_turn(WANTED, vessel, LIMIT)
-    planned = plan_course(WANTED.model_copy(update={"heading": 0.0}), "enter", vessel, TURNING, LIMIT, steady)
+    planned = plan_course(
+        WANTED.model_copy(update={"heading": 0.0}), "enter", vessel, TURNING, LIMIT, steady
+    )
     assert planned.course.heading[0] == pytest.approx(0.0, abs=1e-6)
     inside = planned.course.track[: int(planned.course.length / planned.course.step) + 2]
     for buoy in BUOYS:
@@ -115,7 +138,15 @@ def test_circles_of_acceptance_are_entered(vessel: SteeredPlant) -> None:
 
 
 def test_buoys_too_close_for_the_vessel_are_refused(vessel: SteeredPlant) -> None:
-    near = WANTED.model_copy(update={"buoys": (BUOYS[0], BuoyConfig(north=52, east=20, leave_to="starboard", radius=10), BUOYS[2])})
+    near = WANTED.model_copy(
+        update={
+            "buoys": (
+                BUOYS[0],
+                BuoyConfig(north=52, east=20, leave_to="starboard", radius=10),
+                BUOYS[2],
+            )
+        }
+    )
     with pytest.raises(ConfigError, match=r"buoy|mark"):
         plan_course(near, "sides", vessel, TURNING, LIMIT, smallest_turn(near, vessel, LIMIT))
 
@@ -125,7 +156,19 @@ def test_guidance_asks_for_tangent_yaw_rate_and_line_of_sight_on_a_circle() -> N
     guidance = CourseGuidance(circle(20.0), 8.0, state)
     angle, aside = 0.7, 3.0
     # to port of a turn to starboard: outside the circle
-    x = torch.tensor([[(20 + aside) * math.sin(angle), 20 - (20 + aside) * math.cos(angle), angle, 3.0, 0.0, 0.0]], dtype=torch.float64)
+    x = torch.tensor(
+        [
+            [
+                (20 + aside) * math.sin(angle),
+                20 - (20 + aside) * math.cos(angle),
+                angle,
+                3.0,
+                0.0,
+                0.0,
+            ]
+        ],
+        dtype=torch.float64,
+    )
     s = torch.tensor([[20 * angle - 0.5]], dtype=torch.float64)
     for _ in range(4):
         reference, s = guidance(x, 0, s)
@@ -139,13 +182,28 @@ def test_guidance_asks_for_tangent_yaw_rate_and_line_of_sight_on_a_circle() -> N
 def test_a_vessel_beside_the_course_comes_back_to_it(vessel: SteeredPlant) -> None:
     course = circle(15.0)
     steady = 3.2 / 15.0 / 3.47
-    course = Course(course.step, course.track, course.direction, course.heading, np.full(len(course.track), steady), course.length)
-    law = HeadingPID.placed(vessel.state, gain=3.47, time=3.94, frequency=1.0, damping=1.0, limit=LIMIT)
+    course = Course(
+        course.step,
+        course.track,
+        course.direction,
+        course.heading,
+        np.full(len(course.track), steady),
+        course.length,
+    )
+    law = HeadingPID.placed(
+        vessel.state, gain=3.47, time=3.94, frequency=1.0, damping=1.0, limit=LIMIT
+    )
     guidance = CourseGuidance(course, 8.0, vessel.state)
     x, w = vessel.start(torch.ones(2, dtype=torch.float64))
     x[:, vessel.column("y")] = torch.tensor([2.0, -2.0], dtype=torch.float64)
-    loop = Rollout(vessel.model(0.05), ClosedLoop(Following(law, vessel.state, limit=LIMIT, dt=0.05), guidance))
-    states, _, _ = loop(x, w.unsqueeze(1).expand(-1, 600, -1), torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64).expand(2, -1))
+    loop = Rollout(
+        vessel.model(0.05), ClosedLoop(Following(law, vessel.state, limit=LIMIT, dt=0.05), guidance)
+    )
+    states, _, _ = loop(
+        x,
+        w.unsqueeze(1).expand(-1, 600, -1),
+        torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64).expand(2, -1),
+    )
     end = states[:, -1]
     radius = torch.hypot(end[:, vessel.column("x")], end[:, vessel.column("y")] - 15.0)
     assert radius.tolist() == pytest.approx([15.0, 15.0], abs=0.05)
@@ -165,16 +223,22 @@ def test_a_vessel_that_sways_and_rolls_follows_turns_that_join_each_other() -> N
         planning_dt=0.5,
         turning_time=200.0,
     )
-    planned = plan_course(wanted, "enter", patrol, turning, LIMIT, smallest_turn(wanted, patrol, LIMIT))
+    planned = plan_course(
+        wanted, "enter", patrol, turning, LIMIT, smallest_turn(wanted, patrol, LIMIT)
+    )
     assert np.ptp(np.sign(planned.course.rudder)) == 2.0
-    law = HeadingPID.placed(patrol.state, gain=turning.gain, time=turning.time, frequency=0.8, damping=1.0, limit=LIMIT)
+    law = HeadingPID.placed(
+        patrol.state, gain=turning.gain, time=turning.time, frequency=0.8, damping=1.0, limit=LIMIT
+    )
     follower = Following(law, patrol.state, limit=LIMIT, dt=0.1, rate=patrol.rate)
     guidance = CourseGuidance(planned.course, wanted.lookahead, patrol.state)
     x, w = patrol.start(torch.ones(1, dtype=torch.float64))
     x[:, patrol.column("psi")] = float(planned.course.heading[0])
     nominal = torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64)
     with torch.no_grad():
-        states, _, _ = Rollout(patrol.model(0.1), ClosedLoop(follower, guidance))(x, w.unsqueeze(1).expand(-1, 2500, -1), nominal)
+        states, _, _ = Rollout(patrol.model(0.1), ClosedLoop(follower, guidance))(
+            x, w.unsqueeze(1).expand(-1, 2500, -1), nominal
+        )
     place, aside = torch.zeros(1, 1, dtype=torch.float64), []
     for state in states[0, ::5]:
         _, place = guidance(state[None], 0, place)

@@ -1,4 +1,5 @@
-"""Shortest paths and courses round buoys, against geometry and paths that are flown piece by piece."""
+"""Shortest paths and courses round buoys, against geometry and paths that are flown piece by piece.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +28,13 @@ def flown(pose: np.ndarray, side: float, length: float, radius: float) -> np.nda
     if side == 0:
         return pose + np.array([length * math.cos(pose[2]), length * math.sin(pose[2]), 0.0])
     heading = pose[2] + side * length / radius
-    chord = side * radius * np.array([math.sin(heading) - math.sin(pose[2]), math.cos(pose[2]) - math.cos(heading), 0.0])
+    chord = (
+        side
+        * radius
+        * np.array(
+            [math.sin(heading) - math.sin(pose[2]), math.cos(pose[2]) - math.cos(heading), 0.0]
+        )
+    )
     return np.array([*(pose + chord)[:2], heading])
 
 
@@ -35,7 +42,9 @@ def test_no_flown_path_is_shorter_and_some_are_as_short() -> None:
     rng = np.random.default_rng(0)
     equal = set()
     for _ in range(4000):
-        sides = [(1, 0, 1), (-1, 0, -1), (1, 0, -1), (-1, 0, 1), (1, -1, 1), (-1, 1, -1)][rng.integers(6)]
+        sides = [(1, 0, 1), (-1, 0, -1), (1, 0, -1), (-1, 0, 1), (1, -1, 1), (-1, 1, -1)][
+            rng.integers(6)
+        ]
         start = rng.normal(0.0, 3.0, 3)
         pose, lengths = start, rng.uniform(0.0, [2.0 * math.pi, 5.0, 2.0 * math.pi]) * 2.0
         for side, length in zip(sides, lengths, strict=True):
@@ -50,7 +59,9 @@ def test_no_flown_path_is_shorter_and_some_are_as_short() -> None:
 
 def test_simple_paths() -> None:
     assert dubins_length(np.zeros(3), np.array([7.0, 0.0, 0.0]), 2.0) == pytest.approx(7.0)
-    assert dubins_length(np.zeros(3), np.array([0.0, 4.0, math.pi]), 2.0) == pytest.approx(2.0 * math.pi)
+    assert dubins_length(np.zeros(3), np.array([0.0, 4.0, math.pi]), 2.0) == pytest.approx(
+        2.0 * math.pi
+    )
     # there and back are the same path reversed
     back = np.array([0.0, 0.0, math.pi])
     a, b = np.array([1.0, 2.0, 0.7]), np.array([3.0, -1.0, 2.1])
@@ -58,7 +69,9 @@ def test_simple_paths() -> None:
 
 
 def test_a_course_through_points_in_line_is_straight() -> None:
-    assert shortest_course((0.0, 0.0, 0.0), [(30.0, 0.0), (60.0, 0.0)], 5.0, 2.0) == pytest.approx(55.0, rel=1e-3)
+    assert shortest_course((0.0, 0.0, 0.0), [(30.0, 0.0), (60.0, 0.0)], 5.0, 2.0) == pytest.approx(
+        55.0, rel=1e-3
+    )
 
 
 def test_the_pieces_of_a_course_join_and_leave_every_buoy_on_its_side_outside_its_circle() -> None:
@@ -67,7 +80,10 @@ def test_the_pieces_of_a_course_join_and_leave_every_buoy_on_its_side_outside_it
     for piece, after in itertools.zip_longest(pieces, pieces[1:]):
         pose = np.array([piece.north, piece.east, piece.heading])
         assert piece.turn == 0 or piece.length < 1.2 * math.pi * piece.radius
-        track += [flown(pose, piece.turn, share * piece.length, piece.radius or 1.0) for share in np.linspace(0.0, 1.0, 400)]
+        track += [
+            flown(pose, piece.turn, share * piece.length, piece.radius or 1.0)
+            for share in np.linspace(0.0, 1.0, 400)
+        ]
         if after is not None:
             assert track[-1][:2] == pytest.approx([after.north, after.east], abs=1e-9)
             assert math.cos(track[-1][2] - after.heading) == pytest.approx(1.0)
@@ -79,21 +95,31 @@ def test_the_pieces_of_a_course_join_and_leave_every_buoy_on_its_side_outside_it
         distance = np.hypot(*line.T)
         assert distance.min() >= 10.0 - 1e-6
         near = passed + 1 + int(distance[passed + 1 :].argmin())
-        to_starboard = line[near, 1] * math.cos(poses[near, 2]) - line[near, 0] * math.sin(poses[near, 2])
+        to_starboard = line[near, 1] * math.cos(poses[near, 2]) - line[near, 0] * math.sin(
+            poses[near, 2]
+        )
         assert (to_starboard > 0) == (buoy.leave_to == "starboard")
         assert near > passed
         passed = near
 
 
 def test_a_buoy_in_the_bend_is_rounded_on_its_circle() -> None:
-    bend = [BuoyConfig(north=100, east=0, leave_to="starboard", radius=10), BuoyConfig(north=100, east=100, leave_to="starboard", radius=10)]
+    bend = [
+        BuoyConfig(north=100, east=0, leave_to="starboard", radius=10),
+        BuoyConfig(north=100, east=100, leave_to="starboard", radius=10),
+    ]
     pieces = course_round((0.0, -10.0), bend)
     assert [piece.turn for piece in pieces] == [0, 1, 0]
-    assert sum(piece.length for piece in pieces) == pytest.approx(100.0 + 0.5 * math.pi * 10.0 + 100.0)
+    assert sum(piece.length for piece in pieces) == pytest.approx(
+        100.0 + 0.5 * math.pi * 10.0 + 100.0
+    )
 
 
 def test_a_buoy_that_the_course_turns_away_from_is_left_at_a_distance() -> None:
-    aside = [BuoyConfig(north=50, east=30, leave_to="starboard", radius=10), BuoyConfig(north=100, east=10, leave_to="port", radius=10)]
+    aside = [
+        BuoyConfig(north=50, east=30, leave_to="starboard", radius=10),
+        BuoyConfig(north=100, east=10, leave_to="port", radius=10),
+    ]
     pieces = course_round((0.0, 0.0), aside)
     assert [piece.turn for piece in pieces] == [0]
     assert pieces[0].length == pytest.approx(100.0)

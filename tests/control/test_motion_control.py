@@ -1,4 +1,6 @@
-"""Reference filter and motion PID against SciPy and by hand; the ferry through the document's waypoints."""
+"""Reference filter and motion PID against SciPy and by hand; the ferry through the document's
+waypoints.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +43,9 @@ def asked(guidance: ReferenceFilter, steps: int, start: torch.Tensor) -> torch.T
 def test_filter_against_its_transfer_function() -> None:
     """(2.15) is (s + W)(s^2 + 2 D W s + W^2) (ERRATA J9)."""
     w, d = 0.4, 0.7
-    config = ReferenceFilterConfig(waypoints=((10.0, 0.0, 0.0),), interval=40.0, frequency=(w, w, w), damping=(d, d, d))
+    config = ReferenceFilterConfig(
+        waypoints=((10.0, 0.0, 0.0),), interval=40.0, frequency=(w, w, w), damping=(d, d, d)
+    )
     x = torch.zeros(1, 6, dtype=torch.float64)
     found = asked(config.build(0.05), 800, x)[0]
     _, y = step(lti([w**3], np.polymul([1, w], [1, 2 * d * w, w**2])), T=0.05 * np.arange(800))
@@ -51,7 +55,9 @@ def test_filter_against_its_transfer_function() -> None:
 
 
 def test_body_velocity_and_acceleration_belong_to_the_pose() -> None:
-    """nu_d and its derivative are those of eta_d seen from the turning vessel (ERRATA J7), by differences."""
+    """nu_d and its derivative are those of eta_d seen from the turning vessel (ERRATA J7), by
+    differences.
+    """
     config = ReferenceFilterConfig(waypoints=WAYPOINTS, interval=10.0, frequency=(0.4, 0.5, 0.6))
     dt = 0.01
     x = torch.tensor([[3.0, 1.0, 0.4, 0, 0, 0]], dtype=torch.float64)
@@ -60,16 +66,21 @@ def test_body_velocity_and_acceleration_belong_to_the_pose() -> None:
     eta, nu, nu_dot = found[:, :3], found[:, 3:6], found[:, 6:]
     slope = (eta[2:] - eta[:-2]) / (2 * dt)
     c, s = np.cos(eta[1:-1, 2]), np.sin(eta[1:-1, 2])
-    body = np.stack((c * slope[:, 0] + s * slope[:, 1], c * slope[:, 1] - s * slope[:, 0], slope[:, 2]), axis=1)
+    body = np.stack(
+        (c * slope[:, 0] + s * slope[:, 1], c * slope[:, 1] - s * slope[:, 0], slope[:, 2]), axis=1
+    )
     inside = np.ones(len(body), dtype=bool)
     # at a new waypoint the third derivative jumps
     inside[[998, 999, 1998, 1999]] = False
     np.testing.assert_allclose(nu[1:-1][inside], body[inside], atol=1e-4)
-    np.testing.assert_allclose(nu_dot[1:-1][inside], ((nu[2:] - nu[:-2]) / (2 * dt))[inside], atol=2e-4)
+    np.testing.assert_allclose(
+        nu_dot[1:-1][inside], ((nu[2:] - nu[:-2]) / (2 * dt))[inside], atol=2e-4
+    )
 
 
 def test_headings_are_followed_as_written() -> None:
-    """From 0 to 180 deg clockwise and from 135 to -45 deg the other way (ERRATA J13): no wrapping."""
+    """From 0 to 180 deg clockwise and from 135 to -45 deg the other way (ERRATA J13): no wrapping.
+    """
     points = ((0.0, 0.0, np.pi), (0.0, 0.0, 0.75 * np.pi), (0.0, 0.0, -0.25 * np.pi))
     config = ReferenceFilterConfig(waypoints=points, interval=60.0)
     psi = asked(config.build(0.1), 1800, torch.zeros(1, 6, dtype=torch.float64))[0, :, 2].numpy()
@@ -88,14 +99,18 @@ def test_one_config_for_each_row() -> None:
     x = torch.zeros(2, 6, dtype=torch.float64)
     both = asked(ReferenceFilter([short, long], 0.1), 300, x)
     for row, config in enumerate((short, long)):
-        torch.testing.assert_close(both[row], asked(config.build(0.1), 300, x[:1])[0], rtol=1e-12, atol=1e-12)
+        torch.testing.assert_close(
+            both[row], asked(config.build(0.1), 300, x[:1])[0], rtol=1e-12, atol=1e-12
+        )
     assert both[0, -1, 1] == pytest.approx(-15.0, abs=1e-3)
     assert long.duration == 30.0
 
 
 @pytest.mark.parametrize(("intervals", "dt"), [((10.0,), 0.3), ((0.05,), 0.1), ((10.0, 20.0), 0.1)])
 def test_intervals_of_whole_steps(intervals: tuple[float, ...], dt: float) -> None:
-    configs = [ReferenceFilterConfig(waypoints=WAYPOINTS, interval=interval) for interval in intervals]
+    configs = [
+        ReferenceFilterConfig(waypoints=WAYPOINTS, interval=interval) for interval in intervals
+    ]
     with pytest.raises(ConfigError, match="whole number of steps"):
         ReferenceFilter(configs, dt)
 
@@ -111,11 +126,14 @@ def test_units_of_waypoints_in_a_file(tmp_path: object) -> None:
         load_config(file, ["frequency=[0.2, 0, 0.4]"], ReferenceFilterConfig)
 
 
-GAINS = MotionPIDConfig(proportional=(190.0, 200.0, 900.0), integral=(6.0, 7.0, 45.0), derivative=(860.0, 910.0, 2700.0))
+GAINS = MotionPIDConfig(
+    proportional=(190.0, 200.0, 900.0), integral=(6.0, 7.0, 45.0), derivative=(860.0, 910.0, 2700.0)
+)
 
 
 def test_pid_by_hand() -> None:
-    """Two steps: error in the body frame, heading wrapped, the integral used before it is updated."""
+    """Two steps: error in the body frame, heading wrapped, the integral used before it is updated.
+    """
     x = torch.tensor([[1.0, 2.0, 3.0, 0.5, -0.1, 0.02, 7.0]], dtype=torch.float64)
     reference = torch.tensor([[4.0, 1.0, -3.1, 0.6, 0.1, 0.0, 0.3, 0.2, 0.1]], dtype=torch.float64)
     controller, dt = GAINS.build(0.1), 0.1
@@ -128,8 +146,12 @@ def test_pid_by_hand() -> None:
     np.testing.assert_allclose(second[0], rest + np.array([6, 7, 45]) * e * dt, rtol=1e-12)
     np.testing.assert_allclose(s[0], 2 * dt * e, rtol=1e-12)
     hull = ferry("milliampere").hull
-    forward = GAINS.build(dt, HullFeedForward(hull))(x, reference, controller.initial_state(x))[0] - first
-    np.testing.assert_allclose(hull(reference[:, 3:6], forward), reference[:, 6:9], rtol=1e-9, atol=1e-12)
+    forward = (
+        GAINS.build(dt, HullFeedForward(hull))(x, reference, controller.initial_state(x))[0] - first
+    )
+    np.testing.assert_allclose(
+        hull(reference[:, 3:6], forward), reference[:, 6:9], rtol=1e-9, atol=1e-12
+    )
 
 
 def ferry(name: str) -> FossenVessel:
@@ -139,7 +161,8 @@ def ferry(name: str) -> FossenVessel:
 
 
 def test_the_exact_model_follows_without_feedback() -> None:
-    """Forces of the true hull's inverse, at once: the only error is that they are held over a step."""
+    """Forces of the true hull's inverse, at once: the only error is that they are held over a step.
+    """
     plant = ferry("milliampere")
     dt = 0.05
     config = ReferenceFilterConfig(waypoints=((5.0, -3.0, 0.8),), interval=30.0)
@@ -162,9 +185,14 @@ def test_the_exact_model_follows_without_feedback() -> None:
 
 
 def test_the_closed_loop_scripts() -> None:
-    """A controller has to leave Python: the same commands as TorchScript, after a memory of some steps."""
+    """A controller has to leave Python: the same commands as TorchScript, after a memory of some
+    steps.
+    """
     dt = 0.1
-    loop = ClosedLoop(GAINS.build(dt, HullFeedForward(ferry("milliampere").hull)), ReferenceFilterConfig(waypoints=WAYPOINTS).build(dt))
+    loop = ClosedLoop(
+        GAINS.build(dt, HullFeedForward(ferry("milliampere").hull)),
+        ReferenceFilterConfig(waypoints=WAYPOINTS).build(dt),
+    )
     scripted = torch.jit.script(loop)
     x, w = torch.randn(3, 12, dtype=torch.float64), torch.zeros(3, 5, dtype=torch.float64)
     memory = again = loop.initial(x)
@@ -176,7 +204,9 @@ def test_the_closed_loop_scripts() -> None:
 
 
 def test_allocated_to_azimuth_thrusters() -> None:
-    """The thrusters make the forces that the controller asks for, while they can; its integral brings the ferry to the point."""
+    """The thrusters make the forces that the controller asks for, while they can; its integral
+    brings the ferry to the point.
+    """
     plant = ferry("milliampere_azimuth")
     assert isinstance(plant.actuators, AzimuthThrusters)
     dt = 0.2
@@ -185,8 +215,12 @@ def test_allocated_to_azimuth_thrusters() -> None:
     point[0, 0, :3] = torch.tensor([0.5, -0.3, 0.2], dtype=torch.float64)
     x0 = plant.approach(1)
     asked_for = controller(x0, point[:, 0], torch.zeros(1, 3, dtype=torch.float64))[0]
-    command = Allocated(controller, plant.actuators)(x0, point[:, 0], torch.zeros(1, 3, dtype=torch.float64))[0]
-    torch.testing.assert_close(plant.actuators.force(x0[:, 6:], command, x0[:, 3:6]), asked_for, rtol=1e-9, atol=1e-9)
+    command = Allocated(controller, plant.actuators)(
+        x0, point[:, 0], torch.zeros(1, 3, dtype=torch.float64)
+    )[0]
+    torch.testing.assert_close(
+        plant.actuators.force(x0[:, 6:], command, x0[:, 3:6]), asked_for, rtol=1e-9, atol=1e-9
+    )
     w = torch.zeros(1, 600, len(plant.inputs), dtype=torch.float64)
     w[..., plant.inputs.index("force_north")] = 40.0
     loop = ClosedLoop(Allocated(controller, plant.actuators), GivenReference(point))

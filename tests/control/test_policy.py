@@ -54,7 +54,14 @@ def test_port_mirrors_starboard() -> None:
 
 @pytest.mark.parametrize("bias", [-2.0, 1.0])
 def test_a_constant_push_leaves_no_error_whatever_the_weights(bias: float) -> None:
-    flights = fly(VESSEL, untrained(), torch.tensor([0.2]), torch.tensor([[0.9, 1.1, math.radians(bias)]]), dt=0.05, duration=120.0)
+    flights = fly(
+        VESSEL,
+        untrained(),
+        torch.tensor([0.2]),
+        torch.tensor([[0.9, 1.1, math.radians(bias)]]),
+        dt=0.05,
+        duration=120.0,
+    )
     assert abs(float(flights.error[0, -1])) < 1e-6
     assert float(flights.inputs[0, -1, 0]) == pytest.approx(-math.radians(bias) / 0.9, rel=1e-4)
 
@@ -96,7 +103,9 @@ WRONG = [
 
 @pytest.mark.parametrize(("measured", "reference"), WRONG)
 @pytest.mark.parametrize("safe", ["hold", "amidships"])
-def test_wrong_inputs_bring_the_safe_command_and_a_flag(measured: list[float], reference: float, safe: str) -> None:
+def test_wrong_inputs_bring_the_safe_command_and_a_flag(
+    measured: list[float], reference: float, safe: str
+) -> None:
     module = for_export(untrained(rate=0.2), safe)  # type: ignore[arg-type]
     good = torch.tensor([[0.0, 3.2, 0.0]])
     s = module.initial_state(good)
@@ -135,7 +144,11 @@ def test_a_memory_out_of_range_brings_the_safe_command_and_a_flag(place: int, wr
     command, after, fault = module.step(good, reference, spoilt)
     assert fault.all()
     # towards amidships at the rudder's rate, from where the last command was if that is known
-    kept = {True: 0.0, False: max(-LIMIT, min(LIMIT, wrong))}[math.isnan(wrong)] if place == 9 else float(last)
+    kept = (
+        {True: 0.0, False: max(-LIMIT, min(LIMIT, wrong))}[math.isnan(wrong)]
+        if place == 9
+        else float(last)
+    )
     assert float(command) == pytest.approx(kept - max(-0.01, min(0.01, kept)), abs=1e-7)
     # the memory begins anew, and the next step is as good as ever
     assert torch.allclose(after[:, :9], module.initial_state(good)[:, :9])
@@ -145,7 +158,9 @@ def test_a_memory_out_of_range_brings_the_safe_command_and_a_flag(place: int, wr
 
 
 def test_no_flight_leaves_the_memory_s_range() -> None:
-    """Flights of all corners under bias, hard turns at a third of the speed and at three times: what is remembered is never taken for wrong."""
+    """Flights of all corners under bias, hard turns at a third of the speed and at three times:
+    what is remembered is never taken for wrong.
+    """
     module = for_export(untrained(rate=0.2), "amidships")
     torch.manual_seed(1)
     rows = 64
@@ -154,7 +169,9 @@ def test_no_flight_leaves_the_memory_s_range() -> None:
     s = module.initial_state(y)
     top = float(module.high[2])
     for k in range(400):
-        y[:, 2] = (0.98 * top * torch.sin(torch.tensor(0.05 * k)) * torch.rand(rows)).clamp(-top, top)
+        y[:, 2] = (0.98 * top * torch.sin(torch.tensor(0.05 * k)) * torch.rand(rows)).clamp(
+            -top, top
+        )
         y[:, 0] = 3.0 * torch.randn(rows)
         _, s, fault = module.step(y, torch.randn(rows, 1), s)
         assert not fault.any()
@@ -165,7 +182,9 @@ def test_commands_keep_the_rudders_rate() -> None:
     s = module.initial_state(torch.tensor([[0.0, 3.2, 0.0]]))
     last: Tensor = torch.zeros(1, 1)
     for k in range(40):
-        command, s, _ = module.step(torch.tensor([[0.0, 3.2, 0.0]]), torch.tensor([[0.5 if k < 20 else -0.5]]), s)
+        command, s, _ = module.step(
+            torch.tensor([[0.0, 3.2, 0.0]]), torch.tensor([[0.5 if k < 20 else -0.5]]), s
+        )
         assert float((command - last).abs()) <= 0.1 * 0.05 + 1e-7
         last = command
     assert float(last) < 0

@@ -1,4 +1,6 @@
-"""A learned model that is Nomoto's own, steered beside the plant: with any variation both move alike."""
+"""A learned model that is Nomoto's own, steered beside the plant: with any variation both move
+alike.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,9 @@ from residnet.physics.vessel import load_vessel
 
 DEG = math.pi / 180
 GAIN, TIME = 3.47, 3.94
-VARIED = torch.tensor([[1.0, 1.0, 0.0], [0.8, 1.2, 0.5 * DEG], [1.2, 0.8, -DEG]], dtype=torch.float64)
+VARIED = torch.tensor(
+    [[1.0, 1.0, 0.0], [0.8, 1.2, 0.5 * DEG], [1.2, 0.8, -DEG]], dtype=torch.float64
+)
 
 
 def pair(name: str) -> tuple[SteeredPlant, SteeredModel]:
@@ -31,8 +35,12 @@ def test_a_perfect_model_flies_as_its_vessel(name: str) -> None:
     vessel, learned = pair(name)
     flights = []
     for steered in (vessel, learned):
-        pd = PdConfig(kp=3.0, damping_time=1.5).build(Steering(steered, vessel.turning(5 * DEG, 60.0), 5 * DEG, 0.01))
-        flights.append(fly(steered, pd, torch.tensor([0.5, 0.3, -0.4]), VARIED, dt=0.01, duration=8.0))
+        pd = PdConfig(kp=3.0, damping_time=1.5).build(
+            Steering(steered, vessel.turning(5 * DEG, 60.0), 5 * DEG, 0.01)
+        )
+        flights.append(
+            fly(steered, pd, torch.tensor([0.5, 0.3, -0.4]), VARIED, dt=0.01, duration=8.0)
+        )
     # the model divides what a step changes by `time`, which is of first order in the step
     assert float((flights[0].of("psi") - flights[1].of("psi")).abs().max()) < 1e-3
     assert float((flights[0].inputs - flights[1].inputs).abs().max()) < 0.1 * DEG

@@ -1,4 +1,5 @@
-"""Flights and what is read from them; the time-optimal floor of a rudder that takes time to move."""
+"""Flights and what is read from them; the time-optimal floor of a rudder that takes time to move.
+"""
 
 from __future__ import annotations
 
@@ -23,11 +24,24 @@ VESSEL = SteeredPlant(load_vessel("nomoto_oceanos_rate10").build())
 def made(error: list[list[float]], dt: float = 0.5) -> Flights:
     heading = torch.zeros(len(error), dtype=torch.float64)
     states = -torch.tensor(error, dtype=torch.float64).unsqueeze(-1)
-    return Flights(states, torch.full((len(error), len(error[0]) - 1, 1), 0.2, dtype=torch.float64), heading, dt, ("psi",))
+    return Flights(
+        states,
+        torch.full((len(error), len(error[0]) - 1, 1), 0.2, dtype=torch.float64),
+        heading,
+        dt,
+        ("psi",),
+    )
 
 
 def test_settling_is_the_last_entry_between_samples() -> None:
-    flights = made([[3.0, 1.5, 0.5, 0.2, 0.1], [3.0, 0.5, -1.5, -0.5, 0.0], [0.5, 0.4, 0.3, 0.2, 0.1], [3.0, 2.0, 2.0, 2.0, 1.5]])
+    flights = made(
+        [
+            [3.0, 1.5, 0.5, 0.2, 0.1],
+            [3.0, 0.5, -1.5, -0.5, 0.0],
+            [0.5, 0.4, 0.3, 0.2, 0.1],
+            [3.0, 2.0, 2.0, 2.0, 1.5],
+        ]
+    )
     assert flights.settled(1.0).tolist() == pytest.approx([0.75, 1.25, 0.0, 2.0])
 
 
@@ -43,10 +57,13 @@ def test_effort_and_roots_of_mean_squares() -> None:
 
 
 def shortest_to_rest(change: float, rate: float, limit: float, dt: float = 0.1) -> float:
-    """Least time from rest to rest with the rudder amidships at both ends: linear programmes over rudder sequences, halving the horizon."""
+    """Least time from rest to rest with the rudder amidships at both ends: linear programmes over
+    rudder sequences, halving the horizon.
+    """
 
     def possible(steps: int) -> bool:
-        # delta_k piecewise linear between samples; r and psi at the end are linear in it (trapezoid over fine cells)
+        # delta_k piecewise linear between samples; r and psi at the end are linear in it (trapezoid
+        # over fine cells)
         lag = np.array([(steps - k) * dt for k in range(steps + 1)])
         to_r = GAIN / TIME * np.exp(-lag / TIME) * dt
         to_psi = GAIN * (1 - np.exp(-lag / TIME)) * dt
@@ -72,9 +89,17 @@ def shortest_to_rest(change: float, rate: float, limit: float, dt: float = 0.1) 
 def test_the_floor_of_a_slow_rudder_comes_to_rest_in_the_least_time() -> None:
     floor = BangBangConfig().build(Steering(VESSEL, VESSEL.turning(5 * DEG, 60.0), 5 * DEG, 0.01))
     assert isinstance(floor, RatedBangBangHeading)
-    flights = fly(VESSEL, floor, torch.tensor([30 * DEG, -30 * DEG]), torch.tensor([[1.0, 1.0, 0.0]] * 2), dt=0.01, duration=10.0)
+    flights = fly(
+        VESSEL,
+        floor,
+        torch.tensor([30 * DEG, -30 * DEG]),
+        torch.tensor([[1.0, 1.0, 0.0]] * 2),
+        dt=0.01,
+        duration=10.0,
+    )
     least = shortest_to_rest(30 * DEG, 10 * DEG, 5 * DEG)
-    # on the way to rest the rudder comes back at its rate: heading K/T rate t^3 / 6 is left a time t before
+    # on the way to rest the rudder comes back at its rate: heading K/T rate t^3 / 6 is left a time
+    # t before
     early = (0.1 * DEG * 6.0 * TIME / (GAIN * 10 * DEG)) ** (1 / 3)
     assert float(flights.settled(0.1 * DEG).max()) == pytest.approx(least - early, abs=0.15)
     assert float(flights.overshoot().max()) < 0.05 * DEG
@@ -82,7 +107,9 @@ def test_the_floor_of_a_slow_rudder_comes_to_rest_in_the_least_time() -> None:
 
 
 def test_a_flight_is_what_an_ode_solver_says() -> None:
-    """Rudder hard over from the start: it moves at its rate, and the heading follows Nomoto's equation."""
+    """Rudder hard over from the start: it moves at its rate, and the heading follows Nomoto's
+    equation.
+    """
 
     class HardOver(torch.nn.Module):
         n_state = 0
@@ -90,10 +117,19 @@ def test_a_flight_is_what_an_ode_solver_says() -> None:
         def initial_state(self, x: torch.Tensor) -> torch.Tensor:
             return x[:, :0]
 
-        def forward(self, x: torch.Tensor, reference: torch.Tensor, s: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        def forward(
+            self, x: torch.Tensor, reference: torch.Tensor, s: torch.Tensor
+        ) -> tuple[torch.Tensor, torch.Tensor]:
             return torch.full_like(reference, 5 * DEG), s
 
-    flights = fly(VESSEL, HardOver(), torch.tensor([1.0]), torch.tensor([[0.9, 1.1, 0.0]]), dt=0.005, duration=3.0)  # type: ignore[arg-type]
+    flights = fly(
+        VESSEL,
+        HardOver(),
+        torch.tensor([1.0]),
+        torch.tensor([[0.9, 1.1, 0.0]]),
+        dt=0.005,
+        duration=3.0,
+    )  # type: ignore[arg-type]
     slope = 10 * DEG
 
     def rates(t: float, y: np.ndarray) -> list[float]:

@@ -1,4 +1,6 @@
-"""Tuning of linear heading controllers, against the Riccati equation, the single controller and the limits that it is tuned under."""
+"""Tuning of linear heading controllers, against the Riccati equation, the single controller and the
+limits that it is tuned under.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +45,14 @@ def test_a_row_flies_as_the_controller_itself() -> None:
     config = PidConfig(kp=4.0, damping_time=1.0, integral_time=10.0)
     heading, biased = torch.tensor([0.4]), torch.tensor([[1.0, 1.0, 0.01]])
     gains = tuple(torch.tensor([value], dtype=torch.float64) for value in (4.0, 4.0, 0.4))
-    mine = fly(VESSEL, LinearRows(STEERING, (gains[0], gains[1], gains[2])), heading, biased, dt=0.05, duration=30.0)
+    mine = fly(
+        VESSEL,
+        LinearRows(STEERING, (gains[0], gains[1], gains[2])),
+        heading,
+        biased,
+        dt=0.05,
+        duration=30.0,
+    )
     theirs = fly(VESSEL, config.build(STEERING), heading, biased, dt=0.05, duration=30.0)
     assert torch.allclose(mine.states, theirs.states, atol=1e-12)
 
@@ -56,14 +65,31 @@ def test_tuned_gains_keep_the_limit_and_are_the_fastest_of_a_grid() -> None:
     assert float(flights.settled(DEG).max()) == pytest.approx(tuned.settling)
     for kp in (2.0, 4.0, 8.0):
         for damping in (0.6, 0.9, 1.2, 1.6):
-            other = fly(VESSEL, PdConfig(kp=kp, damping_time=damping).build(STEERING), torch.full((3,), 30 * DEG), SPREAD, dt=0.05, duration=10.0)
-            assert float(other.overshoot().max()) > 0.1 * DEG or float(other.settled(DEG).max()) >= tuned.settling - 1e-9
+            other = fly(
+                VESSEL,
+                PdConfig(kp=kp, damping_time=damping).build(STEERING),
+                torch.full((3,), 30 * DEG),
+                SPREAD,
+                dt=0.05,
+                duration=10.0,
+            )
+            assert (
+                float(other.overshoot().max()) > 0.1 * DEG
+                or float(other.settled(DEG).max()) >= tuned.settling - 1e-9
+            )
 
 
 def test_integral_action_is_tuned_to_take_a_bias_away() -> None:
     tuned = tune(PidConfig(kp=4.0), STEERING, task(), points=64, rounds=2)
     built = PidConfig(**tuned.parameters).build(STEERING)
-    flights = fly(VESSEL, built, torch.tensor([30 * DEG]), torch.tensor([[1.0, 1.0, DEG]]), dt=0.05, duration=60.0)
+    flights = fly(
+        VESSEL,
+        built,
+        torch.tensor([30 * DEG]),
+        torch.tensor([[1.0, 1.0, DEG]]),
+        dt=0.05,
+        duration=60.0,
+    )
     assert abs(float(flights.error[0, -1])) <= 0.2 * DEG
 
 

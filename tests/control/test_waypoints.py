@@ -9,7 +9,11 @@ import pytest
 import torch
 from pydantic import ValidationError
 
-from residnet.control.guidance.line_of_sight import EnclosureConfig, IntegralLookAheadConfig, LookAheadConfig
+from residnet.control.guidance.line_of_sight import (
+    EnclosureConfig,
+    IntegralLookAheadConfig,
+    LookAheadConfig,
+)
 from residnet.control.guidance.waypoints import WaypointGuidance
 from residnet.core.errors import ConfigError
 
@@ -24,15 +28,24 @@ def at(*places: tuple[float, float]) -> torch.Tensor:
 
 @pytest.mark.parametrize("turn", [0.0, 1.0, 2.5, -2.0])
 def test_it_steers_for_a_point_ahead_on_the_leg(turn: float) -> None:
-    """A leg of any direction; 3 m to starboard of it with 4 m look-ahead: atan(3/4) to port of the leg's direction."""
+    """A leg of any direction; 3 m to starboard of it with 4 m look-ahead: atan(3/4) to port of the
+    leg's direction.
+    """
     end = (100 * math.cos(turn), 100 * math.sin(turn))
     guidance = WaypointGuidance([end], 5.0, LookAheadConfig(distance=4.0).build(0.1), STATE)
     s = guidance.initial_state(at((0.0, 0.0)))
     for aside in (3.0, 0.0, -3.0):
-        x = at((20 * math.cos(turn) - aside * math.sin(turn), 20 * math.sin(turn) + aside * math.cos(turn)))
+        x = at(
+            (
+                20 * math.cos(turn) - aside * math.sin(turn),
+                20 * math.sin(turn) + aside * math.cos(turn),
+            )
+        )
         heading, s = guidance(x, 0, s)
         expected = turn - math.atan(aside / 4)
-        assert math.remainder(float(heading) - expected, 2 * math.pi) == pytest.approx(0.0, abs=1e-12)
+        assert math.remainder(float(heading) - expected, 2 * math.pi) == pytest.approx(
+            0.0, abs=1e-12
+        )
         _, ahead, error = guidance.leg(x, s[:, 0].long(), s)
         assert float(ahead) == pytest.approx(80.0)
         assert float(error) == pytest.approx(aside, abs=1e-12)
@@ -40,24 +53,43 @@ def test_it_steers_for_a_point_ahead_on_the_leg(turn: float) -> None:
 
 @pytest.mark.parametrize("turn", [0.0, 1.0, 2.5, -2.0])
 def test_it_steers_for_where_a_circle_about_the_vessel_meets_the_leg(turn: float) -> None:
-    """The point is found here from the quadratic equation of a circle and a line, its root further along the leg."""
+    """The point is found here from the quadratic equation of a circle and a line, its root further
+    along the leg.
+    """
     radius, leg = 5.0, 100 * np.array([math.cos(turn), math.sin(turn)])
     guidance = WaypointGuidance([tuple(leg)], 2.0, EnclosureConfig(radius=radius).build(0.1), STATE)
     s = guidance.initial_state(at((0.0, 0.0)))
     for place in ([20.0, 3.0], [21.0, 0.0], [22.0, -3.0], [23.0, 4.9], [24.0, -4.9]):
-        vessel = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]]) @ np.array(place)
+        vessel = np.array(
+            [[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]]
+        ) @ np.array(place)
         share = max(np.roots([leg @ leg, -2 * leg @ vessel, vessel @ vessel - radius**2]).real)
         north, east = share * leg - vessel
         heading, s = guidance(at((vessel[0], vessel[1])), 0, s)
-        assert math.remainder(float(heading) - math.atan2(east, north), 2 * math.pi) == pytest.approx(0.0, abs=1e-9)
+        assert math.remainder(
+            float(heading) - math.atan2(east, north), 2 * math.pi
+        ) == pytest.approx(0.0, abs=1e-9)
     # out of reach: straight for the leg
     for aside in (8.0, -8.0):
-        heading, s = guidance(at((30 * math.cos(turn) - aside * math.sin(turn), 30 * math.sin(turn) + aside * math.cos(turn))), 0, s)
-        assert math.remainder(float(heading) - turn + math.copysign(math.pi / 2, aside), 2 * math.pi) == pytest.approx(0.0, abs=1e-9)
+        heading, s = guidance(
+            at(
+                (
+                    30 * math.cos(turn) - aside * math.sin(turn),
+                    30 * math.sin(turn) + aside * math.cos(turn),
+                )
+            ),
+            0,
+            s,
+        )
+        assert math.remainder(
+            float(heading) - turn + math.copysign(math.pi / 2, aside), 2 * math.pi
+        ) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_legs_change_in_the_circle_and_behind_the_point() -> None:
-    guidance = WaypointGuidance([(10.0, 0.0), (10.0, 20.0)], 2.0, LookAheadConfig(distance=5.0).build(0.1), STATE)
+    guidance = WaypointGuidance(
+        [(10.0, 0.0), (10.0, 20.0)], 2.0, LookAheadConfig(distance=5.0).build(0.1), STATE
+    )
     x = at((7.9, 0.0), (8.1, 0.0), (10.1, 9.0))
     s = guidance.initial_state(at((0.0, 0.0), (0.0, 0.0), (0.0, 0.0)))
     heading, s = guidance(x, 0, s)
@@ -76,6 +108,10 @@ def test_nonsense_is_refused() -> None:
     for points, acceptance in (([], 1.0), ([(1.0, 1.0)], 0.0)):
         with pytest.raises(ConfigError, match="way-points"):
             WaypointGuidance(points, acceptance, LookAheadConfig(distance=1.0).build(0.1), STATE)
-    for config, key in ((LookAheadConfig, "distance"), (EnclosureConfig, "radius"), (IntegralLookAheadConfig, "gain")):
+    for config, key in (
+        (LookAheadConfig, "distance"),
+        (EnclosureConfig, "radius"),
+        (IntegralLookAheadConfig, "gain"),
+    ):
         with pytest.raises(ValidationError, match="greater than 0"):
             config(**{"distance": 1.0, "gain": 1.0, key: 0.0})

@@ -97,12 +97,18 @@ def test_quantity_takes_si_units_only() -> None:
         Quantity("furlong")
 
 
-def test_quantities_in_containers_and_with_constraints(load: Callable[..., Fit], failure: Failure) -> None:
-    config = load("dt: 50 ms\nlimit: 90 deg\nrates: {gnss: [5 Hz, 60 rpm], imu: [100]}\nwindow: 2 min\n")
+def test_quantities_in_containers_and_with_constraints(
+    load: Callable[..., Fit], failure: Failure
+) -> None:
+    config = load(
+        "dt: 50 ms\nlimit: 90 deg\nrates: {gnss: [5 Hz, 60 rpm], imu: [100]}\nwindow: 2 min\n"
+    )
     assert (config.dt, config.limit, config.window) == (0.05, pytest.approx(math.pi / 2), 120.0)
     assert config.rates == {"gnss": (5.0, 1.0), "imu": (100.0,)}
     assert failure("dt: -50 ms\n") == "run.yaml:2: dt: must be greater than 0 (given -0.05)"
-    assert failure("rates:\n  gnss: [1 Hz, 2 kn]\n").startswith("run.yaml:3: rates.gnss.1: unit 'kn' does not measure [1/s]; units that do: Hz")
+    assert failure("rates:\n  gnss: [1 Hz, 2 kn]\n").startswith(
+        "run.yaml:3: rates.gnss.1: unit 'kn' does not measure [1/s]; units that do: Hz"
+    )
 
 
 def test_config_is_frozen_and_closed() -> None:
@@ -127,11 +133,23 @@ def test_defaults_are_checked() -> None:
 def test_scalars_follow_yaml_1_2(tmp_path: Path) -> None:
     path = tmp_path / "a.yaml"
     path.write_text(
-        "a: 1e-3\nb: 1E6\nc: 010\nd: 0x10\ne: off\nf: yes\ng: 12:30\nh: 2024-01-01\ni: ~\nj:\nk: true\nl: .5\nm: '1e-3'\non: 0o17\n7: x\n"
+        "a: 1e-3\nb: 1E6\nc: 010\nd: 0x10\ne: off\nf: yes\ng: 12:30\nh: 2024-01-01\ni: ~\nj:\nk:"
+        " true\nl: .5\nm: '1e-3'\non: 0o17\n7: x\n"
     )
     mapping = load_mapping(path)
     assert mapping == {
-        **{"a": 1e-3, "b": 1e6, "c": 10, "d": 16, "e": "off", "f": "yes", "g": "12:30", "h": "2024-01-01", "i": None, "j": None},
+        **{
+            "a": 1e-3,
+            "b": 1e6,
+            "c": 10,
+            "d": 16,
+            "e": "off",
+            "f": "yes",
+            "g": "12:30",
+            "h": "2024-01-01",
+            "i": None,
+            "j": None,
+        },
         **{"k": True, "l": 0.5, "m": "1e-3", "on": 15, "7": "x"},
     }
     assert type(mapping["b"]) is float
@@ -141,7 +159,11 @@ def test_scalars_follow_yaml_1_2(tmp_path: Path) -> None:
 def test_merge_keys_are_not_duplicates_and_are_not_shared(load: Callable[..., Fit]) -> None:
     text = "heads:\n  a: &a {kind: lstm, hidden_size: 3}\n  b: *a\n  c: {<<: *a, hidden_size: 5}\n"
     heads = load(text, "heads.a.hidden_size=4").heads
-    assert {name: head.model_dump()["hidden_size"] for name, head in heads.items()} == {"a": 4, "b": 3, "c": 5}
+    assert {name: head.model_dump()["hidden_size"] for name, head in heads.items()} == {
+        "a": 4,
+        "b": 3,
+        "c": 5,
+    }
 
 
 @pytest.mark.parametrize(
@@ -194,7 +216,9 @@ def test_byte_order_mark_is_skipped(tmp_path: Path) -> None:
 # paths
 
 
-def test_path_is_taken_from_the_configs_folder_first(load: Callable[..., Fit], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_path_is_taken_from_the_configs_folder_first(
+    load: Callable[..., Fit], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     here = tmp_path / "here"
     here.mkdir()
     monkeypatch.chdir(here)
@@ -207,7 +231,9 @@ def test_path_is_taken_from_the_configs_folder_first(load: Callable[..., Fit], t
     assert load().out == here / "runs"
 
 
-def test_path_expands_environment_and_home(load: Callable[..., Fit], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_path_expands_environment_and_home(
+    load: Callable[..., Fit], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("TEST_LOGS", str(tmp_path))
     monkeypatch.setenv("HOME", str(tmp_path))
     assert load("out: ${TEST_LOGS}/a\n").out == tmp_path / "a"
@@ -217,21 +243,34 @@ def test_path_expands_environment_and_home(load: Callable[..., Fit], tmp_path: P
 def test_path_faults(failure: Failure, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("TEST_LOGS", raising=False)
-    unset = "out: environment variable 'TEST_LOGS' is not set; set it (export TEST_LOGS=...) or write the path itself"
+    unset = (
+        "out: environment variable 'TEST_LOGS' is not set; set it (export TEST_LOGS=...) or write"
+        " the path itself"
+    )
     assert failure("out: ${TEST_LOGS}/a\n").startswith(f"run.yaml:2: {unset}")
     monkeypatch.setenv("TEST_LOGS", "")
     assert failure("", "out=${TEST_LOGS}/a").startswith(f"override 'out=${{TEST_LOGS}}/a': {unset}")
-    assert failure("logs:\n- nope.csv\n") == "run.yaml:3: logs.0: no such file or folder: nope.csv (given 'nope.csv')"
-    assert failure(f"logs: [{'x' * 400}]\n").startswith("run.yaml:2: logs.0: no such file or folder: ")
+    assert (
+        failure("logs:\n- nope.csv\n")
+        == "run.yaml:3: logs.0: no such file or folder: nope.csv (given 'nope.csv')"
+    )
+    assert failure(f"logs: [{'x' * 400}]\n").startswith(
+        "run.yaml:2: logs.0: no such file or folder: "
+    )
     assert failure("out: 3\n") == "run.yaml:2: out: expected a path (given 3)"
     assert failure("out: ''\n") == "run.yaml:2: out: expected a path (given '')"
-    assert failure("out: ~no-such-user/a\n") == "run.yaml:2: out: no home folder is known for '~' (given '~no-such-user/a')"
+    assert (
+        failure("out: ~no-such-user/a\n")
+        == "run.yaml:2: out: no home folder is known for '~' (given '~no-such-user/a')"
+    )
 
 
 # writing
 
 
-def test_dump_loads_back_to_an_equal_config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_dump_loads_back_to_an_equal_config(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "log: 1.csv").touch()
     config = Fit(
@@ -245,7 +284,12 @@ def test_dump_loads_back_to_an_equal_config(tmp_path: Path, monkeypatch: pytest.
         threshold=[1.0, 1 / 3],
         heads={"a b": Mlp(hidden=()), "<<": Lstm(hidden_size=3), "1e3": Mlp()},
         stages=[Lstm(hidden_size=1), Mlp()],
-        sensors=(Sensor(name="multi\nline # ü"), Sensor(name="12:30"), Sensor(name="~"), Sensor(name="")),
+        sensors=(
+            Sensor(name="multi\nline # ü"),
+            Sensor(name="12:30"),
+            Sensor(name="~"),
+            Sensor(name=""),
+        ),
         by_index={3: 1.5, -1: 2.0},
         out=Path("runs/a"),
         logs=(Path("log: 1.csv"),),
@@ -261,17 +305,29 @@ def test_dump_loads_back_to_an_equal_config(tmp_path: Path, monkeypatch: pytest.
     assert load_config(other, [], Task) == config
 
 
-def test_dump_is_complete_and_in_order_of_the_fields(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_dump_is_complete_and_in_order_of_the_fields(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     text = dump_config(Fit(task="fit", policy=Mlp(hidden=(3, 4))))
-    assert [line.split(":")[0] for line in text.splitlines() if not line.startswith(" ")] == list(Fit.model_fields)
+    assert [line.split(":")[0] for line in text.splitlines() if not line.startswith(" ")] == list(
+        Fit.model_fields
+    )
     assert "  hidden: [3, 4]\n" in text
     assert f"out: {tmp_path}/runs\n" in text
 
 
 def test_import_is_light() -> None:
-    code = "import sys, residnet.core.config; print(sorted({'torch', 'numpy', 'pandas', 'lightning', 'scipy'} & set(sys.modules)))"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
+    code = (
+        "import sys, residnet.core.config; print(sorted({'torch', 'numpy', 'pandas', 'lightning',"
+        " 'scipy'} & set(sys.modules)))"
+    )
+    assert (
+        subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True
+        ).stdout
+        == "[]\n"
+    )
 
 
 class Parts(Config):
@@ -289,8 +345,13 @@ def test_a_key_is_taken_away(tmp_path: Path) -> None:
     assert load_config(path, ["~parts.a", "parts.a=7"], Parts).parts == {"a": 7, "b": 2}
 
 
-@pytest.mark.parametrize(("override", "message"), [("~parts.aa", "did you mean 'a'"), ("~parts.a.x", "no 'parts.a.x'"), ("~", "no ''")])
-def test_what_is_not_there_cannot_be_taken_away(override: str, message: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [("~parts.aa", "did you mean 'a'"), ("~parts.a.x", "no 'parts.a.x'"), ("~", "no ''")],
+)
+def test_what_is_not_there_cannot_be_taken_away(
+    override: str, message: str, tmp_path: Path
+) -> None:
     path = tmp_path / "parts.yaml"
     path.write_text("parts: {a: 1, b: 2}\n")
     with pytest.raises(ConfigError, match=message) as caught:

@@ -1,4 +1,6 @@
-"""Frames: wrapping against complex exponentials, rotations against compass directions and a rotation matrix."""
+"""Frames: wrapping against complex exponentials, rotations against compass directions and a
+rotation matrix.
+"""
 
 from __future__ import annotations
 
@@ -18,10 +20,14 @@ def test_wrap_array_agrees_with_complex_exponential() -> None:
 
 
 def test_wrap_agrees_with_wrap_array() -> None:
-    np.testing.assert_allclose(wrap(torch.from_numpy(ANGLES)).numpy(), wrap_array(ANGLES), atol=1e-15)
+    np.testing.assert_allclose(
+        wrap(torch.from_numpy(ANGLES)).numpy(), wrap_array(ANGLES), atol=1e-15
+    )
     single = wrap(torch.from_numpy(ANGLES).float())
     assert single.dtype == torch.float32
-    np.testing.assert_allclose(single.numpy(), wrap_array(ANGLES.astype(np.float32).astype(float)), atol=2e-4)
+    np.testing.assert_allclose(
+        single.numpy(), wrap_array(ANGLES.astype(np.float32).astype(float)), atol=2e-4
+    )
 
 
 def test_wrap_keeps_small_angles_and_shapes() -> None:
@@ -32,7 +38,9 @@ def test_wrap_keeps_small_angles_and_shapes() -> None:
 
 
 def test_wrapped_difference_across_north() -> None:
-    assert math.isclose(wrap_array(np.radians(359.0) - np.radians(1.0)), np.radians(-2.0), abs_tol=1e-12)
+    assert math.isclose(
+        wrap_array(np.radians(359.0) - np.radians(1.0)), np.radians(-2.0), abs_tol=1e-12
+    )
 
 
 def test_compass_directions() -> None:
@@ -49,10 +57,14 @@ def test_compass_directions() -> None:
 
 def test_rotations_are_inverse_and_equal_the_matrix() -> None:
     generator = torch.Generator().manual_seed(1)
-    psi, forward, starboard = (torch.randn(5, 3, dtype=torch.float64, generator=generator) * 3 for _ in range(3))
+    psi, forward, starboard = (
+        torch.randn(5, 3, dtype=torch.float64, generator=generator) * 3 for _ in range(3)
+    )
     north, east = to_earth(forward, starboard, psi)
     back = to_body(north, east, psi)
-    torch.testing.assert_close(torch.stack(back), torch.stack([forward, starboard]), rtol=1e-13, atol=1e-13)
+    torch.testing.assert_close(
+        torch.stack(back), torch.stack([forward, starboard]), rtol=1e-13, atol=1e-13
+    )
     complex_earth = torch.complex(forward, starboard) * torch.exp(1j * psi)
     torch.testing.assert_close(torch.complex(north, east), complex_earth, rtol=1e-13, atol=1e-13)
 

@@ -33,7 +33,12 @@ def test_round_trip(log: Log, tmp_path: Path) -> None:
     path = tmp_path / "log.parquet"
     log.save(path)
     again = Log.load(path)
-    assert (again.name, again.manoeuvre, again.units, again.meta) == (log.name, log.manoeuvre, log.units, log.meta)
+    assert (again.name, again.manoeuvre, again.units, again.meta) == (
+        log.name,
+        log.manoeuvre,
+        log.units,
+        log.meta,
+    )
     assert again.t.tobytes() == log.t.tobytes()
     assert list(again.channels) == list(log.channels)
     for name, values in log.channels.items():
@@ -50,7 +55,13 @@ def test_round_trip_of_a_bare_log(tmp_path: Path) -> None:
     Log("empty", np.zeros(0), {}).save(path)
     again = Log.load(path)
     assert len(again) == 0
-    assert (again.name, again.manoeuvre, again.channels, again.masks, again.meta) == ("empty", "unknown", {}, {}, {})
+    assert (again.name, again.manoeuvre, again.channels, again.masks, again.meta) == (
+        "empty",
+        "unknown",
+        {},
+        {},
+        {},
+    )
 
 
 def test_units_are_filled_in(log: Log) -> None:
@@ -64,10 +75,14 @@ def test_usable_is_what_no_mask_excludes(log: Log) -> None:
 
 
 def test_access(log: Log) -> None:
-    np.testing.assert_array_equal(log.stack(["psi", "fuel"]), np.column_stack([log["psi"], log["fuel"]]))
+    np.testing.assert_array_equal(
+        log.stack(["psi", "fuel"]), np.column_stack([log["psi"], log["fuel"]])
+    )
     assert log.stack([]).shape == (50, 0)
     assert log.replace(name="other").name == "other"
-    with pytest.raises(UsageError, match=r"log zigzag-20: no channel 'fuels'; did you mean 'fuel'\?$"):
+    with pytest.raises(
+        UsageError, match=r"log zigzag-20: no channel 'fuels'; did you mean 'fuel'\?$"
+    ):
         log["fuels"]
 
 
@@ -108,7 +123,9 @@ def test_cut_short(log: Log, tmp_path: Path) -> None:
         Log.load(path)
 
 
-@pytest.mark.parametrize("metadata", [None, {"other": "{}"}, {"residnet": '{"schema": "residnet.log/0"}'}])
+@pytest.mark.parametrize(
+    "metadata", [None, {"other": "{}"}, {"residnet": '{"schema": "residnet.log/0"}'}]
+)
 def test_foreign_parquet(tmp_path: Path, metadata: dict[str, str] | None) -> None:
     path = tmp_path / "log.parquet"
     pq.write_table(pa.table({"t": [0.0, 1.0]}).replace_schema_metadata(metadata), path)

@@ -45,14 +45,22 @@ def test_averaging_has_the_gain_of_a_boxcar_and_no_delay() -> None:
     for frequency in (0.2, 0.9):
         out = align(Log("a", t, {"u": np.sin(2.0 * np.pi * frequency * t)}), GridConfig(step=0.5))
         inner = slice(2, -2)
-        np.testing.assert_allclose(out["u"][inner], np.sinc(0.5 * frequency) * np.sin(2.0 * np.pi * frequency * out.t[inner]), atol=2e-4)
+        np.testing.assert_allclose(
+            out["u"][inner],
+            np.sinc(0.5 * frequency) * np.sin(2.0 * np.pi * frequency * out.t[inner]),
+            atol=2e-4,
+        )
     # what would fold to a constant has a null
     out = align(Log("a", t, {"u": np.sin(2.0 * np.pi * 2.0 * t + 0.7)}), GridConfig(step=0.5))
     assert np.abs(out["u"][2:-2]).max() < 1e-6
 
 
 def test_held_inputs_take_the_value_before_and_states_the_line_between() -> None:
-    log = Log("a", np.array([0.0, 0.3, 0.6, 0.9]), {"delta": np.array([1.0, 2, 3, 4]), "u": np.array([0.0, 3, 6, 9])})
+    log = Log(
+        "a",
+        np.array([0.0, 0.3, 0.6, 0.9]),
+        {"delta": np.array([1.0, 2, 3, 4]), "u": np.array([0.0, 3, 6, 9])},
+    )
     out = align(log, GridConfig(step=0.2, held=("delta",)))
     np.testing.assert_allclose(out.t, [0.0, 0.2, 0.4, 0.6, 0.8])
     np.testing.assert_allclose(out["delta"], [1.0, 1.0, 2.0, 3.0, 3.0])
@@ -60,7 +68,10 @@ def test_held_inputs_take_the_value_before_and_states_the_line_between() -> None
 
 
 def test_wrapping_angles_go_the_short_way_and_stay_in_their_range() -> None:
-    for wind, expected in (([350.0, 10.0, 20.0], [350.0, 0.0, 10.0, 15.0, 20.0]), ([170.0, -170.0, -160.0], [170.0, -180.0, -170.0, -165.0, -160.0])):
+    for wind, expected in (
+        ([350.0, 10.0, 20.0], [350.0, 0.0, 10.0, 15.0, 20.0]),
+        ([170.0, -170.0, -160.0], [170.0, -180.0, -170.0, -165.0, -160.0]),
+    ):
         log = Log("a", np.array([0.0, 1.0, 2.0]), {"wind_dir": np.radians(wind)})
         values = np.degrees(align(log, GridConfig(step=0.5))["wind_dir"])
         np.testing.assert_allclose(np.remainder(values - expected + 1.0, 360.0), 1.0, atol=1e-9)
@@ -69,7 +80,11 @@ def test_wrapping_angles_go_the_short_way_and_stay_in_their_range() -> None:
 
 
 def test_points_in_gaps_and_beside_missing_samples_are_masked() -> None:
-    log = Log("a", np.array([0.0, 0.1, 0.2, 0.6, 0.7, 0.8, 0.9]), {"u": np.array([0.0, 1, 2, 6, 7, np.nan, 9])})
+    log = Log(
+        "a",
+        np.array([0.0, 0.1, 0.2, 0.6, 0.7, 0.8, 0.9]),
+        {"u": np.array([0.0, 1, 2, 6, 7, np.nan, 9])},
+    )
     out = align(log, GridConfig(step=0.1, longest_gap=0.2))
     np.testing.assert_allclose(out["u"], [0, 1, 2, np.nan, np.nan, np.nan, 6, 7, np.nan, 9])
     assert np.flatnonzero(out.masks["hard:gap"]).tolist() == [3, 4, 5, 8]
@@ -80,7 +95,9 @@ def test_points_in_gaps_and_beside_missing_samples_are_masked() -> None:
 
 
 def test_missing_samples_of_a_log_on_the_grid_are_masked_too() -> None:
-    out = align(Log("a", 0.1 * np.arange(4), {"u": np.array([0.0, np.nan, 2, 3])}), GridConfig(step=0.1))
+    out = align(
+        Log("a", 0.1 * np.arange(4), {"u": np.array([0.0, np.nan, 2, 3])}), GridConfig(step=0.1)
+    )
     assert out.masks["hard:gap"].tolist() == [False, True, False, False]
 
 
@@ -104,6 +121,8 @@ def test_faults() -> None:
     with pytest.raises(DataError, match="1 samples"):
         align(Log("a", np.zeros(1), {"u": np.ones(1)}), GridConfig(step=0.1))
     with pytest.raises(UsageError, match="no channel 'dleta'; did you mean 'delta'"):
-        align(Log("a", np.arange(3.0), {"delta": np.ones(3)}), GridConfig(step=0.1, held=("dleta",)))
+        align(
+            Log("a", np.arange(3.0), {"delta": np.ones(3)}), GridConfig(step=0.1, held=("dleta",))
+        )
     with pytest.raises(DataError, match="check the unit of time"):
         align(Log("a", np.array([0.0, 1.0, 1.7e9]), {"u": np.ones(3)}), GridConfig(step=0.1))

@@ -1,4 +1,6 @@
-"""Damaged recordings of every format end in a log whose clock runs forward, or in one line; nothing else gets out."""
+"""Damaged recordings of every format end in a log whose clock runs forward, or in one line; nothing
+else gets out.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,15 @@ import written_recorders
 
 from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
-from residnet.data.readers import ArduPilotConfig, Hdf5Config, MatConfig, NmeaConfig, RosbagConfig, TopicFolderConfig, UlogConfig
+from residnet.data.readers import (
+    ArduPilotConfig,
+    Hdf5Config,
+    MatConfig,
+    NmeaConfig,
+    RosbagConfig,
+    TopicFolderConfig,
+    UlogConfig,
+)
 from residnet.data.readers.composing.composed import RecordingConfig
 
 CASES: list[tuple[Callable[[Log, Path], Path], RecordingConfig]] = [
@@ -60,7 +70,12 @@ def outcome(path: Path, config: RecordingConfig) -> Log | str:
 
 
 @pytest.mark.parametrize(("write", "config"), CASES)
-def test_damage(write: Callable[[Log, Path], Path], config: RecordingConfig, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_damage(
+    write: Callable[[Log, Path], Path],
+    config: RecordingConfig,
+    tmp_path: Path,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
     path = write(written_logs.trial(3.0), tmp_path)
     files = [file for file in path.rglob("*") if file.is_file()] if path.is_dir() else [path]
     whole = {file: file.read_bytes() for file in files}

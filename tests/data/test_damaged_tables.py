@@ -1,4 +1,6 @@
-"""Damaged tables: each ends in a log whose samples are those that were written, or in one clear line; never in anything else."""
+"""Damaged tables: each ends in a log whose samples are those that were written, or in one clear
+line; never in anything else.
+"""
 
 from __future__ import annotations
 
@@ -32,8 +34,12 @@ _MAP = {
         "n": {"column": "n", "unit": "1/s"},
     },
 }
-READERS = {kind: validate({"kind": kind, **_MAP}, ReaderConfig, "test").build() for kind in ("csv", "parquet")}
-# every cell is another number, with as many decimals as the others of its column, so that one that slipped is seen
+READERS = {
+    kind: validate({"kind": kind, **_MAP}, ReaderConfig, "test").build()
+    for kind in ("csv", "parquet")
+}
+# every cell is another number, with as many decimals as the others of its column, so that one that
+# slipped is seen
 TABLE = pd.DataFrame(
     {
         "t": [round(0.1 * i + 1.0, 6) for i in range(ROWS)],
@@ -43,16 +49,70 @@ TABLE = pd.DataFrame(
         "n": [round(5000.0 + 7.3 * i + 0.000789, 6) for i in range(ROWS)],
     }
 )
-LINES = [",".join(COLUMNS), *(",".join(f"{value:.6f}" for value in row) for row in TABLE.to_numpy())]
+LINES = [
+    ",".join(COLUMNS),
+    *(",".join(f"{value:.6f}" for value in row) for row in TABLE.to_numpy()),
+]
 TRUTH = {f"{row[0]:.6f}": row for row in TABLE.to_numpy()}
 # what stands in a cell that no sensor wrote; none of them is another number
 JUNK = [
-    *["", "nan", "NaN", "NULL", "N/A", "None", "-", "--", "+", "abc", "True", "'", "#", '"', '""', "{'a': 1}", "[1, 2]", "(3)", "=1+1", "a,b,c"],
-    *["1e999", "inf", "-inf", "1,5", "0x1F", "1_0", "1 2", "12 :30", "1.2.3", "2020-01-01", "e5", "1e", "1d5", "$5", "5%", "5m"],
+    *[
+        "",
+        "nan",
+        "NaN",
+        "NULL",
+        "N/A",
+        "None",
+        "-",
+        "--",
+        "+",
+        "abc",
+        "True",
+        "'",
+        "#",
+        '"',
+        '""',
+        "{'a': 1}",
+        "[1, 2]",
+        "(3)",
+        "=1+1",
+        "a,b,c",
+    ],
+    *[
+        "1e999",
+        "inf",
+        "-inf",
+        "1,5",
+        "0x1F",
+        "1_0",
+        "1 2",
+        "12 :30",
+        "1.2.3",
+        "2020-01-01",
+        "e5",
+        "1e",
+        "1d5",
+        "$5",
+        "5%",
+        "5m",
+    ],
     *["\u0661\u0662", "\uff11", "\u2212 3", "\ufeff", "\t", "\x1a"],
 ]
 BYTES = [
-    *[b"\x00", b"\xff", b"\xfe\xff", b"\xc3", b"\xe4", b"\x1a", b"\xef\xbb\xbf", b"\n", b"\r", b"\r\n", b"\t", b" "],
+    *[
+        b"\x00",
+        b"\xff",
+        b"\xfe\xff",
+        b"\xc3",
+        b"\xe4",
+        b"\x1a",
+        b"\xef\xbb\xbf",
+        b"\n",
+        b"\r",
+        b"\r\n",
+        b"\t",
+        b" ",
+    ],
     *[b'"', b"''", b",", b";", b"a", b"\\"],
 ]
 
@@ -111,7 +171,10 @@ def ragged(data: bytes, rng: random.Random) -> bytes:
 
 def other_delimiter(data: bytes, rng: random.Random) -> bytes:
     sign = rng.choice([b";", b"\t", b" ", b"|", b", ", b",,"])
-    return b"\n".join(row.replace(b",", sign) if rng.random() < rng.choice([0.1, 1.0]) else row for row in lines_of(data))
+    return b"\n".join(
+        row.replace(b",", sign) if rng.random() < rng.choice([0.1, 1.0]) else row
+        for row in lines_of(data)
+    )
 
 
 def decimal_commas(data: bytes, rng: random.Random) -> bytes:
@@ -121,7 +184,9 @@ def decimal_commas(data: bytes, rng: random.Random) -> bytes:
 
 def other_encoding(data: bytes, rng: random.Random) -> bytes:
     text = data.decode("latin-1")
-    return text.encode(rng.choice(["utf-16", "utf-16-le", "utf-32", "utf-8-sig", "cp037"]), errors="replace")
+    return text.encode(
+        rng.choice(["utf-16", "utf-16-le", "utf-32", "utf-8-sig", "cp037"]), errors="replace"
+    )
 
 
 def inserted_bytes(data: bytes, rng: random.Random) -> bytes:
@@ -143,7 +208,9 @@ def other_line_ends(data: bytes, rng: random.Random) -> bytes:
 def huge(data: bytes, rng: random.Random) -> bytes:
     rows = [row.split(b",") for row in lines_of(data)]
     row = rng.choice(rows[1:] or rows)
-    row[rng.randrange(len(row))] = rng.choice([b"9" * 400, b"1" + b"0" * 5000, b"-" + b"9" * 310, b"x" * 200_000])
+    row[rng.randrange(len(row))] = rng.choice(
+        [b"9" * 400, b"1" + b"0" * 5000, b"-" + b"9" * 310, b"x" * 200_000]
+    )
     return b"\n".join(b",".join(row) for row in rows)
 
 
@@ -160,11 +227,33 @@ def header_lost(data: bytes, rng: random.Random) -> bytes:
     head, *rows = lines_of(data)
     names = head.split(b",")
     rng.shuffle(names)
-    return b"\n".join(rng.choice([rows, [b"", *rows], [b",".join([*names[:-1], names[0]]), *rows], [head, head, *rows], [head.upper(), *rows]]))
+    return b"\n".join(
+        rng.choice(
+            [
+                rows,
+                [b"", *rows],
+                [b",".join([*names[:-1], names[0]]), *rows],
+                [head, head, *rows],
+                [head.upper(), *rows],
+            ]
+        )
+    )
 
 
 def emptied(data: bytes, rng: random.Random) -> bytes:
-    return rng.choice([b"", b"\n", b"\n\n\n", data.split(b"\n")[0], data.split(b"\n")[0] + b"\n", b" ", b",,,,\n", b"\xef\xbb\xbf", b'"'])
+    return rng.choice(
+        [
+            b"",
+            b"\n",
+            b"\n\n\n",
+            data.split(b"\n")[0],
+            data.split(b"\n")[0] + b"\n",
+            b" ",
+            b",,,,\n",
+            b"\xef\xbb\xbf",
+            b'"',
+        ]
+    )
 
 
 DAMAGES: list[Damage] = [
@@ -203,7 +292,9 @@ def outcome(path: Path, kind: str) -> Log | None:
 
 
 def foreign(log: Log) -> list[str]:
-    """What is not as it was written: times out of order or of no row, and samples that are neither their row's nor missing."""
+    """What is not as it was written: times out of order or of no row, and samples that are neither
+    their row's nor missing.
+    """
     found = [] if log.t.size >= 2 and bool((np.diff(log.t) > 0.0).all()) else ["times"]
     for i, t in enumerate(log.t):
         row = TRUTH.get(f"{t:.6f}")
@@ -222,12 +313,23 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("damaged")
 
 
-ONCE = {"deadline": None, "derandomize": True, "database": None, "suppress_health_check": [HealthCheck.function_scoped_fixture]}
+ONCE = {
+    "deadline": None,
+    "derandomize": True,
+    "database": None,
+    "suppress_health_check": [HealthCheck.function_scoped_fixture],
+}
 
 
 @settings(max_examples=1650, **ONCE)
-@given(seed=st.integers(0, 2**32), which=st.lists(st.sampled_from(DAMAGES), min_size=1, max_size=2), end=st.booleans())
-def test_damaged_text_gives_the_samples_as_written_or_one_clear_line(folder: Path, seed: int, which: list[Damage], end: bool) -> None:
+@given(
+    seed=st.integers(0, 2**32),
+    which=st.lists(st.sampled_from(DAMAGES), min_size=1, max_size=2),
+    end=st.booleans(),
+)
+def test_damaged_text_gives_the_samples_as_written_or_one_clear_line(
+    folder: Path, seed: int, which: list[Damage], end: bool
+) -> None:
     rng = random.Random(seed)
     data = "\n".join(LINES).encode() + (b"\n" if end else b"")
     for damage in which:
@@ -247,7 +349,9 @@ def written_parquet(table: pa.Table) -> bytes:
 OTHER_TYPES: dict[str, Callable[[np.ndarray], pa.Array]] = {
     "text": lambda values: pa.array([f"{value:.6f}" for value in values]),
     "words": lambda values: pa.array([f"{value:.6f} m" for value in values]),
-    "nulls": lambda values: pa.array([None if i % 3 == 0 else value for i, value in enumerate(values)], pa.float64()),
+    "nulls": lambda values: pa.array(
+        [None if i % 3 == 0 else value for i, value in enumerate(values)], pa.float64()
+    ),
     "all null": lambda values: pa.nulls(len(values)),
     "lists": lambda values: pa.array([[value] for value in values]),
     "structs": lambda values: pa.array([{"a": value} for value in values]),
@@ -255,13 +359,22 @@ OTHER_TYPES: dict[str, Callable[[np.ndarray], pa.Array]] = {
     "bytes": lambda values: pa.array([f"{value:.6f}".encode() for value in values]),
     "stamps": lambda values: pa.array((values * 1e6).astype("int64"), pa.timestamp("us")),
     "bools": lambda values: pa.array([bool(i % 2) for i in range(len(values))]),
-    "infinite": lambda values: pa.array([np.inf if i == 7 else value for i, value in enumerate(values)]),
+    "infinite": lambda values: pa.array(
+        [np.inf if i == 7 else value for i, value in enumerate(values)]
+    ),
 }
 
 
 @settings(max_examples=400, **ONCE)
-@given(seed=st.integers(0, 2**32), how=st.sampled_from(["cut", "flipped", "zeroed", "inserted", "shuffled", "repeated", "types", "columns"]))
-def test_damaged_parquet_gives_the_samples_as_written_or_one_clear_line(folder: Path, seed: int, how: str) -> None:
+@given(
+    seed=st.integers(0, 2**32),
+    how=st.sampled_from(
+        ["cut", "flipped", "zeroed", "inserted", "shuffled", "repeated", "types", "columns"]
+    ),
+)
+def test_damaged_parquet_gives_the_samples_as_written_or_one_clear_line(
+    folder: Path, seed: int, how: str
+) -> None:
     rng = random.Random(seed)
     table = pa.Table.from_pandas(TABLE, preserve_index=False)
     kind = rng.choice(list(OTHER_TYPES))
@@ -271,9 +384,17 @@ def test_damaged_parquet_gives_the_samples_as_written_or_one_clear_line(folder: 
     elif how == "repeated":
         table = table.take(pa.array(sorted(rng.choices(range(ROWS), k=ROWS))))
     elif how == "types":
-        table = table.set_column(COLUMNS.index(column), column, OTHER_TYPES[kind](TABLE[column].to_numpy()))
+        table = table.set_column(
+            COLUMNS.index(column), column, OTHER_TYPES[kind](TABLE[column].to_numpy())
+        )
     elif how == "columns":
-        table = rng.choice([table.drop_columns([column]), table.rename_columns(["t", "t", "psi", "u", "n"]), table.slice(0, rng.randint(0, 2))])
+        table = rng.choice(
+            [
+                table.drop_columns([column]),
+                table.rename_columns(["t", "t", "psi", "u", "n"]),
+                table.slice(0, rng.randint(0, 2)),
+            ]
+        )
     data = bytearray(written_parquet(table))
     if how == "cut":
         data = data[: rng.randrange(len(data))]
@@ -289,7 +410,8 @@ def test_damaged_parquet_gives_the_samples_as_written_or_one_clear_line(folder: 
     path = folder / "table.parquet"
     path.write_bytes(bytes(data))
     log = outcome(path, "parquet")
-    # flags are numbers to whoever maps them, and microseconds of an epoch are no time that was written
+    # flags are numbers to whoever maps them, and microseconds of an epoch are no time that was
+    # written
     assert log is None or (how == "types" and kind in ("bools", "stamps")) or foreign(log) == []
 
 
@@ -314,4 +436,6 @@ def test_a_file_that_ends_within_its_last_line_loses_that_line(folder: Path, cut
     assert len(log) == ROWS - 1
     assert foreign(log) == []
     assert log.meta["rows_dropped"] == 1
-    assert [finding.code for finding in inspect(log).findings if "left out" in finding.text] == ["cut_line"]
+    assert [finding.code for finding in inspect(log).findings if "left out" in finding.text] == [
+        "cut_line"
+    ]

@@ -10,19 +10,33 @@ from scipy.signal import butter, filtfilt, savgol_filter
 
 from residnet.core.config import validate
 from residnet.core.errors import ConfigError
-from residnet.data.derivatives import BackwardDifference, Butterworth, Derivative, DerivativeConfig, ForwardDifference, SavitzkyGolay
+from residnet.data.derivatives import (
+    BackwardDifference,
+    Butterworth,
+    Derivative,
+    DerivativeConfig,
+    ForwardDifference,
+    SavitzkyGolay,
+)
 
 STEP = 0.1
 T = STEP * np.arange(200)
 NOISE = np.random.default_rng(0).normal(size=(200, 3))
 ONE = np.zeros(200, dtype=int)
-RULES: list[Derivative] = [SavitzkyGolay(window=1.5, order=2), BackwardDifference(), ForwardDifference(), Butterworth(cutoff=1.0)]
+RULES: list[Derivative] = [
+    SavitzkyGolay(window=1.5, order=2),
+    BackwardDifference(),
+    ForwardDifference(),
+    Butterworth(cutoff=1.0),
+]
 
 
 def test_savitzky_golay_is_scipys_on_one_piece() -> None:
     smooth, rate, valid = SavitzkyGolay(window=1.5, order=3).derive(NOISE, STEP, ONE)
     np.testing.assert_allclose(smooth, savgol_filter(NOISE, 15, 3, axis=0), rtol=0, atol=1e-12)
-    np.testing.assert_allclose(rate, savgol_filter(NOISE, 15, 3, deriv=1, delta=STEP, axis=0), rtol=0, atol=1e-11)
+    np.testing.assert_allclose(
+        rate, savgol_filter(NOISE, 15, 3, deriv=1, delta=STEP, axis=0), rtol=0, atol=1e-11
+    )
     assert valid.all()
 
 
@@ -32,7 +46,9 @@ def test_savitzky_golay_is_exact_for_polynomials_up_to_the_edges() -> None:
     smooth, rate, valid = SavitzkyGolay(window=2.05, order=2).derive(values, STEP, pieces)
     np.testing.assert_array_equal(valid, pieces >= 0)
     np.testing.assert_allclose(smooth[valid], values[valid], atol=1e-9)
-    np.testing.assert_allclose(rate[valid], np.stack([2.0 - 0.6 * T, 2.0 * T], axis=1)[valid], atol=1e-8)
+    np.testing.assert_allclose(
+        rate[valid], np.stack([2.0 - 0.6 * T, 2.0 * T], axis=1)[valid], atol=1e-8
+    )
     assert np.isnan(rate[~valid]).all()
 
 
@@ -90,7 +106,11 @@ def test_a_missing_value_splits_its_piece(rule: Derivative) -> None:
     assert np.isfinite(got[1][got[2]]).all()
 
 
-@pytest.mark.parametrize(("rule", "enough"), list(zip(RULES, (15, 2, 2, 11), strict=True)), ids=lambda x: getattr(x, "kind", None))
+@pytest.mark.parametrize(
+    ("rule", "enough"),
+    list(zip(RULES, (15, 2, 2, 11), strict=True)),
+    ids=lambda x: getattr(x, "kind", None),
+)
 def test_short_pieces_are_invalid(rule: Derivative, enough: int) -> None:
     assert rule.derive(NOISE[:enough], STEP, ONE[:enough])[2].any()
     assert not rule.derive(NOISE[: enough - 1], STEP, ONE[: enough - 1])[2].any()
@@ -99,7 +119,10 @@ def test_short_pieces_are_invalid(rule: Derivative, enough: int) -> None:
 @pytest.mark.parametrize(
     ("config", "words"),
     [
-        ({"kind": "savitzky_golay", "window": "0.2 s", "order": 3}, "set window to 0.5 s or longer"),
+        (
+            {"kind": "savitzky_golay", "window": "0.2 s", "order": 3},
+            "set window to 0.5 s or longer",
+        ),
         ({"kind": "butterworth", "cutoff": "5 Hz"}, "not below the Nyquist frequency 5 Hz"),
     ],
 )
@@ -108,7 +131,10 @@ def test_rules_that_do_not_go_with_the_step(config: dict[str, Any], words: str) 
         validate(config, DerivativeConfig, "test").derive(NOISE, STEP, ONE)
 
 
-@pytest.mark.parametrize("config", [{"kind": "savitzky_golay", "window": -1}, {"kind": "butterworth"}, {"kind": "central"}])
+@pytest.mark.parametrize(
+    "config",
+    [{"kind": "savitzky_golay", "window": -1}, {"kind": "butterworth"}, {"kind": "central"}],
+)
 def test_faulty_configs(config: dict[str, Any]) -> None:
     with pytest.raises(ConfigError):
         validate(config, DerivativeConfig, "test")

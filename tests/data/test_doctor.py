@@ -92,7 +92,10 @@ def test_a_compass_offset_and_a_gyro_bias_are_measured() -> None:
     assert drift.level == "will mislead"
     assert np.degrees(drift.figures["bias"]) == pytest.approx(0.1, rel=0.02)
     assert np.degrees(drift.figures["end"]) == pytest.approx(20.0, rel=0.02)
-    assert one(inspect(changed(log, r=log["r"] - np.radians(2.0))), "yaw_drift").level == "will mislead"
+    assert (
+        one(inspect(changed(log, r=log["r"] - np.radians(2.0))), "yaw_drift").level
+        == "will mislead"
+    )
 
 
 def test_freezes_jumps_and_repeats() -> None:
@@ -107,7 +110,9 @@ def test_freezes_jumps_and_repeats() -> None:
     jump = one(report, "position_jump")
     assert (jump.figures["count"], jump.figures["t"]) == (1, pytest.approx(120.0))
     assert jump.figures["largest"] == pytest.approx(1.0, rel=0.01)
-    slow = Log("slow", log.t, {name: np.repeat(values[::4], 4) for name, values in log.channels.items()})
+    slow = Log(
+        "slow", log.t, {name: np.repeat(values[::4], 4) for name, values in log.channels.items()}
+    )
     assert one(inspect(slow), "repeated_rows").figures["share"] == pytest.approx(0.75, abs=0.01)
 
 
@@ -155,7 +160,9 @@ def test_excitation() -> None:
     assert one(steps, "input_jump").figures["share_of_range"] == pytest.approx(1.0)
     stopped = {name: np.where(log.t < 60.0, 0.0, log[name]) for name in "uv"}
     assert one(inspect(changed(log, **stopped)), "slow").figures["share"] == pytest.approx(0.3)
-    resting = one(inspect(changed(log, **stopped, r=np.where(log.t < 60.0, 0.0, log["r"]))), "standing")
+    resting = one(
+        inspect(changed(log, **stopped, r=np.where(log.t < 60.0, 0.0, log["r"]))), "standing"
+    )
     assert resting.level == "will mislead"
     assert resting.figures["share"] == pytest.approx(0.3, abs=0.01)
 
@@ -171,12 +178,14 @@ def test_a_log_without_position_says_so() -> None:
 @pytest.mark.parametrize("size", [2, 3, 20, 60])
 def test_short_logs_are_examined_as_far_as_they_go(size: int) -> None:
     log = wavy()
-    report = inspect(Log("short", log.t[:size], {name: values[:size] for name, values in log.channels.items()}))
+    report = inspect(
+        Log("short", log.t[:size], {name: values[:size] for name, values in log.channels.items()})
+    )
     assert f"7 channels, {size} samples" in one(report, "channels").text
     assert one(report, "clock").figures["span"] == pytest.approx(0.1 * (size - 1))
-    assert {finding.text.split()[0]: finding.figures["max"] for finding in report.find("range")} == {
-        name: log[name][:size].max() for name in ("u", "v", "r", "delta")
-    }
+    assert {
+        finding.text.split()[0]: finding.figures["max"] for finding in report.find("range")
+    } == {name: log[name][:size].max() for name in ("u", "v", "r", "delta")}
     # frames need 50 samples, and each extreme that is reached once is no clipping
     assert bool(report.find("frames")) == (size >= 50)
     assert bool(report.find("frames_unchecked")) == (size < 50)
@@ -197,7 +206,13 @@ def test_what_a_reader_noticed_is_told_and_masked_samples_excuse() -> None:
     log = wavy()
     x, y = log["x"].copy(), log["y"].copy()
     x[500:520], y[500:520] = x[500], y[500]
-    sick = changed(log, x=x, y=y).replace(meta={"findings": [{"level": "will mislead", "code": "latency", "text": "late", "figures": {"s": 0.9}}]})
+    sick = changed(log, x=x, y=y).replace(
+        meta={
+            "findings": [
+                {"level": "will mislead", "code": "latency", "text": "late", "figures": {"s": 0.9}}
+            ]
+        }
+    )
     plain, masked = inspect(sick), inspect(sick, masks=[Frozen()])
     assert one(plain, "latency").figures == {"s": 0.9}
     assert one(plain, "frozen").level == "will mislead"
@@ -225,11 +240,20 @@ def test_steering_that_turns_to_port_or_comes_late_is_seen() -> None:
 def test_lever_arm_and_current_are_measured() -> None:
     log = wavy()
     c, s = np.cos(log["psi"]), np.sin(log["psi"])
-    arm = one(inspect(changed(log, x=log["x"] - 0.99 * c + 0.4 * s, y=log["y"] - 0.99 * s - 0.4 * c)), "lever_arm")
+    arm = one(
+        inspect(changed(log, x=log["x"] - 0.99 * c + 0.4 * s, y=log["y"] - 0.99 * s - 0.4 * c)),
+        "lever_arm",
+    )
     assert arm.level == "will mislead"
-    assert [arm.figures["value_1"], arm.figures["value_2"]] == pytest.approx([-0.99, -0.4], abs=0.01)
-    current = one(inspect(changed(log, x=log["x"] + 0.4 * log.t, y=log["y"] - 0.1 * log.t)), "current")
-    assert [current.figures["value_1"], current.figures["value_2"]] == pytest.approx([0.4, -0.1], abs=0.01)
+    assert [arm.figures["value_1"], arm.figures["value_2"]] == pytest.approx(
+        [-0.99, -0.4], abs=0.01
+    )
+    current = one(
+        inspect(changed(log, x=log["x"] + 0.4 * log.t, y=log["y"] - 0.1 * log.t)), "current"
+    )
+    assert [current.figures["value_1"], current.figures["value_2"]] == pytest.approx(
+        [0.4, -0.1], abs=0.01
+    )
 
 
 def test_relative_wind_is_told_from_true_wind() -> None:
@@ -244,23 +268,56 @@ def test_relative_wind_is_told_from_true_wind() -> None:
 def test_logs_beside_each_other() -> None:
     log = wavy()
     noise = np.random.default_rng(1)
-    noisy = {name: values + 1e-3 * noise.standard_normal(len(log)) for name, values in log.channels.items()}
+    noisy = {
+        name: values + 1e-3 * noise.standard_normal(len(log))
+        for name, values in log.channels.items()
+    }
     whole = Log("whole", log.t, noisy)
     part = Log("part", log.t[:500], {name: values[700:1200] for name, values in noisy.items()})
     first = Log("first", log.t[:900] + 50.0, {name: values[:900] for name, values in noisy.items()})
-    second = Log("second", log.t[900:] + 50.0, {name: values[900:] for name, values in noisy.items()})
+    second = Log(
+        "second", log.t[900:] + 50.0, {name: values[900:] for name, values in noisy.items()}
+    )
     copied = one(inspect_together([whole, part]), "copied_part")
     assert "part is in 100 % a copy of rows 700 to 1199 of whole" in copied.text
     assert copied.level == "will mislead"
-    assert one(inspect_together([whole, part], splits={"whole": "train", "part": "test"}), "copied_part").level == "fatal"
-    assert one(inspect_together([whole, whole.replace(name="again")]), "duplicate_log").figures["rows"] == 2000.0
-    assert "second goes on where first ends" in one(inspect_together([second, first]), "continued").text
-    assert one(inspect_together([first, second], splits={"first": "train", "second": "test"}), "continued").level == "will mislead"
-    other = Log("other", log.t, {name: values + 1e-3 * noise.standard_normal(len(log)) for name, values in log.channels.items() if name != "delta"})
+    assert (
+        one(
+            inspect_together([whole, part], splits={"whole": "train", "part": "test"}),
+            "copied_part",
+        ).level
+        == "fatal"
+    )
+    assert (
+        one(inspect_together([whole, whole.replace(name="again")]), "duplicate_log").figures["rows"]
+        == 2000.0
+    )
+    assert (
+        "second goes on where first ends"
+        in one(inspect_together([second, first]), "continued").text
+    )
+    assert (
+        one(
+            inspect_together([first, second], splits={"first": "train", "second": "test"}),
+            "continued",
+        ).level
+        == "will mislead"
+    )
+    other = Log(
+        "other",
+        log.t,
+        {
+            name: values + 1e-3 * noise.standard_normal(len(log))
+            for name, values in log.channels.items()
+            if name != "delta"
+        },
+    )
     same = other.replace(channels={**other.channels, "delta": noisy["delta"]})
     assert one(inspect_together([whole, same]), "same_commands").level == "note"
     fast = same.replace(name="fast", channels={**same.channels, "u": same["u"] + 0.6})
-    outside = one(inspect_together([whole, fast], splits={"whole": "train", "fast": "test"}), "extrapolation")
+    outside = one(
+        inspect_together([whole, fast], splits={"whole": "train", "fast": "test"}), "extrapolation"
+    )
     assert outside.level == "will mislead"
     assert outside.figures["share"] > 0.5
 
@@ -273,5 +330,11 @@ def test_the_report_as_json_has_every_finding() -> None:
     assert [entry["misled"] for entry in content["logs"]] == [False, True]
     assert content["misled"]
     for entry, report in zip(content["logs"], reports, strict=True):
-        assert [finding["text"] for finding in entry["findings"]] == [finding.text for finding in report.findings]
-        assert {finding["level"] for finding in entry["findings"]} <= {"note", "will mislead", "fatal"}
+        assert [finding["text"] for finding in entry["findings"]] == [
+            finding.text for finding in report.findings
+        ]
+        assert {finding["level"] for finding in entry["findings"]} <= {
+            "note",
+            "will mislead",
+            "fatal",
+        }

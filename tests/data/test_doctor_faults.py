@@ -1,4 +1,6 @@
-"""The doctor on simulated vessels: planted faults are found, clean logs raise nothing (scripts/bench/doctor.py has more seeds)."""
+"""The doctor on simulated vessels: planted faults are found, clean logs raise nothing
+(scripts/bench/doctor.py has more seeds).
+"""
 
 from __future__ import annotations
 
@@ -18,12 +20,20 @@ _VESSELS = [ship for ship in SHIPS if ship.name != "mariner"]
 
 @cache
 def trials(ship: str, seed: int) -> tuple[Log, ...]:
-    return tuple(clean(next(one for one in SHIPS if one.name == ship), seed, ("zigzag", "three_two_one_one", "random_steps", "turning_circle")))
+    return tuple(
+        clean(
+            next(one for one in SHIPS if one.name == ship),
+            seed,
+            ("zigzag", "three_two_one_one", "random_steps", "turning_circle"),
+        )
+    )
 
 
 def loud(logs: list[Log]) -> list[Finding]:
     found = [finding for log in logs for finding in inspect(log).findings]
-    return [finding for finding in (*found, *inspect_together(logs).findings) if finding.level != "note"]
+    return [
+        finding for finding in (*found, *inspect_together(logs).findings) if finding.level != "note"
+    ]
 
 
 @pytest.mark.parametrize("ship", _VESSELS, ids=lambda ship: ship.name)
@@ -43,4 +53,6 @@ def test_planted_faults_are_named(fault: Fault, ship: Ship) -> None:
         random = np.random.default_rng([seed, FAULTS.index(fault)])
         logs = list(trials(ship.name, seed))[:3]
         said = loud(fault.plant(ship, [logs[i] for i in random.permutation(3)], random))
-        assert any(finding.code in fault.codes for finding in said), [finding.text for finding in said]
+        assert any(finding.code in fault.codes for finding in said), [
+            finding.text for finding in said
+        ]

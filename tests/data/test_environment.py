@@ -1,4 +1,6 @@
-"""Disturbances of simulated trials: what existing configs draw, statistics of gusts, and what a plant cannot feel."""
+"""Disturbances of simulated trials: what existing configs draw, statistics of gusts, and what a
+plant cannot feel.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,12 @@ from scipy.signal import lfilter
 
 from residnet.core.config import validate
 from residnet.core.errors import ConfigError
-from residnet.data.simulated.environment import Disturbance, WindField, gusty_wind, ornstein_uhlenbeck
+from residnet.data.simulated.environment import (
+    Disturbance,
+    WindField,
+    gusty_wind,
+    ornstein_uhlenbeck,
+)
 from residnet.data.simulated.trials import SimulatedTrials, simulate
 from residnet.physics.vessel import load_vessel, vessel_files
 
@@ -23,12 +30,29 @@ TRIALS: dict[str, Any] = {
     "step": 0.1,
     "substeps": 1,
     "seed": 3,
-    "trials": [{"kind": "constant", "drive": [0.4, 0.9], "steer": [0.3]}, {"kind": "zigzag", "count": 2, "heading": ["20 deg"], "start": 3}],
+    "trials": [
+        {"kind": "constant", "drive": [0.4, 0.9], "steer": [0.3]},
+        {"kind": "zigzag", "count": 2, "heading": ["20 deg"], "start": 3},
+    ],
     "identification": {"zigzag": 1},
     "validation": {},
 }
-WAVES = {"significant_height": 0.3, "peak_period": 3.0, "direction": "90 deg", "hull": {"length": 4.9, "breadth": 1.0, "draught": 0.2}}
-WIND = {"kind": "symmetric", "frontal_area": 2.0, "lateral_area": 4.0, "length": 4.9, "c_x": 0.7, "c_y": 0.8, "c_n": 0.1, "source": "made"}
+WAVES = {
+    "significant_height": 0.3,
+    "peak_period": 3.0,
+    "direction": "90 deg",
+    "hull": {"length": 4.9, "breadth": 1.0, "draught": 0.2},
+}
+WIND = {
+    "kind": "symmetric",
+    "frontal_area": 2.0,
+    "lateral_area": 4.0,
+    "length": 4.9,
+    "c_x": 0.7,
+    "c_y": 0.8,
+    "c_n": 0.1,
+    "source": "made",
+}
 
 
 @pytest.fixture
@@ -45,8 +69,12 @@ def trials(**changes: Any) -> SimulatedTrials:
 
 
 def test_random_forces_are_drawn_as_they_always_were() -> None:
-    """Data of one seed stay the same for good: the process written out, three draws per step, sampled from its stationary state."""
-    disturbance = Disturbance(force_x=20, force_y=10, force_n=15, correlation=4, current_north=0.2, current_east=-0.1)
+    """Data of one seed stay the same for good: the process written out, three draws per step,
+    sampled from its stationary state.
+    """
+    disturbance = Disturbance(
+        force_x=20, force_y=10, force_n=15, correlation=4, current_north=0.2, current_east=-0.1
+    )
     plant = load_vessel("wam_v_cal").build()
     found = disturbance.series(plant, 3, 50, 0.1, 7, np.random.default_rng([7, 3]))
     keep = np.exp(-0.1 / 4)
@@ -59,27 +87,44 @@ def test_random_forces_are_drawn_as_they_always_were() -> None:
 
 
 def test_new_disturbances_leave_old_draws_alone(windy: str) -> None:
-    """Wind and waves have generators of their own: noise and random forces of a seed do not move."""
+    """Wind and waves have generators of their own: noise and random forces of a seed do not move.
+    """
     plant = load_vessel(windy).build()
     forces = {"force_x": 20.0, "force_n": 15.0}
-    plain, full = Disturbance(**forces), validate(forces | {"wind": {"speed": 5, "direction": 1.0, "gust": 1.0}, "waves": WAVES}, Disturbance, "here")
+    plain, full = (
+        Disturbance(**forces),
+        validate(
+            forces | {"wind": {"speed": 5, "direction": 1.0, "gust": 1.0}, "waves": WAVES},
+            Disturbance,
+            "here",
+        ),
+    )
     series = [d.series(plant, 2, 30, 0.1, 0, np.random.default_rng(0)) for d in (plain, full)]
     np.testing.assert_array_equal(series[0][:, :, :-2], series[1][:, :, :-2])
     assert np.ptp(series[1][:, :, -2]) > 0.1
 
 
 def test_current_by_speed_and_direction() -> None:
-    assert Disturbance(current_speed=2.0, current_direction=np.pi / 2).current() == pytest.approx((0.0, 2.0))
+    assert Disturbance(current_speed=2.0, current_direction=np.pi / 2).current() == pytest.approx(
+        (0.0, 2.0)
+    )
     with pytest.raises(ConfigError, match="belong together"):
         validate({"current_speed": "1 kn"}, Disturbance, "here")
     with pytest.raises(ConfigError, match="given twice"):
-        validate({"current_speed": 1, "current_direction": 0, "current_east": 0.1}, Disturbance, "here")
+        validate(
+            {"current_speed": 1, "current_direction": 0, "current_east": 0.1}, Disturbance, "here"
+        )
 
 
 def test_each_trial_may_have_a_current_of_its_own() -> None:
-    disturbance = validate({"current_north": 1.0, "current_each": ["0.1 m/s", 0.4]}, Disturbance, "here")
+    disturbance = validate(
+        {"current_north": 1.0, "current_each": ["0.1 m/s", 0.4]}, Disturbance, "here"
+    )
     drawn = disturbance.currents(400, 3)
-    speed, direction = np.hypot(drawn[:, 0] - 1.0, drawn[:, 1]), np.arctan2(drawn[:, 1], drawn[:, 0] - 1.0)
+    speed, direction = (
+        np.hypot(drawn[:, 0] - 1.0, drawn[:, 1]),
+        np.arctan2(drawn[:, 1], drawn[:, 0] - 1.0),
+    )
     assert 0.1 <= speed.min() < 0.11 < 0.39 < speed.max() <= 0.4
     assert abs(np.exp(1j * direction).mean()) < 0.15
     np.testing.assert_array_equal(drawn, disturbance.currents(400, 3))
@@ -95,19 +140,33 @@ def test_gusts_have_the_stated_spread_memory_and_spectrum() -> None:
     process = ornstein_uhlenbeck(np.random.default_rng(0), (200, 2048, 1), step, time)[:, :, 0]
     assert process.var() == pytest.approx(1.0, rel=0.03)
     lag = 12
-    assert np.mean(process[:, lag:] * process[:, :-lag]) == pytest.approx(np.exp(-lag * step / time), abs=0.03)
+    assert np.mean(process[:, lag:] * process[:, :-lag]) == pytest.approx(
+        np.exp(-lag * step / time), abs=0.03
+    )
     power = (np.abs(np.fft.rfft(process, axis=1)) ** 2).mean(0) * step / process.shape[1] / np.pi
     omega = 2 * np.pi * np.fft.rfftfreq(process.shape[1], step)
     low = (omega > 0.02) & (omega < 0.8)
-    np.testing.assert_allclose(power[low], (2 * time / np.pi) / (1 + (omega[low] * time) ** 2), rtol=0.35)
-    np.testing.assert_allclose(power[low].mean(), ((2 * time / np.pi) / (1 + (omega[low] * time) ** 2)).mean(), rtol=0.05)
+    np.testing.assert_allclose(
+        power[low], (2 * time / np.pi) / (1 + (omega[low] * time) ** 2), rtol=0.35
+    )
+    np.testing.assert_allclose(
+        power[low].mean(), ((2 * time / np.pi) / (1 + (omega[low] * time) ** 2)).mean(), rtol=0.05
+    )
 
 
 def test_wind_without_gusts_is_steady_and_gusts_are_isotropic() -> None:
-    speed, direction = gusty_wind(WindField(speed=7.0, direction=2.0), 2, 10, 0.1, np.random.default_rng(0))
+    speed, direction = gusty_wind(
+        WindField(speed=7.0, direction=2.0), 2, 10, 0.1, np.random.default_rng(0)
+    )
     np.testing.assert_allclose(speed, 7.0)
     np.testing.assert_allclose(direction, 2.0)
-    speed, direction = gusty_wind(WindField(speed=7.0, direction=2.0, gust=1.0, correlation=1.0), 20, 3000, 0.5, np.random.default_rng(0))
+    speed, direction = gusty_wind(
+        WindField(speed=7.0, direction=2.0, gust=1.0, correlation=1.0),
+        20,
+        3000,
+        0.5,
+        np.random.default_rng(0),
+    )
     assert (speed >= 0).all()
     assert (speed * np.sin(direction - 2.0)).std() == pytest.approx(1.0, rel=0.03)
     assert (speed * np.cos(direction - 2.0)).std() == pytest.approx(1.0, rel=0.03)
@@ -125,18 +184,25 @@ def test_waves_move_a_vessel_and_one_seed_gives_one_log() -> None:
 
 
 def test_the_true_wind_stands_in_the_log(windy: str) -> None:
-    config = trials(vessel=windy, disturbance={"wind": {"speed": "12 kn", "direction": "200 deg", "gust": 0.5}})
+    config = trials(
+        vessel=windy, disturbance={"wind": {"speed": "12 kn", "direction": "200 deg", "gust": 0.5}}
+    )
     log = simulate(config.draw(), config)[0]
     assert log.units["wind_speed"] == "m/s"
     assert log["wind_speed"].mean() == pytest.approx(12 * 1852 / 3600, abs=1.0)
     assert np.degrees(log["wind_dir"].mean()) == pytest.approx(200, abs=10)
-    assert "wind_speed" not in simulate(trials(vessel=windy).draw(), trials(vessel=windy))[0].channels
+    assert (
+        "wind_speed" not in simulate(trials(vessel=windy).draw(), trials(vessel=windy))[0].channels
+    )
 
 
 @pytest.mark.parametrize(
     ("disturbance", "message"),
     [
-        ({"wind": {"speed": 5, "direction": 0}}, r"disturbance.wind: vessel 'wam_v_cal' has no input 'wind_speed'; give its vessel file"),
+        (
+            {"wind": {"speed": 5, "direction": 0}},
+            r"disturbance.wind: vessel 'wam_v_cal' has no input 'wind_speed'; give its vessel file",
+        ),
         ({"wind": {"speed": 5}}, "direction"),
         ({"waves": {"peak_period": 3}}, "significant_height"),
         ({"current": 3}, "did you mean 'current_east'"),
@@ -149,12 +215,18 @@ def test_what_a_vessel_cannot_feel_is_one_line(disturbance: dict[str, Any], mess
 
 
 def test_dead_time_needs_the_plants_own_step(tmp_path: Path) -> None:
-    """Found when the config is read, not after the first step of a long run; the delay line itself enters no log."""
+    """Found when the config is read, not after the first step of a long run; the delay line itself
+    enters no log.
+    """
     text = vessel_files()["example_rudder_boat"].read_text()
-    late = text.replace("    # dead_time: 0.2 s ", "    dead_time: 0.2 s  # ").replace("    # delay_step: 0.01 s ", "    delay_step: 0.02 s  # ")
+    late = text.replace("    # dead_time: 0.2 s ", "    dead_time: 0.2 s  # ").replace(
+        "    # delay_step: 0.01 s ", "    delay_step: 0.02 s  # "
+    )
     path = tmp_path / "late.yaml"
     path.write_text(late)
-    with pytest.raises(ConfigError, match=r"delay_step is 0.02 s, but the plant steps by 0.1 s") as caught:
+    with pytest.raises(
+        ConfigError, match=r"delay_step is 0.02 s, but the plant steps by 0.1 s"
+    ) as caught:
         trials(vessel=str(path))
     assert "\n" not in str(caught.value)
     config = trials(vessel=str(path), substeps=5)

@@ -25,7 +25,9 @@ STILL = SensorNoise(u=0, v=0, r=0)
 
 def ship(vessel: str, disturbance: Disturbance) -> tuple[Craft, Sea]:
     plant = load_vessel(vessel).build()
-    craft = Craft(vessel, PlantDynamics(plant, STEP, 1), Helm.of(plant), plant.commands, plant.approach(1))
+    craft = Craft(
+        vessel, PlantDynamics(plant, STEP, 1), Helm.of(plant), plant.commands, plant.approach(1)
+    )
     return craft, Sea(plant, disturbance, STILL, 0)
 
 
@@ -46,7 +48,11 @@ class Runaway(Dynamics):
 
 
 def runaway() -> Craft:
-    helm = Helm(lambda drive, steer: drive.unsqueeze(-1), ("x", "y", "psi", "u", "v", "r"), ("cmd_n", "wind_speed", "wind_dir"))
+    helm = Helm(
+        lambda drive, steer: drive.unsqueeze(-1),
+        ("x", "y", "psi", "u", "v", "r"),
+        ("cmd_n", "wind_speed", "wind_dir"),
+    )
     return Craft("runaway", Runaway(STEP), helm, 1, torch.zeros(1, 6, dtype=torch.float64))
 
 
@@ -59,7 +65,12 @@ def test_logs_end_where_the_manoeuvre_does() -> None:
         ConstantInput(drive=0.5, steer=0.1, name="last"),
     ]
     flights = fly(craft, manoeuvres, sea, 20, STEP, {"vessel": "wam_v_cal"})
-    assert [f.log.name for f in flights] == ["turning_circle_01", "constant_01", "turning_circle_02", "last"]
+    assert [f.log.name for f in flights] == [
+        "turning_circle_01",
+        "constant_01",
+        "turning_circle_02",
+        "last",
+    ]
     psi = flights[0].motion["psi"]
     assert psi[-1] >= math.pi / 2 > psi[-2]
     assert [len(f.log) for f in flights[1:]] == [70, 40, 200]
@@ -81,13 +92,23 @@ def test_a_motion_that_is_not_finite_ends_there() -> None:
     assert len(tame.motion) == 50
     assert tame.fault is None
     start = torch.full((1, 6), math.nan, dtype=torch.float64)
-    with pytest.raises(DataError, match="constant_01: the motion is not finite from its first step"):
-        fly(Craft("bad", Runaway(STEP), runaway().helm, 1, start), manoeuvres, Sea(None, Disturbance(), STILL, 0), 5, STEP)
+    with pytest.raises(
+        DataError, match="constant_01: the motion is not finite from its first step"
+    ):
+        fly(
+            Craft("bad", Runaway(STEP), runaway().helm, 1, start),
+            manoeuvres,
+            Sea(None, Disturbance(), STILL, 0),
+            5,
+            STEP,
+        )
 
 
 def test_wind_reaches_a_model_without_a_vessel_and_its_log() -> None:
     wind = Disturbance(wind=WindField(speed=4.0, direction=1.0))
-    (flight,) = fly(runaway(), [ConstantInput(drive=0.1, steer=0)], Sea(None, wind, STILL, 0), 5, STEP)
+    (flight,) = fly(
+        runaway(), [ConstantInput(drive=0.1, steer=0)], Sea(None, wind, STILL, 0), 5, STEP
+    )
     assert (flight.motion["v"][1:] == 4.0).all()
     assert (flight.log["wind_speed"] == 4.0).all()
     assert (flight.log["wind_dir"] == 1.0).all()
@@ -95,15 +116,31 @@ def test_wind_reaches_a_model_without_a_vessel_and_its_log() -> None:
 
 def test_a_manoeuvre_stops_in_waves_too() -> None:
     box = Box(length=5.5, breadth=1.8, draught=0.4)
-    waves = WavesConfig(spectrum=JonswapSpectrum(), significant_height=0.2, peak_period=3.0, direction=0.5, hull=box)
-    for vessel, disturbance in (("wam_v_cal", Disturbance()), ("wam_v_cal", Disturbance(waves=waves))):
+    waves = WavesConfig(
+        spectrum=JonswapSpectrum(), significant_height=0.2, peak_period=3.0, direction=0.5, hull=box
+    )
+    for vessel, disturbance in (
+        ("wam_v_cal", Disturbance()),
+        ("wam_v_cal", Disturbance(waves=waves)),
+    ):
         craft, sea = ship(vessel, disturbance)
-        (flight,) = fly(craft, [Zigzag(drive=0.6, steer=0.5, heading=0.3, start=5, reversals=2)], sea, 40, STEP)
+        (flight,) = fly(
+            craft, [Zigzag(drive=0.6, steer=0.5, heading=0.3, start=5, reversals=2)], sea, 40, STEP
+        )
         assert flight.fault is None
         assert len(flight.motion) < 350
     assert np.abs(flight.motion["v"][:50]).max() > 0, "the waves push before the first order"
 
 
 def test_names_are_numbered_by_kind() -> None:
-    made = [ConstantInput(drive=0, steer=0), Zigzag(drive=0, steer=0, heading=1), ConstantInput(drive=0, steer=0, name="x")]
-    assert log_names([*made, ConstantInput(drive=0, steer=0)]) == ["constant_01", "zigzag_01", "x", "constant_03"]
+    made = [
+        ConstantInput(drive=0, steer=0),
+        Zigzag(drive=0, steer=0, heading=1),
+        ConstantInput(drive=0, steer=0, name="x"),
+    ]
+    assert log_names([*made, ConstantInput(drive=0, steer=0)]) == [
+        "constant_01",
+        "zigzag_01",
+        "x",
+        "constant_03",
+    ]

@@ -22,8 +22,19 @@ from residnet.data.readers.detect import format_of, reader_for, recording_for
 
 Writer = Callable[[Log, Path], Path]
 TABLES: list[Writer] = [written_logs.csv, written_logs.parquet]
-TREES: list[Writer] = [written_logs.mat5, written_logs.mat73, written_logs.hdf5, written_logs.hdf5_table]
-BAGS: list[Writer] = [written_logs.bag1, written_logs.bag2, written_logs.bag2_mcap, written_logs.mcap, written_logs.topics]
+TREES: list[Writer] = [
+    written_logs.mat5,
+    written_logs.mat73,
+    written_logs.hdf5,
+    written_logs.hdf5_table,
+]
+BAGS: list[Writer] = [
+    written_logs.bag1,
+    written_logs.bag2,
+    written_logs.bag2_mcap,
+    written_logs.mcap,
+    written_logs.topics,
+]
 
 
 def assert_same(read: Log, expected: Log) -> None:
@@ -40,7 +51,11 @@ def assert_same(read: Log, expected: Log) -> None:
 def test_tables(write: Writer, tmp_path: Path) -> None:
     log = trial()
     channels = {name: {"column": name, "unit": CHANNEL_UNITS[name]} for name in log.channels}
-    reader = validate({"kind": write.__name__, "time": {"column": "t"}, "channels": channels}, ReaderConfig, "test").build()
+    reader = validate(
+        {"kind": write.__name__, "time": {"column": "t"}, "channels": channels},
+        ReaderConfig,
+        "test",
+    ).build()
     assert_same(reader.read(write(log, tmp_path)), log)
 
 
@@ -51,7 +66,9 @@ def test_recordings_that_describe_themselves(write: Writer, tmp_path: Path) -> N
     read = reader_for(path).read(path)
     assert_same(read, log)
     assert len(read.meta["sha256"]) == 64
-    assert all(finding["level"] == "note" for finding in read.meta["findings"]), read.meta["findings"]
+    assert all(finding["level"] == "note" for finding in read.meta["findings"]), read.meta[
+        "findings"
+    ]
     if write in BAGS:
         assert read.meta["epoch"] == EPOCH
         assert read.meta["start_utc"] == "2025-04-11T09:15:45.000000000Z"
@@ -63,15 +80,35 @@ def test_channel_maps_of_topics(write: Writer, tmp_path: Path) -> None:
     """The same bag with every part declared, read field by field."""
     log = trial()
     path = write(log, tmp_path)
-    turned = {"u": ("twist.twist.linear.x", "m/s"), "v": ("twist.twist.linear.y", "m/s"), "r": ("twist.twist.angular.z", "rad/s")}
+    turned = {
+        "u": ("twist.twist.linear.x", "m/s"),
+        "v": ("twist.twist.linear.y", "m/s"),
+        "r": ("twist.twist.angular.z", "rad/s"),
+    }
     config: dict[str, Any] = {
         "kind": "csv_topics" if write is written_logs.topics else "rosbag",
         "standard_messages": False,
-        "position": {"kind": "local", "topic": "/odometry", "north": "pose.pose.position.y", "east": "pose/pose/position/x"},
-        "heading": {"kind": "quaternion", "topic": "odometry", "field": "pose.pose.orientation", "frame": "enu"},
+        "position": {
+            "kind": "local",
+            "topic": "/odometry",
+            "north": "pose.pose.position.y",
+            "east": "pose/pose/position/x",
+        },
+        "heading": {
+            "kind": "quaternion",
+            "topic": "odometry",
+            "field": "pose.pose.orientation",
+            "frame": "enu",
+        },
         "channels": {
-            **{name: {"topic": "/odometry", "field": f, "unit": unit, "frame": "body_fpu"} for name, (f, unit) in turned.items()},
-            **{name: {"topic": f"/{name}", "field": "data", "unit": "rps", "hold": True} for name in COMMANDS},
+            **{
+                name: {"topic": "/odometry", "field": f, "unit": unit, "frame": "body_fpu"}
+                for name, (f, unit) in turned.items()
+            },
+            **{
+                name: {"topic": f"/{name}", "field": "data", "unit": "rps", "hold": True}
+                for name in COMMANDS
+            },
         },
     }
     assert_same(validate(config, ReaderConfig, "test").build().read(path), log)
@@ -80,14 +117,20 @@ def test_channel_maps_of_topics(write: Writer, tmp_path: Path) -> None:
 @pytest.mark.parametrize("write", [*TREES, *BAGS])
 def test_one_config_reads_any_of_them(write: Writer, tmp_path: Path) -> None:
     log = trial()
-    assert_same(validate({"kind": "auto"}, ReaderConfig, "test").build().read(write(log, tmp_path)), log)
+    assert_same(
+        validate({"kind": "auto"}, ReaderConfig, "test").build().read(write(log, tmp_path)), log
+    )
 
 
 @pytest.mark.parametrize("write", BAGS)
 def test_only_what_is_wanted_is_kept(write: Writer, tmp_path: Path) -> None:
     path = write(trial(), tmp_path)
     kind = "csv_topics" if write is written_logs.topics else "rosbag"
-    config = {"kind": kind, "standard_messages": False, "channels": {"cmd_port": {"topic": "cmd_port", "field": "data", "unit": "rps"}}}
+    config = {
+        "kind": kind,
+        "standard_messages": False,
+        "channels": {"cmd_port": {"topic": "cmd_port", "field": "data", "unit": "rps"}},
+    }
     read = validate(config, ReaderConfig, "test").build().read(path)
     assert list(read.channels) == ["cmd_port"]
     assert {name.strip("/") for name in read.meta["topics_not_used"]} == {"odometry", "cmd_stbd"}
@@ -98,7 +141,15 @@ def test_matlab_matrix_datenum_and_nested_struct(tmp_path: Path) -> None:
 
     t = 739352.25 + np.arange(50) / 86400.0
     path = tmp_path / "a.mat"
-    savemat(path, {"log": {"time": t, "signals": {"values": np.stack((np.arange(50.0), 2 * np.arange(50.0)), axis=1)}}})
+    savemat(
+        path,
+        {
+            "log": {
+                "time": t,
+                "signals": {"values": np.stack((np.arange(50.0), 2 * np.arange(50.0)), axis=1)},
+            }
+        },
+    )
     config = {
         "kind": "mat",
         "time": {"unit": "datenum"},
@@ -119,7 +170,9 @@ def test_several_experiments_in_one_file(tmp_path: Path) -> None:
     path = tmp_path / "trial.mat"
     savemat(path, {name: {"t": log.t, **log.channels} for name, log in logs.items()})
     for name, log in logs.items():
-        assert_same(validate({"kind": "mat", "table": name}, ReaderConfig, "test").build().read(path), log)
+        assert_same(
+            validate({"kind": "mat", "table": name}, ReaderConfig, "test").build().read(path), log
+        )
     both = reader_for(path).read(path)
     assert "several_tables" in {finding["code"] for finding in both.meta["findings"]}
 
@@ -128,7 +181,10 @@ def test_several_experiments_in_one_file(tmp_path: Path) -> None:
 def test_truncated_files_end_in_one_line(write: Writer, tmp_path: Path) -> None:
     path = write(trial(), tmp_path)
     if path.is_dir():
-        path = max((file for file in path.iterdir() if file.suffix != ".yaml"), key=lambda file: file.stat().st_size)
+        path = max(
+            (file for file in path.iterdir() if file.suffix != ".yaml"),
+            key=lambda file: file.stat().st_size,
+        )
     if path.suffix == ".csv":
         return
     whole = path.read_bytes()
@@ -140,9 +196,15 @@ def test_truncated_files_end_in_one_line(write: Writer, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("write", "package", "extra"),
-    [(written_logs.bag1, "rosbags", "ros"), (written_logs.hdf5, "h5py", "hdf5"), (written_logs.mat73, "h5py", "hdf5")],
+    [
+        (written_logs.bag1, "rosbags", "ros"),
+        (written_logs.hdf5, "h5py", "hdf5"),
+        (written_logs.mat73, "h5py", "hdf5"),
+    ],
 )
-def test_a_missing_package_is_named_with_its_extra(write: Writer, package: str, extra: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_package_is_named_with_its_extra(
+    write: Writer, package: str, extra: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = write(trial(), tmp_path)
     for name in [name for name in sys.modules if name.split(".")[0] == package]:
         monkeypatch.delitem(sys.modules, name)

@@ -1,4 +1,6 @@
-"""Tables that are read piece by piece: the same log as in one piece, in memory that does not grow with the file."""
+"""Tables that are read piece by piece: the same log as in one piece, in memory that does not grow
+with the file.
+"""
 
 from __future__ import annotations
 
@@ -18,10 +20,14 @@ from residnet.data.readers.tables import lines, table
 
 def reader(kind: str = "csv") -> LogReader:
     channels = {"psi": {"column": "h", "unit": "deg"}, "u": {"column": "u", "unit": "kn"}}
-    return validate({"kind": kind, "time": {"column": "t"}, "channels": channels}, ReaderConfig, "test").build()
+    return validate(
+        {"kind": kind, "time": {"column": "t"}, "channels": channels}, ReaderConfig, "test"
+    ).build()
 
 
-def in_pieces(path: Path, monkeypatch: pytest.MonkeyPatch, *, rows: int, large: int = 10**9, kind: str = "csv") -> Log:
+def in_pieces(
+    path: Path, monkeypatch: pytest.MonkeyPatch, *, rows: int, large: int = 10**9, kind: str = "csv"
+) -> Log:
     monkeypatch.setattr(table, "_PIECE", rows)
     monkeypatch.setattr(table, "LARGE", large)
     return reader(kind).read(path)
@@ -36,7 +42,9 @@ def assert_equal(a: Log, b: Log) -> None:
 
 @pytest.mark.parametrize("kind", ["csv", "parquet"])
 @pytest.mark.parametrize("large", [0, 10**9])
-def test_pieces_give_the_log_of_the_whole(kind: str, large: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pieces_give_the_log_of_the_whole(
+    kind: str, large: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     t = 0.1 * np.arange(1000)
     frame = pd.DataFrame({"t": t, "h": np.remainder(37.0 * t + 350.0, 360.0), "u": np.sin(t)})
     # no measurement at both ends, a hole in the heading, a blank row
@@ -53,7 +61,9 @@ def test_pieces_give_the_log_of_the_whole(kind: str, large: int, tmp_path: Path,
         assert_equal(in_pieces(path, monkeypatch, rows=rows, large=large, kind=kind), whole)
 
 
-def test_faults_are_named_by_their_line_in_any_piece(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_faults_are_named_by_their_line_in_any_piece(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     lines = [f"{0.1 * i:.1f},1,2" for i in range(100)]
     for line, text, words in [
         (57, "5.5,x,2", "line 59, column 'h': 'x'"),
@@ -66,13 +76,17 @@ def test_faults_are_named_by_their_line_in_any_piece(tmp_path: Path, monkeypatch
             in_pieces(path, monkeypatch, rows=10)
 
 
-def test_a_large_table_does_not_lie_in_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_large_table_does_not_lie_in_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(lines, "_BLOCK", 1 << 16)
     rng = np.random.default_rng(0)
     peaks = []
     for rows in (20_000, 80_000):
         path = tmp_path / "a.csv"
-        pd.DataFrame({"t": 0.1 * np.arange(rows), "h": rng.normal(size=rows), "u": rng.normal(size=rows)}).to_csv(path, index=False)
+        pd.DataFrame(
+            {"t": 0.1 * np.arange(rows), "h": rng.normal(size=rows), "u": rng.normal(size=rows)}
+        ).to_csv(path, index=False)
         tracemalloc.start()
         log = in_pieces(path, monkeypatch, rows=1000, large=0)
         peaks.append(tracemalloc.get_traced_memory()[1])

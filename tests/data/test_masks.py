@@ -10,7 +10,20 @@ from pydantic import TypeAdapter
 from residnet.core.config import validate
 from residnet.core.errors import ConfigError, UsageError
 from residnet.core.log import Log
-from residnet.data.masks import Frozen, Gap, Hampel, InputJump, Jump, MaskConfig, Missing, Outlier, apply_masks, hard_mask, scored, segments
+from residnet.data.masks import (
+    Frozen,
+    Gap,
+    Hampel,
+    InputJump,
+    Jump,
+    MaskConfig,
+    Missing,
+    Outlier,
+    apply_masks,
+    hard_mask,
+    scored,
+    segments,
+)
 
 
 def log_of(t: np.ndarray | None = None, **channels: object) -> Log:
@@ -31,13 +44,20 @@ def test_frozen_equals_an_independent_loop_on_random_logs() -> None:
 
 def test_frozen_without_aftermath_marks_the_equal_samples_only() -> None:
     x = np.array([0.0, 1, 2, 2, 2, 2, 3, 4, 4, 5])
-    assert np.flatnonzero(Frozen(samples=3, after=0.0).apply(log_of(x=x, y=x))).tolist() == [2, 3, 4, 5]
+    assert np.flatnonzero(Frozen(samples=3, after=0.0).apply(log_of(x=x, y=x))).tolist() == [
+        2,
+        3,
+        4,
+        5,
+    ]
     assert not Frozen(samples=4).apply(log_of(x=x, y=x)).any()
     assert not Frozen(samples=3).apply(log_of(x=x, y=np.arange(10))).any()
 
 
 def test_gap_marks_the_sample_after_it_and_splits_there() -> None:
-    log = apply_masks(log_of(np.array([0.0, 0.1, 0.2, 0.9, 1.0, 1.1]), u=np.ones(6)), [Gap(longest=0.2)])
+    log = apply_masks(
+        log_of(np.array([0.0, 0.1, 0.2, 0.9, 1.0, 1.1]), u=np.ones(6)), [Gap(longest=0.2)]
+    )
     assert np.flatnonzero(log.masks["hard:gap"]).tolist() == [3]
     assert segments(log).tolist() == [0, 0, 0, -1, 1, 1]
     assert not log_of(np.array([0.0, 0.1, 0.3]), u=np.ones(3)).masks
@@ -59,13 +79,18 @@ def test_missing_looks_at_the_channels_that_it_is_given() -> None:
 def test_jump_counts_samples_on_either_side() -> None:
     u = np.array([0.0, 0, 0, 5, 5, 5, 5, 5])
     assert np.flatnonzero(Jump(channel="u", limit=1.0).apply(log_of(u=u))).tolist() == [2, 3]
-    assert np.flatnonzero(Jump(channel="u", limit=1.0, before=0, after=3).apply(log_of(u=u))).tolist() == [3, 4, 5]
+    assert np.flatnonzero(
+        Jump(channel="u", limit=1.0, before=0, after=3).apply(log_of(u=u))
+    ).tolist() == [3, 4, 5]
     assert not Jump(channel="u", limit=5.0).apply(log_of(u=u)).any()
 
 
 def test_a_wrapped_angle_does_not_jump() -> None:
     log = log_of(wind_dir=np.radians([350.0, 358.0, 2.0, 10.0, 100.0]))
-    assert np.flatnonzero(Jump(channel="wind_dir", limit=np.radians(20.0)).apply(log)).tolist() == [3, 4]
+    assert np.flatnonzero(Jump(channel="wind_dir", limit=np.radians(20.0)).apply(log)).tolist() == [
+        3,
+        4,
+    ]
 
 
 def test_outliers_are_found_and_noise_ramps_and_steps_are_not() -> None:
@@ -84,7 +109,8 @@ def test_outliers_are_found_and_noise_ramps_and_steps_are_not() -> None:
 
 
 def test_the_rule_of_document_002_taken_literally_never_fires() -> None:
-    # why the sample itself is left out: in a window of 10 the largest possible distance is 9 / sqrt(10) standard deviations
+    # why the sample itself is left out: in a window of 10 the largest possible distance is 9 /
+    # sqrt(10) standard deviations
     window = np.zeros(10)
     window[5] = 1e6
     assert abs(window[5] - window.mean()) / window.std(ddof=1) == pytest.approx(9.0 / np.sqrt(10.0))
@@ -92,19 +118,46 @@ def test_the_rule_of_document_002_taken_literally_never_fires() -> None:
 
 
 def hampel_by_loop(values: np.ndarray, sigmas: float, samples: int) -> np.ndarray:
-    """The rule of the Hampel mask, sample by sample, for finite values; odd reflection beyond the ends."""
+    """The rule of the Hampel mask, sample by sample, for finite values; odd reflection beyond the
+    ends.
+    """
     half, size = samples // 2, values.size
 
     def at(i: int) -> float:
-        return 2 * values[0] - values[-i] if i < 0 else 2 * values[-1] - values[2 * size - 2 - i] if i >= size else values[i]
+        return (
+            2 * values[0] - values[-i]
+            if i < 0
+            else 2 * values[-1] - values[2 * size - 2 - i]
+            if i >= size
+            else values[i]
+        )
 
-    bent = [values[i] - np.median([(at(i - k) + at(i + k)) / 2 for k in range(1, 2 * half + 1)]) for i in range(size)]
-    mirrored = [[bent[abs(j)] if j < size else bent[2 * size - 2 - j] for j in range(i - half, i + half + 1)] for i in range(size)]
+    bent = [
+        values[i] - np.median([(at(i - k) + at(i + k)) / 2 for k in range(1, 2 * half + 1)])
+        for i in range(size)
+    ]
+    mirrored = [
+        [
+            bent[abs(j)] if j < size else bent[2 * size - 2 - j]
+            for j in range(i - half, i + half + 1)
+        ]
+        for i in range(size)
+    ]
     medians = [np.median(window) for window in mirrored]
-    spreads = [1.4826 * np.median(np.abs(np.array(window) - median)) for window, median in zip(mirrored, medians, strict=True)]
+    spreads = [
+        1.4826 * np.median(np.abs(np.array(window) - median))
+        for window, median in zip(mirrored, medians, strict=True)
+    ]
     distances = [abs(b - median) for b, median in zip(bent, medians, strict=True)]
-    floor = max(1.4826 * np.median(distances), 2.0 * np.quantile([d for d in distances if d > 0], 0.1))
-    return np.array([d > sigmas * max(floor, s, abs(m)) for d, s, m in zip(distances, spreads, medians, strict=True)])
+    floor = max(
+        1.4826 * np.median(distances), 2.0 * np.quantile([d for d in distances if d > 0], 0.1)
+    )
+    return np.array(
+        [
+            d > sigmas * max(floor, s, abs(m))
+            for d, s, m in zip(distances, spreads, medians, strict=True)
+        ]
+    )
 
 
 def test_hampel_equals_an_independent_loop_on_random_logs() -> None:
@@ -117,7 +170,9 @@ def test_hampel_equals_an_independent_loop_on_random_logs() -> None:
             np.testing.assert_array_equal(found, hampel_by_loop(u, 4.0, samples))
 
 
-def test_hampel_finds_outliers_in_groups_where_the_moving_rule_is_blind_and_leaves_motion_alone() -> None:
+def test_hampel_finds_outliers_in_groups_where_the_moving_rule_is_blind_and_leaves_motion_alone() -> (
+    None
+):
     rng = np.random.default_rng(5)
     t = np.arange(4000) * 0.1
     motion = np.sin(0.3 * t) + 3.0 * t
@@ -144,12 +199,20 @@ def test_input_jump_masks_seconds_around_the_step() -> None:
     delta = np.where(np.arange(60) < 30, 0.0, 0.5)
     rule = InputJump(channels=("delta",), limit=0.1, before=0.5, after=1.0)
     assert np.flatnonzero(rule.apply(log_of(delta=delta))).tolist() == list(range(25, 41))
-    assert not InputJump(channels=("delta",), limit=0.6, before=0.5, after=1.0).apply(log_of(delta=delta)).any()
+    assert (
+        not InputJump(channels=("delta",), limit=0.6, before=0.5, after=1.0)
+        .apply(log_of(delta=delta))
+        .any()
+    )
 
 
 def test_reasons_tell_hard_soft_and_rate_masks_apart() -> None:
     u = np.array([0.0, 0, 0, 5, 5, 5, 5, np.nan, 5, 5])
-    rules = [Jump(channel="u", limit=1.0), Missing(), InputJump(channels=("u",), limit=1.0, before=0.0, after=0.2)]
+    rules = [
+        Jump(channel="u", limit=1.0),
+        Missing(),
+        InputJump(channels=("u",), limit=1.0, before=0.0, after=0.2),
+    ]
     log = apply_masks(log_of(u=u), rules)
     assert set(log.masks) == {"jump", "hard:nan", "rate:input_jump"}
     assert [rule.hard for rule in rules] == [False, True, False]
@@ -160,8 +223,12 @@ def test_reasons_tell_hard_soft_and_rate_masks_apart() -> None:
 
 
 def test_rules_of_one_kind_share_a_mask_and_older_masks_stay() -> None:
-    log = log_of(u=[0, 9, 9, 9], v=[0, 0, 0, 9]).replace(masks={"jump": np.array([True, False, False, False]), "mine": np.ones(4, dtype=bool)})
-    log = apply_masks(log, [Jump(channel="u", limit=1.0, before=0), Jump(channel="v", limit=1.0, before=0)])
+    log = log_of(u=[0, 9, 9, 9], v=[0, 0, 0, 9]).replace(
+        masks={"jump": np.array([True, False, False, False]), "mine": np.ones(4, dtype=bool)}
+    )
+    log = apply_masks(
+        log, [Jump(channel="u", limit=1.0, before=0), Jump(channel="v", limit=1.0, before=0)]
+    )
     assert log.masks["jump"].tolist() == [True, True, False, True]
     assert log.masks["mine"].all()
 
@@ -176,6 +243,11 @@ def test_configs_read_quantities_and_refuse_nonsense() -> None:
     assert {"frozen", "gap", "nan", "jump", "outlier", "hampel", "input_jump"} == set(
         TypeAdapter(MaskConfig).json_schema()["discriminator"]["mapping"],
     )
-    for faulty in ({"kind": "gap"}, {"kind": "gap", "longest": 0}, {"kind": "gaps", "longest": 1}, {"kind": "outlier", "channels": []}):
+    for faulty in (
+        {"kind": "gap"},
+        {"kind": "gap", "longest": 0},
+        {"kind": "gaps", "longest": 1},
+        {"kind": "outlier", "channels": []},
+    ):
         with pytest.raises(ConfigError):
             validate(faulty, MaskConfig, "test")

@@ -1,4 +1,6 @@
-"""The data layer on measured logs: skipped where RESIDNET_DATA does not name a folder that holds them."""
+"""The data layer on measured logs: skipped where RESIDNET_DATA does not name a folder that holds
+them.
+"""
 
 from __future__ import annotations
 
@@ -21,8 +23,15 @@ from residnet.data.readers import ReaderConfig
 from residnet.data.split import SplitConfig, check_leaks
 
 DATA = Path(os.environ.get("RESIDNET_DATA", ""))
-pytestmark = [pytest.mark.skipif("RESIDNET_DATA" not in os.environ, reason="RESIDNET_DATA is not set: measured logs are absent")]
-needs_kvlcc2 = pytest.mark.skipif(not (DATA / "kvlcc2").is_dir(), reason=f"no kvlcc2 in RESIDNET_DATA={DATA}")
+pytestmark = [
+    pytest.mark.skipif(
+        "RESIDNET_DATA" not in os.environ,
+        reason="RESIDNET_DATA is not set: measured logs are absent",
+    )
+]
+needs_kvlcc2 = pytest.mark.skipif(
+    not (DATA / "kvlcc2").is_dir(), reason=f"no kvlcc2 in RESIDNET_DATA={DATA}"
+)
 
 ESSO = {
     "x": ("x_position_mid [m]", "m"),
@@ -36,7 +45,17 @@ ESSO = {
     "wind_speed": ("wind_velo_true [m/s]", "m/s"),
     "wind_dir": ("wind_dir_true [rad]", "rad"),
 }
-KVLCC2 = {name: (name, unit) for name, unit in [("x", "m"), ("y", "m"), ("psi", "rad"), ("u", "m/s"), ("v", "m/s"), ("r", "rad/s")]}
+KVLCC2 = {
+    name: (name, unit)
+    for name, unit in [
+        ("x", "m"),
+        ("y", "m"),
+        ("psi", "rad"),
+        ("u", "m/s"),
+        ("v", "m/s"),
+        ("r", "rad/s"),
+    ]
+}
 
 
 def read(path: Path, columns: dict[str, tuple[str, str]], time: str) -> Log:
@@ -53,17 +72,25 @@ def esso(path: Path) -> Log:
 def logs() -> dict[str, list[Log]]:
     if not (DATA / "esso_osaka").is_dir():
         pytest.skip(f"no esso_osaka in RESIDNET_DATA={DATA}")
-    files = validate({"file": str(DATA / "esso_osaka" / "split.yaml")}, SplitConfig, "test").resolve()
+    files = validate(
+        {"file": str(DATA / "esso_osaka" / "split.yaml")}, SplitConfig, "test"
+    ).resolve()
     return {split: [esso(path) for path in paths] for split, paths in files.items()}
 
 
-def test_frozen_positions_of_every_file_equal_the_published_rule(logs: dict[str, list[Log]]) -> None:
+def test_frozen_positions_of_every_file_equal_the_published_rule(
+    logs: dict[str, list[Log]],
+) -> None:
     for log in itertools.chain(*logs.values()):
         np.testing.assert_array_equal(Frozen().apply(log), frozen_by_loop(log["x"], log["y"]))
 
 
 def test_logs_are_on_the_grid_and_stay_as_published(logs: dict[str, list[Log]]) -> None:
-    assert {split: len(members) for split, members in logs.items()} == {"train": 21, "validation": 5, "test": 6}
+    assert {split: len(members) for split, members in logs.items()} == {
+        "train": 21,
+        "validation": 5,
+        "test": 6,
+    }
     for log in logs["test"]:
         table = pd.read_csv(log.meta["source"])
         out = align(log, GridConfig(step=0.1, held=("n", "delta")))
@@ -75,7 +102,9 @@ def test_logs_are_on_the_grid_and_stay_as_published(logs: dict[str, list[Log]]) 
     assert {log.manoeuvre for log in logs["test"]} == {"random", "turning", "zigzag", "berthing"}
 
 
-def test_the_copied_file_is_caught_and_the_published_split_passes(logs: dict[str, list[Log]]) -> None:
+def test_the_copied_file_is_caught_and_the_published_split_passes(
+    logs: dict[str, list[Log]],
+) -> None:
     check_leaks(logs)
     copy = esso(DATA / "esso_osaka" / "turning" / "turn_cut_14-Sep-2020_15_58_08.csv")
     with pytest.raises(DataError, match="share 2869 identical rows"):
@@ -89,12 +118,23 @@ def test_the_doctor_finds_the_known_illnesses(logs: dict[str, list[Log]]) -> Non
         assert not any(finding.level == "fatal" for finding in report.findings), report.lines()
         (frames,) = report.find("frames")
         assert (frames.level, frames.figures["coherence"] > 0.97) == ("note", True)
-        trailing = [finding for name in "uv" for finding in report.find(f"follows_{name}") if finding.level == "will mislead"]
+        trailing = [
+            finding
+            for name in "uv"
+            for finding in report.find(f"follows_{name}")
+            if finding.level == "will mislead"
+        ]
         assert all("trails" in finding.text for finding in trailing)
         assert trailing or log.manoeuvre == "berthing"
-        lags += [finding.figures["lag"] for name in "uv" for finding in report.find(f"follows_{name}")]
+        lags += [
+            finding.figures["lag"] for name in "uv" for finding in report.find(f"follows_{name}")
+        ]
         gyro[log.name] = np.degrees(report.find("yaw_drift")[0].figures["end"])
-        freezes += [finding.figures["share"] for finding in report.find("frozen") if finding.text.startswith("position")]
+        freezes += [
+            finding.figures["share"]
+            for finding in report.find("frozen")
+            if finding.text.startswith("position")
+        ]
     assert np.median(lags) == pytest.approx(0.62, abs=0.05)
     assert gyro.pop("random_31-Jul-2020_12_48_39") == pytest.approx(29.3, abs=0.2)
     assert max(abs(drift) for drift in gyro.values()) < 13.0
@@ -112,7 +152,9 @@ def test_tank_data_are_consistent_and_their_mistakes_would_be_seen() -> None:
         assert "rudder_sign" in loud
         log = raw.replace(channels={**raw.channels, "delta": -raw["delta"]})
         report = inspect(log)
-        assert "rudder_sign" not in {finding.code for finding in report.findings if finding.level != "note"}, report.lines()
+        assert "rudder_sign" not in {
+            finding.code for finding in report.findings if finding.level != "note"
+        }, report.lines()
         assert report.find("frames")[0].figures["coherence"] > 0.9999
         assert abs(report.find("follows_r")[0].figures["lag"]) < 0.1
         exchanged = log.replace(channels={**log.channels, "x": log["y"], "y": log["x"]})

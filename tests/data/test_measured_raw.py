@@ -1,4 +1,6 @@
-"""The ferry's raw topics against the table made from them by hand; skipped where RESIDNET_DATA does not hold them."""
+"""The ferry's raw topics against the table made from them by hand; skipped where RESIDNET_DATA does
+not hold them.
+"""
 
 from __future__ import annotations
 
@@ -58,6 +60,10 @@ def test_what_was_mended_on_the_way_is_said(log: Log) -> None:
     }
     zone = next(finding for finding in log.meta["findings"] if finding["code"] == "time_zone")
     assert zone["figures"]["offset"] == 7200.0
-    shared = [finding["text"] for finding in log.meta["findings"] if finding["code"] == "several_publishers"]
+    shared = [
+        finding["text"]
+        for finding in log.meta["findings"]
+        if finding["code"] == "several_publishers"
+    ]
     assert len(shared) == 1
     assert "control_action" in shared[0]

@@ -23,7 +23,13 @@ def made(hold: str, *, broken: bool = False) -> Prepared:
     channels = {name: np.zeros(60) for name in STATE} | {"n": t**2}
     if broken:
         channels["u"][30] = np.nan
-    config = PrepareConfig.model_validate({"grid": {"step": STEP}, "derivative": {"kind": "savitzky_golay", "window": 0.5, "order": 2}, "hold": hold})
+    config = PrepareConfig.model_validate(
+        {
+            "grid": {"step": STEP},
+            "derivative": {"kind": "savitzky_golay", "window": 0.5, "order": 2},
+            "hold": hold,
+        }
+    )
     return prepare(Log("made", t, channels, manoeuvre="made"), "train", ("n",), config)
 
 
@@ -65,7 +71,13 @@ def test_masked_outliers_reach_neither_fits_nor_scores_nor_the_start_of_a_window
     zeros = {name: np.zeros(400) for name in STATE}
     log = Log("spiked", t, {**zeros, "u": spiked, "n": np.ones(400)}, manoeuvre="made")
     derivative = {"kind": "savitzky_golay", "window": 0.5, "order": 2}
-    config = PrepareConfig.model_validate({"grid": {"step": STEP}, "derivative": derivative, "masks": [{"kind": kind, "channels": ["u"]}]})
+    config = PrepareConfig.model_validate(
+        {
+            "grid": {"step": STEP},
+            "derivative": derivative,
+            "masks": [{"kind": kind, "channels": ["u"]}],
+        }
+    )
     found = prepare(log, "train", ("n",), config)
     assert np.isin(bad, np.flatnonzero(~found.usable)).all()
     assert (~found.usable).sum() <= bad.size + 4
@@ -79,6 +91,14 @@ def test_masked_outliers_reach_neither_fits_nor_scores_nor_the_start_of_a_window
     assert not store.usable[bad].any()
     windows = Windows(length=10.0, first=5.7).windows(found, 0, STEP)
     assert windows[0].start == 58
-    perfect = [Prediction(np.stack([*[np.zeros(400)] * 3, u, np.zeros(400), np.zeros(400)], axis=1)[w.start : w.stop], False) for w in windows]
+    perfect = [
+        Prediction(
+            np.stack([*[np.zeros(400)] * 3, u, np.zeros(400), np.zeros(400)], axis=1)[
+                w.start : w.stop
+            ],
+            False,
+        )
+        for w in windows
+    ]
     errors = window_errors(FreeRun("T10", "train", windows, {"truth": perfect}), "truth", [found])
     np.testing.assert_allclose(errors["rmse"], 0.0, atol=1e-12)

@@ -16,7 +16,9 @@ from residnet.core.log import Log
 from residnet.data.readers import LogReader, ReaderConfig
 
 
-def build(channels: dict[str, Any], kind: str = "csv", time: dict[str, str] | None = None, **options: Any) -> LogReader:
+def build(
+    channels: dict[str, Any], kind: str = "csv", time: dict[str, str] | None = None, **options: Any
+) -> LogReader:
     config = {"kind": kind, "time": time or {"column": "t"}, "channels": channels, **options}
     return validate(config, ReaderConfig, "test").build()
 
@@ -54,8 +56,12 @@ def test_units_signs_and_identity(tmp_path: Path) -> None:
 
 
 def test_east_north_up_heading_and_forward_port_up_axes(tmp_path: Path) -> None:
-    # a vessel that heads 30 deg north of east and turns to port has a compass heading of 60 deg that falls
-    channels = {name: {"column": name, "unit": unit, "frame": "body_fpu"} for name, unit in [("u", "m/s"), ("v", "m/s"), ("r", "rad/s")]}
+    # a vessel that heads 30 deg north of east and turns to port has a compass heading of 60 deg
+    # that falls
+    channels = {
+        name: {"column": name, "unit": unit, "frame": "body_fpu"}
+        for name, unit in [("u", "m/s"), ("v", "m/s"), ("r", "rad/s")]
+    }
     channels["psi"] = {"column": "yaw", "unit": "deg", "frame": "enu"}
     log = read(tmp_path, "t,u,v,r,yaw\n0,1,0.2,0.1,30\n1,1,0.2,0.1,36\n", channels)
     np.testing.assert_allclose(np.degrees(log["psi"]), [60.0, 54.0])
@@ -106,8 +112,16 @@ ROWS = "t,u,v\n0,1,2\n1,1,2\n"
         ("t,u,v\n0,1,2\n1,1.2x,2\n", DataError, ["line 3, column 'u'", "'1.2x'"]),
         ("t,u,v\n0,1,2\n1,inf,2\n", DataError, ["line 3, column 'u'", "finite"]),
         ("t,u,v\n0,,2\n1,,2\n", DataError, ["column 'u' (channel u) holds no number"]),
-        ("t,u,v\n0,1,2\n\n1,1,2\n1,1,2\n1,1,2\n", DataError, ["repeats from line 4 (1 s) to line 5", "2 such steps"]),
-        ("t,u,v\n0,1,2\n2,1,2\n1,1,2\n", DataError, ["runs backwards from line 3 (2 s) to line 4 (1 s)"]),
+        (
+            "t,u,v\n0,1,2\n\n1,1,2\n1,1,2\n1,1,2\n",
+            DataError,
+            ["repeats from line 4 (1 s) to line 5", "2 such steps"],
+        ),
+        (
+            "t,u,v\n0,1,2\n2,1,2\n1,1,2\n",
+            DataError,
+            ["runs backwards from line 3 (2 s) to line 4 (1 s)"],
+        ),
         ("t,u,v\n0,1,2\n,1,2\n2,1,2\n", DataError, ["line 3 has measurements but no time"]),
         ("t,u,v\n0,1,5,2\n1,1,2\n", DataError, ["line 2 has 4 cells, the header 3", "decimal"]),
         ("t,u,v\n0,1,2\n1,1,2,3,4\n", DataError, ["line 3 has 5 cells, the header 3"]),
@@ -142,7 +156,10 @@ def test_text_that_is_not_utf8(tmp_path: Path) -> None:
     [
         ({"psi": {"column": "a", "unit": "deg/s"}}, "unit 'deg/s' does not measure [rad]"),
         ({"u": {"column": "a", "unit": "knot"}}, "unknown unit 'knot'"),
-        ({"x": {"column": "a", "unit": "m", "frame": "enu"}}, "frame 'enu' says nothing about it (frames that do: ned)"),
+        (
+            {"x": {"column": "a", "unit": "m", "frame": "enu"}},
+            "frame 'enu' says nothing about it (frames that do: ned)",
+        ),
         ({"delta": {"column": "a", "unit": "rad", "frame": "body_fpu"}}, "frames that do: none"),
         ({"t": {"column": "a", "unit": "s"}}, "cannot name a channel"),
         ({"u": {"column": "a", "unit": "m/s", "sign": 0}}, "sign"),
@@ -162,10 +179,15 @@ def test_time_has_a_unit_of_time() -> None:
 
 
 def test_foreign_parquet_equals_csv(tmp_path: Path) -> None:
-    table = pd.DataFrame({"t": [0, 1, 2], "u": [1.5, None, 2.5], "v": ["1", "2", "3"], "text": list("abc")})
+    table = pd.DataFrame(
+        {"t": [0, 1, 2], "u": [1.5, None, 2.5], "v": ["1", "2", "3"], "text": list("abc")}
+    )
     table.to_parquet(tmp_path / "run.parquet")
     table.to_csv(tmp_path / "run.csv", index=False)
-    a, b = build(SIMPLE, "parquet").read(tmp_path / "run.parquet"), build(SIMPLE).read(tmp_path / "run.csv")
+    a, b = (
+        build(SIMPLE, "parquet").read(tmp_path / "run.parquet"),
+        build(SIMPLE).read(tmp_path / "run.csv"),
+    )
     for name in ("u", "v"):
         np.testing.assert_array_equal(a[name], b[name])
     with pytest.raises(DataError, match="row 1, column 'text': 'a' is not a finite number"):
@@ -179,24 +201,41 @@ def test_foreign_parquet_equals_csv(tmp_path: Path) -> None:
 def test_canonical_round_trip_keeps_masks_and_origin(tmp_path: Path) -> None:
     log = read(tmp_path, ROWS).replace(masks={"hard:gap": np.array([False, True])})
     log.save(tmp_path / "other.parquet")
-    again = validate({"kind": "canonical"}, ReaderConfig, "test").build().read(tmp_path / "other.parquet")
+    again = (
+        validate({"kind": "canonical"}, ReaderConfig, "test")
+        .build()
+        .read(tmp_path / "other.parquet")
+    )
     np.testing.assert_array_equal(again["v"], log["v"])
     np.testing.assert_array_equal(again.masks["hard:gap"], [False, True])
     assert again.name == "other"
     assert again.meta["origin"]["sha256"] == log.meta["sha256"]
-    assert again.meta["sha256"] == hashlib.sha256((tmp_path / "other.parquet").read_bytes()).hexdigest()
+    assert (
+        again.meta["sha256"]
+        == hashlib.sha256((tmp_path / "other.parquet").read_bytes()).hexdigest()
+    )
 
 
 @pytest.mark.parametrize(
     ("log", "error", "words"),
     [
-        (Log("a", np.array([0.0, 1.0, 1.0]), {"u": np.ones(3)}), DataError, r"repeats from row 2 \(1 s\) to row 3"),
+        (
+            Log("a", np.array([0.0, 1.0, 1.0]), {"u": np.ones(3)}),
+            DataError,
+            r"repeats from row 2 \(1 s\) to row 3",
+        ),
         (Log("a", np.array([0.0]), {"u": np.ones(1)}), DataError, "1 usable rows"),
         (Log("a", np.array([0.0, 1.0]), {"u": np.full(2, np.nan)}), DataError, "holds no number"),
-        (Log("a", np.array([0.0, 1.0]), {"u": np.ones(2)}, {"u": "kn"}), UsageError, r"channel u is in \[kn\]"),
+        (
+            Log("a", np.array([0.0, 1.0]), {"u": np.ones(2)}, {"u": "kn"}),
+            UsageError,
+            r"channel u is in \[kn\]",
+        ),
     ],
 )
-def test_faulty_canonical_logs(tmp_path: Path, log: Log, error: type[Exception], words: str) -> None:
+def test_faulty_canonical_logs(
+    tmp_path: Path, log: Log, error: type[Exception], words: str
+) -> None:
     log.save(tmp_path / "a.parquet")
     with pytest.raises(error, match=words):
         validate({"kind": "canonical"}, ReaderConfig, "test").build().read(tmp_path / "a.parquet")
@@ -204,4 +243,6 @@ def test_faulty_canonical_logs(tmp_path: Path, log: Log, error: type[Exception],
 
 def test_unknown_reader_names_the_valid_ones() -> None:
     with pytest.raises(ConfigError, match="csv"):
-        validate({"kind": "csvv", "time": {"column": "t"}, "channels": SIMPLE}, ReaderConfig, "test")
+        validate(
+            {"kind": "csvv", "time": {"column": "t"}, "channels": SIMPLE}, ReaderConfig, "test"
+        )

@@ -1,4 +1,6 @@
-"""Marine electronics and autopilots: NMEA 0183, PX4 and ArduPilot logs give the trial back to what their digits hold."""
+"""Marine electronics and autopilots: NMEA 0183, PX4 and ArduPilot logs give the trial back to what
+their digits hold.
+"""
 
 from __future__ import annotations
 
@@ -69,7 +71,10 @@ def test_a_loggers_own_times_come_first_where_every_line_has_one(tmp_path: Path)
 def test_past_midnight(tmp_path: Path) -> None:
     path = tmp_path / "a.nmea"
     path.write_text(
-        "\n".join(f"$GPGGA,{moment},6326.0,N,01025.0,E,4,12,0.8,43.8,M,,M,," for moment in ("235958.00", "235959.00", "000000.00", "000001.00"))
+        "\n".join(
+            f"$GPGGA,{moment},6326.0,N,01025.0,E,4,12,0.8,43.8,M,,M,,"
+            for moment in ("235958.00", "235959.00", "000000.00", "000001.00")
+        )
     )
     got = read(path, kind="nmea")
     np.testing.assert_allclose(np.diff(got.t), 1.0)
@@ -87,9 +92,18 @@ def test_px4(tmp_path: Path) -> None:
     for name in ("x", "y", "u", "v"):
         np.testing.assert_allclose(got[name], log[name], atol=2e-6, err_msg=name)
     assert "quaternion_flips" in codes(got)
-    exact = read(path, kind="ulog", standard_messages=False, channels={"x": {"topic": "vehicle_local_position", "field": "exact_x", "unit": "m"}})
+    exact = read(
+        path,
+        kind="ulog",
+        standard_messages=False,
+        channels={"x": {"topic": "vehicle_local_position", "field": "exact_x", "unit": "m"}},
+    )
     np.testing.assert_allclose(exact["x"], log["x"], atol=1e-12)
-    assert exact.meta["topics_not_used"] == ["vehicle_angular_velocity", "vehicle_attitude", "vehicle_gps_position"]
+    assert exact.meta["topics_not_used"] == [
+        "vehicle_angular_velocity",
+        "vehicle_attitude",
+        "vehicle_gps_position",
+    ]
 
 
 def test_ardupilot(tmp_path: Path) -> None:
@@ -106,9 +120,16 @@ def test_ardupilot(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("write", "name"), [(written_recorders.nmea, "NMEA 0183"), (written_recorders.ulog, "PX4 ULog"), (written_recorders.ardupilot, "ArduPilot log")]
+    ("write", "name"),
+    [
+        (written_recorders.nmea, "NMEA 0183"),
+        (written_recorders.ulog, "PX4 ULog"),
+        (written_recorders.ardupilot, "ArduPilot log"),
+    ],
 )
-def test_known_by_content_and_clear_when_damaged(write: Callable[[Log, Path], Path], name: str, tmp_path: Path) -> None:
+def test_known_by_content_and_clear_when_damaged(
+    write: Callable[[Log, Path], Path], name: str, tmp_path: Path
+) -> None:
     path = write(trial(3.0), tmp_path).rename(tmp_path / "recording")
     found = format_of(path)
     assert found is not None

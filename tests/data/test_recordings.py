@@ -27,7 +27,13 @@ def recording(*series: Series) -> Recording:
     return Recording(Path("made"), {one.name: one for one in series}, EPOCH * 10**9)
 
 
-def topic(name: str, t: np.ndarray, stamp: np.ndarray | None = None, arrival: np.ndarray | None = None, **fields: np.ndarray) -> Series:
+def topic(
+    name: str,
+    t: np.ndarray,
+    stamp: np.ndarray | None = None,
+    arrival: np.ndarray | None = None,
+    **fields: np.ndarray,
+) -> Series:
     return Series(name, "", fields or {"a": np.sin(t)}, stamp, arrival)
 
 
@@ -40,9 +46,17 @@ def codes(one: Series) -> list[str]:
 
 def printed(ns: np.ndarray, style: str) -> np.ndarray:
     seconds, rest = ns // 10**9, ns % 10**9
-    fraction = {"padded": lambda k: f"{k:09d}", "unpadded": str, "trimmed": lambda k: f"{k:09d}".rstrip("0") or "0"}[style]
+    fraction = {
+        "padded": lambda k: f"{k:09d}",
+        "unpadded": str,
+        "trimmed": lambda k: f"{k:09d}".rstrip("0") or "0",
+    }[style]
     return np.array(
-        [f"{pd.Timestamp(int(s), unit='s'):%Y-%m-%d %H:%M:%S}.{fraction(int(k))}" for s, k in zip(seconds, rest, strict=True)], dtype=object
+        [
+            f"{pd.Timestamp(int(s), unit='s'):%Y-%m-%d %H:%M:%S}.{fraction(int(k))}"
+            for s, k in zip(seconds, rest, strict=True)
+        ],
+        dtype=object,
     )
 
 
@@ -63,7 +77,9 @@ def test_the_readmes_example() -> None:
 
 
 def test_zones_unix_times_and_plain_seconds() -> None:
-    zoned = parse_texts(np.array(["2025-04-11T11:15:45.5+02:00", "2025-04-11T09:15:46Z"], dtype=object))
+    zoned = parse_texts(
+        np.array(["2025-04-11T11:15:45.5+02:00", "2025-04-11T09:15:46Z"], dtype=object)
+    )
     np.testing.assert_array_equal(np.diff(zoned.ns), [5 * 10**8])
     assert zoned.zoned
     for scale in (1, 10**3, 10**6, 10**9):
@@ -72,7 +88,9 @@ def test_zones_unix_times_and_plain_seconds() -> None:
         assert whole.absolute
     plain = parse_texts(np.array(["-0.5", "0.25", "1e1"], dtype=object))
     np.testing.assert_array_equal(plain.ns, [-5 * 10**8, 25 * 10**7, 10**10])
-    np.testing.assert_array_equal(parse_texts(np.array(["-0.5", "12.25"], dtype=object)).ns, [-5 * 10**8, 1225 * 10**7])
+    np.testing.assert_array_equal(
+        parse_texts(np.array(["-0.5", "12.25"], dtype=object)).ns, [-5 * 10**8, 1225 * 10**7]
+    )
     assert not plain.absolute
     with pytest.raises(DataError, match="row 2 is no time"):
         parse_texts(np.array(["2025-04-11 09:15:45", "soon"], dtype=object))
@@ -85,12 +103,20 @@ def test_zones_unix_times_and_plain_seconds() -> None:
 
 @pytest.mark.parametrize(
     ("offset", "expected"),
-    [(7200.0, {"time_zone"}), (-34200.0, {"time_zone"}), (7203.5, {"time_zone", "clock_offset"}), (-0.4, {"clock_offset"}), (0.0, set())],
+    [
+        (7200.0, {"time_zone"}),
+        (-34200.0, {"time_zone"}),
+        (7203.5, {"time_zone", "clock_offset"}),
+        (-0.4, {"clock_offset"}),
+        (0.0, set()),
+    ],
 )
 def test_the_recorders_clock_is_brought_to_the_stamps(offset: float, expected: set[str]) -> None:
     t = 0.1 * np.arange(500)
     late = RNG.exponential(2e-3, t.size)
-    settled = settle(recording(topic("gps", t, t, t + offset + late), topic("rpm", t, None, t + offset)), {})
+    settled = settle(
+        recording(topic("gps", t, t, t + offset + late), topic("rpm", t, None, t + offset)), {}
+    )
     assert {entry["code"] for entry in settled.remarks} == expected
     # what has no stamp is as true as the quickest message
     np.testing.assert_allclose(settled["rpm"].clock, t, atol=1e-3)
@@ -99,7 +125,12 @@ def test_the_recorders_clock_is_brought_to_the_stamps(offset: float, expected: s
 
 def test_one_sender_with_another_clock_is_named_and_delays_correct_it() -> None:
     t = 0.1 * np.arange(500)
-    made = recording(*(topic(name, t, t + ahead, t + 1e-3) for name, ahead in [("a", 0.0), ("b", 0.0), ("c", -0.6)]))
+    made = recording(
+        *(
+            topic(name, t, t + ahead, t + 1e-3)
+            for name, ahead in [("a", 0.0), ("b", 0.0), ("c", -0.6)]
+        )
+    )
     settled = settle(made, {"/c": -0.6})
     assert "clock_offset" in codes(settled["c"])
     assert "clock_offset" not in codes(settled["a"])
@@ -110,7 +141,9 @@ def test_one_sender_with_another_clock_is_named_and_delays_correct_it() -> None:
 def test_estimated_delay_of_a_topic_without_stamps() -> None:
     t = 0.1 * np.arange(500)
     late = 0.05 + RNG.exponential(1e-3, t.size)
-    settled = settle(recording(topic("gps", t, t, t + late), topic("rpm", t, None, t + 0.05)), {"rpm": None})
+    settled = settle(
+        recording(topic("gps", t, t, t + late), topic("rpm", t, None, t + 0.05)), {"rpm": None}
+    )
     np.testing.assert_allclose(settled["rpm"].clock, t, atol=3e-3)
 
 
@@ -132,7 +165,10 @@ def test_order_of_rows() -> None:
     settled = settle(made, {}, 0.0).series
     assert all((np.diff(one.clock) > 0).all() for name, one in settled.items() if name != "restart")
     assert codes(settled["late"]) == ["out_of_order"]
-    assert (settled["restart"].remarks[0]["level"], codes(settled["restart"])[0]) == ("fatal", "time_runs_backwards")
+    assert (settled["restart"].remarks[0]["level"], codes(settled["restart"])[0]) == (
+        "fatal",
+        "time_runs_backwards",
+    )
     assert "stamps_run_backwards" in codes(settled["bad_stamps"])
     assert codes(settled["copies"]) == ["duplicate_rows"]
     assert codes(settled["shared"]) == ["repeated_stamps"]
@@ -153,7 +189,14 @@ def test_several_publishers_are_told_from_noise_and_rounding(seed: int) -> None:
     t = 0.05 * np.arange(2000)
     slow = np.cumsum(rng.normal(size=t.size)) * 0.05
     # clean topics: smooth, noisy, rounded to two values, held for several rows, jitter
-    clean = [slow, slow + rng.normal(size=t.size), np.round(0.2 * slow), np.round(rng.random(t.size)), np.repeat(slow[::5], 5), np.sign(np.sin(t))]
+    clean = [
+        slow,
+        slow + rng.normal(size=t.size),
+        np.round(0.2 * slow),
+        np.round(rng.random(t.size)),
+        np.repeat(slow[::5], 5),
+        np.sign(np.sin(t)),
+    ]
     for values in clean:
         assert not seen(topic("a", t, t + 5e-3 * rng.random(t.size), None, a=values))
     # two trains of messages at their own rates and levels
@@ -164,7 +207,9 @@ def test_several_publishers_are_told_from_noise_and_rounding(seed: int) -> None:
     # one train beside another of the same rate
     twin = np.sort(np.concatenate((t, t + 0.02)))
     assert seen(topic("a", t, both[order], None, a=level[order])) == {"several_publishers"}
-    assert seen(topic("a", t, twin, None, a=np.stack((slow, slow + 4.0), axis=1).reshape(-1))) == {"several_publishers"}
+    assert seen(topic("a", t, twin, None, a=np.stack((slow, slow + 4.0), axis=1).reshape(-1))) == {
+        "several_publishers"
+    }
 
 
 def test_senders_tell_publishers_apart() -> None:
@@ -189,7 +234,11 @@ def folder(tmp_path: Path, **topics: dict[str, Any]) -> Path:
 
 
 def read(path: Path, **config: Any) -> Log:
-    return validate({"kind": "csv_topics", "standard_messages": False, **config}, ReaderConfig, "test").build().read(path)
+    return (
+        validate({"kind": "csv_topics", "standard_messages": False, **config}, ReaderConfig, "test")
+        .build()
+        .read(path)
+    )
 
 
 def field(name: str, unit: str = "-", **more: Any) -> dict[str, Any]:
@@ -198,8 +247,15 @@ def field(name: str, unit: str = "-", **more: Any) -> dict[str, Any]:
 
 def test_commands_hold_measurements_are_interpolated_gaps_stay_gaps(tmp_path: Path) -> None:
     t = np.concatenate((0.1 * np.arange(40), 10.0 + 0.1 * np.arange(40)))
-    place = folder(tmp_path, gyro={"time": t, "data": 2.0 * t}, order={"time": [0.0, 1.05, 11.02], "data": [1.0, 2.0, 3.0]})
-    channels = {"r": field("gyro", "deg/s"), "cmd_delta": field("order", "deg", hold=True, longest_gap="20 s")}
+    place = folder(
+        tmp_path,
+        gyro={"time": t, "data": 2.0 * t},
+        order={"time": [0.0, 1.05, 11.02], "data": [1.0, 2.0, 3.0]},
+    )
+    channels = {
+        "r": field("gyro", "deg/s"),
+        "cmd_delta": field("order", "deg", hold=True, longest_gap="20 s"),
+    }
     log = read(place, channels=channels, clock={"kind": "uniform", "step": "0.04 s"})
     gap = (log.t > 3.9 + 1e-9) & (log.t < 10.0 - 1e-9)
     np.testing.assert_array_equal(np.isnan(log["r"]), gap)
@@ -207,20 +263,30 @@ def test_commands_hold_measurements_are_interpolated_gaps_stay_gaps(tmp_path: Pa
     np.testing.assert_allclose(np.degrees(log["r"][~gap]), 2.0 * log.t[~gap], atol=1e-9)
     expected = np.where(log.t < 1.05 - 1e-9, 1.0, np.where(log.t < 11.02 - 1e-9, 2.0, 3.0))
     before_the_last = log.t <= 11.02
-    np.testing.assert_allclose(np.degrees(log["cmd_delta"][before_the_last]), expected[before_the_last])
+    np.testing.assert_allclose(
+        np.degrees(log["cmd_delta"][before_the_last]), expected[before_the_last]
+    )
 
 
 def test_units(tmp_path: Path) -> None:
     t = 0.1 * np.arange(20)
     place = folder(tmp_path, a={"time": t, "data": np.full(20, 90.0)})
-    units = {"u": ("kn", 90 * 1852 / 3600), "psi_ref": ("deg", np.pi / 2), "n": ("rpm", 1.5), "n_port": ("rps", 90.0), "throttle": ("%", 0.9)}
+    units = {
+        "u": ("kn", 90 * 1852 / 3600),
+        "psi_ref": ("deg", np.pi / 2),
+        "n": ("rpm", 1.5),
+        "n_port": ("rps", 90.0),
+        "throttle": ("%", 0.9),
+    }
     log = read(place, channels={name: field("a", unit) for name, (unit, _) in units.items()})
     for name, (_, value) in units.items():
         np.testing.assert_allclose(log[name], value)
 
 
 def circle(t: np.ndarray) -> dict[str, np.ndarray]:
-    """A vessel on a circle of 20 m, bow along the track: u = 2 m/s, v = 0, r = 0.1 rad/s; x, y of its centre."""
+    """A vessel on a circle of 20 m, bow along the track: u = 2 m/s, v = 0, r = 0.1 rad/s; x, y of
+    its centre.
+    """
     psi = 0.1 * t
     return {"psi": psi, "x": 20.0 * np.sin(psi), "y": -20.0 * np.cos(psi)}
 
@@ -232,17 +298,33 @@ def test_lever_and_derived_velocities(tmp_path: Path) -> None:
     # an antenna 3 m ahead and 1 m to port
     north, east = truth["x"] + 3.0 * c + 1.0 * s, truth["y"] + 3.0 * s - 1.0 * c
     sign = np.where(np.arange(t.size) % 3, 1.0, -1.0)
-    quaternion = {"q_x": 0 * t, "q_y": 0 * t, "q_z": sign * np.sin(truth["psi"] / 2), "q_w": sign * np.cos(truth["psi"] / 2)}
+    quaternion = {
+        "q_x": 0 * t,
+        "q_y": 0 * t,
+        "q_z": sign * np.sin(truth["psi"] / 2),
+        "q_w": sign * np.cos(truth["psi"] / 2),
+    }
     place = folder(
         tmp_path,
         fix={"time": t, "n": north, "e": east},
         heading={"time": t, **quaternion},
     )
     config: dict[str, Any] = {
-        "position": {"kind": "local", "topic": "fix", "north": "n", "east": "e", "antenna": {"x": "3 m", "y": "-1 m"}},
+        "position": {
+            "kind": "local",
+            "topic": "fix",
+            "north": "n",
+            "east": "e",
+            "antenna": {"x": "3 m", "y": "-1 m"},
+        },
         "heading": {"kind": "quaternion", "topic": "heading", "field": "q", "frame": "ned"},
     }
-    derived = read(place, **config, velocity={"kind": "derived", "window": "1 s"}, clock={"kind": "uniform", "step": "0.1 s"})
+    derived = read(
+        place,
+        **config,
+        velocity={"kind": "derived", "window": "1 s"},
+        clock={"kind": "uniform", "step": "0.1 s"},
+    )
     assert len(derived) == 1200
     for name, value in (("u", 2.0), ("v", 0.0), ("r", 0.1)):
         np.testing.assert_allclose(derived[name], value, atol=5e-5, err_msg=name)
@@ -261,12 +343,32 @@ def test_velocity_of_an_antenna_in_earth_axes(kind: str, tmp_path: Path) -> None
     # u = 2, v = 0.3 at the centre, an antenna at (3, -1) m
     u, v = 2.0 - 0.1 * -1.0, 0.3 + 0.1 * 3.0
     north, east = u * np.cos(psi) - v * np.sin(psi), u * np.sin(psi) + v * np.cos(psi)
-    columns = {"n": north, "e": east, "speed": np.hypot(north, east) * 3600 / 1852, "course": np.degrees(np.arctan2(east, north)) % 360}
-    place = folder(tmp_path, gps={"time": t, **columns}, compass={"time": t, "data": np.degrees(np.pi / 2 - psi) % 360}, gyro={"time": t, "data": -r})
-    source = {"north": "n", "east": "e"} if kind == "earth_fixed" else {"course": "course", "speed": "speed", "speed_unit": "kn"}
+    columns = {
+        "n": north,
+        "e": east,
+        "speed": np.hypot(north, east) * 3600 / 1852,
+        "course": np.degrees(np.arctan2(east, north)) % 360,
+    }
+    place = folder(
+        tmp_path,
+        gps={"time": t, **columns},
+        compass={"time": t, "data": np.degrees(np.pi / 2 - psi) % 360},
+        gyro={"time": t, "data": -r},
+    )
+    source = (
+        {"north": "n", "east": "e"}
+        if kind == "earth_fixed"
+        else {"course": "course", "speed": "speed", "speed_unit": "kn"}
+    )
     log = read(
         place,
-        heading={"kind": "angle", "topic": "compass", "field": "data", "unit": "deg", "frame": "enu"},
+        heading={
+            "kind": "angle",
+            "topic": "compass",
+            "field": "data",
+            "unit": "deg",
+            "frame": "enu",
+        },
         velocity={"kind": kind, "topic": "gps", "antenna": {"x": "3 m", "y": "-1 m"}, **source},
         channels={"r": field("gyro", "rad/s", frame="body_fpu")},
     )
@@ -281,7 +383,9 @@ def test_tangent_plane_against_the_ellipsoid() -> None:
     w = np.sqrt(1 - e2 * np.sin(phi) ** 2)
     meridian, prime = a * (1 - e2) / w**3, a / w
     step = 1e-6
-    north, east = tangent_plane(phi + step * np.array([0, 1, 0]), 0.2 + step * np.array([0, 0, 1]), phi, 0.2)
+    north, east = tangent_plane(
+        phi + step * np.array([0, 1, 0]), 0.2 + step * np.array([0, 0, 1]), phi, 0.2
+    )
     np.testing.assert_allclose(north, [0.0, meridian * step, 0.0], atol=2e-5)
     np.testing.assert_allclose(east, [0.0, 0.0, prime * np.cos(phi) * step], atol=2e-5)
 
@@ -308,23 +412,43 @@ def test_a_topic_that_lags_and_one_that_speaks_of_another_point(tmp_path: Path) 
     )
     figures = {entry["code"]: entry["figures"] for entry in log.meta["findings"]}
     assert figures["topic_lag"]["lag"] == pytest.approx(0.4, abs=0.05)
-    assert (figures["lever_arm"]["forward"], figures["lever_arm"]["starboard"]) == pytest.approx((0.0, -0.8), abs=0.02)
+    assert (figures["lever_arm"]["forward"], figures["lever_arm"]["starboard"]) == pytest.approx(
+        (0.0, -0.8), abs=0.02
+    )
 
 
 def test_topics_of_different_length_share_the_stretch_that_all_cover(tmp_path: Path) -> None:
-    place = folder(tmp_path, a={"time": 0.1 * np.arange(200), "data": np.ones(200)}, b={"time": 5.0 + 0.2 * np.arange(50), "data": np.ones(50)})
-    log = read(place, channels={"u": field("a", "m/s"), "v": field("b", "m/s")}, clock={"kind": "uniform", "step": "0.1 s"})
+    place = folder(
+        tmp_path,
+        a={"time": 0.1 * np.arange(200), "data": np.ones(200)},
+        b={"time": 5.0 + 0.2 * np.arange(50), "data": np.ones(50)},
+    )
+    log = read(
+        place,
+        channels={"u": field("a", "m/s"), "v": field("b", "m/s")},
+        clock={"kind": "uniform", "step": "0.1 s"},
+    )
     assert (log.t[0], log.t[-1]) == pytest.approx((5.0, 14.8))
     assert not log.masks
     (tmp_path / "far").mkdir()
-    far = folder(tmp_path / "far", a={"time": [0.0, 1.0], "data": [1, 1]}, b={"time": [5.0, 6.0], "data": [1, 1]})
+    far = folder(
+        tmp_path / "far",
+        a={"time": [0.0, 1.0], "data": [1, 1]},
+        b={"time": [5.0, 6.0], "data": [1, 1]},
+    )
     with pytest.raises(DataError, match="share no stretch of time"):
-        read(far, channels={"u": field("a", "m/s"), "v": field("b", "m/s")}, clock={"kind": "uniform", "step": "0.1 s"})
+        read(
+            far,
+            channels={"u": field("a", "m/s"), "v": field("b", "m/s")},
+            clock={"kind": "uniform", "step": "0.1 s"},
+        )
 
 
 def test_what_is_missing_is_named(tmp_path: Path) -> None:
     t = 0.1 * np.arange(50)
-    place = folder(tmp_path, gyro={"time": t, "data": t, "none": np.full(50, np.nan), "words": ["a"] * 50})
+    place = folder(
+        tmp_path, gyro={"time": t, "data": t, "none": np.full(50, np.nan), "words": ["a"] * 50}
+    )
     (place / "silent.csv").write_text("")
     with pytest.raises(UsageError, match="no topic 'gyr'; did you mean 'gyro'"):
         read(place, channels={"r": field("gyr", "rad/s")})
@@ -334,9 +458,17 @@ def test_what_is_missing_is_named(tmp_path: Path) -> None:
         read(place, channels={"r": {"topic": "gyro", "field": "none", "unit": "rad/s"}})
     with pytest.raises(UsageError, match="no channel to read"):
         read(place)
-    log = read(place, channels={"r": field("gyro", "rad/s"), "delta": field("rudder", "rad", required=False)})
+    log = read(
+        place,
+        channels={"r": field("gyro", "rad/s"), "delta": field("rudder", "rad", required=False)},
+    )
     assert list(log.channels) == ["r"]
-    assert {entry["code"] for entry in log.meta["findings"]} >= {"missing_channels", "empty_topic", "empty_columns", "not_numbers"}
+    assert {entry["code"] for entry in log.meta["findings"]} >= {
+        "missing_channels",
+        "empty_topic",
+        "empty_columns",
+        "not_numbers",
+    }
     with pytest.raises(UsageError, match="no such file"):
         read(tmp_path / "ran", channels={"r": field("gyro", "rad/s")})
 
@@ -356,7 +488,10 @@ def test_chunks_of_a_topic_give_the_whole(tmp_path: Path, monkeypatch: pytest.Mo
     ns = EPOCH * 10**9 + 70_533_347 * np.arange(2000)
     values = np.sin(np.arange(2000.0))
     cells = [f"{v!r}" if i % 500 else "lost" for i, v in enumerate(values.tolist())]
-    place = folder(tmp_path, gyro={"time": printed(ns, "unpadded"), "data": cells, "header_frame_id": ["bow"] * 2000})
+    place = folder(
+        tmp_path,
+        gyro={"time": printed(ns, "unpadded"), "data": cells, "header_frame_id": ["bow"] * 2000},
+    )
     whole = read(place, channels={"r": field("gyro", "rad/s")})
     monkeypatch.setattr("residnet.data.readers.recorders.topic_folder._CHUNK", 300)
     monkeypatch.setattr("residnet.data.readers.recorders.topic_folder.LARGE", 0)
@@ -386,7 +521,12 @@ def test_one_table_with_dates_latitudes_and_a_compass(tmp_path: Path) -> None:
     pd.DataFrame(table).to_csv(path, index=False)
     log = read(
         path,
-        position={"kind": "geodetic", "latitude": "lat", "longitude": "lon", "origin": {"latitude": "63.4411 deg", "longitude": "10.4198 deg"}},
+        position={
+            "kind": "geodetic",
+            "latitude": "lat",
+            "longitude": "lon",
+            "origin": {"latitude": "63.4411 deg", "longitude": "10.4198 deg"},
+        },
         heading={"kind": "angle", "field": "compass", "unit": "deg"},
         velocity={"kind": "derived"},
         clock={"kind": "uniform", "step": "0.2 s"},

@@ -1,4 +1,6 @@
-"""Sensors of simulated trials: what existing configs measure, and bias, noise, sampling and latency per channel."""
+"""Sensors of simulated trials: what existing configs measure, and bias, noise, sampling and latency
+per channel.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,10 @@ TRIALS: dict[str, Any] = {
     "duration": 60,
     "step": 0.1,
     "substeps": 1,
-    "trials": [{"kind": "constant", "drive": [0.4], "steer": [0.3]}, {"kind": "zigzag", "count": 3, "heading": ["20 deg"]}],
+    "trials": [
+        {"kind": "constant", "drive": [0.4], "steer": [0.3]},
+        {"kind": "zigzag", "count": 3, "heading": ["20 deg"]},
+    ],
     "identification": {"zigzag": 1},
     "validation": {},
 }
@@ -46,7 +51,10 @@ def test_white_noise_is_drawn_as_it_always_was() -> None:
 
 
 def test_noise_and_bias_of_one_channel_leave_the_others_alone() -> None:
-    truth, seen = logs({}), logs({"sensors": {"psi": {"noise": "2 deg", "bias": "-1 deg"}, "x": {"bias": 3}}})
+    truth, seen = (
+        logs({}),
+        logs({"sensors": {"psi": {"noise": "2 deg", "bias": "-1 deg"}, "x": {"bias": 3}}}),
+    )
     for a, b in zip(truth, seen, strict=True):
         error = np.degrees(b["psi"] - a["psi"])
         assert error.std() == pytest.approx(2.0, rel=0.1)
@@ -54,7 +62,9 @@ def test_noise_and_bias_of_one_channel_leave_the_others_alone() -> None:
         np.testing.assert_allclose(b["x"] - a["x"], 3.0, rtol=1e-12)
         for name in ("u", "v", "r", "y", "n_stbd"):
             np.testing.assert_array_equal(a[name], b[name])
-    assert np.corrcoef(seen[0]["psi"] - truth[0]["psi"], seen[1]["psi"] - truth[1]["psi"])[0, 1] < 0.2
+    assert (
+        np.corrcoef(seen[0]["psi"] - truth[0]["psi"], seen[1]["psi"] - truth[1]["psi"])[0, 1] < 0.2
+    )
 
 
 def test_a_slow_sensor_is_empty_between_its_samples() -> None:
@@ -67,11 +77,16 @@ def test_a_slow_sensor_is_empty_between_its_samples() -> None:
 
 
 def test_latency_shows_the_past() -> None:
-    truth, seen = logs(CLEAN), logs(CLEAN | {"sensors": {"r": {"latency": "300 ms"}, "psi": {"latency": "250 ms"}}})
+    truth, seen = (
+        logs(CLEAN),
+        logs(CLEAN | {"sensors": {"r": {"latency": "300 ms"}, "psi": {"latency": "250 ms"}}}),
+    )
     for a, b in zip(truth, seen, strict=True):
         np.testing.assert_allclose(b["r"][3:], a["r"][:-3], rtol=0, atol=1e-12)
         np.testing.assert_array_equal(b["r"][:3], np.full(3, a["r"][0]))
-        np.testing.assert_allclose(b["psi"][3:], 0.5 * (a["psi"][:-3] + a["psi"][1:-2]), rtol=0, atol=1e-12)
+        np.testing.assert_allclose(
+            b["psi"][3:], 0.5 * (a["psi"][:-3] + a["psi"][1:-2]), rtol=0, atol=1e-12
+        )
 
 
 def test_a_config_keeps_its_numbers_when_it_is_written_and_read_again() -> None:

@@ -17,7 +17,14 @@ from residnet.data.split import SplitConfig, check_leaks
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    for name in ("turning/a.csv", "turning/b.csv", "zigzag/c.csv", "zigzag/d.csv", "zigzag/deep/e.csv", "odd [1].csv"):
+    for name in (
+        "turning/a.csv",
+        "turning/b.csv",
+        "zigzag/c.csv",
+        "zigzag/d.csv",
+        "zigzag/deep/e.csv",
+        "odd [1].csv",
+    ):
         path = tmp_path / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text("t\n")
@@ -25,19 +32,32 @@ def root(tmp_path: Path) -> Path:
 
 
 def resolve(**config: Any) -> dict[str, list[Path]]:
-    return validate({key: str(value) if isinstance(value, Path) else value for key, value in config.items()}, SplitConfig, "test").resolve()
+    return validate(
+        {key: str(value) if isinstance(value, Path) else value for key, value in config.items()},
+        SplitConfig,
+        "test",
+    ).resolve()
 
 
 def test_patterns(root: Path) -> None:
-    files = resolve(root=root, train=["zigzag/**/*.csv", "zigzag/c.csv"], validation=["turning/b.*"], test=["turning/a.csv", "odd [1].csv"])
-    assert {split: [str(path.relative_to(root)) for path in paths] for split, paths in files.items()} == {
+    files = resolve(
+        root=root,
+        train=["zigzag/**/*.csv", "zigzag/c.csv"],
+        validation=["turning/b.*"],
+        test=["turning/a.csv", "odd [1].csv"],
+    )
+    assert {
+        split: [str(path.relative_to(root)) for path in paths] for split, paths in files.items()
+    } == {
         "train": ["zigzag/c.csv", "zigzag/d.csv", "zigzag/deep/e.csv"],
         "validation": ["turning/b.csv"],
         "test": ["turning/a.csv", "odd [1].csv"],
     }
 
 
-def test_a_file_of_splits_is_relative_to_its_own_folder_unless_a_root_is_given(root: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_a_file_of_splits_is_relative_to_its_own_folder_unless_a_root_is_given(
+    root: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
     text = "train: [zigzag/c.csv]\nvalidation: [zigzag/d.csv]\ntest: [turning/*.csv]\n"
     (root / "split.yaml").write_text(text)
     elsewhere = tmp_path_factory.mktemp("configs") / "split.yaml"
@@ -51,11 +71,26 @@ def test_a_file_of_splits_is_relative_to_its_own_folder_unless_a_root_is_given(r
     ("config", "words"),
     [
         ({"train": ["zigzag/c.csv"], "validation": ["zigzag/d.csv"]}, "no files for test"),
-        ({"train": ["zigzag/c.csv"], "validation": ["zigzag/*.csv"], "test": ["turning/*.csv"]}, "stands in train and in validation"),
-        ({"train": ["zigzag/c.csv"], "validation": ["zigzag/x.csv"], "test": ["turning/*.csv"]}, "'zigzag/x.csv' matches no file"),
-        ({"train": ["zig/c.csv"], "validation": ["zigzag/d.csv"], "test": ["turning/*.csv"]}, "there is no folder"),
-        ({"train": ["turning/c.csv"], "validation": ["zigzag/d.csv"], "test": ["turning/*.csv"]}, "'turning/c.csv' matches no file"),
-        ({"train": ["/zigzag/*.csv"], "validation": ["zigzag/d.csv"], "test": ["turning/*.csv"]}, "not a pattern relative to"),
+        (
+            {"train": ["zigzag/c.csv"], "validation": ["zigzag/*.csv"], "test": ["turning/*.csv"]},
+            "stands in train and in validation",
+        ),
+        (
+            {"train": ["zigzag/c.csv"], "validation": ["zigzag/x.csv"], "test": ["turning/*.csv"]},
+            "'zigzag/x.csv' matches no file",
+        ),
+        (
+            {"train": ["zig/c.csv"], "validation": ["zigzag/d.csv"], "test": ["turning/*.csv"]},
+            "there is no folder",
+        ),
+        (
+            {"train": ["turning/c.csv"], "validation": ["zigzag/d.csv"], "test": ["turning/*.csv"]},
+            "'turning/c.csv' matches no file",
+        ),
+        (
+            {"train": ["/zigzag/*.csv"], "validation": ["zigzag/d.csv"], "test": ["turning/*.csv"]},
+            "not a pattern relative to",
+        ),
         ({"trian": ["zigzag/c.csv"]}, "did you mean 'train'?"),
     ],
 )
@@ -69,11 +104,26 @@ def test_faulty_patterns(root: Path, config: dict[str, Any], words: str) -> None
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("train: [zigzag/c.csv]\nvalidation: [zigzag/d.csv]\n", "test: expected a list of at least one"),
-        ("train: [zigzag/c.csv]\nvalidation: []\ntest: [turning/a.csv]\n", "validation: expected a list"),
-        ("train: zigzag/c.csv\nvalidation: [zigzag/d.csv]\ntest: [turning/a.csv]\n", "train: expected a list"),
-        ("train: [zigzag/c.csv]\nvalid: [zigzag/d.csv]\ntest: [turning/a.csv]\n", "unknown split 'valid'"),
-        ("train: [zigzag/c.csv]\nvalidation: [zigzag/d.csv]\ntest: [zigzag/c.csv]\n", "stands in train and in test"),
+        (
+            "train: [zigzag/c.csv]\nvalidation: [zigzag/d.csv]\n",
+            "test: expected a list of at least one",
+        ),
+        (
+            "train: [zigzag/c.csv]\nvalidation: []\ntest: [turning/a.csv]\n",
+            "validation: expected a list",
+        ),
+        (
+            "train: zigzag/c.csv\nvalidation: [zigzag/d.csv]\ntest: [turning/a.csv]\n",
+            "train: expected a list",
+        ),
+        (
+            "train: [zigzag/c.csv]\nvalid: [zigzag/d.csv]\ntest: [turning/a.csv]\n",
+            "unknown split 'valid'",
+        ),
+        (
+            "train: [zigzag/c.csv]\nvalidation: [zigzag/d.csv]\ntest: [zigzag/c.csv]\n",
+            "stands in train and in test",
+        ),
     ],
 )
 def test_faulty_files_of_splits(root: Path, text: str, words: str) -> None:
@@ -92,7 +142,9 @@ def test_other_faults(root: Path) -> None:
         resolve(root=root / "none", train=["a"], validation=["b"], test=["c"])
     (root / "zigzag/a.csv").write_text("t\n")
     with pytest.raises(ConfigError, match="would both be the log 'a'"):
-        resolve(root=root, train=["zigzag/a.csv"], validation=["zigzag/d.csv"], test=["turning/a.csv"])
+        resolve(
+            root=root, train=["zigzag/a.csv"], validation=["zigzag/d.csv"], test=["turning/a.csv"]
+        )
 
 
 def copied(log: Log, start: int, stop: int, turns: int = 0) -> Log:
@@ -103,13 +155,27 @@ def copied(log: Log, start: int, stop: int, turns: int = 0) -> Log:
 
 def other(seed: int = 0, size: int = 2000) -> Log:
     rng = np.random.default_rng(seed)
-    return Log(f"other{seed}", 0.1 * np.arange(size), {name: rng.normal(size=size) for name in ("x", "y", "psi", "u", "v", "r", "delta", "n")})
+    return Log(
+        f"other{seed}",
+        0.1 * np.arange(size),
+        {name: rng.normal(size=size) for name in ("x", "y", "psi", "u", "v", "r", "delta", "n")},
+    )
 
 
 def test_a_copied_stretch_is_found_wherever_its_clock_and_heading_start() -> None:
     log = wavy()
-    logs = {"train": [other(0), log, other(1)], "validation": [other(2)], "test": [copied(log, 700, 1200, turns=-2)]}
-    with pytest.raises(DataError, match=r"logs wavy \(train\) and copy \(test\) share 500 identical rows, at most 100 are allowed"):
+    logs = {
+        "train": [other(0), log, other(1)],
+        "validation": [other(2)],
+        "test": [copied(log, 700, 1200, turns=-2)],
+    }
+    with pytest.raises(
+        DataError,
+        match=(
+            r"logs wavy \(train\) and copy \(test\) share 500 identical rows, at most 100 are"
+            r" allowed"
+        ),
+    ):
         check_leaks(logs)
     check_leaks(logs, rows=500)
     check_leaks({"train": [log, copied(log, 700, 1200)], "test": [other(0)]})
@@ -117,7 +183,12 @@ def test_a_copied_stretch_is_found_wherever_its_clock_and_heading_start() -> Non
 
 def test_a_vessel_at_rest_shares_no_more_than_one_row() -> None:
     rest = {name: np.zeros(3000) for name in ("x", "y", "psi", "u")}
-    check_leaks({"train": [Log("a", np.arange(3000.0), rest)], "test": [Log("b", np.arange(3000.0), {**rest, "u": -rest["u"]})]})
+    check_leaks(
+        {
+            "train": [Log("a", np.arange(3000.0), rest)],
+            "test": [Log("b", np.arange(3000.0), {**rest, "u": -rest["u"]})],
+        }
+    )
 
 
 def test_missing_values_compare_equal_and_one_split_cannot_leak() -> None:

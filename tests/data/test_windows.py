@@ -1,4 +1,6 @@
-"""Training windows against plain loops over logs with breaks, masked samples and unknown derivatives."""
+"""Training windows against plain loops over logs with breaks, masked samples and unknown
+derivatives.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,9 @@ def runs(count: int, random: np.random.Generator, mean: float) -> np.ndarray:
 
 
 def broken_log(seed: int, count: int) -> Prepared:
-    """Random numbers in stretches; the second stretch follows the first at once, so that only the label tells them apart."""
+    """Random numbers in stretches; the second stretch follows the first at once, so that only the
+    label tells them apart.
+    """
     random = np.random.default_rng(seed)
     piece = np.cumsum(random.random(count) < 0.04)
     piece = np.where(runs(count, random, 25.0), piece, -1)
@@ -29,8 +33,12 @@ def broken_log(seed: int, count: int) -> Prepared:
     y[0] = 1.0
     usable = runs(count, random, 12.0) & (piece >= 0)
     good = usable & (random.random(count) < 0.8)
-    log = Log(f"log_{seed}", 0.1 * np.arange(count), {name: y[:, i] for i, name in enumerate(STATE)})
-    return Prepared(log, "train", y, y + 0.5, random.normal(size=(count, 3)), w, w, piece, usable, good)
+    log = Log(
+        f"log_{seed}", 0.1 * np.arange(count), {name: y[:, i] for i, name in enumerate(STATE)}
+    )
+    return Prepared(
+        log, "train", y, y + 0.5, random.normal(size=(count, 3)), w, w, piece, usable, good
+    )
 
 
 LOGS = [broken_log(seed, count) for seed, count in enumerate((300, 1, 240, 400))]
@@ -54,7 +62,12 @@ def expected_starts(length: int) -> list[int]:
     out = []
     for row, (number, k) in enumerate(ROWS):
         log = LOGS[number]
-        if log.piece[k] >= 0 and k + length <= stretch(number, k)[1] and log.good[k] and log.usable[k : k + length].sum() >= 0.5 * length:
+        if (
+            log.piece[k] >= 0
+            and k + length <= stretch(number, k)[1]
+            and log.good[k]
+            and log.usable[k : k + length].sum() >= 0.5 * length
+        ):
             out.append(row)
     return out
 
@@ -65,7 +78,9 @@ def test_windows_start_where_the_loop_says(length: int) -> None:
     assert starts.tolist() == expected_starts(length)
     for row in starts.tolist():
         window = ROWS[row : row + length]
-        assert len({(number, LOGS[number].piece[k]) for number, k in window}) == 1, "a window crosses no break"
+        assert len({(number, LOGS[number].piece[k]) for number, k in window}) == 1, (
+            "a window crosses no break"
+        )
 
 
 def test_reach_and_depth_are_those_of_the_stretch() -> None:
@@ -80,7 +95,10 @@ def test_reach_and_depth_are_those_of_the_stretch() -> None:
 @pytest.mark.parametrize("length", [1, 9])
 def test_taken_windows_hold_the_logs_samples(length: int) -> None:
     starts = STORE.starts(length)[::3]
-    taken = {name: STORE.take(getattr(STORE, name), starts, length) for name in ("y", "smooth", "nu_dot", "w", "usable", "good")}
+    taken = {
+        name: STORE.take(getattr(STORE, name), starts, length)
+        for name in ("y", "smooth", "nu_dot", "w", "usable", "good")
+    }
     for i, row in enumerate(starts.tolist()):
         number, k = ROWS[row]
         log = LOGS[number]

@@ -1,4 +1,6 @@
-"""Force residuals on measured logs: a log with a known answer must give it, one without must be said to have none."""
+"""Force residuals on measured logs: a log with a known answer must give it, one without must be
+said to have none.
+"""
 
 from __future__ import annotations
 
@@ -34,22 +36,47 @@ def motion(seed: int, seconds: float) -> tuple[np.ndarray, np.ndarray, np.ndarra
     omega, phase = random.uniform(0.1, 0.5, (3, 6)), random.uniform(0, 2 * np.pi, (3, 6))
     size = np.array([0.3, 0.15, 0.05])[:, None] / np.sqrt(6) * 1.4
     angle = omega[..., None] * t + phase[..., None]
-    return t, (size[..., None] * np.sin(angle)).sum(1).T, (size[..., None] * omega[..., None] * np.cos(angle)).sum(1).T
+    return (
+        t,
+        (size[..., None] * np.sin(angle)).sum(1).T,
+        (size[..., None] * omega[..., None] * np.cos(angle)).sum(1).T,
+    )
 
 
-def log(folder: Path, name: str, *, missing: float, seed: int = 0, seconds: float = 300.0, noise: float = 2.0, **spoil: Any) -> None:
-    """A csv like the measured ones: tau = F_believed + missing (500 u_dot + 80 v|v| on surge and sway) + noise."""
+def log(
+    folder: Path,
+    name: str,
+    *,
+    missing: float,
+    seed: int = 0,
+    seconds: float = 300.0,
+    noise: float = 2.0,
+    **spoil: Any,
+) -> None:
+    """A csv like the measured ones: tau = F_believed + missing (500 u_dot + 80 v|v| on surge and
+    sway) + noise.
+    """
     hull = load_config(CONFIG, [f"data.root={folder}"], ForceResidualConfig).hull()
     t, nu, nu_dot = motion(seed, seconds)
     with torch.no_grad():
         force = hull.required(torch.from_numpy(nu_dot), torch.from_numpy(nu)).numpy()
     random = np.random.default_rng(seed + 100)
-    extra = np.stack((500 * nu_dot[:, 0], 300 * nu[:, 1] * np.abs(nu[:, 1]), 400 * nu_dot[:, 2]), axis=1)
+    extra = np.stack(
+        (500 * nu_dot[:, 0], 300 * nu[:, 1] * np.abs(nu[:, 1]), 400 * nu_dot[:, 2]), axis=1
+    )
     force = force + missing * extra + noise * random.standard_normal(force.shape)
     psi = np.cumsum(nu[:, 2]) * STEP
     x = np.cumsum(nu[:, 0] * np.cos(psi) - nu[:, 1] * np.sin(psi)) * STEP
     y = np.cumsum(nu[:, 0] * np.sin(psi) + nu[:, 1] * np.cos(psi)) * STEP
-    columns: dict[str, Any] = {"t": t, "north": x, "east": y, "psi": psi, "u": nu[:, 0], "v": nu[:, 1], "r": nu[:, 2]}
+    columns: dict[str, Any] = {
+        "t": t,
+        "north": x,
+        "east": y,
+        "psi": psi,
+        "u": nu[:, 0],
+        "v": nu[:, 1],
+        "r": nu[:, 2],
+    }
     columns |= {"udot": nu_dot[:, 0] + OFFSET, "vdot": nu_dot[:, 1], "rdot": nu_dot[:, 2]}
     for axis, letter in enumerate("xyn"):
         columns[f"tau_{letter}_est"] = columns[f"tau_{letter}_cmd"] = force[:, axis]
@@ -73,7 +100,9 @@ def rows(found: Any) -> dict[str, Any]:
 
 def test_what_the_hull_lacks_is_found_and_said(tmp_path: Path) -> None:
     log(tmp_path, "one", missing=1.0)
-    settings = config(tmp_path, models={"ridge": {"fit": {"kind": "ridge"}}, "plsr": {"fit": {"kind": "plsr"}}})
+    settings = config(
+        tmp_path, models={"ridge": {"fit": {"kind": "ridge"}}, "plsr": {"fit": {"kind": "plsr"}}}
+    )
     found = force_study(settings)
     for name in ("ridge", "plsr"):
         assert better(rows(found)[name], "believed") == [True] * 4
@@ -81,17 +110,25 @@ def test_what_the_hull_lacks_is_found_and_said(tmp_path: Path) -> None:
     left = rows(found)["ridge"]["mse"]
     # noise of 2 N is all that is left
     assert all(2.0 < value < 8.0 for value in left)
-    coefficients = dict(zip(FERRY_TERMS, found.final["ridge"].fit.coefficients.tolist(), strict=True))
+    coefficients = dict(
+        zip(FERRY_TERMS, found.final["ridge"].fit.coefficients.tolist(), strict=True)
+    )
     assert coefficients["u_dot"][0] == pytest.approx(500, rel=0.05)
     assert coefficients["r_dot"][2] == pytest.approx(400, rel=0.05)
     text = write(settings, found, RunFolder.create(tmp_path / "run", "", resume=False))
     assert "2 of 2 regressions beat a residual of zero" in text
-    assert {path.name for path in (tmp_path / "run" / "figures").glob("*.png")} >= {"scores.png", "forces_one.png", "residual_one.png"}
+    assert {path.name for path in (tmp_path / "run" / "figures").glob("*.png")} >= {
+        "scores.png",
+        "forces_one.png",
+        "residual_one.png",
+    }
 
 
 def test_a_residual_of_noise_is_said_to_be_none(tmp_path: Path) -> None:
     log(tmp_path, "one", missing=0.0, noise=20.0)
-    settings = config(tmp_path, models={"ols": {"fit": {"kind": "ols"}}, "surface": {"fit": {"kind": "surface"}}})
+    settings = config(
+        tmp_path, models={"ols": {"fit": {"kind": "ols"}}, "surface": {"fit": {"kind": "surface"}}}
+    )
     found = force_study(settings)
     assert [row["model"] for row in found.rows] == ["zero", "believed", "ols", "surface"]
     assert not any(any(better(rows(found)[name], "believed")) for name in ("ols", "surface"))
@@ -136,7 +173,9 @@ def test_acceleration_of_an_offset_sensor_is_calibrated(tmp_path: Path) -> None:
     assert found["sway"]["offset"] == pytest.approx(0.0, abs=1e-4)
     measured = read_measured(config(tmp_path, "acceleration=measured"))
     truth = torch.from_numpy(motion(0, 300.0)[2])
-    torch.testing.assert_close(measured.record.nu_dot[measured.good], truth[measured.good], rtol=0, atol=1e-4)
+    torch.testing.assert_close(
+        measured.record.nu_dot[measured.good], truth[measured.good], rtol=0, atol=1e-4
+    )
 
 
 def test_outliers_and_gaps_are_left_out(tmp_path: Path) -> None:
@@ -171,11 +210,20 @@ def test_lag_of_the_thrusters_is_told_by_the_actual_forces(tmp_path: Path) -> No
 
 def test_a_model_that_is_not_determined_is_set_aside_and_said(tmp_path: Path) -> None:
     log(tmp_path, "one", missing=1.0, psi=np.zeros(3000))
-    settings = config(tmp_path, models={"ridge": {"fit": {"kind": "ridge"}}, "earth": {"fit": {"kind": "ridge"}, "earth": True}})
+    settings = config(
+        tmp_path,
+        models={
+            "ridge": {"fit": {"kind": "ridge"}},
+            "earth": {"fit": {"kind": "ridge"}, "earth": True},
+        },
+    )
     found = force_study(settings)
     assert list(found.final) == ["ridge"]
     text = write(settings, found, RunFolder.create(tmp_path / "run", "", resume=False))
-    assert "Not determined by these logs:\n\n- model earth: a force constant in earth axes does not show" in text
+    assert (
+        "Not determined by these logs:\n\n- model earth: a force constant in earth axes does not"
+        " show" in text
+    )
 
 
 def test_data_that_determine_nothing_are_clear_errors(tmp_path: Path) -> None:
@@ -189,7 +237,9 @@ def test_data_that_determine_nothing_are_clear_errors(tmp_path: Path) -> None:
     with pytest.raises(FitError, match="one run or segment only"):
         force_study(config(tmp_path, "validation.segment=1000"))
     log(tmp_path, "one", missing=1.0, seconds=12.0)
-    with pytest.raises((FitError, DataError), match=r"samples do not determine|nothing left to learn"):
+    with pytest.raises(
+        (FitError, DataError), match=r"samples do not determine|nothing left to learn"
+    ):
         force_study(config(tmp_path, "validation.segment=2"))
     log(tmp_path, "one", missing=1.0, seconds=300.0, tau_x_est=np.full(3000, np.nan))
     with pytest.raises(DataError, match="holds no number"):
@@ -226,5 +276,12 @@ def test_a_missing_channel_is_named(tmp_path: Path) -> None:
 def test_comparison_of_accelerations_without_segments_has_no_interval() -> None:
     a = torch.randn(50, 3, dtype=torch.float64)
     assert compare_accelerations(a, a + 1, torch.zeros(50))["yaw"] == pytest.approx(
-        {"offset": 1.0, "offset_ci95": None, "rms_without_offset": 0.0, "rms": float(a[:, 2].std()), "correlation": 1.0}, abs=1e-9
+        {
+            "offset": 1.0,
+            "offset_ci95": None,
+            "rms_without_offset": 0.0,
+            "rms": float(a[:, 2].std()),
+            "correlation": 1.0,
+        },
+        abs=1e-9,
     )

@@ -1,4 +1,6 @@
-"""The ferry study on a shortened course: what identification must recover, what control must gain, what is refused."""
+"""The ferry study on a shortened course: what identification must recover, what control must gain,
+what is refused.
+"""
 
 from __future__ import annotations
 
@@ -28,14 +30,18 @@ from residnet.tasks.ferry_study import FerryStudyConfig
 
 CONFIGS = [
     path
-    for path in sorted((Path(residnet.__file__).parents[2] / "configs" / "studies" / "jervan2020").glob("*.yaml"))
+    for path in sorted(
+        (Path(residnet.__file__).parents[2] / "configs" / "studies" / "jervan2020").glob("*.yaml")
+    )
     if "task: ferry_study" in path.read_text()
 ]
 SHORT = ["course.interval=20", "~models.surface"]
 
 
 def config(name: str, *overrides: str) -> FerryStudyConfig:
-    found: FerryStudyConfig = load_config(next(path for path in CONFIGS if path.stem == name), list(overrides), FerryStudyConfig)
+    found: FerryStudyConfig = load_config(
+        next(path for path in CONFIGS if path.stem == name), list(overrides), FerryStudyConfig
+    )
     return found
 
 
@@ -57,7 +63,11 @@ def test_every_table_has_a_valid_config(path: Path) -> None:
 
 
 def test_the_lag_and_the_missing_half_are_found_and_flown(short: Study) -> None:
-    model, before, after = short.models["lag_ridge"], short.courses["believed"].tracking, short.courses["lag_ridge"].tracking
+    model, before, after = (
+        short.models["lag_ridge"],
+        short.courses["believed"].tracking,
+        short.courses["lag_ridge"].tracking,
+    )
     assert model.lag is not None
     assert model.lag.frequency == pytest.approx(2.0, rel=0.01)
     assert model.lag.damping == pytest.approx(0.8, rel=0.01)
@@ -76,7 +86,8 @@ def test_a_fitted_model_runs_forward_as_the_true_ferry(short: Study) -> None:
     equations = forward_equations("milliampere", short.models["lag_ridge"].model, "lag_ridge")
     names = ("u", "v", "r", "tau_x", "tau_y", "tau_n")
     model = BelievedConfig(vessel=equations).build(names)
-    # along the half that identified: shortened segments leave the other half outside of what was seen
+    # along the half that identified: shortened segments leave the other half outside of what was
+    # seen
     half = slice(0, len(short.first.t) // 2)
     nu, acting = short.first.nu[half], short.first.acting[half]
     with torch.no_grad():
@@ -85,9 +96,17 @@ def test_a_fitted_model_runs_forward_as_the_true_ferry(short: Study) -> None:
 
 
 def test_what_the_believed_hull_lacks_stands_beside_what_was_found() -> None:
-    """ERRATA J19: minus half of the believed model, which its own table misprints in the cross terms."""
+    """ERRATA J19: minus half of the believed model, which its own table misprints in the cross
+    terms.
+    """
     truth = missing_coefficients("milliampere_half", "milliampere")
-    expected = {"u_dot": [-1194.83, 0, 0], "v_dot": [0, -1266.96, -14.07], "r_dot": [0, -31.19, -2534.45], "u": [-13.82, 0, 0], "r^2": [31.19, 0, 0]}
+    expected = {
+        "u_dot": [-1194.83, 0, 0],
+        "v_dot": [0, -1266.96, -14.07],
+        "r_dot": [0, -31.19, -2534.45],
+        "u": [-13.82, 0, 0],
+        "r^2": [31.19, 0, 0],
+    }
     expected |= {
         "u v": [0, 0, -72.13],
         "u r": [0, -1194.83, -31.19],
@@ -101,21 +120,46 @@ def test_what_the_believed_hull_lacks_stands_beside_what_was_found() -> None:
 
 
 def test_feed_forward_alone_and_a_model_that_cannot_run_forward(tmp_path: Path) -> None:
-    found = study(config("operation", *SHORT, "~crossing", "feed_forward_alone=true", "models.case={fit: {kind: plsr, order: 1}, fly: true}"))
+    found = study(
+        config(
+            "operation",
+            *SHORT,
+            "~crossing",
+            "feed_forward_alone=true",
+            "models.case={fit: {kind: plsr, order: 1}, fly: true}",
+        )
+    )
     alone = found.alone
     assert list(alone) == ["believed", "lag_ridge", "case"]
     assert not any(bool(flight.feedback.any()) for flight in alone.values())
     # the thrusters give what is asked for, and half a ferry moves about twice as much
-    assert alone["lag_ridge"].tracking.motion_mse[0] < 0.02 * alone["believed"].tracking.motion_mse[0]
-    assert alone["believed"].tracking.position_mae > 10 * found.courses["believed"].tracking.position_mae
+    assert (
+        alone["lag_ridge"].tracking.motion_mse[0] < 0.02 * alone["believed"].tracking.motion_mse[0]
+    )
+    assert (
+        alone["believed"].tracking.position_mae
+        > 10 * found.courses["believed"].tracking.position_mae
+    )
     upside_down = found.models["case"].model.corrections[0]
     upside_down.coefficients[:3] -= 5000.0 * torch.eye(3)
-    wanted = config("operation", *SHORT, "~crossing", "feed_forward_alone=true", "models.case={fit: {kind: plsr, order: 1}, fly: true}")
+    wanted = config(
+        "operation",
+        *SHORT,
+        "~crossing",
+        "feed_forward_alone=true",
+        "models.case={fit: {kind: plsr, order: 1}, fly: true}",
+    )
     folder = RunFolder.create(tmp_path / "run", "", resume=False)
     text = write(wanted, found, folder)
     assert "Cannot run forward in time:\n\n- model case: its mass matrix" in text
-    assert {path.name for path in (tmp_path / "run" / "models").glob("*.yaml")} == {"lag_ridge_forward.yaml"}
-    assert {path.name for path in folder.figures.glob("*.png")} >= {"errors_course.png", "forces_course.png", "errors_feed_forward_alone.png"}
+    assert {path.name for path in (tmp_path / "run" / "models").glob("*.yaml")} == {
+        "lag_ridge_forward.yaml"
+    }
+    assert {path.name for path in folder.figures.glob("*.png")} >= {
+        "errors_course.png",
+        "forces_course.png",
+        "errors_feed_forward_alone.png",
+    }
     row = json.loads((tmp_path / "run" / "ferry.json").read_text())["course"]["lag_ridge"]
     assert row["power"][0] * float(found.first.t[-1]) == pytest.approx(row["energy"][0], rel=0.01)
 
@@ -125,7 +169,9 @@ def test_exported_feed_forward_is_the_model(short: Study, tmp_path: Path) -> Non
     export_feed_forward(model, None, [(-0.1, 0.1)] * 3 + [(-1.0, 1.0)] * 3, tmp_path / "f.pt")
     loaded = torch.jit.load(str(tmp_path / "f.pt"))
     with torch.no_grad():
-        torch.testing.assert_close(loaded(short.first.nu_dot, short.first.nu), model(short.first.nu_dot, short.first.nu))
+        torch.testing.assert_close(
+            loaded(short.first.nu_dot, short.first.nu), model(short.first.nu_dot, short.first.nu)
+        )
 
 
 def test_one_segment_nan_and_too_few_samples_are_clear_errors(short: Study) -> None:
@@ -133,7 +179,9 @@ def test_one_segment_nan_and_too_few_samples_are_clear_errors(short: Study) -> N
     base = ForceModel(hull("milliampere"))
     record = record_of(short.first, 20.0, MotionNoise())
     with pytest.raises(FitError, match="one run or segment only"):
-        identify(wanted, type(record)(**{**record.__dict__, "fold": torch.zeros_like(record.fold)}), base)
+        identify(
+            wanted, type(record)(**{**record.__dict__, "fold": torch.zeros_like(record.fold)}), base
+        )
     spoiled = record.nu.clone()
     spoiled[5, 1] = torch.nan
     with pytest.raises(FitError, match="not finite at sample 5"):
@@ -148,9 +196,22 @@ def test_constant_force_needs_a_vessel_that_turns() -> None:
     psi = torch.linspace(0, 5, 500, dtype=torch.float64)
     x = torch.randn(500, 4, generator=random, dtype=torch.float64)
     zero = torch.zeros_like(psi)
-    earthly = torch.stack((torch.stack((psi.cos(), -psi.sin(), zero), -1), torch.stack((psi.sin(), psi.cos(), zero), -1)), -1)
-    y = x @ torch.randn(4, 3, generator=random, dtype=torch.float64) + earthly @ torch.tensor([200.0, 100.0], dtype=torch.float64)
-    torch.testing.assert_close(constant_force(x, y, earthly), torch.tensor([200.0, 100.0], dtype=torch.float64), rtol=1e-8, atol=1e-6)
+    earthly = torch.stack(
+        (
+            torch.stack((psi.cos(), -psi.sin(), zero), -1),
+            torch.stack((psi.sin(), psi.cos(), zero), -1),
+        ),
+        -1,
+    )
+    y = x @ torch.randn(4, 3, generator=random, dtype=torch.float64) + earthly @ torch.tensor(
+        [200.0, 100.0], dtype=torch.float64
+    )
+    torch.testing.assert_close(
+        constant_force(x, y, earthly),
+        torch.tensor([200.0, 100.0], dtype=torch.float64),
+        rtol=1e-8,
+        atol=1e-6,
+    )
     with pytest.raises(FitError, match="kept its heading"):
         constant_force(x, y, earthly[:1].expand(500, 3, 2))
 
@@ -163,7 +224,9 @@ def test_course_is_the_filters_own_and_its_derivatives_are_consistent() -> None:
         reference, s = filtered(x, k, s)
         rows.append(reference[0])
     _, nu, nu_dot = motion.later(0.0)
-    torch.testing.assert_close(torch.cat((motion.pose, nu, nu_dot), -1)[:3100], torch.stack(rows), rtol=1e-9, atol=1e-10)
+    torch.testing.assert_close(
+        torch.cat((motion.pose, nu, nu_dot), -1)[:3100], torch.stack(rows), rtol=1e-9, atol=1e-10
+    )
     ahead = Derivatives(*(part[500] for part in motion)).later(0.2)
     torch.testing.assert_close(ahead[1], nu[510], rtol=1e-3, atol=1e-5)
     torch.testing.assert_close(ahead[2], nu_dot[510], rtol=1e-2, atol=1e-4)

@@ -12,12 +12,25 @@ import pytest
 from residnet.core.errors import UsageError
 from residnet.documents import draw_study
 
-MODELS = ("zero", "baseline", "rbf_joint", "rbf_each", "p1_joint", "p1_each", "p2_joint", "p2_each", "symbolic", "gptips")
+MODELS = (
+    "zero",
+    "baseline",
+    "rbf_joint",
+    "rbf_each",
+    "p1_joint",
+    "p1_each",
+    "p2_joint",
+    "p2_each",
+    "symbolic",
+    "gptips",
+)
 COLUMNS = ("u", "v", "r", "psi", "x", "y")
 
 
 def write(run: Path, split: str, models: tuple[str, ...]) -> None:
-    """One record of 400 s: model k is off by (k + 1) cm/s in u and v, and in r by so many mrad/s, with changing sign."""
+    """One record of 400 s: model k is off by (k + 1) cm/s in u and v, and in r by so many mrad/s,
+    with changing sign.
+    """
     t = np.arange(2000) * 0.2
     measured = {name: np.sin(0.01 * (k + 1) * t) for k, name in enumerate(COLUMNS)}
     parts = []
@@ -29,7 +42,18 @@ def write(run: Path, split: str, models: tuple[str, ...]) -> None:
         usable = t > 20.0
         predicted["u_hat"] = np.where(usable, predicted["u_hat"], 5.0)
         parts.append(
-            pd.DataFrame({"protocol": "record", "model": model, "window": 0, "t": t, "usable": usable, "diverged": False, **measured, **predicted})
+            pd.DataFrame(
+                {
+                    "protocol": "record",
+                    "model": model,
+                    "window": 0,
+                    "t": t,
+                    "usable": usable,
+                    "diverged": False,
+                    **measured,
+                    **predicted,
+                }
+            )
         )
     folder = run / "rollouts" / split
     folder.mkdir(parents=True)
@@ -39,7 +63,13 @@ def write(run: Path, split: str, models: tuple[str, ...]) -> None:
 def made(run: Path, models: tuple[str, ...] = MODELS) -> Path:
     kinds = {"zero": "zero", "baseline": "baseline"}
     rows = [
-        {"model": model, "kind": kinds.get(model, "head"), "split": "test", "protocol": "record", "rmse": dict.fromkeys("uvr", 1.0)}
+        {
+            "model": model,
+            "kind": kinds.get(model, "head"),
+            "split": "test",
+            "protocol": "record",
+            "rmse": dict.fromkeys("uvr", 1.0),
+        }
         for model in models
     ]
     (run / "metrics.json").write_text(json.dumps({"rows": rows, "run": "made"}))
@@ -52,14 +82,18 @@ def made(run: Path, models: tuple[str, ...] = MODELS) -> Path:
 def test_tables_hold_the_errors_of_the_records(tmp_path: Path) -> None:
     table, text, figure = draw_study("moreno2019", made(tmp_path))
     content = json.loads(table.read_text())
-    assert {(row["model"], row["split"]) for row in content["rows"]} == {(m, s) for m in MODELS for s in ("train", "validation", "test")}
+    assert {(row["model"], row["split"]) for row in content["rows"]} == {
+        (m, s) for m in MODELS for s in ("train", "validation", "test")
+    }
     for row in content["rows"]:
         number = MODELS.index(row["model"]) + 1
         assert row["u"] == pytest.approx(1e-2 * number)
         assert row["r"] == pytest.approx(1e-3 * number)
         assert row["u_ci95"][0] <= row["u"] * 1.0001
         assert row["u_ci95"][1] >= row["u"] * 0.9999
-    pair = next(row for row in content["pairs"] if (row["model"], row["split"]) == ("rbf_joint", "test"))
+    pair = next(
+        row for row in content["pairs"] if (row["model"], row["split"]) == ("rbf_joint", "test")
+    )
     # of squares: (3 / 4)^2 - 1
     assert pair["v"] == pytest.approx(9 / 16 - 1)
     assert "| polynomial p = 2, together | test | 0.0700 (0.0700 to 0.0700) |" in text.read_text()

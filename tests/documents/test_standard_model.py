@@ -17,7 +17,14 @@ from residnet.core.errors import FitError
 from residnet.core.log import Log
 from residnet.documents.halvorsen2019.odin_phases import BlackConfig, PhasesSettings
 from residnet.documents.halvorsen2019.sea_trial import CHANNELS, PreparationConfig, odin, prepared
-from residnet.documents.halvorsen2019.standard_model import NAMES, PARAMETERS, StandardFitConfig, accelerations, fit, truth
+from residnet.documents.halvorsen2019.standard_model import (
+    NAMES,
+    PARAMETERS,
+    StandardFitConfig,
+    accelerations,
+    fit,
+    truth,
+)
 from residnet.physics.odin import AccelerationHull
 from residnet.tasks import load_task
 
@@ -27,17 +34,27 @@ MASS = 4935.14
 
 def states(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     random = np.random.default_rng(seed)
-    return random.uniform([-1, -2, -0.6], [6, 2, 0.6], (count, 3)), random.normal(size=(count, 3)) * [4000, 1500, 4000]
+    return random.uniform([-1, -2, -0.6], [6, 2, 0.6], (count, 3)), random.normal(
+        size=(count, 3)
+    ) * [4000, 1500, 4000]
 
 
 def matrices(p: dict[str, float], nu: np.ndarray, tau: np.ndarray) -> np.ndarray:
     """(9.4)-(9.9) with ERRATA H1, H4, H18, H19, one sample at a time."""
     out = []
     for (u, v, r), force in zip(nu, tau, strict=True):
-        inertia = np.diag([MASS, MASS, p["I_z"]]) - np.array([[p["X_udot"], 0, 0], [0, p["Y_vdot"], p["Y_rdot"]], [0, p["N_vdot"], p["N_rdot"]]])
+        inertia = np.diag([MASS, MASS, p["I_z"]]) - np.array(
+            [[p["X_udot"], 0, 0], [0, p["Y_vdot"], p["Y_rdot"]], [0, p["N_vdot"], p["N_rdot"]]]
+        )
         top, side = -MASS * v + p["Y_vdot"] * v + p["Y_rdot"] * r, MASS * u - p["X_udot"] * u
         coriolis = np.array([[0, 0, top], [0, 0, side], [-top, -side, 0]])
-        damping = -np.diag([p["X_u"] + p["X_|u|u"] * abs(u), p["Y_v"] + p["Y_|v|v"] * abs(v), p["N_r"] + p["N_|r|r"] * abs(r)])
+        damping = -np.diag(
+            [
+                p["X_u"] + p["X_|u|u"] * abs(u),
+                p["Y_v"] + p["Y_|v|v"] * abs(v),
+                p["N_r"] + p["N_|r|r"] * abs(r),
+            ]
+        )
         damping -= np.array([[0, 0, 0], [0, 0, p["Y_r"]], [0, p["N_v"], 0]])
         out.append(np.linalg.solve(inertia, force - (coriolis + damping) @ [u, v, r]))
     return np.array(out)
@@ -45,28 +62,49 @@ def matrices(p: dict[str, float], nu: np.ndarray, tau: np.ndarray) -> np.ndarray
 
 def some(seed: int = 1) -> dict[str, float]:
     random = np.random.default_rng(seed)
-    values = {name: entry.start + entry.scale * random.uniform(-0.5, 0.5) for name, entry in PARAMETERS.items()}
+    values = {
+        name: entry.start + entry.scale * random.uniform(-0.5, 0.5)
+        for name, entry in PARAMETERS.items()
+    }
     limits = StandardFitConfig().limits()
-    return {name: float(np.clip(value, *limit)) for (name, value), limit in zip(values.items(), limits, strict=True)}
+    return {
+        name: float(np.clip(value, *limit))
+        for (name, value), limit in zip(values.items(), limits, strict=True)
+    }
 
 
 def test_accelerations_equal_the_matrices() -> None:
     nu, tau = states(30)
     p = some() | {"X_udot": -400.0, "Y_vdot": -900.0, "N_rdot": -3e3}
-    np.testing.assert_allclose(accelerations(np.array([p[n] for n in NAMES]), MASS, nu, tau), matrices(p, nu, tau), rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(
+        accelerations(np.array([p[n] for n in NAMES]), MASS, nu, tau),
+        matrices(p, nu, tau),
+        rtol=1e-10,
+        atol=1e-12,
+    )
 
 
 def test_truth_is_the_vessel() -> None:
     nu, tau = states(30)
     vessel = odin("odin_steady")
-    known = AccelerationHull(vessel.gains, vessel.terms)(torch.from_numpy(nu), torch.from_numpy(tau)).numpy()
-    # the vessel's Coriolis terms are exactly v r and -u r, those of its 4935.8 kg differ by the added mass of -0.7 kg
+    known = AccelerationHull(vessel.gains, vessel.terms)(
+        torch.from_numpy(nu), torch.from_numpy(tau)
+    ).numpy()
+    # the vessel's Coriolis terms are exactly v r and -u r, those of its 4935.8 kg differ by the
+    # added mass of -0.7 kg
     np.testing.assert_allclose(matrices(truth(vessel, MASS), nu, tau), known, atol=2e-3)
 
 
 def test_a_fit_recovers_what_is_determined_and_names_what_is_not() -> None:
     nu, tau = states(3000)
-    p = some() | {"X_udot": -400.0, "Y_vdot": -900.0, "N_rdot": -3e3, "Y_r": 700.0, "N_v": 500.0, "N_vdot": -800.0}
+    p = some() | {
+        "X_udot": -400.0,
+        "Y_vdot": -900.0,
+        "N_rdot": -3e3,
+        "Y_r": 700.0,
+        "N_v": 500.0,
+        "N_vdot": -800.0,
+    }
     found = fit(nu, tau, matrices(p, nu, tau), StandardFitConfig(thin=1, starts=2))
     assert set(found.undetermined) == {"I_z", "N_rdot"}
     assert np.isinf(found.errors[[NAMES.index("I_z"), NAMES.index("N_rdot")]]).all()
@@ -79,13 +117,22 @@ def test_a_fit_recovers_what_is_determined_and_names_what_is_not() -> None:
 
 def test_standard_errors_are_those_of_repeated_noise() -> None:
     nu, tau = states(800)
-    p = some() | {"X_udot": -1500.0, "Y_vdot": -2000.0, "N_rdot": -6e3, "X_u": -300.0, "N_r": -2e3, "Y_v": -700.0}
+    p = some() | {
+        "X_udot": -1500.0,
+        "Y_vdot": -2000.0,
+        "N_rdot": -6e3,
+        "X_u": -300.0,
+        "N_r": -2e3,
+        "Y_v": -700.0,
+    }
     clean, away = matrices(p, nu, tau), []
     names = ("X_udot", "Y_vdot", "X_|u|u", "Y_|v|v", "N_v", "Y_r")
     for seed in range(30):
         noise = np.random.default_rng(seed).normal(size=clean.shape) * [0.05, 0.05, 0.02]
         found = fit(nu, tau, clean + noise, StandardFitConfig(thin=1, starts=1))
-        away.append([(found.values[NAMES.index(n)] - p[n]) / found.errors[NAMES.index(n)] for n in names])
+        away.append(
+            [(found.values[NAMES.index(n)] - p[n]) / found.errors[NAMES.index(n)] for n in names]
+        )
     spread = np.std(away, axis=0)
     assert (spread > 0.65).all()
     assert (spread < 1.45).all()
@@ -99,7 +146,11 @@ def test_too_few_samples() -> None:
 
 @pytest.mark.parametrize(
     ("bad", "said"),
-    [({"bounds": {"X_uu": [-1, 0]}}, "no parameter 'X_uu'"), ({"bounds": {"X_u": [1, 0]}}, "lower first"), ({"weights": [1, 1, 0]}, "positive")],
+    [
+        ({"bounds": {"X_uu": [-1, 0]}}, "no parameter 'X_uu'"),
+        ({"bounds": {"X_u": [1, 0]}}, "lower first"),
+        ({"weights": [1, 1, 0]}, "positive"),
+    ],
 )
 def test_wrong_settings_of_the_fit(bad: dict[str, Any], said: str) -> None:
     with pytest.raises(ValidationError, match=said):
@@ -107,12 +158,18 @@ def test_wrong_settings_of_the_fit(bad: dict[str, Any], said: str) -> None:
 
 
 def test_preparation_is_the_documents() -> None:
-    """Where no sample of the grid is missing the velocities are SciPy's zero-phase filter and the accelerations its differences."""
+    """Where no sample of the grid is missing the velocities are SciPy's zero-phase filter and the
+    accelerations its differences.
+    """
     random, t = np.random.default_rng(0), 0.05 * np.arange(1200)
-    channels = {name: np.cumsum(random.normal(size=len(t))) * 0.01 + 1.0 for name in ("u", "v", "r")}
+    channels = {
+        name: np.cumsum(random.normal(size=len(t))) * 0.01 + 1.0 for name in ("u", "v", "r")
+    }
     channels |= {"cmd_n": np.full(len(t), 12.0), "cmd_nozzle": 0.1 * np.sin(t)}
     log = Log("made", t, channels, dict.fromkeys(channels, "-"), "zigzag")
-    config = PreparationConfig(interval=(0.0499, 0.0499), margin=1.0, stretch=10.0, validate_every=3)
+    config = PreparationConfig(
+        interval=(0.0499, 0.0499), margin=1.0, stretch=10.0, validate_every=3
+    )
     trial = prepared([log], odin("odin_planing"), config, 0)
     z = trial.samples.z.numpy()
     assert trial.samples.names == CHANNELS
@@ -120,27 +177,51 @@ def test_preparation_is_the_documents() -> None:
     own = np.stack([channels[name][1:] for name in "uvr"], axis=1)
     smooth = filtfilt(*butter(2, 0.1), own, axis=0)[first - 1 :]
     np.testing.assert_allclose(z[50:-50, :3], smooth[50 : len(z) - 50], atol=1e-6)
-    np.testing.assert_allclose(trial.samples.target.numpy()[:-1], np.diff(z[:, :3], axis=0) / 0.05, atol=1e-9)
-    np.testing.assert_array_equal(trial.validates, (trial.samples.t.numpy() // 10).astype(int) % 3 == 2)
+    np.testing.assert_allclose(
+        trial.samples.target.numpy()[:-1], np.diff(z[:, :3], axis=0) / 0.05, atol=1e-9
+    )
+    np.testing.assert_array_equal(
+        trial.validates, (trial.samples.t.numpy() // 10).astype(int) % 3 == 2
+    )
     assert all((np.diff(piece) == 1).all() for piece in trial.pieces(trial.validates))
 
 
 def test_equations_see_forces_or_controls() -> None:
     with pytest.raises(ValidationError, match="give `inputs` instead"):
-        BlackConfig.model_validate({"inputs": "forces", "head": {"kind": "symbolic", "features": ["u"]}})
+        BlackConfig.model_validate(
+            {"inputs": "forces", "head": {"kind": "symbolic", "features": ["u"]}}
+        )
     settings = yaml.safe_load(CONFIG.read_text())
     settings["equations"]["force"]["head"]["candidates"]["coupling"] = ["cmd_n"]
     with pytest.raises(ValidationError, match="'cmd_n' is not a channel"):
-        PhasesSettings.model_validate({key: value for key, value in settings.items() if key != "task"})
+        PhasesSettings.model_validate(
+            {key: value for key, value in settings.items() if key != "task"}
+        )
     settings["trials"]["calm"]["vessel"] = "odin_forces"
     with pytest.raises(ValidationError, match="needs a vessel of kind 'odin' with water jets"):
-        PhasesSettings.model_validate({key: value for key, value in settings.items() if key != "task"})
+        PhasesSettings.model_validate(
+            {key: value for key, value in settings.items() if key != "task"}
+        )
 
 
 def test_a_short_trial_runs(tmp_path: Path) -> None:
-    given = {"programme": {"drives": [0.35, 0.5], "steers": [0.3], "zigzag": 60, "hold": 20, "courses": [0]}}
+    given = {
+        "programme": {
+            "drives": [0.35, 0.5],
+            "steers": [0.3],
+            "zigzag": 60,
+            "hold": 20,
+            "courses": [0],
+        }
+    }
     over = [f"trials.calm.programme.{key}={value}" for key, value in given["programme"].items()]
-    over += ["~trials.planing", "~trials.standard", "standard.starts=1", "trials.calm.preparation.validate_every=2", "~published"]
+    over += [
+        "~trials.planing",
+        "~trials.standard",
+        "standard.starts=1",
+        "trials.calm.preparation.validate_every=2",
+        "~published",
+    ]
     config = load_task(CONFIG, over)
     config.run(source=CONFIG, overrides=over, out=tmp_path / "run", resume=False)
     found = json.loads((tmp_path / "run" / "study.json").read_text())["trials"]["calm"]
@@ -149,6 +230,13 @@ def test_a_short_trial_runs(tmp_path: Path) -> None:
     assert fitted["sums"]["I_z - N_rdot"][0] == pytest.approx(found["truth"]["I_z"], rel=0.1)
     assert fitted["values"]["X_|u|u"] == pytest.approx(found["truth"]["X_|u|u"], rel=0.2)
     rows = {(row["model"], row["on"], row["axis"]): row for row in found["rows"]["displacement"]}
-    assert rows["standard", "displacement", "r_dot"]["rmse"] < 1.3 * rows["plant", "plant", "r_dot"]["rmse"]
+    assert (
+        rows["standard", "displacement", "r_dot"]["rmse"]
+        < 1.3 * rows["plant", "plant", "r_dot"]["rmse"]
+    )
     assert (tmp_path / "run" / "study.md").read_text().count("## Validation") == len(found["rows"])
-    assert {file.name for file in (tmp_path / "run" / "figures").iterdir()} >= {"trial_calm.png", "parameters_calm.png", "displacement_calm.png"}
+    assert {file.name for file in (tmp_path / "run" / "figures").iterdir()} >= {
+        "trial_calm.png",
+        "parameters_calm.png",
+        "displacement_calm.png",
+    }

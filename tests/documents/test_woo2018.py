@@ -26,8 +26,17 @@ def row(model: str, split: str, manoeuvre: str) -> dict[str, Any]:
     level = 0.01 * (len(MODELS) - MODELS.index(model)) * (0.8 if split == "train" else 1.0)
     rmse = {"u": 2 * level, "v": level, "r": 0.5 * level}
     return {
-        **{"model": model, "kind": "zero" if model == "zero" else "baseline" if "lstm" not in model else "head", "split": split},
-        **{"protocol": "manoeuvre", "manoeuvre": manoeuvre, "rmse": rmse, "selected": model == "lstm"},
+        **{
+            "model": model,
+            "kind": "zero" if model == "zero" else "baseline" if "lstm" not in model else "head",
+            "split": split,
+        },
+        **{
+            "protocol": "manoeuvre",
+            "manoeuvre": manoeuvre,
+            "rmse": rmse,
+            "selected": model == "lstm",
+        },
         "rmse_ci95": {name: [0.9 * value, 1.1 * value] for name, value in rmse.items()},
     }
 
@@ -35,20 +44,48 @@ def row(model: str, split: str, manoeuvre: str) -> dict[str, Any]:
 def rollouts(folder: Path, log: str, size: float) -> None:
     """One log of 8 s; a model's velocities are off by `size` times its place in the list."""
     t = np.arange(81) * 0.1
-    measured = {"u": 1.0 + 0.2 * np.sin(t), "v": 0.1 * np.sin(2 * t), "r": 0.2 * np.cos(t), "psi": 0.2 * np.sin(t), "x": t, "y": 0.2 * t**2}
+    measured = {
+        "u": 1.0 + 0.2 * np.sin(t),
+        "v": 0.1 * np.sin(2 * t),
+        "r": 0.2 * np.cos(t),
+        "psi": 0.2 * np.sin(t),
+        "x": t,
+        "y": 0.2 * t**2,
+    }
     parts = []
     for place, model in enumerate(reversed(MODELS), start=1):
-        predicted = {f"{name}_hat": measured[name] + size * place * 0.02 * np.sin(3 * t + place) for name in COLUMNS}
-        about = {"protocol": "manoeuvre", "model": model, "window": 0, "t": t, "usable": True, "diverged": False}
+        predicted = {
+            f"{name}_hat": measured[name] + size * place * 0.02 * np.sin(3 * t + place)
+            for name in COLUMNS
+        }
+        about = {
+            "protocol": "manoeuvre",
+            "model": model,
+            "window": 0,
+            "t": t,
+            "usable": True,
+            "diverged": False,
+        }
         parts.append(pd.DataFrame({**about, **measured, **predicted}))
     folder.mkdir(parents=True, exist_ok=True)
     pd.concat(parts).to_parquet(folder / f"{log}.parquet")
 
 
-def made_study(run: Path, *, models: tuple[str, ...] = MODELS, kinds: tuple[str, ...] = KINDS) -> Path:
+def made_study(
+    run: Path, *, models: tuple[str, ...] = MODELS, kinds: tuple[str, ...] = KINDS
+) -> Path:
     run.mkdir()
-    rows = [row(model, split, group) for split in ("train", "test") for model in models for group in ("all", "speed", "steering", *KINDS)]
-    (run / "metrics.json").write_text(json.dumps({"schema": "residnet.metrics/1", "run": "made", "selected": "lstm", "rows": rows}))
+    rows = [
+        row(model, split, group)
+        for split in ("train", "test")
+        for model in models
+        for group in ("all", "speed", "steering", *KINDS)
+    ]
+    (run / "metrics.json").write_text(
+        json.dumps(
+            {"schema": "residnet.metrics/1", "run": "made", "selected": "lstm", "rows": rows}
+        )
+    )
     for kind in kinds:
         for number, size in enumerate((3.0, 1.0, 2.0)):
             rollouts(run / "rollouts" / "test", f"{kind}_{number + 1:02d}", size)
@@ -63,7 +100,9 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_six_figures_that_show_something(study: Path) -> None:
     before = dict(mpl.rcParams)
     paths = draw_study("woo2018", study)
-    assert [path.relative_to(study).as_posix() for path in paths] == [f"figures/woo2018_{number}.png" for number in range(13, 19)]
+    assert [path.relative_to(study).as_posix() for path in paths] == [
+        f"figures/woo2018_{number}.png" for number in range(13, 19)
+    ]
     for path in paths:
         image = plt.imread(path)[..., :3]
         assert min(image.shape[:2]) > 200
@@ -72,7 +111,11 @@ def test_six_figures_that_show_something(study: Path) -> None:
         colourful = (image.max(axis=-1) - image.min(axis=-1)) > 0.2
         assert float(colourful.mean()) > 5e-4
         inked = image.min(axis=-1) < 0.7
-        assert all(part.any() for half in np.array_split(inked, 2, axis=0) for part in np.array_split(half, 2, axis=1))
+        assert all(
+            part.any()
+            for half in np.array_split(inked, 2, axis=0)
+            for part in np.array_split(half, 2, axis=1)
+        )
     assert len({path.read_bytes() for path in paths}) == 6
     assert dict(mpl.rcParams) == before, "the look of other figures is left alone"
 
@@ -99,14 +142,22 @@ def test_bars_are_the_rows_of_metrics(study: Path) -> None:
     figure = woo2018._bars(RunFiles(study), ("v", "r"), "steering", ("nomoto", "lstm"))
     for axes, channel, factor in zip(figure.axes, ("v", "r"), (1.0, 180 / np.pi), strict=True):
         heights = [bar.get_height() for bar in axes.patches]
-        expected = [factor * row(model, split, "steering")["rmse"][channel] for split in ("train", "test") for model in ("nomoto", "lstm")]
+        expected = [
+            factor * row(model, split, "steering")["rmse"][channel]
+            for split in ("train", "test")
+            for model in ("nomoto", "lstm")
+        ]
         assert heights == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("absent", [model for model in MODELS if model != "zero"])
 def test_a_missing_model_is_one_line(tmp_path: Path, absent: str) -> None:
-    run = made_study(tmp_path / "run", models=tuple(model for model in MODELS if model != absent), kinds=())
-    with pytest.raises(UsageError, match=f"study woo2018 needs the models .*; '{absent}' is absent") as caught:
+    run = made_study(
+        tmp_path / "run", models=tuple(model for model in MODELS if model != absent), kinds=()
+    )
+    with pytest.raises(
+        UsageError, match=f"study woo2018 needs the models .*; '{absent}' is absent"
+    ) as caught:
         draw_study("woo2018", run)
     assert "\n" not in str(caught.value)
     assert not (run / "figures").exists()

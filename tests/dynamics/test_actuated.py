@@ -1,4 +1,6 @@
-"""Actuators in front of a learned model: the plant's own, given ones, and closed-loop manoeuvres that the model has not seen."""
+"""Actuators in front of a learned model: the plant's own, given ones, and closed-loop manoeuvres
+that the model has not seen.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,23 @@ from residnet.physics.signals import SignalsConfig
 from residnet.physics.vessel import load_vessel
 
 DEG = math.pi / 180
-TERMS = ("u", "v", "r", "tau_x", "tau_n", "u^2", "u|u|", "v|v|", "r|r|", "u v", "u r", "v r", "|u|v", "u^3", "r^3")
+TERMS = (
+    "u",
+    "v",
+    "r",
+    "tau_x",
+    "tau_n",
+    "u^2",
+    "u|u|",
+    "v|v|",
+    "r|r|",
+    "u v",
+    "u r",
+    "v r",
+    "|u|v",
+    "u^3",
+    "r^3",
+)
 
 
 def still(columns: tuple[str, ...], dt: float = 0.1) -> HybridDynamics:
@@ -38,7 +56,9 @@ def still(columns: tuple[str, ...], dt: float = 0.1) -> HybridDynamics:
     return HybridDynamics(signals, StillConfig().build(signals.names), ZeroHead(), dt)
 
 
-@pytest.mark.parametrize("vessel", ["wam_v_cal", "example_rudder_boat", "mariner", "patrol_p06", "nomoto_mariner"])
+@pytest.mark.parametrize(
+    "vessel", ["wam_v_cal", "example_rudder_boat", "mariner", "patrol_p06", "nomoto_mariner"]
+)
 def test_the_gear_is_the_plants_whatever_its_kind(vessel: str) -> None:
     """Actuator states equal those of the plant that is given the same commands."""
     plant = load_vessel(vessel).build()
@@ -54,16 +74,26 @@ def test_the_gear_is_the_plants_whatever_its_kind(vessel: str) -> None:
         truth, _, _ = Rollout(PlantDynamics(plant, step, substeps))(start, w, start[:, :0])
         model = ActuatedDynamics(still(gear.inputs[:1], step), gear.inputs[:1], "start", gear)
         mine, _, _ = Rollout(model)(gear.approach(2), w, start[:, :0])
-    assert len(gear.state) == len(plant.state) - len([n for n in plant.state if n in ("x", "y", "phi", "psi", "u", "v", "p", "r")])
+    assert len(gear.state) == len(plant.state) - len(
+        [n for n in plant.state if n in ("x", "y", "phi", "psi", "u", "v", "p", "r")]
+    )
     for name in gear.state:
         if name != "_yaw_lag":
-            torch.testing.assert_close(mine[:, :, model.state.index(name)], truth[:, :, plant.state.index(name)], rtol=1e-9, atol=1e-9)
+            torch.testing.assert_close(
+                mine[:, :, model.state.index(name)],
+                truth[:, :, plant.state.index(name)],
+                rtol=1e-9,
+                atol=1e-9,
+            )
     assert float((truth[:, -1, 0] - truth[:, 0, 0]).abs().max()) > 0.01
 
 
 def test_given_gear_by_hand() -> None:
     """The rudder moves by 5 deg/s at most, the revolutions jump; a missing input is one line."""
-    shares = {"n": InputShare(drive="600 rpm", limit="480 rpm"), "delta": InputShare(steer="35 deg", rate="5 deg/s")}
+    shares = {
+        "n": InputShare(drive="600 rpm", limit="480 rpm"),
+        "delta": InputShare(steer="35 deg", rate="5 deg/s"),
+    }
     gear = GivenGear(shares, ("wind_speed", "wind_dir"), 0.5)
     assert gear.inputs == ("cmd_n", "cmd_delta", "wind_speed", "wind_dir")
     assert gear.state == ("delta",)
@@ -77,7 +107,12 @@ def test_given_gear_by_hand() -> None:
     assert [([*model.gear.state, *model.gear.inputs])[i] for i in model.take] == ["cmd_n", "delta"]
     with pytest.raises(ConfigError, match="driven by 'tau'"):
         ActuatedDynamics(still(("tau",)), ("tau",), "start", gear)
-    for wrong in ({"steer": "3 m"}, {"steer": "35 deg", "rate": "5 deg"}, {}, {"steer": 0.5, "limit": 0}):
+    for wrong in (
+        {"steer": "3 m"},
+        {"steer": "35 deg", "rate": "5 deg"},
+        {},
+        {"steer": 0.5, "limit": 0},
+    ):
         with pytest.raises(ConfigError, match=r"inputs\.delta"):
             GivenGear({"delta": InputShare(**wrong)}, (), 0.1)  # type: ignore[arg-type]
 
@@ -89,12 +124,16 @@ class Take(ResidualHead):
         return torch.nn.functional.pad(z[..., 3:4], (0, 2)), s
 
 
-@pytest.mark.parametrize(("hold", "expected"), [("start", [0.0, 1.0, 2.0]), ("mean", [0.5, 1.5, 2.5])])
+@pytest.mark.parametrize(
+    ("hold", "expected"), [("start", [0.0, 1.0, 2.0]), ("mean", [0.5, 1.5, 2.5])]
+)
 def test_inputs_are_held_as_in_the_fit(hold: Any, expected: list[float]) -> None:
     """An input that moves by 1 per second: from each step's start, or its mean over the step."""
     gear = GivenGear({"n": InputShare(drive=9.0, rate=1.0)}, (), 1.0)
     hybrid = still(("n",), 1.0)
-    model = ActuatedDynamics(HybridDynamics(hybrid.signals, hybrid.baseline, Take(), 1.0), ("n",), hold, gear)
+    model = ActuatedDynamics(
+        HybridDynamics(hybrid.signals, hybrid.baseline, Take(), 1.0), ("n",), hold, gear
+    )
     w = torch.full((1, 3, 1), 9.0, dtype=torch.float64)
     with torch.no_grad():
         states, _, _ = Rollout(model)(gear.approach(1), w, torch.zeros(1, 0))
@@ -103,7 +142,9 @@ def test_inputs_are_held_as_in_the_fit(hold: Any, expected: list[float]) -> None
 
 @pytest.fixture(scope="module")
 def flights() -> list[tuple[Flight, Flight]]:
-    """Manoeuvres flown by the WAM-V, and by a ridge regression of a few noisy constant inputs, zigzags and 3-2-1-1 of it."""
+    """Manoeuvres flown by the WAM-V, and by a ridge regression of a few noisy constant inputs,
+    zigzags and 3-2-1-1 of it.
+    """
     # at 15 deg/s a longer step would reverse the zigzag up to a degree late
     step = 0.05
     content = {
@@ -119,8 +160,13 @@ def flights() -> list[tuple[Flight, Flight]]:
     trials = validate(content, SimulatedTrials, "trials")
     signals = SignalsConfig(inputs=("n_port", "n_stbd"), forces="wam_v_cal")
     config = PrepareConfig(grid=GridConfig(step=step))
-    data = samples([prepare(log, "train", signals.columns, config) for log in simulate(trials.draw(), trials)], signals.build())
-    head = RidgeConfig(features=("u", "v", "r", "tau_x", "tau_n"), terms=TERMS).build(signals.build().names)
+    data = samples(
+        [prepare(log, "train", signals.columns, config) for log in simulate(trials.draw(), trials)],
+        signals.build(),
+    )
+    head = RidgeConfig(features=("u", "v", "r", "tau_x", "tau_n"), terms=TERMS).build(
+        signals.build().names
+    )
     head.calibrate(data)
     head.solve(data)
     built = signals.build()
@@ -129,13 +175,30 @@ def flights() -> list[tuple[Flight, Flight]]:
     gear = PlantGear(plant, step, 1)
     actuated = ActuatedDynamics(hybrid, signals.columns, "mean", gear)
     sea = Sea(plant, Disturbance(), SensorNoise(), 0)
-    ship = Craft("ship", PlantDynamics(plant, step, 1), Helm.of(plant), plant.commands, plant.approach(1))
-    model = Craft("model", actuated, Helm(gear.demand, actuated.state, gear.inputs), gear.commands, gear.approach(1))
+    ship = Craft(
+        "ship", PlantDynamics(plant, step, 1), Helm.of(plant), plant.commands, plant.approach(1)
+    )
+    model = Craft(
+        "model",
+        actuated,
+        Helm(gear.demand, actuated.state, gear.inputs),
+        gear.commands,
+        gear.approach(1),
+    )
     flown: list[Manoeuvre] = [
         Zigzag(drive=drive, steer=steer, heading=bound * DEG, start=15, reversals=5)
-        for bound, drive, steer in ((10, 0.4, 0.3), (10, 0.9, 0.6), (20, 0.55, 0.4), (20, 0.9, 0.8), (15, 0.7, -0.5))
+        for bound, drive, steer in (
+            (10, 0.4, 0.3),
+            (10, 0.9, 0.6),
+            (20, 0.55, 0.4),
+            (20, 0.9, 0.8),
+            (15, 0.7, -0.5),
+        )
     ]
-    flown += [TurningCircle(drive=0.6, steer=0.4, start=15), ThreeTwoOneOne(drive=0.6, steer=0.7, unit=3.5, start=10, repeat=False)]
+    flown += [
+        TurningCircle(drive=0.6, steer=0.4, start=15),
+        ThreeTwoOneOne(drive=0.6, steer=0.7, unit=3.5, start=10, repeat=False),
+    ]
     pair = [fly(craft, flown, sea, 60, step) for craft in (ship, model)]
     return list(zip(*pair, strict=True))
 
@@ -149,12 +212,21 @@ def test_a_learned_model_flies_zigzags_by_itself(flights: list[tuple[Flight, Fli
         assert mine["period"] == pytest.approx(truth["period"], rel=0.05)
         assert truth["first_overshoot"] > 4 * DEG
         # it steers by the heading that it has itself
-        assert not np.array_equal(ship.motion["psi"][: len(model.motion)], model.motion["psi"][: len(ship.motion)])
+        assert not np.array_equal(
+            ship.motion["psi"][: len(model.motion)], model.motion["psi"][: len(ship.motion)]
+        )
 
 
 def test_a_learned_model_flies_circles_and_3211(flights: list[tuple[Flight, Flight]]) -> None:
     circle = [flight.manoeuvre.indices(flight.motion, 4.88) for flight in flights[5]]
-    for name in ("advance", "transfer", "tactical_diameter", "steady_diameter", "steady_yaw_rate", "time_180"):
+    for name in (
+        "advance",
+        "transfer",
+        "tactical_diameter",
+        "steady_diameter",
+        "steady_yaw_rate",
+        "time_180",
+    ):
         assert circle[1][name] == pytest.approx(circle[0][name], rel=0.05)
     ship, model = (flight.motion for flight in flights[6])
     np.testing.assert_array_equal(ship["cmd_port"], model["cmd_port"])

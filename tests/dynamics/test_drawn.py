@@ -14,7 +14,9 @@ TERMS = ["1", "u", "v", "r", "u v", "tau_x", "tau_n"]
 def test_each_draw_steps_as_the_model_with_its_parameters() -> None:
     torch.manual_seed(0)
     signals = SignalsConfig(inputs=("tau_x", "tau_n")).build()
-    model = HybridDynamics(signals, RegressorBaseline([TERMS] * 3, signals.names), ZeroHead(), 0.1, "rk4").double()
+    model = HybridDynamics(
+        signals, RegressorBaseline([TERMS] * 3, signals.names), ZeroHead(), 0.1, "rk4"
+    ).double()
     theta = 0.3 * torch.randn(4, 3, len(TERMS), dtype=torch.float64)
     x, w = torch.randn(12, 6, dtype=torch.float64), torch.randn(12, 2, dtype=torch.float64)
     many = DrawnDynamics(model, "baseline.theta", theta)
@@ -24,6 +26,13 @@ def test_each_draw_steps_as_the_model_with_its_parameters() -> None:
         for row in range(12):
             alone = copy.deepcopy(model)
             alone.baseline.theta.copy_(theta[row % 4])
-            torch.testing.assert_close(after[row], alone.step(x[row : row + 1], w[row : row + 1], x[:1, :0])[0][0])
-            torch.testing.assert_close(rates[row], alone.rate(x[row : row + 1], signals.prepare(w[row : row + 1]), torch.zeros(1, 3).double())[0])
+            torch.testing.assert_close(
+                after[row], alone.step(x[row : row + 1], w[row : row + 1], x[:1, :0])[0][0]
+            )
+            torch.testing.assert_close(
+                rates[row],
+                alone.rate(
+                    x[row : row + 1], signals.prepare(w[row : row + 1]), torch.zeros(1, 3).double()
+                )[0],
+            )
     assert memory.shape == (12, 0)

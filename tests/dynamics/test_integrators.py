@@ -17,7 +17,9 @@ SECONDS = 4.0
 
 
 class SmoothPlant(Dynamics):
-    """The WAM-V plant with propellers that follow a sine of the time, which is the last state: smooth, and away from every kink."""
+    """The WAM-V plant with propellers that follow a sine of the time, which is the last state:
+    smooth, and away from every kink.
+    """
 
     def __init__(self, dt: float, integrator: Integrator) -> None:
         super().__init__(dt, integrator)
@@ -41,7 +43,9 @@ def run(integrator: Integrator, dt: float) -> np.ndarray:
     model = SmoothPlant(dt, integrator)
     x0 = torch.tensor([START], dtype=torch.float64)
     with torch.no_grad():
-        states, _, _ = Rollout(model)(x0, torch.zeros(1, round(SECONDS / dt), 0, dtype=torch.float64), x0[:, :0])
+        states, _, _ = Rollout(model)(
+            x0, torch.zeros(1, round(SECONDS / dt), 0, dtype=torch.float64), x0[:, :0]
+        )
     return states[0, -1].numpy()
 
 
@@ -63,16 +67,25 @@ def test_the_run_keeps_clear_of_kinks() -> None:
     model = SmoothPlant(0.05, "rk4")
     x0 = torch.tensor([START], dtype=torch.float64)
     with torch.no_grad():
-        states, _, _ = Rollout(model)(x0, torch.zeros(1, round(SECONDS / 0.05), 0, dtype=torch.float64), x0[:, :0])
+        states, _, _ = Rollout(model)(
+            x0, torch.zeros(1, round(SECONDS / 0.05), 0, dtype=torch.float64), x0[:, :0]
+        )
     sign = torch.sign(states[0, :, 3:6])
     assert bool((sign == sign[0]).all()), states[0, :, 3:6]
 
 
 @pytest.mark.parametrize(
     ("integrator", "order", "steps"),
-    [("rk4", 4, (0.2, 0.1)), ("heun", 2, (0.05, 0.025)), ("euler", 1, (0.02, 0.01)), ("semi_implicit_euler", 1, (0.02, 0.01))],
+    [
+        ("rk4", 4, (0.2, 0.1)),
+        ("heun", 2, (0.05, 0.025)),
+        ("euler", 1, (0.02, 0.01)),
+        ("semi_implicit_euler", 1, (0.02, 0.01)),
+    ],
 )
-def test_order(integrator: Integrator, order: int, steps: tuple[float, float], truth: np.ndarray) -> None:
+def test_order(
+    integrator: Integrator, order: int, steps: tuple[float, float], truth: np.ndarray
+) -> None:
     coarse, fine = (np.abs(run(integrator, dt) - truth)[:6] for dt in steps)
     assert np.log2(np.linalg.norm(coarse) / np.linalg.norm(fine)) == pytest.approx(order, abs=0.25)
 
@@ -82,7 +95,9 @@ def test_rk4_equals_dop853(truth: np.ndarray) -> None:
 
 
 def test_plant_with_held_commands_equals_dop853() -> None:
-    """Propellers at their command, commands held over a step, current and force: SciPy integrates step by step."""
+    """Propellers at their command, commands held over a step, current and force: SciPy integrates
+    step by step.
+    """
     plant = load_vessel("wam_v_cal").build()
     dt, steps = 0.1, 30
     rng = np.random.default_rng(0)
@@ -116,17 +131,23 @@ def test_substeps_are_steps_of_the_plant() -> None:
     x0 = torch.zeros(2, 8, dtype=torch.float64)
     with torch.no_grad():
         coarse, _, _ = Rollout(PlantDynamics(plant, 0.1, substeps=5))(x0, w, x0[:, :0])
-        fine, _, _ = Rollout(PlantDynamics(plant, 0.02))(x0, w.repeat_interleave(5, dim=1), x0[:, :0])
+        fine, _, _ = Rollout(PlantDynamics(plant, 0.02))(
+            x0, w.repeat_interleave(5, dim=1), x0[:, :0]
+        )
     torch.testing.assert_close(coarse, fine[:, ::5], rtol=1e-13, atol=1e-13)
 
 
 def test_semi_implicit_euler_keeps_an_undamped_oscillation_bounded() -> None:
-    """v' = -y, y' = v at heading zero: explicit Euler gains energy at every step, the semi-implicit scheme does not."""
+    """v' = -y, y' = v at heading zero: explicit Euler gains energy at every step, the semi-implicit
+    scheme does not.
+    """
 
     class Spring(Dynamics):
         def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
             zero = torch.zeros_like(x[:, 1])
-            return torch.cat((self.kinematics(x), torch.stack((zero, -x[:, 1], zero), dim=-1)), dim=-1)
+            return torch.cat(
+                (self.kinematics(x), torch.stack((zero, -x[:, 1], zero), dim=-1)), dim=-1
+            )
 
         def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
             return self.integrate(x, w, s), s
@@ -134,7 +155,9 @@ def test_semi_implicit_euler_keeps_an_undamped_oscillation_bounded() -> None:
     x0 = torch.tensor([[0.0, 1.0, 0.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
     reach = {}
     for integrator in ("euler", "semi_implicit_euler"):
-        states, _, _ = Rollout(Spring(0.1, integrator))(x0, torch.zeros(1, 2000, 0, dtype=torch.float64), x0[:, :0])
+        states, _, _ = Rollout(Spring(0.1, integrator))(
+            x0, torch.zeros(1, 2000, 0, dtype=torch.float64), x0[:, :0]
+        )
         reach[integrator] = float(states[0, -200:, 1].abs().max())
     assert reach["euler"] > 1e3
     assert reach["semi_implicit_euler"] == pytest.approx(1.0, abs=0.1)
@@ -148,8 +171,16 @@ def test_every_integrator_is_scriptable(integrator: Integrator) -> None:
     from residnet.physics.signals import SignalsConfig
 
     signals = SignalsConfig(inputs=("delta",)).build()
-    model = HybridDynamics(signals, RegressorsConfig(terms=("u", "delta")).build(signals.names), ZeroHead(), 0.1, integrator)
+    model = HybridDynamics(
+        signals,
+        RegressorsConfig(terms=("u", "delta")).build(signals.names),
+        ZeroHead(),
+        0.1,
+        integrator,
+    )
     with torch.no_grad():
         model.baseline.theta.copy_(torch.tensor([[-0.5, 0.1], [0.0, 0.2], [0.0, 0.3]]))
     x, w, s = torch.ones(2, 6), torch.ones(2, 5, 1), torch.zeros(2, 0)
-    torch.testing.assert_close(torch.jit.script(Rollout(model))(x, w, s)[0], Rollout(model)(x, w, s)[0], rtol=0, atol=0)
+    torch.testing.assert_close(
+        torch.jit.script(Rollout(model))(x, w, s)[0], Rollout(model)(x, w, s)[0], rtol=0, atol=0
+    )

@@ -1,4 +1,6 @@
-"""The time loop: batches, stopping rows, gradients, memory; the hybrid model against the matrix exponential."""
+"""The time loop: batches, stopping rows, gradients, memory; the hybrid model against the matrix
+exponential.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,9 @@ B = np.array([[0.003, 0.0], [0.0, 0.0004], [0.0, 0.002]])
 C = np.array([0.1, 0.01, -0.02])
 
 
-def linear(dt: float = 0.1, head: ResidualHead | None = None, integrator: Integrator = "rk4") -> HybridDynamics:
+def linear(
+    dt: float = 0.1, head: ResidualHead | None = None, integrator: Integrator = "rk4"
+) -> HybridDynamics:
     signals = SignalsConfig(inputs=("tau_x", "tau_n")).build()
     baseline = RegressorBaseline([("u", "v", "r", "tau_x", "tau_n", "1")] * 3, signals.names)
     baseline.theta.data.copy_(torch.from_numpy(np.concatenate((A, B, C[:, None]), axis=1)))
@@ -32,7 +36,9 @@ def inputs(batch: int, steps: int) -> Tensor:
 
 
 def starts(batch: int) -> Tensor:
-    return torch.from_numpy(np.random.default_rng(1).normal(size=(batch, 6)) * [10, 10, 1, 1, 0.3, 0.2])
+    return torch.from_numpy(
+        np.random.default_rng(1).normal(size=(batch, 6)) * [10, 10, 1, 1, 0.3, 0.2]
+    )
 
 
 def lstm_model() -> HybridDynamics:
@@ -79,7 +85,9 @@ def test_batch_equals_row_by_row() -> None:
     with torch.no_grad():
         whole = Rollout(model)(x0, w, s)
         for i in range(5):
-            for part, row in zip(whole, Rollout(model)(x0[i : i + 1], w[i : i + 1], s[i : i + 1]), strict=True):
+            for part, row in zip(
+                whole, Rollout(model)(x0[i : i + 1], w[i : i + 1], s[i : i + 1]), strict=True
+            ):
                 torch.testing.assert_close(part[i : i + 1], row, rtol=1e-11, atol=1e-12)
 
 
@@ -139,7 +147,9 @@ def test_rows_stop_on_their_own() -> None:
     w[:, :, 0] = 100.0
     with torch.no_grad():
         free, _, _ = Rollout(model)(x0, w, x0[:, :0])
-        states, _, _ = Rollout(model, StopAt(torch.tensor([1.0, 3.0, 1e9], dtype=torch.float64)))(x0, w, x0[:, :0])
+        states, _, _ = Rollout(model, StopAt(torch.tensor([1.0, 3.0, 1e9], dtype=torch.float64)))(
+            x0, w, x0[:, :0]
+        )
     for i, distance in enumerate((1.0, 3.0, 1e9)):
         over = torch.nonzero(free[i, :, 0] >= distance)
         last = int(over[0]) if over.numel() else 60

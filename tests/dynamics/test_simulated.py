@@ -12,7 +12,9 @@ from residnet.physics.vessel import load_vessel
 
 
 def test_inputs_that_move_within_a_step() -> None:
-    """A sine of force given at the start, middle and end of each step: SciPy sees the same function of time."""
+    """A sine of force given at the start, middle and end of each step: SciPy sees the same function
+    of time.
+    """
     plant = load_vessel("wam_v_cal").build()
     dt, steps = 0.05, 200
 
@@ -23,7 +25,9 @@ def test_inputs_that_move_within_a_step() -> None:
         return w
 
     t = dt * np.arange(steps)
-    w = torch.from_numpy(np.concatenate([force(t), force(t + dt / 2), force(t + dt)], axis=-1))[None]
+    w = torch.from_numpy(np.concatenate([force(t), force(t + dt / 2), force(t + dt)], axis=-1))[
+        None
+    ]
     x0 = torch.tensor([[0.0, 0.0, 0.1, 1.0, 0.1, 0.05, 20.0, 18.0]], dtype=torch.float64)
     held = plant.actuators.n_max
     assert float(x0[0, 6:].max()) < held
@@ -33,15 +37,28 @@ def test_inputs_that_move_within_a_step() -> None:
 
     def rate(time: float, y: np.ndarray) -> np.ndarray:
         with torch.no_grad():
-            return plant.rate(torch.from_numpy(y)[None], torch.from_numpy(force(np.asarray([time]))))[0].numpy()
+            return plant.rate(
+                torch.from_numpy(y)[None], torch.from_numpy(force(np.asarray([time])))
+            )[0].numpy()
 
-    truth = solve_ivp(rate, (0.0, dt * steps), x0[0].numpy(), method="DOP853", rtol=1e-11, atol=1e-12).y[:, -1]
+    truth = solve_ivp(
+        rate, (0.0, dt * steps), x0[0].numpy(), method="DOP853", rtol=1e-11, atol=1e-12
+    ).y[:, -1]
     np.testing.assert_allclose(states[0, -1], truth, atol=2e-7)
 
 
 def test_held_inputs_are_the_same_at_every_stage() -> None:
     plant = load_vessel("wam_v_cal").build()
-    w = torch.randn(3, 40, len(plant.inputs), dtype=torch.float64, generator=torch.Generator().manual_seed(0)) * 10
+    w = (
+        torch.randn(
+            3,
+            40,
+            len(plant.inputs),
+            dtype=torch.float64,
+            generator=torch.Generator().manual_seed(0),
+        )
+        * 10
+    )
     w[..., 5:7] *= 0.01
     x0 = torch.zeros(3, 8, dtype=torch.float64)
     with torch.no_grad():

@@ -20,7 +20,9 @@ def spec(**changes: object) -> ModelSpec:
         "schema": "residnet.model/1",
         "name": "baseline",
         "role": "baseline",
-        "signals": SignalsConfig(inputs=("n_port", "n_stbd"), forces="wam_v_cal").resolved().model_dump(),
+        "signals": (
+            SignalsConfig(inputs=("n_port", "n_stbd"), forces="wam_v_cal").resolved().model_dump()
+        ),
         "baseline": RegressorsConfig(terms=("u", "tau_x", "1")).model_dump(),
         "head": None,
         "dt": 0.05,
@@ -36,12 +38,21 @@ def test_round_trip(tmp_path: Path) -> None:
     with torch.no_grad():
         model.baseline.theta.copy_(torch.randn(3, 3, dtype=torch.float64))  # type: ignore[union-attr, operator]
     save_model(tmp_path / "baseline", saved, model)
-    assert sorted(path.name for path in (tmp_path / "baseline").iterdir()) == ["model.json", "model.safetensors"]
+    assert sorted(path.name for path in (tmp_path / "baseline").iterdir()) == [
+        "model.json",
+        "model.safetensors",
+    ]
     loaded, again = load_model(tmp_path / "baseline")
     assert loaded == saved
     assert torch.equal(again.baseline.theta, model.baseline.theta)  # type: ignore[union-attr, arg-type]
     assert (again.dt, again.integrator) == (0.05, "semi_implicit_euler")
-    assert loaded.ranges == {"u": (-0.1, 0.1), "v": (-0.2, 0.2), "r": (-0.3, 0.3), "n_port": (-4.0, 4.0), "n_stbd": (-5.0, 5.0)}
+    assert loaded.ranges == {
+        "u": (-0.1, 0.1),
+        "v": (-0.2, 0.2),
+        "r": (-0.3, 0.3),
+        "n_port": (-4.0, 4.0),
+        "n_stbd": (-5.0, 5.0),
+    }
     x, w = torch.randn(2, 6, dtype=torch.float64), torch.randn(2, 2, dtype=torch.float64) * 20
     for a, b in zip(model.step(x, w, x[:, :0]), again.step(x, w, x[:, :0]), strict=True):
         assert torch.equal(a, b)
@@ -51,7 +62,9 @@ def test_a_stored_model_needs_no_vessel_file(tmp_path: Path) -> None:
     save_model(tmp_path / "m", spec(), spec().build())
     text = (tmp_path / "m" / "model.json").read_text()
     assert "wam_v_cal" not in text
-    assert json.loads(text)["signals"]["forces"]["forward"] == list(load_vessel("wam_v_cal").actuators.forward)
+    assert json.loads(text)["signals"]["forces"]["forward"] == list(
+        load_vessel("wam_v_cal").actuators.forward
+    )
 
 
 def test_zero_has_no_numbers(tmp_path: Path) -> None:

@@ -23,16 +23,22 @@ def test_effect_and_time_are_gain_and_time_constant() -> None:
     t = steps * dt
     for row, (effect, time, bias) in enumerate(variation.tolist()):
         steady, constant = 3.47 * (effect * delta + bias), 3.94 * time
-        assert float(states[row, -1, plant.state.index("r")]) == pytest.approx(steady * (1 - math.exp(-t / constant)), rel=1e-8)
+        assert float(states[row, -1, plant.state.index("r")]) == pytest.approx(
+            steady * (1 - math.exp(-t / constant)), rel=1e-8
+        )
 
 
 @pytest.mark.parametrize("name", ["nomoto_oceanos", "patrol_p06_linear"])
 def test_no_variation_is_the_plant(name: str) -> None:
     plant = load_vessel(name).build()
     w = torch.zeros(1, 60, len(plant.inputs), dtype=torch.float64)
-    w[:, :, : plant.commands] = plant.demand(torch.ones(1, dtype=torch.float64), torch.full((1,), 0.2, dtype=torch.float64)).unsqueeze(1)
+    w[:, :, : plant.commands] = plant.demand(
+        torch.ones(1, dtype=torch.float64), torch.full((1,), 0.2, dtype=torch.float64)
+    ).unsqueeze(1)
     x = plant.approach(1)
-    mine, _, _ = Rollout(VariedPlant(plant, 0.1))(x, w, torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64))
+    mine, _, _ = Rollout(VariedPlant(plant, 0.1))(
+        x, w, torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64)
+    )
     truth, _, _ = Rollout(PlantDynamics(plant, 0.1))(x, w, x[:, :0])
     assert torch.allclose(mine, truth, rtol=0, atol=1e-12)
     assert mine[0, -1, plant.state.index("psi")] > 0.05

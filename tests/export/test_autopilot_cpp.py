@@ -1,4 +1,5 @@
-"""The C++ program of `scripts/autopilot_cpp`: built as the README says, it steers as Python does."""
+"""The C++ program of `scripts/autopilot_cpp`: built as the README says, it steers as Python does.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +22,10 @@ GAIN, TIME, SPEED, DT, HEADING = 3.47, 3.94, 3.2, 0.02, math.radians(30)
 
 pytestmark = [
     pytest.mark.skipif(shutil.which("cmake") is None, reason="cmake is not installed"),
-    pytest.mark.skipif(shutil.which("c++") is None and shutil.which("g++") is None, reason="no C++ compiler is installed"),
+    pytest.mark.skipif(
+        shutil.which("c++") is None and shutil.which("g++") is None,
+        reason="no C++ compiler is installed",
+    ),
 ]
 
 
@@ -29,7 +33,15 @@ pytestmark = [
 def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
     build = tmp_path_factory.mktemp("build")
     for words in (
-        ["cmake", "-S", str(SOURCE), "-B", str(build), f"-DCMAKE_PREFIX_PATH={torch.utils.cmake_prefix_path}", "-DCMAKE_BUILD_TYPE=Debug"],
+        [
+            "cmake",
+            "-S",
+            str(SOURCE),
+            "-B",
+            str(build),
+            f"-DCMAKE_PREFIX_PATH={torch.utils.cmake_prefix_path}",
+            "-DCMAKE_BUILD_TYPE=Debug",
+        ],
         ["cmake", "--build", str(build)],
     ):
         done = subprocess.run(words, capture_output=True, text=True)
@@ -46,13 +58,20 @@ def policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with torch.no_grad():
         own.network[-1].weight.copy_(0.05 * torch.randn_like(own.network[-1].weight))  # type: ignore[union-attr, arg-type, operator]
     file = tmp_path_factory.mktemp("policy") / "policy.pt"
-    export_autopilot("policy", own.requires_grad_(False), file, safe="amidships", about={}, metrics=[])
+    export_autopilot(
+        "policy", own.requires_grad_(False), file, safe="amidships", about={}, metrics=[]
+    )
     return file
 
 
 def test_it_steers_as_python_does(program: Path, policy: Path, tmp_path: Path) -> None:
     seconds, track = 8.0, tmp_path / "track.csv"
-    words = [str(program), str(policy), str(track), *map(repr, (GAIN, TIME, SPEED, DT, HEADING, seconds))]
+    words = [
+        str(program),
+        str(policy),
+        str(track),
+        *map(repr, (GAIN, TIME, SPEED, DT, HEADING, seconds)),
+    ]
     said = subprocess.run(words, capture_output=True, text=True, check=True).stdout
     assert "median step" in said
     module = torch.jit.load(str(policy))
@@ -80,6 +99,10 @@ def test_wrong_calls_end_with_a_line(program: Path, policy: Path, tmp_path: Path
     none = subprocess.run([str(program)], capture_output=True, text=True)
     assert none.returncode == 2
     assert "usage" in none.stderr
-    missing = subprocess.run([str(program), "nothing.pt", str(tmp_path / "t.csv"), *["1"] * 6], capture_output=True, text=True)
+    missing = subprocess.run(
+        [str(program), "nothing.pt", str(tmp_path / "t.csv"), *["1"] * 6],
+        capture_output=True,
+        text=True,
+    )
     assert missing.returncode == 1
     assert missing.stderr.startswith("autopilot: ")

@@ -1,4 +1,6 @@
-"""Exported modules of every head kind, found from the union itself: the model's answers, the flags, the card, and refusal of what differs."""
+"""Exported modules of every head kind, found from the union itself: the model's answers, the flags,
+the card, and refusal of what differs.
+"""
 
 from __future__ import annotations
 
@@ -26,25 +28,47 @@ from residnet.export.torchscript import check_parity, export_torchscript
 from residnet.heads import ClosedFormHead, HeadConfig
 from residnet.physics.signals import SignalsConfig
 
-SIGNALS = SignalsConfig(inputs=("n_port", "n_stbd"), exogenous=("wind_speed", "wind_dir"), forces="wam_v_cal").resolved()
+SIGNALS = SignalsConfig(
+    inputs=("n_port", "n_stbd"), exogenous=("wind_speed", "wind_dir"), forces="wam_v_cal"
+).resolved()
 NAMES = SIGNALS.build().names
 FEATURES = ("u", "v", "r", "tau_x", "tau_n", "wind_u", "wind_v", "wind_mag")
 LOW, HIGH = (-0.5, -0.6, -0.4, -10.0, -12.0, 0.0, -3.0), (3.0, 0.6, 0.4, 30.0, 32.0, 9.0, 3.0)
-KINDS: dict[str, type[Any]] = {config.model_fields["kind"].default: config for config in get_args(get_args(HeadConfig)[0])}
+KINDS: dict[str, type[Any]] = {
+    config.model_fields["kind"].default: config for config in get_args(get_args(HeadConfig)[0])
+}
 # smaller than the defaults, for the sake of time
 SIZES: dict[str, dict[str, Any]] = {"mlp": {"hidden": (8,)}, "lstm": {"hidden_size": 6}}
 VARIANTS: dict[str, dict[str, Any]] = {
     **{kind: {"kind": kind, "features": FEATURES, **SIZES.get(kind, {})} for kind in KINDS},
     "mlp_mirror": {"kind": "mlp", "hidden": (8,), "mirror": True},
-    "lstm_mirror": {"kind": "lstm", "hidden_size": 5, "readout": 4, "memory": ("tau_x", "tau_n"), "mirror": True},
+    "lstm_mirror": {
+        "kind": "lstm",
+        "hidden_size": 5,
+        "readout": 4,
+        "memory": ("tau_x", "tau_n"),
+        "mirror": True,
+    },
     "lstm_per_axis": {"kind": "lstm", "hidden_size": 4, "per_axis": True, "activation": "softsign"},
 }
-ROW = {"model": "mine", "split": "test", "protocol": "T30", "manoeuvre": "all", "nrmse": {"mean": 0.1}}
+ROW = {
+    "model": "mine",
+    "split": "test",
+    "protocol": "T30",
+    "manoeuvre": "all",
+    "nrmse": {"mean": 0.1},
+}
 
 
 def spec_of(head: dict[str, Any] | None, **changes: Any) -> ModelSpec:
     baseline = RegressorsConfig(terms=("1", "u", "v", "r", "tau_x", "tau_n", "wind_v wind_mag"))
-    content = {"schema": "residnet.model/1", "name": "mine", "role": "head", "signals": SIGNALS.model_dump(), "baseline": baseline.model_dump()}
+    content = {
+        "schema": "residnet.model/1",
+        "name": "mine",
+        "role": "head",
+        "signals": SIGNALS.model_dump(),
+        "baseline": baseline.model_dump(),
+    }
     content |= {"head": head, "dt": 0.1, "integrator": "rk4", "low": LOW, "high": HIGH}
     return ModelSpec.model_validate(content | changes)
 
@@ -54,12 +78,20 @@ def fill(model: HybridDynamics, seed: int = 0) -> None:
     random = np.random.default_rng(seed)
     assert isinstance(model.baseline, RegressorBaseline)
     with torch.no_grad():
-        rows = [[0, -0.5, 0, 0, 2e-3, 0, 0], [0, 0, -0.8, -0.1, 0, 1e-4, 1e-3], [0, 0, 0.1, -0.9, 0, 1e-3, 1e-4]]
+        rows = [
+            [0, -0.5, 0, 0, 2e-3, 0, 0],
+            [0, 0, -0.8, -0.1, 0, 1e-4, 1e-3],
+            [0, 0, 0.1, -0.9, 0, 1e-3, 1e-4],
+        ]
         model.baseline.theta.copy_(torch.tensor(rows, dtype=torch.float64))
     z = torch.from_numpy(
-        random.normal(size=(400, len(NAMES))) * [1, 0.2, 0.2, 10, 10, 200, 1, 100, 4, 4, 2] + [1.2, 0, 0, 10, 10, 200, 0, 0, 0, 0, 5]
+        random.normal(size=(400, len(NAMES))) * [1, 0.2, 0.2, 10, 10, 200, 1, 100, 4, 4, 2]
+        + [1.2, 0, 0, 10, 10, 200, 0, 0, 0, 0, 5]
     )
-    target = torch.stack((0.05 * torch.tanh(z[:, 0]), 0.05 * torch.sin(z[:, 9]), 0.05 * torch.tanh(3 * z[:, 2])), dim=1)
+    target = torch.stack(
+        (0.05 * torch.tanh(z[:, 0]), 0.05 * torch.sin(z[:, 9]), 0.05 * torch.tanh(3 * z[:, 2])),
+        dim=1,
+    )
     target = target + 0.01 * torch.from_numpy(random.normal(size=(400, 3)))
     samples = Samples(z, target, torch.arange(400) // 40, torch.zeros(400), ("zigzag",) * 10, NAMES)
     model.head.calibrate(samples)
@@ -136,7 +168,13 @@ def test_steps_rollout_and_warm_up_are_those_of_the_model(exported: Exported) ->
     """Random jumps instead of the sines of the export's own check."""
     module, model, batch, steps = exported.module, exported.model, 3, 30
     x0, w = drives(batch, steps)
-    past = torch.cat((x0[:, None, :3].expand(-1, 8, -1), torch.linspace(0.1, 0.3, 8)[None, :, None].expand(batch, -1, 3)), dim=-1)
+    past = torch.cat(
+        (
+            x0[:, None, :3].expand(-1, 8, -1),
+            torch.linspace(0.1, 0.3, 8)[None, :, None].expand(batch, -1, 3),
+        ),
+        dim=-1,
+    )
     with torch.no_grad():
         s = model.warmup(past, w[:, :8])
         theirs = module.warmup(past, w[:, :8])
@@ -149,7 +187,9 @@ def test_steps_rollout_and_warm_up_are_those_of_the_model(exported: Exported) ->
             path.append(y)
         torch.testing.assert_close(y, x, rtol=1e-5, atol=1e-5)
         torch.testing.assert_close(theirs, memory, rtol=1e-4, atol=1e-5)
-        torch.testing.assert_close(module.rollout(x0, w, s), torch.stack(path, dim=1), rtol=1e-5, atol=1e-5)
+        torch.testing.assert_close(
+            module.rollout(x0, w, s), torch.stack(path, dim=1), rtol=1e-5, atol=1e-5
+        )
         empty = module.initial_state(batch)
     assert torch.equal(empty, torch.zeros(batch, exported.card["memory"]))
 
@@ -182,12 +222,16 @@ def test_outside_flags_each_channel_beyond_its_range(lstm: Exported) -> None:
     rows = torch.stack(seen)
     x = torch.cat((torch.full((len(rows), 3), 1e4), rows[:, :3]), dim=1)
     _, _, outside = module.step(x, rows[:, 3:], module.initial_state(len(rows)))
-    assert outside.tolist() == [False] * 3 + [True] * (2 * len(LOW)), "position and heading have no range"
+    assert outside.tolist() == [False] * 3 + [True] * (2 * len(LOW)), (
+        "position and heading have no range"
+    )
 
 
 def test_the_card_says_what_a_controller_needs(exported: Exported) -> None:
     card, spec = exported.stored, exported.spec
-    assert card == json.loads(json.dumps(exported.card)), "the file holds the card that was returned"
+    assert card == json.loads(json.dumps(exported.card)), (
+        "the file holds the card that was returned"
+    )
     assert card["schema"] == "residnet.card/1"
     units = {"x": "m", "y": "m", "psi": "rad", "u": "m/s", "v": "m/s", "r": "rad/s"}
     assert card["states"] == [{"name": name, "unit": unit} for name, unit in units.items()]
@@ -199,7 +243,9 @@ def test_the_card_says_what_a_controller_needs(exported: Exported) -> None:
     ]
     assert (card["dt"], card["integrator"], card["model"]) == (0.1, "rk4", "mine")
     names = ("u", "v", "r", "n_port", "n_stbd", "wind_speed", "wind_dir")
-    assert card["training_range"] == {name: [low, high] for name, low, high in zip(names, LOW, HIGH, strict=True)}
+    assert card["training_range"] == {
+        name: [low, high] for name, low, high in zip(names, LOW, HIGH, strict=True)
+    }
     assert card["metrics"] == [ROW]
     assert card["memory"] == exported.model.n_state
     assert card["head"]["kind"] == spec.head.kind  # type: ignore[union-attr]
@@ -212,10 +258,20 @@ def test_the_card_says_what_a_controller_needs(exported: Exported) -> None:
 
 def test_an_ensemble_exports_and_names_its_members(tmp_path: Path) -> None:
     parts = [built("mlp"), built("lstm")]
-    members = [spec.model_copy(update={"name": name}) for (spec, _), name in zip(parts, ("one", "two"), strict=True)]
-    spec = spec_of(None, role="ensemble", baseline={"kind": "still"}).model_copy(update={"members": tuple(members)})
-    card = export_torchscript(spec, mean_of([model for _, model in parts]), tmp_path / "mean.pt", [])
-    assert [(member["name"], member["head"]["kind"]) for member in card["members"]] == [("one", "mlp"), ("two", "lstm")]
+    members = [
+        spec.model_copy(update={"name": name})
+        for (spec, _), name in zip(parts, ("one", "two"), strict=True)
+    ]
+    spec = spec_of(None, role="ensemble", baseline={"kind": "still"}).model_copy(
+        update={"members": tuple(members)}
+    )
+    card = export_torchscript(
+        spec, mean_of([model for _, model in parts]), tmp_path / "mean.pt", []
+    )
+    assert [(member["name"], member["head"]["kind"]) for member in card["members"]] == [
+        ("one", "mlp"),
+        ("two", "lstm"),
+    ]
     assert max(card["parity"]["share_of_range"].values()) <= 1e-5
 
 
@@ -224,7 +280,9 @@ def test_a_changed_weight_is_found(lstm: Exported) -> None:
     other = copy.deepcopy(lstm.model)
     with torch.no_grad():
         other.head.networks[0].readout[0].bias[2] += 1e-3  # type: ignore[union-attr, index]
-    with pytest.raises(ExportError, match=r"model mine: the exported module differs .* allowed 1e-05") as caught:
+    with pytest.raises(
+        ExportError, match=r"model mine: the exported module differs .* allowed 1e-05"
+    ) as caught:
         check_parity(lstm.spec, other, lstm.module)
     assert "\n" not in str(caught.value)
 
@@ -246,13 +304,19 @@ def test_a_value_that_is_not_finite_is_found(lstm: Exported) -> None:
         check_parity(lstm.spec, lstm.model, NotFinite(lstm.module))
 
 
-def test_a_file_that_differs_from_its_model_does_not_stand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_that_differs_from_its_model_does_not_stand(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """What is written is read back and compared before it takes its place."""
     spec, model = built("mlp")
     _, other = built("mlp_mirror")
     wrong = torch.jit.script(torchscript.ExportedModel(other.float().eval(), spec).eval())
     save = torch.jit.save
-    monkeypatch.setattr(torch.jit, "save", lambda module, path, _extra_files: save(wrong, path, _extra_files=_extra_files))
+    monkeypatch.setattr(
+        torch.jit,
+        "save",
+        lambda module, path, _extra_files: save(wrong, path, _extra_files=_extra_files),
+    )
     with pytest.raises(ExportError, match="model mine"):
         export_torchscript(spec, model, tmp_path / "mine.pt", [])
     assert not (tmp_path / "mine.pt").exists()

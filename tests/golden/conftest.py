@@ -1,7 +1,8 @@
-"""Discovery of the golden runs: a test that takes `golden_file` runs once for every file of its module's GROUP.
+"""Discovery of the golden runs: a test that takes `golden_file` runs once for every file of its
+module's GROUP.
 
-`RESIDNET_GOLDEN` names the folder; a module sets `GROUP = "g4_wamv"` and reads its set-up from the file's name, so that
-further files need no new code.
+`RESIDNET_GOLDEN` names the folder; a module sets `GROUP = "g4_wamv"` and reads its set-up from the
+file's name, so that further files need no new code.
 """
 
 from __future__ import annotations
@@ -30,4 +31,9 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     files = [path for path in golden_files(group) if wanted(path)]
     reason = f"no golden files: set RESIDNET_GOLDEN to the folder that holds {group}/{NAMES}"
     values = files or [pytest.param(None, marks=pytest.mark.skip(reason=reason))]
-    metafunc.parametrize("golden_file", values, ids=[path.name.removesuffix(".csv.gz") for path in files] or ["none"], scope="module")
+    metafunc.parametrize(
+        "golden_file",
+        values,
+        ids=[path.name.removesuffix(".csv.gz") for path in files] or ["none"],
+        scope="module",
+    )

@@ -1,8 +1,11 @@
-"""Nomoto's model and heading autopilots against golden runs of another implementation (golden/README.md, g5_nomoto).
+"""Nomoto's model and heading autopilots against golden runs of another implementation
+(golden/README.md, g5_nomoto).
 
-Neither the README nor ERRATA print the gains of `pd_*` and `timeopt_*` and the steps of `patrol_*`. They were read from the files: a linear
-fit of the unsaturated rows gives the gains to rounding (poles of 2 rad/s and damping 0.9 for `pd_tuned`; 6 and 6 s for the patrol vessel;
-layer and linear law of the time-optimal one), and only steps of 0.05 s (PD) and of 0.25 s (document's controller) give these rows.
+Neither the README nor ERRATA print the gains of `pd_*` and `timeopt_*` and the steps of `patrol_*`.
+They were read from the files: a linear fit of the unsaturated rows gives the gains to rounding
+(poles of 2 rad/s and damping 0.9 for `pd_tuned`; 6 and 6 s for the patrol vessel; layer and linear
+law of the time-optimal one), and only steps of 0.05 s (PD) and of 0.25 s (document's controller)
+give these rows.
 """
 
 from __future__ import annotations
@@ -19,7 +22,15 @@ import torch
 from golden_tables import table
 from torch import Tensor
 
-from residnet.control import BangBangHeading, ClosedLoop, DocumentAutopilot, GivenReference, HeadingPID, Policy, SimulatedPredictor
+from residnet.control import (
+    BangBangHeading,
+    ClosedLoop,
+    DocumentAutopilot,
+    GivenReference,
+    HeadingPID,
+    Policy,
+    SimulatedPredictor,
+)
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.nomoto import NomotoDynamics
 from residnet.dynamics.rollout import Rollout, Source
@@ -42,7 +53,8 @@ Heading = Callable[[np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class Case:
-    """What flies: the model and its step, and the source of its rudder for the times of the steps."""
+    """What flies: the model and its step, and the source of its rudder for the times of the steps.
+    """
 
     plant: Plant
     model: Dynamics
@@ -54,7 +66,9 @@ def nomoto(rate: str | None = None) -> SteeringVessel:
     vessel = load_vessel("nomoto_oceanos")
     assert isinstance(vessel, NomotoConfig)
     assert (vessel.K.value, vessel.T.value) == (GAIN, TIME)
-    limited = vessel.rudder.model_copy(update={"rate": None if rate is None else float(np.radians(float(rate)))})
+    limited = vessel.rudder.model_copy(
+        update={"rate": None if rate is None else float(np.radians(float(rate)))}
+    )
     return vessel.model_copy(update={"rudder": limited}).build()
 
 
@@ -83,13 +97,24 @@ def approach(tau: float) -> Heading:
 def rudder_step(angle: str) -> Case:
     plant = nomoto()
     steer = np.radians(float(angle)) / plant.delta_max
-    return Case(plant, NomotoDynamics(plant, 0.01), lambda t: ScheduleSource(torch.ones_like(t)[None], steer * (t >= 1.0)[None], plant.demand))
+    return Case(
+        plant,
+        NomotoDynamics(plant, 0.01),
+        lambda t: ScheduleSource(torch.ones_like(t)[None], steer * (t >= 1.0)[None], plant.demand),
+    )
 
 
 def zigzag(angle: str, heading: str, rate: str | None) -> Case:
     plant = nomoto(rate)
-    manoeuvre = Zigzag(drive=1.0, steer=np.radians(float(angle)) / plant.delta_max, start=0.0, heading=float(np.radians(float(heading))))
-    return Case(plant, NomotoDynamics(plant, 0.01), lambda t: Zigzag.source([manoeuvre], Helm.of(plant), t))
+    manoeuvre = Zigzag(
+        drive=1.0,
+        steer=np.radians(float(angle)) / plant.delta_max,
+        start=0.0,
+        heading=float(np.radians(float(heading))),
+    )
+    return Case(
+        plant, NomotoDynamics(plant, 0.01), lambda t: Zigzag.source([manoeuvre], Helm.of(plant), t)
+    )
 
 
 def document(horizon: str, tau: str) -> Case:
@@ -101,14 +126,20 @@ def document(horizon: str, tau: str) -> Case:
 
 def tuned(heading: str | None = None) -> Case:
     plant = nomoto()
-    policy = HeadingPID.placed(plant.state, gain=GAIN, time=TIME, frequency=2.0, damping=0.9, limit=LIMIT)
-    return Case(plant, NomotoDynamics(plant, 0.01), partial(follow, policy, step_to(float(heading or 30))))
+    policy = HeadingPID.placed(
+        plant.state, gain=GAIN, time=TIME, frequency=2.0, damping=0.9, limit=LIMIT
+    )
+    return Case(
+        plant, NomotoDynamics(plant, 0.01), partial(follow, policy, step_to(float(heading or 30)))
+    )
 
 
 def time_optimal(heading: str | None = None) -> Case:
     plant = nomoto()
     policy = BangBangHeading(plant.state, gain=GAIN, time=TIME, limit=LIMIT)
-    return Case(plant, NomotoDynamics(plant, 0.01), partial(follow, policy, step_to(float(heading or 30))))
+    return Case(
+        plant, NomotoDynamics(plant, 0.01), partial(follow, policy, step_to(float(heading or 30)))
+    )
 
 
 def patrol_document(parameters: str, horizon: str, tau: str | None, spacing: float = 0.25) -> Case:
@@ -116,14 +147,22 @@ def patrol_document(parameters: str, horizon: str, tau: str | None, spacing: flo
     # whole steps of at most 0.25 s make both the spacing of the rows and the horizon
     dt = min(spacing / np.ceil(spacing / 0.25 - 1e-9), h)
     model = TracedPlantDynamics(plant, dt)
-    predictor = SimulatedPredictor(model, plant.state, round(h / dt), torch.tensor([THRUST], dtype=torch.float64))
-    return Case(plant, model, partial(follow, DocumentAutopilot(predictor, limit=LIMIT), approach(float(tau or 0))))
+    predictor = SimulatedPredictor(
+        model, plant.state, round(h / dt), torch.tensor([THRUST], dtype=torch.float64)
+    )
+    return Case(
+        plant,
+        model,
+        partial(follow, DocumentAutopilot(predictor, limit=LIMIT), approach(float(tau or 0))),
+    )
 
 
 def patrol_pd(parameters: str, heading: str) -> Case:
     plant = patrol(parameters)
     policy = HeadingPID(plant.state, kp=6.0, kd=6.0, limit=LIMIT)
-    return Case(plant, TracedPlantDynamics(plant, 0.05), partial(follow, policy, step_to(float(heading))))
+    return Case(
+        plant, TracedPlantDynamics(plant, 0.05), partial(follow, policy, step_to(float(heading)))
+    )
 
 
 NUMBER = r"(\d+(?:\.\d+)?)"
@@ -143,7 +182,9 @@ def case_of(path: Path, **known: float) -> Case:
     name = path.name.removesuffix(".csv.gz")
     for pattern, make in RUNS.items():
         if match := re.fullmatch(pattern, name):
-            return make(*match.groups(), **known) if make is patrol_document else make(*match.groups())
+            return (
+                make(*match.groups(), **known) if make is patrol_document else make(*match.groups())
+            )
     raise AssertionError(f"{name}: no run is written so")
 
 
@@ -174,7 +215,9 @@ def test_trajectory(golden_file: Path) -> None:
 
 
 def test_names_of_further_files_are_understood() -> None:
-    """Files are kept back for acceptance: names of the same pattern give the set-ups that golden/README.md describes."""
+    """Files are kept back for acceptance: names of the same pattern give the set-ups that
+    golden/README.md describes.
+    """
     case = case_of(Path("zigzag_20_10_rate10.csv.gz"))
     assert case.plant.state[-1] == "delta"
     run = fly(case, 300)
@@ -186,6 +229,8 @@ def test_names_of_further_files_are_understood() -> None:
     assert case_of(Path("patrol_HYB_docctrl_h2.csv.gz"), spacing=0.5).model.dt == 0.25
     assert case_of(Path("patrol_HYB_docctrl_h2.csv.gz"), spacing=0.1).model.dt == 0.1
     assert case_of(Path("patrol_HYB_pd_step30.csv.gz")).model.dt == 0.05
-    assert np.degrees(fly(case_of(Path("step2.5.csv.gz")), 102)["delta"][99:]).tolist() == pytest.approx([0.0, 2.5, 2.5])
+    assert np.degrees(
+        fly(case_of(Path("step2.5.csv.gz")), 102)["delta"][99:]
+    ).tolist() == pytest.approx([0.0, 2.5, 2.5])
     with pytest.raises(AssertionError, match="no run"):
         case_of(Path("turn_5.csv.gz"))

@@ -1,4 +1,5 @@
-"""The ferry milliAmpere, its controller and its reference filter against golden runs of another implementation (golden/README.md, g3_milliampere).
+"""The ferry milliAmpere, its controller and its reference filter against golden runs of another
+implementation (golden/README.md, g3_milliampere).
 
 The gains that the README prints are rounded; the files were made with the formulas of ERRATA J10.
 """
@@ -17,7 +18,15 @@ import torch
 from golden_tables import table, tensor
 from torch import Tensor
 
-from residnet.control import ClosedLoop, HullFeedForward, MotionPID, MotionPIDConfig, Reference, ReferenceFilter, ReferenceFilterConfig
+from residnet.control import (
+    ClosedLoop,
+    HullFeedForward,
+    MotionPID,
+    MotionPIDConfig,
+    Reference,
+    ReferenceFilter,
+    ReferenceFilterConfig,
+)
 from residnet.core.config import load_config
 from residnet.core.frames import wrap
 from residnet.dynamics.rollout import Playback, Rollout
@@ -45,7 +54,11 @@ def pid(feedback: bool) -> MotionPIDConfig:
     """Gains by ERRATA J10, or none."""
     mass, w = np.array([2389.657, 2533.911, 5068.910]), np.array([0.4, 0.4, 0.6])
     p = 0.5 * mass * w**2
-    return MotionPIDConfig(proportional=tuple(feedback * p), integral=tuple(feedback * p * w / 12), derivative=tuple(feedback * 0.9 * mass * w))
+    return MotionPIDConfig(
+        proportional=tuple(feedback * p),
+        integral=tuple(feedback * p * w / 12),
+        derivative=tuple(feedback * 0.9 * mass * w),
+    )
 
 
 @dataclass(frozen=True)
@@ -79,33 +92,54 @@ def case_of(path: Path) -> Flight | OpenLoop:
     match = re.fullmatch(r"(cal|lit)_(half|matched)((?:_dist|_FFonly)*)", name)
     assert match, f"{name}: no run is written so"
     laps = 2 if name == "cal_half" else 1
-    guidance = ReferenceFilterConfig(waypoints=LAP * laps, interval=60.0, frequency=FREQUENCY[match[1]], damping=(0.7, 0.7, 0.7))
+    guidance = ReferenceFilterConfig(
+        waypoints=LAP * laps, interval=60.0, frequency=FREQUENCY[match[1]], damping=(0.7, 0.7, 0.7)
+    )
     return Flight(SCALE[match[2]], "_dist" in match[3], guidance, "_FFonly" not in match[3])
 
 
 def vessel(scale: float) -> FossenVessel:
-    config = load_config(vessel_files()["milliampere"], [f"scale={scale}", *UNLIMITED], MassMatrixConfig)
+    config = load_config(
+        vessel_files()["milliampere"], [f"scale={scale}", *UNLIMITED], MassMatrixConfig
+    )
     return config.build()
 
 
 @cache
 def flights(folder: Path, scale: float, disturbed: bool) -> dict[str, pd.DataFrame]:
-    """Every file of one vessel and weather, flown side by side, with all columns of the golden files at their rows."""
-    cases = {path: case for path in sorted(folder.glob("*.csv.gz")) if isinstance(case := case_of(path), Flight)}
-    cases = {path: case for path, case in cases.items() if (case.scale, case.disturbed) == (scale, disturbed)}
+    """Every file of one vessel and weather, flown side by side, with all columns of the golden
+    files at their rows.
+    """
+    cases = {
+        path: case
+        for path in sorted(folder.glob("*.csv.gz"))
+        if isinstance(case := case_of(path), Flight)
+    }
+    cases = {
+        path: case
+        for path, case in cases.items()
+        if (case.scale, case.disturbed) == (scale, disturbed)
+    }
     steps = round(max(case.guidance.duration for case in cases.values()) / DT) + 1
     plant = vessel(scale)
     if not disturbed:
         plant.in_calm_water()
     believed = HullFeedForward(vessel(1.0).hull)
-    guidance = Watched(ReferenceFilter([case.guidance for case in cases.values()], DT), EVERY["closed"])
+    guidance = Watched(
+        ReferenceFilter([case.guidance for case in cases.values()], DT), EVERY["closed"]
+    )
     controller = MotionPID([pid(case.feedback) for case in cases.values()], DT, believed)
     x0 = torch.zeros(len(cases), len(plant.state), dtype=torch.float64)
     w = torch.zeros(len(cases), steps, len(plant.inputs), dtype=torch.float64)
     if disturbed:
-        w[..., plant.inputs.index("force_north")], w[..., plant.inputs.index("force_east")] = 200.0, 100.0
+        w[..., plant.inputs.index("force_north")], w[..., plant.inputs.index("force_east")] = (
+            200.0,
+            100.0,
+        )
     with torch.no_grad():
-        states, inputs, _ = Rollout(TracedPlantDynamics(plant, DT), ClosedLoop(controller, guidance))(x0, w, x0[:, :0])
+        states, inputs, _ = Rollout(
+            TracedPlantDynamics(plant, DT), ClosedLoop(controller, guidance)
+        )(x0, w, x0[:, :0])
         every = range(0, steps, EVERY["closed"])
         reference, waypoint = torch.stack(guidance.asked), torch.stack(guidance.waypoints)
         out = {}
@@ -113,7 +147,10 @@ def flights(folder: Path, scale: float, disturbed: bool) -> dict[str, pd.DataFra
             x, command, desired = states[i, every], inputs[i, every, :3], reference[:, i]
             forward = believed(desired[:, 6:9], desired[:, 3:6])
             rate = plant.rate(x, w[i, every])[:, 3:6]
-            columns = torch.cat((x[:, :9], rate, command, forward, command - forward, desired, waypoint[:, i]), dim=-1)
+            columns = torch.cat(
+                (x[:, :9], rate, command, forward, command - forward, desired, waypoint[:, i]),
+                dim=-1,
+            )
             out[path.name] = pd.DataFrame(columns.numpy(), columns=NAMES)
     return out
 
@@ -125,7 +162,8 @@ NAMES = (
 
 
 class Watched(Reference):
-    """Guidance that remembers what it asked for, and the waypoint of then, at every so manyth step."""
+    """Guidance that remembers what it asked for, and the waypoint of then, at every so manyth step.
+    """
 
     def __init__(self, guidance: ReferenceFilter, every: int) -> None:
         super().__init__()
@@ -164,7 +202,11 @@ def simulated(path: Path) -> pd.DataFrame:
 def test_every_column_along_the_run(golden_file: Path) -> None:
     """To 1e-6 of its range; parts of the command of the largest range among them."""
     truth, found = table(golden_file), simulated(golden_file)
-    step = EVERY["closed"] * DT if isinstance(case_of(golden_file), Flight) else EVERY["open"] * OPEN_DT
+    step = (
+        EVERY["closed"] * DT
+        if isinstance(case_of(golden_file), Flight)
+        else EVERY["open"] * OPEN_DT
+    )
     np.testing.assert_allclose(truth["t"], step * np.arange(len(truth)), atol=1e-9)
     assert set(truth.columns) == {"t", *found.columns}
     for name in found.columns:
@@ -174,7 +216,9 @@ def test_every_column_along_the_run(golden_file: Path) -> None:
         if name.startswith("fb_"):
             # what is left of the command without the feed-forward is as exact as these
             allowed = max(allowed, 1e-12 * float(truth["tc" + name[2:]].abs().max()))
-        assert np.abs(values - known).max() <= allowed, f"{name} differs by {np.abs(values - known).max():.3g} (allowed {allowed:.3g})"
+        assert np.abs(values - known).max() <= allowed, (
+            f"{name} differs by {np.abs(values - known).max():.3g} (allowed {allowed:.3g})"
+        )
 
 
 def closed(function: object) -> object:
@@ -190,17 +234,25 @@ def test_right_hand_side_row_by_row(golden_file: Path) -> None:
     hull = vessel(case.scale).hull
     nu, tau = tensor(frame, "u", "v", "r"), tensor(frame, "tau_u", "tau_v", "tau_r")
     psi = frame["psi"].to_numpy()
-    push = [200.0 * np.cos(psi) + 100.0 * np.sin(psi), 100.0 * np.cos(psi) - 200.0 * np.sin(psi), 0.0 * psi]
+    push = [
+        200.0 * np.cos(psi) + 100.0 * np.sin(psi),
+        100.0 * np.cos(psi) - 200.0 * np.sin(psi),
+        0.0 * psi,
+    ]
     tau = tau + case.disturbed * torch.from_numpy(np.stack(push, axis=1))
     truth = frame[["du", "dv", "dr"]].to_numpy()
     # a difference of forces cannot be more exact than its largest part
-    size = (torch.stack([tau, hull.coriolis(nu), hull.drag(nu)]).abs().amax(0) @ hull.inverse.abs().T).numpy()
+    size = (
+        torch.stack([tau, hull.coriolis(nu), hull.drag(nu)]).abs().amax(0) @ hull.inverse.abs().T
+    ).numpy()
     assert (np.abs(hull(nu, tau).numpy() - truth) <= 1e-12 * np.maximum(size, np.abs(truth))).all()
 
 
 @closed
 def test_controller_row_by_row(golden_file: Path) -> None:
-    """Feed-forward from the desired motion, and feedback whose integral grows as the errors between the rows say."""
+    """Feed-forward from the desired motion, and feedback whose integral grows as the errors between
+    the rows say.
+    """
     frame, case = table(golden_file), case_of(golden_file)
     assert isinstance(case, Flight)
     believed = vessel(1.0).hull
@@ -212,7 +264,10 @@ def test_controller_row_by_row(golden_file: Path) -> None:
     parts = torch.stack([nu_dot_d @ believed.mass.T, believed.coriolis(nu_d), believed.drag(nu_d)])
     size = parts.abs().amax(0).numpy()
     forward = frame[["ff_u", "ff_v", "ff_r"]].to_numpy()
-    assert (np.abs(believed.required(nu_dot_d, nu_d).numpy() - forward) <= 2e-12 * np.maximum(size, np.abs(forward))).all()
+    assert (
+        np.abs(believed.required(nu_dot_d, nu_d).numpy() - forward)
+        <= 2e-12 * np.maximum(size, np.abs(forward))
+    ).all()
     integral = tensor(frame, "tc_u", "tc_v", "tc_r") - command
     if not case.feedback:
         assert float(integral.abs().max()) <= 1e-11 * float(command.abs().max())
@@ -221,14 +276,18 @@ def test_controller_row_by_row(golden_file: Path) -> None:
     assert torch.equal(memory, DT * controller.error(x, desired))
     # over the five steps between two rows, by the trapezoidal rule: the error bends little in 0.1 s
     error = controller.error(x, desired)
-    grown = 0.5 * EVERY["closed"] * DT * (error[1:] + error[:-1]) - 0.5 * DT * (error[1:] - error[:-1])
+    grown = 0.5 * EVERY["closed"] * DT * (error[1:] + error[:-1]) - 0.5 * DT * (
+        error[1:] - error[:-1]
+    )
     found = integral[1:] - integral[:-1]
     assert float((found - grown).abs().max()) <= 2e-3 * float(grown.abs().max())
     assert float(wrap(desired[:, 2] - x[:, 2]).abs().max()) < np.pi
 
 
 def test_names_of_further_files_are_understood() -> None:
-    """Files are kept back for acceptance: names of the same pattern give the set-ups that golden/README.md describes."""
+    """Files are kept back for acceptance: names of the same pattern give the set-ups that
+    golden/README.md describes.
+    """
     for name, (scale, disturbed, frequency, feedback) in {
         "cal_matched": (1.0, False, 0.2, True),
         "cal_half_dist": (0.5, True, 0.2, True),
@@ -238,7 +297,12 @@ def test_names_of_further_files_are_understood() -> None:
     }.items():
         case = case_of(Path(f"{name}.csv.gz"))
         assert isinstance(case, Flight)
-        assert (case.scale, case.disturbed, case.guidance.frequency[0], case.feedback) == (scale, disturbed, frequency, feedback)
+        assert (case.scale, case.disturbed, case.guidance.frequency[0], case.feedback) == (
+            scale,
+            disturbed,
+            frequency,
+            feedback,
+        )
         assert case.guidance.duration == 720.0
     twice = case_of(Path("cal_half.csv.gz"))
     assert isinstance(twice, Flight)
@@ -249,11 +313,18 @@ def test_names_of_further_files_are_understood() -> None:
 
 
 def test_the_disturbed_plant_is_the_calm_one_without_disturbance() -> None:
-    """The faster plant without exogenous inputs, which most of these runs fly, against the one with them."""
+    """The faster plant without exogenous inputs, which most of these runs fly, against the one with
+    them.
+    """
     full, calm = vessel(0.5), vessel(0.5)
     calm.in_calm_water()
     x0 = torch.zeros(2, len(full.state), dtype=torch.float64)
-    command = torch.randn(2, 200, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64).repeat_interleave(5, dim=1) * 200
+    command = (
+        torch.randn(
+            2, 200, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+        ).repeat_interleave(5, dim=1)
+        * 200
+    )
     w = torch.cat((command, torch.zeros(2, 1000, 7, dtype=torch.float64)), dim=-1)
     with torch.no_grad():
         plain, _, _ = Rollout(PlantDynamics(full, DT))(x0, w, x0[:, :0])

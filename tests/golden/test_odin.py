@@ -1,6 +1,8 @@
-"""Odin with forces and with water jets against golden runs of another implementation (golden/README.md, g2_odin).
+"""Odin with forces and with water jets against golden runs of another implementation
+(golden/README.md, g2_odin).
 
-The author's own jet inputs are sets 1 and 2 of the simulations in the repository that the document cites as [15] (ERRATA).
+The author's own jet inputs are sets 1 and 2 of the simulations in the repository that the document
+cites as [15] (ERRATA).
 """
 
 from __future__ import annotations
@@ -27,7 +29,8 @@ from residnet.physics.vessel import load_vessel
 GROUP = "g2_odin"
 DT, EVERY, END = 0.01, 10, 300.0
 VESSELS = {"force": "odin_forces", "jet": "odin_jets"}
-# square waves change within steps, where each implementation has its own rounding (golden/README.md)
+# square waves change within steps, where each implementation has its own rounding
+# (golden/README.md)
 EDGES = ("jet1", "jetA1", "jetA2")
 STEPS = np.array([
     [0, 0, 0], [4000, 0, 0], [4000, 800, 0], [4000, -800, 0], [4000, 0, 1000], [4000, 0, -1000], [2500, 600, 800], [2500, -600, -800],
@@ -50,17 +53,25 @@ def between(t: np.ndarray, *parts: tuple[float, float, object]) -> np.ndarray:
 
 def author1(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     rpm = np.where(t <= 20, 500.0, np.where(t <= 200, 500 * square(t / 3) + 1000, 1000 + 2 * t))
-    nozzle = between(t, (100, 150, 0.05 * square(t / 2)), (150, 200, 0.2 * square(t / 4)), (200, 250, 0.01 * square(t / 2)))
+    nozzle = between(
+        t,
+        (100, 150, 0.05 * square(t / 2)),
+        (150, 200, 0.2 * square(t / 4)),
+        (200, 250, 0.01 * square(t / 2)),
+    )
     return rpm, np.where((t > 50) & (t < 100), 0.1 * square(t / 3), nozzle)
 
 
 def author2(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     rpm = np.where(t <= 20, 500.0, 700 * square(t / 3) + 1000)
-    nozzle = between(t, (55, 65, -0.05), (90, 92, 0.05), (95, 105, -0.05), (180, 185, 0.1), (190, 200, -0.1))
+    nozzle = between(
+        t, (55, 65, -0.05), (90, 92, 0.05), (95, 105, -0.05), (180, 185, 0.1), (190, 200, -0.1)
+    )
     return rpm, np.where((t > 50) & (t < 55), 0.05, nozzle)
 
 
-# commands over time: forces in N, N, N m; motor speed in rpm, before it is clipped, and nozzle angle in rad
+# commands over time: forces in N, N, N m; motor speed in rpm, before it is clipped, and nozzle
+# angle in rad
 DESIGNS: dict[str, Callable[[np.ndarray], tuple[np.ndarray, ...]]] = {
     "force1": lambda t: (
         3000 + 1500 * wave(t, 37) + 900 * wave(t, 11.3),
@@ -118,7 +129,11 @@ def flown(folder: Path, vessel: str) -> dict[str, np.ndarray]:
     t = DT * np.arange(round(END / DT))
     # the last stage sees the input just before the next step (golden/README.md)
     stages = (t, t + DT / 2, t + DT - 1e-12)
-    w = torch.from_numpy(np.stack([np.concatenate([commands(path)(stage) for stage in stages], axis=-1) for path in files]))
+    w = torch.from_numpy(
+        np.stack(
+            [np.concatenate([commands(path)(stage) for stage in stages], axis=-1) for path in files]
+        )
+    )
     x0 = torch.zeros(len(files), 6, dtype=torch.float64)
     with torch.no_grad():
         states, _, _ = Rollout(StagedPlantDynamics(plant, DT))(x0, w, x0[:, :0])
@@ -131,7 +146,9 @@ def test_inputs_from_the_name(golden_file: Path) -> None:
     if isinstance(plant.actuators, WaterJets):
         found[:, 0] = found[:, 0].clamp(0.0, plant.actuators.n_max)
     # times in the file are rounded sums; an input that jumps there may be seen before or after
-    away = (found - recorded(frame, plant)).abs() > 1e-9 * recorded(frame, plant).abs().amax(0) + 1e-12
+    away = (found - recorded(frame, plant)).abs() > 1e-9 * recorded(frame, plant).abs().amax(
+        0
+    ) + 1e-12
     jumps = int(away.any(-1).sum())
     assert jumps <= (3 if case_of(golden_file)[1] in (*EDGES, "force2") else 0), f"{jumps} rows"
 
@@ -144,7 +161,9 @@ def test_forces_of_the_commands(golden_file: Path) -> None:
     size = tau.abs().numpy()
     if isinstance(plant.actuators, WaterJets):
         u, n = nu[:, 0].abs(), command[:, 0].abs()
-        (a, b, c), (d, e, f) = ([abs(p) for p in part] for part in (plant.actuators.a, plant.actuators.c))
+        (a, b, c), (d, e, f) = (
+            [abs(p) for p in part] for part in (plant.actuators.a, plant.actuators.c)
+        )
         largest = 2 * (a + u * (b + u * c)) * (d + n * (e + n * f))
         across = largest * torch.sin(command[:, 1]).abs()
         size = torch.stack((largest, across, 3.82 * across), dim=-1).numpy()
@@ -153,20 +172,25 @@ def test_forces_of_the_commands(golden_file: Path) -> None:
 
 
 def test_right_hand_side_row_by_row(golden_file: Path) -> None:
-    """From the state and the forces of each row; sums of terms are as exact as the largest of them."""
+    """From the state and the forces of each row; sums of terms are as exact as the largest of them.
+    """
     frame, plant = table(golden_file), plant_of(golden_file)
     nu, tau = tensor(frame, "u", "v", "r"), tensor(frame, "tau_x", "tau_y", "tau_z")
     hull = plant.hull
     parts = hull.terms(nu).abs() @ hull.coefficients.abs() + (tau * hull.gain).abs()
     truth = frame[["du", "dv", "dr"]].to_numpy()
-    assert (np.abs(hull(nu, tau).numpy() - truth) <= 1e-12 * np.maximum(parts.numpy(), np.abs(truth))).all()
+    assert (
+        np.abs(hull(nu, tau).numpy() - truth) <= 1e-12 * np.maximum(parts.numpy(), np.abs(truth))
+    ).all()
     x = torch.cat((tensor(frame, "x", "y", "psi"), nu), dim=1)
     w = torch.zeros(len(frame), len(plant.inputs), dtype=torch.float64)
     w[:, : plant.commands] = recorded(frame, plant)
     rate = plant.rate(x, w).numpy()
     np.testing.assert_allclose(rate[:, 3:], truth, rtol=1e-10, atol=1e-12)
     c, s, (u, v, r) = np.cos(frame["psi"]), np.sin(frame["psi"]), nu.T.numpy()
-    np.testing.assert_allclose(rate[:, :3], np.stack((c * u - s * v, s * u + c * v, r), axis=1), rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(
+        rate[:, :3], np.stack((c * u - s * v, s * u + c * v, r), axis=1), rtol=1e-12, atol=1e-15
+    )
 
 
 def test_trajectory(golden_file: Path) -> None:
@@ -174,21 +198,33 @@ def test_trajectory(golden_file: Path) -> None:
     frame = table(golden_file)
     rows = np.rint(frame["t"].to_numpy() / DT).astype(int)
     np.testing.assert_array_equal(rows, EVERY * np.arange(len(frame)))
-    found = dict(zip(("x", "y", "psi", "u", "v", "r"), flown(golden_file.parent, case_of(golden_file)[0])[golden_file.name][rows].T, strict=True))
+    found = dict(
+        zip(
+            ("x", "y", "psi", "u", "v", "r"),
+            flown(golden_file.parent, case_of(golden_file)[0])[golden_file.name][rows].T,
+            strict=True,
+        )
+    )
     edges = case_of(golden_file)[1] in EDGES
     for name in ("u", "v", "r") if edges else found:
         truth = frame[name].to_numpy()
         allowed = 3e-2 if edges else 1e-6 * np.ptp(truth) + 1e-12
-        assert np.abs(found[name] - truth).max() <= allowed, f"{name} differs by {np.abs(found[name] - truth).max():.3g} (allowed {allowed:.3g})"
+        assert np.abs(found[name] - truth).max() <= allowed, (
+            f"{name} differs by {np.abs(found[name] - truth).max():.3g} (allowed {allowed:.3g})"
+        )
 
 
 def test_names_of_further_files_are_understood() -> None:
-    """Files are kept back for acceptance: names of the same pattern give the set-ups that golden/README.md describes."""
+    """Files are kept back for acceptance: names of the same pattern give the set-ups that
+    golden/README.md describes.
+    """
     assert case_of(Path("force3.csv.gz")) == ("odin_forces", "force3")
     assert case_of(Path("jet3_author3.csv.gz")) == ("odin_jets", "jet3")
     assert case_of(Path("jetA2_author2.csv.gz")) == ("odin_jets", "jetA2")
     t = np.array([0.0, 19.99, 20.0, 119.0, 280.0, 299.9, 300.0])
-    np.testing.assert_array_equal(commands(Path("force2.csv.gz"))(t), STEPS[[0, 0, 1, 5, 14, 14, 14]])
+    np.testing.assert_array_equal(
+        commands(Path("force2.csv.gz"))(t), STEPS[[0, 0, 1, 5, 14, 14, 14]]
+    )
     rpm, nozzle = commands(Path("jet3.csv.gz"))(np.array([1.5 * np.pi])).T * [[60], [1]]
     np.testing.assert_allclose([rpm[0], nozzle[0]], [1600.0, -0.1])
     for name in ("jet9", "wave1"):

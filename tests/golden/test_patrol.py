@@ -1,4 +1,6 @@
-"""The 4-DOF patrol vessel against golden runs of another implementation (golden/README.md, g1_4dof)."""
+"""The 4-DOF patrol vessel against golden runs of another implementation (golden/README.md,
+g1_4dof).
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,9 @@ SPEED = 7.71
 
 @dataclass(frozen=True)
 class Run:
-    """Initial state, thrust and rudder that the last part of a name stands for: a step or a zigzag of `rudder` deg from START."""
+    """Initial state, thrust and rudder that the last part of a name stands for: a step or a zigzag
+    of `rudder` deg from START.
+    """
 
     u: float = SPEED
     phi: float = 0.0
@@ -42,7 +46,9 @@ class Run:
 RUNS: dict[str, Callable[..., Run]] = {
     r"straight": Run,
     r"rudder(-?\d+)": lambda angle: Run(rudder=float(angle)),
-    r"zigzag(\d+)(?:_(\d+))?": lambda angle, heading: Run(rudder=float(angle), heading=float(heading or angle)),
+    r"zigzag(\d+)(?:_(\d+))?": lambda angle, heading: Run(
+        rudder=float(angle), heading=float(heading or angle)
+    ),
     r"rolldecay": lambda: Run(phi=10.0),
     r"rolldecay_u0": lambda: Run(phi=10.0, u=0.0, drive=0.0),
 }
@@ -70,7 +76,9 @@ def case_of(path: Path) -> Case:
 
 
 def plant_of(case: Case) -> PatrolVessel:
-    """The set with the rudder: the foil's density is the set's own, the linear rudder is the same for all."""
+    """The set with the rudder: the foil's density is the set's own, the linear rudder is the same
+    for all.
+    """
     vessel = load_vessel(SETS[case.parameters])
     if case.rudder == "lin":
         vessel = vessel.model_copy(update={"actuators": load_vessel(RUDDERS["lin"]).actuators})
@@ -78,11 +86,18 @@ def plant_of(case: Case) -> PatrolVessel:
 
 
 def source_of(runs: list[Run], plant: PatrolVessel, t: torch.Tensor) -> Source:
-    """Manoeuvres of runs, first those without, then those with zigzags; angles as shares of the largest rudder angle."""
+    """Manoeuvres of runs, first those without, then those with zigzags; angles as shares of the
+    largest rudder angle.
+    """
     limit = plant.actuators.delta_max
     steps = [run for run in runs if run.heading is None]
     zigzags = [
-        Zigzag(drive=run.drive, steer=np.radians(run.rudder) / limit, start=START, heading=float(np.radians(run.heading)))
+        Zigzag(
+            drive=run.drive,
+            steer=np.radians(run.rudder) / limit,
+            start=START,
+            heading=float(np.radians(run.heading)),
+        )
         for run in runs
         if run.heading is not None
     ]
@@ -90,16 +105,26 @@ def source_of(runs: list[Run], plant: PatrolVessel, t: torch.Tensor) -> Source:
     if steps:
         steer = torch.tensor(np.radians([run.rudder for run in steps]) / limit)
         drive = torch.tensor([run.drive for run in steps], dtype=torch.float64)
-        sources.append(ScheduleSource(drive[:, None].expand(-1, len(t)), steer[:, None] * (t >= START), plant.demand))
+        sources.append(
+            ScheduleSource(
+                drive[:, None].expand(-1, len(t)), steer[:, None] * (t >= START), plant.demand
+            )
+        )
     if zigzags:
         sources.append(Zigzag.source(zigzags, Helm.of(plant), t))
     return StackedSource(sources, [count for count in (len(steps), len(zigzags)) if count])
 
 
 @cache
-def trajectories(parameters: str, rudder: str, folder: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def trajectories(
+    parameters: str, rudder: str, folder: Path
+) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """States [T+1, 9] and rudder commands [T] of every file of one vessel, flown side by side."""
-    files = [path for path in sorted(folder.glob("*.csv.gz")) if (case_of(path).parameters, case_of(path).rudder) == (parameters, rudder)]
+    files = [
+        path
+        for path in sorted(folder.glob("*.csv.gz"))
+        if (case_of(path).parameters, case_of(path).rudder) == (parameters, rudder)
+    ]
     files.sort(key=lambda path: case_of(path).run.heading is not None)
     steps = round(max(float(table(path)["t"].iloc[-1]) for path in files) / DT) + 1
     t = torch.arange(steps, dtype=torch.float64) * DT
@@ -118,7 +143,9 @@ def trajectories(parameters: str, rudder: str, folder: Path) -> dict[str, tuple[
 
 def test_trajectory(golden_file: Path) -> None:
     frame, case = table(golden_file), case_of(golden_file)
-    states, commands = trajectories(case.parameters, case.rudder, golden_file.parent)[golden_file.name]
+    states, commands = trajectories(case.parameters, case.rudder, golden_file.parent)[
+        golden_file.name
+    ]
     rows = np.rint(frame["t"].to_numpy() / DT).astype(int)
     np.testing.assert_allclose(frame["t"], rows * DT, atol=1e-9)
     np.testing.assert_array_equal(rows, EVERY * np.arange(len(frame)))
@@ -126,11 +153,15 @@ def test_trajectory(golden_file: Path) -> None:
     for name, values in simulated.items():
         truth = frame[name].to_numpy()
         allowed = 1e-6 * np.ptp(truth) + 1e-12
-        assert np.abs(values - truth).max() <= allowed, f"{name} differs by {np.abs(values - truth).max():.3g} (allowed {allowed:.3g})"
+        assert np.abs(values - truth).max() <= allowed, (
+            f"{name} differs by {np.abs(values - truth).max():.3g} (allowed {allowed:.3g})"
+        )
 
 
 def test_from_each_row_to_the_next(golden_file: Path) -> None:
-    """Ten steps from every row of the file at once, with all exogenous inputs at zero: no more than rounding apart."""
+    """Ten steps from every row of the file at once, with all exogenous inputs at zero: no more than
+    rounding apart.
+    """
     frame = table(golden_file)
     case = case_of(golden_file)
     plant = plant_of(case)
@@ -146,14 +177,22 @@ def test_from_each_row_to_the_next(golden_file: Path) -> None:
     reached, truth = states[:-1, -1].numpy()[held], frame[list(COLUMNS)].to_numpy()[1:][held]
     assert held.mean() > 0.9
     allowed = 1e-13 * np.abs(truth).max(0) + 1e-15
-    assert (np.abs(reached - truth) <= allowed).all(), dict(zip(COLUMNS, np.abs(reached - truth).max(0) / allowed, strict=True))
+    assert (np.abs(reached - truth) <= allowed).all(), dict(
+        zip(COLUMNS, np.abs(reached - truth).max(0) / allowed, strict=True)
+    )
 
 
 def test_names_of_further_files_are_understood() -> None:
-    """Files are kept back for acceptance: names of the same pattern give the set-ups that golden/README.md describes."""
-    assert case_of(Path("HYB_foil_zigzag20.csv.gz")) == Case("HYB", "foil", Run(rudder=20.0, heading=20.0))
+    """Files are kept back for acceptance: names of the same pattern give the set-ups that
+    golden/README.md describes.
+    """
+    assert case_of(Path("HYB_foil_zigzag20.csv.gz")) == Case(
+        "HYB", "foil", Run(rudder=20.0, heading=20.0)
+    )
     assert case_of(Path("MSS_lin_rudder10.csv.gz")) == Case("MSS", "lin", Run(rudder=10.0))
-    assert case_of(Path("P06_lin_rolldecay_u0.csv.gz")) == Case("P06", "lin", Run(u=0.0, phi=10.0, drive=0.0))
+    assert case_of(Path("P06_lin_rolldecay_u0.csv.gz")) == Case(
+        "P06", "lin", Run(u=0.0, phi=10.0, drive=0.0)
+    )
     assert case_of(Path("P06_foil_zigzag10_5.csv.gz")).run == Run(rudder=10.0, heading=5.0)
     assert case_of(Path("HYB_lin_straight.csv.gz")).run == Run()
     with pytest.raises(AssertionError, match="no run"):
@@ -168,7 +207,15 @@ def test_every_set_takes_every_rudder(parameters: str, rudder: str) -> None:
     plant = plant_of(Case(parameters, rudder, Run()))
     t = torch.tensor([0.0, 4.99, 5.0, 6.0], dtype=torch.float64)
     commands, _ = zip(
-        *(source_of([Run(rudder=-5.0)], plant, t)(plant.approach(1), torch.zeros(1, 10), k, torch.zeros(1, 0)) for k in range(4)), strict=True
+        *(
+            source_of([Run(rudder=-5.0)], plant, t)(
+                plant.approach(1), torch.zeros(1, 10), k, torch.zeros(1, 0)
+            )
+            for k in range(4)
+        ),
+        strict=True,
     )
-    np.testing.assert_allclose(np.degrees([float(c[0, 0]) for c in commands]), [0, 0, -5, -5], atol=1e-5)
+    np.testing.assert_allclose(
+        np.degrees([float(c[0, 0]) for c in commands]), [0, 0, -5, -5], atol=1e-5
+    )
     np.testing.assert_allclose([float(c[0, 1]) for c in commands], 1960 * 7.71**2, rtol=1e-6)

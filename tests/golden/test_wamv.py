@@ -1,4 +1,6 @@
-"""The WAM-V plant and the linear model of document 003 against golden runs of another implementation (golden/README.md, g4_wamv)."""
+"""The WAM-V plant and the linear model of document 003 against golden runs of another
+implementation (golden/README.md, g4_wamv).
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,15 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import PlantDynamics
 from residnet.heads import ZeroHead
-from residnet.manoeuvres import AccelerationDeceleration, ConstantInput, Helm, Manoeuvre, StackedSource, ThreeTwoOneOne, Zigzag
+from residnet.manoeuvres import (
+    AccelerationDeceleration,
+    ConstantInput,
+    Helm,
+    Manoeuvre,
+    StackedSource,
+    ThreeTwoOneOne,
+    Zigzag,
+)
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.vessel import load_vessel
 
@@ -35,8 +45,12 @@ def tenth(text: str) -> float:
 
 
 MANOEUVRES: dict[str, Callable[..., Manoeuvre]] = {
-    r"accdec": lambda: AccelerationDeceleration(times=(0.0, 15.0, 30.0, 45.0, 60.0, 75.0), levels=(0.2, 0.8, 0.4, 1.0, 0.1, 0.6)),
-    r"zz(\d+)_(\d+)": lambda heading, nd: Zigzag(drive=0.6, steer=tenth(nd), start=8.0, heading=float(np.radians(float(heading)))),
+    r"accdec": lambda: AccelerationDeceleration(
+        times=(0.0, 15.0, 30.0, 45.0, 60.0, 75.0), levels=(0.2, 0.8, 0.4, 1.0, 0.1, 0.6)
+    ),
+    r"zz(\d+)_(\d+)": lambda heading, nd: Zigzag(
+        drive=0.6, steer=tenth(nd), start=8.0, heading=float(np.radians(float(heading)))
+    ),
     r"t3211": lambda: ThreeTwoOneOne(drive=0.5, steer=0.5, start=10.0, unit=3.0, repeat=False),
     r"turn(-?\d+)_(-?\d+)": lambda nm, nd: ConstantInput(drive=tenth(nm), steer=tenth(nd)),
     r"pivot": lambda: ConstantInput(drive=0.0, steer=1.0),
@@ -79,18 +93,26 @@ def on_linear(function: Any) -> Any:
 @cache
 def trajectories(vessel: str, folder: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """States [T+1, 8] and commands [T, 2] of every file of one vessel, flown side by side."""
-    files = [path for path in sorted(folder.glob("*.csv.gz")) if not is_linear(path) and case_of(path).vessel == vessel]
+    files = [
+        path
+        for path in sorted(folder.glob("*.csv.gz"))
+        if not is_linear(path) and case_of(path).vessel == vessel
+    ]
     longest = max(float(table(path)["t"].iloc[-1]) for path in files)
     steps = round(longest / DT) + 1
     t = torch.arange(steps, dtype=torch.float64) * DT
     plant = load_vessel(vessel).build()
     manoeuvres = [case_of(path).manoeuvre for path in files]
-    source = StackedSource([type(m).source([m], Helm.of(plant), t) for m in manoeuvres], [1] * len(files))
+    source = StackedSource(
+        [type(m).source([m], Helm.of(plant), t) for m in manoeuvres], [1] * len(files)
+    )
     x0 = torch.zeros(len(files), len(plant.state), dtype=torch.float64)
     w = torch.zeros(len(files), steps, len(plant.inputs), dtype=torch.float64)
     with torch.no_grad():
         states, inputs, _ = Rollout(PlantDynamics(plant, DT), source)(x0, w, x0[:, :0])
-    return {path.name: (states[i].numpy(), inputs[i, :, :2].numpy()) for i, path in enumerate(files)}
+    return {
+        path.name: (states[i].numpy(), inputs[i, :, :2].numpy()) for i, path in enumerate(files)
+    }
 
 
 @on_plant
@@ -99,7 +121,8 @@ def test_thrust_columns(golden_file: Path) -> None:
     thrusters = load_vessel(case_of(golden_file).vessel).actuators.build()
     thrust = thrusters.thrust(tensor(frame, "n_port", "n_stbd") / 60.0).numpy()
     truth = frame[["T_port", "T_stbd"]].to_numpy()
-    # the printed polynomial cancels near zero thrust, where only its largest term bounds the rounding
+    # the printed polynomial cancels near zero thrust, where only its largest term bounds the
+    # rounding
     np.testing.assert_allclose(thrust, truth, rtol=1e-12, atol=1e-12 * 3.8)
 
 
@@ -107,9 +130,14 @@ def test_thrust_columns(golden_file: Path) -> None:
 def test_right_hand_side_row_by_row(golden_file: Path) -> None:
     frame = table(golden_file)
     plant = load_vessel(case_of(golden_file).vessel).build()
-    x = torch.cat((tensor(frame, "x", "y", "psi", "u", "v", "r"), tensor(frame, "n_port", "n_stbd") / 60.0), dim=1)
+    x = torch.cat(
+        (tensor(frame, "x", "y", "psi", "u", "v", "r"), tensor(frame, "n_port", "n_stbd") / 60.0),
+        dim=1,
+    )
     with torch.no_grad():
-        rate = plant.rate(x, torch.zeros(len(frame), len(plant.inputs), dtype=torch.float64)).numpy()
+        rate = plant.rate(
+            x, torch.zeros(len(frame), len(plant.inputs), dtype=torch.float64)
+        ).numpy()
         hull = plant.hull
         nu = x[:, 3:6]
         parts = [plant.actuators(x[:, 6:8]), hull.coriolis(nu), hull.drag(nu)]
@@ -120,28 +148,38 @@ def test_right_hand_side_row_by_row(golden_file: Path) -> None:
     nu_rows = frame[["u", "v", "r"]].to_numpy()
     c, s = np.cos(frame["psi"]), np.sin(frame["psi"])
     north, east = c * nu_rows[:, 0] - s * nu_rows[:, 1], s * nu_rows[:, 0] + c * nu_rows[:, 1]
-    np.testing.assert_allclose(rate[:, :3], np.stack((north, east, nu_rows[:, 2]), axis=1), rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(
+        rate[:, :3], np.stack((north, east, nu_rows[:, 2]), axis=1), rtol=1e-12, atol=1e-15
+    )
 
 
 @on_plant
 def test_trajectory(golden_file: Path) -> None:
     frame = table(golden_file)
-    states, commands = trajectories(case_of(golden_file).vessel, golden_file.parent)[golden_file.name]
+    states, commands = trajectories(case_of(golden_file).vessel, golden_file.parent)[
+        golden_file.name
+    ]
     rows = np.rint(frame["t"].to_numpy() / DT).astype(int)
     np.testing.assert_allclose(frame["t"], rows * DT, atol=1e-9)
     np.testing.assert_array_equal(rows, EVERY * np.arange(len(frame)))
-    simulated = dict(zip(("x", "y", "psi", "u", "v", "r", "n_port", "n_stbd"), states[rows].T, strict=True))
+    simulated = dict(
+        zip(("x", "y", "psi", "u", "v", "r", "n_port", "n_stbd"), states[rows].T, strict=True)
+    )
     simulated |= dict(zip(("cmd_port", "cmd_stbd"), commands[rows].T, strict=True))
     for name, values in simulated.items():
         truth = frame[name].to_numpy()
         values = values * 60.0 if name.startswith(("n_", "cmd_")) else values
         allowed = 1e-6 * np.ptp(truth) + 1e-12
-        assert np.abs(values - truth).max() <= allowed, f"{name} differs by {np.abs(values - truth).max():.3g} (allowed {allowed:.3g})"
+        assert np.abs(values - truth).max() <= allowed, (
+            f"{name} differs by {np.abs(values - truth).max():.3g} (allowed {allowed:.3g})"
+        )
 
 
 @on_linear
 def test_linear_model_by_exact_discretisation(golden_file: Path) -> None:
-    """(33), (34) as printed, or with B = -A Phi from Table 1 (ERRATA W11-W14): the file's own matrices, by the matrix exponential."""
+    """(33), (34) as printed, or with B = -A Phi from Table 1 (ERRATA W11-W14): the file's own
+    matrices, by the matrix exponential.
+    """
     frame = table(golden_file)
     a, b, c = linear_model(golden_file)
     dt = float(frame["t"].iloc[1])
@@ -194,14 +232,20 @@ def linear_model(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def test_names_of_further_files_are_understood() -> None:
-    """Files are kept back for acceptance: names of the same pattern give the set-ups that golden/README.md describes."""
+    """Files are kept back for acceptance: names of the same pattern give the set-ups that
+    golden/README.md describes.
+    """
     zigzag = case_of(Path("VRXNEW_zz20_10.csv.gz"))
     assert zigzag.vessel == "wam_v_vrx"
-    assert zigzag.manoeuvre == Zigzag(drive=0.6, steer=1.0, start=8.0, heading=float(np.radians(20.0)))
+    assert zigzag.manoeuvre == Zigzag(
+        drive=0.6, steer=1.0, start=8.0, heading=float(np.radians(20.0))
+    )
     assert case_of(Path("CAL_turn08_02.csv.gz")).manoeuvre == ConstantInput(drive=0.8, steer=0.2)
     times = torch.arange(0.0, 60.0, 1.0, dtype=torch.float64)
     drive, steer = case_of(Path("CAL_t3211.csv.gz")).manoeuvre.demands(times)
     assert drive.tolist() == [0.5] * 60
-    assert steer.tolist() == [0.0] * 10 + [0.5] * 9 + [-0.5] * 6 + [0.5] * 3 + [-0.5] * 3 + [0.0] * 29
+    assert (
+        steer.tolist() == [0.0] * 10 + [0.5] * 9 + [-0.5] * 6 + [0.5] * 3 + [-0.5] * 3 + [0.0] * 29
+    )
     with pytest.raises(AssertionError, match="no manoeuvre"):
         case_of(Path("CAL_loop.csv.gz"))

@@ -1,4 +1,6 @@
-"""Residuals in force space: recovered from a vessel whose mass, Coriolis and damping are known, and run forward as its equations of motion."""
+"""Residuals in force space: recovered from a vessel whose mass, Coriolis and damping are known, and
+run forward as its equations of motion.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,25 @@ from residnet.physics.vessel import load_vessel
 SIGNALS = SignalsConfig(inputs=("tau_x", "tau_y", "tau_n"))
 NAMES = SIGNALS.build().names
 BELIEVED = BelievedConfig(vessel="milliampere")
-TERMS = ("u_dot", "v_dot", "r_dot", "u", "v", "r", "u|u|", "v|v|", "u^3", "v^3", "r|r|", "u v", "u r", "v r", "r^2", "|r|v", "|v|r")
+TERMS = (
+    "u_dot",
+    "v_dot",
+    "r_dot",
+    "u",
+    "v",
+    "r",
+    "u|u|",
+    "v|v|",
+    "u^3",
+    "v^3",
+    "r|r|",
+    "u v",
+    "u r",
+    "v r",
+    "r^2",
+    "|r|v",
+    "|v|r",
+)
 
 
 def hull(name: str) -> Any:
@@ -35,14 +55,22 @@ def hull(name: str) -> Any:
 
 
 def samples(mass_sign: float = 1.0, count: int = 3000, groups: int = 10) -> Samples:
-    """Motion and the forces that the true ferry (half the believed one) needs for it; the sign turns its inertia around."""
+    """Motion and the forces that the true ferry (half the believed one) needs for it; the sign
+    turns its inertia around.
+    """
     random = torch.Generator().manual_seed(0)
-    nu = torch.randn(count, 3, generator=random, dtype=torch.float64) * torch.tensor([0.6, 0.4, 0.2])
-    nu_dot = torch.randn(count, 3, generator=random, dtype=torch.float64) * torch.tensor([0.2, 0.2, 0.05])
+    nu = torch.randn(count, 3, generator=random, dtype=torch.float64) * torch.tensor(
+        [0.6, 0.4, 0.2]
+    )
+    nu_dot = torch.randn(count, 3, generator=random, dtype=torch.float64) * torch.tensor(
+        [0.2, 0.2, 0.05]
+    )
     with torch.no_grad():
         tau = hull("milliampere_half").required(mass_sign * nu_dot, nu)
     group = torch.arange(count) * groups // count
-    return Samples(torch.cat((nu, tau), dim=-1), nu_dot, group, torch.zeros(count), ("zigzag",) * groups, NAMES)
+    return Samples(
+        torch.cat((nu, tau), dim=-1), nu_dot, group, torch.zeros(count), ("zigzag",) * groups, NAMES
+    )
 
 
 def spec(head: Any, name: str = "force") -> ModelSpec:
@@ -80,10 +108,15 @@ def test_the_mass_and_the_accelerations_are_the_true_ferrys(model: HybridDynamic
     of = samples()
     with torch.no_grad():
         torch.testing.assert_close(model.one_step(of.z[None])[0], of.target, rtol=0, atol=1e-5)
-    torch.testing.assert_close(torch.linalg.inv(model.head.inverse), hull("milliampere_half").mass, rtol=1e-4, atol=1e-2)
+    torch.testing.assert_close(
+        torch.linalg.inv(model.head.inverse), hull("milliampere_half").mass, rtol=1e-4, atol=1e-2
+    )
 
 
-@pytest.mark.parametrize("config", [PlsrConfig(space="force", choose="one_step"), RidgeConfig(space="force", choose="one_step")])
+@pytest.mark.parametrize(
+    "config",
+    [PlsrConfig(space="force", choose="one_step"), RidgeConfig(space="force", choose="one_step")],
+)
 def test_the_thirty_basis_functions_hold_it_too(config: Any) -> None:
     model = fitted(config, samples())
     assert model.head.inner.library.count == 30
@@ -143,7 +176,11 @@ def test_saved_scripted_and_averaged(model: HybridDynamics, tmp_path: Any) -> No
 
 
 @pytest.mark.parametrize(
-    "config", [PlsrConfig(space="force", order=17, terms=TERMS), RidgeConfig(space="force", terms=TERMS, penalties=(1e-8, 1e-6))]
+    "config",
+    [
+        PlsrConfig(space="force", order=17, terms=TERMS),
+        RidgeConfig(space="force", terms=TERMS, penalties=(1e-8, 1e-6)),
+    ],
 )
 def test_a_mass_that_cannot_be_inverted_safely_fails_the_fit(config: Any) -> None:
     with pytest.raises(FitError, match=r"eigenvalues .* cannot run forward"):
@@ -165,11 +202,20 @@ def test_only_the_solutions_that_run_forward_are_offered() -> None:
     ("build", "said"),
     [
         (lambda: RidgeConfig(terms=("u", "u_dot")), "space: force"),
-        (lambda: RidgeConfig(space="force", terms=("u", "u_dot u")).build(NAMES), "names accelerations only by themselves"),
-        (lambda: RidgeConfig(space="force", terms=("|u_dot|",)).build(NAMES), "names accelerations only by themselves"),
+        (
+            lambda: RidgeConfig(space="force", terms=("u", "u_dot u")).build(NAMES),
+            "names accelerations only by themselves",
+        ),
+        (
+            lambda: RidgeConfig(space="force", terms=("|u_dot|",)).build(NAMES),
+            "names accelerations only by themselves",
+        ),
         (lambda: RidgeConfig(space="force", terms=("u_ddot",)).build(NAMES), "u_ddot"),
         (lambda: MlpConfig(features=("u_dot", "v")).build(NAMES), "only a residual in force space"),
-        (lambda: SymbolicConfig(features=("u_dot",)).build(NAMES), "only a residual in force space"),
+        (
+            lambda: SymbolicConfig(features=("u_dot",)).build(NAMES),
+            "only a residual in force space",
+        ),
         (lambda: _on(RegressorsConfig(terms=("u", "tau_x"))), "kind to 'believed'"),
     ],
 )
@@ -192,7 +238,9 @@ def test_believed_mass_is_the_hulls_times_its_factor() -> None:
 
 @pytest.mark.parametrize("kind", [PlsrConfig, RidgeConfig])
 def test_columns_that_say_nothing_get_nothing(kind: Any) -> None:
-    """A constant and a doubled column: no coefficient for the one, the same prediction without the other; NaN and few samples are errors."""
+    """A constant and a doubled column: no coefficient for the one, the same prediction without the
+    other; NaN and few samples are errors.
+    """
     random = torch.Generator().manual_seed(1)
     z = torch.randn(400, 5, generator=random, dtype=torch.float64)
     z[:, 3] = 0.1

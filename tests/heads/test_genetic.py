@@ -41,7 +41,14 @@ def _deap() -> None:
 def samples(log: dict[str, np.ndarray]) -> Samples:
     z = torch.from_numpy(np.stack([log[name] for name in FORCES], axis=1))
     target = torch.from_numpy(np.stack([log[name] for name in ACCELERATION], axis=1))
-    return Samples(z, target, torch.zeros(len(z), dtype=torch.long), torch.from_numpy(log["t"]), ("made",), FORCES)
+    return Samples(
+        z,
+        target,
+        torch.zeros(len(z), dtype=torch.long),
+        torch.from_numpy(log["t"]),
+        ("made",),
+        FORCES,
+    )
 
 
 def test_force_equations_of_odin() -> None:
@@ -67,12 +74,23 @@ def test_force_equations_of_odin() -> None:
 @pytest.mark.parametrize("final", [True, False])
 def test_mass_spring_damper(final: bool) -> None:
     """Document 000 eq. (5.13); without a final choice the result may hold terms that do nothing."""
-    evolution = {"population": 500, "operators": ["+", "-", "*", "abs"], "tournament": 3, "depth": 7, "split": "sum"}
-    config = GeneticConfig.model_validate({"evolution": evolution} | ({} if final else {"final": None}))
+    evolution = {
+        "population": 500,
+        "operators": ["+", "-", "*", "abs"],
+        "tournament": 3,
+        "depth": 7,
+        "split": "sum",
+    }
+    config = GeneticConfig.model_validate(
+        {"evolution": evolution} | ({} if final else {"final": None})
+    )
     log, names = msd_log(), ("x", "w", "tau")
     algebra = Algebra(names, limits_of(config.evolution))
     bred = breed(algebra, log, log["w_dot"], np.arange(len(log["t"])) % 50 < 35, config, seed=1)
-    found = {term(algebra, product): value for product, value in zip(bred.products, bred.values, strict=True)}
+    found = {
+        term(algebra, product): value
+        for product, value in zip(bred.products, bred.values, strict=True)
+    }
     assert {name: found.pop(name) for name in MSD_TRUTH} == pytest.approx(MSD_TRUTH, rel=1e-6)
     assert not (final and found)
     assert all(abs(value) < 1e-6 for value in found.values())
@@ -80,13 +98,29 @@ def test_mass_spring_damper(final: bool) -> None:
 
 def test_saved_and_loaded_with_functions_of_sums(tmp_path: Path) -> None:
     signals = SignalsConfig(inputs=("tau_x", "tau_n"))
-    config = GeneticConfig.model_validate({"evolution": {"population": 80, "generations": 3, "operators": ["+", "*", "abs", "sin", "/", "sqrt"]}})
+    config = GeneticConfig.model_validate(
+        {
+            "evolution": {
+                "population": 80,
+                "generations": 3,
+                "operators": ["+", "*", "abs", "sin", "/", "sqrt"],
+            }
+        }
+    )
     head = config.build(NAMES)
     head.calibrate(made())
     head.solve(made())
     model = HybridDynamics(signals.build(), StillConfig().build(NAMES), head, 0.1, "rk4")
     spec = ModelSpec(
-        name="m", role="head", signals=signals, baseline=StillConfig(), head=config, dt=0.1, integrator="rk4", low=(0,) * 5, high=(1,) * 5
+        name="m",
+        role="head",
+        signals=signals,
+        baseline=StillConfig(),
+        head=config,
+        dt=0.1,
+        integrator="rk4",
+        low=(0,) * 5,
+        high=(1,) * 5,
     )
     save_model(tmp_path / "m", spec, model)
     _, loaded = load_model(tmp_path / "m")
@@ -106,11 +140,15 @@ def expression(algebra: Algebra) -> Sum:
     cosine = algebra.apply("cos", r)
     below = algebra.apply("inv", algebra.add(one, algebra.multiply(cosine, cosine)))
     first = algebra.multiply(algebra.multiply(u, {(): -2.0}), algebra.apply("abs", inside))
-    return algebra.add(algebra.add(first, algebra.multiply(algebra.apply("sqrt", v), below)), {(): 0.25})
+    return algebra.add(
+        algebra.add(first, algebra.multiply(algebra.apply("sqrt", v), below)), {(): 0.25}
+    )
 
 
 def truth(u: np.ndarray, v: np.ndarray, r: np.ndarray) -> np.ndarray:
-    return np.asarray(-2 * u * np.abs(v + 3 * np.sin(u * r)) + np.sqrt(np.abs(v)) / (1 + np.cos(r) ** 2) + 0.25)
+    return np.asarray(
+        -2 * u * np.abs(v + 3 * np.sin(u * r)) + np.sqrt(np.abs(v)) / (1 + np.cos(r) ** 2) + 0.25
+    )
 
 
 def test_tables_and_writing_say_the_same(tmp_path: Path) -> None:
@@ -123,16 +161,27 @@ def test_tables_and_writing_say_the_same(tmp_path: Path) -> None:
     wanted = truth(*z.T)
     for module in (library, torch.jit.script(library)):
         with torch.no_grad():
-            np.testing.assert_allclose(module(torch.from_numpy(z)).numpy() @ weights, wanted, rtol=1e-12)
+            np.testing.assert_allclose(
+                module(torch.from_numpy(z)).numpy() @ weights, wanted, rtol=1e-12
+            )
     read, same = library.read(algebra.channels)
     assert [term(read, p) for p in same] == [term(algebra, p) for p in products]
     symbols = sympy.symbols("u v r")
-    called = sympy.lambdify(symbols, sympy.sympify(total(algebra, products, weights, SYMPY)), "numpy")
+    called = sympy.lambdify(
+        symbols, sympy.sympify(total(algebra, products, weights, SYMPY)), "numpy"
+    )
     np.testing.assert_allclose(called(*z.T), wanted, rtol=1e-12)
     written = total(algebra, products, weights, C)
     if shutil.which("gcc"):
-        (tmp_path / "total.c").write_text(f"#include <math.h>\ndouble total(double u, double v, double r) {{ return {written}; }}\n")
-        subprocess.run(["gcc", "-std=c99", "-O2", "-shared", "-fPIC", "total.c", "-o", "total.so", "-lm"], cwd=tmp_path, check=True)
+        (tmp_path / "total.c").write_text(
+            f"#include <math.h>\ndouble total(double u, double v, double r) {{ return {written};"
+            " }\n"
+        )
+        subprocess.run(
+            ["gcc", "-std=c99", "-O2", "-shared", "-fPIC", "total.c", "-o", "total.so", "-lm"],
+            cwd=tmp_path,
+            check=True,
+        )
         function = ctypes.CDLL(str(tmp_path / "total.so")).total
         function.restype, function.argtypes = ctypes.c_double, [ctypes.c_double] * 3
         np.testing.assert_allclose([function(*row) for row in z], wanted, rtol=1e-12)
@@ -143,7 +192,13 @@ def test_terms_are_written_as_the_term_language_reads_them() -> None:
     algebra = Algebra(("u", "rpm", "nozzle"))
     u, rpm, nozzle = (algebra.channel(name) for name in algebra.channels)
     multiply, apply = algebra.multiply, algebra.apply
-    made = [multiply(u, apply("abs", u)), multiply(multiply(rpm, rpm), apply("cos", nozzle)), apply("sqrt", u), apply("inv", rpm), {(): 1.0}]
+    made = [
+        multiply(u, apply("abs", u)),
+        multiply(multiply(rpm, rpm), apply("cos", nozzle)),
+        apply("sqrt", u),
+        apply("inv", rpm),
+        {(): 1.0},
+    ]
     products = [next(iter(a)) for a in made]
     z = np.random.default_rng(0).normal(size=(20, 3))
     library = TermLibrary([term(algebra, product) for product in products], algebra.channels)

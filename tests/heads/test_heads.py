@@ -17,7 +17,9 @@ from residnet.heads import ClosedFormHead, HeadConfig, ResidualHead
 from residnet.heads.base import FeatureConfig, Features
 from residnet.physics.signals import SignalsConfig
 
-KINDS: dict[str, type[FeatureConfig]] = {config.model_fields["kind"].default: config for config in get_args(get_args(HeadConfig)[0])}
+KINDS: dict[str, type[FeatureConfig]] = {
+    config.model_fields["kind"].default: config for config in get_args(get_args(HeadConfig)[0])
+}
 # what makes a kind quick enough for a contract
 QUICK: dict[str, dict[str, Any]] = {"genetic": {"evolution": {"population": 60, "generations": 3}}}
 SIGNALS = SignalsConfig(inputs=("tau_x", "tau_n"))
@@ -70,7 +72,9 @@ def test_sequence_equals_steps(kind: str, dtype: torch.dtype) -> None:
             rho, s = head(z[:, k], s)
             out.append(rho)
         tolerance = 1e-6 if dtype == torch.float32 else 1e-12
-        torch.testing.assert_close(head.sequence(z), torch.stack(out, dim=1), rtol=tolerance, atol=tolerance)
+        torch.testing.assert_close(
+            head.sequence(z), torch.stack(out, dim=1), rtol=tolerance, atol=tolerance
+        )
         torch.testing.assert_close(head.warmup(z), s, rtol=tolerance, atol=tolerance)
         assert torch.equal(head.warmup(z[:, :0]), torch.zeros(4, head.n_state, dtype=dtype))
 
@@ -80,7 +84,9 @@ def test_rows_do_not_see_each_other(kind: str) -> None:
     with torch.no_grad():
         whole = head.sequence(z)
         for i in range(len(z)):
-            torch.testing.assert_close(head.sequence(z[i : i + 1]), whole[i : i + 1], rtol=1e-10, atol=1e-12)
+            torch.testing.assert_close(
+                head.sequence(z[i : i + 1]), whole[i : i + 1], rtol=1e-10, atol=1e-12
+            )
 
 
 def test_scriptable_with_the_same_answers(kind: str) -> None:
@@ -97,7 +103,9 @@ def test_scriptable_with_the_same_answers(kind: str) -> None:
 
 
 def test_finite_far_outside_the_training_range(kind: str) -> None:
-    """The guard holds the features at the edge: the residual there is that of the edge, not an extrapolation."""
+    """The guard holds the features at the edge: the residual there is that of the edge, not an
+    extrapolation.
+    """
     head = ready(kind).double()
     far = torch.from_numpy(CENTRE + SPREAD * 1e6)[None]
     further = torch.from_numpy(CENTRE + SPREAD * 1e9)[None]
@@ -160,8 +168,12 @@ def test_a_stored_model_is_the_same_to_the_last_bit(kind: str, tmp_path: Path) -
     assert again_spec == spec
     # once more, from what was loaded
     save_model(tmp_path / "again", again_spec, again)
-    assert (tmp_path / "again" / "model.safetensors").read_bytes() == (tmp_path / "mine" / "model.safetensors").read_bytes()
-    assert (tmp_path / "again" / "model.json").read_text() == (tmp_path / "mine" / "model.json").read_text()
+    assert (tmp_path / "again" / "model.safetensors").read_bytes() == (
+        tmp_path / "mine" / "model.safetensors"
+    ).read_bytes()
+    assert (tmp_path / "again" / "model.json").read_text() == (
+        tmp_path / "mine" / "model.json"
+    ).read_text()
     assert_same(model, again)
 
 
@@ -213,6 +225,8 @@ def test_a_constant_feature_is_left_unscaled() -> None:
     z = samples.z.clone()
     z[:, 3] = 400.0
     features = Features(("tau_x",), NAMES, margin=0.1)
-    features.calibrate(type(samples)(z, samples.target, samples.group, samples.t, samples.kinds, NAMES))
+    features.calibrate(
+        type(samples)(z, samples.target, samples.group, samples.t, samples.kinds, NAMES)
+    )
     assert features(z).abs().max() == 0
     assert bool(torch.isfinite(features(z + 1)).all())

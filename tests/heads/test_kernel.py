@@ -1,4 +1,6 @@
-"""Kernel ridge regression against scikit-learn and explicit refits; Nystroem's method against its textbook form."""
+"""Kernel ridge regression against scikit-learn and explicit refits; Nystroem's method against its
+textbook form.
+"""
 
 from __future__ import annotations
 
@@ -22,8 +24,12 @@ SAMPLES = made(300)
 NEW = torch.from_numpy(channels(200, seed=9))
 
 
-def fitted(kernel: Rbf | Polynomial, penalties: tuple[float, ...], choose: Any = "one_step", folds: int = 5) -> tuple[KernelHead, dict[str, Any]]:
-    head = KernelConfig(kernel=kernel, penalties=penalties, choose=choose, folds=folds, margin=1.0).build(NAMES)
+def fitted(
+    kernel: Rbf | Polynomial, penalties: tuple[float, ...], choose: Any = "one_step", folds: int = 5
+) -> tuple[KernelHead, dict[str, Any]]:
+    head = KernelConfig(
+        kernel=kernel, penalties=penalties, choose=choose, folds=folds, margin=1.0
+    ).build(NAMES)
     head.calibrate(SAMPLES)
     return head, head.solve(SAMPLES)
 
@@ -43,34 +49,55 @@ def standardised(z: torch.Tensor) -> np.ndarray:
 @pytest.mark.parametrize("sigma", [1.0, 10.0, 100.0])
 def test_radial_basis_functions_equal_scikit_learn(sigma: float, penalty: float) -> None:
     head, notes = fitted(Rbf(sigma=(sigma,)), (penalty,))
-    truth = KernelRidge(kernel="rbf", gamma=1 / (2 * sigma), alpha=penalty * len(SAMPLES)).fit(standardised(SAMPLES.z), SAMPLES.target.numpy())
-    np.testing.assert_allclose(answer(head, SAMPLES.z), truth.predict(standardised(SAMPLES.z)), atol=1e-10)
+    truth = KernelRidge(kernel="rbf", gamma=1 / (2 * sigma), alpha=penalty * len(SAMPLES)).fit(
+        standardised(SAMPLES.z), SAMPLES.target.numpy()
+    )
+    np.testing.assert_allclose(
+        answer(head, SAMPLES.z), truth.predict(standardised(SAMPLES.z)), atol=1e-10
+    )
     np.testing.assert_allclose(answer(head, NEW), truth.predict(standardised(NEW)), atol=1e-10)
-    np.testing.assert_allclose(head.kernel.coefficients, truth.dual_coef_, atol=1e-10 * np.abs(truth.dual_coef_).max())
+    np.testing.assert_allclose(
+        head.kernel.coefficients, truth.dual_coef_, atol=1e-10 * np.abs(truth.dual_coef_).max()
+    )
     gram = rbf_kernel(standardised(SAMPLES.z), gamma=1 / (2 * sigma))
     freedom = np.trace(gram @ np.linalg.inv(gram + penalty * len(SAMPLES) * np.eye(len(SAMPLES))))
     assert notes["effective_parameters"] == pytest.approx([freedom] * 3, rel=1e-8)
 
 
 @pytest.mark.parametrize("penalty", [1e-5, 1e-3, 1e-1])
-@pytest.mark.parametrize(("degree", "slope", "constant"), [(1, 1.0, 1.0), (2, 1.0, 1.0), (3, 0.5, 2.0), (2, 0.3, 0.0)])
-def test_polynomials_equal_scikit_learn(degree: int, slope: float, constant: float, penalty: float) -> None:
+@pytest.mark.parametrize(
+    ("degree", "slope", "constant"), [(1, 1.0, 1.0), (2, 1.0, 1.0), (3, 0.5, 2.0), (2, 0.3, 0.0)]
+)
+def test_polynomials_equal_scikit_learn(
+    degree: int, slope: float, constant: float, penalty: float
+) -> None:
     head, _ = fitted(Polynomial(degree=degree, slope=slope, constant=constant), (penalty,))
-    truth = KernelRidge(kernel="poly", degree=degree, gamma=slope, coef0=constant, alpha=penalty * len(SAMPLES))
+    truth = KernelRidge(
+        kernel="poly", degree=degree, gamma=slope, coef0=constant, alpha=penalty * len(SAMPLES)
+    )
     truth.fit(standardised(SAMPLES.z), SAMPLES.target.numpy())
-    np.testing.assert_allclose(answer(head, SAMPLES.z), truth.predict(standardised(SAMPLES.z)), atol=1e-10)
+    np.testing.assert_allclose(
+        answer(head, SAMPLES.z), truth.predict(standardised(SAMPLES.z)), atol=1e-10
+    )
     np.testing.assert_allclose(answer(head, NEW), truth.predict(standardised(NEW)), atol=1e-10)
 
 
 def test_the_linear_kernel_is_ridge_regression() -> None:
-    """Document 001 section 4: p = 1 is standard ridge regression, here with a constant that is penalised too."""
+    """Document 001 section 4: p = 1 is standard ridge regression, here with a constant that is
+    penalised too.
+    """
     head, _ = fitted(Polynomial(degree=1), (1e-2,))
     joined = np.concatenate((np.ones((len(SAMPLES), 1)), standardised(SAMPLES.z)), axis=1)
-    truth = Ridge(alpha=1e-2 * len(SAMPLES), fit_intercept=False, solver="cholesky").fit(joined, SAMPLES.target.numpy())
+    truth = Ridge(alpha=1e-2 * len(SAMPLES), fit_intercept=False, solver="cholesky").fit(
+        joined, SAMPLES.target.numpy()
+    )
     np.testing.assert_allclose(answer(head, SAMPLES.z), truth.predict(joined), atol=1e-10)
 
 
-@pytest.mark.parametrize("kernel", [Rbf(sigma=(3.0, 30.0)), Rbf(sigma=(3.0, 30.0), exact=100, landmarks=80), Polynomial(degree=2)])
+@pytest.mark.parametrize(
+    "kernel",
+    [Rbf(sigma=(3.0, 30.0)), Rbf(sigma=(3.0, 30.0), exact=100, landmarks=80), Polynomial(degree=2)],
+)
 def test_cross_validation_equals_explicit_refits(kernel: Rbf | Polynomial) -> None:
     penalties = (1e-6, 1e-3, 0.3)
     head, notes = fitted(kernel, penalties, folds=4)
@@ -81,12 +108,22 @@ def test_cross_validation_equals_explicit_refits(kernel: Rbf | Polynomial) -> No
         error = np.zeros((3, 3))
         for f in range(4):
             for j, penalty in enumerate(penalties):
-                predicted = whole(head, kernel, i, x[fold != f], y[fold != f], x[fold == f], penalty * len(x))
+                predicted = whole(
+                    head, kernel, i, x[fold != f], y[fold != f], x[fold == f], penalty * len(x)
+                )
                 error[j] += ((predicted - y[fold == f]) ** 2).sum(0)
         np.testing.assert_allclose(found, error / len(x), rtol=1e-7)
 
 
-def refitted_rbf(head: KernelHead, kernel: Any, setting: int, x: np.ndarray, y: np.ndarray, new: np.ndarray, alpha: float) -> np.ndarray:
+def refitted_rbf(
+    head: KernelHead,
+    kernel: Any,
+    setting: int,
+    x: np.ndarray,
+    y: np.ndarray,
+    new: np.ndarray,
+    alpha: float,
+) -> np.ndarray:
     gamma = 1 / (2 * kernel.sigma[setting])
     if len(SAMPLES) <= kernel.exact:
         return KernelRidge(kernel="rbf", gamma=gamma, alpha=alpha).fit(x, y).predict(new)  # type: ignore[no-any-return]
@@ -95,11 +132,21 @@ def refitted_rbf(head: KernelHead, kernel: Any, setting: int, x: np.ndarray, y: 
     # min |y - wide c|^2 + alpha c' own c, stacked: the normal equations would lose half the digits
     values, vectors = np.linalg.eigh(own)
     root = np.sqrt(alpha * values.clip(0))[:, None] * vectors.T
-    coefficients = np.linalg.lstsq(np.concatenate((wide, root)), np.concatenate((y, np.zeros((len(points), 3)))), rcond=None)[0]
+    coefficients = np.linalg.lstsq(
+        np.concatenate((wide, root)), np.concatenate((y, np.zeros((len(points), 3)))), rcond=None
+    )[0]
     return rbf_kernel(new, points, gamma) @ coefficients  # type: ignore[no-any-return]
 
 
-def refitted_polynomial(head: KernelHead, kernel: Any, setting: int, x: np.ndarray, y: np.ndarray, new: np.ndarray, alpha: float) -> np.ndarray:
+def refitted_polynomial(
+    head: KernelHead,
+    kernel: Any,
+    setting: int,
+    x: np.ndarray,
+    y: np.ndarray,
+    new: np.ndarray,
+    alpha: float,
+) -> np.ndarray:
     truth = KernelRidge(kernel="poly", degree=kernel.degree, gamma=1.0, coef0=1.0, alpha=alpha)
     return truth.fit(x, y).predict(new)  # type: ignore[no-any-return]
 
@@ -125,15 +172,22 @@ def test_landmarks_lie_apart_and_are_repeatable() -> None:
 
 def test_each_axis_takes_its_own_setting_by_one_step_errors() -> None:
     target = SAMPLES.target.clone()
-    target[:, 1] = torch.randn(len(SAMPLES), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    head = KernelConfig(kernel=Rbf(sigma=(0.3, 30.0)), penalties=(1e-6, 10.0), choose="one_step").build(NAMES)
+    target[:, 1] = torch.randn(
+        len(SAMPLES), generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
+    head = KernelConfig(
+        kernel=Rbf(sigma=(0.3, 30.0)), penalties=(1e-6, 10.0), choose="one_step"
+    ).build(NAMES)
     head.calibrate(SAMPLES)
     (only,) = head.solutions(SAMPLES.with_target(target))
     assert [only.choice["penalty"][0], only.choice["penalty"][1]] == [1e-6, 10.0]
     assert only.choice["sigma"][0] == 30.0
     error = torch.tensor(only.notes["cross_validated_error"])
     for axis in range(3):
-        i, j = [0.3, 30.0].index(only.choice["sigma"][axis]), [1e-6, 10.0].index(only.choice["penalty"][axis])
+        i, j = (
+            [0.3, 30.0].index(only.choice["sigma"][axis]),
+            [1e-6, 10.0].index(only.choice["penalty"][axis]),
+        )
         assert error[i, j, axis] == error[..., axis].min()
 
 
@@ -142,7 +196,9 @@ def test_free_runs_are_offered_joint_settings_then_single_steps_around_the_best(
     head.calibrate(SAMPLES)
     found = head.solutions(SAMPLES)
     joint = [(s, p) for s in (3.0, 30.0) for p in (1e-6, 1e-4, 1e-2)]
-    assert [(s.choice["sigma"], s.choice["penalty"]) for s in found[1:-1]] == [([s] * 3, [p] * 3) for s, p in joint]
+    assert [(s.choice["sigma"], s.choice["penalty"]) for s in found[1:-1]] == [
+        ([s] * 3, [p] * 3) for s, p in joint
+    ]
     head.load_state_dict(found[-1].state, strict=False)
     assert found[-1].choice == {"penalty": []}
     assert np.abs(answer(head, NEW)).max() == 0.0
@@ -164,7 +220,9 @@ def test_free_runs_are_offered_joint_settings_then_single_steps_around_the_best(
 def test_terms_are_features_too() -> None:
     first, second = NAMES[0], NAMES[1]
     terms = (f"{first}|{first}|", f"{first} {second}")
-    head = KernelConfig(kernel=Polynomial(), penalties=(1e-3,), choose="one_step", terms=terms, margin=1.0).build(NAMES)
+    head = KernelConfig(
+        kernel=Polynomial(), penalties=(1e-3,), choose="one_step", terms=terms, margin=1.0
+    ).build(NAMES)
     head.calibrate(SAMPLES)
     head.solve(SAMPLES)
     low, high = SAMPLES.z.numpy().min(0), SAMPLES.z.numpy().max(0)
@@ -176,7 +234,9 @@ def test_terms_are_features_too() -> None:
     own = columns(SAMPLES.z)
     truth = KernelRidge(kernel="poly", degree=2, gamma=1.0, coef0=1.0, alpha=1e-3 * len(SAMPLES))
     truth.fit((own - own.mean(0)) / own.std(0), SAMPLES.target.numpy())
-    np.testing.assert_allclose(answer(head, NEW), truth.predict((columns(NEW) - own.mean(0)) / own.std(0)), atol=1e-10)
+    np.testing.assert_allclose(
+        answer(head, NEW), truth.predict((columns(NEW) - own.mean(0)) / own.std(0)), atol=1e-10
+    )
     scripted = torch.jit.script(head)
     np.testing.assert_array_equal(scripted(NEW, NEW[:, :0])[0], answer(head, NEW))
 
@@ -195,19 +255,38 @@ def test_recursion_is_a_free_run_of_one_velocity() -> None:
     z, rates = np.zeros((60, 4)), np.zeros((60, 3))
     z[:, 3] = random.normal(size=60)
     for k in range(59):
-        rates[k] = [-0.3 * z[k, 0] + z[k, 3], -0.5 * z[k, 1] + 0.2 * z[k, 0], -z[k, 2] + 0.4 * z[k, 1]] + 0.05 * random.normal(size=3)
+        rates[k] = [
+            -0.3 * z[k, 0] + z[k, 3],
+            -0.5 * z[k, 1] + 0.2 * z[k, 0],
+            -z[k, 2] + 0.4 * z[k, 1],
+        ] + 0.05 * random.normal(size=3)
         z[k + 1, :3] = z[k, :3] + step * rates[k]
     group = np.repeat([0, 1], 30)
     t = step * np.concatenate((np.arange(30), np.arange(30)))
-    made_here = Samples(torch.from_numpy(z), torch.from_numpy(rates), torch.from_numpy(group), torch.from_numpy(t), ("a", "b"), names)
+    made_here = Samples(
+        torch.from_numpy(z),
+        torch.from_numpy(rates),
+        torch.from_numpy(group),
+        torch.from_numpy(t),
+        ("a", "b"),
+        names,
+    )
     penalties = (1e-3, 1.0)
-    head = KernelConfig(kernel=Rbf(sigma=(2.0, 20.0)), penalties=penalties, choose="recursion", folds=2, margin=100.0).build(names)
+    head = KernelConfig(
+        kernel=Rbf(sigma=(2.0, 20.0)),
+        penalties=penalties,
+        choose="recursion",
+        folds=2,
+        margin=100.0,
+    ).build(names)
     head.calibrate(made_here)
     notes = head.solve(made_here)
     mean, std = z.mean(0), z.std(0)
     for i, sigma in enumerate((2.0, 20.0)):
         for j, penalty in enumerate(penalties):
-            model = KernelRidge(kernel="rbf", gamma=1 / (2 * sigma), alpha=penalty * 60).fit((z - mean) / std, rates)
+            model = KernelRidge(kernel="rbf", gamma=1 / (2 * sigma), alpha=penalty * 60).fit(
+                (z - mean) / std, rates
+            )
             for axis in range(3):
                 errors = []
                 for start in (0, 30):
@@ -217,6 +296,8 @@ def test_recursion_is_a_free_run_of_one_velocity() -> None:
                         own[axis] = x
                         x = x + step * model.predict(((own - mean) / std)[None])[0, axis]
                         errors.append((x - z[k + 1, axis]) ** 2)
-                assert notes["recursion_error"][i][j][axis] == pytest.approx(np.mean(errors), rel=1e-6)
+                assert notes["recursion_error"][i][j][axis] == pytest.approx(
+                    np.mean(errors), rel=1e-6
+                )
     flat = np.array(notes["recursion_error"]).reshape(4, 3).argmin(0)
     assert notes["penalty"] == [penalties[k % 2] for k in flat]

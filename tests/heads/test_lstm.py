@@ -1,4 +1,6 @@
-"""The LSTM head: one set of weights, stepped and over sequences, against torch.nn.LSTM and a NumPy cell."""
+"""The LSTM head: one set of weights, stepped and over sequences, against torch.nn.LSTM and a NumPy
+cell.
+"""
 
 from __future__ import annotations
 
@@ -34,12 +36,20 @@ def stepped(head: LstmHead, z: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor
     return torch.stack(out, dim=1), s
 
 
-VARIANTS = [{}, {"activation": "softsign"}, {"per_axis": True}, {"readout": 7}, {"per_axis": True, "readout": 5, "activation": "softsign"}]
+VARIANTS = [
+    {},
+    {"activation": "softsign"},
+    {"per_axis": True},
+    {"readout": 7},
+    {"per_axis": True, "readout": 5, "activation": "softsign"},
+]
 
 
 @pytest.mark.parametrize("config", VARIANTS, ids=str)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_stepping_equals_the_sequence_and_the_warm_up(config: dict[str, object], dtype: torch.dtype) -> None:
+def test_stepping_equals_the_sequence_and_the_warm_up(
+    config: dict[str, object], dtype: torch.dtype
+) -> None:
     head, z = built(**config).to(dtype), windows().to(dtype)
     with torch.no_grad():
         out, s = stepped(head, z)
@@ -53,7 +63,9 @@ def test_stepping_equals_the_sequence_and_the_warm_up(config: dict[str, object],
 @pytest.mark.parametrize("config", VARIANTS, ids=str)
 def test_an_empty_past_leaves_no_memory(config: dict[str, object]) -> None:
     head = built(**config)
-    assert torch.equal(head.warmup(windows()[:, :0]), torch.zeros(3, head.n_state, dtype=torch.float64))
+    assert torch.equal(
+        head.warmup(windows()[:, :0]), torch.zeros(3, head.n_state, dtype=torch.float64)
+    )
 
 
 def test_core_equals_torch_lstm() -> None:
@@ -74,7 +86,11 @@ def test_core_equals_torch_lstm() -> None:
 def test_softsign_cell_equals_numpy() -> None:
     """Document 003 eq. (17): softsign in place of tanh, the gates stay logistic."""
     core, z = LstmCore(3, 6, softsign=True).double(), torch.randn(2, 8, 3, dtype=torch.float64)
-    wi, wh, b = core.w_input.detach().numpy(), core.w_hidden.detach().numpy(), core.bias.detach().numpy()
+    wi, wh, b = (
+        core.w_input.detach().numpy(),
+        core.w_hidden.detach().numpy(),
+        core.bias.detach().numpy(),
+    )
     h, c = np.zeros((2, 6)), np.zeros((2, 6))
 
     def softsign(x: np.ndarray) -> np.ndarray:
@@ -97,14 +113,19 @@ def test_softsign_cell_equals_numpy() -> None:
 
 def test_parameters_of_the_document_s_network() -> None:
     """4 * 100 * (4 + 100 + 1) + 101 = 42,101 for each of surge, sway, yaw (ERRATA W4)."""
-    head = LstmConfig(hidden_size=100, per_axis=True, features=("u", "v", "r", "tau_n")).build(NAMES)
+    head = LstmConfig(hidden_size=100, per_axis=True, features=("u", "v", "r", "tau_n")).build(
+        NAMES
+    )
     counts = [sum(p.numel() for p in network.parameters()) for network in head.networks]
     assert counts == [42_101] * 3
     assert head.n_state == 600
 
 
 def test_axes_of_their_own_are_independent() -> None:
-    config = {"per_axis": True, "axis_features": {"u": ("u", "tau_x"), "v": ("v", "r"), "r": ("r", "tau_n", "v")}}
+    config = {
+        "per_axis": True,
+        "axis_features": {"u": ("u", "tau_x"), "v": ("v", "r"), "r": ("r", "tau_n", "v")},
+    }
     head, z = built(**config), windows()
     with torch.no_grad():
         before = head.sequence(z)

@@ -15,8 +15,16 @@ from residnet.heads import LstmConfig, MlpConfig, ResidualHead
 
 CHANNELS = {
     "rudder": (("u", "v", "r", "n", "delta"), [0, 1, 2, 3, 4], [1, -1, -1, 1, -1]),
-    "wind": (("u", "v", "r", "n", "delta", "wind_u", "wind_v", "wind_mag"), [0, 1, 2, 3, 4, 5, 6, 7], [1, -1, -1, 1, -1, 1, -1, 1]),
-    "thrusters": (("u", "v", "r", "n_port", "n_stbd", "tau_x", "tau_y", "tau_n"), [0, 1, 2, 4, 3, 5, 6, 7], [1, -1, -1, 1, 1, 1, -1, -1]),
+    "wind": (
+        ("u", "v", "r", "n", "delta", "wind_u", "wind_v", "wind_mag"),
+        [0, 1, 2, 3, 4, 5, 6, 7],
+        [1, -1, -1, 1, -1, 1, -1, 1],
+    ),
+    "thrusters": (
+        ("u", "v", "r", "n_port", "n_stbd", "tau_x", "tau_y", "tau_n"),
+        [0, 1, 2, 4, 3, 5, 6, 7],
+        [1, -1, -1, 1, 1, 1, -1, -1],
+    ),
 }
 TURNED = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
 KINDS: dict[str, tuple[Any, dict[str, Any]]] = {
@@ -42,7 +50,14 @@ def samples(names: tuple[str, ...], count: int = 300) -> Samples:
     random = np.random.default_rng(2)
     z = torch.from_numpy(random.normal(size=(count, len(names))) + 0.7)
     target = torch.from_numpy(random.normal(size=(count, 3)) * [0.1, 0.05, 0.2])
-    return Samples(z, target, torch.zeros(count, dtype=torch.long), torch.arange(count) * 0.1, ("turning",), names)
+    return Samples(
+        z,
+        target,
+        torch.zeros(count, dtype=torch.long),
+        torch.arange(count) * 0.1,
+        ("turning",),
+        names,
+    )
 
 
 def built(kind: str, names: tuple[str, ...], **change: Any) -> ResidualHead:
@@ -73,7 +88,9 @@ def stepped(head: Any, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
     return torch.stack(out, dim=1), s
 
 
-def test_the_residual_in_the_mirror_is_the_mirror_of_the_residual(kind: str, scene: tuple[tuple[str, ...], list[int], list[int]]) -> None:
+def test_the_residual_in_the_mirror_is_the_mirror_of_the_residual(
+    kind: str, scene: tuple[tuple[str, ...], list[int], list[int]]
+) -> None:
     names, index, sign = scene
     head, z = built(kind, names), windows(names)
     empty = torch.zeros(len(z), head.n_state, dtype=z.dtype)
@@ -84,14 +101,21 @@ def test_the_residual_in_the_mirror_is_the_mirror_of_the_residual(kind: str, sce
         step_there, _ = stepped(head, mirror(z, index, sign), empty)
         torch.testing.assert_close(step_there, step_here * TURNED, rtol=0, atol=1e-15)
         torch.testing.assert_close(step_here, here, rtol=0, atol=1e-12)
-    assert float(here.abs().amax((0, 1)).min()) > 1e-3, "a head that answers zero is symmetric by nature"
+    assert float(here.abs().amax((0, 1)).min()) > 1e-3, (
+        "a head that answers zero is symmetric by nature"
+    )
 
 
-def test_a_head_without_the_mirror_is_not_symmetric(kind: str, scene: tuple[tuple[str, ...], list[int], list[int]]) -> None:
+def test_a_head_without_the_mirror_is_not_symmetric(
+    kind: str, scene: tuple[tuple[str, ...], list[int], list[int]]
+) -> None:
     names, index, sign = scene
     head, z = built(kind, names, mirror=False), windows(names)
     with torch.no_grad():
-        assert float((head.sequence(mirror(z, index, sign)) - head.sequence(z) * TURNED).abs().max()) > 1e-3
+        assert (
+            float((head.sequence(mirror(z, index, sign)) - head.sequence(z) * TURNED).abs().max())
+            > 1e-3
+        )
 
 
 def test_warm_up_leaves_what_stepping_leaves(kind: str) -> None:
@@ -102,8 +126,12 @@ def test_warm_up_leaves_what_stepping_leaves(kind: str) -> None:
         torch.testing.assert_close(head.warmup(z[:, :12]), s, rtol=0, atol=1e-12)
         assert head.warmup(z[:, :0]).shape == (len(z), head.n_state)
         # and from a mirrored past the mirrored future follows
-        there = stepped(head, mirror(z[:, 12:], index, sign), head.warmup(mirror(z[:, :12], index, sign)))[0]
-        torch.testing.assert_close(there, stepped(head, z[:, 12:], s)[0] * TURNED, rtol=0, atol=1e-14)
+        there = stepped(
+            head, mirror(z[:, 12:], index, sign), head.warmup(mirror(z[:, :12], index, sign))
+        )[0]
+        torch.testing.assert_close(
+            there, stepped(head, z[:, 12:], s)[0] * TURNED, rtol=0, atol=1e-14
+        )
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -1,4 +1,5 @@
-"""PLSR from moments against scikit-learn's NIPALS run to convergence, and against explicit refits."""
+"""PLSR from moments against scikit-learn's NIPALS run to convergence, and against explicit refits.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +40,9 @@ def test_equals_scikit_learn(order: int) -> None:
     scale = x.std(0, ddof=1)
     truth = sklearn_fit(x / scale, y, order)
     coefficients = truth.coef_.T / scale[:, None]
-    np.testing.assert_allclose(head.coefficients, coefficients, atol=1e-8 * np.abs(coefficients).max())
+    np.testing.assert_allclose(
+        head.coefficients, coefficients, atol=1e-8 * np.abs(coefficients).max()
+    )
     predicted = head(samples.z, samples.z[:, :0])[0].numpy()
     np.testing.assert_allclose(predicted, truth.predict(x / scale), atol=1e-8 * y.std())
 
@@ -63,7 +66,9 @@ def test_a_rank_deficient_basis_ends_the_path_early() -> None:
     x, y = x - x.mean(0), y - y.mean(0)
     path = pls_path(torch.from_numpy(x.T @ x), torch.from_numpy(x.T @ y), 6)
     assert 3 <= len(path) <= 6
-    np.testing.assert_allclose(x @ path[2].numpy(), x @ np.linalg.lstsq(x, y, rcond=None)[0], atol=1e-9)
+    np.testing.assert_allclose(
+        x @ path[2].numpy(), x @ np.linalg.lstsq(x, y, rcond=None)[0], atol=1e-9
+    )
     assert bool(torch.isfinite(path).all())
     np.testing.assert_allclose(x @ path[-1].numpy(), x @ path[2].numpy(), atol=1e-6)
 
@@ -110,13 +115,20 @@ def test_named_terms_and_features() -> None:
     samples = made()
     head.calibrate(samples)
     head.solve(samples)
-    u, r = samples.z[:, 0] / samples.z[:, 0].std(correction=0), samples.z[:, 2] / samples.z[:, 2].std(correction=0)
-    np.testing.assert_allclose(head.basis(samples.z), torch.stack((u * u.abs(), u * r, r * r.abs()), dim=1), rtol=1e-12)
+    u, r = (
+        samples.z[:, 0] / samples.z[:, 0].std(correction=0),
+        samples.z[:, 2] / samples.z[:, 2].std(correction=0),
+    )
+    np.testing.assert_allclose(
+        head.basis(samples.z), torch.stack((u * u.abs(), u * r, r * r.abs()), dim=1), rtol=1e-12
+    )
     assert list(head.coefficient_table()) == ["u|u|", "u r", "r|r|"]
 
 
 def test_free_runs_are_offered_every_order_and_none() -> None:
-    """First the cross-validated order, then orders from one to the highest, each scikit-learn's, and a residual of zero."""
+    """First the cross-validated order, then orders from one to the highest, each scikit-learn's,
+    and a residual of zero.
+    """
     samples = made()
     head = PlsrConfig().build(NAMES)
     head.calibrate(samples)
@@ -130,7 +142,9 @@ def test_free_runs_are_offered_every_order_and_none() -> None:
     for solution, order in list(zip(found, orders, strict=True))[:9]:
         head.load_state_dict(solution.state, strict=False)
         predicted = head(samples.z, samples.z[:, :0])[0].numpy()
-        np.testing.assert_allclose(predicted, sklearn_fit(x / scale, y, order).predict(x / scale), atol=1e-8 * y.std())
+        np.testing.assert_allclose(
+            predicted, sklearn_fit(x / scale, y, order).predict(x / scale), atol=1e-8 * y.std()
+        )
     head.load_state_dict(found[-1].state, strict=False)
     assert float(head(samples.z, samples.z[:, :0])[0].abs().max()) == 0.0
 

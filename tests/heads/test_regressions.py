@@ -1,4 +1,6 @@
-"""Regressions of forces: NIPALS against the kernel algorithm and scikit-learn, the others against scikit-learn, and what they refuse."""
+"""Regressions of forces: NIPALS against the kernel algorithm and scikit-learn, the others against
+scikit-learn, and what they refuse.
+"""
 
 from __future__ import annotations
 
@@ -23,8 +25,19 @@ def made(n: int = 240, noise: float = 0.1, seed: int = 0) -> Regression:
     """Correlated columns of unlike scales, six folds; the outputs depend on four of the six."""
     random = np.random.default_rng(seed)
     latent = random.normal(size=(n, 4))
-    x = (latent @ random.normal(size=(4, 6)) + 0.3 * random.normal(size=(n, 6))) * [1, 10, 0.1, 1, 5, 0.5] + [0, 3, 1, 0, -2, 0]
-    y = x[:, :4] @ (random.normal(size=(4, 3)) / np.array([1, 10, 0.1, 1])[:, None]) + noise * random.normal(size=(n, 3)) + [1, 2, 3]
+    x = (latent @ random.normal(size=(4, 6)) + 0.3 * random.normal(size=(n, 6))) * [
+        1,
+        10,
+        0.1,
+        1,
+        5,
+        0.5,
+    ] + [0, 3, 1, 0, -2, 0]
+    y = (
+        x[:, :4] @ (random.normal(size=(4, 3)) / np.array([1, 10, 0.1, 1])[:, None])
+        + noise * random.normal(size=(n, 3))
+        + [1, 2, 3]
+    )
     fold = torch.arange(n) * 6 // n
     test = tuple(torch.from_numpy(part[:60]) for part in (x, y))
     x_t = torch.from_numpy(x)
@@ -43,22 +56,30 @@ def test_nipals_kernel_algorithm_and_scikit_learn_are_one() -> None:
     for order in (1, 3, 6):
         other = PLSRegression(order, tol=1e-24, max_iter=20_000).fit(data.x.numpy(), data.y.numpy())
         mine = fitted(data, kind="plsr", order=order, algorithm="nipals")
-        np.testing.assert_allclose(mine.predict(data.x).numpy(), other.predict(data.x.numpy()), rtol=1e-6, atol=1e-7)
+        np.testing.assert_allclose(
+            mine.predict(data.x).numpy(), other.predict(data.x.numpy()), rtol=1e-6, atol=1e-7
+        )
 
 
 def test_full_order_is_least_squares() -> None:
     data = made()
     reference = LinearRegression().fit(data.x.numpy(), data.y.numpy())
     for config in ({"kind": "plsr", "order": 6}, {"kind": "ols"}):
-        np.testing.assert_allclose(fitted(data, **config).coefficients.numpy(), reference.coef_.T, rtol=1e-7, atol=1e-9)
-        np.testing.assert_allclose(fitted(data, **config).intercept.numpy(), reference.intercept_, rtol=1e-7)
+        np.testing.assert_allclose(
+            fitted(data, **config).coefficients.numpy(), reference.coef_.T, rtol=1e-7, atol=1e-9
+        )
+        np.testing.assert_allclose(
+            fitted(data, **config).intercept.numpy(), reference.intercept_, rtol=1e-7
+        )
 
 
 def test_ridge_is_scikit_learns() -> None:
     data = made()
     e, f, *_ = data.standardised
     reference = Ridge(alpha=0.01 * len(e), fit_intercept=False).fit(e.numpy(), f.numpy())
-    np.testing.assert_allclose(fitted(data, kind="ridge", penalty=0.01).pre.numpy(), reference.coef_.T, rtol=1e-8)
+    np.testing.assert_allclose(
+        fitted(data, kind="ridge", penalty=0.01).pre.numpy(), reference.coef_.T, rtol=1e-8
+    )
 
 
 @pytest.mark.parametrize("kind", ["plsr", "surface", "ridge", "lasso", "elastic_net"])
@@ -74,7 +95,11 @@ def test_the_documents_own_choice_is_at_least_as_good_on_the_half_that_it_saw() 
 
     def error(choose: str) -> torch.Tensor:
         assert data.test is not None
-        return (data.test[1] - fitted(data, kind="surface", choose=choose).predict(data.test[0])).square().mean(0)
+        return (
+            (data.test[1] - fitted(data, kind="surface", choose=choose).predict(data.test[0]))
+            .square()
+            .mean(0)
+        )
 
     assert bool((error("test") <= error("least") + 1e-9).all())
 
@@ -101,13 +126,18 @@ def test_collinear_columns_are_named() -> None:
     ids=lambda config: "_".join(map(str, config.values())),
 )
 def test_collinear_columns_make_no_garbage(config: dict[str, Any], apart: float) -> None:
-    """Two columns that are others, or all but: coefficients stay of the size that they have without them, and so do the predictions."""
+    """Two columns that are others, or all but: coefficients stay of the size that they have without
+    them, and so do the predictions.
+    """
     data = made()
     noise = apart * torch.from_numpy(np.random.default_rng(1).normal(size=(len(data.x), 2)))
     more = torch.stack((data.x[:, 0], data.x[:, 1] / 10 - data.x[:, 2]), dim=1) + noise
     x = torch.cat((data.x, more), dim=1)
     both = Regression((*TERMS, "a_again", "of_b_and_c"), x, data.y, x.std(0), data.fold)
-    plain, found = fitted(Regression(TERMS, data.x, data.y, data.scale, data.fold), kind="ols"), fitted(both, **config)
+    plain, found = (
+        fitted(Regression(TERMS, data.x, data.y, data.scale, data.fold), kind="ols"),
+        fitted(both, **config),
+    )
     assert float(found.coefficients.abs().max()) < 5 * float(plain.coefficients.abs().max())
     left = (plain.predict(data.x) - data.y).std(0)
     assert bool(((found.predict(x) - data.y).std(0) < 1.5 * left).all())

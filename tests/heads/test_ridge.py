@@ -31,8 +31,12 @@ def test_equals_scikit_learn(penalty: float) -> None:
     scaled, scale = standardised(x)
     truth = Ridge(alpha=penalty * len(x), solver="svd").fit(scaled, y)
     coefficients = truth.coef_.T / scale[:, None]
-    np.testing.assert_allclose(head.coefficients, coefficients, atol=1e-10 * np.abs(coefficients).max())
-    np.testing.assert_allclose(head(samples.z, samples.z[:, :0])[0], truth.predict(scaled), atol=1e-10)
+    np.testing.assert_allclose(
+        head.coefficients, coefficients, atol=1e-10 * np.abs(coefficients).max()
+    )
+    np.testing.assert_allclose(
+        head(samples.z, samples.z[:, :0])[0], truth.predict(scaled), atol=1e-10
+    )
 
 
 def test_cross_validation_equals_explicit_refits() -> None:
@@ -46,7 +50,11 @@ def test_cross_validation_equals_explicit_refits() -> None:
         own, rest = fold == f, fold != f
         scaled, scale = standardised(x[rest])
         for i, penalty in enumerate(penalties):
-            predicted = Ridge(alpha=penalty * rest.sum(), solver="svd").fit(scaled, y[rest]).predict(x[own] / scale)
+            predicted = (
+                Ridge(alpha=penalty * rest.sum(), solver="svd")
+                .fit(scaled, y[rest])
+                .predict(x[own] / scale)
+            )
             error[i] += ((predicted - y[own]) ** 2).sum(0)
     np.testing.assert_allclose(notes["cross_validated_error"], error / len(x), rtol=1e-9)  # type: ignore[arg-type]
     assert notes["penalty"] == [penalties[i] for i in error.argmin(0)]
@@ -55,7 +63,9 @@ def test_cross_validation_equals_explicit_refits() -> None:
 def test_each_axis_takes_its_own_penalty() -> None:
     samples = made()
     target = samples.target.clone()
-    target[:, 1] = torch.randn(len(samples), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    target[:, 1] = torch.randn(
+        len(samples), generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
     head = RidgeConfig(penalties=(1e-6, 100.0)).build(NAMES)
     head.calibrate(samples)
     assert head.solve(samples.with_target(target))["penalty"] == [1e-6, 100.0, 1e-6]
@@ -78,7 +88,9 @@ def test_free_runs_are_offered_one_penalty_for_all_axes_and_none() -> None:
     head = RidgeConfig(penalties=penalties).build(NAMES)
     head.calibrate(samples)
     found = head.solutions(samples)
-    assert [solution.choice["penalty"] for solution in found[1:]] == [[penalty] * 3 for penalty in penalties] + [[]]
+    assert [solution.choice["penalty"] for solution in found[1:]] == [
+        [penalty] * 3 for penalty in penalties
+    ] + [[]]
     for solution, penalty in zip(found[1:], penalties, strict=False):
         alone, _ = fitted((penalty,))
         torch.testing.assert_close(solution.state["coefficients"], alone.coefficients)

@@ -24,7 +24,13 @@ from residnet.physics.symmetry import term_parity
 FORCES, JETS = ("u", "v", "r", "tau_x", "tau_y", "tau_n"), ("u", "v", "r", "rpm", "nozzle")
 FORCE: dict[str, Any] = {"candidates": {"input_degree": 2, "coupling": ["u", "v", "r"]}}
 JET: dict[str, Any] = {
-    "candidates": {"inputs": ["rpm"], "input_degree": 2, "coupling": ["u"], "coupling_degree": 2, "angles": ["nozzle"]},
+    "candidates": {
+        "inputs": ["rpm"],
+        "input_degree": 2,
+        "coupling": ["u"],
+        "coupling_degree": 2,
+        "angles": ["nozzle"],
+    },
 }
 GOLDEN = Path(os.environ.get("RESIDNET_GOLDEN", "/nowhere"), "g2_odin")
 Log = dict[str, np.ndarray]
@@ -33,8 +39,12 @@ Log = dict[str, np.ndarray]
 def samples(log: Log, names: tuple[str, ...], target: np.ndarray | None = None) -> Samples:
     """Samples of one log, with its exact accelerations unless others are given."""
     z = torch.from_numpy(np.stack([log[name] for name in names], axis=1))
-    y = torch.from_numpy(np.stack([log[name] for name in ACCELERATION], axis=1) if target is None else target)
-    return Samples(z, y, torch.zeros(len(z), dtype=torch.long), torch.from_numpy(log["t"]), ("made",), names)
+    y = torch.from_numpy(
+        np.stack([log[name] for name in ACCELERATION], axis=1) if target is None else target
+    )
+    return Samples(
+        z, y, torch.zeros(len(z), dtype=torch.long), torch.from_numpy(log["t"]), ("made",), names
+    )
 
 
 def fitted(config: dict[str, Any], data: Samples) -> tuple[SymbolicHead, dict[str, Any]]:
@@ -44,12 +54,17 @@ def fitted(config: dict[str, Any], data: Samples) -> tuple[SymbolicHead, dict[st
 
 
 def found(notes: dict[str, Any], axis: str) -> dict[str, float]:
-    return {entry["term"]: entry["value"] for entry in notes["coefficients"] if entry["axis"] == axis}
+    return {
+        entry["term"]: entry["value"] for entry in notes["coefficients"] if entry["axis"] == axis
+    }
 
 
 @pytest.mark.parametrize("number", range(3))
 def test_all_six_equations_of_random_multisines(number: int) -> None:
-    for logs, names, config, truth in ((force_logs, FORCES, FORCE, FORCE_TRUTH), (jet_logs, JETS, JET, JET_TRUTH)):
+    for logs, names, config, truth in (
+        (force_logs, FORCES, FORCE, FORCE_TRUTH),
+        (jet_logs, JETS, JET, JET_TRUTH),
+    ):
         head, notes = fitted(config, samples(logs(number + 1)[number], names))
         for axis, terms in truth.items():
             assert found(notes, axis) == pytest.approx(terms, rel=1e-6)
@@ -57,7 +72,9 @@ def test_all_six_equations_of_random_multisines(number: int) -> None:
             assert not notes["equations"][axis]["cannot_tell_apart"]
         assert notes["kept"] == [len(terms) for terms in truth.values()]
         data = samples(logs(1)[0], names)
-        torch.testing.assert_close(head.library(data.z) @ head.coefficients, data.target, rtol=0, atol=1e-9)
+        torch.testing.assert_close(
+            head.library(data.z) @ head.coefficients, data.target, rtol=0, atol=1e-9
+        )
 
 
 @pytest.mark.skipif(not GOLDEN.is_dir(), reason="needs RESIDNET_GOLDEN")
@@ -65,7 +82,9 @@ def test_all_six_equations_of_random_multisines(number: int) -> None:
 def test_the_jets_equations_from_steps(file: Path) -> None:
     """Document 000 section 6.4: genetic programming did not find these from such inputs."""
     frame = pd.read_csv(file)
-    log = {name: np.array(frame[name]) for name in frame} | {f"{name}_dot": np.array(frame[f"d{name}"]) for name in "uvr"}
+    log = {name: np.array(frame[name]) for name in frame} | {
+        f"{name}_dot": np.array(frame[f"d{name}"]) for name in "uvr"
+    }
     _, notes = fitted(JET, samples(log, JETS))
     for axis, terms in JET_TRUTH.items():
         assert notes["equations"][axis]["exact"]
@@ -74,22 +93,38 @@ def test_the_jets_equations_from_steps(file: Path) -> None:
 
 
 def test_two_levels_of_an_input_do_not_tell_its_square() -> None:
-    """What the data cannot identify is said: with two motor speeds, rpm^2 is a line through both."""
+    """What the data cannot identify is said: with two motor speeds, rpm^2 is a line through both.
+    """
     log = jet_logs(1)[0]
     log["rpm"] = np.where(log["t"] % 20 < 10, 600.0, 1400.0)
     _, notes = fitted(JET, samples(log, JETS))
     for equation in notes["equations"].values():
-        assert equation["same_as_simpler"]["rpm^2"] == pytest.approx({"1": -840000.0, "rpm": 2000.0})
+        assert equation["same_as_simpler"]["rpm^2"] == pytest.approx(
+            {"1": -840000.0, "rpm": 2000.0}
+        )
         assert "rpm^2" not in equation["text"]
 
 
 def test_a_channel_that_never_moves_is_said_to_be_unknown() -> None:
     log = force_logs(1)[0]
-    log = {name: np.zeros_like(value) if name in ("v", "r", "tau_y", "tau_n", "v_dot", "r_dot") else value for name, value in log.items()}
-    log["u_dot"] = FORCE_TRUTH["u_dot"]["tau_x"] * log["tau_x"] - 0.0101 * log["u"] - 0.0492 * log["u"] * abs(log["u"])
+    log = {
+        name: (
+            np.zeros_like(value)
+            if name in ("v", "r", "tau_y", "tau_n", "v_dot", "r_dot")
+            else value
+        )
+        for name, value in log.items()
+    }
+    log["u_dot"] = (
+        FORCE_TRUTH["u_dot"]["tau_x"] * log["tau_x"]
+        - 0.0101 * log["u"]
+        - 0.0492 * log["u"] * abs(log["u"])
+    )
     _, notes = fitted(FORCE, samples(log, FORCES))
     assert {"v", "r", "v |v|", "tau_n", "v r"} <= set(notes["unexcited"])
-    assert found(notes, "u_dot") == pytest.approx({"tau_x": 2.026e-4, "u": -0.0101, "u |u|": -0.0492}, rel=1e-6)
+    assert found(notes, "u_dot") == pytest.approx(
+        {"tau_x": 2.026e-4, "u": -0.0101, "u |u|": -0.0492}, rel=1e-6
+    )
     assert notes["equations"]["v_dot"]["text"] == "v_dot = 0"
 
 
@@ -107,32 +142,53 @@ def test_structure_in_noisy_accelerations() -> None:
 def measured(log: Log, noise: float, window: float, step: float, jump: float = 300.0) -> Samples:
     """Velocities with noise, differentiated; samples at both sides of an input's jump left out."""
     random = np.random.default_rng(0)
-    nu = np.stack([log[name] + noise * log[name].std() * random.normal(size=len(log["t"])) for name in "uvr"], axis=1)
-    jumps = np.flatnonzero(np.abs(np.diff(np.stack([log[n] for n in FORCES[3:]], axis=1), axis=0)).max(axis=1) > jump)
+    nu = np.stack(
+        [log[name] + noise * log[name].std() * random.normal(size=len(log["t"])) for name in "uvr"],
+        axis=1,
+    )
+    jumps = np.flatnonzero(
+        np.abs(np.diff(np.stack([log[n] for n in FORCES[3:]], axis=1), axis=0)).max(axis=1) > jump
+    )
     bad = np.zeros(len(nu), dtype=bool)
     bad[jumps] = bad[jumps + 1] = True
     pieces = np.where(bad, -1, np.cumsum(np.append(0, np.diff(bad.astype(int)) != 0)))
     smooth, rate, good = SavitzkyGolay(window=window, order=2).derive(nu, step, pieces)
     z = np.concatenate((smooth, np.stack([log[n] for n in FORCES[3:]], axis=1)), axis=1)[good]
     group = torch.zeros(int(good.sum()), dtype=torch.long)
-    return Samples(torch.from_numpy(z), torch.from_numpy(rate[good]), group, torch.from_numpy(log["t"][good]), ("made",), FORCES)
+    return Samples(
+        torch.from_numpy(z),
+        torch.from_numpy(rate[good]),
+        group,
+        torch.from_numpy(log["t"][good]),
+        ("made",),
+        FORCES,
+    )
 
 
 def test_velocities_alone_by_the_weak_form() -> None:
-    """1 % noise on velocities, forces in steps, jumps masked: 600 s at 25 Hz. The linear drag in surge, a tenth of its acceleration's noise, is the
-    hardest."""
+    """1 % noise on velocities, forces in steps, jumps masked: 600 s at 25 Hz. The linear drag in
+    surge, a tenth of its acceleration's noise, is the hardest.
+    """
     data = measured(step_log(0, 600.0, 0.04), 0.01, 0.12, 0.04)
     _, weak = fitted({**FORCE, "estimator": {"kind": "weak", "window": "2 s"}}, data)
     for axis, terms in FORCE_TRUTH.items():
         got = found(weak, axis)
         assert set(got) == set(terms)
-        assert {t: v for t, v in got.items() if t != "u"} == pytest.approx({t: v for t, v in terms.items() if t != "u"}, rel=0.03)
+        assert {t: v for t, v in got.items() if t != "u"} == pytest.approx(
+            {t: v for t, v in terms.items() if t != "u"}, rel=0.03
+        )
     assert found(weak, "u_dot")["u"] == pytest.approx(-0.0101, rel=0.1)
-    _, instruments = fitted({**FORCE, "estimator": {"kind": "instruments", "lag": "2 s", "window": "2 s"}}, data)
+    _, instruments = fitted(
+        {**FORCE, "estimator": {"kind": "instruments", "lag": "2 s", "window": "2 s"}}, data
+    )
     assert found(instruments, "r_dot") == pytest.approx(FORCE_TRUTH["r_dot"], rel=0.05)
     # least squares on the same unsmoothed differences loses the drag
     _, plain = fitted(FORCE, data)
-    worst = max(abs(found(plain, axis).get(term, 0.0) / value - 1) for axis, terms in FORCE_TRUTH.items() for term, value in terms.items())
+    worst = max(
+        abs(found(plain, axis).get(term, 0.0) / value - 1)
+        for axis, terms in FORCE_TRUTH.items()
+        for term, value in terms.items()
+    )
     assert worst > 0.15
 
 
@@ -143,7 +199,9 @@ def spring(log: Log, target: np.ndarray, input_name: str = "tau") -> Samples:
     return samples(renamed, ("u", "v", "tau"), np.stack((zero, target, zero), axis=1))
 
 
-SPRING: dict[str, Any] = {"candidates": {"motions": ["u", "v"], "input_degree": 2, "coupling": ["u", "v"]}}
+SPRING: dict[str, Any] = {
+    "candidates": {"motions": ["u", "v"], "input_degree": 2, "coupling": ["u", "v"]}
+}
 SPRING_TRUTH = {"u": MSD_TRUTH["x"], "v": MSD_TRUTH["w"], "tau": MSD_TRUTH["tau"]}
 
 
@@ -154,7 +212,9 @@ def test_the_mass_spring_damper_without_and_with_noise() -> None:
     right = 0
     for seed in range(20):
         noise = 0.1 * np.random.default_rng(seed).uniform(-1, 1, len(log["t"]))
-        right += set(found(fitted(SPRING, spring(log, log["w_dot"] + noise))[1], "v_dot")) == set(SPRING_TRUTH)
+        right += set(found(fitted(SPRING, spring(log, log["w_dot"] + noise))[1], "v_dot")) == set(
+            SPRING_TRUTH
+        )
     assert right >= 17
 
 
@@ -179,14 +239,19 @@ def test_a_delay_is_found_inside_the_regression_and_remembered() -> None:
     right = 0
     for seed in range(20):
         random = np.random.default_rng(seed)
-        noisy = log | {n: log[n] + 0.1 * np.ptp(log[n]) * random.uniform(-1, 1, len(log["t"])) for n in ("x", "w", "tau", "w_dot")}
+        noisy = log | {
+            n: log[n] + 0.1 * np.ptp(log[n]) * random.uniform(-1, 1, len(log["t"]))
+            for n in ("x", "w", "tau", "w_dot")
+        }
         right += fitted(config, spring(noisy, noisy["w_dot"]))[1]["delay"]["steps"] == 5
     assert right >= 19
 
 
 def test_a_delayed_head_is_scriptable_with_the_same_answers() -> None:
     log = msd_log(delay=0.5)
-    head, _ = fitted({**SPRING, "delay": {"channels": ["tau"], "longest": 12}}, spring(log, log["w_dot"]))
+    head, _ = fitted(
+        {**SPRING, "delay": {"channels": ["tau"], "longest": 12}}, spring(log, log["w_dot"])
+    )
     data = spring(log, log["w_dot"])
     compiled = torch.jit.script(head.eval())
     s = head.warmup(data.z[None, :30])
@@ -197,7 +262,9 @@ def test_a_delayed_head_is_scriptable_with_the_same_answers() -> None:
 
 
 def test_a_symmetric_vessel_has_no_terms_that_a_mirror_forbids() -> None:
-    """Document 001's published equations have such terms (ERRATA M8): fitted, not physical. Here noise and a bias would put them in."""
+    """Document 001's published equations have such terms (ERRATA M8): fitted, not physical. Here
+    noise and a bias would put them in.
+    """
     log = force_logs(1)[0]
     y = np.stack([log[name] for name in ACCELERATION], axis=1) + 0.02 * np.abs(log["v"])[:, None]
     _, free = fitted(FORCE, samples(log, FORCES, y))
@@ -214,7 +281,9 @@ def test_a_symmetric_vessel_has_no_terms_that_a_mirror_forbids() -> None:
 def test_free_runs_may_choose_shorter_equations_or_none() -> None:
     log = force_logs(1)[0]
     y = np.stack([log[name] for name in ACCELERATION], axis=1)
-    data = samples(log, FORCES, y + 0.3 * y.std(axis=0) * np.random.default_rng(0).normal(size=y.shape))
+    data = samples(
+        log, FORCES, y + 0.3 * y.std(axis=0) * np.random.default_rng(0).normal(size=y.shape)
+    )
     head = SymbolicConfig.model_validate({**FORCE, "choose": "free_run"}).build(FORCES)
     head.calibrate(data)
     solutions = head.solutions(data)
@@ -224,18 +293,35 @@ def test_free_runs_may_choose_shorter_equations_or_none() -> None:
     assert all(not torch.equal(a, b) for i, a in enumerate(states) for b in states[:i])
 
 
-WRITTEN = ("u", "v |v|", "1", "u^2 tau_x cos(r)", "sin(v)^2", "sqrt(u) r", "ssqrt(v)", "inv(tau_x)", "u^-2", "|r|^3")
+WRITTEN = (
+    "u",
+    "v |v|",
+    "1",
+    "u^2 tau_x cos(r)",
+    "sin(v)^2",
+    "sqrt(u) r",
+    "ssqrt(v)",
+    "inv(tau_x)",
+    "u^-2",
+    "|r|^3",
+)
 
 
 def written() -> tuple[SymbolicHead, dict[str, Any], torch.Tensor]:
-    z = torch.from_numpy(np.random.default_rng(0).uniform(0.4, 1.6, size=(400, 4)) * [1, -1, 1, 100])
+    z = torch.from_numpy(
+        np.random.default_rng(0).uniform(0.4, 1.6, size=(400, 4)) * [1, -1, 1, 100]
+    )
     names = ("u", "v", "r", "tau_x")
     blank = SymbolicConfig(terms=WRITTEN).build(names)
     weights = torch.from_numpy(
-        np.random.default_rng(1).uniform(0.5, 2, size=(len(WRITTEN), 3)) * np.random.default_rng(2).choice([-1, 1], (len(WRITTEN), 3))
+        np.random.default_rng(1).uniform(0.5, 2, size=(len(WRITTEN), 3))
+        * np.random.default_rng(2).choice([-1, 1], (len(WRITTEN), 3))
     )
     y = blank.library(z) @ (weights / blank.library(z).std(0).clamp(min=1e-3)[:, None])
-    head, notes = fitted({"terms": list(WRITTEN)}, Samples(z, y, torch.zeros(400), torch.zeros(400), ("made",), names))
+    head, notes = fitted(
+        {"terms": list(WRITTEN)},
+        Samples(z, y, torch.zeros(400), torch.zeros(400), ("made",), names),
+    )
     assert notes["kept"] == [len(WRITTEN)] * 3
     return head, notes, z
 
@@ -245,9 +331,24 @@ def test_c_code_equals_the_head(tmp_path: Path) -> None:
     import ctypes
 
     head, notes, z = written()
-    source = "#include <math.h>\n" + "".join(equation["c"] for equation in notes["equations"].values())
+    source = "#include <math.h>\n" + "".join(
+        equation["c"] for equation in notes["equations"].values()
+    )
     (tmp_path / "model.c").write_text(source)
-    build = ["gcc", "-std=c99", "-Wall", "-Wextra", "-Werror", "-O2", "-shared", "-fPIC", "model.c", "-o", "model.so", "-lm"]
+    build = [
+        "gcc",
+        "-std=c99",
+        "-Wall",
+        "-Wextra",
+        "-Werror",
+        "-O2",
+        "-shared",
+        "-fPIC",
+        "model.c",
+        "-o",
+        "model.so",
+        "-lm",
+    ]
     subprocess.run(build, cwd=tmp_path, check=True)
     library = ctypes.CDLL(str(tmp_path / "model.so"))
     with torch.no_grad():
@@ -255,7 +356,9 @@ def test_c_code_equals_the_head(tmp_path: Path) -> None:
     for axis, name in enumerate(ACCELERATION):
         function = getattr(library, name)
         function.restype, function.argtypes = ctypes.c_double, [ctypes.c_double] * 4
-        np.testing.assert_allclose([function(*row) for row in z.tolist()], rho[:, axis], rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(
+            [function(*row) for row in z.tolist()], rho[:, axis], rtol=1e-12, atol=1e-12
+        )
 
 
 def test_sympy_text_equals_the_head() -> None:
@@ -265,16 +368,24 @@ def test_sympy_text_equals_the_head() -> None:
         rho = head(z, z[:, :0])[0]
     symbols = sympy.symbols("u v r tau_x", real=True)
     for axis, equation in enumerate(notes["equations"].values()):
-        function = sympy.lambdify(symbols, sympy.sympify(equation["sympy"], locals={s.name: s for s in symbols}), "numpy")
+        function = sympy.lambdify(
+            symbols, sympy.sympify(equation["sympy"], locals={s.name: s for s in symbols}), "numpy"
+        )
         np.testing.assert_allclose(function(*z.numpy().T), rho[:, axis], rtol=1e-12, atol=1e-12)
 
 
 def test_text_and_latex() -> None:
     log = force_logs(1)[0]
     _, notes = fitted(FORCE, samples(log, FORCES))
-    assert notes["equations"]["u_dot"]["text"] == "u_dot = -0.0101 u + 0.0002026 tau_x - 0.0492 u |u| + 1 v r"
+    assert (
+        notes["equations"]["u_dot"]["text"]
+        == "u_dot = -0.0101 u + 0.0002026 tau_x - 0.0492 u |u| + 1 v r"
+    )
     latex = notes["equations"]["u_dot"]["latex"]
-    assert latex == r"\dot{u} = -0.0101 \, u + 0.0002026 \, \tau_{\mathrm{x}} - 0.0492 \, u \, \left|u\right| + 1 \, v \, r"
+    assert (
+        latex == r"\dot{u} = -0.0101 \, u + 0.0002026 \, \tau_{\mathrm{x}} - 0.0492 \, u \,"
+        r" \left|u\right| + 1 \, v \, r"
+    )
     assert r"4.78 \cdot 10^{-5} \, \tau_{\mathrm{n}}" in notes["equations"]["r_dot"]["latex"]
 
 

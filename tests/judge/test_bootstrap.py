@@ -1,4 +1,6 @@
-"""Block bootstrap against enumeration of all resamples, the normal interval, and the share of intervals that hold a known mean."""
+"""Block bootstrap against enumeration of all resamples, the normal interval, and the share of
+intervals that hold a known mean.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,9 @@ def test_few_logs_are_cut_into_runs_that_stay_within_a_log() -> None:
         assert 1 <= len(members) <= 2
 
 
-@pytest.mark.parametrize("logs", [[0], [0] * 40, [0, 0, 0, 1, 1, 1, 1, 1, 1], [0, 1, 2, 3], [0, 1, 2, 2]])
+@pytest.mark.parametrize(
+    "logs", [[0], [0] * 40, [0, 0, 0, 1, 1, 1, 1, 1, 1], [0, 1, 2, 3], [0, 1, 2, 2]]
+)
 def test_too_little_gives_no_interval(logs: list[int]) -> None:
     assert blocks(logs) is None
     assert intervals(np.ones((len(logs), 2)), blocks(logs)) == [None, None]
@@ -68,7 +72,9 @@ def test_levels_widen_as_student_s_t() -> None:
     assert tail(10**6) == pytest.approx(0.025, rel=1e-4)
     # t of 4 and 7 degrees of freedom from tables
     for count, t in ((5, 2.7764), (8, 2.3646)):
-        assert tail(count) == pytest.approx(0.5 * (1 - _erf(t * np.sqrt(count / (count - 1) / 2))), rel=1e-3)
+        assert tail(count) == pytest.approx(
+            0.5 * (1 - _erf(t * np.sqrt(count / (count - 1) / 2))), rel=1e-3
+        )
 
 
 def test_many_single_windows_have_the_normal_interval() -> None:
@@ -95,7 +101,14 @@ def test_exchanging_the_models_exchanges_the_sign() -> None:
 def test_a_model_against_itself() -> None:
     a = np.random.default_rng(1).uniform(0.1, 0.2, 12)
     found = difference(a, a, "a", blocks(np.arange(12) // 2))
-    assert found == {"to": "a", "nrmse_mean": 0.0, "ci95": [0.0, 0.0], "excludes_zero": False, "ratio": 1.0, "worse": False}
+    assert found == {
+        "to": "a",
+        "nrmse_mean": 0.0,
+        "ci95": [0.0, 0.0],
+        "excludes_zero": False,
+        "ratio": 1.0,
+        "worse": False,
+    }
 
 
 def test_pairing_finds_what_the_errors_of_each_model_hide() -> None:
@@ -122,7 +135,9 @@ def test_worse_is_more_than_five_percent(factor: float, worse: bool) -> None:
 
 @pytest.mark.parametrize("sizes", [[1, 1, 7, 4, 1], [4, 4, 3, 23, 13, 6], [4] * 12])
 def test_coverage_of_differences_that_logs_have_in_common(sizes: list[int]) -> None:
-    """Windows of a log share a part of their difference and follow each other: intervals by log hold the mean, intervals by window do not."""
+    """Windows of a log share a part of their difference and follow each other: intervals by log
+    hold the mean, intervals by window do not.
+    """
     rng = np.random.default_rng(11)
     logs = np.repeat(np.arange(len(sizes)), sizes)
     by_log, by_window = blocks(logs), Blocks(np.arange(len(logs)), "windows", len(logs))
@@ -136,7 +151,9 @@ def test_coverage_of_differences_that_logs_have_in_common(sizes: list[int]) -> N
 
 
 def _clustered(sizes: list[int], rng: np.random.Generator) -> np.ndarray:
-    """Differences of mean zero: a quarter of the variance between logs, the rest autoregressive (0.2) within."""
+    """Differences of mean zero: a quarter of the variance between logs, the rest autoregressive
+    (0.2) within.
+    """
     out = []
     for size in sizes:
         noise = rng.normal(size=size)

@@ -12,7 +12,10 @@ from residnet.judge.courses import CourseFlight, passes
 
 def straight(*corners: tuple[float, float]) -> CourseFlight:
     """Straight from corner to corner in steps of 0.1 m, one step a second."""
-    parts = [np.linspace(a, b, round(10 * float(np.hypot(*np.subtract(b, a)))), endpoint=False) for a, b in itertools.pairwise(corners)]
+    parts = [
+        np.linspace(a, b, round(10 * float(np.hypot(*np.subtract(b, a)))), endpoint=False)
+        for a, b in itertools.pairwise(corners)
+    ]
     track = np.concatenate((*parts, [corners[-1]]))
     rest = np.zeros(len(track))
     return CourseFlight(track, rest, rest, rest, rest, 1.0, True)
@@ -27,7 +30,9 @@ def test_a_buoy_to_starboard_and_one_to_port_at_their_distances() -> None:
 
 
 def test_each_buoy_is_judged_in_its_turn_and_its_distance_over_the_whole_course() -> None:
-    """The track comes by the first buoy again, nearer and with it on the other side: the side is that of its turn."""
+    """The track comes by the first buoy again, nearer and with it on the other side: the side is
+    that of its turn.
+    """
     flight = straight((0.0, 0.0), (60.0, 0.0), (60.0, 30.0), (0.0, 30.0), (0.0, 6.0), (60.0, 6.0))
     first, second = passes(flight, [(30.0, 8.0), (30.0, 25.0)], [4.0, 4.0])
     assert first.side == "starboard"

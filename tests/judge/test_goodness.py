@@ -41,15 +41,25 @@ def test_without_enough_samples_or_noise_there_is_no_measure() -> None:
 
 
 def test_criteria_choose_the_true_polynomial() -> None:
-    """Of nested least-squares fits, BIC has its least value at the true degree; the residual sum of squares never rises."""
+    """Of nested least-squares fits, BIC has its least value at the true degree; the residual sum of
+    squares never rises.
+    """
     random = np.random.default_rng(1)
     x = np.linspace(-1, 1, 400)
     y = 1 + x - 2 * x**3 + 0.3 * random.normal(size=400)
     models = []
     for degree in range(1, 9):
         fit = np.polynomial.Polynomial.fit(x, y, degree)
-        models.append(OneStep(f"p{degree}", "head", [degree] * 3, [np.repeat((y - fit(x))[:, None], 3, axis=1)]))
-    rows = [row for row in table(models, [np.repeat(y[:, None], 3, axis=1)], 0.1) if row["axis"] == "u_dot"]
+        models.append(
+            OneStep(
+                f"p{degree}", "head", [degree] * 3, [np.repeat((y - fit(x))[:, None], 3, axis=1)]
+            )
+        )
+    rows = [
+        row
+        for row in table(models, [np.repeat(y[:, None], 3, axis=1)], 0.1)
+        if row["axis"] == "u_dot"
+    ]
     assert min(rows, key=lambda row: row["bic"])["model"] == "p3"
     assert all(b["rmse"] <= a["rmse"] + 1e-12 for a, b in itertools.pairwise(rows))
     assert all(row["white_p"] > 1e-3 for row in rows[2:])
@@ -64,7 +74,10 @@ def test_pairs_tell_correlated_models_apart_that_their_own_intervals_do_not() ->
     assert found["ratio"] == pytest.approx(0.97)
     assert found["excludes_zero"]
     rows = table(
-        [OneStep(n, "head", [0] * 3, [np.repeat(s[:, None], 3, axis=1)], "worse") for n, s in (("better", better), ("worse", worse))],
+        [
+            OneStep(n, "head", [0] * 3, [np.repeat(s[:, None], 3, axis=1)], "worse")
+            for n, s in (("better", better), ("worse", worse))
+        ],
         [shared[:, None].repeat(3, 1)],
         0.1,
     )

@@ -24,11 +24,18 @@ STEP = 0.1
 
 def candidate(name: str, reference: str | None = None) -> Candidate:
     signals = SignalsConfig(inputs=("delta",)).build()
-    return Candidate(name, "head", HybridDynamics(signals, StillBaseline(), ZeroHead(), STEP, "euler"), reference=reference)
+    return Candidate(
+        name,
+        "head",
+        HybridDynamics(signals, StillBaseline(), ZeroHead(), STEP, "euler"),
+        reference=reference,
+    )
 
 
 def straight(speed: float, count: int = 21, drift: float = 0.0, turned: float = 0.0) -> np.ndarray:
-    """States of a straight run north whose measured position gains `drift` m/s eastwards and whose heading gains `turned` rad, unseen by u, v, r."""
+    """States of a straight run north whose measured position gains `drift` m/s eastwards and whose
+    heading gains `turned` rad, unseen by u, v, r.
+    """
     t = STEP * np.arange(count)
     return np.stack((speed * t, drift * t, turned * t / t[-1], 0 * t + speed, 0 * t, 0 * t), axis=1)
 
@@ -46,10 +53,18 @@ def test_consistency_by_hand() -> None:
 
 
 def nine(wind: list[float] | None = None) -> tuple[FreeRun, list[Prepared]]:
-    """Nine logs of one window each at speeds 1 .. 9 m/s; `a` is off by 0.01, 0.02, .. m/s in u, `b` by twice that."""
+    """Nine logs of one window each at speeds 1 .. 9 m/s; `a` is off by 0.01, 0.02, .. m/s in u, `b`
+    by twice that.
+    """
     logs = [made(straight(k + 1.0), STEP, name=f"log{k}") for k in range(9)]
     if wind is not None:
-        logs = [replace(p, log=p.log.replace(channels={**p.log.channels, "wind_speed": np.full(21, wind[k])})) for k, p in enumerate(logs)]
+        logs = [
+            replace(
+                p,
+                log=p.log.replace(channels={**p.log.channels, "wind_speed": np.full(21, wind[k])}),
+            )
+            for k, p in enumerate(logs)
+        ]
     windows = [Window(k, 0, 21, 0, np.zeros(3)) for k in range(9)]
 
     def off(factor: float) -> list[Prediction]:
@@ -75,7 +90,10 @@ def test_bands_are_thirds_of_the_windows() -> None:
         ("wind", 3.0, 3.0, 3),
     ]
     # u alone is off: nrmse of a window is a third of its error over the scale
-    levels = [np.mean(ks) * 0.01 / 0.5 / 3 for ks in ((1, 2, 3), (4, 5, 6), (7, 8, 9), (2, 5, 8), (3, 6, 9), (1, 4, 7))]
+    levels = [
+        np.mean(ks) * 0.01 / 0.5 / 3
+        for ks in ((1, 2, 3), (4, 5, 6), (7, 8, 9), (2, 5, 8), (3, 6, 9), (1, 4, 7))
+    ]
     assert [band["models"]["a"]["nrmse_mean"] for band in found] == pytest.approx(levels)
     for band, level in zip(found, levels, strict=True):
         paired = band["models"]["a"]["difference"]
@@ -87,10 +105,15 @@ def test_bands_are_thirds_of_the_windows() -> None:
 
 def test_bands_without_windows_enough_or_without_wind_are_left_out() -> None:
     run, logs = nine()
-    assert {band["by"] for band in limits(run, [candidate("a")], logs, SCALES, STEP)["bands"]} == {"speed"}
+    assert {band["by"] for band in limits(run, [candidate("a")], logs, SCALES, STEP)["bands"]} == {
+        "speed"
+    }
     few = FreeRun("T2", "test", run.windows[:8], {"a": run.predictions["a"][:8]})
     # 8 windows: thirds of 3, 2 and 3
-    assert [band["low"] for band in limits(few, [candidate("a")], logs, SCALES, STEP)["bands"]] == [1.0, 6.0]
+    assert [band["low"] for band in limits(few, [candidate("a")], logs, SCALES, STEP)["bands"]] == [
+        1.0,
+        6.0,
+    ]
     # one speed: no breakdown at all
     still = [made(straight(1.0), STEP) for _ in range(9)]
     assert limits(run, [candidate("a")], still, SCALES, STEP)["bands"] == []
@@ -101,7 +124,9 @@ def test_worst_windows_are_named() -> None:
     found = limits(run, [candidate("a")], logs, SCALES, STEP)["worst"]["a"]
     assert [entry["log"] for entry in found] == ["log8", "log7", "log6"]
     errors = window_errors(run, "a", logs)
-    assert [entry["nrmse"] for entry in found] == pytest.approx(nrmse_of_windows(errors, SCALES)[[8, 7, 6]].tolist())
+    assert [entry["nrmse"] for entry in found] == pytest.approx(
+        nrmse_of_windows(errors, SCALES)[[8, 7, 6]].tolist()
+    )
     assert found[0]["t"] == pytest.approx(3.0)
     assert found[0]["rmse"]["u"] == pytest.approx(0.09)
     assert found[0]["manoeuvre"] == "zigzag"

@@ -25,7 +25,9 @@ def window(log: int, start: int, stop: int) -> Window:
 
 
 def candidate(name: str) -> Candidate:
-    return Candidate(name, "head", HybridDynamics(SIGNALS, StillBaseline(), ZeroHead(), 0.1, "euler"))
+    return Candidate(
+        name, "head", HybridDynamics(SIGNALS, StillBaseline(), ZeroHead(), 0.1, "euler")
+    )
 
 
 def test_by_hand() -> None:
@@ -39,32 +41,56 @@ def test_by_hand() -> None:
     run = FreeRun("T1", "test", [window(0, 0, 4)], {"mine": [Prediction(predicted, False)]})
     errors = window_errors(run, "mine", [log])
     # u and v over the three usable samples, r over all four
-    np.testing.assert_allclose(errors["rmse"], [[np.sqrt(0.25 / 3), np.sqrt(0.02 / 3), np.sqrt(0.03 / 4)]])
+    np.testing.assert_allclose(
+        errors["rmse"], [[np.sqrt(0.25 / 3), np.sqrt(0.02 / 3), np.sqrt(0.03 / 4)]]
+    )
     np.testing.assert_allclose(errors["mae"], [[0.7 / 3, 0.2 / 3, 0.3 / 4]])
     assert errors["position_error_end"].tolist() == [5.0]
     assert errors["heading_error_end"].tolist() == [0.5]
     assert errors["samples"].tolist() == [3]
-    (row,) = [r for r in rows(run, [candidate("mine")], [log], SCALES, {}) if r["manoeuvre"] == "all"]
+    (row,) = [
+        r for r in rows(run, [candidate("mine")], [log], SCALES, {}) if r["manoeuvre"] == "all"
+    ]
     nrmse = np.array([np.sqrt(0.25 / 3) / 0.5, np.sqrt(0.02 / 3) / 0.25, np.sqrt(0.03 / 4) / 0.1])
     assert [row["nrmse"][c] for c in "uvr"] == pytest.approx(nrmse.tolist())
     assert row["nrmse"]["mean"] == pytest.approx(nrmse.mean())
-    labels = [row[key] for key in ("model", "kind", "split", "protocol", "windows", "n", "diverged")]
+    labels = [
+        row[key] for key in ("model", "kind", "split", "protocol", "windows", "n", "diverged")
+    ]
     assert labels == ["mine", "head", "test", "T1", 1, 3, 0]
 
 
 def made_run(seed: int = 0) -> tuple[FreeRun, list]:
     rng = np.random.default_rng(seed)
     kinds = ["zigzag", "constant", "zigzag", "turning"]
-    logs = [made(random_states(120, rng), 0.1, usable=rng.random(120) < 0.8, name=f"log{i}", kind=kind) for i, kind in enumerate(kinds)]
+    logs = [
+        made(random_states(120, rng), 0.1, usable=rng.random(120) < 0.8, name=f"log{i}", kind=kind)
+        for i, kind in enumerate(kinds)
+    ]
     windows = [window(i, start, start + 31) for i in range(4) for start in (0, 30, 60)]
-    predictions = {name: [Prediction(random_states(31, rng), bool(rng.random() < 0.3)) for _ in windows] for name in ("a", "b")}
+    predictions = {
+        name: [Prediction(random_states(31, rng), bool(rng.random() < 0.3)) for _ in windows]
+        for name in ("a", "b")
+    }
     return FreeRun("T3", "test", windows, predictions), logs
 
 
 def test_rows_equal_a_loop_over_windows() -> None:
     run, logs = made_run()
-    table = rows(run, [candidate("a"), candidate("b")], logs, SCALES, {"manoeuvring": ["zigzag", "turning"], "absent": ["3211"]})
-    assert {row["manoeuvre"] for row in table} == {"all", "zigzag", "constant", "turning", "manoeuvring"}
+    table = rows(
+        run,
+        [candidate("a"), candidate("b")],
+        logs,
+        SCALES,
+        {"manoeuvring": ["zigzag", "turning"], "absent": ["3211"]},
+    )
+    assert {row["manoeuvre"] for row in table} == {
+        "all",
+        "zigzag",
+        "constant",
+        "turning",
+        "manoeuvring",
+    }
     members = {"all": {"zigzag", "constant", "turning"}, "manoeuvring": {"zigzag", "turning"}}
     for row in table:
         wanted = members.get(row["manoeuvre"], {row["manoeuvre"]})
@@ -74,7 +100,13 @@ def test_rows_equal_a_loop_over_windows() -> None:
             w, p = run.windows[i], run.predictions[row["model"]][i]
             error = p.states - logs[w.log].y[w.start : w.stop]
             good = logs[w.log].usable[w.start : w.stop]
-            rmse.append([np.sqrt((error[good, 3] ** 2).mean()), np.sqrt((error[good, 4] ** 2).mean()), np.sqrt((error[:, 5] ** 2).mean())])
+            rmse.append(
+                [
+                    np.sqrt((error[good, 3] ** 2).mean()),
+                    np.sqrt((error[good, 4] ** 2).mean()),
+                    np.sqrt((error[:, 5] ** 2).mean()),
+                ]
+            )
             position.append(np.hypot(*error[-1, :2]))
             heading.append(abs(error[-1, 2]))
             count += int(good.sum())
@@ -98,14 +130,18 @@ def test_intervals_hold_the_mean_and_say_what_was_drawn() -> None:
     low, high = row["nrmse_mean_ci95"]
     assert low < row["nrmse"]["mean"] < high
     alone = FreeRun("T3", "test", run.windows[:1], {"a": run.predictions["a"][:1]})
-    (single,) = [r for r in rows(alone, [candidate("a")], logs, SCALES, {}) if r["manoeuvre"] == "all"]
+    (single,) = [
+        r for r in rows(alone, [candidate("a")], logs, SCALES, {}) if r["manoeuvre"] == "all"
+    ]
     assert single["rmse_ci95"] == {"u": None, "v": None, "r": None}
     assert single["nrmse_mean_ci95"] is single["ci95_blocks"] is None
 
 
 def test_differences_are_paired_by_window_and_kind() -> None:
     run, logs = made_run()
-    errors = {name: (window_errors(run, name, logs)["rmse"] / [0.5, 0.25, 0.1]).mean(1) for name in "ab"}
+    errors = {
+        name: (window_errors(run, name, logs)["rmse"] / [0.5, 0.25, 0.1]).mean(1) for name in "ab"
+    }
     compared = replace(candidate("a"), reference="b")
     table = rows(run, [compared, candidate("b")], logs, SCALES, {})
     for row in table:
@@ -115,9 +151,16 @@ def test_differences_are_paired_by_window_and_kind() -> None:
             continue
         found = row["difference"]
         assert found["to"] == "b"
-        assert found["nrmse_mean"] == pytest.approx(float((errors["a"] - errors["b"])[chosen].mean()))
-        assert found["nrmse_mean"] == pytest.approx(row["nrmse"]["mean"] - find(table, model="b", manoeuvre=row["manoeuvre"])["nrmse"]["mean"])
-        assert found["ratio"] == pytest.approx(errors["a"][chosen].mean() / errors["b"][chosen].mean())
+        assert found["nrmse_mean"] == pytest.approx(
+            float((errors["a"] - errors["b"])[chosen].mean())
+        )
+        assert found["nrmse_mean"] == pytest.approx(
+            row["nrmse"]["mean"]
+            - find(table, model="b", manoeuvre=row["manoeuvre"])["nrmse"]["mean"]
+        )
+        assert found["ratio"] == pytest.approx(
+            errors["a"][chosen].mean() / errors["b"][chosen].mean()
+        )
         # only all kinds together make blocks enough
         assert (found["ci95"] is None) == (row["manoeuvre"] != "all")
     lost = rows(run, [replace(compared, reference="absent")], logs, SCALES, {})
@@ -126,7 +169,12 @@ def test_differences_are_paired_by_window_and_kind() -> None:
 
 def test_perfect_predictions_have_no_error() -> None:
     run, logs = made_run()
-    exact = FreeRun("T3", "test", run.windows, {"a": [Prediction(logs[w.log].y[w.start : w.stop], False) for w in run.windows]})
+    exact = FreeRun(
+        "T3",
+        "test",
+        run.windows,
+        {"a": [Prediction(logs[w.log].y[w.start : w.stop], False) for w in run.windows]},
+    )
     row = find(rows(exact, [candidate("a")], logs, SCALES, {}), model="a")
     assert row["nrmse"]["mean"] == row["position_error_end"] == row["heading_error_end"] == 0.0
 

@@ -81,7 +81,9 @@ def test_back_to_back_windows_share_their_end_point() -> None:
     windows = Windows(length=10.0, first=0.0).windows(log, 0, STEP)
     assert [(w.start, w.stop) for w in windows] == [(0, 101), (100, 201), (200, 301)]
     # one sample less and the tail is incomplete
-    assert len(Windows(length=10.0, first=0.0).windows(made(np.zeros((300, 6)), STEP), 0, STEP)) == 2
+    assert (
+        len(Windows(length=10.0, first=0.0).windows(made(np.zeros((300, 6)), STEP), 0, STEP)) == 2
+    )
 
 
 def test_history_does_not_reach_across_a_break() -> None:
@@ -99,7 +101,9 @@ def test_whole_manoeuvres() -> None:
     rng = np.random.default_rng(2)
     for _ in range(200):
         count = int(rng.integers(1, 400))
-        piece = np.where(random_runs(count, rng, mean=60.0), np.cumsum(rng.random(count) < 0.01), -1)
+        piece = np.where(
+            random_runs(count, rng, mean=60.0), np.cumsum(rng.random(count) < 0.01), -1
+        )
         piece = np.where(piece >= 0, np.cumsum(np.diff(piece, prepend=-2) != 0), -1)
         log = made(random_states(count, rng), STEP, piece=piece)
         expected = []
@@ -118,12 +122,25 @@ def test_a_stretch_without_a_sample_to_score_is_no_window() -> None:
     """Its error would be the mean of nothing, and metrics.json holds no NaN."""
     usable, piece = np.ones(200, dtype=bool), np.repeat([0, 1], 100)
     usable[4:100] = False
-    windows = WholeManoeuvre(initial=0.4, shortest=3.0).windows(made(np.zeros((200, 6)), STEP, usable=usable, piece=piece), 0, STEP)
+    windows = WholeManoeuvre(initial=0.4, shortest=3.0).windows(
+        made(np.zeros((200, 6)), STEP, usable=usable, piece=piece), 0, STEP
+    )
     assert [w.start for w in windows] == [104]
 
 
 def test_no_window_at_all_says_how_long_the_logs_are() -> None:
-    logs = [made(np.zeros((50, 6)), STEP, name="short"), made(np.zeros((80, 6)), STEP, name="longer")]
-    with pytest.raises(DataError, match=r"protocol T30: none of 2 'test' logs.*longer, lasts 8\.0 s"):
+    logs = [
+        made(np.zeros((50, 6)), STEP, name="short"),
+        made(np.zeros((80, 6)), STEP, name="longer"),
+    ]
+    with pytest.raises(
+        DataError, match=r"protocol T30: none of 2 'test' logs.*longer, lasts 8\.0 s"
+    ):
         all_windows(Windows(length=30.0), logs, STEP, "T30")
-    assert [w.log for w in all_windows(Windows(length=2.0, first=0.0), logs, STEP, "T2")] == [0, 0, 1, 1, 1]
+    assert [w.log for w in all_windows(Windows(length=2.0, first=0.0), logs, STEP, "T2")] == [
+        0,
+        0,
+        1,
+        1,
+        1,
+    ]

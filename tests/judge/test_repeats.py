@@ -29,12 +29,16 @@ def commands(seed: int, count: int) -> np.ndarray:
 
 
 def states(count: int, offset: float = 0.0, heading: float = 0.0) -> np.ndarray:
-    """A straight run at 1 m/s + offset; u, v and r are off by one, two and three times `offset` after the first 6 s."""
+    """A straight run at 1 m/s + offset; u, v and r are off by one, two and three times `offset`
+    after the first 6 s.
+    """
     t = STEP * np.arange(count)
     late = offset * (t > 6.05)
     u = 1.0 + late
     s = np.cumsum(u) * STEP
-    return np.stack((s * np.cos(heading), s * np.sin(heading), 0 * t + heading, u, 2 * late, 3 * late), axis=1)
+    return np.stack(
+        (s * np.cos(heading), s * np.sin(heading), 0 * t + heading, u, 2 * late, 3 * late), axis=1
+    )
 
 
 def test_a_repeated_run_is_found_and_its_difference_measured() -> None:
@@ -52,7 +56,9 @@ def test_a_repeated_run_is_found_and_its_difference_measured() -> None:
     found = repeatability(PROTOCOL, logs, 2, SCALES, STEP)
     share = np.sqrt(51 / 101)
     assert (found["pairs"], found["logs"]) == (1, 2)
-    assert [found[name] for name in "uvr"] == pytest.approx([0.02 * share, 0.01 * share, 0.004 * share])
+    assert [found[name] for name in "uvr"] == pytest.approx(
+        [0.02 * share, 0.01 * share, 0.004 * share]
+    )
     assert found["nrmse"] == pytest.approx(0.2 * share)
     # both run 10 m ahead, whatever their heading
     assert found["position"] == pytest.approx(0, abs=1e-9)
@@ -72,7 +78,12 @@ def test_other_commands_or_another_start_are_no_repeat(column: int) -> None:
     for offset, pairs in ((0.024, 1), (0.026, 0)):
         y = states(160)
         y[:, 3] += offset
-        assert repeatability(PROTOCOL, [made(states(160), STEP, w=w), made(y, STEP, w=w)], 2, SCALES, STEP)["pairs"] == pairs
+        assert (
+            repeatability(
+                PROTOCOL, [made(states(160), STEP, w=w), made(y, STEP, w=w)], 2, SCALES, STEP
+            )["pairs"]
+            == pairs
+        )
 
 
 def test_breaks_and_exogenous_channels() -> None:
@@ -81,7 +92,10 @@ def test_breaks_and_exogenous_channels() -> None:
     wind[:, 2] += 50.0
     whole = made(states(160), STEP, w=w)
     # what nobody commands may differ
-    assert repeatability(PROTOCOL, [whole, made(states(160), STEP, w=wind)], 2, SCALES, STEP)["pairs"] == 1
+    assert (
+        repeatability(PROTOCOL, [whole, made(states(160), STEP, w=wind)], 2, SCALES, STEP)["pairs"]
+        == 1
+    )
     broken = made(states(160), STEP, w=w, piece=np.repeat([0, 1], [100, 60]))
     found = repeatability(PROTOCOL, [whole, broken], 2, SCALES, STEP)
     assert found["pairs"] == found["logs"] == 0
@@ -92,5 +106,9 @@ def test_a_log_repeats_itself_only_after_the_window() -> None:
     once = commands(3, 160)
     twice = np.concatenate((once, once))
     log = made(np.tile(states(1), (320, 1)), STEP, w=twice)
-    pairs = [p for p in find_pairs(PROTOCOL, [log], 2, np.array([0.1, 0.05, 0.02]), STEP) if p.first.start == 50]
+    pairs = [
+        p
+        for p in find_pairs(PROTOCOL, [log], 2, np.array([0.1, 0.05, 0.02]), STEP)
+        if p.first.start == 50
+    ]
     assert [p.start for p in pairs] == [210]

@@ -1,4 +1,6 @@
-"""Correlated residuals: autocovariances and whiteness from their definitions, block lengths from theory, intervals by their coverage."""
+"""Correlated residuals: autocovariances and whiteness from their definitions, block lengths from
+theory, intervals by their coverage.
+"""
 
 from __future__ import annotations
 
@@ -9,13 +11,22 @@ import pytest
 from made_series import autoregressive, coverage
 from scipy import stats
 
-from residnet.judge.residual_series import autocovariance, block_interval, independent_interval, ljung_box, memory
+from residnet.judge.residual_series import (
+    autocovariance,
+    block_interval,
+    independent_interval,
+    ljung_box,
+    memory,
+)
 
 
 def test_autocovariance_is_its_definition_and_does_not_cross_pieces() -> None:
     pieces = [np.array([1.0, 2.0, 4.0, 1.0]), np.array([3.0, -1.0])]
     mean = np.concatenate(pieces).mean()
-    expected = [sum(float((p[k:] - mean) @ (p[: len(p) - k] - mean)) for p in pieces if len(p) > k) / 6 for k in range(4)]
+    expected = [
+        sum(float((p[k:] - mean) @ (p[: len(p) - k] - mean)) for p in pieces if len(p) > k) / 6
+        for k in range(4)
+    ]
     np.testing.assert_allclose(autocovariance(pieces, 3), expected, atol=1e-12)
 
 
@@ -34,18 +45,24 @@ def test_ljung_box_is_its_definition_and_fair_on_white_noise() -> None:
 
 @pytest.mark.parametrize("phi", [0.5, 0.8])
 def test_block_length_and_effective_size_come_near_those_of_the_process(phi: float) -> None:
-    """For an AR(1): long-run variance (1 + phi) / (1 - phi), optimal block (3/2 (2 phi / (1 - phi^2))^2 n)^(1/3)."""
+    """For an AR(1): long-run variance (1 + phi) / (1 - phi), optimal block (3/2 (2 phi / (1 -
+    phi^2))^2 n)^(1/3).
+    """
     n = 5000
     found = [memory([row]) for row in autoregressive(phi, 60, n, seed=4)]
     optimal = (1.5 * (2 * phi / (1 - phi**2)) ** 2 * n) ** (1 / 3)
     assert np.median([m.block for m in found]) == pytest.approx(optimal, rel=0.15)
     assert np.median([m.variance for m in found]) == pytest.approx((1 + phi) / (1 - phi), rel=0.1)
-    assert np.median([m.effective for m in found]) == pytest.approx(n * (1 - phi) / (1 + phi), rel=0.1)
+    assert np.median([m.effective for m in found]) == pytest.approx(
+        n * (1 - phi) / (1 + phi), rel=0.1
+    )
 
 
 @pytest.mark.parametrize(("phi", "least"), [(0.0, 0.90), (0.8, 0.90), (0.95, 0.85)])
 def test_intervals_cover(phi: float, least: float) -> None:
-    """Fewer repetitions than scripts/bench/bootstrap.py, the same demands; the interval of independent samples fails them."""
+    """Fewer repetitions than scripts/bench/bootstrap.py, the same demands; the interval of
+    independent samples fails them.
+    """
     found = coverage(phi, 120, 1000, seed=11)
     assert found["mae"] >= least
     assert found["mean"] >= least

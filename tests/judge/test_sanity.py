@@ -10,14 +10,37 @@ import torch
 
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec, save_model
-from residnet.judge.sanity import BOUNDED, CHECKS, DAMPING, MASS, STABILITY, SYMMETRY, Finding, check_model, check_run, growth_rate
+from residnet.judge.sanity import (
+    BOUNDED,
+    CHECKS,
+    DAMPING,
+    MASS,
+    STABILITY,
+    SYMMETRY,
+    Finding,
+    check_model,
+    check_run,
+    growth_rate,
+)
 from residnet.judge.sanity_points import Mirror, acceleration, operating_points
 from residnet.physics.signals import SignalsConfig
 
 # u_dot, v_dot, r_dot by term: a vessel that behaves
-RUDDER = {"u": (-0.1, 0, 0), "v": (0, -0.3, 0.05), "r": (0, -0.2, -0.5), "n": (0.02, 0, 0), "delta": (0, 0.01, 0.1)}
+RUDDER = {
+    "u": (-0.1, 0, 0),
+    "v": (0, -0.3, 0.05),
+    "r": (0, -0.2, -0.5),
+    "n": (0.02, 0, 0),
+    "delta": (0, 0.01, 0.1),
+}
 # delta from two thrusters, by differences
-TWIN = {"u": (-0.1, 0, 0), "v": (0, -0.3, 0.05), "r": (0, -0.2, -0.5), "n_port": (0.01, 0, 0.02), "n_stbd": (0.01, 0, -0.02)}
+TWIN = {
+    "u": (-0.1, 0, 0),
+    "v": (0, -0.3, 0.05),
+    "r": (0, -0.2, -0.5),
+    "n_port": (0.01, 0, 0.02),
+    "n_stbd": (0.01, 0, -0.02),
+}
 
 
 def made(
@@ -53,13 +76,23 @@ def findings(spec: ModelSpec, model: HybridDynamics) -> dict[str, Finding]:
     return {finding.check: finding for finding in check_model(spec, model)}
 
 
-@pytest.mark.parametrize(("terms", "inputs"), [(RUDDER, ("n", "delta")), (TWIN, ("n_port", "n_stbd"))])
-def test_a_vessel_that_behaves_passes(terms: dict[str, tuple[float, float, float]], inputs: tuple[str, ...]) -> None:
+@pytest.mark.parametrize(
+    ("terms", "inputs"), [(RUDDER, ("n", "delta")), (TWIN, ("n_port", "n_stbd"))]
+)
+def test_a_vessel_that_behaves_passes(
+    terms: dict[str, tuple[float, float, float]], inputs: tuple[str, ...]
+) -> None:
     low = (0.0, -0.4, -0.2, 0.0, -0.6 if inputs[1] == "delta" else 0.0)
     high = (2.0, 0.4, 0.2, 10.0, 0.6 if inputs[1] == "delta" else 10.0)
     found = findings(*made(terms, inputs, low=low, high=high))
     assert list(found) == list(CHECKS)
-    assert {check: finding.ok for check, finding in found.items()} == {DAMPING: True, STABILITY: True, SYMMETRY: True, MASS: None, BOUNDED: True}
+    assert {check: finding.ok for check, finding in found.items()} == {
+        DAMPING: True,
+        STABILITY: True,
+        SYMMETRY: True,
+        MASS: None,
+        BOUNDED: True,
+    }
     assert "not applicable: acceleration-space model" in found[MASS].text
 
 
@@ -79,17 +112,24 @@ def test_a_model_that_no_velocity_changes_is_not_damped() -> None:
 
 
 def test_purely_quadratic_damping_is_no_wrong_sign() -> None:
-    terms = {name: value for name, value in RUDDER.items() if name != "u"} | {"u|u|": (-0.1, 0.0, 0.0)}
+    terms = {name: value for name, value in RUDDER.items() if name != "u"} | {
+        "u|u|": (-0.1, 0.0, 0.0)
+    }
     assert findings(*made(terms))[DAMPING].ok is True
 
 
 def test_instability_inside_the_data_is_flagged_with_its_doubling_time() -> None:
-    # v and r feed each other: the linearisation [[-0.3, -1], [-1, -0.5]] has the eigenvalue 0.605 1/s
+    # v and r feed each other: the linearisation [[-0.3, -1], [-1, -0.5]] has the eigenvalue 0.605
+    # 1/s
     found = findings(*made(RUDDER | {"v": (0, -0.3, -1.0), "r": (0, -1.0, -0.5)}))
     assert found[DAMPING].ok is True
     assert found[STABILITY].ok is False
     assert "inside the training data" in found[STABILITY].text
-    rate = float(torch.linalg.eigvals(torch.tensor([[-0.3, -1.0], [-1.0, -0.5]], dtype=torch.float64)).real.max())
+    rate = float(
+        torch.linalg.eigvals(
+            torch.tensor([[-0.3, -1.0], [-1.0, -0.5]], dtype=torch.float64)
+        ).real.max()
+    )
     assert f"doubles in {math.log(2) / rate:.2g} s" in found[STABILITY].text
 
 
@@ -105,7 +145,11 @@ def test_growth_rate_is_the_eigenvalue_of_the_linearisation() -> None:
     spec, model = made(RUDDER)
     model = model.double()
     for point in operating_points(spec, model):
-        expected = float(torch.linalg.eigvals(torch.tensor([[-0.3, -0.2], [0.05, -0.5]], dtype=torch.float64)).real.max())
+        expected = float(
+            torch.linalg.eigvals(
+                torch.tensor([[-0.3, -0.2], [0.05, -0.5]], dtype=torch.float64)
+            ).real.max()
+        )
         assert growth_rate(model, point) == pytest.approx(expected, rel=1e-4)
 
 
@@ -148,11 +192,19 @@ def test_a_vessel_that_turns_by_itself_is_flagged(term: str) -> None:
 
 def test_unequal_thrusters_are_flagged() -> None:
     low, high = (0.0, -0.4, -0.2, 0.0, 0.0), (2.0, 0.4, 0.2, 10.0, 10.0)
-    assert findings(*made(TWIN | {"n_stbd": (0.01, 0, -0.01)}, ("n_port", "n_stbd"), low=low, high=high))[SYMMETRY].ok is False
+    assert (
+        findings(
+            *made(TWIN | {"n_stbd": (0.01, 0, -0.01)}, ("n_port", "n_stbd"), low=low, high=high)
+        )[SYMMETRY].ok
+        is False
+    )
 
 
 def test_symmetry_needs_to_know_what_steers() -> None:
-    terms = {name: value for name, value in RUDDER.items() if name not in ("n", "delta")} | {"lever": (0.02, 0, 0), "wheel": (0, 0.01, 0.1)}
+    terms = {name: value for name, value in RUDDER.items() if name not in ("n", "delta")} | {
+        "lever": (0.02, 0, 0),
+        "wheel": (0, 0.01, 0.1),
+    }
     found = findings(*made(terms, ("lever", "wheel")))
     assert found[SYMMETRY].ok is None
     assert "nobody said which input steers" in found[SYMMETRY].text
@@ -174,7 +226,13 @@ def test_a_network_on_top_is_checked_with_its_memory_settled() -> None:
     spec, model = made(RUDDER, head={"kind": "lstm", "hidden_size": 4})
     model.head.scale.spread.fill_(1e-6)
     found = findings(spec, model)
-    assert {check: finding.ok for check, finding in found.items()} == {DAMPING: True, STABILITY: True, SYMMETRY: True, MASS: None, BOUNDED: True}
+    assert {check: finding.ok for check, finding in found.items()} == {
+        DAMPING: True,
+        STABILITY: True,
+        SYMMETRY: True,
+        MASS: None,
+        BOUNDED: True,
+    }
     model.head.scale.spread.fill_(0.5)
     assert findings(spec, model)[SYMMETRY].ok is False
 
@@ -182,7 +240,9 @@ def test_a_network_on_top_is_checked_with_its_memory_settled() -> None:
 def test_a_run_is_checked_model_by_model_without_zero(tmp_path: Path) -> None:
     for name, role in (("zero", "zero"), ("baseline", "baseline")):
         spec, model = made(RUDDER)
-        save_model(tmp_path / "models" / name, spec.model_copy(update={"name": name, "role": role}), model)
+        save_model(
+            tmp_path / "models" / name, spec.model_copy(update={"name": name, "role": role}), model
+        )
     threads = torch.get_num_threads()
     found = check_run(tmp_path)
     assert [finding.model for finding in found] == ["baseline"] * len(CHECKS)

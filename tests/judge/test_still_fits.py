@@ -13,7 +13,9 @@ FOLD = torch.arange(N) // 100
 
 
 def residual(scale: float, seed: int = 0) -> torch.Tensor:
-    return scale * torch.randn(N, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return scale * torch.randn(
+        N, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64
+    )
 
 
 FORCE = residual(100.0, 9)
@@ -35,7 +37,9 @@ def test_growth_on_one_axis_is() -> None:
 
 
 def test_a_trifle_or_one_gust_is_not() -> None:
-    assert still_fits(StillFitsConfig(), residual(0.1), residual(1.0, 1), FORCE, FOLD).fits, "one percent of the force"
+    assert still_fits(StillFitsConfig(), residual(0.1), residual(1.0, 1), FORCE, FOLD).fits, (
+        "one percent of the force"
+    )
     gust = residual(20.0, 1)
     gust[:100] *= 6
     assert still_fits(StillFitsConfig(), residual(20.0), gust, FORCE, FOLD).fits
@@ -43,6 +47,12 @@ def test_a_trifle_or_one_gust_is_not() -> None:
 
 def test_nothing_can_be_said_without_force() -> None:
     with pytest.raises(DataError, match="does not vary"):
-        still_fits(StillFitsConfig(), residual(1.0), residual(1.0), torch.zeros(N, 3, dtype=torch.float64), FOLD)
+        still_fits(
+            StillFitsConfig(),
+            residual(1.0),
+            residual(1.0),
+            torch.zeros(N, 3, dtype=torch.float64),
+            FOLD,
+        )
     with pytest.raises(DataError, match="not finite"):
         still_fits(StillFitsConfig(), residual(1.0), residual(1.0) * torch.nan, FORCE, FOLD)

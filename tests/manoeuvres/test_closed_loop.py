@@ -1,4 +1,5 @@
-"""Stop conditions, spirals and excitation: what ends when, and which frequencies are in a demand."""
+"""Stop conditions, spirals and excitation: what ends when, and which frequencies are in a demand.
+"""
 
 from __future__ import annotations
 
@@ -17,20 +18,38 @@ from residnet.data.simulated.sensors import SensorNoise
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.rollout import Rollout, Source
 from residnet.dynamics.simulated import TracedPlantDynamics
-from residnet.manoeuvres import FourCorner, Helm, MultiSine, RandomSteps, Spiral, StackedSource, TurningCircle, Watched, Zigzag
+from residnet.manoeuvres import (
+    FourCorner,
+    Helm,
+    MultiSine,
+    RandomSteps,
+    Spiral,
+    StackedSource,
+    TurningCircle,
+    Watched,
+    Zigzag,
+)
 from residnet.manoeuvres.four_corner import SEGMENTS
 from residnet.manoeuvres.steady import Steady, SteadyConfig
 from residnet.physics.vessel import load_vessel
 
 DEG = math.pi / 180
 STATE = ("x", "y", "psi", "u", "v", "r")
-HELM = Helm(lambda drive, steer: torch.stack((30 * DEG * steer, drive), dim=-1), STATE, ("cmd_delta", "cmd_n"))
+HELM = Helm(
+    lambda drive, steer: torch.stack((30 * DEG * steer, drive), dim=-1),
+    STATE,
+    ("cmd_delta", "cmd_n"),
+)
 
 
 class Nomoto(Dynamics):
-    """T r_dot + r = K (delta - r_0), exactly over a step, at 1 m/s; `offset` makes a vessel that pulls to one side."""
+    """T r_dot + r = K (delta - r_0), exactly over a step, at 1 m/s; `offset` makes a vessel that
+    pulls to one side.
+    """
 
-    def __init__(self, gain: float = 0.4, time: float = 3.0, offset: float = 0.0, dt: float = 0.1) -> None:
+    def __init__(
+        self, gain: float = 0.4, time: float = 3.0, offset: float = 0.0, dt: float = 0.1
+    ) -> None:
         super().__init__(dt, "euler")
         self.gain, self.time, self.offset = gain, time, offset
         self.steps = 0
@@ -45,17 +64,24 @@ class Nomoto(Dynamics):
         psi = x[:, 2] + final * self.dt + (x[:, 5] - final) * self.time * (1 - keep)
         out = x.clone()
         out[:, 2], out[:, 5] = psi, r
-        out[:, 0], out[:, 1] = x[:, 0] + self.dt * torch.cos(psi), x[:, 1] + self.dt * torch.sin(psi)
+        out[:, 0], out[:, 1] = (
+            x[:, 0] + self.dt * torch.cos(psi),
+            x[:, 1] + self.dt * torch.sin(psi),
+        )
         return out, s
 
 
-def flown(source: Source, rows: int, steps: int, model: Nomoto | None = None) -> tuple[Tensor, Tensor, Tensor, Nomoto]:
+def flown(
+    source: Source, rows: int, steps: int, model: Nomoto | None = None
+) -> tuple[Tensor, Tensor, Tensor, Nomoto]:
     model = model or Nomoto()
     watched = Watched(source, rows)
     x0 = torch.zeros(rows, 6, dtype=torch.float64)
     x0[:, 3] = 1.0
     with torch.no_grad():
-        x, w, _ = Rollout(model, watched)(x0, torch.zeros(rows, steps, 2, dtype=torch.float64), x0[:, :0])
+        x, w, _ = Rollout(model, watched)(
+            x0, torch.zeros(rows, steps, 2, dtype=torch.float64), x0[:, :0]
+        )
     return x, w, watched.stopped, model
 
 
@@ -64,10 +90,15 @@ def times(steps: int, dt: float = 0.1) -> Tensor:
 
 
 def test_each_row_stops_on_its_own_and_the_loop_when_all_have() -> None:
-    circles = [TurningCircle(drive=1, steer=1.0, start=1), TurningCircle(drive=1, steer=-0.5, start=1, until=math.pi)]
+    circles = [
+        TurningCircle(drive=1, steer=1.0, start=1),
+        TurningCircle(drive=1, steer=-0.5, start=1, until=math.pi),
+    ]
     zigzags = [Zigzag(drive=1, steer=0.5, heading=10 * DEG, start=1, reversals=3)]
     t = times(2000)
-    source = StackedSource([TurningCircle.source(circles, HELM, t), Zigzag.source(zigzags, HELM, t)], [2, 1])
+    source = StackedSource(
+        [TurningCircle.source(circles, HELM, t), Zigzag.source(zigzags, HELM, t)], [2, 1]
+    )
     x, w, stopped, model = flown(source, 3, 2000)
     assert x.shape == (3, 2001, 6)
     assert w.shape == (3, 2000, 2)
@@ -85,13 +116,24 @@ def test_each_row_stops_on_its_own_and_the_loop_when_all_have() -> None:
 
 def test_what_is_not_reached_does_not_stop() -> None:
     t = times(300)
-    _, _, stopped, _ = flown(TurningCircle.source([TurningCircle(drive=1, steer=0.01)], HELM, t), 1, 300)
+    _, _, stopped, _ = flown(
+        TurningCircle.source([TurningCircle(drive=1, steer=0.01)], HELM, t), 1, 300
+    )
     assert stopped.tolist() == [-1]
 
 
 def test_pull_out_ends_when_the_yaw_rate_is_steady() -> None:
-    """After the turn r decays with T = 3 s; the running mean with the window's time constant follows until both are calm."""
-    circle = TurningCircle(drive=1, steer=1.0, start=1, until=math.pi, pull_out=True, steady=SteadyConfig(window=2.0, tolerance=0.01))
+    """After the turn r decays with T = 3 s; the running mean with the window's time constant
+    follows until both are calm.
+    """
+    circle = TurningCircle(
+        drive=1,
+        steer=1.0,
+        start=1,
+        until=math.pi,
+        pull_out=True,
+        steady=SteadyConfig(window=2.0, tolerance=0.01),
+    )
     t = times(1500)
     x, w, stopped, _ = flown(TurningCircle.source([circle], HELM, t), 1, 1500)
     k = int(stopped)
@@ -109,14 +151,27 @@ def test_steady_by_hand() -> None:
     for r in (1.0, 1.0, 1.0, 1.0, 1.0, 1.0):
         memory = steady(torch.tensor([r]), memory)
         seen.append((round(float(memory[0, 0]), 4), bool(steady.reached(memory))))
-    # the mean halves its distance each step: within 0.1 from the fourth on, for a window of two steps
-    assert seen == [(0.5, False), (0.75, False), (0.875, False), (0.9375, False), (0.9688, True), (0.9844, True)]
+    # the mean halves its distance each step: within 0.1 from the fourth on, for a window of two
+    # steps
+    assert seen == [
+        (0.5, False),
+        (0.75, False),
+        (0.875, False),
+        (0.9375, False),
+        (0.9688, True),
+        (0.9844, True),
+    ]
     assert not bool(steady.reached(steady.again(memory, torch.tensor([True]))))
 
 
 def test_spiral_of_a_linear_vessel_has_no_loop() -> None:
     """Steady r = K (delta - offset) at every angle, up and down alike."""
-    spiral = Spiral(drive=1, rudders=tuple(a * DEG for a in (20, 5, 0, -5, -20, -5, 0, 5)), start=1, steady=SteadyConfig(window=5, tolerance=0.002))
+    spiral = Spiral(
+        drive=1,
+        rudders=tuple(a * DEG for a in (20, 5, 0, -5, -20, -5, 0, 5)),
+        start=1,
+        steady=SteadyConfig(window=5, tolerance=0.002),
+    )
     t = times(6000)
     x, w, stopped, _ = flown(Spiral.source([spiral], HELM, t), 1, 6000, Nomoto(offset=2 * DEG))
     assert int(stopped) > 0
@@ -126,22 +181,31 @@ def test_spiral_of_a_linear_vessel_has_no_loop() -> None:
     channels = {name: x[0, :end, i].numpy() for i, name in enumerate(STATE)}
     channels |= {name: w[0, :end, i].numpy() for i, name in enumerate(HELM.inputs)}
     found = spiral.indices(Log("made", t[:end].numpy(), channels))
-    assert found["yaw_rates"] == pytest.approx([0.4 * (a - 2) * DEG for a in (20, 5, 0, -5, -20, -5, 0, 5)], abs=0.01 * 0.4 * 22 * DEG)
+    assert found["yaw_rates"] == pytest.approx(
+        [0.4 * (a - 2) * DEG for a in (20, 5, 0, -5, -20, -5, 0, 5)], abs=0.01 * 0.4 * 22 * DEG
+    )
     assert found["loop_height"] < 0.01 * 0.4 * 22 * DEG
 
 
 @pytest.mark.parametrize("kind", [MultiSine, RandomSteps])
-def test_excitation_keeps_to_its_band_and_amplitude(kind: type[MultiSine] | type[RandomSteps]) -> None:
+def test_excitation_keeps_to_its_band_and_amplitude(
+    kind: type[MultiSine] | type[RandomSteps],
+) -> None:
     dt, span = 0.1, 4000.0
     t = torch.arange(0.0, span, dt, dtype=torch.float64)
-    wave = kind(drive=0.5, drive_amplitude=0.2, steer_amplitude=0.6, band=(0.02, 0.2), seed=3, start=10.0)
+    wave = kind(
+        drive=0.5, drive_amplitude=0.2, steer_amplitude=0.6, band=(0.02, 0.2), seed=3, start=10.0
+    )
     drive, steer = (demand.numpy() for demand in wave.demands(t))
     assert (drive[t < 9.99] == 0.5).all()
     assert (steer[t < 9.99] == 0).all()
     assert 0.18 < np.abs(drive - 0.5).max() <= 0.2 + 1e-12
     assert 0.55 < np.abs(steer).max() <= 0.6 + 1e-12
     for demand in (drive - drive.mean(), steer):
-        power, frequency = np.abs(np.fft.rfft(demand * np.hanning(t.numel()))) ** 2, np.fft.rfftfreq(t.numel(), dt)
+        power, frequency = (
+            np.abs(np.fft.rfft(demand * np.hanning(t.numel()))) ** 2,
+            np.fft.rfftfreq(t.numel(), dt),
+        )
         inside = power[(frequency > 0.018) & (frequency < 0.22)].sum() / power.sum()
         # steps have harmonics and a level of their own besides
         assert inside > (0.99 if kind is MultiSine else 0.5)
@@ -177,14 +241,25 @@ def test_rudder_angles() -> None:
 
 @pytest.mark.parametrize("vessel", ["milliampere", "milliampere_azimuth"])
 def test_four_corner_course_of_the_ferry(vessel: str) -> None:
-    """Gains from the ferry's own mass; it keeps near the filtered poses and comes back to where it began."""
+    """Gains from the ferry's own mass; it keeps near the filtered poses and comes back to where it
+    began.
+    """
     plant = load_vessel(vessel).build()
     mass, omega = plant.hull.mass.diagonal(), torch.tensor([0.26, 0.26, 0.4], dtype=torch.float64)  # type: ignore[union-attr, operator]
-    gains = [tuple((part).tolist()) for part in (mass * omega**2, 0.1 * mass * omega**3, 2 * mass * omega)]
+    gains = [
+        tuple((part).tolist())
+        for part in (mass * omega**2, 0.1 * mass * omega**3, 2 * mass * omega)
+    ]
     control = MotionPIDConfig(proportional=gains[0], integral=gains[1], derivative=gains[2])
     course = FourCorner(control=control)
     assert course.lasts(10.0) == 720.0
-    craft = Craft(vessel, TracedPlantDynamics(plant, 0.2, 2), Helm.of(plant), plant.commands, plant.approach(1))
+    craft = Craft(
+        vessel,
+        TracedPlantDynamics(plant, 0.2, 2),
+        Helm.of(plant),
+        plant.commands,
+        plant.approach(1),
+    )
     (flight,) = fly(craft, [course], Sea(plant, Disturbance(), SensorNoise(), 0), 10.0, 0.2)
     motion = flight.motion
     assert len(motion) == 3600

@@ -1,4 +1,6 @@
-"""Manoeuvring indices against closed forms: circles, a sinusoidal heading, Nomoto's exact zigzag; IMO's limits."""
+"""Manoeuvring indices against closed forms: circles, a sinusoidal heading, Nomoto's exact zigzag;
+IMO's limits.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,9 @@ from residnet.manoeuvres.indices import IN_LENGTHS, UNITS, Track, first_crossing
 DEG = math.pi / 180
 
 
-def motion(t: np.ndarray, psi: np.ndarray, r: np.ndarray, u: np.ndarray, v: np.ndarray | float = 0.0) -> Log:
+def motion(
+    t: np.ndarray, psi: np.ndarray, r: np.ndarray, u: np.ndarray, v: np.ndarray | float = 0.0
+) -> Log:
     """A log whose track is the fine quadrature of its velocities."""
     v = np.broadcast_to(v, t.shape).copy()
     north, east = u * np.cos(psi) - v * np.sin(psi), u * np.sin(psi) + v * np.cos(psi)
@@ -27,13 +31,17 @@ def motion(t: np.ndarray, psi: np.ndarray, r: np.ndarray, u: np.ndarray, v: np.n
 
 
 def thinned(log: Log, every: int) -> Log:
-    return log.replace(t=log.t[::every], channels={name: values[::every] for name, values in log.channels.items()})
+    return log.replace(
+        t=log.t[::every], channels={name: values[::every] for name, values in log.channels.items()}
+    )
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
 @pytest.mark.parametrize("psi0", [0.0, 2.9])
 def test_circle(side: float, psi0: float) -> None:
-    """Straight on at 2 m/s, then at once a circle of 1.5 m/s with 5 deg of drift: all in closed form."""
+    """Straight on at 2 m/s, then at once a circle of 1.5 m/s with 5 deg of drift: all in closed
+    form.
+    """
     speed, rate, drift, start = 1.5, side * 0.06, 5 * DEG, 20.5
     t = np.arange(0.0, 240.0, 0.001)
     turning_now = t > start
@@ -45,8 +53,11 @@ def test_circle(side: float, psi0: float) -> None:
     radius = speed / abs(rate)
 
     def place(angle: float) -> tuple[float, float]:
-        # the course is drift behind the heading: integrate the velocity direction from -drift to angle - drift
-        return radius * (math.sin(angle - drift) + math.sin(drift)), radius * (math.cos(drift) - math.cos(angle - drift))
+        # the course is drift behind the heading: integrate the velocity direction from -drift to
+        # angle - drift
+        return radius * (math.sin(angle - drift) + math.sin(drift)), radius * (
+            math.cos(drift) - math.cos(angle - drift)
+        )
 
     assert found["approach_speed"] == pytest.approx(2.0, rel=1e-12)
     assert found["time_90"] == pytest.approx(math.pi / 2 / 0.06, abs=1e-3)
@@ -60,8 +71,21 @@ def test_circle(side: float, psi0: float) -> None:
     assert found["steady_yaw_rate"] == pytest.approx(0.06, rel=1e-9)
     assert found["advance_lengths"] == pytest.approx(found["advance"] / 5.0)
     # half a circle has no steady turn
-    short = turning(thinned(motion(t[:80000], psi[:80000], r[:80000], u[:80000], v[:80000]), 500), start, side, 3 * math.pi, None)
-    assert set(short) == {"approach_speed", "advance", "transfer", "time_90", "tactical_diameter", "time_180"}
+    short = turning(
+        thinned(motion(t[:80000], psi[:80000], r[:80000], u[:80000], v[:80000]), 500),
+        start,
+        side,
+        3 * math.pi,
+        None,
+    )
+    assert set(short) == {
+        "approach_speed",
+        "advance",
+        "transfer",
+        "time_90",
+        "tactical_diameter",
+        "time_180",
+    }
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
@@ -81,13 +105,21 @@ def test_sinusoidal_heading(side: float) -> None:
     assert found["period"] == pytest.approx(2 * math.pi / w, abs=1e-4)
     assert found["largest_yaw_rate"] == pytest.approx(a * w, rel=1e-9)
     # the track moves outward as long as the heading is on that side
-    outward, _ = max((float(value), 0) for value in [np.trapezoid(3 * np.sin(a * np.sin(w * s)), s) for s in [np.linspace(first, math.pi / w, 4000)]])
+    outward, _ = max(
+        (float(value), 0)
+        for value in [
+            np.trapezoid(3 * np.sin(a * np.sin(w * s)), s)
+            for s in [np.linspace(first, math.pi / w, 4000)]
+        ]
+    )
     assert found["overshoot_width"] == pytest.approx(outward, rel=1e-3)
     assert set(found) <= set(UNITS) | {f"{name}_lengths" for name in IN_LENGTHS}
 
 
 def test_nomoto_zigzag_in_closed_form() -> None:
-    """T r_dot + r = K delta with an instant rudder: overshoot T r1 - K delta T ln(1 + r1 / (K delta)) after a reversal at r1."""
+    """T r_dot + r = K delta with an instant rudder: overshoot T r1 - K delta T ln(1 + r1 / (K
+    delta)) after a reversal at r1.
+    """
     gain, time, angle, bound, start = 0.08, 9.0, 10 * DEG, 10 * DEG, 4.2
     turn = gain * angle
     edges, rates, headings, sides = [start], [0.0], [0.0], [1.0]
@@ -98,14 +130,24 @@ def test_nomoto_zigzag_in_closed_form() -> None:
     for _ in range(6):
         r0, psi0, side = rates[-1], headings[-1], sides[-1]
         rest = time * math.log(1 - side * r0 / turn) if side * r0 < 0 else 0.0
-        span = brentq(lambda s: side * psi_at(s, r0, psi0, side) - bound, rest, rest + 400.0, xtol=1e-13)  # noqa: B023
+        span = brentq(
+            lambda s, r0=r0, psi0=psi0, side=side: side * psi_at(s, r0, psi0, side) - bound,
+            rest,
+            rest + 400.0,
+            xtol=1e-13,
+        )
         edges.append(edges[-1] + span)
         rates.append(side * turn + (r0 - side * turn) * math.exp(-span / time))
         headings.append(side * bound)
         sides.append(-side)
     t = np.arange(0.0, edges[-1], 0.4)
     piece = np.searchsorted(edges, t, side="right") - 1
-    psi = np.array([0.0 if i < 0 else psi_at(s - edges[i], rates[i], headings[i], sides[i]) for s, i in zip(t, piece, strict=True)])
+    psi = np.array(
+        [
+            0.0 if i < 0 else psi_at(s - edges[i], rates[i], headings[i], sides[i])
+            for s, i in zip(t, piece, strict=True)
+        ]
+    )
     r = np.gradient(psi, t)
     found = zigzag(motion(t, psi, r, np.full_like(t, 5.0)), start, 1.0, bound, None)
 
@@ -115,9 +157,13 @@ def test_nomoto_zigzag_in_closed_form() -> None:
     assert found["initial_turning_time"] == pytest.approx(edges[1] - edges[0], abs=1e-3)
     assert found["first_overshoot"] == pytest.approx(overshoot(abs(rates[1])), abs=1e-4 * bound)
     assert found["second_overshoot"] == pytest.approx(overshoot(abs(rates[2])), abs=1e-4 * bound)
-    assert found["time_to_check_yaw"] == pytest.approx(time * math.log(1 + rates[1] / turn), abs=2e-3)
+    assert found["time_to_check_yaw"] == pytest.approx(
+        time * math.log(1 + rates[1] / turn), abs=2e-3
+    )
     # the log ends just before the sixth reversal
-    assert found["period"] == pytest.approx(np.mean([edges[i + 2] - edges[i] for i in (1, 2, 3)]), abs=1e-3)
+    assert found["period"] == pytest.approx(
+        np.mean([edges[i + 2] - edges[i] for i in (1, 2, 3)]), abs=1e-3
+    )
 
 
 def test_crossings_lie_between_samples() -> None:
@@ -146,17 +192,29 @@ def test_spiral_takes_the_rate_before_each_change() -> None:
     held = np.select([t < 5, t < 15, t < 25, t < 35], [0.0, 0.4, 0.0, -0.4], 0.0)
     r = 0.01 * np.floor(t / 5)
     channels = {"x": t, "y": t, "psi": 0 * t, "u": 0 * t + 1, "v": 0 * t, "r": r, "cmd_delta": held}
-    found = Spiral(drive=0.5, steers=(0.4, 0.0, -0.4, 0.0), start=5.0).indices(Log("made", t, channels))
+    found = Spiral(drive=0.5, steers=(0.4, 0.0, -0.4, 0.0), start=5.0).indices(
+        Log("made", t, channels)
+    )
     assert found["yaw_rates"] == pytest.approx([0.02, 0.04, 0.06, 0.09])
     assert found["loop_height"] == pytest.approx(0.05)
 
 
 @pytest.mark.parametrize(
     ("length", "speed", "first", "second"),
-    [(90.0, 10.0, 10.0, 25.0), (100.0, 10.0, 10.0, 25.0), (200.0, 10.0, 15.0, 32.5), (300.0, 10.0, 20.0, 40.0), (400.0, 10.0, 20.0, 40.0)],
+    [
+        (90.0, 10.0, 10.0, 25.0),
+        (100.0, 10.0, 10.0, 25.0),
+        (200.0, 10.0, 15.0, 32.5),
+        (300.0, 10.0, 20.0, 40.0),
+        (400.0, 10.0, 20.0, 40.0),
+    ],
 )
-def test_imo_limits_of_the_10_10_zigzag(length: float, speed: float, first: float, second: float) -> None:
-    """MSC.137(76): 10 deg below L/V = 10 s, 20 deg from 30 s on, (5 + L/(2V)) deg between; 25, 40 and (17.5 + 0.75 L/V) deg."""
+def test_imo_limits_of_the_10_10_zigzag(
+    length: float, speed: float, first: float, second: float
+) -> None:
+    """MSC.137(76): 10 deg below L/V = 10 s, 20 deg from 30 s on, (5 + L/(2V)) deg between; 25, 40
+    and (17.5 + 0.75 L/V) deg.
+    """
     limits = imo.zigzag_10(length, speed)
     assert limits["first_overshoot"] == pytest.approx(first * DEG)
     assert limits["second_overshoot"] == pytest.approx(second * DEG)
@@ -164,17 +222,33 @@ def test_imo_limits_of_the_10_10_zigzag(length: float, speed: float, first: floa
 
 
 def test_which_manoeuvres_imo_limits() -> None:
-    rudder = Helm(lambda d, s: torch.stack((35 * DEG * s, d), dim=-1), ("psi", "r", "u"), ("cmd_delta", "cmd_n"))
-    twin = Helm(lambda d, s: torch.stack((d + s, d - s), dim=-1), ("psi", "r", "u"), ("cmd_port", "cmd_stbd"))
+    rudder = Helm(
+        lambda d, s: torch.stack((35 * DEG * s, d), dim=-1),
+        ("psi", "r", "u"),
+        ("cmd_delta", "cmd_n"),
+    )
+    twin = Helm(
+        lambda d, s: torch.stack((d + s, d - s), dim=-1),
+        ("psi", "r", "u"),
+        ("cmd_port", "cmd_stbd"),
+    )
     assert rudder.hard_over == pytest.approx(35 * DEG)
     assert twin.hard_over is None
     ten = Zigzag(drive=1, rudder=10 * DEG, heading=10 * DEG)
     assert ten.share(rudder) == pytest.approx(10 / 35)
     assert ten.limits(rudder, 100, 8) == imo.zigzag_10(100, 8)
-    assert Zigzag(drive=1, rudder=-20 * DEG, heading=20 * DEG).limits(rudder, 100, 8) == imo.zigzag_20()
+    assert (
+        Zigzag(drive=1, rudder=-20 * DEG, heading=20 * DEG).limits(rudder, 100, 8)
+        == imo.zigzag_20()
+    )
     assert Zigzag(drive=1, rudder=10 * DEG, heading=20 * DEG).limits(rudder, 100, 8) == {}
-    assert Zigzag(drive=1, steer=0.5, heading=20 * DEG).limits(twin, 100, 8) == imo.zigzag_20(), "without a rudder the heading tells"
-    assert TurningCircle(drive=1, steer=-1).limits(rudder, 100, 8) == {"advance": 450, "tactical_diameter": 500}
+    assert Zigzag(drive=1, steer=0.5, heading=20 * DEG).limits(twin, 100, 8) == imo.zigzag_20(), (
+        "without a rudder the heading tells"
+    )
+    assert TurningCircle(drive=1, steer=-1).limits(rudder, 100, 8) == {
+        "advance": 450,
+        "tactical_diameter": 500,
+    }
     assert TurningCircle(drive=1, steer=0.5).limits(rudder, 100, 8) == {}
     assert Stopping(drive=1).limits(rudder, 100, 8) == {"track_reach": 1500}
     assert Stopping(drive=1, astern=-0.5).limits(rudder, 100, 8) == {}
@@ -183,7 +257,9 @@ def test_which_manoeuvres_imo_limits() -> None:
 def test_empty_samples_are_left_out() -> None:
     t = np.arange(0.0, 100.0, 0.1)
     log = motion(t, 0.3 * np.sin(0.2 * t), 0.06 * np.cos(0.2 * t), np.full_like(t, 2.0))
-    holes = log.replace(channels=log.channels | {"x": np.where(np.arange(t.size) % 5 == 0, log["x"], np.nan)})
+    holes = log.replace(
+        channels=log.channels | {"x": np.where(np.arange(t.size) % 5 == 0, log["x"], np.nan)}
+    )
     whole, few = zigzag(log, 0.0, 1.0, 0.2, None), zigzag(holes, 0.0, 1.0, 0.2, None)
     assert few["period"] == pytest.approx(whole["period"], abs=1e-4)
     with pytest.raises(DataError, match="indices need"):

@@ -1,4 +1,6 @@
-"""The contract of every manoeuvre and family, found from the unions themselves, and the shape of each kind."""
+"""The contract of every manoeuvre and family, found from the unions themselves, and the shape of
+each kind.
+"""
 
 from __future__ import annotations
 
@@ -39,11 +41,20 @@ def kinds(union: Any) -> dict[str, Any]:
 
 
 FAMILIES, MANOEUVRES = kinds(FamilyConfig), kinds(ManoeuvreConfig)
-# what a family cannot do without; a new family whose fields have defaults beyond these needs no line here
-NEEDS: dict[str, Any] = {"count": 5, "heading": (0.2, 0.4), "drive": (0.3, 0.8), "steer": (-0.5, 0.4)}
+# what a family cannot do without; a new family whose fields have defaults beyond these needs no
+# line here
+NEEDS: dict[str, Any] = {
+    "count": 5,
+    "heading": (0.2, 0.4),
+    "drive": (0.3, 0.8),
+    "steer": (-0.5, 0.4),
+}
 # of kinds that nothing draws at random
 EXAMPLES: dict[str, list[dict[str, Any]]] = {
-    "spiral": [{"drive": 0.5, "start": 2, "steady": {"window": 1.5, "tolerance": 0.05}}, {"drive": 0.6, "steers": [0.4, -0.4], "start": 1}],
+    "spiral": [
+        {"drive": 0.5, "start": 2, "steady": {"window": 1.5, "tolerance": 0.05}},
+        {"drive": 0.6, "steers": [0.4, -0.4], "start": 1},
+    ],
     "stopping": [{"drive": 0.6, "start": 8}, {"drive": 0.9, "astern": -0.5, "start": 11}],
     "waypoints": [
         {"drive": 0.7, "points": [[8, 0], [8, 10]], "acceptance": 2, "lookahead": 4},
@@ -54,7 +65,11 @@ DURATION, DT = 15.0, 0.1
 
 
 def family(kind: str) -> Any:
-    required = {name: NEEDS[name] for name, info in FAMILIES[kind].model_fields.items() if info.is_required()}
+    required = {
+        name: NEEDS[name]
+        for name, info in FAMILIES[kind].model_fields.items()
+        if info.is_required()
+    }
     return FAMILIES[kind](**required)
 
 
@@ -73,7 +88,10 @@ def replays() -> list[Manoeuvre]:
     out: list[Manoeuvre] = []
     for i in range(2):
         t = np.arange(0.0, DURATION, 0.25)
-        channels = {name: np.full(t.size, 0.1 * (i + j)) for j, name in enumerate(("x", "y", "psi", "u", "v", "r"))}
+        channels = {
+            name: np.full(t.size, 0.1 * (i + j))
+            for j, name in enumerate(("x", "y", "psi", "u", "v", "r"))
+        }
         channels |= {"cmd_port": 20.0 + 5.0 * np.sin(t + i), "cmd_stbd": 15.0 * np.cos(t)}
         Log(f"log{i}", t, channels).save(folder / f"log{i}.parquet")
         out.append(Replay(log=folder / f"log{i}.parquet"))
@@ -103,7 +121,13 @@ def times(seconds: float = DURATION, dt: float = DT) -> Tensor:
     return torch.arange(round(seconds / dt), dtype=torch.float64) * dt
 
 
-def fly(plant: Plant, manoeuvres: list[Manoeuvre], dt: float = DT, seconds: float = DURATION, psi: float = 0.0) -> tuple[Tensor, Tensor]:
+def fly(
+    plant: Plant,
+    manoeuvres: list[Manoeuvre],
+    dt: float = DT,
+    seconds: float = DURATION,
+    psi: float = 0.0,
+) -> tuple[Tensor, Tensor]:
     """States [B, T+1, 8] and commands [B, T, 2]."""
     t = times(seconds, dt)
     source = type(manoeuvres[0]).source(manoeuvres, Helm.of(plant), t)
@@ -116,7 +140,9 @@ def fly(plant: Plant, manoeuvres: list[Manoeuvre], dt: float = DT, seconds: floa
 
 
 def test_every_family_draws_a_manoeuvre_of_its_kind() -> None:
-    assert set(FAMILIES) | set(EXAMPLES) | {"replay"} == set(FLOWN), "a kind without a family needs an example here"
+    assert set(FAMILIES) | set(EXAMPLES) | {"replay"} == set(FLOWN), (
+        "a kind without a family needs an example here"
+    )
     for kind in FAMILIES:
         assert {type(m) for m in drawn(kind)} == {MANOEUVRES[kind]}
 
@@ -156,7 +182,9 @@ def test_a_batch_equals_single_flights(kind: str, plant: Plant) -> None:
 def test_all_kinds_side_by_side_equal_each_alone(plant: Plant) -> None:
     groups = [drawn(kind)[:2] for kind in FLOWN]
     t = times()
-    source = StackedSource([type(g[0]).source(g, Helm.of(plant), t) for g in groups], [2] * len(groups))
+    source = StackedSource(
+        [type(g[0]).source(g, Helm.of(plant), t) for g in groups], [2] * len(groups)
+    )
     x0 = torch.zeros(2 * len(groups), 8, dtype=torch.float64)
     w = torch.zeros(len(x0), len(t), len(plant.inputs), dtype=torch.float64)
     w[:, :, 2] = 5.0
@@ -164,7 +192,9 @@ def test_all_kinds_side_by_side_equal_each_alone(plant: Plant) -> None:
         states, inputs, _ = Rollout(PlantDynamics(plant, DT), source)(x0, w, x0[:, :0])
         assert bool((inputs[:, :, 2] == 5.0).all()), "disturbances pass through a manoeuvre"
         for i, group in enumerate(groups):
-            alone, _, _ = Rollout(PlantDynamics(plant, DT), type(group[0]).source(group, Helm.of(plant), t))(x0[:2], w[:2], x0[:2, :0])
+            alone, _, _ = Rollout(
+                PlantDynamics(plant, DT), type(group[0]).source(group, Helm.of(plant), t)
+            )(x0[:2], w[:2], x0[:2, :0])
             torch.testing.assert_close(alone, states[2 * i : 2 * i + 2], rtol=1e-10, atol=1e-12)
 
 
@@ -203,7 +233,10 @@ def test_three_two_one_one_pattern() -> None:
     assert single.tolist() == [0.0] * 5 + once + [0.0] * 21
 
 
-@pytest.mark.parametrize(("dt", "unit", "start"), [(0.01, 3.0, 10.0), (0.05, 0.35, 1.15), (0.1, 0.3, 0.7), (0.02, 1.1, 2.3)])
+@pytest.mark.parametrize(
+    ("dt", "unit", "start"),
+    [(0.01, 3.0, 10.0), (0.05, 0.35, 1.15), (0.1, 0.3, 0.7), (0.02, 1.1, 2.3)],
+)
 def test_edges_fall_on_the_grid_point_they_name(dt: float, unit: float, start: float) -> None:
     """Rounding must not move an edge by a step, wherever it lies."""
     t = times(30.0, dt)
@@ -212,7 +245,9 @@ def test_edges_fall_on_the_grid_point_they_name(dt: float, unit: float, start: f
     units = np.cumsum([0, 3, 2, 1] + [1, 3, 2, 1] * 200)
     expected = np.rint((start + unit * units) / dt).astype(int)
     np.testing.assert_array_equal(edges, expected[expected < len(t)])
-    levels = AccelerationDeceleration(times=tuple(start + unit * k for k in range(5)), levels=(1.0, 0.5, 0.2, 0.8, 0.1))
+    levels = AccelerationDeceleration(
+        times=tuple(start + unit * k for k in range(5)), levels=(1.0, 0.5, 0.2, 0.8, 0.1)
+    )
     drive, _ = levels.demands(t)
     edges = np.flatnonzero(np.diff(drive.numpy()) != 0) + 1
     np.testing.assert_array_equal(edges, np.rint((start + unit * np.arange(5)) / dt).astype(int))
@@ -220,7 +255,9 @@ def test_edges_fall_on_the_grid_point_they_name(dt: float, unit: float, start: f
 
 @pytest.mark.parametrize(("dt", "start"), [(0.01, 2.3), (0.05, 1.15), (0.1, 0.7), (0.02, 1.14)])
 def test_zigzag_starts_on_the_grid_point_it_names(dt: float, start: float, plant: Plant) -> None:
-    _, commands = fly(plant, [Zigzag(drive=0.5, steer=0.4, start=start, heading=0.3)], dt=dt, seconds=3.0)
+    _, commands = fly(
+        plant, [Zigzag(drive=0.5, steer=0.4, start=start, heading=0.3)], dt=dt, seconds=3.0
+    )
     turning = np.flatnonzero((commands[0, :, 0] != commands[0, :, 1]).numpy())
     assert turning[0] == round(start / dt)
 
@@ -234,13 +271,17 @@ def test_acceleration_deceleration_levels() -> None:
         assert isinstance(draw, AccelerationDeceleration)
         assert draw.times[0] == 0.0
         assert draw.times[-1] < DURATION
-        assert all(6.0 <= b - a <= 12.0 for a, b in zip(draw.times[:-1], draw.times[1:], strict=True))
+        assert all(
+            6.0 <= b - a <= 12.0 for a, b in zip(draw.times[:-1], draw.times[1:], strict=True)
+        )
         assert all(0.0 <= level <= 1.0 for level in draw.levels)
         assert min(draw.levels[::2]) > max(draw.levels[1::2], default=0.0) - 0.1
 
 
 def test_constant_family_is_every_combination() -> None:
-    got = FAMILIES["constant"](drive=(0.2, 0.6), steer=(-0.1, 0.0, 0.1)).draw(np.random.default_rng(0), 10.0)
+    got = FAMILIES["constant"](drive=(0.2, 0.6), steer=(-0.1, 0.0, 0.1)).draw(
+        np.random.default_rng(0), 10.0
+    )
     assert got == [ConstantInput(drive=d, steer=s) for d in (0.2, 0.6) for s in (-0.1, 0.0, 0.1)]
 
 
@@ -248,7 +289,10 @@ def test_constant_family_is_every_combination() -> None:
     ("config", "message"),
     [
         ({"kind": "zigzag", "drive": 0.5, "steer": 0.4, "heading": "-10 deg"}, "greater than 0"),
-        ({"kind": "zigzag", "drive": 1.5, "steer": 0.4, "heading": "10 deg"}, "less than or equal to 1"),
+        (
+            {"kind": "zigzag", "drive": 1.5, "steer": 0.4, "heading": "10 deg"},
+            "less than or equal to 1",
+        ),
         ({"kind": "constant", "drive": 0.5, "steer": -1.1}, "greater than or equal to -1"),
         ({"kind": "three_two_one_one", "drive": 0.5, "steer": 0.4, "unit": 0}, "greater than 0"),
         ({"kind": "acceleration_deceleration", "times": [0, 5], "levels": [0.3]}, "same number"),
@@ -266,7 +310,10 @@ def trials(**changes: Any) -> SimulatedTrials:
     return SimulatedTrials.model_validate(
         {
             "vessel": "wam_v_cal",
-            "trials": [{"kind": "zigzag", "count": 4, "heading": [0.2]}, {"kind": "constant", "drive": [0.5], "steer": [0.2]}],
+            "trials": [
+                {"kind": "zigzag", "count": 4, "heading": [0.2]},
+                {"kind": "constant", "drive": [0.5], "steer": [0.2]},
+            ],
             "duration": 10.0,
             "substeps": 1,
             "identification": {"zigzag": 3},
@@ -281,7 +328,9 @@ def test_simulated_trials_are_repeatable_and_split_whole() -> None:
     config = trials()
     manoeuvres = config.draw()
     assert sorted(config.splits(manoeuvres)) == ["test", "train", "train", "train", "validation"]
-    assert config.splits(manoeuvres)[-1] == "train", "kinds that are not named are for identification"
+    assert config.splits(manoeuvres)[-1] == "train", (
+        "kinds that are not named are for identification"
+    )
     one, two = simulate(manoeuvres, config), simulate(config.draw(), config)
     for a, b in zip(one, two, strict=True):
         assert a.name == b.name

@@ -10,8 +10,17 @@ from residnet.manoeuvres.recognise import steered_zigzag
 STEP = 0.1
 
 
-def zigzag_log(angle: float, heading: float, side: float, offset: float = 0.0, noise: float = 0.0, seconds: float = 120.0) -> Log:
-    """Nomoto's ship (K = .15, T = 8 s) steered in a zigzag from 4 s on, its rudder resting at `offset` before and turning about it by 15 deg/s."""
+def zigzag_log(
+    angle: float,
+    heading: float,
+    side: float,
+    offset: float = 0.0,
+    noise: float = 0.0,
+    seconds: float = 120.0,
+) -> Log:
+    """Nomoto's ship (K = .15, T = 8 s) steered in a zigzag from 4 s on, its rudder resting at
+    `offset` before and turning about it by 15 deg/s.
+    """
     t = np.arange(0, seconds, STEP)
     psi, r, delta, towards = 0.0, 0.0, offset, side
     out = np.zeros((t.size, 2))
@@ -20,7 +29,9 @@ def zigzag_log(angle: float, heading: float, side: float, offset: float = 0.0, n
         if towards * psi >= heading:
             towards = -towards
         wanted = towards * angle + offset if now >= 4.0 else offset
-        delta += float(np.clip(wanted - delta, -math.radians(15.0) * STEP, math.radians(15.0) * STEP))
+        delta += float(
+            np.clip(wanted - delta, -math.radians(15.0) * STEP, math.radians(15.0) * STEP)
+        )
         r += STEP * (0.15 * (delta - offset) - r) / 8.0
         psi += STEP * r
     measured = out[:, 1] + noise * np.random.default_rng(0).standard_normal(t.size)
@@ -28,8 +39,12 @@ def zigzag_log(angle: float, heading: float, side: float, offset: float = 0.0, n
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
-@pytest.mark.parametrize(("angle", "heading", "offset"), [(10, 10, 0), (20, 5, 0.8), (30, 20, -1.0), (5, 1, 0)])
-def test_what_was_steered_is_read_off(side: float, angle: float, heading: float, offset: float) -> None:
+@pytest.mark.parametrize(
+    ("angle", "heading", "offset"), [(10, 10, 0), (20, 5, 0.8), (30, 20, -1.0), (5, 1, 0)]
+)
+def test_what_was_steered_is_read_off(
+    side: float, angle: float, heading: float, offset: float
+) -> None:
     log = zigzag_log(math.radians(angle), math.radians(heading), side, math.radians(offset))
     found = steered_zigzag(log, "delta")
     assert found.side == side
@@ -40,7 +55,9 @@ def test_what_was_steered_is_read_off(side: float, angle: float, heading: float,
 
 
 def test_noise_on_the_rudder_does_not_make_orders() -> None:
-    found = steered_zigzag(zigzag_log(math.radians(20), math.radians(20), 1.0, noise=math.radians(0.01)), "delta")
+    found = steered_zigzag(
+        zigzag_log(math.radians(20), math.radians(20), 1.0, noise=math.radians(0.01)), "delta"
+    )
     assert math.degrees(found.heading) == pytest.approx(20, abs=0.5)
 
 
@@ -57,14 +74,25 @@ def test_other_manoeuvres_are_refused() -> None:
 
 @pytest.mark.parametrize("every", [1, 2, 3])
 def test_where_the_rudder_left_does_not_hang_on_the_grid(every: int) -> None:
-    """The order of the closed form: the rudder of the made zigzag leaves at the very sample that is the first beyond the heading."""
+    """The order of the closed form: the rudder of the made zigzag leaves at the very sample that is
+    the first beyond the heading.
+    """
     log = zigzag_log(math.radians(20), math.radians(10), 1.0)
     t, psi, delta = log.t, log["psi"] - log["psi"][0], log["delta"]
-    turns = [k for k in range(60, t.size - 1) if abs(delta[k]) == pytest.approx(math.radians(20)) and abs(delta[k + 1]) < abs(delta[k]) - 1e-6]
+    turns = [
+        k
+        for k in range(60, t.size - 1)
+        if abs(delta[k]) == pytest.approx(math.radians(20))
+        and abs(delta[k + 1]) < abs(delta[k]) - 1e-6
+    ]
     expected = float(np.mean(np.abs(psi[turns])))
     assert len(turns) > 2
-    coarse = log.replace(t=t[::every], channels={name: log[name][::every] for name in ("psi", "delta")})
-    assert math.degrees(steered_zigzag(coarse, "delta").leaves) == pytest.approx(math.degrees(expected), abs=0.03)
+    coarse = log.replace(
+        t=t[::every], channels={name: log[name][::every] for name in ("psi", "delta")}
+    )
+    assert math.degrees(steered_zigzag(coarse, "delta").leaves) == pytest.approx(
+        math.degrees(expected), abs=0.03
+    )
     rates = np.abs(np.gradient(psi, t))[turns]
     assert steered_zigzag(coarse, "delta").turning == pytest.approx(float(rates.mean()), rel=0.02)
     if every == 1:

@@ -1,4 +1,6 @@
-"""Abkowitz vessels: the Mariner's equations written out, units of both systems, gradients, and wrong files."""
+"""Abkowitz vessels: the Mariner's equations written out, units of both systems, gradients, and
+wrong files.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,18 @@ def mariner(u: float, v: float, r: float, delta: float) -> np.ndarray:
     speed = np.hypot(u, v)
     e, v, r = (u - SERVICE) / speed, v / speed, r * LENGTH / speed
     d = delta
-    x = -184 * e - 110 * e**2 - 215 * e**3 - 899 * v**2 + 18 * r**2 + 798 * r * v - 95 * d**2 - 190 * e * d**2 + 93 * v * d + 93 * e * v * d
+    x = (
+        -184 * e
+        - 110 * e**2
+        - 215 * e**3
+        - 899 * v**2
+        + 18 * r**2
+        + 798 * r * v
+        - 95 * d**2
+        - 190 * e * d**2
+        + 93 * v * d
+        + 93 * e * v * d
+    )
     y = (
         -1160 * v - 499 * r - 8078 * v**3 + 15356 * v**2 * r - 1160 * v * e - 499 * r * e + 278 * d - 90 * d**3
         + 556 * e * d + 278 * e**2 * d - 4 * v * d**2 + 1190 * v**2 * d - 4 - 8 * e - 4 * e**2
@@ -47,11 +60,15 @@ def test_the_mariner_written_out() -> None:
         x = torch.tensor([[0.0, 0.0, 0.0, *nu, delta]], dtype=torch.float64)
         w = torch.zeros(1, len(plant.inputs), dtype=torch.float64)
         w[0, 0] = delta
-        np.testing.assert_allclose(plant.rate(x, w)[0, 3:6], mariner(*nu, -delta), rtol=1e-10, atol=1e-14)
+        np.testing.assert_allclose(
+            plant.rate(x, w)[0, 3:6], mariner(*nu, -delta), rtol=1e-10, atol=1e-14
+        )
 
 
 def test_a_turn_of_the_mariner() -> None:
-    """35 deg to starboard from 15 kn, against SciPy on the equations written out; advance and tactical diameter of a few lengths."""
+    """35 deg to starboard from 15 kn, against SciPy on the equations written out; advance and
+    tactical diameter of a few lengths.
+    """
     plant = load_vessel("mariner").build()
     steps, dt = 1400, 0.5
     w = torch.zeros(1, steps, len(plant.inputs), dtype=torch.float64)
@@ -64,10 +81,16 @@ def test_a_turn_of_the_mariner() -> None:
     def rate(_: float, s: np.ndarray) -> np.ndarray:
         c, i = np.cos(s[2]), np.sin(s[2])
         gear = np.clip(np.radians(35) - s[6], -np.radians(5), np.radians(5))
-        return np.array([c * s[3] - i * s[4], i * s[3] + c * s[4], s[5], *mariner(*s[3:6], -s[6]), gear])
+        return np.array(
+            [c * s[3] - i * s[4], i * s[3] + c * s[4], s[5], *mariner(*s[3:6], -s[6]), gear]
+        )
 
-    truth = solve_ivp(rate, (0, steps * dt), x0[0].numpy(), rtol=1e-9, atol=1e-10, max_step=1.0).y[:, -1]
-    assert (np.abs(states[0, -1, :6].numpy() - truth[:6]) < [0.5, 0.5, 2e-3, 1e-4, 1e-4, 1e-6]).all()
+    truth = solve_ivp(rate, (0, steps * dt), x0[0].numpy(), rtol=1e-9, atol=1e-10, max_step=1.0).y[
+        :, -1
+    ]
+    assert (
+        np.abs(states[0, -1, :6].numpy() - truth[:6]) < [0.5, 0.5, 2e-3, 1e-4, 1e-4, 1e-6]
+    ).all()
     track = states[0]
     quarter = track[torch.nonzero(track[:, 2] > np.pi / 2)[0, 0]]
     half = track[torch.nonzero(track[:, 2] > np.pi)[0, 0]]
@@ -90,7 +113,9 @@ def test_prime_and_si_are_the_same_vessel() -> None:
 
     rows = {
         axis: {term: scaled(term, value, size) for term, value in row.items()}
-        for axis, row, size in zip("XYN", prime.coefficients.rows(), (force, force, force * length), strict=True)
+        for axis, row, size in zip(
+            "XYN", prime.coefficients.rows(), (force, force, force * length), strict=True
+        )
     }
     kilo, body = 0.5 * 1025 * length**3, prime.mass
     mass = {
@@ -98,32 +123,55 @@ def test_prime_and_si_are_the_same_vessel() -> None:
         "Y_vdot": body.Y_vdot * kilo, "Y_rdot": body.Y_rdot * kilo * length, "N_vdot": body.N_vdot * kilo * length,
         "N_rdot": body.N_rdot * kilo * length**2,
     }  # fmt: skip
-    si = AbkowitzConfig.model_validate(prime.model_dump() | {"units": "si", "coefficients": rows, "mass": mass})
+    si = AbkowitzConfig.model_validate(
+        prime.model_dump() | {"units": "si", "coefficients": rows, "mass": mass}
+    )
     a, b = prime.build(), si.build()
     v = 0.5
-    x = torch.tensor([[0.0, 0.0, 0.3, np.sqrt(SERVICE**2 - v**2), v, 0.008, -0.2]], dtype=torch.float64)
+    x = torch.tensor(
+        [[0.0, 0.0, 0.3, np.sqrt(SERVICE**2 - v**2), v, 0.008, -0.2]], dtype=torch.float64
+    )
     w = torch.zeros(1, len(a.inputs), dtype=torch.float64)
     w[0, 1:4] = torch.tensor([2e5, -1e5, 3e7])
     torch.testing.assert_close(a.rate(x, w), b.rate(x, w), rtol=1e-9, atol=1e-12)
 
 
 def test_coriolis_of_the_rigid_body_may_stand_outside_the_series() -> None:
-    """Taking m out of X_vr and Y_r, and m x_G out of N_r and X_rr, and adding C_RB gives the same (at the service speed)."""
+    """Taking m out of X_vr and Y_r, and m x_G out of N_r and X_rr, and adding C_RB gives the same
+    (at the service speed).
+    """
     inside = load_vessel("mariner")
     m, x_g = 798e-5, -0.023
-    changes = {"coefficients.X.v r": 798e-5 - m, "coefficients.X.r^2": 18e-5 - m * x_g, "coefficients.Y.r": -499e-5 + m}
-    changes |= {"coefficients.Y.du r": -499e-5 + m, "coefficients.N.r": -166e-5 + m * x_g, "coefficients.N.du r": -166e-5 + m * x_g}
-    outside = load_config(MARINER, ["coriolis=rigid_body", *(f"{key}={value}" for key, value in changes.items())], AbkowitzConfig)
+    changes = {
+        "coefficients.X.v r": 798e-5 - m,
+        "coefficients.X.r^2": 18e-5 - m * x_g,
+        "coefficients.Y.r": -499e-5 + m,
+    }
+    changes |= {
+        "coefficients.Y.du r": -499e-5 + m,
+        "coefficients.N.r": -166e-5 + m * x_g,
+        "coefficients.N.du r": -166e-5 + m * x_g,
+    }
+    outside = load_config(
+        MARINER,
+        ["coriolis=rigid_body", *(f"{key}={value}" for key, value in changes.items())],
+        AbkowitzConfig,
+    )
     a, b = inside.build(), outside.build()
     # at the service speed: the series counts 1 + (U - U0) / U where the body has u / U
-    x = torch.tensor([[0.0, 0.0, 0.3, np.sqrt(SERVICE**2 - 0.25), 0.5, 0.008, -0.2]], dtype=torch.float64)
+    x = torch.tensor(
+        [[0.0, 0.0, 0.3, np.sqrt(SERVICE**2 - 0.25), 0.5, 0.008, -0.2]], dtype=torch.float64
+    )
     w = torch.zeros(1, len(a.inputs), dtype=torch.float64)
     torch.testing.assert_close(a.rate(x, w), b.rate(x, w), rtol=1e-9, atol=1e-14)
 
 
 def test_gradients_and_rest() -> None:
     plant = load_vessel("mariner").build()
-    x = torch.tensor([[1.0, -2.0, 0.7, 7.2, -0.3, 0.01, 0.2], [0.0, 0.0, 0.1, 6.0, 0.4, -0.005, -0.1]], dtype=torch.float64)
+    x = torch.tensor(
+        [[1.0, -2.0, 0.7, 7.2, -0.3, 0.01, 0.2], [0.0, 0.0, 0.1, 6.0, 0.4, -0.005, -0.1]],
+        dtype=torch.float64,
+    )
     w = torch.zeros(2, len(plant.inputs), dtype=torch.float64)
     w[:, 0] = torch.tensor([0.21, -0.12])
     assert torch.autograd.gradcheck(plant.rate, (x.requires_grad_(), w.requires_grad_()))
@@ -133,7 +181,11 @@ def test_gradients_and_rest() -> None:
 
 def test_revolutions_enter_where_the_series_knows_them() -> None:
     shaft = "shaft={n_0: 1.5, n_max: 2, n_rate: 0.1}"
-    vessel = load_config(MARINER, [shaft, "coefficients.X.dn=400.0e-5", "coefficients.X.dn^2=50.0e-5"], AbkowitzConfig)
+    vessel = load_config(
+        MARINER,
+        [shaft, "coefficients.X.dn=400.0e-5", "coefficients.X.dn^2=50.0e-5"],
+        AbkowitzConfig,
+    )
     plant = vessel.build()
     assert plant.inputs[:2] == ("cmd_delta", "cmd_n")
     x = plant.approach(2)
@@ -172,7 +224,10 @@ def test_wrong_files_are_one_line(override: str, message: str) -> None:
     ("overrides", "message"),
     [
         (["mass.X_udot=900.0e-5"], "mariner: the mass matrix is not positive definite"),
-        (["mass.x_G=0.0", "mass.Y_rdot=-358.21502e-5", "mass.N_vdot=-358.21502e-5"], "mariner: the mass matrix is (singular|not positive definite)"),
+        (
+            ["mass.x_G=0.0", "mass.Y_rdot=-358.21502e-5", "mass.N_vdot=-358.21502e-5"],
+            "mariner: the mass matrix is (singular|not positive definite)",
+        ),
     ],
 )
 def test_impossible_masses_are_one_line(overrides: list[str], message: str) -> None:

@@ -1,4 +1,6 @@
-"""Thrusters: the printed curves (document 003 eqs. (21), (22)), their clipping, saturation and rate limit."""
+"""Thrusters: the printed curves (document 003 eqs. (21), (22)), their clipping, saturation and rate
+limit.
+"""
 
 from __future__ import annotations
 
@@ -25,8 +27,15 @@ def rpm(*values: float) -> torch.Tensor:
 
 def test_curve_is_the_printed_one_in_rpm(thrusters: DifferentialThrust) -> None:
     ahead, astern = np.linspace(45, 2380, 40), np.linspace(-2380, -61, 40)
-    np.testing.assert_allclose(thrusters.thrust(rpm(*ahead)), 3.54e-5 * ahead**2 + 0.084 * ahead - 3.798, rtol=1e-4)
-    np.testing.assert_allclose(thrusters.thrust(rpm(*astern)), -1.189e-5 * astern**2 + 0.0707 * astern + 4.331, rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(
+        thrusters.thrust(rpm(*ahead)), 3.54e-5 * ahead**2 + 0.084 * ahead - 3.798, rtol=1e-4
+    )
+    np.testing.assert_allclose(
+        thrusters.thrust(rpm(*astern)),
+        -1.189e-5 * astern**2 + 0.0707 * astern + 4.331,
+        rtol=1e-3,
+        atol=1e-3,
+    )
 
 
 def test_full_thrust_of_two_is_what_errata_states(thrusters: DifferentialThrust) -> None:
@@ -36,7 +45,8 @@ def test_full_thrust_of_two_is_what_errata_states(thrusters: DifferentialThrust)
 
 
 def test_dead_band_and_sign(thrusters: DifferentialThrust) -> None:
-    """Clipped, the curve is zero from -60.6 to 44.4 rpm (ERRATA W5) and never opposes the rotation."""
+    """Clipped, the curve is zero from -60.6 to 44.4 rpm (ERRATA W5) and never opposes the rotation.
+    """
     n = torch.linspace(-2380, 2380, 20_001, dtype=torch.float64) / 60.0
     thrust = thrusters.thrust(n)
     assert bool((thrust * n >= 0).all())
@@ -71,7 +81,11 @@ def test_shapes(thrusters: DifferentialThrust) -> None:
 
 def test_rate_limit(thrusters: DifferentialThrust) -> None:
     """From rest to full in 2380 / 1500 = 1.59 s, a reversal in 3.17 s (ERRATA W7)."""
-    dt, n, command = 0.01, torch.zeros(1, 2, dtype=torch.float64), torch.tensor([[N_MAX, -N_MAX]], dtype=torch.float64)
+    dt, n, command = (
+        0.01,
+        torch.zeros(1, 2, dtype=torch.float64),
+        torch.tensor([[N_MAX, -N_MAX]], dtype=torch.float64),
+    )
     steps = 0
     while not torch.equal(n, command):
         before, n = n, thrusters.advance(n, command, dt)
@@ -89,17 +103,31 @@ def test_saturation_and_small_steps(thrusters: DifferentialThrust) -> None:
     far = torch.tensor([[100.0, -100.0]], dtype=torch.float64)
     held = torch.tensor([[N_MAX, -N_MAX]], dtype=torch.float64)
     assert torch.equal(thrusters.advance(held, far, 0.1), held)
-    n, near = torch.tensor([[10.0, 10.0]], dtype=torch.float64), torch.tensor([[10.001, 9.999]], dtype=torch.float64)
+    n, near = (
+        torch.tensor([[10.0, 10.0]], dtype=torch.float64),
+        torch.tensor([[10.001, 9.999]], dtype=torch.float64),
+    )
     torch.testing.assert_close(thrusters.advance(n, near, 0.1), near, rtol=0, atol=1e-15)
 
 
 @pytest.mark.parametrize(
-    ("key", "value", "message"), [("spacing", "0 m", "greater than 0"), ("n_max", "-3 rpm", "greater than 0"), ("n_rate", "10 rpm", "rpm")]
+    ("key", "value", "message"),
+    [
+        ("spacing", "0 m", "greater than 0"),
+        ("n_max", "-3 rpm", "greater than 0"),
+        ("n_rate", "10 rpm", "rpm"),
+    ],
 )
 def test_wrong_limits_are_config_errors(key: str, value: str, message: str) -> None:
     curve = [0.0, 1.0, 0.0]
     limits = {"spacing": 2.0, "n_max": "1000 rpm", "n_rate": "500 rpm/s"}
-    good = {"kind": "differential_thrust", "forward": curve, "reverse": curve, "source": "made", **limits}
+    good = {
+        "kind": "differential_thrust",
+        "forward": curve,
+        "reverse": curve,
+        "source": "made",
+        **limits,
+    }
     validate(good, DifferentialThrustConfig, "here")
     with pytest.raises(ConfigError, match=message) as caught:
         validate({**good, key: value}, DifferentialThrustConfig, "here")

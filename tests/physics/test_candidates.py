@@ -7,14 +7,32 @@ import pytest
 from residnet.core.errors import ConfigError
 from residnet.physics.candidates import CandidatesConfig, rated
 
-JETS = CandidatesConfig(inputs=("rpm",), input_degree=2, coupling=("u",), coupling_degree=2, angles=("nozzle",))
+JETS = CandidatesConfig(
+    inputs=("rpm",), input_degree=2, coupling=("u",), coupling_degree=2, angles=("nozzle",)
+)
 NAMES = ("u", "v", "r", "rpm", "nozzle")
 
 
 def test_motions_with_magnitudes() -> None:
     terms = {c.term for c in CandidatesConfig(inputs=()).candidates(("u", "v"))}
-    assert terms == {"1", "u", "v", "|u|", "|v|", "u^2", "u v", "u |u|", "u |v|", "v^2", "v |u|", "v |v|", "|u| |v|"}
-    assert {c.term for c in CandidatesConfig(inputs=(), magnitudes=False).candidates(("u", "v"))} == {"1", "u", "v", "u^2", "u v", "v^2"}
+    assert terms == {
+        "1",
+        "u",
+        "v",
+        "|u|",
+        "|v|",
+        "u^2",
+        "u v",
+        "u |u|",
+        "u |v|",
+        "v^2",
+        "v |u|",
+        "v |v|",
+        "|u| |v|",
+    }
+    assert {
+        c.term for c in CandidatesConfig(inputs=(), magnitudes=False).candidates(("u", "v"))
+    } == {"1", "u", "v", "u^2", "u v", "v^2"}
 
 
 def test_jets_have_every_term_of_the_document() -> None:
@@ -22,7 +40,9 @@ def test_jets_have_every_term_of_the_document() -> None:
     terms = [c.term for c in found]
     assert len(terms) == len(set(terms)) == 49
     # (6.21)-(6.23): nine products with the cosine, nine with the sine, and the hull
-    products = [" ".join(p for p in (a, b) if p) for a in ("", "u", "u^2") for b in ("", "rpm", "rpm^2")]
+    products = [
+        " ".join(p for p in (a, b) if p) for a in ("", "u", "u^2") for b in ("", "rpm", "rpm^2")
+    ]
     assert {f"{p} {f}(nozzle)".strip() for p in products for f in ("sin", "cos")} <= set(terms)
     assert {"v r", "u r", "u", "v", "r", "u |u|", "v |v|", "r |r|"} <= set(terms)
     assert "v rpm" not in terms
@@ -41,13 +61,17 @@ def test_order_is_by_degree_then_by_effort() -> None:
 
 
 def test_all_other_channels_are_inputs_unless_named() -> None:
-    assert {"tau_x", "tau_n"} <= {c.term for c in CandidatesConfig().candidates(("u", "v", "r", "tau_x", "tau_n"))}
+    assert {"tau_x", "tau_n"} <= {
+        c.term for c in CandidatesConfig().candidates(("u", "v", "r", "tau_x", "tau_n"))
+    }
     extra = CandidatesConfig(inputs=(), extra=("tau_x inv(u)",)).candidates(("u", "tau_x"))
     assert [c.term for c in extra if "tau" in c.term] == ["tau_x inv(u)"]
 
 
 def test_unknown_channels_are_named() -> None:
-    with pytest.raises(ConfigError, match="'nozle' is not a channel of the model; did you mean 'nozzle'"):
+    with pytest.raises(
+        ConfigError, match="'nozle' is not a channel of the model; did you mean 'nozzle'"
+    ):
         CandidatesConfig(angles=("nozle",)).candidates(NAMES)
     with pytest.raises(ConfigError, match="no channel 'w'"):
         rated(["u w"], NAMES)

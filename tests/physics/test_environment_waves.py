@@ -1,4 +1,6 @@
-"""A seaway against its own spectrum, and the force on a box against the integral of the pressure over its surface."""
+"""A seaway against its own spectrum, and the force on a box against the integral of the pressure
+over its surface.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,14 @@ from scipy.integrate import quad
 
 from residnet.core.config import validate
 from residnet.core.errors import ConfigError
-from residnet.physics.environment.waves import GRAVITY, IttcSpectrum, JonswapSpectrum, Spectrum, Waves, WavesConfig
+from residnet.physics.environment.waves import (
+    GRAVITY,
+    IttcSpectrum,
+    JonswapSpectrum,
+    Spectrum,
+    Waves,
+    WavesConfig,
+)
 
 SEA: dict[str, Any] = {
     "significant_height": 1.2,
@@ -32,15 +41,23 @@ def elevations(waves: Waves, t: np.ndarray) -> np.ndarray:
         return torch.stack([waves.elevation(zero, zero, float(time)) for time in t], dim=1).numpy()
 
 
-@pytest.mark.parametrize("spectrum", [IttcSpectrum(), JonswapSpectrum(gamma=1.0), JonswapSpectrum()], ids=["ittc", "jonswap1", "jonswap3.3"])
+@pytest.mark.parametrize(
+    "spectrum",
+    [IttcSpectrum(), JonswapSpectrum(gamma=1.0), JonswapSpectrum()],
+    ids=["ittc", "jonswap1", "jonswap3.3"],
+)
 def test_forms_of_the_spectrum(spectrum: Spectrum) -> None:
-    """Peak at the peak period; the ITTC form has m0 = H^2/16, as JONSWAP with gamma 1 has; the table's A = 173 H^2/T1^4, B = 691/T1^4."""
+    """Peak at the peak period; the ITTC form has m0 = H^2/16, as JONSWAP with gamma 1 has; the
+    table's A = 173 H^2/T1^4, B = 691/T1^4.
+    """
     height, period = 2.0, 7.0
     omega = np.linspace(0.05, 8, 20_000)
     density = spectrum.density(omega, height, period)
     assert 2 * np.pi / omega[density.argmax()] == pytest.approx(period, rel=2e-3)
     if not (isinstance(spectrum, JonswapSpectrum) and spectrum.gamma > 1):
-        area, _ = quad(lambda o: float(spectrum.density(np.array(o), height, period)), 0.05, 60, limit=500)
+        area, _ = quad(
+            lambda o: float(spectrum.density(np.array(o), height, period)), 0.05, 60, limit=500
+        )
         assert area == pytest.approx(height**2 / 16, rel=1e-5)
         t1 = 0.7718 * period
         table = 173 * height**2 / t1**4 * omega**-5 * np.exp(-691 / t1**4 * omega**-4)
@@ -54,7 +71,9 @@ def test_forms_of_the_spectrum(spectrum: Spectrum) -> None:
 @pytest.mark.parametrize("directions", [1, 8])
 def test_the_surface_has_the_spectrums_variance_height_and_peak(kind: str, directions: int) -> None:
     waves = sea(rows=30, spectrum={"kind": kind}, directions=directions)
-    np.testing.assert_allclose(0.5 * waves.amplitude.square().sum(1), np.full(30, 1.2**2 / 16), rtol=1e-12)
+    np.testing.assert_allclose(
+        0.5 * waves.amplitude.square().sum(1), np.full(30, 1.2**2 / 16), rtol=1e-12
+    )
     t = np.arange(0, 900, 0.5)
     zeta = elevations(waves, t)
     assert 4 * np.sqrt(np.mean(zeta**2)) == pytest.approx(1.2, rel=0.02)
@@ -83,7 +102,9 @@ def test_the_force_has_the_variance_that_spectrum_and_response_give() -> None:
 
 @pytest.mark.parametrize("angle", [0.0, 17.0, 90.0, 143.0, 180.0, 250.0])
 def test_the_response_is_the_pressure_on_the_hull(angle: float) -> None:
-    """The undisturbed wave's pressure on walls and bottom of the box, by quadrature over its surface."""
+    """The undisturbed wave's pressure on walls and bottom of the box, by quadrature over its
+    surface.
+    """
     waves = sea(direction=float(np.radians(angle)), frequencies=10)
     psi = torch.zeros(1, dtype=torch.float64)
     quadrature, yaw = waves.response(psi)
@@ -101,7 +122,11 @@ def test_the_response_is_the_pressure_on_the_hull(angle: float) -> None:
             def pressure(x: Any, y: Any, z: Any, k: float = number, theta: float = theta) -> Any:
                 return rho_g * np.exp(-k * z) * np.cos(theta - k * (x * c + y * s))
 
-            (xs, wx), (ys, wy), (zs, wz) = on(length, -length / 2), on(breadth, -breadth / 2), on(draught, 0.0)
+            (xs, wx), (ys, wy), (zs, wz) = (
+                on(length, -length / 2),
+                on(breadth, -breadth / 2),
+                on(draught, 0.0),
+            )
             total = np.zeros(4)
             for side in (1, -1):
                 y, z = np.meshgrid(ys, zs, indexing="ij")
@@ -130,7 +155,8 @@ def test_symmetry_of_the_force() -> None:
 
 
 def test_long_waves_push_down_their_slope() -> None:
-    """Buoyancy on a tilted surface: minus displacement times slope, and no moment about midships."""
+    """Buoyancy on a tilted surface: minus displacement times slope, and no moment about midships.
+    """
     waves = sea(peak_period=60.0, frequencies=10, direction=0.0)
     quadrature, _ = waves.response(torch.zeros(1, dtype=torch.float64))
     slope = waves.number[0]
@@ -139,7 +165,8 @@ def test_long_waves_push_down_their_slope() -> None:
 
 
 def test_a_moving_vessel_meets_waves_at_the_encounter_frequency() -> None:
-    """(5.31): omega_e = omega - omega^2 U cos(chi) / g along a straight course at constant speed."""
+    """(5.31): omega_e = omega - omega^2 U cos(chi) / g along a straight course at constant speed.
+    """
     waves = sea(direction=float(np.radians(40)))
     speed, course = 6.0, np.radians(-100)
     t = 12.0
@@ -152,15 +179,21 @@ def test_a_moving_vessel_meets_waves_at_the_encounter_frequency() -> None:
 
 def test_one_seed_one_sea() -> None:
     t = np.arange(0, 20, 1.0)
-    np.testing.assert_array_equal(elevations(sea(rows=3, seed=4), t), elevations(sea(rows=3, seed=4), t))
-    assert np.abs(elevations(sea(rows=3, seed=4), t) - elevations(sea(rows=3, seed=5), t)).max() > 0.1
+    np.testing.assert_array_equal(
+        elevations(sea(rows=3, seed=4), t), elevations(sea(rows=3, seed=4), t)
+    )
+    assert (
+        np.abs(elevations(sea(rows=3, seed=4), t) - elevations(sea(rows=3, seed=5), t)).max() > 0.1
+    )
     rows = elevations(sea(rows=2, seed=4), t)
     assert np.abs(rows[0] - rows[1]).max() > 0.1
 
 
 def test_gradients() -> None:
     waves = sea(frequencies=10, directions=3)
-    place = [torch.tensor([value], dtype=torch.float64, requires_grad=True) for value in (3.0, -2.0, 0.4)]
+    place = [
+        torch.tensor([value], dtype=torch.float64, requires_grad=True) for value in (3.0, -2.0, 0.4)
+    ]
     assert torch.autograd.gradcheck(lambda n, e, p: waves(n, e, p, 1.5) / 1e3, place, atol=1e-4)
 
 

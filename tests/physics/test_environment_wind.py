@@ -10,11 +10,22 @@ import torch
 
 from residnet.core.config import load_config, validate
 from residnet.core.errors import ConfigError
-from residnet.physics.environment.wind import SymmetricWindConfig, TabulatedWindConfig, WindLoads, WindLoadsConfig
+from residnet.physics.environment.wind import (
+    SymmetricWindConfig,
+    TabulatedWindConfig,
+    WindLoads,
+    WindLoadsConfig,
+)
 from residnet.physics.fossen import FossenConfig
 from residnet.physics.vessel import load_vessel, vessel_files
 
-AREAS: dict[str, Any] = {"frontal_area": 3.0, "lateral_area": 6.0, "length": 5.0, "centre_height": 0.8, "source": "made"}
+AREAS: dict[str, Any] = {
+    "frontal_area": 3.0,
+    "lateral_area": 6.0,
+    "length": 5.0,
+    "centre_height": 0.8,
+    "source": "made",
+}
 SYMMETRIC = AREAS | {"kind": "symmetric", "c_x": 0.7, "c_y": 0.8, "c_n": 0.1}
 ANGLES = np.linspace(0, np.pi, 181)
 TABLE = AREAS | {
@@ -34,7 +45,9 @@ BOTH = [pytest.param(SYMMETRIC, id="symmetric"), pytest.param(TABLE, id="table")
 
 
 def blow(wind: WindLoads, speed: float, degrees: float) -> np.ndarray:
-    """Forces of air that comes from an angle off the bow (positive from starboard) on a vessel at rest."""
+    """Forces of air that comes from an angle off the bow (positive from starboard) on a vessel at
+    rest.
+    """
     angle = torch.tensor(np.radians(degrees), dtype=torch.float64)
     return wind(-speed * torch.cos(angle), -speed * torch.sin(angle)).numpy()
 
@@ -63,7 +76,9 @@ def test_signs_from_starboard(content: dict[str, Any]) -> None:
 def test_port_mirrors_starboard_and_force_grows_with_the_square(content: dict[str, Any]) -> None:
     wind = loads(content)
     for angle in (10.0, 63.0, 120.0, 171.0):
-        np.testing.assert_allclose(blow(wind, 8, -angle), blow(wind, 8, angle) * [1, -1, -1, -1], atol=1e-9)
+        np.testing.assert_allclose(
+            blow(wind, 8, -angle), blow(wind, 8, angle) * [1, -1, -1, -1], atol=1e-9
+        )
         np.testing.assert_allclose(blow(wind, 16, angle), 4 * blow(wind, 8, angle), rtol=1e-9)
     np.testing.assert_allclose(wind(torch.zeros(3), torch.zeros(3)), np.zeros((3, 4)), atol=1e-5)
 
@@ -72,7 +87,9 @@ def test_a_fine_table_of_the_symmetric_form_is_the_symmetric_form() -> None:
     rng = np.random.default_rng(0)
     air = torch.from_numpy(rng.normal(size=(2, 300)) * 8)
     # linear between degrees: the error of a chord
-    torch.testing.assert_close(loads(TABLE)(*air), loads(SYMMETRIC)(*air), rtol=0, atol=2e-4 * 0.5 * 1.225 * 600 * 30)
+    torch.testing.assert_close(
+        loads(TABLE)(*air), loads(SYMMETRIC)(*air), rtol=0, atol=2e-4 * 0.5 * 1.225 * 600 * 30
+    )
 
 
 @pytest.mark.parametrize("content", BOTH)
@@ -86,12 +103,16 @@ def test_gradients(content: dict[str, Any]) -> None:
 
 
 def windy(*extra: str) -> FossenConfig:
-    section = "wind={kind: symmetric, frontal_area: 3, lateral_area: 6, length: 5, c_x: 0.7, c_y: 0.8, c_n: 0.1, source: made}"
+    section = (
+        "wind={kind: symmetric, frontal_area: 3, lateral_area: 6, length: 5, c_x: 0.7, c_y: 0.8,"
+        " c_n: 0.1, source: made}"
+    )
     return load_config(vessel_files()["wam_v_cal"], [section, *extra], FossenConfig)
 
 
 def test_a_plant_feels_the_wind_relative_to_itself() -> None:
-    """Running before the wind at its own speed it feels none; heading and direction turn together."""
+    """Running before the wind at its own speed it feels none; heading and direction turn together.
+    """
     plant = windy().build()
     assert plant.inputs[-2:] == ("wind_speed", "wind_dir")
     still = load_vessel("wam_v_cal").build()
@@ -135,7 +156,9 @@ def test_wind_that_stands_across_drifts_a_vessel_down_wind() -> None:
         (TABLE, {"angle": [0.0, 1.0, 2.0]}, "180 deg"),
     ],
 )
-def test_wrong_coefficients_are_one_line(content: dict[str, Any], change: dict[str, Any], message: str) -> None:
+def test_wrong_coefficients_are_one_line(
+    content: dict[str, Any], change: dict[str, Any], message: str
+) -> None:
     with pytest.raises(ConfigError, match=message) as caught:
         validate(content | change, WindLoadsConfig, "here")
     assert "\n" not in str(caught.value)

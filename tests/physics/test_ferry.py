@@ -1,4 +1,6 @@
-"""The ferry milliAmpere and the mass-spring-damper: their matrices written out, the figures of ERRATA 002, the thrusters."""
+"""The ferry milliAmpere and the mass-spring-damper: their matrices written out, the figures of
+ERRATA 002, the thrusters.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +52,9 @@ def test_matrices_written_out(name: str, delta: float) -> None:
     np.testing.assert_allclose(required, tau, atol=1e-10 * np.abs(tau).max())
 
 
-@pytest.mark.parametrize(("speed", "pole"), [(0.2, 0.0064), (0.5, 0.0545), (1.0, 0.135), (2.0, 0.296)])
+@pytest.mark.parametrize(
+    ("speed", "pole"), [(0.2, 0.0064), (0.5, 0.0545), (1.0, 0.135), (2.0, 0.296)]
+)
 def test_yaw_is_unstable_above_walking_pace(speed: float, pole: float) -> None:
     """ERRATA J6; at rest the poles are -0.019 and -0.026."""
     hull = ferry().hull
@@ -80,18 +84,30 @@ def test_coriolis_is_skew_as_printed() -> None:
 def test_mirror_symmetry() -> None:
     flip = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
     hull, nu, tau = ferry().hull, motions(), motions(seed=1) * 200
-    torch.testing.assert_close(hull(nu * flip, tau * flip), hull(nu, tau) * flip, rtol=1e-12, atol=1e-13)
+    torch.testing.assert_close(
+        hull(nu * flip, tau * flip), hull(nu, tau) * flip, rtol=1e-12, atol=1e-13
+    )
 
 
 def test_gradients() -> None:
     plant = ferry("milliampere_half")
     random = torch.Generator().manual_seed(0)
-    x = torch.cat((torch.randn(6, 3, generator=random, dtype=torch.float64), motions(6), motions(6, 1) * 100, motions(6, 2) * 50), dim=1)
+    x = torch.cat(
+        (
+            torch.randn(6, 3, generator=random, dtype=torch.float64),
+            motions(6),
+            motions(6, 1) * 100,
+            motions(6, 2) * 50,
+        ),
+        dim=1,
+    )
     w = torch.cat((motions(6, 3) * 100, torch.zeros(6, 7, dtype=torch.float64)), dim=1)
     assert torch.autograd.gradcheck(plant.rate, (x.requires_grad_(), w.requires_grad_()))
     fast = ferry("milliampere_half")
     fast.hull.compact()
-    torch.testing.assert_close(fast.hull(x[:, 3:6], x[:, 6:9]), plant.hull(x[:, 3:6], x[:, 6:9]), rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(
+        fast.hull(x[:, 3:6], x[:, 6:9]), plant.hull(x[:, 3:6], x[:, 6:9]), rtol=1e-12, atol=1e-12
+    )
 
 
 def test_forces_follow_by_the_thruster_dynamics() -> None:
@@ -112,7 +128,9 @@ def test_steady_surge_balances_the_drag() -> None:
     w = torch.tensor([[200.0, 0.0, 0.0]], dtype=torch.float64)
     x0 = plant.approach(1)
     with torch.no_grad():
-        states, _, _ = Rollout(PlantDynamics(plant, 0.1))(x0, w[:, None].expand(1, 3000, 3), x0[:, :0])
+        states, _, _ = Rollout(PlantDynamics(plant, 0.1))(
+            x0, w[:, None].expand(1, 3000, 3), x0[:, :0]
+        )
     u = float(states[0, -1, 3])
     assert 27.632 * u + 110.064 * u**2 + 13.965 * u**3 == pytest.approx(200.0, rel=1e-6)
 
@@ -127,7 +145,14 @@ def test_azimuth_thrusters_written_out() -> None:
     """(5.1), (5.2) in rpm."""
     rng = np.random.default_rng(0)
     rpm, angle = rng.uniform(-5200, 5200, (100, 2)), rng.uniform(-3, 3, (100, 2))
-    thrust = -1.31e-16 * rpm**5 - 1.78e-13 * rpm**4 + 6.16e-9 * rpm**3 + 8.7e-6 * rpm**2 + 0.00478 * rpm - 1.07
+    thrust = (
+        -1.31e-16 * rpm**5
+        - 1.78e-13 * rpm**4
+        + 6.16e-9 * rpm**3
+        + 8.7e-6 * rpm**2
+        + 0.00478 * rpm
+        - 1.07
+    )
     along, across = np.cos(angle) * thrust, np.sin(angle) * thrust
     wanted = np.stack([along.sum(1), across.sum(1), 1.8 * (across[:, 0] - across[:, 1])], axis=1)
     command = torch.from_numpy(np.concatenate([rpm / 60, angle], axis=1))
@@ -157,7 +182,10 @@ def test_allocation_makes_the_wanted_forces_with_least_thrust() -> None:
     [
         ("actuators.shaft.n_max=5400 rpm", "curve_range"),
         ("actuators.shaft.n_max=5300 rpm", "thrust falls"),
-        ("actuators.places=[{name: bow, x: 1.8}, {name: bow, x: -1.8}]", "two thrusters are named 'bow'"),
+        (
+            "actuators.places=[{name: bow, x: 1.8}, {name: bow, x: -1.8}]",
+            "two thrusters are named 'bow'",
+        ),
         ("actuators.places=[{name: bow, x: 1.8}]", "give two places"),
         ("mass.m11.value=-1", "not positive definite"),
         ("scale=0", "scale"),
@@ -179,7 +207,8 @@ def test_a_base_of_another_kind_of_actuators() -> None:
 
 
 def test_mass_spring_damper() -> None:
-    """(5.13) under the square wave of section 5.3.1, against SciPy; without force its energy falls."""
+    """(5.13) under the square wave of section 5.3.1, against SciPy; without force its energy falls.
+    """
     config = MassSpringDamperConfig()
     plant = config.build()
     t = 0.1 * np.arange(500)
@@ -191,7 +220,13 @@ def test_mass_spring_damper() -> None:
     for k in range(500):
         force = float(w[0, k, 0])
         np.testing.assert_allclose(states[0, k], x, atol=1e-7)
-        x = solve_ivp(lambda _, y, f=force: [y[1], -1.3 * y[1] + 0.1 * f - 0.5 * y[0]], (0, 0.1), x, rtol=1e-10, atol=1e-12).y[:, -1]
+        x = solve_ivp(
+            lambda _, y, f=force: [y[1], -1.3 * y[1] + 0.1 * f - 0.5 * y[0]],
+            (0, 0.1),
+            x,
+            rtol=1e-10,
+            atol=1e-12,
+        ).y[:, -1]
     start = torch.tensor([[1.0, -0.4]], dtype=torch.float64)
     free, _, _ = Rollout(PlantDynamics(plant, 0.05))(start, w[:, :400] * 0, start[:, :0])
     energy = 0.5 * config.m.value * free[0, :, 1] ** 2 + 0.5 * config.k.value * free[0, :, 0] ** 2

@@ -6,7 +6,14 @@ import pytest
 import torch
 
 from residnet.core.errors import ConfigError, FitError
-from residnet.physics.force_model import FERRY_TERMS, Correction, ForceModel, augmented, column_scale, order_of
+from residnet.physics.force_model import (
+    FERRY_TERMS,
+    Correction,
+    ForceModel,
+    augmented,
+    column_scale,
+    order_of,
+)
 from residnet.physics.fossen import FossenVessel
 from residnet.physics.vessel import load_vessel
 
@@ -19,24 +26,62 @@ def hull(name: str) -> FossenVessel:
 
 def motion(n: int = 50) -> tuple[torch.Tensor, torch.Tensor]:
     generator = torch.Generator().manual_seed(2)
-    return (0.1 * torch.randn(n, 3, generator=generator, dtype=torch.float64), 0.6 * torch.randn(n, 3, generator=generator, dtype=torch.float64))
+    return (
+        0.1 * torch.randn(n, 3, generator=generator, dtype=torch.float64),
+        0.6 * torch.randn(n, 3, generator=generator, dtype=torch.float64),
+    )
 
 
 def truth() -> tuple[torch.Tensor, torch.Tensor]:
-    """What half of the believed ferry lacks, by basis function (document 002 Table 4.11 with the signs of ERRATA J19)."""
+    """What half of the believed ferry lacks, by basis function (document 002 Table 4.11 with the
+    signs of ERRATA J19).
+    """
     axes: list[dict[str, float]] = [
-        {"u_dot": -1194.8285, "u": -13.816, "u|u|": -55.032, "u^3": -6.9825, "r^2": 31.193, "v r": 1266.9555},
-        {"v_dot": -1266.9555, "r_dot": -31.193, "v": -26.4735, "r": 12.366, "v|v|": -58.243, "r|r|": -57.7285, "v^3": -12.1565},
-        {"v_dot": -14.0705, "r_dot": -2534.455, "v": 1.762, "r": -61.43, "v|v|": -0.416, "r|r|": -437.214, "u v": -72.127, "u r": -31.193},
+        {
+            "u_dot": -1194.8285,
+            "u": -13.816,
+            "u|u|": -55.032,
+            "u^3": -6.9825,
+            "r^2": 31.193,
+            "v r": 1266.9555,
+        },
+        {
+            "v_dot": -1266.9555,
+            "r_dot": -31.193,
+            "v": -26.4735,
+            "r": 12.366,
+            "v|v|": -58.243,
+            "r|r|": -57.7285,
+            "v^3": -12.1565,
+        },
+        {
+            "v_dot": -14.0705,
+            "r_dot": -2534.455,
+            "v": 1.762,
+            "r": -61.43,
+            "v|v|": -0.416,
+            "r|r|": -437.214,
+            "u v": -72.127,
+            "u r": -31.193,
+        },
     ]
     axes[1] |= {"u r": -1194.8285, "|v|r": 286.0705, "|r|v": -770.1915}
     axes[2] |= {"|v|r": -60.9785, "|r|v": 168.4135}
-    return torch.tensor([[row.get(term, 0.0) for row in axes] for term in FERRY_TERMS], dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
+    return torch.tensor(
+        [[row.get(term, 0.0) for row in axes] for term in FERRY_TERMS], dtype=torch.float64
+    ), torch.zeros(3, dtype=torch.float64)
 
 
 def test_thirty_basis_functions() -> None:
     assert len(set(FERRY_TERMS)) == len(FERRY_TERMS) == 30
-    assert [order_of(term) for term in ("u_dot", "|u|", "u|u|", "v^2", "r^3", "|u||r|")] == [1, 1, 2, 2, 3, 2]
+    assert [order_of(term) for term in ("u_dot", "|u|", "u|u|", "v^2", "r^3", "|u||r|")] == [
+        1,
+        1,
+        2,
+        2,
+        3,
+        2,
+    ]
 
 
 def test_half_the_ferry_is_the_believed_one_and_table_4_11() -> None:
@@ -49,16 +94,24 @@ def test_half_the_ferry_is_the_believed_one_and_table_4_11() -> None:
 def test_a_chain_adds_up_and_leaves_what_its_corrections_do_not_explain() -> None:
     nu_dot, nu = motion()
     first = Correction(("u_dot",), torch.tensor([[3.0, 0.0, 0.0]]), torch.tensor([1.0, 0.0, 0.0]))
-    second = Correction(("u|u|", "v"), torch.tensor([[0.0, 2.0, 0.0], [0.0, 0.0, 5.0]]), torch.zeros(3))
+    second = Correction(
+        ("u|u|", "v"), torch.tensor([[0.0, 2.0, 0.0], [0.0, 0.0, 5.0]]), torch.zeros(3)
+    )
     base = ForceModel(hull("milliampere").hull)
     chain = base.extended(first).extended(second, torch.tensor([200.0, 100.0], dtype=torch.float64))
     extra = torch.stack((3 * nu_dot[:, 0] + 1, 2 * nu[:, 0] * nu[:, 0].abs(), 5 * nu[:, 1]), dim=-1)
     torch.testing.assert_close(chain(nu_dot, nu) - base(nu_dot, nu), extra)
     psi = torch.full((len(nu),), torch.pi / 2, dtype=torch.float64)
-    # heading east: a force to the north pushes to port, one to the east pushes forward; the thrusters hold against both
+    # heading east: a force to the north pushes to port, one to the east pushes forward; the
+    # thrusters hold against both
     against = chain.at_heading(nu_dot, nu, psi) - chain(nu_dot, nu)
-    torch.testing.assert_close(against, torch.tensor([-100.0, 200.0, 0.0], dtype=torch.float64).expand(len(nu), 3))
-    torch.testing.assert_close(chain.residual(against + chain(nu_dot, nu), nu_dot, nu, psi), torch.zeros(len(nu), 3, dtype=torch.float64))
+    torch.testing.assert_close(
+        against, torch.tensor([-100.0, 200.0, 0.0], dtype=torch.float64).expand(len(nu), 3)
+    )
+    torch.testing.assert_close(
+        chain.residual(against + chain(nu_dot, nu), nu_dot, nu, psi),
+        torch.zeros(len(nu), 3, dtype=torch.float64),
+    )
 
 
 def test_forward_solution_is_the_true_ferry() -> None:
@@ -72,9 +125,16 @@ def test_forward_solution_is_the_true_ferry() -> None:
 def test_what_cannot_run_forward_is_refused() -> None:
     mass = hull("milliampere").hull.mass
     with pytest.raises(FitError, match="cannot run forward"):
-        augmented(mass, ("u_dot",), torch.tensor([[-2400.0, 0.0, 0.0]], dtype=torch.float64), "model plsr")
+        augmented(
+            mass, ("u_dot",), torch.tensor([[-2400.0, 0.0, 0.0]], dtype=torch.float64), "model plsr"
+        )
     with pytest.raises(FitError, match="condition"):
-        augmented(mass, ("u_dot",), torch.tensor([[-2389.65, 0.0, 0.0]], dtype=torch.float64), "model plsr")
+        augmented(
+            mass,
+            ("u_dot",),
+            torch.tensor([[-2389.65, 0.0, 0.0]], dtype=torch.float64),
+            "model plsr",
+        )
     for term in ("u_dot u", "u_dot^2", "|v_dot|"):
         with pytest.raises(ConfigError, match="only by themselves"):
             augmented(mass, (term,), torch.zeros(1, 3, dtype=torch.float64), "model")
@@ -84,4 +144,7 @@ def test_constant_columns_are_named() -> None:
     x = torch.stack((torch.linspace(0, 1, 20), torch.full((20,), 3.0)), dim=1).double()
     with pytest.raises(FitError, match=r"'v' is constant"):
         column_scale(("u", "v"), x)
-    torch.testing.assert_close(column_scale(("u^2", "v"), x + torch.rand(20, 2)) / (x.std(0) + 1) > 0, torch.tensor([True, True]))
+    torch.testing.assert_close(
+        column_scale(("u^2", "v"), x + torch.rand(20, 2)) / (x.std(0) + 1) > 0,
+        torch.tensor([True, True]),
+    )

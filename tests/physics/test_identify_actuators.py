@@ -8,7 +8,13 @@ import torch
 
 from residnet.core.errors import FitError
 from residnet.physics.actuators import DifferentialThrust, DifferentialThrustConfig
-from residnet.physics.actuators.identify import Estimate, fit_step, fit_throttle, fit_thrust, follow_command
+from residnet.physics.actuators.identify import (
+    Estimate,
+    fit_step,
+    fit_throttle,
+    fit_thrust,
+    follow_command,
+)
 from residnet.physics.fossen import FossenConfig
 from residnet.physics.vessel import load_vessel
 
@@ -39,13 +45,18 @@ def throttle_test(seed: int, top: float = 2380.0) -> tuple[np.ndarray, np.ndarra
 
 
 def test_throttle_map_with_its_bound() -> None:
-    """20 rpm of noise: slope and bound to 1 %, and intervals that hold the truth about as often as they say."""
+    """20 rpm of noise: slope and bound to 1 %, and intervals that hold the truth about as often as
+    they say.
+    """
     fits = [fit_throttle(*throttle_test(seed)) for seed in SEEDS]
     for fit in fits:
         assert fit.saturated
         assert fit.slope.value * 60 == pytest.approx(2800, rel=0.01)
         assert fit.n_max.value * 60 == pytest.approx(2380, rel=0.01)
-    held = [inside(f.slope, 2800 / 60) + inside(f.n_max, 2380 / 60) + inside(f.offset, 30 / 60) for f in fits]
+    held = [
+        inside(f.slope, 2800 / 60) + inside(f.n_max, 2380 / 60) + inside(f.offset, 30 / 60)
+        for f in fits
+    ]
     assert sum(held) >= 0.8 * 60
 
 
@@ -57,7 +68,9 @@ def test_throttle_map_that_never_saturates() -> None:
 
 
 def shaft(unit: DifferentialThrust, command: np.ndarray, dt: float, late: int) -> np.ndarray:
-    """Revolutions [T] of one thruster under held commands, by the plant's own actuator after `late` samples of dead time."""
+    """Revolutions [T] of one thruster under held commands, by the plant's own actuator after `late`
+    samples of dead time.
+    """
     delayed = np.concatenate((np.full(late, command[0]), command[: command.size - late]))
     n = torch.zeros(1, 2, dtype=torch.float64)
     out = []
@@ -67,19 +80,25 @@ def shaft(unit: DifferentialThrust, command: np.ndarray, dt: float, late: int) -
     return np.array(out)
 
 
-def step_test(unit: DifferentialThrust, seed: int, noise: float = 25.0) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+def step_test(
+    unit: DifferentialThrust, seed: int, noise: float = 25.0
+) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     dt, random = 0.02, np.random.default_rng(seed)
     t = dt * np.arange(300)
     runs = []
     for levels in ((0.0, 2380.0), (0.0, -1800.0)):
         command = np.where(t < 1.35, levels[0], levels[1]) / 60
-        runs.append((t, command, shaft(unit, command, dt, 7) + random.normal(size=t.size) * noise / 60))
+        runs.append(
+            (t, command, shaft(unit, command, dt, 7) + random.normal(size=t.size) * noise / 60)
+        )
     return runs
 
 
 def test_the_follower_is_the_plants_own(unit: DifferentialThrust) -> None:
     (t, command, n), _ = step_test(unit, 0, noise=0.0)
-    np.testing.assert_allclose(follow_command(t, command, 1500 / 60, 0.14, 0.0), n, atol=1500 / 60 * 0.02)
+    np.testing.assert_allclose(
+        follow_command(t, command, 1500 / 60, 0.14, 0.0), n, atol=1500 / 60 * 0.02
+    )
 
 
 def test_rate_limit_and_dead_time(unit: DifferentialThrust) -> None:
@@ -91,19 +110,29 @@ def test_rate_limit_and_dead_time(unit: DifferentialThrust) -> None:
     assert sum(inside(fit.rate, 25.0) for fit in fits) >= 4
 
 
-def bollard_test(unit: DifferentialThrust, seed: int, noise: float = 5.0) -> tuple[np.ndarray, np.ndarray]:
+def bollard_test(
+    unit: DifferentialThrust, seed: int, noise: float = 5.0
+) -> tuple[np.ndarray, np.ndarray]:
     n = np.concatenate((np.linspace(-2380, -200, 12), np.linspace(200, 2380, 12))) / 60
     pull = 2 * unit.thrust(torch.from_numpy(n)).numpy()
     return n, pull + np.random.default_rng(seed).normal(size=n.size) * noise
 
 
-def test_thrust_curves_of_both_directions(config: DifferentialThrustConfig, unit: DifferentialThrust) -> None:
-    """Exact without noise; with 5 N on the tether the curve to 1.5 % of full thrust, and honest intervals."""
-    for fit, truth in zip(fit_thrust(*bollard_test(unit, 0, 0.0), 2), (config.forward, config.reverse), strict=True):
+def test_thrust_curves_of_both_directions(
+    config: DifferentialThrustConfig, unit: DifferentialThrust
+) -> None:
+    """Exact without noise; with 5 N on the tether the curve to 1.5 % of full thrust, and honest
+    intervals.
+    """
+    for fit, truth in zip(
+        fit_thrust(*bollard_test(unit, 0, 0.0), 2), (config.forward, config.reverse), strict=True
+    ):
         np.testing.assert_allclose([c.value for c in fit.coefficients], truth, rtol=1e-9)
     held = []
     for seed in SEEDS:
-        for fit, truth in zip(fit_thrust(*bollard_test(unit, seed), 2), (config.forward, config.reverse), strict=True):
+        for fit, truth in zip(
+            fit_thrust(*bollard_test(unit, seed), 2), (config.forward, config.reverse), strict=True
+        ):
             n = np.linspace(fit.low, fit.high, 50)
             full = np.abs(unit.thrust(torch.from_numpy(n)).numpy()).max()
             known = truth[0] + n * (truth[1] + n * truth[2])
@@ -116,9 +145,20 @@ def test_thrust_curves_of_both_directions(config: DifferentialThrustConfig, unit
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda u: fit_thrust(*(part[part > 0] for part in bollard_test(u, 0)), 2), "bollard pull astern: 0 points"),
-        (lambda u: fit_thrust(*(part[::8] for part in bollard_test(u, 0)), 2), "needs 5 at 4 revolutions"),
-        (lambda u: fit_thrust(*(sign * part for sign, part in zip((1, -1), bollard_test(u, 0), strict=True)), 2), "wrong sign"),
+        (
+            lambda u: fit_thrust(*(part[part > 0] for part in bollard_test(u, 0)), 2),
+            "bollard pull astern: 0 points",
+        ),
+        (
+            lambda u: fit_thrust(*(part[::8] for part in bollard_test(u, 0)), 2),
+            "needs 5 at 4 revolutions",
+        ),
+        (
+            lambda u: fit_thrust(
+                *(sign * part for sign, part in zip((1, -1), bollard_test(u, 0), strict=True)), 2
+            ),
+            "wrong sign",
+        ),
         (lambda u: fit_throttle(*(part[20:] for part in throttle_test(0))), "only one direction"),
         (lambda u: fit_throttle(*(part[:3] for part in throttle_test(0))), "3 points"),
         (lambda u: fit_throttle(throttle_test(0)[0], -throttle_test(0)[1]), "do not rise"),
@@ -126,7 +166,17 @@ def test_thrust_curves_of_both_directions(config: DifferentialThrustConfig, unit
         (lambda u: fit_step([tuple(part[:60] for part in step_test(u, 0)[0])]), "never changes"),
         (lambda u: fit_step([tuple(part[:75] for part in step_test(u, 0)[0])]), "hardly follow"),
     ],
-    ids=["one direction", "few points", "sign", "throttle ahead", "few throttles", "falling", "short", "no step", "cut off"],
+    ids=[
+        "one direction",
+        "few points",
+        "sign",
+        "throttle ahead",
+        "few throttles",
+        "falling",
+        "short",
+        "no step",
+        "cut off",
+    ],
 )
 def test_tests_that_say_too_little(unit: DifferentialThrust, call: object, message: str) -> None:
     with pytest.raises(FitError, match=message) as caught:

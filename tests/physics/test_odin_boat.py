@@ -1,4 +1,6 @@
-"""Odin: the document's equations written out, what physics demands of them, and the figures of ERRATA 000."""
+"""Odin: the document's equations written out, what physics demands of them, and the figures of
+ERRATA 000.
+"""
 
 from __future__ import annotations
 
@@ -50,26 +52,47 @@ def test_force_model_written_out() -> None:
 
 
 def test_jet_model_against_the_printed_polynomials() -> None:
-    """Surge by (6.21) with g of (6.20) as H9 corrects it, and the yaw terms of (6.54) as H6 and H7 do; both rounded to three digits."""
+    """Surge by (6.21) with g of (6.20) as H9 corrects it, and the yaw terms of (6.54) as H6 and H7
+    do; both rounded to three digits.
+    """
     random = np.random.default_rng(0)
-    u, rpm, nozzle = random.uniform(0, 10, 400), random.uniform(300, 2000, 400), random.uniform(-0.3, 0.3, 400)
+    u, rpm, nozzle = (
+        random.uniform(0, 10, 400),
+        random.uniform(300, 2000, 400),
+        random.uniform(-0.3, 0.3, 400),
+    )
     plant = plant_of("odin_jets")
     x = torch.zeros(400, 6, dtype=torch.float64)
     x[:, 3] = torch.from_numpy(u)
     w = torch.zeros(400, len(plant.inputs), dtype=torch.float64)
     w[:, :2] = torch.from_numpy(np.stack([rpm / 60, nozzle], axis=1))
     rate = plant.rate(x, w).numpy()
-    g = 0.048 - 1.0e-3 * rpm + 2.98e-6 * rpm**2 - 2.65e-3 * u + 5.554e-5 * u * rpm - 1.65e-7 * u * rpm**2
+    g = (
+        0.048
+        - 1.0e-3 * rpm
+        + 2.98e-6 * rpm**2
+        - 2.65e-3 * u
+        + 5.554e-5 * u * rpm
+        - 1.65e-7 * u * rpm**2
+    )
     g += 2.55e-5 * u**2 - 5.31e-7 * u**2 * rpm + 1.58e-9 * u**2 * rpm**2
     # 0.054 m/s^2 is what ERRATA H11 measured between (6.20) and (6.16)
     assert np.abs(rate[:, 3] - (g * np.cos(nozzle) - 0.0101 * u - 0.0492 * u**2)).max() < 0.06
-    yaw = -0.04321 + 9.03e-4 * rpm - 2.683e-6 * rpm**2 + 2.396e-3 * u - 5.01e-5 * u * rpm + 1.488e-7 * u * rpm**2
+    yaw = (
+        -0.04321
+        + 9.03e-4 * rpm
+        - 2.683e-6 * rpm**2
+        + 2.396e-3 * u
+        - 5.01e-5 * u * rpm
+        + 1.488e-7 * u * rpm**2
+    )
     yaw += -2.294e-5 * u**2 + 4.79e-7 * u**2 * rpm - 1.425e-9 * u**2 * rpm**2
     assert np.abs(rate[:, 5] - yaw * np.sin(nozzle)).max() < 5e-3 * np.abs(rate[:, 5]).max()
 
 
 def test_thrust_curve_figures() -> None:
-    """ERRATA H15: its value at rest, its roots, where it turns, and the speed at which it vanishes."""
+    """ERRATA H15: its value at rest, its roots, where it turns, and the speed at which it vanishes.
+    """
     actuators, zero = jets(), torch.zeros(1, dtype=torch.float64)
 
     def thrust(rpm: float, u: float = 0.0) -> float:
@@ -89,16 +112,24 @@ def test_jets_saturate_and_turn_to_the_side_that_is_asked_for() -> None:
     actuators = jets()
     nu = torch.zeros(2, 3, dtype=torch.float64)
     beyond = torch.tensor([[50.0, 1.0], [-5.0, -1.0]], dtype=torch.float64)
-    limits = torch.tensor([[2000 / 60, np.radians(27)], [0.0, -np.radians(27)]], dtype=torch.float64)
-    torch.testing.assert_close(actuators.force(nu[:, :0], beyond, nu), actuators.force(nu[:, :0], limits, nu))
-    command = actuators.demand(torch.tensor([0.5, 0.5]).double(), torch.tensor([0.3, -0.3]).double())
+    limits = torch.tensor(
+        [[2000 / 60, np.radians(27)], [0.0, -np.radians(27)]], dtype=torch.float64
+    )
+    torch.testing.assert_close(
+        actuators.force(nu[:, :0], beyond, nu), actuators.force(nu[:, :0], limits, nu)
+    )
+    command = actuators.demand(
+        torch.tensor([0.5, 0.5]).double(), torch.tensor([0.3, -0.3]).double()
+    )
     tau = actuators.force(nu[:, :0], command, nu)
     assert float(tau[0, 2]) > 0 > float(tau[1, 2])
     torch.testing.assert_close(tau[:, 2], -3.82 * tau[:, 1])
 
 
 def test_slew_rates_where_they_are_switched_on() -> None:
-    plant = plant_of("odin_jets", "actuators.motor.n_rate=2000 rpm/s", "actuators.nozzle.rate=1.3464")
+    plant = plant_of(
+        "odin_jets", "actuators.motor.n_rate=2000 rpm/s", "actuators.nozzle.rate=1.3464"
+    )
     assert plant.state[6:] == ("n", "nozzle")
     x = torch.zeros(1, 8, dtype=torch.float64)
     w = torch.zeros(1, len(plant.inputs), dtype=torch.float64)
@@ -115,12 +146,16 @@ def test_top_speed(rpm: float, top: float) -> None:
     w = torch.tensor([[rpm / 60, 0.0]], dtype=torch.float64)
     x = torch.zeros(1, 6, dtype=torch.float64)
     with torch.no_grad():
-        states, _, _ = Rollout(PlantDynamics(plant, 0.05))(x, w[:, None].expand(1, 1200, 2), x[:, :0])
+        states, _, _ = Rollout(PlantDynamics(plant, 0.05))(
+            x, w[:, None].expand(1, 1200, 2), x[:, :0]
+        )
     assert float(states[0, -1, 3]) == pytest.approx(top, abs=0.005)
     assert float(plant.rate(states[:, -1], w)[0, 3].abs()) < 1e-6
 
 
-@pytest.mark.parametrize(("speed", "pole"), [(0.044, -0.0), (1.0, 0.194), (5.0, 0.50), (10.0, 0.73)])
+@pytest.mark.parametrize(
+    ("speed", "pole"), [(0.044, -0.0), (1.0, 0.194), (5.0, 0.50), (10.0, 0.73)]
+)
 def test_sway_and_yaw_are_unstable_as_printed(speed: float, pole: float) -> None:
     """ERRATA H5."""
     hull = plant_of("odin_forces").hull
@@ -145,14 +180,21 @@ def test_mirror_symmetry() -> None:
     """Port and starboard: sway, yaw, side force, moment and nozzle angle change sign."""
     flip = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
     hull, nu, tau = plant_of("odin_forces").hull, motions(), motions(seed=2) * 1000
-    torch.testing.assert_close(hull(nu * flip, tau * flip), hull(nu, tau) * flip, rtol=1e-12, atol=1e-13)
-    actuators, command = jets(), torch.rand(300, 2, dtype=torch.float64) * torch.tensor([30.0, 0.4], dtype=torch.float64)
+    torch.testing.assert_close(
+        hull(nu * flip, tau * flip), hull(nu, tau) * flip, rtol=1e-12, atol=1e-13
+    )
+    actuators, command = (
+        jets(),
+        torch.rand(300, 2, dtype=torch.float64) * torch.tensor([30.0, 0.4], dtype=torch.float64),
+    )
     mirrored = actuators.force(nu[:, :0], command * flip[:2], nu * flip)
     torch.testing.assert_close(mirrored, actuators.force(nu[:, :0], command, nu) * flip)
 
 
 def test_motion_dies_out_where_the_printed_coupling_does_no_work() -> None:
-    """Without force, u^2 + v^2 falls at every step; N_v of (6.8) may feed yaw (ERRATA H5), so r is left out of the sum."""
+    """Without force, u^2 + v^2 falls at every step; N_v of (6.8) may feed yaw (ERRATA H5), so r is
+    left out of the sum.
+    """
     plant = plant_of("odin_forces").in_calm_water()
     x = torch.cat((torch.zeros(300, 3, dtype=torch.float64), motions()), dim=1)
     w = torch.zeros(300, 100, 3, dtype=torch.float64)
@@ -180,7 +222,8 @@ def test_a_wrong_coefficient_is_found_when_the_file_is_read(override: str, messa
 
 
 def test_froude_phases() -> None:
-    """Appendix D with the length of ERRATA H17: 0.4 at 4.06 m/s, 1.0 at 10.1 m/s; side slip counts."""
+    """Appendix D with the length of ERRATA H17: 0.4 at 4.06 m/s, 1.0 at 10.1 m/s; side slip counts.
+    """
     vessel = load_vessel("odin_forces")
     u = torch.tensor([0.0, 4.0, 4.1, 10.1, 10.2, 3.0], dtype=torch.float64)
     v = torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, -4.0], dtype=torch.float64)

@@ -38,7 +38,9 @@ def test_a_wrong_value_is_one_line(override: str, message: str) -> None:
 
 
 def test_a_mass_matrix_that_is_not_positive_stops() -> None:
-    vessel = load_config(vessel_files()["patrol_p06"], ["added_mass.K_pdot.value=5e6"], VesselConfig)
+    vessel = load_config(
+        vessel_files()["patrol_p06"], ["added_mass.K_pdot.value=5e6"], VesselConfig
+    )
     with pytest.raises(ConfigError, match=r"patrol_p06.*mass matrix is not positive definite"):
         vessel.build()
 
@@ -59,11 +61,18 @@ def test_a_set_has_its_base_but_for_what_it_says() -> None:
 
 
 def test_a_base_by_path(tmp_path: Path) -> None:
-    heavy = "kind: patrol\nname: {name}\ndescription: made\nbase: {base}\nrigid_body:\n  m: {{value: {m}, unit: t, source: made}}\n"
+    heavy = (
+        "kind: patrol\nname: {name}\ndescription: made\nbase: {base}\nrigid_body:\n  m: {{value:"
+        " {m}, unit: t, source: made}}\n"
+    )
     (tmp_path / "first.yaml").write_text(heavy.format(name="first", base="patrol_hyb", m=400))
     (tmp_path / "second.yaml").write_text(heavy.format(name="second", base="first.yaml", m=410))
     vessel = load_vessel(str(tmp_path / "second.yaml"))
-    assert (vessel.name, vessel.rigid_body.m.value, vessel.added_mass.Y_vdot.value) == ("second", 410e3, -393e3)
+    assert (vessel.name, vessel.rigid_body.m.value, vessel.added_mass.Y_vdot.value) == (
+        "second",
+        410e3,
+        -393e3,
+    )
     (tmp_path / "first.yaml").write_text(heavy.format(name="first", base="second.yaml", m=400))
     with pytest.raises(ConfigError, match="name each other in a circle") as caught:
         load_vessel(str(tmp_path / "second.yaml"))

@@ -1,4 +1,6 @@
-"""The patrol vessel: MSS navalvessel.m and document 004 written out, what physics demands, and the figures of ERRATA 004."""
+"""The patrol vessel: MSS navalvessel.m and document 004 written out, what physics demands, and the
+figures of ERRATA 004.
+"""
 
 from __future__ import annotations
 
@@ -36,17 +38,25 @@ class Numbers:
     n_rdot: float
 
 
-P06 = Numbers(1025, 355.88, 1.0, 1025 * 355.88, 3.4263e6, 3.3818e7, -1.07, -1.9022e6, -0.674e6, -4.3958e7)
+P06 = Numbers(
+    1025, 355.88, 1.0, 1025 * 355.88, 3.4263e6, 3.3818e7, -1.07, -1.9022e6, -0.674e6, -4.3958e7
+)
 SETS = {
     "patrol_p06": P06,
     "patrol_p06_linear": P06,
-    "patrol_hyb": Numbers(1025, 355.88, 1.0, 1025 * 355.88, 3.4263e6, 3.3818e7, -1.07, -393e3, -0.674e6, -4.3958e7),
-    "patrol_mss": Numbers(1014, 357, 1.1, 1014 * 357, 2.3763e6, 4.7934e7, -1.06, -393e3, -0.774e6, -38.7e6),
+    "patrol_hyb": Numbers(
+        1025, 355.88, 1.0, 1025 * 355.88, 3.4263e6, 3.3818e7, -1.07, -393e3, -0.674e6, -4.3958e7
+    ),
+    "patrol_mss": Numbers(
+        1014, 357, 1.1, 1014 * 357, 2.3763e6, 4.7934e7, -1.06, -393e3, -0.774e6, -38.7e6
+    ),
 }
 
 
 def navalvessel(c: Numbers, nu: np.ndarray, b: float, tau: np.ndarray) -> np.ndarray:
-    """Accelerations as MSS navalvessel.m forms them, abs(u*b) read as abs(u*v) (ERRATA 004); tau acts beside the hull's own forces."""
+    """Accelerations as MSS navalvessel.m forms them, abs(u*b) read as abs(u*v) (ERRATA 004); tau
+    acts beside the hull's own forces.
+    """
     u, v, p, r = nu
     au, av, ap, ar = np.abs(nu)
     m, x_g, z_g, g = c.m, -3.38, c.z_g, 9.81
@@ -58,7 +68,9 @@ def navalvessel(c: Numbers, nu: np.ndarray, b: float, tau: np.ndarray) -> np.nda
         - 1180 * b * u**2 - 15500 * au * p - 416000 * p * ap - 500000 * p - 0.325 * c.rho * g * c.volume * b**3 - c.rho * g * c.gm * c.volume * b,
         -92000 * au * v - 4710000 * au * r - 202e6 * r * ar - 15.6e6 * r * av - 214000 * b * abs(u * v) - 4980000 * b * u * ar - 8000 * b * u * au,
     ])  # fmt: skip
-    centripetal = m * np.array([r * v + x_g * r**2 - z_g * p * r, -u * r, z_g * u * r, -x_g * u * r])
+    centripetal = m * np.array(
+        [r * v + x_g * r**2 - z_g * p * r, -u * r, z_g * u * r, -x_g * u * r]
+    )
     mass = np.array([
         [m + 17400, 0, 0, 0],
         [0, m - c.y_vdot, -(m * z_g - 296e3), m * x_g + 1.4e6],
@@ -69,7 +81,9 @@ def navalvessel(c: Numbers, nu: np.ndarray, b: float, tau: np.ndarray) -> np.nda
 
 
 def foil(c: Numbers, u: float, v: float, delta: float, thrust: float) -> np.ndarray:
-    """Forces of thrust and rudders by (5.20)-(5.29) as corrected: two rudders, two propellers with half of the thrust each."""
+    """Forces of thrust and rudders by (5.20)-(5.29) as corrected: two rudders, two propellers with
+    half of the thrust each.
+    """
     angle = np.clip(delta, -np.radians(23), np.radians(23))
     lift_coefficient = np.degrees(0.054) * angle
     drag_coefficient = lift_coefficient**2 / (0.9 * np.pi * 3)
@@ -92,15 +106,21 @@ def plant(request: pytest.FixtureRequest) -> PatrolVessel:
     return load_vessel(request.param).build()
 
 
-def inputs(plant: PatrolVessel, rows: int, delta: float = 0.0, thrust: float = THRUST) -> torch.Tensor:
+def inputs(
+    plant: PatrolVessel, rows: int, delta: float = 0.0, thrust: float = THRUST
+) -> torch.Tensor:
     w = torch.zeros(rows, len(plant.inputs), dtype=torch.float64)
     w[:, 0], w[:, 1] = delta, thrust
     return w
 
 
-def flown(plant: PatrolVessel, x0: torch.Tensor, w: torch.Tensor, steps: int, dt: float = 0.05) -> torch.Tensor:
+def flown(
+    plant: PatrolVessel, x0: torch.Tensor, w: torch.Tensor, steps: int, dt: float = 0.05
+) -> torch.Tensor:
     with torch.no_grad():
-        return Rollout(TracedPlantDynamics(plant, dt))(x0, w[:, None].expand(-1, steps, -1), x0[:, :0])[0]
+        return Rollout(TracedPlantDynamics(plant, dt))(
+            x0, w[:, None].expand(-1, steps, -1), x0[:, :0]
+        )[0]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -118,7 +138,12 @@ def test_right_hand_side_written_out(name: str) -> None:
         linear = np.array([thrust, -lift, 1.54 * lift, 25.75 * lift])
         tau = linear if name.endswith("linear") else foil(c, u, v, angle, thrust)
         acceleration = navalvessel(c, row[4:8], phi, tau + np.array([3e3, -2e3, 8e3, 5e4]))
-        pose = [u * np.cos(psi) - v * np.sin(psi) * np.cos(phi), u * np.sin(psi) + v * np.cos(psi) * np.cos(phi), p, r * np.cos(phi)]
+        pose = [
+            u * np.cos(psi) - v * np.sin(psi) * np.cos(phi),
+            u * np.sin(psi) + v * np.cos(psi) * np.cos(phi),
+            p,
+            r * np.cos(phi),
+        ]
         np.testing.assert_allclose(got[:4], pose, rtol=1e-12, atol=1e-14)
         assert np.abs(got[4:8] - acceleration).max() <= 1e-12 * np.abs(acceleration).max()
         assert got[8] == 0.0
@@ -128,7 +153,11 @@ def test_right_hand_side_written_out(name: str) -> None:
 def test_a_foil_beyond_stall_lifts_no_more(name: str) -> None:
     rudders = load_vessel(name).actuators.build()
     delta = torch.linspace(-0.6, 0.6, 241, dtype=torch.float64)
-    u, v, thrust = torch.full_like(delta, 7.0), torch.full_like(delta, 0.5), torch.full_like(delta, THRUST)
+    u, v, thrust = (
+        torch.full_like(delta, 7.0),
+        torch.full_like(delta, 0.5),
+        torch.full_like(delta, THRUST),
+    )
     lift, drag = rudders.foil(delta, u, v, thrust)
     torch.testing.assert_close(lift, -lift.flip(0), rtol=1e-12, atol=1e-9)
     torch.testing.assert_close(drag, drag.flip(0), rtol=1e-12, atol=1e-9)
@@ -141,7 +170,9 @@ def test_a_foil_beyond_stall_lifts_no_more(name: str) -> None:
 
 
 def test_rudders_at_rest() -> None:
-    """Without flow the race alone steers, with half the momentum of a moving vessel; without thrust nothing does, and gradients stay finite."""
+    """Without flow the race alone steers, with half the momentum of a moving vessel; without thrust
+    nothing does, and gradients stay finite.
+    """
     rudders = load_vessel("patrol_p06").actuators.build()
     a = torch.full((2, 1), np.radians(10.0), dtype=torch.float64)
     nu = torch.zeros(2, 4, dtype=torch.float64, requires_grad=True)
@@ -155,7 +186,9 @@ def test_rudders_at_rest() -> None:
 
 def test_commands_are_kept_within_their_limits(plant: PatrolVessel) -> None:
     one = torch.ones(1, dtype=torch.float64)
-    assert plant.demand(one, -0.2 * one).tolist() == [[pytest.approx(-np.radians(7.0)), pytest.approx(THRUST)]]
+    assert plant.demand(one, -0.2 * one).tolist() == [
+        [pytest.approx(-np.radians(7.0)), pytest.approx(THRUST)]
+    ]
     assert plant.demand(-one, 3.0 * one).tolist() == [[pytest.approx(np.radians(35.0)), 0.0]]
     x = plant.approach(2)
     far, most = inputs(plant, 2, 0.0, 2 * THRUST), inputs(plant, 2, 0.0, THRUST)
@@ -166,12 +199,23 @@ def test_commands_are_kept_within_their_limits(plant: PatrolVessel) -> None:
 
 def test_gradients_of_the_right_hand_side(plant: PatrolVessel) -> None:
     """Away from the kinks of |.| and of the limits."""
-    x = torch.from_numpy(np.array([[1, -2, 0.1, 0.7, 6.5, 0.8, 0.1, -0.03, 0.15], [0, 0, -0.2, -1.0, 4.0, -0.6, -0.2, 0.05, -0.3]]))
+    x = torch.from_numpy(
+        np.array(
+            [
+                [1, -2, 0.1, 0.7, 6.5, 0.8, 0.1, -0.03, 0.15],
+                [0, 0, -0.2, -1.0, 4.0, -0.6, -0.2, 0.05, -0.3],
+            ]
+        )
+    )
     w = inputs(plant, 2, 0.1, 1e5)
     w[:, 2:] = torch.from_numpy(np.random.default_rng(2).normal(size=(2, w.shape[1] - 2)))
     # in the units of a vessel of 365 t, so that finite differences resolve the forces
     scale = torch.tensor([1.0, 1e5, *([1e5] * 4), 1.0, 1.0, 1e5, 1e5], dtype=torch.float64)
-    assert torch.autograd.gradcheck(lambda x, w: plant.rate(x, w * scale), (x.requires_grad_(), (w / scale).requires_grad_()), atol=1e-6)
+    assert torch.autograd.gradcheck(
+        lambda x, w: plant.rate(x, w * scale),
+        (x.requires_grad_(), (w / scale).requires_grad_()),
+        atol=1e-6,
+    )
 
 
 DISSIPATIVE = (
@@ -186,12 +230,17 @@ DISSIPATIVE = (
 
 def energy(plant: PatrolVessel, states: torch.Tensor, stiffness: float) -> torch.Tensor:
     nu = states[..., 4:8]
-    return 0.5 * torch.einsum("bti,ij,btj->bt", nu, plant.hull.mass, nu) + 0.5 * stiffness * states[..., 2] ** 2
+    return (
+        0.5 * torch.einsum("bti,ij,btj->bt", nu, plant.hull.mass, nu)
+        + 0.5 * stiffness * states[..., 2] ** 2
+    )
 
 
 @pytest.mark.parametrize("braked", [True, False])
 def test_energy_falls_with_damping_and_is_kept_without(braked: bool) -> None:
-    """With a symmetric mass matrix: neither rotation nor restoring does work over time, and each damping term takes energy."""
+    """With a symmetric mass matrix: neither rotation nor restoring does work over time, and each
+    damping term takes energy.
+    """
     overrides = DISSIPATIVE if braked else (*DISSIPATIVE[:2], "forces={}")
     vessel = load_config(vessel_files()["patrol_p06"], list(overrides), VesselConfig)
     plant = vessel.build()
@@ -214,17 +263,23 @@ def test_port_and_starboard_are_mirror_images(plant: PatrolVessel) -> None:
     torch.testing.assert_close(mirrored, plant.rate(x, w) * MIRROR, rtol=1e-11, atol=1e-13)
 
 
-def test_mirrored_commands_give_the_mirrored_track_and_none_keeps_straight(plant: PatrolVessel) -> None:
+def test_mirrored_commands_give_the_mirrored_track_and_none_keeps_straight(
+    plant: PatrolVessel,
+) -> None:
     w = torch.cat([inputs(plant, 1, delta) for delta in (0.15, -0.15, 0.0)])
     states = flown(plant, plant.approach(3), w, 600)
     torch.testing.assert_close(states[1], states[0] * MIRROR, rtol=1e-9, atol=1e-11)
     assert float(states[0, -1, 3]) > 0.5, "a rudder to starboard turns to starboard"
     straight = states[2, -1]
-    np.testing.assert_allclose(straight, [7.71 * 30, 0, 0, 0, 7.71, 0, 0, 0, 0], rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(
+        straight, [7.71 * 30, 0, 0, 0, 7.71, 0, 0, 0, 0], rtol=1e-12, atol=1e-12
+    )
 
 
 def test_heel_and_steady_turns_are_those_of_errata() -> None:
-    """G9: 10 deg of rudder heel 1.25 deg inward at first and 3.34 deg outward in the end; G17, G18: 7.00 m/s and 190 m at 5 deg, 124 m at 10 deg."""
+    """G9: 10 deg of rudder heel 1.25 deg inward at first and 3.34 deg outward in the end; G17, G18:
+    7.00 m/s and 190 m at 5 deg, 124 m at 10 deg.
+    """
     # the rudder steps
     plant = load_config(vessel_files()["patrol_p06"], ["actuators.rate=null"], VesselConfig).build()
     w = torch.cat([inputs(plant, 1, np.radians(angle)) for angle in (5.0, 10.0)])
@@ -259,7 +314,10 @@ def test_a_current_that_carries_the_upright_vessel_exerts_no_force(plant: Patrol
     psi = torch.linspace(-3, 3, 7, dtype=torch.float64)
     x = torch.zeros(7, 9, dtype=torch.float64)
     x[:, 3] = psi
-    x[:, 4], x[:, 5] = 0.4 * torch.cos(psi) - 0.25 * torch.sin(psi), -0.4 * torch.sin(psi) - 0.25 * torch.cos(psi)
+    x[:, 4], x[:, 5] = (
+        0.4 * torch.cos(psi) - 0.25 * torch.sin(psi),
+        -0.4 * torch.sin(psi) - 0.25 * torch.cos(psi),
+    )
     w = inputs(plant, 7, 0.0, 0.0)
     w[:, 6], w[:, 7] = 0.4, -0.25
     rate = plant.rate(x, w)
@@ -272,8 +330,12 @@ def test_calm_water_held_forces_and_single_rows_are_the_same(plant: PatrolVessel
     w = inputs(plant, 5, 0.1)
     full = plant.rate(x, w)
     for row in range(5):
-        torch.testing.assert_close(plant.rate(x[row : row + 1], w[row : row + 1])[0], full[row], rtol=1e-12, atol=1e-13)
+        torch.testing.assert_close(
+            plant.rate(x[row : row + 1], w[row : row + 1])[0], full[row], rtol=1e-12, atol=1e-13
+        )
     after, _ = PlantDynamics(plant, 0.05).step(x, w, x[:, :0])
     calm = plant.in_calm_water()
     torch.testing.assert_close(calm.rate(x, w[:, :2]), full, rtol=1e-12, atol=1e-13)
-    torch.testing.assert_close(PlantDynamics(calm, 0.05).step(x, w[:, :2], x[:, :0])[0], after, rtol=1e-12, atol=1e-13)
+    torch.testing.assert_close(
+        PlantDynamics(calm, 0.05).step(x, w[:, :2], x[:, :0])[0], after, rtol=1e-12, atol=1e-13
+    )

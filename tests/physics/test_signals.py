@@ -41,11 +41,14 @@ def wind(psi_deg: float, u: float, v: float, speed: float, direction_deg: float)
         (0, 5, 0, 10, 0, (-15, 0)),
         # drifting to starboard in a calm: air from starboard
         (30, 0, 1, 0, 77, (0, -1)),
-        # by hand: air moves to 45 deg + 180 deg, (-7.0711, -7.0711) in NED; heading 30 deg: (-9.6593, -2.5882); less (2, 0.5)
+        # by hand: air moves to 45 deg + 180 deg, (-7.0711, -7.0711) in NED; heading 30 deg:
+        # (-9.6593, -2.5882); less (2, 0.5)
         (30, 2, 0.5, 10, 45, (-11.6593, -3.0882)),
     ],
 )
-def test_relative_wind(psi: float, u: float, v: float, speed: float, direction: float, expected: tuple[float, float]) -> None:
+def test_relative_wind(
+    psi: float, u: float, v: float, speed: float, direction: float, expected: tuple[float, float]
+) -> None:
     along, across, magnitude = wind(psi, u, v, speed, direction)
     assert (along, across) == pytest.approx(expected, abs=6e-5)
     assert magnitude == pytest.approx(np.hypot(*expected), abs=2e-4)
@@ -65,14 +68,38 @@ def build(**changes: object) -> Signals:
 
 def test_names() -> None:
     assert build().names == ("u", "v", "r", "n_port", "n_stbd")
-    assert build(forces="wam_v_cal").names == ("u", "v", "r", "n_port", "n_stbd", "tau_x", "tau_y", "tau_n")
+    assert build(forces="wam_v_cal").names == (
+        "u",
+        "v",
+        "r",
+        "n_port",
+        "n_stbd",
+        "tau_x",
+        "tau_y",
+        "tau_n",
+    )
     both = build(forces="wam_v_cal", exogenous=("wind_dir", "wind_speed"))
-    assert both.names == ("u", "v", "r", "n_port", "n_stbd", "tau_x", "tau_y", "tau_n", "wind_u", "wind_v", "wind_mag")
+    assert both.names == (
+        "u",
+        "v",
+        "r",
+        "n_port",
+        "n_stbd",
+        "tau_x",
+        "tau_y",
+        "tau_n",
+        "wind_u",
+        "wind_v",
+        "wind_mag",
+    )
     assert both.count == len(both.names)
 
 
 def test_order_of_the_wind_columns_is_the_config_s() -> None:
-    one, two = build(exogenous=("wind_speed", "wind_dir")), build(exogenous=("wind_dir", "wind_speed"))
+    one, two = (
+        build(exogenous=("wind_speed", "wind_dir")),
+        build(exogenous=("wind_dir", "wind_speed")),
+    )
     x = torch.randn(5, 6, dtype=torch.float64)
     w = torch.randn(5, 4, dtype=torch.float64)
     torch.testing.assert_close(one(x, one.prepare(w)), two(x, two.prepare(w[:, [0, 1, 3, 2]])))
@@ -89,14 +116,24 @@ def test_forces_are_the_vessel_s() -> None:
 @pytest.mark.parametrize("exogenous", [(), ("wind_speed", "wind_dir")])
 @pytest.mark.parametrize("forces", [None, "wam_v_cal"])
 @pytest.mark.parametrize("shape", [(4,), (3, 5), (0,), (2, 0)])
-def test_batched_shapes_equal_sample_by_sample(exogenous: tuple[str, ...], forces: str | None, shape: tuple[int, ...]) -> None:
+def test_batched_shapes_equal_sample_by_sample(
+    exogenous: tuple[str, ...], forces: str | None, shape: tuple[int, ...]
+) -> None:
     signals = build(exogenous=exogenous, forces=forces)
-    x, w = torch.randn(*shape, 6, dtype=torch.float64), torch.randn(*shape, 2 + len(exogenous), dtype=torch.float64) * 20
+    x, w = (
+        torch.randn(*shape, 6, dtype=torch.float64),
+        torch.randn(*shape, 2 + len(exogenous), dtype=torch.float64) * 20,
+    )
     z = signals(x, signals.prepare(w))
     assert z.shape == (*shape, signals.count)
-    rows = [signals(a[None], signals.prepare(b[None])) for a, b in zip(x.reshape(-1, 6), w.reshape(-1, w.shape[-1]), strict=True)]
+    rows = [
+        signals(a[None], signals.prepare(b[None]))
+        for a, b in zip(x.reshape(-1, 6), w.reshape(-1, w.shape[-1]), strict=True)
+    ]
     if rows:
-        torch.testing.assert_close(z.reshape(-1, signals.count), torch.cat(rows), rtol=1e-13, atol=1e-13)
+        torch.testing.assert_close(
+            z.reshape(-1, signals.count), torch.cat(rows), rtol=1e-13, atol=1e-13
+        )
 
 
 def test_nothing_depends_on_the_position() -> None:
@@ -113,7 +150,12 @@ def test_wind_turns_with_the_vessel() -> None:
     turned, veered = x.clone(), w.clone()
     turned[:, 2] += 1.234
     veered[:, 3] += 1.234
-    torch.testing.assert_close(signals(x, signals.prepare(w)), signals(turned, signals.prepare(veered)), rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(
+        signals(x, signals.prepare(w)),
+        signals(turned, signals.prepare(veered)),
+        rtol=1e-9,
+        atol=1e-12,
+    )
 
 
 def test_a_resolved_config_needs_no_vessel_file() -> None:
@@ -134,7 +176,10 @@ def test_a_resolved_config_needs_no_vessel_file() -> None:
         ({"inputs": ["n", "n"]}, r"\['n'\] are named twice"),
         ({"inputs": ["n", "delta", "m"], "forces": "wam_v_cal"}, "made by two thrusters"),
         ({"inputs": ["n", "u"]}, "input 'u' is a channel that the model has"),
-        ({"inputs": ["tau_x", "tau_n"], "forces": "wam_v_cal"}, "input 'tau_x' is a channel that the model has"),
+        (
+            {"inputs": ["tau_x", "tau_n"], "forces": "wam_v_cal"},
+            "input 'tau_x' is a channel that the model has",
+        ),
         ({"forces": "wam_v_kal"}, "did you mean 'wam_v_cal'"),
     ],
 )

@@ -1,4 +1,6 @@
-"""Nomoto's models against their transfer functions, the vessel they linearise, SciPy and closed forms."""
+"""Nomoto's models against their transfer functions, the vessel they linearise, SciPy and closed
+forms.
+"""
 
 from __future__ import annotations
 
@@ -65,17 +67,24 @@ def test_steps_of_the_rudder_as_the_transfer_functions_say(name: str, dt: float)
     for channel, function in known.items():
         # lsim holds inputs over a step and is exact in it
         _, truth, _ = lsim(function, rudder, np.arange(400) * dt, interp=False)
-        np.testing.assert_allclose(states[:-1, plant.state.index(channel)], truth, rtol=0, atol=1e-11 * np.ptp(truth))
+        np.testing.assert_allclose(
+            states[:-1, plant.state.index(channel)], truth, rtol=0, atol=1e-11 * np.ptp(truth)
+        )
     if "v" not in known:
         assert not states[:, 4].any()
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_exact_step_against_rk4_and_scipy(name: str) -> None:
-    """Whole states under a rudder with a rate; RK4 and positions by Simpson's rule are of fourth order."""
+    """Whole states under a rudder with a rate; RK4 and positions by Simpson's rule are of fourth
+    order.
+    """
     plant = load_config(vessel_files()[name], ["rudder.rate=5 deg/s"], VesselConfig).build()
     dt, rudder = 0.05, commands(200, 0.05)
-    exact, stepped = flown(NomotoDynamics(plant, dt), rudder), flown(PlantDynamics(plant, dt), rudder)
+    exact, stepped = (
+        flown(NomotoDynamics(plant, dt), rudder),
+        flown(PlantDynamics(plant, dt), rudder),
+    )
     spread = np.ptp(exact, axis=0)
     np.testing.assert_array_equal(exact[:, -1], stepped[:, -1])
     assert (np.abs(exact - stepped).max(0) <= 1e-7 * spread).all()
@@ -83,7 +92,9 @@ def test_the_exact_step_against_rk4_and_scipy(name: str) -> None:
     for k in range(200):
         w, delta = torch.tensor([[rudder[k]]]), exact[k, -1]
         x = solve_ivp(
-            lambda _, y, w=w, delta=delta: plant.rate(torch.tensor([[*y, delta]]), w)[0, :-1].numpy(),
+            lambda _, y, w=w, delta=delta: plant.rate(torch.tensor([[*y, delta]]), w)[
+                0, :-1
+            ].numpy(),
             (0, dt),
             x,
             method="DOP853",
@@ -118,19 +129,34 @@ def test_the_linear_mariner_is_the_mariner_about_straight_motion() -> None:
 
 def test_sideslip_leaves_the_yaw_of_the_second_order() -> None:
     rudder = commands(500, 0.2)
-    yaw, slip = (flown(NomotoDynamics(immediate(name), 0.2), rudder) for name in ("nomoto_mariner_yaw", "nomoto_mariner"))
+    yaw, slip = (
+        flown(NomotoDynamics(immediate(name), 0.2), rudder)
+        for name in ("nomoto_mariner_yaw", "nomoto_mariner")
+    )
     np.testing.assert_allclose(yaw[:, [2, 5]], slip[:, [2, 5]], rtol=0, atol=1e-10)
     assert np.ptp(slip[:, 4]) > 0.1
 
 
 def test_gradients(plant: SteeringVessel) -> None:
-    x = torch.rand(3, len(plant.state), dtype=torch.float64, generator=torch.Generator().manual_seed(0)) * 0.3
+    x = (
+        torch.rand(
+            3, len(plant.state), dtype=torch.float64, generator=torch.Generator().manual_seed(0)
+        )
+        * 0.3
+    )
     w = torch.tensor([[0.1], [-0.2], [0.05]], dtype=torch.float64)
     assert torch.autograd.gradcheck(plant.rate, (x.requires_grad_(), w.requires_grad_()))
     model = NomotoDynamics(plant, 0.1)
     # within the rate the rudder follows its command: no kink there
-    near = torch.cat((x[:, :-1], w.detach() + 1e-3), dim=1).detach() if plant.state[-1] == "delta" else x.detach()
-    assert torch.autograd.gradcheck(lambda x, w: model.step(x, w, x[:, :0])[0], (near.requires_grad_(), w.detach().requires_grad_()))
+    near = (
+        torch.cat((x[:, :-1], w.detach() + 1e-3), dim=1).detach()
+        if plant.state[-1] == "delta"
+        else x.detach()
+    )
+    assert torch.autograd.gradcheck(
+        lambda x, w: model.step(x, w, x[:, :0])[0],
+        (near.requires_grad_(), w.detach().requires_grad_()),
+    )
 
 
 def test_mirror_turning_sense_and_straight_run(plant: SteeringVessel) -> None:
@@ -152,7 +178,11 @@ def test_commands_saturate_and_drive_changes_nothing(plant: SteeringVessel) -> N
     one = torch.ones(2, dtype=torch.float64)
     assert torch.equal(plant.demand(one, 0.5 * one), plant.demand(-one, 0.5 * one))
     assert plant.demand(one, 3.0 * one)[:, 0].tolist() == [plant.delta_max] * 2
-    x, far, most = plant.approach(1), torch.tensor([[9.0]], dtype=torch.float64), torch.tensor([[plant.delta_max]], dtype=torch.float64)
+    x, far, most = (
+        plant.approach(1),
+        torch.tensor([[9.0]], dtype=torch.float64),
+        torch.tensor([[plant.delta_max]], dtype=torch.float64),
+    )
     assert torch.equal(plant.rate(x, far), plant.rate(x, most))
 
 
@@ -175,13 +205,21 @@ def test_a_wrong_value_is_one_line(name: str, override: str, message: str) -> No
 
 
 def test_an_unstable_ship_has_both_signs_negative() -> None:
-    plant = load_config(vessel_files()["nomoto_oceanos"], ["K.value=-1", "T.value=-20"], VesselConfig).build()
+    plant = load_config(
+        vessel_files()["nomoto_oceanos"], ["K.value=-1", "T.value=-20"], VesselConfig
+    ).build()
     states = flown(NomotoDynamics(plant, 0.1), np.full(100, 0.1))
     assert states[-1, 5] == pytest.approx(0.1 * (np.exp(10.0 / 20) - 1), rel=1e-12)
 
 
 def test_an_exact_step_needs_a_rudder_that_is_held() -> None:
-    plant = load_config(vessel_files()["nomoto_oceanos"], ["rudder.response={kind: first_order, time: 1 s}"], VesselConfig).build()
+    plant = load_config(
+        vessel_files()["nomoto_oceanos"],
+        ["rudder.response={kind: first_order, time: 1 s}"],
+        VesselConfig,
+    ).build()
     with pytest.raises(ConfigError, match="an exact step holds the rudder"):
         NomotoDynamics(plant, 0.1)
-    assert flown(PlantDynamics(plant, 0.1), np.full(30, 0.1))[-1, -1] == pytest.approx(0.1 * (1 - np.exp(-3.0)), rel=1e-5)
+    assert flown(PlantDynamics(plant, 0.1), np.full(30, 0.1))[-1, -1] == pytest.approx(
+        0.1 * (1 - np.exp(-3.0)), rel=1e-5
+    )

@@ -1,4 +1,6 @@
-"""Port/starboard symmetry against what a mirror does: scenes turned over, and terms evaluated on both sides of it."""
+"""Port/starboard symmetry against what a mirror does: scenes turned over, and terms evaluated on
+both sides of it.
+"""
 
 from __future__ import annotations
 
@@ -34,13 +36,31 @@ def mirrored(z: Tensor, names: tuple[str, ...]) -> Tensor:
 
 def test_parity_of_each_channel() -> None:
     assert tuple(channel_parity(name) for name in NAMES) == SIGNS
-    assert [channel_parity(name) for name in ("n_port", "cmd_stbd", "psi", "anything")] == [None] * 4
+    assert [channel_parity(name) for name in ("n_port", "cmd_stbd", "psi", "anything")] == [
+        None
+    ] * 4
 
 
 def test_parity_of_terms_is_the_sign_that_the_mirror_gives_their_values() -> None:
-    factors = [form.format(name) for name in NAMES for form in ("{}", "|{}|", "{}^2", "|{}|^3", "{}^-1", "|{}|^-1", "{}^-2")]
-    factors += [form.format(name) for name in ("v", "u") for form in ("sin({})", "cos({})", "sqrt({})", "ssqrt({})", "inv({})", "sin({})^2")]
-    terms = ["1", *factors, *(f"{a} {b}" for a, b in combinations_with_replacement(factors, 2)), "v |v| r", "|u| v |v|", "n^2 delta", "v r delta^3 u"]
+    factors = [
+        form.format(name)
+        for name in NAMES
+        for form in ("{}", "|{}|", "{}^2", "|{}|^3", "{}^-1", "|{}|^-1", "{}^-2")
+    ]
+    factors += [
+        form.format(name)
+        for name in ("v", "u")
+        for form in ("sin({})", "cos({})", "sqrt({})", "ssqrt({})", "inv({})", "sin({})^2")
+    ]
+    terms = [
+        "1",
+        *factors,
+        *(f"{a} {b}" for a, b in combinations_with_replacement(factors, 2)),
+        "v |v| r",
+        "|u| v |v|",
+        "n^2 delta",
+        "v r delta^3 u",
+    ]
     z = random_channels()
     library = TermLibrary(terms, NAMES)
     here, there = library(z), library(z * torch.tensor(SIGNS, dtype=z.dtype))
@@ -52,10 +72,17 @@ def test_parity_of_terms_is_the_sign_that_the_mirror_gives_their_values() -> Non
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_a_term_is_wrong_where_it_breaks_the_symmetry_of_its_axis(axis: int) -> None:
     """A symmetric vessel's acceleration f has f(M z) = M f(z)."""
-    terms = ["1", *NAMES, *(f"{a} {b}" for a, b in combinations_with_replacement(NAMES, 2)), *(f"|{a}|" for a in NAMES)]
+    terms = [
+        "1",
+        *NAMES,
+        *(f"{a} {b}" for a, b in combinations_with_replacement(NAMES, 2)),
+        *(f"|{a}|" for a in NAMES),
+    ]
     z = random_channels()
     library = TermLibrary(terms, NAMES)
-    broken = (library(z * torch.tensor(SIGNS, dtype=z.dtype)) - TURNED[axis] * library(z)).abs().amax(0) > 1e-9
+    broken = (
+        library(z * torch.tensor(SIGNS, dtype=z.dtype)) - TURNED[axis] * library(z)
+    ).abs().amax(0) > 1e-9
     assert [wrong_parity(term, axis, NAMES) for term in terms] == broken.tolist()
 
 
@@ -78,8 +105,12 @@ def test_what_nobody_said_is_not_called_wrong() -> None:
 
 
 def test_channels_are_those_of_the_scene_in_the_mirror() -> None:
-    """The same vessel, thrusters and wind, turned over: y, psi, v, r and the wind's direction change sign, port and starboard change places."""
-    signals = SignalsConfig(inputs=("n_port", "n_stbd"), exogenous=("wind_speed", "wind_dir"), forces="wam_v_cal").build()
+    """The same vessel, thrusters and wind, turned over: y, psi, v, r and the wind's direction
+    change sign, port and starboard change places.
+    """
+    signals = SignalsConfig(
+        inputs=("n_port", "n_stbd"), exogenous=("wind_speed", "wind_dir"), forces="wam_v_cal"
+    ).build()
     random = np.random.default_rng(1)
     x = torch.from_numpy(random.normal(size=(40, 6)) * [20, 20, 2, 1, 0.3, 0.2])
     w = torch.from_numpy(random.uniform([-20, -20, 0, -4], [30, 30, 12, 4], size=(40, 4)))
@@ -95,10 +126,15 @@ def test_channels_are_those_of_the_scene_in_the_mirror() -> None:
     [
         (("u", "v", "r", "n", "delta"), ([0, 1, 2, 3, 4], [1.0, -1.0, -1.0, 1.0, -1.0])),
         (("u", "n_port", "n_stbd"), ([0, 2, 1], [1.0, 1.0, 1.0])),
-        (("cmd_stbd", "n_port", "v", "n_stbd", "cmd_port"), ([4, 3, 2, 1, 0], [1.0, 1.0, -1.0, 1.0, 1.0])),
+        (
+            ("cmd_stbd", "n_port", "v", "n_stbd", "cmd_port"),
+            ([4, 3, 2, 1, 0], [1.0, 1.0, -1.0, 1.0, 1.0]),
+        ),
     ],
 )
-def test_pairs_change_places(names: tuple[str, ...], expected: tuple[list[int], list[float]]) -> None:
+def test_pairs_change_places(
+    names: tuple[str, ...], expected: tuple[list[int], list[float]]
+) -> None:
     assert mirrored_channels(names) == expected
     z = random_channels(5, len(names))
     assert torch.equal(mirrored(mirrored(z, names), names), z), "twice mirrored is as before"

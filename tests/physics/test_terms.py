@@ -65,7 +65,16 @@ def test_library_equals_numpy() -> None:
     terms = ["1", "u", "u|u|", "|u|v", "v |r|", "n_port^2 delta2", "|v|^3 u^2", "1"]
     z = np.random.default_rng(0).normal(size=(7, 11, len(NAMES)))
     u, v, r, n, d = (z[..., i] for i in range(5))
-    truth = [np.ones_like(u), u, u * abs(u), abs(u) * v, v * abs(r), n**2 * d, abs(v) ** 3 * u**2, np.ones_like(u)]
+    truth = [
+        np.ones_like(u),
+        u,
+        u * abs(u),
+        abs(u) * v,
+        v * abs(r),
+        n**2 * d,
+        abs(v) ** 3 * u**2,
+        np.ones_like(u),
+    ]
     library = TermLibrary(terms, NAMES)
     assert library.count == len(terms)
     np.testing.assert_allclose(library(torch.from_numpy(z)), np.stack(truth, axis=-1), rtol=1e-14)
@@ -90,7 +99,16 @@ def test_library_of_constants_and_of_nothing() -> None:
 
 
 def test_functions_equal_numpy() -> None:
-    terms = ["sin(u)", "cos(v)^2 n_port", "u^2 n_port^2 cos(delta2)", "sqrt(r)", "ssqrt(r) |v|", "inv(n_port) u", "inv(r)^2", "u^-1 sin(v)"]
+    terms = [
+        "sin(u)",
+        "cos(v)^2 n_port",
+        "u^2 n_port^2 cos(delta2)",
+        "sqrt(r)",
+        "ssqrt(r) |v|",
+        "inv(n_port) u",
+        "inv(r)^2",
+        "u^-1 sin(v)",
+    ]
     z = np.random.default_rng(1).normal(size=(9, len(NAMES)))
     u, v, r, n, d = z.T
     truth = [
@@ -105,7 +123,9 @@ def test_functions_equal_numpy() -> None:
     ]
     library = TermLibrary(terms, NAMES)
     np.testing.assert_allclose(library(torch.from_numpy(z)), np.stack(truth, axis=-1), rtol=1e-13)
-    np.testing.assert_allclose(torch.jit.script(library)(torch.from_numpy(z)), np.stack(truth, axis=-1), rtol=1e-13)
+    np.testing.assert_allclose(
+        torch.jit.script(library)(torch.from_numpy(z)), np.stack(truth, axis=-1), rtol=1e-13
+    )
 
 
 def test_protected_functions_are_finite_at_zero_with_their_gradients() -> None:

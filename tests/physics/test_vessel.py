@@ -33,9 +33,14 @@ def test_every_vessel_file(name: str) -> None:
     assert rate.shape == x.shape
     assert bool(torch.isfinite(rate).all())
     assert plant.settle(x, w, 0.01).shape == x.shape
-    # what a log may hold has a unit; thrusters are named by the vessel file, so that no table can hold their channels
+    # what a log may hold has a unit; thrusters are named by the vessel file, so that no table can
+    # hold their channels
     named_by_file = ("_", "n_", "alpha_", "cmd_n_", "cmd_alpha_")
-    logged = [name for name in (*plant.state, *plant.inputs[: plant.commands]) if not name.startswith(named_by_file)]
+    logged = [
+        name
+        for name in (*plant.state, *plant.inputs[: plant.commands])
+        if not name.startswith(named_by_file)
+    ]
     assert [name for name in logged if name not in CHANNEL_UNITS] == []
     assert {"x", "y", "psi", "u", "v", "r"} <= set(plant.state)
 
@@ -47,7 +52,10 @@ def test_every_vessel_in_a_batch_with_gradients(name: str) -> None:
     x = plant.approach(4)
     x = x + 0.05 * torch.rand(x.shape, generator=random, dtype=torch.float64)
     w = 0.1 * torch.rand(4, len(plant.inputs), generator=random, dtype=torch.float64)
-    w[:, : plant.commands] = plant.demand(torch.full((4,), 0.6, dtype=torch.float64), torch.linspace(-0.5, 0.4, 4, dtype=torch.float64))
+    w[:, : plant.commands] = plant.demand(
+        torch.full((4,), 0.6, dtype=torch.float64),
+        torch.linspace(-0.5, 0.4, 4, dtype=torch.float64),
+    )
     # at rest, too, slopes stay finite
     x[3] = 0.0
     x.requires_grad_()
@@ -56,8 +64,12 @@ def test_every_vessel_in_a_batch_with_gradients(name: str) -> None:
     for slope in torch.autograd.grad(rate.sum(), (x, w), allow_unused=True):
         assert slope is None or bool(torch.isfinite(slope).all())
     for row in range(4):
-        torch.testing.assert_close(plant.rate(x[row : row + 1], w[row : row + 1])[0], rate[row], rtol=1e-9, atol=1e-12)
-        torch.testing.assert_close(plant.settle(x[row : row + 1], w[row : row + 1], 0.01)[0], plant.settle(x, w, 0.01)[row])
+        torch.testing.assert_close(
+            plant.rate(x[row : row + 1], w[row : row + 1])[0], rate[row], rtol=1e-9, atol=1e-12
+        )
+        torch.testing.assert_close(
+            plant.settle(x[row : row + 1], w[row : row + 1], 0.01)[0], plant.settle(x, w, 0.01)[row]
+        )
 
 
 @pytest.mark.parametrize("name", vessel_files())
@@ -66,7 +78,10 @@ def test_every_vessel_turns_to_starboard_where_it_is_steered(name: str) -> None:
     vessel = load_vessel(name)
     plant = vessel.build()
     x = plant.approach(2)
-    drive, steer = torch.ones(2, dtype=torch.float64), torch.tensor([0.3, -0.3], dtype=torch.float64)
+    drive, steer = (
+        torch.ones(2, dtype=torch.float64),
+        torch.tensor([0.3, -0.3], dtype=torch.float64),
+    )
     w = torch.zeros(2, 400, len(plant.inputs), dtype=torch.float64)
     w[:, :, : plant.commands] = plant.demand(drive, steer)[:, None]
     with torch.no_grad():
@@ -83,13 +98,27 @@ def test_calibrated_numbers_are_those_of_errata() -> None:
     assert (added.X_udot.value, added.Y_vdot.value, added.N_rdot.value) == (-42, -250, -500)
     assert {term: p.value for term, p in damping.X.items()} == {"u": 180, "u|u|": 83}
     assert {term: p.value for term, p in damping.Y.items()} == {"v": 250, "|u|v": 150, "v|v|": 600}
-    assert {term: p.value for term, p in damping.N.items()} == {"r": 900, "r|r|": 1700, "|u|v": -320}
-    assert (vessel.actuators.spacing, vessel.actuators.n_max * 60, vessel.actuators.n_rate * 60) == pytest.approx((2.44, 2380, 1500))
+    assert {term: p.value for term, p in damping.N.items()} == {
+        "r": 900,
+        "r|r|": 1700,
+        "|u|v": -320,
+    }
+    assert (
+        vessel.actuators.spacing,
+        vessel.actuators.n_max * 60,
+        vessel.actuators.n_rate * 60,
+    ) == pytest.approx((2.44, 2380, 1500))
 
 
 def test_units_are_converted_at_the_door() -> None:
-    vessel = load_config(CAL, ["rigid_body.m.value=0.315", "rigid_body.m.unit=t", "length.value=488", "length.unit=cm"], FossenConfig)
-    assert vessel.rigid_body.m == Parameter(value=315.0, unit="kg", source=vessel.rigid_body.m.source)
+    vessel = load_config(
+        CAL,
+        ["rigid_body.m.value=0.315", "rigid_body.m.unit=t", "length.value=488", "length.unit=cm"],
+        FossenConfig,
+    )
+    assert vessel.rigid_body.m == Parameter(
+        value=315.0, unit="kg", source=vessel.rigid_body.m.source
+    )
     assert vessel.length.value == pytest.approx(4.88)
     # what is converted once is not converted again
     again = FossenConfig.model_validate(vessel.model_dump())
@@ -143,17 +172,29 @@ def test_a_wrong_damping_term_is_found_when_the_file_is_read(override: str, mess
 
 @pytest.mark.parametrize(
     "override",
-    ["damping.X.u.unit=N s/m", "damping.N.r.unit=N m s/rad", "damping.N.r.unit=N m s", "damping.N.|u|v|v|={value: 1, unit: kg s/m, source: made}"],
+    [
+        "damping.X.u.unit=N s/m",
+        "damping.N.r.unit=N m s/rad",
+        "damping.N.r.unit=N m s",
+        "damping.N.|u|v|v|={value: 1, unit: kg s/m, source: made}",
+    ],
 )
 def test_equal_units_of_damping_are_taken(override: str) -> None:
     vessel, known = load_config(CAL, [override], FossenConfig), load_vessel("wam_v_cal")
-    axis, term = override.split(".")[1], override.removeprefix("damping.").split(".")[1].split("=")[0]
+    axis, term = (
+        override.split(".")[1],
+        override.removeprefix("damping.").split(".")[1].split("=")[0],
+    )
     row = getattr(vessel.damping, axis)
-    assert row[term].value == (1.0 if term == "|u|v|v|" else getattr(known.damping, axis)[term].value)
+    assert row[term].value == (
+        1.0 if term == "|u|v|v|" else getattr(known.damping, axis)[term].value
+    )
     assert row[term].unit in override
     # the plant brakes with the number as it stands, whichever of its equal units was named
     nu = torch.tensor([[1.5, -0.4, 0.3]], dtype=torch.float64)
-    extra = torch.tensor([[0.0, 0.0, 1.5 * -0.4 * 0.4 if term == "|u|v|v|" else 0.0]], dtype=torch.float64)
+    extra = torch.tensor(
+        [[0.0, 0.0, 1.5 * -0.4 * 0.4 if term == "|u|v|v|" else 0.0]], dtype=torch.float64
+    )
     torch.testing.assert_close(Fossen3(vessel).drag(nu), Fossen3(known).drag(nu) + extra)
 
 

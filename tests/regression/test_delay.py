@@ -9,7 +9,9 @@ from residnet.core.errors import FitError
 from residnet.regression.delay import delay_profile
 
 
-def refits(held: np.ndarray, moved: np.ndarray, y: np.ndarray, stretch: np.ndarray, longest: int) -> list[float]:
+def refits(
+    held: np.ndarray, moved: np.ndarray, y: np.ndarray, stretch: np.ndarray, longest: int
+) -> list[float]:
     now = np.array([i for i in range(longest, len(y)) if stretch[i] == stretch[i - longest]])
     out = []
     for shift in range(longest + 1):
@@ -27,7 +29,12 @@ def test_profile_equals_refits_across_gaps(shift: int) -> None:
     stretch = np.repeat([0, 1, 2], [150, 50, 200])
     held = np.stack((state, np.ones(n), state**2), axis=1)
     moved = np.stack((np.ones(n), drive, drive * np.abs(drive)), axis=1)
-    y = -state + 1e-3 * np.roll(drive, shift) + 1e-7 * state**2 * np.roll(drive * np.abs(drive), shift) + 0.3 * random.normal(size=n)
+    y = (
+        -state
+        + 1e-3 * np.roll(drive, shift)
+        + 1e-7 * state**2 * np.roll(drive * np.abs(drive), shift)
+        + 0.3 * random.normal(size=n)
+    )
     profile = delay_profile(held, moved, y, stretch, 10)
     np.testing.assert_allclose(profile.rss, refits(held, moved, y, stretch, 10), rtol=1e-9)
     assert profile.shift == shift
@@ -37,7 +44,9 @@ def test_terms_that_say_the_same_do_no_harm() -> None:
     random = np.random.default_rng(0)
     drive = random.normal(size=300)
     one = np.ones((300, 2))
-    profile = delay_profile(one, np.stack((drive, drive), axis=1), np.roll(drive, 4), np.zeros(300, dtype=int), 8)
+    profile = delay_profile(
+        one, np.stack((drive, drive), axis=1), np.roll(drive, 4), np.zeros(300, dtype=int), 8
+    )
     assert profile.shift == 4
     assert profile.rss[4] < 1e-9 * profile.rss[3]
 

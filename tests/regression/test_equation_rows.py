@@ -1,4 +1,6 @@
-"""Rows of the weak form and of instruments against sums written out, closed forms, and bias that must go."""
+"""Rows of the weak form and of instruments against sums written out, closed forms, and bias that
+must go.
+"""
 
 from __future__ import annotations
 
@@ -6,14 +8,26 @@ import numpy as np
 import pytest
 
 from residnet.core.errors import ConfigError, FitError
-from residnet.regression.equation_rows import Instruments, LeastSquares, Rows, Weak, correlation_time, step_of, stretches
+from residnet.regression.equation_rows import (
+    Instruments,
+    LeastSquares,
+    Rows,
+    Weak,
+    correlation_time,
+    step_of,
+    stretches,
+)
 
 NONE_EXACT = np.zeros(2, dtype=bool)
 
 
 def record(n: int = 200) -> Rows:
     random = np.random.default_rng(0)
-    return Rows(random.normal(size=(n, 2)), random.normal(size=(n, 1)), np.repeat([0, 1, 2], [n // 2, n // 10, n - n // 2 - n // 10]))
+    return Rows(
+        random.normal(size=(n, 2)),
+        random.normal(size=(n, 1)),
+        np.repeat([0, 1, 2], [n // 2, n // 10, n - n // 2 - n // 10]),
+    )
 
 
 def test_windows_are_weighted_sums_within_stretches() -> None:
@@ -35,11 +49,15 @@ def test_windows_are_weighted_sums_within_stretches() -> None:
 
 
 def test_windows_over_central_differences_are_integrals_by_parts() -> None:
-    """Sum of w x_dot over a window equals minus the sum of the weights' own differences times x: no derivative of the record is left."""
+    """Sum of w x_dot over a window equals minus the sum of the weights' own differences times x: no
+    derivative of the record is left.
+    """
     step, size = 0.1, 30
     x = np.random.default_rng(1).normal(size=100)
     rate = (x[2:] - x[:-2]) / (2 * step)
-    rows = Weak(window=size * step, every=1 / size).rows(Rows(np.ones((98, 1)), rate[:, None], np.zeros(98, dtype=int)), step, NONE_EXACT[:1])
+    rows = Weak(window=size * step, every=1 / size).rows(
+        Rows(np.ones((98, 1)), rate[:, None], np.zeros(98, dtype=int)), step, NONE_EXACT[:1]
+    )
     place = np.linspace(-1, 1, size + 2)
     weight = np.concatenate(([0.0, 0.0], (1 - place[1:-1] ** 2) ** 2, [0.0, 0.0]))
     weight /= weight.sum()
@@ -53,10 +71,14 @@ def test_instruments_are_two_stage_least_squares() -> None:
     rows = Instruments(lag=0.3).rows(sampled, 0.1, np.array([False, True]))
     now = [i for i in range(6, 200) if sampled.stretch[i] == sampled.stretch[i - 6]]
     x, y = sampled.x[now], sampled.y[now, 0]
-    z = np.column_stack([sampled.x[[i - 3 for i in now]], sampled.x[[i - 6 for i in now], 0], x[:, 1]])
+    z = np.column_stack(
+        [sampled.x[[i - 3 for i in now]], sampled.x[[i - 6 for i in now], 0], x[:, 1]]
+    )
     project = z @ np.linalg.inv(z.T @ z) @ z.T
     truth = np.linalg.solve(x.T @ project @ x, x.T @ project @ y)
-    np.testing.assert_allclose(np.linalg.lstsq(rows.x, rows.y[:, 0], rcond=None)[0], truth, rtol=1e-9)
+    np.testing.assert_allclose(
+        np.linalg.lstsq(rows.x, rows.y[:, 0], rcond=None)[0], truth, rtol=1e-9
+    )
 
 
 def test_instruments_take_away_the_bias_of_noisy_regressors() -> None:
@@ -66,9 +88,12 @@ def test_instruments_take_away_the_bias_of_noisy_regressors() -> None:
     for k in range(1, n):
         state[k] = 0.98 * state[k - 1] + random.normal()
     noisy = state + 0.5 * state.std() * random.normal(size=n)
-    sampled = Rows(noisy[:, None], (2.0 * state + 0.1 * random.normal(size=n))[:, None], np.zeros(n, dtype=int))
+    sampled = Rows(
+        noisy[:, None], (2.0 * state + 0.1 * random.normal(size=n))[:, None], np.zeros(n, dtype=int)
+    )
     plain, lagged = (
-        np.linalg.lstsq(rows.x, rows.y, rcond=None)[0].item() for rows in (sampled, Instruments(lag=0.2).rows(sampled, 0.1, NONE_EXACT[:1]))
+        np.linalg.lstsq(rows.x, rows.y, rcond=None)[0].item()
+        for rows in (sampled, Instruments(lag=0.2).rows(sampled, 0.1, NONE_EXACT[:1]))
     )
     # a noise of half the deviation leaves 1 / (1 + 0.25) of the coefficient
     assert plain == pytest.approx(1.6, rel=0.02)

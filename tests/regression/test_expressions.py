@@ -8,19 +8,35 @@ import numpy as np
 import pytest
 import sympy
 
-from residnet.regression.expressions import FUNCTIONS, ONE, Algebra, Limits, Sum, TooLargeError, values_of
+from residnet.regression.expressions import (
+    FUNCTIONS,
+    ONE,
+    Algebra,
+    Limits,
+    Sum,
+    TooLargeError,
+    values_of,
+)
 
 NAMES = ("a", "b", "c")
 DATA = {name: np.random.default_rng(i).normal(size=40) for i, name in enumerate(NAMES)}
 
 
 def value(algebra: Algebra, meant: Sum) -> np.ndarray:
-    return np.array(list(meant.values())) @ algebra.values(list(meant), DATA) if meant else np.zeros(40)
+    return (
+        np.array(list(meant.values())) @ algebra.values(list(meant), DATA)
+        if meant
+        else np.zeros(40)
+    )
 
 
 def grown(algebra: Algebra, seed: random.Random, depth: int) -> tuple[Sum, np.ndarray]:
     """A random expression, and its values worked out beside it."""
-    kind = seed.choice(("channel", "number")) if depth == 0 else seed.choice(("add", "subtract", "multiply", "function", "channel"))
+    kind = (
+        seed.choice(("channel", "number"))
+        if depth == 0
+        else seed.choice(("add", "subtract", "multiply", "function", "channel"))
+    )
     if kind == "channel":
         name = seed.choice(NAMES)
         return algebra.channel(name), DATA[name]
@@ -32,31 +48,45 @@ def grown(algebra: Algebra, seed: random.Random, depth: int) -> tuple[Sum, np.nd
         function = seed.choice([f for f in FUNCTIONS if f != "sum"])
         return algebra.apply(function, a), values_of(function, x)
     b, y = grown(algebra, seed, depth - 1)
-    made = {"add": (lambda: algebra.add(a, b), x + y), "subtract": (lambda: algebra.add(a, b, -1.0), x - y)}
+    made = {
+        "add": (lambda: algebra.add(a, b), x + y),
+        "subtract": (lambda: algebra.add(a, b, -1.0), x - y),
+    }
     build, result = made.get(kind, (lambda: algebra.multiply(a, b), x * y))
     return build(), result
 
 
 @pytest.mark.parametrize("expand", [True, False])
 def test_normal_form_keeps_the_values(expand: bool) -> None:
-    algebra, seed, tried = Algebra(NAMES, Limits(terms=200, degree=16, nesting=5, expand=expand)), random.Random(1), 0
+    algebra, seed, tried = (
+        Algebra(NAMES, Limits(terms=200, degree=16, nesting=5, expand=expand)),
+        random.Random(1),
+        0,
+    )
     while tried < 300:
         try:
             meant, truth = grown(algebra, seed, 4)
         except TooLargeError:
             continue
         if np.abs(truth).max() > 1e-9:
-            np.testing.assert_allclose(value(algebra, meant), truth, rtol=1e-6, atol=1e-8 * np.abs(truth).max())
+            np.testing.assert_allclose(
+                value(algebra, meant), truth, rtol=1e-6, atol=1e-8 * np.abs(truth).max()
+            )
             tried += 1
 
 
 def test_products_are_multiplied_out_as_sympy_does() -> None:
     algebra = Algebra(NAMES)
     a, b, c = (algebra.channel(name) for name in NAMES)
-    made = algebra.multiply(algebra.add(a, b), algebra.multiply(algebra.add(a, c, -2.0), algebra.add(b, algebra.multiply(c, c))))
+    made = algebra.multiply(
+        algebra.add(a, b),
+        algebra.multiply(algebra.add(a, c, -2.0), algebra.add(b, algebra.multiply(c, c))),
+    )
     x, y, z = sympy.symbols(NAMES)
     truth = sympy.Poly(sympy.expand((x + y) * (x - 2 * z) * (y + z**2)), x, y, z).as_dict()
-    assert {tuple(product.count(i) for i in range(3)): weight for product, weight in made.items()} == {k: float(v) for k, v in truth.items()}
+    assert {
+        tuple(product.count(i) for i in range(3)): weight for product, weight in made.items()
+    } == {k: float(v) for k, v in truth.items()}
 
 
 def test_equal_expressions_are_one() -> None:
@@ -81,7 +111,9 @@ def test_brackets_stay_where_products_are_not_multiplied_out() -> None:
     a, b, c = (algebra.channel(name) for name in NAMES)
     made = algebra.add(algebra.multiply(algebra.add(a, b), algebra.add(b, c)), a)
     assert len(made) == 2
-    np.testing.assert_allclose(value(algebra, made), (DATA["a"] + DATA["b"]) * (DATA["b"] + DATA["c"]) + DATA["a"])
+    np.testing.assert_allclose(
+        value(algebra, made), (DATA["a"] + DATA["b"]) * (DATA["b"] + DATA["c"]) + DATA["a"]
+    )
 
 
 def test_limits_hold() -> None:

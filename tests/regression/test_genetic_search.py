@@ -1,4 +1,6 @@
-"""Genetic programming: fitness against NumPy's least squares, equations that are known, limits, and the library that it needs."""
+"""Genetic programming: fitness against NumPy's least squares, equations that are known, limits, and
+the library that it needs.
+"""
 
 from __future__ import annotations
 
@@ -30,13 +32,21 @@ def breed(target: np.ndarray, seed: int = 0, **config: Any) -> tuple[Algebra, Fo
 def test_fitness_equals_least_squares() -> None:
     algebra = Algebra(NAMES)
     magnitude = next(iter(algebra.apply("abs", algebra.channel("a"))))
-    sets: list[tuple[Product, ...]] = [((0,), (1, 2)), ((0, 1), (2,), magnitude), (magnitude,), ((0,), (1,))]
+    sets: list[tuple[Product, ...]] = [
+        ((0,), (1, 2)),
+        ((0, 1), (2,), magnitude),
+        (magnitude,),
+        ((0,), (1,)),
+    ]
     fitness = Fitness(algebra, DATA, NOISY, TRAIN, 0.0)
     for terms, (train, validation, left) in zip(sets, fitness.of(sets), strict=True):
         x = algebra.values(terms, DATA).T
         best = np.linalg.lstsq(x[TRAIN], NOISY[TRAIN], rcond=None)[0]
         for part, error in ((TRAIN, train), (~TRAIN, validation)):
-            assert error == pytest.approx(np.square(NOISY[part] - x[part] @ best).sum() / np.square(NOISY[part]).sum(), rel=1e-10)
+            assert error == pytest.approx(
+                np.square(NOISY[part] - x[part] @ best).sum() / np.square(NOISY[part]).sum(),
+                rel=1e-10,
+            )
         assert left == terms
     assert fitness.fitted == 4
     fitness.of(sets)
@@ -67,7 +77,11 @@ def test_pruning_takes_out_terms_that_explain_nothing() -> None:
 
 @pytest.mark.parametrize("split", ["sum", "expand"])
 def test_finds_a_sum_of_products(split: str) -> None:
-    _, found = breed(2 * DATA["a"] - DATA["b"] * DATA["c"] + 0.5 * DATA["c"] * np.abs(DATA["c"]), split=split, population=500)
+    _, found = breed(
+        2 * DATA["a"] - DATA["b"] * DATA["c"] + 0.5 * DATA["c"] * np.abs(DATA["c"]),
+        split=split,
+        population=500,
+    )
     assert found.reached
     assert max(found.train, found.validation) < 1e-12
     assert found.history[-1].train == found.train
@@ -75,7 +89,16 @@ def test_finds_a_sum_of_products(split: str) -> None:
 
 def test_genes_get_a_coefficient_each() -> None:
     target = 2 * (DATA["a"] + DATA["b"] * DATA["b"]) - 0.3 * DATA["c"]
-    algebra, found = breed(target, split="gene", genes=3, depth=3, first_depth=(0, 2), population=600, generations=40, patience=40)
+    algebra, found = breed(
+        target,
+        split="gene",
+        genes=3,
+        depth=3,
+        first_depth=(0, 2),
+        population=600,
+        generations=40,
+        patience=40,
+    )
     assert found.reached
     assert 2 <= len(found.terms) <= 3
     for product in found.terms:

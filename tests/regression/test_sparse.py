@@ -1,4 +1,6 @@
-"""Sparse regression against planted equations, scikit-learn's orthogonal matching pursuit, and the best of all subsets."""
+"""Sparse regression against planted equations, scikit-learn's orthogonal matching pursuit, and the
+best of all subsets.
+"""
 
 from __future__ import annotations
 
@@ -19,10 +21,14 @@ def named(count: int) -> list[str]:
 
 
 def solve(x: np.ndarray, y: np.ndarray, **config: float) -> Equation:
-    return find(reduce(x, y[:, None], named(x.shape[1]), [1] * x.shape[1]), 0, SearchConfig(**config))[0]
+    return find(
+        reduce(x, y[:, None], named(x.shape[1]), [1] * x.shape[1]), 0, SearchConfig(**config)
+    )[0]
 
 
-def planted(seed: int, rows: int = 300, columns: int = 30, noise: float = 0.0) -> tuple[np.ndarray, np.ndarray, dict[str, float]]:
+def planted(
+    seed: int, rows: int = 300, columns: int = 30, noise: float = 0.0
+) -> tuple[np.ndarray, np.ndarray, dict[str, float]]:
     """Correlated columns of very different sizes, and a target of four of them."""
     random = np.random.default_rng(seed)
     x = (
@@ -33,7 +39,11 @@ def planted(seed: int, rows: int = 300, columns: int = 30, noise: float = 0.0) -
     chosen = random.choice(columns, 4, replace=False)
     values = random.uniform(0.5, 2.0, 4) * random.choice([-1, 1], 4) / x[:, chosen].std(0)
     y = x[:, chosen] @ values
-    return x, y + noise * y.std() * random.normal(size=rows), {f"c{i}": float(v) for i, v in zip(chosen, values, strict=True)}
+    return (
+        x,
+        y + noise * y.std() * random.normal(size=rows),
+        {f"c{i}": float(v) for i, v in zip(chosen, values, strict=True)},
+    )
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -52,7 +62,10 @@ def test_a_planted_equation_is_found_in_noise_with_honest_errors(seed: int) -> N
     equation = solve(x, y)
     assert set(equation.terms) == set(truth)
     assert equation.share == pytest.approx(0.2 / np.sqrt(1.04), rel=0.1)
-    deviation = np.array([v - truth[t] for t, v in zip(equation.terms, equation.values, strict=True)]) / equation.errors
+    deviation = (
+        np.array([v - truth[t] for t, v in zip(equation.terms, equation.values, strict=True)])
+        / equation.errors
+    )
     assert np.abs(deviation).max() < 4.0
     # the textbook formula on the columns that were found
     own = x[:, [int(term[1:]) for term in equation.terms]]
@@ -75,7 +88,9 @@ def test_standard_errors_grow_with_the_correlation_of_the_noise() -> None:
 
 
 @pytest.mark.parametrize("terms", [1, 3, 6])
-def test_forward_regression_is_orthogonal_matching_pursuit_on_orthogonal_columns(terms: int) -> None:
+def test_forward_regression_is_orthogonal_matching_pursuit_on_orthogonal_columns(
+    terms: int,
+) -> None:
     random = np.random.default_rng(terms)
     x = np.linalg.qr(random.normal(size=(200, 20)))[0]
     y = x @ random.normal(size=20) + 0.1 * random.normal(size=200)
@@ -83,17 +98,24 @@ def test_forward_regression_is_orthogonal_matching_pursuit_on_orthogonal_columns
     search = Search(x, y, Criterion(200, 20, 1.0, float(y @ y), 1e-13), terms)
     chosen = search.forward()
     assert set(chosen) == set(np.flatnonzero(other.coef_))
-    np.testing.assert_allclose(np.linalg.lstsq(x[:, sorted(chosen)], y, rcond=None)[0], other.coef_[sorted(chosen)], atol=1e-12)
+    np.testing.assert_allclose(
+        np.linalg.lstsq(x[:, sorted(chosen)], y, rcond=None)[0],
+        other.coef_[sorted(chosen)],
+        atol=1e-12,
+    )
 
 
 def test_forward_regression_is_never_worse_than_matching_pursuit_at_its_first_two_terms() -> None:
-    """It takes the column that lessens the error most, pursuit the one most alike to what is left."""
+    """It takes the column that lessens the error most, pursuit the one most alike to what is left.
+    """
     for seed in range(20):
         x, y, _ = planted(seed, columns=12, noise=0.3)
         unit = x / np.linalg.norm(x, axis=0)
         other = OrthogonalMatchingPursuit(n_nonzero_coefs=2, fit_intercept=False).fit(unit, y)
         search = Search(unit, y, Criterion(300, 12, 1.0, float(y @ y), 1e-13), 2)
-        assert search.rss(search.forward()) <= search.rss(list(np.flatnonzero(other.coef_))) * (1 + 1e-12)
+        assert search.rss(search.forward()) <= search.rss(list(np.flatnonzero(other.coef_))) * (
+            1 + 1e-12
+        )
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -125,7 +147,9 @@ def test_swaps_repair_a_wrong_start() -> None:
 
 def test_criterion_is_the_formula() -> None:
     rule = Criterion(100.0, 20, 0.5, 50.0, 1e-13)
-    assert float(rule.value(2.0, 3)) == pytest.approx(100 * log(2.0 / 50.0) + 3 * log(100) + log(comb(20, 3)))
+    assert float(rule.value(2.0, 3)) == pytest.approx(
+        100 * log(2.0 / 50.0) + 3 * log(100) + log(comb(20, 3))
+    )
 
 
 def test_swap_table_equals_refits() -> None:
@@ -143,24 +167,43 @@ def test_columns_that_simpler_ones_make_up_are_set_aside_and_told() -> None:
     random = np.random.default_rng(0)
     a, b, c = np.abs(random.normal(size=(3, 100)))
     levels = random.choice([1.0, 3.0], 100)
-    x = np.stack((a * np.abs(a), a**2, b, np.ones(100), levels, levels**2, np.zeros(100), c), axis=1)
+    x = np.stack(
+        (a * np.abs(a), a**2, b, np.ones(100), levels, levels**2, np.zeros(100), c), axis=1
+    )
     names = ["a|a|", "a^2", "b", "1", "n", "n^2", "v", "c"]
-    reduced = reduce(x, (2 * a**2 + levels**2 - b)[:, None], names, [2, 2, 1, 0, 1, 2, 1, 1], effort=[1.5, 1.0, 1, 0, 1, 1, 1, 1])
+    reduced = reduce(
+        x,
+        (2 * a**2 + levels**2 - b)[:, None],
+        names,
+        [2, 2, 1, 0, 1, 2, 1, 1],
+        effort=[1.5, 1.0, 1, 0, 1, 1, 1, 1],
+    )
     assert reduced.names == ("1", "b", "n", "c", "a^2")
     assert reduced.unexcited == ("v",)
-    assert reduced.dependent == {"a|a|": pytest.approx({"a^2": 1.0}), "n^2": pytest.approx({"1": -3.0, "n": 4.0})}
+    assert reduced.dependent == {
+        "a|a|": pytest.approx({"a^2": 1.0}),
+        "n^2": pytest.approx({"1": -3.0, "n": 4.0}),
+    }
     equation = find(reduced, 0, SearchConfig())[0]
-    assert dict(zip(equation.terms, equation.values, strict=True)) == pytest.approx({"1": -3.0, "n": 4.0, "b": -1.0, "a^2": 2.0})
+    assert dict(zip(equation.terms, equation.values, strict=True)) == pytest.approx(
+        {"1": -3.0, "n": 4.0, "b": -1.0, "a^2": 2.0}
+    )
 
 
 def test_noise_does_not_set_columns_apart() -> None:
-    """A vessel that never goes astern, with a sensor that says it did: u^2 and u|u| must not both be taken."""
+    """A vessel that never goes astern, with a sensor that says it did: u^2 and u|u| must not both
+    be taken.
+    """
     random = np.random.default_rng(2)
-    u = np.concatenate((np.zeros(100), random.uniform(0.5, 2.0, 900))) + 0.01 * random.normal(size=1000)
+    u = np.concatenate((np.zeros(100), random.uniform(0.5, 2.0, 900))) + 0.01 * random.normal(
+        size=1000
+    )
     w = random.normal(size=1000)
     y = -u * np.abs(u) + w + 0.05 * random.normal(size=1000)
     x = np.stack((u, np.abs(u), u**2, u * np.abs(u), w), axis=1)
-    reduced = reduce(x, y[:, None], ["u", "|u|", "u^2", "u|u|", "w"], [1, 1, 2, 2, 1], effort=[1, 1.5, 1, 1.5, 1])
+    reduced = reduce(
+        x, y[:, None], ["u", "|u|", "u^2", "u|u|", "w"], [1, 1, 2, 2, 1], effort=[1, 1.5, 1, 1.5, 1]
+    )
     assert reduced.rank == 5
     equation, within = find(reduced, 0, SearchConfig())
     assert equation.terms == ("w", "u^2")
@@ -174,11 +217,17 @@ def test_terms_that_the_data_cannot_tell_apart_are_named() -> None:
     x = np.stack((a, a + 0.05 * random.normal(size=200), random.normal(size=200)), axis=1)
     equation = solve(x, a + 2 * x[:, 2] + 0.5 * random.normal(size=200))
     assert len(equation.terms) == 2
-    assert equation.alternatives == {next(t for t in equation.terms if t != "c2"): [next(t for t in ("c0", "c1") if t not in equation.terms)]}
+    assert equation.alternatives == {
+        next(t for t in equation.terms if t != "c2"): [
+            next(t for t in ("c0", "c1") if t not in equation.terms)
+        ]
+    }
 
 
 def test_what_the_data_leave_open_is_named_instead_of_taken() -> None:
-    """A true but weak term: left out, and said to be possible; a candidate that is surely absent is not."""
+    """A true but weak term: left out, and said to be possible; a candidate that is surely absent is
+    not.
+    """
     random = np.random.default_rng(4)
     x = random.normal(size=(400, 3))
     x[:, 1] = x[:, 0] + 0.1 * x[:, 1]
@@ -189,7 +238,15 @@ def test_what_the_data_leave_open_is_named_instead_of_taken() -> None:
 
 
 def test_pure_noise_gives_no_terms() -> None:
-    found = [len(solve(np.random.default_rng(s).normal(size=(500, 40)), np.random.default_rng(100 + s).normal(size=500)).terms) for s in range(20)]
+    found = [
+        len(
+            solve(
+                np.random.default_rng(s).normal(size=(500, 40)),
+                np.random.default_rng(100 + s).normal(size=500),
+            ).terms
+        )
+        for s in range(20)
+    ]
     assert sum(found) <= 1
 
 

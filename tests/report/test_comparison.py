@@ -20,7 +20,10 @@ def variants(shift: float, seeds: int = 3, draw: int = 0) -> list[Variant]:
     level = random.uniform(0.1, 0.3, 18)
     plain = level + random.normal(0, 0.01, (seeds, 18))
     other = level + shift + random.normal(0, 0.01, (seeds, 18))
-    return [Variant("recipe", (), {"T30": plain}, (10.0,) * seeds), Variant("other", ("a=1",), {"T30": other}, (20.0,) * seeds)]
+    return [
+        Variant("recipe", (), {"T30": plain}, (10.0,) * seeds),
+        Variant("other", ("a=1",), {"T30": other}, (20.0,) * seeds),
+    ]
 
 
 def test_rows_are_means_over_windows_and_seeds() -> None:
@@ -40,7 +43,9 @@ def test_rows_are_means_over_windows_and_seeds() -> None:
 
 
 def test_pairing_sees_what_the_spread_of_windows_hides() -> None:
-    """Windows differ by 0.2, the variants by 0.01: the paired interval covers the difference as often as it says, and is far from zero."""
+    """Windows differ by 0.2, the variants by 0.01: the paired interval covers the difference as
+    often as it says, and is far from zero.
+    """
     covered = resolved = 0
     for draw_ in range(100):
         low, high = table(variants(0.01, draw=draw_), KEYS, "recipe")[1]["difference_ci95"]

@@ -1,4 +1,6 @@
-"""Figures: pictures that can be opened and show something, of the right windows, from numbers that hold."""
+"""Figures: pictures that can be opened and show something, of the right windows, from numbers that
+hold.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,16 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_every_figure_is_a_light_picture_that_shows_something(run: Path) -> None:
     figures = read_figures(run)
     names = [figure.path.stem[3:] for figure in figures]
-    assert names == ["tracks", "history_turning", "history_zigzag", "horizon_whole", "horizon_T30", "bars", "residuals", "learning"]
+    assert names == [
+        "tracks",
+        "history_turning",
+        "history_zigzag",
+        "horizon_whole",
+        "horizon_T30",
+        "bars",
+        "residuals",
+        "learning",
+    ]
     for figure in figures:
         assert figure.path.stat().st_size < 200_000
         with Image.open(figure.path) as picture:
@@ -39,7 +50,9 @@ def test_every_figure_is_a_light_picture_that_shows_something(run: Path) -> None
         assert 250 < height < 1500
         assert 0.005 < float((pixels < 200).mean()) < 0.6, figure.path.name
         # nothing is cut off: the outermost pixels are white
-        edges = np.concatenate((pixels[:2].ravel(), pixels[-2:].ravel(), pixels[:, 0], pixels[:, -1]))
+        edges = np.concatenate(
+            (pixels[:2].ravel(), pixels[-2:].ravel(), pixels[:, 0], pixels[:, -1])
+        )
         assert edges.min() > 250, figure.path.name
         assert figure.title
         assert figure.caption.endswith(".")
@@ -96,19 +109,32 @@ def test_lines_keep_their_colours(run: Path) -> None:
 
 def test_many_heads_keep_distinct_looks(tmp_path: Path) -> None:
     content = metrics(("test",), ("plsr",))
-    content["rows"] = [content["rows"][0] | {"model": f"head{i}", "selected": False} for i in range(12)]
+    content["rows"] = [
+        content["rows"][0] | {"model": f"head{i}", "selected": False} for i in range(12)
+    ]
     content["selected"] = None
     write_json(tmp_path / "metrics.json", content)
     look = styles(RunFiles(tmp_path))
     assert len({(style["color"], str(style["linestyle"])) for style in look.values()}) == 12
 
 
-def test_bars_follow_speed_and_steering_runs_where_there_are_such_groups(run: Path, tmp_path: Path) -> None:
+def test_bars_follow_speed_and_steering_runs_where_there_are_such_groups(
+    run: Path, tmp_path: Path
+) -> None:
     assert bar_group(RunFiles(run), "whole", "u") == "all"
     content = metrics(("test",))
-    content["rows"] += [line | {"manoeuvre": name} for line in content["rows"] if line["manoeuvre"] == "all" for name in ("speed", "steering")]
+    content["rows"] += [
+        line | {"manoeuvre": name}
+        for line in content["rows"]
+        if line["manoeuvre"] == "all"
+        for name in ("speed", "steering")
+    ]
     write_json(tmp_path / "metrics.json", content)
-    assert [bar_group(RunFiles(tmp_path), "whole", channel) for channel in "uvr"] == ["speed", "steering", "steering"]
+    assert [bar_group(RunFiles(tmp_path), "whole", channel) for channel in "uvr"] == [
+        "speed",
+        "steering",
+        "steering",
+    ]
 
 
 def test_r_squared() -> None:

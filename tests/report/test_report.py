@@ -1,4 +1,6 @@
-"""The report: its numbers are those of metrics.json, it stands alone, and what a folder lacks is left out."""
+"""The report: its numbers are those of metrics.json, it stands alone, and what a folder lacks is
+left out.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,8 @@ _VOID = {"meta", "img", "br", "hr", "link"}
 
 
 class Page(HTMLParser):
-    """Tables as lists of lines of cell texts, and whether every tag is closed where it should be."""
+    """Tables as lists of lines of cell texts, and whether every tag is closed where it should be.
+    """
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -51,7 +54,9 @@ class Page(HTMLParser):
             self.tables[-1][-1][-1] += ("|" if "small" in self.open else "") + data
 
     def table(self, corner: str, first: str) -> dict[str, list[str]]:
-        """Cells by the label of their line, of the table with that corner and that label in its first line."""
+        """Cells by the label of their line, of the table with that corner and that label in its
+        first line.
+        """
         for table in self.tables:
             lines = {line[0]: line[1:] for line in table}
             if table[0][0] == corner and first in lines:
@@ -67,8 +72,16 @@ def run(tmp_path: Path) -> Path:
 def test_free_run_numbers_are_those_of_metrics(run: Path) -> None:
     text = write_report(run).read_text()
     cells = Page(text).table("model", "plsr (selected)")
-    # train and test of u, v, r, then nrmse with its interval, position, heading, diverged; the protocol that selects comes first
-    assert cells["plsr (selected)"][:6] == ["0.0320|−60 %", "0.0400|−60 %", "0.0240|−40 %", "0.0300|−40 %", "0.458|−50 %", "0.573|−50 %"]
+    # train and test of u, v, r, then nrmse with its interval, position, heading, diverged; the
+    # protocol that selects comes first
+    assert cells["plsr (selected)"][:6] == [
+        "0.0320|−60 %",
+        "0.0400|−60 %",
+        "0.0240|−40 %",
+        "0.0300|−40 %",
+        "0.458|−50 %",
+        "0.573|−50 %",
+    ]
     assert row("plsr", "test", "whole")["nrmse"]["mean"] == pytest.approx(0.08)
     assert cells["plsr (selected)"][7] == "0.0800|0.0720–0.0880"
     assert cells["plsr (selected)"][9] == "0.40"
@@ -90,11 +103,17 @@ def test_verdict(run: Path) -> None:
     verdict = re.search(r'<section class="verdict".*?</section>', page, re.DOTALL)
     assert verdict is not None
     for part in (
-        "Model plsr (chosen on validation data) was free-run over 6 whole manoeuvres that no fit has seen (protocol whole).",
+        (
+            "Model plsr (chosen on validation data) was free-run over 6 whole manoeuvres that no"
+            " fit has seen (protocol whole)."
+        ),
         "surge u 0.0400 m/s (0.0360 to 0.0440), 60 % below the baseline",
         "yaw rate r 0.573 deg/s (0.516 to 0.630), 50 % below the baseline",
         "surge u 0.0200 m/s (attained: 75 % of the possible reduction)",
-        "position is off by 0.40 m and the heading by 0.57 deg on average (baseline: 1.0 m, 1.1 deg)",
+        (
+            "position is off by 0.40 m and the heading by 0.57 deg on average (baseline: 1.0 m, 1.1"
+            " deg)"
+        ),
         "No free run of any model diverged on test data.",
     ):
         assert part in verdict[0]
@@ -110,7 +129,10 @@ def test_bad_news_is_told(run: Path) -> None:
             line["nrmse"] = line["nrmse"] | {"mean": 0.3}
     write_json(run / "metrics.json", content)
     page = html.unescape(write_report(run).read_text())
-    assert "DIVERGED on test data, counted with the error of held velocities: plsr 2 of 6 (T30), plsr 2 of 6 (whole)." in page
+    assert (
+        "DIVERGED on test data, counted with the error of held velocities: plsr 2 of 6 (T30), plsr"
+        " 2 of 6 (whole)." in page
+    )
     assert "plsr is worse than the baseline in sway v" in page
     assert "times its training error" in page
     assert "20 % ABOVE the baseline" in page
@@ -126,32 +148,99 @@ def test_parameters_heads_data_and_provenance(run: Path) -> None:
     assert heads["plsr (selected)"][1:3] == ["23 basis functions; order 7 (latent variables)", "72"]
     assert heads["mlp"][2] == "1\u2009347"
     quality = page.table("split, manoeuvre", "test: zigzag")
-    assert quality["test: zigzag"] == ["3", "180", "1800", "97.5", "95.0", "frozen 2.5 %", "1.50", "0.200", "5.73"]
-    for part in ("9.8.7", "abc123", "f00d", "torch 2.13.0", "fitted on 2400 samples", "selection: whole"):
+    assert quality["test: zigzag"] == [
+        "3",
+        "180",
+        "1800",
+        "97.5",
+        "95.0",
+        "frozen 2.5 %",
+        "1.50",
+        "0.200",
+        "5.73",
+    ]
+    for part in (
+        "9.8.7",
+        "abc123",
+        "f00d",
+        "torch 2.13.0",
+        "fitted on 2400 samples",
+        "selection: whole",
+    ):
         assert part in text
 
 
 def limits_file() -> dict[str, Any]:
     """Contents of limits.json for the protocol that selects."""
-    paired = {"to": "baseline", "nrmse_mean": -0.02, "ci95": [-0.03, -0.01], "excludes_zero": True, "ratio": 0.8, "worse": False}
-    bands = [{"by": "wind", "low": 1.0, "high": 2.5, "windows": 4, "models": {"plsr": {"nrmse_mean": 0.08, "difference": paired}}}]
-    worst = [{"log": "zigzag_02", "manoeuvre": "zigzag", "t": 12.5, "nrmse": 0.3, "rmse": {"u": 0.1, "v": 0.2, "r": 0.01}, "position_error_end": 4.2}]
-    kinematics = {"windows": 6, "position_mean": 0.37, "position_rms": 0.47, "heading_mean": 1.35 / DEG, "heading_rms": 1.8 / DEG}
+    paired = {
+        "to": "baseline",
+        "nrmse_mean": -0.02,
+        "ci95": [-0.03, -0.01],
+        "excludes_zero": True,
+        "ratio": 0.8,
+        "worse": False,
+    }
+    bands = [
+        {
+            "by": "wind",
+            "low": 1.0,
+            "high": 2.5,
+            "windows": 4,
+            "models": {"plsr": {"nrmse_mean": 0.08, "difference": paired}},
+        }
+    ]
+    worst = [
+        {
+            "log": "zigzag_02",
+            "manoeuvre": "zigzag",
+            "t": 12.5,
+            "nrmse": 0.3,
+            "rmse": {"u": 0.1, "v": 0.2, "r": 0.01},
+            "position_error_end": 4.2,
+        }
+    ]
+    kinematics = {
+        "windows": 6,
+        "position_mean": 0.37,
+        "position_rms": 0.47,
+        "heading_mean": 1.35 / DEG,
+        "heading_rms": 1.8 / DEG,
+    }
     part = {"kinematics": kinematics, "bands": bands, "worst": {"plsr": worst}}
     tolerance = {"command_share_of_range": 0.05, "start": {"u": 0.125, "v": 0.0625, "r": 0.0625}}
     motion = {"u": 0.04, "v": 0.02, "r": 1 / DEG, "position": 2.0, "heading": 5 / DEG, "nrmse": 0.2}
-    repeats = {"tolerance": tolerance, "pairs": 3, "logs": 2, **motion, "manoeuvres": {"zigzag": {"pairs": 3, **motion}}}
-    return {"schema": "residnet.limits/1", "run": "made", "splits": {"test": {"whole": part}}, "repeatability": {"whole": repeats}}
+    repeats = {
+        "tolerance": tolerance,
+        "pairs": 3,
+        "logs": 2,
+        **motion,
+        "manoeuvres": {"zigzag": {"pairs": 3, **motion}},
+    }
+    return {
+        "schema": "residnet.limits/1",
+        "run": "made",
+        "splits": {"test": {"whole": part}},
+        "repeatability": {"whole": repeats},
+    }
 
 
 def compared(change: dict[str, float]) -> dict[str, Any]:
-    """metrics.json whose heads are compared with the baseline; `change` is the ratio of plsr by kind of manoeuvre."""
+    """metrics.json whose heads are compared with the baseline; `change` is the ratio of plsr by
+    kind of manoeuvre.
+    """
     content = metrics()
     for line in content["rows"]:
         ratio = change.get(line["manoeuvre"], 0.8) if line["model"] == "plsr" else 0.9
         apart = line["nrmse"]["mean"] * (1 - 1 / ratio)
         span = [1.5 * apart, 0.5 * apart] if line["manoeuvre"] == "all" else None
-        found = {"to": "baseline", "nrmse_mean": apart, "ci95": span, "excludes_zero": span is not None, "ratio": ratio, "worse": ratio > 1.05}
+        found = {
+            "to": "baseline",
+            "nrmse_mean": apart,
+            "ci95": span,
+            "excludes_zero": span is not None,
+            "ratio": ratio,
+            "worse": ratio > 1.05,
+        }
         line["difference"] = found if line["kind"] == "head" else None
         line["ci95_blocks"] = {"of": "logs", "count": 6}
     return content
@@ -165,18 +254,40 @@ def test_how_good_where_it_fails_and_what_limits_it(run: Path) -> None:
     # plsr has 0.08, 0.8 times its reference, so that has 0.1
     assert cells["all"] == ["6", "0.0800", "0.100", "−20 %", "−0.0200", "−0.0300 to −0.0100"]
     assert cells["turning"] == ["6", "0.0880", "0.0733", "+20 %", "+0.0147", "–"]
-    assert cells["wind 1.0 to 2.5 m/s"] == ["4", "0.0800", "0.100", "−20 %", "−0.0200", "−0.0300 to −0.0100"]
+    assert cells["wind 1.0 to 2.5 m/s"] == [
+        "4",
+        "0.0800",
+        "0.100",
+        "−20 %",
+        "−0.0200",
+        "−0.0300 to −0.0100",
+    ]
     worst = Page(text).table("worst windows", "zigzag_02 (zigzag)")
     assert worst["zigzag_02 (zigzag)"] == ["12.5", "0.300", "0.100", "0.200", "0.573", "4.2"]
     page = html.unescape(text)
     for part in (
         "plsr: NRMSE 0.0800, 95 % interval 0.0720 to 0.0880 (bootstrap of 6 blocks: whole logs).",
-        "Against baseline over the same windows: −0.0200 (−20 %), paired 95 % interval −0.0300 to −0.0100, without zero: better.",
-        "end 0.37 m and 1.4 deg from the measured pose on average (root mean square 0.47 m, 1.8 deg)",
-        "3 pairs of stretches (zigzag 3) in 2 of the logs of all splits have commands within 5 % of their range",
-        "differ by u 0.0400 m/s, v 0.0200 m/s, r 1.00 deg/s (root mean square), 2.0 m and 5.0 deg at the end",
+        (
+            "Against baseline over the same windows: −0.0200 (−20 %), paired 95 % interval −0.0300"
+            " to −0.0100, without zero: better."
+        ),
+        (
+            "end 0.37 m and 1.4 deg from the measured pose on average (root mean square 0.47 m, 1.8"
+            " deg)"
+        ),
+        (
+            "3 pairs of stretches (zigzag 3) in 2 of the logs of all splits have commands within 5"
+            " % of their range"
+        ),
+        (
+            "differ by u 0.0400 m/s, v 0.0200 m/s, r 1.00 deg/s (root mean square), 2.0 m and 5.0"
+            " deg at the end"
+        ),
         "an NRMSE of 0.141 and 1.4 m",
-        "Protocol whole: worse by more than 5 % in NRMSE on test data: plsr against baseline (turning +20 %).",
+        (
+            "Protocol whole: worse by more than 5 % in NRMSE on test data: plsr against baseline"
+            " (turning +20 %)."
+        ),
     ):
         assert part in page
 
@@ -184,10 +295,19 @@ def test_how_good_where_it_fails_and_what_limits_it(run: Path) -> None:
 def test_no_repeats_no_reference_and_no_interval_are_said(run: Path) -> None:
     content = compared({})
     for line in content["rows"]:
-        line |= {"difference": None, "ci95_blocks": None, "nrmse_mean_ci95": None, "rmse_ci95": dict.fromkeys("uvr")}
+        line |= {
+            "difference": None,
+            "ci95_blocks": None,
+            "nrmse_mean_ci95": None,
+            "rmse_ci95": dict.fromkeys("uvr"),
+        }
     write_json(run / "metrics.json", content)
     found = limits_file()
-    found["repeatability"]["whole"] = {"tolerance": found["repeatability"]["whole"]["tolerance"], "pairs": 0, "logs": 0}
+    found["repeatability"]["whole"] = {
+        "tolerance": found["repeatability"]["whole"]["tolerance"],
+        "pairs": 0,
+        "logs": 0,
+    }
     write_json(run / "limits.json", found)
     write_figures(run)
     text = html.unescape(write_report(run).read_text())
@@ -207,10 +327,19 @@ def test_standard_errors_of_a_refitted_baseline_are_named(run: Path) -> None:
 def test_accelerations_of_logs_stand_log_by_log(run: Path) -> None:
     path = run / "models" / "baseline" / "fit.json"
     own = {"standard_error": 1.0e-4, "spread": 4.0e-4, "speed": 0.9}
-    values = {("first", "v_dot"): -5.5e-4, ("first", "r_dot"): 1.5e-4, ("second", "v_dot"): 0.0, ("second", "r_dot"): 3.0e-4}
-    offsets = [{"log": log, "axis": axis, "value": value} | own for (log, axis), value in values.items()]
+    values = {
+        ("first", "v_dot"): -5.5e-4,
+        ("first", "r_dot"): 1.5e-4,
+        ("second", "v_dot"): 0.0,
+        ("second", "r_dot"): 3.0e-4,
+    }
+    offsets = [
+        {"log": log, "axis": axis, "value": value} | own for (log, axis), value in values.items()
+    ]
     assert "Accelerations of each training log" not in write_report(run).read_text()
-    write_json(path, json.loads(path.read_text()) | {"refit": {"iterations": 3}, "offsets": offsets})
+    write_json(
+        path, json.loads(path.read_text()) | {"refit": {"iterations": 3}, "offsets": offsets}
+    )
     text = write_report(run).read_text()
     cells = Page(text).table("log", "first")
     assert cells["first"] == ["−0.00055", "0.00010", "0.00015", "0.00010"]
@@ -258,7 +387,10 @@ def test_physical_sanity_is_shown_where_models_can_be_loaded(run: Path) -> None:
     save_model(run / "models" / "plsr", spec, model)
     page = html.unescape(write_report(run).read_text())
     assert "Physical sanity" in page
-    assert "plsr, damping: not damped (wrong sign or none): u at rest, v at rest, r at rest, u at cruise" in page
+    assert (
+        "plsr, damping: not damped (wrong sign or none): u at rest, v at rest, r at rest, u at"
+        " cruise" in page
+    )
 
 
 def test_a_folder_of_evaluate_has_other_splits_and_no_models(tmp_path: Path) -> None:
@@ -271,13 +403,23 @@ def test_a_folder_of_evaluate_has_other_splits_and_no_models(tmp_path: Path) -> 
     page = Page(text)
     assert page.table("model", "plsr (selected)")["plsr (selected)"][0] == "0.0400|−60 %"
     assert "that no fit has seen" in text
-    for absent in ("Baseline parameters", "Residual heads", "Physical sanity", "simulated plant", "side by side"):
+    for absent in (
+        "Baseline parameters",
+        "Residual heads",
+        "Physical sanity",
+        "simulated plant",
+        "side by side",
+    ):
         assert absent not in text
 
 
 def test_metrics_alone_make_a_report(tmp_path: Path) -> None:
     content = metrics(("validation",), ("plsr",))
-    content["rows"] = [{key: value for key, value in line.items() if key != "manoeuvre"} for line in content["rows"] if line["manoeuvre"] == "all"]
+    content["rows"] = [
+        {key: value for key, value in line.items() if key != "manoeuvre"}
+        for line in content["rows"]
+        if line["manoeuvre"] == "all"
+    ]
     write_json(tmp_path / "metrics.json", content)
     text = write_report(tmp_path).read_text()
     Page(text)
@@ -298,7 +440,16 @@ def test_folders_that_cannot_be_read_are_refused_by_name(tmp_path: Path) -> None
 
 @pytest.mark.parametrize(
     ("value", "text"),
-    [(0.031849, "0.0318"), (12.34, "12.3"), (1234.0, "1234"), (0.0, "0"), (-0.5, "−0.500"), (1.2e-7, "1.20e−07"), (None, "–"), (float("nan"), "–")],
+    [
+        (0.031849, "0.0318"),
+        (12.34, "12.3"),
+        (1234.0, "1234"),
+        (0.0, "0"),
+        (-0.5, "−0.500"),
+        (1.2e-7, "1.20e−07"),
+        (None, "–"),
+        (float("nan"), "–"),
+    ],
 )
 def test_rounding(value: float | None, text: str) -> None:
     assert number(value) == text

@@ -17,7 +17,17 @@ def sick(name: str, gyro: float) -> Log:
     t = np.arange(0.0, 100.0, 0.1)
     psi = 0.5 * np.sin(0.2 * t)
     r = 0.1 * np.cos(0.2 * t) + gyro
-    return Log(name, t, {"psi": psi, "r": r, "u": 1.0 + 0.1 * np.sin(0.1 * t), "v": 0.05 * np.sin(0.3 * t), "delta": 0.3 * np.sin(0.21 * t)})
+    return Log(
+        name,
+        t,
+        {
+            "psi": psi,
+            "r": r,
+            "u": 1.0 + 0.1 * np.sin(0.1 * t),
+            "v": 0.05 * np.sin(0.3 * t),
+            "delta": 0.3 * np.sin(0.21 * t),
+        },
+    )
 
 
 def test_findings_above_a_note_stand_in_a_table_and_notes_below(tmp_path: Path) -> None:
@@ -30,9 +40,15 @@ def test_findings_above_a_note_stand_in_a_table_and_notes_below(tmp_path: Path) 
     reports = [inspect(log) for log in logs]
     (run / "doctor.json").write_text(json.dumps(inspection(reports, inspect_together(logs))))
     text = write_report(run).read_text()
-    loud = {finding.code for report in reports for finding in report.findings if finding.level != "note"}
+    loud = {
+        finding.code for report in reports for finding in report.findings if finding.level != "note"
+    }
     assert "gaps" in loud
-    page = text[text.index('<section id="doctor">') : text.index("</section>", text.index('<section id="doctor">'))]
+    page = text[
+        text.index('<section id="doctor">') : text.index(
+            "</section>", text.index('<section id="doctor">')
+        )
+    ]
     assert '<a href="#doctor">Data doctor</a>' in text
     assert all(f'<th class="label">{code.replace("_", " ")}</th>' in page for code in loud)
     assert "split the log there (mask kind: gap)" in page

@@ -1,4 +1,5 @@
-"""The section on goodness of fit shows the numbers of goodness.json; a folder without it has none."""
+"""The section on goodness of fit shows the numbers of goodness.json; a folder without it has none.
+"""
 
 from __future__ import annotations
 
@@ -22,12 +23,22 @@ def test_section_shows_what_the_file_says(tmp_path: Path) -> None:
     target = autoregressive(0.9, 3, 800, seed=0).T
     models = [
         OneStep("baseline", "baseline", [4, 4, 4], [0.5 * target]),
-        OneStep("plsr", "head", [9, 9, 9], [0.4 * target + 0.01 * np.random.default_rng(0).normal(size=target.shape)], "baseline"),
+        OneStep(
+            "plsr",
+            "head",
+            [9, 9, 9],
+            [0.4 * target + 0.01 * np.random.default_rng(0).normal(size=target.shape)],
+            "baseline",
+        ),
     ]
     rows = table(models, [target], 0.1)
     write_json(run / "goodness.json", content("made", {"train": rows, "test": rows}, 0.1))
     parts = section(RunFiles(run))
-    assert [part["title"] for part in parts] == ["surge u′ [m/s/s], test data", "sway v′ [m/s/s], test data", "yaw r′ [deg/s/s], test data"]
+    assert [part["title"] for part in parts] == [
+        "surge u′ [m/s/s], test data",
+        "sway v′ [m/s/s], test data",
+        "yaw r′ [deg/s/s], test data",
+    ]
     yaw = dict(parts[2]["table"].rows)
     row = next(row for row in rows if row["model"] == "plsr" and row["axis"] == "r_dot")
     texts = [cell.text for cell in yaw["plsr"]]

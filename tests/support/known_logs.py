@@ -8,7 +8,9 @@ from residnet.core.log import Log
 
 
 def wavy(step: float = 0.1, seconds: float = 200.0, name: str = "wavy", lag: float = 0.0) -> Log:
-    """A weaving vessel: psi, u, v sums of sines; x, y by a fine trapezoid; u, v, r shown `lag` s late; one rudder channel."""
+    """A weaving vessel: psi, u, v sums of sines; x, y by a fine trapezoid; u, v, r shown `lag` s
+    late; one rudder channel.
+    """
     fine = np.arange(0.0, seconds, step / 20.0)
 
     def psi(t: np.ndarray) -> np.ndarray:

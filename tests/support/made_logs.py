@@ -30,9 +30,19 @@ def made(
     return prepared(log, y, w, usable & (piece >= 0), piece)
 
 
-def prepared(log: Log, y: np.ndarray, w: np.ndarray, usable: np.ndarray, piece: np.ndarray) -> Prepared:
+def prepared(
+    log: Log, y: np.ndarray, w: np.ndarray, usable: np.ndarray, piece: np.ndarray
+) -> Prepared:
     """Without smoothing; the accelerations are no part of an evaluation."""
-    parts = {"log": log, "split": "test", "y": y, "smooth": y.copy(), "nu_dot": np.zeros((len(y), 3)), "w": w, "recorded": w}
+    parts = {
+        "log": log,
+        "split": "test",
+        "y": y,
+        "smooth": y.copy(),
+        "nu_dot": np.zeros((len(y), 3)),
+        "w": w,
+        "recorded": w,
+    }
     parts |= {"piece": piece, "usable": usable, "good": usable}
     known = {field.name for field in fields(Prepared)}
     return Prepared(**{name: value for name, value in parts.items() if name in known})

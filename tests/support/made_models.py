@@ -11,7 +11,9 @@ from residnet.physics.signals import SignalsConfig
 
 
 def nomoto_model(gain: float, time: float, dt: float) -> tuple[ModelSpec, HybridDynamics]:
-    """Nomoto's first-order model as a fit would leave it: a baseline of regressors driven by `delta`."""
+    """Nomoto's first-order model as a fit would leave it: a baseline of regressors driven by
+    `delta`.
+    """
     spec = ModelSpec.model_validate(
         {
             "schema": "residnet.model/1",

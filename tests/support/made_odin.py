@@ -1,4 +1,6 @@
-"""Truth for equations: Odin (document 000 eqs. (6.6)-(6.8), (6.12)-(6.23) with ERRATA H1-H11) and the mass-spring-damper (5.13), in plain NumPy."""
+"""Truth for equations: Odin (document 000 eqs. (6.6)-(6.8), (6.12)-(6.23) with ERRATA H1-H11) and
+the mass-spring-damper (5.13), in plain NumPy.
+"""
 
 from __future__ import annotations
 
@@ -69,15 +71,25 @@ def simulate(
 ) -> list[dict[str, np.ndarray]]:
     """Logs of several designs at once: states from rest, inputs and the exact rates at the samples.
 
-    RK4 with `within` steps to a sample and inputs as functions of time; a jump at a sample belongs to the step that begins there.
+    RK4 with `within` steps to a sample and inputs as functions of time; a jump at a sample belongs
+    to the step that begins there.
     """
     h = step / within
-    stage = np.arange(round(seconds / step) * within)[:, None] * h + np.array([0.0, h / 2, h - 1e-12])
-    known = {name: np.stack([design[name](stage) for design in designs], axis=-1) for name in designs[0]}
+    stage = np.arange(round(seconds / step) * within)[:, None] * h + np.array(
+        [0.0, h / 2, h - 1e-12]
+    )
+    known = {
+        name: np.stack([design[name](stage) for design in designs], axis=-1) for name in designs[0]
+    }
     x, path = np.zeros((len(states), len(designs))), []
 
     def f(x: np.ndarray, k: int, s: int) -> np.ndarray:
-        return rate({**dict(zip(states, x, strict=True)), **{name: values[k, s] for name, values in known.items()}})
+        return rate(
+            {
+                **dict(zip(states, x, strict=True)),
+                **{name: values[k, s] for name, values in known.items()},
+            }
+        )
 
     for k in range(len(stage)):
         if k % within == 0:
@@ -89,44 +101,76 @@ def simulate(
     t = np.arange(len(path)) * step
     logs = []
     for number, design in enumerate(designs):
-        log = {"t": t, **dict(zip(states, np.array(path)[..., number].T, strict=True)), **{name: signal(t) for name, signal in design.items()}}
-        logs.append(log | {f"{name}_dot": value for name, value in zip(states, rate(log), strict=True)})
+        log = {
+            "t": t,
+            **dict(zip(states, np.array(path)[..., number].T, strict=True)),
+            **{name: signal(t) for name, signal in design.items()},
+        }
+        logs.append(
+            log | {f"{name}_dot": value for name, value in zip(states, rate(log), strict=True)}
+        )
     return logs
 
 
 def multisine(
-    seed: np.random.Generator, mean: float, amplitude: float, periods: tuple[float, float] = (5.0, 70.0), count: int = 4
+    seed: np.random.Generator,
+    mean: float,
+    amplitude: float,
+    periods: tuple[float, float] = (5.0, 70.0),
+    count: int = 4,
 ) -> Callable[[np.ndarray], np.ndarray]:
     """A sum of sines with random periods (in s), phases and shares."""
     period = np.exp(seed.uniform(np.log(periods[0]), np.log(periods[1]), count))
     phase, share = seed.uniform(0, 2 * np.pi, count), seed.dirichlet(np.full(count, 3.0))
-    return lambda t: mean + amplitude * (share * np.sin(2 * np.pi * np.asarray(t)[..., None] / period + phase)).sum(-1) * np.sqrt(count)
+    return lambda t: (
+        mean
+        + amplitude
+        * (share * np.sin(2 * np.pi * np.asarray(t)[..., None] / period + phase)).sum(-1)
+        * np.sqrt(count)
+    )
 
 
 def force_logs(
-    count: int, seconds: float = 300.0, step: float = 0.1, periods: tuple[float, float] = (5.0, 70.0), first: int = 0
+    count: int,
+    seconds: float = 300.0,
+    step: float = 0.1,
+    periods: tuple[float, float] = (5.0, 70.0),
+    first: int = 0,
 ) -> list[dict[str, np.ndarray]]:
     """Random multi-sine designs of forces."""
     designs = []
     for number in range(first, first + count):
         seed = np.random.default_rng(number)
         ranges = {"tau_x": (2000, 4000), "tau_y": (0, 1500), "tau_n": (0, 2500)}
-        designs.append({name: multisine(seed, mean, amplitude, periods) for name, (mean, amplitude) in ranges.items()})
+        designs.append(
+            {
+                name: multisine(seed, mean, amplitude, periods)
+                for name, (mean, amplitude) in ranges.items()
+            }
+        )
     return simulate(force_rate, ("u", "v", "r"), designs, seconds, step)
 
 
 def jet_logs(count: int, seconds: float = 300.0, step: float = 0.1) -> list[dict[str, np.ndarray]]:
     """Random multi-sine designs of motor speed (rpm) and nozzle angle (rad)."""
     seeds = [np.random.default_rng(1000 + number) for number in range(count)]
-    designs = [{"rpm": multisine(seed, 1000, 500), "nozzle": multisine(seed, 0.0, 0.25)} for seed in seeds]
+    designs = [
+        {"rpm": multisine(seed, 1000, 500), "nozzle": multisine(seed, 0.0, 0.25)} for seed in seeds
+    ]
     return simulate(jet_rate, ("u", "v", "r"), designs, seconds, step)
 
 
-def step_log(number: int, seconds: float = 300.0, step: float = 0.1, every: float = 10.0) -> dict[str, np.ndarray]:
+def step_log(
+    number: int, seconds: float = 300.0, step: float = 0.1, every: float = 10.0
+) -> dict[str, np.ndarray]:
     """Forces that jump to random levels every so many seconds."""
     seed = np.random.default_rng(number)
     count = round(seconds / every)
-    levels = {"tau_x": seed.uniform(-2000, 6000, count), "tau_y": seed.uniform(-1500, 1500, count), "tau_n": seed.uniform(-2500, 2500, count)}
+    levels = {
+        "tau_x": seed.uniform(-2000, 6000, count),
+        "tau_y": seed.uniform(-1500, 1500, count),
+        "tau_n": seed.uniform(-2500, 2500, count),
+    }
 
     def held(values: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
         return lambda t: values[np.minimum((np.asarray(t) + 1e-9) // every, count - 1).astype(int)]
@@ -136,7 +180,9 @@ def step_log(number: int, seconds: float = 300.0, step: float = 0.1, every: floa
 
 
 def msd_log(seconds: float = 50.0, step: float = 0.1, delay: float = 0.0) -> dict[str, np.ndarray]:
-    """Document 000 section 5.3.1: a square wave of 1 N with a period of 6 pi s; `tau_late` is what acts where the input is delayed."""
+    """Document 000 section 5.3.1: a square wave of 1 N with a period of 6 pi s; `tau_late` is what
+    acts where the input is delayed.
+    """
 
     def square(t: np.ndarray) -> np.ndarray:
         return np.where(np.mod(t, 6 * np.pi) < 3 * np.pi, 1.0, -1.0)

@@ -20,7 +20,12 @@ LEVEL = {
     "plsr": (0.0400, 0.0300, 0.0100),
     "truth": (0.0200, 0.0250, 0.0050),
 }
-KINDS = {"zigzag_01": "zigzag", "zigzag_02": "zigzag", "zigzag_03": "zigzag", "turning_01": "turning"}
+KINDS = {
+    "zigzag_01": "zigzag",
+    "zigzag_02": "zigzag",
+    "zigzag_03": "zigzag",
+    "turning_01": "turning",
+}
 RESOLVED = """task: fit
 name: made
 description: made by hand <script>alert(1)</script>
@@ -37,7 +42,15 @@ evaluation:
 """
 
 
-def row(model: str, split: str, protocol: str, manoeuvre: str = "all", *, factor: float = 1.0, diverged: int = 0) -> dict[str, Any]:
+def row(
+    model: str,
+    split: str,
+    protocol: str,
+    manoeuvre: str = "all",
+    *,
+    factor: float = 1.0,
+    diverged: int = 0,
+) -> dict[str, Any]:
     """One row of metrics.json."""
     rmse = {name: factor * value for name, value in zip("uvr", LEVEL[model], strict=True)}
     mean = (rmse["u"] / 0.5 + rmse["v"] / 0.25 + rmse["r"] / 0.25) / 3
@@ -61,7 +74,10 @@ def row(model: str, split: str, protocol: str, manoeuvre: str = "all", *, factor
     }
 
 
-def metrics(splits: tuple[str, ...] = ("train", "validation", "test"), models: tuple[str, ...] = tuple(MODELS)) -> dict[str, Any]:
+def metrics(
+    splits: tuple[str, ...] = ("train", "validation", "test"),
+    models: tuple[str, ...] = tuple(MODELS),
+) -> dict[str, Any]:
     """Contents of metrics.json."""
     rows = []
     for split in splits:
@@ -72,7 +88,14 @@ def metrics(splits: tuple[str, ...] = ("train", "validation", "test"), models: t
                     rows.append(row(model, split, protocol, kind, factor=1.1 + 0.1 * number))
     units = {"x": "m", "y": "m", "psi": "rad", "u": "m/s", "v": "m/s", "r": "rad/s"}
     scales = {"u": 0.5, "v": 0.25, "r": 0.25}
-    return {"schema": "residnet.metrics/1", "run": "made", "channels": units, "scales": scales, "selected": "plsr", "rows": rows}
+    return {
+        "schema": "residnet.metrics/1",
+        "run": "made",
+        "channels": units,
+        "scales": scales,
+        "selected": "plsr",
+        "rows": rows,
+    }
 
 
 def write_json(path: Path, content: Any) -> None:
@@ -81,7 +104,9 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def write_rollout(folder: Path, log: str, models: tuple[str, ...], size: float) -> None:
-    """One log of 6 s under two protocols; errors are `size` times the levels, constant in time, samples 20..29 masked and off by 9 m/s."""
+    """One log of 6 s under two protocols; errors are `size` times the levels, constant in time,
+    samples 20..29 masked and off by 9 m/s.
+    """
     t = np.arange(61) * 0.1
     usable = (t < 1.95) | (t > 2.95)
     u, v, r = 1.0 + 0 * t, 0.1 * np.sin(t), 0.2 * np.cos(t)
@@ -100,8 +125,22 @@ def write_rollout(folder: Path, log: str, models: tuple[str, ...], size: float) 
                         "t": t,
                         "usable": usable,
                         "diverged": False,
-                        **{"u": np.where(usable, u, u + 9), "v": v, "r": r, "psi": psi, "x": x, "y": y},
-                        **{"u_hat": u + eu, "v_hat": v + ev, "r_hat": r + er, "psi_hat": psi + er * t, "x_hat": x + eu * t, "y_hat": y + ev * t},
+                        **{
+                            "u": np.where(usable, u, u + 9),
+                            "v": v,
+                            "r": r,
+                            "psi": psi,
+                            "x": x,
+                            "y": y,
+                        },
+                        **{
+                            "u_hat": u + eu,
+                            "v_hat": v + ev,
+                            "r_hat": r + er,
+                            "psi_hat": psi + er * t,
+                            "x_hat": x + eu * t,
+                            "y_hat": y + ev * t,
+                        },
                     }
                 )
             )
@@ -111,7 +150,15 @@ def write_rollout(folder: Path, log: str, models: tuple[str, ...], size: float) 
 
 def curve() -> list[dict[str, float]]:
     """A learning curve of two stages."""
-    return [{"epoch": float(e), "stage": float(e > 1), "loss": 1.0 / (1 + e) ** 2, "validation": 0.2 - 0.02 * e} for e in range(4)]
+    return [
+        {
+            "epoch": float(e),
+            "stage": float(e > 1),
+            "loss": 1.0 / (1 + e) ** 2,
+            "validation": 0.2 - 0.02 * e,
+        }
+        for e in range(4)
+    ]
 
 
 def residuals() -> pd.DataFrame:
@@ -121,7 +168,16 @@ def residuals() -> pd.DataFrame:
     for model in ("plsr", "mlp"):
         for axis in ("u_dot", "v_dot", "r_dot"):
             target = random.normal(0, 0.1, 400)
-            parts.append(pd.DataFrame({"model": model, "axis": axis, "target": target, "predicted": target if model == "plsr" else 0 * target}))
+            parts.append(
+                pd.DataFrame(
+                    {
+                        "model": model,
+                        "axis": axis,
+                        "target": target,
+                        "predicted": target if model == "plsr" else 0 * target,
+                    }
+                )
+            )
     return pd.concat(parts)
 
 
@@ -129,7 +185,14 @@ def made_run(run: Path, *, split: str = "test") -> Path:
     """The whole folder, but for models that can be loaded."""
     write_json(run / "metrics.json", metrics())
     (run / "resolved.yaml").write_text(RESOLVED)
-    provenance = {"residnet": "9.8.7", "git": "abc123", "seed": 5, "inputs": {"logs/a.csv": "f00d"}, "packages": {"torch": "2.13.0"}, "seconds": 12.3}
+    provenance = {
+        "residnet": "9.8.7",
+        "git": "abc123",
+        "seed": 5,
+        "inputs": {"logs/a.csv": "f00d"},
+        "packages": {"torch": "2.13.0"},
+        "seconds": 12.3,
+    }
     write_json(run / "provenance.json", provenance)
     entry = {
         "seconds": 60.0,
@@ -139,7 +202,10 @@ def made_run(run: Path, *, split: str = "test") -> Path:
         "masked": {"frozen": 0.025},
         "largest": {"u": 1.5, "v": 0.2, "r": 0.1},
     }
-    write_json(run / "data_quality.json", [{"log": log, "split": split, "manoeuvre": kind} | entry for log, kind in KINDS.items()])
+    write_json(
+        run / "data_quality.json",
+        [{"log": log, "split": split, "manoeuvre": kind} | entry for log, kind in KINDS.items()],
+    )
     for number, log in enumerate(KINDS):
         write_rollout(run / "rollouts" / split, log, tuple(MODELS), 0.5 + 0.5 * number)
     coefficients = [
@@ -147,7 +213,16 @@ def made_run(run: Path, *, split: str = "test") -> Path:
         {"axis": "v_dot", "term": "tau_n", "value": 1.0e-5, "standard_error": 5.8e-5},
         {"axis": "r_dot", "term": "v|v|", "value": 0.5, "standard_error": 0.1},
     ]
-    write_json(run / "models" / "baseline" / "fit.json", {"coefficients": coefficients, "samples": 2400, "seconds": 0.01})
-    write_json(run / "models" / "plsr" / "fit.json", {"order": 7, "terms": 23, "seconds": 0.1, "validation": 0.1})
-    write_json(run / "models" / "mlp" / "fit.json", {"parameters": 1347, "epochs": 4, "seconds": 23.0, "validation": 0.14, "curve": curve()})
+    write_json(
+        run / "models" / "baseline" / "fit.json",
+        {"coefficients": coefficients, "samples": 2400, "seconds": 0.01},
+    )
+    write_json(
+        run / "models" / "plsr" / "fit.json",
+        {"order": 7, "terms": 23, "seconds": 0.1, "validation": 0.1},
+    )
+    write_json(
+        run / "models" / "mlp" / "fit.json",
+        {"parameters": 1347, "epochs": 4, "seconds": 23.0, "validation": 0.14, "curve": curve()},
+    )
     return run

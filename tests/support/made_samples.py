@@ -19,7 +19,12 @@ def channels(count: int, seed: int = 0) -> np.ndarray:
 def residual(z: np.ndarray) -> np.ndarray:
     u, v, r, tau_x, tau_n = np.moveaxis(z, -1, 0)
     return np.stack(
-        (0.1 * u * np.abs(u) - 0.3 * v * r + 1e-4 * tau_x, 0.2 * u * v - 0.1 * np.abs(v) * v + 0.05, -0.3 * r * np.abs(r) + 1e-4 * tau_n * u), axis=-1
+        (
+            0.1 * u * np.abs(u) - 0.3 * v * r + 1e-4 * tau_x,
+            0.2 * u * v - 0.1 * np.abs(v) * v + 0.05,
+            -0.3 * r * np.abs(r) + 1e-4 * tau_n * u,
+        ),
+        axis=-1,
     )
 
 
@@ -28,4 +33,11 @@ def made(count: int = 600, groups: int = 12, noise: float = 0.02, seed: int = 0)
     target = residual(z) + noise * np.random.default_rng(seed + 1).normal(size=(count, 3))
     # manoeuvres of unequal length
     group = np.sort(np.random.default_rng(seed + 2).integers(0, groups, size=count))
-    return Samples(torch.from_numpy(z), torch.from_numpy(target), torch.from_numpy(group), torch.zeros(count), ("zigzag",) * groups, NAMES)
+    return Samples(
+        torch.from_numpy(z),
+        torch.from_numpy(target),
+        torch.from_numpy(group),
+        torch.zeros(count),
+        ("zigzag",) * groups,
+        NAMES,
+    )

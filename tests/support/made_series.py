@@ -1,4 +1,5 @@
-"""Autoregressive residuals of unit variance, and how often an interval holds what is true of them."""
+"""Autoregressive residuals of unit variance, and how often an interval holds what is true of them.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +18,9 @@ def autoregressive(phi: float, count: int, length: int, seed: int) -> np.ndarray
 
 
 def coverage(phi: float, count: int, length: int, seed: int) -> dict[str, float]:
-    """Share of intervals that hold the truth: of the mean absolute residual and of the mean, by blocks and as if samples were independent."""
+    """Share of intervals that hold the truth: of the mean absolute residual and of the mean, by
+    blocks and as if samples were independent.
+    """
     series = autoregressive(phi, count, length, seed)
     truth = math.sqrt(2 / math.pi)
     held = {"mae": 0, "mean": 0, "mae independent": 0, "mean independent": 0}

@@ -1,4 +1,6 @@
-"""A small vessel of known equations: its trials, its models, and how far a free run of a model is off."""
+"""A small vessel of known equations: its trials, its models, and how far a free run of a model is
+off.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,9 @@ THETA = torch.tensor(
 )
 
 
-def model_of(terms: Sequence[str], theta: Tensor | None = None, head: ResidualHead | None = None) -> HybridDynamics:
+def model_of(
+    terms: Sequence[str], theta: Tensor | None = None, head: ResidualHead | None = None
+) -> HybridDynamics:
     """A model whose axes all have the same terms."""
     signals = SIGNALS.build()
     baseline = RegressorBaseline([tuple(terms)] * 3, signals.names)
@@ -43,10 +47,15 @@ def model_of(terms: Sequence[str], theta: Tensor | None = None, head: ResidualHe
 
 
 def truth(offset: np.ndarray | None = None) -> HybridDynamics:
-    """The vessel itself, with accelerations [3] at 1 m/s, that grow with the square of the speed, where there are any."""
+    """The vessel itself, with accelerations [3] at 1 m/s, that grow with the square of the speed,
+    where there are any.
+    """
     if offset is None:
         return model_of(QUADRATIC, THETA)
-    return model_of((*QUADRATIC, "u^2", "v^2"), torch.cat((THETA, torch.from_numpy(np.stack((offset, offset), axis=1))), dim=1))
+    return model_of(
+        (*QUADRATIC, "u^2", "v^2"),
+        torch.cat((THETA, torch.from_numpy(np.stack((offset, offset), axis=1))), dim=1),
+    )
 
 
 def inputs(count: int, steps: int, seed: int) -> Tensor:
@@ -64,27 +73,55 @@ def inputs(count: int, steps: int, seed: int) -> Tensor:
 
 
 def trials(
-    count: int = 4, seconds: float = 40.0, noise: float = 0.01, seed: int = 0, window: float = 0.9, offsets: np.ndarray | None = None
+    count: int = 4,
+    seconds: float = 40.0,
+    noise: float = 0.01,
+    seed: int = 0,
+    window: float = 0.9,
+    offsets: np.ndarray | None = None,
 ) -> list[Prepared]:
-    """Logs of the vessel from rest, velocities noisy, derivatives over `window` seconds (a long one biases them); accelerations
-    `offsets` [B, 3] that each log has for itself at 1 m/s."""
+    """Logs of the vessel from rest, velocities noisy, derivatives over `window` seconds (a long one
+    biases them); accelerations `offsets` [B, 3] that each log has for itself at 1 m/s.
+    """
     steps = round(seconds / STEP)
     w = inputs(count, steps, seed)
     with torch.no_grad():
         vessels = [truth(offset) for offset in ([None] * count if offsets is None else offsets)]
         start, memory = torch.zeros(1, 6, dtype=torch.float64), torch.zeros(1, 0)
-        states = torch.cat([Rollout(vessel)(start, w[i : i + 1], memory)[0][:, :-1] for i, vessel in enumerate(vessels)]).numpy()
+        states = torch.cat(
+            [
+                Rollout(vessel)(start, w[i : i + 1], memory)[0][:, :-1]
+                for i, vessel in enumerate(vessels)
+            ]
+        ).numpy()
     states[:, :, 3:] += noise * np.random.default_rng([seed, 1]).standard_normal((count, steps, 3))
-    config = PrepareConfig.model_validate({"grid": {"step": STEP}, "derivative": {"kind": "savitzky_golay", "window": window, "order": 2}})
+    config = PrepareConfig.model_validate(
+        {
+            "grid": {"step": STEP},
+            "derivative": {"kind": "savitzky_golay", "window": window, "order": 2},
+        }
+    )
     out = []
     for i in range(count):
-        channels = {name: states[i, :, j].copy() for j, name in enumerate(STATE)} | {"tau_x": w[i, :, 0].numpy(), "tau_n": w[i, :, 1].numpy()}
-        out.append(prepare(Log(f"trial_{i}", STEP * np.arange(steps), channels, manoeuvre="made"), "train", SIGNALS.columns, config))
+        channels = {name: states[i, :, j].copy() for j, name in enumerate(STATE)} | {
+            "tau_x": w[i, :, 0].numpy(),
+            "tau_n": w[i, :, 1].numpy(),
+        }
+        out.append(
+            prepare(
+                Log(f"trial_{i}", STEP * np.arange(steps), channels, manoeuvre="made"),
+                "train",
+                SIGNALS.columns,
+                config,
+            )
+        )
     return out
 
 
 def free_run_error(model: HybridDynamics, seed: int = 99, seconds: float = 30.0) -> float:
-    """Root mean square error of free-run velocities against the vessel's own on fresh inputs, in units of the scales."""
+    """Root mean square error of free-run velocities against the vessel's own on fresh inputs, in
+    units of the scales.
+    """
     w = inputs(6, round(seconds / STEP), seed)
     own, theirs = truth(), model.double().eval()
     x0 = torch.zeros(6, 6, dtype=torch.float64)

@@ -30,10 +30,19 @@ class Ship:
 
 
 def _noise(velocity: float, rate: str, place: float, heading: str) -> dict[str, Any]:
-    return {"u": velocity, "v": velocity, "r": rate, "sensors": {"x": {"noise": place}, "y": {"noise": place}, "psi": {"noise": heading}}}
+    return {
+        "u": velocity,
+        "v": velocity,
+        "r": rate,
+        "sensors": {"x": {"noise": place}, "y": {"noise": place}, "psi": {"noise": heading}},
+    }
 
 
-_RUDDER: dict[str, Any] = {"steer": ("delta", "cmd_delta"), "actual": "delta", "demand": "cmd_delta"}
+_RUDDER: dict[str, Any] = {
+    "steer": ("delta", "cmd_delta"),
+    "actual": "delta",
+    "demand": "cmd_delta",
+}
 SHIPS = (
     Ship(
         "wam_v",
@@ -48,8 +57,28 @@ SHIPS = (
         "n_port",
         "cmd_port",
     ),
-    Ship("patrol", "patrol_p06", "300 s", "0.2 s", _noise(0.05, "0.1 deg/s", 0.1, "0.2 deg"), (0.8, 2.0), (3.0, 10.0), (0.1, 0.3), **_RUDDER),
-    Ship("mariner", "mariner", "900 s", "0.5 s", _noise(0.05, "0.05 deg/s", 0.2, "0.2 deg"), (3.0, 6.0), (20.0, 60.0), (0.06, 0.2), **_RUDDER),
+    Ship(
+        "patrol",
+        "patrol_p06",
+        "300 s",
+        "0.2 s",
+        _noise(0.05, "0.1 deg/s", 0.1, "0.2 deg"),
+        (0.8, 2.0),
+        (3.0, 10.0),
+        (0.1, 0.3),
+        **_RUDDER,
+    ),
+    Ship(
+        "mariner",
+        "mariner",
+        "900 s",
+        "0.5 s",
+        _noise(0.05, "0.05 deg/s", 0.2, "0.2 deg"),
+        (3.0, 6.0),
+        (20.0, 60.0),
+        (0.06, 0.2),
+        **_RUDDER,
+    ),
     Ship(
         "ferry",
         "milliampere",
@@ -72,10 +101,19 @@ _TRIALS = [
 ]
 
 
-def clean(ship: Ship, seed: int, kinds: Sequence[str] = ("zigzag", "three_two_one_one", "random_steps")) -> list[Log]:
+def clean(
+    ship: Ship, seed: int, kinds: Sequence[str] = ("zigzag", "three_two_one_one", "random_steps")
+) -> list[Log]:
     """Logs of a vessel, one of each kind of manoeuvre."""
     trials = [entry for entry in _TRIALS if entry["kind"] in kinds]
-    content = {"vessel": ship.vessel, "seed": seed, "duration": ship.duration, "step": ship.step, "noise": ship.noise, "trials": trials}
+    content = {
+        "vessel": ship.vessel,
+        "seed": seed,
+        "duration": ship.duration,
+        "step": ship.step,
+        "noise": ship.noise,
+        "trials": trials,
+    }
     config = SimulatedTrials.model_validate({**content, "identification": {}, "validation": {}})
     return simulate(config.draw(), config)
 
@@ -85,7 +123,10 @@ def _with(log: Log, **channels: np.ndarray) -> Log:
 
 
 def _rows(log: Log, keep: np.ndarray, t: np.ndarray | None = None) -> Log:
-    return log.replace(t=log.t[keep] if t is None else t, channels={name: values[keep] for name, values in log.channels.items()})
+    return log.replace(
+        t=log.t[keep] if t is None else t,
+        channels={name: values[keep] for name, values in log.channels.items()},
+    )
 
 
 def _late(log: Log, lag: float, *names: str) -> Log:
@@ -104,7 +145,9 @@ Plant = Callable[[Ship, list[Log], np.random.Generator], list[Log]]
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault of `ships`: `plant` damages the first of some logs, `codes` are the findings that name it."""
+    """A fault of `ships`: `plant` damages the first of some logs, `codes` are the findings that
+    name it.
+    """
 
     name: str
     codes: tuple[str, ...]
@@ -156,24 +199,42 @@ def _freeze(ship: Ship, log: Log, random: np.random.Generator) -> Log:
     names = [["x", "y"], ["psi"], ["u"], ["v"], ["r"]][int(random.integers(5))]
     run = _stretch(log, random, 0.05, 0.15)
     return _with(
-        log, **{name: np.where(np.isin(np.arange(len(log)), np.arange(run.start, run.stop)), log[name][run.start], log[name]) for name in names}
+        log,
+        **{
+            name: np.where(
+                np.isin(np.arange(len(log)), np.arange(run.start, run.stop)),
+                log[name][run.start],
+                log[name],
+            )
+            for name in names
+        },
     )
 
 
 def _clip(ship: Ship, log: Log, random: np.random.Generator) -> Log:
     name = str(random.choice(["u", "r", "v"]))
-    return _with(log, **{name: np.minimum(log[name], np.quantile(log[name], random.uniform(0.75, 0.95)))})
+    return _with(
+        log, **{name: np.minimum(log[name], np.quantile(log[name], random.uniform(0.75, 0.95)))}
+    )
 
 
 def _wrapped(ship: Ship, log: Log, random: np.random.Generator) -> Log:
     away = log["psi"] + np.pi - np.median(log["psi"])
     turn = np.pi - np.median(log["psi"])
     c, s = np.cos(turn), np.sin(turn)
-    return _with(log, psi=(away + np.pi) % (2.0 * np.pi) - np.pi, x=c * log["x"] - s * log["y"], y=s * log["x"] + c * log["y"])
+    return _with(
+        log,
+        psi=(away + np.pi) % (2.0 * np.pi) - np.pi,
+        x=c * log["x"] - s * log["y"],
+        y=s * log["x"] + c * log["y"],
+    )
 
 
 def _arm(ship: Ship, log: Log, random: np.random.Generator) -> Log:
-    ahead, side = random.uniform(*ship.arm) * random.choice([-1.0, 1.0]), random.uniform(0.0, 0.3) * ship.arm[0]
+    ahead, side = (
+        random.uniform(*ship.arm) * random.choice([-1.0, 1.0]),
+        random.uniform(0.0, 0.3) * ship.arm[0],
+    )
     c, s = np.cos(log["psi"]), np.sin(log["psi"])
     return _with(log, x=log["x"] + c * ahead - s * side, y=log["y"] + s * ahead + c * side)
 
@@ -193,8 +254,16 @@ def _decimals(ship: Ship, log: Log, random: np.random.Generator) -> Log:
 
 
 def _copied(ship: Ship, logs: list[Log], random: np.random.Generator) -> list[Log]:
-    source, run = logs[1], slice(len(logs[1]) // 3, len(logs[1]) // 3 + int(random.uniform(0.2, 0.5) * len(logs[1])))
-    part = Log("cut", source.t[run] - source.t[run.start], {name: values[run] for name, values in source.channels.items()}, source.units)
+    source, run = (
+        logs[1],
+        slice(len(logs[1]) // 3, len(logs[1]) // 3 + int(random.uniform(0.2, 0.5) * len(logs[1]))),
+    )
+    part = Log(
+        "cut",
+        source.t[run] - source.t[run.start],
+        {name: values[run] for name, values in source.channels.items()},
+        source.units,
+    )
     return [logs[0], source, part]
 
 
@@ -214,22 +283,48 @@ def _resting(ship: Ship, log: Log, random: np.random.Generator) -> Log:
     channels = {}
     for name, values in log.channels.items():
         level = values[0] if name in ("x", "y", "psi") else 0.0
-        channels[name] = np.concatenate((level + noise.get(name, 0.0) * random.standard_normal(count), values))
+        channels[name] = np.concatenate(
+            (level + noise.get(name, 0.0) * random.standard_normal(count), values)
+        )
     return log.replace(t=step * np.arange(count + len(log)), channels=channels)
 
 
 def _steady(ship: Ship, log: Log, random: np.random.Generator) -> Log:
     speed = float(np.nanmax(log["u"]))
     count, t = len(log), log.t
-    channels = {name: np.full(count, float(np.median(values))) for name, values in log.channels.items()}
+    channels = {
+        name: np.full(count, float(np.median(values))) for name, values in log.channels.items()
+    }
     rate = np.radians(0.05)
-    channels |= {"x": speed * t + 0.03 * random.standard_normal(count), "y": 0.03 * random.standard_normal(count)}
-    channels |= {"psi": 0.003 * random.standard_normal(count), "u": speed + 0.03 * random.standard_normal(count)}
-    channels |= {"v": 0.03 * random.standard_normal(count), "r": rate * random.standard_normal(count)}
+    channels |= {
+        "x": speed * t + 0.03 * random.standard_normal(count),
+        "y": 0.03 * random.standard_normal(count),
+    }
+    channels |= {
+        "psi": 0.003 * random.standard_normal(count),
+        "u": speed + 0.03 * random.standard_normal(count),
+    }
+    channels |= {
+        "v": 0.03 * random.standard_normal(count),
+        "r": rate * random.standard_normal(count),
+    }
     return log.replace(channels=channels)
 
 
-_LAGS = ("lag", "lag_u", "lag_v", "lag_psi", "lag_xy", "follows_u", "follows_v", "follows_r", "acausal", "gain_v", "gain_u", "heading")
+_LAGS = (
+    "lag",
+    "lag_u",
+    "lag_v",
+    "lag_psi",
+    "lag_xy",
+    "follows_u",
+    "follows_v",
+    "follows_r",
+    "acausal",
+    "gain_v",
+    "gain_u",
+    "heading",
+)
 _SIGNS = ("frames", "follows_u", "follows_v", "follows_r", "gain_v", "gain_u", "rudder_sign")
 FAULTS = (
     Fault("time gap", ("gaps",), _one(_gap)),
@@ -240,25 +335,72 @@ FAULTS = (
     Fault("outliers", ("outliers",), _one(_spiky)),
     Fault("frozen sensor", ("frozen",), _one(_freeze)),
     Fault("clipping", ("clipping",), _one(_clip)),
-    Fault("r in deg/s", ("follows_r", "gain"), _one(lambda s, log, g: _with(log, r=np.degrees(log["r"])))),
-    Fault("psi in deg", ("follows_r", "frames", "gain", "heading_wrap"), _one(lambda s, log, g: _with(log, psi=np.degrees(log["psi"])))),
-    Fault("rudder in deg", ("unit",), _one(lambda s, log, g: _with(log, delta=np.degrees(log["delta"]))), ("patrol", "mariner")),
-    Fault("u, v in knots", ("frames", "gain", "gain_u"), _one(lambda s, log, g: _with(log, u=log["u"] / 0.5144, v=log["v"] / 0.5144))),
-    Fault("u in knots", ("frames", "gain", "gain_u", "follows_u"), _one(lambda s, log, g: _with(log, u=log["u"] / 0.5144))),
+    Fault(
+        "r in deg/s",
+        ("follows_r", "gain"),
+        _one(lambda s, log, g: _with(log, r=np.degrees(log["r"]))),
+    ),
+    Fault(
+        "psi in deg",
+        ("follows_r", "frames", "gain", "heading_wrap"),
+        _one(lambda s, log, g: _with(log, psi=np.degrees(log["psi"]))),
+    ),
+    Fault(
+        "rudder in deg",
+        ("unit",),
+        _one(lambda s, log, g: _with(log, delta=np.degrees(log["delta"]))),
+        ("patrol", "mariner"),
+    ),
+    Fault(
+        "u, v in knots",
+        ("frames", "gain", "gain_u"),
+        _one(lambda s, log, g: _with(log, u=log["u"] / 0.5144, v=log["v"] / 0.5144)),
+    ),
+    Fault(
+        "u in knots",
+        ("frames", "gain", "gain_u", "follows_u"),
+        _one(lambda s, log, g: _with(log, u=log["u"] / 0.5144)),
+    ),
     Fault("r reversed", _SIGNS, _one(lambda s, log, g: _with(log, r=-log["r"]))),
     Fault("psi reversed", _SIGNS, _one(lambda s, log, g: _with(log, psi=-log["psi"]))),
     Fault("v reversed", _SIGNS, _one(lambda s, log, g: _with(log, v=-log["v"]))),
     Fault("steering reversed", ("rudder_sign",), lambda s, logs, g: [_steer_reversed(s, logs[0])]),
-    Fault("ENU heading", ("frames",), _one(lambda s, log, g: _with(log, psi=np.pi / 2.0 - log["psi"]))),
-    Fault("x, y exchanged", ("frames",), _one(lambda s, log, g: _with(log, x=log["y"], y=log["x"]))),
-    Fault("lag of r", ("lag", "follows_r"), _one(lambda s, log, g: _late(log, g.uniform(*s.lag), "r"))),
+    Fault(
+        "ENU heading", ("frames",), _one(lambda s, log, g: _with(log, psi=np.pi / 2.0 - log["psi"]))
+    ),
+    Fault(
+        "x, y exchanged", ("frames",), _one(lambda s, log, g: _with(log, x=log["y"], y=log["x"]))
+    ),
+    Fault(
+        "lag of r", ("lag", "follows_r"), _one(lambda s, log, g: _late(log, g.uniform(*s.lag), "r"))
+    ),
     Fault("lag of u, v", _LAGS, _one(lambda s, log, g: _late(log, g.uniform(*s.lag), "u", "v"))),
     Fault("lag of psi", _LAGS, _one(lambda s, log, g: _late(log, g.uniform(*s.lag), "psi"))),
     Fault("lag of x, y", _LAGS, _one(lambda s, log, g: _late(log, g.uniform(*s.lag), "x", "y"))),
-    Fault("clock offset of u, v, r", _LAGS, _one(lambda s, log, g: _late(log, g.uniform(*s.lag), "u", "v", "r"))),
-    Fault("inputs late", ("acausal",), _one(lambda s, log, g: _late(log, 2.0 * s.lag[1], *_driving(log)))),
-    Fault("gyro bias", ("yaw_drift",), _one(lambda s, log, g: _with(log, r=log["r"] + np.radians(g.uniform(*s.bias))))),
-    Fault("gyro drift", ("yaw_drift",), _one(lambda s, log, g: _with(log, r=log["r"] + np.radians(2.0 * g.uniform(*s.bias)) * log.t / log.t[-1]))),
+    Fault(
+        "clock offset of u, v, r",
+        _LAGS,
+        _one(lambda s, log, g: _late(log, g.uniform(*s.lag), "u", "v", "r")),
+    ),
+    Fault(
+        "inputs late",
+        ("acausal",),
+        _one(lambda s, log, g: _late(log, 2.0 * s.lag[1], *_driving(log))),
+    ),
+    Fault(
+        "gyro bias",
+        ("yaw_drift",),
+        _one(lambda s, log, g: _with(log, r=log["r"] + np.radians(g.uniform(*s.bias)))),
+    ),
+    Fault(
+        "gyro drift",
+        ("yaw_drift",),
+        _one(
+            lambda s, log, g: _with(
+                log, r=log["r"] + np.radians(2.0 * g.uniform(*s.bias)) * log.t / log.t[-1]
+            )
+        ),
+    ),
     Fault("heading wrap", ("heading_wrap",), _one(_wrapped)),
     Fault("lever arm", ("lever_arm", "position_jump", "frames"), _one(_arm)),
     Fault("stuck actuator", ("stuck",), _one(_stuck)),
@@ -271,11 +413,19 @@ FAULTS = (
 
 
 def _driving(log: Log) -> list[str]:
-    return [name for name in log.channels if name not in ("x", "y", "psi", "phi", "u", "v", "r", "p")]
+    return [
+        name for name in log.channels if name not in ("x", "y", "psi", "phi", "u", "v", "r", "p")
+    ]
 
 
 def _steer_reversed(ship: Ship, log: Log) -> Log:
     if ship.name == "wam_v":
-        return _with(log, n_port=log["n_stbd"], n_stbd=log["n_port"], cmd_port=log["cmd_stbd"], cmd_stbd=log["cmd_port"])
+        return _with(
+            log,
+            n_port=log["n_stbd"],
+            n_stbd=log["n_port"],
+            cmd_port=log["cmd_stbd"],
+            cmd_stbd=log["cmd_port"],
+        )
     names = [name for name in _driving(log) if "delta" in name or "tau_n" in name]
     return _with(log, **{name: -log[name] for name in names})

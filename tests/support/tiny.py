@@ -24,22 +24,34 @@ TINY = {
         "identification": {"zigzag": 4, "acceleration_deceleration": 2, "three_two_one_one": 2},
         "validation": {"zigzag": 1, "acceleration_deceleration": 0, "three_two_one_one": 0},
     },
-    "prepare": {"grid": {"step": 0.1}, "derivative": {"kind": "savitzky_golay", "window": 1.1, "order": 2}},
+    "prepare": {
+        "grid": {"step": 0.1},
+        "derivative": {"kind": "savitzky_golay", "window": 1.1, "order": 2},
+    },
     "signals": {"inputs": ["n_port", "n_stbd"], "forces": "wam_v_cal"},
     "baseline": {"kind": "linear_steady", "settled": 20},
-    "heads": {"ridge": {"kind": "ridge"}, "lstm": {"kind": "lstm", "hidden_size": 6, "dropout": 0.1}},
+    "heads": {
+        "ridge": {"kind": "ridge"},
+        "lstm": {"kind": "lstm", "hidden_size": 6, "dropout": 0.1},
+    },
     "ensembles": {"mean": ["ridge", "lstm"]},
     "training": {
         "lstm": {
             "steps": 3,
             "one_step": {"epochs": 2, "window": 2.0, "batch": 16},
-            "multi_step": [{"horizon": 1.0, "epochs": 2, "batch": 16}, {"horizon": 2.0, "epochs": 3, "batch": 16}],
+            "multi_step": [
+                {"horizon": 1.0, "epochs": 2, "batch": 16},
+                {"horizon": 2.0, "epochs": 3, "batch": 16},
+            ],
             "average": 0.9,
             "start_noise": 0.1,
         }
     },
     "evaluation": {
-        "protocols": {"manoeuvre": {"kind": "manoeuvre"}, "T10": {"kind": "windows", "length": 10, "first": 2, "history": 1}},
+        "protocols": {
+            "manoeuvre": {"kind": "manoeuvre"},
+            "T10": {"kind": "windows", "length": 10, "first": 2, "history": 1},
+        },
         "selection": "manoeuvre",
         "scales": {"u": 0.35, "v": 0.16, "r": 0.24},
     },

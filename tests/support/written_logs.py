@@ -1,4 +1,5 @@
-"""One simulated trial, written in the formats that boats record, by the libraries of those formats."""
+"""One simulated trial, written in the formats that boats record, by the libraries of those formats.
+"""
 
 from __future__ import annotations
 
@@ -63,13 +64,17 @@ def mat5(log: Log, folder: Path) -> Path:
 
 
 def mat73(log: Log, folder: Path) -> Path:
-    """The same struct as MATLAB 7.3 writes it: HDF5 behind a header of 512 bytes, vectors as rows of one."""
+    """The same struct as MATLAB 7.3 writes it: HDF5 behind a header of 512 bytes, vectors as rows
+    of one.
+    """
     path = folder / "trial.mat"
     with h5py.File(path, "w", userblock_size=512) as file:
         group = file.create_group("trial")
         group.attrs["MATLAB_class"] = np.bytes_("struct")
         for name, values in {"t": log.t, **log.channels}.items():
-            group.create_dataset(name, data=values[None, :]).attrs["MATLAB_class"] = np.bytes_("double")
+            group.create_dataset(name, data=values[None, :]).attrs["MATLAB_class"] = np.bytes_(
+                "double"
+            )
     with path.open("r+b") as stream:
         stream.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM")
     return path
@@ -88,24 +93,41 @@ def hdf5_table(log: Log, folder: Path) -> Path:
     """One table of named columns."""
     path = folder / "trial.hdf5"
     with h5py.File(path, "w") as file:
-        file.create_dataset("table", data=pd.DataFrame({"t": log.t, **log.channels}).to_records(index=False))
+        file.create_dataset(
+            "table", data=pd.DataFrame({"t": log.t, **log.channels}).to_records(index=False)
+        )
     return path
 
 
 def topics(log: Log, folder: Path) -> Path:
-    """One csv per topic, by REP-103, arrivals in local time two hours ahead of the header stamps."""
+    """One csv per topic, by REP-103, arrivals in local time two hours ahead of the header stamps.
+    """
     path = folder / "trial"
     path.mkdir()
     ns = _stamps(log)
     stamp = {"header_stamp_secs": ns // 10**9, "header_stamp_nsecs": ns % 10**9}
     late = ns + 7200 * 10**9 + 1_000_000
-    time = [f"{pd.Timestamp(int(s), unit='s'):%Y/%m/%d %H:%M:%S}.{int(rest)}" for s, rest in zip(late // 10**9, late % 10**9, strict=True)]
-    pose = {f"pose_pose_position_{k}": v for k, v in zip("xyz", (log["y"], log["x"], 0.0 * log["x"]), strict=True)}
+    time = [
+        f"{pd.Timestamp(int(s), unit='s'):%Y/%m/%d %H:%M:%S}.{int(rest)}"
+        for s, rest in zip(late // 10**9, late % 10**9, strict=True)
+    ]
+    pose = {
+        f"pose_pose_position_{k}": v
+        for k, v in zip("xyz", (log["y"], log["x"], 0.0 * log["x"]), strict=True)
+    }
     pose |= {f"pose_pose_orientation_{k}": v for k, v in zip("xyzw", _quaternion(log), strict=True)}
-    twist = {"twist_twist_linear_x": log["u"], "twist_twist_linear_y": -log["v"], "twist_twist_angular_z": -log["r"]}
-    pd.DataFrame({"time": time, **stamp, **pose, **twist}).to_csv(path / "odometry.csv", index=False, float_format="%.17g")
+    twist = {
+        "twist_twist_linear_x": log["u"],
+        "twist_twist_linear_y": -log["v"],
+        "twist_twist_angular_z": -log["r"],
+    }
+    pd.DataFrame({"time": time, **stamp, **pose, **twist}).to_csv(
+        path / "odometry.csv", index=False, float_format="%.17g"
+    )
     for name in COMMANDS:
-        pd.DataFrame({"time": time, **stamp, "data": log[name]}).to_csv(path / f"{name}.csv", index=False, float_format="%.17g")
+        pd.DataFrame({"time": time, **stamp, "data": log[name]}).to_csv(
+            path / f"{name}.csv", index=False, float_format="%.17g"
+        )
     return path
 
 
@@ -114,7 +136,13 @@ def bag1(log: Log, folder: Path) -> Path:
     path = folder / "trial.bag"
     store = get_typestore(Stores.ROS1_NOETIC)
     with Writer1(path) as writer:
-        _messages(log, writer, store, lambda name, kind: writer.add_connection(name, kind, typestore=store), store.serialize_ros1)
+        _messages(
+            log,
+            writer,
+            store,
+            lambda name, kind: writer.add_connection(name, kind, typestore=store),
+            store.serialize_ros1,
+        )
     return path
 
 
@@ -137,12 +165,26 @@ def mcap(log: Log, folder: Path) -> Path:
 def _bag2(log: Log, path: Path, plugin: StoragePlugin) -> Path:
     store = get_typestore(Stores.ROS2_HUMBLE)
     with Writer2(path, version=9, storage_plugin=plugin) as writer:
-        _messages(log, writer, store, lambda name, kind: writer.add_connection(name, kind, typestore=store), store.serialize_cdr)
+        _messages(
+            log,
+            writer,
+            store,
+            lambda name, kind: writer.add_connection(name, kind, typestore=store),
+            store.serialize_cdr,
+        )
     return path
 
 
-def _messages(log: Log, writer: Any, store: Any, connect: Callable[[str, str], Any], serialize: Callable[[Any, str], Any]) -> None:
-    """Odometry by REP-103 with header stamps, commands as std_msgs/Float64 at the arrival of the odometry."""
+def _messages(
+    log: Log,
+    writer: Any,
+    store: Any,
+    connect: Callable[[str, str], Any],
+    serialize: Callable[[Any, str], Any],
+) -> None:
+    """Odometry by REP-103 with header stamps, commands as std_msgs/Float64 at the arrival of the
+    odometry.
+    """
     odometry, number = "nav_msgs/msg/Odometry", "std_msgs/msg/Float64"
     types = store.types
     pose = connect("/odometry", odometry)
@@ -156,11 +198,15 @@ def _messages(log: Log, writer: Any, store: Any, connect: Callable[[str, str], A
         extra = {"seq": i} if "seq" in header_type.__dataclass_fields__ else {}
         point = types["geometry_msgs/msg/Point"](x=log["y"][i], y=log["x"][i], z=0.0)
         turned = types["geometry_msgs/msg/Quaternion"](x=qx[i], y=qy[i], z=qz[i], w=qw[i])
-        twist = types["geometry_msgs/msg/Twist"](linear=vector(log["u"][i], -log["v"][i], 0.0), angular=vector(0.0, 0.0, -log["r"][i]))
+        twist = types["geometry_msgs/msg/Twist"](
+            linear=vector(log["u"][i], -log["v"][i], 0.0), angular=vector(0.0, 0.0, -log["r"][i])
+        )
         message = types[odometry](
             header=header_type(stamp=time, frame_id="odom", **extra),
             child_frame_id="base_link",
-            pose=types["geometry_msgs/msg/PoseWithCovariance"](types["geometry_msgs/msg/Pose"](point, turned), none),
+            pose=types["geometry_msgs/msg/PoseWithCovariance"](
+                types["geometry_msgs/msg/Pose"](point, turned), none
+            ),
             twist=types["geometry_msgs/msg/TwistWithCovariance"](twist, none),
         )
         writer.write(pose, at, serialize(message, odometry))
@@ -180,7 +226,9 @@ def _quaternion(log: Log) -> tuple[np.ndarray, ...]:
 
 
 def outcome(path: Path) -> str | None:
-    """What reading ends in: None for a log, else the error's text; anything but residnet's own errors passes through."""
+    """What reading ends in: None for a log, else the error's text; anything but residnet's own
+    errors passes through.
+    """
     try:
         reader_for(path).read(path)
     except (UsageError, DataError) as error:

@@ -1,4 +1,6 @@
-"""The trial as marine electronics and autopilots record it: sentences by hand, binary logs by struct."""
+"""The trial as marine electronics and autopilots record it: sentences by hand, binary logs by
+struct.
+"""
 
 from __future__ import annotations
 
@@ -17,16 +19,21 @@ BOOT = 100_000_000
 
 
 def geodetic(log: Log) -> tuple[np.ndarray, np.ndarray]:
-    """Latitude and longitude in degrees of the trial's points on a tangent plane at ORIGIN, by ECEF and back (heights of the plane's points kept)."""
+    """Latitude and longitude in degrees of the trial's points on a tangent plane at ORIGIN, by ECEF
+    and back (heights of the plane's points kept).
+    """
     back = Transformer.from_pipeline(
-        f"+proj=pipeline +step +inv +proj=topocentric +ellps=WGS84 +lat_0={ORIGIN[0]} +lon_0={ORIGIN[1]} +h_0=0 +step +inv +proj=cart +ellps=WGS84"
+        f"+proj=pipeline +step +inv +proj=topocentric +ellps=WGS84 +lat_0={ORIGIN[0]}"
+        f" +lon_0={ORIGIN[1]} +h_0=0 +step +inv +proj=cart +ellps=WGS84"
     )
     longitude, latitude, _ = back.transform(log["y"], log["x"], np.zeros(len(log)), radians=False)
     return np.asarray(latitude), np.asarray(longitude)
 
 
 def nmea(log: Log, folder: Path, *, prefix: bool = False) -> Path:
-    """RMC, HDT and ROT, in this order at every sample; `prefix` writes the logger's time in front of each line."""
+    """RMC, HDT and ROT, in this order at every sample; `prefix` writes the logger's time in front
+    of each line.
+    """
     latitude, longitude = geodetic(log)
     north = log["u"] * np.cos(log["psi"]) - log["v"] * np.sin(log["psi"])
     east = log["u"] * np.sin(log["psi"]) + log["v"] * np.cos(log["psi"])
@@ -34,7 +41,10 @@ def nmea(log: Log, folder: Path, *, prefix: bool = False) -> Path:
     for i, t in enumerate(log.t.tolist()):
         clock = 9 * 3600 + 15 * 60 + 45 + t
         moment = f"{int(clock // 3600):02d}{int(clock // 60 % 60):02d}{clock % 60:05.2f}"
-        speed, course = np.hypot(north[i], east[i]) * 3600 / 1852, np.degrees(np.arctan2(east[i], north[i])) % 360
+        speed, course = (
+            np.hypot(north[i], east[i]) * 3600 / 1852,
+            np.degrees(np.arctan2(east[i], north[i])) % 360,
+        )
         fix = f"{_degrees(latitude[i], 2)},N,{_degrees(longitude[i], 3)},E"
         sentences = [
             f"GPRMC,{moment},A,{fix},{speed:.6f},{course:.6f},110425,,,A",
@@ -42,29 +52,44 @@ def nmea(log: Log, folder: Path, *, prefix: bool = False) -> Path:
             f"HEROT,{np.degrees(log['r'][i]) * 60:.6f},A",
         ]
         start = f"2025-04-11T09:15:{45 + t:09.6f}Z " if prefix and 45 + t < 60 else ""
-        lines += [f"{start}${text}*{reduce(lambda a, b: a ^ b, text.encode()):02X}" for text in sentences]
+        lines += [
+            f"{start}${text}*{reduce(lambda a, b: a ^ b, text.encode()):02X}" for text in sentences
+        ]
     path = folder / "trial.nmea"
     path.write_text("\r\n".join(lines) + "\r\n")
     return path
 
 
 def ulog(log: Log, folder: Path) -> Path:
-    """PX4: local position, attitude (the quaternion's sign flipping), angular velocity, and one fix that tells UTC."""
+    """PX4: local position, attitude (the quaternion's sign flipping), angular velocity, and one fix
+    that tells UTC.
+    """
     formats = {
-        "vehicle_local_position": "uint64_t timestamp;float x;float y;float vx;float vy;double exact_x;",
+        "vehicle_local_position": (
+            "uint64_t timestamp;float x;float y;float vx;float vy;double exact_x;"
+        ),
         "vehicle_attitude": "uint64_t timestamp;double[4] q;",
         "vehicle_angular_velocity": "uint64_t timestamp;double[3] xyz;",
-        "vehicle_gps_position": "uint64_t timestamp;uint64_t time_utc_usec;int32_t lat;int32_t lon;",
+        "vehicle_gps_position": (
+            "uint64_t timestamp;uint64_t time_utc_usec;int32_t lat;int32_t lon;"
+        ),
     }
     body = b"ULog\x01\x12\x35\x01" + struct.pack("<Q", BOOT) + _message("B", bytes(40))
     body += b"".join(_message("F", f"{name}:{text}".encode()) for name, text in formats.items())
-    body += b"".join(_message("A", struct.pack("<BH", 0, i) + name.encode()) for i, name in enumerate(formats))
+    body += b"".join(
+        _message("A", struct.pack("<BH", 0, i) + name.encode()) for i, name in enumerate(formats)
+    )
     for i, t in enumerate(log.t.tolist()):
         at, psi = BOOT + round(t * 1e6), log["psi"][i]
-        vx, vy = log["u"][i] * np.cos(psi) - log["v"][i] * np.sin(psi), log["u"][i] * np.sin(psi) + log["v"][i] * np.cos(psi)
+        vx, vy = (
+            log["u"][i] * np.cos(psi) - log["v"][i] * np.sin(psi),
+            log["u"][i] * np.sin(psi) + log["v"][i] * np.cos(psi),
+        )
         sign = -1.0 if i % 7 == 0 else 1.0
         rows = [struct.pack("<Qffffd", at, log["x"][i], log["y"][i], vx, vy, log["x"][i])]
-        rows.append(struct.pack("<Q4d", at, sign * np.cos(psi / 2), 0.0, 0.0, sign * np.sin(psi / 2)))
+        rows.append(
+            struct.pack("<Q4d", at, sign * np.cos(psi / 2), 0.0, 0.0, sign * np.sin(psi / 2))
+        )
         rows.append(struct.pack("<Q3d", at, 0.0, 0.0, log["r"][i]))
         rows += [struct.pack("<QQii", at, EPOCH * 10**6, 634411000, 104198000)] if i == 0 else []
         body += b"".join(_message("D", struct.pack("<H", k) + row) for k, row in enumerate(rows))
@@ -74,10 +99,17 @@ def ulog(log: Log, folder: Path) -> Path:
 
 
 def ardupilot(log: Log, folder: Path) -> Path:
-    """ArduPilot: filter (XKF1), attitude (ATT), gyro (IMU), and GPS with its week and milliseconds."""
+    """ArduPilot: filter (XKF1), attitude (ATT), gyro (IMU), and GPS with its week and milliseconds.
+    """
     formats = [
         (128, "FMT", "BBnNZ", "Type,Length,Name,Format,Columns", 89),
-        (1, "GPS", "QBIHBcLLeffffB", "TimeUS,Status,GMS,GWk,NSats,HDop,Lat,Lng,Alt,Spd,GCrs,VZ,Yaw,U", 0),
+        (
+            1,
+            "GPS",
+            "QBIHBcLLeffffB",
+            "TimeUS,Status,GMS,GWk,NSats,HDop,Lat,Lng,Alt,Spd,GCrs,VZ,Yaw,U",
+            0,
+        ),
         (2, "ATT", "Qff", "TimeUS,Roll,Yaw", 0),
         (3, "IMU", "Qdd", "TimeUS,GyrX,GyrZ", 0),
         (4, "XKF1", "Qdddd", "TimeUS,PN,PE,VN,VE", 0),
@@ -86,16 +118,35 @@ def ardupilot(log: Log, folder: Path) -> Path:
     body = b""
     for number, name, kinds, columns, length in formats:
         whole = length or 3 + sum(size[kind] for kind in kinds)
-        body += b"\xa3\x95\x80" + struct.pack("<BB4s16s64s", number, whole, name.encode(), kinds.encode(), columns.encode())
+        body += b"\xa3\x95\x80" + struct.pack(
+            "<BB4s16s64s", number, whole, name.encode(), kinds.encode(), columns.encode()
+        )
     # GPS time: weeks since 6 January 1980, 18 leap seconds ahead of UTC
     gps = EPOCH - 315_964_800 + 18
     for i, t in enumerate(log.t.tolist()):
         at, psi = BOOT + round(t * 1e6), log["psi"][i]
-        vn, ve = log["u"][i] * np.cos(psi) - log["v"][i] * np.sin(psi), log["u"][i] * np.sin(psi) + log["v"][i] * np.cos(psi)
+        vn, ve = (
+            log["u"][i] * np.cos(psi) - log["v"][i] * np.sin(psi),
+            log["u"][i] * np.sin(psi) + log["v"][i] * np.cos(psi),
+        )
         if i % 2 == 0:
             ms = (gps % 604_800) * 1000 + round(t * 1e3)
             body += b"\xa3\x95\x01" + struct.pack(
-                "<QBIHBhiiiffffB", at, 3, ms, gps // 604_800, 12, 80, 634411000, 104198000, 0, np.hypot(vn, ve), 0.0, 0.0, 0.0, 1
+                "<QBIHBhiiiffffB",
+                at,
+                3,
+                ms,
+                gps // 604_800,
+                12,
+                80,
+                634411000,
+                104198000,
+                0,
+                np.hypot(vn, ve),
+                0.0,
+                0.0,
+                0.0,
+                1,
             )
         body += b"\xa3\x95\x02" + struct.pack("<Qff", at, 0.0, np.degrees(psi) % 360)
         body += b"\xa3\x95\x03" + struct.pack("<Qdd", at, 0.0, log["r"][i])

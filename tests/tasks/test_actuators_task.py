@@ -30,9 +30,13 @@ def config(tmp_path: Path) -> dict[str, Any]:
     pd.DataFrame({"throttle": throttle, "rpm": rpm}).to_csv(tmp_path / "throttle.csv", index=False)
     t = 0.02 * np.arange(250)
     command = np.where(t < 1.0, 0.0, 2380.0)
-    pd.DataFrame({"time": 1000 * t, "cmd": command, "rpm": np.clip(1500 * (t - 1.0), 0, 2380) + random.normal(size=t.size) * 10}).to_csv(
-        tmp_path / "step.csv", index=False
-    )
+    pd.DataFrame(
+        {
+            "time": 1000 * t,
+            "cmd": command,
+            "rpm": np.clip(1500 * (t - 1.0), 0, 2380) + random.normal(size=t.size) * 10,
+        }
+    ).to_csv(tmp_path / "step.csv", index=False)
     n = np.concatenate((np.linspace(-2380, -200, 15), np.linspace(200, 2380, 15)))
     pull = 2 * unit.thrust(torch.from_numpy(n / 60)).numpy() + random.normal(size=n.size)
     pd.DataFrame({"rpm": n, "pull": pull / 1000}).to_csv(tmp_path / "bollard.csv", index=False)
@@ -40,9 +44,23 @@ def config(tmp_path: Path) -> dict[str, Any]:
     return {
         "task": "actuators",
         "name": "thrusters",
-        "throttle": {"files": ["throttle.csv"], "throttle": {"column": "throttle", "unit": "%"}, "n": rev},
-        "step": {"files": ["step.csv"], "t": {"column": "time", "unit": "ms"}, "command": {"column": "cmd", "unit": "rpm"}, "n": rev},
-        "bollard": {"files": ["bollard.csv"], "n": rev, "pull": {"column": "pull", "unit": "kN"}, "thrusters": 2},
+        "throttle": {
+            "files": ["throttle.csv"],
+            "throttle": {"column": "throttle", "unit": "%"},
+            "n": rev,
+        },
+        "step": {
+            "files": ["step.csv"],
+            "t": {"column": "time", "unit": "ms"},
+            "command": {"column": "cmd", "unit": "rpm"},
+            "n": rev,
+        },
+        "bollard": {
+            "files": ["bollard.csv"],
+            "n": rev,
+            "pull": {"column": "pull", "unit": "kN"},
+            "thrusters": 2,
+        },
     }
 
 
@@ -52,11 +70,15 @@ def written(folder: Path, content: dict[str, Any]) -> Path:
     return path
 
 
-def test_logs_become_lines_of_a_vessel_file(config: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_logs_become_lines_of_a_vessel_file(
+    config: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert call(monkeypatch, "run", written(tmp_path, config), "--out", tmp_path / "run") == 0
     lines = yaml.safe_load((tmp_path / "run" / "actuators.yaml").read_text())
     lines["n_max"] = "2375 rpm"
-    found = validate(lines | {"kind": "differential_thrust", "spacing": 2.44}, DifferentialThrustConfig, "here")
+    found = validate(
+        lines | {"kind": "differential_thrust", "spacing": 2.44}, DifferentialThrustConfig, "here"
+    )
     vessel = load_vessel("wam_v_cal")
     assert isinstance(vessel, FossenConfig)
     n = torch.linspace(-2300, 2300, 50, dtype=torch.float64) / 60
@@ -65,7 +87,11 @@ def test_logs_become_lines_of_a_vessel_file(config: dict[str, Any], tmp_path: Pa
     assert found.n_rate * 60 == pytest.approx(1500, rel=0.01)
     numbers = json.loads((tmp_path / "run" / "actuators.json").read_text())
     assert numbers["throttle"]["n_max"]["value"] * 60 == pytest.approx(2380, rel=0.005)
-    assert numbers["forward"]["c2"]["low"] < vessel.actuators.forward[2] < numbers["forward"]["c2"]["high"]
+    assert (
+        numbers["forward"]["c2"]["low"]
+        < vessel.actuators.forward[2]
+        < numbers["forward"]["c2"]["high"]
+    )
     assert (tmp_path / "run" / "figures" / "actuators.png").stat().st_size > 5000
     inputs = json.loads((tmp_path / "run" / "provenance.json").read_text())["inputs"]
     assert len(inputs) == 3
@@ -104,7 +130,10 @@ def test_wrong_configs_and_logs(
 
 
 def test_one_direction_only_and_no_test(
-    config: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    config: dict[str, Any],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     table = pd.read_csv(tmp_path / "bollard.csv")
     table[table["rpm"] > 0].to_csv(tmp_path / "bollard.csv", index=False)

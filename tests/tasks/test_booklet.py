@@ -1,4 +1,6 @@
-"""The manoeuvring booklet of a fit, on simulated zigzags of the rudder boat whose own indices are known."""
+"""The manoeuvring booklet of a fit, on simulated zigzags of the rudder boat whose own indices are
+known.
+"""
 
 from __future__ import annotations
 
@@ -73,7 +75,11 @@ def test_pages_hold_values_within_intervals_and_limits(run: Path) -> None:
     for found in (*circle.values(), *zigzag.values()):
         low, high = found["interval"]
         assert low <= high
-    assert circle["advance"]["interval"][0] < circle["advance"]["value"] < circle["advance"]["interval"][1]
+    assert (
+        circle["advance"]["interval"][0]
+        < circle["advance"]["value"]
+        < circle["advance"]["interval"][1]
+    )
     assert circle["advance"]["lengths"] == pytest.approx(circle["advance"]["value"] / 6.0)
     assert circle["advance"]["ship"] == pytest.approx(4.0 * circle["advance"]["value"])
     assert circle["time_90"]["ship"] == pytest.approx(2.0 * circle["time_90"]["value"])
@@ -88,9 +94,12 @@ def test_measured_zigzags_are_repeated(run: Path) -> None:
     assert len(repeated) == 6
     for page in repeated:
         found = page["indices"]
-        # the form of the model is nearly the plant's: what is left is within the turning of one sample
-        # and of the gear's response (0.2 s each), which a rate alone leaves out
-        assert abs(found["first_overshoot"]["difference"]) < 0.4 * found["largest_yaw_rate"]["measured"], page["name"]
+        # the form of the model is nearly the plant's: what is left is within the turning of one
+        # sample and of the gear's response (0.2 s each), which a rate alone leaves out
+        assert (
+            abs(found["first_overshoot"]["difference"])
+            < 0.4 * found["largest_yaw_rate"]["measured"]
+        ), page["name"]
         assert found["first_overshoot"]["measured"] > 0.02
 
 
@@ -101,11 +110,18 @@ def test_the_report_shows_it(run: Path) -> None:
     assert len(list((run / "figures").glob("*booklet*.png"))) == 3
 
 
-def test_the_model_must_have_been_refitted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_model_must_have_been_refitted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert call(monkeypatch, "check", write(tmp_path, model="other")) == 2
     assert "booklet.model: no refitted baseline is named 'other'" in capsys.readouterr().err
 
 
-def test_a_manoeuvre_that_does_not_end_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_manoeuvre_that_does_not_end_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert call(monkeypatch, "run", write(tmp_path, duration="3 s"), "--out", tmp_path / "run") == 1
-    assert "circle: timed out after 2.8 s before a heading change of 360 deg; give more duration" in capsys.readouterr().err
+    assert (
+        "circle: timed out after 2.8 s before a heading change of 360 deg; give more duration"
+        in capsys.readouterr().err
+    )

@@ -20,7 +20,11 @@ STUDIES = Path(__file__).parents[2] / "configs" / "studies" / "halvorsen2019"
 SMALL: dict[str, Any] = {
     "task": "breeding",
     "name": "small",
-    "head": {"kind": "genetic", "final": None, "evolution": {"operators": ["+", "*", "abs"], "split": "sum", "generations": 5}},
+    "head": {
+        "kind": "genetic",
+        "final": None,
+        "evolution": {"operators": ["+", "*", "abs"], "split": "sum", "generations": 5},
+    },
     "rows": {"key": "head.evolution.population", "values": [10, 300]},
     "columns": {"key": "noise.factor", "values": [0.0, 0.5]},
     "repeats": 3,
@@ -39,15 +43,22 @@ def test_record_against_scipy() -> None:
 
     answer = solve_ivp(rate, (0, 9.0), [0, 0], t_eval=t[:90], rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(record["x"][:90], answer.y[0], atol=1e-7)
-    np.testing.assert_allclose(record["u_dot"], -1.3 * record["u"] + 0.1 * record["tau_x"] - 0.5 * record["x"], atol=1e-15)
+    np.testing.assert_allclose(
+        record["u_dot"], -1.3 * record["u"] + 0.1 * record["tau_x"] - 0.5 * record["x"], atol=1e-15
+    )
     assert config.truth() == pytest.approx({"tau_x": 0.1, "u": -1.3, "x": -0.5})
     assert set(record["tau_x"]) == {-1.0, 1.0}
 
 
-@pytest.mark.parametrize(("on", "noisy"), [("output", {"u_dot"}), ("inputs", {"x", "u", "tau_x"}), ("all", {"x", "u", "tau_x", "u_dot"})])
+@pytest.mark.parametrize(
+    ("on", "noisy"),
+    [("output", {"u_dot"}), ("inputs", {"x", "u", "tau_x"}), ("all", {"x", "u", "tau_x", "u_dot"})],
+)
 def test_noise_as_a_share_of_the_range(on: str, noisy: set[str]) -> None:
     record = RecordConfig().record(18.0)
-    made = NoiseConfig.model_validate({"on": on, "factor": 0.2}).added(record, np.random.default_rng(0))
+    made = NoiseConfig.model_validate({"on": on, "factor": 0.2}).added(
+        record, np.random.default_rng(0)
+    )
     for name, values in record.items():
         largest = np.abs(made[name] - values).max()
         assert (0.19 < largest / np.ptp(values) <= 0.2) if name in noisy else largest == 0
@@ -59,7 +70,11 @@ def test_a_grid_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert call(monkeypatch, "run", tmp_path / "c.yaml", "--out", tmp_path / "run") == 0
     study = json.loads((tmp_path / "run" / "study.json").read_text())
     cells = {(row["row"], row["column"]): row for row in study["rows"]}
-    assert set(cells) == {(10, 0.0), (10, 0.5), (300, 0.0)}, "what has no published number is left out"
+    assert set(cells) == {
+        (10, 0.0),
+        (10, 0.5),
+        (300, 0.0),
+    }, "what has no published number is left out"
     assert cells[300, 0.0]["found"] == 3
     assert cells[300, 0.0]["published_found"] == 3
     assert cells[300, 0.0]["error"] < 1e-20
@@ -73,13 +88,20 @@ def test_a_grid_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"rows": {"key": "head.evolution.populaton", "values": [1, 2]}}, "no key 'head.evolution.populaton'"),
+        (
+            {"rows": {"key": "head.evolution.populaton", "values": [1, 2]}},
+            "no key 'head.evolution.populaton'",
+        ),
         ({"rows": {"key": "head.evolution.crossover", "values": [0.1, 0.9]}}, "together at most 1"),
         ({"published": [[1, 2]]}, "expected 2 rows of 2 numbers"),
     ],
 )
 def test_impossible_grids(
-    change: dict[str, Any], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    change: dict[str, Any],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     (tmp_path / "c.yaml").write_text(yaml.safe_dump(SMALL | change))
     assert call(monkeypatch, "check", tmp_path / "c.yaml") == 2

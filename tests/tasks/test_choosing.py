@@ -21,11 +21,16 @@ from residnet.tasks.choosing import choose
 
 def model() -> HybridDynamics:
     signals = SignalsConfig(inputs=("n", "delta")).build()
-    return HybridDynamics(signals, RegressorsConfig(terms=("u",)).build(signals.names), ZeroHead(), 0.1)
+    return HybridDynamics(
+        signals, RegressorsConfig(terms=("u",)).build(signals.names), ZeroHead(), 0.1
+    )
 
 
 def solutions(*values: float) -> list[Solution]:
-    return [Solution({"value": value}, {"theta": torch.full((3, 1), value, dtype=torch.float64)}) for value in values]
+    return [
+        Solution({"value": value}, {"theta": torch.full((3, 1), value, dtype=torch.float64)})
+        for value in values
+    ]
 
 
 def test_the_best_free_run_is_kept() -> None:
@@ -37,7 +42,9 @@ def test_the_best_free_run_is_kept() -> None:
     best, notes = choose(own, own.baseline, solutions(5.0, 2.0, 1.0), bench)
     assert best.choice == {"value": 2.0}
     assert bench(own) == pytest.approx(0.2)
-    assert [(entry["value"], pytest.approx(entry["validation"])) for entry in notes["free_run_choice"]] == [(5.0, 2.8), (2.0, 0.2), (1.0, 1.2)]
+    assert [
+        (entry["value"], pytest.approx(entry["validation"])) for entry in notes["free_run_choice"]
+    ] == [(5.0, 2.8), (2.0, 0.2), (1.0, 1.2)]
 
 
 def test_a_single_solution_is_taken_without_a_free_run() -> None:
@@ -53,7 +60,9 @@ def test_a_single_solution_is_taken_without_a_free_run() -> None:
 
 
 def test_in_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Baseline and heads carry the solution whose validation free run is best, and fit.json says what was tried."""
+    """Baseline and heads carry the solution whose validation free run is best, and fit.json says
+    what was tried.
+    """
     config: dict[str, Any] = {
         **TINY,
         "baselines": {
@@ -61,7 +70,12 @@ def test_in_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
             "nomoto": {"kind": "nomoto_sideslip", "drive": "tau_x", "steer": "tau_n"},
         },
         "heads": {
-            "plsr": {"kind": "plsr", "choose": "free_run", "terms": ["u", "v", "r", "tau_n", "u|u|", "r|r|"], "features": ["u", "v", "r", "tau_n"]},
+            "plsr": {
+                "kind": "plsr",
+                "choose": "free_run",
+                "terms": ["u", "v", "r", "tau_n", "u|u|", "r|r|"],
+                "features": ["u", "v", "r", "tau_n"],
+            },
             "ridge": {"kind": "ridge", "choose": "free_run", "penalties": [1.0e-6, 1.0e-2]},
         },
         "ensembles": {},
@@ -71,7 +85,10 @@ def test_in_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "config.yaml"
     path.write_text(yaml.safe_dump(config))
     assert call(monkeypatch, "run", path, "--out", tmp_path / "run") == 0
-    notes = {name: json.loads((tmp_path / "run" / "models" / name / "fit.json").read_text()) for name in ("poly", "plsr", "ridge", "nomoto")}
+    notes = {
+        name: json.loads((tmp_path / "run" / "models" / name / "fit.json").read_text())
+        for name in ("poly", "plsr", "ridge", "nomoto")
+    }
     for name, key, count in (("poly", "ridge", 2), ("plsr", "order", 8), ("ridge", "penalty", 4)):
         tried = notes[name]["free_run_choice"]
         assert len(tried) == count
@@ -80,7 +97,9 @@ def test_in_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         assert notes[name]["validation"] == best["validation"]
     assert len(notes["plsr"]["cross_validated_share"]) == 6
     assert "free_run_choice" not in notes["nomoto"]
-    assert {"T", "K", "T_beta", "K_beta"} <= {entry["term"] for entry in notes["nomoto"]["coefficients"]}
+    assert {"T", "K", "T_beta", "K_beta"} <= {
+        entry["term"] for entry in notes["nomoto"]["coefficients"]
+    }
 
 
 def test_what_lies_around_the_best_is_tried_while_it_gains() -> None:
@@ -88,7 +107,9 @@ def test_what_lies_around_the_best_is_tried_while_it_gains() -> None:
 
     def at(value: float) -> Solution:
         theta = torch.full((3, 1), value, dtype=torch.float64)
-        return Solution({"value": value}, {"theta": theta}, around=lambda: [at(value - 1.0), at(value + 1.0)])
+        return Solution(
+            {"value": value}, {"theta": theta}, around=lambda: [at(value - 1.0), at(value + 1.0)]
+        )
 
     def bench(candidate: HybridDynamics) -> float:
         return abs(float(candidate.baseline.theta[0, 0]) - 4.2)  # type: ignore[index, operator]
@@ -101,12 +122,16 @@ def test_what_lies_around_the_best_is_tried_while_it_gains() -> None:
 
 
 def test_what_stands_alone_does_not_end_the_search() -> None:
-    """No residual at all may beat every shared setting, and yet lose to what lies around the best of them."""
+    """No residual at all may beat every shared setting, and yet lose to what lies around the best
+    of them.
+    """
     own = model()
 
     def at(value: float) -> Solution:
         theta = torch.full((3, 1), value, dtype=torch.float64)
-        return Solution({"value": value}, {"theta": theta}, around=lambda: [at(value - 1.0), at(value + 1.0)])
+        return Solution(
+            {"value": value}, {"theta": theta}, around=lambda: [at(value - 1.0), at(value + 1.0)]
+        )
 
     def bench(candidate: HybridDynamics) -> float:
         value = float(candidate.baseline.theta[0, 0])  # type: ignore[index, operator]
@@ -114,6 +139,8 @@ def test_what_stands_alone_does_not_end_the_search() -> None:
 
     nothing = Solution({"value": None}, {"theta": torch.zeros(3, 1, dtype=torch.float64)})
     best, notes = choose(own, own.baseline, [at(4.0), at(3.0), nothing], bench)
-    assert notes["free_run_choice"][2]["validation"] == 2.5 < notes["free_run_choice"][0]["validation"]
+    assert (
+        notes["free_run_choice"][2]["validation"] == 2.5 < notes["free_run_choice"][0]["validation"]
+    )
     assert best.choice == {"value": 7.0}
     assert float(own.baseline.theta[0, 0]) == 7.0  # type: ignore[index, operator]

@@ -1,4 +1,6 @@
-"""The task `course` from config to report and export: two way-points, flown by a hardly trained policy, a PD and the document's law."""
+"""The task `course` from config to report and export: two way-points, flown by a hardly trained
+policy, a PD and the document's law.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,17 @@ AUTOPILOT: dict[str, Any] = {
     "turning_time": "40 s",
     "test": {"dt": "0.1 s", "duration": "8 s", "plants": 1, "bias_time": "10 s"},
     "policies": {
-        "policy": {"hidden": [6], "training": {"epochs": 1, "steps": 1, "batch": 16, "dt": "0.1 s", "horizon": "4 s", "learning_rate": 1e-3}}
+        "policy": {
+            "hidden": [6],
+            "training": {
+                "epochs": 1,
+                "steps": 1,
+                "batch": 16,
+                "dt": "0.1 s",
+                "horizon": "4 s",
+                "learning_rate": 1e-3,
+            },
+        }
     },
     "peers": {"pd": {"kind": "pd"}, "bang_bang": {"kind": "bang_bang"}},
     "floor": "bang_bang",
@@ -54,7 +66,13 @@ COURSE: dict[str, Any] = {
     "dt": "0.2 s",
     "duration": "42 s",
 }
-FLIGHTS = {("enter", "course"), ("enter", "lookahead"), ("enter", "enclosure"), ("enter", "integral"), ("sides", "course")}
+FLIGHTS = {
+    ("enter", "course"),
+    ("enter", "lookahead"),
+    ("enter", "enclosure"),
+    ("enter", "integral"),
+    ("sides", "course"),
+}
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +109,11 @@ def test_a_spread_of_equal_vessels_is_the_nominal_flight(run: Path) -> None:
     each = pd.read_parquet(run / "spread.parquet")
     assert len(each) == 30
     for nominal, spread in zip(rows_of(run, "simulated"), rows_of(run, "spread"), strict=True):
-        own = each[(each["model"] == nominal["model"]) & (each["guidance"] == nominal["guidance"]) & (each["protocol"] == nominal["protocol"])]
+        own = each[
+            (each["model"] == nominal["model"])
+            & (each["guidance"] == nominal["guidance"])
+            & (each["protocol"] == nominal["protocol"])
+        ]
         assert own["course_time"].tolist() == pytest.approx([nominal["course_time"]] * 2, abs=0.21)
         assert spread["ratio"] == pytest.approx(nominal["ratio"], abs=6e-3)
         assert spread["ratio_worst"] == pytest.approx(nominal["ratio"], abs=6e-3)
@@ -100,13 +122,26 @@ def test_a_spread_of_equal_vessels_is_the_nominal_flight(run: Path) -> None:
 
 
 def test_the_tuned_pd_passes_as_asked(run: Path) -> None:
-    """Against the straight lines between the points, which no course through circles of 4 m can cut by more than 16 m."""
-    own = {(row["protocol"], row["guidance"]): row for row in rows_of(run, "simulated") if row["model"] == "pd"}
+    """Against the straight lines between the points, which no course through circles of 4 m can cut
+    by more than 16 m.
+    """
+    own = {
+        (row["protocol"], row["guidance"]): row
+        for row in rows_of(run, "simulated")
+        if row["model"] == "pd"
+    }
     straight = math.hypot(50.0, 30.0) + math.hypot(50.0, 10.0)
     assert own[("enter", "course")]["finished"]
-    assert [own[("enter", guidance)]["entered"] for guidance in ("course", "lookahead", "enclosure", "integral")] == [2] * 4
+    assert [
+        own[("enter", guidance)]["entered"]
+        for guidance in ("course", "lookahead", "enclosure", "integral")
+    ] == [2] * 4
     assert own[("sides", "course")]["right_side"] == own[("sides", "course")]["clear"] == 2
-    assert straight - 4 * 4 < own[("enter", "course")]["course_time"] * metrics(run)["speed"] < straight
+    assert (
+        straight - 4 * 4
+        < own[("enter", "course")]["course_time"] * metrics(run)["speed"]
+        < straight
+    )
 
 
 def test_an_impossible_radius_is_reported_with_the_smallest(run: Path) -> None:
@@ -120,9 +155,15 @@ def test_an_impossible_radius_is_reported_with_the_smallest(run: Path) -> None:
 def test_the_tracks_say_what_the_rows_say(run: Path) -> None:
     tracks = pd.read_parquet(run / "tracks.parquet")
     for row in rows_of(run, "simulated"):
-        own = tracks[(tracks["controller"] == row["model"]) & (tracks["protocol"] == row["protocol"]) & (tracks["guidance"] == row["guidance"])]
+        own = tracks[
+            (tracks["controller"] == row["model"])
+            & (tracks["protocol"] == row["protocol"])
+            & (tracks["guidance"] == row["guidance"])
+        ]
         assert own["t"].iloc[-1] == pytest.approx(row["course_time"], abs=0.21)
-        assert np.sqrt((own["cross_track"] ** 2).mean()) == pytest.approx(row["cross_track_rms"], rel=1e-6)
+        assert np.sqrt((own["cross_track"] ** 2).mean()) == pytest.approx(
+            row["cross_track_rms"], rel=1e-6
+        )
         away = np.hypot(own["north"] - 100.0, own["east"] - 20.0).min()
         assert away == pytest.approx(row["distances"][1], abs=1e-6)
 

@@ -28,7 +28,9 @@ CONFIG: dict[str, Any] = {
 }
 
 
-def test_currents_are_found_and_models_fitted_without_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_currents_are_found_and_models_fitted_without_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     errors = {}
     for name, change in (("with", {}), ("without", {"current": None})):
         path = tmp_path / f"{name}.yaml"
@@ -42,12 +44,19 @@ def test_currents_are_found_and_models_fitted_without_them(tmp_path: Path, monke
     data = validate(CONFIG["data"], SimulatedTrials, "here")
     manoeuvres = data.draw()
     truth = data.disturbance.currents(len(manoeuvres), data.seed)
-    names = [f"{m.kind}_{[other.kind for other in manoeuvres[: i + 1]].count(m.kind):02d}" for i, m in enumerate(manoeuvres)]
+    names = [
+        f"{m.kind}_{[other.kind for other in manoeuvres[: i + 1]].count(m.kind):02d}"
+        for i, m in enumerate(manoeuvres)
+    ]
     known = dict(zip(names, truth, strict=True))
     table = json.loads((tmp_path / "with" / "currents.json").read_text())
-    assert {row["log"] for row in table} == {name for name, split in zip(names, data.splits(manoeuvres), strict=True) if split != "test"}
+    assert {row["log"] for row in table} == {
+        name for name, split in zip(names, data.splits(manoeuvres), strict=True) if split != "test"
+    }
     for row in table:
-        np.testing.assert_allclose([row["current_north"], row["current_east"]], known[row["log"]], atol=0.06)
+        np.testing.assert_allclose(
+            [row["current_north"], row["current_east"]], known[row["log"]], atol=0.06
+        )
 
 
 @pytest.mark.parametrize(
@@ -61,5 +70,9 @@ def test_currents_are_found_and_models_fitted_without_them(tmp_path: Path, monke
 )
 def test_wrong_configs(current: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message) as caught:
-        validate(CONFIG | {"baselines": {"held": {"kind": "still"}}, "current": current}, FitConfig, "here")
+        validate(
+            CONFIG | {"baselines": {"held": {"kind": "still"}}, "current": current},
+            FitConfig,
+            "here",
+        )
     assert "\n" not in str(caught.value)

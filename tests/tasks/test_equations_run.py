@@ -1,4 +1,6 @@
-"""A run with equations: over a baseline, over none, and with late inputs; in its notes, its report, its figures and its exports."""
+"""A run with equations: over a baseline, over none, and with late inputs; in its notes, its report,
+its figures and its exports.
+"""
 
 from __future__ import annotations
 
@@ -24,11 +26,26 @@ FEATURES = ["u", "v", "r", "tau_x", "tau_n"]
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("equations")
     config: dict[str, Any] = copy.deepcopy(TINY)
-    config |= {"name": "equations", "training": {}, "ensembles": {}, "baselines": {"nothing": {"kind": "still"}}, "base_of": {"whole": "nothing"}}
+    config |= {
+        "name": "equations",
+        "training": {},
+        "ensembles": {},
+        "baselines": {"nothing": {"kind": "still"}},
+        "base_of": {"whole": "nothing"},
+    }
     config["heads"] = {
         "equation": {"kind": "symbolic", "features": FEATURES},
-        "whole": {"kind": "symbolic", "features": FEATURES, "estimator": {"kind": "weak", "window": "2 s"}, "choose": "free_run"},
-        "late": {"kind": "symbolic", "features": FEATURES, "delay": {"channels": ["tau_x", "tau_n"], "longest": 4}},
+        "whole": {
+            "kind": "symbolic",
+            "features": FEATURES,
+            "estimator": {"kind": "weak", "window": "2 s"},
+            "choose": "free_run",
+        },
+        "late": {
+            "kind": "symbolic",
+            "features": FEATURES,
+            "delay": {"channels": ["tau_x", "tau_n"], "longest": 4},
+        },
     }
     config["export"] = {"models": ["whole", "late"]}
     (folder / "config.yaml").write_text(yaml.safe_dump(config))
@@ -54,7 +71,12 @@ def test_notes_hold_the_equations_in_writing(run: Path) -> None:
         assert list(own["equations"]) == ["u_dot", "v_dot", "r_dot"]
         for name, equation in own["equations"].items():
             assert equation["text"].startswith(f"{name} = ")
-            assert equation["c"].count(f"double {name}(double u, double v, double r, double tau_x, double tau_n)") == 1
+            assert (
+                equation["c"].count(
+                    f"double {name}(double u, double v, double r, double tau_x, double tau_n)"
+                )
+                == 1
+            )
         assert own["parameters"] == len(own["coefficients"]) == sum(own["kept"])
     assert 0 <= notes(run, "late")["delay"]["steps"] <= 4
     assert len(notes(run, "late")["delay"]["profile"]) == 5
@@ -66,7 +88,9 @@ def test_terms_along_a_log_add_up_to_what_the_head_says(run: Path) -> None:
     rollouts = {path.stem for path in (run / "rollouts" / "test").glob("*.parquet")}
     assert set(table["log"]) <= rollouts
     for model in ("equation", "whole"):
-        coefficients = {(c["axis"], c["term"]): c["value"] for c in notes(run, model)["coefficients"]}
+        coefficients = {
+            (c["axis"], c["term"]): c["value"] for c in notes(run, model)["coefficients"]
+        }
         own = table[(table["model"] == model) & (table["term"] != "target")]
         assert set(zip(own["axis"], own["term"], strict=True)) == set(coefficients)
         _, module = load_model(run / "models" / model)
@@ -82,7 +106,9 @@ def test_terms_along_a_log_add_up_to_what_the_head_says(run: Path) -> None:
 
 def test_report_and_figures_show_the_equations(run: Path) -> None:
     titles = [figure.title for figure in read_figures(run)]
-    assert {f"Equation of {model}, term by term" for model in ("equation", "whole", "late")} <= set(titles)
+    assert {f"Equation of {model}, term by term" for model in ("equation", "whole", "late")} <= set(
+        titles
+    )
     text = (run / "report.html").read_text()
     assert "Equations of equation" in text
     assert "candidates that differ, condition number" in text
@@ -93,7 +119,9 @@ def test_report_and_figures_show_the_equations(run: Path) -> None:
 
 
 def test_the_late_equation_exports_with_its_memory(run: Path) -> None:
-    """The export itself compares the module with the model from a warmed-up memory; here: the memory is that of the delay."""
+    """The export itself compares the module with the model from a warmed-up memory; here: the
+    memory is that of the delay.
+    """
     extra = {"card.json": ""}
     module = torch.jit.load(str(run / "exports" / "late.pt"), _extra_files=extra)
     assert json.loads(extra["card.json"])["memory"] == 4 * 2
@@ -102,6 +130,8 @@ def test_the_late_equation_exports_with_its_memory(run: Path) -> None:
     past = torch.from_numpy(random.normal(size=(1, 9, 6)) * 0.1).float()
     drive = torch.from_numpy(random.uniform(5, 20, size=(1, 9, 2))).float()
     with torch.no_grad():
-        torch.testing.assert_close(module.warmup(past, drive), model.float().warmup(past, drive), rtol=1e-5, atol=1e-5)
+        torch.testing.assert_close(
+            module.warmup(past, drive), model.float().warmup(past, drive), rtol=1e-5, atol=1e-5
+        )
     assert spec.head is not None
     assert spec.head.kind == "symbolic"

@@ -24,19 +24,36 @@ def rows(run: Path) -> list[dict[str, Any]]:
 
 
 def test_folder_is_complete(tiny_run: Path) -> None:
-    for name in ("resolved.yaml", "provenance.json", "metrics.json", "report.html", "data_quality.json", "residuals.parquet", "exports/lstm.pt"):
+    for name in (
+        "resolved.yaml",
+        "provenance.json",
+        "metrics.json",
+        "report.html",
+        "data_quality.json",
+        "residuals.parquet",
+        "exports/lstm.pt",
+    ):
         assert (tiny_run / name).stat().st_size > 0, name
     models = {path.name for path in (tiny_run / "models").iterdir()}
     assert models == {"zero", "baseline", "ridge", "lstm", "mean"}
-    assert {path.suffix for path in (tiny_run / "models").rglob("*") if path.is_file()} == {".json", ".safetensors"}
+    assert {path.suffix for path in (tiny_run / "models").rglob("*") if path.is_file()} == {
+        ".json",
+        ".safetensors",
+    }
 
 
 def test_ensemble_averages_accelerations(tiny_run: Path) -> None:
     from residnet.dynamics.store import load_model
 
-    models = {name: load_model(tiny_run / "models" / name)[1].double() for name in ("ridge", "lstm", "mean")}
+    models = {
+        name: load_model(tiny_run / "models" / name)[1].double()
+        for name in ("ridge", "lstm", "mean")
+    }
     random = torch.Generator().manual_seed(0)
-    y, w = torch.rand(3, 7, 6, generator=random, dtype=torch.float64), 20 * torch.rand(3, 7, 2, generator=random, dtype=torch.float64)
+    y, w = (
+        torch.rand(3, 7, 6, generator=random, dtype=torch.float64),
+        20 * torch.rand(3, 7, 2, generator=random, dtype=torch.float64),
+    )
     rates = {}
     for name, model in models.items():
         p = model.signals.prepare(w[:, -1])
@@ -71,21 +88,36 @@ def test_truth_and_heads_beat_the_baseline(tiny_run: Path) -> None:
     assert sum(row["diverged"] for row in rows(tiny_run)) == 0
 
 
-def test_same_seed_same_metrics(tiny_config: Path, tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_same_seed_same_metrics(
+    tiny_config: Path, tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert call(monkeypatch, "run", tiny_config, "--out", tmp_path / "again") == 0
     assert rows(tmp_path / "again") == rows(tiny_run)
 
 
-def test_another_seed_other_head(tiny_config: Path, tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_seed_other_head(
+    tiny_config: Path, tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert call(monkeypatch, "run", tiny_config, "-s", "seed=1", "--out", tmp_path / "other") == 0
-    changed = {row["model"] for row, old in zip(rows(tmp_path / "other"), rows(tiny_run), strict=True) if row["rmse"] != old["rmse"]}
+    changed = {
+        row["model"]
+        for row, old in zip(rows(tmp_path / "other"), rows(tiny_run), strict=True)
+        if row["rmse"] != old["rmse"]
+    }
     assert changed == {"lstm", "mean"}
 
 
-def test_killed_and_resumed(tiny_config: Path, tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_killed_and_resumed(
+    tiny_config: Path, tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     out = tmp_path / "killed"
     command = [sys.executable, "-m", "residnet.cli", "run", str(tiny_config), "--out", str(out)]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env={**os.environ, "OMP_NUM_THREADS": "1"})
+    process = subprocess.Popen(
+        command,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )
     checkpoint = out / "checkpoints" / "lstm" / "last.ckpt"
     for _ in range(1200):
         if checkpoint.is_file() or process.poll() is not None:
@@ -101,7 +133,10 @@ def test_killed_and_resumed(tiny_config: Path, tiny_run: Path, tmp_path: Path, m
 
 
 def test_resume_needs_the_same_configuration(
-    tiny_config: Path, tiny_run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tiny_config: Path,
+    tiny_run: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert call(monkeypatch, "run", tiny_config, "-s", "seed=9", "--out", tiny_run, "--resume") == 2
     assert "another configuration" in capsys.readouterr().err
@@ -132,6 +167,11 @@ print(float(x[0, 3]))
 """
     file = tmp_path / "plain.py"
     file.write_text(script)
-    result = subprocess.run([sys.executable, str(file), str(tiny_run / "exports" / "lstm.pt")], capture_output=True, text=True, check=False)
+    result = subprocess.run(
+        [sys.executable, str(file), str(tiny_run / "exports" / "lstm.pt")],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert result.returncode == 0, result.stderr
     assert 0.05 < float(result.stdout.splitlines()[-1]) < 2.5

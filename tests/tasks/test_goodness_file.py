@@ -1,4 +1,6 @@
-"""goodness.json of a run: its residuals are those of the stored models, and every model has its rows."""
+"""goodness.json of a run: its residuals are those of the stored models, and every model has its
+rows.
+"""
 
 from __future__ import annotations
 
@@ -19,11 +21,22 @@ def test_rows_of_every_model_and_axis_agree_with_the_stored_residuals(tiny_run: 
         for axis in ("u_dot", "v_dot", "r_dot"):
             assert by["zero", axis]["parameters"] == 0
             assert by["zero", axis]["r2"] <= 1e-9 < by["baseline", axis]["r2"]
-            assert by["lstm", axis]["parameters"] > by["ridge", axis]["parameters"] > by["baseline", axis]["parameters"] > 0
+            assert (
+                by["lstm", axis]["parameters"]
+                > by["ridge", axis]["parameters"]
+                > by["baseline", axis]["parameters"]
+                > 0
+            )
             assert by["ridge", axis]["difference"]["to"] == "baseline"
             low, high = by["ridge", axis]["mae_ci95"]
             assert low < by["ridge", axis]["mae"] < high
     for axis, own in stored[stored.model == "ridge"].groupby("axis"):
-        row = next(row for row in content["splits"]["test"] if (row["model"], row["axis"]) == ("ridge", axis))
+        row = next(
+            row
+            for row in content["splits"]["test"]
+            if (row["model"], row["axis"]) == ("ridge", axis)
+        )
         # every so manieth sample is stored, with inputs held over the step
-        assert ((own.target - own.predicted) ** 2).mean() ** 0.5 == pytest.approx(row["rmse"], rel=0.1)
+        assert ((own.target - own.predicted) ** 2).mean() ** 0.5 == pytest.approx(
+            row["rmse"], rel=0.1
+        )

@@ -1,9 +1,10 @@
-"""Task `import`: recordings become canonical logs with their findings; what does not match stops before any work."""
+"""Task `import`: recordings become canonical logs with their findings; what does not match stops
+before any work.
+"""
 
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,14 @@ from residnet.data.readers import CanonicalConfig
 
 def config(folder: Path, **keys: object) -> Path:
     path = folder / "import.yaml"
-    content = {"task": "import", "name": "trials", "root": str(folder), "logs": ["rec_*"], "reader": {"kind": "auto"}, **keys}
+    content = {
+        "task": "import",
+        "name": "trials",
+        "root": str(folder),
+        "logs": ["rec_*"],
+        "reader": {"kind": "auto"},
+        **keys,
+    }
     path.write_text(yaml.safe_dump(content))
     return path
 
@@ -33,7 +41,10 @@ def recorded(folder: Path, name: str, seconds: float) -> Log:
 def test_recordings_of_different_length_become_canonical_logs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    logs = {name: recorded(tmp_path, name, seconds) for name, seconds in (("rec_a", 20.0), ("rec_b", 7.5))}
+    logs = {
+        name: recorded(tmp_path, name, seconds)
+        for name, seconds in (("rec_a", 20.0), ("rec_b", 7.5))
+    }
     assert call(monkeypatch, "run", config(tmp_path), "--out", tmp_path / "run") == 0
     printed = capsys.readouterr().out
     assert "rec_b: 76 samples" in printed
@@ -48,9 +59,15 @@ def test_recordings_of_different_length_become_canonical_logs(
     assert {Path(path).name for path in inputs} == {"odometry.csv", "cmd_port.csv", "cmd_stbd.csv"}
 
 
-def test_what_does_not_match_stops_before_any_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_does_not_match_stops_before_any_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     recorded(tmp_path, "rec_a", 2.0)
-    for keys, words in [({"logs": ["raw_*"]}, "'raw_*' matches nothing"), ({"logs": ["/rec_*"]}, "set `root` instead"), ({"logs": []}, "logs")]:
+    for keys, words in [
+        ({"logs": ["raw_*"]}, "'raw_*' matches nothing"),
+        ({"logs": ["/rec_*"]}, "set `root` instead"),
+        ({"logs": []}, "logs"),
+    ]:
         assert call(monkeypatch, "run", config(tmp_path, **keys), "--out", tmp_path / "run") == 2
         said = capsys.readouterr().err
         assert words in said
@@ -58,7 +75,9 @@ def test_what_does_not_match_stops_before_any_work(tmp_path: Path, monkeypatch: 
         assert not (tmp_path / "run").exists()
 
 
-def test_two_recordings_of_one_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_two_recordings_of_one_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     for day in ("monday", "tuesday"):
         (tmp_path / day).mkdir()
         recorded(tmp_path / day, "rec_a", 2.0)

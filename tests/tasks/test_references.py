@@ -4,7 +4,15 @@ from __future__ import annotations
 
 from residnet.tasks.references import references
 
-ROLES = {"zero": "zero", "baseline": "baseline", "physics": "baseline", "hull": "baseline", "mlp": "head", "ridge": "head", "mean": "ensemble"}
+ROLES = {
+    "zero": "zero",
+    "baseline": "baseline",
+    "physics": "baseline",
+    "hull": "baseline",
+    "mlp": "head",
+    "ridge": "head",
+    "mean": "ensemble",
+}
 NOTES = {
     "zero": {},
     "baseline": {"validation": 0.5},
@@ -30,6 +38,15 @@ def test_each_model_has_its_reference() -> None:
 
 
 def test_what_is_not_there_is_no_reference() -> None:
-    assert references({"mlp": "head", "mean": "ensemble"}, {"mlp": {"baseline": "hull"}, "mean": {}}) == {}
+    assert (
+        references({"mlp": "head", "mean": "ensemble"}, {"mlp": {"baseline": "hull"}, "mean": {}})
+        == {}
+    )
     # baselines without a recorded validation error: the first
-    assert references({"baseline": "baseline", "b": "baseline", "mean": "ensemble"}, {"baseline": {}, "b": {}, "mean": {}})["mean"] == "baseline"
+    assert (
+        references(
+            {"baseline": "baseline", "b": "baseline", "mean": "ensemble"},
+            {"baseline": {}, "b": {}, "mean": {}},
+        )["mean"]
+        == "baseline"
+    )

@@ -32,7 +32,9 @@ def test_a_new_folder_holds_the_configuration(tmp_path: Path) -> None:
     assert folder.resolved.read_text() == "a: 1\n"
     # an empty folder may be used too
     (tmp_path / "empty").mkdir()
-    assert RunFolder.create(tmp_path / "empty", "b: 2\n", resume=True).resolved.read_text() == "b: 2\n"
+    assert (
+        RunFolder.create(tmp_path / "empty", "b: 2\n", resume=True).resolved.read_text() == "b: 2\n"
+    )
 
 
 def test_a_folder_is_taken_up_only_by_its_own_configuration(tmp_path: Path) -> None:
@@ -79,10 +81,14 @@ def test_json_holds_no_nan_and_the_old_file_stays(tmp_path: Path, value: float) 
         folder.write_json(file, {"a": [value]})
     assert file.read_text() == before
     assert json.loads(before) == {"a": [1.5, None]}
-    assert [path.name for path in file.parent.iterdir()] == ["values.json"], "nothing partial is left"
+    assert [path.name for path in file.parent.iterdir()] == ["values.json"], (
+        "nothing partial is left"
+    )
 
 
-def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_write_that_fails_leaves_the_old_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder = RunFolder.create(tmp_path / "run", "a: 1\n", resume=False)
     folder.write(folder.report, "old")
 
@@ -97,7 +103,9 @@ def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path, monkeypatch: pyt
     assert folder.report.read_text() == "old"
 
 
-def test_provenance_names_every_input_by_its_hash(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_provenance_names_every_input_by_its_hash(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder = RunFolder.create(tmp_path / "run", "a: 1\n", resume=False)
     files = [tmp_path / name for name in ("a.csv", "b.csv", "empty.csv")]
     contents = [b"t,u\n0,1\n", bytes(range(256)) * 5000, b""]
@@ -105,23 +113,37 @@ def test_provenance_names_every_input_by_its_hash(tmp_path: Path, monkeypatch: p
         file.write_bytes(content)
     monkeypatch.setattr("sys.argv", ["residnet", "run", "x.yaml"])
     started = time.time() - 12.0
-    folder.write_provenance(config=tmp_path / "x.yaml", overrides=["seed=3"], seed=3, files=files, started=started)
+    folder.write_provenance(
+        config=tmp_path / "x.yaml", overrides=["seed=3"], seed=3, files=files, started=started
+    )
     content = json.loads((folder.path / "provenance.json").read_text())
-    assert content["inputs"] == {str(file): hashlib.sha256(data).hexdigest() for file, data in zip(files, contents, strict=True)}
-    assert (content["seed"], content["overrides"], content["config"]) == (3, ["seed=3"], str(tmp_path / "x.yaml"))
+    assert content["inputs"] == {
+        str(file): hashlib.sha256(data).hexdigest()
+        for file, data in zip(files, contents, strict=True)
+    }
+    assert (content["seed"], content["overrides"], content["config"]) == (
+        3,
+        ["seed=3"],
+        str(tmp_path / "x.yaml"),
+    )
     assert content["command"] == ["residnet", "run", "x.yaml"]
     assert (content["residnet"], content["python"]) == (__version__, platform.python_version())
     assert content["started"] == time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(started))
     assert 12.0 <= content["seconds"] < 60.0
     import torch
 
-    assert content["packages"]["torch"] == torch.__version__.split("+")[0] or content["packages"]["torch"] == torch.__version__
+    assert (
+        content["packages"]["torch"] == torch.__version__.split("+")[0]
+        or content["packages"]["torch"] == torch.__version__
+    )
     assert sha256(files[1]) == content["inputs"][str(files[1])]
 
 
 def test_revision_is_that_of_git(monkeypatch: pytest.MonkeyPatch) -> None:
     here = Path(folder_module.__file__).parent
-    told = subprocess.run(["git", "rev-parse", "HEAD"], cwd=here, capture_output=True, text=True, check=False)
+    told = subprocess.run(
+        ["git", "rev-parse", "HEAD"], cwd=here, capture_output=True, text=True, check=False
+    )
     expected = told.stdout.strip() if told.returncode == 0 else None
     found = git_revision()
     assert (found.removesuffix("+changes") if found else None) == expected

@@ -32,14 +32,19 @@ def trials(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run of the task."""
     folder = tmp_path_factory.mktemp("simulate")
     with pytest.MonkeyPatch.context() as patch:
-        assert call(patch, "run", written(folder, CONFIG, "trials.yaml"), "--out", folder / "run") == 0
+        assert (
+            call(patch, "run", written(folder, CONFIG, "trials.yaml"), "--out", folder / "run") == 0
+        )
     return folder / "run"
 
 
 def test_the_logs_are_those_of_the_programme(trials: Path) -> None:
     data = SimulatedTrials.model_validate(DATA)
     manoeuvres = data.draw()
-    expected = {log.name: (split, log) for log, split in zip(simulate(manoeuvres, data), data.splits(manoeuvres), strict=True)}
+    expected = {
+        log.name: (split, log)
+        for log, split in zip(simulate(manoeuvres, data), data.splits(manoeuvres), strict=True)
+    }
     files = sorted((trials / "logs").rglob("*.parquet"))
     assert {path.stem for path in files} == set(expected)
     assert {path.parent.name for path in files} == {"train", "validation", "test"}
@@ -61,25 +66,42 @@ def test_the_folder_says_what_made_it(trials: Path) -> None:
     assert provenance["config"].endswith("trials.yaml")
 
 
-def test_inspect_reads_them(trials: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_inspect_reads_them(
+    trials: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     logs = sorted((trials / "logs").rglob("three_two_one_one_*.parquet"))
     assert len(logs) == 3
     assert call(monkeypatch, "inspect", *logs) == 0
     text = capsys.readouterr().out
-    assert all(f"{path.stem}: note: 10 channels, 300 samples, manoeuvre three_two_one_one" in text for path in logs)
+    assert all(
+        f"{path.stem}: note: 10 channels, 300 samples, manoeuvre three_two_one_one" in text
+        for path in logs
+    )
     assert "coherence 1.000" in text
 
 
-def test_a_fit_of_the_files_equals_a_fit_of_the_simulation(trials: Path, tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_fit_of_the_files_equals_a_fit_of_the_simulation(
+    trials: Path, tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Baseline and ridge see the same numbers whether they are simulated or read back."""
     data = SimulatedTrials.model_validate(DATA)
     manoeuvres = data.draw()
-    split: dict[str, Any] = {"root": str(trials / "logs"), "train": [], "validation": [], "test": []}
+    split: dict[str, Any] = {
+        "root": str(trials / "logs"),
+        "train": [],
+        "validation": [],
+        "test": [],
+    }
     # in the order of the programme: the folds of a cross-validation follow the order of the logs
     for log, name in zip(simulate(manoeuvres, data), data.splits(manoeuvres), strict=True):
         split[name].append(f"{name}/{log.name}.parquet")
     measured = {"kind": "measured", "reader": {"kind": "canonical"}, "split": split}
-    light = {"heads": {"ridge": {"kind": "ridge"}}, "ensembles": {}, "training": {}, "export": {"models": []}}
+    light = {
+        "heads": {"ridge": {"kind": "ridge"}},
+        "ensembles": {},
+        "training": {},
+        "export": {"models": []},
+    }
     config = written(tmp_path, TINY | light | {"name": "files", "data": measured}, "files.yaml")
     assert call(monkeypatch, "run", config, "--out", tmp_path / "files") == 0
     found = []
@@ -88,7 +110,9 @@ def test_a_fit_of_the_files_equals_a_fit_of_the_simulation(trials: Path, tiny_ru
         values = {(entry["axis"], entry["term"]): entry["value"] for entry in fit["coefficients"]}
         for row in json.loads((run / "metrics.json").read_text())["rows"]:
             if row["model"] in ("zero", "baseline", "ridge"):
-                values[row["model"], row["split"], row["protocol"], row["manoeuvre"]] = row["nrmse"]["mean"]
+                values[row["model"], row["split"], row["protocol"], row["manoeuvre"]] = row[
+                    "nrmse"
+                ]["mean"]
         found.append(values)
     assert found[1] == pytest.approx(found[0], rel=1e-9)
     assert len(found[0]) > 40
@@ -96,7 +120,9 @@ def test_a_fit_of_the_files_equals_a_fit_of_the_simulation(trials: Path, tiny_ru
     assert len(inputs) == len(manoeuvres)
 
 
-def test_an_existing_folder_is_left_alone(trials: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_existing_folder_is_left_alone(
+    trials: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     before = sorted(path.stat().st_mtime_ns for path in trials.rglob("*.parquet"))
     assert call(monkeypatch, "run", trials.parent / "trials.yaml", "--out", trials) == 2
     assert "exists already" in capsys.readouterr().err
@@ -112,7 +138,13 @@ def test_an_existing_folder_is_left_alone(trials: Path, monkeypatch: pytest.Monk
         ("heads={}", "unknown key"),
     ],
 )
-def test_wrong_configs(trials: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], override: str, said: str) -> None:
+def test_wrong_configs(
+    trials: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    override: str,
+    said: str,
+) -> None:
     assert call(monkeypatch, "check", trials.parent / "trials.yaml", "-s", override) == 2
     text = capsys.readouterr().err.strip()
     assert said in text

@@ -19,7 +19,12 @@ def study(tiny_config: Path, tmp_path: Path) -> Path:
         "task": "study",
         "name": "tiny_study",
         "base": str(tiny_config),
-        "common": ["heads={ridge: {kind: ridge}}", "training={}", "ensembles={}", "export.models=[]"],
+        "common": [
+            "heads={ridge: {kind: ridge}}",
+            "training={}",
+            "ensembles={}",
+            "export.models=[]",
+        ],
         "variants": VARIANTS,
         "reference": "recipe",
         "model": "ridge",
@@ -29,17 +34,30 @@ def study(tiny_config: Path, tmp_path: Path) -> Path:
     return path
 
 
-def test_all_variants_and_seeds_in_one_table(study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_variants_and_seeds_in_one_table(
+    study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     out = tmp_path / "out"
     assert call(monkeypatch, "run", study, "--out", out) == 0
     content = json.loads((out / "study.json").read_text())
-    assert {(row["variant"], row["protocol"]) for row in content["rows"]} == {(v, p) for v in VARIANTS for p in ("manoeuvre", "T10")}
+    assert {(row["variant"], row["protocol"]) for row in content["rows"]} == {
+        (v, p) for v in VARIANTS for p in ("manoeuvre", "T10")
+    }
     for row in content["rows"]:
         found = []
         for seed in (0, 1):
-            metrics = json.loads((out / "variants" / f"{row['variant']}.{seed}" / "metrics.json").read_text())
-            wanted = {"model": "ridge", "split": "test", "protocol": row["protocol"], "manoeuvre": "all"}
-            (own,) = [r for r in metrics["rows"] if all(r[key] == value for key, value in wanted.items())]
+            metrics = json.loads(
+                (out / "variants" / f"{row['variant']}.{seed}" / "metrics.json").read_text()
+            )
+            wanted = {
+                "model": "ridge",
+                "split": "test",
+                "protocol": row["protocol"],
+                "manoeuvre": "all",
+            }
+            (own,) = [
+                r for r in metrics["rows"] if all(r[key] == value for key, value in wanted.items())
+            ]
             found.append(own["nrmse"]["mean"])
         assert row["nrmse_mean"] == pytest.approx(sum(found) / 2, rel=1e-6)
     assert "short" in (out / "study.md").read_text()
@@ -64,7 +82,11 @@ def test_all_variants_and_seeds_in_one_table(study: Path, tmp_path: Path, monkey
     ],
 )
 def test_a_wrong_study_is_one_line(
-    override: str, message: str, study: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    override: str,
+    message: str,
+    study: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert call(monkeypatch, "check", study, "-s", override) == 2
     text = capsys.readouterr().err

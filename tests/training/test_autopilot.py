@@ -28,7 +28,14 @@ def fresh() -> HeadingPolicy:
 
 def settling(policy: HeadingPolicy) -> float:
     policy.dt = 0.05
-    flights = fly(VESSEL, policy, torch.tensor([30 * DEG]), torch.tensor([[1.0, 1.0, 0.0]]), dt=0.05, duration=15.0)
+    flights = fly(
+        VESSEL,
+        policy,
+        torch.tensor([30 * DEG]),
+        torch.tensor([[1.0, 1.0, 0.0]]),
+        dt=0.05,
+        duration=15.0,
+    )
     return float(flights.absolute_error()[0] + 100.0 * flights.overshoot()[0])
 
 
@@ -38,7 +45,14 @@ def test_training_steers_better(tmp_path: Path) -> None:
         policy.law.copy_(torch.tensor([80.0, 0.4, 2.0, 1.0]).log())
     before = settling(policy)
     notes = train_autopilot(
-        "p", policy, VESSEL, SETTINGS.model_copy(update={"epochs": 4, "learning_rate": 0.05}), SpreadConfig(), settling, 0, tmp_path
+        "p",
+        policy,
+        VESSEL,
+        SETTINGS.model_copy(update={"epochs": 4, "learning_rate": 0.05}),
+        SpreadConfig(),
+        settling,
+        0,
+        tmp_path,
     )
     assert settling(policy) < before - 0.02
     assert settling(policy) == pytest.approx(notes["best_validation"])
@@ -57,7 +71,9 @@ def test_resumed_training_ends_with_the_same_weights(tmp_path: Path) -> None:
 
     scores: list[float] = []
     with pytest.raises(RuntimeError, match="killed"):
-        train_autopilot("p", parts, VESSEL, SETTINGS, SpreadConfig(), stopped, 0, tmp_path / "parts")
+        train_autopilot(
+            "p", parts, VESSEL, SETTINGS, SpreadConfig(), stopped, 0, tmp_path / "parts"
+        )
     again = fresh()
     train_autopilot("p", again, VESSEL, SETTINGS, SpreadConfig(), settling, 0, tmp_path / "parts")
     for mine, theirs in zip(whole.state_dict().values(), again.state_dict().values(), strict=True):
@@ -70,13 +86,35 @@ def test_a_pupil_comes_near_its_teacher(tmp_path: Path) -> None:
 
     def difference(policy: HeadingPolicy) -> float:
         policy.dt = 0.05
-        both = [fly(VESSEL, p, torch.tensor([30 * DEG]), torch.tensor([[1.0, 1.0, 0.0]]), dt=0.05, duration=12.0) for p in (policy, teacher)]
+        both = [
+            fly(
+                VESSEL,
+                p,
+                torch.tensor([30 * DEG]),
+                torch.tensor([[1.0, 1.0, 0.0]]),
+                dt=0.05,
+                duration=12.0,
+            )
+            for p in (policy, teacher)
+        ]
         return float((both[0].inputs - both[1].inputs).square().mean().sqrt()) / DEG
 
     before = difference(policy)
     # at the step that it is flown with: the policy's own estimator and brake know the step
-    settings = SETTINGS.model_copy(update={"epochs": 5, "steps": 10, "learning_rate": 0.03, "dt": 0.05})
-    train_autopilot("p", policy, VESSEL, settings, SpreadConfig(effect=(1.0, 1.0), time=(1.0, 1.0), bias=0.0), difference, 0, tmp_path, teacher)
+    settings = SETTINGS.model_copy(
+        update={"epochs": 5, "steps": 10, "learning_rate": 0.03, "dt": 0.05}
+    )
+    train_autopilot(
+        "p",
+        policy,
+        VESSEL,
+        settings,
+        SpreadConfig(effect=(1.0, 1.0), time=(1.0, 1.0), bias=0.0),
+        difference,
+        0,
+        tmp_path,
+        teacher,
+    )
     assert difference(policy) < 0.5 * before
 
 

@@ -1,4 +1,6 @@
-"""Unknown currents of logs: what a drifting frame does to a log, and how well currents and coefficients come back."""
+"""Unknown currents of logs: what a drifting frame does to a log, and how well currents and
+coefficients come back.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,13 @@ from residnet.training import current as module
 from residnet.training.current import CurrentConfig, estimate_currents, through_water
 
 SIGNALS = SignalsConfig(inputs=("n_port", "n_stbd"), forces="wam_v_cal")
-PREPARE = PrepareConfig.model_validate({"grid": {"step": 0.1}, "derivative": {"kind": "savitzky_golay", "window": 0.9, "order": 3}, "hold": "mean"})
+PREPARE = PrepareConfig.model_validate(
+    {
+        "grid": {"step": 0.1},
+        "derivative": {"kind": "savitzky_golay", "window": 0.9, "order": 3},
+        "hold": "mean",
+    }
+)
 TRIALS = {
     "kind": "simulated",
     "vessel": "wam_v_cal",
@@ -27,7 +35,13 @@ TRIALS = {
     "substeps": 2,
     "trials": [
         {"kind": "constant", "drive": [0.3, 0.8], "steer": [-0.5, -0.2, 0.2, 0.5]},
-        {"kind": "zigzag", "count": 8, "heading": ["20 deg", "40 deg"], "steer": [0.3, 0.9], "drive": [0.2, 0.9]},
+        {
+            "kind": "zigzag",
+            "count": 8,
+            "heading": ["20 deg", "40 deg"],
+            "steer": [0.3, 0.9],
+            "drive": [0.2, 0.9],
+        },
         {"kind": "acceleration_deceleration", "count": 3},
         {"kind": "three_two_one_one", "count": 3},
     ],
@@ -40,7 +54,9 @@ def sailed(**change: object) -> tuple[list[Prepared], np.ndarray]:
     """Logs of the simulated catamaran and the current of each."""
     config = validate({**TRIALS, **change}, SimulatedTrials, "here")
     logs = simulate(config.draw(), config)
-    return [prepare(log, "train", SIGNALS.columns, PREPARE) for log in logs], config.disturbance.currents(len(logs), config.seed)
+    return [
+        prepare(log, "train", SIGNALS.columns, PREPARE) for log in logs
+    ], config.disturbance.currents(len(logs), config.seed)
 
 
 CURRENT = {"disturbance": {"current_each": [0.1, 0.5]}}
@@ -48,7 +64,9 @@ EXACT = {"noise": {"u": 0, "v": 0, "r": 0}}
 
 
 def test_a_drifting_frame_is_calm_water() -> None:
-    """The hull's own accelerations, which know nothing of currents, fit the moved log as well as a log in calm water."""
+    """The hull's own accelerations, which know nothing of currents, fit the moved log as well as a
+    log in calm water.
+    """
     fossen = RegressorsConfig(sets=("fossen",))
     signals = SIGNALS.build()
     calm, _ = sailed(**EXACT)
@@ -61,13 +79,17 @@ def test_a_drifting_frame_is_calm_water() -> None:
         with torch.no_grad():
             return np.asarray((known.target - model(known.z)).square().mean(0).sqrt())
 
-    moved = [through_water(log, current, signals) for log, current in zip(logs, currents, strict=True)]
+    moved = [
+        through_water(log, current, signals) for log, current in zip(logs, currents, strict=True)
+    ]
     assert (left(moved) < 1.5 * left(calm) + 2e-3).all()
     assert (left(logs)[:2] > 5 * left(moved)[:2]).all()
     for log in moved:
         # positions of the frame are the integral of its own velocities
         north = log.y[:, 3] * np.cos(log.y[:, 2]) - log.y[:, 4] * np.sin(log.y[:, 2])
-        np.testing.assert_allclose(log.y[-1, 0] - log.y[0, 0], np.trapezoid(north, dx=0.1), atol=0.02)
+        np.testing.assert_allclose(
+            log.y[-1, 0] - log.y[0, 0], np.trapezoid(north, dx=0.1), atol=0.02
+        )
 
 
 def test_wind_is_that_of_the_frame() -> None:
@@ -76,7 +98,10 @@ def test_wind_is_that_of_the_frame() -> None:
     windy = np.concatenate((log.w, np.tile([5.0, 0.7], (len(log), 1))), axis=1)
     log = dataclasses.replace(log, w=windy, recorded=windy)
     moved = through_water(log, np.array([0.8, -0.5]), signals)
-    before, after = (signals(torch.from_numpy(p.smooth), signals.prepare(torch.from_numpy(p.recorded))) for p in (log, moved))
+    before, after = (
+        signals(torch.from_numpy(p.smooth), signals.prepare(torch.from_numpy(p.recorded)))
+        for p in (log, moved)
+    )
     # the air that the vessel feels is the same, whatever frame it is told in
     torch.testing.assert_close(after[:, 4:], before[:, 4:])
     assert float((after[:, :2] - before[:, :2]).abs().max()) > 0.5
@@ -84,7 +109,9 @@ def test_wind_is_that_of_the_frame() -> None:
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_currents_and_coefficients_come_back(seed: int) -> None:
-    """Noise of 3 cm/s and 0.2 deg/s: currents to a centimetre per second, as their standard errors say; coefficients as in calm water."""
+    """Noise of 3 cm/s and 0.2 deg/s: currents to a centimetre per second, as their standard errors
+    say; coefficients as in calm water.
+    """
     logs, truth = sailed(**CURRENT, seed=seed)
     signals = SIGNALS.build()
     fossen = RegressorsConfig(sets=("fossen",))
@@ -104,16 +131,22 @@ def test_currents_and_coefficients_come_back(seed: int) -> None:
 
     calm, _ = sailed(seed=seed)
     own = hull(calm)
-    moved = hull([through_water(log, current, signals) for log, current in zip(logs, found, strict=True)])
+    moved = hull(
+        [through_water(log, current, signals) for log, current in zip(logs, found, strict=True)]
+    )
     naive = hull(logs)
     assert float((moved - own).square().mean()) < 0.02 * float((naive - own).square().mean())
 
 
 def test_a_start_in_a_wrong_valley_is_left() -> None:
-    """The cost has other minima, which the search over a grid leaves: from a current half a metre per second off the same ones come out."""
+    """The cost has other minima, which the search over a grid leaves: from a current half a metre
+    per second off the same ones come out.
+    """
     logs, truth = sailed(**CURRENT)
     signals = SIGNALS.build()
-    problem = module._Problem(RegressorsConfig(sets=("fossen",)).build(signals.names), signals, logs, 4.0)
+    problem = module._Problem(
+        RegressorsConfig(sets=("fossen",)).build(signals.names), signals, logs, 4.0
+    )
     right = torch.from_numpy(truth)
     _, state = problem.solve(right)
     wrong = right.clone()
@@ -125,16 +158,25 @@ def test_a_start_in_a_wrong_valley_is_left() -> None:
 def test_calm_water_has_no_current() -> None:
     logs, _ = sailed()
     signals = SIGNALS.build()
-    found, table = estimate_currents(RegressorsConfig(sets=("fossen",)).build(signals.names), signals, logs, CurrentConfig())
+    found, table = estimate_currents(
+        RegressorsConfig(sets=("fossen",)).build(signals.names), signals, logs, CurrentConfig()
+    )
     assert np.abs(found).max() < 0.03
     assert [row["log"] for row in table] == [log.log.name for log in logs]
-    np.testing.assert_array_equal(found, [[row["current_north"], row["current_east"]] for row in table])
+    np.testing.assert_array_equal(
+        found, [[row["current_north"], row["current_east"]] for row in table]
+    )
 
 
 def test_a_narrow_prior_holds_currents_at_zero() -> None:
     logs, _ = sailed(**CURRENT)
     signals = SIGNALS.build()
-    found, _ = estimate_currents(RegressorsConfig(sets=("linear",)).build(signals.names), signals, logs, CurrentConfig(spread=1e-6))
+    found, _ = estimate_currents(
+        RegressorsConfig(sets=("linear",)).build(signals.names),
+        signals,
+        logs,
+        CurrentConfig(spread=1e-6),
+    )
     assert np.abs(found).max() < 1e-4
 
 
@@ -142,5 +184,12 @@ def test_a_log_without_samples_is_named() -> None:
     logs, _ = sailed()
     signals = SIGNALS.build()
     empty = dataclasses.replace(logs[0], good=np.zeros(len(logs[0]), dtype=bool))
-    with pytest.raises(FitError, match="log constant_01: has no sample to estimate its current from"):
-        estimate_currents(RegressorsConfig(sets=("linear",)).build(signals.names), signals, [empty, *logs[1:]], CurrentConfig())
+    with pytest.raises(
+        FitError, match="log constant_01: has no sample to estimate its current from"
+    ):
+        estimate_currents(
+            RegressorsConfig(sets=("linear",)).build(signals.names),
+            signals,
+            [empty, *logs[1:]],
+            CurrentConfig(),
+        )

@@ -16,7 +16,10 @@ DT = 0.1
 
 def commands(n: int = 1200) -> torch.Tensor:
     t = np.arange(n) * DT
-    columns = [np.sin(0.31 * t + a) + 0.5 * np.sin(1.3 * t * (1 + 0.1 * a)) - np.sin(a) for a in (0.0, 1.0, 2.0)]
+    columns = [
+        np.sin(0.31 * t + a) + 0.5 * np.sin(1.3 * t * (1 + 0.1 * a)) - np.sin(a)
+        for a in (0.0, 1.0, 2.0)
+    ]
     return torch.from_numpy(np.stack(columns, axis=1) * [100.0, 50.0, 200.0])
 
 
@@ -27,15 +30,24 @@ def test_followed_is_the_differential_equation(delay: float) -> None:
     late = np.stack([np.interp(t - delay, t, column, left=0.0) for column in u.T], axis=1)
 
     def rate(time: float, y: np.ndarray) -> np.ndarray:
-        return np.array([y[1], 9.0 * (np.interp(time, t, late[:, 1]) - y[0]) - 2 * 0.6 * 3.0 * y[1]])
+        return np.array(
+            [y[1], 9.0 * (np.interp(time, t, late[:, 1]) - y[0]) - 2 * 0.6 * 3.0 * y[1]]
+        )
 
-    wanted = solve_ivp(rate, (0, t[-1]), [0.0, 0.0], t_eval=t, rtol=1e-9, atol=1e-9, max_step=0.02).y[0]
-    mine = followed(torch.from_numpy(u), Lag(frequency=3.0, damping=0.6, delay=delay), DT)[:, 1].numpy()
-    # a delayed polygon has its corners between samples: exact only where the delay is a whole number of them
+    wanted = solve_ivp(
+        rate, (0, t[-1]), [0.0, 0.0], t_eval=t, rtol=1e-9, atol=1e-9, max_step=0.02
+    ).y[0]
+    mine = followed(torch.from_numpy(u), Lag(frequency=3.0, damping=0.6, delay=delay), DT)[
+        :, 1
+    ].numpy()
+    # a delayed polygon has its corners between samples: exact only where the delay is a whole
+    # number of them
     np.testing.assert_allclose(mine, wanted, atol=1e-5 if delay == 0 else 0.5)
 
 
-@pytest.mark.parametrize("true", [Lag(frequency=2.0, damping=0.8), Lag(frequency=4.0, damping=0.5, delay=0.3)])
+@pytest.mark.parametrize(
+    "true", [Lag(frequency=2.0, damping=0.8), Lag(frequency=4.0, damping=0.5, delay=0.3)]
+)
 def test_lag_and_regression_together(true: Lag) -> None:
     command = commands()
     acting = followed(command, true, DT)
@@ -51,4 +63,9 @@ def test_lag_and_regression_together(true: Lag) -> None:
 
 def test_a_constant_command_shows_no_lag() -> None:
     with pytest.raises(FitError, match="constant"):
-        fit_lag(torch.ones(50, 3, dtype=torch.float64), torch.zeros(50, 3), torch.rand(50, 2, dtype=torch.float64), DT)
+        fit_lag(
+            torch.ones(50, 3, dtype=torch.float64),
+            torch.zeros(50, 3),
+            torch.rand(50, 2, dtype=torch.float64),
+            DT,
+        )

@@ -30,7 +30,9 @@ SCALES = torch.tensor([0.5, 0.2, 0.3], dtype=torch.float64)
 
 def with_mlp() -> HybridDynamics:
     torch.manual_seed(0)
-    return model_of(LINEAR, THETA, MlpConfig(hidden=(5,)).build(("u", "v", "r", "tau_x", "tau_n"))).double()
+    return model_of(
+        LINEAR, THETA, MlpConfig(hidden=(5,)).build(("u", "v", "r", "tau_x", "tau_n"))
+    ).double()
 
 
 def by_euler() -> np.ndarray:
@@ -60,18 +62,25 @@ def test_one_step_loss_is_the_mean_square_over_what_counts() -> None:
                 error = NU_DOT[b, k].numpy() - A @ z[:3] - B @ z[3:] - C - rho
                 total, count = total + float(np.sum((error / SCALES.numpy()) ** 2)), count + 3
     assert 0 < count < 3 * BATCH * STEPS
-    assert one_step_loss(model, Y, W, NU_DOT, COUNTED, SCALES).item() == pytest.approx(total / count, rel=1e-12)
+    assert one_step_loss(model, Y, W, NU_DOT, COUNTED, SCALES).item() == pytest.approx(
+        total / count, rel=1e-12
+    )
 
 
 def test_what_does_not_count_does_not_matter() -> None:
     model, bad = with_mlp(), ~COUNTED
     wild = NU_DOT.clone()
     wild[bad] = 1e6
-    assert one_step_loss(model, Y, W, wild, COUNTED, SCALES).item() == one_step_loss(model, Y, W, NU_DOT, COUNTED, SCALES).item()
+    assert (
+        one_step_loss(model, Y, W, wild, COUNTED, SCALES).item()
+        == one_step_loss(model, Y, W, NU_DOT, COUNTED, SCALES).item()
+    )
     y = Y.clone()
     y[bad] = 1e6
     for robust in (0.0, 0.1):
-        masked, same = (rollout_loss(euler(), X0, W, S, values, COUNTED, SCALES, robust) for values in (y, Y))
+        masked, same = (
+            rollout_loss(euler(), X0, W, S, values, COUNTED, SCALES, robust) for values in (y, Y)
+        )
         assert masked.item() == same.item()
 
 
@@ -80,23 +89,37 @@ def test_rollout_loss_is_the_mean_square_of_small_errors() -> None:
     error = (0.3 * Y[:, :, 3:] / SCALES).numpy()
     assert np.abs(error).max() < 5
     expected = np.mean(error[COUNTED.numpy()] ** 2)
-    assert rollout_loss(euler(), X0, W, S, y, COUNTED, SCALES, 0.0).item() == pytest.approx(expected, rel=1e-12)
+    assert rollout_loss(euler(), X0, W, S, y, COUNTED, SCALES, 0.0).item() == pytest.approx(
+        expected, rel=1e-12
+    )
 
 
 def test_a_rollout_that_runs_away_counts_by_its_error() -> None:
     """Beyond 5 scales the square goes on as its tangent: 10 |e| - 25."""
     error = np.array([2.0, 5.0, 5.5, 400.0, -80.0])
-    y = torch.cat((Y[:, :, :3], torch.from_numpy(by_euler()) - torch.from_numpy(error)[:, None, None] * SCALES), dim=-1)
+    y = torch.cat(
+        (
+            Y[:, :, :3],
+            torch.from_numpy(by_euler()) - torch.from_numpy(error)[:, None, None] * SCALES,
+        ),
+        dim=-1,
+    )
     expected = np.mean([4.0, 25.0, 30.0, 3975.0, 775.0])
     everything = torch.ones_like(COUNTED)
-    assert rollout_loss(euler(), X0, W, S, y, everything, SCALES, 0.0).item() == pytest.approx(expected, rel=1e-9)
+    assert rollout_loss(euler(), X0, W, S, y, everything, SCALES, 0.0).item() == pytest.approx(
+        expected, rel=1e-9
+    )
 
 
 @pytest.mark.parametrize("robust", [0.05, 2.0])
 def test_robust_loss_is_the_mean_of_window_errors(robust: float) -> None:
     error = ((torch.from_numpy(by_euler()) - Y[:, :, 3:]) / SCALES).numpy()
-    expected = np.mean([np.sqrt(np.mean(error[b][COUNTED[b].numpy()] ** 2) + robust**2) for b in range(BATCH)])
-    assert rollout_loss(euler(), X0, W, S, Y, COUNTED, SCALES, robust).item() == pytest.approx(expected, rel=1e-12)
+    expected = np.mean(
+        [np.sqrt(np.mean(error[b][COUNTED[b].numpy()] ** 2) + robust**2) for b in range(BATCH)]
+    )
+    assert rollout_loss(euler(), X0, W, S, Y, COUNTED, SCALES, robust).item() == pytest.approx(
+        expected, rel=1e-12
+    )
 
 
 @pytest.mark.parametrize("robust", [0.0, 0.1])
@@ -110,7 +133,9 @@ def test_nothing_to_count_gives_no_gradient(robust: float) -> None:
     for loss in losses:
         model.zero_grad()
         loss.backward()
-        assert all(float(p.grad.abs().max()) == 0 for p in model.head.parameters() if p.grad is not None)
+        assert all(
+            float(p.grad.abs().max()) == 0 for p in model.head.parameters() if p.grad is not None
+        )
         assert loss.item() == pytest.approx(robust if loss is losses[1] else 0.0)
 
 

@@ -1,4 +1,6 @@
-"""The trainer on a small vessel: it learns, stops, keeps what validated best, and averages weights as it says."""
+"""The trainer on a small vessel: it learns, stops, keeps what validated best, and averages weights
+as it says.
+"""
 
 from __future__ import annotations
 
@@ -35,10 +37,14 @@ def logs() -> list[Prepared]:
     return trials()
 
 
-def prepared(logs: Sequence[Prepared], head: Any = None) -> tuple[HybridDynamics, Samples, WindowStore]:
+def prepared(
+    logs: Sequence[Prepared], head: Any = None
+) -> tuple[HybridDynamics, Samples, WindowStore]:
     """A linear baseline of the quadratic vessel with a fresh head on it."""
     torch.manual_seed(1)
-    model = model_of(LINEAR, head=(head or MlpConfig(hidden=(12,))).build(("u", "v", "r", "tau_x", "tau_n")))
+    model = model_of(
+        LINEAR, head=(head or MlpConfig(hidden=(12,))).build(("u", "v", "r", "tau_x", "tau_n"))
+    )
     known = samples(logs, model.signals)
     RegressorsConfig(terms=LINEAR).fit(model.baseline, known)
     with torch.no_grad():
@@ -65,7 +71,10 @@ class Scripted:
 
 
 def trained(
-    logs: Sequence[Prepared], folder: Path, validate: Callable[[HybridDynamics], float], **config: Any
+    logs: Sequence[Prepared],
+    folder: Path,
+    validate: Callable[[HybridDynamics], float],
+    **config: Any,
 ) -> tuple[HybridDynamics, dict[str, Any]]:
     model, residual, store = prepared(logs)
     settings = TrainingConfig.model_validate({"steps": 3, "one_step": ONE_STEP, **config})
@@ -94,14 +103,20 @@ def test_training_lowers_the_free_run_error(tmp_path: Path) -> None:
 
     stages = {
         "one_step": {"epochs": 6, "window": 1.0, "batch": 32, "learning_rate": 2e-2},
-        "multi_step": [{"horizon": 2.0, "epochs": 6, "batch": 16, "learning_rate": 2e-2, "final": 0.1}],
+        "multi_step": [
+            {"horizon": 2.0, "epochs": 6, "batch": 16, "learning_rate": 2e-2, "final": 0.1}
+        ],
     }
     model, notes = trained(logs, tmp_path, validate, steps=20, **stages)
     curve = notes["curve"]
     assert [entry["stage"] for entry in curve] == [0.0] * 6 + [1.0] * 6
     assert curve[5]["loss"] < 0.95 * curve[0]["loss"]
     assert curve[11]["loss"] < curve[6]["loss"]
-    assert notes["best_validation"] == min(entry["validation"] for entry in curve) == pytest.approx(validate(model), rel=1e-5)
+    assert (
+        notes["best_validation"]
+        == min(entry["validation"] for entry in curve)
+        == pytest.approx(validate(model), rel=1e-5)
+    )
     assert notes["parameters"] == 12 * (5 + 1) + 3 * (12 + 1)
     assert free_run_error(model) < 0.7 * baseline
     assert not any(parameter.requires_grad for parameter in model.parameters())
@@ -127,16 +142,27 @@ def test_the_weights_that_validated_best_are_kept(logs: list[Prepared], tmp_path
         ([2, 5], [5.0, 4.0, 3.0, 2.0, 2.0, 2.0], 6),
     ],
 )
-def test_stops_by_patience_in_the_last_stage(logs: list[Prepared], tmp_path: Path, stages: list[int], scores: list[float], epochs: int) -> None:
+def test_stops_by_patience_in_the_last_stage(
+    logs: list[Prepared], tmp_path: Path, stages: list[int], scores: list[float], epochs: int
+) -> None:
     later = [{**HALF_SECOND, "epochs": length} for length in stages[1:]]
     validate = Scripted(scores)
-    _, notes = trained(logs, tmp_path, validate, patience=2, one_step={**ONE_STEP, "epochs": stages[0]}, multi_step=later)
+    _, notes = trained(
+        logs,
+        tmp_path,
+        validate,
+        patience=2,
+        one_step={**ONE_STEP, "epochs": stages[0]},
+        multi_step=later,
+    )
     assert notes["epochs"] == len(validate.seen) == epochs
 
 
 def test_validates_so_often_and_after_the_last_epoch(logs: list[Prepared], tmp_path: Path) -> None:
     validate = Scripted([1.0])
-    _, notes = trained(logs, tmp_path, validate, one_step={**ONE_STEP, "epochs": 5}, validate_every=2)
+    _, notes = trained(
+        logs, tmp_path, validate, one_step={**ONE_STEP, "epochs": 5}, validate_every=2
+    )
     assert ["validation" in entry for entry in notes["curve"]] == [False, True, False, True, True]
 
 
@@ -154,11 +180,17 @@ def test_averaged_weights_are_validated_and_kept(logs: list[Prepared], tmp_path:
     assert same(state_of(model), validate.seen[1])
     # what was stepped is not what was kept
     checkpoint = torch.load(tmp_path / "checkpoints" / "mlp" / "last.ckpt", weights_only=True)
-    raw = {name.removeprefix("model."): value for name, value in checkpoint["state_dict"].items() if name.startswith("model.")}
+    raw = {
+        name.removeprefix("model."): value
+        for name, value in checkpoint["state_dict"].items()
+        if name.startswith("model.")
+    }
     assert not same({name: raw[name] for name in state_of(model)}, state_of(model))
 
 
-def test_the_average_is_the_recursion_written_out(logs: list[Prepared], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_average_is_the_recursion_written_out(
+    logs: list[Prepared], monkeypatch: pytest.MonkeyPatch
+) -> None:
     module = untrained(logs, average=0.6)
     assert module.average is not None
     weight = module.model.head.net[0].weight  # type: ignore[union-attr]
@@ -170,11 +202,15 @@ def test_the_average_is_the_recursion_written_out(logs: list[Prepared], monkeypa
         module.on_train_batch_end(None, None, 0)
         keep = min(0.6, (1 + step) / (10 + step))
         expected = keep * expected + (1 - keep) * weight.detach().double()
-    torch.testing.assert_close(module.average.head.net[0].weight.double(), expected, rtol=1e-5, atol=1e-6)  # type: ignore[union-attr]
+    torch.testing.assert_close(
+        module.average.head.net[0].weight.double(), expected, rtol=1e-5, atol=1e-6
+    )  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize(("moves", "refit"), [(False, False), (True, True)])
-def test_the_baseline_moves_only_where_it_may(logs: list[Prepared], tmp_path: Path, moves: bool, refit: bool) -> None:
+def test_the_baseline_moves_only_where_it_may(
+    logs: list[Prepared], tmp_path: Path, moves: bool, refit: bool
+) -> None:
     validate = Scripted([4.0, 3.0, 2.0, 1.0])
     trained(logs, tmp_path, validate, multi_step=[HALF_SECOND], refit_baseline=refit)
     theta = [seen["baseline.theta"] for seen in validate.seen]
@@ -182,11 +218,20 @@ def test_the_baseline_moves_only_where_it_may(logs: list[Prepared], tmp_path: Pa
     assert torch.equal(theta[1], theta[3]) == (not moves)
 
 
-def test_learning_rates_fall_along_a_cosine_in_each_stage(logs: list[Prepared], monkeypatch: pytest.MonkeyPatch) -> None:
-    stages = [{"horizon": 0.5, "epochs": 5, "learning_rate": 0.1, "final": 0.1}, {"horizon": 0.5, "epochs": 1, "learning_rate": 0.05, "final": 0.5}]
-    module = untrained(logs, multi_step=stages, one_step={**ONE_STEP, "epochs": 3, "learning_rate": 0.2})
+def test_learning_rates_fall_along_a_cosine_in_each_stage(
+    logs: list[Prepared], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stages = [
+        {"horizon": 0.5, "epochs": 5, "learning_rate": 0.1, "final": 0.1},
+        {"horizon": 0.5, "epochs": 1, "learning_rate": 0.05, "final": 0.5},
+    ]
+    module = untrained(
+        logs, multi_step=stages, one_step={**ONE_STEP, "epochs": 3, "learning_rate": 0.2}
+    )
     optimizer = module.configure_optimizers()
-    monkeypatch.setattr(HeadTraining, "trainer", property(lambda self: SimpleNamespace(optimizers=[optimizer])))
+    monkeypatch.setattr(
+        HeadTraining, "trainer", property(lambda self: SimpleNamespace(optimizers=[optimizer]))
+    )
     rates = []
     for epoch in range(9):
         module.history = [{}] * epoch
@@ -199,9 +244,15 @@ def test_learning_rates_fall_along_a_cosine_in_each_stage(logs: list[Prepared], 
 
 def test_weight_decay_acts_on_matrices_of_the_head_only(logs: list[Prepared]) -> None:
     module = untrained(logs, weight_decay=0.3, refit_baseline=True)
-    decayed = {id(p): group["weight_decay"] for group in module.configure_optimizers().param_groups for p in group["params"]}
+    decayed = {
+        id(p): group["weight_decay"]
+        for group in module.configure_optimizers().param_groups
+        for p in group["params"]
+    }
     for name, parameter in module.model.named_parameters():
-        assert decayed[id(parameter)] == (0.3 if name.startswith("head") and name.endswith("weight") else 0.0), name
+        assert decayed[id(parameter)] == (
+            0.3 if name.startswith("head") and name.endswith("weight") else 0.0
+        ), name
 
 
 def test_batches_hold_their_share_of_beginnings(logs: list[Prepared]) -> None:
@@ -213,7 +264,9 @@ def test_batches_hold_their_share_of_beginnings(logs: list[Prepared]) -> None:
         depth = module.store.depth[batches]
         assert bool((depth[:, 6:] == lead).all())
         assert bool((depth[:, :6] != lead).any())
-        assert torch.equal(torch.stack(list(module.train_dataloader())), batches), "seed and epoch decide alone"
+        assert torch.equal(torch.stack(list(module.train_dataloader())), batches), (
+            "seed and epoch decide alone"
+        )
 
 
 def loss_of(module: HeadTraining, starts: Tensor) -> float:
@@ -223,12 +276,20 @@ def loss_of(module: HeadTraining, starts: Tensor) -> float:
 
 
 def test_rollouts_start_from_the_measured_past(logs: list[Prepared]) -> None:
-    """The loss of one window, from the logs by hand: memory from the past, mean velocities at a beginning."""
+    """The loss of one window, from the logs by hand: memory from the past, mean velocities at a
+    beginning.
+    """
     lstm = LstmConfig(hidden_size=4)
     plain = untrained(logs, lstm, history=0.4, multi_step=[{**HALF_SECOND, "batch": 1}])
     log, row = logs[1], 30
     start = len(logs[0]) + row
-    begun = untrained(logs, lstm, history=0.4, multi_step=[{**HALF_SECOND, "batch": 2}], beginnings={"share": 0.5, "initial": 0.3})
+    begun = untrained(
+        logs,
+        lstm,
+        history=0.4,
+        multi_step=[{**HALF_SECOND, "batch": 2}],
+        beginnings={"share": 0.5, "initial": 0.3},
+    )
 
     def by_hand(first: int, past: int, x0: Tensor) -> float:
         model = plain.model
@@ -237,7 +298,12 @@ def test_rollouts_start_from_the_measured_past(logs: list[Prepared]) -> None:
             return torch.from_numpy(values).float()[None]
 
         with torch.no_grad():
-            x, s = x0[None], model.warmup(tensor(log.y[first - past : first]), tensor(log.w[first - past : first]))
+            x, s = (
+                x0[None],
+                model.warmup(
+                    tensor(log.y[first - past : first]), tensor(log.w[first - past : first])
+                ),
+            )
             total = 0.0
             for k in range(first, first + 5):
                 x, s = model.step(x, tensor(log.w[k]), s)
@@ -246,21 +312,33 @@ def test_rollouts_start_from_the_measured_past(logs: list[Prepared]) -> None:
 
     here = by_hand(row, 4, torch.from_numpy(log.smooth[row]).float())
     assert loss_of(plain, torch.tensor([start])) == pytest.approx(here, rel=1e-4)
-    at_rest = torch.cat((torch.from_numpy(log.smooth[3, :3]), torch.from_numpy(log.y[:3, 3:].mean(0)))).float()
+    at_rest = torch.cat(
+        (torch.from_numpy(log.smooth[3, :3]), torch.from_numpy(log.y[:3, 3:].mean(0)))
+    ).float()
     there = by_hand(3, 3, at_rest)
-    assert loss_of(begun, torch.tensor([start, len(logs[0]) + 3])) == pytest.approx((here + there) / 2, rel=1e-4)
+    assert loss_of(begun, torch.tensor([start, len(logs[0]) + 3])) == pytest.approx(
+        (here + there) / 2, rel=1e-4
+    )
 
 
 def test_short_logs_need_no_room_for_a_stage_without_epochs(tmp_path: Path) -> None:
     """3 s of log hold no one-step window of 5 s; without one-step epochs none is asked for."""
     short = trials(seconds=3.0, window=0.5)
-    config = {"one_step": {"epochs": 0}, "multi_step": [{**HALF_SECOND, "epochs": 1}], "history": 0.0}
+    config = {
+        "one_step": {"epochs": 0},
+        "multi_step": [{**HALF_SECOND, "epochs": 1}],
+        "history": 0.0,
+    }
     _, notes = trained(short, tmp_path, Scripted([1.0]), **config)
     assert notes["epochs"] == 1
     with pytest.raises(DataError, match="window of 50 samples"):
         trained(short, tmp_path / "other", Scripted([1.0]), one_step={"epochs": 1})
 
 
-def test_beginnings_shorter_than_a_step_take_one_sample(logs: list[Prepared], tmp_path: Path) -> None:
-    _, notes = trained(logs, tmp_path, Scripted([1.0]), multi_step=[HALF_SECOND], beginnings={"initial": STEP / 10})
+def test_beginnings_shorter_than_a_step_take_one_sample(
+    logs: list[Prepared], tmp_path: Path
+) -> None:
+    _, notes = trained(
+        logs, tmp_path, Scripted([1.0]), multi_step=[HALF_SECOND], beginnings={"initial": STEP / 10}
+    )
     assert all(math.isfinite(entry["loss"]) for entry in notes["curve"])

@@ -1,4 +1,6 @@
-"""Offsets of logs: the arrow of normal equations against the dense matrix, the spread against the marginal likelihood by SciPy."""
+"""Offsets of logs: the arrow of normal equations against the dense matrix, the spread against the
+marginal likelihood by SciPy.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,9 @@ def arrow_and_dense(seed: int) -> tuple[Arrow, np.ndarray, np.ndarray]:
         rows = random.normal(size=(9, P + 2))
         matrix[np.ix_(here, here)] += rows.T @ rows
     mixed = matrix[:P, P:].reshape(P, LOGS, 2).transpose(1, 0, 2)
-    own = np.stack([matrix[P + 2 * i : P + 2 * i + 2, P + 2 * i : P + 2 * i + 2] for i in range(LOGS)])
+    own = np.stack(
+        [matrix[P + 2 * i : P + 2 * i + 2, P + 2 * i : P + 2 * i + 2] for i in range(LOGS)]
+    )
     parts = (matrix[:P, :P], mixed, own, right[:P], right[P:].reshape(LOGS, 2))
     return Arrow(*(torch.from_numpy(np.array(part)) for part in parts)), matrix, right
 
@@ -51,7 +55,9 @@ def test_its_inverse_is_that_of_the_whole_matrix() -> None:
     inverse = np.linalg.inv(matrix)
     shared = torch.linalg.inv(arrow.reduced()[0])
     np.testing.assert_allclose(shared.numpy(), inverse[:P, :P], rtol=1e-8, atol=1e-12)
-    np.testing.assert_allclose(arrow.variances(shared).flatten().numpy(), np.diag(inverse)[P:], rtol=1e-8)
+    np.testing.assert_allclose(
+        arrow.variances(shared).flatten().numpy(), np.diag(inverse)[P:], rtol=1e-8
+    )
 
 
 def test_beliefs_add_their_precision_and_pull_to_zero() -> None:
@@ -59,16 +65,27 @@ def test_beliefs_add_their_precision_and_pull_to_zero() -> None:
     value = torch.from_numpy(np.random.default_rng(4).normal(size=(LOGS, 2)))
     offsets = offsets_of([0.0, 0.0], v=0.5, r=0.2).moved(-value)
     precision = np.tile([0.7 / 0.25, 0.7 / 0.04], LOGS)
-    expected = np.linalg.solve(matrix + np.diag(np.r_[np.zeros(P), precision]), right + np.r_[np.zeros(P), precision * value.flatten().numpy()])
+    expected = np.linalg.solve(
+        matrix + np.diag(np.r_[np.zeros(P), precision]),
+        right + np.r_[np.zeros(P), precision * value.flatten().numpy()],
+    )
     shared, own = arrow.believing(offsets, torch.tensor(0.7, dtype=torch.float64)).solve()
     np.testing.assert_allclose(np.r_[shared.numpy(), own.flatten().numpy()], expected, rtol=1e-9)
-    assert float(offsets.unlikely()) == pytest.approx(float((value / torch.tensor([0.5, 0.2])).square().sum()))
+    assert float(offsets.unlikely()) == pytest.approx(
+        float((value / torch.tensor([0.5, 0.2])).square().sum())
+    )
 
 
 def test_without_offsets_the_shared_part_is_left_alone() -> None:
     arrow = arrow_and_dense(5)[0]
     none = Offsets.begin(None, LOGS, torch.zeros(3, dtype=torch.float64), 0.9)
-    bare = Arrow(arrow.shared, arrow.mixed[:, :, :0], arrow.own[:, :0, :0], arrow.gradient, arrow.slope[:, :0])
+    bare = Arrow(
+        arrow.shared,
+        arrow.mixed[:, :, :0],
+        arrow.own[:, :0, :0],
+        arrow.gradient,
+        arrow.slope[:, :0],
+    )
     step, own = with_and_believing(bare, none).solve()
     assert torch.equal(step, torch.linalg.solve(arrow.shared, arrow.gradient))
     assert own.shape == (LOGS, 0)
@@ -83,11 +100,23 @@ def with_and_believing(arrow: Arrow, offsets: Offsets) -> Arrow:
 
 
 def test_the_spread_is_the_most_likely() -> None:
-    """Measurements y = X theta + Z c + e of known sigma: the likelihood with theta and c integrated out is a normal one, maximised by SciPy."""
-    random, sigma, wide, planted, count = np.random.default_rng(6), 0.3, 3.0, np.array([0.8, 0.1]), 10
+    """Measurements y = X theta + Z c + e of known sigma: the likelihood with theta and c integrated
+    out is a normal one, maximised by SciPy.
+    """
+    random, sigma, wide, planted, count = (
+        np.random.default_rng(6),
+        0.3,
+        3.0,
+        np.array([0.8, 0.1]),
+        10,
+    )
     logs = 12
     x, z = random.normal(size=(logs, count, P)), random.normal(size=(logs, count, 2))
-    y = (z @ (random.normal(size=(logs, 2)) * planted)[:, :, None])[:, :, 0] + x @ random.normal(size=P) + sigma * random.normal(size=(logs, count))
+    y = (
+        (z @ (random.normal(size=(logs, 2)) * planted)[:, :, None])[:, :, 0]
+        + x @ random.normal(size=P)
+        + sigma * random.normal(size=(logs, count))
+    )
     flat = x.reshape(-1, P)
 
     def unlikely(log_spread: np.ndarray) -> float:
@@ -97,7 +126,14 @@ def test_the_spread_is_the_most_likely() -> None:
             covariance[i * count : (i + 1) * count, i * count : (i + 1) * count] += block
         return -float(multivariate_normal(cov=covariance).logpdf(y.flatten()))
 
-    best = np.exp(minimize(unlikely, np.log([0.3, 0.3]), method="Nelder-Mead", options={"xatol": 1e-5, "fatol": 1e-8}).x)
+    best = np.exp(
+        minimize(
+            unlikely,
+            np.log([0.3, 0.3]),
+            method="Nelder-Mead",
+            options={"xatol": 1e-5, "fatol": 1e-8},
+        ).x
+    )
     parts = (
         flat.T @ flat + sigma**2 / wide**2 * np.eye(P),
         x.transpose(0, 2, 1) @ z,
@@ -105,7 +141,10 @@ def test_the_spread_is_the_most_likely() -> None:
         -flat.T @ y.flatten(),
         -(z.transpose(0, 2, 1) @ y[:, :, None])[:, :, 0],
     )
-    arrow, share = Arrow(*(torch.from_numpy(np.ascontiguousarray(part)) for part in parts)), torch.tensor(sigma**2, dtype=torch.float64)
+    arrow, share = (
+        Arrow(*(torch.from_numpy(np.ascontiguousarray(part)) for part in parts)),
+        torch.tensor(sigma**2, dtype=torch.float64),
+    )
     found = with_spread(offsets_of([0.3, 0.3], logs), arrow, share)
     np.testing.assert_allclose(found.spread.numpy(), best, rtol=0.03)
     # a spread that is given stays
@@ -115,7 +154,9 @@ def test_the_spread_is_the_most_likely() -> None:
 
 
 def test_table_names_logs_axes_and_units_of_si() -> None:
-    offsets = offsets_of([0.0, 0.0], 2, u="2 m/s^2", r="1 deg/s^2").moved(torch.tensor([[1.0, 2.0], [3.0, 4.0]], dtype=torch.float64))
+    offsets = offsets_of([0.0, 0.0], 2, u="2 m/s^2", r="1 deg/s^2").moved(
+        torch.tensor([[1.0, 2.0], [3.0, 4.0]], dtype=torch.float64)
+    )
     rows = offsets.table(["a", "b"])
     assert [(row["log"], row["axis"], row["value"]) for row in rows] == [
         ("a", "u_dot", -1.0),
@@ -130,7 +171,12 @@ def test_table_names_logs_axes_and_units_of_si() -> None:
 
 @pytest.mark.parametrize(
     ("given", "message"),
-    [({}, "for at least one of u, v, r"), ({"r": "1 m/s"}, r"rad/s\^2"), ({"v": 0.0}, "greater than 0"), ({"r": "some"}, "estimated")],
+    [
+        ({}, "for at least one of u, v, r"),
+        ({"r": "1 m/s"}, r"rad/s\^2"),
+        ({"v": 0.0}, "greater than 0"),
+        ({"r": "some"}, "estimated"),
+    ],
 )
 def test_what_is_wrong_is_refused(given: dict[str, Any], message: str) -> None:
     with pytest.raises(ValidationError, match=message):

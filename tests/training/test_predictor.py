@@ -1,4 +1,6 @@
-"""The predictor of document 004's autopilot: its data, its training, and the controller that stands on it."""
+"""The predictor of document 004's autopilot: its data, its training, and the controller that stands
+on it.
+"""
 
 from __future__ import annotations
 
@@ -23,29 +25,39 @@ STEERING = Steering(VESSEL, VESSEL.turning(LIMIT, 60.0), LIMIT, 0.1)
 SETTINGS = PredictorTraining(states=1000, epochs=40, batch=50)
 
 
-def trained(folder: Path, horizon: float, *, linear: bool, hidden: tuple[int, ...] = (20,)) -> tuple[NetworkPredictor, dict[str, float]]:
+def trained(
+    folder: Path, horizon: float, *, linear: bool, hidden: tuple[int, ...] = (20,)
+) -> tuple[NetworkPredictor, dict[str, float]]:
     law = DocumentConfig(horizon=horizon)
     torch.manual_seed(0)
     network = NetworkPredictor(VESSEL.state, candidates=41, hidden=hidden, linear=linear)
     angles = law.law(network, STEERING).rudder
-    return network, train_predictor("mlp", network, VESSEL, law.predictor(STEERING), angles, SETTINGS, 0, folder)
+    return network, train_predictor(
+        "mlp", network, VESSEL, law.predictor(STEERING), angles, SETTINGS, 0, folder
+    )
 
 
 def test_answers_are_nomotos_closed_form() -> None:
-    """T r_dot + r = K delta from the yaw rate r0 under a held angle, for every state and angle of the data."""
+    """T r_dot + r = K delta from the yaw rate r0 under a held angle, for every state and angle of
+    the data.
+    """
     law, horizon = DocumentConfig(horizon=2.0), 2.0
     angles = torch.linspace(-LIMIT, LIMIT, 41, dtype=torch.float64)
     x, change = simulate_answers(VESSEL, law.predictor(STEERING), angles, SETTINGS, 50, 3)
     start, steady = x[:, VESSEL.column("r"), None], GAIN * angles[None, :]
     decay = 1 - math.exp(-horizon / TIME)
     torch.testing.assert_close(change[:, 1], (steady - start) * decay, rtol=1e-4, atol=1e-7)
-    torch.testing.assert_close(change[:, 0], steady * horizon + (start - steady) * TIME * decay, rtol=1e-4, atol=1e-7)
+    torch.testing.assert_close(
+        change[:, 0], steady * horizon + (start - steady) * TIME * decay, rtol=1e-4, atol=1e-7
+    )
     # the states fill what random angles lead to, on both sides
     assert float(start.min()) < -0.3 * GAIN * LIMIT < 0.3 * GAIN * LIMIT < float(start.max())
 
 
 def test_a_linear_network_finds_nomotos_affine_map(tmp_path: Path) -> None:
-    """ERRATA G21: layers without activation are exact here; the network's slope with the yaw rate is that of the closed form."""
+    """ERRATA G21: layers without activation are exact here; the network's slope with the yaw rate
+    is that of the closed form.
+    """
     network, notes = trained(tmp_path, 2.0, linear=True)
     assert notes["rms_heading"] < 0.01 * DEG
     assert notes["rms_yaw_rate"] < 0.01 * DEG
@@ -61,7 +73,9 @@ def test_a_linear_network_finds_nomotos_affine_map(tmp_path: Path) -> None:
 
 
 def test_the_trained_law_steers_as_the_exact_one(tmp_path: Path) -> None:
-    """The same law (6.4) with the network and with the simulated vessel, 30 deg: both settle, at the same time within 5 %."""
+    """The same law (6.4) with the network and with the simulated vessel, 30 deg: both settle, at
+    the same time within 5 %.
+    """
     network, _ = trained(tmp_path, 3.0, linear=False)
     law = DocumentConfig(horizon=3.0)
     nominal = torch.tensor([[1.0, 1.0, 0.0]])

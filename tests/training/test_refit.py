@@ -1,4 +1,6 @@
-"""The refit through rollouts: what it gains over least squares, its gradient, its knowledge of symmetry, its errors."""
+"""The refit through rollouts: what it gains over least squares, its gradient, its knowledge of
+symmetry, its errors.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,17 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 import torch
-from made_system import LINEAR, QUADRATIC, SCALES, STEP, free_run_error, inputs, model_of, trials, truth
+from made_system import (
+    LINEAR,
+    QUADRATIC,
+    SCALES,
+    STEP,
+    free_run_error,
+    inputs,
+    model_of,
+    trials,
+    truth,
+)
 from torch import Tensor
 
 from residnet.baselines import RegressorsConfig, StillConfig
@@ -27,7 +39,9 @@ from residnet.training.refit import RefitConfig, refit
 from residnet.training.sensitivities import ahead
 
 
-def fitted(terms: Sequence[str], logs: Sequence[Prepared]) -> tuple[HybridDynamics, Samples, WindowStore]:
+def fitted(
+    terms: Sequence[str], logs: Sequence[Prepared]
+) -> tuple[HybridDynamics, Samples, WindowStore]:
     """Least squares on derivatives."""
     model = model_of(terms)
     known = samples(logs, model.signals)
@@ -47,10 +61,14 @@ def smoothed() -> list[Prepared]:
 
 
 @pytest.mark.parametrize("terms", [QUADRATIC, LINEAR], ids=["quadratic", "linear"])
-def test_free_runs_on_fresh_data_improve_on_biased_least_squares(smoothed: list[Prepared], terms: Sequence[str]) -> None:
+def test_free_runs_on_fresh_data_improve_on_biased_least_squares(
+    smoothed: list[Prepared], terms: Sequence[str]
+) -> None:
     model, known, store = fitted(terms, smoothed)
     before, start = free_run_error(copy.deepcopy(model)), theta_of(model).detach().clone()
-    notes = refit(model, known, store, RefitConfig(horizon=8.0, every=4.0, prior=1e-4), SCALES).notes
+    notes = refit(
+        model, known, store, RefitConfig(horizon=8.0, every=4.0, prior=1e-4), SCALES
+    ).notes
     assert notes["cost_after"] < notes["cost_before"]
     assert notes["iterations"] >= 1
     after = free_run_error(model)
@@ -67,7 +85,9 @@ def test_a_strong_prior_holds_least_squares(smoothed: list[Prepared]) -> None:
 
 def test_windows_are_laid_every_so_often(smoothed: list[Prepared]) -> None:
     model, known, store = fitted(LINEAR, smoothed)
-    notes = refit(model, known, store, RefitConfig(horizon=8.0, every=4.0, iterations=1), SCALES).notes
+    notes = refit(
+        model, known, store, RefitConfig(horizon=8.0, every=4.0, iterations=1), SCALES
+    ).notes
     steps, every, count = 80, 40, 0
     for log in smoothed:
         for k in range(0, len(log) - steps, every):
@@ -77,19 +97,29 @@ def test_windows_are_laid_every_so_often(smoothed: list[Prepared]) -> None:
 
 
 def windy() -> tuple[HybridDynamics, module._Problem]:
-    """A model in true wind, whose heading matters to it, and windows with samples that do not count; everything moved off its start."""
+    """A model in true wind, whose heading matters to it, and windows with samples that do not
+    count; everything moved off its start.
+    """
     signals = SignalsConfig(inputs=("tau_x", "tau_n"), exogenous=("wind_speed", "wind_dir")).build()
-    rows = [("1", "u", "u|u|", "tau_x", "wind_u"), ("v", "u r", "wind_v wind_mag"), ("r", "v", "r|r|", "tau_n", "wind_v wind_mag")]
+    rows = [
+        ("1", "u", "u|u|", "tau_x", "wind_u"),
+        ("v", "u r", "wind_v wind_mag"),
+        ("r", "v", "r|r|", "tau_n", "wind_v wind_mag"),
+    ]
     baseline = RegressorBaseline(rows, signals.names)
     random = np.random.default_rng(5)
-    baseline.theta.data.copy_(torch.from_numpy(random.normal(size=tuple(baseline.theta.shape)) * 0.1))
+    baseline.theta.data.copy_(
+        torch.from_numpy(random.normal(size=tuple(baseline.theta.shape)) * 0.1)
+    )
     with torch.no_grad():
         for axis, name in enumerate("uvr"):
             baseline.theta[axis, baseline.library.terms.index(name)] = -0.7
     model = HybridDynamics(signals, baseline, ZeroHead(), STEP, "rk4")
     active = torch.nonzero(baseline.allowed.flatten() > 0).squeeze(1)
     batch, steps, count = 5, 25, len(active)
-    wind = torch.from_numpy(random.uniform([2, -3], [6, 3], size=(batch, 1, 2))).expand(-1, steps, -1)
+    wind = torch.from_numpy(random.uniform([2, -3], [6, 3], size=(batch, 1, 2))).expand(
+        -1, steps, -1
+    )
     usable = torch.from_numpy(random.random((batch, steps, 1)) < 0.8).double()
     half = torch.from_numpy(random.normal(size=(count, count)))
     problem = module._Problem(
@@ -123,24 +153,40 @@ NONE = Offsets.begin(None, 4, SCALES, 0.4)
 LEVEL = torch.tensor(0.3, dtype=torch.float64)
 
 
-def with_step(model: HybridDynamics, problem: module._Problem, place: int, step: float, offsets: Offsets = NONE) -> float:
+def with_step(
+    model: HybridDynamics,
+    problem: module._Problem,
+    place: int,
+    step: float,
+    offsets: Offsets = NONE,
+) -> float:
     """Cost with one coefficient moved."""
     other = copy.deepcopy(model)
     assert isinstance(other.baseline, RegressorBaseline)
     with torch.no_grad():
         other.baseline.theta.view(-1)[problem.active[place]] += step
-    return float(module._level(other, problem, offsets) + module._prior_cost(problem, other.baseline, problem.share(LEVEL), offsets))
+    return float(
+        module._level(other, problem, offsets)
+        + module._prior_cost(problem, other.baseline, problem.share(LEVEL), offsets)
+    )
 
 
 def test_normal_equations_hold_half_the_gradient_of_the_cost() -> None:
-    """With m the mean square error of a window, d sqrt(m + c^2) = dm / (2 sqrt(m + c^2)); the prior's d (t'Pt) = 2 P t: half of both is returned."""
+    """With m the mean square error of a window, d sqrt(m + c^2) = dm / (2 sqrt(m + c^2)); the
+    prior's d (t'Pt) = 2 P t: half of both is returned.
+    """
     model, problem = windy()
     assert isinstance(model.baseline, RegressorBaseline)
     arrow = module._normal_equations(model, problem, model.baseline, LEVEL, NONE)
     hessian, gradient = arrow.shared, arrow.gradient
     step = 1e-5
-    central = [(with_step(model, problem, i, step) - with_step(model, problem, i, -step)) / (2 * step) for i in range(len(gradient))]
-    torch.testing.assert_close(2.0 * gradient, torch.tensor(central, dtype=torch.float64), rtol=1e-6, atol=1e-8)
+    central = [
+        (with_step(model, problem, i, step) - with_step(model, problem, i, -step)) / (2 * step)
+        for i in range(len(gradient))
+    ]
+    torch.testing.assert_close(
+        2.0 * gradient, torch.tensor(central, dtype=torch.float64), rtol=1e-6, atol=1e-8
+    )
     assert float(gradient.abs().min()) > 1e-4, "every coefficient is seen"
     torch.testing.assert_close(hessian, hessian.T)
     assert float(torch.linalg.eigvalsh(hessian)[0]) > 0
@@ -158,10 +204,24 @@ def test_normal_equations_hold_the_gradient_and_the_curvature_of_offsets() -> No
         for axis in range(2):
             one = torch.zeros(4, 2, dtype=torch.float64)
             one[log, axis] = step
-            central = (with_step(model, problem, 0, 0.0, offsets.moved(-one)) - with_step(model, problem, 0, 0.0, offsets.moved(one))) / (2 * step)
-            assert 2.0 * float(believing.slope[log, axis]) == pytest.approx(central, rel=1e-6, abs=1e-8)
-    central = [(with_step(model, problem, i, step, offsets) - with_step(model, problem, i, -step, offsets)) / (2 * step) for i in range(3)]
-    torch.testing.assert_close(2.0 * believing.gradient[:3], torch.tensor(central, dtype=torch.float64), rtol=1e-6, atol=1e-8)
+            central = (
+                with_step(model, problem, 0, 0.0, offsets.moved(-one))
+                - with_step(model, problem, 0, 0.0, offsets.moved(one))
+            ) / (2 * step)
+            assert 2.0 * float(believing.slope[log, axis]) == pytest.approx(
+                central, rel=1e-6, abs=1e-8
+            )
+    central = [
+        (with_step(model, problem, i, step, offsets) - with_step(model, problem, i, -step, offsets))
+        / (2 * step)
+        for i in range(3)
+    ]
+    torch.testing.assert_close(
+        2.0 * believing.gradient[:3],
+        torch.tensor(central, dtype=torch.float64),
+        rtol=1e-6,
+        atol=1e-8,
+    )
 
 
 def test_hessian_is_half_that_of_the_cost_where_the_errors_vanish() -> None:
@@ -188,7 +248,9 @@ def test_hessian_is_half_that_of_the_cost_where_the_errors_vanish() -> None:
     centre = with_step(model, perfect, 0, 0.0)
     assert centre == pytest.approx(problem.robust)
     for i in range(len(gradient)):
-        curvature = (with_step(model, perfect, i, step) - 2 * centre + with_step(model, perfect, i, -step)) / step**2
+        curvature = (
+            with_step(model, perfect, i, step) - 2 * centre + with_step(model, perfect, i, -step)
+        ) / step**2
         assert 2.0 * float(hessian[i, i]) == pytest.approx(curvature, rel=2e-3)
 
 
@@ -199,7 +261,13 @@ def test_a_symmetric_vessel_loses_what_it_cannot_have(smoothed: list[Prepared]) 
     refit(free, known, store, RefitConfig.model_validate(config), SCALES)
     refit(held, known, store, RefitConfig.model_validate(config | {"asymmetric": 1e4}), SCALES)
     # by hand: surge has no v, r, tau_n; sway and yaw have no constant, u, tau_x
-    wrong = torch.tensor([[False, False, True, True, False, True], [True, True, False, False, True, False], [True, True, False, False, True, False]])
+    wrong = torch.tensor(
+        [
+            [False, False, True, True, False, True],
+            [True, True, False, False, True, False],
+            [True, True, False, False, True, False],
+        ]
+    )
     assert float(theta_of(held)[wrong].abs().max()) < 1e-5
     assert float(theta_of(free)[wrong].abs().max()) > 1e-3
     assert float(theta_of(held)[~wrong].abs().min()) > 1e-3
@@ -207,7 +275,13 @@ def test_a_symmetric_vessel_loses_what_it_cannot_have(smoothed: list[Prepared]) 
     assert free_run_error(held) < 1.2 * free_run_error(free)
 
 
-def failure(error: type[ResidnetError], model: HybridDynamics, known: Samples, store: WindowStore, config: RefitConfig) -> str:
+def failure(
+    error: type[ResidnetError],
+    model: HybridDynamics,
+    known: Samples,
+    store: WindowStore,
+    config: RefitConfig,
+) -> str:
     """The one line that a refit stops with."""
     with pytest.raises(error) as caught:
         refit(model, known, store, config, SCALES)
@@ -217,24 +291,36 @@ def failure(error: type[ResidnetError], model: HybridDynamics, known: Samples, s
 
 def test_errors(smoothed: list[Prepared]) -> None:
     model, known, store = fitted(LINEAR, smoothed)
-    still = HybridDynamics(model.signals, StillConfig().build(model.signals.names), ZeroHead(), STEP)
-    assert "needs a baseline of kind 'regressors', 'linear_steady'" in failure(FitError, still, known, store, RefitConfig())
-    assert "shorten the horizon or give longer logs" in failure(DataError, model, known, store, RefitConfig(horizon=100.0))
+    still = HybridDynamics(
+        model.signals, StillConfig().build(model.signals.names), ZeroHead(), STEP
+    )
+    assert "needs a baseline of kind 'regressors', 'linear_steady'" in failure(
+        FitError, still, known, store, RefitConfig()
+    )
+    assert "shorten the horizon or give longer logs" in failure(
+        DataError, model, known, store, RefitConfig(horizon=100.0)
+    )
     # a raster wider than a log starts with it alone, and there nothing is known
     late = dataclasses.replace(store, good=store.good & (store.depth > 0))
     wide = RefitConfig(horizon=8.0, every=1000.0)
     assert "no training log holds a free run of 8 s" in failure(FitError, model, known, late, wide)
     with torch.no_grad():
         theta_of(model)[0, LINEAR.index("u")] = 1e6
-    assert "diverges within the refit's horizon" in failure(FitError, model, known, store, RefitConfig(horizon=30.0))
+    assert "diverges within the refit's horizon" in failure(
+        FitError, model, known, store, RefitConfig(horizon=30.0)
+    )
 
 
 def test_nothing_moves_from_the_truth_without_noise() -> None:
-    """Exact data, exact start: the cost is that of the refit's Euler scheme alone, and the free run stays where it was."""
+    """Exact data, exact start: the cost is that of the refit's Euler scheme alone, and the free run
+    stays where it was.
+    """
     logs = trials(noise=0.0, window=0.5)
     model, known, store = fitted(QUADRATIC, logs)
     with torch.no_grad():
         theta_of(model).copy_(theta_of(truth()))
-    notes = refit(model, known, store, RefitConfig(horizon=8.0, every=4.0, robust=1e-3), SCALES).notes
+    notes = refit(
+        model, known, store, RefitConfig(horizon=8.0, every=4.0, robust=1e-3), SCALES
+    ).notes
     assert notes["cost_after"] <= notes["cost_before"] < 0.05
     assert free_run_error(model) < 0.05

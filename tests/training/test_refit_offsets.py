@@ -1,4 +1,6 @@
-"""Offsets planted in some logs of a made vessel: a refit that looks for them finds them and the vessel, and costs nothing where there are none."""
+"""Offsets planted in some logs of a made vessel: a refit that looks for them finds them and the
+vessel, and costs nothing where there are none.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,11 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.heads import ZeroHead
 from residnet.training.refit import RefitConfig, Refitted, refit
 
-ROWS = {"u": ("u", "u|u|", "tau_x"), "v": ("v", "r", "tau_n", "v|v|", "u r"), "r": ("v", "r", "tau_n", "r|r|")}
+ROWS = {
+    "u": ("u", "u|u|", "tau_x"),
+    "v": ("v", "r", "tau_n", "v|v|", "u r"),
+    "r": ("v", "r", "tau_n", "r|r|"),
+}
 SPREAD, LOGS = np.array([0.0, 0.05, 0.04]), 8
 # noise is white at 0.1 s, and that of the state that a window starts with lasts longer
 CONFIG = {"horizon": 8.0, "every": 8.0, "prior": 0.0, "correlation": 0.2, "robust": 0.02}
@@ -29,14 +35,24 @@ def planted(seed: int) -> np.ndarray:
     return (drawn - drawn.mean(0)) / drawn.std(0) * SPREAD
 
 
-def refitted(logs: list[Prepared], offsets: dict[str, str] | None) -> tuple[Tensor, Tensor, Refitted]:
-    """Coefficients less the vessel's own, in ROWS' order [P], their standard errors [P], and the refit, from least squares on."""
+def refitted(
+    logs: list[Prepared], offsets: dict[str, str] | None
+) -> tuple[Tensor, Tensor, Refitted]:
+    """Coefficients less the vessel's own, in ROWS' order [P], their standard errors [P], and the
+    refit, from least squares on.
+    """
     signals = SIGNALS.build()
     baseline = RegressorBaseline(list(ROWS.values()), signals.names)
     model = HybridDynamics(signals, baseline, ZeroHead(), STEP, "heun")
     known = samples(logs, signals)
     RegressorsConfig(terms=ROWS).fit(baseline, known)
-    found = refit(model, known, WindowStore.gather(logs, torch.float64), RefitConfig.model_validate(CONFIG | {"offsets": offsets}), SCALES)
+    found = refit(
+        model,
+        known,
+        WindowStore.gather(logs, torch.float64),
+        RefitConfig.model_validate(CONFIG | {"offsets": offsets}),
+        SCALES,
+    )
     own = torch.zeros_like(baseline.theta)
     for column, term in enumerate(baseline.library.terms):
         own[:, column] = THETA[:, QUADRATIC.index(term)]
@@ -61,7 +77,9 @@ def test_planted_offsets_are_found_and_no_longer_spoil_the_vessel() -> None:
     apart = found.offsets.value - here
     assert float((apart / found.offsets.error).abs().max()) < 3.0
     assert score(apart) < 0.1 * score(here)
-    np.testing.assert_allclose(found.offsets.spread.numpy(), SPREAD[1:] * found.offsets.speed**2, rtol=0.15)
+    np.testing.assert_allclose(
+        found.offsets.spread.numpy(), SPREAD[1:] * found.offsets.speed**2, rtol=0.15
+    )
 
 
 def test_without_offsets_looking_for_them_costs_nothing() -> None:
@@ -69,7 +87,12 @@ def test_without_offsets_looking_for_them_costs_nothing() -> None:
     blind, _, none = refitted(logs, None)
     error, _, found = refitted(logs, BOTH)
     assert score(error) < 1.15 * score(blind)
-    assert float((found.offsets.spread / (torch.from_numpy(SPREAD[1:]) * found.offsets.speed**2)).max()) < 0.1
+    assert (
+        float(
+            (found.offsets.spread / (torch.from_numpy(SPREAD[1:]) * found.offsets.speed**2)).max()
+        )
+        < 0.1
+    )
     assert none.offsets.axes == ()
     assert none.offsets.value.shape == (LOGS, 0)
 

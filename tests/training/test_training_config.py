@@ -39,9 +39,18 @@ def test_after_the_last_epoch_stands_the_last_stage() -> None:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ({"one_step": {"epochs": 0}}, "nothing to train: one_step.epochs is 0 and multi_step is empty"),
-        ({"one_step": {"window": "2 s", "washout": "2 s"}}, r"one_step: washout \(2 s\) must be shorter than window \(2 s\)"),
-        ({"multi_step": [{"horizon": 0, "epochs": 1}]}, "multi_step.0.horizon: must be greater than 0"),
+        (
+            {"one_step": {"epochs": 0}},
+            "nothing to train: one_step.epochs is 0 and multi_step is empty",
+        ),
+        (
+            {"one_step": {"window": "2 s", "washout": "2 s"}},
+            r"one_step: washout \(2 s\) must be shorter than window \(2 s\)",
+        ),
+        (
+            {"multi_step": [{"horizon": 0, "epochs": 1}]},
+            "multi_step.0.horizon: must be greater than 0",
+        ),
         ({"multi_step": [{"epochs": 1}]}, "multi_step.0.horizon: missing"),
         ({"beginnings": {}, "one_step": {"batch": 1}}, "batches of at least 2 windows"),
         ({"beginnings": {"share": 1.0}}, "beginnings.share: must be less than 1"),
@@ -56,5 +65,13 @@ def test_wrong_configs(content: dict[str, object], message: str) -> None:
 
 
 def test_reading_a_configuration_imports_no_lightning() -> None:
-    code = "import sys, residnet.training.config; print('lightning' in sys.modules or 'torch' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "False\n"
+    code = (
+        "import sys, residnet.training.config; print('lightning' in sys.modules or 'torch' in"
+        " sys.modules)"
+    )
+    assert (
+        subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True
+        ).stdout
+        == "False\n"
+    )

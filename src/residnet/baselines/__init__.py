@@ -17,7 +17,14 @@ from residnet.baselines.still import StillConfig
 from residnet.regression.solutions import Coefficient
 
 BaselineConfig = Annotated[
-    BelievedConfig | EquationsConfig | LinearSteadyConfig | MMGConfig | NomotoConfig | NomotoSideslipConfig | RegressorsConfig | StillConfig,
+    BelievedConfig
+    | EquationsConfig
+    | LinearSteadyConfig
+    | MMGConfig
+    | NomotoConfig
+    | NomotoSideslipConfig
+    | RegressorsConfig
+    | StillConfig,
     Field(discriminator="kind"),
 ]
 

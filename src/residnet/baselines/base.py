@@ -15,7 +15,9 @@ from residnet.regression.solutions import Coefficient, Solution
 
 
 class Baseline(nn.Module, ABC):
-    """Acceleration from channels: z [..., nz] -> nu_dot [..., 3] (m/s^2, m/s^2, rad/s^2); memoryless."""
+    """Acceleration from channels: z [..., nz] -> nu_dot [..., 3] (m/s^2, m/s^2, rad/s^2);
+    memoryless.
+    """
 
     @abstractmethod
     def forward(self, z: Tensor) -> Tensor:
@@ -26,15 +28,19 @@ class Baseline(nn.Module, ABC):
         """Number of fitted parameters of each axis."""
 
     def mass(self) -> Tensor | None:
-        """Inertia [3, 3] between forces and accelerations, float64; None where a baseline knows no forces."""
+        """Inertia [3, 3] between forces and accelerations, float64; None where a baseline knows no
+        forces.
+        """
         return None
 
 
 class ParametricBaseline(Baseline, ABC):
-    """A baseline of which all that was fitted stands in `theta`, so that its parameters can be moved through free runs and drawn at random.
+    """A baseline of which all that was fitted stands in `theta`, so that its parameters can be
+    moved through free runs and drawn at random.
 
     Args:
-        theta: numbers of any shape, kept as the parameter `theta`; the P of them that may move are named by `movable`.
+        theta: numbers of any shape, kept as the parameter `theta`; the P of them that may move are
+            named by `movable`.
     """
 
     def __init__(self, theta: Tensor) -> None:
@@ -47,23 +53,33 @@ class ParametricBaseline(Baseline, ABC):
 
     @abstractmethod
     def sensitivity(self, z: Tensor) -> Tensor:
-        """Derivative of nu_dot with respect to the movable parameters at channels z [B, nz], [B, 3, P]."""
+        """Derivative of nu_dot with respect to the movable parameters at channels z [B, nz], [B, 3,
+        P].
+        """
 
     @abstractmethod
     def information(self, samples: Samples) -> Tensor:
-        """Information that a sample's accelerations hold about the movable parameters, mean over the samples, [P, P]."""
+        """Information that a sample's accelerations hold about the movable parameters, mean over
+        the samples, [P, P].
+        """
 
     @abstractmethod
     def belief(self) -> tuple[Tensor, Tensor]:
-        """Mean [P] and precision [P] of what is thought of the movable parameters before any trial; zero precision where nothing is."""
+        """Mean [P] and precision [P] of what is thought of the movable parameters before any trial;
+        zero precision where nothing is.
+        """
 
     @abstractmethod
     def asymmetry(self, samples: Samples) -> Tensor:
-        """Information [P] about those movable parameters that a mirror-symmetric vessel cannot have; zero for all others."""
+        """Information [P] about those movable parameters that a mirror-symmetric vessel cannot
+        have; zero for all others.
+        """
 
     @abstractmethod
     def restated(self, table: Sequence[Coefficient], errors: Tensor) -> list[Coefficient]:
-        """The table of coefficients as theta is now, with standard errors [P] of the movable parameters; errors of ratios stay as they were."""
+        """The table of coefficients as theta is now, with standard errors [P] of the movable
+        parameters; errors of ratios stay as they were.
+        """
 
 
 class IdentifiedConfig(Config, ABC):
@@ -83,7 +99,8 @@ class IdentifiedConfig(Config, ABC):
 
     @abstractmethod
     def solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
-        """Identify from samples whose target is the measured acceleration; several solutions where free runs are to choose between them.
+        """Identify from samples whose target is the measured acceleration; several solutions where
+        free runs are to choose between them.
 
         Raises:
             FitError: where the data do not determine a coefficient.
@@ -105,7 +122,10 @@ def require(names: Sequence[str], wanted: Sequence[str], who: str) -> None:
     """
     for name in wanted:
         if name not in names:
-            raise ConfigError(f"{who} needs the channel '{name}', but the model has {', '.join(names)}; add it to signals")
+            raise ConfigError(
+                f"{who} needs the channel '{name}', but the model has {', '.join(names)}; add it to"
+                " signals"
+            )
 
 
 def of_manoeuvres(samples: Samples, kinds: Sequence[str]) -> Samples:
@@ -117,6 +137,7 @@ def of_manoeuvres(samples: Samples, kinds: Sequence[str]) -> Samples:
     chosen = samples.of_kinds(kinds)
     if len(chosen) == 0:
         raise FitError(
-            f"no sample is of the manoeuvres {list(kinds)} that the baseline is fitted on; kinds in the data: {sorted(set(samples.kinds))}"
+            f"no sample is of the manoeuvres {list(kinds)} that the baseline is fitted on; kinds in"
+            f" the data: {sorted(set(samples.kinds))}"
         )
     return chosen

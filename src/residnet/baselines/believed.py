@@ -1,4 +1,6 @@
-"""The known part as given: the hull of a vessel file, with a factor on its mass, Coriolis and damping matrices (document 002 section 4.1.1)."""
+"""The known part as given: the hull of a vessel file, with a factor on its mass, Coriolis and
+damping matrices (document 002 section 4.1.1).
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,9 @@ Row = dict[str, float]
 
 
 class HullEquations(Config):
-    """Accelerations written out: coefficients of u_dot, v_dot and r_dot by term of u, v, r, tau_x, tau_y, tau_n, in SI."""
+    """Accelerations written out: coefficients of u_dot, v_dot and r_dot by term of u, v, r, tau_x,
+    tau_y, tau_n, in SI.
+    """
 
     u: Row
     v: Row
@@ -57,7 +61,12 @@ class BelievedBaseline(Baseline):
         rows = equations.rows()
         terms = list(dict.fromkeys(term for row in rows for term in row))
         self.library = TermLibrary(terms, names)
-        self.register_buffer("theta", torch.tensor([[row.get(term, 0.0) for term in terms] for row in rows], dtype=torch.float64))
+        self.register_buffer(
+            "theta",
+            torch.tensor(
+                [[row.get(term, 0.0) for term in terms] for row in rows], dtype=torch.float64
+            ),
+        )
         self.theta: Tensor
 
     def forward(self, z: Tensor) -> Tensor:
@@ -69,10 +78,17 @@ class BelievedBaseline(Baseline):
         return [0.0, 0.0, 0.0]
 
     def mass(self) -> Tensor | None:
-        """Inertia [3, 3]: the inverse of what the forces do to the accelerations; None where that has none."""
-        columns = [self.library.terms.index(name) for name in FORCE_CHANNELS if name in self.library.terms]
+        """Inertia [3, 3]: the inverse of what the forces do to the accelerations; None where that
+        has none.
+        """
+        columns = [
+            self.library.terms.index(name) for name in FORCE_CHANNELS if name in self.library.terms
+        ]
         by_force = self.theta[:, columns].to(torch.float64)
-        invertible = len(columns) == len(FORCE_CHANNELS) and float(torch.linalg.cond(by_force / by_force.abs().amax(0))) < 1e6
+        invertible = (
+            len(columns) == len(FORCE_CHANNELS)
+            and float(torch.linalg.cond(by_force / by_force.abs().amax(0))) < 1e6
+        )
         return torch.linalg.inv(by_force) if invertible else None
 
 
@@ -82,8 +98,9 @@ class BelievedConfig(IdentifiedConfig):
     Needs the channels tau_x, tau_y and tau_n: as inputs, or made by `signals.forces`.
 
     Attributes:
-        vessel: name or file of a vessel whose hull is given by matrices or accelerations (kinds fossen, mass_matrix, odin); a saved model
-            has the hull's equations in its place, without the factor.
+        vessel: name or file of a vessel whose hull is given by matrices or accelerations (kinds
+            fossen, mass_matrix, odin); a saved model has the hull's equations in its place, without
+            the factor.
         scale: what mass, Coriolis and damping matrices are multiplied by.
     """
 
@@ -107,7 +124,10 @@ class BelievedConfig(IdentifiedConfig):
         try:
             vessel = load_vessel(self.vessel)
             if not isinstance(vessel, HullConfig | OdinConfig):
-                raise ValueError(f"vessel: '{self.vessel}' is of kind '{vessel.kind}'; a believed hull needs one of kind fossen, mass_matrix or odin")
+                raise ValueError(
+                    f"vessel: '{self.vessel}' is of kind '{vessel.kind}'; a believed hull needs one"
+                    " of kind fossen, mass_matrix or odin"
+                )
             terms, coefficients = vessel.equations()
         except ConfigError as error:
             raise ValueError(str(error)) from None
@@ -127,7 +147,13 @@ class BelievedConfig(IdentifiedConfig):
         """The module with its numbers, for channels `names`."""
         require(names, (*VELOCITY, *FORCE_CHANNELS), "baseline 'believed'")
         # M, C and D times one factor: only the forces act differently
-        rows = [{term: value / self.scale if term in FORCE_CHANNELS else value for term, value in row.items()} for row in self.equations().rows()]
+        rows = [
+            {
+                term: value / self.scale if term in FORCE_CHANNELS else value
+                for term, value in row.items()
+            }
+            for row in self.equations().rows()
+        ]
         return BelievedBaseline(HullEquations(u=rows[0], v=rows[1], r=rows[2]), names)
 
     def solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:

@@ -1,4 +1,6 @@
-"""Equations that somebody published: accelerations as terms with given coefficients, scored beside what is identified here."""
+"""Equations that somebody published: accelerations as terms with given coefficients, scored beside
+what is identified here.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,9 @@ class EquationsBaseline(Baseline):
         terms = list(dict.fromkeys(term for row in rows for term in row))
         self.library = TermLibrary(terms, names)
         theta = [[row.get(term, 0.0) for term in terms] for row in rows]
-        self.register_buffer("theta", torch.tensor(theta, dtype=torch.float64).reshape(3, len(terms)))
+        self.register_buffer(
+            "theta", torch.tensor(theta, dtype=torch.float64).reshape(3, len(terms))
+        )
         self.theta: Tensor
 
     def forward(self, z: Tensor) -> Tensor:
@@ -36,16 +40,20 @@ class EquationsBaseline(Baseline):
         return self.library(z) @ self.theta.to(z.dtype).T
 
     def freedom(self) -> list[float]:
-        """Number of terms of each axis: they were fitted, if to other data (ERRATA E9 of document 000)."""
+        """Number of terms of each axis: they were fitted, if to other data (ERRATA E9 of document
+        000).
+        """
         return [float(count) for count in (self.theta != 0).sum(1)]
 
 
 class EquationsConfig(IdentifiedConfig):
-    """Published equations of the accelerations, for example document 000 eqs. (6.24)-(6.32) and (7.2)-(7.7); nothing is identified.
+    """Published equations of the accelerations, for example document 000 eqs. (6.24)-(6.32) and
+    (7.2)-(7.7); nothing is identified.
 
     Attributes:
         u, v, r: coefficients of u_dot, v_dot, r_dot by term; a term that is left out is zero.
-        units: units in which the coefficients take channels, where not SI (document 000 has revolutions in rpm).
+        units: units in which the coefficients take channels, where not SI (document 000 has
+            revolutions in rpm).
         source: where they stand.
     """
 
@@ -71,7 +79,8 @@ class EquationsConfig(IdentifiedConfig):
         """Coefficients of each axis in SI, for channels `names`.
 
         Raises:
-            ConfigError: where a term names a channel that the model lacks, or a function of one that is not in SI.
+            ConfigError: where a term names a channel that the model lacks, or a function of one
+                that is not in SI.
         """
         out: list[Row] = []
         for axis, row in zip(VELOCITY, (self.u, self.v, self.r), strict=True):
@@ -82,7 +91,8 @@ class EquationsConfig(IdentifiedConfig):
                         continue
                     if factor.function:
                         raise ConfigError(
-                            f"baseline 'equations', {axis}, term '{term}': {factor.symbol} needs {factor.name} in SI; leave its unit out"
+                            f"baseline 'equations', {axis}, term '{term}': {factor.symbol} needs"
+                            f" {factor.name} in SI; leave its unit out"
                         )
                     value /= to_si(self.units[factor.name]) ** factor.power
                 own[term] = value

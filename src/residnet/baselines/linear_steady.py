@@ -1,4 +1,6 @@
-"""The linear speed and steering models of document 003, identified through steady-state constraints (sections 4.2.1, 4.2.2)."""
+"""The linear speed and steering models of document 003, identified through steady-state constraints
+(sections 4.2.1, 4.2.2).
+"""
 
 from __future__ import annotations
 
@@ -20,14 +22,16 @@ from residnet.regression.solutions import Coefficient, Solution
 class LinearSteadyConfig(IdentifiedConfig):
     """u_dot = a u + b tau + c and (v, r)_dot = A (v, r) + B tau + C (eqs. (12), (16)).
 
-    First the steady states of constant-input manoeuvres give x_ss = Phi tau + Phi_bias by least squares (eqs. (24), (32));
-    then x_dot = A (x - Phi tau - Phi_bias) gives A by least squares on derivatives (eq. (29)), and B = -A Phi (eq. (28)).
+    First the steady states of constant-input manoeuvres give x_ss = Phi tau + Phi_bias by least
+    squares (eqs. (24), (32)); then x_dot = A (x - Phi tau - Phi_bias) gives A by least squares on
+    derivatives (eq. (29)), and B = -A Phi (eq. (28)).
 
     Attributes:
         drive: channel that drives surge.
         steer: channel that turns the vessel.
         steady: kinds of manoeuvre with constant input.
-        settled: only samples later than this after a constant manoeuvre's start are taken as steady.
+        settled: only samples later than this after a constant manoeuvre's start are taken as
+            steady.
         speed: kinds of manoeuvre that identify a.
         steering: kinds of manoeuvre that identify A.
     """
@@ -65,37 +69,59 @@ class LinearSteadyConfig(IdentifiedConfig):
         return [Solution({}, {"theta": theta}, tuple(table))]
 
     def _steady_states(self, samples: Samples, states: tuple[str, ...], drive: str) -> LinearFit:
-        """Phi and Phi_bias [2, n] (rows: slope, bias) from the means of the settled part of every constant manoeuvre."""
+        """Phi and Phi_bias [2, n] (rows: slope, bias) from the means of the settled part of every
+        constant manoeuvre.
+        """
         settled = samples.of_kinds(self.steady)
         settled = settled.where(settled.t >= self.settled)
         present, index = torch.unique(settled.group, return_inverse=True)
         if present.numel() < 3:
             raise FitError(
-                f"baseline 'linear_steady' needs at least 3 constant-input manoeuvres of kinds {list(self.steady)} longer than "
-                f"{self.settled:g} s, the data have {present.numel()}; kinds in the data: {sorted(set(samples.kinds))}"
+                "baseline 'linear_steady' needs at least 3 constant-input manoeuvres of kinds"
+                f" {list(self.steady)} longer than {self.settled:g} s, the data have"
+                f" {present.numel()}; kinds in the data: {sorted(set(samples.kinds))}"
             )
         columns = torch.stack([settled.column(name) for name in (*states, drive)], dim=1)
         count = torch.bincount(index).to(columns.dtype)[:, None]
-        means = torch.zeros(int(present.numel()), columns.shape[1], dtype=columns.dtype).index_add_(0, index, columns) / count
+        means = (
+            torch.zeros(int(present.numel()), columns.shape[1], dtype=columns.dtype).index_add_(
+                0, index, columns
+            )
+            / count
+        )
         slope = torch.stack((means[:, -1], torch.ones_like(means[:, -1])), dim=1)
         return solve(slope, means[:, :-1], torch.arange(int(present.numel())), names=(drive, "1"))
 
-    def _block(self, samples: Samples, states: tuple[str, ...], drive: str, kinds: tuple[str, ...]) -> list[list[tuple[str, float, float]]]:
-        """Rows of (term, value, standard error) for each state: A, then B = -A Phi and -A Phi_bias with propagated errors."""
+    def _block(
+        self, samples: Samples, states: tuple[str, ...], drive: str, kinds: tuple[str, ...]
+    ) -> list[list[tuple[str, float, float]]]:
+        """Rows of (term, value, standard error) for each state: A, then B = -A Phi and -A Phi_bias
+        with propagated errors.
+        """
         steady = self._steady_states(samples, states, drive)
         dynamic = samples.of_kinds(kinds)
         if len(dynamic) == 0:
-            raise FitError(f"baseline 'linear_steady' needs manoeuvres of kinds {list(kinds)}; kinds in the data: {sorted(set(samples.kinds))}")
+            raise FitError(
+                f"baseline 'linear_steady' needs manoeuvres of kinds {list(kinds)}; kinds in the"
+                f" data: {sorted(set(samples.kinds))}"
+            )
         x = torch.stack([dynamic.column(name) for name in states], dim=1)
-        deviation = x - dynamic.column(drive)[:, None] * steady.coefficients[0] - steady.coefficients[1]
+        deviation = (
+            x - dynamic.column(drive)[:, None] * steady.coefficients[0] - steady.coefficients[1]
+        )
         axes = ["uvr".index(name) for name in states]
         dynamic_fit = solve(deviation, dynamic.target[:, axes], dynamic.group, names=states)
         a, a_error = dynamic_fit.coefficients.T, dynamic_fit.errors.T
         rows: list[list[tuple[str, float, float]]] = []
         for i in range(len(states)):
             row = [(name, float(a[i, k]), float(a_error[i, k])) for k, name in enumerate(states)]
-            for term, phi, phi_error in ((drive, steady.coefficients[0], steady.errors[0]), ("1", steady.coefficients[1], steady.errors[1])):
-                row.append((term, float(-(a[i] @ phi)), _product_error(a[i], a_error[i], phi, phi_error)))
+            for term, phi, phi_error in (
+                (drive, steady.coefficients[0], steady.errors[0]),
+                ("1", steady.coefficients[1], steady.errors[1]),
+            ):
+                row.append(
+                    (term, float(-(a[i] @ phi)), _product_error(a[i], a_error[i], phi, phi_error))
+                )
             rows.append(row)
         return rows
 

@@ -1,4 +1,6 @@
-"""The MMG standard model with parameters identified from trials, starting from what is thought of such a ship."""
+"""The MMG standard model with parameters identified from trials, starting from what is thought of
+such a ship.
+"""
 
 from __future__ import annotations
 
@@ -9,11 +11,25 @@ import torch
 from pydantic import Field, model_validator
 from torch import Tensor
 
-from residnet.baselines.base import Baseline, IdentifiedConfig, ParametricBaseline, of_manoeuvres, require
+from residnet.baselines.base import (
+    Baseline,
+    IdentifiedConfig,
+    ParametricBaseline,
+    of_manoeuvres,
+    require,
+)
 from residnet.core.errors import FitError
 from residnet.core.names import VELOCITY, nearest
 from residnet.core.samples import Samples
-from residnet.physics.mmg import PARAMETERS, Belief, MMGForces, MMGHull, MMGPropeller, MMGRudder, usual_beliefs
+from residnet.physics.mmg import (
+    PARAMETERS,
+    Belief,
+    MMGForces,
+    MMGHull,
+    MMGPropeller,
+    MMGRudder,
+    usual_beliefs,
+)
 from residnet.regression.solutions import Coefficient, Solution
 
 _MOST_SAMPLES = 4000
@@ -38,16 +54,22 @@ class MMGBaseline(ParametricBaseline):
         return self.forces(z, self.theta.to(z.dtype))
 
     def freedom(self) -> list[float]:
-        """Parameters that are not fixed, by the axis that they are listed under; those of propeller and rudder count in every axis."""
+        """Parameters that are not fixed, by the axis that they are listed under; those of propeller
+        and rudder count in every axis.
+        """
         free = [PARAMETERS[i] for i in self.movable().tolist()]
-        return [float(sum(axis_of(name) in (f"{axis}_dot", "") for name in free)) for axis in VELOCITY]
+        return [
+            float(sum(axis_of(name) in (f"{axis}_dot", "") for name in free)) for axis in VELOCITY
+        ]
 
     def movable(self) -> Tensor:
         """Numbers of the parameters whose spread is not zero, [P]."""
         return torch.nonzero(torch.tensor(self.spread) > 0).squeeze(1)
 
     def sensitivity(self, z: Tensor) -> Tensor:
-        """d nu_dot / d theta [B, 3, P], by central differences of all parameters at once: as exact as needed and 20 times as fast as torch.func."""
+        """d nu_dot / d theta [B, 3, P], by central differences of all parameters at once: as exact
+        as needed and 20 times as fast as torch.func.
+        """
         free = self.movable()
         steps = _STEP * torch.tensor(self.spread, dtype=z.dtype)[free]
         moves = torch.zeros(free.numel(), self.theta.numel(), dtype=z.dtype)
@@ -57,16 +79,24 @@ class MMGBaseline(ParametricBaseline):
         return ((ahead - behind) / (2.0 * steps[:, None, None])).permute(1, 2, 0)
 
     def information(self, samples: Samples) -> Tensor:
-        """Mean information of a sample [P, P], by the variance that the present parameters leave of each axis."""
+        """Mean information of a sample [P, P], by the variance that the present parameters leave of
+        each axis.
+        """
         part = _thinned(samples)
         with torch.no_grad():
-            slopes, variance = self.sensitivity(part.z), (part.target - self(part.z)).square().mean(0)
+            slopes, variance = (
+                self.sensitivity(part.z),
+                (part.target - self(part.z)).square().mean(0),
+            )
         return torch.einsum("bip,biq,i->pq", slopes, slopes, 1.0 / variance) / len(part)
 
     def belief(self) -> tuple[Tensor, Tensor]:
         """Mean and precision [P] as the config gives them."""
         free = self.movable()
-        return torch.tensor(self.mean, dtype=torch.float64)[free], torch.tensor(self.spread, dtype=torch.float64)[free] ** -2
+        return (
+            torch.tensor(self.mean, dtype=torch.float64)[free],
+            torch.tensor(self.spread, dtype=torch.float64)[free] ** -2,
+        )
 
     def asymmetry(self, samples: Samples) -> Tensor:
         """None: what is asymmetric here has a belief of its own."""
@@ -75,7 +105,10 @@ class MMGBaseline(ParametricBaseline):
     def restated(self, table: Sequence[Coefficient], errors: Tensor) -> list[Coefficient]:
         """Every parameter as it is now."""
         known = dict(zip(self.movable().tolist(), errors.tolist(), strict=True))
-        return [Coefficient(axis_of(name), name, float(self.theta[i]), known.get(i, 0.0)) for i, name in enumerate(PARAMETERS)]
+        return [
+            Coefficient(axis_of(name), name, float(self.theta[i]), known.get(i, 0.0))
+            for i, name in enumerate(PARAMETERS)
+        ]
 
 
 def axis_of(name: str) -> str:
@@ -90,15 +123,18 @@ def _thinned(samples: Samples) -> Samples:
 
 
 class MMGConfig(IdentifiedConfig):
-    """Hull, propeller and rudder of the MMG standard model (Yasukawa and Yoshimura 2015), for a ship with one of each.
+    """Hull, propeller and rudder of the MMG standard model (Yasukawa and Yoshimura 2015), for a
+    ship with one of each.
 
-    Every parameter has a belief, a mean and a standard deviation; usual values stand in for those that are not given. The trials move the
-    parameters as far as they tell, first through accelerations, then, with a `refit` of this baseline, through free runs, which also gives
-    the standard errors that intervals of predictions come from.
+    Every parameter has a belief, a mean and a standard deviation; usual values stand in for those
+    that are not given. The trials move the parameters as far as they tell, first through
+    accelerations, then, with a `refit` of this baseline, through free runs, which also gives the
+    standard errors that intervals of predictions come from.
 
     Attributes:
         hull, propeller, rudder: particulars.
-        beliefs: mean and standard deviation by parameter, where not the usual ones; a standard deviation of 0 fixes it.
+        beliefs: mean and standard deviation by parameter, where not the usual ones; a standard
+            deviation of 0 fixes it.
         revolutions: channel of the propeller's.
         angle: channel of the rudder's angle, positive to starboard.
         correlation: number of successive samples of accelerations that tell as much as one alone.
@@ -128,8 +164,17 @@ class MMGConfig(IdentifiedConfig):
         require(names, wanted, "the baseline 'mmg'")
         u, v, r, n, delta = (list(names).index(name) for name in wanted)
         usual = usual_beliefs(self.hull)
-        beliefs = [Belief(*self.beliefs[name], usual[name].meaning) if name in self.beliefs else usual[name] for name in PARAMETERS]
-        return MMGBaseline(MMGForces(self.hull, self.propeller, self.rudder, (u, v, r, n, delta)), beliefs)
+        beliefs = [
+            (
+                Belief(*self.beliefs[name], usual[name].meaning)
+                if name in self.beliefs
+                else usual[name]
+            )
+            for name in PARAMETERS
+        ]
+        return MMGBaseline(
+            MMGForces(self.hull, self.propeller, self.rudder, (u, v, r, n, delta)), beliefs
+        )
 
     def solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
         """The parameters that accelerations and beliefs together make most likely, by Gauss-Newton.
@@ -145,14 +190,25 @@ class MMGConfig(IdentifiedConfig):
         for _ in range(20):
             left = chosen.target - baseline(chosen.z)
             if not torch.isfinite(left).all():
-                raise FitError("the MMG model's accelerations are not finite along the training logs; check hull, propeller and rudder, and units")
+                raise FitError(
+                    "the MMG model's accelerations are not finite along the training logs; check"
+                    " hull, propeller and rudder, and units"
+                )
             weight = 1.0 / left.square().mean(0)
             slopes = baseline.sensitivity(chosen.z)
-            hessian = count * torch.einsum("bip,biq,i->pq", slopes, slopes, weight) / len(chosen) + torch.diag(precision)
-            gradient = count * torch.einsum("bip,bi,i->p", slopes, left, weight) / len(chosen) + precision * (mean - baseline.theta[free])
+            hessian = count * torch.einsum("bip,biq,i->pq", slopes, slopes, weight) / len(
+                chosen
+            ) + torch.diag(precision)
+            gradient = count * torch.einsum("bip,bi,i->p", slopes, left, weight) / len(
+                chosen
+            ) + precision * (mean - baseline.theta[free])
             step = torch.linalg.solve(hessian, gradient)
             baseline.theta[free] += step
             if float((step.square() * precision).max()) < 1e-6:
                 break
         errors = torch.linalg.inv(hessian).diagonal().sqrt()
-        return [Solution({}, {"theta": baseline.theta.detach().clone()}, tuple(baseline.restated((), errors)))]
+        return [
+            Solution(
+                {}, {"theta": baseline.theta.detach().clone()}, tuple(baseline.restated((), errors))
+            )
+        ]

@@ -1,4 +1,6 @@
-"""Nomoto's steering models (document 003 eqs. (12)-(15), document 004 section 5.1.2), identified by least squares on derivatives."""
+"""Nomoto's steering models (document 003 eqs. (12)-(15), document 004 section 5.1.2), identified by
+least squares on derivatives.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,8 @@ from residnet.regression.solutions import Coefficient, Ratio, Solution
 
 
 class _SteeringConfig(IdentifiedConfig):
-    """What both models have: T_u u_dot + u = K_u drive + b_u (eq. (12)) and T r_dot + r = K steer + b (eq. (13)).
+    """What both models have: T_u u_dot + u = K_u drive + b_u (eq. (12)) and T r_dot + r = K steer +
+    b (eq. (13)).
 
     Attributes:
         drive: channel that drives surge.
@@ -48,18 +51,23 @@ class _SteeringConfig(IdentifiedConfig):
             FitError: where the data do not determine it, or it does not settle.
         """
         chosen, terms = of_manoeuvres(samples, self.manoeuvres), self.rows()[axis]
-        columns = baseline.library(chosen.z)[:, [baseline.library.terms.index(term) for term in terms]]
+        columns = baseline.library(chosen.z)[
+            :, [baseline.library.terms.index(term) for term in terms]
+        ]
         fit = solve(columns, chosen.target[:, axis : axis + 1], chosen.group, names=terms)
         slope, error, name = float(fit.coefficients[0, 0]), float(fit.errors[0, 0]), VELOCITY[axis]
         if slope >= 0:
             raise FitError(
-                f"a Nomoto model needs {name} to settle, but {name}_dot rises with {name} ({slope:.2g} +- {error:.1g} 1/s): the vessel is "
-                "unstable on course or hardly excited; take a baseline of kind 'regressors' or fit on other `manoeuvres`"
+                f"a Nomoto model needs {name} to settle, but {name}_dot rises with {name}"
+                f" ({slope:.2g} +- {error:.1g} 1/s): the vessel is unstable on course or hardly"
+                " excited; take a baseline of kind 'regressors' or fit on other `manoeuvres`"
             )
         return fit
 
 
-def _parameters(axis: int, terms: Sequence[str], fit: LinearFit, ratios: Mapping[str, Ratio]) -> list[Coefficient]:
+def _parameters(
+    axis: int, terms: Sequence[str], fit: LinearFit, ratios: Mapping[str, Ratio]
+) -> list[Coefficient]:
     """Parameters that are ratios of the coefficients of an axis, with errors to first order."""
     theta, covariance = fit.coefficients[:, 0], fit.covariance[0]
     out = []
@@ -70,12 +78,22 @@ def _parameters(axis: int, terms: Sequence[str], fit: LinearFit, ratios: Mapping
         gradient[below] = -value / theta[below]
         if ratio.numerator is not None:
             gradient[terms.index(ratio.numerator)] += ratio.sign / theta[below]
-        out.append(Coefficient(f"{VELOCITY[axis]}_dot", name, value, float((gradient @ covariance @ gradient).clamp(min=0).sqrt()), ratio))
+        out.append(
+            Coefficient(
+                f"{VELOCITY[axis]}_dot",
+                name,
+                value,
+                float((gradient @ covariance @ gradient).clamp(min=0).sqrt()),
+                ratio,
+            )
+        )
     return out
 
 
 class NomotoConfig(_SteeringConfig):
-    """First-order Nomoto: T r_dot + r = K steer + b, surge a first-order lag of the drive; sway, of which it knows nothing, dies out with T."""
+    """First-order Nomoto: T r_dot + r = K steer + b, surge a first-order lag of the drive; sway, of
+    which it knows nothing, dies out with T.
+    """
 
     sway = ("v",)
     held = ((1, "v"),)
@@ -93,12 +111,16 @@ class NomotoConfig(_SteeringConfig):
         decay = LinearFit(yaw.coefficients[:1], yaw.covariance[:, :1, :1], yaw.condition)
         rows = self.rows()
         found = baseline.solved(list(zip(rows, (surge, decay, yaw), strict=True)), {})
-        more = _parameters(0, rows[0], surge, _lag_of("u", self.drive, "_u")) + _parameters(2, rows[2], yaw, _lag_of("r", self.steer, ""))
+        more = _parameters(0, rows[0], surge, _lag_of("u", self.drive, "_u")) + _parameters(
+            2, rows[2], yaw, _lag_of("r", self.steer, "")
+        )
         return [Solution({}, found.state, (*found.table, *more))]
 
 
 class NomotoSideslipConfig(_SteeringConfig):
-    """Nomoto with side slip (document 003 eqs. (14), (15)): T_beta beta_dot + beta = -K_beta r + b_beta, written for v = u beta."""
+    """Nomoto with side slip (document 003 eqs. (14), (15)): T_beta beta_dot + beta = -K_beta r +
+    b_beta, written for v = u beta.
+    """
 
     sway = ("v", "u r", "u")
 
@@ -114,12 +136,22 @@ class NomotoSideslipConfig(_SteeringConfig):
         fits = [self.lag(baseline, samples, axis) for axis in range(3)]
         rows = self.rows()
         found = baseline.solved(list(zip(rows, fits, strict=True)), {})
-        slip = {"T_beta": Ratio(-1.0, None, "v"), "K_beta": Ratio(1.0, "u r", "v"), "b_beta": Ratio(-1.0, "u", "v")}
+        slip = {
+            "T_beta": Ratio(-1.0, None, "v"),
+            "K_beta": Ratio(1.0, "u r", "v"),
+            "b_beta": Ratio(-1.0, "u", "v"),
+        }
         ratios = (_lag_of("u", self.drive, "_u"), slip, _lag_of("r", self.steer, ""))
-        more = [c for axis in range(3) for c in _parameters(axis, rows[axis], fits[axis], ratios[axis])]
+        more = [
+            c for axis in range(3) for c in _parameters(axis, rows[axis], fits[axis], ratios[axis])
+        ]
         return [Solution({}, found.state, (*found.table, *more))]
 
 
 def _lag_of(state: str, drive: str, suffix: str) -> dict[str, Ratio]:
     """T x_dot + x = K drive + b from x_dot = a x + k drive + c."""
-    return {f"T{suffix}": Ratio(-1.0, None, state), f"K{suffix}": Ratio(-1.0, drive, state), f"b{suffix}": Ratio(-1.0, "1", state)}
+    return {
+        f"T{suffix}": Ratio(-1.0, None, state),
+        f"K{suffix}": Ratio(-1.0, drive, state),
+        f"b{suffix}": Ratio(-1.0, "1", state),
+    }

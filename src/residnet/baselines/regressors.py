@@ -1,4 +1,5 @@
-"""Baselines that are linear in their coefficients: nu_dot = Theta phi(z), with regressors by name."""
+"""Baselines that are linear in their coefficients: nu_dot = Theta phi(z), with regressors by name.
+"""
 
 from __future__ import annotations
 
@@ -25,14 +26,25 @@ Penalty = Annotated[float, Field(ge=0)]
 
 @final
 class RegressorBaseline(ParametricBaseline):
-    """nu_dot [..., 3] = theta [3, J] phi(z) [..., J]; a term that an axis does not have keeps a zero."""
+    """nu_dot [..., 3] = theta [3, J] phi(z) [..., J]; a term that an axis does not have keeps a
+    zero.
+    """
 
-    def __init__(self, rows: Sequence[Sequence[str]], names: Sequence[str], held: Sequence[tuple[int, str]] = ()) -> None:
-        """From the terms of each axis; `held`: (axis, term) of coefficients that a refit through rollouts must leave as they are."""
+    def __init__(
+        self,
+        rows: Sequence[Sequence[str]],
+        names: Sequence[str],
+        held: Sequence[tuple[int, str]] = (),
+    ) -> None:
+        """From the terms of each axis; `held`: (axis, term) of coefficients that a refit through
+        rollouts must leave as they are.
+        """
         terms = list(dict.fromkeys(term for row in rows for term in row))
         super().__init__(torch.zeros(3, len(terms), dtype=torch.float64))
         self.library = TermLibrary(terms, names)
-        allowed = torch.tensor([[term in row for term in terms] for row in rows], dtype=torch.float64)
+        allowed = torch.tensor(
+            [[term in row for term in terms] for row in rows], dtype=torch.float64
+        )
         self.register_buffer("allowed", allowed, persistent=False)
         self.allowed: Tensor
         self.held = tuple((axis, terms.index(term)) for axis, term in held)
@@ -66,7 +78,9 @@ class RegressorBaseline(ParametricBaseline):
         return out
 
     def information(self, samples: Samples) -> Tensor:
-        """Mean information of a sample [P, P], by the variance that least squares leaves of each axis."""
+        """Mean information of a sample [P, P], by the variance that least squares leaves of each
+        axis.
+        """
         phi, variance = self._residual(samples)
         gram = phi.T @ phi / len(samples)
         free = self.movable()
@@ -80,20 +94,33 @@ class RegressorBaseline(ParametricBaseline):
     def asymmetry(self, samples: Samples) -> Tensor:
         """Mean information of a sample [P] about terms of the wrong parity."""
         phi, variance = self._residual(samples)
-        odd = [[float(wrong_parity(term, axis, samples.names)) for term in self.library.terms] for axis in range(3)]
+        odd = [
+            [float(wrong_parity(term, axis, samples.names)) for term in self.library.terms]
+            for axis in range(3)
+        ]
         pull = torch.tensor(odd, dtype=torch.float64) * phi.square().mean(0) / variance[:, None]
         return pull.flatten()[self.movable()]
 
     def restated(self, table: Sequence[Coefficient], errors: Tensor) -> list[Coefficient]:
         """Coefficients and ratios as theta is now; a ratio keeps its error."""
         terms = self.library.terms
-        rows = {f"{name}_dot": dict(zip(terms, self.theta[axis].tolist(), strict=True)) for axis, name in enumerate(VELOCITY)}
-        names = [(f"{VELOCITY[i // len(terms)]}_dot", terms[i % len(terms)]) for i in self.movable().tolist()]
+        rows = {
+            f"{name}_dot": dict(zip(terms, self.theta[axis].tolist(), strict=True))
+            for axis, name in enumerate(VELOCITY)
+        }
+        names = [
+            (f"{VELOCITY[i // len(terms)]}_dot", terms[i % len(terms)])
+            for i in self.movable().tolist()
+        ]
         known = dict(zip(names, errors.tolist(), strict=True))
         return [
-            replace(c, value=c.ratio.of(rows[c.axis]))
-            if c.ratio is not None
-            else replace(c, value=rows[c.axis][c.term], error=known.get((c.axis, c.term), c.error))
+            (
+                replace(c, value=c.ratio.of(rows[c.axis]))
+                if c.ratio is not None
+                else replace(
+                    c, value=rows[c.axis][c.term], error=known.get((c.axis, c.term), c.error)
+                )
+            )
             for c in table
         ]
 
@@ -103,12 +130,18 @@ class RegressorBaseline(ParametricBaseline):
         left = samples.target - phi @ (self.theta * self.allowed).detach().T
         return phi, left.square().mean(0)
 
-    def solved(self, fits: Sequence[tuple[Sequence[str], LinearFit]], choice: dict[str, float]) -> Solution:
-        """A solution from the fit of each axis: its terms, and coefficients [J, 1] with their errors."""
+    def solved(
+        self, fits: Sequence[tuple[Sequence[str], LinearFit]], choice: dict[str, float]
+    ) -> Solution:
+        """A solution from the fit of each axis: its terms, and coefficients [J, 1] with their
+        errors.
+        """
         theta = torch.zeros_like(self.theta)
         table: list[Coefficient] = []
         for axis, (terms, fit) in enumerate(fits):
-            for term, value, error in zip(terms, fit.coefficients[:, 0].tolist(), fit.errors[:, 0].tolist(), strict=True):
+            for term, value, error in zip(
+                terms, fit.coefficients[:, 0].tolist(), fit.errors[:, 0].tolist(), strict=True
+            ):
                 theta[axis, self.library.terms.index(term)] = value
                 table.append(Coefficient(f"{VELOCITY[axis]}_dot", term, value, error))
         return Solution(dict(choice), {"theta": theta}, tuple(table))
@@ -118,14 +151,19 @@ class RegressorsConfig(IdentifiedConfig):
     """Least squares (or ridge) of accelerations on named regressors.
 
     Attributes:
-        sets: regressors of every axis by the name of a set, written out for the model's channels: `linear`; `fossen` (linear and quadratic
-            damping, Coriolis products, propeller and rudder); `abkowitz` (third-order Taylor series about straight ahead); `wind`;
-            `polynomial_1`, `polynomial_2` (all products of velocities and inputs, the ridge models of document 001 section 2.2).
-        terms: further regressors of every axis, or of each axis `u`, `v`, `r`; with neither sets nor terms: the constant and every channel.
-        drive: channels that the sets take as thrust; empty: n, or tau_x where the model makes forces.
-        steer: channels that the sets take as steering; empty: delta, or tau_n where the model makes forces.
-        ridge: penalty as a share of each regressor's energy, 0 for ordinary least squares; of several the one whose free run is best on
-            validation data.
+        sets: regressors of every axis by the name of a set, written out for the model's channels:
+            `linear`; `fossen` (linear and quadratic damping, Coriolis products, propeller and
+            rudder); `abkowitz` (third-order Taylor series about straight ahead); `wind`;
+            `polynomial_1`, `polynomial_2` (all products of velocities and inputs, the ridge models
+            of document 001 section 2.2).
+        terms: further regressors of every axis, or of each axis `u`, `v`, `r`; with neither sets
+            nor terms: the constant and every channel.
+        drive: channels that the sets take as thrust; empty: n, or tau_x where the model makes
+            forces.
+        steer: channels that the sets take as steering; empty: delta, or tau_n where the model makes
+            forces.
+        ridge: penalty as a share of each regressor's energy, 0 for ordinary least squares; of
+            several the one whose free run is best on validation data.
         manoeuvres: kinds of manoeuvre to fit on; empty for all.
     """
 
@@ -142,12 +180,20 @@ class RegressorsConfig(IdentifiedConfig):
         if isinstance(self.terms, dict) and set(self.terms) != set(VELOCITY):
             raise ValueError(f"terms per axis need all of u, v, r; given {sorted(self.terms)}")
         if (self.drive or self.steer) and not self.sets:
-            raise ValueError("drive and steer say what `sets` are written out for; give sets, or leave them out")
+            raise ValueError(
+                "drive and steer say what `sets` are written out for; give sets, or leave them out"
+            )
         return self
 
     def rows(self, names: Sequence[str]) -> list[tuple[str, ...]]:
-        """Regressors of each axis for channels `names`; one that sets and terms both name stands once, as it was named first."""
-        own = [tuple(self.terms[axis]) for axis in ("u", "v", "r")] if isinstance(self.terms, dict) else [tuple(self.terms)] * 3
+        """Regressors of each axis for channels `names`; one that sets and terms both name stands
+        once, as it was named first.
+        """
+        own = (
+            [tuple(self.terms[axis]) for axis in ("u", "v", "r")]
+            if isinstance(self.terms, dict)
+            else [tuple(self.terms)] * 3
+        )
         if self.sets:
             shared = expand(self.sets, Roles.of(names, self.drive, self.steer))
             return [merged((*shared, *row), names) for row in own]
@@ -172,8 +218,13 @@ class RegressorsConfig(IdentifiedConfig):
             columns = baseline.columns(axis)
             terms.append(tuple(baseline.library.terms[j] for j in columns))
             target = chosen.target[:, axis : axis + 1]
-            paths.append(solve_path(phi[:, columns], target, chosen.group, names=terms[-1], ridges=ridges))
+            paths.append(
+                solve_path(phi[:, columns], target, chosen.group, names=terms[-1], ridges=ridges)
+            )
         return [
-            baseline.solved([(terms[axis], paths[axis][i]) for axis in range(3)], {"ridge": ridge} if len(ridges) > 1 else {})
+            baseline.solved(
+                [(terms[axis], paths[axis][i]) for axis in range(3)],
+                {"ridge": ridge} if len(ridges) > 1 else {},
+            )
             for i, ridge in enumerate(ridges)
         ]

@@ -36,7 +36,9 @@ class Roles(NamedTuple):
     wind: bool
 
     @classmethod
-    def of(cls, names: Sequence[str], drive: Sequence[str] = (), steer: Sequence[str] = ()) -> Roles:
+    def of(
+        cls, names: Sequence[str], drive: Sequence[str] = (), steer: Sequence[str] = ()
+    ) -> Roles:
         """Roles by name, or as given.
 
         Raises:
@@ -46,7 +48,11 @@ class Roles(NamedTuple):
             if name not in names:
                 raise ConfigError(f"sets: no channel '{name}'{nearest(name, names)}")
         forces = "tau_x" in names
-        acting = [name for name in names if name not in (*VELOCITY, *WIND_CHANNELS) and (not forces or name in FORCE_CHANNELS)]
+        acting = [
+            name
+            for name in names
+            if name not in (*VELOCITY, *WIND_CHANNELS) and (not forces or name in FORCE_CHANNELS)
+        ]
         drives = tuple(drive) or tuple(name for name in acting if name in _DRIVES)
         steers = tuple(steer) or tuple(name for name in acting if name in _STEERS)
         others = tuple(name for name in acting if name not in (*drives, *steers) and not forces)
@@ -59,9 +65,15 @@ class Roles(NamedTuple):
             ConfigError: where one has none.
         """
         if self.others:
-            raise ConfigError(f"set '{who}' must know whether '{self.others[0]}' pushes or turns; name it in `drive` or `steer`")
+            raise ConfigError(
+                f"set '{who}' must know whether '{self.others[0]}' pushes or turns; name it in"
+                " `drive` or `steer`"
+            )
         if not self.drives or not self.steers:
-            raise ConfigError(f"set '{who}' needs a channel that pushes and one that turns (name them in `drive` and `steer`)")
+            raise ConfigError(
+                f"set '{who}' needs a channel that pushes and one that turns (name them in `drive`"
+                " and `steer`)"
+            )
         return self
 
 
@@ -75,51 +87,85 @@ def _thrust(drive: str) -> list[str]:
 
 
 def _turning(steer: str, drives: Sequence[str]) -> list[str]:
-    """A moment as it is; of a rudder lift that grows with the square of the inflow from speed and propellers."""
+    """A moment as it is; of a rudder lift that grows with the square of the inflow from speed and
+    propellers.
+    """
     if steer in FORCE_CHANNELS:
         return [steer]
     propellers = [drive for drive in drives if drive not in FORCE_CHANNELS]
-    return [f"u|u| {steer}", *(f"{n}|{n}| {steer}" for n in propellers), *(f"u {n} {steer}" for n in propellers)]
+    return [
+        f"u|u| {steer}",
+        *(f"{n}|{n}| {steer}" for n in propellers),
+        *(f"u {n} {steer}" for n in propellers),
+    ]
 
 
 def _controls(roles: Roles) -> list[str]:
-    return [t for drive in roles.drives for t in _thrust(drive)] + [t for steer in roles.steers for t in _turning(steer, roles.drives)]
+    return [t for drive in roles.drives for t in _thrust(drive)] + [
+        t for steer in roles.steers for t in _turning(steer, roles.drives)
+    ]
 
 
 def _fossen(roles: Roles) -> list[str]:
-    """Coriolis products, linear and quadratic damping of Fossen's manoeuvring model (document 002 eq. (2.4), document 003 eqs. (7)-(9))."""
+    """Coriolis products, linear and quadratic damping of Fossen's manoeuvring model (document 002
+    eq. (2.4), document 003 eqs. (7)-(9)).
+    """
     hull = ["u v", "u r", "v r", "u|u|", "v|v|", "r|r|", "v|r|", "r|v|"]
     return ["1", *VELOCITY, *hull, *_controls(roles.known("fossen"))]
 
 
 def _abkowitz(roles: Roles) -> list[str]:
-    """Taylor series to third order about straight ahead: even products in surge, odd ones in sway and yaw (an asymmetric hull has both)."""
+    """Taylor series to third order about straight ahead: even products in surge, odd ones in sway
+    and yaw (an asymmetric hull has both).
+    """
     sideways = ["v", "r", *roles.known("abkowitz").steers]
     even = [" ".join(c) for c in combinations_with_replacement(sideways, 2)]
     odd = [" ".join(c) for c in combinations_with_replacement(sideways, 3)]
     speed = ["u", "u^2", "u^3", *(f"u {name}" for name in sideways)]
-    return ["1", *speed, *sideways, *even, *odd, *(t for drive in roles.drives for t in _thrust(drive))]
+    return [
+        "1",
+        *speed,
+        *sideways,
+        *even,
+        *odd,
+        *(t for drive in roles.drives for t in _thrust(drive)),
+    ]
 
 
 def _wind(roles: Roles) -> list[str]:
-    """Loads of the relative wind: quadratic in it, with coefficients that turn with its direction (first three harmonics)."""
+    """Loads of the relative wind: quadratic in it, with coefficients that turn with its direction
+    (first three harmonics).
+    """
     if not roles.wind:
-        raise ConfigError("set 'wind' needs the true wind; add wind_speed and wind_dir to signals.exogenous")
+        raise ConfigError(
+            "set 'wind' needs the true wind; add wind_speed and wind_dir to signals.exogenous"
+        )
     harmonics = ["wind_u wind_v", "wind_u wind_v^2 wind_mag^-1", "wind_v wind_u^2 wind_mag^-1"]
     return ["wind_u", "wind_v", "wind_u wind_mag", "wind_v wind_mag", *harmonics]
 
 
 def _astern(roles: Roles) -> list[str]:
-    """What tells a propeller that turns astern from one that turns ahead; the other sets alone take them as mirrored."""
+    """What tells a propeller that turns astern from one that turns ahead; the other sets alone take
+    them as mirrored.
+    """
     propellers = [name for name in roles.drives if name not in FORCE_CHANNELS]
     if not propellers:
-        raise ConfigError("set 'astern' needs a propeller among the channels that push (name it in `drive`)")
-    return [t for n in propellers for t in (f"{n}^2", f"{n} u", *(f"{n}^2 {steer}" for steer in roles.steers))]
+        raise ConfigError(
+            "set 'astern' needs a propeller among the channels that push (name it in `drive`)"
+        )
+    return [
+        t
+        for n in propellers
+        for t in (f"{n}^2", f"{n} u", *(f"{n}^2 {steer}" for steer in roles.steers))
+    ]
 
 
 def _polynomial(roles: Roles, degree: int) -> list[str]:
     wind = ("wind_u", "wind_v") if roles.wind else ()
-    return ["1", *polynomial_terms((*VELOCITY, *roles.drives, *roles.steers, *roles.others, *wind), degree)]
+    return [
+        "1",
+        *polynomial_terms((*VELOCITY, *roles.drives, *roles.steers, *roles.others, *wind), degree),
+    ]
 
 
 _SETS: dict[str, Callable[[Roles], list[str]]] = {
@@ -143,7 +189,9 @@ def expand(sets: Sequence[SetName], roles: Roles) -> tuple[str, ...]:
 
 
 def merged(terms: Sequence[str], names: Sequence[str]) -> tuple[str, ...]:
-    """The terms without those that say the same as one before them, such as `v u` after `u v` or `n^2` after `n n`."""
+    """The terms without those that say the same as one before them, such as `v u` after `u v` or
+    `n^2` after `n n`.
+    """
     seen: dict[frozenset[tuple[Factor, int, bool]], str] = {}
     for term in terms:
         seen.setdefault(_meaning(term, names), term)
@@ -151,7 +199,9 @@ def merged(terms: Sequence[str], names: Sequence[str]) -> tuple[str, ...]:
 
 
 def _meaning(term: str, names: Sequence[str]) -> frozenset[tuple[Factor, int, bool]]:
-    """What a term multiplies: each thing without its power or magnitude, its whole power, and whether the product changes sign with it."""
+    """What a term multiplies: each thing without its power or magnitude, its whole power, and
+    whether the product changes sign with it.
+    """
     power: dict[Factor, int] = {}
     odd: dict[Factor, bool] = {}
     for factor in parse_term(term, names):

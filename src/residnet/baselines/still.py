@@ -1,4 +1,6 @@
-"""The baseline that knows nothing: velocities held. It makes the model `zero`, and a black box where a head is set on it."""
+"""The baseline that knows nothing: velocities held. It makes the model `zero`, and a black box
+where a head is set on it.
+"""
 
 from __future__ import annotations
 

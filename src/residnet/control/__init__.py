@@ -4,9 +4,20 @@ from __future__ import annotations
 
 from residnet.control.base import ClosedLoop, GivenReference, Policy, Reference
 from residnet.control.heading.bang_bang import BangBangHeading
-from residnet.control.heading.document_autopilot import DocumentAutopilot, Predictor, SimulatedPredictor
+from residnet.control.heading.document_autopilot import (
+    DocumentAutopilot,
+    Predictor,
+    SimulatedPredictor,
+)
 from residnet.control.heading.heading_pid import HeadingPID
-from residnet.control.motion.pid import Allocated, FeedForward, HullFeedForward, MotionPID, MotionPIDConfig, NoFeedForward
+from residnet.control.motion.pid import (
+    Allocated,
+    FeedForward,
+    HullFeedForward,
+    MotionPID,
+    MotionPIDConfig,
+    NoFeedForward,
+)
 from residnet.control.motion.reference_filter import ReferenceFilter, ReferenceFilterConfig
 
 __all__ = [

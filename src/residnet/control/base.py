@@ -1,4 +1,5 @@
-"""The interface of controllers and guidance, and the source that flies them in the one time loop."""
+"""The interface of controllers and guidance, and the source that flies them in the one time loop.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +13,9 @@ from residnet.dynamics.rollout import Source
 
 
 class Policy(nn.Module, ABC):
-    """A controller: commands from the state and a reference, once per step; the same tensor code trains, flies and is exported."""
+    """A controller: commands from the state and a reference, once per step; the same tensor code
+    trains, flies and is exported.
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -24,7 +27,9 @@ class Policy(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Command [B, c] and new memory from the state x [B, nx], the reference [B, r] of this step and the memory s [B, n_state]."""
+        """Command [B, c] and new memory from the state x [B, nx], the reference [B, r] of this step
+        and the memory s [B, n_state].
+        """
 
 
 class Reference(nn.Module, ABC):
@@ -41,7 +46,9 @@ class Reference(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, x: Tensor, k: int, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Reference [B, r] for step k and new memory, from the state x [B, nx] and the memory s [B, n_state]."""
+        """Reference [B, r] for step k and new memory, from the state x [B, nx] and the memory s [B,
+        n_state].
+        """
 
     def finished(self, x: Tensor, k: int, s: Tensor) -> Tensor:
         """[B] bool: rows that have arrived; asked only where `may_finish`."""
@@ -63,7 +70,9 @@ class GivenReference(Reference):
 
 @final
 class ClosedLoop(Source):
-    """A controller under guidance as the source of a rollout's inputs: its commands take the first columns of w."""
+    """A controller under guidance as the source of a rollout's inputs: its commands take the first
+    columns of w.
+    """
 
     def __init__(self, policy: Policy, reference: Reference) -> None:
         super().__init__()
@@ -80,7 +89,9 @@ class ClosedLoop(Source):
         n = self.reference.n_state
         target, guided = self.reference(x, k, memory[:, :n])
         command, s = self.policy(x, target, memory[:, n:])
-        return torch.cat((command, w[:, command.shape[-1] :]), dim=-1), torch.cat((guided, s), dim=-1)
+        return torch.cat((command, w[:, command.shape[-1] :]), dim=-1), torch.cat(
+            (guided, s), dim=-1
+        )
 
     def finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
         """Rows whose guidance has arrived."""

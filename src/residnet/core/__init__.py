@@ -1,1 +1,3 @@
-"""What everything else stands on: errors, names and units, frames, the canonical log, configuration."""
+"""What everything else stands on: errors, names and units, frames, the canonical log,
+configuration.
+"""

@@ -1,7 +1,9 @@
-"""Configs: frozen pydantic models read from YAML, with units at the door and errors that fit on one line.
+"""Configs: frozen pydantic models read from YAML, with units at the door and errors that fit on one
+line.
 
-A run is one YAML file plus overrides (`head.lstm.hidden_size=64`). Values are taken strictly: text is no number, a boolean is
-no number, `64.0` is no count. Dimensional values are SI numbers or text with a unit (`20 deg`).
+A run is one YAML file plus overrides (`head.lstm.hidden_size=64`). Values are taken strictly: text
+is no number, a boolean is no number, `64.0` is no count. Dimensional values are SI numbers or text
+with a unit (`20 deg`).
 """
 
 from __future__ import annotations
@@ -14,7 +16,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, overload
 
-from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, TypeAdapter, ValidationError, ValidationInfo
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    GetCoreSchemaHandler,
+    TypeAdapter,
+    ValidationError,
+    ValidationInfo,
+)
 from pydantic_core import CoreSchema, PydanticSerializationError, core_schema, to_json
 from yaml.nodes import Node
 
@@ -27,14 +36,19 @@ T = TypeVar("T")
 
 
 class Config(BaseModel):
-    """Base of all configs: frozen, no unknown keys, finite numbers only, defaults checked as values are."""
+    """Base of all configs: frozen, no unknown keys, finite numbers only, defaults checked as values
+    are.
+    """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, validate_default=True)
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", allow_inf_nan=False, validate_default=True
+    )
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """Marks a float that a config gives in SI or as text with a unit: `Annotated[float, Quantity("kg")]`.
+    """Marks a float that a config gives in SI or as text with a unit: `Annotated[float,
+    Quantity("kg")]`.
 
     Attributes:
         si: SI unit of the dimension; the value that the config holds is in this unit.
@@ -49,7 +63,9 @@ class Quantity:
         if si_unit(self.si) != self.si:
             raise UsageError(f"unit '{self.si}' is not SI; the SI unit is '{si_unit(self.si)}'")
 
-    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
         """The float's own schema, constraints included, behind the conversion."""
         return core_schema.no_info_before_validator_function(self.convert, handler(source))
 
@@ -57,7 +73,8 @@ class Quantity:
         """Value in SI.
 
         Raises:
-            ValueError: where the value is not a finite number or `<number> <unit>`, or the unit is unknown or of another dimension.
+            ValueError: where the value is not a finite number or `<number> <unit>`, or the unit is
+                unknown or of another dimension.
         """
         try:
             si = self._parsed(value)
@@ -73,10 +90,14 @@ class Quantity:
         match = _QUANTITY.fullmatch(value) if isinstance(value, str) else None
         if match is None:
             example = next((unit for unit in self._fitting() if unit != self.si), self.si)
-            raise ValueError(f"expected a number in {self.si} or text such as '1.5 {example}' {given(value)}")
+            raise ValueError(
+                f"expected a number in {self.si} or text such as '1.5 {example}' {given(value)}"
+            )
         number, unit = match.groups()
         if unit and unit not in units():
-            raise ValueError(f"unknown unit '{unit}'{nearest(unit, self._fitting())} {given(value)}")
+            raise ValueError(
+                f"unknown unit '{unit}'{nearest(unit, self._fitting())} {given(value)}"
+            )
         try:
             return float(number) * to_si(unit or self.si, self.si)
         except UsageError as error:
@@ -90,7 +111,8 @@ _QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\
 
 
 def quantity(si: str) -> Any:
-    """Type of a float in `si`, for types that are put together at run time; in annotations write `Annotated[float, Quantity(si)]`.
+    """Type of a float in `si`, for types that are put together at run time; in annotations write
+    `Annotated[float, Quantity(si)]`.
 
     Raises:
         UsageError: where `si` is not the SI unit of a known dimension.
@@ -115,9 +137,12 @@ NewtonMetres = Annotated[float, Quantity("N m")]
 class _PathRule:
     must_exist: bool
 
-    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
         return core_schema.with_info_plain_validator_function(
-            self.resolve, serialization=core_schema.plain_serializer_function_ser_schema(str, when_used="json")
+            self.resolve,
+            serialization=core_schema.plain_serializer_function_ser_schema(str, when_used="json"),
         )
 
     def resolve(self, value: object, info: ValidationInfo) -> Path:
@@ -128,7 +153,10 @@ class _PathRule:
         places = [place / path for place in (folder, Path.cwd()) if place is not None]
         found = next((place for place in places if _exists(place)), None)
         if found is None and self.must_exist:
-            raise ValueError(f"no such file or folder: {' or '.join(str(place) for place in dict.fromkeys(places))}")
+            raise ValueError(
+                "no such file or folder:"
+                f" {' or '.join(str(place) for place in dict.fromkeys(places))}"
+            )
         return (found or places[-1]).absolute()
 
 
@@ -136,7 +164,10 @@ def _expanded(text: str) -> Path:
     def environment(match: re.Match[str]) -> str:
         # an empty variable would turn ${DATA}/logs into /logs
         if not (value := os.environ.get(match[1])):
-            raise ValueError(f"environment variable '{match[1]}' is not set; set it (export {match[1]}=...) or write the path itself")
+            raise ValueError(
+                f"environment variable '{match[1]}' is not set; set it (export {match[1]}=...) or"
+                " write the path itself"
+            )
         return value
 
     try:
@@ -153,7 +184,9 @@ def _exists(path: Path) -> bool:
 
 
 ConfigPath = Annotated[Path, _PathRule(must_exist=False)]
-"""Absolute path; `${NAME}` and `~` expanded, a relative one taken from the config's folder if it exists there, else from the current folder."""
+"""Absolute path; `${NAME}` and `~` expanded, a relative one taken from the config's folder if it
+exists there, else from the current folder.
+"""
 
 ExistingPath = Annotated[Path, _PathRule(must_exist=True)]
 """As `ConfigPath`, and the file or folder exists."""
@@ -178,7 +211,9 @@ class _Origin:
     overrides: tuple[_Override, ...] = ()
 
     def of(self, path: KeyPath) -> str:
-        """Source of the value at `path`: the last override that set it, else the file; and the last one that changed a part of it."""
+        """Source of the value at `path`: the last override that set it, else the file; and the last
+        one that changed a part of it.
+        """
         inside = ""
         for override in reversed(self.overrides):
             if path[: len(override.path)] == override.path:
@@ -213,7 +248,8 @@ def load_mapping(path: Path) -> dict[str, Any]:
     """Plain contents of a YAML file, unvalidated; all keys are text.
 
     Raises:
-        ConfigError: where the file is missing, a folder, not YAML, empty or not a mapping, or repeats a key.
+        ConfigError: where the file is missing, a folder, not YAML, empty or not a mapping, or
+            repeats a key.
     """
     return _read(Path(path))[0]
 
@@ -233,11 +269,13 @@ def load_config(path: Path, overrides: Sequence[str], model: Any) -> Any:
 
     Args:
         path: YAML file.
-        overrides: `dotted.key=value`, value in YAML, in order; an element of a list is addressed by its index. `~dotted.key` takes a key away.
+        overrides: `dotted.key=value`, value in YAML, in order; an element of a list is addressed by
+            its index. `~dotted.key` takes a key away.
         model: config class, or a union of them (`Annotated[A | B, Field(discriminator="kind")]`).
 
     Raises:
-        ConfigError: one line: file (with line) or override, key path, what is wrong, what was given, the nearest valid name.
+        ConfigError: one line: file (with line) or override, key path, what is wrong, what was
+            given, the nearest valid name.
     """
     path = Path(path)
     data, root = _read(path)
@@ -256,7 +294,8 @@ def validate(data: Any, model: Any, where: str, folder: Path | None = None) -> A
 
 
 def validate(data: Any, model: Any, where: str, folder: Path | None = None) -> Any:
-    """Config of type `model` from plain values (what JSON can hold), under the rules of `load_config`.
+    """Config of type `model` from plain values (what JSON can hold), under the rules of
+    `load_config`.
 
     Args:
         data: for example a mapping from `load_mapping`.
@@ -271,9 +310,12 @@ def validate(data: Any, model: Any, where: str, folder: Path | None = None) -> A
 
 
 def _validated(data: Any, model: Any, origin: _Origin, folder: Path | None) -> Any:
-    # pydantic is strict without refusing lists for tuples or text for enums and paths only when it reads JSON
+    # pydantic is strict without refusing lists for tuples or text for enums and paths only when it
+    # reads JSON
     try:
-        return TypeAdapter(model).validate_json(to_json(data), strict=True, context={"folder": folder})
+        return TypeAdapter(model).validate_json(
+            to_json(data), strict=True, context={"folder": folder}
+        )
     except ValidationError as error:
         raise ConfigError(describe(error, model, origin.of)) from error
     except PydanticSerializationError as error:
@@ -281,13 +323,17 @@ def _validated(data: Any, model: Any, origin: _Origin, folder: Path | None) -> A
 
 
 def _apply(data: dict[str, Any], text: str) -> _Override:
-    """Set the value of one override in `data`; keys on the way that the file leaves out are made. `~key` takes a key away."""
+    """Set the value of one override in `data`; keys on the way that the file leaves out are made.
+    `~key` takes a key away.
+    """
     if text.startswith("~"):
         return _remove(data, text)
     key, equals, value_text = text.partition("=")
     keys = key.strip().split(".")
     if not equals or not all(keys):
-        raise ConfigError(f"override '{text}': expected key=value, for example head.lstm.hidden_size=64")
+        raise ConfigError(
+            f"override '{text}': expected key=value, for example head.lstm.hidden_size=64"
+        )
     where = f"override '{text}'"
     value, _ = parse(value_text, where, located=False)
     path: KeyPath = ()
@@ -311,7 +357,10 @@ def _remove(data: dict[str, Any], text: str) -> _Override:
     for i, name in enumerate(keys):
         if not isinstance(here, dict) or name not in here:
             at = ".".join(keys[: i + 1])
-            raise ConfigError(f"{where}: there is no '{at}' to take away{nearest(name, here) if isinstance(here, dict) and here else ''}")
+            raise ConfigError(
+                f"{where}: there is no '{at}' to take"
+                f" away{nearest(name, here) if isinstance(here, dict) and here else ''}"
+            )
         path += (name,)
         if i == len(keys) - 1:
             del here[name]
@@ -328,10 +377,14 @@ def _element(here: Any, name: str, where: str, path: KeyPath) -> str | int:
     if not isinstance(here, list):
         raise ConfigError(f"{where}: {at}: has no key '{name}' {given(here)}")
     if not name.isdecimal() or int(name) >= len(here):
-        raise ConfigError(f"{where}: {at}: a list of {len(here)} items has no item '{name}'; the first is 0")
+        raise ConfigError(
+            f"{where}: {at}: a list of {len(here)} items has no item '{name}'; the first is 0"
+        )
     return int(name)
 
 
 def dump_config(config: BaseModel) -> str:
-    """YAML text of a resolved config: every key, SI numbers, absolute paths; it loads back to an equal config."""
+    """YAML text of a resolved config: every key, SI numbers, absolute paths; it loads back to an
+    equal config.
+    """
     return dump(config.model_dump(mode="json", by_alias=True))

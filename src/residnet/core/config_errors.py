@@ -1,4 +1,6 @@
-"""One line out of pydantic's validation errors: which key, what is wrong, what was given, the nearest valid name."""
+"""One line out of pydantic's validation errors: which key, what is wrong, what was given, the
+nearest valid name.
+"""
 
 from __future__ import annotations
 
@@ -54,7 +56,10 @@ def describe(error: ValidationError, model: Any, where: Callable[[KeyPath], str]
     # a mistyped key is also a missing one; the typo is what the user has to see
     first = next((fault for fault in faults if fault.kind == "extra_forbidden"), faults[0])
     # below a plain union, the member that got furthest into the value is the one that was meant
-    first = max((fault for fault in faults if fault.path[: len(first.path)] == first.path), key=lambda fault: len(fault.path))
+    first = max(
+        (fault for fault in faults if fault.path[: len(first.path)] == first.path),
+        key=lambda fault: len(fault.path),
+    )
     text = _either([fault.text for fault in faults if fault.path == first.path])
     others = {fault.path for fault in faults if first.path[: len(fault.path)] != fault.path}
     more = f" (and {len(others)} more)" if others else ""
@@ -84,14 +89,21 @@ def _fault(details: ErrorDetails, model: Any) -> _Fault:
             text = f"unknown key{nearest(str(path[-1]), _keys(parents))}{_of_kind(parents)}"
         case "union_tag_invalid":
             path += _discriminator(context)
-            text = f"unknown value '{context['tag']}'{nearest(str(context['tag']), _quoted(context['expected_tags']))}"
+            text = (
+                "unknown value"
+                f" '{context['tag']}'{nearest(str(context['tag']), _quoted(context['expected_tags']))}"
+            )
         case "union_tag_not_found":
             path += _discriminator(context)
             text = f"missing{nearest('', _tags(here, path[-1]))}"
         case "literal_error" | "enum":
             valid = _quoted(context["expected"])
             unknown = isinstance(value, str) and bool(valid)
-            text = f"unknown value '{value}'{nearest(value, valid)}" if unknown else f"expected {context['expected']} {given(value)}"
+            text = (
+                f"unknown value '{value}'{nearest(value, valid)}"
+                if unknown
+                else f"expected {context['expected']} {given(value)}"
+            )
         case "value_error" | "assertion_error":
             text = _own_text(str(context["error"]), value)
         case _ if kind in _EXPECTED:
@@ -102,13 +114,16 @@ def _fault(details: ErrorDetails, model: Any) -> _Fault:
 
 
 def _own_text(text: str, value: Any) -> str:
-    # a validator of a whole section has said which of its keys it means; the section itself would only fill the line
+    # a validator of a whole section has said which of its keys it means; the section itself would
+    # only fill the line
     scalar = isinstance(value, (str, int, float)) and "(given " not in text
     return f"{text} {given(value)}" if scalar else text
 
 
 def given(value: Any) -> str:
-    """Text `(given 'x')` with the value as YAML would have it, cut where it is long; for error messages."""
+    """Text `(given 'x')` with the value as YAML would have it, cut where it is long; for error
+    messages.
+    """
     names = {None: "null", True: "true", False: "false"}
     text = names[value] if value is None or isinstance(value, bool) else repr(value)
     return f"(given {text if len(text) <= _LONGEST_VALUE else text[: _LONGEST_VALUE - 4] + ' ...'})"
@@ -123,10 +138,13 @@ def _discriminator(context: dict[str, Any]) -> KeyPath:
     return tuple(_quoted(context["discriminator"])[:1])
 
 
-def _locate(loc: tuple[str | int, ...], model: Any) -> tuple[KeyPath, tuple[Any, ...], tuple[Any, ...]]:
+def _locate(
+    loc: tuple[str | int, ...], model: Any
+) -> tuple[KeyPath, tuple[Any, ...], tuple[Any, ...]]:
     """Key path that the user wrote, types that may hold its last key, and types of its value.
 
-    pydantic puts the chosen member of a union between the keys; only the types tell such a label from a key.
+    pydantic puts the chosen member of a union between the keys; only the types tell such a label
+    from a key.
     """
     path: list[str | int] = []
     parents: tuple[Any, ...] = ()
@@ -141,7 +159,9 @@ def _locate(loc: tuple[str | int, ...], model: Any) -> tuple[KeyPath, tuple[Any,
 
 
 def _plain(annotation: Any) -> Any:
-    """The type without the wrappers that add nothing to an error's location: Annotated and `| None`."""
+    """The type without the wrappers that add nothing to an error's location: Annotated and `|
+    None`.
+    """
     while True:
         if get_origin(annotation) is Annotated:
             annotation = get_args(annotation)[0]
@@ -164,11 +184,21 @@ def _members(annotation: Any) -> tuple[Any, ...]:
 
 
 def _chosen(kinds: tuple[Any, ...], label: str) -> tuple[Any, ...]:
-    """Members of unions that pydantic's label stands for: a discriminator's value or the name of a type; all where none fits."""
+    """Members of unions that pydantic's label stands for: a discriminator's value or the name of a
+    type; all where none fits.
+    """
     options = [_plain(member) for kind in kinds if _is_union(kind) for member in _options(kind)]
-    by_tag = [option for option in options if any(label in values for values in _literals(option).values())]
+    by_tag = [
+        option
+        for option in options
+        if any(label in values for values in _literals(option).values())
+    ]
     words = re.findall(r"\w+", label)
-    by_name = [option for option in options if getattr(get_origin(option) or option, "__name__", "") in words]
+    by_name = [
+        option
+        for option in options
+        if getattr(get_origin(option) or option, "__name__", "") in words
+    ]
     return tuple(by_tag or by_name or options)
 
 
@@ -200,12 +230,21 @@ def _literals(kind: Any) -> dict[str, tuple[Any, ...]]:
     if not _is_model(kind):
         return {}
     plain = {key: _plain(annotation) for key, annotation in _fields(kind).items()}
-    return {key: get_args(annotation) for key, annotation in plain.items() if get_origin(annotation) is Literal}
+    return {
+        key: get_args(annotation)
+        for key, annotation in plain.items()
+        if get_origin(annotation) is Literal
+    }
 
 
 def _of_kind(kinds: tuple[Any, ...]) -> str:
     # which keys a section has follows from its kind, and an override may have changed that
-    fixed = [(key, values[0]) for kind in kinds for key, values in _literals(kind).items() if len(values) == 1]
+    fixed = [
+        (key, values[0])
+        for kind in kinds
+        for key, values in _literals(kind).items()
+        if len(values) == 1
+    ]
     return f" ({fixed[0][0]} '{fixed[0][1]}')" if len(fixed) == 1 else ""
 
 

@@ -1,7 +1,9 @@
-"""YAML as configs use it: YAML 1.2 scalars, no duplicate keys, and the line on which every key stands.
+"""YAML as configs use it: YAML 1.2 scalars, no duplicate keys, and the line on which every key
+stands.
 
-PyYAML follows YAML 1.1, where `1e-3` is text, `off` is a boolean, `12:30` is 750 and `010` is 8. Each of these would put a
-wrong value into a run without a word, so scalars are read by the YAML 1.2 core schema, and keys are always text.
+PyYAML follows YAML 1.1, where `1e-3` is text, `off` is a boolean, `12:30` is 750 and `010` is 8.
+Each of these would put a wrong value into a run without a word, so scalars are read by the YAML 1.2
+core schema, and keys are always text.
 """
 
 from __future__ import annotations
@@ -24,13 +26,19 @@ _SCALARS: tuple[tuple[str, str, str], ...] = (
     ("null", r"^(?:~|null|Null|NULL|)$", "~nN\0"),
     ("bool", r"^(?:true|True|TRUE|false|False|FALSE)$", "tTfF"),
     ("int", r"^(?:[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+)$", "-+0123456789"),
-    ("float", r"^(?:[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$", "-+.0123456789"),
+    (
+        "float",
+        r"^(?:[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$",
+        "-+.0123456789",
+    ),
     ("merge", r"^<<$", "<"),
 )
 _RESOLVERS: dict[str, list[tuple[str, re.Pattern[str]]]] = {}
 for _tag, _pattern, _first in _SCALARS:
     for _char in _first:
-        _RESOLVERS.setdefault("" if _char == "\0" else _char, []).append((_PREFIX + _tag, re.compile(_pattern)))
+        _RESOLVERS.setdefault("" if _char == "\0" else _char, []).append(
+            (_PREFIX + _tag, re.compile(_pattern))
+        )
 
 
 class _DuplicateKey(yaml.constructor.ConstructorError):
@@ -42,7 +50,9 @@ class _Loader(yaml.SafeLoader):
 
     def construct_mapping(self, node: Node, deep: bool = False) -> dict[Hashable, Any]:
         if not isinstance(node, MappingNode):
-            raise yaml.constructor.ConstructorError(None, None, "expected a mapping", node.start_mark)
+            raise yaml.constructor.ConstructorError(
+                None, None, "expected a mapping", node.start_mark
+            )
         _reject_duplicates(node)
         self.flatten_mapping(node)
         return {key.value: self.construct_object(value, deep=deep) for key, value in node.value}
@@ -57,15 +67,25 @@ def _reject_duplicates(node: MappingNode) -> None:
     lines: dict[str, int] = {}
     for key, _ in node.value:
         if not isinstance(key, ScalarNode):
-            raise yaml.constructor.ConstructorError(None, None, "a key must be plain text", key.start_mark)
+            raise yaml.constructor.ConstructorError(
+                None, None, "a key must be plain text", key.start_mark
+            )
         if key.value in lines and key.tag != _PREFIX + "merge":
-            raise _DuplicateKey(None, None, f"duplicate key '{key.value}', first on line {lines[key.value]}", key.start_mark)
+            raise _DuplicateKey(
+                None,
+                None,
+                f"duplicate key '{key.value}', first on line {lines[key.value]}",
+                key.start_mark,
+            )
         lines.setdefault(key.value, key.start_mark.line + 1)
 
 
-# other tags of YAML 1.1 (dates, sets, binary) are refused rather than turned into objects that no config has; None refuses the unknown ones
+# other tags of YAML 1.1 (dates, sets, binary) are refused rather than turned into objects that no
+# config has; None refuses the unknown ones
 _KNOWN = (None, *(_PREFIX + name for name in ("null", "bool", "float", "str", "seq", "map")))
-_Loader.yaml_constructors = {tag: construct for tag, construct in yaml.SafeLoader.yaml_constructors.items() if tag in _KNOWN}
+_Loader.yaml_constructors = {
+    tag: construct for tag, construct in yaml.SafeLoader.yaml_constructors.items() if tag in _KNOWN
+}
 _Loader.add_constructor(_PREFIX + "int", _Loader.construct_whole_number)
 
 
@@ -85,7 +105,8 @@ _Dumper.add_representer(list, _Dumper.represent_short_list)
 
 
 def parse(text: str, where: str, *, located: bool = True) -> tuple[Any, Node | None]:
-    """Plain value (dict with text keys, list, scalar) and node tree of one YAML document; (None, None) where there is none.
+    """Plain value (dict with text keys, list, scalar) and node tree of one YAML document; (None,
+    None) where there is none.
 
     Args:
         text: the document.
@@ -104,7 +125,9 @@ def parse(text: str, where: str, *, located: bool = True) -> tuple[Any, Node | N
         mark = error.problem_mark
         problem = error.problem or error.context or "cannot be read"
         if isinstance(error, _DuplicateKey) and mark is not None:
-            raise ConfigError(f"{where}{f':{mark.line + 1}' if located else ''}: {problem}") from error
+            raise ConfigError(
+                f"{where}{f':{mark.line + 1}' if located else ''}: {problem}"
+            ) from error
         place = "" if mark is None or not located else f":{mark.line + 1}:{mark.column + 1}"
         raise ConfigError(f"{where}{place}: not YAML: {' '.join(problem.split())}") from error
     except (yaml.YAMLError, ValueError) as error:
@@ -129,7 +152,11 @@ def line_of(root: Node, path: KeyPath) -> int:
             for key, value in node.value:
                 if key.value == str(element):
                     child, line = value, key.start_mark.line
-        elif isinstance(node, SequenceNode) and isinstance(element, int) and element < len(node.value):
+        elif (
+            isinstance(node, SequenceNode)
+            and isinstance(element, int)
+            and element < len(node.value)
+        ):
             child = node.value[element]
             line = child.start_mark.line
         if child is None:

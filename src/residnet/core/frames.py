@@ -21,12 +21,16 @@ def wrap_array(angle: np.ndarray) -> np.ndarray:
 
 
 def to_body(north: Tensor, east: Tensor, psi: Tensor) -> tuple[Tensor, Tensor]:
-    """Components of an earth-fixed vector along body x and y (document 003 eq. (4), transposed). Shapes broadcast."""
+    """Components of an earth-fixed vector along body x and y (document 003 eq. (4), transposed).
+    Shapes broadcast.
+    """
     c, s = torch.cos(psi), torch.sin(psi)
     return c * north + s * east, c * east - s * north
 
 
 def to_earth(forward: Tensor, starboard: Tensor, psi: Tensor) -> tuple[Tensor, Tensor]:
-    """Components of a body-fixed vector along north and east (document 003 eq. (4)). Shapes broadcast."""
+    """Components of a body-fixed vector along north and east (document 003 eq. (4)). Shapes
+    broadcast.
+    """
     c, s = torch.cos(psi), torch.sin(psi)
     return c * forward - s * starboard, s * forward + c * starboard

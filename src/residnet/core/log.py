@@ -1,4 +1,6 @@
-"""The canonical log: named SI channels over one clock, as it lies on disk (Parquet, metadata inside)."""
+"""The canonical log: named SI channels over one clock, as it lies on disk (Parquet, metadata
+inside).
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,9 @@ _PIECE = 500_000
 
 
 def forget_pages(values: np.ndarray) -> None:
-    """Give back the memory of a read-only array that lies in a file; it is read again when it is next used. Other arrays stay as they are."""
+    """Give back the memory of a read-only array that lies in a file; it is read again when it is
+    next used. Other arrays stay as they are.
+    """
     owner: Any = values
     while isinstance(owner, np.ndarray):
         owner = owner.base
@@ -34,7 +38,8 @@ class Log:
     Attributes:
         name: unique within a run; the stem of its file names.
         t: time [T] in s, strictly increasing, on the log's own clock.
-        channels: name -> values [T], float64, SI and radians; psi unwrapped; NaN where nothing was measured.
+        channels: name -> values [T], float64, SI and radians; psi unwrapped; NaN where nothing was
+            measured.
         units: name -> SI unit.
         manoeuvre: kind of manoeuvre, for example `zigzag`; `unknown` where nobody said.
         masks: reason -> [T] bool, True where samples must not be scored or learned from.
@@ -52,8 +57,13 @@ class Log:
     def __post_init__(self) -> None:
         for name, values in self.channels.items():
             if values.shape != self.t.shape:
-                raise DataError(f"log {self.name}: channel {name} has {values.size} samples, time has {self.t.size}")
-        missing = {name: CHANNEL_UNITS.get(name, "-") for name in self.channels if name not in self.units}
+                raise DataError(
+                    f"log {self.name}: channel {name} has {values.size} samples, time has"
+                    f" {self.t.size}"
+                )
+        missing = {
+            name: CHANNEL_UNITS.get(name, "-") for name in self.channels if name not in self.units
+        }
         object.__setattr__(self, "units", {**self.units, **missing})
 
     def __len__(self) -> int:
@@ -71,7 +81,9 @@ class Log:
 
     def stack(self, names: tuple[str, ...] | list[str]) -> np.ndarray:
         """Channels side by side, [T, len(names)]."""
-        return np.stack([self[name] for name in names], axis=-1) if names else np.zeros((len(self), 0))
+        return (
+            np.stack([self[name] for name in names], axis=-1) if names else np.zeros((len(self), 0))
+        )
 
     @property
     def usable(self) -> np.ndarray:
@@ -86,17 +98,36 @@ class Log:
         return dataclasses.replace(self, **changes)
 
     def save(self, path: Path) -> None:
-        """Write the canonical Parquet file: columns t, channels, `mask:<reason>`; the rest as JSON in its metadata."""
+        """Write the canonical Parquet file: columns t, channels, `mask:<reason>`; the rest as JSON
+        in its metadata.
+        """
         import pyarrow as pa
         import pyarrow.parquet as pq
 
-        columns = {"t": self.t, **self.channels, **{f"mask:{reason}": mask for reason, mask in self.masks.items()}}
-        about = {"schema": SCHEMA, "name": self.name, "manoeuvre": self.manoeuvre, "units": self.units, "meta": self.meta}
-        schema = pa.table({name: values[:0] for name, values in columns.items()}).schema.with_metadata({"residnet": json.dumps(about)})
+        columns = {
+            "t": self.t,
+            **self.channels,
+            **{f"mask:{reason}": mask for reason, mask in self.masks.items()},
+        }
+        about = {
+            "schema": SCHEMA,
+            "name": self.name,
+            "manoeuvre": self.manoeuvre,
+            "units": self.units,
+            "meta": self.meta,
+        }
+        schema = pa.table(
+            {name: values[:0] for name, values in columns.items()}
+        ).schema.with_metadata({"residnet": json.dumps(about)})
         with pq.ParquetWriter(path, schema) as writer:
             # piece by piece: the columns of a large log lie on disk
             for start in range(0, max(1, len(self)), _PIECE):
-                writer.write_table(pa.table({name: values[start : start + _PIECE] for name, values in columns.items()}, schema=schema))
+                writer.write_table(
+                    pa.table(
+                        {name: values[start : start + _PIECE] for name, values in columns.items()},
+                        schema=schema,
+                    )
+                )
                 for values in columns.values():
                     forget_pages(values)
 
@@ -128,11 +159,27 @@ class Log:
         try:
             table = pq.read_table(path)
         except (pa.ArrowException, OSError) as error:
-            raise UsageError(f"{path}: not a Parquet file ({str(error).splitlines()[0]})") from error
+            raise UsageError(
+                f"{path}: not a Parquet file ({str(error).splitlines()[0]})"
+            ) from error
         about = json.loads((table.schema.metadata or {}).get(b"residnet", b"{}"))
         if about.get("schema") != SCHEMA:
-            raise UsageError(f"{path}: not a residnet log ({SCHEMA}); give a channel map to read a foreign table")
+            raise UsageError(
+                f"{path}: not a residnet log ({SCHEMA}); give a channel map to read a foreign table"
+            )
         columns = {name: table.column(name).to_numpy() for name in table.column_names}
-        masks = {n.removeprefix("mask:"): c.astype(bool) for n, c in columns.items() if n.startswith("mask:")}
+        masks = {
+            n.removeprefix("mask:"): c.astype(bool)
+            for n, c in columns.items()
+            if n.startswith("mask:")
+        }
         channels = {n: c for n, c in columns.items() if n != "t" and not n.startswith("mask:")}
-        return cls(about["name"], columns["t"], channels, about["units"], about["manoeuvre"], masks, about["meta"])
+        return cls(
+            about["name"],
+            columns["t"],
+            channels,
+            about["units"],
+            about["manoeuvre"],
+            masks,
+            about["meta"],
+        )

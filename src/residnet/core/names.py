@@ -1,7 +1,8 @@
 """Names and units of the channels, and the one table that converts units at the door.
 
-Inside residnet everything is SI with angles in radians; propeller revolutions are in 1/s. A channel that enters
-declares its unit once (in the log's channel map or in a config value such as `"20 deg"`) and is converted here.
+Inside residnet everything is SI with angles in radians; propeller revolutions are in 1/s. A channel
+that enters declares its unit once (in the log's channel map or in a config value such as `"20
+deg"`) and is converted here.
 """
 
 from __future__ import annotations
@@ -15,7 +16,9 @@ from residnet.core.errors import UsageError
 POSE = ("x", "y", "psi")
 VELOCITY = ("u", "v", "r")
 STATE = POSE + VELOCITY
-"""State of a 3-DOF model, in the order of the tensors: north [m], east [m], heading [rad], surge [m/s], sway [m/s], yaw rate [rad/s]."""
+"""State of a 3-DOF model, in the order of the tensors: north [m], east [m], heading [rad], surge
+[m/s], sway [m/s], yaw rate [rad/s].
+"""
 
 ACCELERATION = tuple(f"{name}_dot" for name in VELOCITY)
 
@@ -68,7 +71,8 @@ _UNITS: dict[str, tuple[str, float]] = {
     "W": ("W", 1.0),
 }
 
-# SI unit of the channels that residnet knows by name; any other channel keeps the SI unit that its map declares
+# SI unit of the channels that residnet knows by name; any other channel keeps the SI unit that its
+# map declares
 CHANNEL_UNITS: dict[str, str] = {
     "t": "s",
     "x": "m",
@@ -150,5 +154,7 @@ def to_si(unit: str, expected: str | None = None) -> float:
     si, factor = si_unit(unit), _UNITS[unit][1]
     if expected is not None and si != expected:
         fitting = ", ".join(name for name, (base, _) in _UNITS.items() if base == expected)
-        raise UsageError(f"unit '{unit}' does not measure [{expected}]; units that do: {fitting or 'none'}")
+        raise UsageError(
+            f"unit '{unit}' does not measure [{expected}]; units that do: {fitting or 'none'}"
+        )
     return factor

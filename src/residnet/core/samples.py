@@ -41,7 +41,9 @@ class Samples:
 
     def where(self, keep: Tensor) -> Samples:
         """The samples at which `keep` [N] is True."""
-        return Samples(self.z[keep], self.target[keep], self.group[keep], self.t[keep], self.kinds, self.names)
+        return Samples(
+            self.z[keep], self.target[keep], self.group[keep], self.t[keep], self.kinds, self.names
+        )
 
     def with_target(self, target: Tensor) -> Samples:
         """The same samples with another target [N, 3]."""

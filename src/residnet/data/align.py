@@ -13,7 +13,8 @@ from residnet.data.readers.base import unwrap
 
 # share of a step within which a sample counts as lying on the grid
 _ON_GRID = 1e-3
-# share of a time step within which a grid point is a sample, so that rounding of the clock does not drag in the neighbour
+# share of a time step within which a grid point is a sample, so that rounding of the clock does not
+# drag in the neighbour
 _AT_SAMPLE = 1e-5
 # grid points per sample beyond which the clock or its unit must be wrong
 _MOST_POINTS = 1000
@@ -24,8 +25,10 @@ class GridConfig(Config):
 
     Attributes:
         step: time between grid points, s.
-        held: channels whose last value holds until the next (commands); all others are interpolated linearly, angles the short way round.
-        longest_gap: longest time step of the log that is interpolated across, s; null takes three times the log's usual time step.
+        held: channels whose last value holds until the next (commands); all others are interpolated
+            linearly, angles the short way round.
+        longest_gap: longest time step of the log that is interpolated across, s; null takes three
+            times the log's usual time step.
     """
 
     step: Seconds = Field(gt=0.0)
@@ -36,26 +39,33 @@ class GridConfig(Config):
 def align(log: Log, config: GridConfig) -> Log:
     """The log on the grid.
 
-    A log that lies on the grid to a thousandth of a step keeps its times and samples exactly. Where the grid is coarser than the log by a factor
-    of two or more, every channel that is not held is averaged over one grid step around each grid point, or motion above the new Nyquist frequency
-    would fold into the samples. The average is the exact integral of the interpolated signal: zero phase, any sample times, a null at the new rate.
+    A log that lies on the grid to a thousandth of a step keeps its times and samples exactly. Where
+    the grid is coarser than the log by a factor of two or more, every channel that is not held is
+    averaged over one grid step around each grid point, or motion above the new Nyquist frequency
+    would fold into the samples. The average is the exact integral of the interpolated signal: zero
+    phase, any sample times, a null at the new rate.
 
-    Grid points inside a gap or whose value depends on a NaN become NaN and are masked as `hard:gap`; the log's own masks cover every grid point
-    that a masked sample enters.
+    Grid points inside a gap or whose value depends on a NaN become NaN and are masked as
+    `hard:gap`; the log's own masks cover every grid point that a masked sample enters.
 
     Raises:
-        DataError: where the log has fewer than two samples, or the grid would have more than a thousand points per sample.
+        DataError: where the log has fewer than two samples, or the grid would have more than a
+            thousand points per sample.
         UsageError: where the log lacks a held channel.
     """
     if len(log) < 2:
-        raise DataError(f"log {log.name}: {len(log)} samples, at least 2 are needed for a time grid; leave it out")
+        raise DataError(
+            f"log {log.name}: {len(log)} samples, at least 2 are needed for a time grid; leave"
+            " it out"
+        )
     for name in config.held:
         log[name]
     count = int(np.floor((log.t[-1] - log.t[0]) / config.step + _ON_GRID)) + 1
     if count > _MOST_POINTS * len(log):
         raise DataError(
-            f"log {log.name}: a grid of {config.step:g} s from {log.t[0]:g} to {log.t[-1]:g} s has {count} points for {len(log)} samples; "
-            "check the unit of time, or split the log where its clock jumps"
+            f"log {log.name}: a grid of {config.step:g} s from {log.t[0]:g} to {log.t[-1]:g} s has"
+            f" {count} points for {len(log)} samples; check the unit of time, or split the log"
+            " where its clock jumps"
         )
     grid = log.t[0] + config.step * np.arange(count)
     if count == len(log) and float(np.abs(log.t - grid).max()) <= _ON_GRID * config.step:
@@ -64,7 +74,8 @@ def align(log: Log, config: GridConfig) -> Log:
 
 
 def onto(log: Log, config: GridConfig, times: np.ndarray) -> Log:
-    """The log at given times [G], increasing, in s on its clock, by the rules of `align`; NaN before its first sample and after its last.
+    """The log at given times [G], increasing, in s on its clock, by the rules of `align`; NaN
+    before its first sample and after its last.
 
     The length that is averaged over is the config's step.
     """
@@ -80,19 +91,40 @@ def _resampled(log: Log, config: GridConfig, grid: np.ndarray) -> Log:
     longest = config.longest_gap if config.longest_gap is not None else 3.0 * usual
     gap = np.diff(log.t) > longest * (1.0 + _ON_GRID)
     averaged = config.step >= 2.0 * usual * (1.0 - _ON_GRID)
-    half = np.minimum(0.5 * config.step, np.maximum(np.minimum(grid - log.t[0], log.t[-1] - grid), 0.0)) if averaged else np.zeros_like(grid)
+    half = (
+        np.minimum(
+            0.5 * config.step, np.maximum(np.minimum(grid - log.t[0], log.t[-1] - grid), 0.0)
+        )
+        if averaged
+        else np.zeros_like(grid)
+    )
     smooth, held = _Reach(log.t, grid, half, gap), _Reach(log.t, grid, np.zeros_like(grid), gap)
     names = tuple(log.channels)
-    continuous = np.stack([unwrap(log[name]) if log.units[name] == "rad" else log[name] for name in names], axis=-1)
+    continuous = np.stack(
+        [unwrap(log[name]) if log.units[name] == "rad" else log[name] for name in names], axis=-1
+    )
     is_held = np.array([name in config.held for name in names], dtype=bool)
-    # a NaN would poison the whole running integral: zeros stand in for it, and every point that they reach is blanked below
+    # a NaN would poison the whole running integral: zeros stand in for it, and every point that
+    # they reach is blanked below
     values = np.where(is_held, held.previous(continuous), smooth.mean(np.nan_to_num(continuous)))
     missing = np.isnan(continuous)
     values[np.where(is_held, held.broken(missing), smooth.broken(missing))] = np.nan
-    channels = {name: _rewrapped(log[name], continuous[:, i], values[:, i]) for i, name in enumerate(names)}
+    channels = {
+        name: _rewrapped(log[name], continuous[:, i], values[:, i]) for i, name in enumerate(names)
+    }
     masks = {reason: smooth.touched(mask[:, None])[:, 0] for reason, mask in log.masks.items()}
-    meta = {**log.meta, "grid": {"step": config.step, "longest_gap": longest, "averaged": bool(averaged), "samples_before": len(log)}}
-    return _with_gap_mask(log.replace(t=grid, channels=channels, masks=masks, meta=meta), _incomplete(channels))
+    meta = {
+        **log.meta,
+        "grid": {
+            "step": config.step,
+            "longest_gap": longest,
+            "averaged": bool(averaged),
+            "samples_before": len(log),
+        },
+    }
+    return _with_gap_mask(
+        log.replace(t=grid, channels=channels, masks=masks, meta=meta), _incomplete(channels)
+    )
 
 
 class _Reach:
@@ -114,10 +146,13 @@ class _Reach:
         self._last = self._high + (self._w_high > 0.0)
 
     def _place(self, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Index of the sample before each time, and how far towards the next one it lies, 0 to 1."""
+        """Index of the sample before each time, and how far towards the next one it lies, 0 to 1.
+        """
         left = np.clip(np.searchsorted(self._t, at, side="right") - 1, 0, self._t.size - 2)
         weight = np.clip((at - self._t[left]) / (self._t[left + 1] - self._t[left]), 0.0, 1.0)
-        return left, np.where(weight < _AT_SAMPLE, 0.0, np.where(weight > 1.0 - _AT_SAMPLE, 1.0, weight))
+        return left, np.where(
+            weight < _AT_SAMPLE, 0.0, np.where(weight > 1.0 - _AT_SAMPLE, 1.0, weight)
+        )
 
     def previous(self, x: np.ndarray) -> np.ndarray:
         """Last value at or before each grid point, [G, n] from [T, n]."""
@@ -128,17 +163,25 @@ class _Reach:
         # without its mean the running integral keeps its digits for positions far from the origin
         offset = x.mean(axis=0)
         centred, dt = x - offset, np.diff(self._t)[:, None]
-        area = np.concatenate([np.zeros((1, x.shape[1])), np.cumsum(0.5 * dt * (centred[1:] + centred[:-1]), axis=0)])
+        area = np.concatenate(
+            [np.zeros((1, x.shape[1])), np.cumsum(0.5 * dt * (centred[1:] + centred[:-1]), axis=0)]
+        )
 
         def integral(left: np.ndarray, weight: np.ndarray) -> np.ndarray:
             w, a, b = weight[:, None], centred[left], centred[left + 1]
             return area[left] + dt[left] * w * (a + 0.5 * w * (b - a))
 
         w = self._w_low[:, None]
-        point = np.where(w == 1.0, x[self._low + 1], x[self._low] + w * (x[self._low + 1] - x[self._low]))
-        span = (self._t[self._high] + self._w_high * dt[self._high, 0]) - (self._t[self._low] + self._w_low * dt[self._low, 0])
+        point = np.where(
+            w == 1.0, x[self._low + 1], x[self._low] + w * (x[self._low + 1] - x[self._low])
+        )
+        span = (self._t[self._high] + self._w_high * dt[self._high, 0]) - (
+            self._t[self._low] + self._w_low * dt[self._low, 0]
+        )
         wide = span > 0.0
-        mean = (integral(self._high, self._w_high) - integral(self._low, self._w_low)) / np.where(wide, span, 1.0)[:, None] + offset
+        mean = (integral(self._high, self._w_high) - integral(self._low, self._w_low)) / np.where(
+            wide, span, 1.0
+        )[:, None] + offset
         return np.where(wide[:, None], mean, point)
 
     def touched(self, flags: np.ndarray) -> np.ndarray:
@@ -152,12 +195,16 @@ class _Reach:
 
 def _any_between(flags: np.ndarray, first: np.ndarray, stop: np.ndarray) -> np.ndarray:
     """[G, k] bool: any of flags[first:stop], for index arrays [G]."""
-    count = np.concatenate([np.zeros((1, flags.shape[1]), dtype=np.int64), np.cumsum(flags, axis=0)])
+    count = np.concatenate(
+        [np.zeros((1, flags.shape[1]), dtype=np.int64), np.cumsum(flags, axis=0)]
+    )
     return count[stop] > count[first]
 
 
 def _rewrapped(original: np.ndarray, continuous: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Grid values [G] in the range of the original channel [T], where unwrapping had left that range."""
+    """Grid values [G] in the range of the original channel [T], where unwrapping had left that
+    range.
+    """
     if np.array_equal(original, continuous, equal_nan=True):
         return values
     low = 0.0 if np.nanmin(original) >= 0.0 else -np.pi
@@ -173,4 +220,6 @@ def _with_gap_mask(log: Log, missing: np.ndarray) -> Log:
     if not missing.any():
         return log
     reason = HARD + "gap"
-    return log.replace(masks={**log.masks, reason: log.masks.get(reason, np.zeros(len(log), dtype=bool)) | missing})
+    return log.replace(
+        masks={**log.masks, reason: log.masks.get(reason, np.zeros(len(log), dtype=bool)) | missing}
+    )

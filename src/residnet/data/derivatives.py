@@ -1,6 +1,7 @@
 """Rates of change of sampled channels, piece by piece and never across a gap.
 
-Positions and velocities are measured, accelerations hardly ever: they are differentiated here, and the smoothing that goes with it is stated.
+Positions and velocities are measured, accelerations hardly ever: they are differentiated here, and
+the smoothing that goes with it is stated.
 """
 
 from __future__ import annotations
@@ -19,18 +20,23 @@ from residnet.core.errors import ConfigError
 class Derivative(Config, ABC):
     """A rule that smooths and differentiates channels on a uniform grid."""
 
-    def derive(self, values: np.ndarray, step: float, pieces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def derive(
+        self, values: np.ndarray, step: float, pieces: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Smoothed values and their rates.
 
-        A piece is a run of samples with one number >= 0; it is cut further at samples that are not finite, and nothing is smoothed across its ends.
+        A piece is a run of samples with one number >= 0; it is cut further at samples that are not
+        finite, and nothing is smoothed across its ends.
 
         Args:
             values: channels [T, n], SI, angles unwrapped.
             step: time between samples, s.
-            pieces: number of each sample's piece [T] int, -1 for samples of none (`residnet.data.masks.segments`).
+            pieces: number of each sample's piece [T] int, -1 for samples of none
+                (`residnet.data.masks.segments`).
 
         Returns:
-            smooth [T, n] and rate [T, n] in SI (per second), and valid [T] bool; both arrays are NaN where valid is False.
+            smooth [T, n] and rate [T, n] in SI (per second), and valid [T] bool; both arrays are
+            NaN where valid is False.
 
         Raises:
             ConfigError: where a window or cut-off does not go with the step.
@@ -59,9 +65,11 @@ class Derivative(Config, ABC):
 
 @final
 class SavitzkyGolay(Derivative):
-    """Polynomials of `order` fitted to a moving window of `window` seconds (made an odd number of samples, rounded up).
+    """Polynomials of `order` fitted to a moving window of `window` seconds (made an odd number of
+    samples, rounded up).
 
-    Near the ends of a piece the polynomial of the last full window is evaluated; a piece shorter than the window is invalid.
+    Near the ends of a piece the polynomial of the last full window is evaluated; a piece shorter
+    than the window is invalid.
     """
 
     kind: Literal["savitzky_golay"] = "savitzky_golay"
@@ -76,8 +84,9 @@ class SavitzkyGolay(Derivative):
         if self.samples(step) <= self.order:
             needed = (self.order + 1 | 1) * step
             raise ConfigError(
-                f"savitzky_golay: a window of {self.window:g} s holds {self.samples(step)} samples of {step:g} s, order {self.order} needs more; "
-                f"set window to {needed:g} s or longer"
+                f"savitzky_golay: a window of {self.window:g} s holds {self.samples(step)} samples"
+                f" of {step:g} s, order {self.order} needs more; set window to {needed:g} s or"
+                " longer"
             )
 
     def _shortest(self, step: float) -> int:
@@ -88,12 +97,16 @@ class SavitzkyGolay(Derivative):
 
         size = self.samples(step)
         smooth = savgol_filter(values, size, self.order, axis=0, mode="interp")
-        return smooth, savgol_filter(values, size, self.order, deriv=1, delta=step, axis=0, mode="interp")
+        return smooth, savgol_filter(
+            values, size, self.order, deriv=1, delta=step, axis=0, mode="interp"
+        )
 
 
 @final
 class BackwardDifference(Derivative):
-    """Difference to the sample before; the first sample of a piece is invalid. Values are not smoothed."""
+    """Difference to the sample before; the first sample of a piece is invalid. Values are not
+    smoothed.
+    """
 
     kind: Literal["backward"] = "backward"
 
@@ -108,7 +121,9 @@ class BackwardDifference(Derivative):
 
 @final
 class ForwardDifference(Derivative):
-    """Difference to the next sample; the last sample of a piece is invalid. Values are not smoothed."""
+    """Difference to the next sample; the last sample of a piece is invalid. Values are not
+    smoothed.
+    """
 
     kind: Literal["forward"] = "forward"
 
@@ -121,10 +136,12 @@ class ForwardDifference(Derivative):
 
 @final
 class Butterworth(Derivative):
-    """Butterworth low-pass run forward and backward (zero phase), then the forward difference (document 000, section 7.3; ERRATA H27).
+    """Butterworth low-pass run forward and backward (zero phase), then the forward difference
+    (document 000, section 7.3; ERRATA H27).
 
-    The two passes square the magnitude: the gain at `cutoff` is 1/2, not 1/sqrt(2). The document's normalised cut-off is a share of the Nyquist
-    frequency: its 0.1 at 20 Hz is 1 Hz here. The last sample of a piece is invalid, as is a piece no longer than the filter's padding.
+    The two passes square the magnitude: the gain at `cutoff` is 1/2, not 1/sqrt(2). The document's
+    normalised cut-off is a share of the Nyquist frequency: its 0.1 at 20 Hz is 1 Hz here. The last
+    sample of a piece is invalid, as is a piece no longer than the filter's padding.
     """
 
     kind: Literal["butterworth"] = "butterworth"
@@ -134,7 +151,8 @@ class Butterworth(Derivative):
     def _check(self, step: float) -> None:
         if self.cutoff >= 0.5 / step:
             raise ConfigError(
-                f"butterworth: cutoff {self.cutoff:g} Hz is not below the Nyquist frequency {0.5 / step:g} Hz of a step of {step:g} s; lower it"
+                f"butterworth: cutoff {self.cutoff:g} Hz is not below the Nyquist frequency"
+                f" {0.5 / step:g} Hz of a step of {step:g} s; lower it"
             )
 
     def _shortest(self, step: float) -> int:
@@ -152,7 +170,10 @@ class Butterworth(Derivative):
         return smooth, _forward(smooth, step)
 
 
-DerivativeConfig = Annotated[SavitzkyGolay | BackwardDifference | ForwardDifference | Butterworth, Field(discriminator="kind")]
+DerivativeConfig = Annotated[
+    SavitzkyGolay | BackwardDifference | ForwardDifference | Butterworth,
+    Field(discriminator="kind"),
+]
 """Any rule for derivatives; its `kind` says which."""
 
 

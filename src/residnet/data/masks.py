@@ -4,7 +4,8 @@ A mask is stored in `Log.masks` under its reason, the kind with a prefix that sa
 
 * `hard:<kind>`: the log is split there; nothing is simulated, filtered or learned across.
 * `<kind>`: simulated across, but neither scored nor learned from.
-* `rate:<kind>`: only the derivatives there are biased; free runs may be scored (`scored`), one-step fits leave the samples out (`Log.usable`).
+* `rate:<kind>`: only the derivatives there are biased; free runs may be scored (`scored`), one-step
+fits leave the samples out (`Log.usable`).
 """
 
 from __future__ import annotations
@@ -52,9 +53,11 @@ class Mask(Config, ABC):
 
 @final
 class Frozen(Mask):
-    """A receiver that holds its last fix: all `channels` bit-identical over `samples` steps or more.
+    """A receiver that holds its last fix: all `channels` bit-identical over `samples` steps or
+    more.
 
-    From the first of the equal samples until `after` seconds past the last of them: the filters behind the receiver need that long to recover.
+    From the first of the equal samples until `after` seconds past the last of them: the filters
+    behind the receiver need that long to recover.
     """
 
     kind: Literal["frozen"] = "frozen"
@@ -119,11 +122,14 @@ class Jump(Mask):
 
 @final
 class Outlier(Mask):
-    """Samples more than `sigmas` standard deviations away from the moving average of `samples` (document 002, section 5.2).
+    """Samples more than `sigmas` standard deviations away from the moving average of `samples`
+    (document 002, section 5.2).
 
-    Average and deviation are taken over the `samples` nearest *other* samples. Over a window of n that holds the sample itself no distance can exceed
-    (n - 1) / sqrt(n) standard deviations, 2.85 for the document's 10, so that its rule of 3, taken literally, never fires. The deviation is kept
-    above a robust estimate over the whole channel, because ten samples alone would call 2 % of normal noise outliers.
+    Average and deviation are taken over the `samples` nearest *other* samples. Over a window of n
+    that holds the sample itself no distance can exceed (n - 1) / sqrt(n) standard deviations, 2.85
+    for the document's 10, so that its rule of 3, taken literally, never fires. The deviation is
+    kept above a robust estimate over the whole channel, because ten samples alone would call 2 % of
+    normal noise outliers.
     """
 
     kind: Literal["outlier"] = "outlier"
@@ -146,7 +152,9 @@ class Outlier(Mask):
         count = np.arange(values.size)
         first = np.clip(count - self.samples // 2, 0, values.size - self.samples - 1)
         windows = np.lib.stride_tricks.sliding_window_view(values, self.samples + 1)[first]
-        others = windows[np.arange(self.samples + 1) != (count - first)[:, None]].reshape(values.size, self.samples)
+        others = windows[np.arange(self.samples + 1) != (count - first)[:, None]].reshape(
+            values.size, self.samples
+        )
         deviation = np.abs(values - others.mean(axis=1))
         common = 1.4826 * float(np.median(deviation))
         # a spread at the level of rounding is none
@@ -156,12 +164,15 @@ class Outlier(Mask):
 
 @final
 class Hampel(Mask):
-    """Samples that stand out of their neighbours by more than `sigmas` robust standard deviations (Hampel filter; Pearson, 2002).
+    """Samples that stand out of their neighbours by more than `sigmas` robust standard deviations
+    (Hampel filter; Pearson, 2002).
 
-    What is looked at is the distance of a sample from the median of the straight lines between its neighbours on either side, up to `samples` away,
-    so that a moving channel is judged as one at rest; it is bad where that lies far from its running median over `samples`. The robust deviation is
-    1.4826 times the median absolute deviation of those neighbours, and at least that of the whole channel. A few bad samples move neither median,
-    where they move average and deviation of the rule of document 002 (`outlier`).
+    What is looked at is the distance of a sample from the median of the straight lines between its
+    neighbours on either side, up to `samples` away, so that a moving channel is judged as one at
+    rest; it is bad where that lies far from its running median over `samples`. The robust deviation
+    is 1.4826 times the median absolute deviation of those neighbours, and at least that of the
+    whole channel. A few bad samples move neither median, where they move average and deviation of
+    the rule of document 002 (`outlier`).
     """
 
     kind: Literal["hampel"] = "hampel"
@@ -173,15 +184,21 @@ class Hampel(Mask):
         """[T] bool; see `Mask.apply`."""
         bad = np.zeros(len(log), dtype=bool)
         for name in self.channels:
-            bad |= far_from_median(unwrap(log[name]) if log.units[name] == "rad" else log[name], self.sigmas, self.samples)
+            bad |= far_from_median(
+                unwrap(log[name]) if log.units[name] == "rad" else log[name],
+                self.sigmas,
+                self.samples,
+            )
         return bad
 
 
 @final
 class InputJump(Mask):
-    """Steps of more than `limit` (SI, per sample) in any of `channels`, from `before` to `after` seconds around each.
+    """Steps of more than `limit` (SI, per sample) in any of `channels`, from `before` to `after`
+    seconds around each.
 
-    A smoothed derivative spreads the response to a step over the time before it, so that the derivatives there are biased; the samples are good.
+    A smoothed derivative spreads the response to a step over the time before it, so that the
+    derivatives there are biased; the samples are good.
     """
 
     prefix: ClassVar[str] = RATE
@@ -196,15 +213,22 @@ class InputJump(Mask):
         landed = np.concatenate([steps_above(log, name, self.limit) for name in self.channels])
         margin = 1e-6 * _step(log.t)
         starts = np.searchsorted(log.t, log.t[landed] - self.before - margin)
-        return _cover(len(log), starts, np.searchsorted(log.t, log.t[landed] + self.after + margin, side="right"))
+        return _cover(
+            len(log),
+            starts,
+            np.searchsorted(log.t, log.t[landed] + self.after + margin, side="right"),
+        )
 
 
-MaskConfig = Annotated[Frozen | Gap | Missing | Jump | Outlier | Hampel | InputJump, Field(discriminator="kind")]
+MaskConfig = Annotated[
+    Frozen | Gap | Missing | Jump | Outlier | Hampel | InputJump, Field(discriminator="kind")
+]
 """Any masking rule; its `kind` says which."""
 
 
 def apply_masks(log: Log, rules: Sequence[Mask]) -> Log:
-    """The log with the masks of all rules added to those that it has; rules of one kind share one mask.
+    """The log with the masks of all rules added to those that it has; rules of one kind share one
+    mask.
 
     Masks are found best on the log as recorded: interpolation hides what is bit-identical.
 
@@ -213,7 +237,9 @@ def apply_masks(log: Log, rules: Sequence[Mask]) -> Log:
     """
     masks = dict(log.masks)
     for rule in rules:
-        masks[rule.reason] = masks.get(rule.reason, np.zeros(len(log), dtype=bool)) | rule.apply(log)
+        masks[rule.reason] = masks.get(rule.reason, np.zeros(len(log), dtype=bool)) | rule.apply(
+            log
+        )
     return log.replace(masks=masks)
 
 
@@ -223,25 +249,33 @@ def hard_mask(log: Log) -> np.ndarray:
 
 
 def scored(log: Log) -> np.ndarray:
-    """[T] bool: samples that a free run is scored on, all that neither a hard nor a soft mask excludes."""
+    """[T] bool: samples that a free run is scored on, all that neither a hard nor a soft mask
+    excludes.
+    """
     return ~_any(log, [name for name in log.masks if not name.startswith(RATE)])
 
 
 def segments(log: Log) -> np.ndarray:
-    """Number of the contiguous piece that each sample belongs to, [T] int, counted from 0; -1 at hard-masked samples."""
+    """Number of the contiguous piece that each sample belongs to, [T] int, counted from 0; -1 at
+    hard-masked samples.
+    """
     hard = hard_mask(log)
     starts = ~hard & np.append(True, hard[:-1])
     return np.where(hard, -1, np.cumsum(starts) - 1)
 
 
 def steps_above(log: Log, channel: str, limit: float) -> np.ndarray:
-    """Indices [K] of the samples at which `channel` arrives after a step of more than `limit` (SI; angles the short way round)."""
+    """Indices [K] of the samples at which `channel` arrives after a step of more than `limit` (SI;
+    angles the short way round).
+    """
     values = unwrap(log[channel]) if log.units[channel] == "rad" else log[channel]
     return np.flatnonzero(np.abs(np.diff(values)) > limit) + 1
 
 
 def far_from_median(values: np.ndarray, sigmas: float, samples: int) -> np.ndarray:
-    """[T] bool: known values [T] that stand out of their `samples` (made odd) neighbours, by the rule of `Hampel`."""
+    """[T] bool: known values [T] that stand out of their `samples` (made odd) neighbours, by the
+    rule of `Hampel`.
+    """
     out = np.zeros(values.size, dtype=bool)
     at, half = np.flatnonzero(np.isfinite(values)), samples // 2
     reach = 2 * half
@@ -250,13 +284,20 @@ def far_from_median(values: np.ndarray, sigmas: float, samples: int) -> np.ndarr
     known = values[at]
     padded = np.pad(known, reach, mode="reflect", reflect_type="odd")
     # how far a sample lies from the straight lines between its neighbours on both sides
-    pairs = [0.5 * (padded[reach - k : known.size + reach - k] + padded[reach + k : known.size + reach + k]) for k in range(1, reach + 1)]
+    pairs = [
+        0.5
+        * (padded[reach - k : known.size + reach - k] + padded[reach + k : known.size + reach + k])
+        for k in range(1, reach + 1)
+    ]
     bent = known - np.median(np.stack(pairs), axis=0)
-    windows = np.lib.stride_tricks.sliding_window_view(np.pad(bent, half, mode="reflect"), 2 * half + 1)
+    windows = np.lib.stride_tricks.sliding_window_view(
+        np.pad(bent, half, mode="reflect"), 2 * half + 1
+    )
     median = np.median(windows, axis=1)
     distance = np.abs(bent - median)
     spread = _SIGMA * np.median(np.abs(windows - median[:, None]), axis=1)
-    # a coarse channel flickers by single steps of its resolution, a spread at the level of rounding is none
+    # a coarse channel flickers by single steps of its resolution, a spread at the level of rounding
+    # is none
     resolution = 2.0 * float(np.quantile(distance[distance > 0.0], 0.1)) if distance.any() else 0.0
     floor = max(_SIGMA * float(np.median(distance)), resolution, 1e-9 * float(np.abs(known).max()))
     # what a smooth channel bends by anyhow is no outlier where it stops bending
@@ -271,7 +312,11 @@ def true_runs(flags: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _any(log: Log, names: Sequence[str]) -> np.ndarray:
-    return np.logical_or.reduce([log.masks[name] for name in names], axis=0) if names else np.zeros(len(log), dtype=bool)
+    return (
+        np.logical_or.reduce([log.masks[name] for name in names], axis=0)
+        if names
+        else np.zeros(len(log), dtype=bool)
+    )
 
 
 def _step(t: np.ndarray) -> float:

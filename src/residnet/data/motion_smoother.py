@@ -1,4 +1,6 @@
-"""Pose, velocity and acceleration, all measured with known noise, brought into one motion: a fixed-interval smoother along each earth axis."""
+"""Pose, velocity and acceleration, all measured with known noise, brought into one motion: a
+fixed-interval smoother along each earth axis.
+"""
 
 from __future__ import annotations
 
@@ -14,12 +16,14 @@ _JERKS = tuple(10.0 ** (0.5 * k) for k in range(-6, 3))
 def smooth_motion(seen: np.ndarray, noise: Sequence[float], dt: float) -> np.ndarray:
     """Smoothed motion [N, 9] from x, y, psi, u, v, r, u_dot, v_dot, r_dot [N, 9], SI.
 
-    Each axis is a triple integrator driven by white jerk, north and east in the earth with the smoothed heading; the intensity of the jerk is the
-    one under which the measurements are likeliest. A Rauch-Tung-Striebel smoother with constant gains: the past and the future of a sample count
-    alike, so nothing lags.
+    Each axis is a triple integrator driven by white jerk, north and east in the earth with the
+    smoothed heading; the intensity of the jerk is the one under which the measurements are
+    likeliest. A Rauch-Tung-Striebel smoother with constant gains: the past and the future of a
+    sample count alike, so nothing lags.
 
     Args:
-        seen: measured, the heading unwrapped; a quantity that nobody measures has an infinite noise.
+        seen: measured, the heading unwrapped; a quantity that nobody measures has an infinite
+            noise.
         noise: standard deviations of the nine.
         dt: sampling interval in s.
 
@@ -28,25 +32,41 @@ def smooth_motion(seen: np.ndarray, noise: Sequence[float], dt: float) -> np.nda
     """
     if not np.isfinite(seen).all():
         row, column = (int(part[0]) for part in np.nonzero(~np.isfinite(seen)))
-        raise DataError(f"measured motion: column {column} is not finite at sample {row}; mask or fill the gap first")
+        raise DataError(
+            f"measured motion: column {column} is not finite at sample {row}; mask or fill the gap"
+            " first"
+        )
     spread = np.maximum(np.asarray(noise, dtype=np.float64), 1e-9)
     heading = _axis(seen[:, [2, 5, 8]], spread[[2, 5, 8]], dt)
     psi, r = heading[:, 0], heading[:, 1]
     c, s = np.cos(psi), np.sin(psi)
     u, v = seen[:, 3], seen[:, 4]
     along, across = seen[:, 6] - r * v, seen[:, 7] + r * u
-    north = _axis(np.stack((seen[:, 0], c * u - s * v, c * along - s * across), axis=1), spread[[0, 3, 6]], dt)
-    east = _axis(np.stack((seen[:, 1], s * u + c * v, s * along + c * across), axis=1), spread[[1, 4, 7]], dt)
+    north = _axis(
+        np.stack((seen[:, 0], c * u - s * v, c * along - s * across), axis=1), spread[[0, 3, 6]], dt
+    )
+    east = _axis(
+        np.stack((seen[:, 1], s * u + c * v, s * along + c * across), axis=1), spread[[1, 4, 7]], dt
+    )
     u, v = c * north[:, 1] + s * east[:, 1], c * east[:, 1] - s * north[:, 1]
     along, across = c * north[:, 2] + s * east[:, 2], c * east[:, 2] - s * north[:, 2]
-    out: np.ndarray = np.stack((north[:, 0], east[:, 0], psi, u, v, r, along + r * v, across - r * u, heading[:, 2]), axis=1)
+    out: np.ndarray = np.stack(
+        (north[:, 0], east[:, 0], psi, u, v, r, along + r * v, across - r * u, heading[:, 2]),
+        axis=1,
+    )
     return out
 
 
 def _axis(z: np.ndarray, spread: np.ndarray, dt: float) -> np.ndarray:
     """Smoothed position, velocity and acceleration [N, 3]."""
     step = np.array([[1.0, dt, dt * dt / 2], [0.0, 1.0, dt], [0.0, 0.0, 1.0]])
-    driven = np.array([[dt**5 / 20, dt**4 / 8, dt**3 / 6], [dt**4 / 8, dt**3 / 3, dt**2 / 2], [dt**3 / 6, dt**2 / 2, dt]])
+    driven = np.array(
+        [
+            [dt**5 / 20, dt**4 / 8, dt**3 / 6],
+            [dt**4 / 8, dt**3 / 3, dt**2 / 2],
+            [dt**3 / 6, dt**2 / 2, dt],
+        ]
+    )
     known = np.isfinite(spread)
     h, noise = np.eye(3)[known], np.diag(spread[known] ** 2)
     z = z[:, known]
@@ -71,7 +91,9 @@ def _riccati(step: np.ndarray, driven: np.ndarray, h: np.ndarray, noise: np.ndar
     return out
 
 
-def _filter(z: np.ndarray, step: np.ndarray, h: np.ndarray, gain: np.ndarray, innovation: np.ndarray) -> tuple[np.ndarray, float]:
+def _filter(
+    z: np.ndarray, step: np.ndarray, h: np.ndarray, gain: np.ndarray, innovation: np.ndarray
+) -> tuple[np.ndarray, float]:
     """Filtered states [N, 3], and minus twice the mean log-likelihood of the innovations."""
     x = np.zeros(3)
     x[: h.shape[1]] = h.T @ z[0]

@@ -28,10 +28,12 @@ class PrepareConfig(Config):
         grid: the uniform time grid; its step is the model's dt.
         masks: which samples are excluded, and why.
         derivative: how velocities are smoothed and differentiated.
-        trim: seconds cut from the start and the end of every log before samples are taken for identification.
-        hold: what a model is given as an input over the step that follows a sample. `start`: the sample itself, exact for a command that
-            changes on the grid. `mean`: the mean of the samples at both ends of the step, for a measured quantity that moves on during the
-            step, such as shaft revolutions; held from the start it would lag by half a step.
+        trim: seconds cut from the start and the end of every log before samples are taken for
+            identification.
+        hold: what a model is given as an input over the step that follows a sample. `start`: the
+            sample itself, exact for a command that changes on the grid. `mean`: the mean of the
+            samples at both ends of the step, for a measured quantity that moves on during the step,
+            such as shaft revolutions; held from the start it would lag by half a step.
     """
 
     grid: GridConfig
@@ -43,7 +45,8 @@ class PrepareConfig(Config):
 
 @dataclass(frozen=True)
 class Prepared:
-    """One log on the grid, with what identification and evaluation need (float64 arrays of T samples).
+    """One log on the grid, with what identification and evaluation need (float64 arrays of T
+    samples).
 
     Attributes:
         log: the aligned log with its masks.
@@ -92,8 +95,14 @@ def prepare(log: Log, split: str, columns: Sequence[str], config: PrepareConfig)
     piece = np.where(np.isfinite(y).all(1) & np.isfinite(w).all(1), segments(log), -1)
     usable = scored(log) & (piece >= 0)
     if not usable.any():
-        reasons = ", ".join(f"{reason} {mask.mean():.0%}" for reason, mask in log.masks.items()) or "NaN in a channel that the model needs"
-        raise DataError(f"log {log.name}: no sample is usable ({reasons}); check the masks and the channels {', '.join((*STATE, *columns))}")
+        reasons = (
+            ", ".join(f"{reason} {mask.mean():.0%}" for reason, mask in log.masks.items())
+            or "NaN in a channel that the model needs"
+        )
+        raise DataError(
+            f"log {log.name}: no sample is usable ({reasons}); check the masks and the channels"
+            f" {', '.join((*STATE, *columns))}"
+        )
     # derivatives must not see masked samples, so a piece ends at each of them
     clean = _renumber(np.where(log.usable & usable, piece, -1))
     smooth_nu, nu_dot, valid = config.derivative.derive(y[:, 3:], config.grid.step, clean)
@@ -118,13 +127,17 @@ def _renumber(labels: np.ndarray) -> np.ndarray:
 
 
 def samples(logs: Sequence[Prepared], signals: Signals) -> Samples:
-    """Samples of identification from prepared logs: smoothed channels and measured accelerations, float64.
+    """Samples of identification from prepared logs: smoothed channels and measured accelerations,
+    float64.
 
     Raises:
         DataError: where no log has a sample to learn from.
     """
     if not any(p.good.any() for p in logs):
-        raise DataError(f"none of {len(logs)} training logs has a sample to learn from; are the logs shorter than the derivative's window?")
+        raise DataError(
+            f"none of {len(logs)} training logs has a sample to learn from; are the logs shorter"
+            " than the derivative's window?"
+        )
     z, target, group, time = [], [], [], []
     for number, p in enumerate(logs):
         x, w = torch.from_numpy(p.smooth[p.good]), torch.from_numpy(p.recorded[p.good])
@@ -133,10 +146,21 @@ def samples(logs: Sequence[Prepared], signals: Signals) -> Samples:
         target.append(torch.from_numpy(p.nu_dot[p.good]))
         group.append(torch.full((len(x),), number))
         time.append(torch.from_numpy(p.log.t[p.good] - p.log.t[0]))
-    return Samples(torch.cat(z), torch.cat(target), torch.cat(group), torch.cat(time), tuple(p.log.manoeuvre for p in logs), signals.names)
+    return Samples(
+        torch.cat(z),
+        torch.cat(target),
+        torch.cat(group),
+        torch.cat(time),
+        tuple(p.log.manoeuvre for p in logs),
+        signals.names,
+    )
 
 
 def envelope(logs: Sequence[Prepared]) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest measured velocities and inputs, [3 + m] each, over the usable samples of logs."""
-    joined = np.concatenate([np.concatenate((p.y[p.usable, 3:], p.w[p.usable]), axis=1) for p in logs])
+    """Lowest and highest measured velocities and inputs, [3 + m] each, over the usable samples of
+    logs.
+    """
+    joined = np.concatenate(
+        [np.concatenate((p.y[p.usable, 3:], p.w[p.usable]), axis=1) for p in logs]
+    )
     return joined.min(0), joined.max(0)

@@ -31,7 +31,8 @@ def read_logs(config: MeasuredLogs | SimulatedTrials) -> Splits:
     """The logs of a run by split (train, validation, test).
 
     Raises:
-        ResidnetError: where a file is missing or its contents cannot be used, or two splits share measurements.
+        ResidnetError: where a file is missing or its contents cannot be used, or two splits share
+            measurements.
     """
     if isinstance(config, SimulatedTrials):
         manoeuvres = config.draw()
@@ -40,7 +41,10 @@ def read_logs(config: MeasuredLogs | SimulatedTrials) -> Splits:
             splits[split].append(log)
         return splits
     reader = config.reader.build()
-    splits = {split: [reader.read(path) for path in paths] for split, paths in config.split.resolve().items()}
+    splits = {
+        split: [reader.read(path) for path in paths]
+        for split, paths in config.split.resolve().items()
+    }
     check_leaks(splits)
     return splits
 

@@ -1,4 +1,6 @@
-"""Which log files are for training, for choosing and for the final test, and proof that the three share no data."""
+"""Which log files are for training, for choosing and for the final test, and proof that the three
+share no data.
+"""
 
 from __future__ import annotations
 
@@ -21,8 +23,10 @@ class SplitConfig(Config):
     """Files of the three splits: from a YAML file, or from patterns.
 
     Attributes:
-        file: YAML file with the keys train, validation and test, each a list of paths or patterns relative to `root`.
-        root: folder that paths and patterns start from; by default the folder of `file`, else the current folder.
+        file: YAML file with the keys train, validation and test, each a list of paths or patterns
+            relative to `root`.
+        root: folder that paths and patterns start from; by default the folder of `file`, else the
+            current folder.
         train: patterns such as `turning/*.csv` (`**` for any depth), where there is no `file`.
         validation: the same for the logs that models are chosen on.
         test: the same for the logs that nothing is chosen on.
@@ -38,24 +42,37 @@ class SplitConfig(Config):
     def _one_source(self) -> SplitConfig:
         given = [name for name in SPLITS if getattr(self, name)]
         if self.file is not None and given:
-            raise ValueError(f"give either `file` or patterns, not both (given: file and {', '.join(given)})")
+            raise ValueError(
+                f"give either `file` or patterns, not both (given: file and {', '.join(given)})"
+            )
         if self.file is None and len(given) < len(SPLITS):
             empty = [name for name in SPLITS if name not in given]
-            raise ValueError(f"no files for {', '.join(empty)}; give patterns for train, validation and test, or one `file` that names them")
+            raise ValueError(
+                f"no files for {', '.join(empty)}; give patterns for train, validation and test, or"
+                " one `file` that names them"
+            )
         return self
 
     def resolve(self) -> dict[str, list[Path]]:
-        """Split -> its files, each split in the order of its patterns, the matches of a pattern sorted.
+        """Split -> its files, each split in the order of its patterns, the matches of a pattern
+        sorted.
 
         Raises:
-            ConfigError: where a split is empty, a pattern matches nothing, or a file or the name of a log occurs in two places.
+            ConfigError: where a split is empty, a pattern matches nothing, or a file or the name of
+                a log occurs in two places.
         """
-        patterns = {name: getattr(self, name) for name in SPLITS} if self.file is None else _from_file(self.file)
+        patterns = (
+            {name: getattr(self, name) for name in SPLITS}
+            if self.file is None
+            else _from_file(self.file)
+        )
         root = self.root or (self.file.parent if self.file is not None else Path.cwd())
         if not root.is_dir():
             raise ConfigError(f"split: root {root} is not a folder; correct `root`")
         where = "split" if self.file is None else str(self.file)
-        files = {name: matches(root, wanted, f"{where}: {name}") for name, wanted in patterns.items()}
+        files = {
+            name: matches(root, wanted, f"{where}: {name}") for name, wanted in patterns.items()
+        }
         _require_distinct(files, where)
         return files
 
@@ -67,8 +84,15 @@ def _from_file(file: Path) -> dict[str, tuple[str, ...]]:
             raise ConfigError(f"{file}: unknown split '{key}'{nearest(key, SPLITS)}")
     for name in SPLITS:
         entries = content.get(name)
-        if not isinstance(entries, list) or not entries or not all(isinstance(entry, str) for entry in entries):
-            raise ConfigError(f"{file}: {name}: expected a list of at least one path or pattern, found {entries!r}")
+        if (
+            not isinstance(entries, list)
+            or not entries
+            or not all(isinstance(entry, str) for entry in entries)
+        ):
+            raise ConfigError(
+                f"{file}: {name}: expected a list of at least one path or pattern, found"
+                f" {entries!r}"
+            )
     return {name: tuple(content[name]) for name in SPLITS}
 
 
@@ -80,7 +104,11 @@ def matches(root: Path, patterns: Sequence[str], where: str) -> list[Path]:
         files = [root / pattern] if (root / pattern).is_file() else _globbed(root, pattern, where)
         if not files:
             parent = (root / pattern).parent
-            near = nearest(Path(pattern).name, (path.name for path in parent.iterdir())) if parent.is_dir() else f"; there is no folder {parent}"
+            near = (
+                nearest(Path(pattern).name, (path.name for path in parent.iterdir()))
+                if parent.is_dir()
+                else f"; there is no folder {parent}"
+            )
             raise ConfigError(f"{where}: '{pattern}' matches no file in {root}{near}")
         found.update(dict.fromkeys(files))
     return list(found)
@@ -94,7 +122,9 @@ def _globbed(root: Path, pattern: str, where: str) -> list[Path]:
             return sorted(path for path in root.glob(pattern) if path.is_file())
     except ValueError as error:
         why = str(error)
-    raise ConfigError(f"{where}: '{pattern}' is not a pattern relative to {root} ({why}); set `root` instead")
+    raise ConfigError(
+        f"{where}: '{pattern}' is not a pattern relative to {root} ({why}); set `root` instead"
+    )
 
 
 def _require_distinct(files: Mapping[str, Sequence[Path]], where: str) -> None:
@@ -104,17 +134,24 @@ def _require_distinct(files: Mapping[str, Sequence[Path]], where: str) -> None:
         for path in paths:
             real = path.resolve()
             if real in seen:
-                raise ConfigError(f"{where}: {path} stands in {seen[real]} and in {split}; a file belongs to one split")
+                raise ConfigError(
+                    f"{where}: {path} stands in {seen[real]} and in {split}; a file belongs to one"
+                    " split"
+                )
             if path.stem in names:
-                raise ConfigError(f"{where}: {names[path.stem]} and {path} would both be the log '{path.stem}'; rename one of the files")
+                raise ConfigError(
+                    f"{where}: {names[path.stem]} and {path} would both be the log '{path.stem}';"
+                    " rename one of the files"
+                )
             seen[real], names[path.stem] = split, path
 
 
 def check_leaks(logs: Mapping[str, Sequence[Log]], rows: int = 100) -> None:
     """Stop where two logs of different splits hold the same measurements.
 
-    Compared are rows of all channels that the logs have in common, without time and with angles modulo a full circle, so that a copied stretch is
-    found wherever its clock and heading start. Equal rows within one log (a vessel at rest) count once.
+    Compared are rows of all channels that the logs have in common, without time and with angles
+    modulo a full circle, so that a copied stretch is found wherever its clock and heading start.
+    Equal rows within one log (a vessel at rest) count once.
 
     Args:
         logs: split -> its logs.
@@ -141,8 +178,9 @@ def check_leaks(logs: Mapping[str, Sequence[Log]], rows: int = 100) -> None:
     if shared[first, second] > rows:
         (split_a, a), (split_b, b) = flat[first], flat[second]
         raise DataError(
-            f"logs {a.name} ({split_a}) and {b.name} ({split_b}) share {int(shared[first, second])} identical rows, at most {rows} are allowed; "
-            "one is a copy of part of the other: leave one out, or put both into one split"
+            f"logs {a.name} ({split_a}) and {b.name} ({split_b}) share {int(shared[first, second])}"
+            f" identical rows, at most {rows} are allowed; one is a copy of part of the other:"
+            " leave one out, or put both into one split"
         )
 
 
@@ -154,5 +192,9 @@ def row_hashes(log: Log, channels: Sequence[str]) -> np.ndarray:
     for name in channels:
         values = log[name]
         # unwrapping a copied stretch from another start leaves rounding in the heading
-        columns[name] = np.round(np.remainder(values, 2.0 * np.pi), 9) if log.units[name] == "rad" else values + 0.0
+        columns[name] = (
+            np.round(np.remainder(values, 2.0 * np.pi), 9)
+            if log.units[name] == "rad"
+            else values + 0.0
+        )
     return np.asarray(pd.util.hash_pandas_object(pd.DataFrame(columns), index=False).to_numpy())

@@ -24,7 +24,8 @@ class WindowStore:
         w: inputs [N, m].
         usable: samples that may be scored [N].
         good: samples whose derivative may be learned from [N].
-        reach: samples from here to the end of the stretch, itself included, [N]; 0 where there is none.
+        reach: samples from here to the end of the stretch, itself included, [N]; 0 where there is
+            none.
         depth: samples since the stretch began, [N].
         log: number of the log, in the order gathered, [N].
     """
@@ -41,10 +42,14 @@ class WindowStore:
 
     @classmethod
     def gather(cls, logs: Sequence[Prepared], dtype: torch.dtype = torch.float32) -> WindowStore:
-        """From prepared logs; positions are counted from each log's start so that float32 keeps them exact enough."""
+        """From prepared logs; positions are counted from each log's start so that float32 keeps
+        them exact enough.
+        """
         y = np.concatenate([p.y - p.y[0] * [1, 1, 0, 0, 0, 0] for p in logs])
         smooth = np.concatenate([p.smooth - p.y[0] * [1, 1, 0, 0, 0, 0] for p in logs])
-        labels = np.concatenate([np.where(p.piece >= 0, p.piece + 1_000_000 * i, -1) for i, p in enumerate(logs)])
+        labels = np.concatenate(
+            [np.where(p.piece >= 0, p.piece + 1_000_000 * i, -1) for i, p in enumerate(logs)]
+        )
         starts = np.flatnonzero(np.concatenate(([True], labels[1:] != labels[:-1])))
         lengths = np.diff(np.append(starts, labels.size))
         depth = np.arange(labels.size) - np.repeat(starts, lengths)
@@ -69,7 +74,8 @@ class WindowStore:
         )
 
     def starts(self, length: int, share: float = 0.5) -> Tensor:
-        """Rows at which a window of `length` samples may start: within one stretch, the first sample good, at least `share` of all usable.
+        """Rows at which a window of `length` samples may start: within one stretch, the first
+        sample good, at least `share` of all usable.
 
         Raises:
             DataError: where no log holds such a window.
@@ -79,11 +85,15 @@ class WindowStore:
         rows = torch.nonzero(fits).squeeze(1)
         rows = rows[(total[rows + length] - total[rows]) >= share * length]
         if rows.numel() == 0:
-            raise DataError(f"no training log holds a window of {length} samples without a break; shorten the horizon or give longer logs")
+            raise DataError(
+                f"no training log holds a window of {length} samples without a break; shorten the"
+                " horizon or give longer logs"
+            )
         return rows
 
     def beginnings(self, length: int, lead: int) -> Tensor:
-        """Rows `lead` samples after the beginning of a stretch at which a window of `length` samples may start.
+        """Rows `lead` samples after the beginning of a stretch at which a window of `length`
+        samples may start.
 
         Raises:
             DataError: where no stretch is long enough.
@@ -92,26 +102,35 @@ class WindowStore:
         rows = rows[self.depth[rows] == lead]
         if rows.numel() == 0:
             raise DataError(
-                f"no training log holds a window of {length} samples from {lead} samples after its beginning on; shorten it or leave out `beginnings`"
+                f"no training log holds a window of {length} samples from {lead} samples after its"
+                " beginning on; shorten it or leave out `beginnings`"
             )
         return rows
 
     def take(self, values: Tensor, starts: Tensor, length: int) -> Tensor:
         """Windows [B, length, ...] of one of the tensors, from rows `starts` [B] on."""
         index = starts[:, None] + torch.arange(length)
-        return values.index_select(0, index.reshape(-1)).reshape(starts.numel(), length, *values.shape[1:])
+        return values.index_select(0, index.reshape(-1)).reshape(
+            starts.numel(), length, *values.shape[1:]
+        )
 
     def history(self, starts: Tensor, length: int) -> tuple[Tensor, Tensor]:
-        """Measured states and inputs of the `length` samples before each start; where the stretch is shorter, its first sample is repeated."""
+        """Measured states and inputs of the `length` samples before each start; where the stretch
+        is shorter, its first sample is repeated.
+        """
         back = torch.arange(-length, 0)
         index = starts[:, None] + torch.maximum(back, -self.depth[starts][:, None])
         rows = index.reshape(-1)
         shape = (starts.numel(), length)
-        return self.y.index_select(0, rows).unflatten(0, shape), self.w.index_select(0, rows).unflatten(0, shape)
+        return self.y.index_select(0, rows).unflatten(0, shape), self.w.index_select(
+            0, rows
+        ).unflatten(0, shape)
 
 
 class WindowBatches:
-    """Random batches of window starts, the same for the same seed, stage and epoch: a resumed run sees what the undisturbed one did."""
+    """Random batches of window starts, the same for the same seed, stage and epoch: a resumed run
+    sees what the undisturbed one did.
+    """
 
     def __init__(self, starts: Tensor, batch: int, steps: int) -> None:
         self.starts = starts
@@ -123,5 +142,7 @@ class WindowBatches:
         generator = torch.Generator().manual_seed((seed * 1_000_003 + epoch) % (2**63))
         need = self.batch * self.steps
         rounds = -(-need // self.starts.numel())
-        order = torch.cat([torch.randperm(self.starts.numel(), generator=generator) for _ in range(rounds)])[:need]
+        order = torch.cat(
+            [torch.randperm(self.starts.numel(), generator=generator) for _ in range(rounds)]
+        )[:need]
         return self.starts[order].reshape(self.steps, self.batch)

@@ -1,4 +1,6 @@
-"""The source documents' experiments: what a config under `configs/studies` draws beside the ordinary report."""
+"""The source documents' experiments: what a config under `configs/studies` draws beside the
+ordinary report.
+"""
 
 from __future__ import annotations
 

@@ -1,1 +1,3 @@
-"""Models that move: hybrid (baseline + head), simulated plants, and the one time loop that runs them all."""
+"""Models that move: hybrid (baseline + head), simulated plants, and the one time loop that runs
+them all.
+"""

@@ -1,4 +1,6 @@
-"""A learned model with actuators in front: commands go in, so that it flies manoeuvres by itself like the vessel."""
+"""A learned model with actuators in front: commands go in, so that it flies manoeuvres by itself
+like the vessel.
+"""
 
 from __future__ import annotations
 
@@ -16,11 +18,13 @@ from residnet.dynamics.hybrid import HybridDynamics
 
 @final
 class ActuatedDynamics(Dynamics):
-    """State x [B, 6 + k]: x, y, psi, u, v, r, then the states of the gear; inputs w [B, m] as the gear's.
+    """State x [B, 6 + k]: x, y, psi, u, v, r, then the states of the gear; inputs w [B, m] as the
+    gear's.
 
-    Each input of the model is a state of the gear where it has one of that name, else an input of the gear, else the command of that name
-    (`cmd_delta` for `delta`: a rudder that stands at its command at once has no state). A model that was fitted on
-    inputs averaged over each step (`hold: mean`) is given the mean of the values at the step's ends, as in its fit.
+    Each input of the model is a state of the gear where it has one of that name, else an input of
+    the gear, else the command of that name (`cmd_delta` for `delta`: a rudder that stands at its
+    command at once has no state). A model that was fitted on inputs averaged over each step (`hold:
+    mean`) is given the mean of the values at the step's ends, as in its fit.
 
     Args:
         model: the learned model.
@@ -32,7 +36,13 @@ class ActuatedDynamics(Dynamics):
         ConfigError: where the gear has nothing for an input of the model.
     """
 
-    def __init__(self, model: HybridDynamics, columns: tuple[str, ...], hold: Literal["start", "mean"], gear: Gear) -> None:
+    def __init__(
+        self,
+        model: HybridDynamics,
+        columns: tuple[str, ...],
+        hold: Literal["start", "mean"],
+        gear: Gear,
+    ) -> None:
         super().__init__(model.dt, model.integrator)
         self.model = model
         self.gear = gear
@@ -44,7 +54,10 @@ class ActuatedDynamics(Dynamics):
         for name in columns:
             found = next((given for given in (name, commanded(name)) if given in names), None)
             if found is None:
-                raise ConfigError(f"the model is driven by '{name}', which the vessel's actuators do not have{nearest(name, names)}")
+                raise ConfigError(
+                    f"the model is driven by '{name}', which the vessel's actuators do not"
+                    f" have{nearest(name, names)}"
+                )
             self.take.append(names.index(found))
 
     def initial_state(self, batch: int) -> Tensor:

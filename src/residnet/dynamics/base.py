@@ -1,4 +1,6 @@
-"""What the time loop steps: abstract `Dynamics`, with the explicit Runge-Kutta step that all models share."""
+"""What the time loop steps: abstract `Dynamics`, with the explicit Runge-Kutta step that all models
+share.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,8 @@ from residnet.core.frames import to_earth
 
 Integrator = Literal["rk4", "heun", "euler", "semi_implicit_euler"]
 
-# nodes and weights of explicit schemes in which every stage starts from the one before it; the first stage is at the state itself
+# nodes and weights of explicit schemes in which every stage starts from the one before it; the
+# first stage is at the state itself
 _TABLEAUX: dict[str, tuple[list[float], list[float]]] = {
     "rk4": ([0.0, 0.5, 0.5, 1.0], [1 / 6, 1 / 3, 1 / 3, 1 / 6]),
     "heun": ([0.0, 1.0], [0.5, 0.5]),
@@ -22,10 +25,11 @@ _TABLEAUX: dict[str, tuple[list[float], list[float]]] = {
 
 
 class Dynamics(nn.Module, ABC):
-    """A vessel model in discrete time: `step(x, w, s) -> (x', s')` at a fixed dt, inputs held over the step.
+    """A vessel model in discrete time: `step(x, w, s) -> (x', s')` at a fixed dt, inputs held over
+    the step.
 
-    Subclasses give `rate(x, p, rho)`, the derivative of the state at a stage, and `step`. All is pure tensor code that
-    TorchScript compiles.
+    Subclasses give `rate(x, p, rho)`, the derivative of the state at a stage, and `step`. All is
+    pure tensor code that TorchScript compiles.
     """
 
     def __init__(self, dt: float, integrator: Integrator) -> None:
@@ -63,5 +67,12 @@ class Dynamics(nn.Module, ABC):
         after = x + self.dt * total
         if self.semi_implicit:
             # the pose moves with the new velocities, which keeps an undamped oscillation bounded
-            return torch.cat((x[:, :3] + self.dt * self.kinematics(torch.cat((x[:, :3], after[:, 3:]), dim=-1)), after[:, 3:]), dim=-1)
+            return torch.cat(
+                (
+                    x[:, :3]
+                    + self.dt * self.kinematics(torch.cat((x[:, :3], after[:, 3:]), dim=-1)),
+                    after[:, 3:],
+                ),
+                dim=-1,
+            )
         return after

@@ -13,11 +13,13 @@ from residnet.dynamics.base import Dynamics
 
 @final
 class Carried(Dynamics):
-    """A model in water that moves over ground, each row in its own steady current; u and v are velocities through the water.
+    """A model in water that moves over ground, each row in its own steady current; u and v are
+    velocities through the water.
 
-    In a current that is the same everywhere and always, a vessel moves through the water as it does in water at rest (T. I. Fossen, Handbook
-    of Marine Craft Hydrodynamics and Motion Control, section 8.3, irrotational ocean currents); only its position is carried away.
-    Memory s [B, 2 + k]: current to the north and to the east in m/s, then the model's.
+    In a current that is the same everywhere and always, a vessel moves through the water as it does
+    in water at rest (T. I. Fossen, Handbook of Marine Craft Hydrodynamics and Motion Control,
+    section 8.3, irrotational ocean currents); only its position is carried away. Memory s [B, 2 +
+    k]: current to the north and to the east in m/s, then the model's.
 
     Args:
         model: whose steps do not depend on the position.
@@ -40,4 +42,6 @@ class Carried(Dynamics):
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """State and memory one step later."""
         moved, memory = self.model.step(x, w, s[:, 2:])
-        return moved + self.dt * s[:, :2] @ self.places.to(x.dtype), torch.cat((s[:, :2], memory), dim=-1)
+        return moved + self.dt * s[:, :2] @ self.places.to(x.dtype), torch.cat(
+            (s[:, :2], memory), dim=-1
+        )

@@ -12,7 +12,8 @@ from residnet.dynamics.base import Dynamics
 
 @final
 class DrawnDynamics(Dynamics):
-    """Rows [M * D] of a batch, M manoeuvres with D draws each (draws vary fastest); draw d runs with theta[d] in place of a parameter.
+    """Rows [M * D] of a batch, M manoeuvres with D draws each (draws vary fastest); draw d runs
+    with theta[d] in place of a parameter.
 
     Args:
         dynamics: the model, memoryless or not.
@@ -45,7 +46,9 @@ class DrawnDynamics(Dynamics):
             return out if isinstance(out, tuple) else (out,)
 
         split = [part.reshape(part.shape[0] // draws, draws, part.shape[-1]) for part in given]
-        out: tuple[Tensor, ...] = torch.vmap(one, in_dims=(0, *(1 for _ in given)), out_dims=1)(self.theta, *split)
+        out: tuple[Tensor, ...] = torch.vmap(one, in_dims=(0, *(1 for _ in given)), out_dims=1)(
+            self.theta, *split
+        )
         return tuple(part.reshape(given[0].shape[0], part.shape[-1]) for part in out)
 
 

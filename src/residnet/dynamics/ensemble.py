@@ -1,4 +1,6 @@
-"""The mean of several models as one: accelerations are averaged inside one free run, so it steps, warms up and exports like any model."""
+"""The mean of several models as one: accelerations are averaged inside one free run, so it steps,
+warms up and exports like any model.
+"""
 
 from __future__ import annotations
 
@@ -81,5 +83,8 @@ def _summed(counts: Sequence[Sequence[float]]) -> list[float]:
 def mean_of(members: Sequence[HybridDynamics]) -> HybridDynamics:
     """The mean of models with the same signals, step and integrator."""
     first = members[0]
-    baseline, head = MeanBaseline([member.head.carried(member.baseline) for member in members]), MeanHead([member.head for member in members])
+    baseline, head = (
+        MeanBaseline([member.head.carried(member.baseline) for member in members]),
+        MeanHead([member.head for member in members]),
+    )
     return HybridDynamics(first.signals, baseline, head, first.dt, first.integrator)

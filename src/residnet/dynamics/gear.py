@@ -1,4 +1,6 @@
-"""Steering and propulsion gear in front of a learned model: what turns commands into the inputs that the model was fitted on."""
+"""Steering and propulsion gear in front of a learned model: what turns commands into the inputs
+that the model was fitted on.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +49,9 @@ class Gear(nn.Module, ABC):
 
 @final
 class PlantGear(Gear):
-    """The actuators of a plant, whatever its kind: the plant itself moves them, and what its hull would do is thrown away."""
+    """The actuators of a plant, whatever its kind: the plant itself moves them, and what its hull
+    would do is thrown away.
+    """
 
     def __init__(self, plant: Plant, dt: float, substeps: int = 1) -> None:
         super().__init__()
@@ -62,7 +66,9 @@ class PlantGear(Gear):
         return self.plant.demand(drive, steer)
 
     def move(self, a: Tensor, w: Tensor) -> Tensor:
-        """States [B, k] one step later; the hull is where trials start, whose motion the actuators do not feel."""
+        """States [B, k] one step later; the hull is where trials start, whose motion the actuators
+        do not feel.
+        """
         if self.dynamics is None:
             return a
         x = self.plant.approach(a.shape[0])
@@ -76,7 +82,8 @@ class PlantGear(Gear):
 
 
 class InputShare(Config):
-    """How one input of a learned model follows the demands of a manoeuvre; all in the input's SI unit or as text with a unit.
+    """How one input of a learned model follows the demands of a manoeuvre; all in the input's SI
+    unit or as text with a unit.
 
     Attributes:
         drive: value at full drive.
@@ -106,11 +113,15 @@ class GivenGear(Gear):
         ConfigError: where a value has a wrong unit.
     """
 
-    def __init__(self, shares: Mapping[str, InputShare], exogenous: tuple[str, ...], dt: float) -> None:
+    def __init__(
+        self, shares: Mapping[str, InputShare], exogenous: tuple[str, ...], dt: float
+    ) -> None:
         super().__init__()
         self.inputs, self.commands = (*map(commanded, shares), *exogenous), len(shares)
         rows = [_numbers(name, share) for name, share in shares.items()]
-        self.drive, self.steer, self.centre, self.limit, self.rate = torch.tensor(rows, dtype=torch.float64).unbind(-1)
+        self.drive, self.steer, self.centre, self.limit, self.rate = torch.tensor(
+            rows, dtype=torch.float64
+        ).unbind(-1)
         self.limited = [i for i, row in enumerate(rows) if row[4] != float("inf")]
         # what can jump to its command needs no state
         self.state = tuple(list(shares)[i] for i in self.limited)
@@ -118,7 +129,9 @@ class GivenGear(Gear):
 
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
         """Commands [..., c], within their limits."""
-        both = drive.unsqueeze(-1) * self.drive.to(drive.dtype) + steer.unsqueeze(-1) * self.steer.to(drive.dtype)
+        both = drive.unsqueeze(-1) * self.drive.to(drive.dtype) + steer.unsqueeze(
+            -1
+        ) * self.steer.to(drive.dtype)
         limit = self.limit.to(drive.dtype)
         return self.centre.to(drive.dtype) + torch.minimum(torch.maximum(both, -limit), limit)
 
@@ -142,7 +155,9 @@ def _numbers(name: str, share: InputShare) -> list[float]:
     unit = CHANNEL_UNITS.get(name, "-")
     value, rate = Quantity(unit), Quantity(_RATES[unit]) if unit in _RATES else None
     try:
-        drive, steer, centre = (value.convert(given) for given in (share.drive, share.steer, share.centre))
+        drive, steer, centre = (
+            value.convert(given) for given in (share.drive, share.steer, share.centre)
+        )
         limit = abs(drive) + abs(steer) if share.limit is None else value.convert(share.limit)
         if share.rate is None:
             fastest = float("inf")
@@ -151,5 +166,8 @@ def _numbers(name: str, share: InputShare) -> list[float]:
     except ValueError as error:
         raise ConfigError(f"inputs.{name}: {error}") from None
     if limit <= 0 or fastest <= 0:
-        raise ConfigError(f"inputs.{name}: limit and rate must be above zero, and a share given of drive or steer; {limit:g}, {fastest:g}")
+        raise ConfigError(
+            f"inputs.{name}: limit and rate must be above zero, and a share given of drive or"
+            f" steer; {limit:g}, {fastest:g}"
+        )
     return [drive, steer, centre, limit, fastest]

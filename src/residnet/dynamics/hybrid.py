@@ -1,4 +1,6 @@
-"""The hybrid model: nu_dot = baseline + residual in acceleration space (document 003 eq. (19)), or through the head's mass in force space."""
+"""The hybrid model: nu_dot = baseline + residual in acceleration space (document 003 eq. (19)), or
+through the head's mass in force space.
+"""
 
 from __future__ import annotations
 
@@ -15,9 +17,18 @@ from residnet.physics.signals import Signals
 
 @final
 class HybridDynamics(Dynamics):
-    """State x [B, 6] = (x, y, psi, u, v, r); the head is evaluated once per step and held over the integrator's stages."""
+    """State x [B, 6] = (x, y, psi, u, v, r); the head is evaluated once per step and held over the
+    integrator's stages.
+    """
 
-    def __init__(self, signals: Signals, baseline: Baseline, head: ResidualHead, dt: float, integrator: Integrator = "rk4") -> None:
+    def __init__(
+        self,
+        signals: Signals,
+        baseline: Baseline,
+        head: ResidualHead,
+        dt: float,
+        integrator: Integrator = "rk4",
+    ) -> None:
         super().__init__(dt, integrator)
         self.signals = signals
         self.baseline = baseline
@@ -25,7 +36,9 @@ class HybridDynamics(Dynamics):
         self.n_state = head.n_state
 
     def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
-        """x_dot [B, 6] from what the step holds fixed: p = signals.prepare(w) and the residual rho [B, 3]."""
+        """x_dot [B, 6] from what the step holds fixed: p = signals.prepare(w) and the residual rho
+        [B, 3].
+        """
         nu_dot = self.head.accelerations(self.baseline(self.signals(x, p)), rho)
         return torch.cat((self.kinematics(x), nu_dot), dim=-1)
 
@@ -36,7 +49,9 @@ class HybridDynamics(Dynamics):
         return self.integrate(x, p, rho), s
 
     def one_step(self, z: Tensor) -> Tensor:
-        """nu_dot [B, T, 3] along measured channels [B, T, nz], the head's memory empty at first (teacher forcing)."""
+        """nu_dot [B, T, 3] along measured channels [B, T, nz], the head's memory empty at first
+        (teacher forcing).
+        """
         known, rho = self.baseline(z), self.head.sequence(z)
         return self.head.accelerations(known, rho)
 

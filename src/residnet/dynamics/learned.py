@@ -17,12 +17,22 @@ def chosen_model(run: Path, name: str) -> str:
         UsageError: where there is no such folder or no such model in it.
     """
     if not run.is_dir():
-        raise UsageError(f"{run}: no such folder; run the fit first that identifies the model (residnet run CONFIG --out {run})")
+        raise UsageError(
+            f"{run}: no such folder; run the fit first that identifies the model (residnet run"
+            f" CONFIG --out {run})"
+        )
     names = model_names(run / "models")
     if name != "selected" and name in names:
         return name
     metrics = run / "metrics.json"
-    selected = str(json.loads(metrics.read_text())["selected"]) if name == "selected" and metrics.is_file() else ""
+    selected = (
+        str(json.loads(metrics.read_text())["selected"])
+        if name == "selected" and metrics.is_file()
+        else ""
+    )
     if selected not in names:
-        raise UsageError(f"{run}: no model '{name}'{nearest(name, names) if names else '; not the folder of a finished fit'}")
+        raise UsageError(
+            f"{run}: no model"
+            f" '{name}'{nearest(name, names) if names else '; not the folder of a finished fit'}"
+        )
     return selected

@@ -16,10 +16,11 @@ from residnet.physics.nomoto import SteeringVessel
 
 @final
 class NomotoDynamics(Dynamics):
-    """Steps heading, sway and yaw of a `SteeringVessel` by the matrix exponential, then moves the rudder.
+    """Steps heading, sway and yaw of a `SteeringVessel` by the matrix exponential, then moves the
+    rudder.
 
-    The position is the integral of the exact velocities by Simpson's rule over the step: its error is O(dt^4), that of heading and
-    velocities is rounding at any dt.
+    The position is the integral of the exact velocities by Simpson's rule over the step: its error
+    is O(dt^4), that of heading and velocities is rounding at any dt.
 
     Raises:
         ConfigError: where the rudder lags, and so moves within a step.
@@ -28,7 +29,10 @@ class NomotoDynamics(Dynamics):
     def __init__(self, plant: SteeringVessel, dt: float) -> None:
         super().__init__(dt, "rk4")
         if not isinstance(plant.servo.response, Immediate | RateLimited):
-            raise ConfigError("an exact step holds the rudder: give the rudder the response 'immediate' (with or without a rate), or step by RK4")
+            raise ConfigError(
+                "an exact step holds the rudder: give the rudder the response 'immediate' (with or"
+                " without a rate), or step by RK4"
+            )
         self.plant = plant
         size = plant.free + 2
         # psi, then v, r and internal states, then the rudder angle, which is constant
@@ -36,9 +40,19 @@ class NomotoDynamics(Dynamics):
         system[0, 2] = 1.0
         system[1:-1, 1:-1] = plant.a
         system[1:-1, -1] = plant.b
-        self.register_buffer("to_middle", torch.linalg.matrix_exp(0.5 * dt * system)[:-1].T.contiguous(), persistent=False)
-        self.register_buffer("to_end", torch.linalg.matrix_exp(dt * system)[:-1].T.contiguous(), persistent=False)
-        self.register_buffer("simpson", torch.tensor([1.0, 4.0, 1.0], dtype=torch.float64) * dt / 6.0, persistent=False)
+        self.register_buffer(
+            "to_middle",
+            torch.linalg.matrix_exp(0.5 * dt * system)[:-1].T.contiguous(),
+            persistent=False,
+        )
+        self.register_buffer(
+            "to_end", torch.linalg.matrix_exp(dt * system)[:-1].T.contiguous(), persistent=False
+        )
+        self.register_buffer(
+            "simpson",
+            torch.tensor([1.0, 4.0, 1.0], dtype=torch.float64) * dt / 6.0,
+            persistent=False,
+        )
         self.to_middle: Tensor
         self.to_end: Tensor
         self.simpson: Tensor
@@ -51,11 +65,15 @@ class NomotoDynamics(Dynamics):
         """State after a step; the memory passes through."""
         plant = self.plant
         speed, rudder = x[:, 3], x[:, 4 + plant.free :]
-        start = torch.cat((x[:, 2:3], x[:, 4 : 4 + plant.free], plant.delta(x, w).unsqueeze(-1)), dim=-1)
+        start = torch.cat(
+            (x[:, 2:3], x[:, 4 : 4 + plant.free], plant.delta(x, w).unsqueeze(-1)), dim=-1
+        )
         middle, end = start @ self.to_middle.to(x.dtype), start @ self.to_end.to(x.dtype)
         psi, v, _ = torch.stack((start[:, :3], middle[:, :3], end[:, :3]), dim=1).unbind(-1)
         north, east = to_earth(speed.unsqueeze(-1), v, psi)
         simpson = self.simpson.to(x.dtype)
         north, east = x[:, 0] + north @ simpson, x[:, 1] + east @ simpson
-        after = torch.cat((torch.stack((north, east, end[:, 0], speed), dim=-1), end[:, 1:], rudder), dim=-1)
+        after = torch.cat(
+            (torch.stack((north, east, end[:, 0], speed), dim=-1), end[:, 1:], rudder), dim=-1
+        )
         return plant.settle(after, w, self.dt), s

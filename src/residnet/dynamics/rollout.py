@@ -1,7 +1,7 @@
 """The only time loop: batched, differentiable, scriptable.
 
-Its inputs come from a `Source`: playback of given inputs, or a manoeuvre that steers by the state that it sees. Rows
-whose source says so stop there: their state is held from that sample on.
+Its inputs come from a `Source`: playback of given inputs, or a manoeuvre that steers by the state
+that it sees. Rows whose source says so stop there: their state is held from that sample on.
 """
 
 from __future__ import annotations
@@ -28,7 +28,9 @@ class Source(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Inputs [B, m] for step k and the new memory, from the state x [B, nx] and the inputs given for that step, w [B, m]."""
+        """Inputs [B, m] for step k and the new memory, from the state x [B, nx] and the inputs
+        given for that step, w [B, m].
+        """
 
     def finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
         """[B] bool: rows that stop at this state; asked only where `may_stop`."""
@@ -61,7 +63,8 @@ class Rollout(nn.Module):
             s: initial memory [B, n_state].
 
         Returns:
-            states [B, T+1, nx] from x0 on, inputs that acted [B, T, m], and the memory after the last step [B, n_state].
+            states [B, T+1, nx] from x0 on, inputs that acted [B, T, m], and the memory after the
+            last step [B, n_state].
         """
         x, memory = x0, self.source.initial(x0)
         states = [x0]

@@ -13,7 +13,8 @@ from residnet.physics.plant import Plant
 
 @final
 class PlantDynamics(Dynamics):
-    """Steps a plant's hull with held actuators by RK4, then moves the actuators (the order of the golden runs).
+    """Steps a plant's hull with held actuators by RK4, then moves the actuators (the order of the
+    golden runs).
 
     A step of the log may hold several sub-steps of the plant: inputs are held over all of them.
     """
@@ -24,7 +25,9 @@ class PlantDynamics(Dynamics):
         self.substeps = substeps
 
     def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
-        """x_dot [B, nx] of the plant with what a step holds, p = prepare(x, w); a plant has no residual."""
+        """x_dot [B, nx] of the plant with what a step holds, p = prepare(x, w); a plant has no
+        residual.
+        """
         return self.plant.held_rate(x, p)
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
@@ -36,7 +39,8 @@ class PlantDynamics(Dynamics):
 
 @final
 class StagedPlantDynamics(Dynamics):
-    """Steps a plant under inputs that move during a step: RK4 with the inputs of each stage's own time.
+    """Steps a plant under inputs that move during a step: RK4 with the inputs of each stage's own
+    time.
 
     Inputs w [B, 3 m] hold those at the start, the middle and the end of the step side by side.
     """
@@ -56,12 +60,16 @@ class StagedPlantDynamics(Dynamics):
         k2 = self.rate(x + 0.5 * self.dt * k1, middle, s)
         k3 = self.rate(x + 0.5 * self.dt * k2, middle, s)
         k4 = self.rate(x + self.dt * k3, end, s)
-        return self.plant.settle(x + self.dt / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4), end, self.dt), s
+        return (
+            self.plant.settle(x + self.dt / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4), end, self.dt),
+            s,
+        )
 
 
 @final
 class TracedPlantDynamics(Dynamics):
-    """`PlantDynamics` with its step recorded once as TorchScript: the same numbers, two to three times faster for small batches.
+    """`PlantDynamics` with its step recorded once as TorchScript: the same numbers, two to three
+    times faster for small batches.
 
     For simulation only: it runs without gradients, in float64, at any batch size.
     """

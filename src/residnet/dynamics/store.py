@@ -1,4 +1,6 @@
-"""Models on disk: `model.json` says how to build one, `model.safetensors` holds its numbers; nothing in them runs when loaded."""
+"""Models on disk: `model.json` says how to build one, `model.safetensors` holds its numbers;
+nothing in them runs when loaded.
+"""
 
 from __future__ import annotations
 
@@ -32,10 +34,12 @@ class ModelSpec(Config):
         head: the learned part; None for none.
         dt: step in s.
         integrator: explicit scheme.
-        hold: whether an input is the sample at a step's start or the mean of the samples at its ends.
+        hold: whether an input is the sample at a step's start or the mean of the samples at its
+            ends.
         low: smallest u, v, r and inputs of the training data, SI, [3 + m].
         high: their largest.
-        members: of an ensemble, whose accelerations are averaged; its own baseline and head are then empty.
+        members: of an ensemble, whose accelerations are averaged; its own baseline and head are
+            then empty.
     """
 
     schema_name: Literal["residnet.model/1"] = Field(default="residnet.model/1", alias="schema")
@@ -66,7 +70,12 @@ class ModelSpec(Config):
     @property
     def ranges(self) -> dict[str, tuple[float, float]]:
         """Training range of each velocity and input."""
-        return {name: (low, high) for name, low, high in zip(VELOCITY + self.signals.columns, self.low, self.high, strict=True)}
+        return {
+            name: (low, high)
+            for name, low, high in zip(
+                VELOCITY + self.signals.columns, self.low, self.high, strict=True
+            )
+        }
 
 
 def save_model(folder: Path, spec: ModelSpec, model: HybridDynamics) -> None:
@@ -74,7 +83,10 @@ def save_model(folder: Path, spec: ModelSpec, model: HybridDynamics) -> None:
     from safetensors.torch import save_file
 
     folder.mkdir(parents=True, exist_ok=True)
-    save_file({name: value.contiguous() for name, value in model.state_dict().items()}, folder / "model.safetensors")
+    save_file(
+        {name: value.contiguous() for name, value in model.state_dict().items()},
+        folder / "model.safetensors",
+    )
     partial = folder / "model.json.partial"
     partial.write_text(json.dumps(spec.model_dump(mode="json", by_alias=True), indent=1) + "\n")
     partial.replace(folder / "model.json")
@@ -90,7 +102,9 @@ def load_model(folder: Path) -> tuple[ModelSpec, HybridDynamics]:
 
     card = folder / "model.json"
     if not card.is_file():
-        raise UsageError(f"{folder}: no model here{nearest(folder.name, model_names(folder.parent))}")
+        raise UsageError(
+            f"{folder}: no model here{nearest(folder.name, model_names(folder.parent))}"
+        )
     spec = validate(json.loads(card.read_text()), ModelSpec, str(card))
     model = spec.build()
     numbers = load_file(folder / "model.safetensors")

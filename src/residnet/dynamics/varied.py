@@ -1,4 +1,6 @@
-"""A plant whose every row steers a little differently: what controllers are trained and compared on."""
+"""A plant whose every row steers a little differently: what controllers are trained and compared
+on.
+"""
 
 from __future__ import annotations
 
@@ -16,16 +18,20 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.physics.plant import Plant
 
 VARIATION = ("effect", "time", "bias")
-"""Of each row: rudder force as a multiple, time constants of sway and yaw as a multiple, and an angle [rad] that is added to the rudder's."""
+"""Of each row: rudder force as a multiple, time constants of sway and yaw as a multiple, and an
+angle [rad] that is added to the rudder's.
+"""
 
 
 @final
 class VariedPlant(Dynamics):
-    """Steps a plant by RK4 with held actuators, each row with its own rudder effect, time constants and rudder bias.
+    """Steps a plant by RK4 with held actuators, each row with its own rudder effect, time constants
+    and rudder bias.
 
-    Its memory s [B, 3] is the variation, constant over a rollout: rows of ones and a zero bias are the plant itself. With Nomoto's model of
-    first order, T r_dot + r = K delta, `effect` multiplies K and `time` multiplies T; with other hulls `effect` multiplies the rudder angle
-    that the water feels, and `time` divides the accelerations in sway and yaw.
+    Its memory s [B, 3] is the variation, constant over a rollout: rows of ones and a zero bias are
+    the plant itself. With Nomoto's model of first order, T r_dot + r = K delta, `effect` multiplies
+    K and `time` multiplies T; with other hulls `effect` multiplies the rudder angle that the water
+    feels, and `time` divides the accelerations in sway and yaw.
 
     Raises:
         ConfigError: where the vessel has no rudder, or one that moves within a step.
@@ -36,15 +42,23 @@ class VariedPlant(Dynamics):
         self.plant = plant
         self.n_state = len(VARIATION)
         if plant.inputs[0] != "cmd_delta":
-            raise ConfigError(f"heading control needs a vessel whose first command is cmd_delta, found {', '.join(plant.inputs[: plant.commands])}")
+            raise ConfigError(
+                "heading control needs a vessel whose first command is cmd_delta, found"
+                f" {', '.join(plant.inputs[: plant.commands])}"
+            )
         self.rudder = plant.state.index("delta") if "delta" in plant.state else -1
         slowed = torch.tensor([1.0 if name in ("v", "r") else 0.0 for name in plant.state])
         self.register_buffer("slowed", slowed, persistent=False)
         self.slowed: Tensor
         x, w = plant.approach(1), torch.zeros(1, len(plant.inputs), dtype=torch.float64)
         w[:, 0] = 0.1
-        if any(name.startswith("_delta") for name in plant.state) or (self.rudder >= 0 and bool(plant.rate(x, w)[0, self.rudder] != 0)):
-            raise ConfigError("a varied plant holds the rudder over a step: give the rudder the response 'immediate' (with or without a rate)")
+        if any(name.startswith("_delta") for name in plant.state) or (
+            self.rudder >= 0 and bool(plant.rate(x, w)[0, self.rudder] != 0)
+        ):
+            raise ConfigError(
+                "a varied plant holds the rudder over a step: give the rudder the response"
+                " 'immediate' (with or without a rate)"
+            )
 
     def initial_state(self, batch: int) -> Tensor:
         """The plant itself, [batch, 3]."""
@@ -62,7 +76,9 @@ class VariedPlant(Dynamics):
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """State after a step; the variation passes through."""
-        angle = (x[:, self.rudder : self.rudder + 1] if self.rudder >= 0 else w[:, :1]) * s[:, :1] + s[:, 2:]
+        angle = (x[:, self.rudder : self.rudder + 1] if self.rudder >= 0 else w[:, :1]) * s[
+            :, :1
+        ] + s[:, 2:]
         held = torch.cat((angle, w[:, 1:]), dim=-1)
         p = self.plant.prepare(self._felt(x, angle), held)
         moved = self.integrate(x, p, torch.cat((angle, 1.0 / s[:, 1:2] - 1.0), dim=-1))
@@ -71,10 +87,12 @@ class VariedPlant(Dynamics):
 
 @final
 class VariedModel(Dynamics):
-    """A learned model of a hull behind a rudder that follows its command at a rate, each row with its own variation.
+    """A learned model of a hull behind a rudder that follows its command at a rate, each row with
+    its own variation.
 
-    State x [B, 6 or 7]: x, y, psi, u, v, r, and the rudder angle where it has a rate. Memory s [B, 3 + k]: the variation, then the head's.
-    `effect` multiplies the rudder angle that the model is given, `time` divides what a step changes in sway and yaw.
+    State x [B, 6 or 7]: x, y, psi, u, v, r, and the rudder angle where it has a rate. Memory s [B,
+    3 + k]: the variation, then the head's. `effect` multiplies the rudder angle that the model is
+    given, `time` divides what a step changes in sway and yaw.
 
     Args:
         model: of the hull.
@@ -87,12 +105,20 @@ class VariedModel(Dynamics):
         ConfigError: where the model has a memory and steps of another length.
     """
 
-    def __init__(self, model: HybridDynamics, dt: float, take: Sequence[int], mean: bool, rate: float | None) -> None:
+    def __init__(
+        self, model: HybridDynamics, dt: float, take: Sequence[int], mean: bool, rate: float | None
+    ) -> None:
         super().__init__(dt, model.integrator)
         if model.n_state > 0 and not math.isclose(model.dt, dt, rel_tol=1e-9):
-            raise ConfigError(f"the learned model has a memory and steps of {model.dt:g} s; give the policy's training this dt, not {dt:g} s")
+            raise ConfigError(
+                f"the learned model has a memory and steps of {model.dt:g} s; give the policy's"
+                f" training this dt, not {dt:g} s"
+            )
         # one for each precision: policies are trained in single and flown in double
-        self.models = tuple(copy.deepcopy(model).to(dtype).eval().requires_grad_(False) for dtype in (torch.float32, torch.float64))
+        self.models = tuple(
+            copy.deepcopy(model).to(dtype).eval().requires_grad_(False)
+            for dtype in (torch.float32, torch.float64)
+        )
         for own in self.models:
             own.dt = dt
         self.n_state = len(VARIATION) + model.n_state

@@ -1,1 +1,2 @@
-"""Leaving residnet: TorchScript modules for controllers, each with its card and its parity check."""
+"""Leaving residnet: TorchScript modules for controllers, each with its card and its parity check.
+"""

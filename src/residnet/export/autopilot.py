@@ -1,4 +1,6 @@
-"""A heading policy as TorchScript for a control loop: input checks and rate limits inside, never a command that is no number."""
+"""A heading policy as TorchScript for a control loop: input checks and rate limits inside, never a
+command that is no number.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,8 @@ class Limits(NamedTuple):
 
 
 def memory_limits(policy: HeadingPolicy, turn: float) -> list[tuple[float, float]]:
-    """Ranges [low, high] of an exported policy's memory, by `MEMORY` and the last command: what its own steps can lead to, and some room.
+    """Ranges [low, high] of an exported policy's memory, by `MEMORY` and the last command: what its
+    own steps can lead to, and some room.
 
     Args:
         policy: see there.
@@ -55,7 +58,10 @@ def memory_limits(policy: HeadingPolicy, turn: float) -> list[tuple[float, float
     }
     signed = [(-ranges[name], ranges[name]) for name in MEMORY]
     return [
-        *((0.0, high) if name in ("effect", "damping") else (low, high) for name, (low, high) in zip(MEMORY, signed, strict=True)),
+        *(
+            (0.0, high) if name in ("effect", "damping") else (low, high)
+            for name, (low, high) in zip(MEMORY, signed, strict=True)
+        ),
         (-angle, angle),
     ]
 
@@ -63,26 +69,42 @@ def memory_limits(policy: HeadingPolicy, turn: float) -> list[tuple[float, float
 class ExportedPolicy(nn.Module):
     """What a controller calls once per step; float32, SI and radians.
 
-    The memory s [B, 10] is that of the policy and the last command. `fault` tells that a measurement, the reference or the memory was no
-    number or out of range: then the command is the safe one, reached at the rudder's rate. The policy's memory stays as it was; where it was
-    wrong itself, it is forgotten and begins anew.
+    The memory s [B, 10] is that of the policy and the last command. `fault` tells that a
+    measurement, the reference or the memory was no number or out of range: then the command is the
+    safe one, reached at the rudder's rate. The policy's memory stays as it was; where it was wrong
+    itself, it is forgotten and begins anew.
     """
 
-    def __init__(self, policy: HeadingPolicy, limits: Limits, safe: Literal["hold", "amidships"]) -> None:
+    def __init__(
+        self, policy: HeadingPolicy, limits: Limits, safe: Literal["hold", "amidships"]
+    ) -> None:
         super().__init__()
         self.policy = policy
-        self.register_buffer("low", torch.tensor([limit[0] for limit in limits], dtype=torch.float32))
-        self.register_buffer("high", torch.tensor([limit[1] for limit in limits], dtype=torch.float32))
+        self.register_buffer(
+            "low", torch.tensor([limit[0] for limit in limits], dtype=torch.float32)
+        )
+        self.register_buffer(
+            "high", torch.tensor([limit[1] for limit in limits], dtype=torch.float32)
+        )
         self.low: Tensor
         self.high: Tensor
         kept = memory_limits(policy, limits.r[1])
-        self.register_buffer("memory_low", torch.tensor([limit[0] for limit in kept], dtype=torch.float32))
-        self.register_buffer("memory_high", torch.tensor([limit[1] for limit in kept], dtype=torch.float32))
+        self.register_buffer(
+            "memory_low", torch.tensor([limit[0] for limit in kept], dtype=torch.float32)
+        )
+        self.register_buffer(
+            "memory_high", torch.tensor([limit[1] for limit in kept], dtype=torch.float32)
+        )
         self.memory_low: Tensor
         self.memory_high: Tensor
         # the memory of `initial_state` at r = 0, and what it gains with r
-        self.register_buffer("begin", torch.tensor([0.0, 0.0, 0.0, 0.0, 1.0, 1.0, policy.prior, 0.0, policy.prior, 0.0]))
-        self.register_buffer("begin_turn", torch.tensor([0.0, 1.0, 1.0 / (policy.gain * policy.limit), *[0.0] * 7]))
+        self.register_buffer(
+            "begin",
+            torch.tensor([0.0, 0.0, 0.0, 0.0, 1.0, 1.0, policy.prior, 0.0, policy.prior, 0.0]),
+        )
+        self.register_buffer(
+            "begin_turn", torch.tensor([0.0, 1.0, 1.0 / (policy.gain * policy.limit), *[0.0] * 7])
+        )
         self.begin: Tensor
         self.begin_turn: Tensor
         self.keep = 1.0 if safe == "hold" else 0.0
@@ -94,15 +116,27 @@ class ExportedPolicy(nn.Module):
     def initial_state(self, y: Tensor) -> Tensor:
         """Memory s [B, 10] at the first measurement y [B, 3], rudder amidships."""
         good = self._good(y).unsqueeze(-1)
-        return torch.cat((self.policy.initial_state(torch.where(good, y, torch.zeros_like(y))), torch.zeros_like(y[:, :1])), dim=-1)
+        return torch.cat(
+            (
+                self.policy.initial_state(torch.where(good, y, torch.zeros_like(y))),
+                torch.zeros_like(y[:, :1]),
+            ),
+            dim=-1,
+        )
 
     def _good(self, y: Tensor) -> Tensor:
         return (torch.isfinite(y) & (y >= self.low) & (y <= self.high)).all(dim=-1)
 
     @torch.jit.export
     def step(self, y: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Rudder command [B, 1] in rad, memory [B, 10] and fault [B] from y [B, 3] = (psi, u, r), reference heading [B, 1] and memory."""
-        good = (self._good(y) & torch.isfinite(reference[:, 0]) & (reference[:, 0].abs() <= self.high[0])).unsqueeze(-1)
+        """Rudder command [B, 1] in rad, memory [B, 10] and fault [B] from y [B, 3] = (psi, u, r),
+        reference heading [B, 1] and memory.
+        """
+        good = (
+            self._good(y)
+            & torch.isfinite(reference[:, 0])
+            & (reference[:, 0].abs() <= self.high[0])
+        ).unsqueeze(-1)
         y = torch.where(good, y, torch.zeros_like(y))
         reference = torch.where(good, reference, torch.zeros_like(reference))
         last = torch.nan_to_num(s[:, -1:]).clamp(-self.limit, self.limit)
@@ -122,11 +156,17 @@ class ExportedPolicy(nn.Module):
 
 
 def for_export(policy: HeadingPolicy, safe: Literal["hold", "amidships"]) -> ExportedPolicy:
-    """The policy in float32 with its checks: headings up to 1000 turns, three times its speed, five times the steady turn at full rudder."""
+    """The policy in float32 with its checks: headings up to 1000 turns, three times its speed, five
+    times the steady turn at full rudder.
+    """
     policy = copy.deepcopy(policy).float().eval().requires_grad_(False)
     policy.read_from(MEASURED)
     turn = 5.0 * policy.gain * policy.limit
-    return ExportedPolicy(policy, Limits((-2000.0 * math.pi, 2000.0 * math.pi), (0.0, 3.0 * policy.speed), (-turn, turn)), safe).eval()
+    return ExportedPolicy(
+        policy,
+        Limits((-2000.0 * math.pi, 2000.0 * math.pi), (0.0, 3.0 * policy.speed), (-turn, turn)),
+        safe,
+    ).eval()
 
 
 def export_autopilot(
@@ -152,7 +192,8 @@ def export_autopilot(
         The card.
 
     Raises:
-        ExportError: where the exported module does not reproduce the policy, or a wrong input brings a command that is no number.
+        ExportError: where the exported module does not reproduce the policy, or a wrong input
+            brings a command that is no number.
     """
     module = for_export(policy, safe)
     return write_scripted(
@@ -165,7 +206,8 @@ def export_autopilot(
 
 
 def check_parity(name: str, module: ExportedPolicy, exported: Any) -> float:
-    """Largest difference of the command from the eager module over 1,000 steps, as a share of the rudder's limit; wrong inputs are among them.
+    """Largest difference of the command from the eager module over 1,000 steps, as a share of the
+    rudder's limit; wrong inputs are among them.
 
     Raises:
         ExportError: where it exceeds 1e-4, a command is no number, or a wrong input raises no flag.
@@ -185,15 +227,26 @@ def check_parity(name: str, module: ExportedPolicy, exported: Any) -> float:
             b, theirs, fault = exported.step(y[k], reference[k], theirs)
             difference = float((a - b).abs().max()) / module.limit
             if not math.isfinite(difference) or bool(fault[0]) != bool(wrong[k]):
-                raise ExportError(f"policy {name}: step {k} of the parity check gives the command {float(b[0, 0])} and the flag {bool(fault[0])}")
+                raise ExportError(
+                    f"policy {name}: step {k} of the parity check gives the command"
+                    f" {float(b[0, 0])} and the flag {bool(fault[0])}"
+                )
             worst = max(worst, difference)
     if worst > PARITY_TOLERANCE:
-        raise ExportError(f"policy {name}: the exported commands differ by {worst:.2g} of the rudder's limit; allowed {PARITY_TOLERANCE:g}")
+        raise ExportError(
+            f"policy {name}: the exported commands differ by {worst:.2g} of the rudder's limit;"
+            f" allowed {PARITY_TOLERANCE:g}"
+        )
     return worst
 
 
 def _card(
-    name: str, module: ExportedPolicy, safe: str, parity: float, about: Mapping[str, Any], metrics: Sequence[Mapping[str, Any]]
+    name: str,
+    module: ExportedPolicy,
+    safe: str,
+    parity: float,
+    about: Mapping[str, Any],
+    metrics: Sequence[Mapping[str, Any]],
 ) -> dict[str, Any]:
     return {
         "schema": "residnet.policy_card/1",
@@ -201,7 +254,10 @@ def _card(
         "measured": measured_entries(MEASURED, ("rad", "m/s", "rad/s"), module.low, module.high),
         "reference": [{"name": "heading", "unit": "rad"}],
         "memory": [*MEMORY, "last_command"],
-        "fault": f"measurement, reference or memory no number or out of range: command {'held' if safe == 'hold' else 'amidships'}, flag set",
+        "fault": (
+            "measurement, reference or memory no number or out of range: command"
+            f" {'held' if safe == 'hold' else 'amidships'}, flag set"
+        ),
         **policy_entries(module.policy),
         **about,
         "metrics": [dict(row) for row in metrics],
@@ -209,22 +265,39 @@ def _card(
     }
 
 
-def measured_entries(names: Sequence[str], units: Sequence[str], low: Tensor, high: Tensor) -> list[dict[str, Any]]:
+def measured_entries(
+    names: Sequence[str], units: Sequence[str], low: Tensor, high: Tensor
+) -> list[dict[str, Any]]:
     """Of a card: names, units and ranges of what an exported controller sees."""
-    return [{"name": n, "unit": u, "range": [a, b]} for n, u, a, b in zip(names, units, low.tolist(), high.tolist(), strict=True)]
+    return [
+        {"name": n, "unit": u, "range": [a, b]}
+        for n, u, a, b in zip(names, units, low.tolist(), high.tolist(), strict=True)
+    ]
 
 
 def policy_entries(policy: HeadingPolicy) -> dict[str, Any]:
     """What the cards of all exported heading policies say."""
     return {
-        "command": [{"name": "cmd_delta", "unit": "rad", "limit": policy.limit, "rate": None if math.isinf(policy.rate) else policy.rate}],
+        "command": [
+            {
+                "name": "cmd_delta",
+                "unit": "rad",
+                "limit": policy.limit,
+                "rate": None if math.isinf(policy.rate) else policy.rate,
+            }
+        ],
         "dt": policy.dt,
         "dtype": "float32",
-        "hidden": [layer.out_features for layer in policy.network if isinstance(layer, nn.Linear)][:-1],
+        "hidden": [layer.out_features for layer in policy.network if isinstance(layer, nn.Linear)][
+            :-1
+        ],
         "observer": policy.observer,
         "turning": {"K": policy.gain, "T": policy.time, "speed": policy.speed},
         "frame": "NED; psi clockwise from north; delta > 0 turns to starboard",
         "versions": {"residnet": __version__, "torch": torch.__version__},
         "exported": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-        "safety": "TorchScript is code that runs when loaded: load only files that you trust. The files under models/ hold numbers only.",
+        "safety": (
+            "TorchScript is code that runs when loaded: load only files that you trust. The files"
+            " under models/ hold numbers only."
+        ),
     }

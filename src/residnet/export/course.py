@@ -1,4 +1,6 @@
-"""A heading policy and the guidance of a planned course as one TorchScript module: measurements in, rudder out."""
+"""A heading policy and the guidance of a planned course as one TorchScript module: measurements in,
+rudder out.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,9 @@ from residnet.export.autopilot import measured_entries, memory_limits, policy_en
 from residnet.export.scripting import write_scripted
 
 MEASURED = ("x", "y", "psi", "u", "v", "r")
-"""What the exported module sees: north and east [m], heading [rad], surge and sway velocity [m/s], yaw rate [rad/s]."""
+"""What the exported module sees: north and east [m], heading [rad], surge and sway velocity [m/s],
+yaw rate [rad/s].
+"""
 PARITY_STEPS = 1000
 PARITY_TOLERANCE = 1e-4
 _METHODS = ["initial_state", "step"]
@@ -31,20 +35,25 @@ _FAR = 1e3
 class ExportedCourse(nn.Module):
     """What a controller calls once per step; float32, SI and radians.
 
-    The memory s is that of the guidance (place along the course, and the drift where it is estimated), of the policy, and the last command.
-    `fault` tells that a measurement or the memory was no number or out of range: then the command is the safe one, reached at the rudder's
-    rate, and the memory stays as it was; where it was wrong itself, it is forgotten and the course begins anew. `arrived` tells that the course
-    has ended; commands go on along its last leg.
+    The memory s is that of the guidance (place along the course, and the drift where it is
+    estimated), of the policy, and the last command. `fault` tells that a measurement or the memory
+    was no number or out of range: then the command is the safe one, reached at the rudder's rate,
+    and the memory stays as it was; where it was wrong itself, it is forgotten and the course begins
+    anew. `arrived` tells that the course has ended; commands go on along its last leg.
     """
 
-    def __init__(self, policy: HeadingPolicy, guidance: CourseGuidance, safe: Literal["hold", "amidships"]) -> None:
+    def __init__(
+        self, policy: HeadingPolicy, guidance: CourseGuidance, safe: Literal["hold", "amidships"]
+    ) -> None:
         super().__init__()
         policy = copy.deepcopy(policy).float().eval().requires_grad_(False)
         policy.read_from(MEASURED)
         rate = None if math.isinf(policy.rate) else policy.rate
         self.follower = Following(policy, MEASURED, limit=policy.limit, dt=policy.dt, rate=rate)
         self.guidance = copy.deepcopy(guidance).float()
-        self.guidance.x, self.guidance.y, self.guidance.psi, self.guidance.u, self.guidance.v = range(5)
+        self.guidance.x, self.guidance.y, self.guidance.psi, self.guidance.u, self.guidance.v = (
+            range(5)
+        )
         north, east = self.guidance.table[:, 0], self.guidance.table[:, 1]
         far = _FAR * guidance.lookahead
         turn, fast = 5.0 * policy.gain * policy.limit, 3.0 * policy.speed
@@ -59,26 +68,52 @@ class ExportedCourse(nn.Module):
         kept = memory_limits(policy, 2.0 * turn)
         angle = 1.001 * policy.limit
         drift = [(-1.01, 1.01)] * (guidance.n_state - 1)
-        ranges = [(0.0, 1.001 * guidance.farthest), *drift, (-angle, angle), (-2.0 * angle, 2.0 * angle), *kept[1:]]
-        self.register_buffer("memory_low", torch.tensor([limit[0] for limit in ranges], dtype=torch.float32))
-        self.register_buffer("memory_high", torch.tensor([limit[1] for limit in ranges], dtype=torch.float32))
+        ranges = [
+            (0.0, 1.001 * guidance.farthest),
+            *drift,
+            (-angle, angle),
+            (-2.0 * angle, 2.0 * angle),
+            *kept[1:],
+        ]
+        self.register_buffer(
+            "memory_low", torch.tensor([limit[0] for limit in ranges], dtype=torch.float32)
+        )
+        self.register_buffer(
+            "memory_high", torch.tensor([limit[1] for limit in ranges], dtype=torch.float32)
+        )
         self.memory_low: Tensor
         self.memory_high: Tensor
         self.keep = 1.0 if safe == "hold" else 0.0
-        self.travel, self.limit, self.dt, self.speed = self.follower.travel, policy.limit, policy.dt, policy.speed
+        self.travel, self.limit, self.dt, self.speed = (
+            self.follower.travel,
+            policy.limit,
+            policy.dt,
+            policy.speed,
+        )
 
     @torch.jit.export
     def initial_state(self, y: Tensor) -> Tensor:
-        """Memory [B, n] at the first measurement y [B, 6]: the beginning of the course, rudder amidships."""
+        """Memory [B, n] at the first measurement y [B, 6]: the beginning of the course, rudder
+        amidships.
+        """
         y = torch.where(self._good(y).unsqueeze(-1), y, torch.zeros_like(y))
-        return torch.cat((self.guidance.initial_state(y), self.follower.initial_state(y), torch.zeros_like(y[:, :1])), dim=-1)
+        return torch.cat(
+            (
+                self.guidance.initial_state(y),
+                self.follower.initial_state(y),
+                torch.zeros_like(y[:, :1]),
+            ),
+            dim=-1,
+        )
 
     def _good(self, y: Tensor) -> Tensor:
         return (torch.isfinite(y) & (y >= self.low) & (y <= self.high)).all(dim=-1)
 
     @torch.jit.export
     def step(self, y: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Rudder command [B, 1] in rad, memory [B, n], fault [B] and arrived [B] from y [B, 6] = `MEASURED` and the memory."""
+        """Rudder command [B, 1] in rad, memory [B, n], fault [B] and arrived [B] from y [B, 6] =
+        `MEASURED` and the memory.
+        """
         good = self._good(y).unsqueeze(-1)
         y = torch.where(good, y, torch.zeros_like(y))
         last = torch.nan_to_num(s[:, -1:]).clamp(-self.limit, self.limit)
@@ -126,7 +161,8 @@ def export_course(
         The card.
 
     Raises:
-        ExportError: where the exported module does not reproduce the policy and the guidance, or a wrong input brings a command that is no number.
+        ExportError: where the exported module does not reproduce the policy and the guidance, or a
+            wrong input brings a command that is no number.
     """
     module = ExportedCourse(policy, guidance, safe).eval()
     return write_scripted(
@@ -139,16 +175,21 @@ def export_course(
 
 
 def check_parity(name: str, module: ExportedCourse, exported: Any, course: Course) -> float:
-    """Largest difference of the command from the eager module along the course, as a share of the rudder's limit; wrong inputs are among them.
+    """Largest difference of the command from the eager module along the course, as a share of the
+    rudder's limit; wrong inputs are among them.
 
-    The vessel is put beside the course, off its heading, at varying speed, and moves on at the service speed.
+    The vessel is put beside the course, off its heading, at varying speed, and moves on at the
+    service speed.
 
     Raises:
         ExportError: where it exceeds 1e-4, a command is no number, or a wrong input raises no flag.
     """
     steps = torch.arange(PARITY_STEPS, dtype=torch.float32)
     at = (steps * module.dt * module.speed / course.step).long().clamp(max=len(course.track) - 1)
-    track, heading = torch.from_numpy(course.track).float()[at], torch.from_numpy(course.heading).float()[at]
+    track, heading = (
+        torch.from_numpy(course.track).float()[at],
+        torch.from_numpy(course.heading).float()[at],
+    )
     aside = 0.1 * module.guidance.lookahead
     y = torch.stack(
         (
@@ -171,10 +212,16 @@ def check_parity(name: str, module: ExportedCourse, exported: Any, course: Cours
             b, theirs, fault, _ = exported.step(y[k], theirs)
             difference = float((a - b).abs().max()) / module.limit
             if not math.isfinite(difference) or bool(fault[0]) != bool(wrong[k]):
-                raise ExportError(f"course of {name}: step {k} of the parity check gives the command {float(b[0, 0])} and the flag {bool(fault[0])}")
+                raise ExportError(
+                    f"course of {name}: step {k} of the parity check gives the command"
+                    f" {float(b[0, 0])} and the flag {bool(fault[0])}"
+                )
             worst = max(worst, difference)
     if worst > PARITY_TOLERANCE:
-        raise ExportError(f"course of {name}: the exported commands differ by {worst:.2g} of the rudder's limit; allowed {PARITY_TOLERANCE:g}")
+        raise ExportError(
+            f"course of {name}: the exported commands differ by {worst:.2g} of the rudder's limit;"
+            f" allowed {PARITY_TOLERANCE:g}"
+        )
     return worst
 
 
@@ -192,12 +239,26 @@ def _card(
     return {
         "schema": "residnet.course_card/1",
         "policy": name,
-        "measured": measured_entries(MEASURED, ("m", "m", "rad", "m/s", "m/s", "rad/s"), module.low, module.high),
-        "start": {"north": float(course.track[0, 0]), "east": float(course.track[0, 1]), "heading": float(course.heading[0])},
+        "measured": measured_entries(
+            MEASURED, ("m", "m", "rad", "m/s", "m/s", "rad/s"), module.low, module.high
+        ),
+        "start": {
+            "north": float(course.track[0, 0]),
+            "east": float(course.track[0, 1]),
+            "heading": float(course.heading[0]),
+        },
         "length": course.length,
         "lookahead": module.guidance.lookahead,
-        "memory": [*names, "rudder", *(f"policy_{i}" for i in range(policy.n_state)), "last_command"],
-        "fault": f"measurement or memory no number or out of range: command {'held' if safe == 'hold' else 'amidships'}, flag set",
+        "memory": [
+            *names,
+            "rudder",
+            *(f"policy_{i}" for i in range(policy.n_state)),
+            "last_command",
+        ],
+        "fault": (
+            "measurement or memory no number or out of range: command"
+            f" {'held' if safe == 'hold' else 'amidships'}, flag set"
+        ),
         **policy_entries(policy),
         **about,
         "metrics": [dict(row) for row in metrics],

@@ -1,4 +1,6 @@
-"""Export of a force-space model as a controller's feed-forward tau = F(nu_dot, nu) (document 002 eq. (3.24)), as TorchScript."""
+"""Export of a force-space model as a controller's feed-forward tau = F(nu_dot, nu) (document 002
+eq. (3.24)), as TorchScript.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,9 @@ from residnet.physics.signals import FORCE_CHANNELS
 
 @final
 class RequiredForce(nn.Module):
-    """tau [B, 3] = F(nu_dot [B, 3], nu [B, 3]) of a hybrid model in force space: M (nu_dot - nu_dot_0 without forces) + eps, float64, SI."""
+    """tau [B, 3] = F(nu_dot [B, 3], nu [B, 3]) of a hybrid model in force space: M (nu_dot -
+    nu_dot_0 without forces) + eps, float64, SI.
+    """
 
     def __init__(self, baseline: nn.Module, head: ForceHead) -> None:
         super().__init__()
@@ -30,11 +34,15 @@ class RequiredForce(nn.Module):
         """What the motion needs."""
         z = torch.cat((nu, torch.zeros_like(nu)), dim=-1)
         known: Tensor = self.baseline(z)
-        force: Tensor = (nu_dot - known) @ self.head.mass.to(nu.dtype).T + self.head.force(nu_dot, z)
+        force: Tensor = (nu_dot - known) @ self.head.mass.to(nu.dtype).T + self.head.force(
+            nu_dot, z
+        )
         return force
 
 
-def required_force(spec: ModelSpec, model: HybridDynamics) -> tuple[RequiredForce, list[tuple[float, float]]]:
+def required_force(
+    spec: ModelSpec, model: HybridDynamics
+) -> tuple[RequiredForce, list[tuple[float, float]]]:
     """The feed-forward of a model, with the ranges of nu_dot and nu that it was fitted on.
 
     Raises:
@@ -42,15 +50,32 @@ def required_force(spec: ModelSpec, model: HybridDynamics) -> tuple[RequiredForc
     """
     head = model.head
     if not isinstance(head, ForceHead):
-        raise UsageError(f"model {spec.name}: no residual in force space, so no feed-forward; fit a head of kind plsr or ridge with space: force")
+        raise UsageError(
+            f"model {spec.name}: no residual in force space, so no feed-forward; fit a head of kind"
+            " plsr or ridge with space: force"
+        )
     if spec.signals.columns != FORCE_CHANNELS:
-        raise UsageError(f"model {spec.name}: a feed-forward needs the inputs {', '.join(FORCE_CHANNELS)}, in this order, and no others")
+        raise UsageError(
+            f"model {spec.name}: a feed-forward needs the inputs {', '.join(FORCE_CHANNELS)}, in"
+            " this order, and no others"
+        )
     model = model.to(torch.float64)
-    ranges = list(zip((*head.lowest.tolist(), *spec.low[:3]), (*head.highest.tolist(), *spec.high[:3]), strict=True))
+    ranges = list(
+        zip(
+            (*head.lowest.tolist(), *spec.low[:3]),
+            (*head.highest.tolist(), *spec.high[:3]),
+            strict=True,
+        )
+    )
     return RequiredForce(model.baseline, head).eval().requires_grad_(False), ranges
 
 
-def export_feed_forward(model: nn.Module, lag: dict[str, float] | None, ranges: Sequence[tuple[float, float]], file: Path) -> None:
+def export_feed_forward(
+    model: nn.Module,
+    lag: dict[str, float] | None,
+    ranges: Sequence[tuple[float, float]],
+    file: Path,
+) -> None:
     """Write F(nu_dot, nu) as TorchScript with its card.
 
     Args:
@@ -65,22 +90,37 @@ def export_feed_forward(model: nn.Module, lag: dict[str, float] | None, ranges: 
     model = model.eval()
 
     def check(exported: Any) -> float:
-        """Largest difference at random motions within the training ranges, as a share of each force's range."""
+        """Largest difference at random motions within the training ranges, as a share of each
+        force's range.
+        """
         low, high = torch.tensor(ranges, dtype=torch.float64).T
-        motion = low + torch.rand(200, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * (high - low)
+        motion = low + torch.rand(
+            200, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+        ) * (high - low)
         with torch.no_grad():
-            mine, theirs = model(motion[:, :3], motion[:, 3:]), exported(motion[:, :3], motion[:, 3:])
+            mine, theirs = (
+                model(motion[:, :3], motion[:, 3:]),
+                exported(motion[:, :3], motion[:, 3:]),
+            )
         share = float(((mine - theirs).abs().amax(0) / (mine.amax(0) - mine.amin(0))).max())
         if not share < 1e-9:
-            raise ExportError(f"{file.name}: the exported feed-forward differs from the model by {share:.1e} of its range; allowed 1e-9")
+            raise ExportError(
+                f"{file.name}: the exported feed-forward differs from the model by {share:.1e} of"
+                " its range; allowed 1e-9"
+            )
         return share
 
     def card(share: float) -> dict[str, Any]:
         return {
             "schema": "residnet.feed_forward/1",
-            "arguments": {"nu_dot": ["u_dot m/s^2", "v_dot m/s^2", "r_dot rad/s^2"], "nu": ["u m/s", "v m/s", "r rad/s"]},
+            "arguments": {
+                "nu_dot": ["u_dot m/s^2", "v_dot m/s^2", "r_dot rad/s^2"],
+                "nu": ["u m/s", "v m/s", "r rad/s"],
+            },
             "returns": ["tau_x N", "tau_y N", "tau_n N m"],
-            "training_range": {name: list(limits) for name, limits in zip(MOTION, ranges, strict=True)},
+            "training_range": {
+                name: list(limits) for name, limits in zip(MOTION, ranges, strict=True)
+            },
             "thruster_lag": lag,
             "parity_share_of_range": share,
             "safety": "TorchScript is code that runs when loaded: load only files that you trust.",

@@ -1,4 +1,6 @@
-"""TorchScript files, written one way: scripted, frozen, checked against the eager module, and checked again as they lie on disk."""
+"""TorchScript files, written one way: scripted, frozen, checked against the eager module, and
+checked again as they lie on disk.
+"""
 
 from __future__ import annotations
 
@@ -15,15 +17,21 @@ Parity = TypeVar("Parity")
 
 
 def write_scripted(
-    file: Path, module: nn.Module, methods: Sequence[str], check: Callable[[Any], Parity], card: Callable[[Parity], dict[str, Any]]
+    file: Path,
+    module: nn.Module,
+    methods: Sequence[str],
+    check: Callable[[Any], Parity],
+    card: Callable[[Parity], dict[str, Any]],
 ) -> dict[str, Any]:
-    """Write a module as TorchScript with `card.json` as an extra file; the file appears once everything has been checked.
+    """Write a module as TorchScript with `card.json` as an extra file; the file appears once
+    everything has been checked.
 
     Args:
         file: where to write.
         module: in evaluation mode.
         methods: that freezing must keep, beside `forward`.
-        check: compares the scripted module with the eager one and raises ExportError where they differ.
+        check: compares the scripted module with the eager one and raises ExportError where they
+            differ.
         card: from what `check` returned.
 
     Returns:
@@ -33,7 +41,8 @@ def write_scripted(
         ExportError: from `check`.
     """
     with warnings.catch_warnings():
-        # TorchScript still works in torch 2.13 but announces its end; every export depends on it here alone
+        # TorchScript still works in torch 2.13 but announces its end; every export depends on it
+        # here alone
         warnings.filterwarnings("ignore", category=DeprecationWarning)
         warnings.filterwarnings("ignore", category=FutureWarning)
         warnings.filterwarnings("ignore", message=".*torch.jit.*")
@@ -41,7 +50,9 @@ def write_scripted(
         contents = card(check(scripted))
         file.parent.mkdir(parents=True, exist_ok=True)
         partial = file.with_name(file.name + ".partial")
-        torch.jit.save(scripted, str(partial), _extra_files={"card.json": json.dumps(contents, indent=1)})
+        torch.jit.save(
+            scripted, str(partial), _extra_files={"card.json": json.dumps(contents, indent=1)}
+        )
         check(torch.jit.load(str(partial)))
         partial.replace(file)
     return contents

@@ -1,7 +1,7 @@
 """Export to TorchScript: one file that a controller loads with torch alone.
 
-The exported module works in float32 at a fixed step and is frozen; its card is an extra file of the archive. TorchScript
-is code: load only files that you trust.
+The exported module works in float32 at a fixed step and is frozen; its card is an extra file of the
+archive. TorchScript is code: load only files that you trust.
 """
 
 from __future__ import annotations
@@ -46,12 +46,16 @@ class ExportedModel(nn.Module):
 
     @torch.jit.export
     def warmup(self, y_history: Tensor, w_history: Tensor) -> Tensor:
-        """Memory s [B, n_state] that a measured past leaves: states [B, T, 6] and inputs [B, T, m], oldest first."""
+        """Memory s [B, n_state] that a measured past leaves: states [B, T, 6] and inputs [B, T, m],
+        oldest first.
+        """
         return self.simulate.model.warmup(y_history, w_history)  # type: ignore[operator]
 
     @torch.jit.export
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """State [B, 6] and memory after one step under inputs w [B, m]; `outside` [B] is True beyond the training range."""
+        """State [B, 6] and memory after one step under inputs w [B, m]; `outside` [B] is True
+        beyond the training range.
+        """
         seen = torch.cat((x[:, 3:6], w), dim=-1)
         outside = ((seen < self.low) | (seen > self.high)).any(dim=-1)
         x, s = self.simulate.model.step(x, w, s)
@@ -67,7 +71,9 @@ class ExportedModel(nn.Module):
         return self.step(x, w, s)
 
 
-def export_torchscript(spec: ModelSpec, model: HybridDynamics, file: Path, metrics: list[Mapping[str, Any]]) -> dict[str, Any]:
+def export_torchscript(
+    spec: ModelSpec, model: HybridDynamics, file: Path, metrics: list[Mapping[str, Any]]
+) -> dict[str, Any]:
     """Write one model as TorchScript with its card, after a parity check.
 
     Args:
@@ -93,9 +99,11 @@ def export_torchscript(spec: ModelSpec, model: HybridDynamics, file: Path, metri
 
 
 def check_parity(spec: ModelSpec, model: HybridDynamics, exported: Any) -> dict[str, float]:
-    """Largest difference of each state between the model and the exported module over 1,000 steps from a warmed-up memory, as a share of its range.
+    """Largest difference of each state between the model and the exported module over 1,000 steps
+    from a warmed-up memory, as a share of its range.
 
-    Inputs sweep the training range as slow sines, so that the run passes through what the model knows.
+    Inputs sweep the training range as slow sines, so that the run passes through what the model
+    knows.
 
     Raises:
         ExportError: where a share exceeds 1e-5 or a value is not finite.
@@ -124,13 +132,18 @@ def check_parity(spec: ModelSpec, model: HybridDynamics, exported: Any) -> dict[
     shares = {name: float(value) for name, value in zip(STATE, worst[0], strict=True)}
     if not torch.isfinite(single).all() or not bool((worst <= PARITY_TOLERANCE).all()):
         raise ExportError(
-            f"model {spec.name}: the exported module differs from the model by {shares} of each channel's range over {PARITY_STEPS} steps; "
-            f"allowed {PARITY_TOLERANCE:g}"
+            f"model {spec.name}: the exported module differs from the model by {shares} of each"
+            f" channel's range over {PARITY_STEPS} steps; allowed {PARITY_TOLERANCE:g}"
         )
     return shares
 
 
-def make_card(spec: ModelSpec, model: HybridDynamics, metrics: list[Mapping[str, Any]], parity: Mapping[str, float]) -> dict[str, Any]:
+def make_card(
+    spec: ModelSpec,
+    model: HybridDynamics,
+    metrics: list[Mapping[str, Any]],
+    parity: Mapping[str, float],
+) -> dict[str, Any]:
     """The model card: all that a user needs to drive the module, and how good it is."""
     units = spec.signals.units()
     return {
@@ -138,21 +151,38 @@ def make_card(spec: ModelSpec, model: HybridDynamics, metrics: list[Mapping[str,
         "model": spec.name,
         "states": [{"name": name, "unit": units[name]} for name in STATE],
         "inputs": [
-            {"name": name, "unit": units[name], "role": "command" if name in spec.signals.inputs else "exogenous"} for name in spec.signals.columns
+            {
+                "name": name,
+                "unit": units[name],
+                "role": "command" if name in spec.signals.inputs else "exogenous",
+            }
+            for name in spec.signals.columns
         ],
-        "inputs_held": {"start": "the sample at the step's start", "mean": "the mean of the samples at the step's start and end"}[spec.hold],
+        "inputs_held": {
+            "start": "the sample at the step's start",
+            "mean": "the mean of the samples at the step's start and end",
+        }[spec.hold],
         "memory": model.n_state,
         "dt": spec.dt,
         "integrator": spec.integrator,
         "dtype": "float32",
-        "frame": "NED; body axes x forward, y starboard, z down; psi unwrapped, clockwise from north; wind_dir is where the wind comes from",
+        "frame": (
+            "NED; body axes x forward, y starboard, z down; psi unwrapped, clockwise from north;"
+            " wind_dir is where the wind comes from"
+        ),
         "training_range": {name: list(limits) for name, limits in spec.ranges.items()},
         "baseline": spec.baseline.model_dump(mode="json"),
         "head": None if spec.head is None else spec.head.model_dump(mode="json"),
-        "members": [member.model_dump(mode="json", include={"name", "baseline", "head"}) for member in spec.members],
+        "members": [
+            member.model_dump(mode="json", include={"name", "baseline", "head"})
+            for member in spec.members
+        ],
         "metrics": [dict(row) for row in metrics],
         "parity": {"steps": PARITY_STEPS, "share_of_range": dict(parity)},
         "versions": {"residnet": __version__, "torch": torch.__version__},
         "exported": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-        "safety": "TorchScript is code that runs when loaded: load only files that you trust. The files under models/ hold numbers only.",
+        "safety": (
+            "TorchScript is code that runs when loaded: load only files that you trust. The files"
+            " under models/ hold numbers only."
+        ),
     }

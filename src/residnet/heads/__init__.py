@@ -17,7 +17,16 @@ from residnet.heads.ridge import RidgeConfig
 from residnet.heads.symbolic import SymbolicConfig
 from residnet.heads.zero import ZeroHead
 
-HeadConfig = Annotated[PlsrConfig | RidgeConfig | KernelConfig | SymbolicConfig | GeneticConfig | MlpConfig | LstmConfig, Field(discriminator="kind")]
+HeadConfig = Annotated[
+    PlsrConfig
+    | RidgeConfig
+    | KernelConfig
+    | SymbolicConfig
+    | GeneticConfig
+    | MlpConfig
+    | LstmConfig,
+    Field(discriminator="kind"),
+]
 
 __all__ = [
     "ClosedFormHead",

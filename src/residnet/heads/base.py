@@ -19,7 +19,8 @@ from residnet.regression.solutions import Solution
 
 
 class ResidualHead(nn.Module, ABC):
-    """What is learned on top of the baseline: rho [B, 3] in m/s^2, m/s^2, rad/s^2 from channels z [B, nz] and memory s [B, n_state].
+    """What is learned on top of the baseline: rho [B, 3] in m/s^2, m/s^2, rad/s^2 from channels z
+    [B, nz] and memory s [B, n_state].
 
     A memoryless head has n_state = 0. Every head is scriptable, however its parameters were found.
     """
@@ -30,33 +31,47 @@ class ResidualHead(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Residual [B, 3] at channels z [B, nz], and the memory for the next step [B, n_state]; called once per step."""
+        """Residual [B, 3] at channels z [B, nz], and the memory for the next step [B, n_state];
+        called once per step.
+        """
 
     def sequence(self, z: Tensor) -> Tensor:
-        """Residuals [B, T, 3] along measured channels [B, T, nz], from an empty memory (teacher forcing)."""
+        """Residuals [B, T, 3] along measured channels [B, T, nz], from an empty memory (teacher
+        forcing).
+        """
         return self.forward(z, z[..., :0])[0]
 
     def accelerations(self, known: Tensor, rho: Tensor) -> Tensor:
-        """nu_dot [..., 3] from what the baseline says of it and this head's residual, [..., 3] each."""
+        """nu_dot [..., 3] from what the baseline says of it and this head's residual, [..., 3]
+        each.
+        """
         return known + rho
 
     def lacking(self, of: Samples, known: Tensor) -> Samples:
-        """Samples whose target is what the baseline's accelerations `known` [N, 3] leave, in the space that this head lives in."""
+        """Samples whose target is what the baseline's accelerations `known` [N, 3] leave, in the
+        space that this head lives in.
+        """
         return of.with_target(of.target - known)
 
     def carried(self, baseline: nn.Module) -> nn.Module:
-        """The baseline as this head leaves it, so that nu_dot is its acceleration plus the residual."""
+        """The baseline as this head leaves it, so that nu_dot is its acceleration plus the
+        residual.
+        """
         return baseline
 
     def warmup(self, z: Tensor) -> Tensor:
-        """Memory [B, n_state] that past channels [B, T, nz] leave, oldest first; zeros where T = 0."""
+        """Memory [B, n_state] that past channels [B, T, nz] leave, oldest first; zeros where T = 0.
+        """
         return torch.zeros(z.shape[0], self.n_state, dtype=z.dtype, device=z.device)
 
     def calibrate(self, samples: Samples) -> None:
-        """Take scales and ranges from the training samples; called once, before anything is fitted."""
+        """Take scales and ranges from the training samples; called once, before anything is fitted.
+        """
 
     def spread(self) -> Tensor:
-        """Spread of the residual on the training samples, [3], float64: what a one-step loss is measured in; ones where a head keeps none."""
+        """Spread of the residual on the training samples, [3], float64: what a one-step loss is
+        measured in; ones where a head keeps none.
+        """
         return torch.ones(3, dtype=torch.float64)
 
     def freedom(self) -> list[float]:
@@ -69,21 +84,30 @@ class ClosedFormHead(ResidualHead):
 
     @abstractmethod
     def solutions(self, samples: Samples) -> list[Solution]:
-        """Fit samples whose target is the residual [N, 3]: the solution that one-step errors choose, then those that free runs may prefer.
+        """Fit samples whose target is the residual [N, 3]: the solution that one-step errors
+        choose, then those that free runs may prefer.
 
         Raises:
             FitError: where the data do not determine the parameters.
         """
 
     def solve(self, samples: Samples) -> dict[str, Any]:
-        """Fill the buffers with the first of `solutions`; returns what there is to say about the fit."""
+        """Fill the buffers with the first of `solutions`; returns what there is to say about the
+        fit.
+        """
         first = self.solutions(samples)[0]
         self.load_state_dict(first.state, strict=False)
         return first.choice | first.notes
 
     def freedom(self) -> list[float]:
-        """Number of fitted parameters of each axis: coefficients [J, 3] and intercepts [3] that are not zero, where a head says nothing else."""
-        fitted = [numbers.reshape(-1, 3) for name, numbers in self.named_buffers() if name in ("coefficients", "intercept")]
+        """Number of fitted parameters of each axis: coefficients [J, 3] and intercepts [3] that are
+        not zero, where a head says nothing else.
+        """
+        fitted = [
+            numbers.reshape(-1, 3)
+            for name, numbers in self.named_buffers()
+            if name in ("coefficients", "intercept")
+        ]
         return [float((torch.cat(fitted)[:, axis] != 0).sum()) for axis in range(3)]
 
 
@@ -92,7 +116,8 @@ class EquationHead(ClosedFormHead):
 
     @abstractmethod
     def parts(self, z: Tensor, axis: int) -> dict[str, np.ndarray]:
-        """Every term of one axis times its coefficient along measured channels [T, nz], [T] each."""
+        """Every term of one axis times its coefficient along measured channels [T, nz], [T] each.
+        """
 
 
 class FeatureConfig(Config):
@@ -100,8 +125,8 @@ class FeatureConfig(Config):
 
     Attributes:
         features: names of channels; empty for all.
-        margin: features are held at the training range widened by this share of it; outside, the residual stays what it was
-            at the edge instead of running away.
+        margin: features are held at the training range widened by this share of it; outside, the
+            residual stays what it was at the edge instead of running away.
     """
 
     features: tuple[str, ...] = ()
@@ -115,21 +140,32 @@ class FeatureConfig(Config):
         """
         for name in self.features:
             if name in ACCELERATION and name not in names:
-                raise ConfigError(f"head feature '{name}' is an acceleration: only a residual in force space knows it (plsr or ridge, space: force)")
+                raise ConfigError(
+                    f"head feature '{name}' is an acceleration: only a residual in force space"
+                    " knows it (plsr or ridge, space: force)"
+                )
             if name not in names:
-                raise ConfigError(f"head feature '{name}' is not a channel of the model{nearest(name, names)}")
+                raise ConfigError(
+                    f"head feature '{name}' is not a channel of the model{nearest(name, names)}"
+                )
         return self.features or tuple(names)
 
 
 class Features(nn.Module):
-    """Selected, guarded and standardised channels: z [..., nz] -> [..., F], near zero mean and unit variance on the training data."""
+    """Selected, guarded and standardised channels: z [..., nz] -> [..., F], near zero mean and unit
+    variance on the training data.
+    """
 
     def __init__(self, chosen: Sequence[str], names: Sequence[str], margin: float) -> None:
         super().__init__()
         self.names = tuple(chosen)
         self.count = len(self.names)
         self.margin = margin
-        self.register_buffer("index", torch.tensor([list(names).index(name) for name in chosen], dtype=torch.long), persistent=False)
+        self.register_buffer(
+            "index",
+            torch.tensor([list(names).index(name) for name in chosen], dtype=torch.long),
+            persistent=False,
+        )
         self.register_buffer("mean", torch.zeros(self.count, dtype=torch.float64))
         self.register_buffer("std", torch.ones(self.count, dtype=torch.float64))
         self.register_buffer("low", torch.full((self.count,), -torch.inf, dtype=torch.float64))
@@ -141,7 +177,9 @@ class Features(nn.Module):
         self.high: Tensor
 
     def calibrate(self, samples: Samples) -> None:
-        """Take mean, spread and range of each feature from the samples; a constant feature is left unscaled."""
+        """Take mean, spread and range of each feature from the samples; a constant feature is left
+        unscaled.
+        """
         z = samples.z.index_select(1, self.index)
         low, high = z.amin(0), z.amax(0)
         reach = self.margin * (high - low)
@@ -157,7 +195,9 @@ class Features(nn.Module):
 
     def held(self, chosen: Tensor) -> Tensor:
         """Channels that are selected already [..., F], held at the edge of the training range."""
-        return torch.minimum(torch.maximum(chosen, self.low.to(chosen.dtype)), self.high.to(chosen.dtype))
+        return torch.minimum(
+            torch.maximum(chosen, self.low.to(chosen.dtype)), self.high.to(chosen.dtype)
+        )
 
     def forward(self, z: Tensor) -> Tensor:
         """Standardised features [..., F]."""
@@ -165,7 +205,9 @@ class Features(nn.Module):
 
 
 class ResidualScale(nn.Module):
-    """Turns a network's output near one into accelerations: the spread of the residual on the training samples."""
+    """Turns a network's output near one into accelerations: the spread of the residual on the
+    training samples.
+    """
 
     def __init__(self) -> None:
         super().__init__()

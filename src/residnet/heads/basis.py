@@ -1,4 +1,6 @@
-"""Heads that are linear in basis functions of the channels; their solutions differ, their evaluation does not."""
+"""Heads that are linear in basis functions of the channels; their solutions differ, their
+evaluation does not.
+"""
 
 from __future__ import annotations
 
@@ -21,13 +23,16 @@ class BasisConfig(FeatureConfig):
     """Which basis functions.
 
     Attributes:
-        space: what the residual is: `acceleration`, what the baseline leaves of nu_dot; or `force`, tau - F(nu_dot, nu) of a baseline of kind
-            believed, whose features are accelerations and velocities and whose terms are affine in the accelerations.
-        terms: basis functions by name (see `residnet.physics.terms`), in units of each feature's spread; empty: all products of the features up
-            to `degree` and x|x| of the velocities, or in force space the thirty of document 002 (4.12).
+        space: what the residual is: `acceleration`, what the baseline leaves of nu_dot; or `force`,
+            tau - F(nu_dot, nu) of a baseline of kind believed, whose features are accelerations and
+            velocities and whose terms are affine in the accelerations.
+        terms: basis functions by name (see `residnet.physics.terms`), in units of each feature's
+            spread; empty: all products of the features up to `degree` and x|x| of the velocities,
+            or in force space the thirty of document 002 (4.12).
         degree: highest degree of the products where `terms` is empty.
-        choose: what the complexity is chosen by: `free_run`, error of free runs on validation data, which may find that no residual at all
-            is best; or `one_step`, cross-validated error of accelerations.
+        choose: what the complexity is chosen by: `free_run`, error of free runs on validation data,
+            which may find that no residual at all is best; or `one_step`, cross-validated error of
+            accelerations.
         folds: folds of the cross-validation; a manoeuvre is never split between folds.
     """
 
@@ -41,22 +46,31 @@ class BasisConfig(FeatureConfig):
     def _space(self) -> Self:
         named = [term for term in self.terms if any(name in term for name in ACCELERATION)]
         if self.space == "acceleration" and named:
-            raise ValueError(f"terms: '{named[0]}' names an acceleration, which only a residual in force space may (space: force)")
+            raise ValueError(
+                f"terms: '{named[0]}' names an acceleration, which only a residual in force space"
+                " may (space: force)"
+            )
         return self
 
 
 class BasisHead(ClosedFormHead):
-    """rho [..., 3] = intercept + phi(features / spread) coefficients; buffers found by the subclass."""
+    """rho [..., 3] = intercept + phi(features / spread) coefficients; buffers found by the
+    subclass.
+    """
 
     def __init__(self, config: BasisConfig, names: Sequence[str]) -> None:
         super().__init__()
         chosen = config.chosen(names)
         self.features = Features(chosen, names, config.margin)
         magnitudes = [name for name in ("u", "v", "r") if name in chosen]
-        self.library = TermLibrary(config.terms or polynomial_terms(chosen, config.degree, magnitudes=magnitudes), chosen)
+        self.library = TermLibrary(
+            config.terms or polynomial_terms(chosen, config.degree, magnitudes=magnitudes), chosen
+        )
         self.folds = config.folds
         self.by_free_run = config.choose == "free_run"
-        self.register_buffer("coefficients", torch.zeros(self.library.count, 3, dtype=torch.float64))
+        self.register_buffer(
+            "coefficients", torch.zeros(self.library.count, 3, dtype=torch.float64)
+        )
         self.register_buffer("intercept", torch.zeros(3, dtype=torch.float64))
         self.coefficients: Tensor
         self.intercept: Tensor
@@ -66,7 +80,9 @@ class BasisHead(ClosedFormHead):
         self.features.calibrate(samples)
 
     def basis(self, z: Tensor) -> Tensor:
-        """Basis functions [..., J] at channels z [..., nz]; features are scaled but not centred, so that names keep their meaning."""
+        """Basis functions [..., J] at channels z [..., nz]; features are scaled but not centred, so
+        that names keep their meaning.
+        """
         return self.library(self.features.guarded(z) / self.features.std.to(z.dtype))
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
@@ -77,13 +93,20 @@ class BasisHead(ClosedFormHead):
         """Moments of basis functions and target by fold.
 
         Raises:
-            FitError: with fewer manoeuvres than folds, fewer samples than basis functions, or one that is not finite.
+            FitError: with fewer manoeuvres than folds, fewer samples than basis functions, or one
+                that is not finite.
         """
         groups = torch.unique(samples.group)
         if groups.numel() < self.folds:
-            raise FitError(f"{self.folds} folds need as many manoeuvres, the training data have {groups.numel()}; lower `folds`")
+            raise FitError(
+                f"{self.folds} folds need as many manoeuvres, the training data have"
+                f" {groups.numel()}; lower `folds`"
+            )
         if len(samples) <= self.library.count:
-            raise FitError(f"{len(samples)} samples do not determine {self.library.count} basis functions; give more data or fewer terms")
+            raise FitError(
+                f"{len(samples)} samples do not determine {self.library.count} basis functions;"
+                " give more data or fewer terms"
+            )
         fold = torch.searchsorted(groups, samples.group) % self.folds
         chosen = [samples.names.index(name) for name in self.features.names]
         _require_finite(samples.z[:, chosen], self.features.names, "channel")
@@ -94,18 +117,38 @@ class BasisHead(ClosedFormHead):
         return FoldMoments.gather(x.masked_fill(constant, 0.0), samples.target, fold, self.folds)
 
     def solution(
-        self, choice: dict[str, Any], coefficients: Tensor, mean_x: Tensor, mean_y: Tensor, moments: FoldMoments, notes: dict[str, Any] | None = None
+        self,
+        choice: dict[str, Any],
+        coefficients: Tensor,
+        mean_x: Tensor,
+        mean_y: Tensor,
+        moments: FoldMoments,
+        notes: dict[str, Any] | None = None,
     ) -> Solution:
-        """A solution y = mean_y + (x - mean_x) coefficients [J, 3], means as `moments` counts them."""
+        """A solution y = mean_y + (x - mean_x) coefficients [J, 3], means as `moments` counts them.
+        """
         intercept = mean_y + moments.shift_y - (mean_x + moments.shift_x) @ coefficients
-        return Solution(choice, {"coefficients": coefficients, "intercept": intercept}, notes=notes or {})
+        return Solution(
+            choice, {"coefficients": coefficients, "intercept": intercept}, notes=notes or {}
+        )
 
     def nothing(self, choice: dict[str, Any], notes: dict[str, Any]) -> Solution:
-        """The solution that leaves the baseline as it is: a residual that explains accelerations may still spoil free runs."""
-        return Solution(choice, {"coefficients": torch.zeros_like(self.coefficients), "intercept": torch.zeros_like(self.intercept)}, notes=notes)
+        """The solution that leaves the baseline as it is: a residual that explains accelerations
+        may still spoil free runs.
+        """
+        return Solution(
+            choice,
+            {
+                "coefficients": torch.zeros_like(self.coefficients),
+                "intercept": torch.zeros_like(self.intercept),
+            },
+            notes=notes,
+        )
 
     def coefficient_table(self) -> dict[str, list[float]]:
-        """Basis function -> its coefficients (u, v, r axis), for features in units of their spread; for the report."""
+        """Basis function -> its coefficients (u, v, r axis), for features in units of their spread;
+        for the report.
+        """
         return dict(zip(self.library.terms, self.coefficients.tolist(), strict=True))
 
 
@@ -113,14 +156,17 @@ def _require_finite(values: Tensor, names: Sequence[str], what: str) -> None:
     bad = ~torch.isfinite(values)
     if bool(bad.any()):
         row, column = (int(part[0]) for part in bad.nonzero(as_tuple=True))
-        raise FitError(f"{what} '{names[column]}' is not finite at sample {row}; mask or repair the log")
+        raise FitError(
+            f"{what} '{names[column]}' is not finite at sample {row}; mask or repair the log"
+        )
 
 
 class FoldMoments:
-    """Sums over each fold of [1, X, Y]' [1, X, Y], float64: all that closed-form fits and their cross-validation need.
+    """Sums over each fold of [1, X, Y]' [1, X, Y], float64: all that closed-form fits and their
+    cross-validation need.
 
-    The data are passed once; a fold is left out by subtraction. X is shifted by its overall mean before, which keeps the
-    differences well conditioned.
+    The data are passed once; a fold is left out by subtraction. X is shifted by its overall mean
+    before, which keeps the differences well conditioned.
     """
 
     def __init__(self, sums: Tensor, shift_x: Tensor, shift_y: Tensor) -> None:
@@ -154,8 +200,12 @@ class FoldMoments:
         """`centred` of all folds but one."""
         return self.centred(self.sums.sum(0) - self.sums[fold])
 
-    def squared_error(self, fold: int, coefficients: Tensor, mean_x: Tensor, mean_y: Tensor) -> Tensor:
-        """Sum of squared errors on one fold [C, K] of candidates y = mean_y + (x - mean_x) coefficients [C, J, K]."""
+    def squared_error(
+        self, fold: int, coefficients: Tensor, mean_x: Tensor, mean_y: Tensor
+    ) -> Tensor:
+        """Sum of squared errors on one fold [C, K] of candidates y = mean_y + (x - mean_x)
+        coefficients [C, J, K].
+        """
         j = self.regressors
         s = self.sums[fold]
         intercept = mean_y - torch.einsum("j,cjk->ck", mean_x, coefficients)
@@ -165,6 +215,8 @@ class FoldMoments:
         return yy - 2 * torch.einsum("cik,ik->ck", weights, xy) + quadratic
 
     def cross_validate(self, path: list[tuple[Tensor, Tensor, Tensor]]) -> Tensor:
-        """Mean squared error [C, K] over left-out folds of candidate coefficients; path: per fold (coefficients [C, J, K], mean of X, mean of Y)."""
+        """Mean squared error [C, K] over left-out folds of candidate coefficients; path: per fold
+        (coefficients [C, J, K], mean of X, mean of Y).
+        """
         errors = torch.stack([self.squared_error(f, *path[f]) for f in range(self.folds)])
         return errors.sum(0) / self.sums[:, 0, 0].sum()

@@ -30,19 +30,27 @@ class DelayConfig(Config):
 
 
 class DelayLine(nn.Module):
-    """Channels with some of them as they were `steps` ago; the memory holds the last `longest` values of these, oldest first."""
+    """Channels with some of them as they were `steps` ago; the memory holds the last `longest`
+    values of these, oldest first.
+    """
 
     def __init__(self, config: DelayConfig | None, names: Sequence[str]) -> None:
         super().__init__()
         late = config.channels if config is not None else ()
         for name in late:
             if name not in names:
-                raise ConfigError(f"delay: '{name}' is not a feature of the head{nearest(name, names)}")
+                raise ConfigError(
+                    f"delay: '{name}' is not a feature of the head{nearest(name, names)}"
+                )
         self.longest = config.longest if config is not None else 0
         self.channels = late
         self.count = len(late)
         self.n_state = self.longest * self.count
-        self.register_buffer("index", torch.tensor([list(names).index(name) for name in late], dtype=torch.long), persistent=False)
+        self.register_buffer(
+            "index",
+            torch.tensor([list(names).index(name) for name in late], dtype=torch.long),
+            persistent=False,
+        )
         # a float, as all stored numbers are
         self.register_buffer("steps", torch.zeros(1, dtype=torch.float64))
         self.index: Tensor
@@ -62,9 +70,21 @@ class DelayLine(nn.Module):
         if self.count == 0:
             return z
         late = z.index_select(-1, self.index)
-        line = torch.cat((torch.zeros_like(late[..., :1, :]).expand(late.shape[:-2] + (self.longest, self.count)), late), dim=-2)  # noqa: RUF005 (TorchScript)
+        line = torch.cat(
+            (
+                torch.zeros_like(late[..., :1, :]).expand(
+                    late.shape[:-2] + (self.longest, self.count)  # noqa: RUF005 (TorchScript)
+                ),
+                late,
+            ),
+            dim=-2,
+        )
         first = self.longest - self.steps.round().to(torch.long)
-        return z.index_copy(-1, self.index, line.index_select(-2, first + torch.arange(z.shape[-2], device=z.device)))
+        return z.index_copy(
+            -1,
+            self.index,
+            line.index_select(-2, first + torch.arange(z.shape[-2], device=z.device)),
+        )
 
     def warmup(self, z: Tensor) -> Tensor:
         """Memory [B, n_state] after channels [B, T, nz]; zero before their first."""
@@ -74,7 +94,9 @@ class DelayLine(nn.Module):
 
 
 class Past(NamedTuple):
-    """Features [N, F] and targets [N, K] of samples, the unbroken stretch of each, ascending [N], and the step between neighbours in s."""
+    """Features [N, F] and targets [N, K] of samples, the unbroken stretch of each, ascending [N],
+    and the step between neighbours in s.
+    """
 
     chosen: np.ndarray
     target: np.ndarray
@@ -92,8 +114,15 @@ class Past(NamedTuple):
         return Past(chosen, self.target[now], self.stretch[now], self.step)
 
 
-def best_delay(past: Past, terms: Sequence[Sequence[str]], names: Sequence[str], late: Sequence[str], longest: int) -> tuple[int, np.ndarray]:
-    """Delay in steps at which terms explain their targets best, and the mean over targets of ln(RSS) for each delay [longest + 1].
+def best_delay(
+    past: Past,
+    terms: Sequence[Sequence[str]],
+    names: Sequence[str],
+    late: Sequence[str],
+    longest: int,
+) -> tuple[int, np.ndarray]:
+    """Delay in steps at which terms explain their targets best, and the mean over targets of
+    ln(RSS) for each delay [longest + 1].
 
     Args:
         past: samples.
@@ -108,7 +137,10 @@ def best_delay(past: Past, terms: Sequence[Sequence[str]], names: Sequence[str],
     z = torch.from_numpy(past.chosen)
     total = np.zeros(longest + 1)
     for own, y in zip(terms, past.target.T, strict=True):
-        held, moved = (TermLibrary([_part(term, names, late, take) for term in own], names)(z).numpy() for take in (False, True))
+        held, moved = (
+            TermLibrary([_part(term, names, late, take) for term in own], names)(z).numpy()
+            for take in (False, True)
+        )
         rss = delay_profile(held, moved, y, past.stretch, longest).rss
         # what rounding leaves of a perfect fit is no evidence
         total += np.log(rss + 1e-14 * float(y @ y) + 1e-300) / len(terms)
@@ -118,4 +150,6 @@ def best_delay(past: Past, terms: Sequence[Sequence[str]], names: Sequence[str],
 def _part(term: str, names: Sequence[str], late: Sequence[str], take: bool) -> str:
     """The factors of a term that are delayed, or those that are not."""
     factors = [factor for factor in parse_term(term, names) if (factor.name in late) == take]
-    return " ".join(f"{f'|{f.name}|' if f.magnitude else f.symbol}^{f.power}" for f in factors) or "1"
+    return (
+        " ".join(f"{f'|{f.name}|' if f.magnitude else f.symbol}^{f.power}" for f in factors) or "1"
+    )

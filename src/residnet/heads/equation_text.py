@@ -6,11 +6,22 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from residnet.physics.terms import Factor, parse_term
-from residnet.regression.notation import LATEX, PLAIN, SYMPY, C, Style, c_body, latex_left, signed_sum
+from residnet.regression.notation import (
+    LATEX,
+    PLAIN,
+    SYMPY,
+    C,
+    Style,
+    c_body,
+    latex_left,
+    signed_sum,
+)
 
 
 class Written(NamedTuple):
-    """One equation: the name of its left side, its terms, their coefficients, and the channels that may appear."""
+    """One equation: the name of its left side, its terms, their coefficients, and the channels that
+    may appear.
+    """
 
     name: str
     terms: Sequence[str]
@@ -20,7 +31,10 @@ class Written(NamedTuple):
 
 def plain(equation: Written) -> str:
     """`u_dot = 0.0002026 tau_x - 0.0101 u`, six digits; terms as in the term language."""
-    parts = [PLAIN.number(abs(v)) + ("" if t == "1" else f" {t}") for t, v in zip(equation.terms, equation.values, strict=True)]
+    parts = [
+        PLAIN.number(abs(v)) + ("" if t == "1" else f" {t}")
+        for t, v in zip(equation.terms, equation.values, strict=True)
+    ]
     return f"{equation.name} = " + signed_sum(parts, equation.values)
 
 
@@ -30,13 +44,19 @@ def latex(equation: Written) -> str:
 
 
 def sympy_text(equation: Written) -> str:
-    """The right side as text that `sympy.sympify` reads, all digits; SymPy itself is not needed to write it."""
+    """The right side as text that `sympy.sympify` reads, all digits; SymPy itself is not needed to
+    write it.
+    """
     return signed_sum(_parts(equation, SYMPY), equation.values)
 
 
 def c_function(equation: Written, comment: str = "") -> str:
-    """A C99 function `double <name>(double <channel>, ...)` with all channels as arguments, all digits; needs <math.h>."""
-    used = {factor.name for term in equation.terms for factor in parse_term(term, equation.channels)}
+    """A C99 function `double <name>(double <channel>, ...)` with all channels as arguments, all
+    digits; needs <math.h>.
+    """
+    used = {
+        factor.name for term in equation.terms for factor in parse_term(term, equation.channels)
+    }
     value = signed_sum(_parts(equation, C), equation.values) if equation.terms else "0.0"
     return c_body(equation.name, equation.channels, sorted(used), value, comment)
 
@@ -44,7 +64,12 @@ def c_function(equation: Written, comment: str = "") -> str:
 def _parts(equation: Written, style: Style) -> list[str]:
     """Magnitudes of the coefficients times factors."""
     return [
-        style.times.join([style.number(abs(value)), *(_factor(factor, style) for factor in parse_term(term, equation.channels))])
+        style.times.join(
+            [
+                style.number(abs(value)),
+                *(_factor(factor, style) for factor in parse_term(term, equation.channels)),
+            ]
+        )
         for term, value in zip(equation.terms, equation.values, strict=True)
     ]
 

@@ -1,4 +1,6 @@
-"""Values of found expressions: products of channels and of functions of sums, as tables that a saved model carries and TorchScript runs."""
+"""Values of found expressions: products of channels and of functions of sums, as tables that a
+saved model carries and TorchScript runs.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,9 @@ _ROOT_FLOOR = 1e-24
 
 
 class Table(nn.Module):
-    """A module whose buffers take the shapes of what is loaded: how many terms an equation has is known only from the data."""
+    """A module whose buffers take the shapes of what is loaded: how many terms an equation has is
+    known only from the data.
+    """
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
         for name, own in list(self.named_buffers(recurse=False)):
@@ -61,16 +65,25 @@ class Functions(Table):
         """[..., C] -> [..., C + K]."""
         if self.weight.shape[0] == 0:
             return columns
-        s = (self.products(columns).unflatten(-1, self.weight.shape) * self.weight.to(columns.dtype)).sum(-1)
+        s = (
+            self.products(columns).unflatten(-1, self.weight.shape) * self.weight.to(columns.dtype)
+        ).sum(-1)
         zero = s == 0
         inverse = torch.where(zero, s, torch.where(zero, torch.ones_like(s), s).reciprocal())
         # in the order of FUNCTIONS
-        values = torch.stack((s, s.abs(), s.sin(), s.cos(), s.abs().clamp(min=self.root_floor).sqrt(), inverse), dim=-1)
-        return torch.cat((columns, torch.where(self.pick > 0, values, torch.zeros_like(values)).sum(-1)), dim=-1)
+        values = torch.stack(
+            (s, s.abs(), s.sin(), s.cos(), s.abs().clamp(min=self.root_floor).sqrt(), inverse),
+            dim=-1,
+        )
+        return torch.cat(
+            (columns, torch.where(self.pick > 0, values, torch.zeros_like(values)).sum(-1)), dim=-1
+        )
 
 
 class ExpressionLibrary(nn.Module):
-    """Values of J terms from channels: [..., F] -> [..., J]; functions of functions one level after the other."""
+    """Values of J terms from channels: [..., F] -> [..., J]; functions of functions one level after
+    the other.
+    """
 
     def __init__(self, nesting: int) -> None:
         super().__init__()
@@ -87,8 +100,14 @@ class ExpressionLibrary(nn.Module):
             inner = level.products.products(place)
             width = level.weight.shape[1]
             found = []
-            for k, (weights, pick) in enumerate(zip(level.weight.tolist(), level.pick.tolist(), strict=True)):
-                a = {p: w for p, w in zip(inner[k * width : (k + 1) * width], weights, strict=True) if w != 0.0}
+            for k, (weights, pick) in enumerate(
+                zip(level.weight.tolist(), level.pick.tolist(), strict=True)
+            ):
+                a = {
+                    p: w
+                    for p, w in zip(inner[k * width : (k + 1) * width], weights, strict=True)
+                    if w != 0.0
+                }
                 found.append(algebra.atom(FUNCTIONS[pick.index(1.0)], a))
             place |= {len(place) + 1 + k: i for k, i in enumerate(found)}
         return algebra, self.terms.products(place)
@@ -111,7 +130,9 @@ class Weights(Table):
 
 
 def tables(algebra: Algebra, terms: Sequence[Product], nesting: int) -> dict[str, Tensor]:
-    """State of an `ExpressionLibrary` of these terms: all functions that they need, innermost first."""
+    """State of an `ExpressionLibrary` of these terms: all functions that they need, innermost
+    first.
+    """
     used = _used(algebra, terms)
     place = {i: i + 1 for i in range(len(algebra.channels))}
     state: dict[str, Tensor] = {}
@@ -119,11 +140,19 @@ def tables(algebra: Algebra, terms: Sequence[Product], nesting: int) -> dict[str
         own = [i for i in used if algebra.atoms[i].nesting == level + 1]
         atoms = [algebra.atoms[i] for i in own]
         width = max([len(atom.inner) for atom in atoms], default=1)
-        inner = [product for atom in atoms for product in [*(p for p, _ in atom.inner), *[()] * (width - len(atom.inner))]]
+        inner = [
+            product
+            for atom in atoms
+            for product in [*(p for p, _ in atom.inner), *[()] * (width - len(atom.inner))]
+        ]
         state[f"levels.{level}.products.index"] = _index(inner, place)
-        state[f"levels.{level}.weight"] = torch.tensor([_padded(atom, width) for atom in atoms], dtype=torch.float64).reshape(len(atoms), width)
+        state[f"levels.{level}.weight"] = torch.tensor(
+            [_padded(atom, width) for atom in atoms], dtype=torch.float64
+        ).reshape(len(atoms), width)
         pick = [[float(atom.function == function) for function in FUNCTIONS] for atom in atoms]
-        state[f"levels.{level}.pick"] = torch.tensor(pick, dtype=torch.float64).reshape(len(atoms), len(FUNCTIONS))
+        state[f"levels.{level}.pick"] = torch.tensor(pick, dtype=torch.float64).reshape(
+            len(atoms), len(FUNCTIONS)
+        )
         place |= {i: len(place) + 1 + k for k, i in enumerate(own)}
     return state | {"terms.index": _index(terms, place)}
 

@@ -1,4 +1,6 @@
-"""Found expressions in writing: plain text, LaTeX, SymPy and C, for terms with functions of sums as well."""
+"""Found expressions in writing: plain text, LaTeX, SymPy and C, for terms with functions of sums as
+well.
+"""
 
 from __future__ import annotations
 
@@ -9,23 +11,49 @@ from residnet.regression.notation import PLAIN, C, Style, c_body, signed_sum
 
 
 def term(algebra: Algebra, product: Product, style: Style = PLAIN) -> str:
-    """A product, channels before functions; `1` where it is empty. What it says does not depend on the order in which atoms were found."""
-    numbers = sorted(set(product), key=lambda i: (algebra.atoms[i].nesting, i if not algebra.atoms[i].inner else 0, _atom(algebra, i, PLAIN)))
+    """A product, channels before functions; `1` where it is empty. What it says does not depend on
+    the order in which atoms were found.
+    """
+    numbers = sorted(
+        set(product),
+        key=lambda i: (
+            algebra.atoms[i].nesting,
+            i if not algebra.atoms[i].inner else 0,
+            _atom(algebra, i, PLAIN),
+        ),
+    )
     written = [(_atom(algebra, i, style), product.count(i)) for i in numbers]
-    return style.times.join(base if power == 1 else style.power(base, power) for base, power in written) or "1"
+    return (
+        style.times.join(
+            base if power == 1 else style.power(base, power) for base, power in written
+        )
+        or "1"
+    )
 
 
-def total(algebra: Algebra, products: Sequence[Product], weights: Sequence[float], style: Style) -> str:
+def total(
+    algebra: Algebra, products: Sequence[Product], weights: Sequence[float], style: Style
+) -> str:
     """A sum of products; weights of 1 are not written."""
     parts = []
     for product, weight in zip(products, weights, strict=True):
         number, factors = style.number(abs(weight)), term(algebra, product, style)
-        parts.append(number if not product else factors if weight in (1.0, -1.0) else number + style.times + factors)
+        parts.append(
+            number
+            if not product
+            else factors
+            if weight in (1.0, -1.0)
+            else number + style.times + factors
+        )
     return signed_sum(parts, weights)
 
 
-def c_function(algebra: Algebra, name: str, products: Sequence[Product], weights: Sequence[float]) -> str:
-    """A C99 function `double <name>(double <channel>, ...)` with all channels as arguments; needs <math.h>."""
+def c_function(
+    algebra: Algebra, name: str, products: Sequence[Product], weights: Sequence[float]
+) -> str:
+    """A C99 function `double <name>(double <channel>, ...)` with all channels as arguments; needs
+    <math.h>.
+    """
     return c_body(name, algebra.channels, (), total(algebra, products, weights, C))
 
 
@@ -34,4 +62,6 @@ def _atom(algebra: Algebra, i: int, style: Style) -> str:
     if not atom.inner:
         return style.channel(atom.channel)
     inner = sorted(atom.inner, key=lambda pair: (len(pair[0]), term(algebra, pair[0])))
-    return style.functions[atom.function](total(algebra, [p for p, _ in inner], [w for _, w in inner], style))
+    return style.functions[atom.function](
+        total(algebra, [p for p, _ in inner], [w for _, w in inner], style)
+    )

@@ -1,4 +1,6 @@
-"""Residuals in force space: eps = tau - F(nu_dot, nu) of a believed hull (document 002 (3.19)-(3.24)), affine in nu_dot to run forward."""
+"""Residuals in force space: eps = tau - F(nu_dot, nu) of a believed hull (document 002
+(3.19)-(3.24)), affine in nu_dot to run forward.
+"""
 
 from __future__ import annotations
 
@@ -18,15 +20,22 @@ from residnet.physics.signals import FORCE_CHANNELS
 from residnet.regression.solutions import Solution
 
 
-def in_space(config: BasisConfig, names: Sequence[str], make: Callable[[BasisConfig, Sequence[str]], BasisHead]) -> ClosedFormHead:
+def in_space(
+    config: BasisConfig,
+    names: Sequence[str],
+    make: Callable[[BasisConfig, Sequence[str]], BasisHead],
+) -> ClosedFormHead:
     """A head of basis functions in the space that its config names.
 
     Raises:
-        ConfigError: where a term is not understood, or in force space not affine in the accelerations.
+        ConfigError: where a term is not understood, or in force space not affine in the
+            accelerations.
     """
     if config.space == "acceleration":
         return make(config, names)
-    own = config.model_copy(update={"features": config.features or MOTION, "terms": config.terms or FERRY_TERMS})
+    own = config.model_copy(
+        update={"features": config.features or MOTION, "terms": config.terms or FERRY_TERMS}
+    )
     return ForceHead(make(own, (*ACCELERATION, *names)))
 
 
@@ -34,8 +43,9 @@ def in_space(config: BasisConfig, names: Sequence[str], make: Callable[[BasisCon
 class ForceHead(ClosedFormHead):
     """eps = A nu_dot + b(z), a force, by a head of basis functions over accelerations and channels.
 
-    Every stage of the integrator solves (M + A) nu_dot = tau - C nu - D nu - b: with the believed baseline's acceleration nu_dot_0 this is
-    nu_dot = (M + A)^-1 M nu_dot_0 - (M + A)^-1 b, of which b is evaluated once per step.
+    Every stage of the integrator solves (M + A) nu_dot = tau - C nu - D nu - b: with the believed
+    baseline's acceleration nu_dot_0 this is nu_dot = (M + A)^-1 M nu_dot_0 - (M + A)^-1 b, of which
+    b is evaluated once per step.
     """
 
     def __init__(self, inner: BasisHead) -> None:
@@ -62,17 +72,31 @@ class ForceHead(ClosedFormHead):
             ConfigError: where the baseline has none.
         """
         if mass is None:
-            raise ConfigError("space: force needs a baseline that knows its mass and the forces on it; set its kind to 'believed'")
+            raise ConfigError(
+                "space: force needs a baseline that knows its mass and the forces on it; set its"
+                " kind to 'believed'"
+            )
         self.mass.copy_(mass)
         self.inverse.copy_(torch.linalg.inv(mass))
 
     def lacking(self, of: Samples, known: Tensor) -> Samples:
-        """Samples over accelerations and channels whose target is the lack-of-fit tau - F(nu_dot, nu) = M (nu_dot_0 - nu_dot) (3.20)."""
+        """Samples over accelerations and channels whose target is the lack-of-fit tau - F(nu_dot,
+        nu) = M (nu_dot_0 - nu_dot) (3.20).
+        """
         force = (known - of.target) @ self.mass.T
-        return Samples(torch.cat((of.target, of.z), dim=-1), force, of.group, of.t, of.kinds, (*ACCELERATION, *of.names))
+        return Samples(
+            torch.cat((of.target, of.z), dim=-1),
+            force,
+            of.group,
+            of.t,
+            of.kinds,
+            (*ACCELERATION, *of.names),
+        )
 
     def calibrate(self, samples: Samples) -> None:
-        """Take scales and ranges of the features from the samples; accelerations are solved for and never held."""
+        """Take scales and ranges of the features from the samples; accelerations are solved for and
+        never held.
+        """
         self.inner.calibrate(samples)
         varying = dict(zip(samples.names, samples.z.std(0).tolist(), strict=True))
         self.still = [name for name in FORCE_CHANNELS if varying.get(name, 0.0) <= 1e-9]
@@ -81,7 +105,10 @@ class ForceHead(ClosedFormHead):
         self.highest.copy_(moved.amax(0))
         for place, name in enumerate(self.seen):
             if name in ACCELERATION:
-                self.inner.features.low[place], self.inner.features.high[place] = -torch.inf, torch.inf
+                self.inner.features.low[place], self.inner.features.high[place] = (
+                    -torch.inf,
+                    torch.inf,
+                )
 
     def solutions(self, samples: Samples) -> list[Solution]:
         """Those of the basis functions that can run forward.
@@ -95,7 +122,9 @@ class ForceHead(ClosedFormHead):
                 found.append(self._carried(solution))
             except FitError as error:
                 refused.append(error)
-        if refused and not any(bool(solution.state["inner.coefficients"].any()) for solution in found):
+        if refused and not any(
+            bool(solution.state["inner.coefficients"].any()) for solution in found
+        ):
             raise refused[0]
         return found
 
@@ -104,22 +133,32 @@ class ForceHead(ClosedFormHead):
         coefficients = solution.state["coefficients"].clone()
         for j, axis in self.moving.items():
             coefficients[j] /= self.inner.features.std[self.seen.index(ACCELERATION[axis])]
-        total, _ = augmented(self.mass, self.inner.library.terms, coefficients, "residual in force space", self.seen)
+        total, _ = augmented(
+            self.mass, self.inner.library.terms, coefficients, "residual in force space", self.seen
+        )
         inverse = torch.linalg.inv(total)
-        state = {f"inner.{name}": value for name, value in solution.state.items()} | {"inverse": inverse, "gain": inverse @ self.mass}
+        state = {f"inner.{name}": value for name, value in solution.state.items()} | {
+            "inverse": inverse,
+            "gain": inverse @ self.mass,
+        }
         notes = solution.notes | {"space": "force", "augmented_mass": total.tolist()}
         if self.still:
-            # its equation of motion then holds up to a factor, and only the penalty and free runs keep that near one
+            # its equation of motion then holds up to a factor, and only the penalty and free runs
+            # keep that near one
             notes["forces_that_never_vary"] = self.still
         return Solution(solution.choice, state, notes=notes)
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """What the residual's part without accelerations does to nu_dot, -(M + A)^-1 b [..., 3], at channels z [..., nz]; the memory is empty."""
+        """What the residual's part without accelerations does to nu_dot, -(M + A)^-1 b [..., 3], at
+        channels z [..., nz]; the memory is empty.
+        """
         b, s = self.inner(torch.cat((torch.zeros_like(z[..., :3]), z), dim=-1), s)
         return -(b @ self.inverse.to(z.dtype).T), s
 
     def accelerations(self, known: Tensor, rho: Tensor) -> Tensor:
-        """nu_dot [..., 3] from the believed one and the residual's part without accelerations [..., 3]."""
+        """nu_dot [..., 3] from the believed one and the residual's part without accelerations [...,
+        3].
+        """
         return known @ self.gain.to(known.dtype).T + rho
 
     def force(self, nu_dot: Tensor, z: Tensor) -> Tensor:

@@ -1,4 +1,6 @@
-"""The genetic head: the residual, or the whole acceleration, as an equation bred by genetic programming (document 000)."""
+"""The genetic head: the residual, or the whole acceleration, as an equation bred by genetic
+programming (document 000).
+"""
 
 from __future__ import annotations
 
@@ -27,13 +29,16 @@ _BLOCKS = 8
 
 
 class GeneticConfig(FeatureConfig):
-    """An equation for each axis, in SI units, by genetic programming; fitting needs the extra `gp`, using a fitted model does not.
+    """An equation for each axis, in SI units, by genetic programming; fitting needs the extra `gp`,
+    using a fitted model does not.
 
     Attributes:
         evolution: how equations are bred.
-        final: how the terms of the individual that wins are chosen from once more, by the extended BIC on all samples; terms that genetic
-            programming carries along without need go. None keeps all.
-        validate_every: every so manieth manoeuvre validates during the search; with fewer manoeuvres every so manieth eighth of the samples.
+        final: how the terms of the individual that wins are chosen from once more, by the extended
+            BIC on all samples; terms that genetic programming carries along without need go. None
+            keeps all.
+        validate_every: every so manieth manoeuvre validates during the search; with fewer
+            manoeuvres every so manieth eighth of the samples.
         seed: of the random choices; each axis has its own.
     """
 
@@ -49,7 +54,9 @@ class GeneticConfig(FeatureConfig):
 
 
 class Bred(NamedTuple):
-    """The equation of one axis: what the search found; products with coefficients and standard errors; and what the data say about them."""
+    """The equation of one axis: what the search found; products with coefficients and standard
+    errors; and what the data say about them.
+    """
 
     found: Found
     products: tuple[Product, ...]
@@ -58,7 +65,14 @@ class Bred(NamedTuple):
     told: dict[str, Any]
 
 
-def breed(algebra: Algebra, data: Mapping[str, np.ndarray], target: np.ndarray, train: np.ndarray, config: GeneticConfig, seed: int) -> Bred:
+def breed(
+    algebra: Algebra,
+    data: Mapping[str, np.ndarray],
+    target: np.ndarray,
+    train: np.ndarray,
+    config: GeneticConfig,
+    seed: int,
+) -> Bred:
     """Search an equation and fit it to all samples.
 
     Args:
@@ -76,10 +90,24 @@ def breed(algebra: Algebra, data: Mapping[str, np.ndarray], target: np.ndarray, 
     found = evolve(algebra, data, target, train, config.evolution, seed)
     values = algebra.values(found.terms, data).T
     names = [term(algebra, product) for product in found.terms]
-    reduced = reduce(values, target[:, None], names, [algebra.degree(p) for p in found.terms], [algebra.effort(p) for p in found.terms])
-    equation, within = (_whole(reduced), reduced) if config.final is None else find(reduced, 0, config.final)
+    reduced = reduce(
+        values,
+        target[:, None],
+        names,
+        [algebra.degree(p) for p in found.terms],
+        [algebra.effort(p) for p in found.terms],
+    )
+    equation, within = (
+        (_whole(reduced), reduced) if config.final is None else find(reduced, 0, config.final)
+    )
     products = tuple(found.terms[names.index(name)] for name in equation.terms)
-    return Bred(found, products, tuple(equation.values.tolist()), tuple(equation.errors.tolist()), equation.told(within))
+    return Bred(
+        found,
+        products,
+        tuple(equation.values.tolist()),
+        tuple(equation.errors.tolist()),
+        equation.told(within),
+    )
 
 
 def _whole(reduced: Reduced) -> Equation:
@@ -90,12 +118,24 @@ def _whole(reduced: Reduced) -> Equation:
     spread = np.sqrt(left @ left / max(float(reduced.samples[0]) - len(best), 1.0))
     share = float(np.sqrt(left @ left / max(y @ y, 1e-300)))
     errors = spread * np.sqrt(np.square(inverse).sum(axis=1))
-    return Equation(reduced.names, best / reduced.scale, errors / reduced.scale, share, share <= 1e-13, 0.0, 0, {}, {})
+    return Equation(
+        reduced.names,
+        best / reduced.scale,
+        errors / reduced.scale,
+        share,
+        share <= 1e-13,
+        0.0,
+        0,
+        {},
+        {},
+    )
 
 
 @final
 class GeneticHead(EquationHead):
-    """rho [..., 3] = terms(features) coefficients; over the baseline `still` it is the equation of the acceleration itself."""
+    """rho [..., 3] = terms(features) coefficients; over the baseline `still` it is the equation of
+    the acceleration itself.
+    """
 
     def __init__(self, config: GeneticConfig, names: Sequence[str]) -> None:
         super().__init__()
@@ -117,10 +157,17 @@ class GeneticHead(EquationHead):
         return [float(count) for count in (self.weights.values != 0).sum(0)]
 
     def parts(self, z: Tensor, axis: int) -> dict[str, np.ndarray]:
-        """Every term of one axis times its coefficient along measured channels [T, nz], [T] each."""
+        """Every term of one axis times its coefficient along measured channels [T, nz], [T] each.
+        """
         with torch.no_grad():
-            values = (self.library(self.features.guarded(z)) * self.weights.values[:, axis].to(z.dtype)).numpy()
-        return {name: values[:, j] for j, name in enumerate(self.names()) if float(self.weights.values[j, axis]) != 0.0}
+            values = (
+                self.library(self.features.guarded(z)) * self.weights.values[:, axis].to(z.dtype)
+            ).numpy()
+        return {
+            name: values[:, j]
+            for j, name in enumerate(self.names())
+            if float(self.weights.values[j, axis]) != 0.0
+        }
 
     @torch.jit.unused
     def names(self) -> list[str]:
@@ -139,7 +186,10 @@ class GeneticHead(EquationHead):
         z, target = self.features.guarded(samples.z).numpy(), samples.target.numpy()
         data = {name: z[:, i] for i, name in enumerate(self.features.names)}
         train = ~validating(samples.group.numpy(), self.config.validate_every)
-        bred = [breed(algebra, data, target[:, axis], train, self.config, 3 * self.config.seed + axis) for axis in range(3)]
+        bred = [
+            breed(algebra, data, target[:, axis], train, self.config, 3 * self.config.seed + axis)
+            for axis in range(3)
+        ]
         products = sorted({product for own in bred for product in own.products})
         weights = torch.zeros(len(products), 3, dtype=torch.float64)
         for axis, own in enumerate(bred):
@@ -152,16 +202,34 @@ class GeneticHead(EquationHead):
         )
         notes = {
             "parameters": len(table),
-            "coefficients": [{"axis": c.axis, "term": c.term, "value": c.value, "standard_error": c.error} for c in table],
+            "coefficients": [
+                {"axis": c.axis, "term": c.term, "value": c.value, "standard_error": c.error}
+                for c in table
+            ],
             "unexcited": [],
-            "equations": {name: _written(algebra, name, own) for name, own in zip(ACCELERATION, bred, strict=True)},
+            "equations": {
+                name: _written(algebra, name, own)
+                for name, own in zip(ACCELERATION, bred, strict=True)
+            },
         }
-        state = {f"library.{name}": value for name, value in tables(algebra, products, self.config.evolution.nesting).items()}
-        return [Solution({"kept": [len(own.products) for own in bred]}, state | {"weights.values": weights}, table, notes)]
+        state = {
+            f"library.{name}": value
+            for name, value in tables(algebra, products, self.config.evolution.nesting).items()
+        }
+        return [
+            Solution(
+                {"kept": [len(own.products) for own in bred]},
+                state | {"weights.values": weights},
+                table,
+                notes,
+            )
+        ]
 
 
 def validating(group: np.ndarray, every: int) -> np.ndarray:
-    """Which samples [N] validate, from the numbers of their manoeuvres: every so manieth where there are enough, else blocks of the record."""
+    """Which samples [N] validate, from the numbers of their manoeuvres: every so manieth where
+    there are enough, else blocks of the record.
+    """
     numbers = np.unique(group, return_inverse=True)[1]
     if numbers.max(initial=0) + 1 < every:
         numbers = np.arange(len(group)) * _BLOCKS // max(len(group), 1)

@@ -1,4 +1,6 @@
-"""Kernel ridge regression (document 001 section 3.2, ERRATA M4, M5), kernel and penalty chosen jointly in free run or by axis."""
+"""Kernel ridge regression (document 001 section 3.2, ERRATA M4, M5), kernel and penalty chosen
+jointly in free run or by axis.
+"""
 
 from __future__ import annotations
 
@@ -24,20 +26,25 @@ class KernelConfig(FeatureConfig):
 
     Attributes:
         kernel: `rbf` or `polynomial`.
-        terms: further features, made of the others, such as `n|n|`: the kernel of degree p has products of these too. A polynomial of low degree in
-            the revolutions is a poor thrust.
-        penalties: candidates, for each sample: the document's lambda (scikit-learn's alpha) is penalty * samples.
-        choose: `free_run`, jointly: the setting of the kernel and one penalty for all axes by the error of free runs on validation data, then
-            the penalty of each axis in turn for as long as free runs gain, or no residual at all (document 001 section 4, second approach);
-            `one_step`: setting and penalty of each axis for itself by cross-validated errors of accelerations; `recursion`: of each axis for
-            itself by the error of its own velocity in free run along the training records, the other velocities as measured (first approach).
+        terms: further features, made of the others, such as `n|n|`: the kernel of degree p has
+            products of these too. A polynomial of low degree in the revolutions is a poor thrust.
+        penalties: candidates, for each sample: the document's lambda (scikit-learn's alpha) is
+            penalty * samples.
+        choose: `free_run`, jointly: the setting of the kernel and one penalty for all axes by the
+            error of free runs on validation data, then the penalty of each axis in turn for as long
+            as free runs gain, or no residual at all (document 001 section 4, second approach);
+            `one_step`: setting and penalty of each axis for itself by cross-validated errors of
+            accelerations; `recursion`: of each axis for itself by the error of its own velocity in
+            free run along the training records, the other velocities as measured (first approach).
         folds: folds of the cross-validation; a manoeuvre is never split between folds.
     """
 
     kind: Literal["kernel"] = "kernel"
     kernel: Annotated[Rbf | Polynomial, Field(discriminator="kind")] = Field(default_factory=Rbf)
     terms: tuple[str, ...] = ()
-    penalties: tuple[Annotated[float, Field(gt=0)], ...] = Field(default=(1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1), min_length=1)
+    penalties: tuple[Annotated[float, Field(gt=0)], ...] = Field(
+        default=(1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1), min_length=1
+    )
     choose: Literal["one_step", "recursion", "free_run"] = "free_run"
     folds: int = Field(default=5, ge=2)
 
@@ -74,9 +81,14 @@ class TermFeatures(nn.Module):
         """
         values = self.library(channels)
         std = values.std(0, correction=0)
-        for term, still in zip(self.library.terms, (std <= 1e-9 * (1 + values.mean(0).abs())).tolist(), strict=True):
+        for term, still in zip(
+            self.library.terms, (std <= 1e-9 * (1 + values.mean(0).abs())).tolist(), strict=True
+        ):
             if still:
-                raise FitError(f"feature '{term}' is constant over the training samples; leave it out of `terms`")
+                raise FitError(
+                    f"feature '{term}' is constant over the training samples; leave it out of"
+                    " `terms`"
+                )
         self.mean.copy_(values.mean(0))
         self.std.copy_(std)
 
@@ -115,36 +127,57 @@ class KernelHead(ClosedFormHead):
     def columns(self, z: Tensor) -> Tensor:
         """Standardised features and terms [..., F + J]."""
         x = self.features(z)
-        return x if self.terms.count == 0 else torch.cat((x, self.terms(self.features.guarded(z))), dim=-1)
+        return (
+            x
+            if self.terms.count == 0
+            else torch.cat((x, self.terms(self.features.guarded(z))), dim=-1)
+        )
 
     def freedom(self) -> list[float]:
         """Effective number of parameters of each axis, the trace of the smoother."""
         return [float(count) for count in self.effective]
 
     def solutions(self, samples: Samples) -> list[Solution]:
-        """Of each axis the setting and penalty of the least error; where free runs choose, then all joint ones, and no residual.
+        """Of each axis the setting and penalty of the least error; where free runs choose, then all
+        joint ones, and no residual.
 
         Raises:
-            FitError: with fewer manoeuvres than folds, or where a recursion finds no samples that follow each other.
+            FitError: with fewer manoeuvres than folds, or where a recursion finds no samples that
+                follow each other.
         """
         groups = torch.unique(samples.group)
         if groups.numel() < self.folds:
-            raise FitError(f"{self.folds} folds need as many manoeuvres, the training data have {groups.numel()}; lower `folds`")
+            raise FitError(
+                f"{self.folds} folds need as many manoeuvres, the training data have"
+                f" {groups.numel()}; lower `folds`"
+            )
         fold = torch.searchsorted(groups, samples.group) % self.folds
         with torch.no_grad():
             x = self.columns(samples.z)
-            paths = self.kernel.paths(x, samples.target, fold, self.folds, [penalty * len(x) for penalty in self.penalties])
+            paths = self.kernel.paths(
+                x,
+                samples.target,
+                fold,
+                self.folds,
+                [penalty * len(x) for penalty in self.penalties],
+            )
         errors = torch.stack([path.errors for path in paths])
         judged = self._recursion(paths, samples) if self.by_recursion else errors
         best = judged.flatten(0, 1).argmin(0)
         count = len(self.penalties)
         picks = [_Pick(tuple((best // count).tolist()), tuple((best % count).tolist()))]
-        notes = {"cross_validated_error": errors.tolist(), "samples": len(x)} | ({"recursion_error": judged.tolist()} if self.by_recursion else {})
+        notes = {"cross_validated_error": errors.tolist(), "samples": len(x)} | (
+            {"recursion_error": judged.tolist()} if self.by_recursion else {}
+        )
         if not self.by_free_run:
             return [self._solution(paths, picks[0], notes)]
         picks += [_Pick((i,) * 3, (j,) * 3) for i in range(len(paths)) for j in range(count)]
         nothing = {f"kernel.{name}": value for name, value in self.kernel.nothing().items()}
-        none = Solution({"penalty": []}, nothing | {"effective": torch.zeros(3, dtype=torch.float64)}, notes=notes)
+        none = Solution(
+            {"penalty": []},
+            nothing | {"effective": torch.zeros(3, dtype=torch.float64)},
+            notes=notes,
+        )
         return [*(self._solution(paths, pick, notes) for pick in picks), none]
 
     def _recursion(self, paths: Sequence[Path], samples: Samples) -> Tensor:
@@ -156,7 +189,9 @@ class KernelHead(ClosedFormHead):
                 weights = path.coefficients[:, :, axis]
 
                 def predicted(z: Tensor, path: Path = path, weights: Tensor = weights) -> Tensor:
-                    return torch.einsum("cgp,cp->cg", self.kernel.along(path, self.columns(z)), weights)
+                    return torch.einsum(
+                        "cgp,cp->cg", self.kernel.along(path, self.columns(z)), weights
+                    )
 
                 with torch.no_grad():
                     out[i, :, axis] = recursion.errors(axis, predicted, len(self.penalties))
@@ -164,15 +199,25 @@ class KernelHead(ClosedFormHead):
 
     def _solution(self, paths: Sequence[Path], pick: _Pick, notes: dict[str, Any]) -> Solution:
         parts = list(enumerate(zip(pick.settings, pick.penalties, strict=True)))
-        coefficients = torch.stack([paths[i].coefficients[j, :, axis] for axis, (i, j) in parts], dim=1)
+        coefficients = torch.stack(
+            [paths[i].coefficients[j, :, axis] for axis, (i, j) in parts], dim=1
+        )
         effective = torch.stack([paths[i].freedom[j] for _, (i, j) in parts])
         said, state = self.kernel.chosen([paths[i] for i in pick.settings], coefficients)
         choice = said | {"penalty": [self.penalties[j] for j in pick.penalties]}
         told = notes | {"effective_parameters": effective.tolist()}
 
         def around() -> list[Solution]:
-            moved = [(axis, j + step) for axis, (_, j) in parts for step in (-1, 1) if 0 <= j + step < len(self.penalties)]
-            near = [pick._replace(penalties=(*pick.penalties[:axis], j, *pick.penalties[axis + 1 :])) for axis, j in moved]
+            moved = [
+                (axis, j + step)
+                for axis, (_, j) in parts
+                for step in (-1, 1)
+                if 0 <= j + step < len(self.penalties)
+            ]
+            near = [
+                pick._replace(penalties=(*pick.penalties[:axis], j, *pick.penalties[axis + 1 :]))
+                for axis, j in moved
+            ]
             return [self._solution(paths, other, notes) for other in near]
 
         return Solution(

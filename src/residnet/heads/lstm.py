@@ -20,11 +20,13 @@ class LstmConfig(FeatureConfig):
 
     Attributes:
         hidden_size: units.
-        readout: units of one tanh layer between (memory, features) and the residual; 0 reads the memory alone by a linear map, as
-            document 003 does.
-        memory: features that the memory sees; empty for all. A memory of the commands alone is the same in free run as along measurements:
-            it can hold the state of an actuator, but no measured acceleration. Needs `readout`, which sees all features.
-        activation: of block input and output; the document uses softsign in place of the usual tanh.
+        readout: units of one tanh layer between (memory, features) and the residual; 0 reads the
+            memory alone by a linear map, as document 003 does.
+        memory: features that the memory sees; empty for all. A memory of the commands alone is the
+            same in free run as along measurements: it can hold the state of an actuator, but no
+            measured acceleration. Needs `readout`, which sees all features.
+        activation: of block input and output; the document uses softsign in place of the usual
+            tanh.
         dropout: share of hidden outputs dropped before the readout while training.
         per_axis: one network for each of surge, sway, yaw, as the document has it.
         axis_features: channels of each axis' network, where they differ; needs `per_axis`.
@@ -47,9 +49,13 @@ class LstmConfig(FeatureConfig):
             if not self.per_axis:
                 raise ValueError("axis_features needs per_axis: true")
             if set(self.axis_features) != {"u", "v", "r"}:
-                raise ValueError(f"axis_features needs all of u, v, r; given {sorted(self.axis_features)}")
+                raise ValueError(
+                    f"axis_features needs all of u, v, r; given {sorted(self.axis_features)}"
+                )
         if self.memory and not self.readout:
-            raise ValueError("memory needs a readout layer, or the other features are never seen; set readout")
+            raise ValueError(
+                "memory needs a readout layer, or the other features are never seen; set readout"
+            )
         return self
 
     def build(self, names: Sequence[str]) -> ResidualHead:
@@ -63,11 +69,15 @@ class LstmConfig(FeatureConfig):
             return [(self.chosen(names), 3)]
         if self.axis_features is None:
             return [(self.chosen(names), 1)] * 3
-        return [(FeatureConfig(features=self.axis_features[axis]).chosen(names), 1) for axis in ("u", "v", "r")]
+        return [
+            (FeatureConfig(features=self.axis_features[axis]).chosen(names), 1)
+            for axis in ("u", "v", "r")
+        ]
 
 
 class LstmCore(nn.Module):
-    """One LSTM layer with a single bias per gate, stepped by a cell and run over sequences with the same weights.
+    """One LSTM layer with a single bias per gate, stepped by a cell and run over sequences with the
+    same weights.
 
     Memory s [B, 2H] holds h and c side by side. 4 H (F + H + 1) parameters.
     """
@@ -102,10 +112,14 @@ class LstmCore(nn.Module):
         return h, torch.cat((h, c), dim=-1)
 
     def sequence(self, f: Tensor) -> tuple[Tensor, Tensor]:
-        """Features [B, T, F] -> outputs [B, T, H] from an empty memory, and the memory after them [B, 2H]."""
+        """Features [B, T, F] -> outputs [B, T, H] from an empty memory, and the memory after them
+        [B, 2H].
+        """
         zeros = torch.zeros(f.shape[0], self.hidden, dtype=f.dtype, device=f.device)
         if f.shape[1] == 0:
-            return torch.zeros(f.shape[0], 0, self.hidden, dtype=f.dtype, device=f.device), torch.cat((zeros, zeros), dim=-1)
+            return torch.zeros(
+                f.shape[0], 0, self.hidden, dtype=f.dtype, device=f.device
+            ), torch.cat((zeros, zeros), dim=-1)
         if not self.softsign:
             weights = [self.w_input, self.w_hidden, self.bias, self.no_bias]
             start = [zeros.unsqueeze(0), zeros.unsqueeze(0)]
@@ -122,12 +136,18 @@ class LstmCore(nn.Module):
 class LstmNetwork(nn.Module):
     """Features, LSTM and readout of one or all axes; `outputs` numbers per sample."""
 
-    def __init__(self, config: LstmConfig, chosen: Sequence[str], outputs: int, names: Sequence[str]) -> None:
+    def __init__(
+        self, config: LstmConfig, chosen: Sequence[str], outputs: int, names: Sequence[str]
+    ) -> None:
         super().__init__()
         self.features = Features(chosen, names, config.margin)
         seen = FeatureConfig(features=config.memory).chosen(chosen)
         self.partial = len(config.memory) > 0
-        self.register_buffer("seen", torch.tensor([list(chosen).index(name) for name in seen], dtype=torch.long), persistent=False)
+        self.register_buffer(
+            "seen",
+            torch.tensor([list(chosen).index(name) for name in seen], dtype=torch.long),
+            persistent=False,
+        )
         self.seen: Tensor
         self.core = LstmCore(len(seen), config.hidden_size, config.activation == "softsign")
         self.dropout = nn.Dropout(config.dropout)
@@ -136,7 +156,13 @@ class LstmNetwork(nn.Module):
         with torch.no_grad():
             out.weight.mul_(0.1)
             out.bias.zero_()
-        mixer = nn.Sequential(nn.Linear(config.hidden_size + self.features.count, config.readout), nn.Tanh()) if self.skip else nn.Sequential()
+        mixer = (
+            nn.Sequential(
+                nn.Linear(config.hidden_size + self.features.count, config.readout), nn.Tanh()
+            )
+            if self.skip
+            else nn.Sequential()
+        )
         self.readout = nn.Sequential(*mixer, out)
 
     def remembered(self, f: Tensor) -> Tensor:
@@ -168,7 +194,10 @@ class LstmHead(ResidualHead):
     def __init__(self, config: LstmConfig, names: Sequence[str]) -> None:
         super().__init__()
         self.networks: Sequence[LstmNetwork] = nn.ModuleList(  # type: ignore[assignment]
-            [LstmNetwork(config, chosen, outputs, names) for chosen, outputs in config.networks(names)]
+            [
+                LstmNetwork(config, chosen, outputs, names)
+                for chosen, outputs in config.networks(names)
+            ]
         )
         self.width = 2 * config.hidden_size
         self.n_state = self.width * len(self.networks)

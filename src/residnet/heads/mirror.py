@@ -1,6 +1,8 @@
-"""Heads that are mirror-symmetric by construction: what happens to starboard happens, mirrored, to port.
+"""Heads that are mirror-symmetric by construction: what happens to starboard happens, mirrored, to
+port.
 
-A hull is symmetric to better than the data can tell, and knowing it halves what a network has to learn.
+A hull is symmetric to better than the data can tell, and knowing it halves what a network has to
+learn.
 """
 
 from __future__ import annotations
@@ -19,7 +21,8 @@ from residnet.physics.symmetry import mirrored_channels
 
 @final
 class MirroredHead(ResidualHead):
-    """rho = (g(z) + M g(M z)) / 2 of an inner head g, in one batch of twice the size; M mirrors port and starboard.
+    """rho = (g(z) + M g(M z)) / 2 of an inner head g, in one batch of twice the size; M mirrors
+    port and starboard.
 
     The memory holds that of both halves side by side.
     """
@@ -28,19 +31,26 @@ class MirroredHead(ResidualHead):
         super().__init__()
         mirror = mirrored_channels(names)
         if mirror is None:
-            raise ConfigError(f"mirror: nobody said how all of the channels {', '.join(names)} change in the mirror; leave `mirror` out")
+            raise ConfigError(
+                f"mirror: nobody said how all of the channels {', '.join(names)} change in the"
+                " mirror; leave `mirror` out"
+            )
         self.inner = inner
         self.width = inner.n_state
         self.n_state = 2 * inner.n_state
         self.register_buffer("index", torch.tensor(mirror[0], dtype=torch.long), persistent=False)
         self.register_buffer("sign", torch.tensor(mirror[1], dtype=torch.float64), persistent=False)
-        self.register_buffer("turned", torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64), persistent=False)
+        self.register_buffer(
+            "turned", torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64), persistent=False
+        )
         self.index: Tensor
         self.sign: Tensor
         self.turned: Tensor
 
     def calibrate(self, samples: Samples) -> None:
-        """Take scales from the samples and their mirror images, so that the mirror of a known state is known too."""
+        """Take scales from the samples and their mirror images, so that the mirror of a known state
+        is known too.
+        """
         other = samples.z.index_select(1, self.index) * self.sign
         both = Samples(
             torch.cat((samples.z, other)),
@@ -67,7 +77,9 @@ class MirroredHead(ResidualHead):
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Residual [B, 3] at channels z [B, nz] and the memory for the next step."""
-        rho, after = self.inner(self.both(z), torch.cat((s[:, : self.width], s[:, self.width :]), dim=0))
+        rho, after = self.inner(
+            self.both(z), torch.cat((s[:, : self.width], s[:, self.width :]), dim=0)
+        )
         half = z.shape[0]
         return self.mean(rho), torch.cat((after[:half], after[half:]), dim=-1)
 

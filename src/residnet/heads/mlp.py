@@ -13,11 +13,17 @@ from residnet.core.samples import Samples
 from residnet.heads.base import FeatureConfig, Features, ResidualHead, ResidualScale
 from residnet.heads.mirror import MirroredHead
 
-ACTIVATIONS: dict[str, type[nn.Module]] = {"tanh": nn.Tanh, "silu": nn.SiLU, "relu": nn.ReLU, "softsign": nn.Softsign}
+ACTIVATIONS: dict[str, type[nn.Module]] = {
+    "tanh": nn.Tanh,
+    "silu": nn.SiLU,
+    "relu": nn.ReLU,
+    "softsign": nn.Softsign,
+}
 
 
 class MlpConfig(FeatureConfig):
-    """Layers of `hidden` units with one activation; the output layer starts near zero, so that training starts from the baseline.
+    """Layers of `hidden` units with one activation; the output layer starts near zero, so that
+    training starts from the baseline.
 
     Attributes:
         hidden: units of each layer.

@@ -1,4 +1,6 @@
-"""NIPALS as document 002 prints it (section 3.3.1) with ERRATA J14-J17, for comparison with the kernel algorithm."""
+"""NIPALS as document 002 prints it (section 3.3.1) with ERRATA J14-J17, for comparison with the
+kernel algorithm.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,9 @@ from residnet.core.errors import FitError
 from residnet.heads.plsr import LEAST_ENERGY
 
 
-def nipals(e: Tensor, f: Tensor, orders: int, tolerance: float = 1e-12, iterations: int = 50_000) -> Tensor:
+def nipals(
+    e: Tensor, f: Tensor, orders: int, tolerance: float = 1e-12, iterations: int = 50_000
+) -> Tensor:
     """Theta_pre [A, J, K] for every order up to `orders`.
 
     Args:
@@ -29,7 +33,10 @@ def nipals(e: Tensor, f: Tensor, orders: int, tolerance: float = 1e-12, iteratio
     outputs: list[Tensor] = []
     path: list[Tensor] = []
     for _ in range(orders):
-        if float(f.square().sum()) <= 1e-24 * energy or float(e.square().sum()) <= 1e-24 * e.numel():
+        if (
+            float(f.square().sum()) <= 1e-24 * energy
+            or float(e.square().sum()) <= 1e-24 * e.numel()
+        ):
             break
         u = f[:, int(f.square().sum(0).argmax())]
         w = torch.zeros_like(e[0])
@@ -42,7 +49,10 @@ def nipals(e: Tensor, f: Tensor, orders: int, tolerance: float = 1e-12, iteratio
             if float((w - before).abs().max()) < tolerance:
                 break
         else:
-            raise FitError(f"NIPALS: latent variable {len(path) + 1} did not converge in {iterations} iterations; use the kernel algorithm (plsr)")
+            raise FitError(
+                f"NIPALS: latent variable {len(path) + 1} did not converge in {iterations}"
+                " iterations; use the kernel algorithm (plsr)"
+            )
         if float(t @ t) <= LEAST_ENERGY * largest:
             break
         p = e.T @ t / (t @ t)

@@ -1,4 +1,6 @@
-"""Partial least squares regression over basis functions (document 002 section 3.2, ERRATA J14-J17), from moments alone."""
+"""Partial least squares regression over basis functions (document 002 section 3.2, ERRATA J14-J17),
+from moments alone.
+"""
 
 from __future__ import annotations
 
@@ -16,16 +18,20 @@ from residnet.heads.force import in_space
 from residnet.regression.solutions import Solution
 
 LEAST_ENERGY = 1e-13
-"""Least energy of a latent variable in units of a column's: below it are rounding and columns that are sums of others, without a meaning."""
+"""Least energy of a latent variable in units of a column's: below it are rounding and columns that
+are sums of others, without a meaning.
+"""
 
 
 def pls_path(xx: Tensor, xy: Tensor, orders: int) -> Tensor:
-    """Regression coefficients of PLS2 for every order up to `orders`, [A, J, K], by the kernel algorithm of Dayal and MacGregor (1997).
+    """Regression coefficients of PLS2 for every order up to `orders`, [A, J, K], by the kernel
+    algorithm of Dayal and MacGregor (1997).
 
     Args:
         xx: X'X of centred, scaled columns [J, J].
         xy: X'Y [J, K].
-        orders: number of latent variables; the path ends early where nothing is left to explain, or to explain it with.
+        orders: number of latent variables; the path ends early where nothing is left to explain, or
+            to explain it with.
     """
     j, k = xy.shape
     weights: list[Tensor] = []
@@ -69,8 +75,8 @@ class PlsrConfig(BasisConfig):
     """PLSR of the three residuals together.
 
     Attributes:
-        order: number of latent variables; None chooses it as `choose` says (by one-step errors: the sum over axes, each in units of its
-            variance).
+        order: number of latent variables; None chooses it as `choose` says (by one-step errors: the
+            sum over axes, each in units of its variance).
         max_order: highest order tried.
     """
 
@@ -80,7 +86,9 @@ class PlsrConfig(BasisConfig):
 
     def build(self, names: Sequence[str]) -> ClosedFormHead:
         """The module for channels `names`."""
-        return in_space(self, names, lambda own, channels: PlsrHead(self.model_validate(own), channels))
+        return in_space(
+            self, names, lambda own, channels: PlsrHead(self.model_validate(own), channels)
+        )
 
 
 @final
@@ -93,9 +101,15 @@ class PlsrHead(BasisHead):
         self.max_order = config.max_order
 
     def solutions(self, samples: Samples) -> list[Solution]:
-        """The order given, or that of the least cross-validated error; then a ladder of orders and none where free runs choose."""
+        """The order given, or that of the least cross-validated error; then a ladder of orders and
+        none where free runs choose.
+        """
         moments = self.moments(samples)
-        highest = min(self.max_order, self.library.count) if self.order == 0 else min(self.order, self.library.count)
+        highest = (
+            min(self.max_order, self.library.count)
+            if self.order == 0
+            else min(self.order, self.library.count)
+        )
         folds = [self._scaled_path(moments.without(f), highest) for f in range(self.folds)]
         shortest = min(int(path.shape[0]) for path, _, _ in folds)
         if shortest == 0:
@@ -107,11 +121,20 @@ class PlsrHead(BasisHead):
         notes = {"cross_validated_share": score.tolist(), "terms": self.library.count}
         path, mean_x, mean_y = self._scaled_path(moments.all(), shortest)
         order = min(self.order or int(score.argmin()) + 1, len(path))
-        found = [self.solution({"order": k}, path[k - 1], mean_x, mean_y, moments, notes) for k in (order, *_ladder(len(path)))]
-        return [*found, self.nothing({"order": 0}, notes)] if self.by_free_run and not self.order else found[:1]
+        found = [
+            self.solution({"order": k}, path[k - 1], mean_x, mean_y, moments, notes)
+            for k in (order, *_ladder(len(path)))
+        ]
+        return (
+            [*found, self.nothing({"order": 0}, notes)]
+            if self.by_free_run and not self.order
+            else found[:1]
+        )
 
     @staticmethod
-    def _scaled_path(centred: tuple[float, Tensor, Tensor, Tensor, Tensor], orders: int) -> tuple[Tensor, Tensor, Tensor]:
+    def _scaled_path(
+        centred: tuple[float, Tensor, Tensor, Tensor, Tensor], orders: int
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Path of coefficients in unscaled columns [A, J, K], with the means that they refer to."""
         n, mean_x, mean_y, xx, xy = centred
         scale_x = (xx.diagonal() / (n - 1)).sqrt()

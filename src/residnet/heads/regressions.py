@@ -1,4 +1,6 @@
-"""Linear regressions of forces on basis functions, side by side (document 002 chapters 3 and 4): one config class per kind."""
+"""Linear regressions of forces on basis functions, side by side (document 002 chapters 3 and 4):
+one config class per kind.
+"""
 
 from __future__ import annotations
 
@@ -28,8 +30,10 @@ class Regression:
         x: basis functions [N, J], float64.
         y: outputs [N, 3].
         scale: what the columns are divided by [J].
-        fold: of each sample [N], from 0; samples that belong together (a segment, a run) share a fold.
-        test: samples of the document's own choice of a model, which judges on them; None where a model must not see them.
+        fold: of each sample [N], from 0; samples that belong together (a segment, a run) share a
+            fold.
+        test: samples of the document's own choice of a model, which judges on them; None where a
+            model must not see them.
     """
 
     terms: tuple[str, ...]
@@ -43,11 +47,20 @@ class Regression:
         bad = ~torch.isfinite(self.x)
         if bool(bad.any()):
             row, column = (int(part[0]) for part in bad.nonzero(as_tuple=True))
-            raise FitError(f"basis function '{self.terms[column]}' is not finite at sample {row}; mask or repair the log")
+            raise FitError(
+                f"basis function '{self.terms[column]}' is not finite at sample {row}; mask or"
+                " repair the log"
+            )
         if not bool(torch.isfinite(self.y).all()):
-            raise FitError(f"the residual force is not finite at sample {int((~torch.isfinite(self.y)).any(1).nonzero()[0, 0])}; mask the log")
+            raise FitError(
+                "the residual force is not finite at sample"
+                f" {int((~torch.isfinite(self.y)).any(1).nonzero()[0, 0])}; mask the log"
+            )
         if len(self.x) <= len(self.terms):
-            raise FitError(f"{len(self.x)} samples do not determine {len(self.terms)} basis functions; give more data or fewer terms")
+            raise FitError(
+                f"{len(self.x)} samples do not determine {len(self.terms)} basis functions; give"
+                " more data or fewer terms"
+            )
 
     @property
     def standardised(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
@@ -63,7 +76,10 @@ class Regression:
         """
         count = int(self.fold.max()) + 1
         if count < 2:
-            raise FitError("one run or segment only: nothing is left to cross-validate on; give more runs, or a fixed order or penalty")
+            raise FitError(
+                "one run or segment only: nothing is left to cross-validate on; give more runs, or"
+                " a fixed order or penalty"
+            )
         return count
 
 
@@ -76,7 +92,8 @@ class Fit:
         intercept: [3].
         pre: Theta_pre [J, 3], coefficients of the scaled variables (3.11).
         notes: what was chosen.
-        surface: errors of all models that the choice was made from, where a surface analysis made it.
+        surface: errors of all models that the choice was made from, where a surface analysis made
+            it.
     """
 
     coefficients: Tensor
@@ -87,7 +104,9 @@ class Fit:
 
     @classmethod
     def from_pre(cls, data: Regression, pre: Tensor, notes: dict[str, Any]) -> Fit:
-        """From coefficients of scaled variables: Theta_post = diag(scale)^-1 Theta_pre diag(std y) (3.12), ERRATA J15."""
+        """From coefficients of scaled variables: Theta_post = diag(scale)^-1 Theta_pre diag(std y)
+        (3.12), ERRATA J15.
+        """
         _, _, mean_x, mean_y, std_y = data.standardised
         post = pre / data.scale[:, None] * std_y
         return cls(post, mean_y - mean_x @ post, pre, notes)
@@ -119,7 +138,11 @@ class PlsrRegression(RegressionKind):
 
     def path(self, e: Tensor, f: Tensor, orders: int) -> Tensor:
         """Theta_pre [A, J, 3] of every order."""
-        return nipals(e, f, orders) if self.algorithm == "nipals" else pls_path(e.T @ e, e.T @ f, orders)
+        return (
+            nipals(e, f, orders)
+            if self.algorithm == "nipals"
+            else pls_path(e.T @ e, e.T @ f, orders)
+        )
 
     def fit(self, data: Regression) -> Fit:
         """Fit all orders, keep one."""
@@ -144,11 +167,13 @@ class PlsrRegression(RegressionKind):
 
 @final
 class SurfaceRegression(RegressionKind):
-    """PLSR of each axis by itself, order and basis functions by surface analysis (document 002 section 4.5.1).
+    """PLSR of each axis by itself, order and basis functions by surface analysis (document 002
+    section 4.5.1).
 
     Attributes:
-        choose: `test`, the document's own: the least error on the test half, which then also judges it; `simplest`: cross-validation over
-            the folds of the first half and the one-standard-error rule; `least`: cross-validation and its bare minimum.
+        choose: `test`, the document's own: the least error on the test half, which then also judges
+            it; `simplest`: cross-validation over the folds of the first half and the
+            one-standard-error rule; `least`: cross-validation and its bare minimum.
     """
 
     kind: Literal["surface"]
@@ -165,14 +190,25 @@ class SurfaceRegression(RegressionKind):
         if data.test is None:
             raise FitError("surface: choose 'test' needs the test half")
         x, y = torch.cat((data.x, data.test[0])), torch.cat((data.y, data.test[1]))
-        half = torch.cat((torch.zeros(len(data.x), dtype=torch.long), torch.ones(len(data.test[0]), dtype=torch.long)))
+        half = torch.cat(
+            (
+                torch.zeros(len(data.x), dtype=torch.long),
+                torch.ones(len(data.test[0]), dtype=torch.long),
+            )
+        )
         return surface(FoldMoments.gather(x, y, half, 2), test=[1])
 
     def fit(self, data: Regression) -> Fit:
         """The chosen model of each axis."""
         found = self.surfaces(data)
-        coefficients, pre = torch.zeros(len(data.terms), 3, dtype=torch.float64), torch.zeros(len(data.terms), 3, dtype=torch.float64)
-        picks = [found.simplest(axis) if self.choose == "simplest" else found.least(axis) for axis in range(3)]
+        coefficients, pre = (
+            torch.zeros(len(data.terms), 3, dtype=torch.float64),
+            torch.zeros(len(data.terms), 3, dtype=torch.float64),
+        )
+        picks = [
+            found.simplest(axis) if self.choose == "simplest" else found.least(axis)
+            for axis in range(3)
+        ]
         std = data.x.std(0)
         for axis, (order, count) in enumerate(picks):
             kept = found.kept(axis, order, count)
@@ -202,13 +238,22 @@ class LeastSquaresRegression(RegressionKind):
         if float(singular[-1]) <= 1e-9 * float(singular[0]):
             loads = right[-1].abs()
             names = [data.terms[j] for j in (loads > 0.1 * loads.max()).nonzero()[:, 0].tolist()]
-            raise FitError(f"basis functions {', '.join(names)} are collinear over these samples; leave one out, or use ridge or plsr")
-        return Fit.from_pre(data, torch.linalg.lstsq(e, f).solution, {"condition": float(singular[0] / singular[-1])})
+            raise FitError(
+                f"basis functions {', '.join(names)} are collinear over these samples; leave one"
+                " out, or use ridge or plsr"
+            )
+        return Fit.from_pre(
+            data,
+            torch.linalg.lstsq(e, f).solution,
+            {"condition": float(singular[0] / singular[-1])},
+        )
 
 
 @final
 class RidgeRegression(RegressionKind):
-    """Ridge; `penalty` null: the least error over left-out folds (alpha = penalty * samples in scikit-learn's terms)."""
+    """Ridge; `penalty` null: the least error over left-out folds (alpha = penalty * samples in
+    scikit-learn's terms).
+    """
 
     kind: Literal["ridge"]
     penalty: float | None = Field(default=None, gt=0)
@@ -231,13 +276,19 @@ class RidgeRegression(RegressionKind):
             out = data.fold == k
             mx, my = e[~out].mean(0), f[~out].mean(0)
             for i, penalty in enumerate(penalties):
-                error[i] += (f[out] - my - (e[out] - mx) @ self._solve(e[~out] - mx, f[~out] - my, penalty)).square().sum()
+                error[i] += (
+                    (f[out] - my - (e[out] - mx) @ self._solve(e[~out] - mx, f[~out] - my, penalty))
+                    .square()
+                    .sum()
+                )
         return penalties[int(error.argmin())]
 
 
 @final
 class ShrinkRegression(RegressionKind):
-    """LASSO, or elastic net with `l1_ratio` below one, by scikit-learn with its cross-validation over the folds; each axis by itself."""
+    """LASSO, or elastic net with `l1_ratio` below one, by scikit-learn with its cross-validation
+    over the folds; each axis by itself.
+    """
 
     kind: Literal["lasso", "elastic_net"]
     l1_ratio: float = Field(default=0.5, gt=0, lt=1)
@@ -250,13 +301,21 @@ class ShrinkRegression(RegressionKind):
         from sklearn.linear_model import ElasticNetCV, LassoCV
 
         e, f, *_ = data.standardised
-        parts = [((data.fold != k).nonzero()[:, 0].numpy(), (data.fold == k).nonzero()[:, 0].numpy()) for k in range(data.folds())]
+        parts = [
+            ((data.fold != k).nonzero()[:, 0].numpy(), (data.fold == k).nonzero()[:, 0].numpy())
+            for k in range(data.folds())
+        ]
         pre, alphas = [], []
         for axis in range(3):
             options = {"cv": parts, "alphas": 40, "max_iter": 3000, "tol": 1e-4}
-            model = LassoCV(**options) if self.kind == "lasso" else ElasticNetCV(l1_ratio=self.l1_ratio, **options)
+            model = (
+                LassoCV(**options)
+                if self.kind == "lasso"
+                else ElasticNetCV(l1_ratio=self.l1_ratio, **options)
+            )
             with warnings.catch_warnings():
-                # the smallest penalties of the path need not converge: cross-validation leaves them behind
+                # the smallest penalties of the path need not converge: cross-validation leaves them
+                # behind
                 warnings.simplefilter("ignore", ConvergenceWarning)
                 model.fit(e.numpy(), f[:, axis].numpy())
             pre.append(torch.from_numpy(model.coef_))
@@ -265,7 +324,12 @@ class ShrinkRegression(RegressionKind):
 
 
 RegressionConfig = Annotated[
-    PlsrRegression | SurfaceRegression | LeastSquaresRegression | RidgeRegression | ShrinkRegression, Field(discriminator="kind")
+    PlsrRegression
+    | SurfaceRegression
+    | LeastSquaresRegression
+    | RidgeRegression
+    | ShrinkRegression,
+    Field(discriminator="kind"),
 ]
 
 
@@ -276,6 +340,10 @@ def segments(t: Tensor, length: float) -> Tensor:
 
 
 def table(terms: Sequence[str], fit: Fit) -> list[tuple[str, list[float]]]:
-    """Rows of the model for reading: the constant, then each basis function that is kept, with its coefficients (surge, sway, yaw)."""
+    """Rows of the model for reading: the constant, then each basis function that is kept, with its
+    coefficients (surge, sway, yaw).
+    """
     rows = [("1", fit.intercept.tolist())]
-    return rows + [(term, row) for term, row in zip(terms, fit.coefficients.tolist(), strict=True) if any(row)]
+    return rows + [
+        (term, row) for term, row in zip(terms, fit.coefficients.tolist(), strict=True) if any(row)
+    ]

@@ -1,4 +1,6 @@
-"""Surface analysis (document 002 section 4.5): how good PLSR is by model order and number of basis functions, the weakest removed one by one."""
+"""Surface analysis (document 002 section 4.5): how good PLSR is by model order and number of basis
+functions, the weakest removed one by one.
+"""
 
 from __future__ import annotations
 
@@ -18,10 +20,12 @@ class Surface:
     """Errors over orders and numbers of basis functions, for each output by itself.
 
     Attributes:
-        error: mean squared error [K, A, J + 1] of output k with a + 1 latent variables and j basis functions; NaN where there is no such
-            model (fewer basis functions than latent variables, or fewer than two).
+        error: mean squared error [K, A, J + 1] of output k with a + 1 latent variables and j basis
+            functions; NaN where there is no such model (fewer basis functions than latent
+            variables, or fewer than two).
         spread: standard error of that mean over the folds, [K, A, J + 1]; NaN with one fold.
-        removal: basis functions in the order of their removal, [K, A, J], -1 after the last one that was removed.
+        removal: basis functions in the order of their removal, [K, A, J], -1 after the last one
+            that was removed.
     """
 
     error: Tensor
@@ -29,24 +33,32 @@ class Surface:
     removal: Tensor
 
     def kept(self, output: int, order: int, count: int) -> list[int]:
-        """Numbers of the `count` basis functions left at model order `order` (from 1) for one output."""
+        """Numbers of the `count` basis functions left at model order `order` (from 1) for one
+        output.
+        """
         gone = self.removal[output, order - 1, : self.removal.shape[2] - count].tolist()
         return [j for j in range(self.removal.shape[2]) if j not in gone]
 
     def least(self, output: int) -> tuple[int, int]:
-        """(order, count) of the least error of one output: the document's choice; optimistic where its folds also judge the result."""
+        """(order, count) of the least error of one output: the document's choice; optimistic where
+        its folds also judge the result.
+        """
         flat = torch.nan_to_num(self.error[output], nan=torch.inf).flatten()
         a, j = divmod(int(flat.argmin()), self.error.shape[2])
         return a + 1, j
 
     def simplest(self, output: int) -> tuple[int, int]:
-        """(order, count) of the lowest order, then the most basis functions, whose error is within one standard error of the least.
+        """(order, count) of the lowest order, then the most basis functions, whose error is within
+        one standard error of the least.
 
-        The least cross-validated error of some 450 models is partly luck, and high orders on few near-collinear columns explode elsewhere
-        (Breiman's one-standard-error rule; a low order shrinks, removing basis functions does not).
+        The least cross-validated error of some 450 models is partly luck, and high orders on few
+        near-collinear columns explode elsewhere (Breiman's one-standard-error rule; a low order
+        shrinks, removing basis functions does not).
         """
         order, count = self.least(output)
-        limit = self.error[output, order - 1, count] + torch.nan_to_num(self.spread[output, order - 1, count])
+        limit = self.error[output, order - 1, count] + torch.nan_to_num(
+            self.spread[output, order - 1, count]
+        )
         fine = torch.nan_to_num(self.error[output], nan=torch.inf) <= limit
         lowest = int(fine.any(1).nonzero()[0, 0])
         return lowest + 1, int(fine[lowest].nonzero()[-1, 0])
@@ -55,11 +67,13 @@ class Surface:
 def surface(moments: FoldMoments, test: Sequence[int] = (), orders: int | None = None) -> Surface:
     """All models of the surface from moments alone, in one batch over outputs and orders.
 
-    At every model order the basis function with the least |coefficient| on standardised columns is removed, until the order or two are left.
+    At every model order the basis function with the least |coefficient| on standardised columns is
+    removed, until the order or two are left.
 
     Args:
         moments: sums by fold of basis functions [N, J] and outputs [N, K].
-        test: folds that judge the models; these are fitted, and choose what to remove, on the others. Empty: cross-validation over all folds.
+        test: folds that judge the models; these are fitted, and choose what to remove, on the
+            others. Empty: cross-validation over all folds.
         orders: highest model order; None for the number of basis functions.
 
     Raises:
@@ -83,15 +97,19 @@ def surface(moments: FoldMoments, test: Sequence[int] = (), orders: int | None =
         further = torch.arange(active)[order[:active].clamp(min=2) < count]
         removal[j - count, further] = weakest[further]
         mask[weakest[further], further] = 0.0
-    return Surface(*(part.reshape(-1, a, k).permute(2, 1, 0).contiguous() for part in (error, spread, removal)))
+    return Surface(
+        *(part.reshape(-1, a, k).permute(2, 1, 0).contiguous() for part in (error, spread, removal))
+    )
 
 
 @dataclass(frozen=True)
 class _Problems:
-    """Standardised normal equations: the first is fitted on all that may be used, the others on that less one fold each.
+    """Standardised normal equations: the first is fitted on all that may be used, the others on
+    that less one fold each.
 
-    gram [P, J, J], covariance [P, J, K], scale and mean of the columns [P, J], mean of the outputs [P, K]; `judged` are the sums
-    [P', 1 + J + K, 1 + J + K] that the last P' problems are judged on.
+    gram [P, J, J], covariance [P, J, K], scale and mean of the columns [P, J], mean of the outputs
+    [P, K]; `judged` are the sums [P', 1 + J + K, 1 + J + K] that the last P' problems are judged
+    on.
     """
 
     gram: Tensor
@@ -105,31 +123,53 @@ class _Problems:
     def gather(cls, moments: FoldMoments, test: Sequence[int]) -> _Problems:
         total = moments.sums.sum(0)
         apart = moments.sums[list(test)].sum(0) if test else total * 0.0
-        used = [total - apart] + ([] if test else [total - moments.sums[f] for f in range(moments.folds)])
+        used = [total - apart] + (
+            [] if test else [total - moments.sums[f] for f in range(moments.folds)]
+        )
         judged = apart.unsqueeze(0) if test else moments.sums
         centred = [moments.centred(part) for part in used]
         if centred[0][3].shape[0] < 2:
             raise FitError("a surface needs at least two basis functions")
         n = torch.tensor([part[0] for part in centred], dtype=torch.float64)
-        xx, xy = torch.stack([part[3] for part in centred]), torch.stack([part[4] for part in centred])
+        xx, xy = (
+            torch.stack([part[3] for part in centred]),
+            torch.stack([part[4] for part in centred]),
+        )
         scale = (xx.diagonal(dim1=1, dim2=2) / (n[:, None] - 1)).clamp(min=0).sqrt()
-        size = (total[1 : 1 + moments.regressors, 1 : 1 + moments.regressors].diagonal() / total[0, 0]).sqrt() + moments.shift_x.abs()
+        size = (
+            total[1 : 1 + moments.regressors, 1 : 1 + moments.regressors].diagonal() / total[0, 0]
+        ).sqrt() + moments.shift_x.abs()
         if bool((constant := scale <= 1e-9 * size).any()):
-            raise FitError(f"basis function number {int(constant.any(0).nonzero()[0, 0])} is constant; leave it out (the intercept is there)")
+            raise FitError(
+                f"basis function number {int(constant.any(0).nonzero()[0, 0])} is constant; leave"
+                " it out (the intercept is there)"
+            )
         gram = xx / (scale[:, :, None] * scale[:, None, :])
-        return cls(gram, xy / scale[:, :, None], scale, torch.stack([p[1] for p in centred]), torch.stack([p[2] for p in centred]), judged)
+        return cls(
+            gram,
+            xy / scale[:, :, None],
+            scale,
+            torch.stack([p[1] for p in centred]),
+            torch.stack([p[2] for p in centred]),
+            judged,
+        )
 
     def coefficients(self, mask: Tensor, axis: Tensor, order: Tensor) -> Tensor:
-        """PLS1 coefficients on standardised columns [P, J, C] of C models: their basis functions [J, C], outputs [C] and orders [C], ascending.
+        """PLS1 coefficients on standardised columns [P, J, C] of C models: their basis functions
+        [J, C], outputs [C] and orders [C], ascending.
 
-        Kernel algorithm of Dayal and MacGregor (1997) with one output, all models at once; a model is left alone once its order is reached.
+        Kernel algorithm of Dayal and MacGregor (1997) with one output, all models at once; a model
+        is left alone once its order is reached.
         """
         covariance = self.covariance[:, :, axis] * mask
         rest, b = covariance.clone(), torch.zeros_like(covariance)
         least = 1e-26 * covariance.square().sum(1)
         steps = int(order.max())
         least_energy = LEAST_ENERGY * float(self.gram.diagonal(dim1=1, dim2=2).max())
-        loadings, rotations = covariance.new_zeros(steps, *covariance.shape), covariance.new_zeros(steps, *covariance.shape)
+        loadings, rotations = (
+            covariance.new_zeros(steps, *covariance.shape),
+            covariance.new_zeros(steps, *covariance.shape),
+        )
         for step in range(steps):
             first = int((order <= step).sum())
             c = rest[:, :, first:]
@@ -140,8 +180,14 @@ class _Problems:
                 r = w - (known * rotations[:step, :, :, first:]).sum(0)
             image = (self.gram @ r) * mask[:, first:]
             energy = (r * image).sum(1, keepdim=True)
-            alive = (c.square().sum(1, keepdim=True) > least[:, None, first:]) & (energy > least_energy)
-            share = torch.where(alive, (r * covariance[:, :, first:]).sum(1, keepdim=True) / energy, torch.zeros_like(energy))
+            alive = (c.square().sum(1, keepdim=True) > least[:, None, first:]) & (
+                energy > least_energy
+            )
+            share = torch.where(
+                alive,
+                (r * covariance[:, :, first:]).sum(1, keepdim=True) / energy,
+                torch.zeros_like(energy),
+            )
             p = torch.where(alive, image / energy, torch.zeros_like(image))
             b[:, :, first:] += r * share
             rest[:, :, first:] -= p * (share * energy)
@@ -150,14 +196,26 @@ class _Problems:
         return b
 
     def errors(self, coefficients: Tensor, axis: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean squared error [C] over the samples judged on, and its standard error over the folds [C]."""
+        """Mean squared error [C] over the samples judged on, and its standard error over the folds
+        [C].
+        """
         count, j = len(self.judged), self.gram.shape[1]
         slope = coefficients[-count:] / self.scale[-count:, :, None]
         intercept = self.mean_y[-count:][:, axis] - (self.mean_x[-count:, :, None] * slope).sum(1)
         weights = torch.cat((intercept[:, None], slope), dim=1)
-        xx, xy, yy = self.judged[:, : j + 1, : j + 1], self.judged[:, : j + 1, j + 1 :], self.judged[:, j + 1 :, j + 1 :]
-        squares = (weights * (xx @ weights)).sum(1) - 2 * (weights * xy[:, :, axis]).sum(1) + yy.diagonal(dim1=1, dim2=2)[:, axis]
+        xx, xy, yy = (
+            self.judged[:, : j + 1, : j + 1],
+            self.judged[:, : j + 1, j + 1 :],
+            self.judged[:, j + 1 :, j + 1 :],
+        )
+        squares = (
+            (weights * (xx @ weights)).sum(1)
+            - 2 * (weights * xy[:, :, axis]).sum(1)
+            + yy.diagonal(dim1=1, dim2=2)[:, axis]
+        )
         n = self.judged[:, 0, 0]
         by_fold = squares / n[:, None]
-        spread = by_fold.std(0) / count**0.5 if count > 1 else torch.full_like(by_fold[0], torch.nan)
+        spread = (
+            by_fold.std(0) / count**0.5 if count > 1 else torch.full_like(by_fold[0], torch.nan)
+        )
         return squares.sum(0) / n.sum(), spread

@@ -1,4 +1,6 @@
-"""booklet.json: indices of standard manoeuvres with intervals, limits of IMO, and measured zigzags beside their repetition by the model."""
+"""booklet.json: indices of standard manoeuvres with intervals, limits of IMO, and measured zigzags
+beside their repetition by the model.
+"""
 
 from __future__ import annotations
 
@@ -26,8 +28,9 @@ _POWER = {"m": 1.0, "s": 0.5, "m/s": 0.5, "rad/s": -0.5, "rad": 0.0, "-": 0.0}
 class BookletConfig(Config):
     """A manoeuvring booklet by one of the fit's refitted baselines.
 
-    Parameters are drawn from what the refit leaves open; every draw flies every manoeuvre, and the intervals are those of the indices. They
-    know the model's form to be right and speak of nothing else, so that they are short where the form is wrong.
+    Parameters are drawn from what the refit leaves open; every draw flies every manoeuvre, and the
+    intervals are those of the indices. They know the model's form to be right and speak of nothing
+    else, so that they are short where the form is wrong.
 
     Attributes:
         model: name of the baseline.
@@ -37,7 +40,8 @@ class BookletConfig(Config):
         initial: states (by name) that manoeuvres start from.
         manoeuvres: standard manoeuvres.
         duration: of manoeuvres that give none, or the time after which one has failed.
-        repeat: splits whose measured zigzags the model repeats in closed loop, with the rudder angles and reversals of each.
+        repeat: splits whose measured zigzags the model repeats in closed loop, with the rudder
+            angles and reversals of each.
         draws: of the parameters.
         level: of the intervals.
         seed: of the draws.
@@ -58,7 +62,10 @@ class BookletConfig(Config):
     @field_validator("initial")
     @classmethod
     def _units(cls, initial: dict[str, float | str]) -> dict[str, float | str]:
-        return {name: Quantity(CHANNEL_UNITS.get(name, "-")).convert(value) for name, value in initial.items()}
+        return {
+            name: Quantity(CHANNEL_UNITS.get(name, "-")).convert(value)
+            for name, value in initial.items()
+        }
 
     def rudder(self) -> str:
         """The input that steers.
@@ -68,7 +75,9 @@ class BookletConfig(Config):
         """
         steering = [name for name, share in self.inputs.items() if share.steer not in (0, 0.0)]
         if len(steering) != 1:
-            raise ConfigError(f"booklet.inputs: one input must have a share in steer, given {steering or 'none'}")
+            raise ConfigError(
+                f"booklet.inputs: one input must have a share in steer, given {steering or 'none'}"
+            )
         return steering[0]
 
 
@@ -97,8 +106,11 @@ class Page:
     found: Mapping[str, Any]
 
 
-def contents(model: str, length: float, scale: float, draws: int, level: float, pages: Sequence[Page]) -> dict[str, Any]:
-    """What stands in booklet.json, SI and rad, in the scale of the logs; `ship` beside an index is its value for the ship.
+def contents(
+    model: str, length: float, scale: float, draws: int, level: float, pages: Sequence[Page]
+) -> dict[str, Any]:
+    """What stands in booklet.json, SI and rad, in the scale of the logs; `ship` beside an index is
+    its value for the ship.
 
     Args:
         model: its name.
@@ -110,12 +122,23 @@ def contents(model: str, length: float, scale: float, draws: int, level: float, 
     """
     rows = [_row(page, length, scale, level) for page in pages]
     used = sorted({name for row in rows for name in row["indices"]})
-    about = {"schema": SCHEMA, "model": model, "length": length, "scale": scale, "draws": draws, "level": level}
+    about = {
+        "schema": SCHEMA,
+        "model": model,
+        "length": length,
+        "scale": scale,
+        "draws": draws,
+        "level": level,
+    }
     return about | {"units": {name: UNITS[name] for name in used}, "pages": rows}
 
 
 def _row(page: Page, length: float, scale: float, level: float) -> dict[str, Any]:
-    names = [name for name, value in page.indices[0].items() if name in UNITS and not isinstance(value, list)]
+    names = [
+        name
+        for name, value in page.indices[0].items()
+        if name in UNITS and not isinstance(value, list)
+    ]
     indices = {name: _index(page, name, length, scale, level) for name in names}
     return {
         "name": page.name,
@@ -128,7 +151,9 @@ def _row(page: Page, length: float, scale: float, level: float) -> dict[str, Any
 
 
 def _index(page: Page, name: str, length: float, scale: float, level: float) -> dict[str, Any]:
-    """`value` of the fitted parameters, `interval` over draws, and what there is of `lengths`, `measured`, `difference`, `limit`, `kept`."""
+    """`value` of the fitted parameters, `interval` over draws, and what there is of `lengths`,
+    `measured`, `difference`, `limit`, `kept`.
+    """
     value = float(page.indices[0][name])
     others = np.array([float(found[name]) for found in page.indices[1:] if name in found])
     factor = scale ** _POWER[UNITS[name]]
@@ -141,5 +166,9 @@ def _index(page: Page, name: str, length: float, scale: float, level: float) -> 
         out |= {"measured": float(page.found[name]), "difference": value - float(page.found[name])}
     if name in page.limits:
         limit = page.limits[name]
-        out |= {"limit": limit, "kept": factor * value <= limit, "kept_share": float(np.mean(factor * others <= limit)) if others.size else None}
+        out |= {
+            "limit": limit,
+            "kept": factor * value <= limit,
+            "kept_share": float(np.mean(factor * others <= limit)) if others.size else None,
+        }
     return out

@@ -1,4 +1,6 @@
-"""Intervals of mean errors by a block bootstrap: windows of one log resemble each other, so whole blocks of them are drawn."""
+"""Intervals of mean errors by a block bootstrap: windows of one log resemble each other, so whole
+blocks of them are drawn.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,8 @@ class Blocks:
 
     Attributes:
         labels: number of each window's block, [W], from 0 on.
-        of: `logs` where a block is all windows of a log, else `windows`: consecutive windows of one log.
+        of: `logs` where a block is all windows of a log, else `windows`: consecutive windows of one
+            log.
         count: number of blocks.
     """
 
@@ -39,12 +42,14 @@ class Blocks:
 
 
 def blocks(logs: Sequence[int]) -> Blocks | None:
-    """Blocks of windows from the number of the log that each comes from, in time order within a log.
+    """Blocks of windows from the number of the log that each comes from, in time order within a
+    log.
 
-    From five logs on a block is a log: the interval then speaks for other logs, whatever the windows of one have in common. Of three or
-    four logs the mean cannot be resampled so; each is cut into as few equal runs of consecutive windows as make at least eight blocks, and
-    the interval holds only as far as what lies between logs is small against what lies between such runs. None, and so no interval, where
-    there are fewer than three logs or five blocks.
+    From five logs on a block is a log: the interval then speaks for other logs, whatever the
+    windows of one have in common. Of three or four logs the mean cannot be resampled so; each is
+    cut into as few equal runs of consecutive windows as make at least eight blocks, and the
+    interval holds only as far as what lies between logs is small against what lies between such
+    runs. None, and so no interval, where there are fewer than three logs or five blocks.
     """
     numbers = np.asarray(logs, dtype=int)
     names, sizes = np.unique(numbers, return_counts=True)
@@ -64,23 +69,31 @@ def blocks(logs: Sequence[int]) -> Blocks | None:
 
 
 def intervals(values: np.ndarray, blocks: Blocks | None) -> list[list[float] | None]:
-    """95 % intervals of the means of columns [W, C] over windows, [low, high] of each; None where there are no blocks.
+    """95 % intervals of the means of columns [W, C] over windows, [low, high] of each; None where
+    there are no blocks.
 
-    Percentile bootstrap over blocks drawn with replacement, with a fixed seed, at levels widened for few blocks as Student's t
-    is against the normal distribution (Hesterberg 2015, The American Statistician 69, 371-386, section 5.3): plain
-    percentiles cover some 83 % with five blocks.
+    Percentile bootstrap over blocks drawn with replacement, with a fixed seed, at levels widened
+    for few blocks as Student's t is against the normal distribution (Hesterberg 2015, The American
+    Statistician 69, 371-386, section 5.3): plain percentiles cover some 83 % with five blocks.
     """
     if blocks is None:
         return [None] * values.shape[1]
-    sums = np.stack([np.bincount(blocks.labels, column, blocks.count) for column in values.T], axis=1)
+    sums = np.stack(
+        [np.bincount(blocks.labels, column, blocks.count) for column in values.T], axis=1
+    )
     draws = _draws(blocks.count)
     means = (draws @ sums) / (draws @ np.bincount(blocks.labels, minlength=blocks.count))[:, None]
     low = tail(blocks.count)
-    return [[float(lower), float(upper)] for lower, upper in np.quantile(means, [low, 1 - low], axis=0).T]
+    return [
+        [float(lower), float(upper)]
+        for lower, upper in np.quantile(means, [low, 1 - low], axis=0).T
+    ]
 
 
 def tail(count: int) -> float:
-    """Share of resampled means left out at either end, for a number of blocks of at least 2: 0.025 for many, less for few."""
+    """Share of resampled means left out at either end, for a number of blocks of at least 2: 0.025
+    for many, less for few.
+    """
     wide = math.sqrt(count / (count - 1)) * stats.t.ppf(0.5 + _LEVEL / 2, count - 1)
     return float(stats.norm.cdf(-wide))
 
@@ -88,11 +101,18 @@ def tail(count: int) -> float:
 @lru_cache(maxsize=16)
 def _draws(count: int) -> np.ndarray:
     """How often each block is drawn, [resamples, count]."""
-    return np.random.default_rng(0).multinomial(count, np.full(count, 1 / count), size=_RESAMPLES).astype(float)
+    return (
+        np.random.default_rng(0)
+        .multinomial(count, np.full(count, 1 / count), size=_RESAMPLES)
+        .astype(float)
+    )
 
 
-def difference(model: np.ndarray, reference: np.ndarray, to: str, blocks: Blocks | None) -> dict[str, Any]:
-    """Paired difference of two models' mean errors over the same windows, as it stands in metrics.json.
+def difference(
+    model: np.ndarray, reference: np.ndarray, to: str, blocks: Blocks | None
+) -> dict[str, Any]:
+    """Paired difference of two models' mean errors over the same windows, as it stands in
+    metrics.json.
 
     Args:
         model: error of each window, [W].
@@ -101,8 +121,9 @@ def difference(model: np.ndarray, reference: np.ndarray, to: str, blocks: Blocks
         blocks: what is drawn together.
 
     Returns:
-        to; nrmse_mean, the mean of model minus reference (negative where the model is better), with its interval ci95 (None where there is
-        none) and excludes_zero; ratio of the means (None where the reference has no error) and worse, a ratio above 1.05.
+        to; nrmse_mean, the mean of model minus reference (negative where the model is better), with
+        its interval ci95 (None where there is none) and excludes_zero; ratio of the means (None
+        where the reference has no error) and worse, a ratio above 1.05.
     """
     apart = model - reference
     (interval,) = intervals(apart[:, None], blocks)

@@ -13,7 +13,9 @@ from residnet.judge.protocol import ProtocolConfig
 
 
 class Scales(Config):
-    """What nrmse divides by: typical spreads of the measured velocities; `evaluate` reuses them unchanged."""
+    """What nrmse divides by: typical spreads of the measured velocities; `evaluate` reuses them
+    unchanged.
+    """
 
     u: Annotated[MetresPerSecond, Field(gt=0)]
     v: Annotated[MetresPerSecond, Field(gt=0)]
@@ -29,10 +31,12 @@ class EvaluationConfig(Config):
 
     Attributes:
         protocols: by name; the name stands in metrics.json.
-        selection: the protocol whose mean nrmse over the validation windows chooses between models and stops training early.
+        selection: the protocol whose mean nrmse over the validation windows chooses between models
+            and stops training early.
         scales: what nrmse divides by.
         groups: named sets of manoeuvre kinds that get rows of their own.
-        divergence: a free run diverges where a velocity exceeds this many times its largest training value.
+        divergence: a free run diverges where a velocity exceeds this many times its largest
+            training value.
         splits: which splits are evaluated.
     """
 
@@ -46,7 +50,10 @@ class EvaluationConfig(Config):
     @model_validator(mode="after")
     def _names(self) -> EvaluationConfig:
         if self.selection not in self.protocols:
-            raise ValueError(f"selection '{self.selection}' is not a protocol{nearest(self.selection, self.protocols)}")
+            raise ValueError(
+                f"selection '{self.selection}' is not a"
+                f" protocol{nearest(self.selection, self.protocols)}"
+            )
         if "validation" not in self.splits:
             raise ValueError("splits must contain 'validation': models are selected on it")
         return self

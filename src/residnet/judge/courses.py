@@ -1,4 +1,6 @@
-"""What flights along courses say: time against the shortest possible, cross-track error, and how every buoy was passed."""
+"""What flights along courses say: time against the shortest possible, cross-track error, and how
+every buoy was passed.
+"""
 
 from __future__ import annotations
 
@@ -53,7 +55,9 @@ class Pass:
     time: float
 
 
-def passes(flight: CourseFlight, places: Sequence[tuple[float, float]], within: Sequence[float]) -> list[Pass]:
+def passes(
+    flight: CourseFlight, places: Sequence[tuple[float, float]], within: Sequence[float]
+) -> list[Pass]:
     """How each buoy at (north, east) was passed, one after the other.
 
     Args:
@@ -69,20 +73,32 @@ def passes(flight: CourseFlight, places: Sequence[tuple[float, float]], within: 
         left = int(outside[0]) if len(outside) else len(distance) - 1
         begin = min(max(begin, left), len(distance) - 1)
         # its turn lasts until the next buoy is nearer
-        following = np.hypot(*(np.array(places[i + 1]) - flight.track).T) if i + 1 < len(places) else np.full(len(distance), np.inf)
+        following = (
+            np.hypot(*(np.array(places[i + 1]) - flight.track).T)
+            if i + 1 < len(places)
+            else np.full(len(distance), np.inf)
+        )
         reached = (
-            np.flatnonzero(distance[begin:] <= distance[begin:].min() + 1e-9)[0] if i + 1 == len(places) else _first_dip(distance, following, begin)
+            np.flatnonzero(distance[begin:] <= distance[begin:].min() + 1e-9)[0]
+            if i + 1 == len(places)
+            else _first_dip(distance, following, begin)
         )
         near = begin + int(reached)
         step = flight.track[min(near + 1, len(distance) - 1)] - flight.track[max(near - 1, 0)]
         starboard = step[0] * away[near, 1] - step[1] * away[near, 0] > 0
-        found.append(Pass(float(distance[left:].min()), "starboard" if starboard else "port", near * flight.dt))
+        found.append(
+            Pass(
+                float(distance[left:].min()), "starboard" if starboard else "port", near * flight.dt
+            )
+        )
         begin = near
     return found
 
 
 def _first_dip(distance: Array, following: Array, begin: int) -> int:
-    """Where the distance is smallest before the next buoy is nearer for good; samples from `begin` on."""
+    """Where the distance is smallest before the next buoy is nearer for good; samples from `begin`
+    on.
+    """
     here, there = distance[begin:], following[begin:]
     nearer = np.flatnonzero(here < there)
     if len(nearer) == 0:
@@ -94,18 +110,32 @@ def _first_dip(distance: Array, following: Array, begin: int) -> int:
     return first + int(here[first:last].argmin())
 
 
-def row(model: str, kind: str, guidance: str, planned: PlannedCourse, flight: CourseFlight, acceptance: float, speed: float) -> dict[str, Any]:
+def row(
+    model: str,
+    kind: str,
+    guidance: str,
+    planned: PlannedCourse,
+    flight: CourseFlight,
+    acceptance: float,
+    speed: float,
+) -> dict[str, Any]:
     """A row of metrics.json.
 
-    `ratio` is course time over the floor's length at the service speed; `ratio_turning` takes the speed that the vessel keeps in its
-    smallest turn, for vessels that slow down. `margin` is how far inside the circle that was entered least, or outside the one that was passed
-    most closely.
+    `ratio` is course time over the floor's length at the service speed; `ratio_turning` takes the
+    speed that the vessel keeps in its smallest turn, for vessels that slow down. `margin` is how
+    far inside the circle that was entered least, or outside the one that was passed most closely.
     """
     places = [(buoy.north, buoy.east) for buoy in planned.buoys]
     radii = [acceptance if planned.protocol == "enter" else buoy.radius for buoy in planned.buoys]
     seen = passes(flight, places, radii)
     time = (len(flight.track) - 1) * flight.dt
-    out: dict[str, Any] = {"model": model, "kind": kind, "guidance": guidance, "split": "simulated", "protocol": planned.protocol}
+    out: dict[str, Any] = {
+        "model": model,
+        "kind": kind,
+        "guidance": guidance,
+        "split": "simulated",
+        "protocol": planned.protocol,
+    }
     out |= {
         "finished": flight.finished,
         "course_time": time,
@@ -121,12 +151,25 @@ def row(model: str, kind: str, guidance: str, planned: PlannedCourse, flight: Co
     if planned.protocol == "enter":
         inside = [radius - one.distance for one, radius in zip(seen, radii, strict=True)]
         entered = sum(margin >= 0 for margin in inside)
-        return out | {"entered": entered, "passed": entered == len(seen), "margin": min(inside), "n": len(seen)}
+        return out | {
+            "entered": entered,
+            "passed": entered == len(seen),
+            "margin": min(inside),
+            "n": len(seen),
+        }
     right = sum(one.side == buoy.leave_to for one, buoy in zip(seen, planned.buoys, strict=True))
     outside = [one.distance - radius for one, radius in zip(seen, radii, strict=True)]
     clear = sum(margin >= 0 for margin in outside)
     passed = {"right_side": right, "clear": clear, "clearance": min(outside)}
-    return out | passed | {"passed": right == clear == len(seen), "margin": min(outside), "n": len(seen)}
+    return (
+        out
+        | passed
+        | {
+            "passed": right == clear == len(seen),
+            "margin": min(outside),
+            "n": len(seen),
+        }
+    )
 
 
 def _tightest(flight: CourseFlight) -> float:
@@ -136,9 +179,11 @@ def _tightest(flight: CourseFlight) -> float:
 
 
 def spread_row(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """A row of metrics.json for many flights of one controller under one guidance, from their own rows.
+    """A row of metrics.json for many flights of one controller under one guidance, from their own
+    rows.
 
-    `passed` and `finished` are shares of the flights; flights that were given up count with the time until then.
+    `passed` and `finished` are shares of the flights; flights that were given up count with the
+    time until then.
     """
     ratio, margin = (np.array([row[name] for row in rows]) for name in ("ratio", "margin"))
     out = {name: rows[0][name] for name in ("model", "kind", "guidance", "protocol", "floor_time")}
@@ -169,21 +214,32 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
         if not own:
             continue
         lines.append(f"{title}; shortest possible {own[0]['floor_time']:.2f} s")
-        lines += _nominal_lines([row for row in own if row["split"] == "simulated"], "entered" if protocol == "enter" else "side/clear")
+        lines += _nominal_lines(
+            [row for row in own if row["split"] == "simulated"],
+            "entered" if protocol == "enter" else "side/clear",
+        )
         lines += _spread_lines([row for row in own if row["split"] == "spread"])
     return "\n".join(lines)
 
 
 def _nominal_lines(rows: Sequence[Mapping[str, Any]], passed: str) -> list[str]:
     heads = (passed, "margin m", "tightest m", "xte rms m", "max m", "rudder deg")
-    lines = [f"{'controller':12s} {'guidance':14s} {'time s':>8s} {'ratio':>7s} {'turning':>8s} " + " ".join(f"{head:>11s}" for head in heads)]
+    lines = [
+        f"{'controller':12s} {'guidance':14s} {'time s':>8s} {'ratio':>7s} {'turning':>8s} "
+        + " ".join(f"{head:>11s}" for head in heads)
+    ]
     for one in rows:
-        buoys = f"{one['entered']}/{one['n']}" if one["protocol"] == "enter" else f"{one['right_side']}/{one['clear']}/{one['n']}"
+        buoys = (
+            f"{one['entered']}/{one['n']}"
+            if one["protocol"] == "enter"
+            else f"{one['right_side']}/{one['clear']}/{one['n']}"
+        )
         late = "" if one["finished"] else "  (did not finish)"
         lines.append(
-            f"{one['model']:12s} {one['guidance']:14s} {one['course_time']:8.2f} {one['ratio']:7.4f} {one['ratio_turning']:8.4f} "
-            f"{buoys:>11s} {one['margin']:11.3f} {one['tightest_turn']:11.2f} {one['cross_track_rms']:11.3f} {one['cross_track_max']:11.3f} "
-            f"{math.degrees(one['travel']):11.1f}{late}"
+            f"{one['model']:12s} {one['guidance']:14s} {one['course_time']:8.2f}"
+            f" {one['ratio']:7.4f} {one['ratio_turning']:8.4f} {buoys:>11s} {one['margin']:11.3f}"
+            f" {one['tightest_turn']:11.2f} {one['cross_track_rms']:11.3f}"
+            f" {one['cross_track_max']:11.3f} {math.degrees(one['travel']):11.1f}{late}"
         )
     return lines
 
@@ -192,10 +248,14 @@ def _spread_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     if not rows:
         return []
     heads = ("passed %", "finished %", "ratio", "worst", "margin m", "worst m", "xte rms m")
-    lines = [f"{rows[0]['n']} vessels and currents; medians", f"{'controller':12s} {'guidance':14s} " + " ".join(f"{head:>10s}" for head in heads)]
+    lines = [
+        f"{rows[0]['n']} vessels and currents; medians",
+        f"{'controller':12s} {'guidance':14s} " + " ".join(f"{head:>10s}" for head in heads),
+    ]
     for one in rows:
         lines.append(
-            f"{one['model']:12s} {one['guidance']:14s} {100 * one['passed']:10.1f} {100 * one['finished']:10.1f} {one['ratio']:10.4f} "
-            f"{one['ratio_worst']:10.4f} {one['margin']:10.3f} {one['margin_worst']:10.3f} {one['cross_track_rms']:10.3f}"
+            f"{one['model']:12s} {one['guidance']:14s} {100 * one['passed']:10.1f}"
+            f" {100 * one['finished']:10.1f} {one['ratio']:10.4f} {one['ratio_worst']:10.4f}"
+            f" {one['margin']:10.3f} {one['margin_worst']:10.3f} {one['cross_track_rms']:10.3f}"
         )
     return lines

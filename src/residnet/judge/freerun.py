@@ -25,10 +25,13 @@ class Candidate:
         name: unique in a run.
         kind: zero, baseline, head, truth or ensemble.
         model: the dynamics; float64 parameters are run in float64.
-        state: names of the columns of the model's state; what is not x, y, psi, u, v, r (roll, actuators) starts from the log's channel.
+        state: names of the columns of the model's state; what is not x, y, psi, u, v, r (roll,
+            actuators) starts from the log's channel.
         inputs: channels of the log that make w; None for the prepared inputs.
-        idle: inputs after those that are held at zero (disturbances that the model is not told about).
-        reference: name of the model that this one is compared with, window by window; None for none.
+        idle: inputs after those that are held at zero (disturbances that the model is not told
+            about).
+        reference: name of the model that this one is compared with, window by window; None for
+            none.
     """
 
     name: str
@@ -42,7 +45,9 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Prediction:
-    """What one model predicts for one window: states [L, 6] (velocities from the model, pose integrated from them) and whether it diverged."""
+    """What one model predicts for one window: states [L, 6] (velocities from the model, pose
+    integrated from them) and whether it diverged.
+    """
 
     states: np.ndarray
     diverged: bool
@@ -50,7 +55,9 @@ class Prediction:
 
 @dataclass(frozen=True)
 class FreeRun:
-    """All models over all windows of one protocol and split; predictions[model][i] belongs to windows[i]."""
+    """All models over all windows of one protocol and split; predictions[model][i] belongs to
+    windows[i].
+    """
 
     protocol: str
     split: str
@@ -68,24 +75,39 @@ def free_run(
 ) -> dict[str, list[Prediction]]:
     """Free-run every candidate over every window.
 
-    A window whose prediction is not finite or whose velocities exceed `limit` [3] has diverged and holds the prediction
-    of `zero`, velocities held, instead.
+    A window whose prediction is not finite or whose velocities exceed `limit` [3] has diverged and
+    holds the prediction of `zero`, velocities held, instead.
     """
-    return {candidate.name: _run(candidate, windows, logs, step, limit, dtype) for candidate in candidates}
+    return {
+        candidate.name: _run(candidate, windows, logs, step, limit, dtype)
+        for candidate in candidates
+    }
 
 
 def _run(
-    candidate: Candidate, windows: Sequence[Window], logs: Sequence[Prepared], step: float, limit: np.ndarray, dtype: torch.dtype
+    candidate: Candidate,
+    windows: Sequence[Window],
+    logs: Sequence[Prepared],
+    step: float,
+    limit: np.ndarray,
+    dtype: torch.dtype,
 ) -> list[Prediction]:
     longest = max(window.stop - window.start for window in windows)
     tables = {n: _inputs(candidate, logs[n]) for n in {window.log for window in windows}}
     x0 = np.stack([_initial(candidate, window, logs[window.log]) for window in windows])
-    ahead = np.stack([tables[w.log][np.minimum(np.arange(w.start, w.start + longest - 1), w.stop - 1)] for w in windows])
+    ahead = np.stack(
+        [
+            tables[w.log][np.minimum(np.arange(w.start, w.start + longest - 1), w.stop - 1)]
+            for w in windows
+        ]
+    )
     # a copy: a validation in float32 must not round the model that it validates
     model = copy.deepcopy(candidate.model).to(dtype).eval()
     with torch.no_grad():
         s = _memory(model, windows, logs, tables, dtype)
-        states, _, _ = Rollout(model)(torch.from_numpy(x0).to(dtype), torch.from_numpy(ahead).to(dtype), s)
+        states, _, _ = Rollout(model)(
+            torch.from_numpy(x0).to(dtype), torch.from_numpy(ahead).to(dtype), s
+        )
     nu = states[:, :, [candidate.state.index(name) for name in VELOCITY]].double().numpy()
     out = []
     for i, window in enumerate(windows):
@@ -100,9 +122,15 @@ def _run(
 
 
 def _memory(
-    model: Dynamics, windows: Sequence[Window], logs: Sequence[Prepared], tables: Mapping[int, np.ndarray], dtype: torch.dtype
+    model: Dynamics,
+    windows: Sequence[Window],
+    logs: Sequence[Prepared],
+    tables: Mapping[int, np.ndarray],
+    dtype: torch.dtype,
 ) -> torch.Tensor:
-    """Memory [W, n_state] that each window's own past leaves; windows with pasts of equal length go together."""
+    """Memory [W, n_state] that each window's own past leaves; windows with pasts of equal length go
+    together.
+    """
     s = model.initial_state(len(windows)).to(dtype)
     if isinstance(model, HybridDynamics):
         lengths = np.array([window.start - window.past for window in windows])
@@ -111,7 +139,9 @@ def _memory(
             members = [windows[i] for i in rows.tolist()]
             y = np.stack([logs[window.log].y[window.past : window.start] for window in members])
             w = np.stack([tables[window.log][window.past : window.start] for window in members])
-            s[torch.from_numpy(rows)] = model.warmup(torch.from_numpy(y).to(dtype), torch.from_numpy(w).to(dtype))
+            s[torch.from_numpy(rows)] = model.warmup(
+                torch.from_numpy(y).to(dtype), torch.from_numpy(w).to(dtype)
+            )
     return s
 
 
@@ -124,11 +154,15 @@ def _inputs(candidate: Candidate, log: Prepared) -> np.ndarray:
 
 def _initial(candidate: Candidate, window: Window, log: Prepared) -> np.ndarray:
     known = dict(zip(STATE, (*log.y[window.start, :3], *window.nu), strict=True))
-    return np.array([known[name] if name in known else log.log[name][window.start] for name in candidate.state])
+    return np.array(
+        [known[name] if name in known else log.log[name][window.start] for name in candidate.state]
+    )
 
 
 def integrate(pose: np.ndarray, nu: np.ndarray, step: float) -> np.ndarray:
-    """Pose [L, 3] from its first value [3] and velocities [L, 3] by the trapezoidal rule, heading first, then position."""
+    """Pose [L, 3] from its first value [3] and velocities [L, 3] by the trapezoidal rule, heading
+    first, then position.
+    """
 
     def trapezoid(start: float, rate: np.ndarray) -> np.ndarray:
         return start + np.concatenate(([0.0], np.cumsum(0.5 * step * (rate[1:] + rate[:-1]))))

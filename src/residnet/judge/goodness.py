@@ -1,4 +1,6 @@
-"""Goodness of fit of one-step predictions, by model and axis (document 000 appendix E, as corrected in ERRATA E1-E9)."""
+"""Goodness of fit of one-step predictions, by model and axis (document 000 appendix E, as corrected
+in ERRATA E1-E9).
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,13 @@ from typing import Any
 import numpy as np
 
 from residnet.core.names import ACCELERATION
-from residnet.judge.residual_series import autocovariance, block_interval, independent_interval, ljung_box, memory
+from residnet.judge.residual_series import (
+    autocovariance,
+    block_interval,
+    independent_interval,
+    ljung_box,
+    memory,
+)
 
 SCHEMA = "residnet.goodness/1"
 LAGS = 20
@@ -36,18 +44,22 @@ class OneStep:
     reference: str | None = None
 
 
-def measures(residual: np.ndarray, target: np.ndarray, freedom: float, variance: float) -> dict[str, float | None]:
-    """RMSE (9.11), R^2 (9.15), adjusted R^2 (9.16), Mallows' C_p (9.12), AIC (9.13) and BIC (9.14), sums of squares in the place of means.
+def measures(
+    residual: np.ndarray, target: np.ndarray, freedom: float, variance: float
+) -> dict[str, float | None]:
+    """RMSE (9.11), R^2 (9.15), adjusted R^2 (9.16), Mallows' C_p (9.12), AIC (9.13) and BIC (9.14),
+    sums of squares in the place of means.
 
     Args:
         residual: measured minus predicted, [m].
         target: measured, [m].
         freedom: number of parameters d.
-        variance: of the noise, sigma^2, by `noise_variance` of the richest model that is compared: from each model's own the criteria tell
-            nothing apart.
+        variance: of the noise, sigma^2, by `noise_variance` of the richest model that is compared:
+            from each model's own the criteria tell nothing apart.
 
     Returns:
-        rmse, r2, r2_adjusted, cp, aic, bic; None where the target does not vary, the noise vanishes, or m does not exceed d + 1.
+        rmse, r2, r2_adjusted, cp, aic, bic; None where the target does not vary, the noise
+        vanishes, or m does not exceed d + 1.
     """
     m, rss = len(residual), float(residual @ residual)
     total = float(((target - target.mean()) ** 2).sum())
@@ -56,7 +68,11 @@ def measures(residual: np.ndarray, target: np.ndarray, freedom: float, variance:
     return {
         "rmse": math.sqrt(rss / m),
         "r2": r2,
-        "r2_adjusted": 1 - (1 - r2) * (m - 1) / (m - freedom - 1) if r2 is not None and m > freedom + 1 else None,
+        "r2_adjusted": (
+            1 - (1 - r2) * (m - 1) / (m - freedom - 1)
+            if r2 is not None and m > freedom + 1
+            else None
+        ),
         "cp": (rss + 2 * freedom * variance) / m,
         "aic": (rss + 2 * freedom * variance) / (m * variance) if noisy else None,
         "bic": (rss + math.log(m) * freedom * variance) / (m * variance) if noisy else None,
@@ -64,12 +80,16 @@ def measures(residual: np.ndarray, target: np.ndarray, freedom: float, variance:
 
 
 def noise_variance(residual: np.ndarray, freedom: float) -> float:
-    """sigma^2 = RSS / (m - d - 1) (9.17 with ERRATA E1); infinite where there are no more samples than that."""
+    """sigma^2 = RSS / (m - d - 1) (9.17 with ERRATA E1); infinite where there are no more samples
+    than that.
+    """
     left = len(residual) - freedom - 1
     return float(residual @ residual) / left if left > 0 else math.inf
 
 
-def table(models: Sequence[OneStep], targets: Sequence[np.ndarray], step: float) -> list[dict[str, Any]]:
+def table(
+    models: Sequence[OneStep], targets: Sequence[np.ndarray], step: float
+) -> list[dict[str, Any]]:
     """A row for each model and axis.
 
     Args:
@@ -85,11 +105,24 @@ def table(models: Sequence[OneStep], targets: Sequence[np.ndarray], step: float)
         joined = {key: np.concatenate(pieces) for key, pieces in series.items()}
         variance = min(noise_variance(joined[model.model], model.freedom[axis]) for model in models)
         for model in models:
-            row = {"model": model.model, "kind": model.kind, "axis": name, "samples": len(target), "parameters": float(model.freedom[axis])}
-            row |= measures(joined[model.model], target, model.freedom[axis], variance if math.isfinite(variance) else 0.0)
+            row = {
+                "model": model.model,
+                "kind": model.kind,
+                "axis": name,
+                "samples": len(target),
+                "parameters": float(model.freedom[axis]),
+            }
+            row |= measures(
+                joined[model.model],
+                target,
+                model.freedom[axis],
+                variance if math.isfinite(variance) else 0.0,
+            )
             row |= _series(series[model.model], step)
             if model.reference in by_name:
-                row["difference"] = paired(series[model.model], series[str(model.reference)], str(model.reference))
+                row["difference"] = paired(
+                    series[model.model], series[str(model.reference)], str(model.reference)
+                )
             out.append(row)
     return out
 
@@ -110,14 +143,19 @@ def _series(pieces: Sequence[np.ndarray], step: float) -> dict[str, Any]:
         "mean": offset.mean,
         "mean_ci95": _bounds(offset.low, offset.high),
         "effective": memory(pieces).effective,
-        "autocorrelation": (covariance[1:] / covariance[0]).tolist() if covariance[0] > 0 else [0.0] * lags,
+        "autocorrelation": (
+            (covariance[1:] / covariance[0]).tolist() if covariance[0] > 0 else [0.0] * lags
+        ),
         "ljung_box": statistic,
         "white_p": chance,
     }
 
 
-def paired(pieces: Sequence[np.ndarray], reference: Sequence[np.ndarray], to: str) -> dict[str, Any]:
-    """Difference of two models' mean absolute residuals over the same samples, with its interval by blocks; negative where the model is better.
+def paired(
+    pieces: Sequence[np.ndarray], reference: Sequence[np.ndarray], to: str
+) -> dict[str, Any]:
+    """Difference of two models' mean absolute residuals over the same samples, with its interval by
+    blocks; negative where the model is better.
 
     Args:
         pieces: residuals of the model, piece by piece.

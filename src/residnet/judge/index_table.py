@@ -1,4 +1,6 @@
-"""Manoeuvring indices of flights as a table: vessel beside model, with the limits of IMO where they apply."""
+"""Manoeuvring indices of flights as a table: vessel beside model, with the limits of IMO where they
+apply.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +15,11 @@ SCHEMA = "residnet.indices/1"
 _SHOWN = {"rad": ("deg", math.degrees(1.0)), "rad/s": ("deg/s", math.degrees(1.0))}
 
 
-def index_rows(craft: Craft, flights: Sequence[Flight], length: float | None) -> list[dict[str, Any]]:
-    """For each flight its log, manoeuvre, craft, faults, indices (SI, rad) and limits, each with whether it is kept.
+def index_rows(
+    craft: Craft, flights: Sequence[Flight], length: float | None
+) -> list[dict[str, Any]]:
+    """For each flight its log, manoeuvre, craft, faults, indices (SI, rad) and limits, each with
+    whether it is kept.
 
     Args:
         craft: what flew.
@@ -23,9 +28,17 @@ def index_rows(craft: Craft, flights: Sequence[Flight], length: float | None) ->
     """
     out = []
     for flight in flights:
-        indices = {} if flight.log.meta.get("diverged") else flight.manoeuvre.indices(flight.motion, length)
+        indices = (
+            {}
+            if flight.log.meta.get("diverged")
+            else flight.manoeuvre.indices(flight.motion, length)
+        )
         speed = indices.get("approach_speed", 0.0)
-        limits = flight.manoeuvre.limits(craft.helm, length, speed) if length is not None and speed > 0 else {}
+        limits = (
+            flight.manoeuvre.limits(craft.helm, length, speed)
+            if length is not None and speed > 0
+            else {}
+        )
         out.append(
             {
                 "log": flight.motion.name,
@@ -34,7 +47,11 @@ def index_rows(craft: Craft, flights: Sequence[Flight], length: float | None) ->
                 "fault": flight.fault,
                 "timed_out": bool(flight.log.meta.get("timed_out", False)),
                 "indices": indices,
-                "limits": {name: {"limit": limit, "kept": indices[name] <= limit} for name, limit in limits.items() if name in indices},
+                "limits": {
+                    name: {"limit": limit, "kept": indices[name] <= limit}
+                    for name, limit in limits.items()
+                    if name in indices
+                },
             }
         )
     return out
@@ -48,16 +65,24 @@ def contents(run: str, length: float | None, rows: Sequence[Mapping[str, Any]]) 
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Indices as text, flight by flight, one column for each craft; with two crafts how far the second is off."""
+    """Indices as text, flight by flight, one column for each craft; with two crafts how far the
+    second is off.
+    """
     crafts = list(dict.fromkeys(row["craft"] for row in rows))
     lines: list[str] = []
     for log in dict.fromkeys(row["log"] for row in rows):
         of = {row["craft"]: row for row in rows if row["log"] == log}
-        names = [n for n in dict.fromkeys(n for row in of.values() for n in row["indices"]) if n in UNITS and _single(of, n)]
+        names = [
+            n
+            for n in dict.fromkeys(n for row in of.values() for n in row["indices"])
+            if n in UNITS and _single(of, n)
+        ]
         lines += [f"{log}: {row['craft']}: {row['fault']}" for row in of.values() if row["fault"]]
         if not names:
             continue
-        titles = "".join(f"{craft[:14]:>15s}" for craft in crafts) + (f"{'difference':>12s}" if len(crafts) == 2 else "")
+        titles = "".join(f"{craft[:14]:>15s}" for craft in crafts) + (
+            f"{'difference':>12s}" if len(crafts) == 2 else ""
+        )
         lines.append(f"{log:28s} {'':6s}{titles}{'  in lengths' if _lengths(of) else ''}")
         lines += [_line(of, crafts, name) for name in names]
     return "\n".join(lines)
@@ -66,14 +91,22 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
 def _line(of: Mapping[str, Mapping[str, Any]], crafts: Sequence[str], name: str) -> str:
     unit, factor = _SHOWN.get(UNITS[name], (UNITS[name], 1.0))
     values = [of[craft]["indices"].get(name) if craft in of else None for craft in crafts]
-    text = f"  {name:26s} {unit:6s}" + "".join(f"{'-':>15s}" if value is None else f"{factor * value:15.4g}" for value in values)
+    text = f"  {name:26s} {unit:6s}" + "".join(
+        f"{'-':>15s}" if value is None else f"{factor * value:15.4g}" for value in values
+    )
     if len(crafts) == 2:
         one, other = values
-        text += f"{'-':>12s}" if one is None or other is None else f"{factor * (other - one):+12.3g}"
+        text += (
+            f"{'-':>12s}" if one is None or other is None else f"{factor * (other - one):+12.3g}"
+        )
     lengths = [of[craft]["indices"].get(f"{name}_lengths") for craft in crafts if craft in of]
     if any(value is not None for value in lengths):
         text += "  " + ", ".join("-" if value is None else f"{value:.2f} L" for value in lengths)
-    limits = {craft: of[craft]["limits"][name] for craft in crafts if craft in of and name in of[craft]["limits"]}
+    limits = {
+        craft: of[craft]["limits"][name]
+        for craft in crafts
+        if craft in of and name in of[craft]["limits"]
+    }
     if limits:
         first = next(iter(limits.values()))
         kept = ", ".join("kept" if limit["kept"] else "EXCEEDED" for limit in limits.values())

@@ -1,4 +1,6 @@
-"""Where a model fails and what limits it: errors by band of speed and wind, worst windows, consistency of the measured channels."""
+"""Where a model fails and what limits it: errors by band of speed and wind, worst windows,
+consistency of the measured channels.
+"""
 
 from __future__ import annotations
 
@@ -19,22 +21,32 @@ _LEAST_WINDOWS = 3
 _WIND = "wind_speed"
 
 
-def limits(run: FreeRun, candidates: Sequence[Candidate], logs: Sequence[Prepared], scales: Mapping[str, float], step: float) -> dict[str, Any]:
+def limits(
+    run: FreeRun,
+    candidates: Sequence[Candidate],
+    logs: Sequence[Prepared],
+    scales: Mapping[str, float],
+    step: float,
+) -> dict[str, Any]:
     """What stands in limits.json for one protocol and split: `kinematics`, `bands` and `worst`."""
     errors = {candidate.name: window_errors(run, candidate.name, logs) for candidate in candidates}
     return {
         "kinematics": kinematics(run, logs, step),
         "bands": bands(run, candidates, logs, scales, errors),
-        "worst": {name: worst(run, logs, nrmse_of_windows(part, scales), part) for name, part in errors.items()},
+        "worst": {
+            name: worst(run, logs, nrmse_of_windows(part, scales), part)
+            for name, part in errors.items()
+        },
     }
 
 
 def kinematics(run: FreeRun, logs: Sequence[Prepared], step: float) -> dict[str, float]:
-    """How far measured velocities, integrated over each window from its measured pose as predictions are, end from the measured pose.
+    """How far measured velocities, integrated over each window from its measured pose as
+    predictions are, end from the measured pose.
 
     Returns:
-        windows; position_mean, position_rms in m and heading_mean, heading_rms in rad at the ends of windows. A model that predicted the
-        measured velocities exactly would have these errors.
+        windows; position_mean, position_rms in m and heading_mean, heading_rms in rad at the ends
+        of windows. A model that predicted the measured velocities exactly would have these errors.
     """
     apart = []
     for window in run.windows:
@@ -58,13 +70,17 @@ def bands(
     scales: Mapping[str, float],
     errors: Mapping[str, Mapping[str, np.ndarray]],
 ) -> list[dict[str, Any]]:
-    """Errors by thirds of the windows in mean speed and, where every log has it, in mean true wind speed.
+    """Errors by thirds of the windows in mean speed and, where every log has it, in mean true wind
+    speed.
 
-    A band of fewer than three windows is left out, and so is a quantity of which one band remains. Each entry: `by` (speed or wind), `low`
-    and `high` in m/s (extremes of the windows' means), `windows`, and by model `nrmse_mean` and `difference` as in metrics.json.
+    A band of fewer than three windows is left out, and so is a quantity of which one band remains.
+    Each entry: `by` (speed or wind), `low` and `high` in m/s (extremes of the windows' means),
+    `windows`, and by model `nrmse_mean` and `difference` as in metrics.json.
     """
     parts = [(logs[window.log], slice(window.start, window.stop)) for window in run.windows]
-    of = {"speed": np.array([np.hypot(log.y[rows, 3], log.y[rows, 4]).mean() for log, rows in parts])}
+    of = {
+        "speed": np.array([np.hypot(log.y[rows, 3], log.y[rows, 4]).mean() for log, rows in parts])
+    }
     if all(_WIND in log.log.channels for log, _ in parts):
         of["wind"] = np.array([log.log[_WIND][rows].mean() for log, rows in parts])
     out = []
@@ -73,16 +89,28 @@ def bands(
             continue
         thirds = [chosen for chosen in _bands(values) if chosen.sum() >= _LEAST_WINDOWS]
         for chosen in thirds if len(thirds) > 1 else ():
-            drawn = blocks([window.log for window, taken in zip(run.windows, chosen, strict=True) if taken])
+            drawn = blocks(
+                [window.log for window, taken in zip(run.windows, chosen, strict=True) if taken]
+            )
             models = {
                 candidate.name: {
-                    "nrmse_mean": float(nrmse_of_windows(errors[candidate.name], scales)[chosen].mean()),
+                    "nrmse_mean": float(
+                        nrmse_of_windows(errors[candidate.name], scales)[chosen].mean()
+                    ),
                     "difference": against(errors, candidate, scales, chosen, drawn),
                 }
                 for candidate in candidates
             }
             low, high = float(values[chosen].min()), float(values[chosen].max())
-            out.append({"by": name, "low": low, "high": high, "windows": int(chosen.sum()), "models": models})
+            out.append(
+                {
+                    "by": name,
+                    "low": low,
+                    "high": high,
+                    "windows": int(chosen.sum()),
+                    "models": models,
+                }
+            )
     return out
 
 
@@ -93,8 +121,12 @@ def _bands(values: np.ndarray) -> list[np.ndarray]:
     return [place == band for band in range(_BANDS)]
 
 
-def worst(run: FreeRun, logs: Sequence[Prepared], nrmse: np.ndarray, errors: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
-    """The three windows with the largest nrmse [W]: log, manoeuvre, t (start, the log's clock, s), nrmse, rmse and position_error_end."""
+def worst(
+    run: FreeRun, logs: Sequence[Prepared], nrmse: np.ndarray, errors: Mapping[str, np.ndarray]
+) -> list[dict[str, Any]]:
+    """The three windows with the largest nrmse [W]: log, manoeuvre, t (start, the log's clock, s),
+    nrmse, rmse and position_error_end.
+    """
     out = []
     for i in np.argsort(-nrmse, kind="stable")[:_WORST].tolist():
         log = logs[run.windows[i].log]
@@ -102,6 +134,13 @@ def worst(run: FreeRun, logs: Sequence[Prepared], nrmse: np.ndarray, errors: Map
         start = float(log.log.t[run.windows[i].start])
         end = float(errors["position_error_end"][i])
         out.append(
-            {"log": log.log.name, "manoeuvre": log.log.manoeuvre, "t": start, "nrmse": float(nrmse[i]), "rmse": rmse, "position_error_end": end}
+            {
+                "log": log.log.name,
+                "manoeuvre": log.log.manoeuvre,
+                "t": start,
+                "nrmse": float(nrmse[i]),
+                "rmse": rmse,
+                "position_error_end": end,
+            }
         )
     return out

@@ -16,7 +16,8 @@ SCHEMA = "residnet.metrics/1"
 
 
 def window_errors(run: FreeRun, model: str, logs: Sequence[Prepared]) -> dict[str, np.ndarray]:
-    """Errors of one model by window: rmse and mae [W, 3] of (u, v, r), position_error_end and heading_error_end [W], samples [W].
+    """Errors of one model by window: rmse and mae [W, 3] of (u, v, r), position_error_end and
+    heading_error_end [W], samples [W].
 
     u and v are scored over usable samples; r, which no position sensor disturbs, over all.
     """
@@ -48,12 +49,18 @@ def rows(
     scales: Mapping[str, float],
     groups: Mapping[str, Sequence[str]],
 ) -> list[dict[str, Any]]:
-    """Rows of metrics.json for one protocol and split: every model, over all windows, every kind of manoeuvre and every named group of kinds.
+    """Rows of metrics.json for one protocol and split: every model, over all windows, every kind of
+    manoeuvre and every named group of kinds.
 
-    `difference` compares a model with its reference (`Candidate.reference`) over the same windows; None where it has none.
+    `difference` compares a model with its reference (`Candidate.reference`) over the same windows;
+    None where it has none.
     """
     kinds = [logs[window.log].log.manoeuvre for window in run.windows]
-    subsets = {"all": sorted(set(kinds))} | {kind: [kind] for kind in sorted(set(kinds))} | {name: list(members) for name, members in groups.items()}
+    subsets = (
+        {"all": sorted(set(kinds))}
+        | {kind: [kind] for kind in sorted(set(kinds))}
+        | {name: list(members) for name, members in groups.items()}
+    )
     errors = {candidate.name: window_errors(run, candidate.name, logs) for candidate in candidates}
     out = []
     for candidate in candidates:
@@ -61,9 +68,17 @@ def rows(
         for name, members in subsets.items():
             chosen = np.array([kind in members for kind in kinds])
             if chosen.any():
-                row = {"model": candidate.name, "kind": candidate.kind, "split": run.split, "protocol": run.protocol, "manoeuvre": name}
+                row = {
+                    "model": candidate.name,
+                    "kind": candidate.kind,
+                    "split": run.split,
+                    "protocol": run.protocol,
+                    "manoeuvre": name,
+                }
                 part = {key: values[chosen] for key, values in errors[candidate.name].items()}
-                drawn = blocks([window.log for window, taken in zip(run.windows, chosen, strict=True) if taken])
+                drawn = blocks(
+                    [window.log for window, taken in zip(run.windows, chosen, strict=True) if taken]
+                )
                 row |= _summary(part, int(diverged[chosen].sum()), scales, drawn)
                 out.append(row | {"difference": against(errors, candidate, scales, chosen, drawn)})
     return out
@@ -75,20 +90,36 @@ def nrmse_of_windows(errors: Mapping[str, np.ndarray], scales: Mapping[str, floa
 
 
 def against(
-    errors: Mapping[str, Mapping[str, np.ndarray]], candidate: Candidate, scales: Mapping[str, float], chosen: np.ndarray, drawn: Blocks | None
+    errors: Mapping[str, Mapping[str, np.ndarray]],
+    candidate: Candidate,
+    scales: Mapping[str, float],
+    chosen: np.ndarray,
+    drawn: Blocks | None,
 ) -> dict[str, Any] | None:
-    """Paired difference of a model to its reference over chosen windows [W] bool; None where it has none among the models."""
+    """Paired difference of a model to its reference over chosen windows [W] bool; None where it has
+    none among the models.
+    """
     if candidate.reference is None or candidate.reference not in errors:
         return None
-    own, other = (nrmse_of_windows(errors[name], scales)[chosen] for name in (candidate.name, candidate.reference))
+    own, other = (
+        nrmse_of_windows(errors[name], scales)[chosen]
+        for name in (candidate.name, candidate.reference)
+    )
     return difference(own, other, candidate.reference, drawn)
 
 
-def _summary(errors: Mapping[str, np.ndarray], diverged: int, scales: Mapping[str, float], drawn: Blocks | None) -> dict[str, Any]:
+def _summary(
+    errors: Mapping[str, np.ndarray],
+    diverged: int,
+    scales: Mapping[str, float],
+    drawn: Blocks | None,
+) -> dict[str, Any]:
     divisor = np.array([scales[name] for name in VELOCITY])
     rmse, mae = errors["rmse"].mean(0), errors["mae"].mean(0)
     nrmse = rmse / divisor
-    spread = intervals(np.concatenate((errors["rmse"], nrmse_of_windows(errors, scales)[:, None]), axis=1), drawn)
+    spread = intervals(
+        np.concatenate((errors["rmse"], nrmse_of_windows(errors, scales)[:, None]), axis=1), drawn
+    )
 
     def named(values: np.ndarray) -> dict[str, float]:
         return {name: float(value) for name, value in zip(VELOCITY, values, strict=True)}

@@ -36,8 +36,9 @@ class Window:
 class Windows(Config):
     """Back-to-back windows of one length (the free-run protocol of the measured tanker).
 
-    The first starts `first` after the log's start; a start on a sample that is not usable moves on to the first that is; an
-    incomplete tail is dropped. The initial state is measured. `history` seconds before the window may warm up a memory.
+    The first starts `first` after the log's start; a start on a sample that is not usable moves on
+    to the first that is; an incomplete tail is dropped. The initial state is measured. `history`
+    seconds before the window may warm up a memory.
     """
 
     kind: Literal["windows"] = "windows"
@@ -68,8 +69,9 @@ class Windows(Config):
 class WholeManoeuvre(Config):
     """Every uninterrupted stretch of a log as one free run.
 
-    The initial velocities are the mean of the first `initial` seconds, which also warm up a memory; scoring starts after them.
-    Stretches shorter than `shortest`, or without a sample to score, are left out.
+    The initial velocities are the mean of the first `initial` seconds, which also warm up a memory;
+    scoring starts after them. Stretches shorter than `shortest`, or without a sample to score, are
+    left out.
     """
 
     kind: Literal["manoeuvre"] = "manoeuvre"
@@ -86,8 +88,15 @@ class WholeManoeuvre(Config):
                 begin += 1
                 continue
             stop = int(end[begin])
-            if stop - begin > max(lead + 1, round(self.shortest / step)) and log.usable[begin + lead : stop].any():
-                out.append(Window(number, begin + lead, stop, begin, log.y[begin : begin + lead, 3:].mean(0)))
+            if (
+                stop - begin > max(lead + 1, round(self.shortest / step))
+                and log.usable[begin + lead : stop].any()
+            ):
+                out.append(
+                    Window(
+                        number, begin + lead, stop, begin, log.y[begin : begin + lead, 3:].mean(0)
+                    )
+                )
             begin = stop
         return out
 
@@ -96,23 +105,30 @@ ProtocolConfig = Annotated[Windows | WholeManoeuvre, Field(discriminator="kind")
 
 
 def _ends(piece: np.ndarray) -> np.ndarray:
-    """One past the last sample of each sample's stretch, [T]; the sample itself where there is none."""
+    """One past the last sample of each sample's stretch, [T]; the sample itself where there is
+    none.
+    """
     change = np.flatnonzero(np.append(piece[1:] != piece[:-1], True)) + 1
     ends = change[np.searchsorted(change, np.arange(piece.size), side="right")]
     return np.where(piece >= 0, ends, np.arange(piece.size))
 
 
-def all_windows(protocol: Windows | WholeManoeuvre, logs: Sequence[Prepared], step: float, name: str) -> list[Window]:
+def all_windows(
+    protocol: Windows | WholeManoeuvre, logs: Sequence[Prepared], step: float, name: str
+) -> list[Window]:
     """The windows of a protocol over several logs.
 
     Raises:
         DataError: where no log is long enough for a single one.
     """
-    out = [window for number, log in enumerate(logs) for window in protocol.windows(log, number, step)]
+    out = [
+        window for number, log in enumerate(logs) for window in protocol.windows(log, number, step)
+    ]
     if not out:
         longest = max(logs, key=len)
         raise DataError(
-            f"protocol {name}: none of {len(logs)} '{logs[0].split}' logs holds a window; the longest, {longest.log.name}, lasts "
-            f"{len(longest) * step:.1f} s; give longer logs or shorten the protocol"
+            f"protocol {name}: none of {len(logs)} '{logs[0].split}' logs holds a window; the"
+            f" longest, {longest.log.name}, lasts {len(longest) * step:.1f} s; give longer logs or"
+            " shorten the protocol"
         )
     return out

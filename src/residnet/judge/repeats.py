@@ -1,4 +1,6 @@
-"""Repeatability: stretches of logs with the same commands and the same start, and how far the vessel's motions in them differ."""
+"""Repeatability: stretches of logs with the same commands and the same start, and how far the
+vessel's motions in them differ.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,9 @@ _SEARCH = 0.5
 
 @dataclass(frozen=True)
 class Pair:
-    """Window `first` and the stretch of log number `log` from sample `start` on that repeats it; `mismatch` of the commands, share of their range."""
+    """Window `first` and the stretch of log number `log` from sample `start` on that repeats it;
+    `mismatch` of the commands, share of their range.
+    """
 
     first: Window
     log: int
@@ -28,12 +32,20 @@ class Pair:
     mismatch: float
 
 
-def repeatability(protocol: ProtocolConfig, logs: Sequence[Prepared], commands: int, scales: Mapping[str, float], step: float) -> dict[str, Any]:
+def repeatability(
+    protocol: ProtocolConfig,
+    logs: Sequence[Prepared],
+    commands: int,
+    scales: Mapping[str, float],
+    step: float,
+) -> dict[str, Any]:
     """What stands in limits.json about repeated manoeuvres.
 
-    Every window of the protocol is compared with every stretch of equal length of the logs after its own, and of its own after the window, at
-    starts every 0.5 s. A stretch repeats a window where the root mean square difference of every command stays below 5 % of the command's
-    range over all logs, and each initial velocity differs by less than a quarter of its scale; the best stretch of a log counts.
+    Every window of the protocol is compared with every stretch of equal length of the logs after
+    its own, and of its own after the window, at starts every 0.5 s. A stretch repeats a window
+    where the root mean square difference of every command stays below 5 % of the command's range
+    over all logs, and each initial velocity differs by less than a quarter of its scale; the best
+    stretch of a log counts.
 
     Args:
         protocol: whose windows.
@@ -43,27 +55,43 @@ def repeatability(protocol: ProtocolConfig, logs: Sequence[Prepared], commands: 
         step: of the grid in s.
 
     Returns:
-        tolerances; pairs, logs (how many take part); where there are pairs, means over them of the root mean square differences u, v, r (SI),
-        of position and heading at the end (m, rad; seen from the start of each run), `nrmse` (mean over u, v, r of difference / scale), and the
-        same by kind of manoeuvre. Two independent runs differ by sqrt(2) times what each is off their expectation.
+        tolerances; pairs, logs (how many take part); where there are pairs, means over them of the
+        root mean square differences u, v, r (SI), of position and heading at the end (m, rad; seen
+        from the start of each run), `nrmse` (mean over u, v, r of difference / scale), and the same
+        by kind of manoeuvre. Two independent runs differ by sqrt(2) times what each is off their
+        expectation.
     """
     divisor = np.array([scales[name] for name in VELOCITY])
     found = list(find_pairs(protocol, logs, commands, divisor, step))
     out: dict[str, Any] = {
-        "tolerance": {"command_share_of_range": _COMMAND, "start": {name: _START * float(scales[name]) for name in VELOCITY}},
+        "tolerance": {
+            "command_share_of_range": _COMMAND,
+            "start": {name: _START * float(scales[name]) for name in VELOCITY},
+        },
         "pairs": len(found),
         "logs": len({pair.first.log for pair in found} | {pair.log for pair in found}),
     }
     if found:
         apart = np.array([_apart(pair, logs) for pair in found])
         kinds = np.array([logs[pair.first.log].log.manoeuvre for pair in found])
-        by_kind = {str(kind): {"pairs": int((kinds == kind).sum())} | _mean(apart[kinds == kind], divisor) for kind in np.unique(kinds)}
+        by_kind = {
+            str(kind): {"pairs": int((kinds == kind).sum())} | _mean(apart[kinds == kind], divisor)
+            for kind in np.unique(kinds)
+        }
         out |= _mean(apart, divisor) | {"manoeuvres": by_kind}
     return out
 
 
-def find_pairs(protocol: ProtocolConfig, logs: Sequence[Prepared], commands: int, scales: np.ndarray, step: float) -> Iterator[Pair]:
-    """Pairs of repeated runs: each window of the protocol with at most one stretch of each log from its own on; scales [3] of u, v, r."""
+def find_pairs(
+    protocol: ProtocolConfig,
+    logs: Sequence[Prepared],
+    commands: int,
+    scales: np.ndarray,
+    step: float,
+) -> Iterator[Pair]:
+    """Pairs of repeated runs: each window of the protocol with at most one stretch of each log from
+    its own on; scales [3] of u, v, r.
+    """
     every = max(round(_SEARCH / step), 1)
     known = [log.recorded[log.piece >= 0, :commands] for log in logs]
     spread = np.concatenate(known).max(0) - np.concatenate(known).min(0)
@@ -72,7 +100,9 @@ def find_pairs(protocol: ProtocolConfig, logs: Sequence[Prepared], commands: int
     for number, log in enumerate(logs):
         for window in protocol.windows(log, number, step):
             length = window.stop - window.start
-            given = np.nan_to_num(log.recorded[window.start : window.stop : every, :commands]) / spread
+            given = (
+                np.nan_to_num(log.recorded[window.start : window.stop : every, :commands]) / spread
+            )
             for other in range(number, len(logs)):
                 starts = np.arange(0, len(logs[other]) - length + 1, every)
                 if len(starts) == 0:
@@ -87,27 +117,41 @@ def find_pairs(protocol: ProtocolConfig, logs: Sequence[Prepared], commands: int
 
 
 def mismatch(given: np.ndarray, series: np.ndarray) -> np.ndarray:
-    """Root mean square difference of a stretch [L, m] to every stretch of a series [T, m], the largest over columns, [T - L + 1]."""
+    """Root mean square difference of a stretch [L, m] to every stretch of a series [T, m], the
+    largest over columns, [T - L + 1].
+    """
     if len(series) < len(given):
         return np.zeros(0)
     length, out = len(given), []
     middle = series.mean(0)
     for a, b in zip((given - middle).T, (series - middle).T, strict=True):
         energy = np.concatenate(([0.0], np.cumsum(b**2)))
-        square = energy[length:] - energy[:-length] - 2 * correlate(b, a, mode="valid") + np.sum(a**2)
+        square = (
+            energy[length:] - energy[:-length] - 2 * correlate(b, a, mode="valid") + np.sum(a**2)
+        )
         out.append(np.sqrt(np.maximum(square, 0.0) / length))
     return np.asarray(np.max(out, axis=0))
 
 
-def _same_start(window: Window, log: Prepared, starts: np.ndarray, length: int, scales: np.ndarray) -> np.ndarray:
-    """[S] bool: starts in an unbroken, usable stretch with nearly the initial velocities of the window."""
-    whole = (log.piece[starts] >= 0) & (log.piece[starts] == log.piece[starts + length - 1]) & log.usable[starts]
+def _same_start(
+    window: Window, log: Prepared, starts: np.ndarray, length: int, scales: np.ndarray
+) -> np.ndarray:
+    """[S] bool: starts in an unbroken, usable stretch with nearly the initial velocities of the
+    window.
+    """
+    whole = (
+        (log.piece[starts] >= 0)
+        & (log.piece[starts] == log.piece[starts + length - 1])
+        & log.usable[starts]
+    )
     near = (np.abs(log.smooth[starts, 3:] - window.nu) < _START * scales).all(1)
     return np.asarray(whole & near)
 
 
 def _apart(pair: Pair, logs: Sequence[Prepared]) -> list[float]:
-    """Differences of two runs: root mean square of u, v (samples usable in both) and r, then position and heading at the end."""
+    """Differences of two runs: root mean square of u, v (samples usable in both) and r, then
+    position and heading at the end.
+    """
     one, other = logs[pair.first.log], logs[pair.log]
     a = slice(pair.first.start, pair.first.stop)
     b = slice(pair.start, pair.start + a.stop - a.start)
@@ -119,7 +163,8 @@ def _apart(pair: Pair, logs: Sequence[Prepared]) -> list[float]:
 
 
 def _end(y: np.ndarray) -> np.ndarray:
-    """Pose at the end of a run [T, 6] in the axes of its start: ahead, to starboard, turned; [3]."""
+    """Pose at the end of a run [T, 6] in the axes of its start: ahead, to starboard, turned; [3].
+    """
     north, east, turned = y[-1, :3] - y[0, :3]
     c, s = np.cos(y[0, 2]), np.sin(y[0, 2])
     return np.array([c * north + s * east, c * east - s * north, turned])

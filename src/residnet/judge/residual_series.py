@@ -1,6 +1,8 @@
-"""Statistics of serially correlated residuals: autocorrelation, whiteness, effective sample size, intervals by moving-block bootstrap.
+"""Statistics of serially correlated residuals: autocorrelation, whiteness, effective sample size,
+intervals by moving-block bootstrap.
 
-A series may consist of pieces (logs, stretches between masked samples): nothing is correlated across their ends and no block crosses them.
+A series may consist of pieces (logs, stretches between masked samples): nothing is correlated
+across their ends and no block crosses them.
 """
 
 from __future__ import annotations
@@ -20,7 +22,9 @@ _MANY = 500
 """From so many blocks on the mean of a resample is normal, and is not drawn."""
 _WIDEST = 1.5
 _SCREEN = 2.0
-"""Standard deviations of a correlation that is no more than noise (Politis and White 2004, section 3.2: c = 2 for log base 10)."""
+"""Standard deviations of a correlation that is no more than noise (Politis and White 2004, section
+3.2: c = 2 for log base 10).
+"""
 
 Pieces = Sequence[np.ndarray]
 
@@ -42,7 +46,9 @@ class Memory:
 
 @dataclass(frozen=True)
 class Interval:
-    """A mean with a 95 % interval, the length of the blocks in samples, and the number of blocks that the series holds."""
+    """A mean with a 95 % interval, the length of the blocks in samples, and the number of blocks
+    that the series holds.
+    """
 
     mean: float
     low: float
@@ -52,7 +58,9 @@ class Interval:
 
 
 def autocovariance(pieces: Pieces, lags: int) -> np.ndarray:
-    """Autocovariances at lags 0 .. `lags`, [lags + 1], about the mean of all pieces, products within pieces over the number n of all samples."""
+    """Autocovariances at lags 0 .. `lags`, [lags + 1], about the mean of all pieces, products
+    within pieces over the number n of all samples.
+    """
     joined = np.concatenate(list(pieces))
     mean, out = joined.mean(), np.zeros(lags + 1)
     for piece in pieces:
@@ -64,11 +72,13 @@ def autocovariance(pieces: Pieces, lags: int) -> np.ndarray:
 
 
 def memory(pieces: Pieces) -> Memory:
-    """Block length and long-run variance chosen from the data (Politis and White 2004, Econometric Reviews 23, 53-70; corrected by Patton, Politis
-    and White 2009, 28, 372-375), for blocks of fixed length.
+    """Block length and long-run variance chosen from the data (Politis and White 2004, Econometric
+    Reviews 23, 53-70; corrected by Patton, Politis and White 2009, 28, 372-375), for blocks of
+    fixed length.
 
-    The flat-top window of the autocovariances R(k) reaches to twice the lag m from which on correlations are no more than noise; with
-    g = sum R(k) and G = sum |k| R(k) under it, the block is (3 G^2 / (2 g^2) n)^(1/3), at most min(3 sqrt(n), n / 3).
+    The flat-top window of the autocovariances R(k) reaches to twice the lag m from which on
+    correlations are no more than noise; with g = sum R(k) and G = sum |k| R(k) under it, the block
+    is (3 G^2 / (2 g^2) n)^(1/3), at most min(3 sqrt(n), n / 3).
     """
     n = sum(len(piece) for piece in pieces)
     run = max(5, math.ceil(math.sqrt(math.log10(n)))) if n > 1 else 5
@@ -92,11 +102,13 @@ def memory(pieces: Pieces) -> Memory:
 
 
 def block_interval(pieces: Pieces, seed: int = 0) -> Interval:
-    """Mean of all samples with its 95 % interval by a moving-block bootstrap, block length by `memory`.
+    """Mean of all samples with its 95 % interval by a moving-block bootstrap, block length by
+    `memory`.
 
-    Percentiles about the mean, at levels widened for few blocks as Student's t is (see `residnet.judge.bootstrap`), and by what blocks
-    of finite length miss: the ratio of the standard error from the long-run variance to that of the bootstrap, where it is above one (at most
-    1.5). The interval speaks for more data of the same kind, not for other kinds of manoeuvre.
+    Percentiles about the mean, at levels widened for few blocks as Student's t is (see
+    `residnet.judge.bootstrap`), and by what blocks of finite length miss: the ratio of the standard
+    error from the long-run variance to that of the bootstrap, where it is above one (at most 1.5).
+    The interval speaks for more data of the same kind, not for other kinds of manoeuvre.
     """
     found = memory(pieces)
     n = sum(len(piece) for piece in pieces)
@@ -110,7 +122,9 @@ def block_interval(pieces: Pieces, seed: int = 0) -> Interval:
     level, drawn = tail(max(math.floor(held), 2)), math.ceil(held)
     if held > _MANY:
         # of a ratio of sums, by its linear part
-        error = float(np.std(sums - sizes * (sums.sum() / sizes.sum())) / sizes.mean()) / math.sqrt(held)
+        error = float(np.std(sums - sizes * (sums.sum() / sizes.sum())) / sizes.mean()) / math.sqrt(
+            held
+        )
         low, high = error * float(stats.norm.ppf(level)), -error * float(stats.norm.ppf(level))
     else:
         draws = np.random.default_rng(seed).integers(0, len(sums), size=(_RESAMPLES, drawn))
@@ -134,17 +148,25 @@ def _blocks(pieces: Pieces, length: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def independent_interval(values: np.ndarray) -> tuple[float, float]:
-    """95 % interval of the mean as document 000 Listing 9.1 prints it: Student's t times the standard error of independent samples.
+    """95 % interval of the mean as document 000 Listing 9.1 prints it: Student's t times the
+    standard error of independent samples.
 
-    The resampling of the listing moves only the centre, by noise (ERRATA E8); here it is the mean itself. Far too narrow for correlated values.
+    The resampling of the listing moves only the centre, by noise (ERRATA E8); here it is the mean
+    itself. Far too narrow for correlated values.
     """
     n = len(values)
-    half = float(stats.t.ppf(0.5 + _LEVEL / 2, n - 1) * values.std(ddof=1)) / math.sqrt(n) if n > 1 else math.inf
+    half = (
+        float(stats.t.ppf(0.5 + _LEVEL / 2, n - 1) * values.std(ddof=1)) / math.sqrt(n)
+        if n > 1
+        else math.inf
+    )
     return float(values.mean()) - half, float(values.mean()) + half
 
 
 def ljung_box(pieces: Pieces, lags: int) -> tuple[float, float]:
-    """Ljung and Box's (1978) statistic n (n + 2) sum rho_k^2 / (n - k), lags 1 .. `lags`, and the chance of a larger one in white noise."""
+    """Ljung and Box's (1978) statistic n (n + 2) sum rho_k^2 / (n - k), lags 1 .. `lags`, and the
+    chance of a larger one in white noise.
+    """
     n = sum(len(piece) for piece in pieces)
     covariance = autocovariance(pieces, lags)
     if covariance[0] <= 1e-300:

@@ -1,4 +1,6 @@
-"""The stored rollouts: `rollouts/<split>/<log>.parquet`, from which anyone can recompute the metrics."""
+"""The stored rollouts: `rollouts/<split>/<log>.parquet`, from which anyone can recompute the
+metrics.
+"""
 
 from __future__ import annotations
 
@@ -17,15 +19,17 @@ _ORDER = ("u", "v", "r", "psi", "x", "y")
 def write_rollouts(folder: Path, runs: Sequence[FreeRun], logs: Sequence[Prepared]) -> None:
     """One file per log of a split; `runs` are the protocols of that split.
 
-    Columns: protocol, model, window, t (s, the log's clock), usable, diverged, then u, v, r, psi, x, y as measured and with
-    `_hat` as predicted (SI, rad).
+    Columns: protocol, model, window, t (s, the log's clock), usable, diverged, then u, v, r, psi,
+    x, y as measured and with `_hat` as predicted (SI, rad).
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     folder.mkdir(parents=True, exist_ok=True)
     for number, log in enumerate(logs):
-        parts: dict[str, list[np.ndarray]] = {name: [] for name in ("protocol", "model", "window", "t", "usable", "diverged")}
+        parts: dict[str, list[np.ndarray]] = {
+            name: [] for name in ("protocol", "model", "window", "t", "usable", "diverged")
+        }
         measured: list[np.ndarray] = []
         predicted: list[np.ndarray] = []
         for run in runs:
@@ -34,7 +38,12 @@ def write_rollouts(folder: Path, runs: Sequence[FreeRun], logs: Sequence[Prepare
                 for place, i in enumerate(own):
                     rows = slice(run.windows[i].start, run.windows[i].stop)
                     length = rows.stop - rows.start
-                    labels: dict[str, object] = {"protocol": run.protocol, "model": model, "window": place, "diverged": predictions[i].diverged}
+                    labels: dict[str, object] = {
+                        "protocol": run.protocol,
+                        "model": model,
+                        "window": place,
+                        "diverged": predictions[i].diverged,
+                    }
                     for key, label in labels.items():
                         parts[key].append(np.full(length, label))
                     parts["t"].append(log.log.t[rows])

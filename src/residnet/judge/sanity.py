@@ -1,4 +1,6 @@
-"""Physical sanity of a model: does what was identified behave like a vessel, inside its training data and outside?"""
+"""Physical sanity of a model: does what was identified behave like a vessel, inside its training
+data and outside?
+"""
 
 from __future__ import annotations
 
@@ -13,9 +15,21 @@ from torch import Tensor
 from residnet.core.names import STATE, VELOCITY
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec, load_model, model_names
-from residnet.judge.sanity_points import Mirror, OperatingPoint, acceleration, operating_points, settled_memory
+from residnet.judge.sanity_points import (
+    Mirror,
+    OperatingPoint,
+    acceleration,
+    operating_points,
+    settled_memory,
+)
 
-DAMPING, STABILITY, SYMMETRY, MASS, BOUNDED = "damping", "stability", "symmetry", "mass matrix", "bounded outside"
+DAMPING, STABILITY, SYMMETRY, MASS, BOUNDED = (
+    "damping",
+    "stability",
+    "symmetry",
+    "mass matrix",
+    "bounded outside",
+)
 CHECKS = (DAMPING, STABILITY, SYMMETRY, MASS, BOUNDED)
 
 _DOUBLING = 300.0
@@ -25,7 +39,9 @@ _LONG_RUN = 300.0
 
 @dataclass(frozen=True)
 class Finding:
-    """Outcome of one check of one model; `ok` is None where the check does not apply or could not be made."""
+    """Outcome of one check of one model; `ok` is None where the check does not apply or could not
+    be made.
+    """
 
     model: str
     check: str
@@ -53,7 +69,9 @@ def check_run(run: Path, *, divergence: float = 3.0) -> list[Finding]:
     return out
 
 
-def check_model(spec: ModelSpec, model: HybridDynamics, *, divergence: float = 3.0) -> list[Finding]:
+def check_model(
+    spec: ModelSpec, model: HybridDynamics, *, divergence: float = 3.0
+) -> list[Finding]:
     """All checks of one model, in the order of `CHECKS`.
 
     Args:
@@ -67,33 +85,64 @@ def check_model(spec: ModelSpec, model: HybridDynamics, *, divergence: float = 3
         check_damping(spec, model, points),
         check_stability(spec, model, points),
         check_symmetry(spec, model),
-        Finding(spec.name, MASS, None, "not applicable: acceleration-space model, it has no mass matrix"),
+        Finding(
+            spec.name, MASS, None, "not applicable: acceleration-space model, it has no mass matrix"
+        ),
         check_bounded(spec, model, divergence),
     ]
 
 
-def check_damping(spec: ModelSpec, model: HybridDynamics, points: Sequence[OperatingPoint]) -> Finding:
-    """Does each velocity decay by itself? Slopes d u_dot/du, d v_dot/dv, d r_dot/dr with the memory settled, by autograd."""
+def check_damping(
+    spec: ModelSpec, model: HybridDynamics, points: Sequence[OperatingPoint]
+) -> Finding:
+    """Does each velocity decay by itself? Slopes d u_dot/du, d v_dot/dv, d r_dot/dr with the memory
+    settled, by autograd.
+    """
     chosen = [point for point in points if point.label in ("rest", "cruise")]
     x = torch.stack([point.x for point in chosen]).requires_grad_()
     # a model may depend on no velocity at all
     nu_dot = acceleration(model, x, torch.stack([point.w for point in chosen])) + 0.0 * x[:, 3:6]
-    slopes = torch.stack([torch.autograd.grad(nu_dot[:, i].sum(), x, retain_graph=True)[0][:, 3 + i] for i in range(3)], dim=1)
-    # a slope that is small beside the other point's is no damping at all, as of a purely quadratic drag at rest
+    slopes = torch.stack(
+        [
+            torch.autograd.grad(nu_dot[:, i].sum(), x, retain_graph=True)[0][:, 3 + i]
+            for i in range(3)
+        ],
+        dim=1,
+    )
+    # a slope that is small beside the other point's is no damping at all, as of a purely quadratic
+    # drag at rest
     largest = slopes.abs().amax(0)
     wrong = (slopes > 0.05 * largest) | (largest == 0)
     parts = []
     for row, point in enumerate(chosen):
-        values = ", ".join(f"d{name}′/d{name} {float(slopes[row, i]):+.3g}" for i, name in enumerate(VELOCITY))
+        values = ", ".join(
+            f"d{name}′/d{name} {float(slopes[row, i]):+.3g}" for i, name in enumerate(VELOCITY)
+        )
         parts.append(f"{point.text}: {values} 1/s")
     if not bool(wrong.any()):
-        return Finding(spec.name, DAMPING, True, "every velocity decays by itself. " + "; ".join(parts))
-    which = [f"{VELOCITY[i]} at {point.label}" for row, point in enumerate(chosen) for i in range(3) if bool(wrong[row, i])]
-    return Finding(spec.name, DAMPING, False, f"not damped (wrong sign or none): {', '.join(which)}. " + "; ".join(parts))
+        return Finding(
+            spec.name, DAMPING, True, "every velocity decays by itself. " + "; ".join(parts)
+        )
+    which = [
+        f"{VELOCITY[i]} at {point.label}"
+        for row, point in enumerate(chosen)
+        for i in range(3)
+        if bool(wrong[row, i])
+    ]
+    return Finding(
+        spec.name,
+        DAMPING,
+        False,
+        f"not damped (wrong sign or none): {', '.join(which)}. " + "; ".join(parts),
+    )
 
 
-def check_stability(spec: ModelSpec, model: HybridDynamics, points: Sequence[OperatingPoint]) -> Finding:
-    """Straight running at several speeds: growth of small sway-yaw disturbances, memory included, from the Jacobian of a step."""
+def check_stability(
+    spec: ModelSpec, model: HybridDynamics, points: Sequence[OperatingPoint]
+) -> Finding:
+    """Straight running at several speeds: growth of small sway-yaw disturbances, memory included,
+    from the Jacobian of a step.
+    """
     unstable: list[tuple[OperatingPoint, float]] = []
     parts = []
     for point in points:
@@ -101,24 +150,37 @@ def check_stability(spec: ModelSpec, model: HybridDynamics, points: Sequence[Ope
         if rate > math.log(2.0) / _DOUBLING:
             unstable.append((point, rate))
         if point.label in ("rest", "cruise"):
-            parts.append(f"{point.text}: slowest mode " + (f"halves in {-math.log(2) / rate:.2g} s" if rate < 0 else f"has the rate {rate:+.2g} 1/s"))
+            parts.append(
+                f"{point.text}: slowest mode "
+                + (
+                    f"halves in {-math.log(2) / rate:.2g} s"
+                    if rate < 0
+                    else f"has the rate {rate:+.2g} 1/s"
+                )
+            )
     summary = "; ".join(parts)
     if not unstable:
         reach = f"{points[0].speed:.2g} to {points[-1].speed:.2g} m/s"
-        text = f"sway and yaw are stable in straight running at {reach} (no mode doubles within {_DOUBLING:.0f} s). {summary}"
+        text = (
+            f"sway and yaw are stable in straight running at {reach} (no mode doubles within"
+            f" {_DOUBLING:.0f} s). {summary}"
+        )
         return Finding(spec.name, STABILITY, True, text)
     inside = [(point, rate) for point, rate in unstable if point.inside]
     worst, rate = max(inside or unstable, key=lambda pair: pair[1])
     where = "inside the training data" if inside else "only outside the training data"
     text = (
-        f"sway and yaw unstable in straight running, {where}: worst at {worst.text}, a disturbance doubles in {math.log(2) / rate:.2g} s. "
-        f"Some full hulls are so in truth; otherwise do not trust long free runs there. {summary}"
+        f"sway and yaw unstable in straight running, {where}: worst at {worst.text}, a disturbance"
+        f" doubles in {math.log(2) / rate:.2g} s. Some full hulls are so in truth; otherwise do not"
+        f" trust long free runs there. {summary}"
     )
     return Finding(spec.name, STABILITY, False, text)
 
 
 def growth_rate(model: HybridDynamics, point: OperatingPoint) -> float:
-    """Largest growth rate [1/s] of a small disturbance of (v, r, memory) about a point: log of the step map's spectral radius over dt."""
+    """Largest growth rate [1/s] of a small disturbance of (v, r, memory) about a point: log of the
+    step map's spectral radius over dt.
+    """
     s = settled_memory(model, point.x[None], point.w[None])
     start = torch.cat((point.x[4:6], s[0])).detach()
     count = start.numel()
@@ -133,32 +195,59 @@ def growth_rate(model: HybridDynamics, point: OperatingPoint) -> float:
 
 
 def check_symmetry(spec: ModelSpec, model: HybridDynamics, *, samples: int = 500) -> Finding:
-    """A mirrored state with mirrored inputs must give the mirrored acceleration; sampled over the symmetric part of the training ranges."""
+    """A mirrored state with mirrored inputs must give the mirrored acceleration; sampled over the
+    symmetric part of the training ranges.
+    """
     mirror = Mirror.of(spec.signals.columns)
     if mirror is None:
-        text = f"not checked: nobody said which input steers (inputs {', '.join(spec.signals.inputs)}; delta and *_port/*_stbd pairs are understood)"
+        text = (
+            f"not checked: nobody said which input steers (inputs {', '.join(spec.signals.inputs)};"
+            " delta and *_port/*_stbd pairs are understood)"
+        )
         return Finding(spec.name, SYMMETRY, None, text)
     x, w = mirror.draw(spec, samples)
     with torch.no_grad():
-        one, other = acceleration(model, x, w), acceleration(model, mirror.state(x), mirror.inputs(w))
+        one, other = (
+            acceleration(model, x, w),
+            acceleration(model, mirror.state(x), mirror.inputs(w)),
+        )
     sign = torch.tensor([1.0, -1.0, -1.0], dtype=one.dtype)
     uneven = 0.5 * (one - sign * other).abs()
     spread = torch.cat((one, sign * other)).std(0).clamp(min=1e-12)
     typical, largest = uneven.square().mean(0).sqrt() / spread, uneven.amax(0) / spread
-    parts = [f"{name}′ {100 * float(t):.1f} % (largest {100 * float(m):.1f} %)" for name, t, m in zip(VELOCITY, typical, largest, strict=True)]
+    parts = [
+        f"{name}′ {100 * float(t):.1f} % (largest {100 * float(m):.1f} %)"
+        for name, t, m in zip(VELOCITY, typical, largest, strict=True)
+    ]
     ok = bool((typical <= _ASYMMETRY).all())
     word = "alike" if ok else "differ"
-    text = f"port and starboard {word}: the uneven part of the acceleration is up to {100 * float(typical.max()):.0f} % of its spread. "
+    text = (
+        f"port and starboard {word}: the uneven part of the acceleration is up to"
+        f" {100 * float(typical.max()):.0f} % of its spread. "
+    )
     if not ok:
-        text += "A single screw, an offset of the steering or too few turns one way may be the reason. "
-    return Finding(spec.name, SYMMETRY, ok, text + f"RMS over {samples} points in the training box: " + ", ".join(parts))
+        text += (
+            "A single screw, an offset of the steering or too few turns one way may be the reason. "
+        )
+    return Finding(
+        spec.name,
+        SYMMETRY,
+        ok,
+        text + f"RMS over {samples} points in the training box: " + ", ".join(parts),
+    )
 
 
 def check_bounded(spec: ModelSpec, model: HybridDynamics, divergence: float) -> Finding:
-    """From rest with every input held at the edges of its training range: does the motion stay bounded?"""
+    """From rest with every input held at the edges of its training range: does the motion stay
+    bounded?
+    """
     corners = _corners(spec)
     x = torch.zeros(len(corners), len(STATE), dtype=torch.float64)
-    limit = torch.maximum(torch.tensor(spec.low[:3]).abs(), torch.tensor(spec.high[:3]).abs()).double().clamp(min=1e-9)
+    limit = (
+        torch.maximum(torch.tensor(spec.low[:3]).abs(), torch.tensor(spec.high[:3]).abs())
+        .double()
+        .clamp(min=1e-9)
+    )
     largest, seconds = torch.zeros(len(corners), 3, dtype=torch.float64), 0.0
     s = model.initial_state(len(corners)).double()
     steps, pause = round(_LONG_RUN / model.dt), max(round(10.0 / model.dt), 1)
@@ -172,27 +261,49 @@ def check_bounded(spec: ModelSpec, model: HybridDynamics, divergence: float) -> 
                 if not bool(torch.isfinite(x).all()) or float(largest.max()) > divergence:
                     break
             if k % pause == 0:
-                if not spec.signals.exogenous and float(((x[:, 3:6] - before).abs() / limit).max()) < 1e-6:
+                if (
+                    not spec.signals.exogenous
+                    and float(((x[:, 3:6] - before).abs() / limit).max()) < 1e-6
+                ):
                     break  # settled: nothing more will come
                 before = x[:, 3:6]
     ratio = torch.nan_to_num(largest, nan=math.inf).amax(1)
     row = int(ratio.argmax())
-    inputs = ", ".join(f"{name} {float(value):.3g}" for name, value in zip(spec.signals.columns, corners[row], strict=True))
-    reached = ", ".join(f"{name} {float(part):.2f}" for name, part in zip(VELOCITY, largest[row], strict=True))
+    inputs = ", ".join(
+        f"{name} {float(value):.3g}"
+        for name, value in zip(spec.signals.columns, corners[row], strict=True)
+    )
+    reached = ", ".join(
+        f"{name} {float(part):.2f}" for name, part in zip(VELOCITY, largest[row], strict=True)
+    )
     if not bool(torch.isfinite(x).all()) or float(largest.max()) > divergence:
-        text = f"runs away within {seconds:.0f} s with {inputs} held from rest (more than {divergence:g} times the largest training velocity)"
+        text = (
+            f"runs away within {seconds:.0f} s with {inputs} held from rest (more than"
+            f" {divergence:g} times the largest training velocity)"
+        )
         return Finding(spec.name, BOUNDED, False, text)
     text = (
-        f"{len(corners)} runs of {_LONG_RUN:.0f} s from rest with inputs held at their extremes stay bounded; "
-        f"the farthest ({inputs}) reaches {reached} of the largest training values"
+        f"{len(corners)} runs of {_LONG_RUN:.0f} s from rest with inputs held at their extremes"
+        f" stay bounded; the farthest ({inputs}) reaches {reached} of the largest training values"
     )
     return Finding(spec.name, BOUNDED, True, text)
 
 
 def _corners(spec: ModelSpec, most: int = 64) -> Tensor:
     """Inputs [K, m] at the edges of their ranges, every combination or `most` drawn ones."""
-    low, high = torch.tensor(spec.low[3:], dtype=torch.float64), torch.tensor(spec.high[3:], dtype=torch.float64)
-    pick = torch.cartesian_prod(*[torch.tensor([0.0, 1.0], dtype=torch.float64)] * low.numel()).reshape(-1, low.numel()) if low.numel() <= 6 else None
+    low, high = (
+        torch.tensor(spec.low[3:], dtype=torch.float64),
+        torch.tensor(spec.high[3:], dtype=torch.float64),
+    )
+    pick = (
+        torch.cartesian_prod(
+            *[torch.tensor([0.0, 1.0], dtype=torch.float64)] * low.numel()
+        ).reshape(-1, low.numel())
+        if low.numel() <= 6
+        else None
+    )
     if pick is None:
-        pick = torch.randint(0, 2, (most, low.numel()), generator=torch.Generator().manual_seed(0)).double()
+        pick = torch.randint(
+            0, 2, (most, low.numel()), generator=torch.Generator().manual_seed(0)
+        ).double()
     return low + pick * (high - low)

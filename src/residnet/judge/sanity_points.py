@@ -19,7 +19,9 @@ _CRUISE = 0.67
 
 @dataclass(frozen=True)
 class OperatingPoint:
-    """Straight running at a speed: state x [6], inputs w [m], and whether both lie inside the training ranges."""
+    """Straight running at a speed: state x [6], inputs w [m], and whether both lie inside the
+    training ranges.
+    """
 
     label: str
     speed: float
@@ -31,17 +33,23 @@ class OperatingPoint:
     def text(self) -> str:
         """For a sentence."""
         name = f"{self.label}, " if self.label else ""
-        return f"{name}u = {self.speed:.3g} m/s" + ("" if self.inside else " (outside the training data)")
+        return f"{name}u = {self.speed:.3g} m/s" + (
+            "" if self.inside else " (outside the training data)"
+        )
 
 
 def settled_memory(model: HybridDynamics, x: Tensor, w: Tensor) -> Tensor:
-    """Memory [B, n_state] after ten seconds in the same state x [B, 6] under the same inputs w [B, m]."""
+    """Memory [B, n_state] after ten seconds in the same state x [B, 6] under the same inputs w [B,
+    m].
+    """
     steps = max(round(_SETTLE / model.dt), 1) if model.n_state else 0
     return model.warmup(x[:, None].expand(-1, steps, -1), w[:, None].expand(-1, steps, -1))
 
 
 def acceleration(model: HybridDynamics, x: Tensor, w: Tensor) -> Tensor:
-    """nu_dot [B, 3] of baseline and head together at states x [B, 6] and inputs w [B, m], the head's memory settled there."""
+    """nu_dot [B, 3] of baseline and head together at states x [B, 6] and inputs w [B, m], the
+    head's memory settled there.
+    """
     z = model.signals(x, model.signals.prepare(w))
     rho, _ = model.head(z, settled_memory(model, x, w))
     out: Tensor = model.head.accelerations(model.baseline(z), rho)
@@ -49,18 +57,25 @@ def acceleration(model: HybridDynamics, x: Tensor, w: Tensor) -> Tensor:
 
 
 def steering(columns: Sequence[str]) -> tuple[list[int], list[tuple[int, int]]]:
-    """Columns of rudders (they change sign in a mirror) and pairs (port, starboard) of columns (they change places)."""
+    """Columns of rudders (they change sign in a mirror) and pairs (port, starboard) of columns
+    (they change places).
+    """
     names = list(columns)
     rudders = [i for i, name in enumerate(names) if name == "delta"]
-    pairs = [(i, names.index(name[:-5] + "_stbd")) for i, name in enumerate(names) if name.endswith("_port") and name[:-5] + "_stbd" in names]
+    pairs = [
+        (i, names.index(name[:-5] + "_stbd"))
+        for i, name in enumerate(names)
+        if name.endswith("_port") and name[:-5] + "_stbd" in names
+    ]
     return rudders, pairs
 
 
 def operating_points(spec: ModelSpec, model: HybridDynamics) -> list[OperatingPoint]:
-    """Straight running from rest to half as fast again as the training data, each under the drive that nearly holds the speed.
+    """Straight running from rest to half as fast again as the training data, each under the drive
+    that nearly holds the speed.
 
-    Drives are all inputs that do not steer, moved together from the low to the high end of their ranges; rudders are
-    amidships and the air is calm, as far as the ranges allow.
+    Drives are all inputs that do not steer, moved together from the low to the high end of their
+    ranges; rudders are amidships and the air is calm, as far as the ranges allow.
     """
     top = max(spec.high[0], 1e-6)
     drives = _drives(spec)
@@ -73,14 +88,21 @@ def operating_points(spec: ModelSpec, model: HybridDynamics) -> list[OperatingPo
             surge = acceleration(model, x, drives)[:, 0]
         best = int(surge.abs().argmin())
         label = {0.0: "rest", _CRUISE: "cruise"}.get(fraction, "")
-        out.append(OperatingPoint(label, speed, x[best], drives[best], spec.low[0] <= speed <= spec.high[0]))
+        out.append(
+            OperatingPoint(
+                label, speed, x[best], drives[best], spec.low[0] <= speed <= spec.high[0]
+            )
+        )
     return out
 
 
 def _drives(spec: ModelSpec, count: int = 41) -> Tensor:
     """Inputs [count, m] of straight running, from the least to the most drive."""
     columns = spec.signals.columns
-    low, high = torch.tensor(spec.low[3:], dtype=torch.float64), torch.tensor(spec.high[3:], dtype=torch.float64)
+    low, high = (
+        torch.tensor(spec.low[3:], dtype=torch.float64),
+        torch.tensor(spec.high[3:], dtype=torch.float64),
+    )
     rudders, pairs = steering(columns)
     for port, stbd in pairs:
         # both sides alike, over the range that they share
@@ -95,7 +117,9 @@ def _drives(spec: ModelSpec, count: int = 41) -> Tensor:
 
 @dataclass(frozen=True)
 class Mirror:
-    """Reflection in the vessel's plane of symmetry: rudders change sign, port and starboard change places, wind comes from the other side."""
+    """Reflection in the vessel's plane of symmetry: rudders change sign, port and starboard change
+    places, wind comes from the other side.
+    """
 
     columns: tuple[str, ...]
     rudders: tuple[int, ...]
@@ -103,10 +127,16 @@ class Mirror:
 
     @classmethod
     def of(cls, columns: Sequence[str]) -> Mirror | None:
-        """The reflection of inputs `columns`; None where none of them is known to steer, or a lone port or starboard input has no partner."""
+        """The reflection of inputs `columns`; None where none of them is known to steer, or a lone
+        port or starboard input has no partner.
+        """
         rudders, pairs = steering(columns)
         paired = {i for pair in pairs for i in pair}
-        lone = [name for i, name in enumerate(columns) if name.endswith(("_port", "_stbd")) and i not in paired]
+        lone = [
+            name
+            for i, name in enumerate(columns)
+            if name.endswith(("_port", "_stbd")) and i not in paired
+        ]
         if lone or not (rudders or pairs):
             return None
         return cls(tuple(columns), tuple(rudders), tuple(pairs))
@@ -128,7 +158,9 @@ class Mirror:
         return out
 
     def draw(self, spec: ModelSpec, count: int) -> tuple[Tensor, Tensor]:
-        """States [count, 6] and inputs [count, m], uniform over the part of the training ranges that lies inside it mirrored too."""
+        """States [count, 6] and inputs [count, m], uniform over the part of the training ranges
+        that lies inside it mirrored too.
+        """
         low, high = list(spec.low), list(spec.high)
         for i in (1, 2, *(3 + k for k in self.rudders)):
             high[i] = max(min(-low[i], high[i]), 0.0)
@@ -137,8 +169,13 @@ class Mirror:
             ends = max(low[3 + port], low[3 + stbd]), min(high[3 + port], high[3 + stbd])
             for i in (3 + port, 3 + stbd):
                 low[i], high[i] = ends
-        low_t, high_t = torch.tensor(low, dtype=torch.float64), torch.tensor(high, dtype=torch.float64)
-        share = torch.rand(count, len(low), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        low_t, high_t = (
+            torch.tensor(low, dtype=torch.float64),
+            torch.tensor(high, dtype=torch.float64),
+        )
+        share = torch.rand(
+            count, len(low), generator=torch.Generator().manual_seed(0), dtype=torch.float64
+        )
         values = low_t + share * (high_t - low_t)
         x = torch.cat((torch.zeros(count, 3, dtype=torch.float64), values[:, :3]), dim=1)
         return x, values[:, 3:]

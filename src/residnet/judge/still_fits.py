@@ -1,4 +1,6 @@
-"""Whether a force model still fits what is logged now: the trigger of an update (document 002 section 3.7)."""
+"""Whether a force model still fits what is logged now: the trigger of an update (document 002
+section 3.7).
+"""
 
 from __future__ import annotations
 
@@ -13,12 +15,14 @@ from residnet.core.errors import DataError
 
 
 class StillFitsConfig(Config):
-    """When a model no longer fits: on some axis the residual has grown by `factor` beyond what it was, and it is no trifle.
+    """When a model no longer fits: on some axis the residual has grown by `factor` beyond what it
+    was, and it is no trifle.
 
     Attributes:
         factor: of the mean square residual of the stretch it is compared with.
         share: of the variance of the force, below which a residual does not matter.
-        segments: share of the segments of an axis that must show both, so that one gust or one wake is no reason.
+        segments: share of the segments of an axis that must show both, so that one gust or one wake
+            is no reason.
     """
 
     factor: float = Field(default=4.0, gt=1)
@@ -44,12 +48,20 @@ class Verdict:
 
     def text(self) -> str:
         """One line."""
-        growth, share = ("/".join(f"{value:.3g}" for value in part) for part in (self.growth, [100 * value for value in self.share]))
+        growth, share = (
+            "/".join(f"{value:.3g}" for value in part)
+            for part in (self.growth, [100 * value for value in self.share])
+        )
         said = "still fits" if self.fits else "no longer fits: identify it again from this log"
-        return f"{said} (residual {growth} times what it was, {share} % of the force's variance; surge/sway/yaw)"
+        return (
+            f"{said} (residual {growth} times what it was, {share} % of the force's variance;"
+            " surge/sway/yaw)"
+        )
 
 
-def still_fits(config: StillFitsConfig, then: Tensor, now: Tensor, force: Tensor, fold: Tensor) -> Verdict:
+def still_fits(
+    config: StillFitsConfig, then: Tensor, now: Tensor, force: Tensor, fold: Tensor
+) -> Verdict:
     """Compare residuals.
 
     Args:
@@ -63,13 +75,29 @@ def still_fits(config: StillFitsConfig, then: Tensor, now: Tensor, force: Tensor
         DataError: where the new data are empty or not finite, or their force does not vary.
     """
     if len(now) == 0 or not bool(torch.isfinite(now).all()):
-        raise DataError("the new log has no samples or a residual that is not finite; mask it before it is judged")
+        raise DataError(
+            "the new log has no samples or a residual that is not finite; mask it before it is"
+            " judged"
+        )
     variance, before = force.var(0), then.square().mean(0)
     if bool((variance <= 0).any()):
-        raise DataError("the force of the new log does not vary on some axis: nothing can be said about the model; give a log with manoeuvres")
+        raise DataError(
+            "the force of the new log does not vary on some axis: nothing can be said about the"
+            " model; give a log with manoeuvres"
+        )
     by_segment = torch.stack([now[fold == f].square().mean(0) for f in torch.unique(fold)])
-    worse = ((by_segment > config.factor * before) & (by_segment > config.share * variance)).to(torch.float64).mean(0)
+    worse = (
+        ((by_segment > config.factor * before) & (by_segment > config.share * variance))
+        .to(torch.float64)
+        .mean(0)
+    )
     mean = now.square().mean(0)
-    grown = (mean > config.factor * before) & (mean > config.share * variance) & (worse >= config.segments)
+    grown = (
+        (mean > config.factor * before)
+        & (mean > config.share * variance)
+        & (worse >= config.segments)
+    )
     growth = mean / before.clamp(min=1e-300)
-    return Verdict(not bool(grown.any()), growth.tolist(), (mean / variance).tolist(), worse.tolist())
+    return Verdict(
+        not bool(grown.any()), growth.tolist(), (mean / variance).tolist(), worse.tolist()
+    )

@@ -19,10 +19,12 @@ class Tracking:
         heading_mae, heading_mse: of the wrapped heading error in rad, rad^2 (4.7).
         tau: mean |tau| commanded in surge, sway, yaw.
         feedback: mean |tau_FB| in surge, sway, yaw.
-        motion_mse: of the velocities and accelerations against the desired ones in (m/s)^2, (m/s)^2, (rad/s)^2 and per second squared (Table 4.8).
+        motion_mse: of the velocities and accelerations against the desired ones in (m/s)^2,
+            (m/s)^2, (rad/s)^2 and per second squared (Table 4.8).
         energy: integral of |tau' nu| in J, surge and sway, then yaw.
         power: the same per second in W (Table 4.13).
-        iaew: integral of |e| times integral of power (3.18), position [m s J] and heading [rad s J].
+        iaew: integral of |e| times integral of power (3.18), position [m s J] and heading [rad s
+            J].
     """
 
     position_mae: float
@@ -38,10 +40,15 @@ class Tracking:
 
     def row(self) -> dict[str, float | list[float]]:
         """For JSON."""
-        return {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()}
+        return {
+            key: list(value) if isinstance(value, tuple) else value
+            for key, value in asdict(self).items()
+        }
 
 
-def tracking(pose: Tensor, motion: Tensor, desired: Tensor, command: Tensor, feedback: Tensor, dt: float) -> Tracking:
+def tracking(
+    pose: Tensor, motion: Tensor, desired: Tensor, command: Tensor, feedback: Tensor, dt: float
+) -> Tracking:
     """Metrics of a run.
 
     Args:

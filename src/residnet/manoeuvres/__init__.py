@@ -1,4 +1,6 @@
-"""Manoeuvres, one file each: the manoeuvre, its source of inputs, and where it is drawn at random the family that does so."""
+"""Manoeuvres, one file each: the manoeuvre, its source of inputs, and where it is drawn at random
+the family that does so.
+"""
 
 from __future__ import annotations
 
@@ -6,10 +8,18 @@ from typing import Annotated
 
 from pydantic import Field
 
-from residnet.manoeuvres.acceleration_deceleration import AccelerationDeceleration, AccelerationDecelerationFamily
+from residnet.manoeuvres.acceleration_deceleration import (
+    AccelerationDeceleration,
+    AccelerationDecelerationFamily,
+)
 from residnet.manoeuvres.base import Helm, Manoeuvre, StackedSource, Watched
 from residnet.manoeuvres.constant import ConstantFamily, ConstantInput
-from residnet.manoeuvres.excitation import MultiSine, MultiSineFamily, RandomSteps, RandomStepsFamily
+from residnet.manoeuvres.excitation import (
+    MultiSine,
+    MultiSineFamily,
+    RandomSteps,
+    RandomStepsFamily,
+)
 from residnet.manoeuvres.four_corner import FourCorner
 from residnet.manoeuvres.replay import Replay
 from residnet.manoeuvres.spiral import Spiral
@@ -35,7 +45,13 @@ AnyManoeuvre = (
 )
 ManoeuvreConfig = Annotated[AnyManoeuvre, Field(discriminator="kind")]
 FamilyConfig = Annotated[
-    ConstantFamily | ZigzagFamily | TurningCircleFamily | AccelerationDecelerationFamily | ThreeTwoOneOneFamily | RandomStepsFamily | MultiSineFamily,
+    ConstantFamily
+    | ZigzagFamily
+    | TurningCircleFamily
+    | AccelerationDecelerationFamily
+    | ThreeTwoOneOneFamily
+    | RandomStepsFamily
+    | MultiSineFamily,
     Field(discriminator="kind"),
 ]
 

@@ -33,7 +33,9 @@ class AccelerationDeceleration(Scheduled):
 
 
 class AccelerationDecelerationFamily(Config):
-    """Steps between a high level, lowered by a quarter and by half in turn, and a low level; all uniform in their ranges."""
+    """Steps between a high level, lowered by a quarter and by half in turn, and a low level; all
+    uniform in their ranges.
+    """
 
     kind: Literal["acceleration_deceleration"] = "acceleration_deceleration"
     count: int = Field(ge=1)
@@ -52,5 +54,9 @@ class AccelerationDecelerationFamily(Config):
             peaks = high * np.array([1.0, 0.75, 0.5])[(np.arange(most) // 2) % 3]
             levels = np.where(np.arange(most) % 2 == 0, peaks, low)
             keep = times < duration
-            out.append(AccelerationDeceleration(times=tuple(times[keep].tolist()), levels=tuple(levels[keep].tolist())))
+            out.append(
+                AccelerationDeceleration(
+                    times=tuple(times[keep].tolist()), levels=tuple(levels[keep].tolist())
+                )
+            )
         return out

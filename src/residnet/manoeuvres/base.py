@@ -1,8 +1,9 @@
 """The interface of manoeuvres.
 
-A manoeuvre demands a normalised drive (mean thrust or revolutions) and steer (difference, or rudder) over time, open
-loop or by the motion that it sees. The vessel turns the two into its own commands, so one manoeuvre drives any plant and
-any learned model that has actuators. A manoeuvre with a stop condition ends its row of the rollout there.
+A manoeuvre demands a normalised drive (mean thrust or revolutions) and steer (difference, or
+rudder) over time, open loop or by the motion that it sees. The vessel turns the two into its own
+commands, so one manoeuvre drives any plant and any learned model that has actuators. A manoeuvre
+with a stop condition ends its row of the rollout there.
 """
 
 from __future__ import annotations
@@ -38,7 +39,8 @@ class Helm:
         demand: turns its normalised demands into the vessel's commands.
         state: names of the columns of the vessel's state.
         inputs: names of the columns of its inputs, commands first.
-        forces: turns forces tau [..., 3] in surge, sway and yaw into its commands; None for a vessel that cannot make all three.
+        forces: turns forces tau [..., 3] in surge, sway and yaw into its commands; None for a
+            vessel that cannot make all three.
     """
 
     demand: Demand
@@ -63,7 +65,10 @@ class Helm:
             UsageError: where the vessel has no such state.
         """
         if name not in self.state:
-            raise UsageError(f"the manoeuvre watches '{name}', which the vessel does not have; it has {', '.join(self.state)}")
+            raise UsageError(
+                f"the manoeuvre watches '{name}', which the vessel does not have; it has"
+                f" {', '.join(self.state)}"
+            )
         return self.state.index(name)
 
     @property
@@ -103,14 +108,21 @@ class StackedSource(Source):
 
     def initial(self, x: Tensor) -> Tensor:
         """Memories of all sources, padded to the widest, [B, k]."""
-        parts = [source.initial(part) for source, part in zip(self.sources, x.split(self.rows), strict=True)]
+        parts = [
+            source.initial(part)
+            for source, part in zip(self.sources, x.split(self.rows), strict=True)
+        ]
         self.widths = [part.shape[1] for part in parts]
-        return torch.cat([torch.nn.functional.pad(part, (0, max(self.widths) - part.shape[1])) for part in parts])
+        return torch.cat(
+            [torch.nn.functional.pad(part, (0, max(self.widths) - part.shape[1])) for part in parts]
+        )
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Inputs [B, m], each block of rows from its source."""
         inputs, memories = [], []
-        for source, xs, ws, ms in zip(self.sources, x.split(self.rows), w.split(self.rows), self._own(memory), strict=True):
+        for source, xs, ws, ms in zip(
+            self.sources, x.split(self.rows), w.split(self.rows), self._own(memory), strict=True
+        ):
             acting, after = source(xs, ws, k, ms)
             inputs.append(acting)
             # a source may need less memory than the widest of the batch
@@ -123,12 +135,17 @@ class StackedSource(Source):
         return torch.cat([source.finished(xs, k, ms) for source, xs, ms in parts])
 
     def _own(self, memory: Tensor) -> list[Tensor]:
-        return [part[:, :width] for part, width in zip(memory.split(self.rows), self.widths, strict=True)]
+        return [
+            part[:, :width]
+            for part, width in zip(memory.split(self.rows), self.widths, strict=True)
+        ]
 
 
 @final
 class Watched(Source):
-    """A source that remembers when its rows stopped: `stopped` [B] is the sample at which each did, -1 where it did not."""
+    """A source that remembers when its rows stopped: `stopped` [B] is the sample at which each did,
+    -1 where it did not.
+    """
 
     def __init__(self, source: Source, rows: int) -> None:
         super().__init__()
@@ -158,7 +175,8 @@ class Manoeuvre(Config, ABC):
 
     Attributes:
         name: of its log; the kind with a number where None.
-        duration: its length, or for a manoeuvre with a stop condition the time after which it has failed; that of the programme where None.
+        duration: its length, or for a manoeuvre with a stop condition the time after which it has
+            failed; that of the programme where None.
     """
 
     kind: str
@@ -168,7 +186,9 @@ class Manoeuvre(Config, ABC):
     @classmethod
     @abstractmethod
     def source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
-        """The source that flies several manoeuvres of this kind side by side; t [T] are the times of the steps."""
+        """The source that flies several manoeuvres of this kind side by side; t [T] are the times
+        of the steps.
+        """
 
     @property
     def goal(self) -> str | None:
@@ -180,11 +200,13 @@ class Manoeuvre(Config, ABC):
         return duration if self.duration is None else self.duration
 
     def begin(self, x: Tensor, state: tuple[str, ...]) -> Tensor:
-        """State [nx] that the manoeuvre starts from, where trials of the vessel start from x [nx]."""
+        """State [nx] that the manoeuvre starts from, where trials of the vessel start from x [nx].
+        """
         return x
 
     def indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
-        """Manoeuvring indices by name, SI and rad (units in `indices.UNITS`); those that the log is too short for are left out.
+        """Manoeuvring indices by name, SI and rad (units in `indices.UNITS`); those that the log is
+        too short for are left out.
 
         Args:
             log: what was flown: t, x, y, psi, u, v, r.
@@ -193,7 +215,9 @@ class Manoeuvre(Config, ABC):
         return {}
 
     def limits(self, helm: Helm, length: float, speed: float) -> dict[str, float]:
-        """Largest values of indices that IMO resolution MSC.137(76) allows a ship of `length` [m] at approach `speed` [m/s], by index."""
+        """Largest values of indices that IMO resolution MSC.137(76) allows a ship of `length` [m]
+        at approach `speed` [m/s], by index.
+        """
         return {}
 
 
@@ -207,8 +231,12 @@ class Scheduled(Manoeuvre):
     @classmethod
     def source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
         """Playback of the demands."""
-        pairs = [manoeuvre.demands(t) for manoeuvre in manoeuvres if isinstance(manoeuvre, Scheduled)]
-        return ScheduleSource(torch.stack([d for d, _ in pairs]), torch.stack([s for _, s in pairs]), helm.demand)
+        pairs = [
+            manoeuvre.demands(t) for manoeuvre in manoeuvres if isinstance(manoeuvre, Scheduled)
+        ]
+        return ScheduleSource(
+            torch.stack([d for d, _ in pairs]), torch.stack([s for _, s in pairs]), helm.demand
+        )
 
 
 class Steering(Config):
@@ -237,7 +265,10 @@ class RudderSteering(Config):
     @model_validator(mode="after")
     def _one(self) -> RudderSteering:
         if (self.steer is None) == (self.rudder is None):
-            raise ValueError("give either steer (share of full steer, -1 to 1) or rudder (an angle such as '10 deg')")
+            raise ValueError(
+                "give either steer (share of full steer, -1 to 1) or rudder (an angle such as '10"
+                " deg')"
+            )
         return self
 
     @property
@@ -249,7 +280,8 @@ class RudderSteering(Config):
         """Share of full steer on a vessel.
 
         Raises:
-            UsageError: where an angle is asked of a vessel without rudder, or more than its largest.
+            UsageError: where an angle is asked of a vessel without rudder, or more than its
+                largest.
         """
         return self.steer if self.steer is not None else rudder_share(self.rudder or 0.0, helm)
 
@@ -262,10 +294,16 @@ def rudder_share(angle: float, helm: Helm) -> float:
     """
     most = helm.hard_over
     if most is None:
-        raise UsageError("the manoeuvre gives a rudder angle, but the vessel has no rudder; give steer, a share of full steer from -1 to 1")
+        raise UsageError(
+            "the manoeuvre gives a rudder angle, but the vessel has no rudder; give steer, a share"
+            " of full steer from -1 to 1"
+        )
     share = angle / most
     if abs(share) > 1.0 + 1e-9:
-        raise UsageError(f"the manoeuvre asks for {abs(angle) * 57.29578:.4g} deg of rudder, the vessel's goes to {most * 57.29578:.4g} deg")
+        raise UsageError(
+            f"the manoeuvre asks for {abs(angle) * 57.29578:.4g} deg of rudder, the vessel's goes"
+            f" to {most * 57.29578:.4g} deg"
+        )
     return share
 
 

@@ -1,4 +1,5 @@
-"""Constant input: from rest to the steady state of a speed or a turn (document 003 section 4.2.2)."""
+"""Constant input: from rest to the steady state of a speed or a turn (document 003 section 4.2.2).
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Random excitation over a band of frequencies: steps of random height and length, and sums of sines."""
+"""Random excitation over a band of frequencies: steps of random height and length, and sums of
+sines.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,10 @@ from residnet.manoeuvres.base import Manoeuvre, Range, Scheduled
 
 def _ordered(band: tuple[float, float]) -> tuple[float, float]:
     if not 0 < band[0] < band[1]:
-        raise ValueError(f"a band goes from a low to a higher frequency above zero, given {band[0]:g} Hz to {band[1]:g} Hz")
+        raise ValueError(
+            f"a band goes from a low to a higher frequency above zero, given {band[0]:g} Hz to"
+            f" {band[1]:g} Hz"
+        )
     return band
 
 
@@ -51,12 +56,21 @@ class Excitation(Scheduled, ABC):
     def demands(self, t: Tensor) -> tuple[Tensor, Tensor]:
         """Drive and steer [T], clipped to +-1."""
         active = t >= self.start - 1e-9
-        waves = [torch.where(active, self._wave((t - self.start).clamp(min=0.0), which), torch.zeros_like(t)) for which in (0, 1)]
-        return (self.drive + self.drive_amplitude * waves[0]).clamp(-1.0, 1.0), self.steer_amplitude * waves[1]
+        waves = [
+            torch.where(
+                active, self._wave((t - self.start).clamp(min=0.0), which), torch.zeros_like(t)
+            )
+            for which in (0, 1)
+        ]
+        return (self.drive + self.drive_amplitude * waves[0]).clamp(
+            -1.0, 1.0
+        ), self.steer_amplitude * waves[1]
 
 
 class RandomSteps(Excitation):
-    """Drive and steer jump to levels uniform within their amplitudes; each is held for half a period of a random frequency of the band."""
+    """Drive and steer jump to levels uniform within their amplitudes; each is held for half a
+    period of a random frequency of the band.
+    """
 
     kind: Literal["random_steps"] = "random_steps"
 
@@ -72,9 +86,11 @@ class RandomSteps(Excitation):
 
 
 class MultiSine(Excitation):
-    """Sums of sines at frequencies spread evenly in their logarithm over the band, drive and steer at frequencies of their own.
+    """Sums of sines at frequencies spread evenly in their logarithm over the band, drive and steer
+    at frequencies of their own.
 
-    The phases are the ones with the flattest sum of some random draws, so that the amplitude is well used.
+    The phases are the ones with the flattest sum of some random draws, so that the amplitude is
+    well used.
 
     Attributes:
         tones: frequencies of each of drive and steer.
@@ -95,7 +111,9 @@ class MultiSine(Excitation):
             peak = float(np.abs(np.sin(angle + phases).sum(axis=1)).max())
             if peak < least:
                 best, least = phases, peak
-        argument = 2.0 * math.pi * t.unsqueeze(-1) * torch.from_numpy(frequencies).to(t.dtype) + torch.from_numpy(best).to(t.dtype)
+        argument = 2.0 * math.pi * t.unsqueeze(-1) * torch.from_numpy(frequencies).to(
+            t.dtype
+        ) + torch.from_numpy(best).to(t.dtype)
         return (torch.sin(argument).sum(-1) / least).clamp(-1.0, 1.0)
 
 
@@ -138,4 +156,7 @@ class MultiSineFamily(_Family):
 
     def draw(self, random: np.random.Generator, duration: float) -> list[Manoeuvre]:
         """`count` manoeuvres."""
-        return [MultiSine.model_validate({**self._one(random), "tones": self.tones}) for _ in range(self.count)]
+        return [
+            MultiSine.model_validate({**self._one(random), "tones": self.tones})
+            for _ in range(self.count)
+        ]

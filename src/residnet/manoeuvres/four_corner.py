@@ -1,4 +1,6 @@
-"""The four-corner course: twelve segments of surge, sway and yaw, alone and together (document 002 section 4.1, Table 4.1)."""
+"""The four-corner course: twelve segments of surge, sway and yaw, alone and together (document 002
+section 4.1, Table 4.1).
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,8 @@ SEGMENTS: tuple[Waypoint, ...] = (
 
 
 class FourCorner(Manoeuvre):
-    """Poses given one after the other through a reference filter, followed by a PID; for vessels that are commanded in all three forces.
+    """Poses given one after the other through a reference filter, followed by a PID; for vessels
+    that are commanded in all three forces.
 
     Attributes:
         poses: (north, east, heading); the twelve of the document where absent.
@@ -47,7 +50,12 @@ class FourCorner(Manoeuvre):
     @property
     def filter(self) -> ReferenceFilterConfig:
         """The reference filter."""
-        return ReferenceFilterConfig(waypoints=self.poses, interval=self.interval, frequency=self.frequency, damping=self.damping)
+        return ReferenceFilterConfig(
+            waypoints=self.poses,
+            interval=self.interval,
+            frequency=self.frequency,
+            damping=self.damping,
+        )
 
     def lasts(self, duration: float) -> float:
         """One interval for each pose, or `self.duration` where that is less."""
@@ -61,7 +69,10 @@ class FourCorner(Manoeuvre):
             UsageError: where the vessel has no command for each of the three forces.
         """
         step = float(t[1] - t[0])
-        return StackedSource([FourCornerSource(m, helm, step) for m in manoeuvres if isinstance(m, FourCorner)], [1] * len(manoeuvres))
+        return StackedSource(
+            [FourCornerSource(m, helm, step) for m in manoeuvres if isinstance(m, FourCorner)],
+            [1] * len(manoeuvres),
+        )
 
     def indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
         """Mean distance from the reference, and mean absolute error of the heading."""
@@ -74,7 +85,10 @@ class FourCorner(Manoeuvre):
             wanted.append(pose[0, :3].numpy())
         away = x.numpy() - np.stack(wanted)
         heading = np.abs((away[:, 2] + math.pi) % (2 * math.pi) - math.pi)
-        return {"mean_position_error": float(np.hypot(away[:, 0], away[:, 1]).mean()), "mean_heading_error": float(heading.mean())}
+        return {
+            "mean_position_error": float(np.hypot(away[:, 0], away[:, 1]).mean()),
+            "mean_heading_error": float(heading.mean()),
+        }
 
 
 @final
@@ -85,7 +99,8 @@ class FourCornerSource(Source):
         super().__init__()
         if helm.forces is None or helm.state[:6] != ("x", "y", "psi", "u", "v", "r"):
             raise UsageError(
-                "a four-corner course needs a vessel in surge, sway and yaw that is commanded in all three, by forces or azimuth thrusters"
+                "a four-corner course needs a vessel in surge, sway and yaw that is commanded in"
+                " all three, by forces or azimuth thrusters"
             )
         self.forces = helm.forces
         self.reference = manoeuvre.filter.build(step)
@@ -101,4 +116,6 @@ class FourCornerSource(Source):
         target, guided = self.reference(x, k, memory[:, :n])
         tau, s = self.policy(x, target, memory[:, n:])
         command = self.forces(tau)
-        return torch.cat((command, w[:, command.shape[-1] :]), dim=-1), torch.cat((guided, s), dim=-1)
+        return torch.cat((command, w[:, command.shape[-1] :]), dim=-1), torch.cat(
+            (guided, s), dim=-1
+        )

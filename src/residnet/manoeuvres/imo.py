@@ -1,4 +1,6 @@
-"""Limits of IMO resolution MSC.137(76), Standards for Ship Manoeuvrability, for ships of 100 m and more."""
+"""Limits of IMO resolution MSC.137(76), Standards for Ship Manoeuvrability, for ships of 100 m and
+more.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,9 @@ def turning(length: float) -> dict[str, float]:
 
 
 def zigzag_10(length: float, speed: float) -> dict[str, float]:
-    """10/10 zigzag (sections 5.3.2 and 5.3.3): overshoots in rad by length [m] over speed [m/s], and the distance of the initial turn in m."""
+    """10/10 zigzag (sections 5.3.2 and 5.3.3): overshoots in rad by length [m] over speed [m/s],
+    and the distance of the initial turn in m.
+    """
     ratio = min(max(length / speed, 10.0), 30.0) if speed > 0 else 30.0
     # between 10 s and 30 s; below and above the standard is the value at the end
     return {

@@ -1,6 +1,8 @@
-"""Manoeuvring indices from logged motion: crossings and peaks between samples, turning circle, zigzag, stopping.
+"""Manoeuvring indices from logged motion: crossings and peaks between samples, turning circle,
+zigzag, stopping.
 
-Definitions as in IMO resolution MSC.137(76) and ITTC procedure 7.5-02-06-01. All SI and rad; lengths also in hull lengths.
+Definitions as in IMO resolution MSC.137(76) and ITTC procedure 7.5-02-06-01. All SI and rad;
+lengths also in hull lengths.
 """
 
 from __future__ import annotations
@@ -32,14 +34,22 @@ UNITS: dict[str, str] = {
 }  # fmt: skip
 """Unit of each index."""
 
-IN_LENGTHS = {"advance", "transfer", "tactical_diameter", "steady_diameter", "initial_turning_distance", "overshoot_width"}
+IN_LENGTHS = {
+    "advance",
+    "transfer",
+    "tactical_diameter",
+    "steady_diameter",
+    "initial_turning_distance",
+    "overshoot_width",
+}
 IN_LENGTHS |= {"track_reach", "head_reach", "lateral_deviation"}
 
 _TURN = math.pi / 2
 
 
 class Track:
-    """Motion of a log as smooth functions of its time; samples at which a channel is empty are left out.
+    """Motion of a log as smooth functions of its time; samples at which a channel is empty are left
+    out.
 
     Raises:
         DataError: where fewer than four samples hold all of x, y, psi, u, v, r.
@@ -49,7 +59,10 @@ class Track:
         motion = log.stack(("x", "y", "psi", "u", "v", "r"))
         whole = np.isfinite(motion).all(axis=1)
         if whole.sum() < 4:
-            raise DataError(f"log {log.name}: {int(whole.sum())} samples hold x, y, psi, u, v and r together; indices need at least 4")
+            raise DataError(
+                f"log {log.name}: {int(whole.sum())} samples hold x, y, psi, u, v and r together;"
+                " indices need at least 4"
+            )
         self.t: np.ndarray = log.t[whole] - log.t[0]
         x, y, self.heading, self.u, self.v, self.r = motion[whole].T
         self.psi = CubicSpline(self.t, self.heading)
@@ -68,7 +81,9 @@ class Track:
         return float(self.speed[max(int(np.searchsorted(self.t, start + 1e-9)) - 1, 0)])
 
     def crossing(self, level: float, after: float, sign: float = 1.0) -> float | None:
-        """First time after `after` at which sign * heading rises to sign * `level`; None where it does not."""
+        """First time after `after` at which sign * heading rises to sign * `level`; None where it
+        does not.
+        """
         return first_crossing(lambda t: sign * (self.psi(t) - level), self.t, after)
 
     def peak(self, begin: float, end: float, sign: float) -> tuple[float, float]:
@@ -84,36 +99,48 @@ class Track:
         return time, float(sign * self.psi(time))
 
     def beside(self, time: float, origin: float) -> tuple[float, float]:
-        """Place at `time` ahead and to starboard of where the vessel was at `origin`, along the heading that it had there."""
+        """Place at `time` ahead and to starboard of where the vessel was at `origin`, along the
+        heading that it had there.
+        """
         north, east = float(self.x(time) - self.x(origin)), float(self.y(time) - self.y(origin))
         c, s = math.cos(float(self.psi(origin))), math.sin(float(self.psi(origin)))
         return north * c + east * s, east * c - north * s
 
 
 def first_crossing(function: Callable[[Any], Any], t: np.ndarray, after: float) -> float | None:
-    """First time after `after` at which a function rises through zero, between samples at t [T]; None where it does not."""
+    """First time after `after` at which a function rises through zero, between samples at t [T];
+    None where it does not.
+    """
     times = np.concatenate(([after], t[t > after]))
     values = function(times)
     rising = np.flatnonzero((values[:-1] < 0) & (values[1:] >= 0))
     if rising.size == 0:
         return None
     i = int(rising[0])
-    return float(brentq(function, times[i], times[i + 1], xtol=1e-12)) if values[i + 1] > 0 else float(times[i + 1])
+    return (
+        float(brentq(function, times[i], times[i + 1], xtol=1e-12))
+        if values[i + 1] > 0
+        else float(times[i + 1])
+    )
 
 
 def in_lengths(found: dict[str, Any], length: float | None) -> dict[str, Any]:
     """Indices with the distances among them in hull lengths as well, `<index>_lengths`."""
     if length is None:
         return found
-    return found | {f"{name}_lengths": value / length for name, value in found.items() if name in IN_LENGTHS}
+    return found | {
+        f"{name}_lengths": value / length for name, value in found.items() if name in IN_LENGTHS
+    }
 
 
-def turning(log: Log, start: float, side: float, until: float, length: float | None) -> dict[str, Any]:
+def turning(
+    log: Log, start: float, side: float, until: float, length: float | None
+) -> dict[str, Any]:
     """Indices of a turning circle.
 
-    Advance is along, transfer and tactical diameter are across the heading at `start`, towards the turn. The steady turn is the last
-    half turn before the heading has changed by `until`, where that is a full turn or more; its drift angle is positive with the bow
-    inside the turn.
+    Advance is along, transfer and tactical diameter are across the heading at `start`, towards the
+    turn. The steady turn is the last half turn before the heading has changed by `until`, where
+    that is a full turn or more; its drift angle is positive with the bow inside the turn.
 
     Args:
         log: t, x, y, psi, u, v, r.
@@ -127,13 +154,20 @@ def turning(log: Log, start: float, side: float, until: float, length: float | N
         return {}
     origin = float(track.psi(start))
     found: dict[str, Any] = {"approach_speed": track.approach(start)}
-    quarter, half = (track.crossing(origin + side * angle, start, side) for angle in (_TURN, 2 * _TURN))
+    quarter, half = (
+        track.crossing(origin + side * angle, start, side) for angle in (_TURN, 2 * _TURN)
+    )
     if quarter is not None:
         ahead, across = track.beside(quarter, start)
         found |= {"advance": ahead, "transfer": side * across, "time_90": quarter - start}
     if half is not None:
-        found |= {"tactical_diameter": side * track.beside(half, start)[1], "time_180": half - start}
-    begin, end = (track.crossing(origin + side * angle, start, side) for angle in (until - math.pi, until))
+        found |= {
+            "tactical_diameter": side * track.beside(half, start)[1],
+            "time_180": half - start,
+        }
+    begin, end = (
+        track.crossing(origin + side * angle, start, side) for angle in (until - math.pi, until)
+    )
     if until >= 2 * math.pi - 1e-9 and begin is not None:
         inside = (track.t >= begin) & (track.t <= (track.end if end is None else end))
     else:
@@ -141,19 +175,28 @@ def turning(log: Log, start: float, side: float, until: float, length: float | N
     if inside.any():
         speed, rate = float(track.speed[inside].mean()), float(np.abs(track.r[inside].mean()))
         drift = np.arctan2(-side * track.v[inside], track.u[inside])
-        found |= {"steady_diameter": 2 * speed / rate, "steady_speed": speed, "steady_yaw_rate": rate, "steady_drift_angle": float(drift.mean())}
+        found |= {
+            "steady_diameter": 2 * speed / rate,
+            "steady_speed": speed,
+            "steady_yaw_rate": rate,
+            "steady_drift_angle": float(drift.mean()),
+        }
         if found["approach_speed"] > 0:
             found["steady_speed_ratio"] = speed / found["approach_speed"]
     return in_lengths(found, length)
 
 
-def zigzag(log: Log, start: float, side: float, heading: float, length: float | None) -> dict[str, Any]:
+def zigzag(
+    log: Log, start: float, side: float, heading: float, length: float | None
+) -> dict[str, Any]:
     """Indices of a zigzag.
 
-    An overshoot is how far the heading goes beyond its bound after a reversal. The time to check yaw is from the first reversal to the
-    peak of the heading; the overshoot width is how far the track moves on across the initial course after that reversal; the reach is the
-    time from the first execute until the heading is back on the initial course; the period is that of a whole cycle, from reversal to
-    reversal of the same side, mean over the log. The initial course is the heading that the log begins with.
+    An overshoot is how far the heading goes beyond its bound after a reversal. The time to check
+    yaw is from the first reversal to the peak of the heading; the overshoot width is how far the
+    track moves on across the initial course after that reversal; the reach is the time from the
+    first execute until the heading is back on the initial course; the period is that of a whole
+    cycle, from reversal to reversal of the same side, mean over the log. The initial course is the
+    heading that the log begins with.
 
     Args:
         log: t, x, y, psi, u, v, r.
@@ -176,13 +219,23 @@ def zigzag(log: Log, start: float, side: float, heading: float, length: float | 
             time, value = track.peak(reversal, back, towards)
             overshoots.append((time, value - towards * origin - heading))
         now, towards = reversal, -towards
-    found: dict[str, Any] = {"approach_speed": track.approach(start), "largest_yaw_rate": float(np.abs(track.r[track.t >= start]).max())}
+    found: dict[str, Any] = {
+        "approach_speed": track.approach(start),
+        "largest_yaw_rate": float(np.abs(track.r[track.t >= start]).max()),
+    }
     if reversals:
         found["initial_turning_time"] = reversals[0] - start
-        found["initial_turning_distance"] = float(track.travelled(reversals[0]) - track.travelled(start))
+        found["initial_turning_distance"] = float(
+            track.travelled(reversals[0]) - track.travelled(start)
+        )
         back = track.crossing(origin, reversals[0], -side)
         found |= {} if back is None else {"reach": back - start}
-    found |= {name: value for name, (_, value) in zip(("first_overshoot", "second_overshoot"), overshoots, strict=False)}
+    found |= {
+        name: value
+        for name, (_, value) in zip(
+            ("first_overshoot", "second_overshoot"), overshoots, strict=False
+        )
+    }
     if overshoots:
         found["time_to_check_yaw"] = overshoots[0][0] - reversals[0]
     if len(reversals) > 1:
@@ -195,7 +248,9 @@ def zigzag(log: Log, start: float, side: float, heading: float, length: float | 
 
 
 def stopping(log: Log, start: float, length: float | None) -> dict[str, Any]:
-    """Indices of a stopping trial from the order at `start` [s] to where the surge velocity is zero: along the track, ahead and across."""
+    """Indices of a stopping trial from the order at `start` [s] to where the surge velocity is
+    zero: along the track, ahead and across.
+    """
     track = Track(log)
     surge = CubicSpline(track.t, track.u)
     found: dict[str, Any] = {"approach_speed": track.approach(start)}
@@ -203,5 +258,9 @@ def stopping(log: Log, start: float, length: float | None) -> dict[str, Any]:
     if stop is None:
         return found
     ahead, across = track.beside(stop, start)
-    found |= {"track_reach": float(track.travelled(stop) - track.travelled(start)), "head_reach": ahead, "lateral_deviation": abs(across)}
+    found |= {
+        "track_reach": float(track.travelled(stop) - track.travelled(start)),
+        "head_reach": ahead,
+        "lateral_deviation": abs(across),
+    }
     return in_lengths(found | {"stopping_time": stop - start}, length)

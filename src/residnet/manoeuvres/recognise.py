@@ -1,4 +1,6 @@
-"""Reading off a measured log which zigzag was steered, so that a model can repeat it in closed loop."""
+"""Reading off a measured log which zigzag was steered, so that a model can repeat it in closed
+loop.
+"""
 
 from __future__ import annotations
 
@@ -20,8 +22,10 @@ class SteeredZigzag(NamedTuple):
         start: time of the first execute in s, from the log's first sample.
         side: of the first execute, +1 starboard, -1 port.
         angle: rudder angle held, mean over both sides, rad.
-        heading: change of heading at which the rudder was ordered back, mean over the reversals, rad.
-        leaves: change of heading at which the rudder left its side, rad; beyond `heading` by what the vessel turned while the order took effect.
+        heading: change of heading at which the rudder was ordered back, mean over the reversals,
+            rad.
+        leaves: change of heading at which the rudder left its side, rad; beyond `heading` by what
+            the vessel turned while the order took effect.
         turning: rate of turn when it left, mean over the reversals, rad/s.
     """
 
@@ -36,8 +40,9 @@ class SteeredZigzag(NamedTuple):
 def steered_zigzag(log: Log, rudder: str) -> SteeredZigzag:
     """The zigzag of a log that holds t, psi and a rudder angle.
 
-    An order is given at the last sample before the rudder moves, at a tenth of its largest rate. When the rudder left its side is told to a
-    fraction of a sample, by its rate on the way across: a sample of a coarse grid can be worth half a degree of heading.
+    An order is given at the last sample before the rudder moves, at a tenth of its largest rate.
+    When the rudder left its side is told to a fraction of a sample, by its rate on the way across:
+    a sample of a coarse grid can be worth half a degree of heading.
 
     Raises:
         DataError: where the rudder does not change sides with the heading at least twice.
@@ -53,25 +58,44 @@ def steered_zigzag(log: Log, rudder: str) -> SteeredZigzag:
     turned = stands[over[1:]] != stands[over[:-1]]
     changes = list(zip(over[:-1][turned], over[1:][turned], strict=True))
     if angle == 0.0 or len(changes) < 2:
-        raise DataError(f"log {log.name}: the rudder is reversed {len(changes)} times; a zigzag needs at least 2")
+        raise DataError(
+            f"log {log.name}: the rudder is reversed {len(changes)} times; a zigzag needs at"
+            " least 2"
+        )
     # the rudder may rest beside the middle before the first order
     begun = int(np.argmax(moving))
     arrived = int(np.argmax(~moving & (np.arange(delta.size) > begun)))
     side = float(np.sign(delta[arrived] - delta[begun]))
     reversals = [(int(a), int(b)) for a, b in changes if b > arrived]
     if len(reversals) < 2:
-        raise DataError(f"log {log.name}: the rudder is reversed {len(reversals)} times; a zigzag needs at least 2")
+        raise DataError(
+            f"log {log.name}: the rudder is reversed {len(reversals)} times; a zigzag needs at"
+            " least 2"
+        )
     towards = side * (-1.0) ** np.arange(len(reversals))
     orders = [int(np.flatnonzero(~moving[:b])[-1]) for _, b in reversals]
-    left = [_left(log.t[a : b + 1], stands[b] * (delta[a : b + 1] - middle) / angle) for a, b in reversals]
-    heading, leaves = float(np.mean(towards * psi[orders])), float(np.mean(towards * np.interp(left, log.t, psi)))
+    left = [
+        _left(log.t[a : b + 1], stands[b] * (delta[a : b + 1] - middle) / angle)
+        for a, b in reversals
+    ]
+    heading, leaves = (
+        float(np.mean(towards * psi[orders])),
+        float(np.mean(towards * np.interp(left, log.t, psi))),
+    )
     turning = float(np.mean(towards * np.interp(left, log.t, np.gradient(psi, log.t))))
     if heading <= 0.0:
-        raise DataError(f"log {log.name}: the heading does not follow the rudder at the reversals; check the sign of {rudder}")
-    return SteeredZigzag(float(log.t[max(begun - 1, 0)] - log.t[0]), side, angle, heading, leaves, turning)
+        raise DataError(
+            f"log {log.name}: the heading does not follow the rudder at the reversals; check the"
+            f" sign of {rudder}"
+        )
+    return SteeredZigzag(
+        float(log.t[max(begun - 1, 0)] - log.t[0]), side, angle, heading, leaves, turning
+    )
 
 
 def _left(t: np.ndarray, way: np.ndarray) -> float:
-    """Time at which the rudder leaves -1 for +1, from samples that begin below -1/2 and end above +1/2."""
+    """Time at which the rudder leaves -1 for +1, from samples that begin below -1/2 and end above
+    +1/2.
+    """
     below, above = np.interp((-_OVER, _OVER), np.maximum.accumulate(way), t)
     return float(below - (1.0 - _OVER) / (2.0 * _OVER) * (above - below))

@@ -19,12 +19,14 @@ from residnet.manoeuvres.base import Helm, Manoeuvre
 
 
 class Replay(Manoeuvre):
-    """The recorded inputs, each held until the next sample, from the recorded initial state; lasts as long as the log unless `duration` is less.
+    """The recorded inputs, each held until the next sample, from the recorded initial state; lasts
+    as long as the log unless `duration` is less.
 
     Attributes:
         log: file of the log; canonical, or any that the reader of the programme reads.
-        channels: channel of the log that is taken for an input or state of the vessel, by the latter's name; the one of the same name where absent
-            (`{cmd_port: n_port}` replays measured revolutions as commands).
+        channels: channel of the log that is taken for an input or state of the vessel, by the
+            latter's name; the one of the same name where absent (`{cmd_port: n_port}` replays
+            measured revolutions as commands).
     """
 
     kind: Literal["replay"] = "replay"
@@ -57,7 +59,10 @@ class Replay(Manoeuvre):
         if wanted in self.recorded.channels:
             return self.recorded[wanted]
         if name in self.channels:
-            raise UsageError(f"replay.channels: log {self.recorded.name} has no channel '{wanted}'{nearest(wanted, self.recorded.channels)}")
+            raise UsageError(
+                f"replay.channels: log {self.recorded.name} has no channel"
+                f" '{wanted}'{nearest(wanted, self.recorded.channels)}"
+            )
         return None
 
     def lasts(self, duration: float) -> float:
@@ -66,7 +71,8 @@ class Replay(Manoeuvre):
         return span if self.duration is None else min(span, self.duration)
 
     def begin(self, x: Tensor, state: tuple[str, ...]) -> Tensor:
-        """State [nx] at the log's first sample; what the log does not have stays as it is in x [nx].
+        """State [nx] at the log's first sample; what the log does not have stays as it is in x
+        [nx].
 
         Raises:
             UsageError: where the log lacks position, heading or a velocity.
@@ -78,14 +84,21 @@ class Replay(Manoeuvre):
             if values is not None:
                 filled = np.flatnonzero(np.isfinite(values))
                 if filled.size == 0:
-                    raise DataError(f"log {self.recorded.name}: channel '{name}' is empty; a replay starts from its first value")
+                    raise DataError(
+                        f"log {self.recorded.name}: channel '{name}' is empty; a replay starts from"
+                        " its first value"
+                    )
                 out[i] = float(values[filled[0]])
             elif name in STATE:
-                raise UsageError(f"log {self.recorded.name}: no channel '{name}', which a replay starts from{nearest(name, self.recorded.channels)}")
+                raise UsageError(
+                    f"log {self.recorded.name}: no channel '{name}', which a replay starts"
+                    f" from{nearest(name, self.recorded.channels)}"
+                )
         return out
 
     def inputs(self, helm: Helm, t: Tensor) -> Tensor:
-        """Inputs [T, m] at times t [T]; NaN in the columns that nobody commands and that the log does not have.
+        """Inputs [T, m] at times t [T]; NaN in the columns that nobody commands and that the log
+        does not have.
 
         Raises:
             UsageError: where the log lacks a command.
@@ -98,8 +111,9 @@ class Replay(Manoeuvre):
             values = self.channel(name)
             if values is None and i < commands:
                 raise UsageError(
-                    f"log {self.recorded.name}: no channel '{name}', which the vessel is commanded with; name one that it has in "
-                    f"replay.channels; it has {', '.join(self.recorded.channels)}"
+                    f"log {self.recorded.name}: no channel '{name}', which the vessel is commanded"
+                    " with; name one that it has in replay.channels; it has"
+                    f" {', '.join(self.recorded.channels)}"
                 )
             if values is not None and np.isfinite(values).any():
                 known = np.isfinite(values)
@@ -108,7 +122,9 @@ class Replay(Manoeuvre):
         return torch.from_numpy(out)
 
     def indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
-        """How far the motion is from the recorded one: root mean square errors of u, v, r, and where it ends."""
+        """How far the motion is from the recorded one: root mean square errors of u, v, r, and
+        where it ends.
+        """
         clock = self.recorded.t - self.recorded.t[0]
         errors: dict[str, np.ndarray] = {}
         for name in STATE:
@@ -116,14 +132,21 @@ class Replay(Manoeuvre):
             assert values is not None, "a replay does not begin without it"
             known = np.isfinite(values)
             errors[name] = log[name] - np.interp(log.t - log.t[0], clock[known], values[known])
-        found: dict[str, Any] = {f"rmse_{name}": float(np.sqrt(np.mean(errors[name] ** 2))) for name in VELOCITY}
+        found: dict[str, Any] = {
+            f"rmse_{name}": float(np.sqrt(np.mean(errors[name] ** 2))) for name in VELOCITY
+        }
         away = float(np.hypot(errors["x"][-1], errors["y"][-1]))
-        return found | {"position_error_end": away, "heading_error_end": float(abs((errors["psi"][-1] + np.pi) % (2 * np.pi) - np.pi))}
+        return found | {
+            "position_error_end": away,
+            "heading_error_end": float(abs((errors["psi"][-1] + np.pi) % (2 * np.pi) - np.pi)),
+        }
 
     @classmethod
     def source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
         """Playback of the recorded inputs."""
-        return RecordedSource(torch.stack([m.inputs(helm, t) for m in manoeuvres if isinstance(m, Replay)]))
+        return RecordedSource(
+            torch.stack([m.inputs(helm, t) for m in manoeuvres if isinstance(m, Replay)])
+        )
 
 
 @final

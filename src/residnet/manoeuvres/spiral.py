@@ -1,4 +1,6 @@
-"""Dieudonne's spiral: a sequence of helm angles, each held until the yaw rate is steady; shows whether a vessel keeps its course."""
+"""Dieudonne's spiral: a sequence of helm angles, each held until the yaw rate is steady; shows
+whether a vessel keeps its course.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,8 @@ _DOWN = (1.0, 0.6, 0.4, 0.2, 0.1, 0.0, -0.1, -0.2, -0.4, -0.6, -1.0)
 
 
 class Spiral(Manoeuvre):
-    """Helm angles from one side to the other and back; an unstable vessel shows a loop of yaw rate over angle.
+    """Helm angles from one side to the other and back; an unstable vessel shows a loop of yaw rate
+    over angle.
 
     Attributes:
         drive: held throughout.
@@ -63,14 +66,17 @@ class Spiral(Manoeuvre):
         return SpiralSource([m for m in manoeuvres if isinstance(m, Spiral)], helm, t)
 
     def indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
-        """Steady yaw rate of each angle that was finished, in order, and the height of the loop amidships: the largest difference of
-        the yaw rates that the angle nearest to zero had; `steers` are shares of full steer (rad where the log has a rudder)."""
+        """Steady yaw rate of each angle that was finished, in order, and the height of the loop
+        amidships: the largest difference of the yaw rates that the angle nearest to zero had;
+        `steers` are shares of full steer (rad where the log has a rudder).
+        """
         commands = [name for name in log.channels if name.startswith("cmd_")]
         table = log.stack(commands)
         active = log.t - log.t[0] >= self.start - 1e-9
         changes = np.flatnonzero((np.abs(np.diff(table, axis=0)) > 1e-12).any(axis=1) & active[1:])
         angles = list(self.rudders or self.steers or _DOWN + _DOWN[-2::-1])
-        # the first change is the order of the first angle, unless that is amidships as the approach is
+        # the first change is the order of the first angle, unless that is amidships as the approach
+        # is
         held = changes if angles[0] == 0 else changes[1:]
         ends = [*held.tolist(), len(log) - 1][: len(angles)]
         rates = [float(log["r"][i]) for i in ends]
@@ -78,7 +84,9 @@ class Spiral(Manoeuvre):
         middle = min(angles, key=abs)
         amidships = [rate for angle, rate in zip(angles, rates, strict=True) if angle == middle]
         found: dict[str, Any] = {"steers": angles, "yaw_rates": rates}
-        return found | ({"loop_height": max(amidships) - min(amidships)} if len(amidships) > 1 else {})
+        return found | (
+            {"loop_height": max(amidships) - min(amidships)} if len(amidships) > 1 else {}
+        )
 
 
 @final
@@ -89,9 +97,13 @@ class SpiralSource(Source):
         super().__init__()
         shares = [m.shares(helm) for m in manoeuvres]
         most = max(map(len, shares))
-        self.shares = torch.tensor([[*row, *[0.0] * (most + 1 - len(row))] for row in shares], dtype=torch.float64)
+        self.shares = torch.tensor(
+            [[*row, *[0.0] * (most + 1 - len(row))] for row in shares], dtype=torch.float64
+        )
         self.count = torch.tensor([len(row) for row in shares], dtype=torch.float64)
-        self.drive, self.start = torch.tensor([[m.drive, m.start] for m in manoeuvres], dtype=torch.float64).unbind(-1)
+        self.drive, self.start = torch.tensor(
+            [[m.drive, m.start] for m in manoeuvres], dtype=torch.float64
+        ).unbind(-1)
         self.steady = Steady([m.steady for m in manoeuvres], float(t[1] - t[0]))
         self.demand = helm.demand
         self.r = helm.column("r")
@@ -110,8 +122,12 @@ class SpiralSource(Source):
         number = torch.minimum(memory[:, 0] + settled.to(x.dtype), self.count.to(x.dtype))
         kept = self.steady.again(kept, settled)
         share = self.shares.to(x.dtype).gather(1, number.long().unsqueeze(-1))[:, 0]
-        command = self.demand(self.drive.to(x.dtype), torch.where(over, share, torch.zeros_like(share)))
-        return torch.cat((command, w[:, command.shape[-1] :]), dim=-1), torch.cat((number.unsqueeze(-1), kept), dim=-1)
+        command = self.demand(
+            self.drive.to(x.dtype), torch.where(over, share, torch.zeros_like(share))
+        )
+        return torch.cat((command, w[:, command.shape[-1] :]), dim=-1), torch.cat(
+            (number.unsqueeze(-1), kept), dim=-1
+        )
 
     def finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
         """Rows that have held their last angle."""

@@ -15,8 +15,10 @@ class SteadyConfig(Config):
     """Steady: for `window` seconds the yaw rate stays near its running mean.
 
     Attributes:
-        window: how long it must stay, and time constant of the running mean; a few times what the vessel needs to sail its length.
-        tolerance: how far it may be off, as a share of the largest yaw rate of the manoeuvre so far.
+        window: how long it must stay, and time constant of the running mean; a few times what the
+            vessel needs to sail its length.
+        tolerance: how far it may be off, as a share of the largest yaw rate of the manoeuvre so
+            far.
     """
 
     window: Seconds = Field(default=10.0, gt=0)
@@ -25,7 +27,9 @@ class SteadyConfig(Config):
 
 @final
 class Steady(nn.Module):
-    """Memory [B, 3]: running mean of r, largest |r| so far, and for how long r has been near the mean."""
+    """Memory [B, 3]: running mean of r, largest |r| so far, and for how long r has been near the
+    mean.
+    """
 
     width = 3
 
@@ -45,7 +49,9 @@ class Steady(nn.Module):
         mean = mean + (self.dt / self.window).clamp(max=1.0).to(r.dtype) * (r - mean)
         largest = torch.maximum(largest, r.abs())
         near = (r - mean).abs() <= self.tolerance.to(r.dtype) * largest
-        return torch.stack((mean, largest, torch.where(near, calm + self.dt, torch.zeros_like(calm))), dim=-1)
+        return torch.stack(
+            (mean, largest, torch.where(near, calm + self.dt, torch.zeros_like(calm))), dim=-1
+        )
 
     def reached(self, memory: Tensor) -> Tensor:
         """[B] bool."""
@@ -53,4 +59,6 @@ class Steady(nn.Module):
 
     def again(self, memory: Tensor, where: Tensor) -> Tensor:
         """The memory with the wait begun anew in rows [B] bool."""
-        return torch.cat((memory[:, :2], memory[:, 2:].masked_fill(where.unsqueeze(-1), 0.0)), dim=-1)
+        return torch.cat(
+            (memory[:, :2], memory[:, 2:].masked_fill(where.unsqueeze(-1), 0.0)), dim=-1
+        )

@@ -1,4 +1,6 @@
-"""3-2-1-1: steering steps of 3, 2, 1 and 1 units to alternating sides, rich over a broad band (document 003 section 4.2.2)."""
+"""3-2-1-1: steering steps of 3, 2, 1 and 1 units to alternating sides, rich over a broad band
+(document 003 section 4.2.2).
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,8 @@ class ThreeTwoOneOne(Steering, Scheduled):
 
 
 class ThreeTwoOneOneFamily(Config):
-    """3-2-1-1 manoeuvres with unit, steer and drive uniform in their ranges, repeated to the end."""
+    """3-2-1-1 manoeuvres with unit, steer and drive uniform in their ranges, repeated to the end.
+    """
 
     kind: Literal["three_two_one_one"] = "three_two_one_one"
     count: int = Field(ge=1)

@@ -1,4 +1,6 @@
-"""Turning circle: approach, helm over until the heading has changed by so much, and where asked for a pull-out."""
+"""Turning circle: approach, helm over until the heading has changed by so much, and where asked for
+a pull-out.
+"""
 
 from __future__ import annotations
 
@@ -20,11 +22,13 @@ from residnet.manoeuvres.steady import Steady, SteadyConfig
 
 
 class TurningCircle(RudderSteering, Manoeuvre):
-    """Straight ahead until `start`, then the helm held until the heading has changed by `until` (IMO asks for 540 deg and full rudder).
+    """Straight ahead until `start`, then the helm held until the heading has changed by `until`
+    (IMO asks for 540 deg and full rudder).
 
     Attributes:
         until: change of heading.
-        pull_out: the helm then goes amidships until the yaw rate is steady: a vessel that is straight-line stable stops turning.
+        pull_out: the helm then goes amidships until the yaw rate is steady: a vessel that is
+            straight-line stable stops turning.
         steady: when it is.
     """
 
@@ -60,12 +64,19 @@ class TurningCircle(RudderSteering, Manoeuvre):
 
 @final
 class TurningSource(Source):
-    """Memory [B, 2 + 3]: heading at the helm order; 0 before the heading change is reached, then 1, then 2; what `Steady` keeps."""
+    """Memory [B, 2 + 3]: heading at the helm order; 0 before the heading change is reached, then 1,
+    then 2; what `Steady` keeps.
+    """
 
     def __init__(self, manoeuvres: Sequence[TurningCircle], helm: Helm, t: Tensor) -> None:
         super().__init__()
-        columns = [[m.drive, m.share(helm), m.start, m.until, m.side, float(m.pull_out)] for m in manoeuvres]
-        self.drive, self.steer, self.start, self.until, self.side, self.pull_out = torch.tensor(columns, dtype=torch.float64).unbind(-1)
+        columns = [
+            [m.drive, m.share(helm), m.start, m.until, m.side, float(m.pull_out)]
+            for m in manoeuvres
+        ]
+        self.drive, self.steer, self.start, self.until, self.side, self.pull_out = torch.tensor(
+            columns, dtype=torch.float64
+        ).unbind(-1)
         self.steady = Steady([m.steady for m in manoeuvres], float(t[1] - t[0]))
         self.demand = helm.demand
         self.psi, self.r = helm.column("psi"), helm.column("r")
@@ -74,7 +85,10 @@ class TurningSource(Source):
 
     def initial(self, x: Tensor) -> Tensor:
         """Present heading, approaching."""
-        return torch.cat((x[:, self.psi, None], torch.zeros_like(x[:, :1]), self.steady.initial(x[:, self.r])), dim=-1)
+        return torch.cat(
+            (x[:, self.psi, None], torch.zeros_like(x[:, :1]), self.steady.initial(x[:, self.r])),
+            dim=-1,
+        )
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Inputs [B, m]; the heading change is tested at the start of the step."""
@@ -82,11 +96,17 @@ class TurningSource(Source):
         kept = self.steady(x[:, self.r], memory[:, 2:])
         over = self.times[k] >= self.start
         origin = torch.where(over, origin, x[:, self.psi])
-        turned = (phase == 0) & over & (self.side.to(x.dtype) * (x[:, self.psi] - origin) >= self.until.to(x.dtype))
+        turned = (
+            (phase == 0)
+            & over
+            & (self.side.to(x.dtype) * (x[:, self.psi] - origin) >= self.until.to(x.dtype))
+        )
         kept = self.steady.again(kept, turned)
         settled = (phase == 1) & self.steady.reached(kept)
         # without a pull-out the heading change is the end
-        phase = torch.where(turned, 2.0 - self.pull_out.to(x.dtype), torch.where(settled, 2.0, phase))
+        phase = torch.where(
+            turned, 2.0 - self.pull_out.to(x.dtype), torch.where(settled, 2.0, phase)
+        )
         steer = torch.where(over & (phase == 0), self.steer.to(x.dtype), torch.zeros_like(phase))
         command = self.demand(self.drive.to(x.dtype), steer)
         memory = torch.cat((torch.stack((origin, phase), dim=-1), kept), dim=-1)
@@ -112,6 +132,9 @@ class TurningCircleFamily(Config):
         out: list[Manoeuvre] = []
         for _ in range(self.count):
             side = 1.0 if random.random() < 0.5 else -1.0
-            steer, drive = side * float(random.uniform(*self.steer)), float(random.uniform(*self.drive))
+            steer, drive = (
+                side * float(random.uniform(*self.steer)),
+                float(random.uniform(*self.drive)),
+            )
             out.append(TurningCircle(steer=steer, drive=drive, start=self.start, until=self.until))
         return out

@@ -21,7 +21,8 @@ from residnet.manoeuvres.base import Helm, Manoeuvre, StackedSource
 
 
 class Waypoints(Manoeuvre):
-    """Straight legs between way-points: line-of-sight guidance, and steer in proportion to heading error and yaw rate.
+    """Straight legs between way-points: line-of-sight guidance, and steer in proportion to heading
+    error and yaw rate.
 
     Attributes:
         drive: held throughout.
@@ -43,7 +44,10 @@ class Waypoints(Manoeuvre):
     @classmethod
     def source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
         """Closed loop on position and heading; each row has a course of its own."""
-        return StackedSource([WaypointSource(m, helm) for m in manoeuvres if isinstance(m, Waypoints)], [1] * len(manoeuvres))
+        return StackedSource(
+            [WaypointSource(m, helm) for m in manoeuvres if isinstance(m, Waypoints)],
+            [1] * len(manoeuvres),
+        )
 
     @property
     def goal(self) -> str:
@@ -53,7 +57,9 @@ class Waypoints(Manoeuvre):
     def indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
         """Cross-track errors from the leg that was sailed, and the time that the course took."""
         x = torch.from_numpy(np.nan_to_num(log.stack(("x", "y"))))
-        guidance = WaypointGuidance(self.points, self.acceptance, LookAhead(self.lookahead), ("x", "y"))
+        guidance = WaypointGuidance(
+            self.points, self.acceptance, LookAhead(self.lookahead), ("x", "y")
+        )
         s = guidance.initial_state(x[:1])
         errors = []
         for k in range(len(log)):
@@ -77,8 +83,12 @@ class WaypointSource(Source):
         super().__init__()
         for name in ("x", "y", "psi", "r"):
             helm.column(name)
-        self.guidance = WaypointGuidance(manoeuvre.points, manoeuvre.acceptance, LookAhead(manoeuvre.lookahead), helm.state)
-        self.autopilot = HeadingPID(helm.state, kp=manoeuvre.gain, kd=manoeuvre.rate_gain, limit=1.0)
+        self.guidance = WaypointGuidance(
+            manoeuvre.points, manoeuvre.acceptance, LookAhead(manoeuvre.lookahead), helm.state
+        )
+        self.autopilot = HeadingPID(
+            helm.state, kp=manoeuvre.gain, kd=manoeuvre.rate_gain, limit=1.0
+        )
         self.drive = manoeuvre.drive
         self.demand = helm.demand
         self.may_stop = True

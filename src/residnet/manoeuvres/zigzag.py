@@ -1,4 +1,6 @@
-"""Zigzag: the steering command changes side whenever the heading reaches its bound (document 003 section 4.2.2)."""
+"""Zigzag: the steering command changes side whenever the heading reaches its bound (document 003
+section 4.2.2).
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,8 @@ class Zigzag(RudderSteering, Manoeuvre):
     Attributes:
         heading: change of heading at which the steering is reversed.
         first: side of a positive steer or rudder.
-        reversals: ends when the heading is back on its initial course after so many reversals; None: lasts as long as it is given time.
+        reversals: ends when the heading is back on its initial course after so many reversals;
+            None: lasts as long as it is given time.
     """
 
     kind: Literal["zigzag"] = "zigzag"
@@ -43,7 +46,10 @@ class Zigzag(RudderSteering, Manoeuvre):
         """So many reversals."""
         if self.reversals is None:
             return None
-        return f"{self.reversals} reversals at {math.degrees(self.heading):.4g} deg of heading and the way back"
+        return (
+            f"{self.reversals} reversals at {math.degrees(self.heading):.4g} deg of heading and the"
+            " way back"
+        )
 
     @property
     def begins(self) -> float:
@@ -55,23 +61,38 @@ class Zigzag(RudderSteering, Manoeuvre):
         return indices.zigzag(log, self.start, self.begins, self.heading, length)
 
     def limits(self, helm: Helm, length: float, speed: float) -> dict[str, float]:
-        """IMO's limits of the 10/10 and 20/20 zigzag; where there is no rudder the heading alone tells which of them it is."""
+        """IMO's limits of the 10/10 and 20/20 zigzag; where there is no rudder the heading alone
+        tells which of them it is.
+        """
         angle = self.heading if helm.hard_over is None else abs(self.share(helm)) * helm.hard_over
         for nominal, limits in ((10.0, imo.zigzag_10(length, speed)), (20.0, imo.zigzag_20())):
-            if max(abs(math.degrees(self.heading) - nominal), abs(math.degrees(angle) - nominal)) < 0.05 * nominal:
+            if (
+                max(abs(math.degrees(self.heading) - nominal), abs(math.degrees(angle) - nominal))
+                < 0.05 * nominal
+            ):
                 return limits
         return {}
 
 
 @final
 class ZigzagSource(Source):
-    """Memory [B, 3]: side of the command (+1 starboard, -1 port), heading at the start, reversals so far."""
+    """Memory [B, 3]: side of the command (+1 starboard, -1 port), heading at the start, reversals
+    so far.
+    """
 
     def __init__(self, manoeuvres: Sequence[Zigzag], helm: Helm, t: Tensor) -> None:
         super().__init__()
-        columns = [[m.drive, m.share(helm), m.start, m.heading, 1.0 if m.first == "starboard" else -1.0] for m in manoeuvres]
-        self.drive, self.steer, self.start, self.heading, self.first = torch.tensor(columns, dtype=torch.float64).unbind(-1)
-        self.most = torch.tensor([math.inf if m.reversals is None else m.reversals for m in manoeuvres], dtype=torch.float64)
+        columns = [
+            [m.drive, m.share(helm), m.start, m.heading, 1.0 if m.first == "starboard" else -1.0]
+            for m in manoeuvres
+        ]
+        self.drive, self.steer, self.start, self.heading, self.first = torch.tensor(
+            columns, dtype=torch.float64
+        ).unbind(-1)
+        self.most = torch.tensor(
+            [math.inf if m.reversals is None else m.reversals for m in manoeuvres],
+            dtype=torch.float64,
+        )
         self.may_stop = any(m.reversals is not None for m in manoeuvres)
         # a negative steer turns to the other side
         self.sense = torch.where(self.steer < 0, -1.0, 1.0).to(torch.float64)
@@ -81,14 +102,20 @@ class ZigzagSource(Source):
 
     def initial(self, x: Tensor) -> Tensor:
         """First side, present heading and no reversals, [B, 3]."""
-        return torch.stack((self.first.to(x.dtype), x[:, self.psi], torch.zeros_like(x[:, 0])), dim=-1)
+        return torch.stack(
+            (self.first.to(x.dtype), x[:, self.psi], torch.zeros_like(x[:, 0])), dim=-1
+        )
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Inputs [B, m]; the bound is tested on the heading at the start of the step."""
         side, origin, count = memory.unbind(-1)
-        reached = side * self.sense.to(x.dtype) * (x[:, self.psi] - origin) >= self.heading.to(x.dtype)
+        reached = side * self.sense.to(x.dtype) * (x[:, self.psi] - origin) >= self.heading.to(
+            x.dtype
+        )
         side = torch.where(reached, -side, side)
-        steer = torch.where(self.times[k] >= self.start, side * self.steer.to(x.dtype), torch.zeros_like(side))
+        steer = torch.where(
+            self.times[k] >= self.start, side * self.steer.to(x.dtype), torch.zeros_like(side)
+        )
         command = self.demand(self.drive.to(x.dtype), steer)
         memory = torch.stack((side, origin, count + reached.to(x.dtype)), dim=-1)
         return torch.cat((command, w[:, command.shape[-1] :]), dim=-1), memory
@@ -96,11 +123,15 @@ class ZigzagSource(Source):
     def finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
         """Rows whose heading is back after their last reversal."""
         side, origin, count = memory.unbind(-1)
-        return (count >= self.most.to(x.dtype)) & (side * self.sense.to(x.dtype) * (x[:, self.psi] - origin) >= 0)
+        return (count >= self.most.to(x.dtype)) & (
+            side * self.sense.to(x.dtype) * (x[:, self.psi] - origin) >= 0
+        )
 
 
 class ZigzagFamily(Config):
-    """Zigzags drawn at random: one of the headings, steer and drive uniform in their ranges, either side first."""
+    """Zigzags drawn at random: one of the headings, steer and drive uniform in their ranges, either
+    side first.
+    """
 
     kind: Literal["zigzag"] = "zigzag"
     count: int = Field(ge=1)

@@ -1,1 +1,3 @@
-"""What is known of a vessel: rigid body, hydrodynamics, actuators, environment. Everything batched and differentiable."""
+"""What is known of a vessel: rigid body, hydrodynamics, actuators, environment. Everything batched
+and differentiable.
+"""

@@ -1,4 +1,6 @@
-"""Abkowitz vessels: Taylor series of the forces about straight motion at service speed, from a vessel file alone (Abkowitz 1964)."""
+"""Abkowitz vessels: Taylor series of the forces about straight motion at service speed, from a
+vessel file alone (Abkowitz 1964).
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,14 @@ import torch
 from pydantic import Field, model_validator
 from torch import Tensor, nn
 
-from residnet.core.config import Config, MetresPerSecond, Radians, RadiansPerSecond, RevRate, RevsPerSecond
+from residnet.core.config import (
+    Config,
+    MetresPerSecond,
+    Radians,
+    RadiansPerSecond,
+    RevRate,
+    RevsPerSecond,
+)
 from residnet.core.errors import ConfigError
 from residnet.physics.actuators.base import Actuators
 from residnet.physics.actuators.servo import ServoConfig, Servos
@@ -32,7 +41,9 @@ class SteeringGearConfig(ServoConfig):
 
 
 class ShaftConfig(ServoConfig):
-    """The propeller's shaft, for series with terms in dn: service revolutions n_0, largest revolutions and rate."""
+    """The propeller's shaft, for series with terms in dn: service revolutions n_0, largest
+    revolutions and rate.
+    """
 
     n_0: RevsPerSecond = Field(gt=0)
     n_max: RevsPerSecond = Field(gt=0)
@@ -53,7 +64,9 @@ class SeriesMass(Config):
 
 
 class Derivatives(Config):
-    """Coefficients of the force on each axis by term, for example `Y: {v: ..., v^2 r: ..., "1": ...}`."""
+    """Coefficients of the force on each axis by term, for example `Y: {v: ..., v^2 r: ..., "1":
+    ...}`.
+    """
 
     X: dict[str, float] = Field(default_factory=dict)
     Y: dict[str, float] = Field(default_factory=dict)
@@ -77,21 +90,24 @@ class Derivatives(Config):
 
 
 class AbkowitzConfig(VesselFile):
-    """A vessel given by its hydrodynamic derivatives: M nu_dot = sum of terms in (du, v, r, delta, dn).
+    """A vessel given by its hydrodynamic derivatives: M nu_dot = sum of terms in (du, v, r, delta,
+    dn).
 
     Attributes:
         name: of the vessel, as its file is called.
         description: one line for `residnet list vessels`.
         length: L, between perpendiculars.
-        units: `prime` for dimensionless coefficients (SNAME's prime system: forces over 0.5 rho L^2 U^2, moments over 0.5 rho L^3 U^2,
-            masses over 0.5 rho L^3, with U the present speed through the water; du/U, v/U, r L/U, dn/n_0), `si` for coefficients in SI.
-        speed: U0, the service speed that the series is taken about. In the prime system the present speed counts as at
-            least a tenth of it: the series says nothing about a vessel at rest.
+        units: `prime` for dimensionless coefficients (SNAME's prime system: forces over 0.5 rho L^2
+            U^2, moments over 0.5 rho L^3 U^2, masses over 0.5 rho L^3, with U the present speed
+            through the water; du/U, v/U, r L/U, dn/n_0), `si` for coefficients in SI.
+        speed: U0, the service speed that the series is taken about. In the prime system the present
+            speed counts as at least a tenth of it: the series says nothing about a vessel at rest.
         density: of the water, for the prime system.
-        coriolis: `included` where the coefficients of v r and u r hold the rigid body's terms (m in X_vr, -m in Y_r), as in most
-            published series; `rigid_body` where they do not, and -C_RB(nu) nu is added.
-        delta_sign: -1 where the coefficients' rudder angle is positive to port (Y_delta > 0), +1 where it is positive to starboard;
-            commands and states here are positive to starboard.
+        coriolis: `included` where the coefficients of v r and u r hold the rigid body's terms (m in
+            X_vr, -m in Y_r), as in most published series; `rigid_body` where they do not, and
+            -C_RB(nu) nu is added.
+        delta_sign: -1 where the coefficients' rudder angle is positive to port (Y_delta > 0), +1
+            where it is positive to starboard; commands and states here are positive to starboard.
         mass, coefficients: with the source of all of them.
         rudder, shaft: how these follow their commands; `shaft` only where there are terms in dn.
         wind: coefficients of the hull above water.
@@ -112,12 +128,23 @@ class AbkowitzConfig(VesselFile):
 
     @model_validator(mode="after")
     def _consistent(self) -> AbkowitzConfig:
-        used = {factor.name for row in self.coefficients.rows() for term in row for factor in parse_term(term, SERIES)}
+        used = {
+            factor.name
+            for row in self.coefficients.rows()
+            for term in row
+            for factor in parse_term(term, SERIES)
+        }
         if ("dn" in used) != (self.shaft is not None):
-            raise ValueError("terms in dn and the section 'shaft' belong together: the series needs both or neither")
+            raise ValueError(
+                "terms in dn and the section 'shaft' belong together: the series needs both or"
+                " neither"
+            )
         turning = self.delta_sign * self.coefficients.N.get("delta", 0.0)
         if turning < 0:
-            raise ValueError("N.delta times delta_sign must be positive: a rudder to starboard turns to starboard; check delta_sign")
+            raise ValueError(
+                "N.delta times delta_sign must be positive: a rudder to starboard turns to"
+                " starboard; check delta_sign"
+            )
         return self
 
     def build(self) -> AbkowitzVessel:
@@ -147,23 +174,33 @@ class SeriesForces(Actuators):
         self.servos = Servos(servos)
         self.state = self.servos.state
         self.prime = config.units == "prime"
-        self.length, self.speed, self.sign = config.length.value, config.speed, float(config.delta_sign)
+        self.length, self.speed, self.sign = (
+            config.length.value,
+            config.speed,
+            float(config.delta_sign),
+        )
         self.turns = config.shaft is not None
         self.dynamic = 0.5 * config.density * self.length**2
         rows = config.coefficients.rows()
         terms = sorted({term for row in rows for term in row})
         self.terms = TermLibrary(terms, SERIES)
-        values = torch.tensor([[row.get(term, 0.0) for row in rows] for term in terms], dtype=torch.float64).reshape(len(terms), 3)
+        values = torch.tensor(
+            [[row.get(term, 0.0) for row in rows] for term in terms], dtype=torch.float64
+        ).reshape(len(terms), 3)
         self.register_buffer("coefficients", values, persistent=False)
         self.register_buffer("limits", torch.tensor(limits, dtype=torch.float64), persistent=False)
         # moments carry one length more than forces
-        self.register_buffer("lengths", torch.tensor([1.0, 1.0, self.length], dtype=torch.float64), persistent=False)
+        self.register_buffer(
+            "lengths", torch.tensor([1.0, 1.0, self.length], dtype=torch.float64), persistent=False
+        )
         self.coefficients: Tensor
         self.limits: Tensor
         self.lengths: Tensor
 
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Rudder angle from steer; revolutions from drive where the series knows them (else it keeps its service power)."""
+        """Rudder angle from steer; revolutions from drive where the series knows them (else it
+        keeps its service power).
+        """
         both = torch.stack((steer, drive) if self.turns else (steer,), dim=-1)
         return both.clamp(-1.0, 1.0) * self.limits.to(drive.dtype)
 
@@ -176,7 +213,10 @@ class SeriesForces(Actuators):
         if not self.prime:
             return self.terms(torch.stack((u - self.speed, v, r, delta, dn), dim=-1)) @ coefficients
         speed = torch.sqrt((u * u + v * v).clamp(min=(0.1 * self.speed) ** 2))
-        motion = torch.stack(((u - self.speed) / speed, v / speed, r * self.length / speed, delta, dn / self.n_0), dim=-1)
+        motion = torch.stack(
+            ((u - self.speed) / speed, v / speed, r * self.length / speed, delta, dn / self.n_0),
+            dim=-1,
+        )
         force = self.dynamic * (speed * speed).unsqueeze(-1) * (self.terms(motion) @ coefficients)
         return force * self.lengths.to(nu.dtype)
 
@@ -190,7 +230,9 @@ class SeriesForces(Actuators):
 
 
 class SeriesInertia(nn.Module):
-    """Mass matrix of the series in SI, its inverse, and the rigid body's Coriolis force where the series leaves it out."""
+    """Mass matrix of the series in SI, its inverse, and the rigid body's Coriolis force where the
+    series leaves it out.
+    """
 
     def __init__(self, config: AbkowitzConfig) -> None:
         super().__init__()
@@ -216,16 +258,22 @@ class SeriesInertia(nn.Module):
         """nu_dot [..., 3]."""
         if self.added:
             u, v, r = nu[..., 0], nu[..., 1], nu[..., 2]
-            tau = tau + self.m * torch.stack((r * (v + self.x_G * r), -u * r, -self.x_G * u * r), dim=-1)
+            tau = tau + self.m * torch.stack(
+                (r * (v + self.x_G * r), -u * r, -self.x_G * u * r), dim=-1
+            )
         return tau @ self.inverse.to(nu.dtype).T
 
 
 @final
 class AbkowitzVessel(HullPlant):
-    """The series in current, wind and external force. State x [B, 6 + k]: x, y, psi, u, v, r, then rudder and shaft."""
+    """The series in current, wind and external force. State x [B, 6 + k]: x, y, psi, u, v, r, then
+    rudder and shaft.
+    """
 
     def __init__(self, config: AbkowitzConfig) -> None:
-        super().__init__(Planar(), SeriesForces(config), config.wind.build() if config.wind is not None else None)
+        super().__init__(
+            Planar(), SeriesForces(config), config.wind.build() if config.wind is not None else None
+        )
         self.inertia = SeriesInertia(config)
         self.speed = config.speed
         self.n_0 = config.shaft.n_0 if config.shaft is not None else 0.0

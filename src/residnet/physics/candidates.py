@@ -1,4 +1,6 @@
-"""Candidate terms of an equation, by type: motions multiply motions, inputs multiply inputs, and only what is named couples the two."""
+"""Candidate terms of an equation, by type: motions multiply motions, inputs multiply inputs, and
+only what is named couples the two.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,9 @@ from residnet.physics.terms import parse_term
 
 
 class Candidate(NamedTuple):
-    """A term, its degree (a function counts one) and how complicated it is among those of its degree."""
+    """A term, its degree (a function counts one) and how complicated it is among those of its
+    degree.
+    """
 
     term: str
     degree: int
@@ -25,9 +29,10 @@ class Candidate(NamedTuple):
 class CandidatesConfig(Config):
     """Which terms an equation may have.
 
-    The candidates are all products of motions (with any factor as its magnitude), and all products of inputs times products of coupled motions
-    times the sine or cosine of an angle or neither. Document 000 eqs. (6.21)-(6.23): inputs rpm up to degree 2, coupled with u up to degree 2,
-    angle nozzle.
+    The candidates are all products of motions (with any factor as its magnitude), and all products
+    of inputs times products of coupled motions times the sine or cosine of an angle or neither.
+    Document 000 eqs. (6.21)-(6.23): inputs rpm up to degree 2, coupled with u up to degree 2, angle
+    nozzle.
 
     Attributes:
         motions: channels of the motion that the model has; those that it lacks are left out.
@@ -59,17 +64,27 @@ class CandidatesConfig(Config):
         """
         motions = [name for name in self.motions if name in names]
         angles = list(self.angles)
-        inputs = [n for n in names if n not in motions and n not in angles] if self.inputs is None else list(self.inputs)
+        inputs = (
+            [n for n in names if n not in motions and n not in angles]
+            if self.inputs is None
+            else list(self.inputs)
+        )
         for name in (*angles, *inputs, *self.coupling):
             if name not in names:
-                raise ConfigError(f"candidates: '{name}' is not a channel of the model{nearest(name, names)}")
+                raise ConfigError(
+                    f"candidates: '{name}' is not a channel of the model{nearest(name, names)}"
+                )
         flows = _products(motions, self.motion_degree, magnitudes=self.magnitudes)
         driven = product(
             _products(self.coupling, self.coupling_degree if self.coupling else 0),
             _products(inputs, self.input_degree),
             ["", *(f"{function}({angle})" for angle in angles for function in ("sin", "cos"))],
         )
-        texts = [*flows, *(" ".join(part for part in parts if part) for parts in driven), *self.extra]
+        texts = [
+            *flows,
+            *(" ".join(part for part in parts if part) for parts in driven),
+            *self.extra,
+        ]
         return rated(dict.fromkeys(text or "1" for text in texts), names)
 
 
@@ -83,19 +98,30 @@ def rated(terms: Iterable[str], names: Sequence[str]) -> tuple[Candidate, ...]:
     for term in terms:
         factors = parse_term(term, names)
         degree = sum(abs(factor.power) for factor in factors)
-        effort = len({factor.name for factor in factors}) + sum(0.5 * f.magnitude + 0.75 * bool(f.function) + (f.power < 0) for f in factors)
+        effort = len({factor.name for factor in factors}) + sum(
+            0.5 * f.magnitude + 0.75 * bool(f.function) + (f.power < 0) for f in factors
+        )
         out.append(Candidate(term, degree, effort))
     return tuple(sorted(out, key=lambda candidate: candidate[1:]))
 
 
 def _products(names: Sequence[str], degree: int, *, magnitudes: bool = False) -> list[str]:
-    """Products up to a degree, the empty one first; of one channel's factors at most one stands as a magnitude, since |x|^2 is x^2."""
-    symbols = [(name, False) for name in names] + ([(name, True) for name in names] if magnitudes else [])
+    """Products up to a degree, the empty one first; of one channel's factors at most one stands as
+    a magnitude, since |x|^2 is x^2.
+    """
+    symbols = [(name, False) for name in names] + (
+        [(name, True) for name in names] if magnitudes else []
+    )
     out = []
     for d in range(degree + 1):
         for chosen in combinations_with_replacement(symbols, d):
             if all(chosen.count((name, True)) <= 1 for name in names):
-                out.append(" ".join(_power(name, bars, chosen.count((name, bars))) for name, bars in dict.fromkeys(chosen)))
+                out.append(
+                    " ".join(
+                        _power(name, bars, chosen.count((name, bars)))
+                        for name, bars in dict.fromkeys(chosen)
+                    )
+                )
     return out
 
 

@@ -1,4 +1,6 @@
-"""Models in force space: tau = F(nu_dot, nu), a believed hull and what was found to be missing in it (document 002 eqs. (3.19)-(3.27))."""
+"""Models in force space: tau = F(nu_dot, nu), a believed hull and what was found to be missing in
+it (document 002 eqs. (3.19)-(3.27)).
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,20 @@ from residnet.physics.terms import TermLibrary, parse_term
 MOTION = (*ACCELERATION, *VELOCITY)
 """Channels of a force-space model: u_dot, v_dot, r_dot, u, v, r."""
 
-_CROSS = ("u v", "u r", "v r", "|u|v", "|u|r", "|v|u", "|v|r", "|r|u", "|r|v", "|u||v|", "|u||r|", "|v||r|")
+_CROSS = (
+    "u v",
+    "u r",
+    "v r",
+    "|u|v",
+    "|u|r",
+    "|v|u",
+    "|v|r",
+    "|r|u",
+    "|r|v",
+    "|u||v|",
+    "|u||r|",
+    "|v||r|",
+)
 FERRY_TERMS: tuple[str, ...] = (
     *MOTION,
     *(f"{name}|{name}|" for name in VELOCITY),
@@ -30,16 +45,21 @@ FERRY_TERMS: tuple[str, ...] = (
 
 
 _WORST_CONDITION = 100.0
-"""Of a mass in units of the believed one: beyond it an axis has a hundredth of the mass that another has, and none in truth."""
+"""Of a mass in units of the believed one: beyond it an axis has a hundredth of the mass that
+another has, and none in truth.
+"""
 
 
 def order_of(term: str) -> int:
-    """beta of a basis function: how many channels are multiplied in it (document 002 section 4.3.4)."""
+    """beta of a basis function: how many channels are multiplied in it (document 002 section
+    4.3.4).
+    """
     return max(sum(abs(factor.power) for factor in parse_term(term, MOTION)), 1)
 
 
 def column_scale(terms: Sequence[str], x: Tensor) -> Tensor:
-    """What the columns x [N, J] of basis functions are divided by, beta std(x) [J], so that higher orders weigh less (4.8), (4.9), ERRATA J15.
+    """What the columns x [N, J] of basis functions are divided by, beta std(x) [J], so that higher
+    orders weigh less (4.8), (4.9), ERRATA J15.
 
     Raises:
         FitError: where a column is constant.
@@ -47,7 +67,10 @@ def column_scale(terms: Sequence[str], x: Tensor) -> Tensor:
     std = x.std(0)
     small = std <= 1e-9 * x.abs().amax(0).clamp(min=1e-300)
     if bool(small.any()):
-        raise FitError(f"basis function '{terms[int(small.nonzero()[0, 0])]}' is constant over the samples; leave it out or give data that excite it")
+        raise FitError(
+            f"basis function '{terms[int(small.nonzero()[0, 0])]}' is constant over the samples;"
+            " leave it out or give data that excite it"
+        )
     return std * torch.tensor([order_of(term) for term in terms], dtype=x.dtype)
 
 
@@ -73,14 +96,19 @@ class ForceModel(nn.Module):
     """F_k = F_(k-1) + Theta phi on a believed hull; the chain of (3.26) is a list of corrections.
 
     Attributes:
-        earth: a force constant in earth axes [2] (north, east) in N that acts on the vessel beside the thrusters.
+        earth: a force constant in earth axes [2] (north, east) in N that acts on the vessel beside
+            the thrusters.
     """
 
-    def __init__(self, hull: Fossen3, corrections: Sequence[Correction] = (), earth: Tensor | None = None) -> None:
+    def __init__(
+        self, hull: Fossen3, corrections: Sequence[Correction] = (), earth: Tensor | None = None
+    ) -> None:
         super().__init__()
         self.hull = hull
         self.corrections = nn.ModuleList(corrections)
-        self.register_buffer("earth", torch.zeros(2, dtype=torch.float64) if earth is None else earth)
+        self.register_buffer(
+            "earth", torch.zeros(2, dtype=torch.float64) if earth is None else earth
+        )
         self.earth: Tensor
 
     def extended(self, correction: Correction, earth: Tensor | None = None) -> ForceModel:
@@ -96,7 +124,9 @@ class ForceModel(nn.Module):
         return tau
 
     def at_heading(self, nu_dot: Tensor, nu: Tensor, psi: Tensor) -> Tensor:
-        """tau [..., 3] that the thrusters have to give at heading psi [...] rad, against the force that is constant in earth axes."""
+        """tau [..., 3] that the thrusters have to give at heading psi [...] rad, against the force
+        that is constant in earth axes.
+        """
         earth = self.earth.to(nu.dtype)
         along, across = to_body(earth[0], earth[1], psi)
         return self(nu_dot, nu) - torch.stack((along, across, torch.zeros_like(along)), dim=-1)
@@ -107,7 +137,8 @@ class ForceModel(nn.Module):
 
 
 def accelerating(terms: Sequence[str], names: Sequence[str] = MOTION) -> dict[int, int]:
-    """Numbers of the terms that are an acceleration, each with its axis; the others are free of accelerations.
+    """Numbers of the terms that are an acceleration, each with its axis; the others are free of
+    accelerations.
 
     Raises:
         ConfigError: where a term is not affine in nu_dot with a constant factor.
@@ -119,17 +150,27 @@ def accelerating(terms: Sequence[str], names: Sequence[str] = MOTION) -> dict[in
         if not moving:
             continue
         if len(factors) > 1 or moving[0].magnitude or moving[0].power != 1 or moving[0].function:
-            raise ConfigError(f"term '{term}': a force-space model that runs forward names accelerations only by themselves (u_dot, v_dot, r_dot)")
+            raise ConfigError(
+                f"term '{term}': a force-space model that runs forward names accelerations only by"
+                " themselves (u_dot, v_dot, r_dot)"
+            )
         out[j] = ACCELERATION.index(moving[0].name)
     return out
 
 
-def augmented(mass: Tensor, terms: Sequence[str], coefficients: Tensor, who: str, names: Sequence[str] = MOTION) -> tuple[Tensor, list[int]]:
+def augmented(
+    mass: Tensor,
+    terms: Sequence[str],
+    coefficients: Tensor,
+    who: str,
+    names: Sequence[str] = MOTION,
+) -> tuple[Tensor, list[int]]:
     """M + A [3, 3] of eps = A nu_dot + b(nu), and the numbers of the terms that make b.
 
     Raises:
         ConfigError: where a term is not affine in nu_dot with a constant factor.
-        FitError: where M + A has an eigenvalue whose real part is not positive, or is ill-conditioned: the model cannot run forward.
+        FitError: where M + A has an eigenvalue whose real part is not positive, or is
+            ill-conditioned: the model cannot run forward.
     """
     moving = accelerating(terms, names)
     total, rest = mass.clone(), [j for j in range(len(terms)) if j not in moving]
@@ -137,10 +178,15 @@ def augmented(mass: Tensor, terms: Sequence[str], coefficients: Tensor, who: str
         total[:, axis] += coefficients[j]
     # in units of the believed masses, so that an axis that has lost its mass shows
     scale = mass.diagonal().abs().sqrt()
-    values, condition = torch.linalg.eigvals(total).real, float(torch.linalg.cond(total / torch.outer(scale, scale)))
+    values, condition = (
+        torch.linalg.eigvals(total).real,
+        float(torch.linalg.cond(total / torch.outer(scale, scale))),
+    )
     if bool((values <= 0).any()) or not condition < _WORST_CONDITION:
         raise FitError(
-            f"{who}: its mass matrix with the fitted accelerations has eigenvalues {[round(float(v), 1) for v in values]} and condition "
-            f"{condition:.1e}, it cannot run forward; give data with more acceleration, fewer terms, or a higher penalty or lower order"
+            f"{who}: its mass matrix with the fitted accelerations has eigenvalues"
+            f" {[round(float(v), 1) for v in values]} and condition {condition:.1e}, it cannot run"
+            " forward; give data with more acceleration, fewer terms, or a higher penalty or lower"
+            " order"
         )
     return total, rest

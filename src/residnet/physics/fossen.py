@@ -1,4 +1,6 @@
-"""The 3-DOF Fossen model M nu_dot + C(nu) nu + D(nu) nu = tau, from a vessel file alone (document 003 eqs. (5)-(9), ERRATA W1, W2)."""
+"""The 3-DOF Fossen model M nu_dot + C(nu) nu + D(nu) nu = tau, from a vessel file alone (document
+003 eqs. (5)-(9), ERRATA W1, W2).
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,16 @@ from residnet.physics.actuators import ActuatorsConfig
 from residnet.physics.environment.wind import WindLoadsConfig
 from residnet.physics.kinematics import Planar
 from residnet.physics.mass import inverse_mass
-from residnet.physics.parameters import Inertia, Length, Mass, MassArm, Parameter, above_zero, dimension, unit_text
+from residnet.physics.parameters import (
+    Inertia,
+    Length,
+    Mass,
+    MassArm,
+    Parameter,
+    above_zero,
+    dimension,
+    unit_text,
+)
 from residnet.physics.plant import HullPlant
 from residnet.physics.terms import TermLibrary, parse_term
 from residnet.physics.vessel_file import VesselFile
@@ -33,7 +44,8 @@ class RigidBody(Config):
 
 
 class AddedMass(Config):
-    """Hydrodynamic derivatives with respect to accelerations (SNAME: negative for a normal hull)."""
+    """Hydrodynamic derivatives with respect to accelerations (SNAME: negative for a normal hull).
+    """
 
     X_udot: Mass
     Y_vdot: Mass
@@ -43,7 +55,9 @@ class AddedMass(Config):
 
 
 class Damping(Config):
-    """Damping force of each axis as terms of (u, v, r), positive = damping, e.g. `X: {u: ..., "u|u|": ...}`."""
+    """Damping force of each axis as terms of (u, v, r), positive = damping, e.g. `X: {u: ...,
+    "u|u|": ...}`.
+    """
 
     X: dict[str, Parameter] = Field(default_factory=dict)
     Y: dict[str, Parameter] = Field(default_factory=dict)
@@ -51,7 +65,11 @@ class Damping(Config):
 
     @model_validator(mode="after")
     def _units(self) -> Damping:
-        for axis, row, force in (("X", self.X, (1, -2)), ("Y", self.Y, (1, -2)), ("N", self.N, (2, -2))):
+        for axis, row, force in (
+            ("X", self.X, (1, -2)),
+            ("Y", self.Y, (1, -2)),
+            ("N", self.N, (2, -2)),
+        ):
             for term, parameter in row.items():
                 try:
                     metres, seconds = force
@@ -63,15 +81,20 @@ class Damping(Config):
                 except ConfigError as error:
                     raise ValueError(f"{axis}: {error}") from None
                 if dimension(parameter.unit) != (metres, seconds):
-                    raise ValueError(f"{axis}.{term}: its unit must be {unit_text(metres, seconds)}, given '{parameter.unit}'")
+                    raise ValueError(
+                        f"{axis}.{term}: its unit must be {unit_text(metres, seconds)}, given"
+                        f" '{parameter.unit}'"
+                    )
         return self
 
 
 class HullConfig(VesselFile, ABC):
-    """A 3-DOF vessel M nu_dot + C(nu) nu + D(nu) nu = tau; a file may name another one as `base` and give only what differs.
+    """A 3-DOF vessel M nu_dot + C(nu) nu + D(nu) nu = tau; a file may name another one as `base`
+    and give only what differs.
 
     Attributes:
-        scale: what M, C and D are all multiplied by: a true vessel beside the believed one of its `base` (document 002 eq. (4.2)).
+        scale: what M, C and D are all multiplied by: a true vessel beside the believed one of its
+            `base` (document 002 eq. (4.2)).
         wind: coefficients of the hull above water; without them the vessel feels no wind.
     """
 
@@ -89,7 +112,9 @@ class HullConfig(VesselFile, ABC):
         """What r is multiplied by in the sway momentum of C(nu), in kg m, without the scale."""
 
     def equations(self) -> tuple[tuple[str, ...], list[list[float]]]:
-        """nu_dot as terms of (u, v, r), and the coefficients of these, then of tau_x, tau_y, tau_n, on each axis."""
+        """nu_dot as terms of (u, v, r), and the coefficients of these, then of tau_x, tau_y, tau_n,
+        on each axis.
+        """
         terms, response = Fossen3(self).products()
         return terms, response.tolist()
 
@@ -121,7 +146,9 @@ class FossenConfig(HullConfig):
         ]
 
     def coupling(self) -> float:
-        """The mean of m23 and m32, which makes C that of the symmetric part of M (Fossen 2011 section 6.3)."""
+        """The mean of m23 and m32, which makes C that of the symmetric part of M (Fossen 2011
+        section 6.3).
+        """
         mass = self.mass_matrix()
         return 0.5 * (mass[1][2] + mass[2][1])
 
@@ -137,7 +164,9 @@ class MassEntries(Config):
 
 
 class MassMatrixConfig(HullConfig):
-    """A 3-DOF vessel whose mass matrix was identified as a whole, as that of milliAmpere (document 002 eqs. (2.3)-(2.6), appendix A)."""
+    """A 3-DOF vessel whose mass matrix was identified as a whole, as that of milliAmpere (document
+    002 eqs. (2.3)-(2.6), appendix A).
+    """
 
     kind: Literal["mass_matrix"]
     mass: MassEntries
@@ -145,7 +174,11 @@ class MassMatrixConfig(HullConfig):
     def mass_matrix(self) -> list[list[float]]:
         """As given; it need not be symmetric."""
         m = self.mass
-        return [[m.m11.value, 0.0, 0.0], [0.0, m.m22.value, m.m23.value], [0.0, m.m32.value, m.m33.value]]
+        return [
+            [m.m11.value, 0.0, 0.0],
+            [0.0, m.m22.value, m.m23.value],
+            [0.0, m.m32.value, m.m33.value],
+        ]
 
     def coupling(self) -> float:
         """m23 alone, as (2.5) has it (ERRATA J4)."""
@@ -155,8 +188,8 @@ class MassMatrixConfig(HullConfig):
 class Fossen3(nn.Module):
     """Acceleration of a vessel in surge, sway and yaw.
 
-    The Coriolis matrix is Fossen's skew form of the whole mass matrix, so inertia does no work where that is symmetric. Buffers are
-    float64; results take the dtype of the input.
+    The Coriolis matrix is Fossen's skew form of the whole mass matrix, so inertia does no work
+    where that is symmetric. Buffers are float64; results take the dtype of the input.
     """
 
     def __init__(self, vessel: HullConfig) -> None:
@@ -168,8 +201,13 @@ class Fossen3(nn.Module):
         rows = (vessel.damping.X, vessel.damping.Y, vessel.damping.N)
         terms = sorted({term for row in rows for term in row})
         self.terms = TermLibrary(terms, VELOCITY)
-        damping = torch.tensor([[row[t].value if t in row else 0.0 for t in terms] for row in rows], dtype=torch.float64)
-        self.register_buffer("damping", vessel.scale * damping.reshape(3, len(terms)), persistent=False)
+        damping = torch.tensor(
+            [[row[t].value if t in row else 0.0 for t in terms] for row in rows],
+            dtype=torch.float64,
+        )
+        self.register_buffer(
+            "damping", vessel.scale * damping.reshape(3, len(terms)), persistent=False
+        )
         self.register_buffer("response", torch.zeros(3, 0, dtype=torch.float64), persistent=False)
         self.compacted = False
         # not empty, so that TorchScript knows the type
@@ -192,13 +230,22 @@ class Fossen3(nn.Module):
         return self.terms(nu) @ self.damping.to(nu.dtype).T
 
     def required(self, nu_dot: Tensor, nu: Tensor) -> Tensor:
-        """Forces [..., 3] that accelerate the vessel by nu_dot [..., 3] at velocities nu [..., 3] (document 002 eq. (2.10))."""
+        """Forces [..., 3] that accelerate the vessel by nu_dot [..., 3] at velocities nu [..., 3]
+        (document 002 eq. (2.10)).
+        """
         return nu_dot @ self.mass.to(nu.dtype).T + self.coriolis(nu) + self.drag(nu)
 
     def products(self) -> tuple[tuple[str, ...], Tensor]:
-        """nu_dot as products: J terms of (u, v, r), and their coefficients with those of tau behind them, [3, J + 3]."""
+        """nu_dot as products: J terms of (u, v, r), and their coefficients with those of tau behind
+        them, [3, J + 3].
+        """
         m, cross = self.mass.tolist(), self.coupling
-        coriolis = {"v r": (0, -m[1][1]), "r^2": (0, -cross), "u r": (1, m[0][0]), "u v": (2, m[1][1] - m[0][0])}
+        coriolis = {
+            "v r": (0, -m[1][1]),
+            "r^2": (0, -cross),
+            "u r": (1, m[0][0]),
+            "u v": (2, m[1][1] - m[0][0]),
+        }
         terms = (*self.terms.terms, *coriolis, "u r")
         force = torch.zeros(3, len(terms), dtype=torch.float64)
         force[:, : self.terms.count] = self.damping
@@ -208,7 +255,9 @@ class Fossen3(nn.Module):
         return terms, torch.cat((-(self.inverse @ force), self.inverse), dim=1)
 
     def compact(self) -> None:
-        """Write Coriolis force, drag and tau as one product of terms and a matrix: the same to rounding, with a third of the operations."""
+        """Write Coriolis force, drag and tau as one product of terms and a matrix: the same to
+        rounding, with a third of the operations.
+        """
         terms, self.response = self.products()
         library = TermLibrary(terms, VELOCITY)
         # the forces are rows of their own behind [1, nu, |nu|]
@@ -218,9 +267,12 @@ class Fossen3(nn.Module):
         self.compacted = True
 
     def forward(self, nu: Tensor, tau: Tensor) -> Tensor:
-        """Acceleration nu_dot [..., 3] from velocities through the water nu [..., 3] and forces tau [..., 3]; [B, 3] once compacted."""
+        """Acceleration nu_dot [..., 3] from velocities through the water nu [..., 3] and forces tau
+        [..., 3]; [B, 3] once compacted.
+        """
         if self.compacted:
-            # terms as rows: gathering rows and a product of few long rows cost a third of gathering columns
+            # terms as rows: gathering rows and a product of few long rows cost a third of gathering
+            # columns
             motion = nu.mT.contiguous()
             base = torch.cat((torch.ones_like(motion[:1]), motion, motion.abs(), tau.mT))
             rows = base.index_select(0, self.gather[0])
@@ -235,11 +287,16 @@ class Fossen3(nn.Module):
 class FossenVessel(HullPlant):
     """The hull with its actuators, in current and external force.
 
-    State x [B, 6 + k]: x, y [m], psi [rad], u, v [m/s] over ground, r [rad/s], then the actuators' states.
+    State x [B, 6 + k]: x, y [m], psi [rad], u, v [m/s] over ground, r [rad/s], then the actuators'
+    states.
     """
 
     def __init__(self, vessel: HullConfig) -> None:
-        super().__init__(Planar(), vessel.actuators.build(), vessel.wind.build() if vessel.wind is not None else None)
+        super().__init__(
+            Planar(),
+            vessel.actuators.build(),
+            vessel.wind.build() if vessel.wind is not None else None,
+        )
         self.hull = Fossen3(vessel)
 
     def in_calm_water(self) -> HullPlant:

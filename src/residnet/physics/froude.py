@@ -11,7 +11,9 @@ from torch import Tensor
 Phase = Literal["displacement", "semi_displacement", "planing"]
 PHASES: tuple[Phase, ...] = ("displacement", "semi_displacement", "planing")
 BOUNDARIES = (0.4, 1.0)
-"""Froude numbers at which the phases meet; the document puts the beginning of planing between 1.0 and 1.2."""
+"""Froude numbers at which the phases meet; the document puts the beginning of planing between 1.0
+and 1.2.
+"""
 GRAVITY = 9.81
 
 
@@ -27,5 +29,9 @@ def froude_number(u: Tensor, v: Tensor, length: float) -> Tensor:
 
 
 def phase_of(froude: Tensor, boundaries: tuple[float, float] = BOUNDARIES) -> Tensor:
-    """Number of the phase in `PHASES` at each Froude number, integers of the same shape; a boundary belongs to the phase above it."""
-    return torch.bucketize(froude, torch.tensor(boundaries, dtype=froude.dtype, device=froude.device), right=True)
+    """Number of the phase in `PHASES` at each Froude number, integers of the same shape; a boundary
+    belongs to the phase above it.
+    """
+    return torch.bucketize(
+        froude, torch.tensor(boundaries, dtype=froude.dtype, device=froude.device), right=True
+    )

@@ -30,8 +30,12 @@ class Kinematics(nn.Module, ABC):
         """Derivative [..., n] of the pose."""
 
     @abstractmethod
-    def carried(self, north: Tensor, east: Tensor, pose: Tensor, nu: Tensor) -> tuple[Tensor, Tensor]:
-        """A constant earth-fixed velocity (north, east) [...] in body axes [..., n], and how that changes while the body turns [..., n]."""
+    def carried(
+        self, north: Tensor, east: Tensor, pose: Tensor, nu: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """A constant earth-fixed velocity (north, east) [...] in body axes [..., n], and how that
+        changes while the body turns [..., n].
+        """
 
     @abstractmethod
     def pushed(self, north: Tensor, east: Tensor, pose: Tensor) -> Tensor:
@@ -53,12 +57,16 @@ class Planar(Kinematics):
         north, east = to_earth(u, v, pose[..., 2])
         return torch.stack((north, east, r), dim=-1)
 
-    def carried(self, north: Tensor, east: Tensor, pose: Tensor, nu: Tensor) -> tuple[Tensor, Tensor]:
+    def carried(
+        self, north: Tensor, east: Tensor, pose: Tensor, nu: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Body components and their derivative: the vector turns by -r."""
         along, across = to_body(north, east, pose[..., 2])
         zero = torch.zeros_like(along)
         r = nu[..., 2]
-        return torch.stack((along, across, zero), dim=-1), torch.stack((r * across, -r * along, zero), dim=-1)
+        return torch.stack((along, across, zero), dim=-1), torch.stack(
+            (r * across, -r * along, zero), dim=-1
+        )
 
     def pushed(self, north: Tensor, east: Tensor, pose: Tensor) -> Tensor:
         """Force along x and y; no moment."""
@@ -68,7 +76,9 @@ class Planar(Kinematics):
 
 @final
 class Rolling(Kinematics):
-    """Surge, sway, roll, yaw without heave and pitch (document 004, ERRATA 004): pose x, y, phi, psi; velocities u, v, p, r."""
+    """Surge, sway, roll, yaw without heave and pitch (document 004, ERRATA 004): pose x, y, phi,
+    psi; velocities u, v, p, r.
+    """
 
     pose = ("x", "y", "phi", "psi")
     velocity = ("u", "v", "p", "r")
@@ -76,19 +86,31 @@ class Rolling(Kinematics):
     heading = 3
 
     def rate(self, pose: Tensor, nu: Tensor) -> Tensor:
-        """x_dot = u cos psi - v sin psi cos phi, y_dot = u sin psi + v cos psi cos phi, phi_dot = p, psi_dot = r cos phi."""
+        """x_dot = u cos psi - v sin psi cos phi, y_dot = u sin psi + v cos psi cos phi, phi_dot =
+        p, psi_dot = r cos phi.
+        """
         cos_phi = torch.cos(pose[..., 2])
         north, east = to_earth(nu[..., 0], nu[..., 1] * cos_phi, pose[..., 3])
         return torch.stack((north, east, nu[..., 2], nu[..., 3] * cos_phi), dim=-1)
 
-    def carried(self, north: Tensor, east: Tensor, pose: Tensor, nu: Tensor) -> tuple[Tensor, Tensor]:
+    def carried(
+        self, north: Tensor, east: Tensor, pose: Tensor, nu: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Components along the rolled body axes x and y, and their derivative."""
         along, across = to_body(north, east, pose[..., 3])
         cos_phi, sin_phi = torch.cos(pose[..., 2]), torch.sin(pose[..., 2])
         zero = torch.zeros_like(along)
         turning = nu[..., 3] * cos_phi
         body = torch.stack((along, across * cos_phi, zero, zero), dim=-1)
-        change = torch.stack((turning * across, -turning * along * cos_phi - nu[..., 2] * across * sin_phi, zero, zero), dim=-1)
+        change = torch.stack(
+            (
+                turning * across,
+                -turning * along * cos_phi - nu[..., 2] * across * sin_phi,
+                zero,
+                zero,
+            ),
+            dim=-1,
+        )
         return body, change
 
     def pushed(self, north: Tensor, east: Tensor, pose: Tensor) -> Tensor:

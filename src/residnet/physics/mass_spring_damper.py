@@ -1,4 +1,6 @@
-"""The mass-spring-damper of document 000 (eqs. (4.1), (4.2)): the plant that its methods are tried on first."""
+"""The mass-spring-damper of document 000 (eqs. (4.1), (4.2)): the plant that its methods are tried
+on first.
+"""
 
 from __future__ import annotations
 
@@ -17,15 +19,21 @@ class MassSpringDamperConfig(Config):
     """m x_ddot + d x_dot + k x = tau.
 
     Attributes:
-        m, d, k: mass, damping, stiffness; by default those of section 5.3. (4.3) is another system: m = 20 kg, d = 10 kg/s,
-            k = 12 N/m (ERRATA H24).
+        m, d, k: mass, damping, stiffness; by default those of section 5.3. (4.3) is another system:
+            m = 20 kg, d = 10 kg/s, k = 12 N/m (ERRATA H24).
         tau_max: force that the full drive of a manoeuvre stands for.
     """
 
     kind: Literal["mass_spring_damper"] = "mass_spring_damper"
-    m: Annotated[Mass, AfterValidator(above_zero)] = Parameter(value=10.0, unit="kg", source="document 000, section 5.3, (5.13)")
-    d: Annotated[Parameter, AfterValidator(of_dimension(1, 0, -1))] = Parameter(value=13.0, unit="kg/s", source="document 000, section 5.3, (5.13)")
-    k: Annotated[Parameter, AfterValidator(of_dimension(1, 0, -2))] = Parameter(value=5.0, unit="N/m", source="document 000, section 5.3, (5.13)")
+    m: Annotated[Mass, AfterValidator(above_zero)] = Parameter(
+        value=10.0, unit="kg", source="document 000, section 5.3, (5.13)"
+    )
+    d: Annotated[Parameter, AfterValidator(of_dimension(1, 0, -1))] = Parameter(
+        value=13.0, unit="kg/s", source="document 000, section 5.3, (5.13)"
+    )
+    k: Annotated[Parameter, AfterValidator(of_dimension(1, 0, -2))] = Parameter(
+        value=5.0, unit="N/m", source="document 000, section 5.3, (5.13)"
+    )
     tau_max: Newtons = Field(default=1.0, gt=0)
 
     def build(self) -> MassSpringDamper:
@@ -53,4 +61,6 @@ class MassSpringDamper(Plant):
     def rate(self, x: Tensor, w: Tensor) -> Tensor:
         """x_dot [B, 2] under the force w [B, 1]."""
         displacement, speed = x[:, 0], x[:, 1]
-        return torch.stack((speed, (w[:, 0] - self.d * speed - self.k * displacement) / self.m), dim=-1)
+        return torch.stack(
+            (speed, (w[:, 0] - self.d * speed - self.k * displacement) / self.m), dim=-1
+        )

@@ -1,8 +1,10 @@
-"""The MMG standard model of a ship with one propeller and one rudder: hull, propeller and rudder apart, and what each does to the others.
+"""The MMG standard model of a ship with one propeller and one rudder: hull, propeller and rudder
+apart, and what each does to the others.
 
-Source: Yasukawa and Yoshimura, Introduction of MMG standard method for ship maneuvering predictions, J Mar Sci Technol 20 (2015) 37-52.
-Starting values of the hull's linear derivatives: Kijima et al., On the manoeuvring performance of a ship with the parameter of loading
-condition, J SNAJ 168 (1990).
+Source: Yasukawa and Yoshimura, Introduction of MMG standard method for ship maneuvering
+predictions, J Mar Sci Technol 20 (2015) 37-52. Starting values of the hull's linear derivatives:
+Kijima et al., On the manoeuvring performance of a ship with the parameter of loading condition, J
+SNAJ 168 (1990).
 """
 
 from __future__ import annotations
@@ -84,7 +86,9 @@ class MMGRudder(Config):
 
 
 class Belief(NamedTuple):
-    """What is thought of a parameter before any trial: `mean`, standard deviation `sd`, and what the parameter is."""
+    """What is thought of a parameter before any trial: `mean`, standard deviation `sd`, and what
+    the parameter is.
+    """
 
     mean: float
     sd: float
@@ -92,9 +96,11 @@ class Belief(NamedTuple):
 
 
 def usual_beliefs(hull: MMGHull) -> dict[str, Belief]:
-    """Every parameter of the model, dimensionless, as one would expect of a merchant ship with these particulars.
+    """Every parameter of the model, dimensionless, as one would expect of a merchant ship with
+    these particulars.
 
-    Linear hull derivatives by Kijima's formulas; those of higher order are thought to be near zero, so that the trials speak for themselves.
+    Linear hull derivatives by Kijima's formulas; those of higher order are thought to be near zero,
+    so that the trials speak for themselves.
     """
     k = 2.0 * hull.draught / hull.length
     fullness = hull.block * hull.beam / hull.length
@@ -124,7 +130,11 @@ def usual_beliefs(hull: MMGHull) -> dict[str, Belief]:
         "N_rrr": Belief(0.0, 0.02, "yaw moment of fast turning"),
         "t_P": Belief(0.22, 0.03, "thrust deduction"),
         "w_P0": Belief(0.4, 0.06, "wake fraction straight ahead"),
-        "C_2p": Belief(1.3, 0.25, "inflow far aside over inflow straight ahead, drift towards port or turn to starboard"),
+        "C_2p": Belief(
+            1.3,
+            0.25,
+            "inflow far aside over inflow straight ahead, drift towards port or turn to starboard",
+        ),
         "C_2n": Belief(1.1, 0.25, "the same, drift towards starboard or turn to port"),
         "t_R": Belief(0.35, 0.15, "steering resistance deduction"),
         "a_H": Belief(0.3, 0.2, "sway force that the rudder raises on the hull, over its own"),
@@ -145,14 +155,21 @@ PARAMETERS = tuple(usual_beliefs(MMGHull(length=1.0, beam=0.2, draught=0.1, mass
 class MMGForces(nn.Module):
     """Accelerations of the ship.
 
-    Holds ahead, propeller turning ahead. Hull forces are divided by rho/2 L d U^2, moments by rho/2 L^2 d U^2, with v' = v/U and r' = r L/U.
+    Holds ahead, propeller turning ahead. Hull forces are divided by rho/2 L d U^2, moments by rho/2
+    L^2 d U^2, with v' = v/U and r' = r L/U.
 
     Args:
         hull, propeller, rudder: particulars.
         columns: of u, v, r, propeller revolutions and rudder angle among the channels z.
     """
 
-    def __init__(self, hull: MMGHull, propeller: MMGPropeller, rudder: MMGRudder, columns: tuple[int, int, int, int, int]) -> None:
+    def __init__(
+        self,
+        hull: MMGHull,
+        propeller: MMGPropeller,
+        rudder: MMGRudder,
+        columns: tuple[int, int, int, int, int],
+    ) -> None:
         super().__init__()
         self.columns = list(columns)
         self.wake_slope, self.still = _WAKE_SLOPE, _STILL
@@ -160,12 +177,23 @@ class MMGForces(nn.Module):
         self.pressed = 0.5 * hull.density * hull.length * hull.draught
         self.mass, self.x_G = float(hull.mass), float(hull.x_G)
         self.inertia = hull.mass * ((hull.gyration * hull.length) ** 2 + hull.x_G**2)
-        self.density, self.diameter, self.x_P = float(hull.density), float(propeller.diameter), propeller.x
+        self.density, self.diameter, self.x_P = (
+            float(hull.density),
+            float(propeller.diameter),
+            propeller.x,
+        )
         self.k0, self.k1, self.k2 = propeller.thrust
-        self.area, self.lift, self.x_R, self.race = float(rudder.area), rudder.lift, rudder.x, rudder.race
+        self.area, self.lift, self.x_R, self.race = (
+            float(rudder.area),
+            rudder.lift,
+            rudder.x,
+            rudder.race,
+        )
 
     def forward(self, z: Tensor, theta: Tensor) -> Tensor:
-        """nu_dot [..., 3] at channels z [..., nz] with parameters theta [..., 34] (see `PARAMETERS`)."""
+        """nu_dot [..., 3] at channels z [..., nz] with parameters theta [..., 34] (see
+        `PARAMETERS`).
+        """
         (
             m_x, m_y, J_z, R_0, X_vv, X_vr, X_rr, X_vvvv, Y_0, Y_v, Y_r, Y_vvv, Y_vvr, Y_vrr, Y_rrr, N_0, N_v, N_r, N_vvv, N_vvr, N_vrr, N_rrr,
             t_P, w_P0, C_2p, C_2n, t_R, a_H, x_H, gamma_p, gamma_n, l_R, epsilon, kappa,
@@ -176,9 +204,27 @@ class MMGForces(nn.Module):
         a, b = v / speed, r * self.length / speed
         # hull
         pressure = self.pressed * speed * speed
-        x_hull = pressure * (-R_0 * (u / speed) ** 2 + X_vv * a * a + X_vr * a * b + X_rr * b * b + X_vvvv * a**4)
-        y_hull = pressure * (Y_0 + Y_v * a + Y_r * b + Y_vvv * a**3 + Y_vvr * a * a * b + Y_vrr * a * b * b + Y_rrr * b**3)
-        n_hull = N_0 + N_v * a + N_r * b + N_vvv * a**3 + N_vvr * a * a * b + N_vrr * a * b * b + N_rrr * b**3
+        x_hull = pressure * (
+            -R_0 * (u / speed) ** 2 + X_vv * a * a + X_vr * a * b + X_rr * b * b + X_vvvv * a**4
+        )
+        y_hull = pressure * (
+            Y_0
+            + Y_v * a
+            + Y_r * b
+            + Y_vvv * a**3
+            + Y_vvr * a * a * b
+            + Y_vrr * a * b * b
+            + Y_rrr * b**3
+        )
+        n_hull = (
+            N_0
+            + N_v * a
+            + N_r * b
+            + N_vvv * a**3
+            + N_vvr * a * a * b
+            + N_vrr * a * b * b
+            + N_rrr * b**3
+        )
         n_hull = pressure * self.length * n_hull
         # propeller: inflow changes with its drift angle, to both sides differently
         aside = -a - self.x_P * b
@@ -189,12 +235,21 @@ class MMGForces(nn.Module):
         thrust = self.density * self.diameter**2 * loading
         # rudder: partly in the race
         raced = torch.sqrt(torch.clamp(inflow * inflow + 8.0 / math.pi * loading, min=self.still))
-        squared = self.race * (inflow + kappa * (raced - inflow)) ** 2 + (1 - self.race) * inflow * inflow
+        squared = (
+            self.race * (inflow + kappa * (raced - inflow)) ** 2 + (1 - self.race) * inflow * inflow
+        )
         along = epsilon * torch.sqrt(squared + self.still)
         cross = -a - l_R * b
         across = speed * torch.where(cross > 0, gamma_p, gamma_n) * cross
         angle = delta - torch.atan2(across, along)
-        normal = 0.5 * self.density * self.area * (along * along + across * across) * self.lift * torch.sin(angle)
+        normal = (
+            0.5
+            * self.density
+            * self.area
+            * (along * along + across * across)
+            * self.lift
+            * torch.sin(angle)
+        )
         x_rudder = -(1 - t_R) * normal * torch.sin(delta)
         y_rudder = -(1 + a_H) * normal * torch.cos(delta)
         n_rudder = -(self.x_R + a_H * x_H) * self.length * normal * torch.cos(delta)
@@ -207,4 +262,11 @@ class MMGForces(nn.Module):
         sway = y_hull + y_rudder - mass_x * u * r
         yaw = n_hull + n_rudder - arm * u * r
         determinant = mass_y * inertia - arm * arm
-        return torch.stack((surge / mass_x, (inertia * sway - arm * yaw) / determinant, (mass_y * yaw - arm * sway) / determinant), dim=-1)
+        return torch.stack(
+            (
+                surge / mass_x,
+                (inertia * sway - arm * yaw) / determinant,
+                (mass_y * yaw - arm * sway) / determinant,
+            ),
+            dim=-1,
+        )

@@ -1,4 +1,6 @@
-"""Nomoto's steering models at constant speed: first order, second order, and second order with sideslip (document 004, section 5.1)."""
+"""Nomoto's steering models at constant speed: first order, second order, and second order with
+sideslip (document 004, section 5.1).
+"""
 
 from __future__ import annotations
 
@@ -35,8 +37,8 @@ class SteeringConfig(VesselFile, ABC):
 
     Attributes:
         speed: u, which nothing changes.
-        K: yaw rate per rudder angle in a steady turn; K over the product of the time constants must be positive, so that a rudder
-            to starboard turns to starboard at first.
+        K: yaw rate per rudder angle in a steady turn; K over the product of the time constants must
+            be positive, so that a rudder to starboard turns to starboard at first.
         rudder: largest angle, rate and lag.
     """
 
@@ -61,7 +63,8 @@ class SteeringConfig(VesselFile, ABC):
             product /= time
         if product <= 0:
             raise ValueError(
-                "K over the time constants must be positive: a rudder to starboard turns to starboard (an unstable ship has K and a T negative)"
+                "K over the time constants must be positive: a rudder to starboard turns to"
+                " starboard (an unstable ship has K and a T negative)"
             )
         return self
 
@@ -83,11 +86,15 @@ class NomotoConfig(SteeringConfig):
 
     def steering(self) -> LinearSteering:
         """r alone; v stays as it is."""
-        return LinearSteering(np.diag([0.0, -1.0 / self.T.value]), np.array([0.0, self.K.value / self.T.value]))
+        return LinearSteering(
+            np.diag([0.0, -1.0 / self.T.value]), np.array([0.0, self.K.value / self.T.value])
+        )
 
 
 class SecondOrderConfig(SteeringConfig, ABC):
-    """The three time constants of r/delta = K (1 + T3 s) / ((1 + T1 s)(1 + T2 s)), document 004 eq. (5.3)."""
+    """The three time constants of r/delta = K (1 + T3 s) / ((1 + T1 s)(1 + T2 s)), document 004 eq.
+    (5.3).
+    """
 
     T1: TimeConstant
     T2: TimeConstant
@@ -100,9 +107,11 @@ class SecondOrderConfig(SteeringConfig, ABC):
 
 
 class SecondOrderNomotoConfig(SecondOrderConfig):
-    """T1 T2 r_ddot + (T1 + T2) r_dot + r = K (delta + T3 delta_dot) (document 004 eq. (5.5), ERRATA G12); no sideslip.
+    """T1 T2 r_ddot + (T1 + T2) r_dot + r = K (delta + T3 delta_dot) (document 004 eq. (5.5), ERRATA
+    G12); no sideslip.
 
-    The internal state is q = r_dot - K T3 / (T1 T2) delta, which needs no derivative of the rudder angle.
+    The internal state is q = r_dot - K T3 / (T1 T2) delta, which needs no derivative of the rudder
+    angle.
     """
 
     kind: Literal["nomoto_second_order"]
@@ -112,12 +121,17 @@ class SecondOrderNomotoConfig(SecondOrderConfig):
         product, total = self.T1.value * self.T2.value, self.T1.value + self.T2.value
         direct = self.K.value * self.T3.value / product
         a = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0 / product, -total / product]])
-        return LinearSteering(a, np.array([0.0, direct, self.K.value / product - total / product * direct]), ("_yaw_lag",))
+        return LinearSteering(
+            a,
+            np.array([0.0, direct, self.K.value / product - total / product * direct]),
+            ("_yaw_lag",),
+        )
 
 
 class SideslipNomotoConfig(SecondOrderConfig):
-    """Second order in yaw and sway: M nu_dot + N(u) nu = b delta with nu = (v, r) (document 004 eq. (5.1)), given by its transfer functions
-    (5.3) and v/delta = K_v (1 + T_v s) / ((1 + T1 s)(1 + T2 s)), (5.4) as in ERRATA G12.
+    """Second order in yaw and sway: M nu_dot + N(u) nu = b delta with nu = (v, r) (document 004 eq.
+    (5.1)), given by its transfer functions (5.3) and v/delta = K_v (1 + T_v s) / ((1 + T1 s)(1 + T2
+    s)), (5.4) as in ERRATA G12.
 
     K_v and T_v belong to v, in m/s per rad and s.
     """
@@ -129,7 +143,10 @@ class SideslipNomotoConfig(SecondOrderConfig):
     @model_validator(mode="after")
     def _two_states(self) -> SideslipNomotoConfig:
         if self.K_v.value == 0 or self.T_v.value == self.T3.value:
-            raise ValueError("K_v must not be zero and T_v must differ from T3: sway would be no state of its own; use kind nomoto_second_order")
+            raise ValueError(
+                "K_v must not be zero and T_v must differ from T3: sway would be no state of its"
+                " own; use kind nomoto_second_order"
+            )
         return self
 
     def steering(self) -> LinearSteering:
@@ -138,15 +155,17 @@ class SideslipNomotoConfig(SecondOrderConfig):
         k, k_v = self.K.value, self.K_v.value
         out = np.array([[k_v, k_v * self.T_v.value], [k, k * self.T3.value]])
         companion = np.array([[0.0, 1.0], [-1.0 / product, -total / product]])
-        return LinearSteering(out @ companion @ np.linalg.inv(out), out @ np.array([0.0, 1.0 / product]))
+        return LinearSteering(
+            out @ companion @ np.linalg.inv(out), out @ np.array([0.0, 1.0 / product])
+        )
 
 
 @final
 class SteeringVessel(Plant):
     """A vessel that turns as its steering model says and keeps its speed.
 
-    State x [B, 6 + k]: x, y [m], psi [rad], u, v [m/s], r [rad/s], internal states of the model, then the rudder where it has a rate or lag.
-    Input: cmd_delta [rad].
+    State x [B, 6 + k]: x, y [m], psi [rad], u, v [m/s], r [rad/s], internal states of the model,
+    then the rudder where it has a rate or lag. Input: cmd_delta [rad].
     """
 
     def __init__(self, config: SteeringConfig) -> None:
@@ -164,7 +183,8 @@ class SteeringVessel(Plant):
         self.b: Tensor
 
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Rudder angle [..., 1] as a share of its limit; the speed is constant whatever the drive."""
+        """Rudder angle [..., 1] as a share of its limit; the speed is constant whatever the drive.
+        """
         return (steer.clamp(-1.0, 1.0) * self.delta_max).unsqueeze(-1)
 
     def delta(self, x: Tensor, w: Tensor) -> Tensor:

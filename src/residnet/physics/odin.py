@@ -1,4 +1,6 @@
-"""The USV Odin: accelerations as terms of the velocities, and forces by their gains (document 000 eqs. (6.6)-(6.8), ERRATA H1-H5)."""
+"""The USV Odin: accelerations as terms of the velocities, and forces by their gains (document 000
+eqs. (6.6)-(6.8), ERRATA H1-H5).
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,9 @@ class Gains(Config):
 
 
 class AccelerationTerms(Config):
-    """Accelerations without force as terms of (u, v, r), with the sign that they act with: what brakes is negative."""
+    """Accelerations without force as terms of (u, v, r), with the sign that they act with: what
+    brakes is negative.
+    """
 
     u: dict[str, Parameter] = Field(default_factory=dict)
     v: dict[str, Parameter] = Field(default_factory=dict)
@@ -53,15 +57,21 @@ class AccelerationTerms(Config):
                     raise ValueError(f"{axis}: {error}") from None
                 if any(factor.power < 0 for factor in factors):
                     raise ValueError(f"{axis}: term '{term}' is infinite at rest")
-                metres = (axis != "r") - sum(factor.power for factor in factors if factor.name != "r")
+                metres = (axis != "r") - sum(
+                    factor.power for factor in factors if factor.name != "r"
+                )
                 seconds = -2 + sum(factor.power for factor in factors)
                 if dimension(parameter.unit, 0) != (metres, seconds):
-                    raise ValueError(f"{axis}.{term}: its unit must be {unit_text(metres, seconds, 0)}, given '{parameter.unit}'")
+                    raise ValueError(
+                        f"{axis}.{term}: its unit must be {unit_text(metres, seconds, 0)}, given"
+                        f" '{parameter.unit}'"
+                    )
         return self
 
 
 class OdinConfig(VesselFile):
-    """A 3-DOF vessel known by its accelerations; a file may name another one as `base` and give only what differs.
+    """A 3-DOF vessel known by its accelerations; a file may name another one as `base` and give
+    only what differs.
 
     Attributes:
         name: of the vessel, as its file is called.
@@ -79,9 +89,14 @@ class OdinConfig(VesselFile):
     wind: WindLoadsConfig | None = None
 
     def equations(self) -> tuple[tuple[str, ...], list[list[float]]]:
-        """nu_dot as terms of (u, v, r), and the coefficients of these, then of tau_x, tau_y, tau_n, on each axis."""
+        """nu_dot as terms of (u, v, r), and the coefficients of these, then of tau_x, tau_y, tau_n,
+        on each axis.
+        """
         hull = AccelerationHull(self.gains, self.terms)
-        return hull.terms.terms, torch.cat((hull.coefficients.T, torch.diag(hull.gain)), dim=1).tolist()
+        return (
+            hull.terms.terms,
+            torch.cat((hull.coefficients.T, torch.diag(hull.gain)), dim=1).tolist(),
+        )
 
     def build(self) -> OdinVessel:
         """The plant."""
@@ -89,7 +104,9 @@ class OdinConfig(VesselFile):
 
 
 class AccelerationHull(nn.Module):
-    """nu_dot = gain tau + terms of the velocities. Buffers are float64; results take the dtype of the input."""
+    """nu_dot = gain tau + terms of the velocities. Buffers are float64; results take the dtype of
+    the input.
+    """
 
     def __init__(self, gains: Gains, terms: AccelerationTerms) -> None:
         super().__init__()
@@ -97,14 +114,20 @@ class AccelerationHull(nn.Module):
         used = sorted({term for row in rows for term in row})
         self.terms = TermLibrary(used, VELOCITY)
         coefficients = [[row[term].value if term in row else 0.0 for row in rows] for term in used]
-        self.register_buffer("coefficients", torch.tensor(coefficients, dtype=torch.float64).reshape(len(used), 3), persistent=False)
+        self.register_buffer(
+            "coefficients",
+            torch.tensor(coefficients, dtype=torch.float64).reshape(len(used), 3),
+            persistent=False,
+        )
         gain = [gains.x.value, gains.y.value, gains.n.value]
         self.register_buffer("gain", torch.tensor(gain, dtype=torch.float64), persistent=False)
         self.coefficients: Tensor
         self.gain: Tensor
 
     def forward(self, nu: Tensor, tau: Tensor) -> Tensor:
-        """Acceleration nu_dot [..., 3] from velocities through the water nu [..., 3] and forces tau [..., 3] in N, N, N m."""
+        """Acceleration nu_dot [..., 3] from velocities through the water nu [..., 3] and forces tau
+        [..., 3] in N, N, N m.
+        """
         return tau * self.gain.to(nu.dtype) + self.terms(nu) @ self.coefficients.to(nu.dtype)
 
 
@@ -112,11 +135,16 @@ class AccelerationHull(nn.Module):
 class OdinVessel(HullPlant):
     """The hull with its actuators, in current and external force.
 
-    State x [B, 6 + k]: x, y [m], psi [rad], u, v [m/s] over ground, r [rad/s], then the actuators' states.
+    State x [B, 6 + k]: x, y [m], psi [rad], u, v [m/s] over ground, r [rad/s], then the actuators'
+    states.
     """
 
     def __init__(self, vessel: OdinConfig) -> None:
-        super().__init__(Planar(), vessel.actuators.build(), vessel.wind.build() if vessel.wind is not None else None)
+        super().__init__(
+            Planar(),
+            vessel.actuators.build(),
+            vessel.wind.build() if vessel.wind is not None else None,
+        )
         self.hull = AccelerationHull(vessel.gains, vessel.terms)
 
     def acceleration(self, pose: Tensor, nu: Tensor, tau: Tensor) -> Tensor:

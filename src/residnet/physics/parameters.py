@@ -1,4 +1,6 @@
-"""Numbers of vessel files: SI parameters, each with its unit and source, converted once when the file is read."""
+"""Numbers of vessel files: SI parameters, each with its unit and source, converted once when the
+file is read.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,9 @@ class Parameter(Config):
     @classmethod
     def _source(cls, source: str) -> str:
         if not source.strip():
-            raise ValueError("a parameter needs its source (a document and equation, or 'measured by ...')")
+            raise ValueError(
+                "a parameter needs its source (a document and equation, or 'measured by ...')"
+            )
         return source
 
 
@@ -59,11 +63,21 @@ def above_zero(parameter: Parameter) -> Parameter:
     return parameter
 
 
-_BASE = {"kg": (0, 0), "m": (1, 0), "s": (0, 1), "rad": (0, 0), "N": (1, -2), "1": (0, 0), "-": (0, 0)}
+_BASE = {
+    "kg": (0, 0),
+    "m": (1, 0),
+    "s": (0, 1),
+    "rad": (0, 0),
+    "N": (1, -2),
+    "1": (0, 0),
+    "-": (0, 0),
+}
 
 
 def dimension(unit: str, mass: int = 1) -> tuple[int, int] | None:
-    """Powers of metre and second in an SI unit with `mass` times mass, for example (2, -1) for `kg m^2/s` or `N m s/rad`; None for any other."""
+    """Powers of metre and second in an SI unit with `mass` times mass, for example (2, -1) for `kg
+    m^2/s` or `N m s/rad`; None for any other.
+    """
     metres = seconds = masses = 0
     for sign, name, power in re.findall(r"([/ ]?)([^/ ^]*)(?:\^([1-9]))?", unit.strip()):
         if not name:
@@ -81,7 +95,9 @@ def of_dimension(mass: int, metres: int, seconds: int) -> Callable[[Parameter], 
 
     def check(parameter: Parameter) -> Parameter:
         if dimension(parameter.unit, mass) != (metres, seconds):
-            raise ValueError(f"its unit must be {unit_text(metres, seconds, mass)}, given '{parameter.unit}'")
+            raise ValueError(
+                f"its unit must be {unit_text(metres, seconds, mass)}, given '{parameter.unit}'"
+            )
         return parameter
 
     return check
@@ -92,7 +108,9 @@ def unit_text(metres: int, seconds: int, mass: int = 1) -> str:
 
     def powers(sign: int) -> list[str]:
         given = (("kg", mass), ("m", metres), ("s", seconds))
-        return [name + (f"^{sign * p}" if sign * p > 1 else "") for name, p in given if sign * p > 0]
+        return [
+            name + (f"^{sign * p}" if sign * p > 1 else "") for name, p in given if sign * p > 0
+        ]
 
     above = powers(1) or (["1"] if powers(-1) else ["-"])
     return " ".join(above) + "".join(f"/{name}" for name in powers(-1))

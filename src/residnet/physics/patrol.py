@@ -1,4 +1,6 @@
-"""The 4-DOF patrol vessel: surge, sway, roll and yaw with roll restoring (document 004, section 5.2, as corrected in ERRATA 004)."""
+"""The 4-DOF patrol vessel: surge, sway, roll and yaw with roll restoring (document 004, section
+5.2, as corrected in ERRATA 004).
+"""
 
 from __future__ import annotations
 
@@ -14,18 +16,33 @@ from residnet.physics.actuators.stern_rudders import FoilRuddersConfig, LinearRu
 from residnet.physics.environment.wind import WindLoadsConfig
 from residnet.physics.kinematics import Rolling
 from residnet.physics.mass import inverse_mass
-from residnet.physics.parameters import Inertia, Length, Mass, MassArm, MassDensity, Parameter, Volume, above_zero, dimension, unit_text
+from residnet.physics.parameters import (
+    Inertia,
+    Length,
+    Mass,
+    MassArm,
+    MassDensity,
+    Parameter,
+    Volume,
+    above_zero,
+    dimension,
+    unit_text,
+)
 from residnet.physics.plant import HullPlant
 from residnet.physics.terms import TermLibrary, parse_term
 from residnet.physics.vessel_file import VesselFile
 
 MOTION = (*Rolling.velocity, "phi")
-"""What the terms are made of: surge, sway, roll and yaw velocities through the water, and the roll angle."""
+"""What the terms are made of: surge, sway, roll and yaw velocities through the water, and the roll
+angle.
+"""
 GRAVITY = 9.81
 
 
 class RollingBody(Config):
-    """Mass, moments of inertia about the body origin and centre of gravity (z down: above the origin is negative)."""
+    """Mass, moments of inertia about the body origin and centre of gravity (z down: above the
+    origin is negative).
+    """
 
     m: Mass
     I_x: Inertia
@@ -52,7 +69,9 @@ class RollingAddedMass(Config):
 
 
 class HullForces(Config):
-    """Forces of the water on the hull as terms of (u, v, p, r, phi), with the sign that they act with: braking is negative."""
+    """Forces of the water on the hull as terms of (u, v, p, r, phi), with the sign that they act
+    with: braking is negative.
+    """
 
     X: dict[str, Parameter] = Field(default_factory=dict)
     Y: dict[str, Parameter] = Field(default_factory=dict)
@@ -73,10 +92,15 @@ class HullForces(Config):
                     raise ValueError(f"{axis}: {error}") from None
                 if any(factor.power < 0 for factor in factors):
                     raise ValueError(f"{axis}: term '{term}' is infinite at rest")
-                metres = (2 if axis in "KN" else 1) - sum(f.power for f in factors if f.name in "uv")
+                metres = (2 if axis in "KN" else 1) - sum(
+                    f.power for f in factors if f.name in "uv"
+                )
                 seconds = -2 + sum(f.power for f in factors if f.name != "phi")
                 if dimension(parameter.unit) != (metres, seconds):
-                    raise ValueError(f"{axis}.{term}: its unit must be {unit_text(metres, seconds)}, given '{parameter.unit}'")
+                    raise ValueError(
+                        f"{axis}.{term}: its unit must be {unit_text(metres, seconds)}, given"
+                        f" '{parameter.unit}'"
+                    )
         return self
 
 
@@ -129,8 +153,9 @@ class PatrolConfig(VesselFile):
 
 
 class PatrolHull(nn.Module):
-    """Acceleration of the hull. Inertia is that of the rigid body about the origin (eq. (5.12)); the water's Coriolis forces are
-    among the terms, as far as the source has them (X_vr). Buffers are float64; results take the dtype of the input.
+    """Acceleration of the hull. Inertia is that of the rigid body about the origin (eq. (5.12));
+    the water's Coriolis forces are among the terms, as far as the source has them (X_vr). Buffers
+    are float64; results take the dtype of the input.
     """
 
     def __init__(self, vessel: PatrolConfig) -> None:
@@ -141,13 +166,29 @@ class PatrolHull(nn.Module):
         mass = torch.tensor(
             [
                 [m - added.X_udot.value, 0.0, 0.0, 0.0],
-                [0.0, m - added.Y_vdot.value, -(down + added.Y_pdot.value), along - added.Y_rdot.value],
-                [0.0, -(down + added.K_vdot.value), body.I_x.value - added.K_pdot.value, -added.K_rdot.value],
-                [0.0, along - added.N_vdot.value, -added.N_pdot.value, body.I_z.value - added.N_rdot.value],
+                [
+                    0.0,
+                    m - added.Y_vdot.value,
+                    -(down + added.Y_pdot.value),
+                    along - added.Y_rdot.value,
+                ],
+                [
+                    0.0,
+                    -(down + added.K_vdot.value),
+                    body.I_x.value - added.K_pdot.value,
+                    -added.K_rdot.value,
+                ],
+                [
+                    0.0,
+                    along - added.N_vdot.value,
+                    -added.N_pdot.value,
+                    body.I_z.value - added.N_rdot.value,
+                ],
             ],
             dtype=torch.float64,
         )
-        # centripetal terms of the rigid body, (5.12), and the restoring moment, which (5.17) leaves out
+        # centripetal terms of the rigid body, (5.12), and the restoring moment, which (5.17) leaves
+        # out
         inertia = {
             "v r": (m, 0.0, 0.0, 0.0),
             "r r": (along, 0.0, 0.0, 0.0),
@@ -161,14 +202,22 @@ class PatrolHull(nn.Module):
         self.terms = TermLibrary([*inertia, *given], MOTION)
         self.register_buffer("mass", mass, persistent=False)
         self.register_buffer("inverse", inverse_mass(mass, vessel.name), persistent=False)
-        self.register_buffer("coefficients", torch.tensor([*inertia.values(), *coefficients], dtype=torch.float64), persistent=False)
+        self.register_buffer(
+            "coefficients",
+            torch.tensor([*inertia.values(), *coefficients], dtype=torch.float64),
+            persistent=False,
+        )
         self.mass: Tensor
         self.inverse: Tensor
         self.coefficients: Tensor
 
     def load(self, phi: Tensor, nu: Tensor) -> Tensor:
-        """Forces [..., 4] in N, N, N m, N m of water, weight and rotation at roll phi [...] and velocities through the water nu [..., 4]."""
-        return self.terms(torch.cat((nu, phi.unsqueeze(-1)), dim=-1)) @ self.coefficients.to(nu.dtype)
+        """Forces [..., 4] in N, N, N m, N m of water, weight and rotation at roll phi [...] and
+        velocities through the water nu [..., 4].
+        """
+        return self.terms(torch.cat((nu, phi.unsqueeze(-1)), dim=-1)) @ self.coefficients.to(
+            nu.dtype
+        )
 
     def forward(self, phi: Tensor, nu: Tensor, tau: Tensor) -> Tensor:
         """Acceleration nu_dot [..., 4] under the further forces tau [..., 4]."""
@@ -179,20 +228,28 @@ class PatrolHull(nn.Module):
 class PatrolVessel(HullPlant):
     """The hull with rudders and propellers, in current, wind and external force.
 
-    State x [B, 8 + k]: x, y [m], phi, psi [rad], u, v [m/s] over ground, p, r [rad/s], then the rudder angle where it has a rate.
+    State x [B, 8 + k]: x, y [m], phi, psi [rad], u, v [m/s] over ground, p, r [rad/s], then the
+    rudder angle where it has a rate.
     """
 
     def __init__(self, vessel: PatrolConfig) -> None:
-        super().__init__(Rolling(), vessel.actuators.build(), vessel.wind.build() if vessel.wind is not None else None)
+        super().__init__(
+            Rolling(),
+            vessel.actuators.build(),
+            vessel.wind.build() if vessel.wind is not None else None,
+        )
         self.hull = PatrolHull(vessel)
         self.speed = vessel.speed
 
     def acceleration(self, pose: Tensor, nu: Tensor, tau: Tensor) -> Tensor:
-        """nu_dot [B, 4] at pose [B, 4] from velocities through the water [B, 4] and forces [B, 4]."""
+        """nu_dot [B, 4] at pose [B, 4] from velocities through the water [B, 4] and forces [B, 4].
+        """
         return self.hull(pose[..., 2], nu, tau)
 
     def approach(self, rows: int) -> Tensor:
-        """Straight ahead at service speed, [rows, nx]: the source's thrust compensates the resistance there."""
+        """Straight ahead at service speed, [rows, nx]: the source's thrust compensates the
+        resistance there.
+        """
         x = super().approach(rows)
         x[:, self.state.index("u")] = self.speed
         return x

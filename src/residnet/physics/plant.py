@@ -1,4 +1,5 @@
-"""Plants: a vessel with its actuators and environment, as a right-hand side that a simulator steps."""
+"""Plants: a vessel with its actuators and environment, as a right-hand side that a simulator steps.
+"""
 
 from __future__ import annotations
 
@@ -35,15 +36,21 @@ class Plant(nn.Module, ABC):
         """x_dot [B, nx] under inputs w [B, m]."""
 
     def prepare(self, x: Tensor, w: Tensor) -> Tensor:
-        """What a step holds fixed, p [B, k], from the state x [B, nx] at its start and its inputs w [B, m]."""
+        """What a step holds fixed, p [B, k], from the state x [B, nx] at its start and its inputs w
+        [B, m].
+        """
         return w
 
     def held_rate(self, x: Tensor, p: Tensor) -> Tensor:
-        """x_dot [B, nx] within a step that holds p = prepare(x, w); equals `rate` under the same inputs."""
+        """x_dot [B, nx] within a step that holds p = prepare(x, w); equals `rate` under the same
+        inputs.
+        """
         return self.rate(x, p)
 
     def approach(self, rows: int) -> Tensor:
-        """State [rows, nx] that trials start from, float64: at rest; a model that only holds near its service speed starts there."""
+        """State [rows, nx] that trials start from, float64: at rest; a model that only holds near
+        its service speed starts there.
+        """
         return torch.zeros(rows, len(self.state), dtype=torch.float64)
 
     def settle(self, x: Tensor, w: Tensor, dt: float) -> Tensor:
@@ -52,14 +59,19 @@ class Plant(nn.Module, ABC):
 
 
 class HullPlant(Plant, ABC):
-    """A hull with actuators in current and external forces; a subclass gives the acceleration of the hull.
+    """A hull with actuators in current and external forces; a subclass gives the acceleration of
+    the hull.
 
-    Inputs: commands; force_x, force_y, (force_k,) force_n in body axes [N, N, (N m,) N m]; current_north, current_east [m/s];
-    force_north, force_east [N], constant in earth axes; where the vessel has wind coefficients, wind_speed [m/s] and wind_dir [rad],
-    the true wind and where it comes from. A current is constant in earth axes and acts through the velocity relative to the water.
+    Inputs: commands; force_x, force_y, (force_k,) force_n in body axes [N, N, (N m,) N m];
+    current_north, current_east [m/s]; force_north, force_east [N], constant in earth axes; where
+    the vessel has wind coefficients, wind_speed [m/s] and wind_dir [rad], the true wind and where
+    it comes from. A current is constant in earth axes and acts through the velocity relative to the
+    water.
     """
 
-    def __init__(self, kinematics: Kinematics, actuators: Actuators, wind: WindLoads | None = None) -> None:
+    def __init__(
+        self, kinematics: Kinematics, actuators: Actuators, wind: WindLoads | None = None
+    ) -> None:
         super().__init__()
         self.kinematics = kinematics
         self.actuators = actuators
@@ -70,15 +82,27 @@ class HullPlant(Plant, ABC):
         self.parts = [self.n, self.n, len(actuators.state)]
         self.commands = len(actuators.commands)
         forces = tuple(f"force_{axis}" for axis in kinematics.axes)
-        self.inputs = (*actuators.commands, *forces, "current_north", "current_east", "force_north", "force_east")
+        self.inputs = (
+            *actuators.commands,
+            *forces,
+            "current_north",
+            "current_east",
+            "force_north",
+            "force_east",
+        )
         if wind is not None:
             self.inputs += WIND_INPUTS
-        self.register_buffer("blown", torch.tensor(["xykn".index(axis) for axis in kinematics.axes]), persistent=False)
+        self.register_buffer(
+            "blown",
+            torch.tensor(["xykn".index(axis) for axis in kinematics.axes]),
+            persistent=False,
+        )
         self.blown: Tensor
 
     @abstractmethod
     def acceleration(self, pose: Tensor, nu: Tensor, tau: Tensor) -> Tensor:
-        """nu_dot [B, n] at pose [B, n] from velocities through the water [B, n] and forces [B, n]."""
+        """nu_dot [B, n] at pose [B, n] from velocities through the water [B, n] and forces [B, n].
+        """
 
     @final
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
@@ -86,14 +110,18 @@ class HullPlant(Plant, ABC):
         return self.actuators.demand(drive, steer)
 
     def in_calm_water(self) -> HullPlant:
-        """This plant without its exogenous inputs: no body or earth-fixed forces, current, wind or air resistance; faster."""
+        """This plant without its exogenous inputs: no body or earth-fixed forces, current, wind or
+        air resistance; faster.
+        """
         self.weather = False
         self.inputs = self.actuators.commands
         return self
 
     @final
     def prepare(self, x: Tensor, w: Tensor) -> Tensor:
-        """Inputs with the actuators' forces, where these stay the same over a step, added to the body forces; w itself elsewhere."""
+        """Inputs with the actuators' forces, where these stay the same over a step, added to the
+        body forces; w itself elsewhere.
+        """
         if not self.actuators.held:
             return w
         n, c = self.n, self.commands
@@ -113,17 +141,25 @@ class HullPlant(Plant, ABC):
         return self._rate(x, w, False)
 
     def _rate(self, x: Tensor, w: Tensor, held: bool) -> Tensor:
-        """x_dot; `held`: the actuators' forces are among the body forces already, and their states stand still."""
+        """x_dot; `held`: the actuators' forces are among the body forces already, and their states
+        stand still.
+        """
         n, c = self.n, self.commands
         pose, nu, a = torch.split(x, self.parts, dim=-1)
         command = w.narrow(-1, 0, c)
         moving = torch.zeros_like(a) if held else self.actuators.rate(a, command)
         if not self.weather:
             tau = w.narrow(-1, c, n) if held else self.actuators.force(a, command, nu)
-            return torch.cat((self.kinematics.rate(pose, nu), self.acceleration(pose, nu, tau), moving), dim=-1)
+            return torch.cat(
+                (self.kinematics.rate(pose, nu), self.acceleration(pose, nu, tau), moving), dim=-1
+            )
         water, turned = self.kinematics.carried(w[:, c + n], w[:, c + n + 1], pose, nu)
         relative = nu - water
-        body = w[:, c : c + n] if held else self.actuators.force(a, command, relative) + w[:, c : c + n]
+        body = (
+            w[:, c : c + n]
+            if held
+            else self.actuators.force(a, command, relative) + w[:, c : c + n]
+        )
         tau = body + self.kinematics.pushed(w[:, c + n + 2], w[:, c + n + 3], pose)
         if self.wind is not None:
             tau = tau + self._wind(w[:, c + n + 4], w[:, c + n + 5], pose, nu)
@@ -133,11 +169,15 @@ class HullPlant(Plant, ABC):
     def _wind(self, speed: Tensor, direction: Tensor, pose: Tensor, nu: Tensor) -> Tensor:
         """Forces [B, n] of the true wind on the vessel that moves over ground with nu [B, n]."""
         assert self.wind is not None
-        air = self.kinematics.pushed(-speed * torch.cos(direction), -speed * torch.sin(direction), pose)
+        air = self.kinematics.pushed(
+            -speed * torch.cos(direction), -speed * torch.sin(direction), pose
+        )
         return self.wind(air[:, 0] - nu[:, 0], air[:, 1] - nu[:, 1]).index_select(-1, self.blown)
 
     @final
     def settle(self, x: Tensor, w: Tensor, dt: float) -> Tensor:
-        """State [B, nx] with the actuators moved on by a step of dt seconds (they are held while the hull moves)."""
+        """State [B, nx] with the actuators moved on by a step of dt seconds (they are held while
+        the hull moves).
+        """
         after = self.actuators.advance(x[:, 2 * self.n :], w[:, : self.commands], dt)
         return torch.cat((x[:, : 2 * self.n], after), dim=-1)

@@ -1,7 +1,9 @@
-"""From state and inputs to the channels that baselines and heads may use: velocities, commands, forces, relative wind.
+"""From state and inputs to the channels that baselines and heads may use: velocities, commands,
+forces, relative wind.
 
-Position and heading are not offered: a model in body axes must not depend on where the vessel is or where it points.
-True wind enters earth-fixed and is turned into wind relative to the vessel with the predicted heading and velocity.
+Position and heading are not offered: a model in body axes must not depend on where the vessel is or
+where it points. True wind enters earth-fixed and is turned into wind relative to the vessel with
+the predicted heading and velocity.
 """
 
 from __future__ import annotations
@@ -28,9 +30,11 @@ class SignalsConfig(Config):
 
     Attributes:
         inputs: command channels of the log, in order; held over a step.
-        exogenous: channels that nobody commands; `wind_speed` and `wind_dir` (where the true wind comes FROM, earth-fixed)
-            become the channels wind_u, wind_v, wind_mag: velocity of the air relative to the vessel in body axes.
-        forces: a vessel (by name or file) whose thrusters turn the two inputs into tau_x, tau_y, tau_n; or the thrusters themselves.
+        exogenous: channels that nobody commands; `wind_speed` and `wind_dir` (where the true wind
+            comes FROM, earth-fixed) become the channels wind_u, wind_v, wind_mag: velocity of the
+            air relative to the vessel in body axes.
+        forces: a vessel (by name or file) whose thrusters turn the two inputs into tau_x, tau_y,
+            tau_n; or the thrusters themselves.
     """
 
     inputs: tuple[str, ...] = Field(min_length=1)
@@ -41,17 +45,32 @@ class SignalsConfig(Config):
     def _combination(self) -> SignalsConfig:
         for name in self.exogenous:
             if name not in WIND_INPUTS:
-                raise ValueError(f"exogenous channel '{name}' is not understood{nearest(name, WIND_INPUTS)}")
+                raise ValueError(
+                    f"exogenous channel '{name}' is not understood{nearest(name, WIND_INPUTS)}"
+                )
         if self.exogenous and set(self.exogenous) != set(WIND_INPUTS):
-            raise ValueError(f"true wind needs both {' and '.join(WIND_INPUTS)}; given {list(self.exogenous)}")
+            raise ValueError(
+                f"true wind needs both {' and '.join(WIND_INPUTS)}; given {list(self.exogenous)}"
+            )
         if self.resolved().forces is not None and len(self.inputs) != 2:
-            raise ValueError(f"forces are made by two thrusters, but inputs are {list(self.inputs)}")
-        repeated = {name for name in self.inputs if name in self.exogenous or self.inputs.count(name) > 1}
+            raise ValueError(
+                f"forces are made by two thrusters, but inputs are {list(self.inputs)}"
+            )
+        repeated = {
+            name for name in self.inputs if name in self.exogenous or self.inputs.count(name) > 1
+        }
         if repeated:
             raise ValueError(f"inputs {sorted(repeated)} are named twice")
-        made = STATE + (FORCE_CHANNELS if self.forces is not None else ()) + (WIND_CHANNELS if self.exogenous else ())
+        made = (
+            STATE
+            + (FORCE_CHANNELS if self.forces is not None else ())
+            + (WIND_CHANNELS if self.exogenous else ())
+        )
         if taken := [name for name in self.inputs if name in made]:
-            raise ValueError(f"input '{taken[0]}' is a channel that the model has or makes itself; leave it out or rename it in the channel map")
+            raise ValueError(
+                f"input '{taken[0]}' is a channel that the model has or makes itself; leave it out"
+                " or rename it in the channel map"
+            )
         return self
 
     @property
@@ -60,7 +79,8 @@ class SignalsConfig(Config):
         return self.inputs + self.exogenous
 
     def resolved(self) -> SignalsConfig:
-        """The same with the vessel's name replaced by its thrusters, so that a saved model needs no vessel file.
+        """The same with the vessel's name replaced by its thrusters, so that a saved model needs no
+        vessel file.
 
         Raises:
             ValueError: where there is no such vessel.
@@ -73,7 +93,10 @@ class SignalsConfig(Config):
             raise ValueError(str(error)) from None
         actuators = vessel.actuators if isinstance(vessel, FossenConfig) else None
         if not isinstance(actuators, DifferentialThrustConfig):
-            raise ValueError(f"forces: the actuators of '{self.forces}' are not two thrusters (differential_thrust); leave forces out")
+            raise ValueError(
+                f"forces: the actuators of '{self.forces}' are not two thrusters"
+                " (differential_thrust); leave forces out"
+            )
         return self.model_copy(update={"forces": actuators})
 
     def units(self) -> dict[str, str]:
@@ -86,9 +109,11 @@ class SignalsConfig(Config):
 
 
 class Signals(nn.Module):
-    """Channels z [B, nz] from state x [B, nx] and inputs w [B, m]; `names` holds the names of the columns of z.
+    """Channels z [B, nz] from state x [B, nx] and inputs w [B, m]; `names` holds the names of the
+    columns of z.
 
-    `prepare` does what depends on the inputs alone, once per step; `forward` does the rest at every stage of the integrator.
+    `prepare` does what depends on the inputs alone, once per step; `forward` does the rest at every
+    stage of the integrator.
     """
 
     def __init__(self, config: SignalsConfig) -> None:
@@ -108,17 +133,23 @@ class Signals(nn.Module):
         self.count = len(names)
 
     def prepare(self, w: Tensor) -> Tensor:
-        """What a step holds fixed: inputs, forces and the air's velocity over ground (north, east), [..., k]."""
+        """What a step holds fixed: inputs, forces and the air's velocity over ground (north, east),
+        [..., k].
+        """
         parts = [w[..., : self.inputs]]
         if self.forces:
             parts.append(self.thrusters(w[..., : self.inputs]))
         if self.wind:
             speed, direction = w[..., self.speed_column], w[..., self.direction_column]
-            parts.append(torch.stack((-speed * torch.cos(direction), -speed * torch.sin(direction)), dim=-1))
+            parts.append(
+                torch.stack((-speed * torch.cos(direction), -speed * torch.sin(direction)), dim=-1)
+            )
         return torch.cat(parts, dim=-1)
 
     def forward(self, x: Tensor, p: Tensor) -> Tensor:
-        """Channels z [..., nz] from state x [..., nx] (x, y, psi, u, v, r first) and p = prepare(w)."""
+        """Channels z [..., nz] from state x [..., nx] (x, y, psi, u, v, r first) and p =
+        prepare(w).
+        """
         if not self.wind:
             return torch.cat((x[..., 3:6], p), dim=-1)
         known = p.shape[-1] - 2
@@ -126,4 +157,6 @@ class Signals(nn.Module):
         along, across = along - x[..., 3], across - x[..., 4]
         # the offset keeps the gradient finite in a calm
         magnitude = torch.sqrt(along * along + across * across + 1e-8)
-        return torch.cat((x[..., 3:6], p[..., :known], torch.stack((along, across, magnitude), dim=-1)), dim=-1)
+        return torch.cat(
+            (x[..., 3:6], p[..., :known], torch.stack((along, across, magnitude), dim=-1)), dim=-1
+        )

@@ -1,4 +1,6 @@
-"""Port/starboard symmetry: how channels and terms change when a vessel and all that happens to it are mirrored."""
+"""Port/starboard symmetry: how channels and terms change when a vessel and all that happens to it
+are mirrored.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,9 @@ _OTHER_SIDE = {"port": "stbd", "stbd": "port"}
 
 
 def channel_parity(name: str) -> int | None:
-    """+1 where a channel keeps its sign in the mirror, -1 where it changes it, None where nobody said."""
+    """+1 where a channel keeps its sign in the mirror, -1 where it changes it, None where nobody
+    said.
+    """
     return -1 if name in _ODD else 1 if name in _EVEN else None
 
 
@@ -24,19 +28,27 @@ def term_parity(term: str, names: Sequence[str]) -> int | None:
         own = channel_parity(factor.name)
         if own is None:
             return None
-        if own < 0 and not factor.magnitude and factor.function not in EVEN_FUNCTIONS and factor.power % 2 == 1:
+        if (
+            own < 0
+            and not factor.magnitude
+            and factor.function not in EVEN_FUNCTIONS
+            and factor.power % 2 == 1
+        ):
             parity = -parity
     return parity
 
 
 def wrong_parity(term: str, axis: int, names: Sequence[str]) -> bool:
-    """Whether a mirror-symmetric vessel cannot have this term in the acceleration of this axis (0 surge, 1 sway, 2 yaw)."""
+    """Whether a mirror-symmetric vessel cannot have this term in the acceleration of this axis (0
+    surge, 1 sway, 2 yaw).
+    """
     parity = term_parity(term, names)
     return parity is not None and parity != (1 if VELOCITY[axis] == "u" else -1)
 
 
 def mirrored_channels(names: Sequence[str]) -> tuple[list[int], list[float]] | None:
-    """How channels look in the mirror: the column that each takes its value from, and the sign; None where one is not known.
+    """How channels look in the mirror: the column that each takes its value from, and the sign;
+    None where one is not known.
 
     Channels of a port/starboard pair change places.
     """

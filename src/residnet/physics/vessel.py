@@ -1,4 +1,6 @@
-"""Vessel files (`configs/vessels/*.yaml`): every kind of plant, its parameters in SI, each with its source."""
+"""Vessel files (`configs/vessels/*.yaml`): every kind of plant, its parameters in SI, each with its
+source.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,14 @@ from residnet.physics.odin import OdinConfig
 from residnet.physics.patrol import PatrolConfig
 
 AnyVessel = (
-    FossenConfig | MassMatrixConfig | AbkowitzConfig | OdinConfig | PatrolConfig | NomotoConfig | SecondOrderNomotoConfig | SideslipNomotoConfig
+    FossenConfig
+    | MassMatrixConfig
+    | AbkowitzConfig
+    | OdinConfig
+    | PatrolConfig
+    | NomotoConfig
+    | SecondOrderNomotoConfig
+    | SideslipNomotoConfig
 )
 VesselConfig = Annotated[AnyVessel, Field(discriminator="kind")]
 
@@ -40,7 +49,9 @@ def load_vessel(name: str) -> AnyVessel:
     path = Path(name)
     if path.suffix in {".yaml", ".yml"}:
         return load_config(path, [], VesselConfig)
-    raise ConfigError(f"no vessel '{name}'{nearest(name, files)}; or give the path of a vessel's yaml file")
+    raise ConfigError(
+        f"no vessel '{name}'{nearest(name, files)}; or give the path of a vessel's yaml file"
+    )
 
 
 def _loadable(name: str) -> str:

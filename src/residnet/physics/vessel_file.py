@@ -1,4 +1,6 @@
-"""What every vessel file has, and files that say only what differs from another one: `base: patrol_p06`."""
+"""What every vessel file has, and files that say only what differs from another one: `base:
+patrol_p06`.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,8 @@ from residnet.physics.plant import Plant
 
 
 class VesselFile(Config, ABC):
-    """A vessel of any kind; a file may name another one of its kind as `base` and give only what differs.
+    """A vessel of any kind; a file may name another one of its kind as `base` and give only what
+    differs.
 
     Attributes:
         name: of the vessel, as its file is called.
@@ -48,18 +51,22 @@ class VesselFile(Config, ABC):
 def with_base(data: Any, folder: Path | None) -> Any:
     """Content of a vessel file laid over that of its `base`, which may have one of its own.
 
-    Sections are merged key by key; a section of another `kind` takes the place of the base's. `base` is the name of a file in
-    `configs/vessels`, or the path of a YAML file, looked for beside the file first.
+    Sections are merged key by key; a section of another `kind` takes the place of the base's.
+    `base` is the name of a file in `configs/vessels`, or the path of a YAML file, looked for beside
+    the file first.
 
     Raises:
-        ValueError: where there is no such file, it cannot be read, or files name each other in a circle.
+        ValueError: where there is no such file, it cannot be read, or files name each other in a
+            circle.
     """
     seen: list[Path] = []
     layers = [_frozen(data)]
     while isinstance(layers[-1], dict) and "base" in layers[-1]:
         path = _file(layers[-1]["base"], folder)
         if path in seen:
-            raise ValueError(f"base: {' and '.join(p.name for p in seen)} name each other in a circle")
+            raise ValueError(
+                f"base: {' and '.join(p.name for p in seen)} name each other in a circle"
+            )
         seen.append(path)
         folder = path.parent
         try:
@@ -83,11 +90,15 @@ def _file(name: object, folder: Path | None) -> Path:
     for candidate in (beside, path):
         if candidate.suffix in {".yaml", ".yml"} and candidate.is_file():
             return candidate.resolve()
-    raise ValueError(f"base: no vessel '{name}'{nearest(name, files)}; or give the path of a vessel's yaml file")
+    raise ValueError(
+        f"base: no vessel '{name}'{nearest(name, files)}; or give the path of a vessel's yaml file"
+    )
 
 
 def _frozen(data: Any) -> Any:
-    """The same with tuples for lists: what a validator of a whole model hands on is taken for Python, not for YAML, and lists are no tuples."""
+    """The same with tuples for lists: what a validator of a whole model hands on is taken for
+    Python, not for YAML, and lists are no tuples.
+    """
     if isinstance(data, dict):
         return {key: _frozen(value) for key, value in data.items()}
     return tuple(_frozen(value) for value in data) if isinstance(data, list) else data
@@ -97,7 +108,11 @@ def _laid_over(upper: dict[str, Any], lower: dict[str, Any]) -> dict[str, Any]:
     out = dict(lower)
     for key, value in upper.items():
         below = lower.get(key)
-        if isinstance(value, dict) and isinstance(below, dict) and value.get("kind", below.get("kind")) == below.get("kind"):
+        if (
+            isinstance(value, dict)
+            and isinstance(below, dict)
+            and value.get("kind", below.get("kind")) == below.get("kind")
+        ):
             value = _laid_over(value, below)
         out[key] = value
     return out

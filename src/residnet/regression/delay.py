@@ -1,4 +1,6 @@
-"""Time delay of inputs by a least-squares profile over shifts, all of them from the same correlations (document 000 section 5.3.4)."""
+"""Time delay of inputs by a least-squares profile over shifts, all of them from the same
+correlations (document 000 section 5.3.4).
+"""
 
 from __future__ import annotations
 
@@ -10,17 +12,22 @@ from residnet.core.errors import FitError
 
 
 class DelayProfile(NamedTuple):
-    """Residual sum of squares of each shift [S + 1], and the shift where it is least, in samples."""
+    """Residual sum of squares of each shift [S + 1], and the shift where it is least, in samples.
+    """
 
     rss: np.ndarray
     shift: int
 
 
-def delay_profile(held: np.ndarray, delayed: np.ndarray, y: np.ndarray, stretch: np.ndarray, longest: int) -> DelayProfile:
-    """Least-squares error of y(t) = sum_j c_j held_j(t) delayed_j(t - s) for every shift s = 0 ... longest.
+def delay_profile(
+    held: np.ndarray, delayed: np.ndarray, y: np.ndarray, stretch: np.ndarray, longest: int
+) -> DelayProfile:
+    """Least-squares error of y(t) = sum_j c_j held_j(t) delayed_j(t - s) for every shift s = 0 ...
+    longest.
 
-    All shifts are judged on the same samples, those with a past of `longest`. The moments of all shifts are correlations of held_i held_j with
-    delayed_i delayed_j, taken by FFT: no shift costs a regression over the samples.
+    All shifts are judged on the same samples, those with a past of `longest`. The moments of all
+    shifts are correlations of held_i held_j with delayed_i delayed_j, taken by FFT: no shift costs
+    a regression over the samples.
 
     Args:
         held: the part of each term that is not delayed [N, J].
@@ -33,10 +40,15 @@ def delay_profile(held: np.ndarray, delayed: np.ndarray, y: np.ndarray, stretch:
         FitError: with fewer samples that have a past than terms.
     """
     n, j = held.shape
-    has_past = np.concatenate((np.zeros(min(longest, n), dtype=bool), stretch[longest:] == stretch[: max(n - longest, 0)]))
+    has_past = np.concatenate(
+        (np.zeros(min(longest, n), dtype=bool), stretch[longest:] == stretch[: max(n - longest, 0)])
+    )
     count = int(has_past.sum())
     if count <= j:
-        raise FitError(f"delay: {count} samples have a past of {longest} samples, {j} terms need more; give longer logs or a shorter delay")
+        raise FitError(
+            f"delay: {count} samples have a past of {longest} samples, {j} terms need more; give"
+            " longer logs or a shorter delay"
+        )
     scale = np.maximum(np.abs(held).max(axis=0) * np.abs(delayed).max(axis=0), 1e-300)
     held = held / scale * has_past[:, None]
     first, second = np.triu_indices(j)
@@ -63,4 +75,6 @@ def delay_profile(held: np.ndarray, delayed: np.ndarray, y: np.ndarray, stretch:
 def _correlations(now: np.ndarray, past: np.ndarray, longest: int) -> np.ndarray:
     """sum_t now(t) past(t - s) for s = 0 ... longest, [longest + 1, P]."""
     size = 1 << (len(now) + longest).bit_length()
-    return np.fft.irfft(np.fft.rfft(now, size, axis=0) * np.conj(np.fft.rfft(past, size, axis=0)), size, axis=0)[: longest + 1]
+    return np.fft.irfft(
+        np.fft.rfft(now, size, axis=0) * np.conj(np.fft.rfft(past, size, axis=0)), size, axis=0
+    )[: longest + 1]

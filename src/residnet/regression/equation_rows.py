@@ -1,10 +1,13 @@
-"""Rows of a regression from sampled terms: as they are, integrated over short windows, or behind lagged instruments.
+"""Rows of a regression from sampled terms: as they are, integrated over short windows, or behind
+lagged instruments.
 
-Noise enters an equation twice: through the derivative on its left, which differentiation amplifies, and through the regressors on its right, which
-pull coefficients towards zero. Integrating both sides against a test function w that vanishes at the ends of a window,
-int w y dt = sum c_j int w f_j dt, takes the derivative off the noisy record (by parts, int w x_dot dt = -int w_dot x dt). Where accelerations are
-central differences (`savitzky_golay` over three samples) summing them is the same as summing by parts. Instruments, the terms themselves some
-time earlier, share what is true with the regressors and not the noise.
+Noise enters an equation twice: through the derivative on its left, which differentiation amplifies,
+and through the regressors on its right, which pull coefficients towards zero. Integrating both
+sides against a test function w that vanishes at the ends of a window, int w y dt = sum c_j int w
+f_j dt, takes the derivative off the noisy record (by parts, int w x_dot dt = -int w_dot x dt).
+Where accelerations are central differences (`savitzky_golay` over three samples) summing them is
+the same as summing by parts. Instruments, the terms themselves some time earlier, share what is
+true with the regressors and not the noise.
 """
 
 from __future__ import annotations
@@ -20,7 +23,9 @@ from residnet.core.errors import ConfigError, FitError
 
 
 class Rows(NamedTuple):
-    """Terms [N, J] and targets [N, K], and the number of the stretch of unbroken samples that each belongs to, ascending [N]."""
+    """Terms [N, J] and targets [N, K], and the number of the stretch of unbroken samples that each
+    belongs to, ascending [N].
+    """
 
     x: np.ndarray
     y: np.ndarray
@@ -43,7 +48,8 @@ class Estimator(Config, ABC):
         Args:
             sampled: terms and targets at samples `step` seconds apart within each stretch.
             step: time between samples, s.
-            exact: which terms are free of measuring noise, such as those of commands alone, [J] bool.
+            exact: which terms are free of measuring noise, such as those of commands alone, [J]
+                bool.
 
         Raises:
             ConfigError: where a window or a lag holds too few samples.
@@ -65,7 +71,8 @@ class LeastSquares(Estimator):
 
 @final
 class Weak(Estimator):
-    """Both sides integrated over windows against (1 - s^2)^2, s from -1 to 1 (weak form; Bortz, Messenger and others, 2021).
+    """Both sides integrated over windows against (1 - s^2)^2, s from -1 to 1 (weak form; Bortz,
+    Messenger and others, 2021).
 
     Attributes:
         window: length of a window.
@@ -83,11 +90,13 @@ class Weak(Estimator):
 
 @final
 class Instruments(Estimator):
-    """Regressors projected on instruments, the terms one and two lags earlier and the exact terms (two-stage least squares).
+    """Regressors projected on instruments, the terms one and two lags earlier and the exact terms
+    (two-stage least squares).
 
     Attributes:
         lag: longer than noise stays correlated, shorter than the motion takes to change.
-        window: of a weak form taken first, s; 0 for none. Windows that overlap share noise: a lag should then be as long.
+        window: of a weak form taken first, s; 0 for none. Windows that overlap share noise: a lag
+            should then be as long.
         every: distance between windows as a share of their length.
     """
 
@@ -103,14 +112,22 @@ class Instruments(Estimator):
             sampled, step = integrated(sampled, step, self.window, self.every), apart
         lag = round(self.lag / step)
         if lag < 1:
-            raise ConfigError(f"instruments: a lag of {self.lag:g} s is less than one step of {step:g} s; lengthen it")
+            raise ConfigError(
+                f"instruments: a lag of {self.lag:g} s is less than one step of {step:g} s;"
+                " lengthen it"
+            )
         now = np.arange(2 * lag, len(sampled.stretch))
         now = now[sampled.stretch[now] == sampled.stretch[now - 2 * lag]]
         x = sampled.x[now]
-        behind = np.concatenate((sampled.x[now - lag], sampled.x[now - 2 * lag][:, ~exact], x[:, exact]), axis=1)
+        behind = np.concatenate(
+            (sampled.x[now - lag], sampled.x[now - 2 * lag][:, ~exact], x[:, exact]), axis=1
+        )
         if len(now) <= behind.shape[1]:
             few = f"{len(now)} samples have a past of {2 * self.lag:g} s"
-            raise FitError(f"instruments: {few}, {behind.shape[1]} instruments need more; shorten the lag or give longer logs")
+            raise FitError(
+                f"instruments: {few}, {behind.shape[1]} instruments need more; shorten the lag or"
+                " give longer logs"
+            )
         length = np.linalg.norm(behind, axis=0)
         q, r = np.linalg.qr(behind / np.where(length > 0, length, 1.0))
         q = q[:, np.abs(np.diagonal(r)) > 1e-10]
@@ -122,7 +139,8 @@ EstimatorConfig = Annotated[LeastSquares | Weak | Instruments, Field(discriminat
 
 
 def integrated(sampled: Rows, step: float, window: float, every: float) -> Rows:
-    """Weighted sums over windows of `window` seconds within each stretch, scaled so that a constant keeps its value.
+    """Weighted sums over windows of `window` seconds within each stretch, scaled so that a constant
+    keeps its value.
 
     Raises:
         ConfigError: where a window holds fewer than three samples.
@@ -130,14 +148,20 @@ def integrated(sampled: Rows, step: float, window: float, every: float) -> Rows:
     """
     size = round(window / step)
     if size < 3:
-        raise ConfigError(f"weak form: a window of {window:g} s holds {size} samples of {step:g} s; set it to {3 * step:g} s or longer")
+        raise ConfigError(
+            f"weak form: a window of {window:g} s holds {size} samples of {step:g} s; set it to"
+            f" {3 * step:g} s or longer"
+        )
     place = np.linspace(-1.0, 1.0, size + 2)[1:-1]
     weight = np.square(1.0 - np.square(place))
     weight /= weight.sum()
     first = np.arange(0, len(sampled.stretch) - size + 1)
     first = first[sampled.stretch[first] == sampled.stretch[first + size - 1]]
     if not first.size:
-        raise FitError(f"weak form: no unbroken stretch of samples is {window:g} s long; shorten the window or give logs with fewer gaps")
+        raise FitError(
+            f"weak form: no unbroken stretch of samples is {window:g} s long; shorten the window or"
+            " give logs with fewer gaps"
+        )
     # windows every so many samples, counted from the start of each stretch
     begins = np.searchsorted(sampled.stretch, sampled.stretch[first])
     first = first[(first - begins) % max(round(every * size), 1) == 0]
@@ -171,12 +195,15 @@ def step_of(group: np.ndarray, t: np.ndarray) -> float:
     """
     apart = np.diff(t)[np.diff(group) == 0]
     if not apart.size or float(np.median(apart)) <= 0:
-        raise FitError("no manoeuvre has two samples at different times; the step between samples is not known")
+        raise FitError(
+            "no manoeuvre has two samples at different times; the step between samples is not known"
+        )
     return float(np.median(apart))
 
 
 def correlation_time(residual: np.ndarray) -> np.ndarray:
-    """How many neighbouring rows say together what one independent row would, [K], at least 1, from residuals [N, K].
+    """How many neighbouring rows say together what one independent row would, [K], at least 1, from
+    residuals [N, K].
 
     1 + 2 sum rho over the first lags until rho is negative (initial positive sequence).
     """

@@ -1,7 +1,9 @@
-"""Expressions in normal form: sums of products of channels and of functions of such sums, equal expressions being equal objects.
+"""Expressions in normal form: sums of products of channels and of functions of such sums, equal
+expressions being equal objects.
 
-Genetic programming breeds trees; what a tree means is the sum of products that it comes to, whose terms get a coefficient each (document 000
-sections 5.1.1 and 5.1.3). Here every product is a tuple of numbers of atoms, so that trees that mean the same share their columns and their fit.
+Genetic programming breeds trees; what a tree means is the sum of products that it comes to, whose
+terms get a coefficient each (document 000 sections 5.1.1 and 5.1.3). Here every product is a tuple
+of numbers of atoms, so that trees that mean the same share their columns and their fit.
 """
 
 from __future__ import annotations
@@ -12,7 +14,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 Function = Literal["sum", "abs", "sin", "cos", "sqrt", "inv"]
-"""Functions of a sum: itself in brackets, magnitude, sine, cosine, and the protected square root and inverse (document 001 section 2.4)."""
+"""Functions of a sum: itself in brackets, magnitude, sine, cosine, and the protected square root
+and inverse (document 001 section 2.4).
+"""
 FUNCTIONS: tuple[Function, ...] = ("sum", "abs", "sin", "cos", "sqrt", "inv")
 
 Product = tuple[int, ...]
@@ -23,7 +27,9 @@ ONE: Product = ()
 
 
 class Limits(NamedTuple):
-    """What an expression may be: terms of a sum, factors of a product, functions inside functions, whether sums are multiplied out."""
+    """What an expression may be: terms of a sum, factors of a product, functions inside functions,
+    whether sums are multiplied out.
+    """
 
     terms: int = 50
     degree: int = 8
@@ -45,7 +51,9 @@ class Atom(NamedTuple):
 
 
 class Algebra:
-    """Sums of products over named channels, kept in normal form: |a|^2 = a^2, |a b| = |a| |b|, cos(-a) = cos a, sin(-a) = -sin a."""
+    """Sums of products over named channels, kept in normal form: |a|^2 = a^2, |a b| = |a| |b|,
+    cos(-a) = cos a, sin(-a) = -sin a.
+    """
 
     def __init__(self, channels: Sequence[str], limits: Limits = Limits()) -> None:  # noqa: B008 (immutable)
         self.channels = tuple(channels)
@@ -111,7 +119,9 @@ class Algebra:
         if len(a) <= 1:
             return a
         lead = a[min(a)]
-        return {self._function("sum", {product: weight / lead for product, weight in a.items()}): lead}
+        return {
+            self._function("sum", {product: weight / lead for product, weight in a.items()}): lead
+        }
 
     def atom(self, function: Function, a: Sum) -> int:
         """The number of a function of a sum in normal form."""
@@ -124,11 +134,17 @@ class Algebra:
 
     def degree(self, product: Product) -> int:
         """Factors of a product, with those inside its functions."""
-        return sum(max([self.degree(p) for p, _ in self.atoms[i].inner], default=1) + bool(self.atoms[i].nesting) for i in product)
+        return sum(
+            max([self.degree(p) for p, _ in self.atoms[i].inner], default=1)
+            + bool(self.atoms[i].nesting)
+            for i in product
+        )
 
     def effort(self, product: Product) -> float:
         """How complicated a product is among those of its degree."""
-        return len(set(product)) + sum(0.5 + 0.1 * len(self.atoms[i].inner) for i in product if self.atoms[i].inner)
+        return len(set(product)) + sum(
+            0.5 + 0.1 * len(self.atoms[i].inner) for i in product if self.atoms[i].inner
+        )
 
     def _signed(self, function: Function, a: Sum) -> Sum:
         """With the first weight of the inner sum positive, where the function is even or odd."""
@@ -139,15 +155,25 @@ class Algebra:
         return {self._function(function, turned): -1.0 if odd else 1.0}
 
     def _function(self, function: Function, a: Sum) -> Product:
-        """The product that a function of a sum is; of one atom alone a simpler one where there is."""
+        """The product that a function of a sum is; of one atom alone a simpler one where there is.
+        """
         ((first, weight),) = list(a.items())[:1]
-        if len(a) == 1 and len(first) == 1 and weight == 1.0 and (inner := self.atoms[first[0]]).inner:
+        if (
+            len(a) == 1
+            and len(first) == 1
+            and weight == 1.0
+            and (inner := self.atoms[first[0]]).inner
+        ):
             if function == "abs" and inner.function in ("abs", "sqrt"):
                 return first
             if function == "sqrt" and inner.function == "abs":
                 return self._function("sqrt", dict(inner.inner))
             if function == "inv" and inner.function == "inv":
-                return self._function("sum", dict(inner.inner)) if len(inner.inner) > 1 else inner.inner[0][0]
+                return (
+                    self._function("sum", dict(inner.inner))
+                    if len(inner.inner) > 1
+                    else inner.inner[0][0]
+                )
         nesting = 1 + max([self.atoms[i].nesting for product in a for i in product], default=0)
         if nesting > self.limits.nesting:
             raise TooLargeError
@@ -164,7 +190,11 @@ class Algebra:
         out = sorted(factors)
         for i in {i for i in out if self.atoms[i].function == "abs" and out.count(i) > 1}:
             inner = self.atoms[i].inner
-            plain = inner[0][0] if len(inner) == 1 and inner[0][1] == 1.0 else self._function("sum", dict(inner))
+            plain = (
+                inner[0][0]
+                if len(inner) == 1 and inner[0][1] == 1.0
+                else self._function("sum", dict(inner))
+            )
             pairs = out.count(i) // 2
             out = [k for k in out if k != i] + [i] * (out.count(i) % 2) + list(plain) * (2 * pairs)
         if len(out) > self.limits.degree:
@@ -177,7 +207,9 @@ class Algebra:
         return a
 
     def values(self, products: Sequence[Product], data: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Values [P, N] of products at channels [N] each; infinite or not a number where they overflow."""
+        """Values [P, N] of products at channels [N] each; infinite or not a number where they
+        overflow.
+        """
         columns = Columns(self, data)
         return columns.of(products)
 
@@ -195,7 +227,13 @@ class Columns:
         """Values [P, N] of products."""
         self._prepare({i for product in products for i in product})
         depth = max([len(product) for product in products], default=0)
-        index = np.array([[self._row[i] for i in product] + [0] * (depth - len(product)) for product in products], dtype=np.intp)
+        index = np.array(
+            [
+                [self._row[i] for i in product] + [0] * (depth - len(product))
+                for product in products
+            ],
+            dtype=np.intp,
+        )
         out = np.ones((len(products), self._table.shape[1]))
         with np.errstate(over="ignore", invalid="ignore"):
             for d in range(depth):
@@ -210,7 +248,9 @@ class Columns:
         for i in missing:
             atom = self.algebra.atoms[i]
             with np.errstate(over="ignore", invalid="ignore"):
-                inner = np.array([weight for _, weight in atom.inner]) @ self.of([product for product, _ in atom.inner])
+                inner = np.array([weight for _, weight in atom.inner]) @ self.of(
+                    [product for product, _ in atom.inner]
+                )
                 rows.append(values_of(atom.function, inner))
         for i, row in zip(missing, rows, strict=True):
             self._row[i] = len(self._table)

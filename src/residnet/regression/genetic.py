@@ -1,8 +1,10 @@
 """Genetic programming of equations as document 000 does it (chapters 4 and 5), on the library DEAP.
 
-Individuals are trees over channels and operators. What a tree comes to is taken apart at + and - into terms, products multiplied out first where
-`split` says so; each term gets a coefficient by least squares, and the mean square error that is left is the fitness. Tournaments choose parents,
-one-point crossover and uniform mutation make the next generation within a limit of depth, and the search stops early on validation samples.
+Individuals are trees over channels and operators. What a tree comes to is taken apart at + and -
+into terms, products multiplied out first where `split` says so; each term gets a coefficient by
+least squares, and the mean square error that is left is the fitness. Tournaments choose parents,
+one-point crossover and uniform mutation make the next generation within a limit of depth, and the
+search stops early on validation samples.
 """
 
 from __future__ import annotations
@@ -20,11 +22,28 @@ from pydantic import Field, model_validator
 
 from residnet.core.config import Config
 from residnet.core.errors import FitError, UsageError
-from residnet.regression.expressions import ONE, Algebra, Function, Limits, Product, Sum, TooLargeError
+from residnet.regression.expressions import (
+    ONE,
+    Algebra,
+    Function,
+    Limits,
+    Product,
+    Sum,
+    TooLargeError,
+)
 from residnet.regression.genetic_fitness import Fitness, Terms
 
 Operator = Literal["+", "-", "*", "/", "abs", "sin", "cos", "sqrt"]
-_NAMES = {"+": "add", "-": "subtract", "*": "multiply", "/": "divide", "abs": "abs", "sin": "sin", "cos": "cos", "sqrt": "sqrt"}
+_NAMES = {
+    "+": "add",
+    "-": "subtract",
+    "*": "multiply",
+    "/": "divide",
+    "abs": "abs",
+    "sin": "sin",
+    "cos": "cos",
+    "sqrt": "sqrt",
+}
 _BINARY = ("+", "-", "*", "/")
 
 
@@ -34,28 +53,37 @@ class EvolutionConfig(Config):
     Attributes:
         population: number of individuals.
         generations: most generations after the first.
-        operators: of the trees; `/` is 0 at a divisor of 0 and `sqrt` takes the magnitude (document 001 section 2.4).
+        operators: of the trees; `/` is 0 at a divisor of 0 and `sqrt` takes the magnitude (document
+            001 section 2.4).
         one: whether trees may also hold the number 1.
-        constants: range of random constants in trees; None for none. A term's factor is fitted, so that they only matter within functions.
+        constants: range of random constants in trees; None for none. A term's factor is fitted, so
+            that they only matter within functions.
         tournament: individuals among which a parent is the best.
         crossover: share of an offspring generation from one-point crossover.
-        mutation: share from uniform mutation, which puts a full tree of depth 0 to 2 in a node's place; the rest is copied.
+        mutation: share from uniform mutation, which puts a full tree of depth 0 to 2 in a node's
+            place; the rest is copied.
         depth: highest depth of a tree.
         first_depth: least and largest depth of the first trees, half of them full, half grown.
-        genes: trees per individual (multigene form of document 001; there 5 of depth 3); of two crossovers one then exchanges whole trees.
-        split: what gets a coefficient: every `gene`, every summand of the tree as it stands (`sum`, section 5.1.1), or every
-            summand when it is multiplied out (`expand`, section 5.1.3).
-        equal_terms: what becomes of a tree in which a term stands twice: its terms are added (`merge`), or it takes no part (`reject`), as in
-            the document, whose Gram matrix is then singular (section 5.1.2).
+        genes: trees per individual (multigene form of document 001; there 5 of depth 3); of two
+            crossovers one then exchanges whole trees.
+        split: what gets a coefficient: every `gene`, every summand of the tree as it stands (`sum`,
+            section 5.1.1), or every summand when it is multiplied out (`expand`, section 5.1.3).
+        equal_terms: what becomes of a tree in which a term stands twice: its terms are added
+            (`merge`), or it takes no part (`reject`), as in the document, whose Gram matrix is then
+            singular (section 5.1.2).
         intercept: whether the constant always is a term.
-        prune: share of the target's energy that a term must explain beside those before it (orthogonal least squares, section 5.1.4); 0 keeps all.
-        max_terms: most terms of an individual; those with more take no part, nor those with products of more than `max_degree` factors.
+        prune: share of the target's energy that a term must explain beside those before it
+            (orthogonal least squares, section 5.1.4); 0 keeps all.
+        max_terms: most terms of an individual; those with more take no part, nor those with
+            products of more than `max_degree` factors.
         max_degree: most factors of a term.
         nesting: most functions within functions; bars of a magnitude and brackets count.
         elite: how many of the best go over unchanged.
-        goal: mean square error over the target's mean square, in training and validation, at which the search ends.
+        goal: mean square error over the target's mean square, in training and validation, at which
+            the search ends.
         patience: generations without a better validation error after which it ends.
-        rows: most training samples that the search looks at, evenly thinned; coefficients in the result are fitted to all.
+        rows: most training samples that the search looks at, evenly thinned; coefficients in the
+            result are fitted to all.
     """
 
     population: int = Field(default=500, ge=2, le=100_000)
@@ -84,21 +112,34 @@ class EvolutionConfig(Config):
     @model_validator(mode="after")
     def _possible(self) -> EvolutionConfig:
         if self.crossover + self.mutation > 1:
-            raise ValueError(f"crossover and mutation are shares of the offspring; together at most 1, given {self.crossover} + {self.mutation}")
+            raise ValueError(
+                "crossover and mutation are shares of the offspring; together at most 1, given"
+                f" {self.crossover} + {self.mutation}"
+            )
         if not set(self.operators) & set(_BINARY):
             raise ValueError("operators: trees need one of +, -, *, / at least")
         if not 0 <= self.first_depth[0] <= self.first_depth[1] <= self.depth:
-            raise ValueError(f"first_depth: expected least <= largest <= depth ({self.depth}), given {list(self.first_depth)}")
+            raise ValueError(
+                f"first_depth: expected least <= largest <= depth ({self.depth}), given"
+                f" {list(self.first_depth)}"
+            )
         if self.equal_terms == "reject" and self.split == "gene":
-            raise ValueError("equal_terms: a gene is one term whatever stands in it; reject goes with split sum or expand")
+            raise ValueError(
+                "equal_terms: a gene is one term whatever stands in it; reject goes with split sum"
+                " or expand"
+            )
         if self.elite >= self.population:
-            raise ValueError(f"elite: must leave room for offspring in a population of {self.population}, given {self.elite}")
+            raise ValueError(
+                f"elite: must leave room for offspring in a population of {self.population}, given"
+                f" {self.elite}"
+            )
         return self
 
 
 @dataclass(frozen=True)
 class Generation:
-    """The best individual of one generation: its relative mean square errors and number of terms."""
+    """The best individual of one generation: its relative mean square errors and number of terms.
+    """
 
     train: float
     validation: float
@@ -111,7 +152,8 @@ class Found:
 
     Attributes:
         terms: of the individual of the least validation error among the best of each generation.
-        train: its mean square error over the target's mean square on the training samples that the search looked at.
+        train: its mean square error over the target's mean square on the training samples that the
+            search looked at.
         validation: the same on all validation samples.
         generation: when it appeared; 0 is the first population.
         reached: whether both errors came below the goal.
@@ -153,7 +195,10 @@ def require_deap() -> ModuleType:
     try:
         from deap import gp
     except ImportError as error:
-        raise UsageError("genetic programming needs the library DEAP, which is not installed; install it with: pip install 'residnet[gp]'") from error
+        raise UsageError(
+            "genetic programming needs the library DEAP, which is not installed; install it with:"
+            " pip install 'residnet[gp]'"
+        ) from error
     module: ModuleType = gp
     return module
 
@@ -163,7 +208,14 @@ def limits_of(config: EvolutionConfig) -> Limits:
     return Limits(config.max_terms, config.max_degree, config.nesting, config.split == "expand")
 
 
-def evolve(algebra: Algebra, data: Mapping[str, np.ndarray], target: np.ndarray, train: np.ndarray, config: EvolutionConfig, seed: int) -> Found:
+def evolve(
+    algebra: Algebra,
+    data: Mapping[str, np.ndarray],
+    target: np.ndarray,
+    train: np.ndarray,
+    config: EvolutionConfig,
+    seed: int,
+) -> Found:
     """Search the equation of one target.
 
     Args:
@@ -175,23 +227,40 @@ def evolve(algebra: Algebra, data: Mapping[str, np.ndarray], target: np.ndarray,
         seed: of all random choices.
 
     Raises:
-        FitError: without training or validation samples, with values that are not finite, or where no individual could be fitted.
+        FitError: without training or validation samples, with values that are not finite, or where
+            no individual could be fitted.
         UsageError: where DEAP is not installed.
     """
     require_deap()
-    for name, values in [*((name, data[name]) for name in algebra.channels), ("the target", target)]:
+    for name, values in [
+        *((name, data[name]) for name in algebra.channels),
+        ("the target", target),
+    ]:
         if not np.isfinite(values).all():
             raise FitError(f"genetic programming: {name} is not finite in all samples; mask those")
     if not 0 < train.sum() < len(train):
-        raise FitError(f"genetic programming: needs samples to train and to validate, given {int(train.sum())} of {len(train)} to train")
-    chosen = np.sort(np.concatenate((_thinned(np.flatnonzero(train), config.rows), np.flatnonzero(~train))))
-    fitness = Fitness(algebra, {name: data[name][chosen] for name in algebra.channels}, target[chosen], train[chosen], config.prune)
+        raise FitError(
+            f"genetic programming: needs samples to train and to validate, given {int(train.sum())}"
+            f" of {len(train)} to train"
+        )
+    chosen = np.sort(
+        np.concatenate((_thinned(np.flatnonzero(train), config.rows), np.flatnonzero(~train)))
+    )
+    fitness = Fitness(
+        algebra,
+        {name: data[name][chosen] for name in algebra.channels},
+        target[chosen],
+        train[chosen],
+        config.prune,
+    )
     with _seeded(seed):
         return _Breeding(algebra, fitness, config).run()
 
 
 def _thinned(indices: np.ndarray, most: int) -> np.ndarray:
-    return indices[np.unique(np.linspace(0, len(indices) - 1, min(most, len(indices))).round().astype(int))]
+    return indices[
+        np.unique(np.linspace(0, len(indices) - 1, min(most, len(indices))).round().astype(int))
+    ]
 
 
 @contextmanager
@@ -215,26 +284,50 @@ class _Breeding:
         self.meaning = _meanings(algebra)
         limit = self.gp.staticLimit(key=lambda tree: tree.height, max_value=config.depth)
         self.mate = limit(self.gp.cxOnePoint)
-        self.mutate = limit(partial(self.gp.mutUniform, expr=partial(self.gp.genFull, min_=0, max_=2), pset=self.set))
+        self.mutate = limit(
+            partial(
+                self.gp.mutUniform, expr=partial(self.gp.genFull, min_=0, max_=2), pset=self.set
+            )
+        )
 
     def run(self) -> Found:
         """Generation after generation until the goal, the patience's end or the last one."""
         low, high = self.config.first_depth
         tree = partial(self.gp.genHalfAndHalf, self.set, low, high)
-        first = [Individual([self.gp.PrimitiveTree(tree()) for _ in range(self.config.genes)]) for _ in range(self.config.population)]
+        first = [
+            Individual([self.gp.PrimitiveTree(tree()) for _ in range(self.config.genes)])
+            for _ in range(self.config.population)
+        ]
         population = self._rated(first)
         best, when, history, reached = population[0], 0, [self._told(population[0])], False
         for generation in range(self.config.generations + 1):
             reached = max(-best.fitness, best.validation) <= self.config.goal
-            if reached or generation == self.config.generations or generation - when >= self.config.patience:
+            if (
+                reached
+                or generation == self.config.generations
+                or generation - when >= self.config.patience
+            ):
                 break
-            population = self._rated([*population[: self.config.elite], *self._offspring(population)])
+            population = self._rated(
+                [*population[: self.config.elite], *self._offspring(population)]
+            )
             history.append(self._told(population[0]))
             if population[0].validation < best.validation:
                 best, when = population[0], generation + 1
         if not best.terms:
-            raise FitError("genetic programming: no individual has terms that the data tell apart; give a larger population or other operators")
-        return Found(best.terms, -best.fitness, best.validation, when, reached, tuple(history), self.fitness.fitted)
+            raise FitError(
+                "genetic programming: no individual has terms that the data tell apart; give a"
+                " larger population or other operators"
+            )
+        return Found(
+            best.terms,
+            -best.fitness,
+            best.validation,
+            when,
+            reached,
+            tuple(history),
+            self.fitness.fitted,
+        )
 
     def _told(self, best: Individual) -> Generation:
         return Generation(-best.fitness, best.validation, len(best.terms))
@@ -248,7 +341,9 @@ class _Breeding:
         if self.config.one:
             made.addTerminal(1.0)
         if self.config.constants is not None:
-            made.addEphemeralConstant(f"constant {self.config.constants}", partial(random.uniform, *self.config.constants))
+            made.addEphemeralConstant(
+                f"constant {self.config.constants}", partial(random.uniform, *self.config.constants)
+            )
         return made
 
     def _offspring(self, population: Sequence[Individual]) -> list[Individual]:
@@ -270,7 +365,9 @@ class _Breeding:
         return out
 
     def _cross(self, child: Individual, other: Individual) -> None:
-        """One-point crossover of a tree of each; with several genes every other time an exchange of whole ones."""
+        """One-point crossover of a tree of each; with several genes every other time an exchange of
+        whole ones.
+        """
         here, there = random.randrange(len(child.trees)), random.randrange(len(other.trees))
         if len(child.trees) > 1 and random.random() < 0.5:
             child.trees[here] = other.trees[there]
@@ -292,7 +389,9 @@ class _Breeding:
                 if self.config.equal_terms == "reject" and self._repeats(tree):
                     return None
                 meant = self._sum(tree)
-                products.update(self.algebra.bracket(meant) if self.config.split == "gene" else meant)
+                products.update(
+                    self.algebra.bracket(meant) if self.config.split == "gene" else meant
+                )
         except TooLargeError:
             return None
         return tuple(sorted(products)) if 0 < len(products) <= self.config.max_terms else None
@@ -323,7 +422,11 @@ class _Breeding:
                 stack.append(self.meaning[node.name](stack.pop()))
             else:
                 name = node.value
-                stack.append(self.algebra.channel(name.removeprefix("channel ")) if isinstance(name, str) else {ONE: float(name)})
+                stack.append(
+                    self.algebra.channel(name.removeprefix("channel "))
+                    if isinstance(name, str)
+                    else {ONE: float(name)}
+                )
         return stack[0]
 
 

@@ -1,4 +1,6 @@
-"""Fitness of a generation: the coefficients of every individual's terms by least squares, and its errors on training and validation samples."""
+"""Fitness of a generation: the coefficients of every individual's terms by least squares, and its
+errors on training and validation samples.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,9 @@ from residnet.regression.expressions import Algebra, Columns, Product
 
 Terms = tuple[Product, ...]
 _SINGULAR = 1e-13
-"""Share of a term's energy that must be left beside the terms before it; below it the Gram matrix counts as singular (section 5.1.2)."""
+"""Share of a term's energy that must be left beside the terms before it; below it the Gram matrix
+counts as singular (section 5.1.2).
+"""
 _ROWS = 40_000_000
 """Numbers in the cache of columns before it is emptied."""
 _CHUNK = 3_000_000
@@ -20,28 +24,50 @@ _CHUNK = 3_000_000
 
 
 class Fitness:
-    """Errors of individuals: mean square errors on training and validation samples, over the target's mean square on each.
+    """Errors of individuals: mean square errors on training and validation samples, over the
+    target's mean square on each.
 
-    Each distinct set of terms is fitted once in the whole search. A generation's new sets go through together: columns of the terms that they
-    share are computed once, then Gram matrices, Cholesky factors and residuals are batched (document 000 eqs. (5.4)-(5.6)).
+    Each distinct set of terms is fitted once in the whole search. A generation's new sets go
+    through together: columns of the terms that they share are computed once, then Gram matrices,
+    Cholesky factors and residuals are batched (document 000 eqs. (5.4)-(5.6)).
     """
 
-    def __init__(self, algebra: Algebra, data: Mapping[str, np.ndarray], target: np.ndarray, train: np.ndarray, prune: float) -> None:
-        """From channels [N], the target [N], which samples [N] train, and the share of the target's energy below which a term is pruned."""
+    def __init__(
+        self,
+        algebra: Algebra,
+        data: Mapping[str, np.ndarray],
+        target: np.ndarray,
+        train: np.ndarray,
+        prune: float,
+    ) -> None:
+        """From channels [N], the target [N], which samples [N] train, and the share of the target's
+        energy below which a term is pruned.
+        """
         order = np.argsort(~train, kind="stable")
-        self.columns = Columns(algebra, {name: np.asarray(data[name], dtype=np.float64)[order] for name in algebra.channels})
+        self.columns = Columns(
+            algebra,
+            {name: np.asarray(data[name], dtype=np.float64)[order] for name in algebra.channels},
+        )
         self.count = int(train.sum())
         y = torch.from_numpy(np.asarray(target, dtype=np.float64)[order])
         self.y, self.y_validation = y[: self.count], y[self.count :]
-        self.energy = [max(float(part.square().mean()), 1e-300) for part in (self.y, self.y_validation)]
+        self.energy = [
+            max(float(part.square().mean()), 1e-300) for part in (self.y, self.y_validation)
+        ]
         self.prune = prune
         self.fitted = 0
         self._known: dict[Terms, tuple[float, float, Terms]] = {}
         self._empty()
 
     def of(self, individuals: Sequence[Terms | None]) -> list[tuple[float, float, Terms]]:
-        """(training error, validation error, terms that are left) of each; infinite where there are no terms, or they are not independent."""
-        new = [terms for terms in dict.fromkeys(individuals) if terms is not None and terms not in self._known]
+        """(training error, validation error, terms that are left) of each; infinite where there are
+        no terms, or they are not independent.
+        """
+        new = [
+            terms
+            for terms in dict.fromkeys(individuals)
+            if terms is not None and terms not in self._known
+        ]
         if new:
             self._fit(new)
         nothing = (np.inf, np.inf, ())
@@ -90,20 +116,30 @@ class Fitness:
         factor, info = torch.linalg.cholesky_ex(gram)
         right = (x @ self.y / self.count)[..., None]
         good = (info == 0) & (factor.diagonal(dim1=1, dim2=2).square().amin(dim=1) > _SINGULAR)
-        factor = torch.where(good[:, None, None], factor, torch.eye(gram.shape[1], dtype=gram.dtype))
+        factor = torch.where(
+            good[:, None, None], factor, torch.eye(gram.shape[1], dtype=gram.dtype)
+        )
         if self.prune > 0:
-            self._pruned(group, good, torch.linalg.solve_triangular(factor, right, upper=False)[..., 0])
+            self._pruned(
+                group, good, torch.linalg.solve_triangular(factor, right, upper=False)[..., 0]
+            )
         coefficients = torch.cholesky_solve(right, factor).transpose(1, 2)
         train = (self.y - (coefficients @ x)[:, 0]).square().mean(dim=1) / self.energy[0]
-        validation = (self.y_validation - (coefficients @ x_validation)[:, 0]).square().mean(dim=1) / self.energy[1]
-        for terms, fine, a, b in zip(group, good.tolist(), train.tolist(), validation.tolist(), strict=True):
+        validation = (self.y_validation - (coefficients @ x_validation)[:, 0]).square().mean(
+            dim=1
+        ) / self.energy[1]
+        for terms, fine, a, b in zip(
+            group, good.tolist(), train.tolist(), validation.tolist(), strict=True
+        ):
             if not fine:
                 self._known[terms] = (np.inf, np.inf, ())
             elif terms not in self._known:
                 self._known[terms] = (a, b, terms)
 
     def _pruned(self, group: Sequence[Terms], good: Tensor, parts: Tensor) -> None:
-        """Orthogonal least squares: terms that explain less than a share of the target beside those before them go, and the rest is fitted anew."""
+        """Orthogonal least squares: terms that explain less than a share of the target beside those
+        before them go, and the rest is fitted anew.
+        """
         keep = parts.square() / self.energy[0] >= self.prune
         rest = {}
         for terms, fine, kept in zip(group, good.tolist(), keep.tolist(), strict=True):

@@ -1,4 +1,6 @@
-"""Ridge regression on the features of a kernel: every penalty, and its cross-validation, from one decomposition."""
+"""Ridge regression on the features of a kernel: every penalty, and its cross-validation, from one
+decomposition.
+"""
 
 from __future__ import annotations
 
@@ -31,10 +33,14 @@ class Path:
     points: Tensor = field(default_factory=lambda: torch.zeros(0))
 
 
-def dual_path(kernel: Tensor, y: Tensor, fold: Tensor, folds: int, penalties: Sequence[float]) -> Path:
-    """Kernel ridge regression alpha = (K + lambda I)^-1 Y (document 001 section 3.2, ERRATA M4) for every penalty lambda.
+def dual_path(
+    kernel: Tensor, y: Tensor, fold: Tensor, folds: int, penalties: Sequence[float]
+) -> Path:
+    """Kernel ridge regression alpha = (K + lambda I)^-1 Y (document 001 section 3.2, ERRATA M4) for
+    every penalty lambda.
 
-    A left-out fold needs no refit: with the smoother H = K (K + lambda I)^-1 its errors are (I - H_ff)^-1 (Y - H Y)_f.
+    A left-out fold needs no refit: with the smoother H = K (K + lambda I)^-1 its errors are (I -
+    H_ff)^-1 (Y - H Y)_f.
 
     Args:
         kernel: K of all samples with each other, [N, N].
@@ -63,9 +69,16 @@ def dual_path(kernel: Tensor, y: Tensor, fold: Tensor, folds: int, penalties: Se
 
 
 def primal_path(
-    features: Callable[[Tensor], Tensor], whiten: Tensor, x: Tensor, y: Tensor, fold: Tensor, folds: int, penalties: Sequence[float]
+    features: Callable[[Tensor], Tensor],
+    whiten: Tensor,
+    x: Tensor,
+    y: Tensor,
+    fold: Tensor,
+    folds: int,
+    penalties: Sequence[float],
 ) -> Path:
-    """Ridge regression min |Y - Phi W w|^2 + lambda |w|^2 for every penalty lambda, from R factors of the folds.
+    """Ridge regression min |Y - Phi W w|^2 + lambda |w|^2 for every penalty lambda, from R factors
+    of the folds.
 
     Args:
         features: raw features [n, P] of inputs [n, F].
@@ -82,8 +95,14 @@ def primal_path(
     factors = [_factor(features, whiten, x[fold == f], y[fold == f]) for f in range(folds)]
     errors = torch.zeros(len(penalties), y.shape[1], dtype=y.dtype)
     for f, own in enumerate(factors):
-        weights, _ = _weights(_triangle(torch.cat([other for g, other in enumerate(factors) if g != f])), y.shape[1], penalties)
-        joined = torch.cat((weights, -torch.eye(y.shape[1], dtype=y.dtype).expand(len(penalties), -1, -1)), dim=1)
+        weights, _ = _weights(
+            _triangle(torch.cat([other for g, other in enumerate(factors) if g != f])),
+            y.shape[1],
+            penalties,
+        )
+        joined = torch.cat(
+            (weights, -torch.eye(y.shape[1], dtype=y.dtype).expand(len(penalties), -1, -1)), dim=1
+        )
         errors += (own @ joined).square().sum(1)
     weights, freedom = _weights(_triangle(torch.cat(factors)), y.shape[1], penalties)
     return Path(whiten @ weights, errors / len(y), freedom)
@@ -103,7 +122,9 @@ def _triangle(rows: Tensor) -> Tensor:
 
 
 def _weights(factor: Tensor, outputs: int, penalties: Sequence[float]) -> tuple[Tensor, Tensor]:
-    """Coefficients [C, Q, outputs] and effective numbers of parameters [C] from the R factor of [Phi W, Y]."""
+    """Coefficients [C, Q, outputs] and effective numbers of parameters [C] from the R factor of
+    [Phi W, Y].
+    """
     count = factor.shape[1] - outputs
     left, values, right = torch.linalg.svd(factor[:, :count], full_matrices=False)
     projected = left.T @ factor[:, count:]

@@ -1,4 +1,6 @@
-"""Kernels on standardised features, and how each is fitted and evaluated: radial basis functions and polynomials."""
+"""Kernels on standardised features, and how each is fitted and evaluated: radial basis functions
+and polynomials.
+"""
 
 from __future__ import annotations
 
@@ -21,23 +23,33 @@ _RANK = 1e-12
 
 
 class Kernel(nn.Module, ABC):
-    """f(x) [..., 3] from standardised features [..., F]: raw features of the kernel times coefficients."""
+    """f(x) [..., 3] from standardised features [..., F]: raw features of the kernel times
+    coefficients.
+    """
 
     @abstractmethod
     def forward(self, x: Tensor) -> Tensor:
         """[..., 3] at features [..., F]."""
 
     @abstractmethod
-    def paths(self, x: Tensor, y: Tensor, fold: Tensor, folds: int, penalties: Sequence[float]) -> list[Path]:
-        """Fits of targets [N, 3] at features [N, F] with absolute penalties, one path for each setting of the kernel."""
+    def paths(
+        self, x: Tensor, y: Tensor, fold: Tensor, folds: int, penalties: Sequence[float]
+    ) -> list[Path]:
+        """Fits of targets [N, 3] at features [N, F] with absolute penalties, one path for each
+        setting of the kernel.
+        """
 
     @abstractmethod
     def along(self, path: Path, x: Tensor) -> Tensor:
         """Raw features [..., P] that the coefficients of a path belong to, at features [..., F]."""
 
     @abstractmethod
-    def chosen(self, paths: Sequence[Path], coefficients: Tensor) -> tuple[dict[str, Any], dict[str, Tensor]]:
-        """What there is to say of the path that each axis takes, and the state with coefficients [P, 3]."""
+    def chosen(
+        self, paths: Sequence[Path], coefficients: Tensor
+    ) -> tuple[dict[str, Any], dict[str, Tensor]]:
+        """What there is to say of the path that each axis takes, and the state with coefficients
+        [P, 3].
+        """
 
     @abstractmethod
     def nothing(self) -> dict[str, Tensor]:
@@ -46,7 +58,9 @@ class Kernel(nn.Module, ABC):
 
 @final
 class RbfKernel(Kernel):
-    """f_k(x) = sum_i c_ik exp(-gamma_k |x - x_i|^2), gamma = 1 / (2 sigma) (document 001 section 3.2, ERRATA M5: sigma is a squared length)."""
+    """f_k(x) = sum_i c_ik exp(-gamma_k |x - x_i|^2), gamma = 1 / (2 sigma) (document 001 section
+    3.2, ERRATA M5: sigma is a squared length).
+    """
 
     def __init__(self, config: Rbf, count: int) -> None:
         super().__init__()
@@ -66,37 +80,61 @@ class RbfKernel(Kernel):
         apart = squared_distances(x, self.points.to(x.dtype))
         out: list[Tensor] = []
         for axis in range(3):
-            out.append(torch.exp(-self.gamma[axis].to(x.dtype) * apart) @ self.coefficients[:, axis].to(x.dtype))
+            out.append(
+                torch.exp(-self.gamma[axis].to(x.dtype) * apart)
+                @ self.coefficients[:, axis].to(x.dtype)
+            )
         return torch.stack(out, dim=-1)
 
-    def paths(self, x: Tensor, y: Tensor, fold: Tensor, folds: int, penalties: Sequence[float]) -> list[Path]:
-        """One path for each sigma: exact where there are no more than `exact` samples, else by Nystroem's method on landmarks."""
+    def paths(
+        self, x: Tensor, y: Tensor, fold: Tensor, folds: int, penalties: Sequence[float]
+    ) -> list[Path]:
+        """One path for each sigma: exact where there are no more than `exact` samples, else by
+        Nystroem's method on landmarks.
+        """
         if len(x) <= self.exact:
             apart = squared_distances(x, x)
-            exact = [(sigma, dual_path(torch.exp(-apart / (2 * sigma)), y, fold, folds, penalties)) for sigma in self.sigmas]
+            exact = [
+                (sigma, dual_path(torch.exp(-apart / (2 * sigma)), y, fold, folds, penalties))
+                for sigma in self.sigmas
+            ]
             return [replace(path, sigma=sigma, points=x) for sigma, path in exact]
         points = x[spread_out(x, self.landmarks, self.seed)]
         out = []
         for sigma in self.sigmas:
-            values, vectors = torch.linalg.eigh(torch.exp(-squared_distances(points, points) / (2 * sigma)))
+            values, vectors = torch.linalg.eigh(
+                torch.exp(-squared_distances(points, points) / (2 * sigma))
+            )
             kept = values > _RANK * values[-1]
             whiten = vectors[:, kept] / values[kept].sqrt()
 
             def features(part: Tensor, sigma: float = sigma) -> Tensor:
                 return torch.exp(-squared_distances(part, points) / (2 * sigma))
 
-            out.append(replace(primal_path(features, whiten, x, y, fold, folds, penalties), sigma=sigma, points=points))
+            out.append(
+                replace(
+                    primal_path(features, whiten, x, y, fold, folds, penalties),
+                    sigma=sigma,
+                    points=points,
+                )
+            )
         return out
 
     def along(self, path: Path, x: Tensor) -> Tensor:
         """The kernel between x and the points that carry the function."""
         return torch.exp(-squared_distances(x, path.points) / (2 * path.sigma))
 
-    def chosen(self, paths: Sequence[Path], coefficients: Tensor) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    def chosen(
+        self, paths: Sequence[Path], coefficients: Tensor
+    ) -> tuple[dict[str, Any], dict[str, Tensor]]:
         """Sigma of each axis, and the points, gamma and coefficients."""
         sigma = [path.sigma for path in paths]
         gamma = torch.tensor([0.5 / value for value in sigma], dtype=torch.float64)
-        return {"sigma": sigma}, {"points": paths[0].points, "gamma": gamma, "coefficients": coefficients}
+        return {"sigma": sigma}, {
+            "points": paths[0].points,
+            "gamma": gamma,
+            "coefficients": coefficients,
+        }
 
     def nothing(self) -> dict[str, Tensor]:
         """No landmarks."""
@@ -119,7 +157,8 @@ class RbfKernel(Kernel):
 
 @final
 class PolynomialKernel(Kernel):
-    """Kernel (slope x'x' + constant)^degree (document 001 section 3.2), as the ridge regression on weighted products that it equals.
+    """Kernel (slope x'x' + constant)^degree (document 001 section 3.2), as the ridge regression on
+    weighted products that it equals.
 
     The products are finitely many, so that any number of samples is fitted exactly.
     """
@@ -128,8 +167,14 @@ class PolynomialKernel(Kernel):
         super().__init__()
         self.degree = config.degree
         chosen = list(combinations_with_replacement(range(count + 1), config.degree))
-        self.register_buffer("index", torch.tensor(chosen, dtype=torch.long).T.contiguous(), persistent=False)
-        self.register_buffer("weight", torch.tensor([_weight(c) for c in chosen], dtype=torch.float64).sqrt(), persistent=False)
+        self.register_buffer(
+            "index", torch.tensor(chosen, dtype=torch.long).T.contiguous(), persistent=False
+        )
+        self.register_buffer(
+            "weight",
+            torch.tensor([_weight(c) for c in chosen], dtype=torch.float64).sqrt(),
+            persistent=False,
+        )
         self.register_buffer("coefficients", torch.zeros(len(chosen), 3, dtype=torch.float64))
         self.slope, self.constant = config.slope**0.5, config.constant**0.5
         self.index: Tensor
@@ -148,15 +193,29 @@ class PolynomialKernel(Kernel):
         """[..., 3] at features [..., F]."""
         return self.products(x) @ self.coefficients.to(x.dtype)
 
-    def paths(self, x: Tensor, y: Tensor, fold: Tensor, folds: int, penalties: Sequence[float]) -> list[Path]:
+    def paths(
+        self, x: Tensor, y: Tensor, fold: Tensor, folds: int, penalties: Sequence[float]
+    ) -> list[Path]:
         """A single path, exact for any number of samples."""
-        return [primal_path(self.products, torch.eye(len(self.coefficients), dtype=torch.float64), x, y, fold, folds, penalties)]
+        return [
+            primal_path(
+                self.products,
+                torch.eye(len(self.coefficients), dtype=torch.float64),
+                x,
+                y,
+                fold,
+                folds,
+                penalties,
+            )
+        ]
 
     def along(self, path: Path, x: Tensor) -> Tensor:
         """The products."""
         return self.products(x)
 
-    def chosen(self, paths: Sequence[Path], coefficients: Tensor) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    def chosen(
+        self, paths: Sequence[Path], coefficients: Tensor
+    ) -> tuple[dict[str, Any], dict[str, Tensor]]:
         """Nothing to say; the coefficients."""
         return {}, {"coefficients": coefficients}
 
@@ -170,13 +229,17 @@ class Rbf(Config):
 
     Attributes:
         sigma: candidates, in squared units of a feature's spread (ERRATA M5).
-        exact: with no more samples than these all of them carry the function, as in kernel ridge regression; with more, landmarks do.
-        landmarks: samples that carry the function where there are more than `exact` (Nystroem's method), spread out by k-means++ seeding.
+        exact: with no more samples than these all of them carry the function, as in kernel ridge
+            regression; with more, landmarks do.
+        landmarks: samples that carry the function where there are more than `exact` (Nystroem's
+            method), spread out by k-means++ seeding.
         seed: of the choice of landmarks.
     """
 
     kind: Literal["rbf"] = "rbf"
-    sigma: tuple[Annotated[float, Field(gt=0)], ...] = Field(default=(3.0, 10.0, 30.0, 100.0, 300.0), min_length=1)
+    sigma: tuple[Annotated[float, Field(gt=0)], ...] = Field(
+        default=(3.0, 10.0, 30.0, 100.0, 300.0), min_length=1
+    )
     exact: int = Field(default=2000, ge=1, le=10_000)
     landmarks: int = Field(default=300, ge=2, le=5000)
     seed: int = Field(default=0, ge=0)
@@ -187,7 +250,8 @@ class Rbf(Config):
 
 
 class Polynomial(Config):
-    """The polynomial kernel (slope x'x' + constant)^degree of standardised features; degree 1 is ridge regression.
+    """The polynomial kernel (slope x'x' + constant)^degree of standardised features; degree 1 is
+    ridge regression.
 
     Attributes:
         degree: p.
@@ -212,7 +276,8 @@ def squared_distances(x: Tensor, points: Tensor) -> Tensor:
 
 
 def spread_out(x: Tensor, count: int, seed: int) -> Tensor:
-    """Indices [count] of samples that lie apart: each is drawn with a chance that grows with its squared distance to those before (k-means++).
+    """Indices [count] of samples that lie apart: each is drawn with a chance that grows with its
+    squared distance to those before (k-means++).
 
     Fewer than `count` where the samples have no more different values.
     """

@@ -12,7 +12,9 @@ from residnet.core.errors import FitError
 
 
 class LinearFit(NamedTuple):
-    """Coefficients [J, K], their covariance for each column of y [K, J, J], and the condition number of the scaled regressors."""
+    """Coefficients [J, K], their covariance for each column of y [K, J, J], and the condition
+    number of the scaled regressors.
+    """
 
     coefficients: Tensor
     covariance: Tensor
@@ -24,29 +26,41 @@ class LinearFit(NamedTuple):
         return self.covariance.diagonal(dim1=1, dim2=2).clamp(min=0).sqrt().T
 
 
-def solve(x: Tensor, y: Tensor, group: Tensor, *, names: tuple[str, ...], ridge: float = 0.0) -> LinearFit:
+def solve(
+    x: Tensor, y: Tensor, group: Tensor, *, names: tuple[str, ...], ridge: float = 0.0
+) -> LinearFit:
     """Fit y [N, K] by x [N, J] with one penalty; see `solve_path`."""
     return solve_path(x, y, group, names=names, ridges=(ridge,))[0]
 
 
-def solve_path(x: Tensor, y: Tensor, group: Tensor, *, names: tuple[str, ...], ridges: Sequence[float]) -> list[LinearFit]:
-    """Fit y [N, K] by x [N, J] with each of several relative ridge penalties (0 = ordinary least squares), from one Gram matrix.
+def solve_path(
+    x: Tensor, y: Tensor, group: Tensor, *, names: tuple[str, ...], ridges: Sequence[float]
+) -> list[LinearFit]:
+    """Fit y [N, K] by x [N, J] with each of several relative ridge penalties (0 = ordinary least
+    squares), from one Gram matrix.
 
-    Columns are scaled to unit root mean square first, so a penalty is a share of each column's own energy. Standard errors
-    are cluster-robust over manoeuvres (`group` [N]): residuals at 10-20 Hz are far from independent, and the textbook
-    formula would claim several times the accuracy. With fewer than two manoeuvres they are the textbook ones.
+    Columns are scaled to unit root mean square first, so a penalty is a share of each column's own
+    energy. Standard errors are cluster-robust over manoeuvres (`group` [N]): residuals at 10-20 Hz
+    are far from independent, and the textbook formula would claim several times the accuracy. With
+    fewer than two manoeuvres they are the textbook ones.
 
     Raises:
-        FitError: with fewer samples than regressors, a regressor that is zero throughout, or regressors that the data
-            cannot tell apart and no penalty decides between.
+        FitError: with fewer samples than regressors, a regressor that is zero throughout, or
+            regressors that the data cannot tell apart and no penalty decides between.
     """
     n, j = x.shape
     if n <= j:
-        raise FitError(f"{n} samples do not determine {j} coefficients ({', '.join(names)}); give longer or more logs")
+        raise FitError(
+            f"{n} samples do not determine {j} coefficients ({', '.join(names)}); give longer or"
+            " more logs"
+        )
     scale = x.square().mean(0).sqrt()
     if bool((scale <= 0).any()):
         dead = [name for name, s in zip(names, scale.tolist(), strict=True) if s <= 0]
-        raise FitError(f"regressor '{dead[0]}' is zero in all {n} samples; the data do not excite it: leave it out or log it")
+        raise FitError(
+            f"regressor '{dead[0]}' is zero in all {n} samples; the data do not excite it: leave it"
+            " out or log it"
+        )
     a = x / scale
     gram, cross = a.T @ a / n, a.T @ y / n
     condition = _condition(gram, min(ridges), names)
@@ -55,7 +69,9 @@ def solve_path(x: Tensor, y: Tensor, group: Tensor, *, names: tuple[str, ...], r
         inverse = torch.linalg.inv(gram + ridge * torch.eye(j, dtype=x.dtype))
         coefficients = inverse @ cross
         residual = y - a @ coefficients
-        meat = torch.stack([_meat(a, residual[:, k : k + 1], gram, group) for k in range(y.shape[1])])
+        meat = torch.stack(
+            [_meat(a, residual[:, k : k + 1], gram, group) for k in range(y.shape[1])]
+        )
         covariance = inverse @ meat @ inverse / n**2 / torch.outer(scale, scale)
         out.append(LinearFit(coefficients / scale[:, None], covariance, condition))
     return out
@@ -69,14 +85,16 @@ def _condition(gram: Tensor, ridge: float, names: tuple[str, ...]) -> float:
     if float(values[0]) + ridge < 10 * len(names) * torch.finfo(gram.dtype).eps * float(values[-1]):
         worst = [names[i] for i in vectors[:, 0].abs().argsort(descending=True)[:2].tolist()]
         raise FitError(
-            f"the data cannot tell apart regressors '{worst[0]}' and '{worst[1]}' (condition {condition:.1e}); "
-            "leave one out, excite them separately, or give a ridge penalty"
+            f"the data cannot tell apart regressors '{worst[0]}' and '{worst[1]}' (condition"
+            f" {condition:.1e}); leave one out, excite them separately, or give a ridge penalty"
         )
     return condition
 
 
 def _meat(a: Tensor, residual: Tensor, gram: Tensor, group: Tensor) -> Tensor:
-    """Spread of the score a'e [J, J]: over manoeuvres where there are at least two, else of independent residuals [N, 1]."""
+    """Spread of the score a'e [J, J]: over manoeuvres where there are at least two, else of
+    independent residuals [N, 1].
+    """
     n, j = a.shape
     present, index = torch.unique(group, return_inverse=True)
     count = int(present.numel())

@@ -1,4 +1,6 @@
-"""How formulas are written: plain text, LaTeX, SymPy and C, one table of functions for equations of terms and for bred expressions."""
+"""How formulas are written: plain text, LaTeX, SymPy and C, one table of functions for equations of
+terms and for bred expressions.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,9 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Style:
-    """How to write: numbers, channels, powers (positive, or negative for a divisor), what stands between factors, and functions of what is within."""
+    """How to write: numbers, channels, powers (positive, or negative for a divisor), what stands
+    between factors, and functions of what is within.
+    """
 
     number: Callable[[float], str]
     channel: Callable[[str], str]
@@ -18,16 +22,28 @@ class Style:
 
 
 def signed_sum(parts: Sequence[str], values: Sequence[float]) -> str:
-    """Parts that are written without sign, joined by the signs of their values; `0` where there are none."""
-    out = "".join((" - " if value < 0 else " + ") + part for part, value in zip(parts, values, strict=True))
+    """Parts that are written without sign, joined by the signs of their values; `0` where there are
+    none.
+    """
+    out = "".join(
+        (" - " if value < 0 else " + ") + part for part, value in zip(parts, values, strict=True)
+    )
     return ("-" if out.startswith(" - ") else "") + out[3:] or "0"
 
 
-def c_body(name: str, channels: Sequence[str], used: Sequence[str], value: str, comment: str = "") -> str:
-    """A C99 function `double <name>(double <channel>, ...)` that returns `value`, with all channels as arguments; needs <math.h>."""
+def c_body(
+    name: str, channels: Sequence[str], used: Sequence[str], value: str, comment: str = ""
+) -> str:
+    """A C99 function `double <name>(double <channel>, ...)` that returns `value`, with all channels
+    as arguments; needs <math.h>.
+    """
     unused = "".join(f"    (void){channel};\n" for channel in channels if channel not in used)
     note = f"/* {comment} */\n" if comment else ""
-    return f"{note}double {name}({', '.join(f'double {channel}' for channel in channels)})\n{{\n{unused}    return {value};\n}}\n"
+    return (
+        f"{note}double"
+        f" {name}({', '.join(f'double {channel}' for channel in channels)})\n{{\n{unused}    return"
+        f" {value};\n}}\n"
+    )
 
 
 def latex_name(name: str) -> str:

@@ -1,4 +1,6 @@
-"""What a closed-form fit hands back: its numbers, what they mean, and what sets them apart from other solutions of the same fit."""
+"""What a closed-form fit hands back: its numbers, what they mean, and what sets them apart from
+other solutions of the same fit.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,9 @@ from torch import Tensor
 
 
 class Ratio(NamedTuple):
-    """A parameter that is a ratio of two coefficients of one axis: sign * numerator / denominator; no numerator stands for 1."""
+    """A parameter that is a ratio of two coefficients of one axis: sign * numerator / denominator;
+    no numerator stands for 1.
+    """
 
     sign: float
     numerator: str | None
@@ -46,11 +50,13 @@ class Solution:
     """One solution of a closed-form fit; a fit with a complexity to choose has several.
 
     Attributes:
-        choice: what sets it apart, for example {"ridge": 1e-4}; empty where there is nothing to choose.
+        choice: what sets it apart, for example {"ridge": 1e-4}; empty where there is nothing to
+            choose.
         state: numbers of the module that was fitted, by name, as in its state_dict.
         table: the same with names and standard errors, where the fit knows them.
         notes: what else there is to say about the fit.
-        around: solutions near this one, made when free runs find it best, to be tried next; None where there are none.
+        around: solutions near this one, made when free runs find it best, to be tried next; None
+            where there are none.
     """
 
     choice: dict[str, Any]

@@ -1,8 +1,11 @@
-"""Sparse regression: the few candidate columns, out of many, that make up a target exactly or as well as the data can tell.
+"""Sparse regression: the few candidate columns, out of many, that make up a target exactly or as
+well as the data can tell.
 
-Everything works on one QR factorisation of [candidates | targets]: columns that the data cannot tell from simpler ones are set aside, then
-orthogonal forward regression, backward elimination and swaps search the rest (`residnet.regression.sparse_search`). A QR factor keeps what its square,
-the Gram matrix, loses: candidates such as u, u cos(delta) and u |u| differ in the eighth digit on a log of small nozzle angles.
+Everything works on one QR factorisation of [candidates | targets]: columns that the data cannot
+tell from simpler ones are set aside, then orthogonal forward regression, backward elimination and
+swaps search the rest (`residnet.regression.sparse_search`). A QR factor keeps what its square, the
+Gram matrix, loses: candidates such as u, u cos(delta) and u |u| differ in the eighth digit on a log
+of small nozzle angles.
 """
 
 from __future__ import annotations
@@ -20,11 +23,14 @@ from residnet.regression.equation_rows import correlation_time
 from residnet.regression.sparse_search import Criterion, Search, coefficients, swap_table
 
 _DEPENDENT = 1e-12
-"""Share of a column's length that must be left beside simpler columns; below it rounding decides."""
+"""Share of a column's length that must be left beside simpler columns; below it rounding decides.
+"""
 _NOISY = 1e-9
 """Unexplained share of a target from which data count as noisy."""
 _EVIDENCE = 6.0
-"""Difference of the criterion above which one model is strongly preferred to another (Kass and Raftery 1995)."""
+"""Difference of the criterion above which one model is strongly preferred to another (Kass and
+Raftery 1995).
+"""
 
 
 class SearchConfig(Config):
@@ -32,11 +38,13 @@ class SearchConfig(Config):
 
     Attributes:
         max_terms: most terms of an equation on the way of the search; the result usually has fewer.
-        gamma: weight of the number of candidates in the extended BIC (Chen and Chen 2008), n ln(RSS) + k ln(n) + 2 gamma ln(J over k); 0 is BIC.
+        gamma: weight of the number of candidates in the extended BIC (Chen and Chen 2008), n
+            ln(RSS) + k ln(n) + 2 gamma ln(J over k); 0 is BIC.
         precision: error relative to the target below which a fit counts as exact.
         swaps: most terms that are taken out at once, for as many others or one less.
-        resolution: share of its length by which a term must differ from simpler ones where the data are noisy (or the unexplained share of the
-            target, if that is less). u|u| differs from u^2 by noise alone on a vessel that is at rest for a moment and never goes astern.
+        resolution: share of its length by which a term must differ from simpler ones where the data
+            are noisy (or the unexplained share of the target, if that is less). u|u| differs from
+            u^2 by noise alone on a vessel that is at rest for a moment and never goes astern.
     """
 
     max_terms: int = Field(default=30, ge=1, le=80)
@@ -60,7 +68,8 @@ class Reduced:
         rank: number of candidates that are independent, J.
         condition: condition number of the scaled candidates.
         unexcited: candidates that are zero in all samples.
-        dependent: candidate -> how simpler ones make it up on these data, for example {"u|u|": {"u^2": 1.0}}.
+        dependent: candidate -> how simpler ones make it up on these data, for example {"u|u|":
+            {"u^2": 1.0}}.
     """
 
     names: tuple[str, ...]
@@ -87,8 +96,10 @@ class Equation:
         exact: whether the error is at the precision of the arithmetic.
         criterion: extended BIC.
         searched: degree of the candidates that were searched.
-        alternatives: term -> other candidates that could stand in its place as far as these data can tell.
-        undecided: candidates left out whose coefficient could, within two standard errors, make up a twentieth of the target: {name: that share}.
+        alternatives: term -> other candidates that could stand in its place as far as these data
+            can tell.
+        undecided: candidates left out whose coefficient could, within two standard errors, make up
+            a twentieth of the target: {name: that share}.
     """
 
     terms: tuple[str, ...]
@@ -118,8 +129,15 @@ NOTHING = Equation((), np.zeros(0), np.zeros(0), 1.0, False, 0.0, 0, {}, {})
 """The equation without terms."""
 
 
-def reduce(x: np.ndarray, y: np.ndarray, names: Sequence[str], degree: Sequence[int], effort: Sequence[float] = ()) -> Reduced:
-    """One QR factorisation of candidates and targets, with columns that simpler ones make up set aside.
+def reduce(
+    x: np.ndarray,
+    y: np.ndarray,
+    names: Sequence[str],
+    degree: Sequence[int],
+    effort: Sequence[float] = (),
+) -> Reduced:
+    """One QR factorisation of candidates and targets, with columns that simpler ones make up set
+    aside.
 
     Args:
         x: candidate columns [N, J].
@@ -129,19 +147,33 @@ def reduce(x: np.ndarray, y: np.ndarray, names: Sequence[str], degree: Sequence[
         effort: how complicated each column is, within its degree; the order given where empty.
 
     Raises:
-        FitError: with values that are not finite, no candidate that is excited, or fewer samples than candidates.
+        FitError: with values that are not finite, no candidate that is excited, or fewer samples
+            than candidates.
     """
     if not (np.isfinite(x).all() and np.isfinite(y).all()):
-        bad = [name for name, good in zip(names, np.isfinite(x).all(axis=0), strict=True) if not good]
+        bad = [
+            name for name, good in zip(names, np.isfinite(x).all(axis=0), strict=True) if not good
+        ]
         what = f"term '{bad[0]}'" if bad else "the target"
-        raise FitError(f"sparse regression: {what} is not finite in all samples; mask those or leave the term out")
-    order = np.lexsort((np.asarray(effort) if len(effort) else np.arange(x.shape[1]), np.asarray(degree)))
+        raise FitError(
+            f"sparse regression: {what} is not finite in all samples; mask those or leave the"
+            " term out"
+        )
+    order = np.lexsort(
+        (np.asarray(effort) if len(effort) else np.arange(x.shape[1]), np.asarray(degree))
+    )
     length = np.linalg.norm(x, axis=0)[order]
     excited = order[length > 1e-300]
     if not excited.size:
-        raise FitError("sparse regression: every candidate term is zero in all samples; the data excite nothing")
+        raise FitError(
+            "sparse regression: every candidate term is zero in all samples; the data excite"
+            " nothing"
+        )
     if x.shape[0] <= excited.size + y.shape[1]:
-        raise FitError(f"sparse regression: {x.shape[0]} samples do not determine {excited.size} candidates; give longer logs or fewer candidates")
+        raise FitError(
+            f"sparse regression: {x.shape[0]} samples do not determine {excited.size} candidates;"
+            " give longer logs or fewer candidates"
+        )
     scale = np.linalg.norm(x[:, excited], axis=0)
     full = triangle(np.concatenate((x[:, excited] / scale, y), axis=1))
     whole = Reduced(
@@ -163,7 +195,9 @@ def reduce(x: np.ndarray, y: np.ndarray, names: Sequence[str], degree: Sequence[
 
 
 def coarser(reduced: Reduced, resolution: float) -> Reduced:
-    """The same without the candidates that differ from simpler ones by no more than a share of their length."""
+    """The same without the candidates that differ from simpler ones by no more than a share of
+    their length.
+    """
     kept, dependent = _independent(reduced.r, reduced.names, reduced.scale, resolution)
     rows = triangle(np.concatenate((reduced.r[:, kept], reduced.y), axis=1))
     singular = np.linalg.svd(rows[:, : len(kept)], compute_uv=False)
@@ -185,7 +219,9 @@ def triangle(x: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.qr(x, mode="r"))
 
 
-def _independent(r: np.ndarray, names: Sequence[str], scale: np.ndarray, least: float) -> tuple[list[int], dict[str, dict[str, float]]]:
+def _independent(
+    r: np.ndarray, names: Sequence[str], scale: np.ndarray, least: float
+) -> tuple[list[int], dict[str, dict[str, float]]]:
     """Columns of the triangle that simpler ones do not make up, and what makes up the others."""
     kept = list(range(len(names)))
     while True:
@@ -199,13 +235,18 @@ def _independent(r: np.ndarray, names: Sequence[str], scale: np.ndarray, least: 
     for i in gone:
         before = [k for k in kept if k < i]
         share = np.linalg.lstsq(r[:, before], r[:, i], rcond=None)[0]
-        parts = {names[k]: float(s * scale[i] / scale[k]) for k, s in zip(before, share, strict=True) if abs(s) > max(1e-6, least)}
+        parts = {
+            names[k]: float(s * scale[i] / scale[k])
+            for k, s in zip(before, share, strict=True)
+            if abs(s) > max(1e-6, least)
+        }
         dependent[names[i]] = parts
     return kept, dependent
 
 
 def find(reduced: Reduced, target: int, config: SearchConfig) -> tuple[Equation, Reduced]:
-    """The equation of one target, and the candidates that it was searched in: fewer where noise hides what sets some apart.
+    """The equation of one target, and the candidates that it was searched in: fewer where noise
+    hides what sets some apart.
 
     Args:
         reduced: candidates and targets.
@@ -217,14 +258,18 @@ def find(reduced: Reduced, target: int, config: SearchConfig) -> tuple[Equation,
     if fine.share <= _NOISY:
         return fine, reduced
     coarse = coarser(reduced, limit)
-    return (fine, reduced) if coarse.rank == reduced.rank else (_search(coarse, target, config), coarse)
+    return (
+        (fine, reduced)
+        if coarse.rank == reduced.rank
+        else (_search(coarse, target, config), coarse)
+    )
 
 
 def _search(reduced: Reduced, target: int, config: SearchConfig) -> Equation:
     """The best equation.
 
-    Degrees are searched in turn, simplest first, until one explains the target exactly; otherwise the criterion, which knows how many
-    candidates each had to choose from, decides between them.
+    Degrees are searched in turn, simplest first, until one explains the target exactly; otherwise
+    the criterion, which knows how many candidates each had to choose from, decides between them.
     """
     y = reduced.y[:, target]
     energy = float(y @ y)
@@ -233,7 +278,9 @@ def _search(reduced: Reduced, target: int, config: SearchConfig) -> Equation:
     best: tuple[float, list[int], Search, int] | None = None
     for stage in np.unique(reduced.degree).tolist():
         width = int((reduced.degree <= stage).sum())
-        rule = Criterion(float(reduced.samples[target]), width, config.gamma, energy, config.precision)
+        rule = Criterion(
+            float(reduced.samples[target]), width, config.gamma, energy, config.precision
+        )
         search = Search(reduced.r[:, :width], y, rule, config.max_terms)
         value, chosen = search.start()
         if best is None or value < best[0]:
@@ -282,11 +329,19 @@ def _alternatives(search: Search, chosen: list[int], names: np.ndarray) -> dict[
     return out
 
 
-def _undecided(search: Search, chosen: list[int], names: np.ndarray, spread: float) -> dict[str, float]:
-    """Candidates whose coefficient the data leave so open that they could matter: the share of the target within two standard errors."""
+def _undecided(
+    search: Search, chosen: list[int], names: np.ndarray, spread: float
+) -> dict[str, float]:
+    """Candidates whose coefficient the data leave so open that they could matter: the share of the
+    target within two standard errors.
+    """
     left = search.left_over(chosen)
     length = np.linalg.norm(left.columns, axis=0)
     free = np.flatnonzero(length > 1e-9)
     free = free[~np.isin(free, chosen)]
-    reach = (np.abs(left.columns[:, free].T @ left.target) / length[free] + 2.0 * spread) / length[free] / np.sqrt(search.rule.energy)
+    reach = (
+        (np.abs(left.columns[:, free].T @ left.target) / length[free] + 2.0 * spread)
+        / length[free]
+        / np.sqrt(search.rule.energy)
+    )
     return {str(names[j]): round(float(s), 3) for j, s in zip(free, reach, strict=True) if s > 0.05}

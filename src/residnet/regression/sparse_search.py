@@ -1,4 +1,6 @@
-"""The search for a sparse solution on the factor of one QR: forward, backward, and swaps that leave the model shorter."""
+"""The search for a sparse solution on the factor of one QR: forward, backward, and swaps that leave
+the model shorter.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,9 @@ import numpy as np
 from scipy.special import gammaln
 
 _ALIKE = 1e-11
-"""Length of a unit column beside the chosen ones below which it adds nothing that rounding does not."""
+"""Length of a unit column beside the chosen ones below which it adds nothing that rounding does
+not.
+"""
 _BLOCK = 4_000_000
 """Numbers held at once by the batched swaps."""
 _PAIR_CANDIDATES = 40
@@ -18,7 +22,9 @@ _PAIR_CANDIDATES = 40
 
 
 class Criterion(NamedTuple):
-    """Extended BIC of k terms out of `candidates`; an error below `precision` of the target is no better than none."""
+    """Extended BIC of k terms out of `candidates`; an error below `precision` of the target is no
+    better than none.
+    """
 
     samples: float
     candidates: int
@@ -31,7 +37,9 @@ class Criterion(NamedTuple):
         share = np.maximum(np.asarray(rss), 0.0) / self.energy + self.precision**2
         room = max(self.candidates, terms)
         ways = gammaln(room + 1) - gammaln(terms + 1) - gammaln(room - terms + 1)
-        return np.asarray(self.samples * np.log(share) + terms * np.log(self.samples) + 2.0 * self.gamma * ways)
+        return np.asarray(
+            self.samples * np.log(share) + terms * np.log(self.samples) + 2.0 * self.gamma * ways
+        )
 
     def exact(self, rss: float) -> bool:
         """Whether a fit is as good as arithmetic allows."""
@@ -46,7 +54,9 @@ class LeftOver(NamedTuple):
 
 
 def coefficients(r: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Least-squares coefficients [p] of columns [R, p], and the inverse of their triangle [p, p], whose rows give standard errors."""
+    """Least-squares coefficients [p] of columns [R, p], and the inverse of their triangle [p, p],
+    whose rows give standard errors.
+    """
     q, triangle = np.linalg.qr(r)
     inverse = np.linalg.inv(triangle) if triangle.size else triangle
     return inverse @ (q.T @ y), inverse
@@ -83,17 +93,20 @@ class Search:
         return LeftOver(columns, target)
 
     def start(self) -> tuple[float, list[int]]:
-        """Criterion and columns of the better of two ways: forward and back again, and back from all columns where there are enough samples."""
+        """Criterion and columns of the better of two ways: forward and back again, and back from
+        all columns where there are enough samples.
+        """
         ways = [self.backward(self.forward())]
         if self.rule.samples > 4 * self.r.shape[1]:
             ways.append(self.backward(list(range(self.r.shape[1]))))
         return min(ways)
 
     def forward(self) -> list[int]:
-        """Columns in the order of orthogonal forward regression, until the fit is exact or `max_terms` are chosen.
+        """Columns in the order of orthogonal forward regression, until the fit is exact or
+        `max_terms` are chosen.
 
-        Each step takes the column that lessens the error most beside those chosen, and takes its direction out of all others, twice, so that
-        nearly collinear columns keep their digits.
+        Each step takes the column that lessens the error most beside those chosen, and takes its
+        direction out of all others, twice, so that nearly collinear columns keep their digits.
         """
         columns, target = self.r.copy(), self.y.copy()
         chosen: list[int] = []
@@ -103,7 +116,9 @@ class Search:
             usable[chosen] = False
             if not usable.any():
                 break
-            gain = np.where(usable, np.square(columns.T @ target) / np.where(usable, square, 1.0), -1.0)
+            gain = np.where(
+                usable, np.square(columns.T @ target) / np.where(usable, square, 1.0), -1.0
+            )
             best = int(gain.argmax())
             chosen.append(best)
             q = columns[:, best] / np.sqrt(square[best])
@@ -116,7 +131,9 @@ class Search:
         return chosen
 
     def backward(self, chosen: list[int]) -> tuple[float, list[int]]:
-        """Best criterion on the way from the chosen columns to none, dropping the least useful one at a time (a tenth at a time while many)."""
+        """Best criterion on the way from the chosen columns to none, dropping the least useful one
+        at a time (a tenth at a time while many).
+        """
         chosen = list(chosen)
         best: tuple[float, list[int]] = (float(self.rule.value(float(self.y @ self.y), 0)), [])
         rss = self.rss(chosen)
@@ -126,20 +143,26 @@ class Search:
                 best = (value, sorted(chosen))
             estimate, inverse = coefficients(self.r[:, chosen], self.y)
             cost = np.square(estimate) / np.square(inverse).sum(axis=1)
-            drop = np.argsort(cost)[: max(len(chosen) // 10 if len(chosen) > self.max_terms else 1, 1)]
+            drop = np.argsort(cost)[
+                : max(len(chosen) // 10 if len(chosen) > self.max_terms else 1, 1)
+            ]
             chosen = [c for i, c in enumerate(chosen) if i not in drop]
             rss = rss + float(cost[drop[0]]) if drop.size == 1 else self.rss(chosen)
         return best
 
     def refine(self, chosen: list[int], swaps: int) -> list[int]:
-        """Swaps until none betters the criterion, each k chosen columns for k others, k - 1 or (k = 0) one more; every gain is trimmed backward."""
+        """Swaps until none betters the criterion, each k chosen columns for k others, k - 1 or (k =
+        0) one more; every gain is trimmed backward.
+        """
         value = self.value(chosen)
         again = True
         while again and chosen:
             again = False
             for out, into in ((1, 1), (0, 1), (2, 1), (2, 2), (3, 2)):
                 # an exact fit can only become shorter
-                if out > min(swaps, len(chosen)) or (into >= out and self.rule.exact(self.rss(chosen))):
+                if out > min(swaps, len(chosen)) or (
+                    into >= out and self.rule.exact(self.rss(chosen))
+                ):
                     continue
                 found = self._swapped(chosen, out, into)
                 if found is not None and found[0] < value - 1e-6:
@@ -151,7 +174,9 @@ class Search:
     def _swapped(self, chosen: list[int], out: int, into: int) -> tuple[float, list[int]] | None:
         """The best of all swaps of `out` chosen columns for `into` others, judged exactly."""
         gone = list(combinations(chosen, out))
-        kept = np.array([[c for c in chosen if c not in away] for away in gone], dtype=int).reshape(len(gone), len(chosen) - out)
+        kept = np.array([[c for c in chosen if c not in away] for away in gone], dtype=int).reshape(
+            len(gone), len(chosen) - out
+        )
         found: list[tuple[float, tuple[int, ...], tuple[int, ...]]] = []
         step = max(_BLOCK // (self.r.size + 1), 1)
         for first in range(0, len(kept), step):
@@ -160,18 +185,28 @@ class Search:
             rss = np.square(target).sum(axis=1)
             one = _single_gains(columns, target, block)
             for m, gains in enumerate(one):
-                best, added = _best_single(gains) if into == 1 else _best_pair(columns[m], target[m], gains)
+                best, added = (
+                    _best_single(gains) if into == 1 else _best_pair(columns[m], target[m], gains)
+                )
                 found.append((float(rss[m]) - best, tuple(block[m]), added))
         found.sort()
-        judged = [(self.value([*stay, *added]), sorted([*map(int, stay), *added])) for _, stay, added in found[:6] if added]
+        judged = [
+            (self.value([*stay, *added]), sorted([*map(int, stay), *added]))
+            for _, stay, added in found[:6]
+            if added
+        ]
         return min(judged) if judged else None
 
 
 def swap_table(r: np.ndarray, y: np.ndarray, chosen: list[int]) -> np.ndarray:
-    """Residual sums of squares [p, J] with each chosen column replaced by each other one; infinite where it adds nothing."""
+    """Residual sums of squares [p, J] with each chosen column replaced by each other one; infinite
+    where it adds nothing.
+    """
     if not chosen:
         return np.zeros((0, r.shape[1]))
-    kept = np.array([[c for c in chosen if c != gone] for gone in chosen], dtype=int).reshape(len(chosen), -1)
+    kept = np.array([[c for c in chosen if c != gone] for gone in chosen], dtype=int).reshape(
+        len(chosen), -1
+    )
     columns, target = _projected(r, y, kept)
     gains = _single_gains(columns, target, kept)
     return np.where(gains >= 0, np.square(target).sum(axis=1)[:, None] - gains, np.inf)
@@ -201,7 +236,9 @@ def _best_single(gains: np.ndarray) -> tuple[float, tuple[int, ...]]:
     return float(gains[best]), (best,) if gains[best] >= 0 else ()
 
 
-def _best_pair(columns: np.ndarray, target: np.ndarray, gains: np.ndarray) -> tuple[float, tuple[int, ...]]:
+def _best_pair(
+    columns: np.ndarray, target: np.ndarray, gains: np.ndarray
+) -> tuple[float, tuple[int, ...]]:
     """The pair of columns that takes most from the error, among the best single ones."""
     tried = np.argsort(gains)[::-1][:_PAIR_CANDIDATES]
     tried = tried[gains[tried] >= 0]
@@ -213,7 +250,9 @@ def _best_pair(columns: np.ndarray, target: np.ndarray, gains: np.ndarray) -> tu
     room = 1.0 - np.square(angle)
     np.fill_diagonal(room, 0.0)
     usable = room > 1e-12
-    both = np.square(along)[:, None] + np.square(along)[None, :] - 2.0 * angle * np.outer(along, along)
+    both = (
+        np.square(along)[:, None] + np.square(along)[None, :] - 2.0 * angle * np.outer(along, along)
+    )
     gain = np.where(usable, both / np.where(usable, room, 1.0), -np.inf)
     i, j = np.unravel_index(int(gain.argmax()), gain.shape)
     return float(gain[i, j]), (int(tried[i]), int(tried[j])) if np.isfinite(gain[i, j]) else ()

@@ -46,15 +46,24 @@ def window_nrmse(run: Path, model: str, split: str) -> dict[str, WindowErrors]:
     for window in files.windows(split):
         if name not in window.predicted:
             raise DataError(f"{run}: no model '{name}' among {', '.join(window.predicted)}")
-        found.setdefault(window.protocol, []).append(((window.log, window.number), float((window.rmse(name) / scales).mean())))
+        found.setdefault(window.protocol, []).append(
+            ((window.log, window.number), float((window.rmse(name) / scales).mean()))
+        )
     if not found:
         raise DataError(f"{run}: no rollouts of the split '{split}'")
-    return {protocol: WindowErrors(tuple(key for key, _ in pairs), np.array([value for _, value in pairs])) for protocol, pairs in found.items()}
+    return {
+        protocol: WindowErrors(
+            tuple(key for key, _ in pairs), np.array([value for _, value in pairs])
+        )
+        for protocol, pairs in found.items()
+    }
 
 
 @dataclass(frozen=True)
 class Variant:
-    """One way to do it: errors [S, W] by protocol over the windows `keys` for S seeds; `seconds` of the runs, [S]."""
+    """One way to do it: errors [S, W] by protocol over the windows `keys` for S seeds; `seconds` of
+    the runs, [S].
+    """
 
     name: str
     overrides: tuple[str, ...]
@@ -62,11 +71,14 @@ class Variant:
     seconds: tuple[float, ...]
 
 
-def table(variants: Sequence[Variant], keys: Mapping[str, Sequence[tuple[str, int]]], reference: str) -> list[dict[str, Any]]:
+def table(
+    variants: Sequence[Variant], keys: Mapping[str, Sequence[tuple[str, int]]], reference: str
+) -> list[dict[str, Any]]:
     """One row per variant and protocol.
 
-    A row has the mean error over windows and seeds, its standard deviation over seeds (None for one seed), the smallest and largest of the
-    seeds, and the difference to the reference variant over the same windows, seeds averaged first, with its 95 % interval by blocks of windows.
+    A row has the mean error over windows and seeds, its standard deviation over seeds (None for one
+    seed), the smallest and largest of the seeds, and the difference to the reference variant over
+    the same windows, seeds averaged first, with its 95 % interval by blocks of windows.
 
     Args:
         variants: what was run.
@@ -79,10 +91,16 @@ def table(variants: Sequence[Variant], keys: Mapping[str, Sequence[tuple[str, in
         logs = [log for log, _ in windows]
         names = list(dict.fromkeys(logs))
         together[protocol] = blocks([names.index(log) for log in logs])
-    return [_row(variant, known, protocol, together[protocol]) for variant in variants for protocol in keys]
+    return [
+        _row(variant, known, protocol, together[protocol])
+        for variant in variants
+        for protocol in keys
+    ]
 
 
-def _row(variant: Variant, reference: Variant, protocol: str, together: Blocks | None) -> dict[str, Any]:
+def _row(
+    variant: Variant, reference: Variant, protocol: str, together: Blocks | None
+) -> dict[str, Any]:
     errors = variant.errors[protocol]
     by_seed = errors.mean(1)
     apart = errors.mean(0) - reference.errors[protocol].mean(0)
@@ -105,7 +123,12 @@ def _row(variant: Variant, reference: Variant, protocol: str, together: Blocks |
 def as_text(rows: Sequence[Mapping[str, Any]], reference: str) -> str:
     """The table in Markdown."""
     protocols = list(dict.fromkeys(row["protocol"] for row in rows))
-    head = ["variant", *(f"{p} NRMSE (sd of seeds) | difference to {reference} [95 %]" for p in protocols), "s per run", "what changes"]
+    head = [
+        "variant",
+        *(f"{p} NRMSE (sd of seeds) | difference to {reference} [95 %]" for p in protocols),
+        "s per run",
+        "what changes",
+    ]
     lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * (3 + 2 * len(protocols))]
     for name in dict.fromkeys(row["variant"] for row in rows):
         parts = {row["protocol"]: row for row in rows if row["variant"] == name}
@@ -115,7 +138,11 @@ def as_text(rows: Sequence[Mapping[str, Any]], reference: str) -> str:
             spread = "" if row["nrmse_sd"] is None else f" ({row['nrmse_sd']:.4f})"
             interval = row["difference_ci95"]
             cells.append(f"{row['nrmse_mean']:.4f}{spread}")
-            cells.append("" if interval is None else f"{row['difference']:+.4f} [{interval[0]:+.4f}, {interval[1]:+.4f}]")
+            cells.append(
+                ""
+                if interval is None
+                else f"{row['difference']:+.4f} [{interval[0]:+.4f}, {interval[1]:+.4f}]"
+            )
         first = parts[protocols[0]]
         cells += [f"{first['seconds']:.0f}", ", ".join(f"`{text}`" for text in first["overrides"])]
         lines.append("| " + " | ".join(cells) + " |")
@@ -123,7 +150,9 @@ def as_text(rows: Sequence[Mapping[str, Any]], reference: str) -> str:
 
 
 def draw(rows: Sequence[Mapping[str, Any]], reference: str, path: Path) -> None:
-    """Differences to the reference with their intervals, one row per variant, one panel per protocol."""
+    """Differences to the reference with their intervals, one row per variant, one panel per
+    protocol.
+    """
     from matplotlib import rc_context
 
     from residnet.report.figures.style import RC, new_figure, save
@@ -135,10 +164,21 @@ def draw(rows: Sequence[Mapping[str, Any]], reference: str, path: Path) -> None:
         axes = figure.subplots(1, len(protocols), sharey=True, squeeze=False)[0]
         for axis, protocol in zip(axes, protocols, strict=True):
             for height, name in enumerate(reversed(names)):
-                row = next(row for row in rows if row["variant"] == name and row["protocol"] == protocol)
+                row = next(
+                    row for row in rows if row["variant"] == name and row["protocol"] == protocol
+                )
                 if row["difference_ci95"] is not None:
-                    axis.plot(row["difference_ci95"], [height, height], color="black", linewidth=1.2)
-                axis.plot(row["difference"], height, marker="o", markersize=4.5, color="#0072B2", linestyle="none")
+                    axis.plot(
+                        row["difference_ci95"], [height, height], color="black", linewidth=1.2
+                    )
+                axis.plot(
+                    row["difference"],
+                    height,
+                    marker="o",
+                    markersize=4.5,
+                    color="#0072B2",
+                    linestyle="none",
+                )
             axis.axvline(0.0, color="0.4", linewidth=0.8)
             axis.set_xlabel(f"{protocol}: NRMSE minus that of {reference} [-]")
         axes[0].set_yticks(range(len(names)), list(reversed(names)))
@@ -146,5 +186,6 @@ def draw(rows: Sequence[Mapping[str, Any]], reference: str, path: Path) -> None:
             figure,
             path,
             "Variants of the recipe",
-            f"Free-run error of each variant minus that of {reference}, mean over windows and seeds; bars: 95 % interval over logs.",
+            f"Free-run error of each variant minus that of {reference}, mean over windows and"
+            " seeds; bars: 95 % interval over logs.",
         )

@@ -24,7 +24,8 @@ _TEMPLATE = "report.html.j2"
 
 
 def write_report(run: Path) -> Path:
-    """Write `report.html` into a run folder (or what `residnet evaluate` wrote) from what stands there; sections without data are left out.
+    """Write `report.html` into a run folder (or what `residnet evaluate` wrote) from what stands
+    there; sections without data are left out.
 
     Figures are taken from `figures/`: call `residnet.report.figures.fit.write_figures` before.
 
@@ -44,7 +45,13 @@ def write_report(run: Path) -> Path:
     divergence = float(files.evaluation.get("divergence") or 3.0)
     findings = check_run(run, divergence=divergence)
     loader = FileSystemLoader(Path(__file__).parent)
-    environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment = Environment(
+        loader=loader,
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
     environment.filters["minus"] = _minus
     text = environment.get_template(_TEMPLATE).render(_context(files, findings, read_figures(run)))
     path = run / "report.html"
@@ -54,9 +61,16 @@ def write_report(run: Path) -> Path:
     return path
 
 
-def _context(run: RunFiles, findings: Sequence[Finding], figures: Sequence[FigureFile]) -> dict[str, Any]:
+def _context(
+    run: RunFiles, findings: Sequence[Finding], figures: Sequence[FigureFile]
+) -> dict[str, Any]:
     protocols = [
-        {"name": name, "table": tables.free_runs(run, name), "kinds": tables.by_manoeuvre(run, name, run.focus), "first": name == run.protocols[0]}
+        {
+            "name": name,
+            "table": tables.free_runs(run, name),
+            "kinds": tables.by_manoeuvre(run, name, run.focus),
+            "first": name == run.protocols[0],
+        }
         for name in run.protocols
     ]
     return {
@@ -80,7 +94,10 @@ def _context(run: RunFiles, findings: Sequence[Finding], figures: Sequence[Figur
         "goodness": report_goodness.section(run),
         "booklet": report_booklet.section(run),
         "protocols": [entry for entry in protocols if entry["table"] is not None],
-        "figures": [{"title": f.title, "caption": f.caption, "name": f.path.name, "data": _embedded(f.path)} for f in figures],
+        "figures": [
+            {"title": f.title, "caption": f.caption, "name": f.path.name, "data": _embedded(f.path)}
+            for f in figures
+        ],
         "checks": CHECKS,
         "sanity": _by_model(findings),
         "provenance": tables.provenance(run),
@@ -91,7 +108,10 @@ def _context(run: RunFiles, findings: Sequence[Finding], figures: Sequence[Figur
 
 def _coefficients(run: RunFiles) -> list[dict[str, Any]]:
     """Tables of identified coefficients, the first baseline's first."""
-    names = [run.baseline or "baseline", *(model for model, kind in run.kinds.items() if kind == "further")]
+    names = [
+        run.baseline or "baseline",
+        *(model for model, kind in run.kinds.items() if kind == "further"),
+    ]
     found = [
         {
             "name": name,
@@ -105,7 +125,10 @@ def _coefficients(run: RunFiles) -> list[dict[str, Any]]:
 
 
 def _by_model(findings: Sequence[Finding]) -> list[tuple[str, list[Finding]]]:
-    return [(model, [f for f in findings if f.model == model]) for model in dict.fromkeys(f.model for f in findings)]
+    return [
+        (model, [f for f in findings if f.model == model])
+        for model in dict.fromkeys(f.model for f in findings)
+    ]
 
 
 def _minus(text: str) -> str:

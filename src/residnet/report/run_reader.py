@@ -1,4 +1,6 @@
-"""Reading a run folder back: metrics, rollouts and what stands beside them; parts that a folder does not have are empty."""
+"""Reading a run folder back: metrics, rollouts and what stands beside them; parts that a folder
+does not have are empty.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,9 @@ _FOCUS = ("test", "external", "validation", "train")
 
 @dataclass(frozen=True)
 class StoredWindow:
-    """One free run of a log under every model: t [T] s, usable [T], measured and predicted [T, 6] = (u, v, r, psi, x, y), SI and rad."""
+    """One free run of a log under every model: t [T] s, usable [T], measured and predicted [T, 6] =
+    (u, v, r, psi, x, y), SI and rad.
+    """
 
     log: str
     manoeuvre: str
@@ -38,7 +42,9 @@ class StoredWindow:
         """Root mean square errors [3] of u, v (usable samples) and r (all), as in metrics.json."""
         error = self.predicted[model][:, :3] - self.measured[:, :3]
         good = self.usable if self.usable.any() else np.ones_like(self.usable)
-        return np.sqrt([np.mean(error[good, 0] ** 2), np.mean(error[good, 1] ** 2), np.mean(error[:, 2] ** 2)])
+        return np.sqrt(
+            [np.mean(error[good, 0] ** 2), np.mean(error[good, 1] ** 2), np.mean(error[:, 2] ** 2)]
+        )
 
 
 class RunFiles:
@@ -71,11 +77,15 @@ class RunFiles:
     def kinds(self) -> dict[str, str]:
         """Kind (zero, baseline, head, truth, ...) of each model, in the order of metrics.json.
 
-        Only the first baseline is one here, what reductions refer to; others are `further` models, judged like heads.
+        Only the first baseline is one here, what reductions refer to; others are `further` models,
+        judged like heads.
         """
         kinds = {row["model"]: row.get("kind", "head") for row in self.rows}
         first = next((model for model, kind in kinds.items() if kind == "baseline"), None)
-        return {model: "further" if kind == "baseline" and model != first else kind for model, kind in kinds.items()}
+        return {
+            model: "further" if kind == "baseline" and model != first else kind
+            for model, kind in kinds.items()
+        }
 
     @cached_property
     def selected(self) -> str | None:
@@ -96,7 +106,9 @@ class RunFiles:
     @cached_property
     def heads(self) -> list[str]:
         """Models that are neither zero, baseline nor truth; the selected one first."""
-        heads = [model for model, kind in self.kinds.items() if kind not in ("zero", "baseline", "truth")]
+        heads = [
+            model for model, kind in self.kinds.items() if kind not in ("zero", "baseline", "truth")
+        ]
         return sorted(heads, key=lambda model: model != self.selected)
 
     @cached_property
@@ -112,7 +124,9 @@ class RunFiles:
     @cached_property
     def sides(self) -> list[str]:
         """Splits that stand side by side: train, where there is one, and the focus."""
-        return [split for split in ("train",) if split in self.splits and split != self.focus] + [self.focus]
+        return [split for split in ("train",) if split in self.splits and split != self.focus] + [
+            self.focus
+        ]
 
     @cached_property
     def protocols(self) -> list[str]:
@@ -130,14 +144,28 @@ class RunFiles:
         """Channels that are scored."""
         return [name for name in self.rows[0]["rmse"] if name != "mean"]
 
-    def row(self, model: str | None, split: str, protocol: str, manoeuvre: str = "all") -> Row | None:
+    def row(
+        self, model: str | None, split: str, protocol: str, manoeuvre: str = "all"
+    ) -> Row | None:
         """The row of metrics.json, None where there is none."""
         wanted = (model, split, protocol, manoeuvre)
-        return next((row for row in self.rows if (row["model"], row["split"], row["protocol"], row.get("manoeuvre", "all")) == wanted), None)
+        return next(
+            (
+                row
+                for row in self.rows
+                if (row["model"], row["split"], row["protocol"], row.get("manoeuvre", "all"))
+                == wanted
+            ),
+            None,
+        )
 
     def manoeuvres(self, split: str, protocol: str) -> list[str]:
         """Kinds and named groups of manoeuvres that have rows; without `all`."""
-        names = [row.get("manoeuvre", "all") for row in self.rows if row["split"] == split and row["protocol"] == protocol]
+        names = [
+            row.get("manoeuvre", "all")
+            for row in self.rows
+            if row["split"] == split and row["protocol"] == protocol
+        ]
         return [name for name in dict.fromkeys(names) if name != "all"]
 
     def card(self, model: str) -> Row:
@@ -149,7 +177,9 @@ class RunFiles:
         return _json(self.path / "models" / model / "fit.json", {})
 
     def manoeuvre_of(self, log: str) -> str:
-        """Kind of manoeuvre of a log: as recorded, else the kind that its name begins with, else its name without a number."""
+        """Kind of manoeuvre of a log: as recorded, else the kind that its name begins with, else
+        its name without a number.
+        """
         recorded = {entry["log"]: entry.get("manoeuvre") for entry in self.quality}
         if recorded.get(log):
             return str(recorded[log])
@@ -176,8 +206,13 @@ class RunFiles:
                         t=first["t"].to_numpy(float),
                         usable=first["usable"].to_numpy(bool),
                         measured=first[list(COLUMNS)].to_numpy(float),
-                        predicted={model: part[[f"{name}_hat" for name in COLUMNS]].to_numpy(float) for model, part in parts.items()},
-                        diverged={model: bool(part["diverged"].any()) for model, part in parts.items()},
+                        predicted={
+                            model: part[[f"{name}_hat" for name in COLUMNS]].to_numpy(float)
+                            for model, part in parts.items()
+                        },
+                        diverged={
+                            model: bool(part["diverged"].any()) for model, part in parts.items()
+                        },
                     )
                 )
         return out

@@ -30,7 +30,9 @@ class Cell:
 
 @dataclass
 class Table:
-    """A table: `groups` are headers that span several columns (text, span), `heads` the columns, rows begin with their label."""
+    """A table: `groups` are headers that span several columns (text, span), `heads` the columns,
+    rows begin with their label.
+    """
 
     heads: list[str]
     rows: list[tuple[str, list[Cell]]] = field(default_factory=list)
@@ -50,7 +52,9 @@ def title_of(channel: str) -> str:
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """A number with so many significant digits, without an exponent where it is of common size; a dash for none."""
+    """A number with so many significant digits, without an exponent where it is of common size; a
+    dash for none.
+    """
     if value is None or not math.isfinite(value):
         return "–"
     if value == 0:
@@ -72,50 +76,99 @@ def change(value: float, reference: float) -> str:
 
 
 def free_runs(run: RunFiles, protocol: str) -> Table | None:
-    """One line for each model; train and test (or whatever splits the run has) side by side for every quantity."""
-    sides = [split for split in run.sides if any(run.row(model, split, protocol) for model in run.kinds)]
+    """One line for each model; train and test (or whatever splits the run has) side by side for
+    every quantity.
+    """
+    sides = [
+        split for split in run.sides if any(run.row(model, split, protocol) for model in run.kinds)
+    ]
     if not sides:
         return None
     quantities = [*run.channels, "nrmse", "position", "heading", "diverged"]
-    titles = {channel: f"{title_of(channel)} [{unit_of(run, channel)[0]}]" for channel in run.channels}
-    titles |= {"nrmse": "NRMSE, mean [-]", "position": "position, end [m]", "heading": "heading, end [deg]", "diverged": "diverged"}
-    table = Table(heads=[split for _ in quantities for split in sides], groups=[(titles[key], len(sides)) for key in quantities])
+    titles = {
+        channel: f"{title_of(channel)} [{unit_of(run, channel)[0]}]" for channel in run.channels
+    }
+    titles |= {
+        "nrmse": "NRMSE, mean [-]",
+        "position": "position, end [m]",
+        "heading": "heading, end [deg]",
+        "diverged": "diverged",
+    }
+    table = Table(
+        heads=[split for _ in quantities for split in sides],
+        groups=[(titles[key], len(sides)) for key in quantities],
+    )
     for model in run.kinds:
         found = [run.row(model, split, protocol) for split in sides]
-        reference = [run.row(run.baseline, split, protocol) if run.kinds[model] not in ("zero", "baseline") else None for split in sides]
-        cells = [_quantity(run, key, row, base) for key in quantities for row, base in zip(found, reference, strict=True)]
+        reference = [
+            (
+                run.row(run.baseline, split, protocol)
+                if run.kinds[model] not in ("zero", "baseline")
+                else None
+            )
+            for split in sides
+        ]
+        cells = [
+            _quantity(run, key, row, base)
+            for key in quantities
+            for row, base in zip(found, reference, strict=True)
+        ]
         table.rows.append((label(run, model), cells))
     return table
 
 
 def by_manoeuvre(run: RunFiles, protocol: str, split: str) -> Table | None:
-    """The focus split taken apart by kind and named group of manoeuvre; None where there is only one."""
+    """The focus split taken apart by kind and named group of manoeuvre; None where there is only
+    one.
+    """
     kinds = distinct(run, run.manoeuvres(split, protocol), split, protocol)
     if len(kinds) < 2:
         return None
     quantities = [*run.channels, "nrmse", "position", "heading", "diverged"]
     heads = [f"{title_of(channel)} [{unit_of(run, channel)[0]}]" for channel in run.channels]
-    table = Table(heads=["runs", *heads, "NRMSE [-]", "position, end [m]", "heading, end [deg]", "diverged"], corner="manoeuvre, model")
+    table = Table(
+        heads=["runs", *heads, "NRMSE [-]", "position, end [m]", "heading, end [deg]", "diverged"],
+        corner="manoeuvre, model",
+    )
     for kind in kinds:
         for place, model in enumerate(model for model, role in run.kinds.items() if role != "zero"):
             row = run.row(model, split, protocol, kind)
             if row is None:
                 continue
-            base = run.row(run.baseline, split, protocol, kind) if run.kinds[model] != "baseline" else None
-            cells = [Cell(str(row["windows"])), *(_quantity(run, key, row, base) for key in quantities)]
-            name = f"{kind.replace('_', ' ')}: {label(run, model)}" if place == 0 else label(run, model)
+            base = (
+                run.row(run.baseline, split, protocol, kind)
+                if run.kinds[model] != "baseline"
+                else None
+            )
+            cells = [
+                Cell(str(row["windows"])),
+                *(_quantity(run, key, row, base) for key in quantities),
+            ]
+            name = (
+                f"{kind.replace('_', ' ')}: {label(run, model)}"
+                if place == 0
+                else label(run, model)
+            )
             if place == 0:
-                cells = [Cell(cell.text, cell.note, (cell.mark + " first").strip()) for cell in cells]
+                cells = [
+                    Cell(cell.text, cell.note, (cell.mark + " first").strip()) for cell in cells
+                ]
             table.rows.append((name, cells))
     return table
 
 
 def distinct(run: RunFiles, kinds: Sequence[str], split: str, protocol: str) -> list[str]:
-    """Kinds and groups without those that hold the same runs as one before (a group of a single kind)."""
+    """Kinds and groups without those that hold the same runs as one before (a group of a single
+    kind).
+    """
     seen: list[Any] = []
     out: list[str] = []
     for kind in kinds:
-        errors = [(row["windows"], row["rmse"]) for model in run.kinds if (row := run.row(model, split, protocol, kind)) is not None]
+        errors = [
+            (row["windows"], row["rmse"])
+            for model in run.kinds
+            if (row := run.row(model, split, protocol, kind)) is not None
+        ]
         if errors not in seen:
             seen.append(errors)
             out.append(kind)
@@ -130,7 +183,9 @@ def _quantity(run: RunFiles, key: str, row: Row | None, base: Row | None) -> Cel
     if key == "position":
         return Cell(number(row.get("position_error_end"), 2))
     if key == "heading":
-        return Cell(number(DEG * row["heading_error_end"], 2) if "heading_error_end" in row else "–")
+        return Cell(
+            number(DEG * row["heading_error_end"], 2) if "heading_error_end" in row else "–"
+        )
     if key == "nrmse":
         interval = row.get("nrmse_mean_ci95")
         note = f"{number(interval[0])}–{number(interval[1])}" if interval else ""
@@ -139,11 +194,17 @@ def _quantity(run: RunFiles, key: str, row: Row | None, base: Row | None) -> Cel
     if value is None:
         return Cell("–")
     worse = base is not None and value > 1.005 * base["rmse"][key]
-    return Cell(number(unit_of(run, key)[1] * value), change(value, base["rmse"][key]) if base is not None else "", "bad" if worse else "")
+    return Cell(
+        number(unit_of(run, key)[1] * value),
+        change(value, base["rmse"][key]) if base is not None else "",
+        "bad" if worse else "",
+    )
 
 
 def baseline_parameters(run: RunFiles, model: str) -> Table | None:
-    """Identified coefficients of a baseline with standard errors; None where the folder does not hold them."""
+    """Identified coefficients of a baseline with standard errors; None where the folder does not
+    hold them.
+    """
     entries = run.fit(model).get("coefficients") or []
     if not entries:
         return None
@@ -155,13 +216,20 @@ def baseline_parameters(run: RunFiles, model: str) -> Table | None:
         decimals = min(max(1 - math.floor(math.log10(error)), 0), 12) if error > 0 else 4
         shown = f"{value:.{decimals}f}" if decimals <= 6 else number(value, 3)
         unit = Cell(term_unit(entry["axis"], entry["term"]))
-        cells = [Cell(shown.replace("-", "−")), Cell(number(error, 2)), Cell(ratio, mark="weak" if weak else ""), unit]
+        cells = [
+            Cell(shown.replace("-", "−")),
+            Cell(number(error, 2)),
+            Cell(ratio, mark="weak" if weak else ""),
+            unit,
+        ]
         table.rows.append((f"{entry['axis'].replace('_dot', '')}′: {entry['term']}", cells))
     return table
 
 
 def term_unit(axis: str, term: str) -> str:
-    """Unit of a coefficient: that of the acceleration over that of its term; empty where a factor's unit is not known."""
+    """Unit of a coefficient: that of the acceleration over that of its term; empty where a factor's
+    unit is not known.
+    """
     units = CHANNEL_UNITS | _EXTRA_UNITS
     try:
         factors = parse_term(term, [name for name in units if name != "t"], functions=False)
@@ -184,7 +252,9 @@ def _add(powers: dict[str, int], unit: str, sign: int) -> None:
         for piece in part.split():
             name, _, exponent = piece.partition("^")
             if name not in ("1", "-"):
-                powers[name] = powers.get(name, 0) + (sign if place == 0 else -sign) * int(exponent or 1)
+                powers[name] = powers.get(name, 0) + (sign if place == 0 else -sign) * int(
+                    exponent or 1
+                )
 
 
 def _power(name: str, power: int) -> str:
@@ -192,17 +262,32 @@ def _power(name: str, power: int) -> str:
 
 
 def heads(run: RunFiles) -> Table | None:
-    """What was learned: kind, what chose its complexity, parameters, time, the error that the selection compares."""
+    """What was learned: kind, what chose its complexity, parameters, time, the error that the
+    selection compares.
+    """
     if not any(run.fit(model) for model in run.heads):
         return None
     protocol = run.protocols[0]
-    table = Table(heads=["kind", "complexity", "parameters", "sees; stands on", "fit [s]", "epochs", "validation NRMSE [-]"], corner="head")
+    table = Table(
+        heads=[
+            "kind",
+            "complexity",
+            "parameters",
+            "sees; stands on",
+            "fit [s]",
+            "epochs",
+            "validation NRMSE [-]",
+        ],
+        corner="head",
+    )
     for model in run.heads:
         notes, card = run.fit(model), run.card(model)
         head = card.get("head") or {}
         row = run.row(model, "validation", protocol)
         error = row["nrmse"]["mean"] if row else notes.get("validation")
-        count = notes.get("parameters") or (3 * (int(notes["terms"]) + 1) if "terms" in notes else None)
+        count = notes.get("parameters") or (
+            3 * (int(notes["terms"]) + 1) if "terms" in notes else None
+        )
         cells = [
             Cell(str(head.get("kind") or card.get("role", "–"))),
             Cell(_complexity(notes, head), mark="text"),
@@ -223,7 +308,9 @@ def _foundation(notes: Row, head: Row) -> str:
     if not head:
         return "refitted through rollouts" if notes.get("refit") else "least squares"
     sees = ", ".join(head.get("features") or []) or "all channels"
-    return f"{sees}; {notes['baseline']}" if notes.get("baseline", "baseline") != "baseline" else sees
+    return (
+        f"{sees}; {notes['baseline']}" if notes.get("baseline", "baseline") != "baseline" else sees
+    )
 
 
 def _complexity(notes: Row, head: Row) -> str:
@@ -238,7 +325,10 @@ def _complexity(notes: Row, head: Row) -> str:
     if "hidden" in head:
         parts.append("layers of " + ", ".join(str(units) for units in head["hidden"]))
     if "hidden_size" in head:
-        parts.append(f"{head['hidden_size']} hidden units" + (" for each axis" if head.get("per_axis") else ""))
+        parts.append(
+            f"{head['hidden_size']} hidden units"
+            + (" for each axis" if head.get("per_axis") else "")
+        )
     return "; ".join(parts) or "–"
 
 
@@ -248,7 +338,10 @@ def quality(run: RunFiles) -> tuple[Table, Table] | None:
         return None
     columns = ["logs", "seconds", "samples", "scored [%]", "learned from [%]", "masked"]
     columns += ["largest |u| [m/s]", "largest |v| [m/s]", "largest |r| [deg/s]"]
-    short, full = Table(heads=columns, corner="split, manoeuvre"), Table(heads=columns[1:], corner="log")
+    short, full = (
+        Table(heads=columns, corner="split, manoeuvre"),
+        Table(heads=columns[1:], corner="log"),
+    )
     groups: dict[tuple[str, str], list[Row]] = {}
     for entry in run.quality:
         groups.setdefault((entry["split"], entry.get("manoeuvre") or "–"), []).append(entry)
@@ -274,12 +367,26 @@ def _log_cells(entries: Sequence[Row]) -> list[Cell]:
         return Cell(number(100 * sum(entry[key] * entry["samples"] for entry in entries) / samples))
 
     def largest(channel: str, factor: float) -> Cell:
-        return Cell(number(factor * max((entry.get("largest") or {}).get(channel, math.nan) for entry in entries)))
+        return Cell(
+            number(
+                factor
+                * max((entry.get("largest") or {}).get(channel, math.nan) for entry in entries)
+            )
+        )
 
-    reasons = ", ".join(f"{reason} {100 * share:.2g} %" for reason, share in masked.items()) or "nothing"
+    reasons = (
+        ", ".join(f"{reason} {100 * share:.2g} %" for reason, share in masked.items()) or "nothing"
+    )
     seconds = sum(entry["seconds"] for entry in entries)
     reach = [largest("u", 1), largest("v", 1), largest("r", DEG)]
-    return [Cell(f"{seconds:.0f}"), Cell(str(samples)), mean("usable"), mean("learned_from"), Cell(reasons, mark="text"), *reach]
+    return [
+        Cell(f"{seconds:.0f}"),
+        Cell(str(samples)),
+        mean("usable"),
+        mean("learned_from"),
+        Cell(reasons, mark="text"),
+        *reach,
+    ]
 
 
 def provenance(run: RunFiles) -> list[tuple[str, Any]]:
@@ -293,7 +400,14 @@ def provenance(run: RunFiles) -> list[tuple[str, Any]]:
     if record.get("seconds") is not None:
         out.append(("duration", f"{record['seconds']:.0f} s"))
     if record.get("packages"):
-        out.append(("packages", ", ".join(f"{name} {version}" for name, version in record["packages"].items() if version)))
+        out.append(
+            (
+                "packages",
+                ", ".join(
+                    f"{name} {version}" for name, version in record["packages"].items() if version
+                ),
+            )
+        )
     if record.get("config"):
         out.append(("configuration", record["config"]))
     if record.get("overrides"):

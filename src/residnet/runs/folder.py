@@ -1,4 +1,5 @@
-"""The run folder: what a run leaves behind, and what other programs may rely on (DESIGN section 5)."""
+"""The run folder: what a run leaves behind, and what other programs may rely on (DESIGN section 5).
+"""
 
 from __future__ import annotations
 
@@ -20,7 +21,9 @@ _PACKAGES = ("torch", "lightning", "numpy", "scipy", "pandas", "scikit-learn", "
 
 
 class RunFolder:
-    """Paths and writers of one run; every file is written beside its place and then put there, whole."""
+    """Paths and writers of one run; every file is written beside its place and then put there,
+    whole.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -42,7 +45,8 @@ class RunFolder:
         """Make a new folder, or take up an unfinished one with the same configuration.
 
         Raises:
-            UsageError: where the folder exists and is not to be resumed, or was made by another configuration.
+            UsageError: where the folder exists and is not to be resumed, or was made by another
+                configuration.
         """
         folder = cls(path)
         if folder.resolved.is_file() and resume:
@@ -119,7 +123,9 @@ def sha256(path: Path) -> str:
 
 
 def git_revision() -> str | None:
-    """Revision of the checkout that residnet runs from, with `+changes` where it is not clean; None outside a checkout."""
+    """Revision of the checkout that residnet runs from, with `+changes` where it is not clean; None
+    outside a checkout.
+    """
     here = Path(__file__).parent
     try:
         revision = subprocess.run(["git", "rev-parse", "HEAD"], cwd=here, capture_output=True, text=True, timeout=10, check=True).stdout.strip()

@@ -1,4 +1,5 @@
-"""Weights and notes of what a run has trained, so that an interrupted run need not train it again."""
+"""Weights and notes of what a run has trained, so that an interrupted run need not train it again.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +22,9 @@ def store_weights(module: nn.Module, name: str, folder: RunFolder, notes: dict[s
 
 
 def stored_weights(module: nn.Module, name: str, folder: RunFolder) -> dict[str, Any] | None:
-    """Put the stored weights into a module and freeze it; returns the notes, or None where its training had not ended."""
+    """Put the stored weights into a module and freeze it; returns the notes, or None where its
+    training had not ended.
+    """
     from safetensors.torch import load_file
 
     place = folder.models / name

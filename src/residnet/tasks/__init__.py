@@ -14,11 +14,15 @@ from residnet.tasks.study import StudyConfig
 from residnet.tasks.union import TaskConfig
 
 
-def load_task(path: Path, overrides: Sequence[str]) -> FitConfig | SimulateConfig | StudyConfig | ActuatorsTaskConfig | BreedingTaskConfig:
+def load_task(
+    path: Path, overrides: Sequence[str]
+) -> FitConfig | SimulateConfig | StudyConfig | ActuatorsTaskConfig | BreedingTaskConfig:
     """The task of a config file with overrides.
 
     Raises:
         ConfigError: one line with file or override, key, fault and the nearest valid name.
     """
-    task: FitConfig | SimulateConfig | StudyConfig | ActuatorsTaskConfig | BreedingTaskConfig = load_config(path, overrides, TaskConfig)
+    task: FitConfig | SimulateConfig | StudyConfig | ActuatorsTaskConfig | BreedingTaskConfig = (
+        load_config(path, overrides, TaskConfig)
+    )
     return task

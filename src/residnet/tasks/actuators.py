@@ -1,4 +1,6 @@
-"""Task `actuators`: throttle, step and bollard-pull tests to the actuators of a vessel file (document 003 section 4.1)."""
+"""Task `actuators`: throttle, step and bollard-pull tests to the actuators of a vessel file
+(document 003 section 4.1).
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,14 @@ from pydantic import Field, field_validator, model_validator
 from residnet.core.config import Config, ExistingPath, dump_config
 from residnet.core.errors import DataError, UsageError
 from residnet.core.names import nearest, to_si
-from residnet.physics.actuators.identify import StepAnswer, ThrottleMap, ThrustFit, fit_step, fit_throttle, fit_thrust
+from residnet.physics.actuators.identify import (
+    StepAnswer,
+    ThrottleMap,
+    ThrustFit,
+    fit_step,
+    fit_throttle,
+    fit_thrust,
+)
 from residnet.runs.folder import RunFolder
 
 
@@ -78,7 +87,9 @@ class StepTest(_Test):
 
 
 class BollardTest(_Test):
-    """Steady pull on the tether over revolutions `n`, positive ahead, of all `thrusters` running together."""
+    """Steady pull on the tether over revolutions `n`, positive ahead, of all `thrusters` running
+    together.
+    """
 
     n: Column
     pull: Column
@@ -92,7 +103,8 @@ class BollardTest(_Test):
 
 
 class ActuatorsTaskConfig(Config):
-    """Throttle map, rate limit and thrust curves from tests of the actuators, as lines for a vessel file.
+    """Throttle map, rate limit and thrust curves from tests of the actuators, as lines for a vessel
+    file.
 
     Attributes:
         name: of the run.
@@ -125,7 +137,9 @@ class ActuatorsTaskConfig(Config):
         """
         _Logs(self)
 
-    def run(self, *, source: Path, overrides: Sequence[str], out: Path | None, resume: bool) -> RunFolder:
+    def run(
+        self, *, source: Path, overrides: Sequence[str], out: Path | None, resume: bool
+    ) -> RunFolder:
         """Identify, then write actuators.yaml, actuators.json and a figure.
 
         Raises:
@@ -135,7 +149,11 @@ class ActuatorsTaskConfig(Config):
         logs = _Logs(self)
         throttle = fit_throttle(logs.throttle[0], logs.throttle[1]) if logs.throttle else None
         step = fit_step(logs.steps) if logs.steps else None
-        thrust = fit_thrust(logs.bollard[0], logs.bollard[1], self.bollard.thrusters) if self.bollard is not None and logs.bollard else None
+        thrust = (
+            fit_thrust(logs.bollard[0], logs.bollard[1], self.bollard.thrusters)
+            if self.bollard is not None and logs.bollard
+            else None
+        )
         folder = RunFolder.create(out or Path("runs") / self.name, dump_config(self), resume=resume)
         text = vessel_lines(self, throttle, step, thrust)
         folder.write(folder.path / "actuators.yaml", text)
@@ -143,8 +161,12 @@ class ActuatorsTaskConfig(Config):
         from residnet.report.figures.actuators import draw_actuators
 
         draw_actuators(folder.figures / "actuators.png", self, logs, throttle, step, thrust)
-        folder.write_provenance(config=source, overrides=overrides, seed=0, files=self.files(), started=started)
-        print(text + f"written: {folder.path / 'actuators.yaml'}, {folder.figures / 'actuators.png'}")
+        folder.write_provenance(
+            config=source, overrides=overrides, seed=0, files=self.files(), started=started
+        )
+        print(
+            text + f"written: {folder.path / 'actuators.yaml'}, {folder.figures / 'actuators.png'}"
+        )
         return folder
 
 
@@ -152,15 +174,26 @@ class _Logs:
     """Contents of the tests in SI: throttle and n; (t, command, n) of each step; n and pull."""
 
     def __init__(self, config: ActuatorsTaskConfig) -> None:
-        self.throttle = _together(config.throttle.files, config.throttle.throttle, config.throttle.n) if config.throttle else None
-        self.bollard = _together(config.bollard.files, config.bollard.n, config.bollard.pull) if config.bollard else None
+        self.throttle = (
+            _together(config.throttle.files, config.throttle.throttle, config.throttle.n)
+            if config.throttle
+            else None
+        )
+        self.bollard = (
+            _together(config.bollard.files, config.bollard.n, config.bollard.pull)
+            if config.bollard
+            else None
+        )
         self.steps: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
         for path in config.step.files if config.step else ():
             assert config.step is not None
             t, command, n = _read(path, config.step.t, config.step.command, config.step.n)
             self.steps.append((t, command, n))
             if (np.diff(t) <= 0).any():
-                raise DataError(f"{path}: time repeats or runs backwards in row {int(np.flatnonzero(np.diff(t) <= 0)[0]) + 2} of the data")
+                raise DataError(
+                    f"{path}: time repeats or runs backwards in row"
+                    f" {int(np.flatnonzero(np.diff(t) <= 0)[0]) + 2} of the data"
+                )
 
 
 def _together(paths: Sequence[Path], *columns: Column) -> tuple[np.ndarray, ...]:
@@ -180,51 +213,87 @@ def _read(path: Path, *columns: Column) -> tuple[np.ndarray, ...]:
     try:
         table = pd.read_csv(path, skipinitialspace=True)
     except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
-        raise DataError(f"{path}: not a readable csv table ({' '.join(str(error).split())})") from error
+        raise DataError(
+            f"{path}: not a readable csv table ({' '.join(str(error).split())})"
+        ) from error
     out = []
     for entry in columns:
         if entry.column not in table.columns:
-            raise UsageError(f"{path}: no column '{entry.column}'{nearest(entry.column, map(str, table.columns))}")
+            raise UsageError(
+                f"{path}: no column"
+                f" '{entry.column}'{nearest(entry.column, map(str, table.columns))}"
+            )
         values = pd.to_numeric(table[entry.column], errors="coerce").to_numpy(dtype=np.float64)
         bad = np.flatnonzero(~np.isfinite(values) & table[entry.column].notna().to_numpy())
         if bad.size:
             raise DataError(
-                f"{path}: line {int(bad[0]) + 2}, column '{entry.column}': '{table[entry.column].iloc[int(bad[0])]}' is not a finite number"
+                f"{path}: line {int(bad[0]) + 2}, column '{entry.column}':"
+                f" '{table[entry.column].iloc[int(bad[0])]}' is not a finite number"
             )
         out.append(values * to_si(entry.unit))
     whole = np.isfinite(np.stack(out)).all(axis=0)
     if not whole.any():
-        raise DataError(f"{path}: no row has a number in all of {', '.join(entry.column for entry in columns)}")
+        raise DataError(
+            f"{path}: no row has a number in all of {', '.join(entry.column for entry in columns)}"
+        )
     return tuple(values[whole] for values in out)
 
 
 def vessel_lines(
-    config: ActuatorsTaskConfig, throttle: ThrottleMap | None, step: StepAnswer | None, thrust: tuple[ThrustFit, ThrustFit] | None
+    config: ActuatorsTaskConfig,
+    throttle: ThrottleMap | None,
+    step: StepAnswer | None,
+    thrust: tuple[ThrustFit, ThrustFit] | None,
 ) -> str:
     """Lines for the section `actuators` of a vessel file, with 95 % intervals as comments."""
     lines = [f"# from {', '.join(path.name for path in config.files())}; intervals are 95 %"]
     if throttle is not None:
         k, o, m = throttle.slope, throttle.offset, throttle.n_max
-        lines.append(f"# n = {k.value * 60:.6g} rpm * throttle {o.value * 60:+.4g} rpm (slope {k.low * 60:.6g} .. {k.high * 60:.6g})")
-        about = f"{m.low * 60:.5g} .. {m.high * 60:.5g}" if throttle.saturated else "largest measured: nothing saturated"
+        lines.append(
+            f"# n = {k.value * 60:.6g} rpm * throttle {o.value * 60:+.4g} rpm (slope"
+            f" {k.low * 60:.6g} .. {k.high * 60:.6g})"
+        )
+        about = (
+            f"{m.low * 60:.5g} .. {m.high * 60:.5g}"
+            if throttle.saturated
+            else "largest measured: nothing saturated"
+        )
         lines.append(f"n_max: {m.value * 60:.5g} rpm  # {about}")
     if step is not None:
-        lines.append(f"n_rate: {step.rate.value * 60:.5g} rpm/s  # {step.rate.low * 60:.5g} .. {step.rate.high * 60:.5g}")
-        lines.append(f"# dead_time: {step.dead_time.value:.3g} s  ({step.dead_time.low:.3g} .. {step.dead_time.high:.3g})")
+        lines.append(
+            f"n_rate: {step.rate.value * 60:.5g} rpm/s  # {step.rate.low * 60:.5g} .."
+            f" {step.rate.high * 60:.5g}"
+        )
+        lines.append(
+            f"# dead_time: {step.dead_time.value:.3g} s  ({step.dead_time.low:.3g} .."
+            f" {step.dead_time.high:.3g})"
+        )
     for name, fit in zip(("forward", "reverse"), thrust or (), strict=False):
-        lines.append(f"{name}: [{', '.join(f'{c.value:.6g}' for c in fit.coefficients)}]  # rms residual {fit.rms:.3g} N per thruster")
-        lines += [f"#   c{i}: {c.low:.6g} .. {c.high:.6g} {c.unit}" for i, c in enumerate(fit.coefficients)]
+        lines.append(
+            f"{name}: [{', '.join(f'{c.value:.6g}' for c in fit.coefficients)}]  # rms residual"
+            f" {fit.rms:.3g} N per thruster"
+        )
+        lines += [
+            f"#   c{i}: {c.low:.6g} .. {c.high:.6g} {c.unit}"
+            for i, c in enumerate(fit.coefficients)
+        ]
     if thrust is not None:
         lines.append(f"curve_range: [{thrust[1].low * 60:.5g} rpm, {thrust[0].high * 60:.5g} rpm]")
     lines.append(f"source: {json.dumps(f'identified by residnet, run {config.name}')}")
     return "\n".join(lines) + "\n"
 
 
-def _numbers(throttle: ThrottleMap | None, step: StepAnswer | None, thrust: tuple[ThrustFit, ThrustFit] | None) -> dict[str, Any]:
+def _numbers(
+    throttle: ThrottleMap | None,
+    step: StepAnswer | None,
+    thrust: tuple[ThrustFit, ThrustFit] | None,
+) -> dict[str, Any]:
     out: dict[str, Any] = {"schema": "residnet.actuators/1"}
     if throttle is not None:
         parts = {"slope": throttle.slope, "offset": throttle.offset, "n_max": throttle.n_max}
-        out["throttle"] = {name: estimate._asdict() for name, estimate in parts.items()} | {"saturated": throttle.saturated}
+        out["throttle"] = {name: estimate._asdict() for name, estimate in parts.items()} | {
+            "saturated": throttle.saturated
+        }
     if step is not None:
         out["step"] = {name: estimate._asdict() for name, estimate in step._asdict().items()}
     for name, fit in zip(("forward", "reverse"), thrust or (), strict=False):

@@ -1,4 +1,6 @@
-"""Task `autopilot`: train heading policies, tune their classical peers, and compare all of them over random vessels."""
+"""Task `autopilot`: train heading policies, tune their classical peers, and compare all of them
+over random vessels.
+"""
 
 from __future__ import annotations
 
@@ -44,8 +46,10 @@ class PolicyConfig(Config):
         hidden: widths of the layers.
         observer: bandwidth of the disturbance observer as a multiple of 1/T.
         training: how it is trained.
-        learned: a learned model to train on instead of the vessel itself; the policy is then compared on the vessel.
-        imitate: name of a peer whose commands it learns to give; null to train it for fast changes without overshoot.
+        learned: a learned model to train on instead of the vessel itself; the policy is then
+            compared on the vessel.
+        imitate: name of a peer whose commands it learns to give; null to train it for fast changes
+            without overshoot.
     """
 
     hidden: Annotated[tuple[_Units, ...], Field(min_length=1)] = (24, 24)
@@ -56,13 +60,15 @@ class PolicyConfig(Config):
 
 
 class PredictiveConfig(Config):
-    """The autopilot of document 004 as it stands there: a perceptron that predicts what each rudder angle leads to, and the law (6.4).
+    """The autopilot of document 004 as it stands there: a perceptron that predicts what each rudder
+    angle leads to, and the law (6.4).
 
     Attributes:
         horizon: of the prediction; the source's 0.01 s cannot settle (ERRATA 004).
         candidates: rudder angles.
         weight: of the choice for the heading error.
-        hidden: widths of the layers; the source has 20 for Nomoto's model and 30 for the 4-DOF vessel.
+        hidden: widths of the layers; the source has 20 for Nomoto's model and 30 for the 4-DOF
+            vessel.
         linear: without activations, as in the source's listing.
         training: of the perceptron.
     """
@@ -76,7 +82,8 @@ class PredictiveConfig(Config):
 
 
 class StepTestConfig(Config):
-    """The one test of all controllers: a step of the reference without prefilter, from straight ahead.
+    """The one test of all controllers: a step of the reference without prefilter, from straight
+    ahead.
 
     Attributes:
         heading: the step.
@@ -88,7 +95,8 @@ class StepTestConfig(Config):
         bias: constant rudder angle of the steady-error test.
         bias_error: largest heading error there after `bias_time`.
         bias_time: see above.
-        wind: mean wind speed of the same test in wind, from eight directions and without bias; null for none.
+        wind: mean wind speed of the same test in wind, from eight directions and without bias; null
+            for none.
         sea: waves in which the course is kept after the step; null for none.
         sea_time: how long, counted from the end of the step's flight.
     """
@@ -108,7 +116,10 @@ class StepTestConfig(Config):
 
     def weather(self) -> Disturbance:
         """What the vessel must be able to feel."""
-        return Disturbance(wind=None if self.wind is None else WindField(speed=self.wind, direction=0.0), waves=self.sea)
+        return Disturbance(
+            wind=None if self.wind is None else WindField(speed=self.wind, direction=0.0),
+            waves=self.sea,
+        )
 
 
 class AutopilotConfig(Config):
@@ -126,9 +137,11 @@ class AutopilotConfig(Config):
         policies: by name.
         predictive: the document's own autopilots, by name.
         peers: by name; gains that are left out are tuned.
-        floor: peer that knows the vessel exactly: the others are measured in multiples of its settling time.
+        floor: peer that knows the vessel exactly: the others are measured in multiples of its
+            settling time.
         tuning_points: candidates of each of four rounds of tuning.
-        safe: what an exported policy commands while its inputs are wrong: the last good command, or rudder amidships.
+        safe: what an exported policy commands while its inputs are wrong: the last good command, or
+            rudder amidships.
     """
 
     task: Literal["autopilot"]
@@ -155,7 +168,10 @@ class AutopilotConfig(Config):
             raise ValueError(f"'{twice[0]}' names two controllers; names are unique in a run")
         for name, policy in self.policies.items():
             if policy.imitate is not None and policy.imitate not in self.peers:
-                raise ValueError(f"policies.{name}.imitate: no peer '{policy.imitate}'{nearest(policy.imitate, self.peers)}")
+                raise ValueError(
+                    f"policies.{name}.imitate: no peer"
+                    f" '{policy.imitate}'{nearest(policy.imitate, self.peers)}"
+                )
         if self.floor is not None and not isinstance(self.peers.get(self.floor), BangBangConfig):
             raise ValueError(f"floor: '{self.floor}' must name a peer of kind bang_bang")
         return self
@@ -166,11 +182,17 @@ class AutopilotConfig(Config):
         one = torch.ones(1, dtype=torch.float64)
         most = float(plant.demand(one, one)[0, 0])
         if self.rudder > (1.0 + 1e-6) * most:
-            raise ValueError(f"rudder: vessel '{self.vessel}' has {most:.4g} rad at most, given {self.rudder:.4g}")
+            raise ValueError(
+                f"rudder: vessel '{self.vessel}' has {most:.4g} rad at most, given"
+                f" {self.rudder:.4g}"
+            )
         self.test.weather().check(plant, self.vessel)
         for name in self.spread.needs():
             if name not in plant.inputs:
-                raise ValueError(f"spread: vessel '{self.vessel}' has no input '{name}'; it has {', '.join(plant.inputs)}")
+                raise ValueError(
+                    f"spread: vessel '{self.vessel}' has no input '{name}'; it has"
+                    f" {', '.join(plant.inputs)}"
+                )
         return self
 
     def check(self) -> None:
@@ -183,7 +205,9 @@ class AutopilotConfig(Config):
             if policy.learned is not None:
                 chosen_model(policy.learned.run, policy.learned.model)
 
-    def run(self, *, source: Path, overrides: Sequence[str], out: Path | None, resume: bool) -> RunFolder:
+    def run(
+        self, *, source: Path, overrides: Sequence[str], out: Path | None, resume: bool
+    ) -> RunFolder:
         """Train, tune, compare, export.
 
         Raises:
@@ -196,6 +220,8 @@ class AutopilotConfig(Config):
         started = time.time()
         folder = RunFolder.create(out or Path("runs") / self.name, dump_config(self), resume=resume)
         run_autopilot(self, folder)
-        folder.write_provenance(config=source, overrides=overrides, seed=self.seed, files=[], started=started)
+        folder.write_provenance(
+            config=source, overrides=overrides, seed=self.seed, files=[], started=started
+        )
         print(f"report: {folder.report}")
         return folder

@@ -10,7 +10,15 @@ from torch import Tensor
 
 from residnet.control.base import Policy
 from residnet.control.heading.steering import Flights, SteeredPlant, fly
-from residnet.judge.autopilots import measure, random_variations, row, sea_flights, sea_row, step_flights, wind_flights
+from residnet.judge.autopilots import (
+    measure,
+    random_variations,
+    row,
+    sea_flights,
+    sea_row,
+    step_flights,
+    wind_flights,
+)
 from residnet.physics.vessel import load_vessel
 from residnet.tasks.autopilot import AutopilotConfig
 
@@ -18,7 +26,8 @@ from residnet.tasks.autopilot import AutopilotConfig
 def compare(
     controllers: dict[str, tuple[str, Policy]], vessel: SteeredPlant, config: AutopilotConfig
 ) -> tuple[list[dict[str, Any]], pd.DataFrame, pd.DataFrame]:
-    """Rows of metrics.json, the flights over the corners of the spread as a table, and what each random vessel gave as another.
+    """Rows of metrics.json, the flights over the corners of the spread as a table, and what each
+    random vessel gave as another.
 
     Args:
         controllers: kind (policy, classical, floor) and controller by name.
@@ -38,7 +47,12 @@ def compare(
         flights = step_flights(vessel, policy, drawn, test.heading, test.dt, test.duration, speed)
         rows.append(row(name, kind, "random", flights, test.band))
         found = {key: values.numpy() for key, values in measure(flights, test.band).items()}
-        given = {"controller": name, "effect": drawn[:, 0].numpy(), "time": drawn[:, 1].numpy(), "speed": speed.numpy()}
+        given = {
+            "controller": name,
+            "effect": drawn[:, 0].numpy(),
+            "time": drawn[:, 1].numpy(),
+            "speed": speed.numpy(),
+        }
         plants.append(pd.DataFrame({**given, **found}))
         rows += _disturbed(name, kind, policy, vessel, config)
     return rows, pd.concat(series, ignore_index=True), pd.concat(plants, ignore_index=True)
@@ -48,22 +62,54 @@ def _random(config: AutopilotConfig) -> tuple[Tensor, Tensor]:
     """Variations [B, 3] and speeds [B]: the same for all controllers."""
     low, high = config.spread.speed
     count, seed = config.test.plants, config.seed + 1
-    share = torch.rand(count, generator=torch.Generator().manual_seed(seed + 1_000_000), dtype=torch.float64)
-    return random_variations(config.spread.effect, config.spread.time, count, seed), low + (high - low) * share
+    share = torch.rand(
+        count, generator=torch.Generator().manual_seed(seed + 1_000_000), dtype=torch.float64
+    )
+    return (
+        random_variations(config.spread.effect, config.spread.time, count, seed),
+        low + (high - low) * share,
+    )
 
 
-def _disturbed(name: str, kind: str, policy: Policy, vessel: SteeredPlant, config: AutopilotConfig) -> list[dict[str, Any]]:
+def _disturbed(
+    name: str, kind: str, policy: Policy, vessel: SteeredPlant, config: AutopilotConfig
+) -> list[dict[str, Any]]:
     """Rows under a constant rudder bias, in wind and in waves."""
     test = config.test
-    pushed = torch.tensor([[1.0, 1.0, side * test.bias] for side in (1.0, -1.0)], dtype=torch.float64)
-    flown = {"bias": fly(vessel, policy, torch.full((2,), test.heading), pushed, dt=test.dt, duration=test.bias_time)}
+    pushed = torch.tensor(
+        [[1.0, 1.0, side * test.bias] for side in (1.0, -1.0)], dtype=torch.float64
+    )
+    flown = {
+        "bias": fly(
+            vessel,
+            policy,
+            torch.full((2,), test.heading),
+            pushed,
+            dt=test.dt,
+            duration=test.bias_time,
+        )
+    }
     if test.wind is not None:
         abroad = SteeredPlant(load_vessel(config.vessel).build(), calm=False)
-        flown["wind"] = wind_flights(abroad, policy, test.wind, test.heading, test.dt, test.bias_time)
-    rows = [row(name, kind, key, flights, test.band) | {"error_end": float(flights.error[:, -1].abs().max())} for key, flights in flown.items()]
+        flown["wind"] = wind_flights(
+            abroad, policy, test.wind, test.heading, test.dt, test.bias_time
+        )
+    rows = [
+        row(name, kind, key, flights, test.band)
+        | {"error_end": float(flights.error[:, -1].abs().max())}
+        for key, flights in flown.items()
+    ]
     if test.sea is not None:
         plant = load_vessel(config.vessel).build()
-        kept = sea_flights(plant, policy, test.sea, test.heading, test.dt, test.duration + test.sea_time, config.seed + 2)
+        kept = sea_flights(
+            plant,
+            policy,
+            test.sea,
+            test.heading,
+            test.dt,
+            test.duration + test.sea_time,
+            config.seed + 2,
+        )
         rows.append(sea_row(name, kind, kept, test.duration))
     return rows
 

@@ -1,4 +1,6 @@
-"""The document's own autopilots of an autopilot run: data, training and controller (document 004 sections 6.1.1 to 6.1.3)."""
+"""The document's own autopilots of an autopilot run: data, training and controller (document 004
+sections 6.1.1 to 6.1.3).
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,9 @@ from residnet.tasks.pipeline import say
 from residnet.training.predictor import train_predictor
 
 
-def predictive(name: str, wanted: PredictiveConfig, steering: Steering, seed: int, folder: RunFolder) -> tuple[Policy, dict[str, Any]]:
+def predictive(
+    name: str, wanted: PredictiveConfig, steering: Steering, seed: int, folder: RunFolder
+) -> tuple[Policy, dict[str, Any]]:
     """A trained controller, and what there is to say about it.
 
     Args:
@@ -39,15 +43,31 @@ def predictive(name: str, wanted: PredictiveConfig, steering: Steering, seed: in
     if notes is None:
         started = time.time()
         say(f"  training {name}")
-        notes = train_predictor(name, network, steering.vessel, exact, controller.rudder, wanted.training, seed, folder.path)
+        notes = train_predictor(
+            name,
+            network,
+            steering.vessel,
+            exact,
+            controller.rudder,
+            wanted.training,
+            seed,
+            folder.path,
+        )
         notes["seconds"] = round(time.time() - started, 1)
         store_weights(network, name, folder, notes)
     degrees = [math.degrees(notes[key]) for key in ("rms_heading", "rms_yaw_rate")]
-    say(f"  {name}: predicts {wanted.horizon:g} s ahead within {degrees[0]:.2g} deg and {degrees[1]:.2g} deg/s (rms), {notes['seconds']:.0f} s")
-    return controller, {"config": wanted.model_dump(mode="json")} | {key: value for key, value in notes.items() if key != "curve"}
+    say(
+        f"  {name}: predicts {wanted.horizon:g} s ahead within {degrees[0]:.2g} deg and"
+        f" {degrees[1]:.2g} deg/s (rms), {notes['seconds']:.0f} s"
+    )
+    return controller, {"config": wanted.model_dump(mode="json")} | {
+        key: value for key, value in notes.items() if key != "curve"
+    }
 
 
-def load_predictive(name: str, wanted: PredictiveConfig, steering: Steering, folder: RunFolder) -> Policy:
+def load_predictive(
+    name: str, wanted: PredictiveConfig, steering: Steering, folder: RunFolder
+) -> Policy:
     """The controller that a finished run trained.
 
     Raises:
@@ -59,6 +79,16 @@ def load_predictive(name: str, wanted: PredictiveConfig, steering: Steering, fol
     return law.law(network, steering)
 
 
-def _untrained(wanted: PredictiveConfig, steering: Steering) -> tuple[DocumentConfig, NetworkPredictor]:
+def _untrained(
+    wanted: PredictiveConfig, steering: Steering
+) -> tuple[DocumentConfig, NetworkPredictor]:
     law = DocumentConfig(horizon=wanted.horizon, candidates=wanted.candidates, weight=wanted.weight)
-    return law, NetworkPredictor(steering.vessel.state, candidates=wanted.candidates, hidden=wanted.hidden, linear=wanted.linear).double()
+    return (
+        law,
+        NetworkPredictor(
+            steering.vessel.state,
+            candidates=wanted.candidates,
+            hidden=wanted.hidden,
+            linear=wanted.linear,
+        ).double(),
+    )

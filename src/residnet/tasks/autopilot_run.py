@@ -38,14 +38,20 @@ def run_autopilot(config: AutopilotConfig, folder: RunFolder) -> None:
     torch.set_num_threads(config.threads)
     vessel = SteeredPlant(load_vessel(config.vessel).build())
     turning = vessel.turning(config.rudder, config.turning_time)
-    say(f"{config.name}: {config.vessel} answers {config.rudder:.3g} rad of rudder with K = {turning.gain:.4g} 1/s, T = {turning.time:.4g} s")
+    say(
+        f"{config.name}: {config.vessel} answers {config.rudder:.3g} rad of rudder with K ="
+        f" {turning.gain:.4g} 1/s, T = {turning.time:.4g} s"
+    )
     steering = Steering(vessel, turning, config.rudder, config.test.dt)
     controllers: dict[str, tuple[str, Policy]] = {}
     notes: dict[str, Any] = {}
     complete: dict[str, AnyController] = {}
     for name, peer in config.peers.items():
         complete[name], notes[name] = _peer(name, peer, steering, config)
-        controllers[name] = ("floor" if name == config.floor else "classical", complete[name].build(steering))
+        controllers[name] = (
+            "floor" if name == config.floor else "classical",
+            complete[name].build(steering),
+        )
     for name, own in config.predictive.items():
         built, notes[name] = predictive(name, own, steering, config.seed, folder)
         controllers[name] = ("predictive", built)
@@ -55,14 +61,23 @@ def run_autopilot(config: AutopilotConfig, folder: RunFolder) -> None:
         policy, notes[name] = _policy(name, wanted, school, config, folder, teacher)
         policy.read_from(vessel.state)
         controllers = {name: ("policy", policy), **controllers}
-    folder.write_json(folder.path / "controllers.json", {"schema": "residnet.controllers/1", "turning": vars(turning), "controllers": notes})
+    folder.write_json(
+        folder.path / "controllers.json",
+        {"schema": "residnet.controllers/1", "turning": vars(turning), "controllers": notes},
+    )
     rows, series, plants = compare(controllers, vessel, config)
     folder.write_json(
         folder.metrics,
         {
             "schema": SCHEMA,
             "run": config.name,
-            "channels": {**QUANTITIES, "error_end": "rad", "heading_rms": "rad", "rudder_rms": "rad", "heel_rms": "rad"},
+            "channels": {
+                **QUANTITIES,
+                "error_end": "rad",
+                "heading_rms": "rad",
+                "rudder_rms": "rad",
+                "heel_rms": "rad",
+            },
             "floor": config.floor,
             "rows": rows,
         },
@@ -76,21 +91,43 @@ def run_autopilot(config: AutopilotConfig, folder: RunFolder) -> None:
         about = {"vessel": config.vessel, "spread": config.spread.model_dump(mode="json")}
         about |= {} if learned is None else {"learned": learned.model_dump(mode="json")}
         found = [entry for entry in rows if entry["model"] == name]
-        export_autopilot(name, trained, folder.exports / f"{name}.pt", safe=config.safe, about=about, metrics=found)
+        export_autopilot(
+            name,
+            trained,
+            folder.exports / f"{name}.pt",
+            safe=config.safe,
+            about=about,
+            metrics=found,
+        )
         print(f"exported: {folder.exports / f'{name}.pt'}")
     write_autopilot_report(folder.path)
     print(table(rows, config.floor), effort_table(rows), sep="\n")
 
 
-def _peer(name: str, peer: AnyController, steering: Steering, config: AutopilotConfig) -> tuple[AnyController, dict[str, Any]]:
+def _peer(
+    name: str, peer: AnyController, steering: Steering, config: AutopilotConfig
+) -> tuple[AnyController, dict[str, Any]]:
     """A peer with all its gains, and what there is to say about it."""
     if not isinstance(peer, TunedConfig):
         return peer, {"config": peer.model_dump(mode="json")}
     test = config.test
-    task = TuningTask(test.heading, config.spread.corners(), test.overshoot, test.band, test.duration, test.bias, test.bias_error, test.bias_time)
+    task = TuningTask(
+        test.heading,
+        config.spread.corners(),
+        test.overshoot,
+        test.band,
+        test.duration,
+        test.bias,
+        test.bias_error,
+        test.bias_time,
+    )
     started = time.time()
     tuned = tune(peer, steering, task, config.tuning_points)
-    say(f"  tuned {name}: " + ", ".join(f"{k} {v:.4g}" for k, v in (tuned.parameters | tuned.gains).items()) + f", worst {tuned.settling:.2f} s")
+    say(
+        f"  tuned {name}: "
+        + ", ".join(f"{k} {v:.4g}" for k, v in (tuned.parameters | tuned.gains).items())
+        + f", worst {tuned.settling:.2f} s"
+    )
     complete = peer.model_copy(update=tuned.parameters)
     return complete, {
         "config": complete.model_dump(mode="json"),
@@ -102,23 +139,36 @@ def _peer(name: str, peer: AnyController, steering: Steering, config: AutopilotC
     }
 
 
-def _school(name: str, wanted: PolicyConfig, steering: Steering, config: AutopilotConfig) -> Steering:
-    """What a policy is trained on: the vessel, in wind and current where the spread has them, or a learned model of it.
+def _school(
+    name: str, wanted: PolicyConfig, steering: Steering, config: AutopilotConfig
+) -> Steering:
+    """What a policy is trained on: the vessel, in wind and current where the spread has them, or a
+    learned model of it.
 
     Raises:
         FitError: where the learned model does not turn steadily.
         ConfigError: where its inputs are not those of the vessel.
     """
     if wanted.learned is None:
-        return steering._replace(vessel=SteeredPlant(load_vessel(config.vessel).build(), calm=False)) if config.spread.weather else steering
+        return (
+            steering._replace(vessel=SteeredPlant(load_vessel(config.vessel).build(), calm=False))
+            if config.spread.weather
+            else steering
+        )
     if config.spread.weather:
-        raise ConfigError(f"policies.{name}.learned: a learned model feels no wind or current; leave them out of spread")
+        raise ConfigError(
+            f"policies.{name}.learned: a learned model feels no wind or current; leave them out of"
+            " spread"
+        )
     chosen = chosen_model(wanted.learned.run, wanted.learned.model)
     spec, model = load_model(wanted.learned.run / "models" / chosen)
     assert isinstance(steering.vessel, SteeredPlant)
     vessel = SteeredModel(model, spec.signals.columns, spec.hold, steering.vessel)
     turning = vessel.turning(config.rudder, config.turning_time, wanted.training.dt)
-    say(f"  {name} learns on {wanted.learned.run}/models/{chosen}: K = {turning.gain:.4g} 1/s, T = {turning.time:.4g} s")
+    say(
+        f"  {name} learns on {wanted.learned.run}/models/{chosen}: K = {turning.gain:.4g} 1/s, T ="
+        f" {turning.time:.4g} s"
+    )
     return steering._replace(vessel=vessel, turning=turning)
 
 
@@ -144,10 +194,25 @@ def _policy(
     notes = stored_weights(policy, name, folder)
     if notes is None:
         say(f"  training {name}")
-        # a controller with a memory knows its step: one teaches at the step of training, its like is compared at that of flights
+        # a controller with a memory knows its step: one teaches at the step of training, its like
+        # is compared at that of flights
         shown = None if teacher is None else teacher.build(steering._replace(dt=wanted.training.dt))
-        score = _Score(steering, config) if teacher is None else _Unlikeness(steering, config, teacher.build(steering))
-        notes = train_autopilot(name, policy, steering.vessel, wanted.training, config.spread, score, config.seed, folder.path, shown)
+        score = (
+            _Score(steering, config)
+            if teacher is None
+            else _Unlikeness(steering, config, teacher.build(steering))
+        )
+        notes = train_autopilot(
+            name,
+            policy,
+            steering.vessel,
+            wanted.training,
+            config.spread,
+            score,
+            config.seed,
+            folder.path,
+            shown,
+        )
         notes |= {"seconds": round(time.time() - started, 1), "imitates": wanted.imitate}
         store_weights(policy, name, folder, notes)
     policy.dt = steering.dt
@@ -156,7 +221,9 @@ def _policy(
 
 
 class _Score:
-    """Mean and worst settling time over the corners of the spread, and what overshoot beyond the limit costs; seconds."""
+    """Mean and worst settling time over the corners of the spread, and what overshoot beyond the
+    limit costs; seconds.
+    """
 
     def __init__(self, steering: Steering, config: AutopilotConfig) -> None:
         self.steering, self.test, self.corners = steering, config.test, config.spread.corners()
@@ -164,17 +231,26 @@ class _Score:
     def __call__(self, policy: HeadingPolicy) -> float:
         test = self.test
         policy.dt = test.dt
-        flights = step_flights(self.steering.vessel, policy, self.corners, test.heading, test.dt, test.duration)
+        flights = step_flights(
+            self.steering.vessel, policy, self.corners, test.heading, test.dt, test.duration
+        )
         settled = flights.settled(test.band)
         beyond = (flights.overshoot() - 0.9 * test.overshoot).clamp(min=0.0) / test.overshoot
         return float(settled.mean() + 2.0 * settled.max() + 0.5 * test.duration * beyond.amax())
 
 
 class _Unlikeness:
-    """Root mean square of the difference between the commands of a policy and of its teacher, which sees what the policy flies; radians."""
+    """Root mean square of the difference between the commands of a policy and of its teacher, which
+    sees what the policy flies; radians.
+    """
 
     def __init__(self, steering: Steering, config: AutopilotConfig, teacher: Policy) -> None:
-        self.steering, self.test, self.corners, self.teacher = steering, config.test, config.spread.corners(), teacher.double()
+        self.steering, self.test, self.corners, self.teacher = (
+            steering,
+            config.test,
+            config.spread.corners(),
+            teacher.double(),
+        )
 
     def __call__(self, policy: HeadingPolicy) -> float:
         test, rows = self.test, len(self.corners)
@@ -187,5 +263,13 @@ class _Unlikeness:
             return beside[0]
 
         heading = torch.full((rows,), test.heading)
-        flights = fly(self.steering.vessel, policy, heading, self.corners, dt=test.dt, duration=test.duration, surround=watched)
+        flights = fly(
+            self.steering.vessel,
+            policy,
+            heading,
+            self.corners,
+            dt=test.dt,
+            duration=test.duration,
+            surround=watched,
+        )
         return math.sqrt(float(beside[0].total) / flights.inputs.shape[1])

@@ -1,4 +1,6 @@
-"""The manoeuvring booklet of a fit: what the identified model does in standard manoeuvres, with intervals, beside what was measured."""
+"""The manoeuvring booklet of a fit: what the identified model does in standard manoeuvres, with
+intervals, beside what was measured.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,13 @@ from residnet.tasks.pipeline import Fitted
 _PARAMETER = "model.baseline.theta"
 
 
-def write_booklet(folder: RunFolder, config: BookletConfig, fitted: Fitted, logs: Mapping[str, Sequence[Prepared]], limit: np.ndarray) -> str:
+def write_booklet(
+    folder: RunFolder,
+    config: BookletConfig,
+    fitted: Fitted,
+    logs: Mapping[str, Sequence[Prepared]],
+    limit: np.ndarray,
+) -> str:
     """Fly, and write booklet.json and booklet.parquet; returns a line for the console.
 
     Args:
@@ -45,7 +53,10 @@ def write_booklet(folder: RunFolder, config: BookletConfig, fitted: Fitted, logs
     import pandas as pd
 
     craft = _craft(config, fitted, config.inputs)
-    pages = [_page(craft, config, flights, limit, None) for flights in _flown(craft, config, fitted, config.manoeuvres)]
+    pages = [
+        _page(craft, config, flights, limit, None)
+        for flights in _flown(craft, config, fitted, config.manoeuvres)
+    ]
     repeated = _measured(config, logs)
     if repeated:
         shares = _shares(config, [log for log, _ in repeated])
@@ -53,13 +64,35 @@ def write_booklet(folder: RunFolder, config: BookletConfig, fitted: Fitted, logs
         craft = replace(craft, start=torch.cat([_began(craft, log) for log, _ in repeated]))
         zigzags = [_like(config, shares, log) for log, _ in repeated]
         flown = _flown(
-            craft, config, fitted, [_acted(config, zigzag, log, craft.dynamics.dt) for zigzag, (log, _) in zip(zigzags, repeated, strict=True)]
+            craft,
+            config,
+            fitted,
+            [
+                _acted(config, zigzag, log, craft.dynamics.dt)
+                for zigzag, (log, _) in zip(zigzags, repeated, strict=True)
+            ],
         )
         for measured, zigzag, flights in zip(repeated, zigzags, flown, strict=True):
-            pages.append(_page(craft, config, [replace(flight, manoeuvre=zigzag) for flight in flights], limit, measured))
-    folder.write_json(folder.booklet, contents(config.model, config.length, config.scale, config.draws, config.level, pages))
-    pd.concat([_frame(page, config.rudder()) for page in pages]).to_parquet(folder.booklet.with_suffix(".parquet"), index=False)
-    return f"booklet: {len(config.manoeuvres)} manoeuvres, {len(repeated)} measured zigzags repeated, {config.draws} draws each"
+            pages.append(
+                _page(
+                    craft,
+                    config,
+                    [replace(flight, manoeuvre=zigzag) for flight in flights],
+                    limit,
+                    measured,
+                )
+            )
+    folder.write_json(
+        folder.booklet,
+        contents(config.model, config.length, config.scale, config.draws, config.level, pages),
+    )
+    pd.concat([_frame(page, config.rudder()) for page in pages]).to_parquet(
+        folder.booklet.with_suffix(".parquet"), index=False
+    )
+    return (
+        f"booklet: {len(config.manoeuvres)} manoeuvres, {len(repeated)} measured zigzags repeated,"
+        f" {config.draws} draws each"
+    )
 
 
 def _craft(config: BookletConfig, fitted: Fitted, inputs: Mapping[str, InputShare]) -> Craft:
@@ -70,18 +103,32 @@ def _craft(config: BookletConfig, fitted: Fitted, inputs: Mapping[str, InputShar
     start = gear.approach(1)
     for name, value in config.initial.items():
         if name not in actuated.state:
-            raise ConfigError(f"booklet.initial: '{config.model}' has no state '{name}'{nearest(name, actuated.state)}")
+            raise ConfigError(
+                f"booklet.initial: '{config.model}' has no state"
+                f" '{name}'{nearest(name, actuated.state)}"
+            )
         start[:, actuated.state.index(name)] = float(value)
-    return Craft(config.model, actuated, Helm(gear.demand, actuated.state, gear.inputs), gear.commands, start)
+    return Craft(
+        config.model, actuated, Helm(gear.demand, actuated.state, gear.inputs), gear.commands, start
+    )
 
 
-def _flown(craft: Craft, config: BookletConfig, fitted: Fitted, manoeuvres: Sequence[Manoeuvre]) -> Iterator[list[Flight]]:
-    """For each manoeuvre its flights: with the fitted parameters first, then with the drawn ones."""
+def _flown(
+    craft: Craft, config: BookletConfig, fitted: Fitted, manoeuvres: Sequence[Manoeuvre]
+) -> Iterator[list[Flight]]:
+    """For each manoeuvre its flights: with the fitted parameters first, then with the drawn ones.
+    """
     theta = drawn(fitted, config.draws, config.seed)
     rows = [manoeuvre for manoeuvre in manoeuvres for _ in range(len(theta))]
     start = craft.start.repeat_interleave(len(theta), 0) if len(craft.start) > 1 else craft.start
     many = replace(craft, dynamics=DrawnDynamics(craft.dynamics, _PARAMETER, theta), start=start)
-    flights = fly(many, rows, Sea(None, Disturbance(), SensorNoise(), config.seed), config.duration, craft.dynamics.dt)
+    flights = fly(
+        many,
+        rows,
+        Sea(None, Disturbance(), SensorNoise(), config.seed),
+        config.duration,
+        craft.dynamics.dt,
+    )
     for place in range(0, len(flights), len(theta)):
         yield flights[place : place + len(theta)]
 
@@ -96,22 +143,37 @@ def _began(craft: Craft, log: Log) -> torch.Tensor:
 
 
 def drawn(fitted: Fitted, draws: int, seed: int) -> torch.Tensor:
-    """Parameters of a refitted baseline: as fitted, then `draws` times from their normal distribution, [1 + draws, ...]."""
+    """Parameters of a refitted baseline: as fitted, then `draws` times from their normal
+    distribution, [1 + draws, ...].
+    """
     baseline = fitted.model.baseline
     assert isinstance(baseline, ParametricBaseline), "the configuration was validated"
     assert fitted.covariance is not None, "the configuration was validated"
     values, vectors = torch.linalg.eigh(fitted.covariance)
-    random = torch.from_numpy(np.random.default_rng([seed, 7]).standard_normal((draws, len(values))))
+    random = torch.from_numpy(
+        np.random.default_rng([seed, 7]).standard_normal((draws, len(values)))
+    )
     moves = random * values.clamp(min=0.0).sqrt() @ vectors.T
     theta = baseline.theta.detach().double().flatten().repeat(1 + draws, 1)
     theta[1:, baseline.movable()] += moves
     return theta.reshape(1 + draws, *baseline.theta.shape)
 
 
-def _measured(config: BookletConfig, logs: Mapping[str, Sequence[Prepared]]) -> list[tuple[Log, str]]:
+def _measured(
+    config: BookletConfig, logs: Mapping[str, Sequence[Prepared]]
+) -> list[tuple[Log, str]]:
     """Logs of the splits to repeat whose manoeuvre is a zigzag."""
-    chosen = [(p.log, split) for split in config.repeat for p in logs.get(split, ()) if p.log.manoeuvre == "zigzag"]
-    return [(log, split) for log, split in chosen if np.isfinite(log.stack(("psi", config.rudder()))).all()]
+    chosen = [
+        (p.log, split)
+        for split in config.repeat
+        for p in logs.get(split, ())
+        if p.log.manoeuvre == "zigzag"
+    ]
+    return [
+        (log, split)
+        for log, split in chosen
+        if np.isfinite(log.stack(("psi", config.rudder()))).all()
+    ]
 
 
 def _shares(config: BookletConfig, logs: Sequence[Log]) -> dict[str, InputShare]:
@@ -123,14 +185,20 @@ def _shares(config: BookletConfig, logs: Sequence[Log]) -> dict[str, InputShare]
         if name == rudder:
             out[name] = share.model_copy(update={"steer": steer, "limit": steer})
         else:
-            out[name] = share.model_copy(update={"drive": max(float(log[name].mean()) for log in logs), "limit": None})
+            out[name] = share.model_copy(
+                update={"drive": max(float(log[name].mean()) for log in logs), "limit": None}
+            )
     return out
 
 
 def _like(config: BookletConfig, shares: Mapping[str, InputShare], log: Log) -> Zigzag:
     """The zigzag of a log as a manoeuvre."""
     steered, rudder = steered_zigzag(log, config.rudder()), config.rudder()
-    drives = [float(log[name].mean()) / float(share.drive) for name, share in shares.items() if name != rudder]
+    drives = [
+        float(log[name].mean()) / float(share.drive)
+        for name, share in shares.items()
+        if name != rudder
+    ]
     return Zigzag(
         name=log.name,
         drive=min(drives[0], 1.0) if drives else 0.0,
@@ -143,7 +211,8 @@ def _like(config: BookletConfig, shares: Mapping[str, InputShare], log: Log) -> 
 
 
 def _acted(config: BookletConfig, zigzag: Zigzag, log: Log, step: float) -> Zigzag:
-    """The zigzag with reversals where the rudder of the log left its side: the gear moves at once, the trial's did after its order took effect.
+    """The zigzag with reversals where the rudder of the log left its side: the gear moves at once,
+    the trial's did after its order took effect.
 
     A bound on the heading is seen at the next step, on average half a step of `step` seconds late.
     """
@@ -152,11 +221,19 @@ def _acted(config: BookletConfig, zigzag: Zigzag, log: Log, step: float) -> Zigz
 
 
 def sound(flight: Flight, limit: np.ndarray) -> bool:
-    """Whether a flight ended as it should, with |u, v, r| within the limit [3] beyond which a free run has diverged."""
+    """Whether a flight ended as it should, with |u, v, r| within the limit [3] beyond which a free
+    run has diverged.
+    """
     return flight.fault is None and bool((np.abs(flight.motion.stack(VELOCITY)) <= limit).all())
 
 
-def _page(craft: Craft, config: BookletConfig, flights: Sequence[Flight], limit: np.ndarray, measured: tuple[Log, str] | None) -> Page:
+def _page(
+    craft: Craft,
+    config: BookletConfig,
+    flights: Sequence[Flight],
+    limit: np.ndarray,
+    measured: tuple[Log, str] | None,
+) -> Page:
     """One manoeuvre with its indices by flight.
 
     Raises:
@@ -164,24 +241,42 @@ def _page(craft: Craft, config: BookletConfig, flights: Sequence[Flight], limit:
     """
     manoeuvre = flights[0].manoeuvre
     if flights[0].fault:
-        raise DataError(f"booklet: {config.model}, {flights[0].motion.name}: {flights[0].fault}; give more duration, or another model")
-    indices = [manoeuvre.indices(flight.motion, None) if sound(flight, limit) else {} for flight in flights]
+        raise DataError(
+            f"booklet: {config.model}, {flights[0].motion.name}: {flights[0].fault}; give more"
+            " duration, or another model"
+        )
+    indices = [
+        manoeuvre.indices(flight.motion, None) if sound(flight, limit) else {} for flight in flights
+    ]
     ship = config.scale**0.5
-    limits = manoeuvre.limits(craft.helm, config.length * config.scale, indices[0].get("approach_speed", 0.0) * ship)
+    limits = manoeuvre.limits(
+        craft.helm, config.length * config.scale, indices[0].get("approach_speed", 0.0) * ship
+    )
     log, split = measured or (None, "")
     found = {} if log is None else manoeuvre.indices(log.replace(t=log.t - log.t[0]), None)
     return Page(flights[0].motion.name, manoeuvre, flights, indices, limits, log, split, found)
 
 
 def _frame(page: Page, rudder: str) -> Any:
-    """Motion of each flight (draw 0 as fitted) and of the measurement (draw -1), every half second or so."""
+    """Motion of each flight (draw 0 as fitted) and of the measurement (draw -1), every half second
+    or so.
+    """
     import pandas as pd
 
     parts = []
     logs = [(-1, page.measured)] if page.measured is not None else []
-    for draw, log in [*logs, *((i, flight.motion) for i, flight in enumerate(page.flights) if page.indices[i])]:
+    for draw, log in [
+        *logs,
+        *((i, flight.motion) for i, flight in enumerate(page.flights) if page.indices[i]),
+    ]:
         every = max(round(0.5 / float(log.t[1] - log.t[0])), 1) if draw > 0 else 1
         columns = {name: log[name][::every] for name in ("x", "y", "psi", "u", "v", "r")}
-        columns["rudder"] = (log[rudder] if rudder in log.channels else log[f"cmd_{rudder}"])[::every]
-        parts.append(pd.DataFrame({"page": page.name, "draw": draw, "t": log.t[::every] - log.t[0], **columns}))
+        columns["rudder"] = (log[rudder] if rudder in log.channels else log[f"cmd_{rudder}"])[
+            ::every
+        ]
+        parts.append(
+            pd.DataFrame(
+                {"page": page.name, "draw": draw, "t": log.t[::every] - log.t[0], **columns}
+            )
+        )
     return pd.concat(parts)

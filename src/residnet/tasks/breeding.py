@@ -1,4 +1,6 @@
-"""Task `breeding`: how often genetic programming finds the mass-spring-damper, over a grid of two settings (document 000 chapter 5)."""
+"""Task `breeding`: how often genetic programming finds the mass-spring-damper, over a grid of two
+settings (document 000 chapter 5).
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,14 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, ValidationError, model_validator
 
 from residnet.core.config import Config, dump_config
-from residnet.documents.halvorsen2019.breeding import NoiseConfig, RecordConfig, Trial, as_text, attempt, draw
+from residnet.documents.halvorsen2019.breeding import (
+    NoiseConfig,
+    RecordConfig,
+    Trial,
+    as_text,
+    attempt,
+    draw,
+)
 from residnet.heads.genetic import GeneticConfig
 from residnet.runs.folder import RunFolder
 
@@ -19,7 +28,9 @@ Matrix = tuple[tuple[float | None, ...], ...]
 
 
 class Axis(Config):
-    """One setting and the values that it takes: a dotted key of the task, such as `head.evolution.population`."""
+    """One setting and the values that it takes: a dotted key of the task, such as
+    `head.evolution.population`.
+    """
 
     key: str = Field(pattern=r"^(head|noise|record)\.[a-z_.]+$")
     values: Annotated[tuple[Value, ...], Field(min_length=1)]
@@ -32,11 +43,14 @@ class BreedingTaskConfig(Config):
         name: of the run.
         record: the data.
         noise: on them.
-        head: how the equation is searched; `final: null` keeps the individual as it was bred, as the document does.
+        head: how the equation is searched; `final: null` keeps the individual as it was bred, as
+            the document does.
         rows, columns: the two settings.
         repeats: runs of each combination, seeds 0, 1, ...
-        threshold: mean square error on the test record below which the equation counts as found (section 5.2.2).
-        published: the document's numbers of found runs, one row for each row of the grid; combinations without a number (null) are left out.
+        threshold: mean square error on the test record below which the equation counts as found
+            (section 5.2.2).
+        published: the document's numbers of found runs, one row for each row of the grid;
+            combinations without a number (null) are left out.
         published_error: its mean square errors.
     """
 
@@ -55,25 +69,44 @@ class BreedingTaskConfig(Config):
 
     @model_validator(mode="after")
     def _grid(self) -> BreedingTaskConfig:
-        for name, table in (("published", self.published), ("published_error", self.published_error)):
-            if table is not None and [len(row) for row in table] != [len(self.columns.values)] * len(self.rows.values):
+        for name, table in (
+            ("published", self.published),
+            ("published_error", self.published_error),
+        ):
+            if table is not None and [len(row) for row in table] != [
+                len(self.columns.values)
+            ] * len(self.rows.values):
                 raise ValueError(
-                    f"{name}: expected {len(self.rows.values)} rows of {len(self.columns.values)} numbers, as rows and columns have values"
+                    f"{name}: expected {len(self.rows.values)} rows of {len(self.columns.values)}"
+                    " numbers, as rows and columns have values"
                 )
         for row, column in self._cells():
             try:
                 self._cell(row, column)
             except (ValidationError, KeyError) as error:
-                what = error.errors()[0]["msg"] if isinstance(error, ValidationError) else f"no key {error}"
-                raise ValueError(f"{self.rows.key}={self.rows.values[row]}, {self.columns.key}={self.columns.values[column]}: {what}") from None
+                what = (
+                    error.errors()[0]["msg"]
+                    if isinstance(error, ValidationError)
+                    else f"no key {error}"
+                )
+                raise ValueError(
+                    f"{self.rows.key}={self.rows.values[row]},"
+                    f" {self.columns.key}={self.columns.values[column]}: {what}"
+                ) from None
         return self
 
     def _cells(self) -> list[tuple[int, int]]:
-        grid = [(i, j) for i in range(len(self.rows.values)) for j in range(len(self.columns.values))]
-        return [(i, j) for i, j in grid if self.published is None or self.published[i][j] is not None]
+        grid = [
+            (i, j) for i in range(len(self.rows.values)) for j in range(len(self.columns.values))
+        ]
+        return [
+            (i, j) for i, j in grid if self.published is None or self.published[i][j] is not None
+        ]
 
     def _cell(self, row: int, column: int) -> tuple[RecordConfig, NoiseConfig, GeneticConfig]:
-        parts: dict[str, Any] = {name: getattr(self, name).model_dump() for name in ("record", "noise", "head")}
+        parts: dict[str, Any] = {
+            name: getattr(self, name).model_dump() for name in ("record", "noise", "head")
+        }
         for axis, number in ((self.rows, row), (self.columns, column)):
             *path, last = axis.key.split(".")
             place = parts
@@ -82,7 +115,11 @@ class BreedingTaskConfig(Config):
             if last not in place:
                 raise KeyError(axis.key)
             place[last] = axis.values[number]
-        return RecordConfig.model_validate(parts["record"]), NoiseConfig.model_validate(parts["noise"]), GeneticConfig.model_validate(parts["head"])
+        return (
+            RecordConfig.model_validate(parts["record"]),
+            NoiseConfig.model_validate(parts["noise"]),
+            GeneticConfig.model_validate(parts["head"]),
+        )
 
     def check(self) -> None:
         """That DEAP is there.
@@ -94,7 +131,9 @@ class BreedingTaskConfig(Config):
 
         require_deap()
 
-    def run(self, *, source: Path, overrides: Sequence[str], out: Path | None, resume: bool) -> RunFolder:
+    def run(
+        self, *, source: Path, overrides: Sequence[str], out: Path | None, resume: bool
+    ) -> RunFolder:
         """Run the grid and write study.json, study.md and figures/study.png.
 
         Raises:
@@ -105,12 +144,17 @@ class BreedingTaskConfig(Config):
         folder = RunFolder.create(out or Path("runs") / self.name, dump_config(self), resume=resume)
         rows = [self._row(i, j) for i, j in self._cells()]
         keys = (self.rows.key, self.columns.key)
-        folder.write_json(folder.path / "study.json", {"schema": "residnet.breeding/1", "run": self.name, "keys": keys, "rows": rows})
+        folder.write_json(
+            folder.path / "study.json",
+            {"schema": "residnet.breeding/1", "run": self.name, "keys": keys, "rows": rows},
+        )
         text = as_text(rows, keys, self.repeats, self.threshold)
         folder.write(folder.path / "study.md", f"{self.description or self.name}\n\n{text}")
         folder.figures.mkdir(exist_ok=True)
         draw(rows, keys, self.repeats, folder.figures / "study.png")
-        folder.write_provenance(config=source, overrides=overrides, seed=0, files=[], started=started)
+        folder.write_provenance(
+            config=source, overrides=overrides, seed=0, files=[], started=started
+        )
         print(text)
         print(f"study: {folder.path / 'study.md'}")
         return folder

@@ -13,7 +13,9 @@ from residnet.tasks.union import TaskConfig
 
 
 def catalogue(what: str) -> list[tuple[str, str]]:
-    """Names and one-line descriptions of `vessels`, `heads`, `manoeuvres`, `readers`, `tasks` or `baselines`."""
+    """Names and one-line descriptions of `vessels`, `heads`, `manoeuvres`, `readers`, `tasks` or
+    `baselines`.
+    """
     if what == "vessels":
         return [(name, load_vessel(name).description) for name in vessel_files()]
     unions: dict[str, Any] = {

@@ -12,9 +12,13 @@ from residnet.regression.solutions import Solution
 
 
 def choose(
-    model: HybridDynamics, part: nn.Module, solutions: Sequence[Solution], bench: Callable[[HybridDynamics], float]
+    model: HybridDynamics,
+    part: nn.Module,
+    solutions: Sequence[Solution],
+    bench: Callable[[HybridDynamics], float],
 ) -> tuple[Solution, dict[str, Any]]:
-    """Fill a part of the model with the solution whose free run is best; what lies around the best is tried for as long as it gains.
+    """Fill a part of the model with the solution whose free run is best; what lies around the best
+    is tried for as long as it gains.
 
     Args:
         model: the model that runs.
@@ -23,7 +27,8 @@ def choose(
         bench: error of a model's free runs on validation data.
 
     Returns:
-        The solution, and for fit.json the free-run error of each; empty where there was nothing to choose.
+        The solution, and for fit.json the free-run error of each; empty where there was nothing to
+        choose.
     """
     tried: list[tuple[Solution, float]] = []
 
@@ -52,5 +57,7 @@ def _error(tried: tuple[Solution, float]) -> float:
 
 
 def _best(tried: Sequence[tuple[Solution, float]]) -> tuple[Solution, float] | None:
-    """The best of those that others lie around; one that stands alone, such as no residual at all, does not end the search."""
+    """The best of those that others lie around; one that stands alone, such as no residual at all,
+    does not end the search.
+    """
     return min((pair for pair in tried if pair[0].around is not None), key=_error, default=None)

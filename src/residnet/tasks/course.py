@@ -20,26 +20,32 @@ _Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
 
 
 class CourseTaskConfig(Config):
-    """A course past buoys, flown by a policy, by peers of its autopilot run, and by line of sight from way-point to way-point.
+    """A course past buoys, flown by a policy, by peers of its autopilot run, and by line of sight
+    from way-point to way-point.
 
     Attributes:
         name: of the run.
         threads: of PyTorch.
-        autopilot: folder of a finished autopilot run, or the config of one, which is then carried out first, in this run's own folder.
-            Vessel, rudder, policy and tuned peers come from there.
+        autopilot: folder of a finished autopilot run, or the config of one, which is then carried
+            out first, in this run's own folder. Vessel, rudder, policy and tuned peers come from
+            there.
         policy: its name there.
         peers: names of tuned peers and of the document's own autopilots there.
         others: further controllers, for example the document's law with another horizon.
         course: see there.
         protocols: that are flown.
-        integral: gain of integral action against a steady current in the guidance along the plan; null for none.
-        line_of_sight: laws that are also flown without a plan, on straight legs from way-point to way-point, as the source did it; for the
-            protocol `enter`.
-        legs_change: where they do: in the circle of acceptance, as in the source, or at the wheel-over before it.
-        spread: of vessels and currents that all fly the course too, beside the nominal vessel in water at rest; null for none.
+        integral: gain of integral action against a steady current in the guidance along the plan;
+            null for none.
+        line_of_sight: laws that are also flown without a plan, on straight legs from way-point to
+            way-point, as the source did it; for the protocol `enter`.
+        legs_change: where they do: in the circle of acceptance, as in the source, or at the
+            wheel-over before it.
+        spread: of vessels and currents that all fly the course too, beside the nominal vessel in
+            water at rest; null for none.
         dt: step of simulation and controllers.
         duration: after which a flight that has not ended is given up.
-        safe: what the exported policy commands while its inputs are wrong: the last good command, or rudder amidships.
+        safe: what the exported policy commands while its inputs are wrong: the last good command,
+            or rudder amidships.
     """
 
     task: Literal["course"]
@@ -78,7 +84,9 @@ class CourseTaskConfig(Config):
 
         autopilot_of(self)
 
-    def run(self, *, source: Path, overrides: Sequence[str], out: Path | None, resume: bool) -> RunFolder:
+    def run(
+        self, *, source: Path, overrides: Sequence[str], out: Path | None, resume: bool
+    ) -> RunFolder:
         """Train where there is no trained policy yet, plan, fly, compare, export.
 
         Raises:
@@ -92,6 +100,12 @@ class CourseTaskConfig(Config):
         started = time.time()
         folder = RunFolder.create(out or Path("runs") / self.name, dump_config(self), resume=resume)
         run_course(self, folder, resume=resume)
-        folder.write_provenance(config=source, overrides=overrides, seed=self.spread.seed if self.spread else 0, files=[], started=started)
+        folder.write_provenance(
+            config=source,
+            overrides=overrides,
+            seed=self.spread.seed if self.spread else 0,
+            files=[],
+            started=started,
+        )
         print(f"report: {folder.report}")
         return folder

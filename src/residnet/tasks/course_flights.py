@@ -1,4 +1,6 @@
-"""Flights of a course run: many vessels at once, each in its own current, under one controller and one guidance."""
+"""Flights of a course run: many vessels at once, each in its own current, under one controller and
+one guidance.
+"""
 
 from __future__ import annotations
 
@@ -21,18 +23,23 @@ from residnet.judge.courses import CourseFlight
 
 
 class Vessels(NamedTuple):
-    """B vessels: variation [B, 3] (`dynamics.varied.VARIATION`) and current to the north and to the east [B, 2] in m/s."""
+    """B vessels: variation [B, 3] (`dynamics.varied.VARIATION`) and current to the north and to the
+    east [B, 2] in m/s.
+    """
 
     variation: Tensor
     current: Tensor
 
 
-NOMINAL = Vessels(torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64), torch.zeros(1, 2, dtype=torch.float64))
+NOMINAL = Vessels(
+    torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64), torch.zeros(1, 2, dtype=torch.float64)
+)
 """The vessel that the course is planned with, in water at rest."""
 
 
 class CourseSpreadConfig(Config):
-    """Random vessels, each in a steady current from a random direction; the same ones for every controller and guidance.
+    """Random vessels, each in a steady current from a random direction; the same ones for every
+    controller and guidance.
 
     Attributes:
         flights: how many.
@@ -54,20 +61,34 @@ class CourseSpreadConfig(Config):
     def _ordered(self) -> Self:
         for name, (low, high) in {"effect": self.effect, "time": self.time}.items():
             if not 0 < low <= high:
-                raise ValueError(f"{name}: low and high must be positive and in order, given {low:g}, {high:g}")
+                raise ValueError(
+                    f"{name}: low and high must be positive and in order, given {low:g}, {high:g}"
+                )
         return self
 
     def draw(self) -> Vessels:
         """Evenly spread over their ranges."""
         generator = np.random.default_rng(self.seed)
-        effect, time, bias = (generator.uniform(*limits, self.flights) for limits in (self.effect, self.time, (-self.bias, self.bias)))
+        effect, time, bias = (
+            generator.uniform(*limits, self.flights)
+            for limits in (self.effect, self.time, (-self.bias, self.bias))
+        )
         towards = generator.uniform(-math.pi, math.pi, self.flights)
-        variation, current = np.stack((effect, time, bias), axis=-1), self.current * np.stack((np.cos(towards), np.sin(towards)), axis=-1)
+        variation, current = (
+            np.stack((effect, time, bias), axis=-1),
+            self.current * np.stack((np.cos(towards), np.sin(towards)), axis=-1),
+        )
         return Vessels(torch.from_numpy(variation), torch.from_numpy(current))
 
 
 def fly(
-    steering: Steering, policy: Policy, reference: Reference, planned: PlannedCourse, lookahead: float, duration: float, vessels: Vessels
+    steering: Steering,
+    policy: Policy,
+    reference: Reference,
+    planned: PlannedCourse,
+    lookahead: float,
+    duration: float,
+    vessels: Vessels,
 ) -> list[CourseFlight]:
     """One flight of each vessel from the plan's first point and heading.
 
@@ -91,7 +112,9 @@ def fly(
         states, inputs, _ = loop(x, w.unsqueeze(1).expand(-1, steps, -1), memory)
         moves = (states.diff(dim=1)[:, :, place].abs().sum(dim=-1) > 0).numpy()
         ends = [int(np.flatnonzero(row)[-1]) + 1 for row in moves]
-        aside = _aside(CourseGuidance(planned.course, lookahead, vessel.state), states[:, : max(ends) + 1])
+        aside = _aside(
+            CourseGuidance(planned.course, lookahead, vessel.state), states[:, : max(ends) + 1]
+        )
     speed = torch.hypot(states[:, :, vessel.column("u")], states[:, :, vessel.column("v")])
     psi = states[:, :, vessel.column("psi")]
     return [

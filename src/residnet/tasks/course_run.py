@@ -12,7 +12,13 @@ import torch
 from pydantic import TypeAdapter
 
 from residnet.control.base import Policy, Reference
-from residnet.control.courses.config import PlannedCourse, Protocol, plan_course, report_feasibility, smallest_turn
+from residnet.control.courses.config import (
+    PlannedCourse,
+    Protocol,
+    plan_course,
+    report_feasibility,
+    smallest_turn,
+)
 from residnet.control.courses.turns import SteadyTurn
 from residnet.control.guidance.course_guidance import CourseGuidance
 from residnet.control.guidance.drift import DriftEstimate
@@ -64,12 +70,17 @@ def autopilot_of(config: CourseTaskConfig) -> AutopilotConfig:
     file = RunFolder.open(given).resolved if given.is_dir() else given
     autopilot = load_config(file, [], AutopilotConfig)
     if config.policy not in autopilot.policies:
-        raise ConfigError(f"policy: '{config.policy}' is none of {given}{nearest(config.policy, autopilot.policies)}")
+        raise ConfigError(
+            f"policy: '{config.policy}' is none of"
+            f" {given}{nearest(config.policy, autopilot.policies)}"
+        )
     for name in config.peers:
         if name not in (known := {**autopilot.peers, **autopilot.predictive}):
             raise ConfigError(f"peers: '{name}' is none of {given}{nearest(name, known)}")
     if taken := sorted({config.policy, *config.peers} & set(config.others)):
-        raise ConfigError(f"others: '{taken[0]}' is a policy or peer already; names are unique in a run")
+        raise ConfigError(
+            f"others: '{taken[0]}' is a policy or peer already; names are unique in a run"
+        )
     return autopilot
 
 
@@ -92,52 +103,82 @@ class Ready(NamedTuple):
 
 
 def ready(config: CourseTaskConfig, folder: RunFolder) -> Ready:
-    """From the finished run of the autopilot: the one that is given, or the one in the course's own folder.
+    """From the finished run of the autopilot: the one that is given, or the one in the course's own
+    folder.
 
     Raises:
         UsageError: where it is not finished.
     """
     autopilot = autopilot_of(config)
-    run = RunFolder.open(config.autopilot if config.autopilot.is_dir() else folder.path / "autopilot")
+    run = RunFolder.open(
+        config.autopilot if config.autopilot.is_dir() else folder.path / "autopilot"
+    )
     notes = json.loads((run.path / "controllers.json").read_text())
-    steering = Steering(SteeredPlant(load_vessel(autopilot.vessel).build()), Turning(**notes["turning"]), autopilot.rudder, config.dt)
-    return Ready(autopilot, run, steering, smallest_turn(config.course, steering.vessel, steering.limit), notes["controllers"])
+    steering = Steering(
+        SteeredPlant(load_vessel(autopilot.vessel).build()),
+        Turning(**notes["turning"]),
+        autopilot.rudder,
+        config.dt,
+    )
+    return Ready(
+        autopilot,
+        run,
+        steering,
+        smallest_turn(config.course, steering.vessel, steering.limit),
+        notes["controllers"],
+    )
 
 
-def plan_for(config: CourseTaskConfig, known: Ready, protocol: Protocol) -> tuple[PlannedCourse, CourseGuidance]:
+def plan_for(
+    config: CourseTaskConfig, known: Ready, protocol: Protocol
+) -> tuple[PlannedCourse, CourseGuidance]:
     """The plan of a protocol, and the guidance along it.
 
     Raises:
         ConfigError: where no course fits the vessel's turns.
     """
     steering = known.steering
-    planned = plan_course(config.course, protocol, steering.vessel, steering.turning, steering.limit, known.steady)
+    planned = plan_course(
+        config.course, protocol, steering.vessel, steering.turning, steering.limit, known.steady
+    )
     return planned, _guidance(config, planned, steering)
 
 
 def run_course(config: CourseTaskConfig, folder: RunFolder, *, resume: bool) -> None:
     """Train, plan, fly, draw, report, export."""
     if not config.autopilot.is_dir() and not (folder.path / "autopilot" / "metrics.json").is_file():
-        autopilot_of(config).run(source=config.autopilot, overrides=[], out=folder.path / "autopilot", resume=resume)
+        autopilot_of(config).run(
+            source=config.autopilot, overrides=[], out=folder.path / "autopilot", resume=resume
+        )
     torch.set_num_threads(config.threads)
     known = ready(config, folder)
     steering, steady = known.steering, known.steady
     feasible = report_feasibility(config.course, steady)
     for one in feasible:
         if not one["possible"]:
-            say(f"buoy {one['buoy']}: {one['radius']:.4g} m cannot be followed; the smallest radius possible is {one['smallest']:.2f} m")
+            say(
+                f"buoy {one['buoy']}: {one['radius']:.4g} m cannot be followed; the smallest radius"
+                f" possible is {one['smallest']:.2f} m"
+            )
     trained = load_policy(known.run.path, config.policy, steering)
     controllers = {config.policy: trained, **_peers(config, known)}
     done = _Flown([], [], [])
     plans = []
     for protocol in config.protocols:
         planned, guided = plan_for(config, known, protocol)
-        say(f"{protocol}: planned {planned.course.length:.1f} m, shortest possible {planned.floor:.1f} m")
+        say(
+            f"{protocol}: planned {planned.course.length:.1f} m, shortest possible"
+            f" {planned.floor:.1f} m"
+        )
         plans.append(_plan_table(planned))
         for name in controllers:
             for sight in (None, *(config.line_of_sight if protocol == "enter" else ())):
                 _fly(config, planned, steering, name, controllers[name], sight, done)
-        own = [entry for entry in done.rows if entry["protocol"] == protocol and entry["model"] == config.policy]
+        own = [
+            entry
+            for entry in done.rows
+            if entry["protocol"] == protocol and entry["model"] == config.policy
+        ]
         _export(config, folder, planned, guided, trained, known.autopilot, own)
     shown = {
         "schema": SCHEMA,
@@ -171,9 +212,13 @@ def _peers(config: CourseTaskConfig, known: Ready) -> dict[str, Policy]:
     built: dict[str, Policy] = {}
     for name in config.peers:
         if name in known.autopilot.predictive:
-            built[name] = load_predictive(name, known.autopilot.predictive[name], known.steering, known.run)
+            built[name] = load_predictive(
+                name, known.autopilot.predictive[name], known.steering, known.run
+            )
         else:
-            built[name] = reader.validate_python(known.controllers[name]["config"]).build(known.steering)
+            built[name] = reader.validate_python(known.controllers[name]["config"]).build(
+                known.steering
+            )
     built |= {name: law.build(known.steering) for name, law in config.others.items()}
     return {name: law.double() for name, law in built.items()}
 
@@ -193,8 +238,15 @@ def _fly(
     steered = _steered(config, planned, steering, law, sight)
 
     def flown(vessels: Vessels) -> tuple[list[CourseFlight], list[dict[str, Any]]]:
-        flights = fly(steering, *steered, planned, config.course.lookahead, config.duration, vessels)
-        return flights, [row(name, kind, guidance, planned, one, config.course.acceptance, steering.turning.speed) for one in flights]
+        flights = fly(
+            steering, *steered, planned, config.course.lookahead, config.duration, vessels
+        )
+        return flights, [
+            row(
+                name, kind, guidance, planned, one, config.course.acceptance, steering.turning.speed
+            )
+            for one in flights
+        ]
 
     flights, rows = flown(NOMINAL)
     done.rows.extend(rows)
@@ -216,7 +268,9 @@ def load_policy(run: Path, name: str, steering: Steering) -> HeadingPolicy:
 
     file, weights = run / "exports" / f"{name}.pt", run / "models" / name / "weights.safetensors"
     if not file.is_file() or not weights.is_file():
-        raise UsageError(f"{run}: no policy '{name}' (models/{name}/weights.safetensors and exports/{name}.pt)")
+        raise UsageError(
+            f"{run}: no policy '{name}' (models/{name}/weights.safetensors and exports/{name}.pt)"
+        )
     extra = {"card.json": ""}
     torch.jit.load(str(file), _extra_files=extra)
     card = json.loads(extra["card.json"])
@@ -234,31 +288,67 @@ def load_policy(run: Path, name: str, steering: Steering) -> HeadingPolicy:
     return policy.eval().requires_grad_(False).double()
 
 
-def _guidance(config: CourseTaskConfig, planned: PlannedCourse, steering: Steering) -> CourseGuidance:
+def _guidance(
+    config: CourseTaskConfig, planned: PlannedCourse, steering: Steering
+) -> CourseGuidance:
     """Along the plan."""
     lookahead = config.course.lookahead
-    drift = None if config.integral is None else DriftEstimate(lookahead, config.integral, steering.dt)
+    drift = (
+        None if config.integral is None else DriftEstimate(lookahead, config.integral, steering.dt)
+    )
     return CourseGuidance(planned.course, lookahead, steering.vessel.state, drift)
 
 
 def _steered(
-    config: CourseTaskConfig, planned: PlannedCourse, steering: Steering, law: Policy, sight: AnyLineOfSight | None
+    config: CourseTaskConfig,
+    planned: PlannedCourse,
+    steering: Steering,
+    law: Policy,
+    sight: AnyLineOfSight | None,
 ) -> tuple[Policy, Reference]:
-    """Controller and guidance along the plan, or under a line of sight on the legs from buoy to buoy instead."""
+    """Controller and guidance along the plan, or under a line of sight on the legs from buoy to
+    buoy instead.
+    """
     vessel = steering.vessel
     if sight is None:
-        return Following(law, vessel.state, limit=steering.limit, dt=steering.dt, rate=vessel.rate), _guidance(config, planned, steering)
-    points, acceptance = [(buoy.north, buoy.east) for buoy in planned.buoys], config.course.acceptance
-    over = WheelOver(steering.turning, steering.limit, acceptance, rate=vessel.rate) if config.legs_change == "wheel_over" else None
+        return Following(
+            law, vessel.state, limit=steering.limit, dt=steering.dt, rate=vessel.rate
+        ), _guidance(config, planned, steering)
+    points, acceptance = (
+        [(buoy.north, buoy.east) for buoy in planned.buoys],
+        config.course.acceptance,
+    )
+    over = (
+        WheelOver(steering.turning, steering.limit, acceptance, rate=vessel.rate)
+        if config.legs_change == "wheel_over"
+        else None
+    )
     return law, WaypointGuidance(points, acceptance, sight.build(steering.dt), vessel.state, over)
 
 
 def _spread_table(rows: list[dict[str, Any]], vessels: Vessels) -> pd.DataFrame:
     """One line for each flight."""
-    kept = ("model", "guidance", "protocol", "finished", "passed", "course_time", "ratio", "margin", "cross_track_rms")
-    columns = {"effect": vessels.variation[:, 0], "time": vessels.variation[:, 1], "bias": vessels.variation[:, 2]}
+    kept = (
+        "model",
+        "guidance",
+        "protocol",
+        "finished",
+        "passed",
+        "course_time",
+        "ratio",
+        "margin",
+        "cross_track_rms",
+    )
+    columns = {
+        "effect": vessels.variation[:, 0],
+        "time": vessels.variation[:, 1],
+        "bias": vessels.variation[:, 2],
+    }
     columns |= {"current_north": vessels.current[:, 0], "current_east": vessels.current[:, 1]}
-    return pd.DataFrame({name: [one[name] for one in rows] for name in kept} | {name: values.numpy() for name, values in columns.items()})
+    return pd.DataFrame(
+        {name: [one[name] for one in rows] for name in kept}
+        | {name: values.numpy() for name, values in columns.items()}
+    )
 
 
 def _track_table(name: str, guidance: str, protocol: str, flight: CourseFlight) -> pd.DataFrame:
@@ -282,7 +372,12 @@ def _track_table(name: str, guidance: str, protocol: str, flight: CourseFlight) 
 def _plan_table(planned: PlannedCourse) -> pd.DataFrame:
     course = planned.course
     within = course.step * np.arange(len(course.track)) <= course.length
-    columns = {"north": course.track[within, 0], "east": course.track[within, 1], "heading": course.heading[within], "rudder": course.rudder[within]}
+    columns = {
+        "north": course.track[within, 0],
+        "east": course.track[within, 1],
+        "heading": course.heading[within],
+        "rudder": course.rudder[within],
+    }
     return pd.DataFrame({"protocol": planned.protocol, **columns})
 
 
@@ -298,6 +393,19 @@ def _export(
     from residnet.export.course import export_course
 
     file = folder.exports / f"{config.policy}_{planned.protocol}.pt"
-    about = {"vessel": autopilot.vessel, "course": config.course.model_dump(mode="json"), "protocol": planned.protocol}
-    export_course(config.policy, trained, guided, planned.course, file, safe=config.safe, about=about, metrics=rows)
+    about = {
+        "vessel": autopilot.vessel,
+        "course": config.course.model_dump(mode="json"),
+        "protocol": planned.protocol,
+    }
+    export_course(
+        config.policy,
+        trained,
+        guided,
+        planned.course,
+        file,
+        safe=config.safe,
+        about=about,
+        metrics=rows,
+    )
     print(f"exported: {file}")

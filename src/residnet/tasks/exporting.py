@@ -15,7 +15,8 @@ from residnet.runs.folder import RunFolder
 
 
 def export_model(path: Path, name: str, out: Path | None, form: str = "torchscript") -> Path:
-    """Export one model of a finished run, `torchscript` to run it or `feed_forward` for the force that a motion needs; returns the file.
+    """Export one model of a finished run, `torchscript` to run it or `feed_forward` for the force
+    that a motion needs; returns the file.
 
     Raises:
         UsageError: where the run or the model does not exist.
@@ -28,7 +29,9 @@ def export_model(path: Path, name: str, out: Path | None, form: str = "torchscri
         return _exported_policy(folder, name, list(policies), out, form)
     chosen = str(content["selected"]) if name == "selected" else name
     if chosen not in model_names(folder.models):
-        raise UsageError(f"{path}: no model '{name}'{nearest(name, ['selected', *model_names(folder.models)])}")
+        raise UsageError(
+            f"{path}: no model '{name}'{nearest(name, ['selected', *model_names(folder.models)])}"
+        )
     spec, model = load_model(folder.models / chosen)
     if form == "feed_forward":
         force, ranges = required_force(spec, model)
@@ -41,8 +44,11 @@ def export_model(path: Path, name: str, out: Path | None, form: str = "torchscri
     return file
 
 
-def _exported_policy(folder: RunFolder, name: str, policies: list[str], out: Path | None, form: str) -> Path:
-    """A policy of an autopilot run: exported and checked when the run ended, so that a copy is all there is to do.
+def _exported_policy(
+    folder: RunFolder, name: str, policies: list[str], out: Path | None, form: str
+) -> Path:
+    """A policy of an autopilot run: exported and checked when the run ended, so that a copy is all
+    there is to do.
 
     Raises:
         UsageError: where there is no such policy, or another form is asked for.

@@ -25,7 +25,8 @@ from residnet.tasks.run import print_table, write_data_quality, write_limits, wr
 
 
 def evaluate_external(run: Path, paths: Sequence[Path], out: Path | None) -> RunFolder:
-    """Free-run every model of a run on other logs, with the run's reader, masks, protocols and scales; the split is called `external`.
+    """Free-run every model of a run on other logs, with the run's reader, masks, protocols and
+    scales; the split is called `external`.
 
     Raises:
         ResidnetError: where the run, a log or a channel is missing, or a log is too short.
@@ -34,31 +35,48 @@ def evaluate_external(run: Path, paths: Sequence[Path], out: Path | None) -> Run
     source = RunFolder.open(run)
     task = load_mapping(source.resolved).get("task")
     if task != "fit":
-        raise UsageError(f"{run}: a run of task '{task}' has no models to free-run on logs; give a run of task 'fit'")
+        raise UsageError(
+            f"{run}: a run of task '{task}' has no models to free-run on logs; give a run of task"
+            " 'fit'"
+        )
     config = load_config(source.resolved, [], FitConfig)
     torch.set_num_threads(config.threads)
     files = log_files(paths)
-    logs = [prepare(read_external(path, config), "external", config.signals.columns, config.prepare) for path in files]
+    logs = [
+        prepare(read_external(path, config), "external", config.signals.columns, config.prepare)
+        for path in files
+    ]
     names = [log.log.name for log in logs]
     for name in names:
         if names.count(name) > 1:
             raise DataError(f"two logs are named '{name}'; rename one file")
     for log in logs:
         require_window(log, config)
-    folder = RunFolder.create(out or run / time.strftime("external-%Y%m%dT%H%M%S"), dump_config(config), resume=False)
-    fitted = [Fitted(*load_model(source.models / name), notes=source.fit_notes(name)) for name in model_names(source.models)]
+    folder = RunFolder.create(
+        out or run / time.strftime("external-%Y%m%dT%H%M%S"), dump_config(config), resume=False
+    )
+    fitted = [
+        Fitted(*load_model(source.models / name), notes=source.fit_notes(name))
+        for name in model_names(source.models)
+    ]
     order = ["zero", "baseline", *config.baselines, *config.heads, *config.ensembles]
     fitted.sort(key=lambda f: order.index(f.spec.name) if f.spec.name in order else len(order))
     low, high = np.array(fitted[0].spec.low[:3]), np.array(fitted[0].spec.high[:3])
     limit = config.evaluation.divergence * np.maximum(np.abs(low), np.abs(high))
     say(f"{config.name}: {len(logs)} logs, {len(fitted)} models")
-    simulated = isinstance(config.data, SimulatedTrials) and all("vessel" in log.log.meta for log in logs)
+    simulated = isinstance(config.data, SimulatedTrials) and all(
+        "vessel" in log.log.meta for log in logs
+    )
     models = [c for c in candidates(fitted, config.data) if c.kind != "truth" or simulated]
-    table, limiting = evaluate(models, logs, config.evaluation, config.prepare.grid.step, limit, folder)
+    table, limiting = evaluate(
+        models, logs, config.evaluation, config.prepare.grid.step, limit, folder
+    )
     write_data_quality(folder, {"external": logs})
     write_metrics(folder, config, table, str(source.read_metrics()["selected"]))
     write_limits(folder, config, {"external": limiting}, logs)
-    folder.write_provenance(config=source.resolved, overrides=[], seed=config.seed, files=files, started=started)
+    folder.write_provenance(
+        config=source.resolved, overrides=[], seed=config.seed, files=files, started=started
+    )
     report = report_run(folder.path)
     print_table(table, "external")
     print(f"report: {report}")

@@ -1,4 +1,6 @@
-"""Task `ferry_study`: identify the force residual of a believed ferry in closed loop, and fly again with it (document 002 chapter 4)."""
+"""Task `ferry_study`: identify the force residual of a believed ferry in closed loop, and fly again
+with it (document 002 chapter 4).
+"""
 
 from __future__ import annotations
 
@@ -14,14 +16,18 @@ from residnet.runs.folder import RunFolder
 
 @final
 class FerryStudyConfig(FerrySettings):
-    """A course flown with the believed model, models of what it lacks, and the course again with them."""
+    """A course flown with the believed model, models of what it lacks, and the course again with
+    them.
+    """
 
     task: Literal["ferry_study"]
 
     def check(self) -> None:
         """Everything was checked when the config was read."""
 
-    def run(self, *, source: Path, overrides: Sequence[str], out: Path | None, resume: bool) -> RunFolder:
+    def run(
+        self, *, source: Path, overrides: Sequence[str], out: Path | None, resume: bool
+    ) -> RunFolder:
         """Fly, identify, fly again; writes ferry.json, ferry.md and figures.
 
         Raises:
@@ -36,7 +42,9 @@ class FerryStudyConfig(FerrySettings):
         torch.set_num_threads(1)
         folder = RunFolder.create(out or Path("runs") / self.name, dump_config(self), resume=resume)
         text = write(self, study(self), folder)
-        folder.write_provenance(config=source, overrides=overrides, seed=self.seed, files=[], started=started)
+        folder.write_provenance(
+            config=source, overrides=overrides, seed=self.seed, files=[], started=started
+        )
         print(text)
         print(f"study: {folder.path / 'ferry.md'}")
         return folder

@@ -1,4 +1,6 @@
-"""Task `force_residual`: what a believed hull leaves of measured forces, and whether any regression explains it (document 002 chapter 5)."""
+"""Task `force_residual`: what a believed hull leaves of measured forces, and whether any regression
+explains it (document 002 chapter 5).
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,9 @@ from residnet.runs.folder import RunFolder
 
 @final
 class ForceResidualConfig(ForceSettings):
-    """The residual force of a believed hull on measured logs, explained by regressions and judged where they saw nothing."""
+    """The residual force of a believed hull on measured logs, explained by regressions and judged
+    where they saw nothing.
+    """
 
     task: Literal["force_residual"]
 
@@ -26,8 +30,11 @@ class ForceResidualConfig(ForceSettings):
         """
         self.data.files()
 
-    def run(self, *, source: Path, overrides: Sequence[str], out: Path | None, resume: bool) -> RunFolder:
-        """Read, fit, judge; writes force_residual.json, force_residual.md, tables of the models and figures.
+    def run(
+        self, *, source: Path, overrides: Sequence[str], out: Path | None, resume: bool
+    ) -> RunFolder:
+        """Read, fit, judge; writes force_residual.json, force_residual.md, tables of the models and
+        figures.
 
         Raises:
             ResidnetError: where a log cannot be used or a model is not determined.
@@ -42,7 +49,9 @@ class ForceResidualConfig(ForceSettings):
         files = self.data.files()
         folder = RunFolder.create(out or Path("runs") / self.name, dump_config(self), resume=resume)
         text = write(self, force_study(self), folder)
-        folder.write_provenance(config=source, overrides=overrides, seed=0, files=files, started=started)
+        folder.write_provenance(
+            config=source, overrides=overrides, seed=0, files=files, started=started
+        )
         print(text)
         print(f"study: {folder.path / 'force_residual.md'}")
         return folder

@@ -18,9 +18,19 @@ from residnet.tasks.references import references
 _SPLITS = ("train", "test")
 
 
-def write_goodness(file: Path, run: str, fitted: Sequence[Fitted], logs: Mapping[str, Sequence[Prepared]], step: float) -> None:
-    """Statistics of what each model leaves of the measured accelerations along measured states, on training and test logs."""
-    to = references({f.spec.name: f.spec.role for f in fitted}, {f.spec.name: f.notes for f in fitted})
+def write_goodness(
+    file: Path,
+    run: str,
+    fitted: Sequence[Fitted],
+    logs: Mapping[str, Sequence[Prepared]],
+    step: float,
+) -> None:
+    """Statistics of what each model leaves of the measured accelerations along measured states, on
+    training and test logs.
+    """
+    to = references(
+        {f.spec.name: f.spec.role for f in fitted}, {f.spec.name: f.notes for f in fitted}
+    )
     splits = {}
     for split in _SPLITS:
         pieces = [piece for log in logs[split] for piece in stretches(log)]
@@ -28,8 +38,15 @@ def write_goodness(file: Path, run: str, fitted: Sequence[Fitted], logs: Mapping
             OneStep(
                 f.spec.name,
                 f.spec.role,
-                [a + b for a, b in zip(f.model.baseline.freedom(), f.model.head.freedom(), strict=True)],
-                [part for log in logs[split] for part in _residuals(f.model.to(torch.float64), log)],
+                [
+                    a + b
+                    for a, b in zip(f.model.baseline.freedom(), f.model.head.freedom(), strict=True)
+                ],
+                [
+                    part
+                    for log in logs[split]
+                    for part in _residuals(f.model.to(torch.float64), log)
+                ],
                 to.get(f.spec.name),
             )
             for f in fitted
@@ -44,9 +61,14 @@ def stretches(log: Prepared) -> list[np.ndarray]:
 
 
 def _residuals(model: HybridDynamics, log: Prepared) -> list[np.ndarray]:
-    """Measured minus predicted acceleration [T, 3] of each stretch; a head runs along the whole log, as its memory needs."""
+    """Measured minus predicted acceleration [T, 3] of each stretch; a head runs along the whole
+    log, as its memory needs.
+    """
     with torch.no_grad():
-        x, w = torch.from_numpy(np.nan_to_num(log.smooth))[None], torch.from_numpy(np.nan_to_num(log.recorded))[None]
+        x, w = (
+            torch.from_numpy(np.nan_to_num(log.smooth))[None],
+            torch.from_numpy(np.nan_to_num(log.recorded))[None],
+        )
         z = model.signals(x, model.signals.prepare(w))
         said = model.one_step(z)[0].numpy()
     return [log.nu_dot[a:b] - said[a:b] for a, b in _bounds(log)]

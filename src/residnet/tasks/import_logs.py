@@ -1,4 +1,5 @@
-"""Task `import`: recordings of any format to canonical logs, with what was noticed on the way in."""
+"""Task `import`: recordings of any format to canonical logs, with what was noticed on the way in.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +20,8 @@ from residnet.runs.folder import RunFolder
 
 
 class ImportConfig(Config):
-    """Recordings read once and kept as logs/<name>.parquet; findings.json says what was noticed and mended.
+    """Recordings read once and kept as logs/<name>.parquet; findings.json says what was noticed and
+    mended.
 
     Attributes:
         name: of the run.
@@ -43,7 +45,9 @@ class ImportConfig(Config):
         """
         self._paths()
 
-    def run(self, *, source: Path, overrides: Sequence[str], out: Path | None, resume: bool) -> RunFolder:
+    def run(
+        self, *, source: Path, overrides: Sequence[str], out: Path | None, resume: bool
+    ) -> RunFolder:
         """Read, write logs and findings, print one line for each log and each finding above a note.
 
         Raises:
@@ -62,9 +66,16 @@ class ImportConfig(Config):
             print("\n".join(_lines(log)), flush=True)
         folder.write_json(folder.path / "findings.json", findings)
         folder.write_provenance(
-            config=source, overrides=overrides, seed=0, files=[file for path in paths for file in files_of(path)], started=started
+            config=source,
+            overrides=overrides,
+            seed=0,
+            files=[file for path in paths for file in files_of(path)],
+            started=started,
         )
-        print(f"{folder.path}: {len(paths)} log{'s' if len(paths) > 1 else ''} in {folder.path / 'logs'}, findings in findings.json")
+        print(
+            f"{folder.path}: {len(paths)} log{'s' if len(paths) > 1 else ''} in"
+            f" {folder.path / 'logs'}, findings in findings.json"
+        )
         return folder
 
     def _paths(self) -> list[Path]:
@@ -73,12 +84,19 @@ class ImportConfig(Config):
         for pattern in self.logs:
             matches = [root / pattern] if (root / pattern).exists() else _globbed(root, pattern)
             if not matches:
-                near = nearest(pattern, (path.name for path in root.iterdir())) if root.is_dir() else f"; there is no folder {root}"
+                near = (
+                    nearest(pattern, (path.name for path in root.iterdir()))
+                    if root.is_dir()
+                    else f"; there is no folder {root}"
+                )
                 raise ConfigError(f"logs: '{pattern}' matches nothing in {root}{near}")
             for path in matches:
                 name = path.name if path.is_dir() else path.stem
                 if found.setdefault(name, path) != path:
-                    raise ConfigError(f"logs: {found[name]} and {path} would both be the log '{name}'; rename one of them")
+                    raise ConfigError(
+                        f"logs: {found[name]} and {path} would both be the log '{name}'; rename one"
+                        " of them"
+                    )
         return list(found.values())
 
 
@@ -86,7 +104,9 @@ def _globbed(root: Path, pattern: str) -> list[Path]:
     try:
         return sorted(root.glob(pattern))
     except (ValueError, NotImplementedError) as error:
-        raise ConfigError(f"logs: '{pattern}' is not a pattern relative to {root} ({error}); set `root` instead") from error
+        raise ConfigError(
+            f"logs: '{pattern}' is not a pattern relative to {root} ({error}); set `root` instead"
+        ) from error
 
 
 def _write(log: Log, folder: RunFolder) -> None:
@@ -104,8 +124,11 @@ def _lines(log: Log) -> list[str]:
     usual = (log.t[-1] - log.t[0]) / (len(log) - 1)
     lost = sum(int(mask.sum()) for reason, mask in log.masks.items() if reason.startswith("hard:"))
     head = (
-        f"{log.name}: {len(log)} samples, step {usual:.4g} s, {log.t[-1] - log.t[0]:.1f} s, {len(log.channels)} channels ({', '.join(log.channels)})"
+        f"{log.name}: {len(log)} samples, step {usual:.4g} s, {log.t[-1] - log.t[0]:.1f} s,"
+        f" {len(log.channels)} channels ({', '.join(log.channels)})"
     )
     notes = sum(one["level"] == "note" for one in findings)
-    loud = [f"{log.name}: {one['level']}: {one['text']}" for one in findings if one["level"] != "note"]
+    loud = [
+        f"{log.name}: {one['level']}: {one['text']}" for one in findings if one["level"] != "note"
+    ]
     return [f"{head}, {lost} samples in gaps, {notes} notes", *loud]

@@ -1,4 +1,6 @@
-"""What the task `simulate` flies: manoeuvres on a vessel, on a learned model, or on both side by side."""
+"""What the task `simulate` flies: manoeuvres on a vessel, on a learned model, or on both side by
+side.
+"""
 
 from __future__ import annotations
 
@@ -34,8 +36,10 @@ class ModelChoice(Config):
     Attributes:
         run: folder of the run.
         name: of the model; `selected` is the one chosen on validation data.
-        actuators: vessel (name or file) whose actuators turn commands into the model's inputs; the programme's vessel where absent.
-        inputs: instead of a vessel's actuators, each input of the model by its share in drive and steer, with limits and rates.
+        actuators: vessel (name or file) whose actuators turn commands into the model's inputs; the
+            programme's vessel where absent.
+        inputs: instead of a vessel's actuators, each input of the model by its share in drive and
+            steer, with limits and rates.
     """
 
     run: ExistingPath
@@ -67,7 +71,8 @@ class Programme(Config):
         model: a learned model that flies them instead, or besides.
         manoeuvres: in their order.
         families: further ones drawn at random by `seed`.
-        duration: of manoeuvres that give none; for one with a stop condition the time after which it has failed.
+        duration: of manoeuvres that give none; for one with a stop condition the time after which
+            it has failed.
         step: of the logs; that of the model where there is one, else 0.05 s.
         substeps: steps of the vessel within one step of the logs.
         initial: states (by name) that trials start from, where not as the vessel's kind does.
@@ -95,7 +100,10 @@ class Programme(Config):
     @field_validator("initial")
     @classmethod
     def _units(cls, initial: dict[str, float | str]) -> dict[str, float | str]:
-        return {name: Quantity(CHANNEL_UNITS.get(name, "-")).convert(value) for name, value in initial.items()}
+        return {
+            name: Quantity(CHANNEL_UNITS.get(name, "-")).convert(value)
+            for name, value in initial.items()
+        }
 
     @model_validator(mode="after")
     def _complete(self) -> Programme:
@@ -116,7 +124,14 @@ class Programme(Config):
     def draw(self) -> list[Manoeuvre]:
         """The manoeuvres: those given, then those drawn."""
         random = np.random.default_rng([self.seed, 1])
-        return [*self.manoeuvres, *(manoeuvre for family in self.families for manoeuvre in family.draw(random, self.duration))]
+        return [
+            *self.manoeuvres,
+            *(
+                manoeuvre
+                for family in self.families
+                for manoeuvre in family.draw(random, self.duration)
+            ),
+        ]
 
     @cached_property
     def flown(self) -> list[Manoeuvre]:
@@ -136,7 +151,11 @@ class Programme(Config):
     def hull_length(self) -> float | None:
         """Length of the hull in m; None where nobody says."""
         vessel = self.vessel or (self.model.actuators if self.model is not None else None)
-        return self.length if self.length is not None or vessel is None else load_vessel(vessel).length.value
+        return (
+            self.length
+            if self.length is not None or vessel is None
+            else load_vessel(vessel).length.value
+        )
 
     def crafts(self) -> list[tuple[Craft, Sea]]:
         """What flies, each with what surrounds it: the vessel, then the model.
@@ -152,7 +171,14 @@ class Programme(Config):
     def fly(self, craft: Craft, sea: Sea) -> list[Flight]:
         """All manoeuvres in one batch."""
         step = self.step or (craft.dynamics.dt if self.model is not None else STEP)
-        return fly(craft, self.flown, sea, self.duration, step, {"vessel": self.vessel, "craft": craft.name})
+        return fly(
+            craft,
+            self.flown,
+            sea,
+            self.duration,
+            step,
+            {"vessel": self.vessel, "craft": craft.name},
+        )
 
     def check(self) -> None:
         """Build everything that flies, and the source of every manoeuvre.
@@ -163,7 +189,9 @@ class Programme(Config):
         import torch
 
         for craft, _ in self.crafts():
-            source_of(self.flown, craft.helm, torch.arange(2, dtype=torch.float64) * (self.step or STEP))
+            source_of(
+                self.flown, craft.helm, torch.arange(2, dtype=torch.float64) * (self.step or STEP)
+            )
             for manoeuvre in self.flown:
                 manoeuvre.begin(craft.start[0], craft.helm.state)
 
@@ -173,11 +201,25 @@ class Programme(Config):
 
         plant = load_vessel(self.vessel).build()
         # actuators with dead time move by a step of their own
-        plant.settle(plant.approach(1), torch.zeros(1, len(plant.inputs), dtype=torch.float64), step / self.substeps)
+        plant.settle(
+            plant.approach(1),
+            torch.zeros(1, len(plant.inputs), dtype=torch.float64),
+            step / self.substeps,
+        )
         self.disturbance.check(plant, self.vessel)
-        self.noise.check((*plant.state, *plant.inputs[: plant.commands], *self.disturbance.logged), step, self.vessel)
+        self.noise.check(
+            (*plant.state, *plant.inputs[: plant.commands], *self.disturbance.logged),
+            step,
+            self.vessel,
+        )
         start = self._started(plant.approach(1), plant.state, self.vessel)
-        craft = Craft(plant_name(self.vessel), TracedPlantDynamics(plant, step, self.substeps), Helm.of(plant), plant.commands, start)
+        craft = Craft(
+            plant_name(self.vessel),
+            TracedPlantDynamics(plant, step, self.substeps),
+            Helm.of(plant),
+            plant.commands,
+            start,
+        )
         return craft, Sea(plant, self.disturbance, self.noise, self.seed)
 
     def _model_craft(self, choice: ModelChoice) -> tuple[Craft, Sea]:
@@ -185,26 +227,51 @@ class Programme(Config):
         spec, model = load_model(choice.run / "models" / name)
         step = spec.dt
         if self.step is not None and abs(self.step - step) > 1e-9:
-            raise ConfigError(f"programme.step ({self.step:g} s) must be that of model '{name}' ({step:g} s); leave it out")
+            raise ConfigError(
+                f"programme.step ({self.step:g} s) must be that of model '{name}' ({step:g} s);"
+                " leave it out"
+            )
         vessel = choice.actuators or self.vessel
         # waves and forces do not reach a learned model
         calm = self.disturbance.model_copy(update={"waves": None})
         gear: GivenGear | PlantGear
         forces: Callable[[Tensor], Tensor] | None = None
         if choice.inputs:
-            gear, sea = GivenGear(choice.inputs, spec.signals.exogenous, step), Sea(None, calm, self.noise, self.seed)
+            gear, sea = (
+                GivenGear(choice.inputs, spec.signals.exogenous, step),
+                Sea(None, calm, self.noise, self.seed),
+            )
         elif vessel is not None:
             plant = load_vessel(vessel).build()
-            gear, sea = PlantGear(plant, step, self.substeps), Sea(plant, calm, self.noise, self.seed)
+            gear, sea = (
+                PlantGear(plant, step, self.substeps),
+                Sea(plant, calm, self.noise, self.seed),
+            )
             forces = Helm.of(plant).forces
         else:
-            raise ConfigError("a model flies with actuators: name a vessel's in programme.model.actuators, or give programme.model.inputs")
+            raise ConfigError(
+                "a model flies with actuators: name a vessel's in programme.model.actuators, or"
+                " give programme.model.inputs"
+            )
         actuated = ActuatedDynamics(model.double(), spec.signals.columns, spec.hold, gear)
-        self.noise.check((*actuated.state, *gear.inputs[: gear.commands], *self.disturbance.logged), step, name)
+        self.noise.check(
+            (*actuated.state, *gear.inputs[: gear.commands], *self.disturbance.logged), step, name
+        )
         if missing := [wanted for wanted in self.disturbance.logged if wanted not in gear.inputs]:
-            raise ConfigError(f"disturbance.wind: model '{name}' and its actuators have no input '{missing[0]}'")
+            raise ConfigError(
+                f"disturbance.wind: model '{name}' and its actuators have no input '{missing[0]}'"
+            )
         helm = Helm(gear.demand, actuated.state, gear.inputs, forces)
-        return Craft(name, actuated, helm, gear.commands, self._started(gear.approach(1), actuated.state, name)), sea
+        return (
+            Craft(
+                name,
+                actuated,
+                helm,
+                gear.commands,
+                self._started(gear.approach(1), actuated.state, name),
+            ),
+            sea,
+        )
 
     def _started(self, x: Tensor, state: tuple[str, ...], who: str) -> Tensor:
         for name, value in self.initial.items():

@@ -26,12 +26,29 @@ from residnet.tasks.exporting import export_model
 from residnet.tasks.fit import FitConfig
 from residnet.tasks.goodness import write_goodness
 from residnet.tasks.inspection import write_inspection
-from residnet.tasks.pipeline import Fitted, Fitter, PreparedSplits, candidates, evaluate, prepare_logs, say, write_residuals
+from residnet.tasks.pipeline import (
+    Fitted,
+    Fitter,
+    PreparedSplits,
+    candidates,
+    evaluate,
+    prepare_logs,
+    say,
+    write_residuals,
+)
 from residnet.tasks.reporting import report_run
 from residnet.tasks.terms import write_terms
 
 
-def run_fit(config: FitConfig, *, source: Path, overrides: Sequence[str], out: Path | None, resume: bool, report: bool = True) -> RunFolder:
+def run_fit(
+    config: FitConfig,
+    *,
+    source: Path,
+    overrides: Sequence[str],
+    out: Path | None,
+    resume: bool,
+    report: bool = True,
+) -> RunFolder:
     """Fit, evaluate, report and export.
 
     Args:
@@ -49,19 +66,25 @@ def run_fit(config: FitConfig, *, source: Path, overrides: Sequence[str], out: P
     torch.set_num_threads(config.threads)
     files = input_files(config.data)
     folder = RunFolder.create(out or Path("runs") / config.name, dump_config(config), resume=resume)
-    folder.write_provenance(config=source, overrides=overrides, seed=config.seed, files=files, started=started)
+    folder.write_provenance(
+        config=source, overrides=overrides, seed=config.seed, files=files, started=started
+    )
     logs = _prepared(config, folder)
     fitter = Fitter(config, logs, folder)
     fitted = _fitted(config, fitter)
     _judged(config, folder, fitter, fitted, logs)
     if report:
         finish(folder, config)
-    folder.write_provenance(config=source, overrides=overrides, seed=config.seed, files=files, started=started)
+    folder.write_provenance(
+        config=source, overrides=overrides, seed=config.seed, files=files, started=started
+    )
     return folder
 
 
 def _prepared(config: FitConfig, folder: RunFolder) -> PreparedSplits:
-    """Logs read, looked at by the doctor and prepared, through the water where they ran in currents."""
+    """Logs read, looked at by the doctor and prepared, through the water where they ran in
+    currents.
+    """
     say(f"{config.name}: reading logs")
     read = read_logs(config.data)
     write_inspection(folder, read, config)
@@ -84,7 +107,10 @@ def _fitted(config: FitConfig, fitter: Fitter) -> list[Fitted]:
     for name in config.heads:
         say(f"  fitting {name}")
         head = fitter.head(name, baselines[config.base_of.get(name, "baseline")].model)
-        say(f"  {name}: validation free-run error {head.notes['validation']:.4f} after {head.notes['seconds']:.1f} s")
+        say(
+            f"  {name}: validation free-run error {head.notes['validation']:.4f} after"
+            f" {head.notes['seconds']:.1f} s"
+        )
         fitted.append(head)
     by_name = {f.spec.name: f for f in fitted}
     for name, members in config.ensembles.items():
@@ -93,17 +119,27 @@ def _fitted(config: FitConfig, fitter: Fitter) -> list[Fitted]:
     return fitted
 
 
-def _judged(config: FitConfig, folder: RunFolder, fitter: Fitter, fitted: Sequence[Fitted], logs: PreparedSplits) -> None:
+def _judged(
+    config: FitConfig,
+    folder: RunFolder,
+    fitter: Fitter,
+    fitted: Sequence[Fitted],
+    logs: PreparedSplits,
+) -> None:
     """Free runs of all models, and everything that is written of them."""
     say("  free runs")
     models = candidates(fitted, config.data)
     table: list[dict[str, Any]] = []
     limiting: dict[str, Any] = {}
     for split in config.evaluation.splits:
-        found, limiting[split] = evaluate(models, logs[split], config.evaluation, config.prepare.grid.step, fitter.limit, folder)
+        found, limiting[split] = evaluate(
+            models, logs[split], config.evaluation, config.prepare.grid.step, fitter.limit, folder
+        )
         table += found
     write_metrics(folder, config, table, select(table, fitted, config.evaluation.selection))
-    write_limits(folder, config, limiting, [log for split in config.evaluation.splits for log in logs[split]])
+    write_limits(
+        folder, config, limiting, [log for split in config.evaluation.splits for log in logs[split]]
+    )
     write_residuals(folder.residuals, fitter, fitted, logs["test"])
     write_terms(folder.path / "terms.parquet", fitted, logs["test"])
     write_goodness(folder.goodness, config.name, fitted, logs, config.prepare.grid.step)
@@ -113,27 +149,53 @@ def _judged(config: FitConfig, folder: RunFolder, fitter: Fitter, fitted: Sequen
 
 
 def select(table: Sequence[dict[str, Any]], fitted: Sequence[Fitted], protocol: str) -> str:
-    """Name of the model (a head, or the baseline where no head beats it) with the least mean nrmse on validation."""
+    """Name of the model (a head, or the baseline where no head beats it) with the least mean nrmse
+    on validation.
+    """
     names = [f.spec.name for f in fitted if f.spec.role != "zero"]
-    return min(names, key=lambda name: float(find(table, model=name, split="validation", protocol=protocol)["nrmse"]["mean"]))
+    return min(
+        names,
+        key=lambda name: float(
+            find(table, model=name, split="validation", protocol=protocol)["nrmse"]["mean"]
+        ),
+    )
 
 
-def write_metrics(folder: RunFolder, config: FitConfig, table: Sequence[dict[str, Any]], selected: str) -> None:
+def write_metrics(
+    folder: RunFolder, config: FitConfig, table: Sequence[dict[str, Any]], selected: str
+) -> None:
     """metrics.json with schema, units, scales and rows."""
     for row in table:
         row["selected"] = row["model"] == selected
     units = {name: si_unit(unit) for name, unit in config.signals.units().items() if name in STATE}
     scales = {name: float(value) for name, value in config.evaluation.scales.model_dump().items()}
-    content = {"schema": SCHEMA, "run": config.name, "channels": units, "scales": scales, "selected": selected, "rows": list(table)}
+    content = {
+        "schema": SCHEMA,
+        "run": config.name,
+        "channels": units,
+        "scales": scales,
+        "selected": selected,
+        "rows": list(table),
+    }
     folder.write_json(folder.metrics, content)
 
 
-def write_limits(folder: RunFolder, config: FitConfig, limiting: Mapping[str, Any], logs: Sequence[Prepared]) -> None:
-    """limits.json: where models fail and what limits them, by split and protocol, and how well the vessel repeats itself over all logs."""
+def write_limits(
+    folder: RunFolder, config: FitConfig, limiting: Mapping[str, Any], logs: Sequence[Prepared]
+) -> None:
+    """limits.json: where models fail and what limits them, by split and protocol, and how well the
+    vessel repeats itself over all logs.
+    """
     scales = {name: float(value) for name, value in config.evaluation.scales.model_dump().items()}
     commands, step = len(config.signals.inputs), config.prepare.grid.step
-    repeats = {name: repeatability(protocol, logs, commands, scales, step) for name, protocol in config.evaluation.protocols.items()}
-    folder.write_json(folder.limits, {"schema": LIMITS, "run": config.name, "splits": limiting, "repeatability": repeats})
+    repeats = {
+        name: repeatability(protocol, logs, commands, scales, step)
+        for name, protocol in config.evaluation.protocols.items()
+    }
+    folder.write_json(
+        folder.limits,
+        {"schema": LIMITS, "run": config.name, "splits": limiting, "repeatability": repeats},
+    )
 
 
 def write_data_quality(folder: RunFolder, logs: dict[str, list[Any]]) -> None:
@@ -141,7 +203,9 @@ def write_data_quality(folder: RunFolder, logs: dict[str, list[Any]]) -> None:
     out = []
     for split, members in logs.items():
         for p in members:
-            masked = {reason: float(np.mean(mask)) for reason, mask in p.log.masks.items() if mask.any()}
+            masked = {
+                reason: float(np.mean(mask)) for reason, mask in p.log.masks.items() if mask.any()
+            }
             out.append(
                 {
                     "log": p.log.name,
@@ -152,7 +216,10 @@ def write_data_quality(folder: RunFolder, logs: dict[str, list[Any]]) -> None:
                     "usable": float(p.usable.mean()),
                     "learned_from": float(p.good.mean()),
                     "masked": masked,
-                    "largest": {name: float(np.abs(p.y[p.usable, 3 + i]).max()) for i, name in enumerate(("u", "v", "r"))},
+                    "largest": {
+                        name: float(np.abs(p.y[p.usable, 3 + i]).max())
+                        for i, name in enumerate(("u", "v", "r"))
+                    },
                 }
             )
     folder.write_json(folder.data_quality, out)
@@ -171,15 +238,18 @@ def finish(folder: RunFolder, config: FitConfig) -> None:
 
 def print_table(table: Sequence[Mapping[str, Any]], split: str) -> None:
     """The free-run table of one split on standard output."""
-    titles = f"{'protocol':12s} {'model':14s} {'u m/s':>8s} {'v m/s':>8s} {'r deg/s':>8s} {'nrmse':>7s}"
+    titles = (
+        f"{'protocol':12s} {'model':14s} {'u m/s':>8s} {'v m/s':>8s} {'r deg/s':>8s} {'nrmse':>7s}"
+    )
     print(f"{titles} {'position m':>11s} {'heading deg':>12s} {'diverged':>9s}")
     for row in table:
         if row["split"] != split or row["manoeuvre"] != "all":
             continue
         rmse, mark = row["rmse"], " *" if row["selected"] else ""
         print(
-            f"{row['protocol']:12s} {row['model'] + mark:14s} {rmse['u']:8.4f} {rmse['v']:8.4f} {math.degrees(rmse['r']):8.3f} "
-            f"{row['nrmse']['mean']:7.4f} "
-            f"{row['position_error_end']:11.2f} {math.degrees(row['heading_error_end']):12.2f} {row['diverged']:5d}/{row['windows']}"
+            f"{row['protocol']:12s} {row['model'] + mark:14s} {rmse['u']:8.4f} {rmse['v']:8.4f}"
+            f" {math.degrees(rmse['r']):8.3f} {row['nrmse']['mean']:7.4f}"
+            f" {row['position_error_end']:11.2f} {math.degrees(row['heading_error_end']):12.2f}"
+            f" {row['diverged']:5d}/{row['windows']}"
         )
     print("free-run errors, mean over windows; * = selected on validation data")

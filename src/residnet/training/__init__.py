@@ -1,1 +1,3 @@
-"""Fitting heads: closed form, and by gradient through one-step and free-run losses (Lightning, imported only when training)."""
+"""Fitting heads: closed form, and by gradient through one-step and free-run losses (Lightning,
+imported only when training).
+"""

@@ -1,4 +1,6 @@
-"""Training a heading policy through the closed loop: the one time loop carries gradients through vessel and policy."""
+"""Training a heading policy through the closed loop: the one time loop carries gradients through
+vessel and policy.
+"""
 
 from __future__ import annotations
 
@@ -54,7 +56,9 @@ class AutopilotFit(EpochTraining):
         self.columns = vessel.column("psi"), vessel.column("r")
 
     def train_dataloader(self) -> range:
-        """Numbers of batches: what is in them is drawn when they are used. (A loader of PyTorch would draw random numbers of its own.)"""
+        """Numbers of batches: what is in them is drawn when they are used. (A loader of PyTorch
+        would draw random numbers of its own.)
+        """
         return range(self.settings.steps)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
@@ -67,7 +71,10 @@ class AutopilotFit(EpochTraining):
         if not self.history:
             model, score = self.validated()
             if math.isfinite(score):
-                self.best_score, self.best_state = score, {name: value.detach().clone() for name, value in model.state_dict().items()}
+                self.best_score, self.best_state = (
+                    score,
+                    {name: value.detach().clone() for name, value in model.state_dict().items()},
+                )
 
     def on_train_epoch_start(self) -> None:
         """Seed the epoch and set the learning rate."""
@@ -87,43 +94,62 @@ class AutopilotFit(EpochTraining):
             Rollout(self.model, difference)(x, w, self.vessel.memory(variation))
             loss = difference.total / (steps * self.policy.limit**2)
         else:
-            states, inputs, _ = Rollout(self.model, ClosedLoop(self.seen, reference))(x, w, self.vessel.memory(variation))
+            states, inputs, _ = Rollout(self.model, ClosedLoop(self.seen, reference))(
+                x, w, self.vessel.memory(variation)
+            )
             error = wrap(heading[:, None] - states[:, 1:, self.columns[0]])
             loss = (
                 self.cost(error, heading, variation, calm)
-                + self.settings.smoothness * (inputs[:, :, 0].diff(dim=1) / self.policy.limit).square().mean()
+                + self.settings.smoothness
+                * (inputs[:, :, 0].diff(dim=1) / self.policy.limit).square().mean()
             )
         self._losses.append(float(loss.detach()))
         return loss
 
     def on_after_backward(self) -> None:
-        """Leave out a batch whose gradient is no number: through hundreds of steps of a saturated loop a single flight's can overflow."""
+        """Leave out a batch whose gradient is no number: through hundreds of steps of a saturated
+        loop a single flight's can overflow.
+        """
         given = [p.grad for p in self.policy.parameters() if p.grad is not None]
         if not all(bool(torch.isfinite(grad).all()) for grad in given):
             self.trainer.optimizers[0].zero_grad()
 
     def _draw(self, rows: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """States [B, nx], inputs [B, m], headings [B], variations [B, 3], and which rows start straight ahead without disturbance [B]."""
+        """States [B, nx], inputs [B, m], headings [B], variations [B, 3], and which rows start
+        straight ahead without disturbance [B].
+        """
         spread = self.spread
         low, high = spread.speed
         x, w = self.vessel.start(low + (high - low) * torch.rand(rows))
         heading = spread.heading * (2.0 * torch.rand(rows) - 1.0)
         straight = torch.arange(rows) % 8 < 5
         undisturbed = torch.rand(rows) >= spread.disturbed
-        x[:, self.columns[1]] = torch.where(straight, 0.0, self.policy.gain * self.policy.limit * (2.0 * torch.rand(rows) - 1.0))
+        x[:, self.columns[1]] = torch.where(
+            straight, 0.0, self.policy.gain * self.policy.limit * (2.0 * torch.rand(rows) - 1.0)
+        )
         bias = torch.where(undisturbed, 0.0, spread.bias * (2.0 * torch.rand(rows) - 1.0))
         for name, values in spread.draw_weather(rows).items() if spread.weather else ():
             w[:, self.vessel.inputs.index(name)] = torch.where(undisturbed, 0.0, values)
-        return x, w, heading, torch.cat((spread.draw(rows), bias.unsqueeze(1)), dim=1), straight & undisturbed
+        return (
+            x,
+            w,
+            heading,
+            torch.cat((spread.draw(rows), bias.unsqueeze(1)), dim=1),
+            straight & undisturbed,
+        )
 
     def cost(self, error: Tensor, heading: Tensor, variation: Tensor, calm: Tensor) -> Tensor:
-        """Time outside the band, absolute error and overshoot of errors [B, T] after changes of heading [B].
+        """Time outside the band, absolute error and overshoot of errors [B, T] after changes of
+        heading [B].
 
-        The share |e| / (|e| + band) counts time, so that small changes weigh as much as large ones. Where the start already turns or
-        something pushes, the vessel cannot be known in time and an overshoot may be unavoidable: these count little.
+        The share |e| / (|e| + band) counts time, so that small changes weigh as much as large ones.
+        Where the start already turns or something pushes, the vessel cannot be known in time and an
+        overshoot may be unavoidable: these count little.
         """
         own, size = self.settings, error.abs()
-        outside = size / (size + own.band) + own.sharp * torch.sigmoid((size - own.band) * (5.0 / own.band))
+        outside = size / (size + own.band) + own.sharp * torch.sigmoid(
+            (size - own.band) * (5.0 / own.band)
+        )
         relative = size / (heading.abs()[:, None] + 5.0 * own.band)
         over = torch.relu(-error * heading.sign()[:, None] - own.margin) / own.band
         most = over.amax(1)
@@ -150,7 +176,8 @@ def train_autopilot(
     folder: Path,
     teacher: Policy | None = None,
 ) -> dict[str, Any]:
-    """Train a policy and leave the weights that scored best in it; `checkpoints/<name>/last.ckpt` in the folder is resumed where it exists.
+    """Train a policy and leave the weights that scored best in it; `checkpoints/<name>/last.ckpt`
+    in the folder is resumed where it exists.
 
     Returns:
         What there is to say: the curve by epoch, the best score, the number of parameters.
@@ -158,5 +185,13 @@ def train_autopilot(
     Raises:
         FitError: where no epoch gave a finite score.
     """
-    fit = AutopilotFit(policy.float(), vessel, settings, spread, score, None if teacher is None else teacher.float(), seed)
+    fit = AutopilotFit(
+        policy.float(),
+        vessel,
+        settings,
+        spread,
+        score,
+        None if teacher is None else teacher.float(),
+        seed,
+    )
     return run_epochs(name, fit, policy, policy, folder)

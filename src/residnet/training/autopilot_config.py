@@ -15,15 +15,18 @@ Range = Annotated[tuple[float, float], Field(description="low and high multiple"
 
 
 class SpreadConfig(Config):
-    """The range of vessels, starts and disturbances that a policy is trained for and controllers are compared over.
+    """The range of vessels, starts and disturbances that a policy is trained for and controllers
+    are compared over.
 
     Attributes:
         effect: of the rudder, as a multiple (K of Nomoto's model).
         time: constants of sway and yaw, as a multiple (T of Nomoto's model).
         speed: at the start, as a multiple of the service speed, thrust to match.
-        disturbed: share of the training's changes of heading that start under a bias, wind or current.
+        disturbed: share of the training's changes of heading that start under a bias, wind or
+            current.
         bias: largest constant angle that is added to the rudder's.
-        wind: slowest and fastest mean wind in training, from any direction, for vessels with wind coefficients; null for none.
+        wind: slowest and fastest mean wind in training, from any direction, for vessels with wind
+            coefficients; null for none.
         current: fastest current in training, in any direction.
         heading: largest change of heading.
         noise_psi, noise_r: standard deviation of white sensor noise.
@@ -45,9 +48,14 @@ class SpreadConfig(Config):
         for name in ("effect", "time", "speed"):
             low, high = getattr(self, name)
             if not 0 < low <= high:
-                raise ValueError(f"{name}: low and high must be positive and in order, given {low:g}, {high:g}")
+                raise ValueError(
+                    f"{name}: low and high must be positive and in order, given {low:g}, {high:g}"
+                )
         if self.wind is not None and not 0 <= self.wind[0] <= self.wind[1]:
-            raise ValueError(f"wind: slowest and fastest must be in order and not negative, given {self.wind[0]:g}, {self.wind[1]:g}")
+            raise ValueError(
+                "wind: slowest and fastest must be in order and not negative, given"
+                f" {self.wind[0]:g}, {self.wind[1]:g}"
+            )
         return self
 
     @property
@@ -57,29 +65,46 @@ class SpreadConfig(Config):
 
     def needs(self) -> tuple[str, ...]:
         """Inputs that a vessel must have for it."""
-        return (*(("wind_speed", "wind_dir") if self.wind is not None else ()), *(("current_north", "current_east") if self.current > 0 else ()))
+        return (
+            *(("wind_speed", "wind_dir") if self.wind is not None else ()),
+            *(("current_north", "current_east") if self.current > 0 else ()),
+        )
 
     def draw_weather(self, rows: int) -> dict[str, Tensor]:
         """Inputs of a vessel by name, each [rows]."""
         drawn, around = torch.rand(2, rows), 2.0 * torch.pi * torch.rand(2, rows)
         out: dict[str, Tensor] = {}
         if self.wind is not None:
-            out |= {"wind_speed": self.wind[0] + (self.wind[1] - self.wind[0]) * drawn[0], "wind_dir": around[0]}
+            out |= {
+                "wind_speed": self.wind[0] + (self.wind[1] - self.wind[0]) * drawn[0],
+                "wind_dir": around[0],
+            }
         if self.current > 0:
-            out |= {"current_north": self.current * drawn[1] * torch.cos(around[1]), "current_east": self.current * drawn[1] * torch.sin(around[1])}
+            out |= {
+                "current_north": self.current * drawn[1] * torch.cos(around[1]),
+                "current_east": self.current * drawn[1] * torch.sin(around[1]),
+            }
         return out
 
     def draw(self, rows: int) -> Tensor:
-        """Effect and time [rows, 2], every second row at a corner of their ranges, where controllers fail first."""
+        """Effect and time [rows, 2], every second row at a corner of their ranges, where
+        controllers fail first.
+        """
         low, high = torch.tensor([self.effect, self.time]).T
         share = torch.rand(rows, 2)
-        return low + (high - low) * torch.where(torch.arange(rows)[:, None] % 2 == 0, share, share.round())
+        return low + (high - low) * torch.where(
+            torch.arange(rows)[:, None] % 2 == 0, share, share.round()
+        )
 
     def corners(self) -> Tensor:
-        """Effect, time and zero bias [9, 3]: nominal first, then the ends and the middles between them."""
+        """Effect, time and zero bias [9, 3]: nominal first, then the ends and the middles between
+        them.
+        """
         effects = (1.0, *self.effect)
         times = (1.0, *self.time)
-        return torch.tensor([(effect, time, 0.0) for effect in effects for time in times], dtype=torch.float64)
+        return torch.tensor(
+            [(effect, time, 0.0) for effect in effects for time in times], dtype=torch.float64
+        )
 
 
 class AutopilotTraining(OneStage):
@@ -95,7 +120,8 @@ class AutopilotTraining(OneStage):
         margin: overshoot that costs nothing.
         band: error at which half of the cost of a large error is left.
         sharp: weight of the time outside the band itself, beside what smoothly counts near it.
-        slowest: slow vessels weigh more, by this power of time over effect: the slowest decides the worst case.
+        slowest: slow vessels weigh more, by this power of time over effect: the slowest decides the
+            worst case.
         smoothness: weight of the squared changes of the command.
     """
 

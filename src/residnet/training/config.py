@@ -12,7 +12,8 @@ class OneStep(Config):
 
     Attributes:
         epochs: of `steps` batches each.
-        window: length of a window; the loss counts its part after `washout`, which fills a memory first.
+        window: length of a window; the loss counts its part after `washout`, which fills a memory
+            first.
         washout: see above.
         batch: windows per batch.
         learning_rate: of Adam; it falls to `final` of it over the stage, along a cosine.
@@ -29,18 +30,22 @@ class OneStep(Config):
     @model_validator(mode="after")
     def _washout(self) -> OneStep:
         if self.washout >= self.window:
-            raise ValueError(f"washout ({self.washout:g} s) must be shorter than window ({self.window:g} s)")
+            raise ValueError(
+                f"washout ({self.washout:g} s) must be shorter than window ({self.window:g} s)"
+            )
         return self
 
 
 class MultiStep(Config):
-    """A stage of free-run training: the model is rolled out over `horizon` and its velocities are compared with the measured ones.
+    """A stage of free-run training: the model is rolled out over `horizon` and its velocities are
+    compared with the measured ones.
 
     Attributes:
         horizon: length of the rollouts.
         epochs: of `steps` batches each.
         batch: rollouts per batch.
-        learning_rate: at the start of the stage; it falls to `final` of it over the stage, along a cosine.
+        learning_rate: at the start of the stage; it falls to `final` of it over the stage, along a
+            cosine.
         final: share of the learning rate at the stage's end.
     """
 
@@ -52,10 +57,11 @@ class MultiStep(Config):
 
 
 class Beginnings(Config):
-    """Windows at the beginning of a stretch, where there is hardly a past: whole manoeuvres are run from there.
+    """Windows at the beginning of a stretch, where there is hardly a past: whole manoeuvres are run
+    from there.
 
-    One-step windows start with the stretch and are scored from their first sample on; rollouts start after `initial`, from the mean
-    velocities of that time, which alone warms up the memory.
+    One-step windows start with the stretch and are scored from their first sample on; rollouts
+    start after `initial`, from the mean velocities of that time, which alone warms up the memory.
 
     Attributes:
         share: of each batch.
@@ -74,15 +80,19 @@ class TrainingConfig(Config):
         multi_step: free-run stages.
         steps: batches per epoch.
         history: measured past that warms up the memory before a rollout.
-        beginnings: windows at the beginning of stretches in every batch; null for no more than chance brings.
-        start_noise: standard deviation of the noise on the initial velocities of rollouts, in units of the metrics' scales.
-        robust: 0 for the mean square of free-run errors; else windows whose error (in units of the scales) is far above this count by their
-            error and not by its square.
+        beginnings: windows at the beginning of stretches in every batch; null for no more than
+            chance brings.
+        start_noise: standard deviation of the noise on the initial velocities of rollouts, in units
+            of the metrics' scales.
+        robust: 0 for the mean square of free-run errors; else windows whose error (in units of the
+            scales) is far above this count by their error and not by its square.
         gradient_clip: largest norm of the gradient.
         weight_decay: of AdamW, on matrices only.
-        average: decay of the exponential average of the weights that is validated and kept; 0 for none.
+        average: decay of the exponential average of the weights that is validated and kept; 0 for
+            none.
         refit_baseline: let free-run stages move the baseline's coefficients too.
-        patience: stop when this many validations in a row bring no better free run, once the last stage has begun.
+        patience: stop when this many validations in a row bring no better free run, once the last
+            stage has begun.
         validate_every: epochs between validations.
     """
 
@@ -104,8 +114,14 @@ class TrainingConfig(Config):
     def _work(self) -> TrainingConfig:
         if self.epochs == 0:
             raise ValueError("nothing to train: one_step.epochs is 0 and multi_step is empty")
-        if self.beginnings is not None and 1 in (self.one_step.batch, *(stage.batch for stage in self.multi_step)):
-            raise ValueError("beginnings need batches of at least 2 windows: some lie at the beginning of a stretch, the others anywhere")
+        if self.beginnings is not None and 1 in (
+            self.one_step.batch,
+            *(stage.batch for stage in self.multi_step),
+        ):
+            raise ValueError(
+                "beginnings need batches of at least 2 windows: some lie at the beginning of a"
+                " stretch, the others anywhere"
+            )
         return self
 
     @property
@@ -121,7 +137,9 @@ class TrainingConfig(Config):
     def stage(self, epoch: int) -> tuple[int, int]:
         """(stage, epoch within it); stage 0 is one-step, stage i the i-th free-run stage."""
         begin = 0
-        for number, length in enumerate((self.one_step.epochs, *(stage.epochs for stage in self.multi_step))):
+        for number, length in enumerate(
+            (self.one_step.epochs, *(stage.epochs for stage in self.multi_step))
+        ):
             if epoch < begin + length:
                 return number, epoch - begin
             begin += length

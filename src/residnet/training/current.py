@@ -1,8 +1,10 @@
-"""The unknown current of each log, estimated together with a baseline's coefficients, and logs as motion through the water.
+"""The unknown current of each log, estimated together with a baseline's coefficients, and logs as
+motion through the water.
 
-A log measures velocities over ground, a hull feels those through the water: nu_r = nu - R(psi)' [c_north, c_east, 0]. Without the
-current, least squares takes what it does for properties of the hull. Here every log has a constant current of its own, which turns
-in body axes as the vessel does; Gauss-Newton finds all of them, the coefficients eliminated (variable projection).
+A log measures velocities over ground, a hull feels those through the water: nu_r = nu - R(psi)'
+[c_north, c_east, 0]. Without the current, least squares takes what it does for properties of the
+hull. Here every log has a constant current of its own, which turns in body axes as the vessel does;
+Gauss-Newton finds all of them, the coefficients eliminated (variable projection).
 """
 
 from __future__ import annotations
@@ -31,12 +33,15 @@ _THIN = 10
 class CurrentConfig(Config):
     """Each training and validation log ran in a constant current of its own that nobody measured.
 
-    The currents are estimated first; what follows fits and chooses models on these logs as motion through the water, without current.
-    Test logs stay as they were measured: there the current is not known beforehand, and models take it as zero.
+    The currents are estimated first; what follows fits and chooses models on these logs as motion
+    through the water, without current. Test logs stay as they were measured: there the current is
+    not known beforehand, and models take it as zero.
 
     Attributes:
-        baseline: name of the baseline whose regressors explain the accelerations while the currents are estimated.
-        spread: standard deviation that each component of a current is expected to have; keeps logs that say little near zero.
+        baseline: name of the baseline whose regressors explain the accelerations while the currents
+            are estimated.
+        spread: standard deviation that each component of a current is expected to have; keeps logs
+            that say little near zero.
         iterations: at most.
     """
 
@@ -48,17 +53,21 @@ class CurrentConfig(Config):
 def estimate_currents(
     baseline: RegressorBaseline, signals: Signals, logs: Sequence[Prepared], config: CurrentConfig
 ) -> tuple[np.ndarray, list[dict[str, Any]]]:
-    """Currents towards north and east [L, 2] in m/s of logs over ground, and a table of them for the record.
+    """Currents towards north and east [L, 2] in m/s of logs over ground, and a table of them for
+    the record.
 
-    The baseline gives the regressors and keeps its own coefficients. The table's standard errors hold where the regressors are the
-    true ones and the errors of neighbouring samples independent.
+    The baseline gives the regressors and keeps its own coefficients. The table's standard errors
+    hold where the regressors are the true ones and the errors of neighbouring samples independent.
 
     Raises:
-        FitError: where a log has no sample to learn from, or the logs do not determine their currents.
+        FitError: where a log has no sample to learn from, or the logs do not determine their
+            currents.
     """
     for p in logs:
         if not p.good.any():
-            raise FitError(f"log {p.log.name}: has no sample to estimate its current from; leave it out")
+            raise FitError(
+                f"log {p.log.name}: has no sample to estimate its current from; leave it out"
+            )
     problem = _Problem(baseline, signals, logs, config.spread**-2)
     current = torch.zeros(len(logs), 2, dtype=torch.float64)
     best = _descend(problem, current, config)
@@ -70,19 +79,27 @@ def estimate_currents(
     _cost, current, state = best
     error = problem.step(current, state)[1].diagonal().sqrt().reshape(-1, 2)
     rows = [
-        {"log": p.log.name, "current_north": float(c[0]), "current_east": float(c[1]), "standard_error": e.tolist()}
+        {
+            "log": p.log.name,
+            "current_north": float(c[0]),
+            "current_east": float(c[1]),
+            "standard_error": e.tolist(),
+        }
         for p, c, e in zip(logs, current, error, strict=True)
     ]
     return current.numpy(), rows
 
 
-def _descend(problem: _Problem, current: Tensor, config: CurrentConfig) -> tuple[float, Tensor, _State]:
+def _descend(
+    problem: _Problem, current: Tensor, config: CurrentConfig
+) -> tuple[float, Tensor, _State]:
     """Gauss-Newton from some currents [L, 2] on; the best on the way, with its cost."""
     cost, state = problem.solve(current)
     best = (cost, current, state)
     for _ in range(config.iterations):
         step, _covariance = problem.step(current, state)
-        # magnitudes make the cost rugged far from the true current: full steps cross what a search along the line would stop at
+        # magnitudes make the cost rugged far from the true current: full steps cross what a search
+        # along the line would stop at
         step = step * (config.spread / step.norm(dim=1, keepdim=True)).clamp(max=1.0)
         current = current + step
         cost, state = problem.solve(current)
@@ -94,7 +111,9 @@ def _descend(problem: _Problem, current: Tensor, config: CurrentConfig) -> tuple
 
 
 def through_water(log: Prepared, current: np.ndarray, signals: Signals) -> Prepared:
-    """A log as seen from a frame that drifts with the current [2]: positions, velocities, accelerations and the wind."""
+    """A log as seen from a frame that drifts with the current [2]: positions, velocities,
+    accelerations and the wind.
+    """
     psi, drifted = log.y[:, 2], (log.log.t - log.log.t[0])[:, None] * current
     along = np.cos(psi) * current[0] + np.sin(psi) * current[1]
     across = np.cos(psi) * current[1] - np.sin(psi) * current[0]
@@ -129,7 +148,9 @@ def _felt(w: np.ndarray, current: np.ndarray, signals: Signals) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _State:
-    """Coefficients [3, J] at given currents, and what is left: errors [N, 3], their variances [3], regressors [N, J], log of each sample [N]."""
+    """Coefficients [3, J] at given currents, and what is left: errors [N, 3], their variances [3],
+    regressors [N, J], log of each sample [N].
+    """
 
     theta: Tensor
     error: Tensor
@@ -147,47 +168,76 @@ class _Problem:
 
     def regression(self, current: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Regressors [N, J], accelerations [N, 3] and log [N] of all samples through the water."""
-        moved = samples([through_water(p, c, self.signals) for p, c in zip(self.logs, current.numpy(), strict=True)], self.signals)
+        moved = samples(
+            [
+                through_water(p, c, self.signals)
+                for p, c in zip(self.logs, current.numpy(), strict=True)
+            ],
+            self.signals,
+        )
         return self.baseline.library(moved.z), moved.target, moved.group
 
     def solve(self, current: Tensor) -> tuple[float, _State]:
-        """Least-squares coefficients at given currents [L, 2], and the negative log-likelihood with the prior of the currents."""
+        """Least-squares coefficients at given currents [L, 2], and the negative log-likelihood with
+        the prior of the currents.
+        """
         phi, target, group = self.regression(current)
         theta = torch.zeros_like(self.baseline.theta)
         for axis in range(3):
             columns = self.baseline.columns(axis)
-            theta[axis, columns] = torch.linalg.solve(_gram(phi[:, columns]), phi[:, columns].T @ target[:, axis])
+            theta[axis, columns] = torch.linalg.solve(
+                _gram(phi[:, columns]), phi[:, columns].T @ target[:, axis]
+            )
         error = target - phi @ theta.T
         variance = error.square().mean(0).clamp(min=1e-300)
-        cost = 0.5 * len(phi) * float(variance.log().sum()) + 0.5 * self.precision * float(current.square().sum())
+        cost = 0.5 * len(phi) * float(variance.log().sum()) + 0.5 * self.precision * float(
+            current.square().sum()
+        )
         return cost, _State(theta, error, variance, phi, group)
 
     def step(self, current: Tensor, state: _State) -> tuple[Tensor, Tensor]:
         """Gauss-Newton step [L, 2] and covariance [2L, 2L] of the currents."""
         count = len(self.logs)
-        slopes = torch.stack([self._slope(current, direction, state) for direction in range(2)], dim=2)
+        slopes = torch.stack(
+            [self._slope(current, direction, state) for direction in range(2)], dim=2
+        )
         hessian = self.precision * torch.eye(2 * count, dtype=torch.float64)
         gradient = self.precision * current
         for axis in range(3):
             slope, columns = slopes[:, axis], self.baseline.columns(axis)
             phi, weight = state.phi[:, columns], 1.0 / state.variance[axis]
-            own = torch.zeros(count, 2, 2, dtype=torch.float64).index_add_(0, state.group, slope[:, :, None] * slope[:, None, :])
-            mixed = torch.zeros(count, len(columns), 2, dtype=torch.float64).index_add_(0, state.group, phi[:, :, None] * slope[:, None, :])
+            own = torch.zeros(count, 2, 2, dtype=torch.float64).index_add_(
+                0, state.group, slope[:, :, None] * slope[:, None, :]
+            )
+            mixed = torch.zeros(count, len(columns), 2, dtype=torch.float64).index_add_(
+                0, state.group, phi[:, :, None] * slope[:, None, :]
+            )
             mixed = mixed.permute(1, 0, 2).reshape(len(columns), 2 * count)
-            hessian += weight * (torch.block_diag(*own) - mixed.T @ torch.linalg.solve(_gram(phi), mixed))
-            gradient = gradient + weight * torch.zeros_like(current).index_add_(0, state.group, slope * state.error[:, axis : axis + 1])
+            hessian += weight * (
+                torch.block_diag(*own) - mixed.T @ torch.linalg.solve(_gram(phi), mixed)
+            )
+            gradient = gradient + weight * torch.zeros_like(current).index_add_(
+                0, state.group, slope * state.error[:, axis : axis + 1]
+            )
         covariance = torch.linalg.inv(hessian)
         return -(covariance @ gradient.flatten()).reshape(-1, 2), covariance
 
     def search(self, current: Tensor, state: _State, spread: float) -> Tensor:
-        """Currents [L, 2] with a lower cost than `current` at the same coefficients, log by log, on a grid over what is likely; else as they are."""
-        thin = replace(self, logs=[replace(p, good=p.good & (np.arange(len(p)) % _THIN == 0)) for p in self.logs])
+        """Currents [L, 2] with a lower cost than `current` at the same coefficients, log by log, on
+        a grid over what is likely; else as they are.
+        """
+        thin = replace(
+            self,
+            logs=[replace(p, good=p.good & (np.arange(len(p)) % _THIN == 0)) for p in self.logs],
+        )
         count = len(self.logs)
 
         def cost(trial: Tensor) -> Tensor:
             phi, target, group = thin.regression(trial)
             square = ((target - phi @ state.theta.T).square() / state.variance).sum(1)
-            return _THIN * torch.zeros(count, dtype=torch.float64).index_add_(0, group, square) + self.precision * trial.square().sum(1)
+            return _THIN * torch.zeros(count, dtype=torch.float64).index_add_(
+                0, group, square
+            ) + self.precision * trial.square().sum(1)
 
         best, found = cost(current), current.clone()
         for point in _grid(1.25 * spread, spread / 6):
@@ -198,7 +248,9 @@ class _Problem:
         return found
 
     def _slope(self, current: Tensor, direction: int, state: _State) -> Tensor:
-        """Derivative of the errors [N, 3] with respect to one component of each sample's own current, the coefficients held."""
+        """Derivative of the errors [N, 3] with respect to one component of each sample's own
+        current, the coefficients held.
+        """
         little = torch.zeros_like(current)
         little[:, direction] = 1e-4
         ends = []
@@ -216,6 +268,8 @@ def _grid(radius: float, spacing: float) -> Tensor:
 
 
 def _gram(phi: Tensor) -> Tensor:
-    """phi' phi [J, J] with a trace of its diagonal, so that regressors which the data cannot tell apart share what they explain."""
+    """phi' phi [J, J] with a trace of its diagonal, so that regressors which the data cannot tell
+    apart share what they explain.
+    """
     gram = phi.T @ phi
     return gram + 1e-12 * torch.diag(gram.diagonal().clamp(min=1e-300))

@@ -1,4 +1,6 @@
-"""One trainer for all networks: epochs that repeat themselves when resumed, the best state so far, early stopping, TensorBoard, progress."""
+"""One trainer for all networks: epochs that repeat themselves when resumed, the best state so far,
+early stopping, TensorBoard, progress.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +50,8 @@ class Epochs(Protocol):
 class EpochTraining(L.LightningModule, ABC):
     """A Lightning module that `run_epochs` trains.
 
-    Every epoch is seeded by (seed, epoch) alone, so that a run resumed at an epoch's end repeats the undisturbed one.
+    Every epoch is seeded by (seed, epoch) alone, so that a run resumed at an epoch's end repeats
+    the undisturbed one.
     """
 
     def __init__(self, settings: Epochs, seed: int) -> None:
@@ -80,24 +83,34 @@ class EpochTraining(L.LightningModule, ABC):
         torch.manual_seed((self.seed * 7_919 + self.epoch) % (2**63))
 
     def finish_epoch(self) -> None:
-        """Validate; keep the best weights; stop early in the last stage. Called by the first callback of an epoch's end."""
+        """Validate; keep the best weights; stop early in the last stage. Called by the first
+        callback of an epoch's end.
+        """
         stage, _ = self.settings.stage(self.epoch)
         last = self.epoch + 1 == self.settings.epochs
-        entry = {"epoch": float(self.epoch), "stage": float(stage), "loss": sum(self._losses) / max(len(self._losses), 1)}
+        entry = {
+            "epoch": float(self.epoch),
+            "stage": float(stage),
+            "loss": sum(self._losses) / max(len(self._losses), 1),
+        }
         self._losses.clear()
         if last or (self.epoch + 1) % self.settings.validate_every == 0:
             model, score = self.validated()
             entry["validation"] = score
             if score < self.best_score:
                 self.best_score, self.without_gain = score, 0
-                self.best_state = {name: value.detach().clone() for name, value in model.state_dict().items()}
+                self.best_state = {
+                    name: value.detach().clone() for name, value in model.state_dict().items()
+                }
             else:
                 self.without_gain += 1
         self.history.append(entry)
         logger = self.trainer.logger
         if logger is not None:
             logger.log_metrics({k: v for k, v in entry.items() if k != "epoch"}, step=self.epoch)
-        self.stopped = stage == self.settings.last_stage and self.without_gain >= self.settings.patience
+        self.stopped = (
+            stage == self.settings.last_stage and self.without_gain >= self.settings.patience
+        )
         self.trainer.should_stop = self.stopped
 
     def on_fit_start(self) -> None:
@@ -105,7 +118,8 @@ class EpochTraining(L.LightningModule, ABC):
         self._losses: list[float] = []
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Beside weights and optimiser: the best weights, the curve, random state and thread count."""
+        """Beside weights and optimiser: the best weights, the curve, random state and thread count.
+        """
         checkpoint["residnet"] = {
             "best_score": self.best_score,
             "best_state": self.best_state,
@@ -123,14 +137,20 @@ class EpochTraining(L.LightningModule, ABC):
 
     def restore(self, own: dict[str, Any]) -> None:
         """Put back what a checkpoint kept of this module."""
-        self.best_score, self.best_state, self.without_gain = own["best_score"], own["best_state"], own["without_gain"]
+        self.best_score, self.best_state, self.without_gain = (
+            own["best_score"],
+            own["best_state"],
+            own["without_gain"],
+        )
         self.history, self.stopped = own["history"], own["stopped"]
         torch.set_rng_state(own["random"])
         torch.set_num_threads(own["threads"])
 
 
 class FinishEpoch(L.Callback):
-    """Lets the module finish its epoch before the checkpoint is written: Lightning runs callbacks before the module's own hook."""
+    """Lets the module finish its epoch before the checkpoint is written: Lightning runs callbacks
+    before the module's own hook.
+    """
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Validate."""
@@ -162,19 +182,31 @@ class ProgressLine(L.Callback):
         """Show epoch, loss and the best validation."""
         assert isinstance(pl_module, EpochTraining)
         done, last = trainer.current_epoch + 1, pl_module.history[-1]
-        text = f"  {self.name}: epoch {done}/{self.epochs}, stage {int(last['stage'])}, loss {last['loss']:.4g}"
+        text = (
+            f"  {self.name}: epoch {done}/{self.epochs}, stage {int(last['stage'])}, loss"
+            f" {last['loss']:.4g}"
+        )
         text += f", best validation {pl_module.best_score:.4g}"
         if sys.stderr.isatty():
-            print(f"\r{text}\033[K", end="\n" if done == self.epochs or trainer.should_stop else "", file=sys.stderr, flush=True)
+            print(
+                f"\r{text}\033[K",
+                end="\n" if done == self.epochs or trainer.should_stop else "",
+                file=sys.stderr,
+                flush=True,
+            )
         elif done % max(self.epochs // 10, 1) == 0 or done == self.epochs:
             print(text, file=sys.stderr, flush=True)
 
 
-def run_epochs(name: str, module: EpochTraining, model: nn.Module, trained: nn.Module, folder: Path) -> dict[str, Any]:
-    """Train to the last epoch, from the last checkpoint where there is one, and leave the best state in the model; Ctrl-C can be resumed.
+def run_epochs(
+    name: str, module: EpochTraining, model: nn.Module, trained: nn.Module, folder: Path
+) -> dict[str, Any]:
+    """Train to the last epoch, from the last checkpoint where there is one, and leave the best
+    state in the model; Ctrl-C can be resumed.
 
     Args:
-        name: of what is trained; `checkpoints/<name>/last.ckpt` in the folder is resumed where it exists.
+        name: of what is trained; `checkpoints/<name>/last.ckpt` in the folder is resumed where it
+            exists.
         module: that trains it.
         model: that is validated; it ends frozen, with the weights that scored best.
         trained: its part whose parameters are counted.
@@ -214,7 +246,10 @@ def run_epochs(name: str, module: EpochTraining, model: nn.Module, trained: nn.M
     if trainer.interrupted:
         raise KeyboardInterrupt
     if not module.best_state:
-        raise FitError(f"{name}: no epoch gave a finite free run on the validation data; lower the learning rate or the horizon")
+        raise FitError(
+            f"{name}: no epoch gave a finite free run on the validation data; lower the learning"
+            " rate or the horizon"
+        )
     model.load_state_dict(module.best_state)
     model.eval().requires_grad_(False)
     return {

@@ -1,4 +1,6 @@
-"""Lag of actuators fitted together with a force residual: for each candidate lag the regression is linear (variable projection)."""
+"""Lag of actuators fitted together with a force residual: for each candidate lag the regression is
+linear (variable projection).
+"""
 
 from __future__ import annotations
 
@@ -19,15 +21,18 @@ _LEAST, _MOST = np.array([0.1, 0.1, 0.0]), np.array([30.0, 3.0, 2.0])
 
 
 def followed(command: Tensor, lag: Lag, dt: float, runs: Sequence[int] = ()) -> Tensor:
-    """Force [N, c] that follows a command [N, c] sampled every dt seconds, taken as straight between samples; at rest before.
+    """Force [N, c] that follows a command [N, c] sampled every dt seconds, taken as straight
+    between samples; at rest before.
 
-    `runs` are the lengths of several runs that stand one after another, each at rest before; empty for one.
+    `runs` are the lengths of several runs that stand one after another, each at rest before; empty
+    for one.
     """
     if len(runs) > 1:
         return torch.cat([followed(part, lag, dt) for part in command.split(list(runs))])
     u = _delayed(command.numpy(), lag.delay, dt)
     w, z = lag.frequency, lag.damping
-    # exact for inputs that are straight lines between samples: one matrix exponential of the state, the input and its slope
+    # exact for inputs that are straight lines between samples: one matrix exponential of the state,
+    # the input and its slope
     a = np.zeros((4, 4))
     a[0, 1] = 1.0
     a[1] = [-w * w, -2 * z * w, w * w, 0.0]
@@ -60,7 +65,14 @@ class LagFit:
     left_without: tuple[float, float, float]
 
 
-def fit_lag(command: Tensor, needed: Tensor, basis: Tensor, dt: float, use: Tensor | None = None, runs: Sequence[int] = ()) -> LagFit:
+def fit_lag(
+    command: Tensor,
+    needed: Tensor,
+    basis: Tensor,
+    dt: float,
+    use: Tensor | None = None,
+    runs: Sequence[int] = (),
+) -> LagFit:
     """The lag under which F_believed + basis explains the followed command best.
 
     Args:
@@ -75,7 +87,9 @@ def fit_lag(command: Tensor, needed: Tensor, basis: Tensor, dt: float, use: Tens
         FitError: where the command does not vary, or the search ends at a bound.
     """
     if bool((command.std(0) == 0).all()):
-        raise FitError("the command is constant: no lag shows in it; give a run with changing commands")
+        raise FitError(
+            "the command is constant: no lag shows in it; give a run with changing commands"
+        )
     keep = torch.ones(len(command), dtype=torch.bool) if use is None else use
     x = basis[keep] - basis[keep].mean(0)
     q, r = torch.linalg.qr(x / x.std(0).clamp(min=1e-300))
@@ -89,19 +103,43 @@ def fit_lag(command: Tensor, needed: Tensor, basis: Tensor, dt: float, use: Tens
     def miss(p: np.ndarray) -> np.ndarray:
         lag = Lag(frequency=float(p[0]), damping=float(p[1]), delay=float(p[2]))
         force = followed(command, lag, dt, runs)[keep]
-        # in units of the followed force itself: a lag that lets nothing through would leave nothing to explain
-        out: np.ndarray = (unexplained(force - needed[keep]) / force.std(0).clamp(min=1e-300)).numpy().ravel()
+        # in units of the followed force itself: a lag that lets nothing through would leave nothing
+        # to explain
+        out: np.ndarray = (
+            (unexplained(force - needed[keep]) / force.std(0).clamp(min=1e-300)).numpy().ravel()
+        )
         return out
 
     starts = [np.array([w, 0.8, d]) for w in (1.0, 3.0, 8.0) for d in (0.05, 0.5)]
     first = min(starts, key=lambda p: float(np.square(miss(p)).sum()))
-    found = least_squares(miss, first, bounds=(_LEAST, _MOST), x_scale=[1.0, 0.3, 0.1], diff_step=[1e-4] * 3, max_nfev=60)
+    found = least_squares(
+        miss,
+        first,
+        bounds=(_LEAST, _MOST),
+        x_scale=[1.0, 0.3, 0.1],
+        diff_step=[1e-4] * 3,
+        max_nfev=60,
+    )
     p = found.x
-    inside = [low * 1.02 < value < high * 0.98 or (low == 0.0 and value < 0.98 * high) for value, low, high in zip(p, _LEAST, _MOST, strict=True)]
-    at = [name for name, fine in zip(("frequency", "damping", "delay"), inside, strict=True) if not fine]
+    inside = [
+        low * 1.02 < value < high * 0.98 or (low == 0.0 and value < 0.98 * high)
+        for value, low, high in zip(p, _LEAST, _MOST, strict=True)
+    ]
+    at = [
+        name
+        for name, fine in zip(("frequency", "damping", "delay"), inside, strict=True)
+        if not fine
+    ]
     if at:
-        raise FitError(f"the lag's {at[0]} ends at the bound of its search ({p[0]:.3g} rad/s, {p[1]:.3g}, {p[2]:.3g} s); the data do not show one")
+        raise FitError(
+            f"the lag's {at[0]} ends at the bound of its search ({p[0]:.3g} rad/s, {p[1]:.3g},"
+            f" {p[2]:.3g} s); the data do not show one"
+        )
     lag = Lag(frequency=float(p[0]), damping=float(p[1]), delay=float(p[2]))
-    rests = [unexplained((force - needed)[keep]) for force in (followed(command, lag, dt, runs), command)]
+    rests = [
+        unexplained((force - needed)[keep]) for force in (followed(command, lag, dt, runs), command)
+    ]
     shares = [(rest.square().mean(0) / variance).tolist() for rest in rests]
-    return LagFit(lag, (shares[0][0], shares[0][1], shares[0][2]), (shares[1][0], shares[1][1], shares[1][2]))
+    return LagFit(
+        lag, (shares[0][0], shares[0][1], shares[0][2]), (shares[1][0], shares[1][1], shares[1][2])
+    )

@@ -9,8 +9,11 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 
 
-def one_step_loss(model: HybridDynamics, y: Tensor, w: Tensor, nu_dot: Tensor, good: Tensor, spread: Tensor) -> Tensor:
-    """Mean squared error of accelerations along measured windows, in units of the residual's spread (document 003 eq. (20)).
+def one_step_loss(
+    model: HybridDynamics, y: Tensor, w: Tensor, nu_dot: Tensor, good: Tensor, spread: Tensor
+) -> Tensor:
+    """Mean squared error of accelerations along measured windows, in units of the residual's spread
+    (document 003 eq. (20)).
 
     Args:
         model: the hybrid model.
@@ -26,8 +29,18 @@ def one_step_loss(model: HybridDynamics, y: Tensor, w: Tensor, nu_dot: Tensor, g
     return (error.square() * weight).sum() / (3.0 * weight.sum()).clamp(min=1.0)
 
 
-def rollout_loss(rollout: Rollout, x0: Tensor, w: Tensor, s: Tensor, y: Tensor, usable: Tensor, scales: Tensor, robust: float) -> Tensor:
-    """Error of free-run velocities, in units of the metrics' scales: their mean square, or the mean over windows of their root mean square.
+def rollout_loss(
+    rollout: Rollout,
+    x0: Tensor,
+    w: Tensor,
+    s: Tensor,
+    y: Tensor,
+    usable: Tensor,
+    scales: Tensor,
+    robust: float,
+) -> Tensor:
+    """Error of free-run velocities, in units of the metrics' scales: their mean square, or the mean
+    over windows of their root mean square.
 
     Args:
         rollout: the free run of the model.
@@ -37,7 +50,8 @@ def rollout_loss(rollout: Rollout, x0: Tensor, w: Tensor, s: Tensor, y: Tensor, 
         y: measured states after each step [B, T, 6].
         usable: measured samples that may be scored [B, T].
         scales: [3].
-        robust: 0 for the mean square; else windows count by sqrt(mean square + robust^2), as the metrics do, so that few bad ones do not rule.
+        robust: 0 for the mean square; else windows count by sqrt(mean square + robust^2), as the
+            metrics do, so that few bad ones do not rule.
     """
     states, _, _ = rollout(x0, w, s)
     error = (states[:, 1:, 3:6] - y[:, :, 3:6]) / scales
@@ -46,5 +60,7 @@ def rollout_loss(rollout: Rollout, x0: Tensor, w: Tensor, s: Tensor, y: Tensor, 
         square = (error.square() * weight).sum((1, 2)) / (3.0 * weight.sum((1, 2))).clamp(min=1.0)
         return torch.sqrt(square + robust**2).mean()
     # a rollout that runs away must pull back, not drown the batch
-    square = 2.0 * torch.nn.functional.huber_loss(error, torch.zeros_like(error), reduction="none", delta=5.0)
+    square = 2.0 * torch.nn.functional.huber_loss(
+        error, torch.zeros_like(error), reduction="none", delta=5.0
+    )
     return (square * weight).sum() / (3.0 * weight.sum()).clamp(min=1.0)

@@ -22,9 +22,19 @@ Validate = Callable[[HybridDynamics], float]
 
 @final
 class HeadTraining(EpochTraining):
-    """Trains `model.head` (and the baseline, where the config says so) and keeps the weights that validate best in free run."""
+    """Trains `model.head` (and the baseline, where the config says so) and keeps the weights that
+    validate best in free run.
+    """
 
-    def __init__(self, model: HybridDynamics, store: WindowStore, config: TrainingConfig, scales: Tensor, validate: Validate, seed: int) -> None:
+    def __init__(
+        self,
+        model: HybridDynamics,
+        store: WindowStore,
+        config: TrainingConfig,
+        scales: Tensor,
+        validate: Validate,
+        seed: int,
+    ) -> None:
         super().__init__(config, seed)
         self.model = model
         self.average = copy.deepcopy(model).requires_grad_(False) if config.average > 0 else None
@@ -32,22 +42,34 @@ class HeadTraining(EpochTraining):
         self.store = store
         self.scales = scales
         self.validate = validate
-        self.batches = [self._batches(stage, length, batch) for stage, (length, batch) in enumerate(self._stages())]
+        self.batches = [
+            self._batches(stage, length, batch)
+            for stage, (length, batch) in enumerate(self._stages())
+        ]
 
     def _stages(self) -> list[tuple[int, int]]:
         dt, config = self.model.dt, self.settings
-        return [(round(config.one_step.window / dt), config.one_step.batch)] + [(round(s.horizon / dt) + 1, s.batch) for s in config.multi_step]
+        return [(round(config.one_step.window / dt), config.one_step.batch)] + [
+            (round(s.horizon / dt) + 1, s.batch) for s in config.multi_step
+        ]
 
     def _batches(self, stage: int, length: int, batch: int) -> list[WindowBatches]:
-        """Where the windows of a stage's batches come from: anywhere, then the beginnings of stretches."""
+        """Where the windows of a stage's batches come from: anywhere, then the beginnings of
+        stretches.
+        """
         own, steps = self.settings.beginnings, self.settings.steps
         if stage == 0 and self.settings.one_step.epochs == 0:
             return []
         if own is None:
             return [WindowBatches(self.store.starts(length), batch, steps)]
         few = min(max(round(own.share * batch), 1), batch - 1)
-        begins = self.store.beginnings(length, 0 if stage == 0 else max(round(own.initial / self.model.dt), 1))
-        return [WindowBatches(self.store.starts(length), batch - few, steps), WindowBatches(begins, few, steps)]
+        begins = self.store.beginnings(
+            length, 0 if stage == 0 else max(round(own.initial / self.model.dt), 1)
+        )
+        return [
+            WindowBatches(self.store.starts(length), batch - few, steps),
+            WindowBatches(begins, few, steps),
+        ]
 
     def train_dataloader(self) -> EpochBatches:
         """Window starts [batch], `steps` times an epoch."""
@@ -80,7 +102,11 @@ class HeadTraining(EpochTraining):
         """Loss of one batch of windows."""
         stage, _ = self.settings.stage(self.epoch)
         length, _ = self._stages()[stage]
-        loss = self._one_step(starts, length) if stage == 0 else self._multi_step(starts, length, self.batches[stage])
+        loss = (
+            self._one_step(starts, length)
+            if stage == 0
+            else self._multi_step(starts, length, self.batches[stage])
+        )
         self._losses.append(float(loss.detach()))
         return loss
 
@@ -92,25 +118,35 @@ class HeadTraining(EpochTraining):
         counted = take(self.store.good, starts, length) & (torch.arange(length) >= washout[:, None])
         y, w = take(self.store.smooth, starts, length), take(self.store.w, starts, length)
         spread = self.model.head.spread().to(y.dtype)
-        return one_step_loss(self.model, y, w, take(self.store.nu_dot, starts, length), counted, spread)
+        return one_step_loss(
+            self.model, y, w, take(self.store.nu_dot, starts, length), counted, spread
+        )
 
     def _multi_step(self, starts: Tensor, length: int, sources: list[WindowBatches]) -> Tensor:
         take, dt = self.store.take, self.model.dt
         x0 = self.store.smooth[starts]
         own = self.settings.beginnings
         parts = starts.split([source.batch for source in sources])
-        memories = [self.model.warmup(*self.store.history(parts[0], round(self.settings.history / dt)))]
+        memories = [
+            self.model.warmup(*self.store.history(parts[0], round(self.settings.history / dt)))
+        ]
         if own is not None:
             past, w_past = self.store.history(parts[1], max(round(own.initial / dt), 1))
             memories.append(self.model.warmup(past, w_past))
             begun = torch.cat((x0[len(parts[0]) :, :3], past[:, :, 3:].mean(1)), dim=1)
             x0 = torch.cat((x0[: len(parts[0])], begun))
         if self.settings.start_noise > 0:
-            noise = self.settings.start_noise * self.scales * torch.randn(len(starts), 3, dtype=x0.dtype)
+            noise = (
+                self.settings.start_noise
+                * self.scales
+                * torch.randn(len(starts), 3, dtype=x0.dtype)
+            )
             x0 = torch.cat((x0[:, :3], x0[:, 3:] + noise), dim=1)
         w, y = take(self.store.w, starts, length - 1), take(self.store.y, starts + 1, length - 1)
         usable = take(self.store.usable, starts + 1, length - 1)
-        return rollout_loss(self.rollout, x0, w, torch.cat(memories), y, usable, self.scales, self.settings.robust)
+        return rollout_loss(
+            self.rollout, x0, w, torch.cat(memories), y, usable, self.scales, self.settings.robust
+        )
 
     def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Move the averaged weights."""

@@ -1,9 +1,12 @@
-"""Accelerations that every log has for itself, beside parameters that all logs share: beliefs, normal equations, spread.
+"""Accelerations that every log has for itself, beside parameters that all logs share: beliefs,
+normal equations, spread.
 
-A model test is never quite the same vessel twice: trim, rudder zero, carriage and tank leave a small yaw moment and sway force that differ from
-log to log. Taken for nothing, they are taken for properties of the hull. Here each log has its own, growing with the square of the speed as hull
-forces do and believed to be normally distributed about zero; Gauss-Newton's matrix is then an arrow (a block for what is shared, one for each log,
-nothing between logs), so that logs are eliminated one by one. Offsets end with the fit: the model is that of a run without, and small manoeuvres of a
+A model test is never quite the same vessel twice: trim, rudder zero, carriage and tank leave a
+small yaw moment and sway force that differ from log to log. Taken for nothing, they are taken for
+properties of the hull. Here each log has its own, growing with the square of the speed as hull
+forces do and believed to be normally distributed about zero; Gauss-Newton's matrix is then an arrow
+(a block for what is shared, one for each log, nothing between logs), so that logs are eliminated
+one by one. Offsets end with the fit: the model is that of a run without, and small manoeuvres of a
 run that has one are predicted the worse for it.
 """
 
@@ -28,10 +31,12 @@ Estimated = Literal["estimated"]
 
 
 class OffsetsConfig(Config):
-    """Standard deviations from log to log of an acceleration, at the root mean square speed of the free runs, by axis; no offset where null.
+    """Standard deviations from log to log of an acceleration, at the root mean square speed of the
+    free runs, by axis; no offset where null.
 
-    `estimated` takes the standard deviation under which the training logs are most likely, parameters and offsets integrated out (type-II
-    maximum likelihood); it needs about five logs or more.
+    `estimated` takes the standard deviation under which the training logs are most likely,
+    parameters and offsets integrated out (type-II maximum likelihood); it needs about five logs or
+    more.
 
     Attributes:
         u: in surge.
@@ -46,7 +51,10 @@ class OffsetsConfig(Config):
     @model_validator(mode="after")
     def _any(self) -> OffsetsConfig:
         if not self.axes:
-            raise ValueError("give a standard deviation, or `estimated`, for at least one of u, v, r; or leave `offsets` out")
+            raise ValueError(
+                "give a standard deviation, or `estimated`, for at least one of u, v, r; or leave"
+                " `offsets` out"
+            )
         return self
 
     @property
@@ -82,11 +90,23 @@ class Offsets:
 
     @classmethod
     def begin(cls, config: OffsetsConfig | None, logs: int, usual: Tensor, speed: float) -> Offsets:
-        """All zero; `usual` [3] is where spreads that are to be estimated start from, `speed` that at which offsets are what they are said to be."""
+        """All zero; `usual` [3] is where spreads that are to be estimated start from, `speed` that
+        at which offsets are what they are said to be.
+        """
         axes, given = (config.axes, config.given()) if config is not None else ((), ())
-        spread = torch.tensor([usual[axis] if sd is None else sd for axis, sd in zip(axes, given, strict=True)], dtype=torch.float64)
+        spread = torch.tensor(
+            [usual[axis] if sd is None else sd for axis, sd in zip(axes, given, strict=True)],
+            dtype=torch.float64,
+        )
         zero = torch.zeros(logs, len(axes), dtype=torch.float64)
-        return cls(axes, zero, spread, torch.tensor([sd is None for sd in given], dtype=torch.bool), zero, speed)
+        return cls(
+            axes,
+            zero,
+            spread,
+            torch.tensor([sd is None for sd in given], dtype=torch.bool),
+            zero,
+            speed,
+        )
 
     def moved(self, step: Tensor) -> Offsets:
         """With a step [L, a] subtracted."""
@@ -106,7 +126,14 @@ class Offsets:
         """A row for each log and axis: log, axis, value, standard_error, spread, speed."""
         spread = self.spread.tolist()
         return [
-            {"log": log, "axis": ACCELERATION[axis], "value": v[i], "standard_error": e[i], "spread": spread[i], "speed": self.speed}
+            {
+                "log": log,
+                "axis": ACCELERATION[axis],
+                "value": v[i],
+                "standard_error": e[i],
+                "spread": spread[i],
+                "speed": self.speed,
+            }
             for log, v, e in zip(logs, self.value.tolist(), self.error.tolist(), strict=True)
             for i, axis in enumerate(self.axes)
         ]
@@ -131,37 +158,55 @@ class Arrow:
     slope: Tensor
 
     def believing(self, offsets: Offsets, share: Tensor) -> Arrow:
-        """With what is believed of the offsets, `share` being what one unit of minus the logarithm of a probability costs, halved."""
+        """With what is believed of the offsets, `share` being what one unit of minus the logarithm
+        of a probability costs, halved.
+        """
         precision = share / offsets.spread.square()
-        return replace(self, own=self.own + torch.diag(precision), slope=self.slope + precision * offsets.value)
+        return replace(
+            self, own=self.own + torch.diag(precision), slope=self.slope + precision * offsets.value
+        )
 
     def damped(self, damping: float) -> Arrow:
         """With a share of the diagonal added to itself (Levenberg and Marquardt)."""
         own = self.own + damping * torch.diag_embed(self.own.diagonal(dim1=1, dim2=2))
-        return replace(self, shared=self.shared + damping * torch.diag(self.shared.diagonal()), own=own)
+        return replace(
+            self, shared=self.shared + damping * torch.diag(self.shared.diagonal()), own=own
+        )
 
     def solve(self) -> tuple[Tensor, Tensor]:
         """Gauss-Newton step of the shared parameters [P] and of the offsets [L, a]."""
         matrix, gradient = self.reduced()
         step = torch.linalg.solve(matrix, gradient)
-        return step, torch.linalg.solve(self.own, (self.slope - step @ self.mixed).unsqueeze(-1)).squeeze(-1)
+        return step, torch.linalg.solve(
+            self.own, (self.slope - step @ self.mixed).unsqueeze(-1)
+        ).squeeze(-1)
 
     def reduced(self) -> tuple[Tensor, Tensor]:
-        """Matrix [P, P] and right side [P] of the shared parameters alone, every log eliminated (Schur complement)."""
-        taken = torch.linalg.solve(self.own, torch.cat((self.mixed.transpose(1, 2), self.slope.unsqueeze(-1)), dim=2))
+        """Matrix [P, P] and right side [P] of the shared parameters alone, every log eliminated
+        (Schur complement).
+        """
+        taken = torch.linalg.solve(
+            self.own, torch.cat((self.mixed.transpose(1, 2), self.slope.unsqueeze(-1)), dim=2)
+        )
         less = (self.mixed @ taken).sum(0)
         return self.shared - less[:, :-1], self.gradient - less[:, -1]
 
     def variances(self, shared: Tensor) -> Tensor:
-        """Diagonal [L, a] of the offsets' blocks of the inverse, from that of the shared block [P, P]."""
+        """Diagonal [L, a] of the offsets' blocks of the inverse, from that of the shared block [P,
+        P].
+        """
         taken = torch.linalg.solve(self.own, self.mixed.transpose(1, 2))
-        return (torch.linalg.inv(self.own) + taken @ shared @ taken.transpose(1, 2)).diagonal(dim1=1, dim2=2)
+        return (torch.linalg.inv(self.own) + taken @ shared @ taken.transpose(1, 2)).diagonal(
+            dim1=1, dim2=2
+        )
 
 
 def with_spread(offsets: Offsets, arrow: Arrow, share: Tensor) -> Offsets:
-    """Offsets with those spreads that are to be estimated at their most likely, the free runs taken for linear around where they are.
+    """Offsets with those spreads that are to be estimated at their most likely, the free runs taken
+    for linear around where they are.
 
-    Expectation maximisation: a spread's square is the mean over the logs of the squares of the offsets and of their standard errors.
+    Expectation maximisation: a spread's square is the mean over the logs of the squares of the
+    offsets and of their standard errors.
 
     Args:
         offsets: as they are.
@@ -174,7 +219,9 @@ def with_spread(offsets: Offsets, arrow: Arrow, share: Tensor) -> Offsets:
     for _ in range(_ROUNDS):
         believing = arrow.believing(offsets, share)
         _, step = believing.solve()
-        variances = share * believing.variances(torch.linalg.pinv(believing.reduced()[0], hermitian=True))
+        variances = share * believing.variances(
+            torch.linalg.pinv(believing.reduced()[0], hermitian=True)
+        )
         found = ((offsets.value - step).square() + variances).mean(0).sqrt()
         spread = torch.where(offsets.estimated, torch.maximum(found, least), offsets.spread)
         change = float((spread / offsets.spread - 1.0).abs().max())

@@ -1,4 +1,5 @@
-"""What trainings of one stage have in common. No Lightning here: `residnet check` must stay quick."""
+"""What trainings of one stage have in common. No Lightning here: `residnet check` must stay quick.
+"""
 
 from __future__ import annotations
 

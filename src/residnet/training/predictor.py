@@ -1,4 +1,6 @@
-"""Training the predictor of document 004's autopilot on simulated answers to its rudder angles (sections 6.1.1, 6.1.2, 6.2.1, 6.2.2)."""
+"""Training the predictor of document 004's autopilot on simulated answers to its rudder angles
+(sections 6.1.1, 6.1.2, 6.2.1, 6.2.2).
+"""
 
 from __future__ import annotations
 
@@ -17,19 +19,26 @@ from residnet.training.predictor_config import PredictorTraining
 
 
 class Answers(NamedTuple):
-    """States [S, nx] and the changes of heading [rad] and yaw rate [rad/s] that each of C rudder angles brings, [S, 2, C]."""
+    """States [S, nx] and the changes of heading [rad] and yaw rate [rad/s] that each of C rudder
+    angles brings, [S, 2, C].
+    """
 
     x: Tensor
     change: Tensor
 
 
 def simulate_answers(
-    vessel: SteeredVessel, exact: SimulatedPredictor, rudder: Tensor, settings: PredictorTraining, states: int, seed: int
+    vessel: SteeredVessel,
+    exact: SimulatedPredictor,
+    rudder: Tensor,
+    settings: PredictorTraining,
+    states: int,
+    seed: int,
 ) -> Answers:
     """Data of section 6.1.1: random states, each simulated under all rudder angles.
 
-    The states are those that the vessel comes through under random angles, since few combinations of its velocities can occur, scattered a
-    little beyond.
+    The states are those that the vessel comes through under random angles, since few combinations
+    of its velocities can occur, scattered a little beyond.
 
     Args:
         vessel: in calm water.
@@ -43,7 +52,8 @@ def simulate_answers(
     dt = min(settings.hold / 10.0, 0.25)
     steps = math.ceil(settings.wander / dt)
     x, w = vessel.start(torch.ones(states, dtype=torch.float64))
-    # each angle is held for a random time: an angle that was drawn at a step stays until the next drawing
+    # each angle is held for a random time: an angle that was drawn at a step stays until the next
+    # drawing
     drawn = torch.rand(states, steps, generator=random) < dt / settings.hold
     drawn[:, 0] = True
     last = torch.where(drawn, torch.arange(steps), 0).cummax(1).values
@@ -54,7 +64,9 @@ def simulate_answers(
         tracks = Rollout(vessel.model(dt))(x, given, vessel.memory(nominal))[0]
         taken = torch.randint(steps + 1, (states,), generator=random)
         x = tracks[torch.arange(states), taken]
-        x = x + settings.scatter * x.std(0) * torch.randn(x.shape, generator=random, dtype=torch.float64)
+        x = x + settings.scatter * x.std(0) * torch.randn(
+            x.shape, generator=random, dtype=torch.float64
+        )
         error, rate = exact(x, x[:, vessel.column("psi")], rudder)
     return Answers(x, torch.stack((-error, rate - x[:, vessel.column("r"), None]), dim=1))
 
@@ -71,7 +83,14 @@ class PredictorFit(EpochTraining):
         seed: of the batches.
     """
 
-    def __init__(self, predictor: NetworkPredictor, train: Answers, kept: Answers, settings: PredictorTraining, seed: int) -> None:
+    def __init__(
+        self,
+        predictor: NetworkPredictor,
+        train: Answers,
+        kept: Answers,
+        settings: PredictorTraining,
+        seed: int,
+    ) -> None:
         super().__init__(settings, seed)
         self.predictor = predictor
         self.train_answers, self.kept = train, kept
@@ -94,7 +113,11 @@ class PredictorFit(EpochTraining):
     def training_step(self, number: int, batch_index: int) -> Tensor:
         """Mean squared error of one batch of states."""
         rows = self.order[number]
-        loss = self._misses(Answers(self.train_answers.x[rows], self.train_answers.change[rows])).square().mean()
+        loss = (
+            self._misses(Answers(self.train_answers.x[rows], self.train_answers.change[rows]))
+            .square()
+            .mean()
+        )
         self._losses.append(float(loss.detach()))
         return loss
 
@@ -102,7 +125,9 @@ class PredictorFit(EpochTraining):
         return (self.predictor.changes(answers.x) - answers.change) / self.predictor.scale
 
     def validated(self) -> tuple[nn.Module, float]:
-        """The predictor, and the root of its mean squared error on states that it was not trained on, as a share of the spread."""
+        """The predictor, and the root of its mean squared error on states that it was not trained
+        on, as a share of the spread.
+        """
         with torch.no_grad():
             return self.predictor, float(self._misses(self.kept).square().mean().sqrt())
 
@@ -117,7 +142,8 @@ def train_predictor(
     seed: int,
     folder: Path,
 ) -> dict[str, Any]:
-    """Simulate, train, and leave the weights that validated best in the predictor; `checkpoints/<name>/last.ckpt` is resumed where it exists.
+    """Simulate, train, and leave the weights that validated best in the predictor;
+    `checkpoints/<name>/last.ckpt` is resumed where it exists.
 
     Args:
         name: of the controller.
@@ -130,8 +156,8 @@ def train_predictor(
         folder: of the run.
 
     Returns:
-        The curve by epoch, the best score, the number of parameters, and on states kept back the roots of the mean squared errors of heading
-        [rad] and yaw rate [rad/s] at the horizon's end.
+        The curve by epoch, the best score, the number of parameters, and on states kept back the
+        roots of the mean squared errors of heading [rad] and yaw rate [rad/s] at the horizon's end.
 
     Raises:
         FitError: where no epoch gave a finite error.
@@ -140,7 +166,11 @@ def train_predictor(
     kept = simulate_answers(vessel, exact, rudder, settings, settings.states // 5, 2 * seed + 1)
     predictor = predictor.double()
     predictor.calibrate(*train)
-    notes = run_epochs(name, PredictorFit(predictor, train, kept, settings, seed), predictor, predictor, folder)
+    notes = run_epochs(
+        name, PredictorFit(predictor, train, kept, settings, seed), predictor, predictor, folder
+    )
     with torch.no_grad():
-        heading, rate = (predictor.changes(kept.x) - kept.change).square().mean((0, 2)).sqrt().tolist()
+        heading, rate = (
+            (predictor.changes(kept.x) - kept.change).square().mean((0, 2)).sqrt().tolist()
+        )
     return notes | {"rms_heading": heading, "rms_yaw_rate": rate}

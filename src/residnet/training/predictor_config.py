@@ -1,4 +1,6 @@
-"""How the predictor of document 004's autopilot is trained. No Lightning here: `residnet check` must stay quick."""
+"""How the predictor of document 004's autopilot is trained. No Lightning here: `residnet check`
+must stay quick.
+"""
 
 from __future__ import annotations
 
@@ -9,13 +11,16 @@ from residnet.training.one_stage import OneStage
 
 
 class PredictorTraining(OneStage):
-    """Supervised: from states that the vessel comes through under random rudder angles to what each angle leads to (document 004, 6.1.1, 6.2.1).
+    """Supervised: from states that the vessel comes through under random rudder angles to what each
+    angle leads to (document 004, 6.1.1, 6.2.1).
 
     Attributes:
         states: to train on; a fifth as many are kept back to validate on.
-        wander: longest time under random rudder angles before a state is taken, from straight ahead at service speed.
+        wander: longest time under random rudder angles before a state is taken, from straight ahead
+            at service speed.
         hold: mean time between these angles.
-        scatter: noise that is added to these states, as a share of each channel's standard deviation.
+        scatter: noise that is added to these states, as a share of each channel's standard
+            deviation.
         batch: states.
     """
 

@@ -1,8 +1,10 @@
-"""Refitting a baseline's parameters through rollouts: Gauss-Newton on free-run errors with forward sensitivities.
+"""Refitting a baseline's parameters through rollouts: Gauss-Newton on free-run errors with forward
+sensitivities.
 
-Least squares on derivatives weighs every instant alike and ignores how errors add up; this minimises what a free run is
-judged by. The least-squares solution and its information matrix stand as the prior, so that directions which the
-free runs do not see stay where the derivatives put them; a baseline that holds beliefs about its parameters adds them.
+Least squares on derivatives weighs every instant alike and ignores how errors add up; this
+minimises what a free run is judged by. The least-squares solution and its information matrix stand
+as the prior, so that directions which the free runs do not see stay where the derivatives put them;
+a baseline that holds beliefs about its parameters adds them.
 """
 
 from __future__ import annotations
@@ -31,12 +33,16 @@ class RefitConfig(Config):
         horizon: length of the free runs.
         every: time between their starts.
         prior: weight of the least-squares solution, as a share of its own information.
-        asymmetric: shrinks terms that a mirror-symmetric vessel cannot have towards zero; 0 for no such knowledge.
-        robust: windows whose error (in units of the scales) is far above this count by their error and not by its square.
-        correlation: time over which errors of a free run hang together; the logs hold so many independent errors, which says how much beliefs
-            weigh beside them, and how large the standard errors are.
-        offsets: accelerations that each log has for itself (trim, rudder zero, carriage), estimated with the parameters and left out of the model;
-            null where all logs are of exactly the same vessel. The least-squares prior does not know them: give it little weight.
+        asymmetric: shrinks terms that a mirror-symmetric vessel cannot have towards zero; 0 for no
+            such knowledge.
+        robust: windows whose error (in units of the scales) is far above this count by their error
+            and not by its square.
+        correlation: time over which errors of a free run hang together; the logs hold so many
+            independent errors, which says how much beliefs weigh beside them, and how large the
+            standard errors are.
+        offsets: accelerations that each log has for itself (trim, rudder zero, carriage), estimated
+            with the parameters and left out of the model; null where all logs are of exactly the
+            same vessel. The least-squares prior does not know them: give it little weight.
         iterations: at most.
     """
 
@@ -72,9 +78,11 @@ class Refitted:
 
 @dataclass(frozen=True)
 class _Problem:
-    """Windows x0 [B, 6], w [B, T, m], measured nu [B, T, 3], weights [B, T, 3] (0 or 1/scale); numbers of the movable parameters [P]; precision
-    [P, P] about where least squares put them [P], pull to zero [P]; beliefs, mean and precision [P]; count of independent errors per channel; log
-    of each window [B]; speed at which offsets are what they are said to be."""
+    """Windows x0 [B, 6], w [B, T, m], measured nu [B, T, 3], weights [B, T, 3] (0 or 1/scale);
+    numbers of the movable parameters [P]; precision [P, P] about where least squares put them [P],
+    pull to zero [P]; beliefs, mean and precision [P]; count of independent errors per channel; log
+    of each window [B]; speed at which offsets are what they are said to be.
+    """
 
     x0: Tensor
     w: Tensor
@@ -92,15 +100,19 @@ class _Problem:
     speed: float
 
     def share(self, level: Tensor) -> Tensor:
-        """Half of what one unit of minus the logarithm of a probability costs, where the cost is `level`.
+        """Half of what one unit of minus the logarithm of a probability costs, where the cost is
+        `level`.
 
-        With c the mean square error of three channels of so many independent errors each, that logarithm grows by 3 N / 2c for each unit of c,
-        and the cost sqrt(c + robust^2) by 1 / (2 cost).
+        With c the mean square error of three channels of so many independent errors each, that
+        logarithm grows by 3 N / 2c for each unit of c, and the cost sqrt(c + robust^2) by 1 / (2
+        cost).
         """
         return (level.square() - self.robust**2).clamp(min=1e-12) / (6.0 * self.count * level)
 
 
-def refit(model: HybridDynamics, samples: Samples, store: WindowStore, config: RefitConfig, scales: Tensor) -> Refitted:
+def refit(
+    model: HybridDynamics, samples: Samples, store: WindowStore, config: RefitConfig, scales: Tensor
+) -> Refitted:
     """Move the parameters of `model.baseline` to the minimum; float64.
 
     Args:
@@ -115,13 +127,22 @@ def refit(model: HybridDynamics, samples: Samples, store: WindowStore, config: R
     """
     baseline = model.baseline
     if not isinstance(baseline, ParametricBaseline):
-        raise FitError("a refit through rollouts needs a baseline of kind 'regressors', 'linear_steady', 'mmg', 'nomoto' or 'nomoto_sideslip'")
+        raise FitError(
+            "a refit through rollouts needs a baseline of kind 'regressors', 'linear_steady',"
+            " 'mmg', 'nomoto' or 'nomoto_sideslip'"
+        )
     problem = _problem(model, baseline, samples, store, config, scales)
-    # spreads that are to be estimated start from what moves a velocity by its scale while errors hang together
-    offsets = Offsets.begin(config.offsets, int(store.log.max()) + 1, scales / config.correlation, problem.speed)
+    # spreads that are to be estimated start from what moves a velocity by its scale while errors
+    # hang together
+    offsets = Offsets.begin(
+        config.offsets, int(store.log.max()) + 1, scales / config.correlation, problem.speed
+    )
     level = first = _level(model, problem, offsets)
     if not torch.isfinite(first):
-        raise FitError("the least-squares baseline diverges within the refit's horizon; shorten `horizon` or raise the baseline's ridge")
+        raise FitError(
+            "the least-squares baseline diverges within the refit's horizon; shorten `horizon` or"
+            " raise the baseline's ridge"
+        )
     damping, count = 1e-3, 0
     arrow = _normal_equations(model, problem, baseline, level, offsets)
     for _ in range(config.iterations):
@@ -137,15 +158,33 @@ def refit(model: HybridDynamics, samples: Samples, store: WindowStore, config: R
     share = problem.share(level)
     believing = arrow.believing(offsets, share)
     inverse = torch.linalg.pinv(believing.reduced()[0], hermitian=True)
-    notes = {"cost_before": float(first), "cost_after": float(level), "iterations": count, "windows": len(problem.x0), "horizon": config.horizon}
+    notes = {
+        "cost_before": float(first),
+        "cost_after": float(level),
+        "iterations": count,
+        "windows": len(problem.x0),
+        "horizon": config.horizon,
+    }
     error = (share * believing.variances(inverse)).clamp(min=0.0).sqrt()
-    return Refitted(share * inverse, notes | {"independent_errors": round(problem.count, 1)}, replace(offsets, error=error))
+    return Refitted(
+        share * inverse,
+        notes | {"independent_errors": round(problem.count, 1)},
+        replace(offsets, error=error),
+    )
 
 
 def _descend(
-    model: HybridDynamics, problem: _Problem, baseline: ParametricBaseline, arrow: Arrow, offsets: Offsets, level: Tensor, damping: float
+    model: HybridDynamics,
+    problem: _Problem,
+    baseline: ParametricBaseline,
+    arrow: Arrow,
+    offsets: Offsets,
+    level: Tensor,
+    damping: float,
 ) -> tuple[Tensor, Offsets, float, float] | None:
-    """One step of Levenberg and Marquardt: level, offsets and damping after it, and its gain as a share of the cost; None where nothing gains."""
+    """One step of Levenberg and Marquardt: level, offsets and damping after it, and its gain as a
+    share of the cost; None where nothing gains.
+    """
     share = problem.share(level)
     believing = arrow.believing(offsets, share)
     cost = level + _prior_cost(problem, baseline, share, offsets)
@@ -172,13 +211,21 @@ def _place(baseline: ParametricBaseline, values: Tensor, active: Tensor) -> None
 
 
 def _problem(
-    model: HybridDynamics, baseline: ParametricBaseline, samples: Samples, store: WindowStore, config: RefitConfig, scales: Tensor
+    model: HybridDynamics,
+    baseline: ParametricBaseline,
+    samples: Samples,
+    store: WindowStore,
+    config: RefitConfig,
+    scales: Tensor,
 ) -> _Problem:
     steps, every = round(config.horizon / model.dt), max(round(config.every / model.dt), 1)
     starts = store.starts(steps + 1)
     starts = starts[store.depth[starts] % every == 0]
     if starts.numel() == 0:
-        raise FitError(f"no training log holds a free run of {config.horizon:g} s for the refit; shorten `horizon`")
+        raise FitError(
+            f"no training log holds a free run of {config.horizon:g} s for the refit; shorten"
+            " `horizon`"
+        )
     take = store.take
     nu = take(store.y, starts + 1, steps)[:, :, 3:]
     usable = take(store.usable, starts + 1, steps).to(scales.dtype).unsqueeze(-1)
@@ -210,19 +257,27 @@ def _window_cost(error: Tensor) -> Tensor:
     return error.square().mean((1, 2))
 
 
-def _prior_cost(problem: _Problem, baseline: ParametricBaseline, share: Tensor, offsets: Offsets) -> Tensor:
+def _prior_cost(
+    problem: _Problem, baseline: ParametricBaseline, share: Tensor, offsets: Offsets
+) -> Tensor:
     theta = baseline.theta.detach().flatten()[problem.active]
     moved, off = theta - problem.start, theta - problem.believed
     believed = (problem.belief * off.square()).sum() + offsets.unlikely()
-    return moved @ problem.precision @ moved + (problem.pull * theta.square()).sum() + share * believed
+    return (
+        moved @ problem.precision @ moved + (problem.pull * theta.square()).sum() + share * believed
+    )
 
 
-def _shifted(model: HybridDynamics, problem: _Problem, offsets: Offsets) -> tuple[HybridDynamics, ParametricBaseline | Shifted]:
+def _shifted(
+    model: HybridDynamics, problem: _Problem, offsets: Offsets
+) -> tuple[HybridDynamics, ParametricBaseline | Shifted]:
     """The model with the offset of its log in every window, and its baseline."""
     assert isinstance(model.baseline, ParametricBaseline)
     if not offsets.axes:
         return model, model.baseline
-    baseline = Shifted(model.baseline, offsets.accelerations()[problem.log], offsets.axes, offsets.speed)
+    baseline = Shifted(
+        model.baseline, offsets.accelerations()[problem.log], offsets.axes, offsets.speed
+    )
     return HybridDynamics(model.signals, baseline, model.head, model.dt, model.integrator), baseline
 
 
@@ -239,8 +294,16 @@ def _level(model: HybridDynamics, problem: _Problem, offsets: Offsets) -> Tensor
 
 
 @torch.no_grad()
-def _normal_equations(model: HybridDynamics, problem: _Problem, baseline: ParametricBaseline, level: Tensor, offsets: Offsets) -> Arrow:
-    """Gauss-Newton Hessian and half the gradient of the robust cost, as yet without what is believed of the offsets."""
+def _normal_equations(
+    model: HybridDynamics,
+    problem: _Problem,
+    baseline: ParametricBaseline,
+    level: Tensor,
+    offsets: Offsets,
+) -> Arrow:
+    """Gauss-Newton Hessian and half the gradient of the robust cost, as yet without what is
+    believed of the offsets.
+    """
     batch, steps = problem.w.shape[:2]
     shared, logs = int(problem.active.numel()), len(offsets.value)
     count = shared + len(offsets.axes)
@@ -262,9 +325,24 @@ def _normal_equations(model: HybridDynamics, problem: _Problem, baseline: Parame
     weight = 0.5 / torch.sqrt(square / (3 * steps) + problem.robust**2) / (3 * steps * batch)
     theta = baseline.theta.flatten()[problem.active]
     belief = problem.share(level) * problem.belief
-    total = torch.einsum("b,bij->ij", weight, hessian[:, :shared, :shared]) + problem.precision + torch.diag(problem.pull + belief)
-    prior = problem.precision @ (theta - problem.start) + problem.pull * theta + belief * (theta - problem.believed)
-    weighted, slope = weight[:, None, None] * hessian[:, :, shared:], weight[:, None] * gradient[:, shared:]
-    own = torch.zeros(logs, count, len(offsets.axes), dtype=x.dtype).index_add_(0, problem.log, weighted)
+    total = (
+        torch.einsum("b,bij->ij", weight, hessian[:, :shared, :shared])
+        + problem.precision
+        + torch.diag(problem.pull + belief)
+    )
+    prior = (
+        problem.precision @ (theta - problem.start)
+        + problem.pull * theta
+        + belief * (theta - problem.believed)
+    )
+    weighted, slope = (
+        weight[:, None, None] * hessian[:, :, shared:],
+        weight[:, None] * gradient[:, shared:],
+    )
+    own = torch.zeros(logs, count, len(offsets.axes), dtype=x.dtype).index_add_(
+        0, problem.log, weighted
+    )
     slopes = torch.zeros_like(offsets.value).index_add_(0, problem.log, slope)
-    return Arrow(total, own[:, :shared], own[:, shared:], weight @ gradient[:, :shared] + prior, slopes)
+    return Arrow(
+        total, own[:, :shared], own[:, shared:], weight @ gradient[:, :shared] + prior, slopes
+    )

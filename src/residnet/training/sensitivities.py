@@ -1,4 +1,6 @@
-"""One step of a free run, and the derivative of that step with respect to a baseline's parameters and the offsets beside it."""
+"""One step of a free run, and the derivative of that step with respect to a baseline's parameters
+and the offsets beside it.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,8 @@ from residnet.dynamics.hybrid import HybridDynamics
 
 @final
 class Shifted(Baseline):
-    """A baseline with an acceleration of its own beside it for every row of a batch, growing with the square of the speed as hull forces do.
+    """A baseline with an acceleration of its own beside it for every row of a batch, growing with
+    the square of the speed as hull forces do.
 
     Args:
         baseline: as it is without.
@@ -23,7 +26,9 @@ class Shifted(Baseline):
         speed: in m/s.
     """
 
-    def __init__(self, baseline: ParametricBaseline, value: Tensor, axes: Sequence[int], speed: float) -> None:
+    def __init__(
+        self, baseline: ParametricBaseline, value: Tensor, axes: Sequence[int], speed: float
+    ) -> None:
         super().__init__()
         self.baseline = baseline
         self.value = value
@@ -32,7 +37,9 @@ class Shifted(Baseline):
 
     def forward(self, z: Tensor) -> Tensor:
         """nu_dot [B, 3] at channels z [B, nz], which begin with u and v."""
-        return self.baseline(z) + self.growth(z) * self.value.repeat(z.shape[0] // self.value.shape[0], 1)
+        return self.baseline(z) + self.growth(z) * self.value.repeat(
+            z.shape[0] // self.value.shape[0], 1
+        )
 
     def growth(self, z: Tensor) -> Tensor:
         """Square of the speed over that at which the values hold, [B, 1]."""
@@ -43,8 +50,12 @@ class Shifted(Baseline):
         return self.baseline.freedom()
 
     def sensitivity(self, z: Tensor) -> Tensor:
-        """Derivative of nu_dot [B, 3, P + a] with respect to the baseline's movable parameters and to the row's own offsets."""
-        return torch.cat((self.baseline.sensitivity(z), self.growth(z).unsqueeze(-1) * self.unit), dim=2)
+        """Derivative of nu_dot [B, 3, P + a] with respect to the baseline's movable parameters and
+        to the row's own offsets.
+        """
+        return torch.cat(
+            (self.baseline.sensitivity(z), self.growth(z).unsqueeze(-1) * self.unit), dim=2
+        )
 
 
 def ahead(model: HybridDynamics, x: Tensor, p: Tensor) -> Tensor:
@@ -56,8 +67,12 @@ def ahead(model: HybridDynamics, x: Tensor, p: Tensor) -> Tensor:
     return torch.cat((x[:, :2], psi[:, None], nu), dim=-1)
 
 
-def carried(model: HybridDynamics, baseline: ParametricBaseline | Shifted, x: Tensor, p: Tensor, s: Tensor) -> Tensor:
-    """Sensitivities of (psi, u, v, r) to the parameters one step later, [B, 4, P], from s [B, 4, P] at the states x: the scheme's own derivative."""
+def carried(
+    model: HybridDynamics, baseline: ParametricBaseline | Shifted, x: Tensor, p: Tensor, s: Tensor
+) -> Tensor:
+    """Sensitivities of (psi, u, v, r) to the parameters one step later, [B, 4, P], from s [B, 4, P]
+    at the states x: the scheme's own derivative.
+    """
     change, total = torch.zeros_like(s), torch.zeros_like(s)
     place = x
     for node, weight in zip(model.nodes, model.weights, strict=True):
@@ -69,16 +84,24 @@ def carried(model: HybridDynamics, baseline: ParametricBaseline | Shifted, x: Te
         total = total + weight * change
     after = s + model.dt * total
     if len(model.nodes) == 1:
-        after = torch.cat((s[:, :1] + 0.5 * model.dt * (after[:, 3:] + s[:, 3:]), after[:, 1:]), dim=1)
+        after = torch.cat(
+            (s[:, :1] + 0.5 * model.dt * (after[:, 3:] + s[:, 3:]), after[:, 1:]), dim=1
+        )
     return after
 
 
 def _slopes(model: HybridDynamics, x: Tensor, p: Tensor) -> Tensor:
-    """Derivative of nu_dot with respect to (psi, u, v, r), [B, 3, 4], by forward differentiation along the four directions at once."""
+    """Derivative of nu_dot with respect to (psi, u, v, r), [B, 3, 4], by forward differentiation
+    along the four directions at once.
+    """
     batch = x.shape[0]
     tangent = torch.zeros(4, batch, x.shape[1], dtype=x.dtype)
     for direction in range(4):
         tangent[direction, :, 2 + direction] = 1.0
     repeated, inputs = x.repeat(4, 1), p.repeat(4, 1)
-    slopes = torch.func.jvp(lambda state: model.baseline(model.signals(state, inputs)), (repeated,), (tangent.reshape(-1, x.shape[1]),))[1]
+    slopes = torch.func.jvp(
+        lambda state: model.baseline(model.signals(state, inputs)),
+        (repeated,),
+        (tangent.reshape(-1, x.shape[1]),),
+    )[1]
     return slopes.reshape(4, batch, 3).permute(1, 2, 0)

@@ -46,5 +46,7 @@ def train(
         FitError: where training never gave a finite free run.
     """
     model.head.calibrate(samples)
-    module = HeadTraining(model.to(torch.float32), store, config, scales.to(torch.float32), validate, seed)
+    module = HeadTraining(
+        model.to(torch.float32), store, config, scales.to(torch.float32), validate, seed
+    )
     return run_epochs(name, module, model, model.head, folder)

@@ -1,4 +1,6 @@
-"""Courses round buoys, each with a side to pass and a radius to keep: arcs and their common tangents (document 004 sections 6.1.4.2, 6.2.4.2)."""
+"""Courses round buoys, each with a side to pass and a radius to keep: arcs and their common
+tangents (document 004 sections 6.1.4.2, 6.2.4.2).
+"""
 
 from __future__ import annotations
 
@@ -17,8 +19,9 @@ class BuoyConfig(Config):
 
     Attributes:
         north, east: where it is.
-        leave_to: the side of the vessel that it passes on; rounded to starboard, it is left to starboard. Document 004 plots x to the right
-            and y upwards: its "counter-clockwise" is a turn from x towards y, to starboard with x north and y east.
+        leave_to: the side of the vessel that it passes on; rounded to starboard, it is left to
+            starboard. Document 004 plots x to the right and y upwards: its "counter-clockwise" is a
+            turn from x towards y, to starboard with x north and y east.
         radius: of the circle that the vessel must stay outside of.
     """
 
@@ -29,7 +32,8 @@ class BuoyConfig(Config):
 
 
 class Piece(NamedTuple):
-    """A part of a course: a straight line where `turn` is 0, else an arc to starboard (+1) or port (-1) about a centre.
+    """A part of a course: a straight line where `turn` is 0, else an arc to starboard (+1) or port
+    (-1) about a centre.
 
     Attributes:
         length: in m.
@@ -47,7 +51,9 @@ class Piece(NamedTuple):
 
 
 class Feasibility(NamedTuple):
-    """Whether a vessel can follow a buoy's circle: by number, the radius asked for and the smallest possible one, in m."""
+    """Whether a vessel can follow a buoy's circle: by number, the radius asked for and the smallest
+    possible one, in m.
+    """
 
     buoy: int
     radius: float
@@ -60,7 +66,9 @@ class Feasibility(NamedTuple):
 
 
 def feasibility(buoys: Sequence[BuoyConfig], smallest: float) -> list[Feasibility]:
-    """Each buoy's radius beside the vessel's smallest turning radius in m (ERRATA 004 G18: both printed courses ask for less)."""
+    """Each buoy's radius beside the vessel's smallest turning radius in m (ERRATA 004 G18: both
+    printed courses ask for less).
+    """
     return [Feasibility(number + 1, buoy.radius, smallest) for number, buoy in enumerate(buoys)]
 
 
@@ -70,12 +78,15 @@ def widened(buoys: Sequence[BuoyConfig], smallest: float) -> list[BuoyConfig]:
 
 
 def course_round(start: tuple[float, float], buoys: Sequence[BuoyConfig]) -> list[Piece]:
-    """The taut course from a point past the buoys in their order, to the last one's circle: tangents and arcs in turn.
+    """The taut course from a point past the buoys in their order, to the last one's circle:
+    tangents and arcs in turn.
 
-    A buoy that the course turns away from is left on its side at a distance: the course is drawn without it.
+    A buoy that the course turns away from is left on its side at a distance: the course is drawn
+    without it.
 
     Raises:
-        ConfigError: where the start lies in the first circle, or circles overlap so that no tangent joins them.
+        ConfigError: where the start lies in the first circle, or circles overlap so that no tangent
+            joins them.
     """
     if not buoys:
         raise ConfigError("a course needs at least one buoy")
@@ -83,17 +94,25 @@ def course_round(start: tuple[float, float], buoys: Sequence[BuoyConfig]) -> lis
     while True:
         pieces = _tangents(start, left)
         arcs = [piece.length / piece.radius for piece in pieces if piece.turn != 0]
-        away = [i for i, arc in enumerate(arcs) if arc > math.pi and not _bends_round(start, left, i)]
+        away = [
+            i for i, arc in enumerate(arcs) if arc > math.pi and not _bends_round(start, left, i)
+        ]
         if not away:
             return pieces
         del left[max(away, key=lambda i: arcs[i])]
 
 
-def _bends_round(start: tuple[float, float], buoys: Sequence[tuple[int, BuoyConfig]], place: int) -> bool:
-    """Whether the line from the point before a buoy over it to the next one bends towards the side that it is left on."""
+def _bends_round(
+    start: tuple[float, float], buoys: Sequence[tuple[int, BuoyConfig]], place: int
+) -> bool:
+    """Whether the line from the point before a buoy over it to the next one bends towards the side
+    that it is left on.
+    """
     own, after = buoys[place][1], buoys[place + 1][1]
     north, east = start if place == 0 else (buoys[place - 1][1].north, buoys[place - 1][1].east)
-    bend = (own.north - north) * (after.east - own.east) - (own.east - east) * (after.north - own.north)
+    bend = (own.north - north) * (after.east - own.east) - (own.east - east) * (
+        after.north - own.north
+    )
     return (bend > 0) == (own.leave_to == "starboard")
 
 
@@ -104,13 +123,20 @@ def _tangents(start: tuple[float, float], buoys: Sequence[tuple[int, BuoyConfig]
     north, east, radius, sign = start[0], start[1], 0.0, 0
     for (number, buoy), side in zip(buoys, signs, strict=True):
         along, across = buoy.north - north, buoy.east - east
-        # the tangent from circle 0 to circle 1: the centres' line in its own frame is (length, s1 r1 - s0 r0)
+        # the tangent from circle 0 to circle 1: the centres' line in its own frame is (length, s1
+        # r1 - s0 r0)
         offset = side * buoy.radius - sign * radius
         square = along**2 + across**2 - offset**2
         if square <= 0:
-            raise ConfigError(f"buoy {number}: its circle of {buoy.radius:.4g} m overlaps what comes before it: no tangent joins them")
+            raise ConfigError(
+                f"buoy {number}: its circle of {buoy.radius:.4g} m overlaps what comes before it:"
+                " no tangent joins them"
+            )
         heading = math.atan2(across, along) - math.atan2(offset, math.sqrt(square))
-        begin = (north + sign * radius * math.sin(heading), east - sign * radius * math.cos(heading))
+        begin = (
+            north + sign * radius * math.sin(heading),
+            east - sign * radius * math.cos(heading),
+        )
         lines.append((*begin, heading, math.sqrt(square)))
         north, east, radius, sign = buoy.north, buoy.east, buoy.radius, side
     pieces: list[Piece] = []
@@ -118,7 +144,18 @@ def _tangents(start: tuple[float, float], buoys: Sequence[tuple[int, BuoyConfig]
         if number > 0:
             before, side = lines[number - 1], signs[number - 1]
             turned = (side * (heading - before[2])) % (2.0 * math.pi)
-            end = (before[0] + before[3] * math.cos(before[2]), before[1] + before[3] * math.sin(before[2]))
-            pieces.append(Piece(turned * buoys[number - 1][1].radius, *end, before[2], side, buoys[number - 1][1].radius))
+            end = (
+                before[0] + before[3] * math.cos(before[2]),
+                before[1] + before[3] * math.sin(before[2]),
+            )
+            pieces.append(
+                Piece(
+                    turned * buoys[number - 1][1].radius,
+                    *end,
+                    before[2],
+                    side,
+                    buoys[number - 1][1].radius,
+                )
+            )
         pieces.append(Piece(length, line_north, line_east, heading, 0, 0.0))
     return pieces

@@ -1,4 +1,6 @@
-"""Buoy courses as configs: what is asked for, what a vessel can do of it, the plan, and the shortest possible course."""
+"""Buoy courses as configs: what is asked for, what a vessel can do of it, the plan, and the
+shortest possible course.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,9 @@ from residnet.control.heading.turning import Turning
 from residnet.core.config import Config, Metres, Radians, Seconds
 
 Protocol = Literal["enter", "sides"]
-"""Buoys are entered: a circle of acceptance about each; or each is passed on its side, outside its own circle."""
+"""Buoys are entered: a circle of acceptance about each; or each is passed on its side, outside its
+own circle.
+"""
 
 
 class BuoyCourseConfig(Config):
@@ -60,7 +64,8 @@ class PlannedCourse:
         course: the plan.
         buoys: with radii that the vessel can follow.
         steady: the vessel's smallest turn.
-        floor: length in m of the shortest course of bounded curvature at that radius that fulfils the protocol.
+        floor: length in m of the shortest course of bounded curvature at that radius that fulfils
+            the protocol.
     """
 
     protocol: Protocol
@@ -75,16 +80,30 @@ def smallest_turn(config: BuoyCourseConfig, vessel: SteeredVessel, limit: float)
     return steady_turn(vessel, limit, config.turning_time, config.planning_dt)
 
 
-def report_feasibility(config: BuoyCourseConfig, steady: SteadyTurn) -> list[dict[str, float | bool]]:
-    """Of each buoy: radius asked for, smallest possible radius, in m, and whether the former is possible."""
+def report_feasibility(
+    config: BuoyCourseConfig, steady: SteadyTurn
+) -> list[dict[str, float | bool]]:
+    """Of each buoy: radius asked for, smallest possible radius, in m, and whether the former is
+    possible.
+    """
     return [
-        {"buoy": found.buoy, "radius": found.radius, "smallest": found.smallest, "possible": found.possible}
+        {
+            "buoy": found.buoy,
+            "radius": found.radius,
+            "smallest": found.smallest,
+            "possible": found.possible,
+        }
         for found in feasibility(config.buoys, steady.radius)
     ]
 
 
 def plan_course(
-    config: BuoyCourseConfig, protocol: Protocol, vessel: SteeredVessel, turning: Turning, limit: float, steady: SteadyTurn
+    config: BuoyCourseConfig,
+    protocol: Protocol,
+    vessel: SteeredVessel,
+    turning: Turning,
+    limit: float,
+    steady: SteadyTurn,
 ) -> PlannedCourse:
     """The shortest course that the nominal vessel can follow with a share of its rudder.
 
@@ -93,14 +112,29 @@ def plan_course(
     """
     buoys = tuple(widened(config.buoys, steady.radius))
     hardest = config.share * limit
-    marks = _to_enter(config, hardest) if protocol == "enter" else _to_pass(config, buoys, hardest, steady.radius)
+    marks = (
+        _to_enter(config, hardest)
+        if protocol == "enter"
+        else _to_pass(config, buoys, hardest, steady.radius)
+    )
     make = TurnMaker(vessel, turning, config.planning_dt)
-    course = plan(config.start, config.heading, marks[:-1], marks[-1], make, steady, 0.1 * turning.speed, 5.0 * config.lookahead)
+    course = plan(
+        config.start,
+        config.heading,
+        marks[:-1],
+        marks[-1],
+        make,
+        steady,
+        0.1 * turning.speed,
+        5.0 * config.lookahead,
+    )
     return PlannedCourse(protocol, course, buoys, steady, _floor(config, protocol, buoys, steady))
 
 
 def _to_enter(config: BuoyCourseConfig, rudder: float) -> list[Mark]:
-    """Turns where the line from way-point to way-point bends; one that the line enters anyway needs none."""
+    """Turns where the line from way-point to way-point bends; one that the line enters anyway needs
+    none.
+    """
     depth = -(1.0 - config.reach) * config.acceptance
     places = [config.start, *((buoy.north, buoy.east) for buoy in config.buoys)]
     left = list(range(1, len(places)))
@@ -108,7 +142,13 @@ def _to_enter(config: BuoyCourseConfig, rudder: float) -> list[Mark]:
     before = places[0]
     for number, after in itertools.pairwise(left):
         here, there = places[number], places[after]
-        along, across = (there[0] - before[0], there[1] - before[1]), (here[0] - before[0], here[1] - before[1])
+        along, across = (
+            (there[0] - before[0], there[1] - before[1]),
+            (
+                here[0] - before[0],
+                here[1] - before[1],
+            ),
+        )
         offset = along[0] * across[1] - along[1] * across[0]
         inside = 0 <= along[0] * across[0] + along[1] * across[1] <= along[0] ** 2 + along[1] ** 2
         if inside and abs(offset) <= -depth * math.hypot(*along):
@@ -118,7 +158,9 @@ def _to_enter(config: BuoyCourseConfig, rudder: float) -> list[Mark]:
     return [*marks, Mark(left[-1], *places[-1], 1, depth, rudder)]
 
 
-def _to_pass(config: BuoyCourseConfig, buoys: tuple[BuoyConfig, ...], rudder: float, smallest: float) -> list[Mark]:
+def _to_pass(
+    config: BuoyCourseConfig, buoys: tuple[BuoyConfig, ...], rudder: float, smallest: float
+) -> list[Mark]:
     """Turns where the taut course bends round a circle."""
     arcs = [piece for piece in course_round(config.start, buoys) if piece.turn != 0]
     marks = []
@@ -126,22 +168,45 @@ def _to_pass(config: BuoyCourseConfig, buoys: tuple[BuoyConfig, ...], rudder: fl
         sign = 1 if buoy.leave_to == "starboard" else -1
         # the centre of an arc is its buoy
         centres = [
-            (arc.north - arc.turn * arc.radius * math.sin(arc.heading), arc.east + arc.turn * arc.radius * math.cos(arc.heading)) for arc in arcs
+            (
+                arc.north - arc.turn * arc.radius * math.sin(arc.heading),
+                arc.east + arc.turn * arc.radius * math.cos(arc.heading),
+            )
+            for arc in arcs
         ]
-        if number == len(buoys) or any(math.hypot(n - buoy.north, e - buoy.east) < 1e-6 * buoy.radius + 1e-9 for n, e in centres):
+        if number == len(buoys) or any(
+            math.hypot(n - buoy.north, e - buoy.east) < 1e-6 * buoy.radius + 1e-9
+            for n, e in centres
+        ):
             # a wide circle needs less rudder
             needed = rudder * min(1.0, smallest / buoy.radius)
-            marks.append(Mark(number, buoy.north, buoy.east, sign, (1.0 + config.margin) * buoy.radius, needed))
+            marks.append(
+                Mark(
+                    number, buoy.north, buoy.east, sign, (1.0 + config.margin) * buoy.radius, needed
+                )
+            )
     return marks
 
 
-def _floor(config: BuoyCourseConfig, protocol: Protocol, buoys: tuple[BuoyConfig, ...], steady: SteadyTurn) -> float:
+def _floor(
+    config: BuoyCourseConfig, protocol: Protocol, buoys: tuple[BuoyConfig, ...], steady: SteadyTurn
+) -> float:
     if protocol == "sides":
         line, *others = course_round(config.start, buoys)
         onto = line.length
         if config.heading is not None:
-            end = (line.north + line.length * math.cos(line.heading), line.east + line.length * math.sin(line.heading), line.heading)
-            onto = float(dubins_length(np.array([*config.start, config.heading]), np.array(end), steady.radius))
+            end = (
+                line.north + line.length * math.cos(line.heading),
+                line.east + line.length * math.sin(line.heading),
+                line.heading,
+            )
+            onto = float(
+                dubins_length(
+                    np.array([*config.start, config.heading]), np.array(end), steady.radius
+                )
+            )
         return onto + sum(piece.length for piece in others)
     points = [(buoy.north, buoy.east) for buoy in config.buoys]
-    return shortest_course((*config.start, config.heading), points, config.acceptance, steady.radius)
+    return shortest_course(
+        (*config.start, config.heading), points, config.acceptance, steady.radius
+    )

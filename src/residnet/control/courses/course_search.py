@@ -1,4 +1,6 @@
-"""The search for the quickest course of turns and legs: what a choice of times gives, by splines through simulated turns, and its best choice."""
+"""The search for the quickest course of turns and legs: what a choice of times gives, by splines
+through simulated turns, and its best choice.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,9 @@ from scipy.optimize import Bounds, minimize
 from residnet.control.courses.turns import Array, Turn
 
 _LEG = 60
-"""Points of a leg, denser at its beginning, where the turn's sway dies out; many more where a turn is not one of several."""
+"""Points of a leg, denser at its beginning, where the turn's sway dies out; many more where a turn
+is not one of several.
+"""
 _ASIDE = 0.5
 """By which the first heading may be changed, in rad."""
 _DIFFERENCE = 1e-5
@@ -32,8 +36,8 @@ class Mark(NamedTuple):
         number: of the buoy or way-point, from 1.
         north, east: in m.
         turn: to starboard (+1) or to port (-1).
-        clearance: between the mark and the track in m, the mark on the inner side; where it is negative, the track may pass within that
-            distance on either side.
+        clearance: between the mark and the track in m, the mark on the inner side; where it is
+            negative, the track may pass within that distance on either side.
         rudder: angle that the turn is made with in rad, positive.
     """
 
@@ -91,8 +95,8 @@ class Asked:
 
 @final
 class Family:
-    """A turn and the leg behind it as functions of the time for which the rudder is held: cubic splines through turns made, in units of the
-    course's time; a single turn stands for itself.
+    """A turn and the leg behind it as functions of the time for which the rudder is held: cubic
+    splines through turns made, in units of the course's time; a single turn stands for itself.
 
     Args:
         turns: from one and the same motion, held ever longer.
@@ -100,11 +104,19 @@ class Family:
     """
 
     def __init__(self, turns: Sequence[Turn], unit: float) -> None:
-        self.times = turns[0].leg.x[-1] * np.linspace(0.0, 1.0, _LEG if len(turns) > 1 else 10 * _LEG) ** 2 / unit
+        self.times = (
+            turns[0].leg.x[-1]
+            * np.linspace(0.0, 1.0, _LEG if len(turns) > 1 else 10 * _LEG) ** 2
+            / unit
+        )
         rows = []
         for turn in turns:
             after, heading = turn.along(unit * self.times)
-            rows.append(np.concatenate((turn.track.ravel(), after.ravel(), heading, [turn.times[-1] / unit])))
+            rows.append(
+                np.concatenate(
+                    (turn.track.ravel(), after.ravel(), heading, [turn.times[-1] / unit])
+                )
+            )
         holds = np.array([turn.hold for turn in turns]) / unit
         self.points = len(turns[0].track)
         self.low, self.high = float(holds[0]), float(holds[-1])
@@ -112,10 +124,17 @@ class Family:
         self.spline = CubicSpline(holds, np.array(rows)) if len(turns) > 1 else None
 
     def __call__(self, hold: float) -> tuple[Array, Array, Array, float]:
-        """Track [N, 2] until the counter-rudder ends, the leg's [M, 2] and its headings [M] by `times`, and when it begins."""
+        """Track [N, 2] until the counter-rudder ends, the leg's [M, 2] and its headings [M] by
+        `times`, and when it begins.
+        """
         row = self.row if self.spline is None else self.spline(hold)
         split, end = 2 * self.points, 2 * (self.points + len(self.times))
-        return row[:split].reshape(-1, 2), row[split:end].reshape(-1, 2), row[end:-1], float(row[-1])
+        return (
+            row[:split].reshape(-1, 2),
+            row[split:end].reshape(-1, 2),
+            row[end:-1],
+            float(row[-1]),
+        )
 
 
 def turned(points: Array, heading: float) -> Array:
@@ -125,7 +144,8 @@ def turned(points: Array, heading: float) -> Array:
 
 
 def _clearance(mark: Mark, track: Array) -> float:
-    """Distance of a mark from a track of straight pieces, positive on the inner side of its turn."""
+    """Distance of a mark from a track of straight pieces, positive on the inner side of its turn.
+    """
     place = np.array([mark.north, mark.east])
     begin, piece = track[:-1], np.diff(track, axis=0)
     square = (piece**2).sum(axis=1)
@@ -138,7 +158,8 @@ def _clearance(mark: Mark, track: Array) -> float:
 
 @final
 class Problem:
-    """What times give: z = (first heading, leg, hold, leg, hold, ..., leg), in rad and in the course's unit of time.
+    """What times give: z = (first heading, leg, hold, leg, hold, ..., leg), in rad and in the
+    course's unit of time.
 
     Args:
         asked: of the course.
@@ -150,8 +171,9 @@ class Problem:
         self.asked, self.families, self.straight = asked, families, straight
 
     def legs(self, z: Array) -> tuple[list[tuple[Array, Array]], float, float]:
-        """Tracks of each turn (of none before the first leg) and of the leg behind it in the earth's frame, the heading at the end, and the
-        time of all."""
+        """Tracks of each turn (of none before the first leg) and of the leg behind it in the
+        earth's frame, the heading at the end, and the time of all.
+        """
         level, unit = float(z[0]), self.asked.unit
         along = np.array([math.cos(level), math.sin(level)])
         at = self.asked.start + self.straight * unit * float(z[1]) * along
@@ -168,7 +190,9 @@ class Problem:
         return parts, level, time
 
     def results(self, z: Array) -> Array:
-        """Time of the course, clearances of the marks and of the goal, and the distance left along the last leg, where it ends abeam."""
+        """Time of the course, clearances of the marks and of the goal, and the distance left along
+        the last leg, where it ends abeam.
+        """
         asked = self.asked
         parts, level, time = self.legs(z)
         found = []
@@ -184,9 +208,13 @@ class Problem:
         return np.array([time, *(value / asked.radius for value in found)])
 
     def missed(self, z: Array) -> Array:
-        """How far the clearances lie outside their limits, and the course's end from where it should be, in turning radii."""
+        """How far the clearances lie outside their limits, and the course's end from where it
+        should be, in turning radii.
+        """
         found = self.results(z)[1:]
-        outside = np.maximum(np.maximum(self.asked.low - found[:-1], found[:-1] - self.asked.high), 0.0)
+        outside = np.maximum(
+            np.maximum(self.asked.low - found[:-1], found[:-1] - self.asked.high), 0.0
+        )
         return np.append(outside, abs(found[-1]))
 
     def cost(self, z: Array) -> float:
@@ -205,15 +233,20 @@ class _Differences:
         if self.at is None or not np.array_equal(self.at, z):
             self.at = z.copy()
             value = self.function(z)
-            columns = [(self.function(z + _DIFFERENCE * unit) - value) / _DIFFERENCE for unit in np.eye(len(z))]
+            columns = [
+                (self.function(z + _DIFFERENCE * unit) - value) / _DIFFERENCE
+                for unit in np.eye(len(z))
+            ]
             self.known = (value, np.stack(columns, axis=-1))
         return self.known
 
 
 def quickest(problem: Problem, z: Array, reach: float) -> Array:
-    """The best that sequential quadratic programming finds from z, within the times that the families know; a single turn's time stays.
+    """The best that sequential quadratic programming finds from z, within the times that the
+    families know; a single turn's time stays.
 
-    The time is linear in z: how far its first steps go depends on the weight of the time beside the constraints, so that several are tried.
+    The time is linear in z: how far its first steps go depends on the weight of the time beside the
+    constraints, so that several are tried.
 
     Args:
         problem: see there.
@@ -222,12 +255,17 @@ def quickest(problem: Problem, z: Array, reach: float) -> Array:
     """
     asked, both = problem.asked, _Differences(problem.results)
     least, most = z - reach, z + reach
-    least[2::2], most[2::2] = [family.low for family in problem.families], [family.high for family in problem.families]
+    least[2::2], most[2::2] = (
+        [family.low for family in problem.families],
+        [family.high for family in problem.families],
+    )
     least[3::2] = np.maximum(least[3::2], 0.0)
     most[3::2] = np.minimum(most[3::2], [family.times[-1] for family in problem.families])
     aside = _ASIDE if asked.heading is None else 0.0
     least[0], most[0] = z[0] - aside, z[0] + aside
-    least[1], most[1] = (max(float(least[1]), 0.0), float(most[1])) if asked.heading is None else (0.0, 0.0)
+    least[1], most[1] = (
+        (max(float(least[1]), 0.0), float(most[1])) if asked.heading is None else (0.0, 0.0)
+    )
     begin = np.clip(z, least, most)
     # its types know no constraints with Jacobians
     solve: Any = minimize
@@ -251,7 +289,10 @@ def _constraints(asked: Asked, both: _Differences) -> list[dict[str, Any]]:
     n, bounded = len(low), np.flatnonzero(np.isfinite(high))
     if asked.goal.clearance > 0:
         bounded = bounded[:-1]
-        kinds = [("ineq", 1.0, np.arange(1, n), -low[:-1]), ("eq", 1.0, np.array([n, n + 1]), np.array([-low[-1], 0.0]))]
+        kinds = [
+            ("ineq", 1.0, np.arange(1, n), -low[:-1]),
+            ("eq", 1.0, np.array([n, n + 1]), np.array([-low[-1], 0.0])),
+        ]
     else:
         kinds = [("ineq", 1.0, np.arange(1, n + 1), -low)]
     kinds.append(("ineq", -1.0, 1 + bounded, high[bounded]))

@@ -1,4 +1,6 @@
-"""Shortest paths of bounded curvature: between poses, and through circles of acceptance. Over the speed they are the floor of a course's time."""
+"""Shortest paths of bounded curvature: between poses, and through circles of acceptance. Over the
+speed they are the floor of a course's time.
+"""
 
 from __future__ import annotations
 
@@ -18,12 +20,15 @@ def _arc(side: float, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
 
 
 def _centre(pose: np.ndarray, side: float, radius: float) -> np.ndarray:
-    return pose[..., :2] + side * radius * np.stack((-np.sin(pose[..., 2]), np.cos(pose[..., 2])), axis=-1)
+    return pose[..., :2] + side * radius * np.stack(
+        (-np.sin(pose[..., 2]), np.cos(pose[..., 2])), axis=-1
+    )
 
 
 def dubins_length(start: np.ndarray, end: np.ndarray, radius: float) -> np.ndarray:
-    """Length [...] in m of the shortest path between poses [..., 3] = (north, east, heading), shapes broadcast, whose turns have a radius of
-    at least `radius` (L. E. Dubins 1957): two arcs and their common tangent, or three arcs.
+    """Length [...] in m of the shortest path between poses [..., 3] = (north, east, heading),
+    shapes broadcast, whose turns have a radius of at least `radius` (L. E. Dubins 1957): two arcs
+    and their common tangent, or three arcs.
     """
     start, end = np.broadcast_arrays(np.asarray(start, dtype=float), np.asarray(end, dtype=float))
     h0, h1 = start[..., 2], end[..., 2]
@@ -31,8 +36,13 @@ def dubins_length(start: np.ndarray, end: np.ndarray, radius: float) -> np.ndarr
     for side in (1.0, -1.0):
         own = _centre(start, side, radius)
         line = _centre(end, side, radius) - own
-        distance, bearing = np.hypot(line[..., 0], line[..., 1]), np.arctan2(line[..., 1], line[..., 0])
-        best = np.minimum(best, radius * (_arc(side, h0, bearing) + _arc(side, bearing, h1)) + distance)
+        distance, bearing = (
+            np.hypot(line[..., 0], line[..., 1]),
+            np.arctan2(line[..., 1], line[..., 0]),
+        )
+        best = np.minimum(
+            best, radius * (_arc(side, h0, bearing) + _arc(side, bearing, h1)) + distance
+        )
         # three arcs, the middle one about either point that is two radii from both centres
         lean = np.arccos(np.clip(distance / (4.0 * radius), 0.0, 1.0))
         for hand in (1.0, -1.0):
@@ -42,7 +52,10 @@ def dubins_length(start: np.ndarray, end: np.ndarray, radius: float) -> np.ndarr
             turned = _arc(side, h0, first) + _arc(-side, first, second) + _arc(side, second, h1)
             best = np.where(distance <= 4.0 * radius, np.minimum(best, radius * turned), best)
         line = _centre(end, -side, radius) - own
-        distance, bearing = np.hypot(line[..., 0], line[..., 1]), np.arctan2(line[..., 1], line[..., 0])
+        distance, bearing = (
+            np.hypot(line[..., 0], line[..., 1]),
+            np.arctan2(line[..., 1], line[..., 0]),
+        )
         straight = np.sqrt(np.maximum(distance**2 - 4.0 * radius**2, 0.0))
         heading = bearing + side * np.arctan2(2.0 * radius, straight)
         total = radius * (_arc(side, h0, heading) + _arc(-side, heading, h1)) + straight
@@ -58,20 +71,28 @@ def shortest_course(
     places: int = 24,
     headings: int = 36,
 ) -> float:
-    """Length in m of the shortest path from a pose (heading None: any) that enters the circles of acceptance of way-points in their order.
+    """Length in m of the shortest path from a pose (heading None: any) that enters the circles of
+    acceptance of way-points in their order.
 
-    Dynamic programming over `places` on each circle and `headings` there: an upper bound of the shortest, which falls as both grow.
+    Dynamic programming over `places` on each circle and `headings` there: an upper bound of the
+    shortest, which falls as both grow.
     """
     angle = np.linspace(0.0, _TURN, places, endpoint=False)
     course = np.linspace(-math.pi, math.pi, headings, endpoint=False)
-    poses = np.array([(start[0], start[1], heading) for heading in (course if start[2] is None else (start[2],))])
+    poses = np.array(
+        [(start[0], start[1], heading) for heading in (course if start[2] is None else (start[2],))]
+    )
     cost = np.zeros(len(poses))
     for north, east in points:
         if acceptance > 0:
-            spots = np.stack((north + acceptance * np.cos(angle), east + acceptance * np.sin(angle)), axis=-1)
+            spots = np.stack(
+                (north + acceptance * np.cos(angle), east + acceptance * np.sin(angle)), axis=-1
+            )
         else:
             spots = np.array([[north, east]])
-        after = np.concatenate((np.repeat(spots, headings, axis=0), np.tile(course, len(spots))[:, None]), axis=1)
+        after = np.concatenate(
+            (np.repeat(spots, headings, axis=0), np.tile(course, len(spots))[:, None]), axis=1
+        )
         reached = np.full(len(after), np.inf)
         for block in range(0, len(poses), 64):
             part = slice(block, block + 64)

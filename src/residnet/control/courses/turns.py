@@ -1,4 +1,6 @@
-"""Turns as a vessel makes them: rudder held, then counter-rudder until the yaw stops, then amidships; from any motion that it comes with."""
+"""Turns as a vessel makes them: rudder held, then counter-rudder until the yaw stops, then
+amidships; from any motion that it comes with.
+"""
 
 from __future__ import annotations
 
@@ -23,12 +25,14 @@ _COUNTER = 1.5
 
 @dataclass(frozen=True)
 class Turn:
-    """A turn from the origin, heading north at the beginning, and the leg behind it with the rudder amidships.
+    """A turn from the origin, heading north at the beginning, and the leg behind it with the rudder
+    amidships.
 
     Attributes:
         rudder: angle held in rad, positive to starboard; then the same to the other side.
         hold: for how long, in s.
-        times: samples of the turn [N] in s; the last is where the counter-rudder ends and the leg begins.
+        times: samples of the turn [N] in s; the last is where the counter-rudder ends and the leg
+            begins.
         track: north, east [N, 2] in m.
         heading: [N] in rad, not wrapped.
         leg: states of the vessel [nx] by the time in s since the leg began.
@@ -51,9 +55,11 @@ class Turn:
 
 @final
 class TurnMaker:
-    """Turns of the nominal vessel: rudder held, counter-rudder until the yaw stops, rudder amidships.
+    """Turns of the nominal vessel: rudder held, counter-rudder until the yaw stops, rudder
+    amidships.
 
-    The three follow from simulations that begin where they do, so that what comes of a turn changes smoothly with its time.
+    The three follow from simulations that begin where they do, so that what comes of a turn changes
+    smoothly with its time.
 
     Args:
         vessel: that turns.
@@ -68,7 +74,9 @@ class TurnMaker:
         x, self.inputs = vessel.start(torch.ones(1, dtype=torch.float64))
         self.straight: Array = x[0].numpy()
 
-    def __call__(self, holds: Array, rudder: Array, begin: Sequence[Array], leg: float) -> list[list[Turn]]:
+    def __call__(
+        self, holds: Array, rudder: Array, begin: Sequence[Array], leg: float
+    ) -> list[list[Turn]]:
         """Turns of n rudder angles, each held for K times.
 
         Args:
@@ -82,18 +90,31 @@ class TurnMaker:
         x[:, list(self.columns)] = 0.0
         held = self._phase(x, rudder, float(holds.max()))
         rows = np.repeat(np.arange(n), k)
-        countered = self._phase(_of_rows(held, holds.ravel(), rows), -rudder[rows], _COUNTER * self.turning.time)
+        countered = self._phase(
+            _of_rows(held, holds.ravel(), rows), -rudder[rows], _COUNTER * self.turning.time
+        )
         stops = self._stops(countered, np.sign(rudder)[rows])
         rows = np.arange(n * k)
         left = self._phase(_of_rows(countered, stops, rows), np.zeros(n * k), leg)
         turns = []
         for row, (hold, stop) in enumerate(zip(holds.ravel(), stops, strict=True)):
-            first, then = np.linspace(0.0, hold, len(held.x)), np.linspace(0.0, stop, len(countered.x))
+            first, then = (
+                np.linspace(0.0, hold, len(held.x)),
+                np.linspace(0.0, stop, len(countered.x)),
+            )
             states = np.concatenate((held(first)[:-1, row // k], countered(then)[:, row]))
             times = np.concatenate((first[:-1], hold + then))
             after = PPoly(left.c[:, :, row], left.x)
             turns.append(
-                Turn(float(rudder[row // k]), hold, times, states[:, list(self.columns[:2])], states[:, self.columns[2]], after, self.columns)
+                Turn(
+                    float(rudder[row // k]),
+                    hold,
+                    times,
+                    states[:, list(self.columns[:2])],
+                    states[:, self.columns[2]],
+                    after,
+                    self.columns,
+                )
             )
         return [turns[k * i : k * i + k] for i in range(n)]
 
@@ -133,7 +154,9 @@ class SteadyTurn:
 
 
 def steady_turn(vessel: SteeredVessel, rudder: float, duration: float, dt: float) -> SteadyTurn:
-    """What is left after `duration` s of a held rudder angle in rad: at the rudder's limit, the smallest turn that the vessel makes."""
+    """What is left after `duration` s of a held rudder angle in rad: at the rudder's limit, the
+    smallest turn that the vessel makes.
+    """
     x, w = vessel.start(torch.ones(1, dtype=torch.float64))
     w[:, 0] = rudder
     variation = torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64)

@@ -1,4 +1,6 @@
-"""Guidance along a planned course: where the vessel is along it, and what heading, yaw rate and rudder it asks for there."""
+"""Guidance along a planned course: where the vessel is along it, and what heading, yaw rate and
+rudder it asks for there.
+"""
 
 from __future__ import annotations
 
@@ -16,20 +18,24 @@ from residnet.control.guidance.drift import DriftEstimate
 from residnet.core.errors import ConfigError
 
 _LEAST = 0.3
-"""Of 1 - curvature x cross-track error: beyond, the centre of the turn is near and the nearest point no longer known."""
+"""Of 1 - curvature x cross-track error: beyond, the centre of the turn is near and the nearest
+point no longer known.
+"""
 
 
 @final
 class CourseGuidance(Reference):
     """Reference [B, 3] of `following.FOLLOWED` for a planned course.
 
-    Line of sight on a curved path: heading_d = heading of the course - atan(e / look-ahead), e the cross-track error, positive to starboard,
-    where the vessel makes way along the course's own tangent. Yaw rate and rudder are those of the course at the present speed, so that
-    turns begin before the arc does. The place along the course moves by one Newton step of the nearest point each time, never back.
+    Line of sight on a curved path: heading_d = heading of the course - atan(e / look-ahead), e the
+    cross-track error, positive to starboard, where the vessel makes way along the course's own
+    tangent. Yaw rate and rudder are those of the course at the present speed, so that turns begin
+    before the arc does. The place along the course moves by one Newton step of the nearest point
+    each time, never back.
 
-    With an estimate of the drift D, heading_d = heading of the course - atan(e / look-ahead + D across), and the yaw rate counts what D says
-    of the speed over ground; D turns with respect to the course in its bends.
-    Memory [B, 1 or 3]: place along the course in m, and D.
+    With an estimate of the drift D, heading_d = heading of the course - atan(e / look-ahead + D
+    across), and the yaw rate counts what D says of the speed over ground; D turns with respect to
+    the course in its bends. Memory [B, 1 or 3]: place along the course in m, and D.
 
     Args:
         course: to follow.
@@ -38,13 +44,24 @@ class CourseGuidance(Reference):
         drift: integral action against a steady current, at the same look-ahead; None for none.
     """
 
-    def __init__(self, course: Course, lookahead: float, state: Sequence[str], drift: DriftEstimate | None = None) -> None:
+    def __init__(
+        self,
+        course: Course,
+        lookahead: float,
+        state: Sequence[str],
+        drift: DriftEstimate | None = None,
+    ) -> None:
         super().__init__()
         if lookahead <= 0:
             raise ConfigError(f"look-ahead must be above zero, given {lookahead:g} m")
-        curvatures = (np.gradient(course.direction, course.step), np.gradient(course.heading, course.step))
+        curvatures = (
+            np.gradient(course.direction, course.step),
+            np.gradient(course.heading, course.step),
+        )
         columns = (*course.track.T, course.direction, course.heading, course.rudder, *curvatures)
-        self.register_buffer("table", torch.from_numpy(np.stack(columns, axis=-1)), persistent=False)
+        self.register_buffer(
+            "table", torch.from_numpy(np.stack(columns, axis=-1)), persistent=False
+        )
         self.table: Tensor
         self.spacing, self.length, self.lookahead = course.step, course.length, lookahead
         self.farthest = course.step * (len(course.track) - 1)
@@ -56,12 +73,16 @@ class CourseGuidance(Reference):
         self.may_finish = True
 
     def at(self, place: Tensor) -> Tensor:
-        """North, east, direction, heading, rudder, and the curvatures of direction and heading [B, 7] at places [B] in m."""
+        """North, east, direction, heading, rudder, and the curvatures of direction and heading [B,
+        7] at places [B] in m.
+        """
         along = (place / self.spacing).clamp(0.0, float(self.table.shape[0]) - 1.001)
         before = along.floor()
         share = (along - before).unsqueeze(-1)
         number = before.long()
-        return (1.0 - share) * self.table[number].to(place.dtype) + share * self.table[number + 1].to(place.dtype)
+        return (1.0 - share) * self.table[number].to(place.dtype) + share * self.table[
+            number + 1
+        ].to(place.dtype)
 
     def error(self, x: Tensor, place: Tensor) -> tuple[Tensor, Tensor]:
         """Distance ahead [B] of a place along the course, and cross-track error [B], in m."""
@@ -82,7 +103,10 @@ class CourseGuidance(Reference):
         slope, memory = aside / self.lookahead, s[:, 1:]
         across, along = torch.zeros_like(aside), torch.zeros_like(aside)
         if self.drift is not None:
-            across, along = self.drift.across(direction, memory), self.drift.along(direction, memory)
+            across, along = (
+                self.drift.across(direction, memory),
+                self.drift.along(direction, memory),
+            )
             memory = self.drift(aside, direction, memory)
         slope = slope + across
         speed = torch.sqrt(x[:, self.u].square() + x[:, self.v].square())
@@ -90,7 +114,9 @@ class CourseGuidance(Reference):
         away = torch.remainder(x[:, self.psi] - heading + math.pi, 2.0 * math.pi) - math.pi
         closeness = (1.0 - known[:, 5] * aside).clamp(min=self.least)
         progress = (speed * torch.cos(away) + stream * along).clamp(min=0.0) / closeness
-        sliding = (speed * torch.sin(away) + stream * across) / self.lookahead - along * known[:, 5] * progress
+        sliding = (speed * torch.sin(away) + stream * across) / self.lookahead - along * known[
+            :, 5
+        ] * progress
         rate = known[:, 6] * progress - sliding / (1.0 + slope.square())
         reference = torch.stack((heading - torch.atan(slope), rate, known[:, 4]), dim=-1)
         return reference, torch.cat((place.unsqueeze(-1), memory), dim=-1)

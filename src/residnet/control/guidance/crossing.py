@@ -1,4 +1,6 @@
-"""Line-of-sight guidance with a circle of acceptance that feeds a reference filter (document 002 section 2.2.2)."""
+"""Line-of-sight guidance with a circle of acceptance that feeds a reference filter (document 002
+section 2.2.2).
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,13 @@ from pydantic import Field, model_validator
 from torch import Tensor
 
 from residnet.control.base import Reference
-from residnet.control.motion.anticipation import Derivatives, Lag, derivatives, needed_force, reference_row
+from residnet.control.motion.anticipation import (
+    Derivatives,
+    Lag,
+    derivatives,
+    needed_force,
+    reference_row,
+)
 from residnet.control.motion.reference_filter import ReferenceFilterConfig
 from residnet.core.config import Config, Metres, RadiansPerSecond, Seconds
 from residnet.core.frames import wrap
@@ -22,7 +30,8 @@ class CrossingConfig(Config):
 
     Attributes:
         points: (north, east) in m, where the ferry starts and then where each leg ends.
-        circle: radius around the ferry; it meets the leg at the point that is steered for (2.16)-(2.18).
+        circle: radius around the ferry; it meets the leg at the point that is steered for
+            (2.16)-(2.18).
         frequency: Omega of the filter, all axes.
         damping: Delta of the filter.
         duration: of the whole crossing with its stop.
@@ -45,17 +54,23 @@ class CrossingConfig(Config):
         """The filter behind the guidance."""
         last = (*self.points[-1], 0.0)
         three = (self.frequency,) * 3
-        return ReferenceFilterConfig(waypoints=(last,), frequency=three, damping=(self.damping,) * 3)
+        return ReferenceFilterConfig(
+            waypoints=(last,), frequency=three, damping=(self.damping,) * 3
+        )
 
 
 @final
 class Crossing(Reference):
-    """Reference [B, 18] for `Assisted`: the filtered line-of-sight point and what each row's own model needs.
+    """Reference [B, 18] for `Assisted`: the filtered line-of-sight point and what each row's own
+    model needs.
 
-    Memory [B, 13]: the filter's nine, the number of the leg, the point and heading that were steered for last.
+    Memory [B, 13]: the filter's nine, the number of the leg, the point and heading that were
+    steered for last.
     """
 
-    def __init__(self, config: CrossingConfig, dt: float, models: Sequence[tuple[ForceModel, Lag | None]]) -> None:
+    def __init__(
+        self, config: CrossingConfig, dt: float, models: Sequence[tuple[ForceModel, Lag | None]]
+    ) -> None:
         super().__init__()
         self.n_state = 13
         self.config, self.dt, self.models = config, dt, list(models)
@@ -66,10 +81,14 @@ class Crossing(Reference):
     def initial_state(self, x: Tensor) -> Tensor:
         """At rest where the ferry is, on the first leg; NaN for no point yet."""
         rest = torch.zeros_like(x[:, :1])
-        return torch.cat((x[:, :3], rest.expand(-1, 7), torch.full_like(x[:, :3], torch.nan)), dim=-1)
+        return torch.cat(
+            (x[:, :3], rest.expand(-1, 7), torch.full_like(x[:, :3], torch.nan)), dim=-1
+        )
 
     def target(self, x: Tensor, heading: Tensor, leg: Tensor) -> tuple[Tensor, Tensor]:
-        """Point and heading [B, 3] to steer for from states x [B, nx], and the leg [B] after a change; `heading` [B] is the desired one."""
+        """Point and heading [B, 3] to steer for from states x [B, nx], and the leg [B] after a
+        change; `heading` [B] is the desired one.
+        """
         last = len(self.points) - 2
         place = x[:, :2]
         near = (self.points[leg + 1] - place).norm(dim=-1) < self.config.circle
@@ -95,8 +114,14 @@ class Crossing(Reference):
         steady = (rate[:, :2].norm(dim=-1) < self.config.circle) & (leg == old)
         rate = torch.where(steady[:, None], rate, torch.zeros_like(rate))
         motion = derivatives(self.filter_config, s[:, :9], target, rate)
-        forces = [needed_force(model, Derivatives(*(part[i : i + 1] for part in motion)), lag, self.dt) for i, (model, lag) in enumerate(self.models)]
+        forces = [
+            needed_force(model, Derivatives(*(part[i : i + 1] for part in motion)), lag, self.dt)
+            for i, (model, lag) in enumerate(self.models)
+        ]
         error = torch.stack((s[:, :3] - target, s[:, 3:6], s[:, 6:9]), dim=-1)
         after = torch.einsum("aij,baj->bia", self.advance, error)
-        memory = torch.cat((after[:, 0] + target, after[:, 1], after[:, 2], leg[:, None].to(s.dtype), target), dim=-1)
+        memory = torch.cat(
+            (after[:, 0] + target, after[:, 1], after[:, 2], leg[:, None].to(s.dtype), target),
+            dim=-1,
+        )
         return reference_row(motion, torch.cat(forces)), memory

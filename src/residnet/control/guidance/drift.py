@@ -1,4 +1,6 @@
-"""Integral action of line-of-sight guidance: how far a current that nobody measures sets the vessel across its way."""
+"""Integral action of line-of-sight guidance: how far a current that nobody measures sets the vessel
+across its way.
+"""
 
 from __future__ import annotations
 
@@ -15,20 +17,25 @@ _MOST = 1.0
 
 @final
 class DriftEstimate(nn.Module):
-    """The integral of E. Borhaug, A. Pavlov and K. Y. Pettersen (Integral LOS control for path following of underactuated marine surface vessels
-    in the presence of constant ocean currents, CDC 2008; T. I. Fossen, Handbook of Marine Craft Hydrodynamics and Motion Control, section 12.3).
+    """The integral of E. Borhaug, A. Pavlov and K. Y. Pettersen (Integral LOS control for path
+    following of underactuated marine surface vessels in the presence of constant ocean currents,
+    CDC 2008; T. I. Fossen, Handbook of Marine Craft Hydrodynamics and Motion Control, section
+    12.3).
 
-    heading_d = direction - atan(e / distance + D), dD/dt = gain e / (distance^2 + (e + distance D)^2), their D being sigma e_int / distance. At
-    rest e = 0 and D is the tangent of the crab angle asin(V_c / U) for a current V_c across the way of a vessel at speed U.
+    heading_d = direction - atan(e / distance + D), dD/dt = gain e / (distance^2 + (e + distance
+    D)^2), their D being sigma e_int / distance. At rest e = 0 and D is the tangent of the crab
+    angle asin(V_c / U) for a current V_c across the way of a vessel at speed U.
 
-    A current keeps its direction over ground while the way bends. So D is kept as a vector, north and east, that only its part across the way
-    steers by and that grows only there: what one leg has taught is known on the next.
+    A current keeps its direction over ground while the way bends. So D is kept as a vector, north
+    and east, that only its part across the way steers by and that grows only there: what one leg
+    has taught is known on the next.
 
     Memory s [B, 2]: the vector, at most one long.
 
     Args:
         distance: look-ahead in m.
-        gain: sigma in m/s. With a quarter of the speed both poles of the error lie at U / (2 distance).
+        gain: sigma in m/s. With a quarter of the speed both poles of the error lie at U / (2
+            distance).
         dt: step in s.
 
     Raises:
@@ -38,7 +45,10 @@ class DriftEstimate(nn.Module):
     def __init__(self, distance: float, gain: float, dt: float) -> None:
         super().__init__()
         if distance <= 0 or gain <= 0 or dt <= 0:
-            raise ConfigError(f"integral line of sight: distance, gain and step must be above zero, given {distance:g} m, {gain:g} m/s, {dt:g} s")
+            raise ConfigError(
+                "integral line of sight: distance, gain and step must be above zero, given"
+                f" {distance:g} m, {gain:g} m/s, {dt:g} s"
+            )
         self.distance, self.gain, self.dt = distance, gain, dt
         self.most = _MOST
 
@@ -51,8 +61,12 @@ class DriftEstimate(nn.Module):
         return torch.cos(direction) * s[:, 0] + torch.sin(direction) * s[:, 1]
 
     def forward(self, error: Tensor, direction: Tensor, s: Tensor) -> Tensor:
-        """Memory after a step at the cross-track error [B] in m from a way in a direction [B] in rad."""
+        """Memory after a step at the cross-track error [B] in m from a way in a direction [B] in
+        rad.
+        """
         aim = error + self.distance * self.across(direction, s)
         grown = self.dt * self.gain * error / (self.distance**2 + aim.square())
-        s = s + grown.unsqueeze(-1) * torch.stack((-torch.sin(direction), torch.cos(direction)), dim=-1)
+        s = s + grown.unsqueeze(-1) * torch.stack(
+            (-torch.sin(direction), torch.cos(direction)), dim=-1
+        )
         return s / (s.square().sum(dim=-1, keepdim=True).sqrt() / self.most).clamp(min=1.0)

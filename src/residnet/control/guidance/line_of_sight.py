@@ -22,14 +22,15 @@ class LineOfSight(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, error: Tensor, direction: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Angle [B] in rad, added to the leg's direction [B] in rad, from the cross-track error [B] in m, positive to starboard of the leg;
-        and the memory [B, n_state], zeros at the start."""
+        """Angle [B] in rad, added to the leg's direction [B] in rad, from the cross-track error [B]
+        in m, positive to starboard of the leg; and the memory [B, n_state], zeros at the start.
+        """
 
 
 @final
 class LookAhead(LineOfSight):
-    """Towards the point of the leg that lies a distance before the vessel: -atan(error / distance) (T. I. Fossen, Handbook of Marine Craft
-    Hydrodynamics and Motion Control, section 12.3).
+    """Towards the point of the leg that lies a distance before the vessel: -atan(error / distance)
+    (T. I. Fossen, Handbook of Marine Craft Hydrodynamics and Motion Control, section 12.3).
 
     Args:
         distance: along the leg in m.
@@ -46,7 +47,8 @@ class LookAhead(LineOfSight):
 
 @final
 class Enclosure(LineOfSight):
-    """Towards the forward one of the points where a circle about the vessel meets the leg: -asin(error / radius) (Fossen, section 12.3).
+    """Towards the forward one of the points where a circle about the vessel meets the leg:
+    -asin(error / radius) (Fossen, section 12.3).
 
     Further from the leg than the radius there is none; the vessel then steers straight for the leg.
 
@@ -65,7 +67,8 @@ class Enclosure(LineOfSight):
 
 @final
 class IntegralLookAhead(LineOfSight):
-    """As `LookAhead`, turned further by the crab angle that a steady current asks for: -atan(error / distance + D).
+    """As `LookAhead`, turned further by the crab angle that a steady current asks for: -atan(error
+    / distance + D).
 
     Memory [B, 2]: of `DriftEstimate`, whose D across the leg this is.
 
@@ -83,7 +86,9 @@ class IntegralLookAhead(LineOfSight):
 
     def forward(self, error: Tensor, direction: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Angle [B]; never a right angle."""
-        return -torch.atan(error / self.distance + self.drift.across(direction, s)), self.drift(error, direction, s)
+        return -torch.atan(error / self.distance + self.drift.across(direction, s)), self.drift(
+            error, direction, s
+        )
 
 
 class LookAheadConfig(Config):
@@ -121,7 +126,8 @@ class IntegralLookAheadConfig(Config):
 
     Attributes:
         distance: along the leg.
-        gain: sigma of the integral action, below speed less current; a quarter of the speed returns to a leg without overshoot.
+        gain: sigma of the integral action, below speed less current; a quarter of the speed returns
+            to a leg without overshoot.
     """
 
     kind: Literal["integral"] = "integral"
@@ -133,4 +139,6 @@ class IntegralLookAheadConfig(Config):
         return IntegralLookAhead(self.distance, self.gain, dt)
 
 
-AnyLineOfSight = Annotated[LookAheadConfig | EnclosureConfig | IntegralLookAheadConfig, Field(discriminator="kind")]
+AnyLineOfSight = Annotated[
+    LookAheadConfig | EnclosureConfig | IntegralLookAheadConfig, Field(discriminator="kind")
+]

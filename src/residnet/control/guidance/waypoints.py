@@ -15,18 +15,22 @@ from residnet.control.guidance.wheel_over import WheelOver
 from residnet.core.errors import ConfigError
 
 _ON_LEG = 0.4
-"""Share of the circle of acceptance that a vessel may be set off its leg by, at the wheel-over and on from there, for the turn to count on."""
+"""Share of the circle of acceptance that a vessel may be set off its leg by, at the wheel-over and
+on from there, for the turn to count on.
+"""
 
 
 @final
 class WaypointGuidance(Reference):
-    """Reference heading [B, 1]: the leg's direction and the angle by which a law of the line of sight steers back to it.
+    """Reference heading [B, 1]: the leg's direction and the angle by which a law of the line of
+    sight steers back to it.
 
-    The leg changes when the vessel enters the circle of acceptance of its way-point, or has passed it; with a wheel-over, before that, where
-    the vessel runs along its leg: its cross-track error, and what its heading aside of the leg would add on the way, are small against the
-    circle. A crab angle is such a heading, by as much as the current will set the vessel. Behind the last way-point it has arrived.
-    Memory [B, 3 + that of the law]: number of the way-point that is steered for, and where the vessel began, which is the beginning of the
-    first leg.
+    The leg changes when the vessel enters the circle of acceptance of its way-point, or has passed
+    it; with a wheel-over, before that, where the vessel runs along its leg: its cross-track error,
+    and what its heading aside of the leg would add on the way, are small against the circle. A crab
+    angle is such a heading, by as much as the current will set the vessel. Behind the last
+    way-point it has arrived. Memory [B, 3 + that of the law]: number of the way-point that is
+    steered for, and where the vessel began, which is the beginning of the first leg.
 
     Args:
         points: way-points (north, east) in m, in their order.
@@ -46,7 +50,10 @@ class WaypointGuidance(Reference):
     ) -> None:
         super().__init__()
         if not points or acceptance <= 0:
-            raise ConfigError(f"way-points: give at least one, and a circle of acceptance above zero; given {len(points)}, {acceptance:g} m")
+            raise ConfigError(
+                "way-points: give at least one, and a circle of acceptance above zero; given"
+                f" {len(points)}, {acceptance:g} m"
+            )
         self.register_buffer("points", torch.tensor(points, dtype=torch.float64), persistent=False)
         self.points: Tensor
         self.acceptance, self.sight, self.wheel_over = acceptance, sight, wheel_over
@@ -58,14 +65,25 @@ class WaypointGuidance(Reference):
     def initial_state(self, x: Tensor) -> Tensor:
         """The first way-point, from here."""
         rest = torch.zeros(x.shape[0], self.n_state - 3, dtype=x.dtype, device=x.device)
-        return torch.cat((torch.zeros_like(x[:, :1]), x[:, self.x : self.x + 1], x[:, self.y : self.y + 1], rest), dim=-1)
+        return torch.cat(
+            (
+                torch.zeros_like(x[:, :1]),
+                x[:, self.x : self.x + 1],
+                x[:, self.y : self.y + 1],
+                rest,
+            ),
+            dim=-1,
+        )
 
     def leg(self, x: Tensor, number: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Direction [B] of the leg that ends at a way-point in rad, distance [B] still to go along it, and cross-track error [B] in m,
-        positive to starboard of it."""
+        """Direction [B] of the leg that ends at a way-point in rad, distance [B] still to go along
+        it, and cross-track error [B] in m, positive to starboard of it.
+        """
         points = self.points.to(x.dtype)
         target = points[number.clamp(max=len(points) - 1)]
-        before = torch.where((number == 0).unsqueeze(-1), s[:, 1:3], points[(number - 1).clamp(0, len(points) - 1)])
+        before = torch.where(
+            (number == 0).unsqueeze(-1), s[:, 1:3], points[(number - 1).clamp(0, len(points) - 1)]
+        )
         along = target - before
         direction = torch.atan2(along[:, 1], along[:, 0])
         north, east = target[:, 0] - x[:, self.x], target[:, 1] - x[:, self.y]
@@ -81,11 +99,15 @@ class WaypointGuidance(Reference):
             change = self.leg(x, number + 1, s)[0] - direction
             before = self.wheel_over(torch.remainder(change + math.pi, 2.0 * math.pi) - math.pi)
             aside = error.abs() + before * torch.sin(x[:, self.psi] - direction).abs()
-            reached = reached | ((ahead <= before) & (aside <= self.on_leg) & (number < len(self.points) - 1))
+            reached = reached | (
+                (ahead <= before) & (aside <= self.on_leg) & (number < len(self.points) - 1)
+            )
         number = (number + reached.long()).clamp(max=self.points.shape[0])
         direction, _, error = self.leg(x, number, s)
         angle, memory = self.sight(error, direction, s[:, 3:])
-        heading = torch.remainder(direction + angle + math.pi, 2.0 * math.pi).unsqueeze(-1) - math.pi
+        heading = (
+            torch.remainder(direction + angle + math.pi, 2.0 * math.pi).unsqueeze(-1) - math.pi
+        )
         return heading, torch.cat((number.to(x.dtype).unsqueeze(-1), s[:, 1:3], memory), dim=-1)
 
     def finished(self, x: Tensor, k: int, s: Tensor) -> Tensor:

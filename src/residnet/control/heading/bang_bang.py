@@ -1,4 +1,6 @@
-"""Time-optimal heading changes of Nomoto's first-order model: full rudder, full counter-rudder, then a linear law at the target."""
+"""Time-optimal heading changes of Nomoto's first-order model: full rudder, full counter-rudder,
+then a linear law at the target.
+"""
 
 from __future__ import annotations
 
@@ -17,9 +19,10 @@ from residnet.core.frames import wrap
 class BangBangHeading(Policy):
     """Full rudder towards the switching curve of T r_dot + r = K delta (document 004 eq. (5.9)).
 
-    Full counter-rudder stops a yaw rate r within T r - T K d ln(1 + r / (K d)) of heading, d the largest angle; the sign of the heading
-    error less that decides. Within `layer` of the curve the command is proportional, and where error and yaw rate are inside `capture`
-    the command is kp e - kd r, which brings them to zero.
+    Full counter-rudder stops a yaw rate r within T r - T K d ln(1 + r / (K d)) of heading, d the
+    largest angle; the sign of the heading error less that decides. Within `layer` of the curve the
+    command is proportional, and where error and yaw rate are inside `capture` the command is kp e -
+    kd r, which brings them to zero.
 
     Args:
         state: names of the vessel's state.
@@ -44,7 +47,10 @@ class BangBangHeading(Policy):
     ) -> None:
         super().__init__()
         if min(gain, time, limit, layer) <= 0:
-            raise ConfigError(f"bang-bang heading: gain, time, limit and layer must be positive, given {gain:g}, {time:g}, {limit:g}, {layer:g}")
+            raise ConfigError(
+                f"bang-bang heading: gain, time, limit and layer must be positive, given {gain:g},"
+                f" {time:g}, {limit:g}, {layer:g}"
+            )
         self.psi, self.r = state.index("psi"), state.index("r")
         self.time, self.limit, self.layer = time, limit, layer
         self.steady = gain * limit
@@ -52,7 +58,9 @@ class BangBangHeading(Policy):
         self.kp, self.kd = kp, time / (2.0 * gain) if kd is None else kd
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Rudder command [B, 1] in rad from the state x [B, nx] and the reference heading [B, 1] in rad; it keeps no memory."""
+        """Rudder command [B, 1] in rad from the state x [B, nx] and the reference heading [B, 1] in
+        rad; it keeps no memory.
+        """
         r = x[:, self.r : self.r + 1]
         error = wrap(reference - x[:, self.psi : self.psi + 1])
         braking = self.time * (r - r.sign() * self.steady * torch.log1p(r.abs() / self.steady))

@@ -1,4 +1,5 @@
-"""Time-optimal heading changes of Nomoto's first-order model with a rudder that takes time to move."""
+"""Time-optimal heading changes of Nomoto's first-order model with a rudder that takes time to move.
+"""
 
 from __future__ import annotations
 
@@ -18,12 +19,15 @@ _HALVINGS = 40
 
 @final
 class RatedBangBangHeading(Policy):
-    """Full rudder towards the reference until only the braking programme is left, with the rudder moving at its rate.
+    """Full rudder towards the reference until only the braking programme is left, with the rudder
+    moving at its rate.
 
-    The braking programme takes the rudder to an angle on the other side, holds it where that is the largest one, and brings it amidships, such
-    that T r_dot + r = K delta (document 004 eq. (5.9)) ends at rest; how much counter-rudder that takes is found by halving. The heading that
-    is gained on the way, K times the integral of delta plus T r, is compared with the heading error. Within `layer` of equality the two
-    commands are mixed, and where error, yaw rate and rudder are inside `capture` the command is kp e - kd r.
+    The braking programme takes the rudder to an angle on the other side, holds it where that is the
+    largest one, and brings it amidships, such that T r_dot + r = K delta (document 004 eq. (5.9))
+    ends at rest; how much counter-rudder that takes is found by halving. The heading that is gained
+    on the way, K times the integral of delta plus T r, is compared with the heading error. Within
+    `layer` of equality the two commands are mixed, and where error, yaw rate and rudder are inside
+    `capture` the command is kp e - kd r.
 
     Args:
         state: names of the vessel's state, with `delta`.
@@ -49,20 +53,36 @@ class RatedBangBangHeading(Policy):
     ) -> None:
         super().__init__()
         if min(gain, time, limit, rate, dt, layer) <= 0:
-            raise ConfigError("bang-bang heading: gain, time, limit, rate, step and layer must be positive")
+            raise ConfigError(
+                "bang-bang heading: gain, time, limit, rate, step and layer must be positive"
+            )
         self.psi, self.r, self.delta = (state.index(name) for name in ("psi", "r", "delta"))
-        self.gain, self.time, self.limit, self.rate, self.dt, self.layer = gain, time, limit, rate, dt, layer
+        self.gain, self.time, self.limit, self.rate, self.dt, self.layer = (
+            gain,
+            time,
+            limit,
+            rate,
+            dt,
+            layer,
+        )
         self.near, self.slow = capture
 
     def _ramp(self, r: Tensor, start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
-        """Yaw rate after the rudder has moved from one angle to another at its rate, and the integral of the angle."""
+        """Yaw rate after the rudder has moved from one angle to another at its rate, and the
+        integral of the angle.
+        """
         wait = (end - start).abs() / self.rate
         slope = (end - start).sign() * self.rate
         steady = self.gain * (start - slope * self.time)
-        return self.gain * (end - slope * self.time) + (r - steady) * torch.exp(-wait / self.time), 0.5 * (start + end) * wait
+        return (
+            self.gain * (end - slope * self.time) + (r - steady) * torch.exp(-wait / self.time),
+            0.5 * (start + end) * wait,
+        )
 
     def _braked(self, r: Tensor, rudder: Tensor, effort: Tensor) -> tuple[Tensor, Tensor]:
-        """Yaw rate after a braking programme of some effort [rad], and the heading gained in it; effort beyond the limit is time held there."""
+        """Yaw rate after a braking programme of some effort [rad], and the heading gained in it;
+        effort beyond the limit is time held there.
+        """
         most = effort.clamp(max=self.limit)
         after, first = self._ramp(r, rudder, -most)
         wait = (effort - most) / self.rate
@@ -71,7 +91,9 @@ class RatedBangBangHeading(Policy):
         return end, self.gain * (first - most * wait + last) + self.time * (r - end)
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Rudder command [B, 1] in rad from the state x [B, nx] and the reference heading [B, 1] in rad; it keeps no memory."""
+        """Rudder command [B, 1] in rad from the state x [B, nx] and the reference heading [B, 1] in
+        rad; it keeps no memory.
+        """
         error = wrap(reference - x[:, self.psi : self.psi + 1])
         turn, angle = x[:, self.r : self.r + 1], x[:, self.delta : self.delta + 1]
         # this step goes by as it is: the rudder answers at its end
@@ -92,8 +114,13 @@ class RatedBangBangHeading(Policy):
         left = side * error - distance
         share = (left / self.layer).clamp(-1.0, 1.0)
         brake = -effort.clamp(max=self.limit)
-        command = side * torch.where(share > 0, brake + share * (self.limit - brake), brake - share * (-self.limit - brake))
+        command = side * torch.where(
+            share > 0, brake + share * (self.limit - brake), brake - share * (-self.limit - brake)
+        )
         caught = (error.abs() < self.near) & (turn.abs() < self.slow)
         kp = 0.8
         kd = self.time / (2.0 * self.gain)
-        return torch.where(caught, (kp * error - kd * turn).clamp(-self.limit, self.limit), command), s
+        return (
+            torch.where(caught, (kp * error - kd * turn).clamp(-self.limit, self.limit), command),
+            s,
+        )

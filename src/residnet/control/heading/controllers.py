@@ -13,7 +13,11 @@ from torch import Tensor
 from residnet.control.base import Policy
 from residnet.control.heading.bang_bang import BangBangHeading
 from residnet.control.heading.bang_bang_rate import RatedBangBangHeading
-from residnet.control.heading.document_autopilot import DocumentAutopilot, Predictor, SimulatedPredictor
+from residnet.control.heading.document_autopilot import (
+    DocumentAutopilot,
+    Predictor,
+    SimulatedPredictor,
+)
 from residnet.control.heading.heading_pid import HeadingPID
 from residnet.control.heading.steering import NominalSteering, SteeredVessel
 from residnet.control.heading.turning import Turning
@@ -22,7 +26,9 @@ from residnet.core.errors import ConfigError
 
 
 class Steering(NamedTuple):
-    """What a controller is built for: the vessel, its K and T, the rudder's limit [rad] and the controller's step [s]."""
+    """What a controller is built for: the vessel, its K and T, the rudder's limit [rad] and the
+    controller's step [s].
+    """
 
     vessel: SteeredVessel
     turning: Turning
@@ -61,17 +67,31 @@ class TunedConfig(ControllerConfig, ABC):
         """Where tuning searches."""
 
     @abstractmethod
-    def gains(self, parameters: dict[str, Tensor], turning: Turning) -> tuple[Tensor, Tensor, Tensor]:
+    def gains(
+        self, parameters: dict[str, Tensor], turning: Turning
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """kp, kd, ki of parameters, any shape."""
 
     def build(self, steering: Steering) -> Policy:
         """A PID controller with these gains."""
         missing = [name for name, value in self.parameters().items() if value is None]
         if missing:
-            raise ConfigError(f"controller without {', '.join(missing)}: tune it first or give them")
-        given = {name: torch.tensor(value or 0.0, dtype=torch.float64) for name, value in self.parameters().items()}
+            raise ConfigError(
+                f"controller without {', '.join(missing)}: tune it first or give them"
+            )
+        given = {
+            name: torch.tensor(value or 0.0, dtype=torch.float64)
+            for name, value in self.parameters().items()
+        }
         kp, kd, ki = (float(gain) for gain in self.gains(given, steering.turning))
-        return HeadingPID(steering.vessel.state, kp=kp, kd=kd, ki=ki, limit=steering.limit, dt=steering.dt if ki > 0 else None)
+        return HeadingPID(
+            steering.vessel.state,
+            kp=kp,
+            kd=kd,
+            ki=ki,
+            limit=steering.limit,
+            dt=steering.dt if ki > 0 else None,
+        )
 
 
 class PdConfig(TunedConfig):
@@ -92,11 +112,20 @@ class PdConfig(TunedConfig):
 
     def axes(self, turning: Turning) -> dict[str, Axis]:
         """Two decades of kp, damping within a tenth to twice T."""
-        return {"kp": Axis(0.3, 60.0), "damping_time": Axis(0.05 * turning.time, 2.0 * turning.time)}
+        return {
+            "kp": Axis(0.3, 60.0),
+            "damping_time": Axis(0.05 * turning.time, 2.0 * turning.time),
+        }
 
-    def gains(self, parameters: dict[str, Tensor], turning: Turning) -> tuple[Tensor, Tensor, Tensor]:
+    def gains(
+        self, parameters: dict[str, Tensor], turning: Turning
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """As given."""
-        return parameters["kp"], parameters["kp"] * parameters["damping_time"], torch.zeros_like(parameters["kp"])
+        return (
+            parameters["kp"],
+            parameters["kp"] * parameters["damping_time"],
+            torch.zeros_like(parameters["kp"]),
+        )
 
 
 class PidConfig(TunedConfig):
@@ -115,23 +144,31 @@ class PidConfig(TunedConfig):
 
     def parameters(self) -> dict[str, float | None]:
         """kp, damping_time, integral_time."""
-        return {"kp": self.kp, "damping_time": self.damping_time, "integral_time": self.integral_time}
+        return {
+            "kp": self.kp,
+            "damping_time": self.damping_time,
+            "integral_time": self.integral_time,
+        }
 
     def axes(self, turning: Turning) -> dict[str, Axis]:
         """As PD; the integral takes T to 50 T."""
         pd = PdConfig().axes(turning)
         return {**pd, "integral_time": Axis(turning.time, 50.0 * turning.time)}
 
-    def gains(self, parameters: dict[str, Tensor], turning: Turning) -> tuple[Tensor, Tensor, Tensor]:
+    def gains(
+        self, parameters: dict[str, Tensor], turning: Turning
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """As given."""
         kp = parameters["kp"]
         return kp, kp * parameters["damping_time"], kp / parameters["integral_time"]
 
 
 class LqrConfig(TunedConfig):
-    """Linear-quadratic regulator of T r_dot + r = K delta: the integral of heading_weight e^2 + rate_weight (T r)^2 + delta^2 is least.
+    """Linear-quadratic regulator of T r_dot + r = K delta: the integral of heading_weight e^2 +
+    rate_weight (T r)^2 + delta^2 is least.
 
-    The Riccati equation of this model has the solution kp = sqrt(heading_weight), (1 + K kd)^2 = 1 + K^2 T^2 rate_weight + 2 K T kp.
+    The Riccati equation of this model has the solution kp = sqrt(heading_weight), (1 + K kd)^2 = 1
+    + K^2 T^2 rate_weight + 2 K T kp.
     """
 
     kind: Literal["lqr"] = "lqr"
@@ -146,15 +183,23 @@ class LqrConfig(TunedConfig):
         """Both weights over decades."""
         return {"heading_weight": Axis(0.1, 3600.0), "rate_weight": Axis(1e-3, 3600.0)}
 
-    def gains(self, parameters: dict[str, Tensor], turning: Turning) -> tuple[Tensor, Tensor, Tensor]:
+    def gains(
+        self, parameters: dict[str, Tensor], turning: Turning
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """kp and kd of the weights."""
         kp = parameters["heading_weight"].sqrt()
-        square = 1.0 + (turning.gain * turning.time) ** 2 * parameters["rate_weight"] + 2.0 * turning.gain * turning.time * kp
+        square = (
+            1.0
+            + (turning.gain * turning.time) ** 2 * parameters["rate_weight"]
+            + 2.0 * turning.gain * turning.time * kp
+        )
         return kp, (square.sqrt() - 1.0) / turning.gain, torch.zeros_like(kp)
 
 
 class BangBangConfig(ControllerConfig):
-    """Time-optimal control of T r_dot + r = K delta, which knows the vessel and its rudder's rate exactly: the floor."""
+    """Time-optimal control of T r_dot + r = K delta, which knows the vessel and its rudder's rate
+    exactly: the floor.
+    """
 
     kind: Literal["bang_bang"] = "bang_bang"
 
@@ -162,8 +207,20 @@ class BangBangConfig(ControllerConfig):
         """The controller."""
         vessel, turning = steering.vessel, steering.turning
         if vessel.rate is not None:
-            return RatedBangBangHeading(vessel.state, gain=turning.gain, time=turning.time, limit=steering.limit, rate=vessel.rate, dt=steering.dt)
-        return BangBangHeading(steering.vessel.state, gain=steering.turning.gain, time=steering.turning.time, limit=steering.limit)
+            return RatedBangBangHeading(
+                vessel.state,
+                gain=turning.gain,
+                time=turning.time,
+                limit=steering.limit,
+                rate=vessel.rate,
+                dt=steering.dt,
+            )
+        return BangBangHeading(
+            steering.vessel.state,
+            gain=steering.turning.gain,
+            time=steering.turning.time,
+            limit=steering.limit,
+        )
 
 
 class DocumentConfig(ControllerConfig):
@@ -188,11 +245,15 @@ class DocumentConfig(ControllerConfig):
 
     def law(self, predictor: Predictor, steering: Steering) -> DocumentAutopilot:
         """The controller with some predictor of this horizon."""
-        return DocumentAutopilot(predictor, limit=steering.limit, candidates=self.candidates, weight=self.weight)
+        return DocumentAutopilot(
+            predictor, limit=steering.limit, candidates=self.candidates, weight=self.weight
+        )
 
     def build(self, steering: Steering) -> Policy:
         """The controller with the exact predictor."""
         return self.law(self.predictor(steering), steering)
 
 
-AnyController = Annotated[PdConfig | PidConfig | LqrConfig | BangBangConfig | DocumentConfig, Field(discriminator="kind")]
+AnyController = Annotated[
+    PdConfig | PidConfig | LqrConfig | BangBangConfig | DocumentConfig, Field(discriminator="kind")
+]

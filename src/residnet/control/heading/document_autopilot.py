@@ -1,4 +1,5 @@
-"""The predictive heading autopilot of document 004 (section 6.1.3, eqs. (6.3), (6.4), ERRATA 004)."""
+"""The predictive heading autopilot of document 004 (section 6.1.3, eqs. (6.3), (6.4), ERRATA 004).
+"""
 
 from __future__ import annotations
 
@@ -16,7 +17,9 @@ from residnet.dynamics.base import Dynamics
 
 
 class Predictor(nn.Module, ABC):
-    """What heading error and yaw rate each of C rudder angles would lead to, a horizon ahead: a network, or a model that is simulated."""
+    """What heading error and yaw rate each of C rudder angles would lead to, a horizon ahead: a
+    network, or a model that is simulated.
+    """
 
     @abstractmethod
     def forward(self, x: Tensor, heading: Tensor, rudder: Tensor) -> tuple[Tensor, Tensor]:
@@ -24,7 +27,8 @@ class Predictor(nn.Module, ABC):
 
         Args:
             x: states [B, nx].
-            heading: reference [B] of now, which the error is measured from (the source's own listing does so, ERRATA G22).
+            heading: reference [B] of now, which the error is measured from (the source's own
+                listing does so, ERRATA G22).
             rudder: candidates [C] in rad.
         """
 
@@ -34,20 +38,25 @@ class SimulatedPredictor(Predictor):
     """Simulates a model of the vessel, the rudder command held over the horizon.
 
     Args:
-        model: with the columns of the controlled vessel's state; its commands begin with the rudder angle.
+        model: with the columns of the controlled vessel's state; its commands begin with the rudder
+            angle.
         state: names of these columns.
         steps: of the model, which make the horizon.
         others: its inputs beside the rudder command [m - 1], held over the horizon.
     """
 
-    def __init__(self, model: Dynamics, state: Sequence[str], steps: int, others: Tensor | None = None) -> None:
+    def __init__(
+        self, model: Dynamics, state: Sequence[str], steps: int, others: Tensor | None = None
+    ) -> None:
         super().__init__()
         if steps < 1:
             raise ConfigError(f"the predictor's horizon must be one step or more, given {steps}")
         self.model = model
         self.steps = steps
         self.psi, self.r = state.index("psi"), state.index("r")
-        self.register_buffer("others", torch.zeros(0) if others is None else others, persistent=False)
+        self.register_buffer(
+            "others", torch.zeros(0) if others is None else others, persistent=False
+        )
         self.others: Tensor
 
     def forward(self, x: Tensor, heading: Tensor, rudder: Tensor) -> tuple[Tensor, Tensor]:
@@ -65,11 +74,13 @@ class SimulatedPredictor(Predictor):
 
 @final
 class NetworkPredictor(Predictor):
-    """A perceptron with one output for each rudder angle: how heading and yaw rate change over the horizon (sections 6.1.2 and 6.2.2).
+    """A perceptron with one output for each rudder angle: how heading and yaw rate change over the
+    horizon (sections 6.1.2 and 6.2.2).
 
-    What moves the vessel goes in: velocities, heel, and the rudder's angle where it takes time to move. Where the vessel is and heads changes
-    nothing in calm water, so that the heading error itself passes through. With linear layers, as in the source's listing, the map is affine:
-    exact for Nomoto's model, and no more than a tangent to the 4-DOF vessel (ERRATA G21).
+    What moves the vessel goes in: velocities, heel, and the rudder's angle where it takes time to
+    move. Where the vessel is and heads changes nothing in calm water, so that the heading error
+    itself passes through. With linear layers, as in the source's listing, the map is affine: exact
+    for Nomoto's model, and no more than a tangent to the 4-DOF vessel (ERRATA G21).
 
     Args:
         state: names of the columns of x.
@@ -78,7 +89,9 @@ class NetworkPredictor(Predictor):
         linear: without activations.
     """
 
-    def __init__(self, state: Sequence[str], *, candidates: int, hidden: Sequence[int], linear: bool = False) -> None:
+    def __init__(
+        self, state: Sequence[str], *, candidates: int, hidden: Sequence[int], linear: bool = False
+    ) -> None:
         super().__init__()
         self.psi, self.r = state.index("psi"), state.index("r")
         self.take = [place for place, name in enumerate(state) if name not in ("x", "y", "psi")]
@@ -105,7 +118,9 @@ class NetworkPredictor(Predictor):
         # what does not vary says nothing; Nomoto's speed is one
         self.spread.copy_(torch.where(spread > 1e-9 * (1.0 + self.centre.abs()), spread, 1.0))
         self.offset.copy_(change.mean(0))
-        self.scale.copy_((change - change.mean(0)).square().mean((0, 2)).sqrt().unsqueeze(-1).clamp(min=1e-12))
+        self.scale.copy_(
+            (change - change.mean(0)).square().mean((0, 2)).sqrt().unsqueeze(-1).clamp(min=1e-12)
+        )
 
     def changes(self, x: Tensor) -> Tensor:
         """Changes of heading and yaw rate [B, 2, C] over the horizon from states x [B, nx]."""
@@ -115,36 +130,50 @@ class NetworkPredictor(Predictor):
     def forward(self, x: Tensor, heading: Tensor, rudder: Tensor) -> tuple[Tensor, Tensor]:
         """Heading errors and yaw rates [B, C]; the angles are those that it was trained for."""
         change = self.changes(x)
-        return (heading - x[:, self.psi]).unsqueeze(-1) - change[:, 0], x[:, self.r].unsqueeze(-1) + change[:, 1]
+        return (heading - x[:, self.psi]).unsqueeze(-1) - change[:, 0], x[:, self.r].unsqueeze(
+            -1
+        ) + change[:, 1]
 
 
 @final
 class DocumentAutopilot(Policy):
-    """delta = weight d_e + (1 - weight) d_r: of the candidates, d_e leads to the smallest heading error and d_r to the smallest yaw rate.
+    """delta = weight d_e + (1 - weight) d_r: of the candidates, d_e leads to the smallest heading
+    error and d_r to the smallest yaw rate.
 
-    The source takes 41 candidates between -5 and 5 deg, weight 0.2 and a horizon of one step of 0.01 s. There the first choice saturates and
-    the second stops the yaw, so that it turns at 0.011 deg/s (ERRATA 004); a horizon of seconds repairs it.
+    The source takes 41 candidates between -5 and 5 deg, weight 0.2 and a horizon of one step of
+    0.01 s. There the first choice saturates and the second stops the yaw, so that it turns at 0.011
+    deg/s (ERRATA 004); a horizon of seconds repairs it.
 
     Args:
         predictor: of heading error and yaw rate.
         limit: of the candidates in rad, either side.
-        candidates: how many, evenly spaced, both limits included; an odd number has the rudder amidships among them.
+        candidates: how many, evenly spaced, both limits included; an odd number has the rudder
+            amidships among them.
         weight: of the choice for the heading error.
     """
 
-    def __init__(self, predictor: Predictor, *, limit: float, candidates: int = 41, weight: float = 0.2) -> None:
+    def __init__(
+        self, predictor: Predictor, *, limit: float, candidates: int = 41, weight: float = 0.2
+    ) -> None:
         super().__init__()
         if limit <= 0 or candidates < 2 or not 0 <= weight <= 1:
-            raise ConfigError(f"document autopilot: limit > 0, candidates >= 2 and 0 <= weight <= 1, given {limit:g}, {candidates}, {weight:g}")
+            raise ConfigError(
+                "document autopilot: limit > 0, candidates >= 2 and 0 <= weight <= 1, given"
+                f" {limit:g}, {candidates}, {weight:g}"
+            )
         self.predictor = predictor
         self.weight = weight
         # from whole numbers, so that amidships is zero and both sides are alike
-        angles = limit * (torch.arange(1 - candidates, candidates, 2, dtype=torch.float64) / (candidates - 1))
+        angles = limit * (
+            torch.arange(1 - candidates, candidates, 2, dtype=torch.float64) / (candidates - 1)
+        )
         self.register_buffer("rudder", angles, persistent=False)
         self.rudder: Tensor
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Rudder command [B, 1] in rad from the state x [B, nx] and the reference heading [B, 1] in rad; it keeps no memory."""
+        """Rudder command [B, 1] in rad from the state x [B, nx] and the reference heading [B, 1] in
+        rad; it keeps no memory.
+        """
         error, rate = self.predictor(x, reference[:, 0], self.rudder)
         rudder = self.rudder.to(x.dtype)
         toward, calm = rudder[wrap(error).abs().argmin(-1)], rudder[rate.abs().argmin(-1)]

@@ -1,4 +1,6 @@
-"""Heading controllers on a moving reference: they see where they are against it, and the rudder that the motion itself needs is added."""
+"""Heading controllers on a moving reference: they see where they are against it, and the rudder
+that the motion itself needs is added.
+"""
 
 from __future__ import annotations
 
@@ -17,12 +19,15 @@ FOLLOWED = ("heading", "yaw_rate", "rudder")
 
 @final
 class Following(Policy):
-    """delta = delta_d + law(psi - psi_d, r - r_d), saturated: any heading controller follows turns as it holds a course.
+    """delta = delta_d + law(psi - psi_d, r - r_d), saturated: any heading controller follows turns
+    as it holds a course.
 
-    T r_dot + r = K delta has the same form for the differences from a motion that fulfils it, so that a law for steps of the heading corrects
-    them and lags behind nothing. A law with an observer is told the rudder that it got, less delta_d.
+    T r_dot + r = K delta has the same form for the differences from a motion that fulfils it, so
+    that a law for steps of the heading corrects them and lags behind nothing. A law with an
+    observer is told the rudder that it got, less delta_d.
 
-    Reference [B, 3]: `FOLLOWED`. Memory [B, 1 + n_state of the law]: the rudder angle [rad] as the steering gear follows, then the law's.
+    Reference [B, 3]: `FOLLOWED`. Memory [B, 1 + n_state of the law]: the rudder angle [rad] as the
+    steering gear follows, then the law's.
 
     Args:
         law: heading controller.
@@ -32,7 +37,15 @@ class Following(Policy):
         rate: of the rudder in rad/s; None where it stands at its command at once.
     """
 
-    def __init__(self, law: Policy, state: Sequence[str], *, limit: float, dt: float, rate: float | None = None) -> None:
+    def __init__(
+        self,
+        law: Policy,
+        state: Sequence[str],
+        *,
+        limit: float,
+        dt: float,
+        rate: float | None = None,
+    ) -> None:
         super().__init__()
         self.law = law
         self.limit = limit
@@ -46,7 +59,9 @@ class Following(Policy):
         return torch.cat((torch.zeros_like(x[:, :1]), self.law.initial_state(x)), dim=-1)
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Rudder command [B, 1] in rad and memory from the state x [B, nx], the reference [B, 3] and the memory."""
+        """Rudder command [B, 1] in rad and memory from the state x [B, nx], the reference [B, 3]
+        and the memory.
+        """
         needed = reference[:, 2:3]
         away = x.clone()
         away[:, self.psi] = x[:, self.psi] - reference[:, 0]

@@ -1,4 +1,6 @@
-"""Heading autopilot: proportional, derivative and integral action on the heading error, within the rudder's limit."""
+"""Heading autopilot: proportional, derivative and integral action on the heading error, within the
+rudder's limit.
+"""
 
 from __future__ import annotations
 
@@ -15,9 +17,11 @@ from residnet.core.frames import wrap
 
 @final
 class HeadingPID(Policy):
-    """delta = kp e - kd r + ki I, saturated, with e the wrapped heading error and I_dot = e while the command is not saturated by it.
+    """delta = kp e - kd r + ki I, saturated, with e the wrapped heading error and I_dot = e while
+    the command is not saturated by it.
 
-    Memory: I [rad s], where ki > 0. The command of a step uses the integral before that step's error enters it.
+    Memory: I [rad s], where ki > 0. The command of a step uses the integral before that step's
+    error enters it.
 
     Args:
         state: names of the vessel's state.
@@ -28,22 +32,52 @@ class HeadingPID(Policy):
         dt: step of the controller in s, where ki > 0.
     """
 
-    def __init__(self, state: Sequence[str], *, kp: float, kd: float, limit: float, ki: float = 0.0, dt: float | None = None) -> None:
+    def __init__(
+        self,
+        state: Sequence[str],
+        *,
+        kp: float,
+        kd: float,
+        limit: float,
+        ki: float = 0.0,
+        dt: float | None = None,
+    ) -> None:
         super().__init__()
         if limit <= 0 or ki < 0 or (ki > 0) != (dt is not None):
-            raise ConfigError(f"heading PID: the limit must be positive, ki >= 0, and dt belongs to ki > 0; given {limit:g}, {ki:g}, {dt}")
+            raise ConfigError(
+                "heading PID: the limit must be positive, ki >= 0, and dt belongs to ki > 0; given"
+                f" {limit:g}, {ki:g}, {dt}"
+            )
         self.psi, self.r = state.index("psi"), state.index("r")
         self.kp, self.kd, self.ki, self.limit = kp, kd, ki, limit
         self.dt = dt or 0.0
         self.n_state = 1 if ki > 0 else 0
 
     @classmethod
-    def placed(cls, state: Sequence[str], *, gain: float, time: float, frequency: float, damping: float, limit: float) -> HeadingPID:
-        """PD that gives T r_dot + r = K delta (document 004 eq. (5.9)) poles of natural frequency [rad/s] and relative damping."""
-        return cls(state, kp=time * frequency**2 / gain, kd=(2.0 * damping * frequency * time - 1.0) / gain, limit=limit)
+    def placed(
+        cls,
+        state: Sequence[str],
+        *,
+        gain: float,
+        time: float,
+        frequency: float,
+        damping: float,
+        limit: float,
+    ) -> HeadingPID:
+        """PD that gives T r_dot + r = K delta (document 004 eq. (5.9)) poles of natural frequency
+        [rad/s] and relative damping.
+        """
+        return cls(
+            state,
+            kp=time * frequency**2 / gain,
+            kd=(2.0 * damping * frequency * time - 1.0) / gain,
+            limit=limit,
+        )
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Rudder command [B, 1] in rad and the integral [B, 0 or 1] from the state x [B, nx] and the reference heading [B, 1] in rad."""
+        """Rudder command [B, 1] in rad and the integral [B, 0 or 1] from the state x [B, nx] and
+        the reference heading [B, 1] in rad.
+        """
         error = wrap(reference - x[:, self.psi : self.psi + 1])
         wish = self.kp * error - self.kd * x[:, self.r : self.r + 1]
         if self.n_state == 0:

@@ -15,11 +15,13 @@ from residnet.dynamics.rollout import Source
 class SideBySide(Source):
     """The pupil's commands act; the teacher sees the same states with a memory of its own.
 
-    The pupil meets what its own commands lead to, so that it also learns the way back from its mistakes. States carry no gradient: the pupil
-    shall command as the teacher does, not come to where they agree.
+    The pupil meets what its own commands lead to, so that it also learns the way back from its
+    mistakes. States carry no gradient: the pupil shall command as the teacher does, not come to
+    where they agree.
 
     Attributes:
-        total: sum over steps of the mean squared difference of the commands, since `initial` was asked.
+        total: sum over steps of the mean squared difference of the commands, since `initial` was
+            asked.
     """
 
     def __init__(self, pupil: Policy, teacher: Policy, reference: Reference) -> None:
@@ -30,7 +32,9 @@ class SideBySide(Source):
     def initial(self, x: Tensor) -> Tensor:
         """Memories of guidance, pupil and teacher side by side."""
         self.total = torch.zeros((), dtype=x.dtype)
-        return torch.cat([part.initial_state(x) for part in (self.reference, self.pupil, self.teacher)], dim=-1)
+        return torch.cat(
+            [part.initial_state(x) for part in (self.reference, self.pupil, self.teacher)], dim=-1
+        )
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Inputs [B, m] with the pupil's command."""
@@ -42,4 +46,6 @@ class SideBySide(Source):
         with torch.no_grad():
             shown, other = self.teacher(x, target, other)
         self.total = self.total + (command - shown).square().mean()
-        return torch.cat((command.detach(), w[:, command.shape[-1] :]), dim=-1), torch.cat((guided, own, other), dim=-1)
+        return torch.cat((command.detach(), w[:, command.shape[-1] :]), dim=-1), torch.cat(
+            (guided, own, other), dim=-1
+        )

@@ -1,4 +1,6 @@
-"""The neural heading autopilot: a small network around a linear law, with an observer of what pushes the bow."""
+"""The neural heading autopilot: a small network around a linear law, with an observer of what
+pushes the bow.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,17 @@ from residnet.control.base import Policy
 from residnet.control.heading.turning import Turning
 from residnet.core.frames import wrap
 
-MEMORY = ("rudder", "yaw_rate", "turning", "push", "effect", "damping", "effect_variance", "covariance", "damping_variance")
+MEMORY = (
+    "rudder",
+    "yaw_rate",
+    "turning",
+    "push",
+    "effect",
+    "damping",
+    "effect_variance",
+    "covariance",
+    "damping_variance",
+)
 _PRIOR = 0.04
 """Variance of effect and damping before anything was seen: about the spread of vessels."""
 _DOUBT = 0.02
@@ -23,20 +35,23 @@ _DOUBT = 0.02
 
 @final
 class HeadingPolicy(Policy):
-    """delta = k (e - g(r)) + phi - b, saturated: a proximate time-optimal law, a network phi that corrects it, and a push b taken away.
+    """delta = k (e - g(r)) + phi - b, saturated: a proximate time-optimal law, a network phi that
+    corrects it, and a push b taken away.
 
-    g(r) is the heading in which full counter-rudder still stops the yaw rate r: the braking distance of T r_dot + r = K delta far away, a
-    straight line near the reference (M. L. Workman, Adaptive proximate time-optimal servomechanisms, 1987). A rudder that takes time to
-    move is counted as if it were already amidships, with the error and the yaw rate that will then be left. The network is odd, so that
-    port and starboard are alike, and vanishes at e = r = delta + b = 0: under any constant push the heading error goes to zero, once b is
-    right.
+    g(r) is the heading in which full counter-rudder still stops the yaw rate r: the braking
+    distance of T r_dot + r = K delta far away, a straight line near the reference (M. L. Workman,
+    Adaptive proximate time-optimal servomechanisms, 1987). A rudder that takes time to move is
+    counted as if it were already amidships, with the error and the yaw rate that will then be left.
+    The network is odd, so that port and starboard are alike, and vanishes at e = r = delta + b = 0:
+    under any constant push the heading error goes to zero, once b is right.
 
-    K/T and 1/T are estimated on the way: recursive least squares on the filtered equation r_dot = effect K/T (delta + b) - damping r/T, with
-    estimates that slowly return to one. The estimator knows the saturated command, so nothing winds up. While the rudder does little, what
-    it cannot explain is the push.
+    K/T and 1/T are estimated on the way: recursive least squares on the filtered equation r_dot =
+    effect K/T (delta + b) - damping r/T, with estimates that slowly return to one. The estimator
+    knows the saturated command, so nothing winds up. While the rudder does little, what it cannot
+    explain is the push.
 
-    Memory s [B, 9]: rudder angle [rad] as the steering gear follows, filtered yaw rate [rad/s] and filtered rudder as a share of its limit,
-    push b [rad], effect and damping, and their covariance.
+    Memory s [B, 9]: rudder angle [rad] as the steering gear follows, filtered yaw rate [rad/s] and
+    filtered rudder as a share of its limit, push b [rad], effect and damping, and their covariance.
 
     Args:
         state: names of the vessel's state.
@@ -75,29 +90,53 @@ class HeadingPolicy(Policy):
         last = nn.Linear(widths[-1], 1, bias=False)
         nn.init.zeros_(last.weight)
         self.network = nn.Sequential(*layers, last)
-        # errors per rad that full rudder answers, share of the rudder's braking that is counted on, relative damping, and how much less braking
-        # is counted on while the rudder's effect is unknown; logarithms, since all are positive
-        # as steep as the rudder's swing allows, and full rudder for no less than a tenth of a degree
-        steep = 250.0 if rate is None else min(600.0, 2.0 / (self.swing**2 * turning.gain * limit / turning.time))
+        # errors per rad that full rudder answers, share of the rudder's braking that is counted on,
+        # relative damping, and how much less braking is counted on while the rudder's effect is
+        # unknown; logarithms, since all are positive as steep as the rudder's swing allows, and
+        # full rudder for no less than a tenth of a degree
+        steep = (
+            250.0
+            if rate is None
+            else min(600.0, 2.0 / (self.swing**2 * turning.gain * limit / turning.time))
+        )
         self.law = nn.Parameter(torch.tensor([steep, 0.98, 0.92, 0.2]).log())
 
     def read_from(self, state: Sequence[str]) -> None:
-        """Take heading, speed and yaw rate from a state with these names, for a vessel other than the one that it was trained on."""
+        """Take heading, speed and yaw rate from a state with these names, for a vessel other than
+        the one that it was trained on.
+        """
         self.psi, self.u, self.r = state.index("psi"), state.index("u"), state.index("r")
 
     def initial_state(self, x: Tensor) -> Tensor:
-        """Memory [B, 9]: rudder amidships, the yaw rate as if it had been steady, no push, the vessel as expected."""
+        """Memory [B, 9]: rudder amidships, the yaw rate as if it had been steady, no push, the
+        vessel as expected.
+        """
         r = x[:, self.r : self.r + 1]
         gain = self.gain * self._ratio(x)
         none, one = torch.zeros_like(r), torch.ones_like(r)
-        return torch.cat((none, r, r / (gain * self.limit), none, one, one, self.prior * one, none, self.prior * one), dim=-1)
+        return torch.cat(
+            (
+                none,
+                r,
+                r / (gain * self.limit),
+                none,
+                one,
+                one,
+                self.prior * one,
+                none,
+                self.prior * one,
+            ),
+            dim=-1,
+        )
 
     def _ratio(self, x: Tensor) -> Tensor:
         """Speed [B, 1] as a multiple of the service speed; K goes with it, T against it."""
         return (x[:, self.u : self.u + 1] / self.speed).clamp(0.3, 3.0)
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Rudder command [B, 1] in rad and memory from the state x [B, nx] and the reference heading [B, 1] in rad."""
+        """Rudder command [B, 1] in rad and memory from the state x [B, nx] and the reference
+        heading [B, 1] in rad.
+        """
         error = wrap(reference - x[:, self.psi : self.psi + 1])
         r = x[:, self.r : self.r + 1]
         ratio = self._ratio(x)
@@ -129,7 +168,9 @@ class HeadingPolicy(Policy):
             ),
             dim=-1,
         )
-        command = (self.limit * (wanted + 3.0 * self.network(seen)) - push).clamp(-self.limit, self.limit)
+        command = (self.limit * (wanted + 3.0 * self.network(seen)) - push).clamp(
+            -self.limit, self.limit
+        )
         step = self.rate * self.dt
         follows = rudder + (command - rudder).clamp(-step, step)
         return command, torch.cat((follows, known[:, 1:]), dim=-1)
@@ -141,47 +182,75 @@ class HeadingPolicy(Policy):
         keep = torch.exp(-pace * self.dt)
         full = per_time * steady
         after = r + keep * (slow - r)
-        # both sides of the equation of motion through the same filter; the trapezoid of r is exact for its difference
+        # both sides of the equation of motion through the same filter; the trapezoid of r is exact
+        # for its difference
         change = (after - slow) / (self.dt * full)
         turn = 0.5 * (after + slow) / steady
         share = keep * share + (1.0 - keep) * (rudder + push) / self.limit
         surprise = change - effect * share + damping * turn
         quiet = 1.0 / (1.0 + (5.0 * share).square())
-        push = (push + (0.25 * self.dt) * pace * self.limit * quiet * surprise).clamp(-self.limit, self.limit)
+        push = (push + (0.25 * self.dt) * pace * self.limit * quiet * surprise).clamp(
+            -self.limit, self.limit
+        )
         forget = (self.dt / 60.0) * per_time
-        p, c, q = p + 2.0 * forget * (self.prior - p), c - 2.0 * forget * c, q + 2.0 * forget * (self.prior - q)
+        p, c, q = (
+            p + 2.0 * forget * (self.prior - p),
+            c - 2.0 * forget * c,
+            q + 2.0 * forget * (self.prior - q),
+        )
         a, b = p * share - c * turn, c * share - q * turn
         noise = self.doubt**2 * 2.0 / (pace * self.dt)
         scale = 1.0 / (noise + a * share - b * turn)
-        effect = (effect + forget * (1.0 - effect) + (a * scale).detach() * surprise).clamp(0.4, 2.5)
-        damping = (damping + forget * (1.0 - damping) + (b * scale).detach() * surprise).clamp(0.4, 2.5)
+        effect = (effect + forget * (1.0 - effect) + (a * scale).detach() * surprise).clamp(
+            0.4, 2.5
+        )
+        damping = (damping + forget * (1.0 - damping) + (b * scale).detach() * surprise).clamp(
+            0.4, 2.5
+        )
         p, c, q = p - a * a * scale, c - a * b * scale, q - b * b * scale
-        return torch.cat((rudder, after, share, push, effect, damping, p.detach(), c.detach(), q.detach()), dim=-1)
+        return torch.cat(
+            (rudder, after, share, push, effect, damping, p.detach(), c.detach(), q.detach()),
+            dim=-1,
+        )
 
-    def _centred(self, error: Tensor, r: Tensor, acting: Tensor, force: Tensor, decay: Tensor) -> tuple[Tensor, Tensor]:
-        """Error and yaw rate [B, 1] that will be left once the rudder, which acts with a share of its limit, has gone to where it does nothing."""
+    def _centred(
+        self, error: Tensor, r: Tensor, acting: Tensor, force: Tensor, decay: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Error and yaw rate [B, 1] that will be left once the rudder, which acts with a share of
+        its limit, has gone to where it does nothing.
+        """
         wait = acting.abs() * self.swing
         later = r + wait * (0.5 * force * acting - decay * r)
         return error - wait * (r + wait * (force * acting / 3.0 - 0.5 * decay * r)), later
 
-    def _braking(self, r: Tensor, force: Tensor, decay: Tensor, stiffness: Tensor, stiff: Tensor) -> Tensor:
-        """Heading [B, 1] that passes while r_dot = -force - decay r stops the yaw rate r [B, 1]; r / nu near zero, with the same slope there.
+    def _braking(
+        self, r: Tensor, force: Tensor, decay: Tensor, stiffness: Tensor, stiff: Tensor
+    ) -> Tensor:
+        """Heading [B, 1] that passes while r_dot = -force - decay r stops the yaw rate r [B, 1]; r
+        / nu near zero, with the same slope there.
 
-        The rudder starts from amidships and comes back there: that takes half of its swing more, or a pulse that does not reach the limit.
-        nu is chosen such that e'' + (decay + stiffness / nu) e' + stiffness e = 0 has the relative damping `stiff`.
+        The rudder starts from amidships and comes back there: that takes half of its swing more, or
+        a pulse that does not reach the limit. nu is chosen such that e'' + (decay + stiffness / nu)
+        e' + stiffness e = 0 has the relative damping `stiff`.
         """
         line = ((2.0 * stiff * torch.sqrt(stiffness) - decay) / stiffness).clamp(min=1e-3)
         lead = (line - 0.5 * self.swing).clamp(min=1e-3)
         end = force * lead / (1.0 - decay * lead).clamp(min=0.1)
         if self.swing > 0.0:
-            end = torch.where(line < 1.5 * self.swing, (line / 1.5).square() * force / self.swing, end)
+            end = torch.where(
+                line < 1.5 * self.swing, (line / 1.5).square() * force / self.swing, end
+            )
         size = r.abs()
         beyond = torch.maximum(size, end)
-        curve = self._distance(beyond, force, decay) - self._distance(end, force, decay) + end * line
+        curve = (
+            self._distance(beyond, force, decay) - self._distance(end, force, decay) + end * line
+        )
         return r.sign() * torch.where(size < end, size * line, curve)
 
     def _distance(self, r: Tensor, force: Tensor, decay: Tensor) -> Tensor:
-        """Heading [B, 1] in which a yaw rate r > 0 is stopped: the integral of r dr / (force + decay r), and what the rudder's swing adds."""
+        """Heading [B, 1] in which a yaw rate r > 0 is stopped: the integral of r dr / (force +
+        decay r), and what the rudder's swing adds.
+        """
         own = (r - force / decay * torch.log1p(decay * r / force)) / decay
         if self.swing == 0.0:
             return own

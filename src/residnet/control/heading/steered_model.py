@@ -1,4 +1,6 @@
-"""A learned model as heading controllers see it: policies are trained on it and flown on the vessel itself."""
+"""A learned model as heading controllers see it: policies are trained on it and flown on the vessel
+itself.
+"""
 
 from __future__ import annotations
 
@@ -18,11 +20,13 @@ from residnet.dynamics.varied import VariedModel
 
 @final
 class SteeredModel(SteeredVessel):
-    """A learned model, with the steering gear and the straight courses of the vessel that it was identified on.
+    """A learned model, with the steering gear and the straight courses of the vessel that it was
+    identified on.
 
     Args:
         model: hybrid model of the hull.
-        columns: names of its inputs; the rudder's is `delta` or `cmd_delta`, the others are commands of the vessel.
+        columns: names of its inputs; the rudder's is `delta` or `cmd_delta`, the others are
+            commands of the vessel.
         hold: whether its inputs are those at a step's start or means over the step.
         vessel: in calm water.
 
@@ -30,21 +34,30 @@ class SteeredModel(SteeredVessel):
         ConfigError: where the model has no rudder, or an input that the vessel does not command.
     """
 
-    def __init__(self, model: HybridDynamics, columns: tuple[str, ...], hold: str, vessel: SteeredPlant) -> None:
+    def __init__(
+        self, model: HybridDynamics, columns: tuple[str, ...], hold: str, vessel: SteeredPlant
+    ) -> None:
         self.hull, self.vessel, self.mean = model, vessel, hold == "mean"
         self.state = STATE if vessel.rate is None else (*STATE, "delta")
         self.inputs, self.rate = vessel.inputs, vessel.rate
         if not {"delta", "cmd_delta"} & set(columns):
-            raise ConfigError(f"heading control needs a model that is driven by 'delta' or 'cmd_delta'; its inputs are {', '.join(columns)}")
+            raise ConfigError(
+                "heading control needs a model that is driven by 'delta' or 'cmd_delta'; its"
+                f" inputs are {', '.join(columns)}"
+            )
         self.take: list[int] = []
         for name in columns:
             command = commanded(name)
             if command not in vessel.inputs:
-                raise ConfigError(f"the model is driven by '{name}', which the vessel does not command{nearest(command, vessel.inputs)}")
+                raise ConfigError(
+                    f"the model is driven by '{name}', which the vessel does not"
+                    f" command{nearest(command, vessel.inputs)}"
+                )
             self.take.append(vessel.inputs.index(command))
 
     def model(self, dt: float, integrator: str = "rk4") -> Dynamics:
-        """The model, varied, with its own integrator; one without memory takes steps of any length."""
+        """The model, varied, with its own integrator; one without memory takes steps of any length.
+        """
         return VariedModel(self.hull, dt, self.take, self.mean, self.rate)
 
     def memory(self, variation: Tensor) -> Tensor:

@@ -1,4 +1,6 @@
-"""Vessels as heading controllers see them, and flights: heading changes of many varied vessels at once."""
+"""Vessels as heading controllers see them, and flights: heading changes of many varied vessels at
+once.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,9 @@ class SteeredVessel(ABC):
 
     @abstractmethod
     def model(self, dt: float, integrator: str = "rk4") -> Dynamics:
-        """Steps of dt seconds; the first columns of its memory are the variation of each row (`dynamics.varied.VARIATION`)."""
+        """Steps of dt seconds; the first columns of its memory are the variation of each row
+        (`dynamics.varied.VARIATION`).
+        """
 
     def memory(self, variation: Tensor) -> Tensor:
         """Of `model`, for variations [B, 3]."""
@@ -42,7 +46,9 @@ class SteeredVessel(ABC):
 
     @abstractmethod
     def start(self, speed: Tensor) -> tuple[Tensor, Tensor]:
-        """States [B, nx] and inputs [B, m] of straight courses at multiples [B] of the service speed."""
+        """States [B, nx] and inputs [B, m] of straight courses at multiples [B] of the service
+        speed.
+        """
 
     @final
     def column(self, name: str) -> int:
@@ -54,7 +60,15 @@ class SteeredVessel(ABC):
         """K and T at the service speed, from the answer to a held rudder angle [rad]."""
         x, w = self.start(torch.ones(1, dtype=torch.float64))
         variation = torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64)
-        return measure_turning(self.model(dt), x, w, self.memory(variation), (self.column("u"), self.column("r")), angle, duration)
+        return measure_turning(
+            self.model(dt),
+            x,
+            w,
+            self.memory(variation),
+            (self.column("u"), self.column("r")),
+            angle,
+            duration,
+        )
 
 
 @final
@@ -77,7 +91,9 @@ class SteeredPlant(SteeredVessel):
         x = self.plant.approach(len(speed)).to(speed.dtype).clone()
         x[:, self.column("u")] *= speed
         command = self.plant.demand(speed.square(), torch.zeros_like(speed))
-        return x, torch.cat((command, command.new_zeros(len(speed), len(self.inputs) - command.shape[1])), dim=1)
+        return x, torch.cat(
+            (command, command.new_zeros(len(speed), len(self.inputs) - command.shape[1])), dim=1
+        )
 
 
 @final
@@ -106,7 +122,9 @@ class NominalSteering(Dynamics):
 
 
 def _rudder_rate(plant: Plant) -> float | None:
-    """Of the steering gear [rad/s], by what it does in a short time when asked for a small and a large angle."""
+    """Of the steering gear [rad/s], by what it does in a short time when asked for a small and a
+    large angle.
+    """
     if "delta" not in plant.state:
         return None
     column, dt = plant.state.index("delta"), 1e-3
@@ -129,7 +147,9 @@ class Measured(Policy):
         super().__init__()
         self.policy = policy
         self.n_state = policy.n_state
-        self.register_buffer("spread", torch.tensor([noise.get(name, 0.0) for name in state]), persistent=False)
+        self.register_buffer(
+            "spread", torch.tensor([noise.get(name, 0.0) for name in state]), persistent=False
+        )
         self.spread: Tensor
 
     def initial_state(self, x: Tensor) -> Tensor:
@@ -138,13 +158,17 @@ class Measured(Policy):
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """As the controller, with noise on what it sees."""
-        command: tuple[Tensor, Tensor] = self.policy(x + torch.randn_like(x) * self.spread.to(x.dtype), reference, s)
+        command: tuple[Tensor, Tensor] = self.policy(
+            x + torch.randn_like(x) * self.spread.to(x.dtype), reference, s
+        )
         return command
 
 
 @dataclass(frozen=True)
 class Flights:
-    """B heading changes of T steps: states [B, T+1, nx] and their names, inputs [B, T, m], reference [B] in rad, and the step in s."""
+    """B heading changes of T steps: states [B, T+1, nx] and their names, inputs [B, T, m],
+    reference [B] in rad, and the step in s.
+    """
 
     states: Tensor
     inputs: Tensor
@@ -162,17 +186,23 @@ class Flights:
         return wrap(self.heading[:, None] - self.of("psi"))
 
     def settled(self, band: float) -> Tensor:
-        """Time [B] of the last entry into +-band [rad], between samples along a straight line; the flight's length where it ends outside."""
+        """Time [B] of the last entry into +-band [rad], between samples along a straight line; the
+        flight's length where it ends outside.
+        """
         size = self.error.abs()
         outside = ~(size <= band)
         inside = outside.flip(1).to(torch.int64).argmax(1)
         last = (size.shape[1] - 1 - inside).unsqueeze(1)
-        before, after = (size.gather(1, k.clamp(max=size.shape[1] - 1))[:, 0] for k in (last, last + 1))
+        before, after = (
+            size.gather(1, k.clamp(max=size.shape[1] - 1))[:, 0] for k in (last, last + 1)
+        )
         share = torch.where(inside > 0, (before - band) / (before - after).clamp(min=1e-12), 0.0)
         return torch.where(outside.any(1), last[:, 0] + share, 0.0) * self.dt
 
     def overshoot(self) -> Tensor:
-        """Largest heading beyond the reference [B] in rad, seen from the first heading; zero where there is none."""
+        """Largest heading beyond the reference [B] in rad, seen from the first heading; zero where
+        there is none.
+        """
         error = self.error
         return (-error * error[:, :1].sign()).amax(1).clamp(min=0.0)
 
@@ -210,7 +240,8 @@ def fly(
     weather: Mapping[str, float | Tensor] | None = None,
     surround: Callable[[Source], Source] | None = None,
 ) -> Flights:
-    """Heading changes [B] in rad from straight ahead of vessels varied by [B, 3], float64, without gradients.
+    """Heading changes [B] in rad from straight ahead of vessels varied by [B, 3], float64, without
+    gradients.
 
     Args:
         speed: multiples [B] of the service speed.

@@ -1,4 +1,6 @@
-"""Gains of linear heading controllers: the fastest in the worst case among those that keep an overshoot limit over a spread of vessels."""
+"""Gains of linear heading controllers: the fastest in the worst case among those that keep an
+overshoot limit over a spread of vessels.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,8 @@ class TuningTask:
         overshoot: limit [rad] over all variations.
         band: that the change ends within [rad].
         duration: of a flight [s].
-        bias, bias_error, bias_time: under a constant rudder bias [rad] the error [rad] of controllers with an integral after this time [s].
+        bias, bias_error, bias_time: under a constant rudder bias [rad] the error [rad] of
+            controllers with an integral after this time [s].
     """
 
     heading: float
@@ -40,7 +43,9 @@ class TuningTask:
 
 @dataclass(frozen=True)
 class Tuned:
-    """Parameters, the gains that they make, and what tuning found: worst settling time [s] and overshoot [rad], candidates tried."""
+    """Parameters, the gains that they make, and what tuning found: worst settling time [s] and
+    overshoot [rad], candidates tried.
+    """
 
     parameters: dict[str, float]
     gains: dict[str, float]
@@ -68,24 +73,45 @@ class LinearRows(Policy):
         return wish.clamp(-self.limit, self.limit), torch.where(winding, s, s + self.dt * error)
 
 
-def tune(config: TunedConfig, steering: Steering, task: TuningTask, points: int = 400, rounds: int = 6) -> Tuned:
-    """Search the missing parameters on grids, each a fifth of the one before around the best so far.
+def tune(
+    config: TunedConfig, steering: Steering, task: TuningTask, points: int = 400, rounds: int = 6
+) -> Tuned:
+    """Search the missing parameters on grids, each a fifth of the one before around the best so
+    far.
 
     Raises:
         FitError: where no candidate keeps the limits.
     """
     missing = [name for name, value in config.parameters().items() if value is None]
-    span = {name: (torch.tensor(axis.low).log(), torch.tensor(axis.high).log()) for name, axis in config.axes(steering.turning).items()}
+    span = {
+        name: (torch.tensor(axis.low).log(), torch.tensor(axis.high).log())
+        for name, axis in config.axes(steering.turning).items()
+    }
     count = max(round(points ** (1.0 / max(len(missing), 1))), 2) if missing else 1
     best: tuple[float, dict[str, float], float, float] | None = None
     tried = 0
     for _ in range(rounds if missing else 1):
         grid = (
-            torch.meshgrid(*[torch.linspace(float(span[name][0]), float(span[name][1]), count) for name in missing], indexing="ij") if missing else ()
+            torch.meshgrid(
+                *[
+                    torch.linspace(float(span[name][0]), float(span[name][1]), count)
+                    for name in missing
+                ],
+                indexing="ij",
+            )
+            if missing
+            else ()
         )
-        parameters = {name: values.double().exp().flatten() for name, values in zip(missing, grid, strict=True)}
+        parameters = {
+            name: values.double().exp().flatten()
+            for name, values in zip(missing, grid, strict=True)
+        }
         size = count ** len(missing)
-        fixed = {name: torch.full((size,), value, dtype=torch.float64) for name, value in config.parameters().items() if value is not None}
+        fixed = {
+            name: torch.full((size,), value, dtype=torch.float64)
+            for name, value in config.parameters().items()
+            if value is not None
+        }
         cost, settling, over = _judge(config, steering, task, parameters | fixed)
         tried += size
         place = int(cost.argmin())
@@ -101,27 +127,53 @@ def tune(config: TunedConfig, steering: Steering, task: TuningTask, points: int 
             span[name] = (middle - half, middle + half)
     if best is None:
         raise FitError(
-            f"no {config.model_dump()['kind']} controller of {tried} tried keeps the overshoot within {task.overshoot:.3g} rad over the spread; "
-            "allow more overshoot or narrow the spread"
+            f"no {config.model_dump()['kind']} controller of {tried} tried keeps the overshoot"
+            f" within {task.overshoot:.3g} rad over the spread; allow more overshoot or narrow the"
+            " spread"
         )
-    kp, kd, ki = config.gains({name: torch.tensor(value) for name, value in best[1].items()}, steering.turning)
-    return Tuned(best[1], {"kp": float(kp), "kd": float(kd), "ki": float(ki)}, best[2], best[3], tried)
+    kp, kd, ki = config.gains(
+        {name: torch.tensor(value) for name, value in best[1].items()}, steering.turning
+    )
+    return Tuned(
+        best[1], {"kp": float(kp), "kd": float(kd), "ki": float(ki)}, best[2], best[3], tried
+    )
 
 
-def _judge(config: TunedConfig, steering: Steering, task: TuningTask, parameters: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-    """Cost, worst settling time [s] and worst overshoot [rad] of each candidate [C]; an infinite cost breaks a limit."""
+def _judge(
+    config: TunedConfig, steering: Steering, task: TuningTask, parameters: dict[str, Tensor]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Cost, worst settling time [s] and worst overshoot [rad] of each candidate [C]; an infinite
+    cost breaks a limit.
+    """
     gains = config.gains(parameters, steering.turning)
     many, size = len(task.variations), len(gains[0])
     each = tuple(gain.repeat_interleave(many) for gain in gains)
     rows = LinearRows(steering, (each[0], each[1], each[2]))
     heading = torch.full((size * many,), task.heading)
-    flights = fly(steering.vessel, rows, heading, task.variations.repeat(size, 1), dt=steering.dt, duration=task.duration)
-    settled, over = (values.reshape(size, many) for values in (flights.settled(task.band).double(), flights.overshoot()))
+    flights = fly(
+        steering.vessel,
+        rows,
+        heading,
+        task.variations.repeat(size, 1),
+        dt=steering.dt,
+        duration=task.duration,
+    )
+    settled, over = (
+        values.reshape(size, many)
+        for values in (flights.settled(task.band).double(), flights.overshoot())
+    )
     cost = settled.amax(1) + 0.01 * settled.mean(1)
     cost = torch.where(over.amax(1) <= task.overshoot, cost, torch.inf)
     if bool((gains[2] > 0).any()):
         bias = torch.tensor([[1.0, 1.0, task.bias]]).expand(size, -1)
         slow = LinearRows(steering._replace(dt=0.1), gains)
-        pushed = fly(steering.vessel, slow, torch.full((size,), task.heading), bias, dt=0.1, duration=task.bias_time)
+        pushed = fly(
+            steering.vessel,
+            slow,
+            torch.full((size,), task.heading),
+            bias,
+            dt=0.1,
+            duration=task.bias_time,
+        )
         cost = torch.where(pushed.error[:, -1].abs() <= task.bias_error, cost, torch.inf)
     return cost, settled.amax(1), over.amax(1)

@@ -1,4 +1,6 @@
-"""How a vessel answers its rudder about straight ahead, as Nomoto's K and T: the scales of heading controllers."""
+"""How a vessel answers its rudder about straight ahead, as Nomoto's K and T: the scales of heading
+controllers.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,15 @@ class Turning:
     speed: float
 
 
-def measure_turning(model: Dynamics, x: Tensor, w: Tensor, s: Tensor, columns: tuple[int, int], angle: float, duration: float) -> Turning:
+def measure_turning(
+    model: Dynamics,
+    x: Tensor,
+    w: Tensor,
+    s: Tensor,
+    columns: tuple[int, int],
+    angle: float,
+    duration: float,
+) -> Turning:
     """K and T from the answer to a rudder angle that is held.
 
     Args:
@@ -46,7 +56,10 @@ def measure_turning(model: Dynamics, x: Tensor, w: Tensor, s: Tensor, columns: t
             rates.append(float(x[0, r]))
     steady = rates[-1]
     if not steady * angle > 0 or abs(rates[-1] - rates[len(rates) // 2]) > 0.1 * abs(steady):
-        raise FitError(f"the vessel's turn at {angle:.3g} rad of rudder is not steady after {duration:g} s; train on a vessel that holds its course")
+        raise FitError(
+            f"the vessel's turn at {angle:.3g} rad of rudder is not steady after {duration:g} s;"
+            " train on a vessel that holds its course"
+        )
     # T is the area above the rate's answer, in which lags and overshoots count as they matter
     gain = steady / angle
     area = (0.5 * steady + sum(steady - rate for rate in rates)) * model.dt

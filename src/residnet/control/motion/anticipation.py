@@ -1,4 +1,6 @@
-"""Feed-forward through lagging actuators: the force that a model needs a little later, led by what the actuators lag behind."""
+"""Feed-forward through lagging actuators: the force that a model needs a little later, led by what
+the actuators lag behind.
+"""
 
 from __future__ import annotations
 
@@ -17,13 +19,19 @@ from residnet.core.frames import to_body
 from residnet.physics.force_model import ForceModel
 
 _STEP = 0.05
-"""Seconds between the points that the force's derivatives are taken from; the reference itself is known analytically there."""
+"""Seconds between the points that the force's derivatives are taken from; the reference itself is
+known analytically there.
+"""
 _MEND = 0.7
-"""How fast a miss of the needed force is made up for, in units of the lag's own frequency: the command's peaks grow with it."""
+"""How fast a miss of the needed force is made up for, in units of the lag's own frequency: the
+command's peaks grow with it.
+"""
 
 
 class Lag(Config):
-    """tau'' + 2 zeta omega tau' + omega^2 tau = omega^2 tau_c(t - delay): how forces follow commands (document 002 eq. (4.3))."""
+    """tau'' + 2 zeta omega tau' + omega^2 tau = omega^2 tau_c(t - delay): how forces follow
+    commands (document 002 eq. (4.3)).
+    """
 
     frequency: RadiansPerSecond = Field(gt=0)
     damping: float = Field(gt=0)
@@ -31,7 +39,9 @@ class Lag(Config):
 
 
 class Derivatives(NamedTuple):
-    """A desired pose and its derivatives in earth axes (north [m], east [m], heading [rad]), each [..., 3]."""
+    """A desired pose and its derivatives in earth axes (north [m], east [m], heading [rad]), each
+    [..., 3].
+    """
 
     pose: Tensor
     rate: Tensor
@@ -40,19 +50,31 @@ class Derivatives(NamedTuple):
     snap: Tensor
 
     def later(self, h: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Heading [...], nu_d and nu_dot_d [..., 3] in body axes h seconds later, along the Taylor series."""
-        pose = self.pose + h * (self.rate + h / 2 * (self.acceleration + h / 3 * (self.jerk + h / 4 * self.snap)))
+        """Heading [...], nu_d and nu_dot_d [..., 3] in body axes h seconds later, along the Taylor
+        series.
+        """
+        pose = self.pose + h * (
+            self.rate + h / 2 * (self.acceleration + h / 3 * (self.jerk + h / 4 * self.snap))
+        )
         rate = self.rate + h * (self.acceleration + h / 2 * (self.jerk + h / 3 * self.snap))
         change = self.acceleration + h * (self.jerk + h / 2 * self.snap)
         psi, r = pose[..., 2], rate[..., 2]
         u, v = to_body(rate[..., 0], rate[..., 1], psi)
         along, across = to_body(change[..., 0], change[..., 1], psi)
         # a vector fixed in the earth turns by -r in the body (ERRATA J7)
-        return psi, torch.stack((u, v, r), dim=-1), torch.stack((along + r * v, across - r * u, change[..., 2]), dim=-1)
+        return (
+            psi,
+            torch.stack((u, v, r), dim=-1),
+            torch.stack((along + r * v, across - r * u, change[..., 2]), dim=-1),
+        )
 
 
-def derivatives(config: ReferenceFilterConfig, memory: Tensor, target: Tensor, target_rate: Tensor) -> Derivatives:
-    """Jerk and snap of the third-order filter (2.15) at its memory [..., 9] under a target [..., 3] that moves by `target_rate`."""
+def derivatives(
+    config: ReferenceFilterConfig, memory: Tensor, target: Tensor, target_rate: Tensor
+) -> Derivatives:
+    """Jerk and snap of the third-order filter (2.15) at its memory [..., 9] under a target [..., 3]
+    that moves by `target_rate`.
+    """
     w = torch.tensor(config.frequency, dtype=memory.dtype)
     d = 2.0 * torch.tensor(config.damping, dtype=memory.dtype) + 1.0
     pose, rate, change = memory[..., :3], memory[..., 3:6], memory[..., 6:]
@@ -62,7 +84,8 @@ def derivatives(config: ReferenceFilterConfig, memory: Tensor, target: Tensor, t
 
 
 def needed_force(model: ForceModel, motion: Derivatives, lag: Lag | None, held: float) -> Tensor:
-    """What a model needs for the motion when a command given now takes effect, and its first and second derivative: [..., 9].
+    """What a model needs for the motion when a command given now takes effect, and its first and
+    second derivative: [..., 9].
 
     Args:
         model: of the vessel.
@@ -80,19 +103,23 @@ def needed_force(model: ForceModel, motion: Derivatives, lag: Lag | None, held: 
         return torch.cat((now, torch.zeros_like(now), torch.zeros_like(now)), dim=-1)
     at = lag.delay + 0.5 * held
     before, now, after = force(at - _STEP), force(at), force(at + _STEP)
-    return torch.cat((now, (after - before) / (2 * _STEP), (after - 2 * now + before) / _STEP**2), dim=-1)
+    return torch.cat(
+        (now, (after - before) / (2 * _STEP), (after - 2 * now + before) / _STEP**2), dim=-1
+    )
 
 
 @final
 class Assisted(Policy):
     """PID on a reference that brings along what a model needs, led by the lag of the actuators.
 
-    Reference [B, 18]: eta_d, nu_d, nu_dot_d, then `needed_force`. Memory [B, 15]: the integral of the PID, then of each axis the predicted
-    force of the actuators, its rate, and the integral and double integral of what it misses of the needed force.
+    Reference [B, 18]: eta_d, nu_d, nu_dot_d, then `needed_force`. Memory [B, 15]: the integral of
+    the PID, then of each axis the predicted force of the actuators, its rate, and the integral and
+    double integral of what it misses of the needed force.
 
-    The command is tau_p + 2 zeta / omega tau_p' + (tau'' + k1 e' + k2 e + k3 I + k4 II) / omega^2, e the miss: where the desired jerk jumps, the
-    needed force has a corner that no command follows, and the vessel would be left with a wrong velocity that the PID takes a minute to mend;
-    the integrals make up for it within seconds.
+    The command is tau_p + 2 zeta / omega tau_p' + (tau'' + k1 e' + k2 e + k3 I + k4 II) / omega^2,
+    e the miss: where the desired jerk jumps, the needed force has a corner that no command follows,
+    and the vessel would be left with a wrong velocity that the PID takes a minute to mend; the
+    integrals make up for it within seconds.
 
     Args:
         feedback: the PID, without feed-forward.
@@ -110,8 +137,14 @@ class Assisted(Policy):
         self.led = torch.tensor([[lag is not None] for lag in lags])
         self.frequency = torch.tensor([[lag.frequency] for lag in known], dtype=torch.float64)
         self.damping = torch.tensor([[lag.damping] for lag in known], dtype=torch.float64)
-        self.gains = [factor * (_MEND * self.frequency) ** power for factor, power in ((4.0, 1), (6.0, 2), (4.0, 3), (1.0, 4))]
-        rows = [[[0.0, 1.0, 0.0], [-(w**2), -2 * z * w, w**2], [0.0, 0.0, 0.0]] for w, z in ((lag.frequency, lag.damping) for lag in known)]
+        self.gains = [
+            factor * (_MEND * self.frequency) ** power
+            for factor, power in ((4.0, 1), (6.0, 2), (4.0, 3), (1.0, 4))
+        ]
+        rows = [
+            [[0.0, 1.0, 0.0], [-(w**2), -2 * z * w, w**2], [0.0, 0.0, 0.0]]
+            for w, z in ((lag.frequency, lag.damping) for lag in known)
+        ]
         self.step = torch.linalg.matrix_exp(torch.tensor(rows, dtype=torch.float64) * dt)
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
@@ -124,10 +157,25 @@ class Assisted(Policy):
         force, rate, missed, twice = s[:, n:].unflatten(-1, (4, 3)).unbind(1)
         error = needed - force
         k1, k2, k3, k4 = self.gains
-        drive = reference[:, 15:18] + k1 * (reference[:, 12:15] - rate) + k2 * error + k3 * missed + k4 * twice
+        drive = (
+            reference[:, 15:18]
+            + k1 * (reference[:, 12:15] - rate)
+            + k2 * error
+            + k3 * missed
+            + k4 * twice
+        )
         lead = force + (2 * self.damping / self.frequency) * rate + drive / self.frequency**2
         state = self.step @ torch.stack((force, rate, lead), dim=1)
-        memory = torch.cat((integral, state[:, 0], state[:, 1], missed + self.dt * error, twice + self.dt * missed), dim=-1)
+        memory = torch.cat(
+            (
+                integral,
+                state[:, 0],
+                state[:, 1],
+                missed + self.dt * error,
+                twice + self.dt * missed,
+            ),
+            dim=-1,
+        )
         return torch.where(self.led, lead, needed) + correction, memory
 
 
@@ -138,9 +186,11 @@ def reference_row(motion: Derivatives, needed: Tensor) -> Tensor:
 
 
 def course(config: ReferenceFilterConfig, dt: float) -> Derivatives:
-    """The desired motion [T, 3] of a whole course from rest at the origin: what the filter of `config` gives step by step.
+    """The desired motion [T, 3] of a whole course from rest at the origin: what the filter of
+    `config` gives step by step.
 
-    The filter is linear and its target constant over an interval, so that powers of its step matrix give each interval at once.
+    The filter is linear and its target constant over an interval, so that powers of its step matrix
+    give each interval at once.
     """
     filtered = config.build(dt)
     matrix, every = filtered.advance[0], filtered.every

@@ -1,4 +1,6 @@
-"""Position and heading control in three degrees of freedom: PID in the body frame with a feed-forward (document 002 section 2.2)."""
+"""Position and heading control in three degrees of freedom: PID in the body frame with a
+feed-forward (document 002 section 2.2).
+"""
 
 from __future__ import annotations
 
@@ -71,18 +73,26 @@ class MotionPIDConfig(Config):
 
 @final
 class MotionPID(Policy):
-    """tau = F(nu_dot_d, nu_d) + Kp e + Ki I + Kd (nu_d - nu), e = R^T(psi) (eta_d - eta) with its heading wrapped (2.9)-(2.14).
+    """tau = F(nu_dot_d, nu_d) + Kp e + Ki I + Kd (nu_d - nu), e = R^T(psi) (eta_d - eta) with its
+    heading wrapped (2.9)-(2.14).
 
-    Reference [B, 9]: eta_d, nu_d, nu_dot_d, as `ReferenceFilter` gives it. The memory [B, 3] is I, the sum of e dt of the steps before.
-    There is one config for all rows, or one for each row of the batch.
+    Reference [B, 9]: eta_d, nu_d, nu_dot_d, as `ReferenceFilter` gives it. The memory [B, 3] is I,
+    the sum of e dt of the steps before. There is one config for all rows, or one for each row of
+    the batch.
     """
 
-    def __init__(self, configs: Sequence[MotionPIDConfig], dt: float, feed_forward: FeedForward) -> None:
+    def __init__(
+        self, configs: Sequence[MotionPIDConfig], dt: float, feed_forward: FeedForward
+    ) -> None:
         super().__init__()
         self.n_state = 3
         self.dt = dt
         self.feed_forward = feed_forward
-        gains = [[config.proportional for config in configs], [config.integral for config in configs], [config.derivative for config in configs]]
+        gains = [
+            [config.proportional for config in configs],
+            [config.integral for config in configs],
+            [config.derivative for config in configs],
+        ]
         self.register_buffer("gains", torch.tensor(gains, dtype=torch.float64), persistent=False)
         self.gains: Tensor
 
@@ -103,7 +113,9 @@ class MotionPID(Policy):
 
 @final
 class Allocated(Policy):
-    """A controller of forces for a vessel with azimuth thrusters: its tau is allocated to their revolutions and angles."""
+    """A controller of forces for a vessel with azimuth thrusters: its tau is allocated to their
+    revolutions and angles.
+    """
 
     def __init__(self, policy: Policy, thrusters: AzimuthThrusters) -> None:
         super().__init__()

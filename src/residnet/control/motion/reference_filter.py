@@ -1,4 +1,6 @@
-"""Waypoints through a third-order reference filter (document 002 section 2.2.1, eq. (2.15), ERRATA J7, J9, J13)."""
+"""Waypoints through a third-order reference filter (document 002 section 2.2.1, eq. (2.15), ERRATA
+J7, J9, J13).
+"""
 
 from __future__ import annotations
 
@@ -15,13 +17,16 @@ from residnet.core.errors import ConfigError
 from residnet.core.frames import to_body
 
 Waypoint = tuple[Metres, Metres, Radians]
-"""North, east and heading; headings are followed as they are written: from 0 to 180 deg clockwise, from 135 to -45 deg the other way."""
+"""North, east and heading; headings are followed as they are written: from 0 to 180 deg clockwise,
+from 135 to -45 deg the other way.
+"""
 Frequency = Annotated[RadiansPerSecond, Field(gt=0)]
 Damping = Annotated[float, Field(gt=0)]
 
 
 class ReferenceFilterConfig(Config):
-    """A trajectory through waypoints that are given one after the other, smoothed to what a vessel can follow.
+    """A trajectory through waypoints that are given one after the other, smoothed to what a vessel
+    can follow.
 
     Attributes:
         waypoints: (north, east, heading), the first from the start on.
@@ -52,11 +57,14 @@ class ReferenceFilterConfig(Config):
 
 @final
 class ReferenceFilter(Reference):
-    """(s + W)(s^2 + 2 D W s + W^2) on each of north, east and heading, stepped by RK4 with the waypoint held over a step.
+    """(s + W)(s^2 + 2 D W s + W^2) on each of north, east and heading, stepped by RK4 with the
+    waypoint held over a step.
 
-    The reference [B, 9] of a step is where the filter stands at its start: eta_d (north, east [m], heading [rad], not wrapped), then
-    nu_d and nu_d_dot in body axes along the desired heading. The memory [B, 9] holds eta_d and its first and second derivative. The
-    filter starts at rest where the vessel is. It has one config for all rows, or one for each row of the batch, with the same interval.
+    The reference [B, 9] of a step is where the filter stands at its start: eta_d (north, east [m],
+    heading [rad], not wrapped), then nu_d and nu_d_dot in body axes along the desired heading. The
+    memory [B, 9] holds eta_d and its first and second derivative. The filter starts at rest where
+    the vessel is. It has one config for all rows, or one for each row of the batch, with the same
+    interval.
     """
 
     def __init__(self, configs: Sequence[ReferenceFilterConfig], dt: float) -> None:
@@ -66,21 +74,41 @@ class ReferenceFilter(Reference):
         steps = max(intervals) / dt
         if len(intervals) > 1 or abs(steps - round(steps)) > 1e-6 * steps or round(steps) < 1:
             given = ", ".join(f"{interval:g} s" for interval in sorted(intervals))
-            raise ConfigError(f"reference filter: interval ({given}) must be the same for all and a whole number of steps of {dt:g} s")
+            raise ConfigError(
+                f"reference filter: interval ({given}) must be the same for all and a whole number"
+                f" of steps of {dt:g} s"
+            )
         self.every = round(steps)
         self.count = max(len(config.waypoints) for config in configs)
-        points = [(*config.waypoints, *[config.waypoints[-1]] * (self.count - len(config.waypoints))) for config in configs]
-        self.register_buffer("waypoints", torch.tensor(points, dtype=torch.float64), persistent=False)
+        points = [
+            (*config.waypoints, *[config.waypoints[-1]] * (self.count - len(config.waypoints)))
+            for config in configs
+        ]
+        self.register_buffer(
+            "waypoints", torch.tensor(points, dtype=torch.float64), persistent=False
+        )
         self.waypoints: Tensor
-        self.register_buffer("advance", torch.stack([self._step_matrix(config, dt) for config in configs]), persistent=False)
+        self.register_buffer(
+            "advance",
+            torch.stack([self._step_matrix(config, dt) for config in configs]),
+            persistent=False,
+        )
         self.advance: Tensor
 
     @staticmethod
     def _step_matrix(config: ReferenceFilterConfig, dt: float) -> Tensor:
-        """What a step of RK4 does to (error, rate, acceleration) of each axis, [3, 3, 3]: exact for a linear filter."""
+        """What a step of RK4 does to (error, rate, acceleration) of each axis, [3, 3, 3]: exact for
+        a linear filter.
+        """
         matrices = []
         for w, d in zip(config.frequency, config.damping, strict=True):
-            a = torch.tensor([[0, 1, 0], [0, 0, 1], [-(w**3), -(2 * d + 1) * w**2, -(2 * d + 1) * w]], dtype=torch.float64) * dt
+            a = (
+                torch.tensor(
+                    [[0, 1, 0], [0, 0, 1], [-(w**3), -(2 * d + 1) * w**2, -(2 * d + 1) * w]],
+                    dtype=torch.float64,
+                )
+                * dt
+            )
             one = torch.eye(3, dtype=torch.float64)
             matrices.append(one + a @ (one + a @ (one + a @ (one + a / 4.0) / 3.0) / 2.0))
         return torch.stack(matrices)

@@ -28,8 +28,10 @@ def inspect(log: Log, inputs: Sequence[str] | None = None, masks: Sequence[Mask]
 
     Args:
         log: any log.
-        inputs: channels that drive the vessel; None takes all that no sensor of the motion measures.
-        masks: rules that will leave samples out of a fit; a finding about such samples only is a note.
+        inputs: channels that drive the vessel; None takes all that no sensor of the motion
+            measures.
+        masks: rules that will leave samples out of a fit; a finding about such samples only is a
+            note.
 
     Raises:
         UsageError: where the log lacks an input that was named.
@@ -39,14 +41,22 @@ def inspect(log: Log, inputs: Sequence[str] | None = None, masks: Sequence[Mask]
         raise DataError(f"log {log.name}: {len(log)} samples, at least 2 are needed; leave it out")
     for name, values in log.channels.items():
         if not np.isfinite(values).any():
-            raise DataError(f"log {log.name}: channel {name} holds no number; take it out of the channel map")
-    driving = tuple(name for name in log.channels if name not in MEASURED) if inputs is None else tuple(inputs)
+            raise DataError(
+                f"log {log.name}: channel {name} holds no number; take it out of the channel map"
+            )
+    driving = (
+        tuple(name for name in log.channels if name not in MEASURED)
+        if inputs is None
+        else tuple(inputs)
+    )
     log.stack(driving)
     findings = [*imported(log.meta.get("findings", ())), *channel_findings(log)]
     broken = order_findings(log)
     if not broken:
         findings += [*clock_findings(log), *_contents(log, driving)]
-    left_out = ~apply_masks(log, masks).usable if masks and not broken else np.zeros(len(log), dtype=bool)
+    left_out = (
+        ~apply_masks(log, masks).usable if masks and not broken else np.zeros(len(log), dtype=bool)
+    )
     excused = [finding.excused(left_out) for finding in (*findings, *broken)]
     return Report(log.name, tuple(excused), str(log.meta.get("source", "")))
 
@@ -56,16 +66,33 @@ def _contents(log: Log, driving: Sequence[str]) -> list[Finding]:
     findings = wrap_findings(log)
     log = unwrapped(log)
     values = value_findings(log, driving)
-    return [*findings, *values, *_frames(_trusted(log, values)), *input_findings(log, driving), *excitation_findings(log, driving)]
+    return [
+        *findings,
+        *values,
+        *_frames(_trusted(log, values)),
+        *input_findings(log, driving),
+        *excitation_findings(log, driving),
+    ]
 
 
 def _trusted(log: Log, findings: Sequence[Finding]) -> Log:
-    """The log with NaN in the pose and velocities where a finding about values already says that they are wrong."""
-    doubted = [finding.at for finding in findings if finding.at is not None and finding.code in ("frozen", "outliers", "clipping")]
+    """The log with NaN in the pose and velocities where a finding about values already says that
+    they are wrong.
+    """
+    doubted = [
+        finding.at
+        for finding in findings
+        if finding.at is not None and finding.code in ("frozen", "outliers", "clipping")
+    ]
     bad = np.logical_or.reduce(doubted) if doubted else np.zeros(len(log), dtype=bool)
     if bad.mean() > 0.5:
         return log
-    return log.replace(channels={name: without(values, bad) if name in MEASURED else values for name, values in log.channels.items()})
+    return log.replace(
+        channels={
+            name: without(values, bad) if name in MEASURED else values
+            for name, values in log.channels.items()
+        }
+    )
 
 
 def _frames(log: Log) -> list[Finding]:
@@ -75,12 +102,18 @@ def _frames(log: Log) -> list[Finding]:
         return [Finding("fatal", "clock_span", f"frames not checked: {error}")]
 
 
-def inspect_together(logs: Sequence[Log], inputs: Sequence[str] | None = None, splits: Mapping[str, str] | None = None) -> Report:
-    """Examine logs beside each other: copies, runs cut into files, ranges, and whether a fit to all of them has something to learn from.
+def inspect_together(
+    logs: Sequence[Log],
+    inputs: Sequence[str] | None = None,
+    splits: Mapping[str, str] | None = None,
+) -> Report:
+    """Examine logs beside each other: copies, runs cut into files, ranges, and whether a fit to all
+    of them has something to learn from.
 
     Args:
         logs: at least one, each with an increasing clock.
-        inputs: channels that drive the vessel; None takes all that no sensor of the motion measures.
+        inputs: channels that drive the vessel; None takes all that no sensor of the motion
+            measures.
         splits: log's name -> train, validation or test, where a config says.
     """
     sound = [log for log in logs if not order_findings(log)]

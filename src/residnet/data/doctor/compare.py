@@ -1,4 +1,6 @@
-"""What the data doctor sees between logs: copies, overlaps, runs that were cut into files, the same commands, ranges not covered."""
+"""What the data doctor sees between logs: copies, overlaps, runs that were cut into files, the same
+commands, ranges not covered.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,9 @@ _EPOCH = 1e8
 _OUTSIDE = 0.25
 
 
-def comparison_findings(logs: Sequence[Log], splits: Mapping[str, str] | None = None) -> list[Finding]:
+def comparison_findings(
+    logs: Sequence[Log], splits: Mapping[str, str] | None = None
+) -> list[Finding]:
     """Findings between logs.
 
     Args:
@@ -39,7 +43,9 @@ def comparison_findings(logs: Sequence[Log], splits: Mapping[str, str] | None = 
 def _copies(logs: Sequence[Log], splits: Mapping[str, str]) -> Iterator[Finding]:
     """Stretches that two logs, or two places of one log, have in common."""
     names = [name for name in VELOCITY if all(name in log.channels for log in logs)]
-    names = names if len(names) > 1 else sorted(set.intersection(*(set(log.channels) for log in logs)))
+    names = (
+        names if len(names) > 1 else sorted(set.intersection(*(set(log.channels) for log in logs)))
+    )
     if not names:
         return
     hashes = [row_hashes(log, names) for log in logs]
@@ -55,7 +61,9 @@ def _copies(logs: Sequence[Log], splits: Mapping[str, str]) -> Iterator[Finding]
     pairs: dict[tuple[int, int, int], list[int]] = {}
     for _, members in itertools.groupby(order.tolist(), key=lambda i: int(inverse[i])):
         for i, j in itertools.combinations(sorted(members), 2):
-            pairs.setdefault((int(owner[i]), int(owner[j]), int(row[j] - row[i])), []).append(int(row[i]))
+            pairs.setdefault((int(owner[i]), int(owner[j]), int(row[j] - row[i])), []).append(
+                int(row[i])
+            )
     for (i, j, offset), rows in sorted(pairs.items()):
         if i == j and offset == 1:
             continue
@@ -64,28 +72,52 @@ def _copies(logs: Sequence[Log], splits: Mapping[str, str]) -> Iterator[Finding]
         starts, stops = true_runs(flags)
         longest = int((stops - starts).max(initial=0))
         if longest >= _COPIED:
-            yield _copy(logs[i], logs[j], int(starts[np.argmax(stops - starts)]), offset, longest, splits)
+            yield _copy(
+                logs[i], logs[j], int(starts[np.argmax(stops - starts)]), offset, longest, splits
+            )
 
 
-def _copy(a: Log, b: Log, start: int, offset: int, count: int, splits: Mapping[str, str]) -> Finding:
+def _copy(
+    a: Log, b: Log, start: int, offset: int, count: int, splits: Mapping[str, str]
+) -> Finding:
     figures = {"rows": float(count), "first": float(start), "offset": float(offset)}
     if a is b:
-        text = f"{a.name}: rows {start} to {start + count - 1} stand again from row {start + offset} on"
+        text = (
+            f"{a.name}: rows {start} to {start + count - 1} stand again from row"
+            f" {start + offset} on"
+        )
         return Finding("will mislead", "repeated_block", text, figures, "delete one of the copies")
     leak = splits.get(a.name) != splits.get(b.name)
-    across = f" ({splits[a.name]} and {splits[b.name]})" if leak and a.name in splits and b.name in splits else ""
+    across = (
+        f" ({splits[a.name]} and {splits[b.name]})"
+        if leak and a.name in splits and b.name in splits
+        else ""
+    )
     level: Level = "fatal" if across else "will mislead"
     if count >= max(len(a), len(b)) - 1:
-        return Finding(level, "duplicate_log", f"{a.name} and {b.name} are the same{across}", figures, "leave one of them out")
-    part, whole, first = (b, a, start) if len(b) - count < len(a) - count else (a, b, start + offset)
+        return Finding(
+            level,
+            "duplicate_log",
+            f"{a.name} and {b.name} are the same{across}",
+            figures,
+            "leave one of them out",
+        )
+    part, whole, first = (
+        (b, a, start) if len(b) - count < len(a) - count else (a, b, start + offset)
+    )
     share = share_of(count / len(part))
-    text = f"{part.name} is in {share} a copy of rows {first} to {first + count - 1} of {whole.name}{across}"
+    text = (
+        f"{part.name} is in {share} a copy of rows {first} to {first + count - 1} of"
+        f" {whole.name}{across}"
+    )
     return Finding(level, "copied_part", text, figures, "leave it out, or keep both in one split")
 
 
 def _continued(a: Log, b: Log, splits: Mapping[str, str]) -> Iterator[Finding]:
     """A log that goes on where another ended: one run, cut into files."""
-    states = [name for name in ("x", "y", "u", "v", "r") if name in a.channels and name in b.channels]
+    states = [
+        name for name in ("x", "y", "u", "v", "r") if name in a.channels and name in b.channels
+    ]
     if len(states) < 4 or len(a) < 20 or len(b) < 20:
         return
     step = float(np.median(np.diff(a.t)))
@@ -96,15 +128,25 @@ def _continued(a: Log, b: Log, splits: Mapping[str, str]) -> Iterator[Finding]:
     for name in states:
         ends = np.array([a[name][-3:].mean(), b[name][:3].mean()])
         change = np.abs(np.diff(a[name]))
-        usual = float(np.median(change[np.isfinite(change)])) + noise_of(a[name]) + noise_of(b[name]) if np.isfinite(change).any() else 0.0
-        if not np.isfinite(ends).all() or abs(ends[1] - ends[0]) > (30.0 if on_time else 8.0) * max(float(usual), 1e-12):
+        usual = (
+            float(np.median(change[np.isfinite(change)])) + noise_of(a[name]) + noise_of(b[name])
+            if np.isfinite(change).any()
+            else 0.0
+        )
+        if not np.isfinite(ends).all() or abs(ends[1] - ends[0]) > (30.0 if on_time else 8.0) * max(
+            float(usual), 1e-12
+        ):
             return
-    if not on_time and float(np.hypot(a["u"][-1], a["v"][-1])) < 0.2 * float(np.nanquantile(np.hypot(a["u"], a["v"]), 0.9)):
+    if not on_time and float(np.hypot(a["u"][-1], a["v"][-1])) < 0.2 * float(
+        np.nanquantile(np.hypot(a["u"], a["v"]), 0.9)
+    ):
         # where both are at rest nothing tells one quay from another
         return
     torn = a.name in splits and b.name in splits and splits[a.name] != splits[b.name]
     text = (
-        f"{b.name} goes on where {a.name} ends, {pause:.2f} s later: one run, cut into files" if on_time else f"{b.name} goes on where {a.name} ends"
+        f"{b.name} goes on where {a.name} ends, {pause:.2f} s later: one run, cut into files"
+        if on_time
+        else f"{b.name} goes on where {a.name} ends"
     )
     text += f"; they stand in {splits[a.name]} and {splits[b.name]}" if torn else ""
     action = "keep them in one split" if torn or not splits else ""
@@ -116,21 +158,41 @@ def _overlapping(a: Log, b: Log) -> Iterator[Finding]:
     if min(a.t[0], b.t[0]) > _EPOCH and last > first:
         text = f"{a.name} and {b.name} overlap in time for {last - first:.1f} s"
         yield Finding(
-            "note", "overlapping", text, {"seconds": float(last - first)}, "two vessels, or two recordings of one run? keep them in one split"
+            "note",
+            "overlapping",
+            text,
+            {"seconds": float(last - first)},
+            "two vessels, or two recordings of one run? keep them in one split",
         )
 
 
 def _same_commands(a: Log, b: Log, splits: Mapping[str, str]) -> Iterator[Finding]:
-    names = [name for name in a.channels if name in b.channels and name not in MEASURED and not name.startswith(("wind", "current"))]
+    names = [
+        name
+        for name in a.channels
+        if name in b.channels and name not in MEASURED and not name.startswith(("wind", "current"))
+    ]
     size = min(len(a), len(b))
     moving = [name for name in names if float(np.nanstd(a[name][:size])) > 1e-9]
     if not moving or size < 50:
         return
-    if all(np.allclose(a[name][:size], b[name][:size], rtol=1e-6, atol=1e-9, equal_nan=True) for name in moving):
+    if all(
+        np.allclose(a[name][:size], b[name][:size], rtol=1e-6, atol=1e-9, equal_nan=True)
+        for name in moving
+    ):
         torn = a.name in splits and b.name in splits and splits[a.name] != splits[b.name]
-        text = f"{a.name} and {b.name} have the same commands ({', '.join(moving)}) over {size} samples"
+        text = (
+            f"{a.name} and {b.name} have the same commands ({', '.join(moving)}) over {size}"
+            " samples"
+        )
         text += f" and stand in {splits[a.name]} and {splits[b.name]}" if torn else ""
-        yield Finding("note", "same_commands", text, {"samples": size}, "repeats show how far the vessel repeats itself; keep them in one split")
+        yield Finding(
+            "note",
+            "same_commands",
+            text,
+            {"samples": size},
+            "repeats show how far the vessel repeats itself; keep them in one split",
+        )
 
 
 def _ranges(logs: Sequence[Log], splits: Mapping[str, str]) -> Iterator[Finding]:
@@ -139,7 +201,11 @@ def _ranges(logs: Sequence[Log], splits: Mapping[str, str]) -> Iterator[Finding]
     others = [log for log in logs if splits.get(log.name) in ("validation", "test")]
     if not train or not others:
         return
-    for name in (name for name in train[0].channels if name not in ("x", "y", "psi") and all(name in log.channels for log in (*train, *others))):
+    for name in (
+        name
+        for name in train[0].channels
+        if name not in ("x", "y", "psi") and all(name in log.channels for log in (*train, *others))
+    ):
         known = np.concatenate([log[name] for log in train])
         low, high = float(np.nanmin(known)), float(np.nanmax(known))
         margin = 0.02 * (high - low)
@@ -147,7 +213,16 @@ def _ranges(logs: Sequence[Log], splits: Mapping[str, str]) -> Iterator[Finding]
             values = log[name][np.isfinite(log[name])]
             share = float(((values < low - margin) | (values > high + margin)).mean())
             if share > 0.01:
-                text = f"{name} of {log.name} ({splits[log.name]}) lies outside the training range {show(low, log.units[name])} to "
+                text = (
+                    f"{name} of {log.name} ({splits[log.name]}) lies outside the training range"
+                    f" {show(low, log.units[name])} to "
+                )
                 text += f"{show(high, log.units[name])} for {share_of(share)} of the time"
                 level: Level = "will mislead" if share > _OUTSIDE else "note"
-                yield Finding(level, "extrapolation", text, {"share": share}, "add training logs that go there, or do not trust the model there")
+                yield Finding(
+                    level,
+                    "extrapolation",
+                    text,
+                    {"share": share},
+                    "add training logs that go there, or do not trust the model there",
+                )

@@ -1,4 +1,6 @@
-"""A first channel map for a table that nobody has described: guessed from names, units in the header and values, to be checked and pasted."""
+"""A first channel map for a table that nobody has described: guessed from names, units in the
+header and values, to be checked and pasted.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _ROWS = 20_000
-# channel -> what columns that hold it are called, without units and punctuation; the first that fits is taken
+# channel -> what columns that hold it are called, without units and punctuation; the first that
+# fits is taken
 _NAMES = {
     "x": r"x|north|northing|x pos(ition)?( mid)?|pos(ition)? (x|north)|n pos",
     "y": r"y|east|easting|y pos(ition)?( mid)?|pos(ition)? (y|east)|e pos",
@@ -75,10 +78,17 @@ class Draft:
     def lines(self) -> list[str]:
         """The map as YAML, to paste under `data:`."""
         out = ["reader:", f"  kind: {self.content['kind']}"]
-        out += [f"  {key}: {self.content[key]!r}".replace("'", '"') for key in ("delimiter", "decimal") if key in self.content]
+        out += [
+            f"  {key}: {self.content[key]!r}".replace("'", '"')
+            for key in ("delimiter", "decimal")
+            if key in self.content
+        ]
         time = self.content["time"]
         out += [f'  time: {{column: "{time["column"]}", unit: {time["unit"]}}}', "  channels:"]
-        return out + [f'    {name}: {{column: "{entry["column"]}", unit: {entry["unit"]}}}' for name, entry in self.content["channels"].items()]
+        return out + [
+            f'    {name}: {{column: "{entry["column"]}", unit: {entry["unit"]}}}'
+            for name, entry in self.content["channels"].items()
+        ]
 
 
 def draft_map(path: Path) -> Draft:
@@ -114,20 +124,39 @@ def _peek(path: Path) -> tuple[pd.DataFrame, dict[str, Any]]:
             batches = pq.ParquetFile(path).iter_batches(batch_size=_ROWS)
             return next(batches).to_pandas(), {"kind": "parquet"}
         except (pa.ArrowException, OSError, StopIteration) as error:
-            raise DataError(f"{path}: not a readable Parquet table ({str(error).splitlines()[0] if str(error) else 'no rows'})") from error
+            raise DataError(
+                f"{path}: not a readable Parquet table"
+                f" ({str(error).splitlines()[0] if str(error) else 'no rows'})"
+            ) from error
     try:
         with path.open(newline="", encoding="utf-8-sig") as stream:
             head = stream.readline()
         if not head.strip() or "\x00" in head:
-            raise DataError(f"{path}: the file is empty or no text; a table with a header line was expected")
+            raise DataError(
+                f"{path}: the file is empty or no text; a table with a header line was expected"
+            )
         delimiter = max((",", ";", "\t"), key=head.count)
         decimal = "," if delimiter != "," and _comma_decimals(path, delimiter) else "."
-        table = pd.read_csv(path, sep=delimiter, decimal=decimal, nrows=_ROWS, encoding="utf-8-sig", skipinitialspace=True, low_memory=False)
+        table = pd.read_csv(
+            path,
+            sep=delimiter,
+            decimal=decimal,
+            nrows=_ROWS,
+            encoding="utf-8-sig",
+            skipinitialspace=True,
+            low_memory=False,
+        )
     except UnicodeDecodeError as error:
-        raise DataError(f"{path}: not UTF-8 text (byte {error.start}); save the file as UTF-8") from error
+        raise DataError(
+            f"{path}: not UTF-8 text (byte {error.start}); save the file as UTF-8"
+        ) from error
     except (ValueError, csv.Error) as error:
         raise DataError(f"{path}: not a regular table ({str(error).splitlines()[0]})") from error
-    about: dict[str, Any] = {"kind": "csv", **({"delimiter": delimiter} if delimiter != "," else {}), **({"decimal": ","} if decimal == "," else {})}
+    about: dict[str, Any] = {
+        "kind": "csv",
+        **({"delimiter": delimiter} if delimiter != "," else {}),
+        **({"decimal": ","} if decimal == "," else {}),
+    }
     table.columns = [str(name).strip() for name in table.columns]
     return table, about
 
@@ -154,19 +183,34 @@ def _numeric(table: pd.DataFrame) -> tuple[dict[str, np.ndarray], list[dict[str,
         else:
             numbers[str(column)] = values
     remarks = []
-    for code, what, names in (("empty_columns", "hold nothing", empty), ("text_cells", "hold text", text)):
+    for code, what, names in (
+        ("empty_columns", "hold nothing", empty),
+        ("text_cells", "hold text", text),
+    ):
         if names:
             remarks.append(
-                {"level": "note", "code": code, "text": f"{len(names)} columns {what}: {', '.join(names[:8])}", "figures": {"count": len(names)}}
+                {
+                    "level": "note",
+                    "code": code,
+                    "text": f"{len(names)} columns {what}: {', '.join(names[:8])}",
+                    "figures": {"count": len(names)},
+                }
             )
     return numbers, remarks
 
 
 def _clock(path: Path, numbers: dict[str, np.ndarray]) -> str:
     named = [column for column in numbers if _TIME.fullmatch(_bare(column))]
-    rising = [column for column, values in numbers.items() if values.size > 1 and bool((np.diff(values) > 0.0).all())]
+    rising = [
+        column
+        for column, values in numbers.items()
+        if values.size > 1 and bool((np.diff(values) > 0.0).all())
+    ]
     if not named and not rising:
-        raise DataError(f"{path}: no column is called time or increases as time does; name it in a channel map (--config)")
+        raise DataError(
+            f"{path}: no column is called time or increases as time does; name it in a channel map"
+            " (--config)"
+        )
     return next((column for column in named if column in rising), (named or rising)[0])
 
 
@@ -190,10 +234,14 @@ def _channel(column: str, taken: dict[str, Any]) -> str:
 
 
 def _unit(name: str, column: str, values: np.ndarray) -> str:
-    """Unit from the header, else the SI unit, else degrees where an angle is too large for radians."""
+    """Unit from the header, else the SI unit, else degrees where an angle is too large for radians.
+    """
     declared = _IN_BRACKETS.search(column)
     expected = CHANNEL_UNITS.get(name)
-    candidates = [declared.group(1).strip() if declared else "", *reversed(re.split(r"[_\s]", column))]
+    candidates = [
+        declared.group(1).strip() if declared else "",
+        *reversed(re.split(r"[_\s]", column)),
+    ]
     for text in candidates:
         unit = _WRITTEN.get(text.lower(), text)
         if text and unit in units():
@@ -203,14 +251,25 @@ def _unit(name: str, column: str, values: np.ndarray) -> str:
                 continue
             return unit
     if expected is None:
-        return "rad" if re.search(r"dir|angle|azi", _bare(column)) and float(np.nanmax(np.abs(values))) <= 6.5 else "-"
+        return (
+            "rad"
+            if re.search(r"dir|angle|azi", _bare(column))
+            and float(np.nanmax(np.abs(values))) <= 6.5
+            else "-"
+        )
     largest = float(np.nanquantile(np.abs(values), 0.99)) if np.isfinite(values).any() else 0.0
-    if expected == "rad" and ((name in ("delta", "phi") and largest > 1.7) or (name in ("psi", "wind_dir") and 30.0 < largest <= 360.0)):
+    if expected == "rad" and (
+        (name in ("delta", "phi") and largest > 1.7)
+        or (name in ("psi", "wind_dir") and 30.0 < largest <= 360.0)
+    ):
         return "deg"
     return "rpm" if name == "n" and "rpm" in _bare(column) else expected
 
 
 def _time_unit(column: str) -> str:
     declared = _IN_BRACKETS.search(column)
-    candidates: Sequence[str] = [declared.group(1).strip() if declared else "", *reversed(re.split(r"[_\s]", column))]
+    candidates: Sequence[str] = [
+        declared.group(1).strip() if declared else "",
+        *reversed(re.split(r"[_\s]", column)),
+    ]
     return next((unit for unit in candidates if unit in ("s", "ms", "us", "ns", "min", "h")), "s")

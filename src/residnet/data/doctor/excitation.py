@@ -19,7 +19,9 @@ _RECORD = "record manoeuvres: zigzag, 3-2-1-1"
 
 
 def excitation_findings(log: Log, inputs: Sequence[str]) -> Iterator[Finding]:
-    """Findings about ranges, spectrum, standstill and collinearity of velocities and inputs in one log."""
+    """Findings about ranges, spectrum, standstill and collinearity of velocities and inputs in one
+    log.
+    """
     moving = []
     for name in (*(name for name in VELOCITY if name in log.channels), *inputs):
         values, unit = log[name][np.isfinite(log[name])], log.units[name]
@@ -27,14 +29,20 @@ def excitation_findings(log: Log, inputs: Sequence[str]) -> Iterator[Finding]:
         figures = {"min": low, "max": high, "std": std}
         if std > 1e-6 * max(abs(low), abs(high)):
             moving.append(name)
-            text = f"{name} from {show(low, unit)} to {show(high, unit)}, standard deviation {show(std, unit)}"
+            text = (
+                f"{name} from {show(low, unit)} to {show(high, unit)}, standard deviation"
+                f" {show(std, unit)}"
+            )
             band = _band(log, name) if name in inputs else 0.0
             if band:
                 text += f", 95 % of its power below {band:.3g} Hz"
                 figures["band"] = band
             yield Finding("note", "range", text, figures)
         else:
-            text = f"{name} stays at {show(low, unit)}: its effect cannot be identified from this log alone"
+            text = (
+                f"{name} stays at {show(low, unit)}: its effect cannot be identified from this log"
+                " alone"
+            )
             yield Finding("note", "constant", text, figures)
     yield from _rest(log)
     if len(moving) > 1:
@@ -42,17 +50,24 @@ def excitation_findings(log: Log, inputs: Sequence[str]) -> Iterator[Finding]:
 
 
 def still(log: Log) -> np.ndarray | None:
-    """[T] bool: no motion beyond the noise over two seconds; None where u, v or r is not measured."""
+    """[T] bool: no motion beyond the noise over two seconds; None where u, v or r is not measured.
+    """
     if any(name not in log.channels for name in VELOCITY):
         return None
     step = float(np.median(np.diff(log.t)))
     samples = max(round(2.0 / step), 5)
     at_rest = np.ones(len(log), dtype=bool)
     speed = np.hypot(averaged(log["u"], samples), averaged(log["v"], samples))
-    for values, noise in ((speed, np.hypot(noise_of(log["u"]), noise_of(log["v"]))), (np.abs(averaged(log["r"], samples)), noise_of(log["r"]))):
+    for values, noise in (
+        (speed, np.hypot(noise_of(log["u"]), noise_of(log["v"]))),
+        (np.abs(averaged(log["r"], samples)), noise_of(log["r"])),
+    ):
         usual = float(np.nanquantile(values, 0.95))
         # what is left of the noise after averaging, but never a motion that is one for this vessel
-        at_rest &= values < min(max(0.03 * usual, 4.0 * noise / np.sqrt(samples)), max(0.2 * usual, 4.0 * noise / np.sqrt(samples)))
+        at_rest &= values < min(
+            max(0.03 * usual, 4.0 * noise / np.sqrt(samples)),
+            max(0.2 * usual, 4.0 * noise / np.sqrt(samples)),
+        )
     return at_rest
 
 
@@ -64,16 +79,29 @@ def _rest(log: Log) -> Iterator[Finding]:
         longest = int(np.argmax(stops - starts)) if starts.size else 0
         seconds = float(log.t[stops[longest] - 1] - log.t[starts[longest]]) if starts.size else 0.0
         if share > 0.02 and seconds > 3.0:
-            text = f"the vessel rests for {share_of(share)} of the time, at most {seconds:.1f} s on end from t = {log.t[starts[longest]]:.2f} s"
+            text = (
+                f"the vessel rests for {share_of(share)} of the time, at most {seconds:.1f} s on"
+                f" end from t = {log.t[starts[longest]]:.2f} s"
+            )
             figures = {"share": share, "longest": seconds, "t": float(log.t[starts[longest]])}
             action = "leave these parts out: they hold noise only"
-            yield Finding("will mislead" if share > _MOST_REST else "note", "standing", text, figures, action, at_rest)
+            yield Finding(
+                "will mislead" if share > _MOST_REST else "note",
+                "standing",
+                text,
+                figures,
+                action,
+                at_rest,
+            )
     if "u" in log.channels and "v" in log.channels:
         speed = np.hypot(log["u"], log["v"])
         slow = 0.1 * float(np.nanpercentile(speed, 95))
         share = float(np.mean(speed[np.isfinite(speed)] <= slow))
         if share > 0.05:
-            text = f"the vessel stands almost still (slower than {show(slow, 'm/s')}, a tenth of its speed) for {share_of(share)} of the time"
+            text = (
+                f"the vessel stands almost still (slower than {show(slow, 'm/s')}, a tenth of its"
+                f" speed) for {share_of(share)} of the time"
+            )
             action = "there is little to learn there"
             yield Finding("note", "slow", text, {"share": share}, action)
 
@@ -84,9 +112,18 @@ def _band(log: Log, name: str) -> float:
     known = np.isfinite(values)
     if known.sum() < 20:
         return 0.0
-    power = np.abs(np.fft.rfft(np.interp(log.t, log.t[known], values[known]) - values[known].mean())[1:]) ** 2
+    power = (
+        np.abs(
+            np.fft.rfft(np.interp(log.t, log.t[known], values[known]) - values[known].mean())[1:]
+        )
+        ** 2
+    )
     total = np.cumsum(power)
-    return float((1 + np.searchsorted(total, 0.95 * total[-1])) / (len(log) * step)) if total[-1] > 0.0 else 0.0
+    return (
+        float((1 + np.searchsorted(total, 0.95 * total[-1])) / (len(log) * step))
+        if total[-1] > 0.0
+        else 0.0
+    )
 
 
 def _collinearity(log: Log, names: Sequence[str]) -> Iterator[Finding]:
@@ -97,7 +134,10 @@ def _collinearity(log: Log, names: Sequence[str]) -> Iterator[Finding]:
     condition, worst = conditioning(columns, names)
     text = f"condition number of {_list(names)} (centred, scaled): {condition:.3g}"
     if condition > _COLLINEAR:
-        text += f"; {', '.join(worst)} move together in this log: their effects are told apart by other manoeuvres only"
+        text += (
+            f"; {', '.join(worst)} move together in this log: their effects are told apart by other"
+            " manoeuvres only"
+        )
     yield Finding("note", "condition", text, {"condition": condition})
 
 
@@ -106,21 +146,38 @@ def _list(names: Sequence[str]) -> str:
 
 
 def conditioning(columns: np.ndarray, names: Sequence[str]) -> tuple[float, list[str]]:
-    """Condition number of columns [N, k], centred and scaled, and the up to three names that move together most."""
-    scaled = (columns - columns.mean(axis=0)) / np.maximum(columns.std(axis=0), np.finfo(float).tiny)
+    """Condition number of columns [N, k], centred and scaled, and the up to three names that move
+    together most.
+    """
+    scaled = (columns - columns.mean(axis=0)) / np.maximum(
+        columns.std(axis=0), np.finfo(float).tiny
+    )
     _, singular, directions = np.linalg.svd(scaled, full_matrices=False)
     condition = float(singular[0] / max(singular[-1], 1e-16 * singular[0], np.finfo(float).tiny))
-    return condition, [names[i] for i in np.argsort(-np.abs(directions[-1]))[:3] if abs(directions[-1][i]) > 0.2]
+    return condition, [
+        names[i] for i in np.argsort(-np.abs(directions[-1]))[:3] if abs(directions[-1][i]) > 0.2
+    ]
 
 
 def set_findings(logs: Sequence[Log], inputs: Sequence[str] | None) -> Iterator[Finding]:
     """Whether a fit to all logs together has something to learn from."""
     driving = _common(logs, inputs)
-    awake = {name: max(_awake(log, name) for log in logs) for name in VELOCITY if all(name in log.channels for log in logs)}
+    awake = {
+        name: max(_awake(log, name) for log in logs)
+        for name in VELOCITY
+        if all(name in log.channels for log in logs)
+    }
     if awake and max(awake.values()) < 1.0:
-        text = f"no velocity varies beyond its noise in any of {len(logs)} logs: a fit would find nothing but noise"
+        text = (
+            f"no velocity varies beyond its noise in any of {len(logs)} logs: a fit would find"
+            " nothing but noise"
+        )
         yield Finding(
-            "fatal", "no_excitation", text, {f"{name}_over_noise": value for name, value in awake.items()}, "record manoeuvres: zigzag, 3-2-1-1"
+            "fatal",
+            "no_excitation",
+            text,
+            {f"{name}_over_noise": value for name, value in awake.items()},
+            "record manoeuvres: zigzag, 3-2-1-1",
         )
     if not driving:
         return
@@ -129,10 +186,21 @@ def set_findings(logs: Sequence[Log], inputs: Sequence[str] | None) -> Iterator[
         text = f"no input ({', '.join(driving)}) varies within any of {len(logs)} logs"
         # constant in each, but not the same in all
         if max(_between(logs, name) for name in driving) <= 1e-2:
-            yield Finding("will mislead", "no_excitation", f"{text}: what they do cannot be identified", {"spread": max(spread.values())}, _RECORD)
+            yield Finding(
+                "will mislead",
+                "no_excitation",
+                f"{text}: what they do cannot be identified",
+                {"spread": max(spread.values())},
+                _RECORD,
+            )
     held = [name for name in driving if _between(logs, name) < 1e-3 and spread[name] < 1e-3]
     if held:
-        yield Finding("note", "constant_inputs", f"{', '.join(held)} never varies: its effect cannot be told from a constant", {"count": len(held)})
+        yield Finding(
+            "note",
+            "constant_inputs",
+            f"{', '.join(held)} never varies: its effect cannot be told from a constant",
+            {"count": len(held)},
+        )
     moving = [name for name in (*awake, *driving) if name not in held]
     if len(moving) > 1:
         columns = np.concatenate([log.stack(tuple(moving)) for log in logs])
@@ -141,25 +209,46 @@ def set_findings(logs: Sequence[Log], inputs: Sequence[str] | None) -> Iterator[
             condition, worst = conditioning(columns, moving)
             text = f"{len(logs)} logs together: condition number of {_list(moving)} {condition:.3g}"
             if condition > _COLLINEAR:
-                text += f"; {', '.join(worst)} move together: give one of them, or add manoeuvres that move them apart"
+                text += (
+                    f"; {', '.join(worst)} move together: give one of them, or add manoeuvres that"
+                    " move them apart"
+                )
             yield Finding("note", "condition", text, {"condition": condition})
 
 
 def _common(logs: Sequence[Log], inputs: Sequence[str] | None) -> list[str]:
-    names = inputs if inputs is not None else [name for name in logs[0].channels if name not in MEASURED]
-    return [name for name in names if all(name in log.channels for log in logs) and not name.startswith(("wind", "current"))]
+    names = (
+        inputs
+        if inputs is not None
+        else [name for name in logs[0].channels if name not in MEASURED]
+    )
+    return [
+        name
+        for name in names
+        if all(name in log.channels for log in logs) and not name.startswith(("wind", "current"))
+    ]
 
 
 def _awake(log: Log, name: str) -> float:
-    """Spread of a velocity beyond what its averaged noise explains, over the least that counts; below 1 it does not vary."""
+    """Spread of a velocity beyond what its averaged noise explains, over the least that counts;
+    below 1 it does not vary.
+    """
     step = float(np.median(np.diff(log.t)))
     samples = max(round(2.0 / step), 5)
     smooth = averaged(log[name], samples)
     known = smooth[np.isfinite(smooth)]
     if known.size < 10:
         return 0.0
-    scale = float(np.abs(np.nanmean(np.hypot(log["u"], log["v"])))) if "u" in log.channels and "v" in log.channels else 0.0
-    least = max(3.0 * noise_of(log[name]) / np.sqrt(samples), 0.02 * scale if name != "r" else np.radians(0.05), 1e-9)
+    scale = (
+        float(np.abs(np.nanmean(np.hypot(log["u"], log["v"]))))
+        if "u" in log.channels and "v" in log.channels
+        else 0.0
+    )
+    least = max(
+        3.0 * noise_of(log[name]) / np.sqrt(samples),
+        0.02 * scale if name != "r" else np.radians(0.05),
+        1e-9,
+    )
     return float(known.std()) / least
 
 

@@ -20,7 +20,8 @@ class Finding:
     """One thing that the doctor saw.
 
     Attributes:
-        level: `note`, `will mislead` (a fit comes out wrong unless something is done) or `fatal` (nothing can be learned from it).
+        level: `note`, `will mislead` (a fit comes out wrong unless something is done) or `fatal`
+            (nothing can be learned from it).
         code: what kind of finding, fixed for programs that read the report.
         text: one line with figures.
         figures: the numbers, SI.
@@ -42,14 +43,28 @@ class Finding:
 
     def excused(self, masked: np.ndarray) -> Finding:
         """The finding as a note where masks [T] leave out every sample that it concerns."""
-        if self.at is None or self.level == "note" or not self.at.any() or not masked[self.at].all():
+        if (
+            self.at is None
+            or self.level == "note"
+            or not self.at.any()
+            or not masked[self.at].all()
+        ):
             return self
         return dataclasses.replace(self, level="note", action="the config masks these samples")
 
     def content(self) -> dict[str, Any]:
         """For JSON."""
-        figures = {name: float(value) if math.isfinite(value) else None for name, value in self.figures.items()}
-        return {"level": self.level, "code": self.code, "text": self.text, "action": self.action, "figures": figures}
+        figures = {
+            name: float(value) if math.isfinite(value) else None
+            for name, value in self.figures.items()
+        }
+        return {
+            "level": self.level,
+            "code": self.code,
+            "text": self.text,
+            "action": self.action,
+            "figures": figures,
+        }
 
 
 @dataclass(frozen=True)
@@ -82,18 +97,37 @@ class Report:
 
     def content(self) -> dict[str, Any]:
         """For JSON."""
-        return {"name": self.name, "source": self.source, "misled": self.misled, "findings": [finding.content() for finding in self.findings]}
+        return {
+            "name": self.name,
+            "source": self.source,
+            "misled": self.misled,
+            "findings": [finding.content() for finding in self.findings],
+        }
 
 
 def inspection(reports: Sequence[Report], together: Report) -> dict[str, Any]:
     """All reports for JSON, schema residnet.inspection/1."""
     misled = any(report.misled for report in (*reports, together))
-    return {"schema": SCHEMA, "misled": misled, "logs": [report.content() for report in reports], "together": together.content()["findings"]}
+    return {
+        "schema": SCHEMA,
+        "misled": misled,
+        "logs": [report.content() for report in reports],
+        "together": together.content()["findings"],
+    }
 
 
 def imported(remarks: Iterable[dict[str, Any]]) -> list[Finding]:
     """What a reader noted on the way in (`Log.meta["findings"]`)."""
-    return [Finding(entry["level"], entry["code"], entry["text"], dict(entry.get("figures", {})), entry.get("action", "")) for entry in remarks]
+    return [
+        Finding(
+            entry["level"],
+            entry["code"],
+            entry["text"],
+            dict(entry.get("figures", {})),
+            entry.get("action", ""),
+        )
+        for entry in remarks
+    ]
 
 
 def show(value: float, unit: str) -> str:

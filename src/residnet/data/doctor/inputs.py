@@ -1,4 +1,6 @@
-"""What the data doctor sees in the channels that drive the vessel: jumps, limits, offset, astern, stuck, wind that contains the motion."""
+"""What the data doctor sees in the channels that drive the vessel: jumps, limits, offset, astern,
+stuck, wind that contains the motion.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,9 @@ from residnet.data.doctor.signals import noise_of
 from residnet.data.masks import true_runs
 
 # words that tell a demand from what the actuator does
-_DEMAND = re.compile(r"^(cmd|ref|command|commanded|set|desired)_|_(cmd|ref|command|commanded|set|desired)(?=_|$)")
+_DEMAND = re.compile(
+    r"^(cmd|ref|command|commanded|set|desired)_|_(cmd|ref|command|commanded|set|desired)(?=_|$)"
+)
 # an actuator that rests so long, s, so far from its demand (share of the demand's range) is stuck
 _STUCK = 5.0
 _APART = 0.2
@@ -39,14 +43,30 @@ def input_findings(log: Log, inputs: Sequence[str]) -> Iterator[Finding]:
 
 
 def _jumps(log: Log, name: str) -> Iterator[Finding]:
-    change, span = np.abs(np.nan_to_num(np.diff(log[name]))), float(np.nanmax(log[name]) - np.nanmin(log[name]))
+    change, span = (
+        np.abs(np.nan_to_num(np.diff(log[name]))),
+        float(np.nanmax(log[name]) - np.nanmin(log[name])),
+    )
     at = int(np.argmax(change))
     # a direction may wrap
     if 0.0 < 0.25 * span < change[at] and (log.units[name] != "rad" or name in _STEERING):
-        text = f"{name} changes by {show(change[at], log.units[name])} within one sample ({share_of(change[at] / span)} of its range) "
+        text = (
+            f"{name} changes by {show(change[at], log.units[name])} within one sample"
+            f" ({share_of(change[at] / span)} of its range) "
+        )
         text += f"at t = {log.t[at + 1]:.2f} s"
-        figures = {"largest": float(change[at]), "t": float(log.t[at + 1]), "share_of_range": float(change[at] / span)}
-        yield Finding("note", "input_jump", text, figures, "derivatives are biased around it, mask them (kind: input_jump)")
+        figures = {
+            "largest": float(change[at]),
+            "t": float(log.t[at + 1]),
+            "share_of_range": float(change[at] / span),
+        }
+        yield Finding(
+            "note",
+            "input_jump",
+            text,
+            figures,
+            "derivatives are biased around it, mask them (kind: input_jump)",
+        )
 
 
 def _limits(log: Log, name: str) -> Iterator[Finding]:
@@ -59,14 +79,30 @@ def _limits(log: Log, name: str) -> Iterator[Finding]:
     if np.unique(known).size <= 2 or max(shares) <= 0.01:
         return
     unit = log.units[name]
-    text = f"{name} rests at its limits {show(low, unit)} ({share_of(shares[0])}) and {show(high, unit)} ({share_of(shares[1])})"
-    yield Finding("note", "at_limits", text, {"low": low, "high": high, "share": sum(shares)}, "what lies beyond is not learned")
+    text = (
+        f"{name} rests at its limits {show(low, unit)} ({share_of(shares[0])}) and"
+        f" {show(high, unit)} ({share_of(shares[1])})"
+    )
+    yield Finding(
+        "note",
+        "at_limits",
+        text,
+        {"low": low, "high": high, "share": sum(shares)},
+        "what lies beyond is not learned",
+    )
     middle = 0.5 * (low + high)
     # only limits that are nearly the same on both sides are two ends of one actuator
     if name in _STEERING and low < 0.0 < high and 1e-3 * high < abs(middle) < 0.02 * (high - low):
-        text = f"{name} goes from {show(low, unit)} to {show(high, unit)}, not the same to both sides: an offset of {show(middle, unit)}"
+        text = (
+            f"{name} goes from {show(low, unit)} to {show(high, unit)}, not the same to both sides:"
+            f" an offset of {show(middle, unit)}"
+        )
         yield Finding(
-            "note", "input_offset", text, {"offset": middle, "low": low, "high": high}, "take it off, or keep a constant among the regressors"
+            "note",
+            "input_offset",
+            text,
+            {"offset": middle, "low": low, "high": high},
+            "take it off, or keep a constant among the regressors",
         )
 
 
@@ -75,9 +111,17 @@ def _astern(log: Log, name: str) -> Iterator[Finding]:
         return
     share = float((log[name] < 0.0).mean())
     if 0.0 < share < 1.0:
-        text = f"{name} is negative (astern) in {share_of(share)} of the samples, down to {show(float(np.nanmin(log[name])), log.units[name])}"
+        text = (
+            f"{name} is negative (astern) in {share_of(share)} of the samples, down to"
+            f" {show(float(np.nanmin(log[name])), log.units[name])}"
+        )
         yield Finding(
-            "note", "reversed", text, {"share": share}, "a propeller astern obeys another law: give it terms of its own, or leave these parts out"
+            "note",
+            "reversed",
+            text,
+            {"share": share},
+            "a propeller astern obeys another law: give it terms of its own, or leave these"
+            " parts out",
         )
 
 
@@ -88,33 +132,59 @@ def _size(log: Log, name: str) -> Iterator[Finding]:
     largest = float(np.nanquantile(np.abs(log[name]), 0.99))
     if largest > math.radians(100.0):
         text = f"{name} reaches {show(largest, 'rad')}, more than any rudder: deg taken as rad?"
-        yield Finding("will mislead", "unit", text, {"largest": largest}, "correct the unit in the channel map")
+        yield Finding(
+            "will mislead",
+            "unit",
+            text,
+            {"largest": largest},
+            "correct the unit in the channel map",
+        )
 
 
 def _excursions(log: Log, name: str) -> Iterator[Finding]:
-    """Values far outside the rest of the channel that return to where they came from, for a second or less, held or not."""
+    """Values far outside the rest of the channel that return to where they came from, for a second
+    or less, held or not.
+    """
     values = log[name]
     step = float(np.median(np.diff(log.t)))
     half = max(round(1.5 / step), 3)
     if np.isfinite(values).sum() < 10 * half:
         return
     known = np.interp(log.t, log.t[np.isfinite(values)], values[np.isfinite(values)])
-    windows = np.lib.stride_tricks.sliding_window_view(np.pad(known, half, mode="edge"), 2 * half + 1)
+    windows = np.lib.stride_tricks.sliding_window_view(
+        np.pad(known, half, mode="edge"), 2 * half + 1
+    )
     away = np.abs(known - np.median(windows, axis=1))
     low, high = (float(value) for value in np.quantile(known, (0.01, 0.99)))
     beyond = np.maximum(low - known, known - high)
-    far = (away > 0.25 * max(high - low, 1e-12)) & (beyond > 0.25 * max(high - low, 1e-12)) & (away > 8.0 * noise_of(known))
+    far = (
+        (away > 0.25 * max(high - low, 1e-12))
+        & (beyond > 0.25 * max(high - low, 1e-12))
+        & (away > 8.0 * noise_of(known))
+    )
     far = _abrupt(known, away, far)
     starts, _ = true_runs(far)
     if starts.size:
         furthest = show(float(known[far][np.argmax(away[far])]), log.units[name])
-        text = f"{name} leaves its range for a moment {starts.size} times ({int(far.sum())} samples), to {furthest}"
+        text = (
+            f"{name} leaves its range for a moment {starts.size} times ({int(far.sum())} samples),"
+            f" to {furthest}"
+        )
         figures = {"count": starts.size, "samples": far.sum(), "t": float(log.t[starts[0]])}
-        yield Finding("will mislead", "outliers", text, figures, f"mask them (kind: hampel, channels: [{name}])", far)
+        yield Finding(
+            "will mislead",
+            "outliers",
+            text,
+            figures,
+            f"mask them (kind: hampel, channels: [{name}])",
+            far,
+        )
 
 
 def _abrupt(values: np.ndarray, away: np.ndarray, far: np.ndarray) -> np.ndarray:
-    """The excursions among far [T] that go and come within a step or two; an actuator takes its time."""
+    """The excursions among far [T] that go and come within a step or two; an actuator takes its
+    time.
+    """
     change = np.abs(np.diff(values, prepend=values[0], append=values[-1]))
     out = far.copy()
     for start, stop in zip(*true_runs(far), strict=True):
@@ -140,18 +210,35 @@ def _stuck(log: Log, inputs: Sequence[str]) -> Iterator[Finding]:
             run = slice(start, stop + 1)
             seconds = float(log.t[stop] - log.t[start])
             apart = np.abs(wanted[run] - done[run]) > _APART * span
-            if seconds >= _STUCK and float(np.ptp(wanted[run])) > _APART * span and float(apart.mean()) > 0.1 and seconds > worst[0]:
+            if (
+                seconds >= _STUCK
+                and float(np.ptp(wanted[run])) > _APART * span
+                and float(apart.mean()) > 0.1
+                and seconds > worst[0]
+            ):
                 worst = (seconds, int(start), int(stop))
         if worst[0] > 0.0:
             at = np.zeros(len(log), dtype=bool)
             at[worst[1] : worst[2] + 1] = True
-            text = f"{actual} rests for {worst[0]:.1f} s from t = {log.t[worst[1]]:.2f} s while {demand} moves on: stuck, or not recorded"
-            yield Finding("will mislead", "stuck", text, {"seconds": worst[0], "t": float(log.t[worst[1]])}, "leave this part out", at)
+            text = (
+                f"{actual} rests for {worst[0]:.1f} s from t = {log.t[worst[1]]:.2f} s while"
+                f" {demand} moves on: stuck, or not recorded"
+            )
+            yield Finding(
+                "will mislead",
+                "stuck",
+                text,
+                {"seconds": worst[0], "t": float(log.t[worst[1]])},
+                "leave this part out",
+                at,
+            )
     yield from _idle(log, inputs)
 
 
 def _actual_of(demand: str, log: Log) -> str | None:
-    """The channel that says what an actuator does, for that which says what it should; None where there is none."""
+    """The channel that says what an actuator does, for that which says what it should; None where
+    there is none.
+    """
     bare = _DEMAND.sub("", demand)
     if bare == demand:
         candidates = [f"acting_{demand}"]
@@ -167,15 +254,34 @@ def _idle(log: Log, inputs: Sequence[str]) -> Iterator[Finding]:
         return
     known = np.isfinite(log["psi"])
     psi = np.interp(log.t, log.t[known], log["psi"][known])
-    still = np.logical_and.reduce([np.abs(np.nan_to_num(np.diff(log[name]))) <= 1e-9 * np.nanmax(np.abs(log[name])) for name in driving])
+    still = np.logical_and.reduce(
+        [
+            np.abs(np.nan_to_num(np.diff(log[name]))) <= 1e-9 * np.nanmax(np.abs(log[name]))
+            for name in driving
+        ]
+    )
     for start, stop in zip(*true_runs(still), strict=True):
         turns = _swings(psi[start : stop + 1])
         if turns >= 2:
-            text = f"no input moves for {log.t[stop] - log.t[start]:.1f} s from t = {log.t[start]:.2f} s, yet the heading turns round {turns} times"
+            text = (
+                f"no input moves for {log.t[stop] - log.t[start]:.1f} s from t = {log.t[start]:.2f}"
+                f" s, yet the heading turns round {turns} times"
+            )
             at = np.zeros(len(log), dtype=bool)
             at[start : stop + 1] = True
-            figures = {"seconds": float(log.t[stop] - log.t[start]), "turns": float(turns), "t": float(log.t[start])}
-            yield Finding("will mislead", "stuck", text, figures, "the recorded input is stuck, or another one is missing from the log", at)
+            figures = {
+                "seconds": float(log.t[stop] - log.t[start]),
+                "turns": float(turns),
+                "t": float(log.t[start]),
+            }
+            yield Finding(
+                "will mislead",
+                "stuck",
+                text,
+                figures,
+                "the recorded input is stuck, or another one is missing from the log",
+                at,
+            )
 
 
 def _swings(angle: np.ndarray) -> int:
@@ -197,24 +303,43 @@ def _relative_wind(log: Log, inputs: Sequence[str]) -> Iterator[Finding]:
     directions = [name for name in log.channels if "wind" in name and log.units[name] == "rad"]
     for name in directions:
         slope, error = _slope_against_heading(log, name)
-        twin = next((other for other in directions if other != name and _same_direction(log, name, other)), None)
+        twin = next(
+            (other for other in directions if other != name and _same_direction(log, name, other)),
+            None,
+        )
         turns = error > 0.0 and slope < -5.0 * error and abs(slope + 1.0) < max(3.0 * error, 0.2)
         if not (turns or twin or "relative" in name or name.startswith("rel_")):
             continue
-        text = f"{name} turns by {slope:+.2f} +- {2.0 * error:.2f} of every change of heading" + (f", and plus psi it is {twin}" if twin else "")
-        action = "a free run must not be given it: use the true wind" if name in inputs else "do not make it an input: use the true wind"
+        text = f"{name} turns by {slope:+.2f} +- {2.0 * error:.2f} of every change of heading" + (
+            f", and plus psi it is {twin}" if twin else ""
+        )
+        action = (
+            "a free run must not be given it: use the true wind"
+            if name in inputs
+            else "do not make it an input: use the true wind"
+        )
         level: Level = "will mislead" if name in inputs else "note"
-        yield Finding(level, "relative_wind", f"{text}: a relative wind contains psi, u and v", {"slope": slope, "error": error}, action)
+        yield Finding(
+            level,
+            "relative_wind",
+            f"{text}: a relative wind contains psi, u and v",
+            {"slope": slope, "error": error},
+            action,
+        )
 
 
 def _same_direction(log: Log, relative: str, true: str) -> bool:
     """Whether one direction plus the heading is the other, where the heading tells."""
     both, alone = (np.exp(1j * (log[relative] + turn - log[true])) for turn in (log["psi"], 0.0))
-    return bool(abs(np.nanmean(both)) > 0.9 and abs(np.nanmean(alone)) < abs(np.nanmean(both)) - 0.02)
+    return bool(
+        abs(np.nanmean(both)) > 0.9 and abs(np.nanmean(alone)) < abs(np.nanmean(both)) - 0.02
+    )
 
 
 def _slope_against_heading(log: Log, name: str) -> tuple[float, float]:
-    """Change of a direction over ten seconds for each rad that the heading changes, and its standard error; 0, 0 where nothing can be said."""
+    """Change of a direction over ten seconds for each rad that the heading changes, and its
+    standard error; 0, 0 where nothing can be said.
+    """
     hop = max(round(10.0 / float(np.median(np.diff(log.t)))), 1)
     if len(log) < 5 * hop:
         return 0.0, 0.0

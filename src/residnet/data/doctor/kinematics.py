@@ -1,9 +1,12 @@
-"""Whether position, heading and velocities describe one motion, to the accuracy of their noise: gains, lags, biases, lever arm, drift.
+"""Whether position, heading and velocities describe one motion, to the accuracy of their noise:
+gains, lags, biases, lever arm, drift.
 
-Increments of the pose between neighbouring samples are compared with the integral of the velocities over them. White noise on pose and velocities
-gives the increments a tridiagonal covariance, by which they are whitened; what remains is explained by as few causes as it takes, one after the
-other, each by what it would add to the increments (orthogonal matching pursuit over groups of columns). Intervals are those of a sandwich estimate
-over twenty sections of the log, because filters leave errors that are not white.
+Increments of the pose between neighbouring samples are compared with the integral of the velocities
+over them. White noise on pose and velocities gives the increments a tridiagonal covariance, by
+which they are whitened; what remains is explained by as few causes as it takes, one after the
+other, each by what it would add to the increments (orthogonal matching pursuit over groups of
+columns). Intervals are those of a sandwich estimate over twenty sections of the log, because
+filters leave errors that are not white.
 """
 
 from __future__ import annotations
@@ -21,7 +24,8 @@ from residnet.data.doctor.signals import noise_of
 _FEWEST = 50
 _SECTIONS = 20
 _MOST_CAUSES = 4
-# a cause must lower the sum of squares by this many variances of the noise, and be this many standard errors from nothing
+# a cause must lower the sum of squares by this many variances of the noise, and be this many
+# standard errors from nothing
 _WORTH = 60.0
 _SURE = 3.5
 
@@ -49,8 +53,9 @@ class Cause:
 def yaw_causes(log: Log) -> dict[str, Cause]:
     """What makes the increments of psi differ from the integral of r.
 
-    Causes: `gain` (r is too large by 1 + value), `lag` (r trails psi, s), `bias` (of r, rad/s, the negative of what psi gains over it) and `ramp`
-    (its growth over the log, rad/s from start to end).
+    Causes: `gain` (r is too large by 1 + value), `lag` (r trails psi, s), `bias` (of r, rad/s, the
+    negative of what psi gains over it) and `ramp` (its growth over the log, rad/s from start to
+    end).
     """
     psi, r, t = log["psi"], log["r"], log.t
     dt = np.diff(t)
@@ -71,9 +76,11 @@ def yaw_causes(log: Log) -> dict[str, Cause]:
 def position_causes(log: Log) -> dict[str, Cause]:
     """What makes the increments of x, y differ from the integral of R(psi) [u, v].
 
-    Causes: `gain_u`, `gain_v`, `gain` (u, v, or both too large by 1 + value), `heading` (to be added to psi, rad), `lag_u`, `lag_v`, `lag` (they
-    trail the position, s), `lag_psi` (psi trails, s), `lag_xy` (x, y trail all else, s), `lever_arm` (the receiver stands so far forward and to
-    starboard, m), `current` (u, v are through water that moves north, east, m/s), `bias` (of u, v, m/s).
+    Causes: `gain_u`, `gain_v`, `gain` (u, v, or both too large by 1 + value), `heading` (to be
+    added to psi, rad), `lag_u`, `lag_v`, `lag` (they trail the position, s), `lag_psi` (psi trails,
+    s), `lag_xy` (x, y trail all else, s), `lever_arm` (the receiver stands so far forward and to
+    starboard, m), `current` (u, v are through water that moves north, east, m/s), `bias` (of u, v,
+    m/s).
     """
     t = log.t
     dt = np.diff(t)
@@ -104,12 +111,23 @@ def position_causes(log: Log) -> dict[str, Cause]:
         "bias": [-area(turn), -1j * area(turn)],
     }
     speed = np.hypot(np.nan_to_num(log["u"]), np.nan_to_num(log["v"]))
-    noise = np.sqrt(max(noise_of(log["u"]), noise_of(log["v"])) ** 2 + (noise_of(log["psi"]) * 0.5 * (speed[1:] + speed[:-1])) ** 2)
-    rows = _Rows(log["x"] + 1j * log["y"], measured, dt, max(noise_of(log["x"]), noise_of(log["y"])), noise)
+    noise = np.sqrt(
+        max(noise_of(log["u"]), noise_of(log["v"])) ** 2
+        + (noise_of(log["psi"]) * 0.5 * (speed[1:] + speed[:-1])) ** 2
+    )
+    rows = _Rows(
+        log["x"] + 1j * log["y"], measured, dt, max(noise_of(log["x"]), noise_of(log["y"])), noise
+    )
     noisy = {name for name in ("u", "v") if not _stands_out(log[name])}
     noisy |= {"psi"} if "r" in log.channels and not _stands_out(log["r"]) else set()
     without = {cause for name in noisy for cause in _NEEDS[name]}
-    return rows.explained({name: np.stack(parts, axis=-1) for name, parts in complex_columns.items() if name not in without})
+    return rows.explained(
+        {
+            name: np.stack(parts, axis=-1)
+            for name, parts in complex_columns.items()
+            if name not in without
+        }
+    )
 
 
 # channel -> causes that cannot be told where it holds noise only: the noise would explain itself
@@ -127,7 +145,9 @@ def _stands_out(values: np.ndarray) -> bool:
 
 
 def _smoothed(values: np.ndarray) -> np.ndarray:
-    """Values [T] smoothed by a parabola over 15 samples, so that columns share no noise with what they explain; NaN stay where they are."""
+    """Values [T] smoothed by a parabola over 15 samples, so that columns share no noise with what
+    they explain; NaN stay where they are.
+    """
     known = np.isfinite(values)
     if known.sum() < 15:
         return values
@@ -147,14 +167,18 @@ class _Rows:
         rate: noise [T - 1] of the velocity.
     """
 
-    def __init__(self, pose: np.ndarray, known: np.ndarray, dt: np.ndarray, noise: float, rate: np.ndarray) -> None:
+    def __init__(
+        self, pose: np.ndarray, known: np.ndarray, dt: np.ndarray, noise: float, rate: np.ndarray
+    ) -> None:
         self._at = np.flatnonzero(np.isfinite(pose))
         self._excess = np.diff(pose[self._at]) - self._between(known)
         self._seconds = self._between(dt)
         self._dt, self._rate, self._noise = dt, rate, noise
 
     def _between(self, steps: np.ndarray) -> np.ndarray:
-        """Sums [K, ...] of steps [T - 1, ...] between neighbouring samples of the pose, NaN where one of them is."""
+        """Sums [K, ...] of steps [T - 1, ...] between neighbouring samples of the pose, NaN where
+        one of them is.
+        """
         unknown = ~np.isfinite(steps)
         start = np.zeros((1, *steps.shape[1:]))
         total = np.concatenate((start, np.cumsum(np.where(unknown, 0.0, steps), axis=0)))[self._at]
@@ -162,13 +186,20 @@ class _Rows:
         return np.where(np.diff(count, axis=0) > 0, np.nan, np.diff(total, axis=0))
 
     def explained(self, columns: Mapping[str, np.ndarray]) -> dict[str, Cause]:
-        """The causes that it takes, in the order of their weight; columns [T - 1, m] real or complex."""
+        """The causes that it takes, in the order of their weight; columns [T - 1, m] real or
+        complex.
+        """
         if self._at.size < _FEWEST:
             return {}
         names = np.array([name for name, part in columns.items() for _ in range(part.shape[1])])
         table = self._between(np.concatenate(list(columns.values()), axis=1))
         longest = 3.0 * float(np.median(self._seconds))
-        usable = np.isfinite(self._excess) & np.isfinite(table).all(axis=1) & np.isfinite(self._between(self._rate)) & (self._seconds <= longest)
+        usable = (
+            np.isfinite(self._excess)
+            & np.isfinite(table).all(axis=1)
+            & np.isfinite(self._between(self._rate))
+            & (self._seconds <= longest)
+        )
         keep = np.flatnonzero(usable)
         if keep.size < _FEWEST:
             return {}
@@ -176,7 +207,11 @@ class _Rows:
         y, x = self._white(self._excess[keep][:, None])[:, 0], self._white(table[keep])
         section = np.arange(keep.size) * _SECTIONS // keep.size
         if np.iscomplexobj(y):
-            y, x, section = np.concatenate((y.real, y.imag)), np.concatenate((x.real, x.imag)), np.concatenate((section, section))
+            y, x, section = (
+                np.concatenate((y.real, y.imag)),
+                np.concatenate((x.real, x.imag)),
+                np.concatenate((section, section)),
+            )
         weight = self._trimmed(y, x)
         return _pursuit(y * weight, x * weight[:, None], names, section)
 
@@ -185,12 +220,14 @@ class _Rows:
         total, one = self._between(each)[keep], each[np.minimum(self._at[keep], each.size - 1)]
         one = np.where(np.isfinite(one), np.minimum(one, total), total)
         floor = 1e-3 * float(np.median(np.abs(self._excess[keep]))) + 1e-12
-        # the trapezoid shares half a sample with its neighbour, which noise of the pose hides at least in part: increments are never taken as
-        # more alike than independent ones, or the whitening would look at the highest frequencies alone
+        # the trapezoid shares half a sample with its neighbour, which noise of the pose hides at
+        # least in part: increments are never taken as more alike than independent ones, or the
+        # whitening would look at the highest frequencies alone
         ends = np.maximum(self._noise**2 - 0.25 * one, 0.0)
         beside = np.append(keep[1:] == keep[:-1] + 1, False)
         diagonal, off = total + 2.0 * ends + floor**2, np.where(beside, -ends, 0.0)
-        # noise of the pose alone is singular in the limit: a little of the diagonal keeps the factor
+        # noise of the pose alone is singular in the limit: a little of the diagonal keeps the
+        # factor
         self._factor = cholesky_banded(np.stack((1.0001 * diagonal, off)), lower=True)
 
     def _white(self, table: np.ndarray) -> np.ndarray:
@@ -206,8 +243,12 @@ class _Rows:
         return (rest <= 8.0 * 1.4826 * max(float(np.median(rest)), 1e-300)).astype(float)
 
 
-def _pursuit(y: np.ndarray, x: np.ndarray, names: np.ndarray, section: np.ndarray) -> dict[str, Cause]:
-    """Forward one group of columns at a time, then backward: a cause that others made superfluous goes."""
+def _pursuit(
+    y: np.ndarray, x: np.ndarray, names: np.ndarray, section: np.ndarray
+) -> dict[str, Cause]:
+    """Forward one group of columns at a time, then backward: a cause that others made superfluous
+    goes.
+    """
     scale = np.linalg.norm(x, axis=0)
     alive = scale > 0.0
     x, names, scale = x[:, alive] / scale[alive], names[alive], scale[alive]
@@ -215,14 +256,26 @@ def _pursuit(y: np.ndarray, x: np.ndarray, names: np.ndarray, section: np.ndarra
 
     def left(chosen: list[str]) -> float:
         part = np.isin(names, chosen)
-        return energy - float(product[part] @ np.linalg.lstsq(gram[np.ix_(part, part)], product[part], rcond=1e-9)[0]) if chosen else energy
+        return (
+            energy
+            - float(
+                product[part]
+                @ np.linalg.lstsq(gram[np.ix_(part, part)], product[part], rcond=1e-9)[0]
+            )
+            if chosen
+            else energy
+        )
 
     every = list(dict.fromkeys(names.tolist()))
     variance = max(left(every) / y.size, 1e-12 * energy / y.size)
     price = {name: _WORTH * variance * (1.0 + 0.2 * float((names == name).sum())) for name in every}
     chosen: list[str] = []
     while len(chosen) < _MOST_CAUSES:
-        gain = {name: left(chosen) - left([*chosen, name]) - price[name] for name in every if name not in chosen}
+        gain = {
+            name: left(chosen) - left([*chosen, name]) - price[name]
+            for name in every
+            if name not in chosen
+        }
         best = max(gain, key=lambda name: gain[name], default="")
         if not best or gain[best] <= 0.0:
             break
@@ -232,10 +285,19 @@ def _pursuit(y: np.ndarray, x: np.ndarray, names: np.ndarray, section: np.ndarra
         if left(rest) - left(chosen) < price[name]:
             chosen = rest
     columns = np.isin(names, chosen)
-    return _causes(y, x[:, columns], names[columns], scale[columns], section, chosen) if chosen else {}
+    return (
+        _causes(y, x[:, columns], names[columns], scale[columns], section, chosen) if chosen else {}
+    )
 
 
-def _causes(y: np.ndarray, x: np.ndarray, names: np.ndarray, scale: np.ndarray, section: np.ndarray, order: list[str]) -> dict[str, Cause]:
+def _causes(
+    y: np.ndarray,
+    x: np.ndarray,
+    names: np.ndarray,
+    scale: np.ndarray,
+    section: np.ndarray,
+    order: list[str],
+) -> dict[str, Cause]:
     values = np.linalg.lstsq(x, y, rcond=1e-9)[0]
     rest = y - x @ values
     inverse = np.linalg.pinv(x.T @ x)
@@ -243,4 +305,7 @@ def _causes(y: np.ndarray, x: np.ndarray, names: np.ndarray, scale: np.ndarray, 
     spread = inverse @ (scores.T @ scores) @ inverse * _SECTIONS / (_SECTIONS - 1)
     plain = inverse * float(rest @ rest) / max(y.size - x.shape[1], 1)
     errors = np.sqrt(np.maximum(np.diag(spread), np.diag(plain)))
-    return {name: Cause(name, (values / scale)[names == name], (errors / scale)[names == name]) for name in order}
+    return {
+        name: Cause(name, (values / scale)[names == name], (errors / scale)[names == name])
+        for name in order
+    }

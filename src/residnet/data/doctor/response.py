@@ -25,23 +25,51 @@ _WORTH = 1.2
 
 def response_findings(log: Log, inputs: Sequence[str]) -> Iterator[Finding]:
     """Sign and timing of the yaw rate's answer to what steers."""
-    found = _steering(log, inputs) if "r" in log.channels and np.isfinite(log["r"]).sum() >= _FEWEST else None
+    found = (
+        _steering(log, inputs)
+        if "r" in log.channels and np.isfinite(log["r"]).sum() >= _FEWEST
+        else None
+    )
     if found is not None and _opposite(log, found[1]):
         text = f"{found[0]} stays on one side and the vessel turns to the other"
-        yield Finding("will mislead", "rudder_sign", text, {}, "turn it in the channel map (sign: -1), and check the sign of r and psi")
+        yield Finding(
+            "will mislead",
+            "rudder_sign",
+            text,
+            {},
+            "turn it in the channel map (sign: -1), and check the sign of r and psi",
+        )
         return
     answer = None if found is None else _answer(log, found[1])
     if found is None or answer is None:
         return
     name, step = found[0], float(np.median(np.diff(log.t)))
     late = max(0.7, 3.0 * step)
-    figures = {"effect": answer.effect, "t": answer.sure, "lag": answer.lag, "better": answer.better}
+    figures = {
+        "effect": answer.effect,
+        "t": answer.sure,
+        "lag": answer.lag,
+        "better": answer.better,
+    }
     if answer.better > _BETTER and answer.lag < -late and abs(answer.best_sure) > _SURE:
         text = f"the yaw rate answers {name} {-answer.lag:.2f} s before it is given "
         text += f"(a yaw model leaves {answer.better:.1f} times less with the inputs shifted)"
-        yield Finding("will mislead", "acausal", text, figures, "the clocks of inputs and motion differ: shift one of them")
-    elif answer.sure < -_SURE and answer.worth > _WORTH and (answer.better < _BETTER or answer.best_sure < 0.0):
-        text = f"positive {name} turns the vessel to port (yaw acceleration {answer.effect:.3g} per unit, {-answer.sure:.0f} standard errors)"
+        yield Finding(
+            "will mislead",
+            "acausal",
+            text,
+            figures,
+            "the clocks of inputs and motion differ: shift one of them",
+        )
+    elif (
+        answer.sure < -_SURE
+        and answer.worth > _WORTH
+        and (answer.better < _BETTER or answer.best_sure < 0.0)
+    ):
+        text = (
+            f"positive {name} turns the vessel to port (yaw acceleration {answer.effect:.3g} per"
+            f" unit, {-answer.sure:.0f} standard errors)"
+        )
         action = "turn it in the channel map (sign: -1), and check the sign of r and psi"
         yield Finding("will mislead", "rudder_sign", text, figures, action)
     elif answer.sure > _SURE:
@@ -49,7 +77,13 @@ def response_findings(log: Log, inputs: Sequence[str]) -> Iterator[Finding]:
         yield Finding("note", "rudder_sign", text, figures)
     if answer.better > _BETTER and answer.lag > late and answer.best_sure > _SURE:
         action = "an actuator's lag, or another clock"
-        yield Finding("note", "answer_delay", f"the yaw rate answers {name} {answer.lag:.2f} s late", figures, action)
+        yield Finding(
+            "note",
+            "answer_delay",
+            f"the yaw rate answers {name} {answer.lag:.2f} s late",
+            figures,
+            action,
+        )
 
 
 @dataclass(frozen=True)
@@ -59,8 +93,10 @@ class _Answer:
     Attributes:
         effect: yaw acceleration per unit of steering.
         sure: that in standard errors.
-        lag: shift of the steering with which a yaw model leaves least, s; positive where the answer comes late.
-        better: what the model leaves without the shift, over what it leaves with it (sums of squares).
+        lag: shift of the steering with which a yaw model leaves least, s; positive where the answer
+            comes late.
+        better: what the model leaves without the shift, over what it leaves with it (sums of
+            squares).
         best_sure: effect in standard errors with the shift.
         worth: what a yaw model without steering leaves, over what it leaves with it.
     """
@@ -79,7 +115,9 @@ def _opposite(log: Log, steer: np.ndarray) -> bool:
     r, given = _smoothed(log["r"])[good], steer[good]
     if r.size < _FEWEST or float(np.abs(r).mean()) < 6.0 * noise_of(log["r"]):
         return False
-    one_sided = all(abs(float(values.sum())) > 0.95 * float(np.abs(values).sum()) for values in (r, given))
+    one_sided = all(
+        abs(float(values.sum())) > 0.95 * float(np.abs(values).sum()) for values in (r, given)
+    )
     return one_sided and float(r.sum()) * float(given.sum()) < 0.0
 
 
@@ -100,14 +138,22 @@ def _steering(log: Log, inputs: Sequence[str]) -> tuple[str, np.ndarray] | None:
 def _answer(log: Log, steer: np.ndarray) -> _Answer | None:
     """Effect and timing of steering [T] on the yaw rate; None where nothing can be said.
 
-    Over blocks of a second or so: the change of r on the integrals of 1, r, r|r|, v, v|v| and the steering, with the steering shifted in time.
+    Over blocks of a second or so: the change of r on the integrals of 1, r, r|r|, v, v|v| and the
+    steering, with the steering shifted in time.
     """
     step, noise = float(np.median(np.diff(log.t))), noise_of(log["r"])
     good = np.isfinite(log["r"]) & np.isfinite(steer)
-    if good.sum() < _FEWEST or float(np.nanquantile(log["r"], 0.95) - np.nanquantile(log["r"], 0.05)) < 4.0 * noise:
+    if (
+        good.sum() < _FEWEST
+        or float(np.nanquantile(log["r"], 0.95) - np.nanquantile(log["r"], 0.05)) < 4.0 * noise
+    ):
         return None
     smooth, window = _smoothed(log["r"]), 15
-    v = _smoothed(log["v"]) if "v" in log.channels and np.isfinite(log["v"]).sum() > 100 else np.zeros(len(log))
+    v = (
+        _smoothed(log["v"])
+        if "v" in log.channels and np.isfinite(log["v"]).sum() > 100
+        else np.zeros(len(log))
+    )
     dt = np.diff(log.t)
 
     def area(values: np.ndarray) -> np.ndarray:
@@ -124,13 +170,28 @@ def _answer(log: Log, steer: np.ndarray) -> _Answer | None:
     def change(values: np.ndarray, shift: int = 0) -> np.ndarray:
         return values[first + block - shift] - values[first - shift]
 
-    columns = [log.t - log.t[0], area(smooth), area(smooth * np.abs(smooth)), area(v), area(v * np.abs(v))]
+    columns = [
+        log.t - log.t[0],
+        area(smooth),
+        area(smooth * np.abs(smooth)),
+        area(v),
+        area(v * np.abs(v)),
+    ]
     known, y = np.stack([change(column) for column in columns], axis=-1), change(smooth)
     given = area(steer)
     shifts = np.unique(np.round(np.linspace(-reach, reach, 61)).astype(int))
-    left = {int(shift): _fit(np.column_stack((known, change(given, int(shift)))), y) for shift in shifts}
+    left = {
+        int(shift): _fit(np.column_stack((known, change(given, int(shift)))), y) for shift in shifts
+    }
     zero, best = left[0], min(left, key=lambda shift: left[shift][0])
-    return _Answer(zero[1], zero[2], best * step, zero[0] / max(left[best][0], 1e-300), left[best][2], _fit(known, y)[0] / max(zero[0], 1e-300))
+    return _Answer(
+        zero[1],
+        zero[2],
+        best * step,
+        zero[0] / max(left[best][0], 1e-300),
+        left[best][2],
+        _fit(known, y)[0] / max(zero[0], 1e-300),
+    )
 
 
 def _reach(r: np.ndarray, step: float) -> int:
@@ -139,7 +200,9 @@ def _reach(r: np.ndarray, step: float) -> int:
     power = np.abs(np.fft.rfft(known, 2 * known.size)) ** 2
     memory = np.fft.irfft(power)[: known.size]
     below = np.flatnonzero(memory < 0.0)
-    return max(min(int(below[0]) if below.size else known.size, known.size // 8, round(30.0 / step)), 3)
+    return max(
+        min(int(below[0]) if below.size else known.size, known.size // 8, round(30.0 / step)), 3
+    )
 
 
 def _fit(x: np.ndarray, y: np.ndarray) -> tuple[float, float, float]:

@@ -14,9 +14,11 @@ _SIGMA = 1.4826
 
 
 def noise_of(values: np.ndarray) -> float:
-    """Standard deviation of the white noise of a channel [T]: from its third differences, which hardly see the motion.
+    """Standard deviation of the white noise of a channel [T]: from its third differences, which
+    hardly see the motion.
 
-    The differences are taken over the known samples only; 0 where there are fewer than 8, or where most third differences vanish.
+    The differences are taken over the known samples only; 0 where there are fewer than 8, or where
+    most third differences vanish.
     """
     known = values[np.isfinite(values)]
     if known.size < 8:
@@ -25,7 +27,9 @@ def noise_of(values: np.ndarray) -> float:
 
 
 def spikes(values: np.ndarray) -> np.ndarray:
-    """[T] bool: samples that stand far out of their neighbours (the rule of the mask `hampel` as it is without settings)."""
+    """[T] bool: samples that stand far out of their neighbours (the rule of the mask `hampel` as it
+    is without settings).
+    """
     return far_from_median(values, 6.0, 11)
 
 

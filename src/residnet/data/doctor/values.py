@@ -1,4 +1,6 @@
-"""What the data doctor sees in single channels: missing, repeated, frozen, outlying, clipped and coarse values."""
+"""What the data doctor sees in single channels: missing, repeated, frozen, outlying, clipped and
+coarse values.
+"""
 
 from __future__ import annotations
 
@@ -26,16 +28,32 @@ _FEWEST_LEVELS = 50
 def channel_findings(log: Log) -> Iterator[Finding]:
     """Names and units of the channels, and which of the state are absent."""
     named = ", ".join(f"{name} [{unit}]" for name, unit in log.units.items())
-    yield Finding("note", "channels", f"{len(log.channels)} channels, {len(log)} samples, manoeuvre {log.manoeuvre}: {named}")
+    yield Finding(
+        "note",
+        "channels",
+        f"{len(log.channels)} channels, {len(log)} samples, manoeuvre {log.manoeuvre}: {named}",
+    )
     absent = [name for name in STATE if name not in log.channels]
     if absent:
-        yield Finding("note", "absent", f"no {', '.join(absent)}: free runs cannot be scored on what is not measured")
+        yield Finding(
+            "note",
+            "absent",
+            f"no {', '.join(absent)}: free runs cannot be scored on what is not measured",
+        )
 
 
 def value_findings(log: Log, inputs: Sequence[str]) -> list[Finding]:
-    """Findings about the values of a log as recorded; `inputs` drive the vessel and may jump, hold and rest at their limits."""
+    """Findings about the values of a log as recorded; `inputs` drive the vessel and may jump, hold
+    and rest at their limits.
+    """
     measured = [name for name in log.channels if name not in inputs and name in MEASURED]
-    return [*_missing(log), *_repeats(log), *frozen_findings(log, measured), *_outliers(log, measured), *_single_channels(log, measured)]
+    return [
+        *_missing(log),
+        *_repeats(log),
+        *frozen_findings(log, measured),
+        *_outliers(log, measured),
+        *_single_channels(log, measured),
+    ]
 
 
 def _single_channels(log: Log, measured: Sequence[str]) -> Iterator[Finding]:
@@ -56,30 +74,65 @@ def _missing(log: Log) -> Iterator[Finding]:
             continue
         every = np.diff(np.flatnonzero(~absent))
         usual = float(np.median(every)) if every.size else 1.0
-        if usual > 1.0 and every.max() <= 2.0 * usual and max(np.argmin(absent), np.argmin(absent[::-1])) <= 2.0 * usual:
-            text = f"{name} holds a value in every {usual:.0f}th sample only: its sensor is slower than the log"
-            yield Finding("note", "slow_channel", text, {"share": share, "every": usual}, "give it a log of its own, or interpolate it")
+        if (
+            usual > 1.0
+            and every.max() <= 2.0 * usual
+            and max(np.argmin(absent), np.argmin(absent[::-1])) <= 2.0 * usual
+        ):
+            text = (
+                f"{name} holds a value in every {usual:.0f}th sample only: its sensor is slower"
+                " than the log"
+            )
+            yield Finding(
+                "note",
+                "slow_channel",
+                text,
+                {"share": share, "every": usual},
+                "give it a log of its own, or interpolate it",
+            )
             continue
         starts, stops = true_runs(absent)
         longest = int(np.argmax(stops - starts))
         seconds = float(log.t[min(stops[longest], len(log) - 1)] - log.t[starts[longest]])
-        text = f"{name} is missing in {share_of(share)} of the samples, {starts.size} stretches, the longest {seconds:.2f} s from "
+        text = (
+            f"{name} is missing in {share_of(share)} of the samples, {starts.size} stretches, the"
+            f" longest {seconds:.2f} s from "
+        )
         text += f"t = {log.t[starts[longest]]:.2f} s"
         level: Level = "fatal" if share > 0.5 else "will mislead"
-        figures = {"share": share, "stretches": starts.size, "longest": seconds, "t": float(log.t[starts[longest]])}
+        figures = {
+            "share": share,
+            "stretches": starts.size,
+            "longest": seconds,
+            "t": float(log.t[starts[longest]]),
+        }
         yield Finding(level, "nan", text, figures, "split the log there (mask kind: nan)", absent)
 
 
 def _repeats(log: Log) -> Iterator[Finding]:
     """Rows that repeat the row before in every channel, which noise never does."""
     same = np.append(False, (np.diff(log.stack(tuple(log.channels)), axis=0) == 0.0).all(axis=1))
-    moving = [name for name in log.channels if name in MEASURED and float((np.diff(log[name]) == 0.0).mean()) < 0.5]
+    moving = [
+        name
+        for name in log.channels
+        if name in MEASURED and float((np.diff(log[name]) == 0.0).mean()) < 0.5
+    ]
     share = float(same.mean())
     if not same.any() or (not moving and share <= 0.5):
         return
-    text = f"{int(same.sum())} rows ({share_of(share)}) repeat the row before in every channel: logged twice, or faster than measured"
+    text = (
+        f"{int(same.sum())} rows ({share_of(share)}) repeat the row before in every channel: logged"
+        " twice, or faster than measured"
+    )
     level: Level = "fatal" if share > 0.9 else "will mislead"
-    yield Finding(level, "repeated_rows", text, {"count": same.sum(), "share": share}, "delete them, or log at the sensors' rate", same)
+    yield Finding(
+        level,
+        "repeated_rows",
+        text,
+        {"count": same.sum(), "share": share},
+        "delete them, or log at the sensors' rate",
+        same,
+    )
 
 
 def frozen_findings(log: Log, measured: Sequence[str]) -> Iterator[Finding]:
@@ -108,7 +161,10 @@ def _sample_and_hold(log: Log, name: str) -> Iterator[Finding]:
     if float((np.abs(every - usual) <= 0.25 * usual).mean()) < 0.9:
         return
     text = f"{name} changes in every {usual:.0f}th sample only, its last value is held in between"
-    action = "leave the cells between two measurements empty: held values are late by half an interval and their derivative is spikes"
+    action = (
+        "leave the cells between two measurements empty: held values are late by half an interval"
+        " and their derivative is spikes"
+    )
     yield Finding("will mislead", "held", text, {"every": usual}, action)
 
 
@@ -120,12 +176,28 @@ def _frozen(log: Log, name: str, held: np.ndarray) -> Finding:
         for stop in stops:
             at[stop : int(np.searchsorted(log.t, log.t[stop - 1] + _RECOVERY - 1e-9))] = True
     share, longest = float(at.mean()), int(np.argmax(seconds))
-    text = f"{name} is bit-identical in {starts.size} stretches of {_FROZEN} steps or more while the vessel moves, {seconds.sum():.2f} s in all, "
+    text = (
+        f"{name} is bit-identical in {starts.size} stretches of {_FROZEN} steps or more while the"
+        f" vessel moves, {seconds.sum():.2f} s in all, "
+    )
     text += f"the longest {seconds[longest]:.2f} s from t = {log.t[starts[longest]]:.2f} s"
     channels = "x, y" if name == "position" else name
-    figures = {"count": starts.size, "seconds": seconds.sum(), "longest": seconds[longest], "share": share, "t": float(log.t[starts[longest]])}
+    figures = {
+        "count": starts.size,
+        "seconds": seconds.sum(),
+        "longest": seconds[longest],
+        "share": share,
+        "t": float(log.t[starts[longest]]),
+    }
     level: Level = "fatal" if share > 0.5 else "will mislead"
-    return Finding(level, "frozen", text, figures, f"mask them and what follows (kind: frozen, channels: [{channels}])", at)
+    return Finding(
+        level,
+        "frozen",
+        text,
+        figures,
+        f"mask them and what follows (kind: frozen, channels: [{channels}])",
+        at,
+    )
 
 
 def _held(log: Log, names: Sequence[str]) -> np.ndarray:
@@ -137,22 +209,33 @@ def _held(log: Log, names: Sequence[str]) -> np.ndarray:
     outside = same.size - int((stops - starts)[long].sum())
     if outside < 0.02 * same.size:
         return out
-    # share of equal neighbours where the channel runs: a coarse one stands still for some samples by nature
+    # share of equal neighbours where the channel runs: a coarse one stands still for some samples
+    # by nature
     chance = min(float((stops - starts)[~long].sum()) / outside, 0.99)
     # two channels that hold together are never chance
-    least = _FROZEN if chance <= 0.0 or len(names) > 1 else max(_FROZEN, int(np.ceil(np.log(1e-4 / same.size) / np.log(chance))))
+    least = (
+        _FROZEN
+        if chance <= 0.0 or len(names) > 1
+        else max(_FROZEN, int(np.ceil(np.log(1e-4 / same.size) / np.log(chance))))
+    )
     limit = 0.15 if len(names) > 1 else 1e-3
     for start, stop in zip(starts, stops, strict=True):
         run = slice(start, stop + 1)
         # the last digits of a noisy channel never rest, whatever the vessel does
-        if stop - start >= least and ((chance < limit and _noisy(log[names[0]])) or _moves(log, names, run)):
+        if stop - start >= least and (
+            (chance < limit and _noisy(log[names[0]])) or _moves(log, names, run)
+        ):
             out[start : stop + 1] = True
     return out
 
 
 def _moves(log: Log, names: Sequence[str], run: slice) -> bool:
-    """Whether a channel must have changed over a run: a pose by what the velocities say, any other wherever it is noisy elsewhere."""
-    rates = {"psi": ("r",), "phi": ("p",)}.get(names[0], ("u", "v", "psi") if names[0] in ("x", "y") else ())
+    """Whether a channel must have changed over a run: a pose by what the velocities say, any other
+    wherever it is noisy elsewhere.
+    """
+    rates = {"psi": ("r",), "phi": ("p",)}.get(
+        names[0], ("u", "v", "psi") if names[0] in ("x", "y") else ()
+    )
     if not rates:
         return _never_rests(log[names[0]], run)
     if any(name not in log.channels for name in rates):
@@ -161,12 +244,24 @@ def _moves(log: Log, names: Sequence[str], run: slice) -> bool:
     rate = log[rates[0]][run]
     if names[0] in ("x", "y"):
         over_ground = (rate + 1j * log["v"][run]) * np.exp(1j * log["psi"][run])
-        rate = np.abs(over_ground) if len(names) == 2 else over_ground.real if names[0] == "x" else over_ground.imag
+        rate = (
+            np.abs(over_ground)
+            if len(names) == 2
+            else over_ground.real
+            if names[0] == "x"
+            else over_ground.imag
+        )
     moved = abs(float(np.nanmean(rate))) * dt if np.isfinite(rate).any() else 0.0
-    noise = np.hypot.reduce([noise_of(log[name]) for name in rates if name != "psi"]) * dt / np.sqrt(count if len(names) == 1 else 1)
+    noise = (
+        np.hypot.reduce([noise_of(log[name]) for name in rates if name != "psi"])
+        * dt
+        / np.sqrt(count if len(names) == 1 else 1)
+    )
     steps = np.abs(np.diff(log[names[0]]))
     resolution = float(np.quantile(steps[steps > 0.0], 0.1)) if (steps > 0.0).any() else 0.0
-    return bool(moved > max(4.0 * noise, 3.0 * resolution, _FELT if names[0] in ("psi", "phi") else 0.0))
+    return bool(
+        moved > max(4.0 * noise, 3.0 * resolution, _FELT if names[0] in ("psi", "phi") else 0.0)
+    )
 
 
 def _noisy(values: np.ndarray) -> bool:
@@ -176,7 +271,9 @@ def _noisy(values: np.ndarray) -> bool:
 
 
 def _never_rests(values: np.ndarray, run: slice) -> bool:
-    """Whether a channel that is no pose cannot have rested over a run: it is noisy, or it lands far off where it goes on."""
+    """Whether a channel that is no pose cannot have rested over a run: it is noisy, or it lands far
+    off where it goes on.
+    """
     if _noisy(values):
         return True
     after = np.abs(np.diff(values[run.stop - 1 : run.stop + 6]))
@@ -196,9 +293,19 @@ def _outliers(log: Log, measured: Sequence[str]) -> Iterator[Finding]:
         if not count:
             continue
         worst = _worst(log[name], far)
-        text = f"{count} samples of {name} ({share_of(count / len(log))}) stand far out of their neighbours, the worst at t = {log.t[worst]:.2f} s"
+        text = (
+            f"{count} samples of {name} ({share_of(count / len(log))}) stand far out of their"
+            f" neighbours, the worst at t = {log.t[worst]:.2f} s"
+        )
         level: Level = "will mislead" if count > 2 else "note"
-        yield Finding(level, "outliers", text, {"count": count, "share": count / len(log), "t": float(log.t[worst])}, _HAMPEL.format(name), far)
+        yield Finding(
+            level,
+            "outliers",
+            text,
+            {"count": count, "share": count / len(log), "t": float(log.t[worst])},
+            _HAMPEL.format(name),
+            far,
+        )
 
 
 _HAMPEL = "mask them (kind: hampel, channels: [{}])"
@@ -222,11 +329,14 @@ def _clipping(log: Log, name: str) -> Iterator[Finding]:
         if count < 5 or count < 4 * int(beside.max()) or share < 0.003:
             continue
         text = (
-            f"{name} is exactly at its limit {show(levels[end], log.units[name])} in {count} samples ({share_of(share)}): the sensor clips or holds"
+            f"{name} is exactly at its limit {show(levels[end], log.units[name])} in {count}"
+            f" samples ({share_of(share)}): the sensor clips or holds"
         )
         at = log[name] == levels[end]
         figures = {"count": count, "share": share, "limit": float(levels[end])}
-        yield Finding("will mislead", "clipping", text, figures, "mask them, or log with a wider range", at)
+        yield Finding(
+            "will mislead", "clipping", text, figures, "mask them, or log with a wider range", at
+        )
 
 
 def _resolution(log: Log, name: str) -> Iterator[Finding]:
@@ -243,9 +353,18 @@ def _resolution(log: Log, name: str) -> Iterator[Finding]:
     if float((np.abs(steps - np.round(steps)) < 1e-3).mean()) < 0.9:
         return
     coarse = count < _FEWEST_LEVELS
-    text = f"{name} has a resolution of {show(resolution, log.units[name])}, {count:.0f} levels between its 5th and 95th percentile"
+    text = (
+        f"{name} has a resolution of {show(resolution, log.units[name])}, {count:.0f} levels"
+        " between its 5th and 95th percentile"
+    )
     action = "decimals were dropped on the way: log more digits" if coarse else ""
-    yield Finding("will mislead" if coarse else "note", "resolution", text, {"resolution": resolution, "levels": count}, action)
+    yield Finding(
+        "will mislead" if coarse else "note",
+        "resolution",
+        text,
+        {"resolution": resolution, "levels": count},
+        action,
+    )
 
 
 def _steps(log: Log, name: str) -> Iterator[Finding]:
@@ -255,14 +374,26 @@ def _steps(log: Log, name: str) -> Iterator[Finding]:
     if np.isfinite(change).sum() < 50:
         return
     noise = noise_of(values)
-    around = np.lib.stride_tricks.sliding_window_view(np.pad(np.nan_to_num(change), 4, mode="edge"), 9)
+    around = np.lib.stride_tricks.sliding_window_view(
+        np.pad(np.nan_to_num(change), 4, mode="edge"), 9
+    )
     beside = np.sort(around, axis=1)[:, -2]
     span = float(np.nanquantile(values, 0.99) - np.nanquantile(values, 0.01))
     over = np.nan_to_num(change) > np.maximum(np.maximum(8.0 * noise, 4.0 * beside), 0.1 * span)
     if over.any():
         at = int(np.argmax(np.where(over, change, 0.0)))
-        text = f"{name} changes level {int(over.sum())} times within one sample, at most by {show(change[at], log.units[name])} "
+        text = (
+            f"{name} changes level {int(over.sum())} times within one sample, at most by"
+            f" {show(change[at], log.units[name])} "
+        )
         text += f"at t = {log.t[at + 1]:.2f} s"
         figures = {"count": over.sum(), "largest": float(change[at]), "t": float(log.t[at + 1])}
         action = f"mask it (kind: jump, channel: {name}), or split the log there"
-        yield Finding("will mislead", "jump", text, figures, action, np.append(False, over) | np.append(over, False))
+        yield Finding(
+            "will mislead",
+            "jump",
+            text,
+            figures,
+            action,
+            np.append(False, over) | np.append(over, False),
+        )

@@ -24,14 +24,27 @@ def wrap_findings(log: Log) -> list[Finding]:
         for circle, what in _CIRCLES:
             at = _wraps(log, name, circle)
             if at.any():
-                text = f"{name} wraps {int(at.sum())} times{what}, first at t = {log.t[np.argmax(at)]:.2f} s: logs hold it continuous"
+                text = (
+                    f"{name} wraps {int(at.sum())} times{what}, first at t ="
+                    f" {log.t[np.argmax(at)]:.2f} s: logs hold it continuous"
+                )
                 figures = {"count": at.sum(), "t": float(log.t[np.argmax(at)])}
-                out.append(Finding("will mislead", "heading_wrap", text, figures, "unwrap it before it is filtered or differentiated"))
+                out.append(
+                    Finding(
+                        "will mislead",
+                        "heading_wrap",
+                        text,
+                        figures,
+                        "unwrap it before it is filtered or differentiated",
+                    )
+                )
     return out
 
 
 def _wraps(log: Log, name: str, circle: float) -> np.ndarray:
-    """[T] bool: samples that arrive by about a full circle from the one before or the one before that (a wrap with a sample in between)."""
+    """[T] bool: samples that arrive by about a full circle from the one before or the one before
+    that (a wrap with a sample in between).
+    """
     known = np.isfinite(log[name])
     change = np.diff(log[name][known], prepend=log[name][known][:1])
     out = np.zeros(len(log), dtype=bool)
@@ -41,5 +54,7 @@ def _wraps(log: Log, name: str, circle: float) -> np.ndarray:
 
 def unwrapped(log: Log) -> Log:
     """The log with its headings continuous."""
-    channels = {name: unwrap(values) if name in _ANGLES else values for name, values in log.channels.items()}
+    channels = {
+        name: unwrap(values) if name in _ANGLES else values for name, values in log.channels.items()
+    }
     return log.replace(channels=channels)

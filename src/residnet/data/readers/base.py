@@ -1,4 +1,5 @@
-"""What every reader of logs shares: the interface, the file's identity, and the checks at the door."""
+"""What every reader of logs shares: the interface, the file's identity, and the checks at the door.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +23,8 @@ class LogReader(ABC):
     def read(self, path: Path) -> Log:
         """The log in one file, in SI units, psi unwrapped, time strictly increasing.
 
-        The log's name is the file's stem; `meta` holds `source`, `sha256`, `rows_read` and `rows_dropped`.
+        The log's name is the file's stem; `meta` holds `source`, `sha256`, `rows_read` and
+        `rows_dropped`.
 
         Raises:
             UsageError: where the file or a column is missing, or a unit does not fit.
@@ -37,17 +39,30 @@ def require_file(path: Path) -> None:
         UsageError: naming the nearest file of the same folder.
     """
     if path.is_dir():
-        raise UsageError(f"{path}: is a folder, a log file was expected; name one file or a pattern such as '{path}/*.csv'")
+        raise UsageError(
+            f"{path}: is a folder, a log file was expected; name one file or a pattern such as"
+            f" '{path}/*.csv'"
+        )
     if not path.is_file():
-        near = nearest(path.name, (other.name for other in path.parent.iterdir())) if path.parent.is_dir() else "; its folder does not exist either"
+        near = (
+            nearest(path.name, (other.name for other in path.parent.iterdir()))
+            if path.parent.is_dir()
+            else "; its folder does not exist either"
+        )
         raise UsageError(f"{path}: no such file{near}")
 
 
 def provenance(path: Path, rows_read: int, rows_dropped: int) -> dict[str, Any]:
-    """Where a log comes from: `source`, `sha256` of the file's bytes, `rows_read`, `rows_dropped`."""
+    """Where a log comes from: `source`, `sha256` of the file's bytes, `rows_read`, `rows_dropped`.
+    """
     with path.open("rb") as stream:
         digest = hashlib.file_digest(stream, "sha256").hexdigest()
-    return {"source": str(path), "sha256": digest, "rows_read": rows_read, "rows_dropped": rows_dropped}
+    return {
+        "source": str(path),
+        "sha256": digest,
+        "rows_read": rows_read,
+        "rows_dropped": rows_dropped,
+    }
 
 
 def unwrap(angle: np.ndarray) -> np.ndarray:
@@ -72,7 +87,8 @@ def require_samples(path: Path, t: np.ndarray) -> None:
 
 
 def require_increasing(path: Path, t: np.ndarray, row: Callable[[int], str]) -> None:
-    """Stop where time [T] in s repeats or runs backwards; `row` names the row of a sample in the file.
+    """Stop where time [T] in s repeats or runs backwards; `row` names the row of a sample in the
+    file.
 
     Raises:
         DataError: naming the first two rows concerned.
@@ -80,10 +96,17 @@ def require_increasing(path: Path, t: np.ndarray, row: Callable[[int], str]) -> 
     bad = np.flatnonzero(~(np.diff(t) > 0.0))
     if bad.size:
         i = int(bad[0])
-        what = "repeats" if t[i + 1] == t[i] else "runs backwards" if t[i + 1] < t[i] else "is not a number"
+        what = (
+            "repeats"
+            if t[i + 1] == t[i]
+            else "runs backwards"
+            if t[i + 1] < t[i]
+            else "is not a number"
+        )
         raise DataError(
-            f"{path}: time {what} from {row(i)} ({t[i]:.6g} s) to {row(i + 1)} ({t[i + 1]:.6g} s), {bad.size} such steps in all; "
-            "delete the repeated rows, or split the file where its clock restarts"
+            f"{path}: time {what} from {row(i)} ({t[i]:.6g} s) to {row(i + 1)} ({t[i + 1]:.6g} s),"
+            f" {bad.size} such steps in all; delete the repeated rows, or split the file where its"
+            " clock restarts"
         )
 
 
@@ -94,4 +117,7 @@ def require_values(path: Path, channel: str, column: str, values: np.ndarray) ->
         DataError: naming channel and column.
     """
     if not np.isfinite(values).any():
-        raise DataError(f"{path}: column '{column}' (channel {channel}) holds no number in any of {values.size} rows; take it out of the channel map")
+        raise DataError(
+            f"{path}: column '{column}' (channel {channel}) holds no number in any of {values.size}"
+            " rows; take it out of the channel map"
+        )

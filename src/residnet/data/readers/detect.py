@@ -1,4 +1,5 @@
-"""Which reader a file needs, by its content first and its ending second, where no config says so."""
+"""Which reader a file needs, by its content first and its ending second, where no config says so.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +36,9 @@ _NMEA = re.compile(rb"(?m)^[^$!\n]{0,40}[$!][A-Z]{2}[A-Z]{3},[\x20-\x7e]*\*[0-9A
 
 @dataclass(frozen=True)
 class Format:
-    """A format of recordings: how it is recognised, and the reader's config with everything left to standard messages."""
+    """A format of recordings: how it is recognised, and the reader's config with everything left to
+    standard messages.
+    """
 
     name: str
     fits: Callable[[Path, bytes], bool]
@@ -44,22 +47,36 @@ class Format:
 
 # in the order in which they are asked: content that cannot be mistaken first, endings last
 FORMATS: tuple[Format, ...] = (
-    Format("ROS 2 bag", lambda path, head: path.is_dir() and (path / "metadata.yaml").is_file(), RosbagConfig),
+    Format(
+        "ROS 2 bag",
+        lambda path, head: path.is_dir() and (path / "metadata.yaml").is_file(),
+        RosbagConfig,
+    ),
     Format("folder of csv files", lambda path, head: is_topic_folder(path), TopicFolderConfig),
     Format("ROS 1 bag", lambda path, head: head.startswith(b"#ROSBAG"), RosbagConfig),
     Format("MCAP", lambda path, head: head.startswith(_MCAP), RosbagConfig),
-    Format("ROS 2 bag (SQLite)", lambda path, head: head.startswith(_SQLITE) and path.suffix == ".db3", RosbagConfig),
+    Format(
+        "ROS 2 bag (SQLite)",
+        lambda path, head: head.startswith(_SQLITE) and path.suffix == ".db3",
+        RosbagConfig,
+    ),
     Format("PX4 ULog", lambda path, head: head.startswith(_ULOG), UlogConfig),
     Format("ArduPilot log", lambda path, head: head.startswith(_DATAFLASH), ArduPilotConfig),
     Format("NMEA 0183", lambda path, head: _NMEA.search(head) is not None, NmeaConfig),
-    Format("MATLAB", lambda path, head: head.startswith(_MAT5) or path.suffix.lower() == ".mat", MatConfig),
+    Format(
+        "MATLAB",
+        lambda path, head: head.startswith(_MAT5) or path.suffix.lower() == ".mat",
+        MatConfig,
+    ),
     Format("HDF5", lambda path, head: is_hdf5(path), Hdf5Config),
 )
 
 
 @final
 class AutoConfig(RecordingConfig):
-    """Any recording that describes itself, by its content and ending; the other kinds have settings of their own."""
+    """Any recording that describes itself, by its content and ending; the other kinds have settings
+    of their own.
+    """
 
     kind: Literal["auto"] = "auto"
 
@@ -69,7 +86,8 @@ class AutoConfig(RecordingConfig):
 
 
 def format_of(path: Path) -> Format | None:
-    """The format of a recording; None where it is none that describes itself (a csv table, a foreign Parquet file, anything else).
+    """The format of a recording; None where it is none that describes itself (a csv table, a
+    foreign Parquet file, anything else).
 
     Raises:
         UsageError: where there is nothing at `path`.
@@ -108,6 +126,7 @@ def _config_for(path: Path) -> RecordingConfig:
     if one is None:
         known = ", ".join(dict.fromkeys(entry.name for entry in FORMATS))
         raise UsageError(
-            f"{path}: does not say what its columns are; give a channel map with --config (formats that need none: {known}, canonical Parquet)"
+            f"{path}: does not say what its columns are; give a channel map with --config (formats"
+            f" that need none: {known}, canonical Parquet)"
         )
     return one.config()

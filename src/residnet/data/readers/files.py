@@ -44,7 +44,8 @@ class Advance(Protocol):
 
 @contextmanager
 def progress(what: str, size: int, total: float) -> Iterator[Advance]:
-    """A bar on standard error while a recording of `size` bytes is read; none where it is small or nobody watches.
+    """A bar on standard error while a recording of `size` bytes is read; none where it is small or
+    nobody watches.
 
     Args:
         what: name of the file.
@@ -57,9 +58,20 @@ def progress(what: str, size: int, total: float) -> Iterator[Advance]:
         yield lambda done: None
         return
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        TaskProgressColumn,
+        TextColumn,
+        TimeRemainingColumn,
+    )
 
-    columns = (TextColumn("reading {task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    columns = (
+        TextColumn("reading {task.description}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TimeRemainingColumn(),
+    )
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(what, total=total)
         yield lambda done: bar.update(task, completed=done)
@@ -67,4 +79,7 @@ def progress(what: str, size: int, total: float) -> Iterator[Advance]:
 
 def missing_package(extra: str, package: str, what: str) -> UsageError:
     """The error for a format whose package is not installed."""
-    return UsageError(f'{what} needs the package {package}, which is not installed; install it with: pip install "residnet[{extra}]"')
+    return UsageError(
+        f"{what} needs the package {package}, which is not installed; install it with: pip install"
+        f' "residnet[{extra}]"'
+    )

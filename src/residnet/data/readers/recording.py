@@ -20,7 +20,9 @@ Remark = dict[str, Any]
 
 
 def remark(level: Level, code: str, text: str, **figures: float) -> Remark:
-    """One thing noticed on the way in, as `Log.meta["findings"]` holds it: level, code, text, figures (SI)."""
+    """One thing noticed on the way in, as `Log.meta["findings"]` holds it: level, code, text,
+    figures (SI).
+    """
     return {"level": level, "code": code, "text": text, "figures": figures}
 
 
@@ -30,10 +32,13 @@ class Series:
 
     Attributes:
         name: topic or table, as its source names it.
-        kind: message type, for example `sensor_msgs/msg/NavSatFix`; empty where the source has none.
+        kind: message type, for example `sensor_msgs/msg/NavSatFix`; empty where the source has
+            none.
         fields: path -> values [T], float64, in the source's units; NaN where a cell is empty.
-        stamp: time [T] in s by the sender's clock (header stamp), from the recording's epoch; None where messages carry none.
-        arrival: time [T] in s by the recorder's clock, from the same epoch; None where the source has none.
+        stamp: time [T] in s by the sender's clock (header stamp), from the recording's epoch; None
+            where messages carry none.
+        arrival: time [T] in s by the recorder's clock, from the same epoch; None where the source
+            has none.
         sender: who sent each row [T] (frame id, node or instance), where the source says.
         remarks: what was noticed while reading.
     """
@@ -60,7 +65,9 @@ class Series:
         return {key_of(path): path for path in reversed(self.fields)}
 
     def has(self, path: str) -> bool:
-        """Whether there is a field of this path; `pose.position.x`, `pose/position/x` and `pose_position_x` are the same."""
+        """Whether there is a field of this path; `pose.position.x`, `pose/position/x` and
+        `pose_position_x` are the same.
+        """
         return path in self.fields or key_of(path) in self._by_key
 
     def __getitem__(self, path: str) -> np.ndarray:
@@ -76,7 +83,9 @@ class Series:
 
     def where(self, keep: np.ndarray) -> Series:
         """The rows at which `keep` ([T] bool, or indices) points."""
-        stamp, arrival, sender = (None if part is None else part[keep] for part in (self.stamp, self.arrival, self.sender))
+        stamp, arrival, sender = (
+            None if part is None else part[keep] for part in (self.stamp, self.arrival, self.sender)
+        )
         fields = {path: values[keep] for path, values in self.fields.items()}
         return dataclasses.replace(self, fields=fields, stamp=stamp, arrival=arrival, sender=sender)
 
@@ -86,9 +95,15 @@ class Series:
         Raises:
             UsageError: where no row has this sender.
         """
-        known = [] if self.sender is None else [str(name) for name in dict.fromkeys(self.sender.tolist())]
+        known = (
+            []
+            if self.sender is None
+            else [str(name) for name in dict.fromkeys(self.sender.tolist())]
+        )
         if self.sender is None or sender not in known:
-            raise UsageError(f"topic {self.name}: no rows of sender '{sender}'{nearest(sender, known)}")
+            raise UsageError(
+                f"topic {self.name}: no rows of sender '{sender}'{nearest(sender, known)}"
+            )
         return self.where(self.sender == sender)
 
     def noting(self, *remarks: Remark) -> Series:
@@ -103,7 +118,8 @@ class Recording:
     Attributes:
         path: where it lies.
         series: by name.
-        epoch: Unix time in whole ns that all times count from; None where times count from a start that nobody knows.
+        epoch: Unix time in whole ns that all times count from; None where times count from a start
+            that nobody knows.
         files: files that were read.
         remarks: what was noticed about the recording as a whole.
         listed: names of series that the source holds and that were not asked for.
@@ -125,10 +141,15 @@ class Recording:
         if topic is None:
             if len(self.series) == 1:
                 return next(iter(self.series.values()))
-            raise UsageError(f"{self.path}: holds {len(self.series)} topics, name one with `topic` ({', '.join(list(self.series)[:12])})")
+            raise UsageError(
+                f"{self.path}: holds {len(self.series)} topics, name one with `topic`"
+                f" ({', '.join(list(self.series)[:12])})"
+            )
         name = same_topic(topic, self.series)
         if name is None:
-            raise UsageError(f"{self.path}: no topic '{topic}'{nearest(topic, (*self.series, *self.listed))}")
+            raise UsageError(
+                f"{self.path}: no topic '{topic}'{nearest(topic, (*self.series, *self.listed))}"
+            )
         return self.series[name]
 
 
@@ -138,5 +159,7 @@ def same_topic(topic: str, names: Iterable[str]) -> str | None:
 
 
 def key_of(path: str) -> str:
-    """A field's path with every separator as one underscore: exporters write `pose.position.x`, `pose/position/x` or `pose_position_x`."""
+    """A field's path with every separator as one underscore: exporters write `pose.position.x`,
+    `pose/position/x` or `pose_position_x`.
+    """
     return re.sub(r"[./\[\]_]+", "_", path).strip("_").removeprefix("field_")

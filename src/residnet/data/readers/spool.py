@@ -1,4 +1,6 @@
-"""Columns that grow piece by piece: in memory, or on disk where a file is larger than memory should be."""
+"""Columns that grow piece by piece: in memory, or on disk where a file is larger than memory should
+be.
+"""
 
 from __future__ import annotations
 
@@ -19,13 +21,17 @@ class Spool:
 
     Args:
         columns: how many.
-        on_disk: collects them in temporary files, whose pages the system may drop; they vanish with the arrays that `finish` gives.
+        on_disk: collects them in temporary files, whose pages the system may drop; they vanish with
+            the arrays that `finish` gives.
     """
 
     def __init__(self, columns: int, *, on_disk: bool) -> None:
         self._parts: list[list[np.ndarray]] = [[] for _ in range(columns)]
         # they outlive this call, and vanish when the last array over them does
-        self._files: list[IO[bytes]] = [tempfile.TemporaryFile(prefix="residnet-") for _ in range(columns if on_disk else 0)]  # noqa: SIM115
+        self._files: list[IO[bytes]] = [
+            tempfile.TemporaryFile(prefix="residnet-")  # noqa: SIM115
+            for _ in range(columns if on_disk else 0)
+        ]
 
     def add(self, columns: list[np.ndarray]) -> None:
         """One more piece of each column.
@@ -42,7 +48,8 @@ class Spool:
                 file.write(np.ascontiguousarray(values, dtype=np.float64).data)
         except OSError as error:
             raise DataError(
-                f"{tempfile.gettempdir()}: no room for the columns of a large log ({error.strerror}); set TMPDIR to a larger disk"
+                f"{tempfile.gettempdir()}: no room for the columns of a large log"
+                f" ({error.strerror}); set TMPDIR to a larger disk"
             ) from error
 
     def finish(self) -> list[np.ndarray]:
@@ -50,9 +57,15 @@ class Spool:
         out = []
         for file in self._files:
             file.flush()
-            out.append(np.asarray(np.memmap(file, dtype=np.float64, mode="r")) if file.tell() else np.zeros(0))
+            out.append(
+                np.asarray(np.memmap(file, dtype=np.float64, mode="r"))
+                if file.tell()
+                else np.zeros(0)
+            )
             file.close()
         for i, parts in enumerate([] if self._files else self._parts):
-            out.append(parts[0] if len(parts) == 1 else np.concatenate(parts) if parts else np.zeros(0))
+            out.append(
+                parts[0] if len(parts) == 1 else np.concatenate(parts) if parts else np.zeros(0)
+            )
             self._parts[i] = []
         return out

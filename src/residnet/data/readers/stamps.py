@@ -1,4 +1,6 @@
-"""Time as sources print it: numbers or dates, with zones, and with fractions of seconds whose zeros were lost."""
+"""Time as sources print it: numbers or dates, with zones, and with fractions of seconds whose zeros
+were lost.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,8 @@ from residnet.core.errors import DataError
 from residnet.data.readers.recording import Remark, remark
 
 _DATE = (
-    r"^\s*(?P<date>\d{4}[-/.]\d{1,2}[-/.]\d{1,2})[T ]+(?P<clock>\d{1,2}:\d{2}:\d{2})(?:[.,](?P<fraction>\d+))?"
+    r"^\s*(?P<date>\d{4}[-/.]\d{1,2}[-/.]\d{1,2})[T"
+    r" ]+(?P<clock>\d{1,2}:\d{2}:\d{2})(?:[.,](?P<fraction>\d+))?"
     r"\s*(?P<zone>Z|UTC|GMT|[+-]\d{2}:?\d{2})?\s*$"
 )
 _NUMBER = r"^\s*(?P<whole>[-+]?\d+)(?:\.(?P<fraction>\d+))?\s*$"
@@ -40,7 +43,8 @@ class Stamps:
 
 
 def parse_numbers(values: np.ndarray, factor: float | None = None) -> Stamps:
-    """Times from numbers [T], in units of `factor` seconds; None reads Unix time in s, ms, us or ns by its size, and anything smaller as s.
+    """Times from numbers [T], in units of `factor` seconds; None reads Unix time in s, ms, us or ns
+    by its size, and anything smaller as s.
 
     Raises:
         DataError: where a value is not finite.
@@ -61,9 +65,10 @@ def parse_numbers(values: np.ndarray, factor: float | None = None) -> Stamps:
 def parse_texts(texts: np.ndarray, unpadded: bool | None = None) -> Stamps:
     """Times from text [T]: dates with or without a zone, or plain numbers, one style throughout.
 
-    A fraction of a second printed as an integer without its leading zeros (`09.70533347` for 9.070533347 s) is recognised by the whole column: it
-    makes time run backwards where the padded reading does not, or no fraction at all starts with a zero. `unpadded` says what an earlier part of the
-    column was found to be.
+    A fraction of a second printed as an integer without its leading zeros (`09.70533347` for
+    9.070533347 s) is recognised by the whole column: it makes time run backwards where the padded
+    reading does not, or no fraction at all starts with a zero. `unpadded` says what an earlier part
+    of the column was found to be.
 
     Raises:
         DataError: naming the first cell that is no time.
@@ -81,15 +86,30 @@ def parse_texts(texts: np.ndarray, unpadded: bool | None = None) -> Stamps:
         if np.isfinite(numbers).all():
             return parse_numbers(numbers)
     if bad.size:
-        raise DataError(f"'{texts[bad[0]]}' in row {int(bad[0]) + 1} is no time ({bad.size} such cells)")
+        raise DataError(
+            f"'{texts[bad[0]]}' in row {int(bad[0]) + 1} is no time ({bad.size} such cells)"
+        )
     whole = _whole(parts, dated)
     fraction, remarks = _fractions(parts["fraction"], whole, unpadded)
     lost_zeros = bool(remarks) or bool(unpadded)
     if not dated:
-        fraction = np.where(column.str.strip().str.startswith("-").to_numpy(dtype=bool), -fraction, fraction)
-        scale = next((s for s in _SCALES if whole.size and _EPOCH_FROM * s <= abs(int(np.median(whole))) <= _EPOCH_TO * s), None)
+        fraction = np.where(
+            column.str.strip().str.startswith("-").to_numpy(dtype=bool), -fraction, fraction
+        )
+        scale = next(
+            (
+                s
+                for s in _SCALES
+                if whole.size and _EPOCH_FROM * s <= abs(int(np.median(whole))) <= _EPOCH_TO * s
+            ),
+            None,
+        )
         return Stamps(
-            whole * (_NS // (scale or 1)) + fraction // (scale or 1), scale is not None, scale is not None, remarks, bool(remarks) or bool(unpadded)
+            whole * (_NS // (scale or 1)) + fraction // (scale or 1),
+            scale is not None,
+            scale is not None,
+            remarks,
+            bool(remarks) or bool(unpadded),
         )
     zone = parts["zone"].dropna()
     return Stamps(whole * _NS + fraction, True, len(zone) > 0, remarks, lost_zeros)
@@ -103,10 +123,16 @@ def _whole(parts: object, dated: bool) -> np.ndarray:
     if not dated:
         return parts["whole"].astype("int64").to_numpy()
     # a date and a clock time repeat over many rows: parse each once
-    minutes = (parts["date"].str.replace(r"[/.]", "-", regex=True) + " " + parts["clock"]).astype("category")
-    moments = pd.to_datetime(pd.Series(minutes.cat.categories.astype("str")), format="%Y-%m-%d %H:%M:%S", errors="coerce")
+    minutes = (parts["date"].str.replace(r"[/.]", "-", regex=True) + " " + parts["clock"]).astype(
+        "category"
+    )
+    moments = pd.to_datetime(
+        pd.Series(minutes.cat.categories.astype("str")), format="%Y-%m-%d %H:%M:%S", errors="coerce"
+    )
     if moments.isna().any():
-        raise DataError(f"'{minutes.cat.categories[int(np.flatnonzero(moments.isna())[0])]}' is no date")
+        raise DataError(
+            f"'{minutes.cat.categories[int(np.flatnonzero(moments.isna())[0])]}' is no date"
+        )
     seconds = (moments - pd.Timestamp(0)) // pd.Timedelta(seconds=1)
     whole = seconds.to_numpy(dtype=np.int64)[minutes.cat.codes.to_numpy()]
     zone = parts["zone"].fillna("Z").astype("category")
@@ -122,7 +148,9 @@ def _zone_seconds(zone: str) -> int:
     return (1 if zone[0] == "+" else -1) * (3600 * int(digits[:2]) + 60 * int(digits[2:]))
 
 
-def _fractions(column: object, whole: np.ndarray, known: bool | None) -> tuple[np.ndarray, tuple[Remark, ...]]:
+def _fractions(
+    column: object, whole: np.ndarray, known: bool | None
+) -> tuple[np.ndarray, tuple[Remark, ...]]:
     """Fractions of the unit in ns [T] int64."""
     import pandas as pd
 
@@ -145,7 +173,16 @@ def _fractions(column: object, whole: np.ndarray, known: bool | None) -> tuple[n
     unit = {3: "ms", 6: "us", 9: "ns"}[longest]
     changed = int((padded != unpadded).sum())
     text = (
-        f"fractions of seconds are whole {unit} without their leading zeros: {changed} of {whole.size} times are repaired, "
-        f"taken as printed time runs backwards {back[0]} times"
+        f"fractions of seconds are whole {unit} without their leading zeros: {changed} of"
+        f" {whole.size} times are repaired, taken as printed time runs backwards {back[0]} times"
     )
-    return unpadded, (remark("note", "unpadded_fraction", text, repaired=changed, backwards_as_printed=back[0], backwards_repaired=back[1]),)
+    return unpadded, (
+        remark(
+            "note",
+            "unpadded_fraction",
+            text,
+            repaired=changed,
+            backwards_as_printed=back[0],
+            backwards_repaired=back[1],
+        ),
+    )

@@ -1,4 +1,6 @@
-"""What the sea does to a simulated trial: random and constant forces, current, wind with gusts, waves."""
+"""What the sea does to a simulated trial: random and constant forces, current, wind with gusts,
+waves.
+"""
 
 from __future__ import annotations
 
@@ -20,8 +22,9 @@ from residnet.physics.plant import Plant
 class WindField(Config):
     """Mean wind with gusts.
 
-    The gusts along and across the mean wind are independent Ornstein-Uhlenbeck processes, whose one-sided spectrum is the first-order
-    form that Dryden gave the longitudinal turbulence: S(omega) = (2 sigma^2 T / pi) / (1 + (omega T)^2).
+    The gusts along and across the mean wind are independent Ornstein-Uhlenbeck processes, whose
+    one-sided spectrum is the first-order form that Dryden gave the longitudinal turbulence:
+    S(omega) = (2 sigma^2 T / pi) / (1 + (omega T)^2).
 
     Attributes:
         speed: mean true wind speed at the height of the vessel's coefficients.
@@ -40,12 +43,15 @@ class Disturbance(Config):
     """Random and constant forces, a constant current, wind and waves.
 
     Attributes:
-        force_x: standard deviation of an Ornstein-Uhlenbeck force along the hull; force_y and force_n likewise.
+        force_x: standard deviation of an Ornstein-Uhlenbeck force along the hull; force_y and
+            force_n likewise.
         correlation: correlation time of the three processes.
         force_north: constant force towards north; force_east likewise.
         current_north: current, towards north; current_east likewise.
-        current_speed, current_direction: the same current as its speed and where it sets TO, clockwise from north, instead of the two.
-        current_each: slowest and fastest of a further current that each trial has of its own, constant in speed and direction.
+        current_speed, current_direction: the same current as its speed and where it sets TO,
+            clockwise from north, instead of the two.
+        current_each: slowest and fastest of a further current that each trial has of its own,
+            constant in speed and direction.
         wind: mean wind and gusts, for vessels with wind coefficients.
         waves: first-order wave forces.
     """
@@ -60,18 +66,30 @@ class Disturbance(Config):
     current_east: MetresPerSecond = 0.0
     current_speed: MetresPerSecond | None = Field(default=None, ge=0)
     current_direction: Radians | None = None
-    current_each: tuple[Annotated[MetresPerSecond, Field(ge=0)], Annotated[MetresPerSecond, Field(ge=0)]] | None = None
+    current_each: (
+        tuple[Annotated[MetresPerSecond, Field(ge=0)], Annotated[MetresPerSecond, Field(ge=0)]]
+        | None
+    ) = None
     wind: WindField | None = None
     waves: WavesConfig | None = None
 
     @model_validator(mode="after")
     def _one_current(self) -> Disturbance:
         if (self.current_speed is None) != (self.current_direction is None):
-            raise ValueError("current_speed and current_direction belong together; give both, or current_north and current_east")
+            raise ValueError(
+                "current_speed and current_direction belong together; give both, or current_north"
+                " and current_east"
+            )
         if self.current_speed is not None and (self.current_north or self.current_east):
-            raise ValueError("the current is given twice; give current_speed and current_direction, or current_north and current_east")
+            raise ValueError(
+                "the current is given twice; give current_speed and current_direction, or"
+                " current_north and current_east"
+            )
         if self.current_each is not None and self.current_each[0] > self.current_each[1]:
-            raise ValueError(f"current_each: the slowest ({self.current_each[0]:g} m/s) is faster than the fastest ({self.current_each[1]:g} m/s)")
+            raise ValueError(
+                f"current_each: the slowest ({self.current_each[0]:g} m/s) is faster than the"
+                f" fastest ({self.current_each[1]:g} m/s)"
+            )
         return self
 
     def currents(self, rows: int, seed: int) -> np.ndarray:
@@ -79,7 +97,10 @@ class Disturbance(Config):
         out = np.tile(self.current(), (rows, 1))
         if self.current_each is not None:
             random = np.random.default_rng([seed, 7])
-            speed, direction = random.uniform(*self.current_each, rows), random.uniform(0.0, 2.0 * np.pi, rows)
+            speed, direction = (
+                random.uniform(*self.current_each, rows),
+                random.uniform(0.0, 2.0 * np.pi, rows),
+            )
             out += speed[:, None] * np.stack((np.cos(direction), np.sin(direction)), axis=1)
         return out
 
@@ -87,7 +108,9 @@ class Disturbance(Config):
         """The current of all trials towards north and east in m/s."""
         if self.current_speed is None or self.current_direction is None:
             return self.current_north, self.current_east
-        return self.current_speed * float(np.cos(self.current_direction)), self.current_speed * float(np.sin(self.current_direction))
+        return self.current_speed * float(
+            np.cos(self.current_direction)
+        ), self.current_speed * float(np.sin(self.current_direction))
 
     @property
     def logged(self) -> tuple[str, ...]:
@@ -95,7 +118,9 @@ class Disturbance(Config):
         return WIND_INPUTS if self.wind is not None else ()
 
     def needs(self) -> dict[str, str]:
-        """Inputs that a plant must have for this disturbance to reach it, each with the key that asks for it."""
+        """Inputs that a plant must have for this disturbance to reach it, each with the key that
+        asks for it.
+        """
         north, east = self.current()
         asked = {
             "force_x": self.force_x != 0, "force_y": self.force_y != 0, "force_n": self.force_n != 0,
@@ -104,7 +129,11 @@ class Disturbance(Config):
         }  # fmt: skip
         needs = {name: name for name, wanted in asked.items() if wanted}
         needs |= dict.fromkeys(WIND_INPUTS, "wind") if self.wind is not None else {}
-        return needs | (dict.fromkeys(("force_x", "force_y", "force_n"), "waves") if self.waves is not None else {})
+        return needs | (
+            dict.fromkeys(("force_x", "force_y", "force_n"), "waves")
+            if self.waves is not None
+            else {}
+        )
 
     def check(self, plant: Plant, vessel: str) -> None:
         """Stop where a plant cannot feel this disturbance.
@@ -115,22 +144,49 @@ class Disturbance(Config):
         for name, key in self.needs().items():
             if name not in plant.inputs:
                 hint = "; give its vessel file a section 'wind'" if key == "wind" else ""
-                raise ConfigError(f"disturbance.{key}: vessel '{vessel}' has no input '{name}'{hint}; it has {', '.join(plant.inputs)}")
+                raise ConfigError(
+                    f"disturbance.{key}: vessel '{vessel}' has no input '{name}'{hint}; it has"
+                    f" {', '.join(plant.inputs)}"
+                )
         if self.waves is not None and not {"x", "y", "psi"} <= set(plant.state):
-            raise ConfigError(f"disturbance.waves: vessel '{vessel}' has no position in its state; waves need x, y, psi")
+            raise ConfigError(
+                f"disturbance.waves: vessel '{vessel}' has no position in its state; waves need x,"
+                " y, psi"
+            )
 
-    def series(self, plant: Plant, rows: int, steps: int, step: float, seed: int, random: np.random.Generator) -> np.ndarray:
-        """Inputs of the plant [B, T, m] with the commands zero, of all that does not depend on where the vessel is.
+    def series(
+        self,
+        plant: Plant,
+        rows: int,
+        steps: int,
+        step: float,
+        seed: int,
+        random: np.random.Generator,
+    ) -> np.ndarray:
+        """Inputs of the plant [B, T, m] with the commands zero, of all that does not depend on
+        where the vessel is.
 
-        The random forces are drawn from `random` (three values per step whatever their sizes, so that data of one seed stay the
-        same), the gusts from generators of their own under `seed`.
+        The random forces are drawn from `random` (three values per step whatever their sizes, so
+        that data of one seed stay the same), the gusts from generators of their own under `seed`.
         """
-        forces = ornstein_uhlenbeck(random, (rows, steps, 3), step, self.correlation) * [self.force_x, self.force_y, self.force_n]
-        values: dict[str, np.ndarray | float] = {name: forces[:, :, j] for j, name in enumerate(("force_x", "force_y", "force_n"))}
+        forces = ornstein_uhlenbeck(random, (rows, steps, 3), step, self.correlation) * [
+            self.force_x,
+            self.force_y,
+            self.force_n,
+        ]
+        values: dict[str, np.ndarray | float] = {
+            name: forces[:, :, j] for j, name in enumerate(("force_x", "force_y", "force_n"))
+        }
         values["current_north"], values["current_east"] = self.currents(rows, seed).T[:, :, None]
         values |= {"force_north": self.force_north, "force_east": self.force_east}
         if self.wind is not None:
-            values |= dict(zip(WIND_INPUTS, gusty_wind(self.wind, rows, steps, step, np.random.default_rng([seed, 4])), strict=True))
+            values |= dict(
+                zip(
+                    WIND_INPUTS,
+                    gusty_wind(self.wind, rows, steps, step, np.random.default_rng([seed, 4])),
+                    strict=True,
+                )
+            )
         w = np.zeros((rows, steps, len(plant.inputs)))
         for j, name in enumerate(plant.inputs):
             if name in values:
@@ -146,7 +202,9 @@ class Disturbance(Config):
 
 @final
 class Seaway(Source):
-    """Adds the waves' forces, where the vessel is at the start of each step and held over it, to the inputs of another source."""
+    """Adds the waves' forces, where the vessel is at the start of each step and held over it, to
+    the inputs of another source.
+    """
 
     def __init__(self, source: Source, waves: Waves, plant: Plant, step: float) -> None:
         super().__init__()
@@ -170,7 +228,9 @@ class Seaway(Source):
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Inputs [B, m] with the force of the waves at the time of step k."""
         acting, memory = self.source(x, w, k, memory)
-        force = self.waves(x[:, self.place[0]], x[:, self.place[1]], x[:, self.place[2]], k * self.step)
+        force = self.waves(
+            x[:, self.place[0]], x[:, self.place[1]], x[:, self.place[2]], k * self.step
+        )
         return acting + (force @ self.spread).to(acting.dtype), memory
 
     def finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
@@ -178,7 +238,9 @@ class Seaway(Source):
         return self.source.finished(x, k, memory)
 
 
-def ornstein_uhlenbeck(random: np.random.Generator, shape: tuple[int, int, int], step: float, correlation: float) -> np.ndarray:
+def ornstein_uhlenbeck(
+    random: np.random.Generator, shape: tuple[int, int, int], step: float, correlation: float
+) -> np.ndarray:
     """Stationary first-order processes [B, T, k] of unit variance along T, discretised exactly."""
     from scipy.signal import lfilter
 
@@ -189,8 +251,12 @@ def ornstein_uhlenbeck(random: np.random.Generator, shape: tuple[int, int, int],
     return out
 
 
-def gusty_wind(wind: WindField, rows: int, steps: int, step: float, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Speed [B, T] in m/s and direction [B, T] in rad (where it comes from) of the mean wind with its gusts."""
+def gusty_wind(
+    wind: WindField, rows: int, steps: int, step: float, random: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Speed [B, T] in m/s and direction [B, T] in rad (where it comes from) of the mean wind with
+    its gusts.
+    """
     gust = wind.gust * ornstein_uhlenbeck(random, (rows, steps, 2), step, wind.correlation)
     along = wind.speed + gust[:, :, 0]
     return np.hypot(along, gust[:, :, 1]), wind.direction + np.arctan2(gust[:, :, 1], along)

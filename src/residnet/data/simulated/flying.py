@@ -1,4 +1,6 @@
-"""Flying manoeuvres with a plant or a learned model: the motion itself, and the logs that sensors would make of it."""
+"""Flying manoeuvres with a plant or a learned model: the motion itself, and the logs that sensors
+would make of it.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +49,8 @@ class Sea:
     """What surrounds a craft, and what measures it.
 
     Attributes:
-        plant: whose inputs the disturbance is laid out for; None for a model without a vessel, which feels the wind alone.
+        plant: whose inputs the disturbance is laid out for; None for a model without a vessel,
+            which feels the wind alone.
         disturbance: forces, current, wind, waves.
         noise: of the sensors.
         seed: of everything random in both.
@@ -66,8 +69,8 @@ class Flight:
     Attributes:
         manoeuvre: what was to be flown.
         motion: the motion itself.
-        log: what sensors measured of it. Its meta says `timed_out` where the stop condition was not reached, `diverged` where the motion
-            ceased to be finite; both logs end there.
+        log: what sensors measured of it. Its meta says `timed_out` where the stop condition was not
+            reached, `diverged` where the motion ceased to be finite; both logs end there.
     """
 
     manoeuvre: Manoeuvre
@@ -80,7 +83,11 @@ class Flight:
         seconds = f"{self.motion.t[-1] - self.motion.t[0]:.5g} s"
         if self.log.meta.get("diverged"):
             return f"the motion was no longer finite after {seconds}"
-        return f"timed out after {seconds} before {self.manoeuvre.goal}" if self.log.meta.get("timed_out") else None
+        return (
+            f"timed out after {seconds} before {self.manoeuvre.goal}"
+            if self.log.meta.get("timed_out")
+            else None
+        )
 
 
 def source_of(manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
@@ -90,11 +97,19 @@ def source_of(manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
         UsageError: where the vessel lacks what a manoeuvre needs.
     """
     runs = [list(members) for _, members in groupby(manoeuvres, key=lambda m: m.kind)]
-    return StackedSource([type(members[0]).source(members, helm, t) for members in runs], [len(members) for members in runs])
+    return StackedSource(
+        [type(members[0]).source(members, helm, t) for members in runs],
+        [len(members) for members in runs],
+    )
 
 
 def fly(
-    craft: Craft, manoeuvres: Sequence[Manoeuvre], sea: Sea, duration: float, step: float, about: Mapping[str, Any] | None = None
+    craft: Craft,
+    manoeuvres: Sequence[Manoeuvre],
+    sea: Sea,
+    duration: float,
+    step: float,
+    about: Mapping[str, Any] | None = None,
 ) -> list[Flight]:
     """Fly the manoeuvres in one batch.
 
@@ -115,14 +130,24 @@ def fly(
     steps = max(lengths)
     t = torch.arange(steps, dtype=torch.float64) * step
     random = np.random.default_rng([sea.seed, 3])
-    source, w = source_of(manoeuvres, craft.helm, t), _surroundings(sea, craft, rows, steps, step, random)
+    source, w = (
+        source_of(manoeuvres, craft.helm, t),
+        _surroundings(sea, craft, rows, steps, step, random),
+    )
     if sea.plant is not None:
         source = sea.disturbance.surround(source, sea.plant, rows, step, sea.seed)
     watched = Watched(source, rows)
     starts = craft.start.expand(rows, -1)
-    start = torch.stack([manoeuvre.begin(x, craft.helm.state) for manoeuvre, x in zip(manoeuvres, starts, strict=True)])
+    start = torch.stack(
+        [
+            manoeuvre.begin(x, craft.helm.state)
+            for manoeuvre, x in zip(manoeuvres, starts, strict=True)
+        ]
+    )
     with torch.no_grad():
-        states, inputs, _ = Rollout(craft.dynamics, watched)(start, w, craft.dynamics.initial_state(rows).to(w.dtype))
+        states, inputs, _ = Rollout(craft.dynamics, watched)(
+            start, w, craft.dynamics.initial_state(rows).to(w.dtype)
+        )
     noise = random.standard_normal((rows, steps, 3)) * [sea.noise.u, sea.noise.v, sea.noise.r]
     names = log_names(manoeuvres)
     out = []
@@ -131,16 +156,28 @@ def fly(
         reached = 0 <= stopped < lengths[i]
         length = stopped + 1 if reached else lengths[i]
         finite = np.isfinite(states[i, :length].numpy()).all(axis=1)
-        meta: dict[str, Any] = {**(about or {}), "demand": manoeuvre.model_dump(mode="json"), "seed": sea.seed}
+        meta: dict[str, Any] = {
+            **(about or {}),
+            "demand": manoeuvre.model_dump(mode="json"),
+            "seed": sea.seed,
+        }
         if not finite.all():
             length, meta["diverged"] = int(np.argmin(finite)), True
         elif manoeuvre.goal is not None and not reached:
             meta["timed_out"] = True
         if length < 2:
-            raise DataError(f"{craft.name}, {names[i]}: the motion is not finite from its first step on")
-        clean = {n: states[i, :length, j].numpy().copy() for j, n in enumerate(craft.helm.state) if not n.startswith("_")}
+            raise DataError(
+                f"{craft.name}, {names[i]}: the motion is not finite from its first step on"
+            )
+        clean = {
+            n: states[i, :length, j].numpy().copy()
+            for j, n in enumerate(craft.helm.state)
+            if not n.startswith("_")
+        }
         known = [*craft.helm.inputs[: craft.commands], *sea.disturbance.logged]
-        clean |= {name: inputs[i, :length, craft.helm.inputs.index(name)].numpy().copy() for name in known}
+        clean |= {
+            name: inputs[i, :length, craft.helm.inputs.index(name)].numpy().copy() for name in known
+        }
         time = t[:length].numpy().copy()
         measured = sea.noise.measured(clean, time, noise[i, :length], (sea.seed, 6, i))
         units = {name: CHANNEL_UNITS.get(name, "-") for name in clean}
@@ -149,13 +186,19 @@ def fly(
     return out
 
 
-def _surroundings(sea: Sea, craft: Craft, rows: int, steps: int, step: float, random: np.random.Generator) -> Tensor:
+def _surroundings(
+    sea: Sea, craft: Craft, rows: int, steps: int, step: float, random: np.random.Generator
+) -> Tensor:
     """Inputs [B, T, m] with the commands zero."""
     if sea.plant is not None:
-        return torch.from_numpy(sea.disturbance.series(sea.plant, rows, steps, step, sea.seed, random))
+        return torch.from_numpy(
+            sea.disturbance.series(sea.plant, rows, steps, step, sea.seed, random)
+        )
     w = torch.zeros(rows, steps, len(craft.helm.inputs), dtype=torch.float64)
     if sea.disturbance.wind is not None:
-        wind = gusty_wind(sea.disturbance.wind, rows, steps, step, np.random.default_rng([sea.seed, 4]))
+        wind = gusty_wind(
+            sea.disturbance.wind, rows, steps, step, np.random.default_rng([sea.seed, 4])
+        )
         for name, values in zip(WIND_INPUTS, wind, strict=True):
             w[:, :, craft.helm.inputs.index(name)] = torch.from_numpy(values)
     return w

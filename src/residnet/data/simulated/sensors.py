@@ -16,9 +16,11 @@ class Sensor(Config):
     """What one channel's sensor does to it.
 
     Attributes:
-        noise: standard deviation of white noise, in the channel's unit (`0.5 deg`); not for u, v, r, which have theirs beside `sensors`.
+        noise: standard deviation of white noise, in the channel's unit (`0.5 deg`); not for u, v,
+            r, which have theirs beside `sensors`.
         bias: constant error, in the channel's unit.
-        interval: time between its samples, a multiple of the log's step; the channel is empty in between. None: every sample of the log.
+        interval: time between its samples, a multiple of the log's step; the channel is empty in
+            between. None: every sample of the log.
         latency: age of what it reports: the log shows at t what was at t - latency.
     """
 
@@ -29,7 +31,9 @@ class Sensor(Config):
 
 
 class SensorNoise(Config):
-    """Standard deviations of white noise on the measured velocities; all else is measured exactly unless `sensors` says otherwise."""
+    """Standard deviations of white noise on the measured velocities; all else is measured exactly
+    unless `sensors` says otherwise.
+    """
 
     u: MetresPerSecond = Field(default=0.03, ge=0)
     v: MetresPerSecond = Field(default=0.03, ge=0)
@@ -48,27 +52,45 @@ class SensorNoise(Config):
             except ValueError as error:
                 raise ValueError(f"sensors.{name}: {error}") from None
             if noise < 0:
-                raise ValueError(f"sensors.{name}.noise: a standard deviation must not be negative, given {noise:g}")
+                raise ValueError(
+                    f"sensors.{name}.noise: a standard deviation must not be negative, given"
+                    f" {noise:g}"
+                )
             if noise and name in VELOCITY:
-                raise ValueError(f"sensors.{name}.noise: the white noise of {name} is given as noise.{name}")
+                raise ValueError(
+                    f"sensors.{name}.noise: the white noise of {name} is given as noise.{name}"
+                )
             converted[name] = sensor.model_copy(update={"noise": noise, "bias": bias})
         object.__setattr__(self, "sensors", converted)
         return self
 
     def check(self, channels: tuple[str, ...], step: float, vessel: str) -> None:
-        """Stop where a sensor measures what the log does not have, or samples between the log's samples.
+        """Stop where a sensor measures what the log does not have, or samples between the log's
+        samples.
 
         Raises:
             ConfigError: naming the sensor.
         """
         for name, sensor in self.sensors.items():
             if name not in channels:
-                raise ConfigError(f"noise.sensors: vessel '{vessel}' has no channel '{name}'{nearest(name, channels)}")
+                raise ConfigError(
+                    f"noise.sensors: vessel '{vessel}' has no channel"
+                    f" '{name}'{nearest(name, channels)}"
+                )
             every = 1.0 if sensor.interval is None else sensor.interval / step
             if round(every) < 1 or abs(every - round(every)) > 1e-6 * every:
-                raise ConfigError(f"noise.sensors.{name}.interval: {sensor.interval:g} s is not a multiple of the log's step, {step:g} s")
+                raise ConfigError(
+                    f"noise.sensors.{name}.interval: {sensor.interval:g} s is not a multiple of the"
+                    f" log's step, {step:g} s"
+                )
 
-    def measured(self, clean: Mapping[str, np.ndarray], t: np.ndarray, white: np.ndarray, seed: tuple[int, ...]) -> dict[str, np.ndarray]:
+    def measured(
+        self,
+        clean: Mapping[str, np.ndarray],
+        t: np.ndarray,
+        white: np.ndarray,
+        seed: tuple[int, ...],
+    ) -> dict[str, np.ndarray]:
         """What the log holds.
 
         Args:
@@ -80,16 +102,30 @@ class SensorNoise(Config):
         out = {}
         for name, truth in clean.items():
             sensor = self.sensors.get(name)
-            values = truth if sensor is None or sensor.latency == 0 else np.interp(t - sensor.latency, t, truth)
+            values = (
+                truth
+                if sensor is None or sensor.latency == 0
+                else np.interp(t - sensor.latency, t, truth)
+            )
             if name in VELOCITY:
                 values = values + white[:, VELOCITY.index(name)]
-            out[name] = values.copy() if sensor is None else _sampled(sensor, values, t, (*seed, *name.encode()))
+            out[name] = (
+                values.copy()
+                if sensor is None
+                else _sampled(sensor, values, t, (*seed, *name.encode()))
+            )
         return out
 
 
-def _sampled(sensor: Sensor, values: np.ndarray, t: np.ndarray, seed: tuple[int, ...]) -> np.ndarray:
+def _sampled(
+    sensor: Sensor, values: np.ndarray, t: np.ndarray, seed: tuple[int, ...]
+) -> np.ndarray:
     """With bias and noise, NaN where the sensor takes no sample."""
-    out: np.ndarray = values + float(sensor.bias) + float(sensor.noise) * np.random.default_rng(seed).standard_normal(t.size)
+    out: np.ndarray = (
+        values
+        + float(sensor.bias)
+        + float(sensor.noise) * np.random.default_rng(seed).standard_normal(t.size)
+    )
     if sensor.interval is not None:
         every = round(sensor.interval / float(t[1] - t[0]))
         out[np.arange(t.size) % every != 0] = np.nan

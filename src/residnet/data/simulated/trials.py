@@ -1,4 +1,6 @@
-"""Simulated sea trials: a plant, a programme of manoeuvres, disturbances and sensors, all in one batch."""
+"""Simulated sea trials: a plant, a programme of manoeuvres, disturbances and sensors, all in one
+batch.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,8 @@ from residnet.physics.vessel import VesselName, load_vessel
 
 
 class SimulatedTrials(Config):
-    """A programme of sea trials on a simulated vessel, from rest (a model that only holds near its service speed starts there).
+    """A programme of sea trials on a simulated vessel, from rest (a model that only holds near its
+    service speed starts there).
 
     Attributes:
         vessel: name of a vessel of residnet, or path of a vessel file.
@@ -29,8 +32,9 @@ class SimulatedTrials(Config):
         duration: of each manoeuvre.
         step: sampling interval of the logs.
         substeps: steps of the plant within one sampling interval.
-        identification: number of manoeuvres of each kind that models may be fitted on, drawn by `seed`; kinds that are not named
-            are for identification altogether. The rest is the test set.
+        identification: number of manoeuvres of each kind that models may be fitted on, drawn by
+            `seed`; kinds that are not named are for identification altogether. The rest is the test
+            set.
         validation: how many of those are kept back to choose between models.
         seed: of everything random in the data (the run's own seed moves only the training).
     """
@@ -52,9 +56,17 @@ class SimulatedTrials(Config):
         try:
             plant = load_vessel(self.vessel).build()
             # actuators with dead time move by a step of their own
-            plant.settle(plant.approach(1), torch.zeros(1, len(plant.inputs), dtype=torch.float64), self.step / self.substeps)
+            plant.settle(
+                plant.approach(1),
+                torch.zeros(1, len(plant.inputs), dtype=torch.float64),
+                self.step / self.substeps,
+            )
             self.disturbance.check(plant, self.vessel)
-            self.noise.check((*plant.state, *plant.inputs[: plant.commands], *self.disturbance.logged), self.step, self.vessel)
+            self.noise.check(
+                (*plant.state, *plant.inputs[: plant.commands], *self.disturbance.logged),
+                self.step,
+                self.vessel,
+            )
         except ConfigError as error:
             raise ValueError(str(error)) from None
         return self
@@ -62,7 +74,9 @@ class SimulatedTrials(Config):
     def draw(self) -> list[Manoeuvre]:
         """The manoeuvres, by family."""
         random = np.random.default_rng([self.seed, 1])
-        return [manoeuvre for family in self.trials for manoeuvre in family.draw(random, self.duration)]
+        return [
+            manoeuvre for family in self.trials for manoeuvre in family.draw(random, self.duration)
+        ]
 
     def splits(self, manoeuvres: Sequence[Manoeuvre]) -> list[str]:
         """`train`, `validation` or `test` of each manoeuvre; whole manoeuvres only.
@@ -77,7 +91,8 @@ class SimulatedTrials(Config):
             kept = self.validation.get(kind, 0)
             if not 0 < count < len(members) or not 0 <= kept < count:
                 raise ValueError(
-                    f"{count} of {len(members)} '{kind}' manoeuvres for identification, {kept} of them for validation: leaves a split empty"
+                    f"{count} of {len(members)} '{kind}' manoeuvres for identification, {kept} of"
+                    " them for validation: leaves a split empty"
                 )
             order = random.permutation(members)
             for i in order[:kept]:
@@ -88,9 +103,11 @@ class SimulatedTrials(Config):
 
 
 def fly_trials(manoeuvres: Sequence[Manoeuvre], config: SimulatedTrials) -> list[Flight]:
-    """Fly the manoeuvres in one batch: the motion itself, and the logs of it as sensors would measure it.
+    """Fly the manoeuvres in one batch: the motion itself, and the logs of it as sensors would
+    measure it.
 
-    Channels: the plant's state (for the WAM-V x, y, psi, u, v, r, n_port, n_stbd), the commands, and the true wind where there is any. Float64.
+    Channels: the plant's state (for the WAM-V x, y, psi, u, v, r, n_port, n_stbd), the commands,
+    and the true wind where there is any. Float64.
     """
     plant = load_vessel(config.vessel).build()
     craft = trials_craft(config)
@@ -101,7 +118,13 @@ def fly_trials(manoeuvres: Sequence[Manoeuvre], config: SimulatedTrials) -> list
 def trials_craft(config: SimulatedTrials) -> Craft:
     """The vessel of the trials."""
     plant = load_vessel(config.vessel).build()
-    return Craft(config.vessel, PlantDynamics(plant, config.step, config.substeps), Helm.of(plant), plant.commands, plant.approach(1))
+    return Craft(
+        config.vessel,
+        PlantDynamics(plant, config.step, config.substeps),
+        Helm.of(plant),
+        plant.commands,
+        plant.approach(1),
+    )
 
 
 def simulate(manoeuvres: Sequence[Manoeuvre], config: SimulatedTrials) -> list[Log]:

@@ -1,4 +1,6 @@
-"""Chapter 5 of document 000 (Halvorsen 2019): the mass-spring-damper that genetic programming is tried on, with noise, and how often it is found."""
+"""Chapter 5 of document 000 (Halvorsen 2019): the mass-spring-damper that genetic programming is
+tried on, with noise, and how often it is found.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,8 @@ Record = dict[str, np.ndarray]
 
 
 class RecordConfig(Config):
-    """A record of the mass-spring-damper under a square wave of the force, from rest (section 5.3.1, Figure 5.3).
+    """A record of the mass-spring-damper under a square wave of the force, from rest (section
+    5.3.1, Figure 5.3).
 
     Attributes:
         system: mass, damping, stiffness and amplitude of the force.
@@ -39,7 +42,9 @@ class RecordConfig(Config):
     test_period: Seconds = Field(default=10.0, gt=0)
 
     def record(self, period: float) -> Record:
-        """Displacement x, its rate u, the force tau_x and the acceleration u_dot, [N] each, without noise."""
+        """Displacement x, its rate u, the force tau_x and the acceleration u_dot, [N] each, without
+        noise.
+        """
         from scipy.linalg import expm
 
         m, d, k = (getattr(self.system, name).value for name in ("m", "d", "k"))
@@ -74,12 +79,19 @@ class NoiseConfig(Config):
     def added(self, record: Record, random: np.random.Generator) -> Record:
         """The record with noise."""
         noisy = {"output": ("u_dot",), "inputs": CHANNELS, "all": (*CHANNELS, "u_dot")}[self.on]
-        return {name: v + self.factor * np.ptp(v) * random.uniform(-1, 1, len(v)) if name in noisy else v for name, v in record.items()}
+        return {
+            name: (
+                v + self.factor * np.ptp(v) * random.uniform(-1, 1, len(v)) if name in noisy else v
+            )
+            for name, v in record.items()
+        }
 
 
 @dataclass(frozen=True)
 class Trial:
-    """One run: mean square error on the test record without noise, whether the terms are the true ones, and the equation."""
+    """One run: mean square error on the test record without noise, whether the terms are the true
+    ones, and the equation.
+    """
 
     error: float
     right: bool
@@ -100,24 +112,46 @@ def attempt(record: RecordConfig, noise: NoiseConfig, head: GeneticConfig, seed:
     train = ~validating(np.zeros(len(clean["x"]), dtype=int), head.validate_every)
     bred = breed(algebra, data, data["u_dot"], train, head, seed)
     test = record.record(record.test_period)
-    predicted = np.array(bred.values) @ algebra.values(bred.products, test) if bred.products else np.zeros(len(test["x"]))
+    predicted = (
+        np.array(bred.values) @ algebra.values(bred.products, test)
+        if bred.products
+        else np.zeros(len(test["x"]))
+    )
     names = tuple(term(algebra, product) for product in bred.products)
-    return Trial(float(np.square(predicted - test["u_dot"]).mean()), set(names) == set(record.truth()), names, bred.values)
+    return Trial(
+        float(np.square(predicted - test["u_dot"]).mean()),
+        set(names) == set(record.truth()),
+        names,
+        bred.values,
+    )
 
 
-def as_text(rows: Sequence[Mapping[str, Any]], keys: tuple[str, str], repeats: int, threshold: float) -> str:
-    """A table of cells: how many of the runs came below the threshold, with the published number where there is one, and the mean error."""
+def as_text(
+    rows: Sequence[Mapping[str, Any]], keys: tuple[str, str], repeats: int, threshold: float
+) -> str:
+    """A table of cells: how many of the runs came below the threshold, with the published number
+    where there is one, and the mean error.
+    """
     first, second = ([*dict.fromkeys(row[axis] for row in rows)] for axis in ("row", "column"))
     cells = {(row["row"], row["column"]): row for row in rows}
     out = [
-        f"Runs of {repeats} with a mean square error below {threshold:g} (published in brackets); right terms; mean square error on average; "
-        f"rows: {keys[0]}, columns: {keys[1]}.",
+        (
+            f"Runs of {repeats} with a mean square error below {threshold:g} (published in"
+            f" brackets); right terms; mean square error on average; rows: {keys[0]}, columns:"
+            f" {keys[1]}."
+        ),
         "",
-        "| | " + " | ".join(f"{value:g}" if isinstance(value, float) else str(value) for value in second) + " |",
+        "| | "
+        + " | ".join(f"{value:g}" if isinstance(value, float) else str(value) for value in second)
+        + " |",
         "|---" * (len(second) + 1) + "|",
     ]
     for value in first:
-        out.append(f"| {value} | " + " | ".join(_cell(cells.get((value, other))) for other in second) + " |")
+        out.append(
+            f"| {value} | "
+            + " | ".join(_cell(cells.get((value, other))) for other in second)
+            + " |"
+        )
     return "\n".join(out) + "\n"
 
 
@@ -128,7 +162,9 @@ def _cell(row: Mapping[str, Any] | None) -> str:
     return f"{row['found']}{published}; {row['right']}; {row['error']:.1e}"
 
 
-def draw(rows: Sequence[Mapping[str, Any]], keys: tuple[str, str], repeats: int, file: Path) -> None:
+def draw(
+    rows: Sequence[Mapping[str, Any]], keys: tuple[str, str], repeats: int, file: Path
+) -> None:
     """Found runs over the columns, one line for each row; published ones dotted."""
     from matplotlib import rc_context
 
@@ -140,12 +176,32 @@ def draw(rows: Sequence[Mapping[str, Any]], keys: tuple[str, str], repeats: int,
         for number, value in enumerate(dict.fromkeys(row["row"] for row in rows)):
             own = [row for row in rows if row["row"] == value]
             x = range(len(own))
-            axes.plot(x, [row["found"] for row in own], marker="o", markersize=3, color=f"C{number}", label=str(value))
+            axes.plot(
+                x,
+                [row["found"] for row in own],
+                marker="o",
+                markersize=3,
+                color=f"C{number}",
+                label=str(value),
+            )
             if all(row["published_found"] is not None for row in own):
-                axes.plot(x, [row["published_found"] for row in own], linestyle=":", color=f"C{number}")
-        longest = max(([row["column"] for row in rows if row["row"] == value] for value in {row["row"] for row in rows}), key=len)
+                axes.plot(
+                    x, [row["published_found"] for row in own], linestyle=":", color=f"C{number}"
+                )
+        longest = max(
+            (
+                [row["column"] for row in rows if row["row"] == value]
+                for value in {row["row"] for row in rows}
+            ),
+            key=len,
+        )
         axes.set_xticks(range(len(longest)), [str(value) for value in longest])
         axes.set_xlabel(keys[1])
         axes.set_ylabel(f"found, of {repeats}")
         axes.legend(title=keys[0], ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.0))
-        save(figure, file, "Equations found", "Runs below the error threshold: ours (lines), published (dotted).")
+        save(
+            figure,
+            file,
+            "Equations found",
+            "Runs below the error threshold: ours (lines), published (dotted).",
+        )

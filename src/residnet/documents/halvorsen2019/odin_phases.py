@@ -1,4 +1,6 @@
-"""The standard model of Odin against equations found from the data, in the displacement phase and in all phases (document 000, section 7.5)."""
+"""The standard model of Odin against equations found from the data, in the displacement phase and
+in all phases (document 000, section 7.5).
+"""
 
 from __future__ import annotations
 
@@ -13,8 +15,21 @@ from pydantic import Field, model_validator
 from residnet.core.config import Config
 from residnet.core.errors import ConfigError
 from residnet.core.names import VELOCITY, nearest
-from residnet.documents.halvorsen2019.sea_trial import CHANNELS, CONTROLS, FORCES, Trial, TrialConfig, odin, sail
-from residnet.documents.halvorsen2019.standard_model import StandardFit, StandardFitConfig, fit, truth
+from residnet.documents.halvorsen2019.sea_trial import (
+    CHANNELS,
+    CONTROLS,
+    FORCES,
+    Trial,
+    TrialConfig,
+    odin,
+    sail,
+)
+from residnet.documents.halvorsen2019.standard_model import (
+    StandardFit,
+    StandardFitConfig,
+    fit,
+    truth,
+)
 from residnet.heads.base import ClosedFormHead
 from residnet.heads.genetic import GeneticConfig
 from residnet.heads.symbolic import SymbolicConfig
@@ -36,7 +51,8 @@ class BlackConfig(Config):
     """An equation of the accelerations from the data alone.
 
     Attributes:
-        inputs: `forces` of the jets by their known thrust, or `controls`, motor speed and nozzle angle.
+        inputs: `forces` of the jets by their known thrust, or `controls`, motor speed and nozzle
+            angle.
         head: how the equation is found.
     """
 
@@ -107,7 +123,10 @@ class PhasesSettings(Config):
                 raise ValueError(f"published: no set '{where}'{nearest(where, SETS)}")
             for model in models:
                 if model not in (STANDARD, *self.equations):
-                    raise ValueError(f"published.{where}: no model '{model}'{nearest(model, (STANDARD, *self.equations))}")
+                    raise ValueError(
+                        f"published.{where}: no model"
+                        f" '{model}'{nearest(model, (STANDARD, *self.equations))}"
+                    )
         for name, equation in self.equations.items():
             try:
                 equation.build()
@@ -118,7 +137,9 @@ class PhasesSettings(Config):
 
 @dataclass(frozen=True)
 class Fitted:
-    """A model fitted on one set: its prediction at all samples [N, 3], the number of parameters of each axis, and what there is to say."""
+    """A model fitted on one set: its prediction at all samples [N, 3], the number of parameters of
+    each axis, and what there is to say.
+    """
 
     predicted: np.ndarray
     freedom: tuple[float, ...]
@@ -156,7 +177,11 @@ def study(settings: PhasesSettings) -> dict[str, PhaseStudy]:
 def one_trial(settings: PhasesSettings, config: SeaTrialConfig) -> PhaseStudy:
     """Sail a trial, fit and judge; see `study`."""
     trial = sail(config.vessel, config)
-    sets = {name: keep for name, keep in _sets(trial).items() if min((keep & ~trial.validates).sum(), (keep & trial.validates).sum()) >= _FEWEST}
+    sets = {
+        name: keep
+        for name, keep in _sets(trial).items()
+        if min((keep & ~trial.validates).sum(), (keep & trial.validates).sum()) >= _FEWEST
+    }
     z, a = trial.samples.z.numpy(), trial.samples.target.numpy()
     standard, models = {}, {}
     for name, keep in sets.items():
@@ -168,11 +193,19 @@ def one_trial(settings: PhasesSettings, config: SeaTrialConfig) -> PhaseStudy:
             models[equation, name] = _found(black, trial, own)
     if settings.separate:
         models |= _separate(models, sets, trial)
-    return PhaseStudy(trial, standard, truth(odin(config.vessel), settings.standard.mass), models, _judged(config, trial, sets, models))
+    return PhaseStudy(
+        trial,
+        standard,
+        truth(odin(config.vessel), settings.standard.mass),
+        models,
+        _judged(config, trial, sets, models),
+    )
 
 
 def _sets(trial: Trial) -> dict[str, np.ndarray]:
-    return {phase: trial.phase == number for number, phase in enumerate(PHASES)} | {ALL: np.ones(len(trial.phase), dtype=bool)}
+    return {phase: trial.phase == number for number, phase in enumerate(PHASES)} | {
+        ALL: np.ones(len(trial.phase), dtype=bool)
+    }
 
 
 def _found(config: BlackConfig, trial: Trial, own: np.ndarray) -> Fitted:
@@ -182,39 +215,67 @@ def _found(config: BlackConfig, trial: Trial, own: np.ndarray) -> Fitted:
     notes = head.solve(seen)
     with torch.no_grad():
         predicted = head(trial.samples.z, trial.samples.z[:, :0])[0].numpy()
-    return Fitted(predicted, tuple(head.freedom()), {"equations": {axis: own["text"] for axis, own in notes["equations"].items()}})
+    return Fitted(
+        predicted,
+        tuple(head.freedom()),
+        {"equations": {axis: own["text"] for axis, own in notes["equations"].items()}},
+    )
 
 
-def _separate(models: Mapping[tuple[str, str], Fitted], sets: Mapping[str, np.ndarray], trial: Trial) -> dict[tuple[str, str], Fitted]:
-    """Of each kind of model one that takes, at each sample, the one fitted on its phase (where a phase has none, the one of all phases)."""
+def _separate(
+    models: Mapping[tuple[str, str], Fitted], sets: Mapping[str, np.ndarray], trial: Trial
+) -> dict[tuple[str, str], Fitted]:
+    """Of each kind of model one that takes, at each sample, the one fitted on its phase (where a
+    phase has none, the one of all phases).
+    """
     out = {}
     for name in dict.fromkeys(model for model, _ in models):
         predicted, freedom = models[name, ALL].predicted.copy(), np.zeros(3)
         for number, phase in enumerate(PHASES):
             if phase in sets:
-                predicted[trial.phase == number] = models[name, phase].predicted[trial.phase == number]
+                predicted[trial.phase == number] = models[name, phase].predicted[
+                    trial.phase == number
+                ]
                 freedom += models[name, phase].freedom
         out[name, SEPARATE] = Fitted(predicted, tuple(freedom), {})
     return out
 
 
 def _judged(
-    config: SeaTrialConfig, trial: Trial, sets: Mapping[str, np.ndarray], models: Mapping[tuple[str, str], Fitted]
+    config: SeaTrialConfig,
+    trial: Trial,
+    sets: Mapping[str, np.ndarray],
+    models: Mapping[tuple[str, str], Fitted],
 ) -> dict[str, list[dict[str, Any]]]:
-    """Goodness of fit on the validation stretches of each set; the plant's own equations show what the sea and the preparation leave."""
+    """Goodness of fit on the validation stretches of each set; the plant's own equations show what
+    the sea and the preparation leave.
+    """
     vessel = odin(config.vessel)
     z, a = trial.samples.z, trial.samples.target.numpy()
-    known = Fitted(AccelerationHull(vessel.gains, vessel.terms)(z[:, :3], z[:, 5:]).numpy(), (0.0, 0.0, 0.0), {})
+    known = Fitted(
+        AccelerationHull(vessel.gains, vessel.terms)(z[:, :3], z[:, 5:]).numpy(),
+        (0.0, 0.0, 0.0),
+        {},
+    )
     out = {}
     for name, keep in sets.items():
         pieces = trial.pieces(keep & trial.validates)
-        judged = {key: model for key, model in models.items() if key[1] in (name, ALL, SEPARATE)} | {(PLANT, PLANT): known}
+        judged = {
+            key: model for key, model in models.items() if key[1] in (name, ALL, SEPARATE)
+        } | {(PLANT, PLANT): known}
         steps = [
-            OneStep(f"{model} on {on}", "head", own.freedom, [(a - own.predicted)[piece] for piece in pieces], f"{STANDARD} on {name}")
+            OneStep(
+                f"{model} on {on}",
+                "head",
+                own.freedom,
+                [(a - own.predicted)[piece] for piece in pieces],
+                f"{STANDARD} on {name}",
+            )
             for (model, on), own in judged.items()
         ]
         keys = {f"{model} on {on}": (model, on) for model, on in judged}
         out[name] = [
-            row | dict(zip(("model", "on"), keys[row["model"]], strict=True)) for row in goodness_table(steps, [a[p] for p in pieces], trial.step)
+            row | dict(zip(("model", "on"), keys[row["model"]], strict=True))
+            for row in goodness_table(steps, [a[p] for p in pieces], trial.step)
         ]
     return out

@@ -1,6 +1,8 @@
-"""A log that looks like Odin's sea trial (document 000 sections 7.1, 7.3): zigzags and speed steps over all phases, in waves, measured unevenly.
+"""A log that looks like Odin's sea trial (document 000 sections 7.1, 7.3): zigzags and speed steps
+over all phases, in waves, measured unevenly.
 
-The document's recipe: interpolation to 20 Hz, a Butterworth low-pass forward and backward, accelerations as differences (7.1).
+The document's recipe: interpolation to 20 Hz, a Butterworth low-pass forward and backward,
+accelerations as differences (7.1).
 """
 
 from __future__ import annotations
@@ -31,7 +33,8 @@ CHANNELS = (*VELOCITY, *CONTROLS, *FORCES)
 
 
 class ProgrammeConfig(Config):
-    """Zigzags at several speeds, and a straight run in steps up and down through all of them; sailed once on each course.
+    """Zigzags at several speeds, and a straight run in steps up and down through all of them;
+    sailed once on each course.
 
     Attributes:
         drives: shares of the motor's revolutions.
@@ -39,7 +42,8 @@ class ProgrammeConfig(Config):
         heading: at which zigzags are reversed.
         zigzag: how long each of them lasts.
         hold: how long a level of the straight run is held.
-        courses: against which the sea turns; the same programme on opposite courses cancels a steady drift, as in the document.
+        courses: against which the sea turns; the same programme on opposite courses cancels a
+            steady drift, as in the document.
     """
 
     drives: tuple[float, ...] = Field(default=(0.35, 0.45, 0.55, 0.7, 0.85, 1.0), min_length=2)
@@ -53,11 +57,17 @@ class ProgrammeConfig(Config):
         """Of one course, in the order that they are sailed."""
         levels = (*self.drives, *reversed(self.drives[:-1]))
         times = tuple(self.hold * i for i in range(len(levels)))
-        out: list[Manoeuvre] = [AccelerationDeceleration(times=times, levels=levels, duration=self.hold * len(levels))]
+        out: list[Manoeuvre] = [
+            AccelerationDeceleration(times=times, levels=levels, duration=self.hold * len(levels))
+        ]
         for drive in self.drives:
             for number, steer in enumerate(self.steers):
                 first = "starboard" if number % 2 == 0 else "port"
-                out.append(Zigzag.model_validate({**self._zigzag(), "drive": drive, "steer": steer, "first": first}))
+                out.append(
+                    Zigzag.model_validate(
+                        {**self._zigzag(), "drive": drive, "steer": steer, "first": first}
+                    )
+                )
         return out
 
     def _zigzag(self) -> dict[str, float]:
@@ -72,7 +82,8 @@ class PreparationConfig(Config):
         step: of the uniform grid.
         cutoff: of the Butterworth filter as a share of the Nyquist frequency (ERRATA H27).
         order: of the filter, before it is run backward as well.
-        filter_inputs: whether commands and forces pass the same filter as the velocities; the document filters the velocities alone.
+        filter_inputs: whether commands and forces pass the same filter as the velocities; the
+            document filters the velocities alone.
         margin: cut off at both ends of every log, where the filter knows one side only.
         stretch: length of the stretches that are for training or validation as a whole.
         validate_every: every so manieth stretch validates.
@@ -90,7 +101,10 @@ class PreparationConfig(Config):
     @model_validator(mode="after")
     def _ordered(self) -> PreparationConfig:
         if not 0 < self.interval[0] <= self.interval[1]:
-            raise ValueError(f"interval: expected shortest and longest, both positive, given {list(self.interval)} s")
+            raise ValueError(
+                "interval: expected shortest and longest, both positive, given"
+                f" {list(self.interval)} s"
+            )
         return self
 
 
@@ -117,7 +131,9 @@ class TrialConfig(Config):
     @classmethod
     def _fine(cls, step: float) -> float:
         if step > 0.05:
-            raise ValueError(f"step: the simulation must be finer than the log, at most 0.05 s, given {step:g} s")
+            raise ValueError(
+                f"step: the simulation must be finer than the log, at most 0.05 s, given {step:g} s"
+            )
         return step
 
 
@@ -143,7 +159,13 @@ class Trial:
         """Numbers of the kept samples [N] bool in runs without a gap."""
         chosen = np.flatnonzero(keep)
         group = self.samples.group.numpy()[chosen]
-        return [run for run in np.split(chosen, np.flatnonzero((np.diff(chosen) > 1) | (np.diff(group) != 0)) + 1) if len(run) > 1]
+        return [
+            run
+            for run in np.split(
+                chosen, np.flatnonzero((np.diff(chosen) > 1) | (np.diff(group) != 0)) + 1
+            )
+            if len(run) > 1
+        ]
 
 
 def odin(name: str) -> OdinConfig:
@@ -154,7 +176,10 @@ def odin(name: str) -> OdinConfig:
     """
     vessel = load_vessel(name)
     if not isinstance(vessel, OdinConfig) or vessel.build().actuators.commands != CONTROLS:
-        raise ConfigError(f"vessel '{name}': the sea trial needs a vessel of kind 'odin' with water jets, such as odin_jets")
+        raise ConfigError(
+            f"vessel '{name}': the sea trial needs a vessel of kind 'odin' with water jets, such as"
+            " odin_jets"
+        )
     return vessel
 
 
@@ -169,9 +194,20 @@ def sail(name: str, config: TrialConfig) -> Trial:
     for number, course in enumerate(config.programme.courses):
         plant = vessel.build()
         config.disturbance.check(plant, name)
-        craft = Craft(name, TracedPlantDynamics(plant, config.step), Helm.of(plant), plant.commands, plant.approach(1))
+        craft = Craft(
+            name,
+            TracedPlantDynamics(plant, config.step),
+            Helm.of(plant),
+            plant.commands,
+            plant.approach(1),
+        )
         sea = Sea(plant, _turned(config.disturbance, course), config.noise, config.seed + number)
-        logs += [flight.log for flight in fly(craft, config.programme.manoeuvres(), sea, config.programme.zigzag, config.step)]
+        logs += [
+            flight.log
+            for flight in fly(
+                craft, config.programme.manoeuvres(), sea, config.programme.zigzag, config.step
+            )
+        ]
     return prepared(logs, vessel, config.preparation, config.seed)
 
 
@@ -179,10 +215,18 @@ def _turned(disturbance: Disturbance, course: float) -> Disturbance:
     """The sea as it meets a vessel that leaves on a course instead of north."""
     if disturbance.waves is None:
         return disturbance
-    return disturbance.model_copy(update={"waves": disturbance.waves.model_copy(update={"direction": disturbance.waves.direction - course})})
+    return disturbance.model_copy(
+        update={
+            "waves": disturbance.waves.model_copy(
+                update={"direction": disturbance.waves.direction - course}
+            )
+        }
+    )
 
 
-def prepared(logs: Sequence[Log], vessel: OdinConfig, config: PreparationConfig, seed: int) -> Trial:
+def prepared(
+    logs: Sequence[Log], vessel: OdinConfig, config: PreparationConfig, seed: int
+) -> Trial:
     """Interpolate, filter and differentiate logs with channels u, v, r, cmd_n, cmd_nozzle."""
     random, actuators = np.random.default_rng([seed, 11]), vessel.build().actuators
     rows, rates, times, logged, stretch = [], [], [], [], []
@@ -194,7 +238,11 @@ def prepared(logs: Sequence[Log], vessel: OdinConfig, config: PreparationConfig,
         velocity = _filtered(z[:, :3], config)
         cut = round(config.margin / config.step)
         kept = slice(cut, len(t) - 1 - cut)
-        rows.append(np.concatenate((velocity, _filtered(inputs, config) if config.filter_inputs else inputs), axis=1)[kept])
+        rows.append(
+            np.concatenate(
+                (velocity, _filtered(inputs, config) if config.filter_inputs else inputs), axis=1
+            )[kept]
+        )
         rates.append((np.diff(velocity, axis=0) / config.step)[kept])
         times.append(t[kept])
         logged.append(np.full(len(times[-1]), number))
@@ -210,17 +258,32 @@ def prepared(logs: Sequence[Log], vessel: OdinConfig, config: PreparationConfig,
         ("made",) * (group[-1] + 1),
         CHANNELS,
     )
-    phase = phase_of(froude_number(samples.z[:, 0], samples.z[:, 1], float(vessel.length.value))).numpy()
-    return Trial(samples, log_of, (of + log_of) % config.validate_every == config.validate_every - 1, phase, config.step)
+    phase = phase_of(
+        froude_number(samples.z[:, 0], samples.z[:, 1], float(vessel.length.value))
+    ).numpy()
+    return Trial(
+        samples,
+        log_of,
+        (of + log_of) % config.validate_every == config.validate_every - 1,
+        phase,
+        config.step,
+    )
 
 
-def _even(log: Log, config: PreparationConfig, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Times [T] and u, v, r, commands [T, 5] on the uniform grid, from samples taken at uneven times."""
+def _even(
+    log: Log, config: PreparationConfig, random: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Times [T] and u, v, r, commands [T, 5] on the uniform grid, from samples taken at uneven
+    times.
+    """
     end = float(log.t[-1])
     at = np.cumsum(random.uniform(*config.interval, size=round(end / config.interval[0]) + 1))
     taken = np.unique(np.searchsorted(log.t, at[at < end]))
     t = np.arange(float(log.t[taken[0]]), float(log.t[taken[-1]]), config.step)
-    return t, np.stack([np.interp(t, log.t[taken], log.channels[name][taken]) for name in (*VELOCITY, *CONTROLS)], axis=1)
+    return t, np.stack(
+        [np.interp(t, log.t[taken], log.channels[name][taken]) for name in (*VELOCITY, *CONTROLS)],
+        axis=1,
+    )
 
 
 def _filtered(values: np.ndarray, config: PreparationConfig) -> np.ndarray:

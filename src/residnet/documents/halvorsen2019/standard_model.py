@@ -1,7 +1,9 @@
-"""The standard model of document 000 (appendix C.2, (9.4)-(9.9), ERRATA H17-H21) and its fit to accelerations (section 7.5.1).
+"""The standard model of document 000 (appendix C.2, (9.4)-(9.9), ERRATA H17-H21) and its fit to
+accelerations (section 7.5.1).
 
-M nu_dot + C(nu) nu + D(nu) nu = tau with a known mass. The document counts 14 parameters to find and lists 13 beside the mass; the fourteenth is
-N_v of (9.8), which its table lacks (ERRATA H20). The centre of gravity is amidships (x_g of (9.6) is not in the table either).
+M nu_dot + C(nu) nu + D(nu) nu = tau with a known mass. The document counts 14 parameters to find
+and lists 13 beside the mass; the fourteenth is N_v of (9.8), which its table lacks (ERRATA H20).
+The centre of gravity is amidships (x_g of (9.6) is not in the table either).
 """
 
 from __future__ import annotations
@@ -19,13 +21,17 @@ from residnet.physics.odin import OdinConfig
 from residnet.regression.equation_rows import correlation_time
 
 _RANK = 1e-6
-"""Singular values of the scaled Jacobian below this share of the largest belong to directions that the data do not determine."""
+"""Singular values of the scaled Jacobian below this share of the largest belong to directions that
+the data do not determine.
+"""
 _LEAST = 1e-3
 """Share of the known inertias squared that the determinant of sway and yaw is kept above."""
 
 
 class Entry(NamedTuple):
-    """A parameter: value before the fit (C.2, N_v by ERRATA H20), bounds, a typical size, and the value that the document found."""
+    """A parameter: value before the fit (C.2, N_v by ERRATA H20), bounds, a typical size, and the
+    value that the document found.
+    """
 
     start: float
     low: float
@@ -57,7 +63,9 @@ SUMS: dict[str, tuple[str, float, str]] = {
     "m - Y_vdot": ("Y_vdot", -1.0, ""),
     "I_z - N_rdot": ("I_z", 1.0, "N_rdot"),
 }
-"""What the equations contain of the inertias: a parameter with its sign, minus another or plus the mass."""
+"""What the equations contain of the inertias: a parameter with its sign, minus another or plus the
+mass.
+"""
 
 
 class StandardFitConfig(Config):
@@ -65,9 +73,11 @@ class StandardFitConfig(Config):
 
     Attributes:
         mass: known, kg.
-        weights: W_0, W_1, W_2 of the squared errors of u_dot, v_dot, r_dot; the document's are 1, 1, 10.
+        weights: W_0, W_1, W_2 of the squared errors of u_dot, v_dot, r_dot; the document's are 1,
+            1, 10.
         bounds: lowest and highest values by parameter, SI, instead of the built-in ones.
-        starts: the document's original values, then this many less one random ones around them within the bounds.
+        starts: the document's original values, then this many less one random ones around them
+            within the bounds.
         seed: of these.
         thin: every so manieth sample is fitted.
     """
@@ -92,14 +102,22 @@ class StandardFitConfig(Config):
 
     def limits(self) -> np.ndarray:
         """Bounds [14, 2]."""
-        return np.array([self.bounds.get(name, (entry.low, entry.high)) for name, entry in PARAMETERS.items()])
+        return np.array(
+            [self.bounds.get(name, (entry.low, entry.high)) for name, entry in PARAMETERS.items()]
+        )
 
     def begins(self) -> list[np.ndarray]:
         """Values [14] that searches start from, inside the bounds."""
         random, limits = np.random.default_rng([self.seed, 14]), self.limits()
-        start, scale = (np.array([getattr(entry, key) for entry in PARAMETERS.values()]) for key in ("start", "scale"))
+        start, scale = (
+            np.array([getattr(entry, key) for entry in PARAMETERS.values()])
+            for key in ("start", "scale")
+        )
         inside = 1e-9 * (limits[:, 1] - limits[:, 0])
-        tried = [start, *(start + scale * random.normal(size=len(start)) for _ in range(self.starts - 1))]
+        tried = [
+            start,
+            *(start + scale * random.normal(size=len(start)) for _ in range(self.starts - 1)),
+        ]
         return [np.clip(values, limits[:, 0] + inside, limits[:, 1] - inside) for values in tried]
 
 
@@ -133,7 +151,8 @@ class StandardFit:
 
 
 def accelerations(p: np.ndarray, mass: float, nu: np.ndarray, tau: np.ndarray) -> np.ndarray:
-    """nu_dot = M^-1 (tau - C nu - D nu), [N, 3], with parameters [14] in the order of `PARAMETERS`, kg, m, s, rad.
+    """nu_dot = M^-1 (tau - C nu - D nu), [N, 3], with parameters [14] in the order of `PARAMETERS`,
+    kg, m, s, rad.
 
     M_A(3,2) = -N_vdot and M_A(3,3) = -N_rdot (ERRATA H18), C skew (H4, H19), D = -diag(...) (H1).
     """
@@ -145,10 +164,19 @@ def accelerations(p: np.ndarray, mass: float, nu: np.ndarray, tau: np.ndarray) -
     n = tau[:, 2] - sway * u + yaw * v + n_v * v + (n_r + n_rr * np.abs(r)) * r
     across, about = mass - y_vdot, i_z - n_rdot
     determinant = max(across * about - y_rdot * n_vdot, _LEAST * mass * _INERTIA)
-    return np.stack((x / (mass - x_udot), (about * y + y_rdot * n) / determinant, (across * n + n_vdot * y) / determinant), axis=1)
+    return np.stack(
+        (
+            x / (mass - x_udot),
+            (about * y + y_rdot * n) / determinant,
+            (across * n + n_vdot * y) / determinant,
+        ),
+        axis=1,
+    )
 
 
-def fit(nu: np.ndarray, tau: np.ndarray, nu_dot: np.ndarray, config: StandardFitConfig) -> StandardFit:
+def fit(
+    nu: np.ndarray, tau: np.ndarray, nu_dot: np.ndarray, config: StandardFitConfig
+) -> StandardFit:
     """The parameters of least weighted squared error.
 
     Args:
@@ -164,14 +192,24 @@ def fit(nu: np.ndarray, tau: np.ndarray, nu_dot: np.ndarray, config: StandardFit
 
     nu, tau, nu_dot = nu[:: config.thin], tau[:: config.thin], nu_dot[:: config.thin]
     if 3 * len(nu) <= len(NAMES):
-        raise FitError(f"the standard model's {len(NAMES)} parameters need more than {len(nu)} samples; give a longer trial")
+        raise FitError(
+            f"the standard model's {len(NAMES)} parameters need more than {len(nu)} samples; give a"
+            " longer trial"
+        )
     root, limits = np.sqrt(config.weights), config.limits()
     scale = np.array([entry.scale for entry in PARAMETERS.values()])
 
     def left(p: np.ndarray) -> np.ndarray:
-        return np.asarray(((nu_dot - accelerations(p * scale, config.mass, nu, tau)) * root).ravel())
+        return np.asarray(
+            ((nu_dot - accelerations(p * scale, config.mass, nu, tau)) * root).ravel()
+        )
 
-    found = [least_squares(left, p / scale, jac="3-point", bounds=(limits / scale[:, None]).T, method="trf") for p in config.begins()]
+    found = [
+        least_squares(
+            left, p / scale, jac="3-point", bounds=(limits / scale[:, None]).T, method="trf"
+        )
+        for p in config.begins()
+    ]
     best = min(found, key=lambda answer: float(answer.cost))
     if not np.isfinite(best.cost):
         raise FitError("the standard model's fit does not stay finite; narrow `bounds`")
@@ -186,13 +224,18 @@ def fit(nu: np.ndarray, tau: np.ndarray, nu_dot: np.ndarray, config: StandardFit
         along[NAMES.index(first)] = sign * scale[NAMES.index(first)]
         if second:
             along[NAMES.index(second)] = -scale[NAMES.index(second)]
-        sums[name] = (float(along @ best.x) + (0.0 if second else config.mass), _spread(told, along))
+        sums[name] = (
+            float(along @ best.x) + (0.0 if second else config.mass),
+            _spread(told, along),
+        )
     errors = np.array([_spread(told, scale[i] * np.eye(len(NAMES))[i]) for i in range(len(NAMES))])
     return StandardFit(
         values=values,
         errors=errors,
         sums=sums,
-        undetermined=tuple(NAMES[i] for i in np.flatnonzero(np.abs(told.open).max(axis=1, initial=0.0) > 0.1)),
+        undetermined=tuple(
+            NAMES[i] for i in np.flatnonzero(np.abs(told.open).max(axis=1, initial=0.0) > 0.1)
+        ),
         bound=tuple(NAMES[i] for i in np.flatnonzero(near)),
         condition=told.condition,
         cost=tuple(sorted(float(answer.cost) for answer in found)),
@@ -201,7 +244,9 @@ def fit(nu: np.ndarray, tau: np.ndarray, nu_dot: np.ndarray, config: StandardFit
 
 
 class _Told(NamedTuple):
-    """Covariance of the scaled parameters [14, 14], directions that the data leave open [14, k], and the condition of the rest."""
+    """Covariance of the scaled parameters [14, 14], directions that the data leave open [14, k],
+    and the condition of the rest.
+    """
 
     covariance: np.ndarray
     open: np.ndarray
@@ -209,7 +254,9 @@ class _Told(NamedTuple):
 
 
 def _errors(jacobian: np.ndarray, left: np.ndarray, free: np.ndarray) -> _Told:
-    """What the Jacobian [3 N, 14] of weighted errors [N, 3] says, each axis with its own noise and its memory (sandwich)."""
+    """What the Jacobian [3 N, 14] of weighted errors [N, 3] says, each axis with its own noise and
+    its memory (sandwich).
+    """
     count = jacobian.shape[1]
     _, values, turned = np.linalg.svd(jacobian, full_matrices=False)
     kept = values > _RANK * values[0]
@@ -223,20 +270,27 @@ def _errors(jacobian: np.ndarray, left: np.ndarray, free: np.ndarray) -> _Told:
 
 
 def _spread(told: _Told, along: np.ndarray) -> float:
-    """Standard error of a combination of scaled parameters; infinite where the data leave it open."""
+    """Standard error of a combination of scaled parameters; infinite where the data leave it open.
+    """
     if told.open.size and np.linalg.norm(told.open.T @ along) > 1e-3 * np.linalg.norm(along):
         return float("inf")
     return float(np.sqrt(max(along @ told.covariance @ along, 0.0)))
 
 
 def truth(vessel: OdinConfig, mass: float) -> dict[str, float]:
-    """The parameters of a vessel whose accelerations are known as terms; what it has beyond them is left out.
+    """The parameters of a vessel whose accelerations are known as terms; what it has beyond them is
+    left out.
 
-    Exact for a vessel without added mass and with Coriolis terms v r and -u r, as document 000 has it.
+    Exact for a vessel without added mass and with Coriolis terms v r and -u r, as document 000 has
+    it.
     """
     gain = [1.0 / parameter.value for parameter in (vessel.gains.x, vessel.gains.y, vessel.gains.n)]
-    rows = [{term: parameter.value for term, parameter in row.items()} for row in vessel.terms.rows()]
+    rows = [
+        {term: parameter.value for term, parameter in row.items()} for row in vessel.terms.rows()
+    ]
     of = {"X_u": (0, "u"), "Y_v": (1, "v"), "Y_r": (1, "r"), "N_v": (2, "v"), "N_r": (2, "r")}
     of |= {"X_|u|u": (0, "u|u|"), "Y_|v|v": (1, "v|v|"), "N_|r|r": (2, "r|r|")}
-    out = dict.fromkeys(NAMES, 0.0) | {name: gain[axis] * rows[axis].get(term, 0.0) for name, (axis, term) in of.items()}
+    out = dict.fromkeys(NAMES, 0.0) | {
+        name: gain[axis] * rows[axis].get(term, 0.0) for name, (axis, term) in of.items()
+    }
     return out | {"I_z": gain[2], "X_udot": mass - gain[0], "Y_vdot": mass - gain[1]}

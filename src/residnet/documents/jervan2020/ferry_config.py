@@ -19,7 +19,8 @@ _Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
 
 
 class FerrySettings(Config):
-    """A course flown with the believed model, models of what it lacks, and the course again with them.
+    """A course flown with the believed model, models of what it lacks, and the course again with
+    them.
 
     Attributes:
         name: of the run.
@@ -33,7 +34,8 @@ class FerrySettings(Config):
         feed_forward_alone: fly the course without feedback too (Table 4.8).
         models: by name, each after those that it stands on.
         published: the document's figures for the believed model.
-        later: a vessel that the true one has become; models that fly are judged on its log and identified again where they no longer fit.
+        later: a vessel that the true one has become; models that fly are judged on its log and
+            identified again where they no longer fit.
         check_fit: when a model no longer fits.
         seed: of the noise.
     """
@@ -61,12 +63,20 @@ class FerrySettings(Config):
             if name == "believed":
                 raise ValueError("'believed' cannot name a model: it is the controller's own")
             if model.on and model.on not in known:
-                raise ValueError(f"models.{name}.on: no model before it is named '{model.on}'{nearest(model.on, known)}")
+                raise ValueError(
+                    f"models.{name}.on: no model before it is named"
+                    f" '{model.on}'{nearest(model.on, known)}"
+                )
             if model.on and self.models[model.on].lag != model.lag:
-                raise ValueError(f"models.{name}.on: '{model.on}' and it must both be with lag or without")
+                raise ValueError(
+                    f"models.{name}.on: '{model.on}' and it must both be with lag or without"
+                )
             known.append(name)
         if len(self.course.waypoints) < 4:
-            raise ValueError("course: at least four waypoints; half of them identify, segment by segment, and half test")
+            raise ValueError(
+                "course: at least four waypoints; half of them identify, segment by segment, and"
+                " half test"
+            )
         try:
             self.ferry()
             if self.later is not None:
@@ -78,4 +88,6 @@ class FerrySettings(Config):
 
     def ferry(self, true: str | None = None) -> Ferry:
         """The plant in its loop."""
-        return Ferry.of(true or self.true, self.believed, self.loop, self.disturbance, self.noise, self.seed)
+        return Ferry.of(
+            true or self.true, self.believed, self.loop, self.disturbance, self.noise, self.seed
+        )

@@ -21,7 +21,8 @@ from residnet.training.lag import LagFit, fit_lag, followed
 
 
 class Published(Config):
-    """Figures of the document for one model, as printed where ERRATA does not say otherwise; they stand beside the run's own.
+    """Figures of the document for one model, as printed where ERRATA does not say otherwise; they
+    stand beside the run's own.
 
     Attributes:
         mse: of the residual on the test half in N^2, N^2, (N m)^2.
@@ -30,8 +31,10 @@ class Published(Config):
         heading_mae: deg.
         tau: mean |tau| in N, N, N m.
         feedback: mean |tau_FB|.
-        alone: MSE of u, v, r and their derivatives against the desired ones without feedback, in (m/s)^2, (rad/s)^2 and per second squared.
-        crossing_position_mae, crossing_position_mse, crossing_heading_mae: the same of the operational crossing.
+        alone: MSE of u, v, r and their derivatives against the desired ones without feedback, in
+            (m/s)^2, (rad/s)^2 and per second squared.
+        crossing_position_mae, crossing_position_mse, crossing_heading_mae: the same of the
+        operational crossing.
         crossing_power: mean power of keeping position and heading in the crossing in W.
         coefficients: Theta by basis function, surge, sway and yaw.
     """
@@ -75,8 +78,10 @@ class FerryModelConfig(ResidualModelConfig):
     """One model of the ferry's residual; with `lag` its feed-forward is led by the lag.
 
     Attributes:
-        smooth: bring the noisy measurements into one motion first (see `residnet.data.motion_smoother`).
-        on: the model whose remaining residual this one explains (3.26); empty for the believed hull.
+        smooth: bring the noisy measurements into one motion first (see
+            `residnet.data.motion_smoother`).
+        on: the model whose remaining residual this one explains (3.26); empty for the believed
+            hull.
         fly: fly the course, and the crossing where there is one, with it as feed-forward.
         published: the document's figures.
     """
@@ -95,7 +100,8 @@ class FerryModel:
         model: F = F_0 + corrections.
         lag: of the thrusters, where it was fitted.
         fit: coefficients.
-        test_mse: of the remaining residual on the test half, by axis; against the command, or for a lag-aware model against the followed command.
+        test_mse: of the remaining residual on the test half, by axis; against the command, or for a
+            lag-aware model against the followed command.
         notes: what was chosen.
     """
 
@@ -138,7 +144,9 @@ class Record:
         return float(self.t[1] - self.t[0])
 
     def smoothed(self) -> Record:
-        """With the motion that all measurements together make likeliest, under the noise that the sensors are known to have."""
+        """With the motion that all measurements together make likeliest, under the noise that the
+        sensors are known to have.
+        """
         from residnet.data.motion_smoother import smooth_motion
 
         seen = torch.cat((self.pose, self.nu, self.nu_dot), dim=-1)
@@ -147,7 +155,8 @@ class Record:
 
 
 def identify(config: FerryModelConfig, record: Record, base: ForceModel) -> FerryModel:
-    """Fit one model on the record's training samples and judge it on the others, as they were logged.
+    """Fit one model on the record's training samples and judge it on the others, as they were
+    logged.
 
     Raises:
         FitError: where the data do not determine it.
@@ -156,8 +165,11 @@ def identify(config: FerryModelConfig, record: Record, base: ForceModel) -> Ferr
     return FerryModel(model, lag, fit, judged(model, lag, record), notes)
 
 
-def fit_model(config: ResidualModelConfig, used: Record, base: ForceModel) -> tuple[ForceModel, Lag | None, Fit, dict[str, Any]]:
-    """One model from a record's training samples: F = F_base + correction, the lag, the coefficients, and what was chosen.
+def fit_model(
+    config: ResidualModelConfig, used: Record, base: ForceModel
+) -> tuple[ForceModel, Lag | None, Fit, dict[str, Any]]:
+    """One model from a record's training samples: F = F_base + correction, the lag, the
+    coefficients, and what was chosen.
 
     Raises:
         FitError: where the data do not determine it.
@@ -165,9 +177,14 @@ def fit_model(config: ResidualModelConfig, used: Record, base: ForceModel) -> tu
     train = used.train
     x = TermLibrary(config.terms, MOTION)(torch.cat((used.nu_dot, used.nu), dim=-1))
     needed = base.at_heading(used.nu_dot, used.nu, used.pose[:, 2])
-    along, across = to_body(torch.ones(()), torch.zeros(()), used.pose[:, 2]), to_body(torch.zeros(()), torch.ones(()), used.pose[:, 2])
+    along, across = (
+        to_body(torch.ones(()), torch.zeros(()), used.pose[:, 2]),
+        to_body(torch.zeros(()), torch.ones(()), used.pose[:, 2]),
+    )
     nothing = torch.zeros_like(along[0])
-    earthly = torch.stack((torch.stack((*along, nothing), dim=-1), torch.stack((*across, nothing), dim=-1)), dim=-1)
+    earthly = torch.stack(
+        (torch.stack((*along, nothing), dim=-1), torch.stack((*across, nothing), dim=-1)), dim=-1
+    )
     found: LagFit | None = None
     force = used.command
     if config.lag:
@@ -179,25 +196,42 @@ def fit_model(config: ResidualModelConfig, used: Record, base: ForceModel) -> tu
     if config.earth:
         push = constant_force(x[train], y[train], -earthly[train])
         y = y + torch.einsum("nad,d->na", earthly, push)
-    data = Regression(config.terms, x[train], y[train], _scale(config, x[train]), _ranked(used.fold[train]), (x[~train], y[~train]))
+    data = Regression(
+        config.terms,
+        x[train],
+        y[train],
+        _scale(config, x[train]),
+        _ranked(used.fold[train]),
+        (x[~train], y[~train]),
+    )
     fit = config.fit.fit(data)
     model = base.extended(Correction(config.terms, fit.coefficients, fit.intercept), push)
     notes = dict(fit.notes)
     if found is not None:
-        notes["lag"] = {"frequency": found.lag.frequency, "damping": found.lag.damping, "delay": found.lag.delay}
+        notes["lag"] = {
+            "frequency": found.lag.frequency,
+            "damping": found.lag.damping,
+            "delay": found.lag.delay,
+        }
     if config.earth:
         notes["earth"] = {"north": float(push[0]), "east": float(push[1])}
     return model, found.lag if found is not None else None, fit, notes
 
 
 def judged(model: ForceModel, lag: Lag | None, record: Record) -> list[float]:
-    """MSE of the residual that a model leaves on a record's test samples as they were logged, by axis; through its lag where it has one."""
+    """MSE of the residual that a model leaves on a record's test samples as they were logged, by
+    axis; through its lag where it has one.
+    """
     return mse(remaining(model, lag, record)[~record.train])
 
 
 def remaining(model: ForceModel, lag: Lag | None, record: Record) -> Tensor:
-    """The residual [N, 3] that a model leaves along a record as it was logged; through its lag where it has one."""
-    force = record.command if lag is None else followed(record.averaged, lag, record.dt, record.runs)
+    """The residual [N, 3] that a model leaves along a record as it was logged; through its lag
+    where it has one.
+    """
+    force = (
+        record.command if lag is None else followed(record.averaged, lag, record.dt, record.runs)
+    )
     return model.residual(force, record.nu_dot, record.nu, record.pose[:, 2])
 
 
@@ -211,7 +245,8 @@ def _ranked(fold: Tensor) -> Tensor:
 
 
 def constant_force(x: Tensor, y: Tensor, earthly: Tensor) -> Tensor:
-    """A force (north, east) [2] shared by the axes, beside regressors that each axis weighs by itself (partialled out).
+    """A force (north, east) [2] shared by the axes, beside regressors that each axis weighs by
+    itself (partialled out).
 
     Args:
         x: regressors [N, J].
@@ -219,9 +254,12 @@ def constant_force(x: Tensor, y: Tensor, earthly: Tensor) -> Tensor:
         earthly: what a unit of each force adds to the residual [N, 3, 2].
 
     Raises:
-        FitError: where the vessel hardly turned, so that a constant of the body axes explains the same.
+        FitError: where the vessel hardly turned, so that a constant of the body axes explains the
+            same.
     """
-    centred = torch.cat((torch.ones_like(x[:, :1]), (x - x.mean(0)) / x.std(0).clamp(min=1e-300)), dim=-1)
+    centred = torch.cat(
+        (torch.ones_like(x[:, :1]), (x - x.mean(0)) / x.std(0).clamp(min=1e-300)), dim=-1
+    )
     left, singular, _ = torch.linalg.svd(centred, full_matrices=False)
     left = left[:, singular > 1e-7 * singular[0]]
 
@@ -229,9 +267,17 @@ def constant_force(x: Tensor, y: Tensor, earthly: Tensor) -> Tensor:
         return part - left @ (left.T @ part)
 
     weight = rest(y).std(0).clamp(min=1e-9)
-    design = torch.cat([torch.stack([rest(earthly[:, a, d]) for d in range(2)], dim=-1) / weight[a] for a in range(2)])
+    design = torch.cat(
+        [
+            torch.stack([rest(earthly[:, a, d]) for d in range(2)], dim=-1) / weight[a]
+            for a in range(2)
+        ]
+    )
     target = torch.cat([rest(y[:, a]) / weight[a] for a in range(2)])
     own = float(torch.linalg.svdvals(design * weight[:2].mean())[-1]) / len(y) ** 0.5
     if own < 0.02:
-        raise FitError("a force constant in earth axes does not show: the vessel kept its heading; give a run that turns, or leave earth out")
+        raise FitError(
+            "a force constant in earth axes does not show: the vessel kept its heading; give a run"
+            " that turns, or leave earth out"
+        )
     return torch.linalg.lstsq(design, target[:, None]).solution[:, 0]

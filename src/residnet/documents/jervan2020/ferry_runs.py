@@ -1,4 +1,6 @@
-"""The ferry of document 002 in closed loop: courses and crossings flown by a true plant under a controller that believes a model."""
+"""The ferry of document 002 in closed loop: courses and crossings flown by a true plant under a
+controller that believes a model.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,16 @@ from residnet.control.guidance.crossing import Crossing, CrossingConfig
 from residnet.control.motion.anticipation import Assisted, Lag, course, needed_force, reference_row
 from residnet.control.motion.pid import Gain, MotionPID, MotionPIDConfig, NoFeedForward
 from residnet.control.motion.reference_filter import ReferenceFilterConfig
-from residnet.core.config import Config, Metres, MetresPerSecond, Newtons, Radians, RadiansPerSecond, Seconds, quantity
+from residnet.core.config import (
+    Config,
+    Metres,
+    MetresPerSecond,
+    Newtons,
+    Radians,
+    RadiansPerSecond,
+    Seconds,
+    quantity,
+)
 from residnet.core.errors import ConfigError, DataError
 from residnet.dynamics.rollout import Rollout, Source
 from residnet.dynamics.simulated import TracedPlantDynamics
@@ -26,7 +37,8 @@ from residnet.physics.vessel import load_vessel
 
 
 class LoopConfig(Config):
-    """The controller: Kp = m omega^2, Kd = 2 m omega, Ki = integral omega Kp with m the believed mass of each axis.
+    """The controller: Kp = m omega^2, Kd = 2 m omega, Ki = integral omega Kp with m the believed
+    mass of each axis.
 
     Attributes:
         frequency: omega of surge, sway and yaw.
@@ -44,12 +56,19 @@ class LoopConfig(Config):
         """The feedback."""
         mass, omega = hull_mass.diagonal(), torch.tensor(self.frequency, dtype=torch.float64)
         proportional = mass * omega**2
-        gains = [tuple(part.tolist()) for part in (proportional, self.integral * omega * proportional, 2.0 * mass * omega)]
-        return MotionPIDConfig(proportional=gains[0], integral=gains[1], derivative=gains[2]).build(self.step, NoFeedForward())
+        gains = [
+            tuple(part.tolist())
+            for part in (proportional, self.integral * omega * proportional, 2.0 * mass * omega)
+        ]
+        return MotionPIDConfig(proportional=gains[0], integral=gains[1], derivative=gains[2]).build(
+            self.step, NoFeedForward()
+        )
 
 
 class MotionNoise(Config):
-    """Standard deviations of white noise on what is measured, drawn anew at every step of the controller (document 002 Table 4.14, ERRATA J25)."""
+    """Standard deviations of white noise on what is measured, drawn anew at every step of the
+    controller (document 002 Table 4.14, ERRATA J25).
+    """
 
     position: Metres = Field(default=0.0, ge=0)
     heading: Radians = Field(default=0.0, ge=0)
@@ -60,13 +79,22 @@ class MotionNoise(Config):
 
     def spread(self) -> tuple[float, ...]:
         """Of pose, velocities and accelerations, nine."""
-        linear, angular = (self.position, self.velocity, self.acceleration), (self.heading, self.yaw_rate, self.yaw_acceleration)
+        linear, angular = (
+            (self.position, self.velocity, self.acceleration),
+            (
+                self.heading,
+                self.yaw_rate,
+                self.yaw_acceleration,
+            ),
+        )
         return tuple(value for a, b in zip(linear, angular, strict=True) for value in (a, a, b))
 
     def draw(self, shape: Sequence[int], seed: int) -> Tensor:
         """Noise [..., 9] on pose, velocities and accelerations, float64."""
         generator = torch.Generator().manual_seed(seed)
-        return torch.randn(*shape, 9, generator=generator, dtype=torch.float64) * torch.tensor(self.spread(), dtype=torch.float64)
+        return torch.randn(*shape, 9, generator=generator, dtype=torch.float64) * torch.tensor(
+            self.spread(), dtype=torch.float64
+        )
 
 
 class Disturbance(Config):
@@ -90,7 +118,9 @@ class Sensed(Source):
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Inputs [B, m] from the state as it is measured."""
-        inputs, memory = self.loop(torch.cat((x[:, :6] + self.noise[:, k], x[:, 6:]), dim=-1), w, k, memory)
+        inputs, memory = self.loop(
+            torch.cat((x[:, :6] + self.noise[:, k], x[:, 6:]), dim=-1), w, k, memory
+        )
         return inputs, memory
 
 
@@ -103,7 +133,8 @@ class Flight:
         pose, nu, nu_dot: truth [N, 3].
         seen: measured pose, nu, nu_dot [N, 9].
         command: tau_c at the samples [N, 3].
-        averaged: tau_c averaged over the steps around each sample [N, 3]: without the noise between samples that would fold down.
+        averaged: tau_c averaged over the steps around each sample [N, 3]: without the noise between
+            samples that would fold down.
         feedback: tau_FB [N, 3].
         acting: the thrusters' force [N, 3].
         desired: eta_d [N, 3].
@@ -135,7 +166,15 @@ class Ferry:
     seed: int
 
     @classmethod
-    def of(cls, true: str, believed: str, loop: LoopConfig, disturbance: Disturbance, noise: MotionNoise | None, seed: int) -> Ferry:
+    def of(
+        cls,
+        true: str,
+        believed: str,
+        loop: LoopConfig,
+        disturbance: Disturbance,
+        noise: MotionNoise | None,
+        seed: int,
+    ) -> Ferry:
         """From vessels by name.
 
         Raises:
@@ -145,10 +184,16 @@ class Ferry:
         for name in (true, believed):
             config = load_vessel(name)
             if not isinstance(config, HullConfig) or config.actuators.kind != "forces":
-                raise ConfigError(f"vessel '{name}': this study needs a hull whose commands are forces (actuators of kind forces)")
+                raise ConfigError(
+                    f"vessel '{name}': this study needs a hull whose commands are forces (actuators"
+                    " of kind forces)"
+                )
             plants.append(config.build())
         if not plants[0].actuators.state:
-            raise ConfigError(f"vessel '{true}': its forces follow at once; the study is about thrusters that lag, give actuators.response")
+            raise ConfigError(
+                f"vessel '{true}': its forces follow at once; the study is about thrusters that"
+                " lag, give actuators.response"
+            )
         if disturbance == Disturbance():
             plants[0].in_calm_water()
         return cls(plants[0], plants[1], loop, disturbance, noise, seed)
@@ -157,15 +202,28 @@ class Ferry:
         """The same with the feed-forward alone."""
         return replace(self, loop=self.loop.model_copy(update={"frequency": (0.0, 0.0, 0.0)}))
 
-    def fly_course(self, config: ReferenceFilterConfig, models: Sequence[tuple[ForceModel, Lag | None]]) -> list[Flight]:
+    def fly_course(
+        self, config: ReferenceFilterConfig, models: Sequence[tuple[ForceModel, Lag | None]]
+    ) -> list[Flight]:
         """The course with each model as feed-forward, all in one batch."""
         motion = course(config, self.loop.step)
-        rows = [reference_row(motion, needed_force(model, motion, lag, self.loop.step)) for model, lag in models]
-        return self._fly(GivenReference(torch.stack(rows)), len(motion.pose), [lag for _, lag in models])
+        rows = [
+            reference_row(motion, needed_force(model, motion, lag, self.loop.step))
+            for model, lag in models
+        ]
+        return self._fly(
+            GivenReference(torch.stack(rows)), len(motion.pose), [lag for _, lag in models]
+        )
 
-    def fly_crossing(self, config: CrossingConfig, models: Sequence[tuple[ForceModel, Lag | None]]) -> list[Flight]:
+    def fly_crossing(
+        self, config: CrossingConfig, models: Sequence[tuple[ForceModel, Lag | None]]
+    ) -> list[Flight]:
         """The crossing with each model as feed-forward, all in one batch."""
-        return self._fly(Crossing(config, self.loop.step, models), round(config.duration / self.loop.step), [lag for _, lag in models])
+        return self._fly(
+            Crossing(config, self.loop.step, models),
+            round(config.duration / self.loop.step),
+            [lag for _, lag in models],
+        )
 
     def _fly(self, guidance: Reference, steps: int, lags: Sequence[Lag | None]) -> list[Flight]:
         step, rows = self.loop.step, len(lags)
@@ -179,12 +237,20 @@ class Ferry:
         source: Source = Sensed(loop, noise[..., :6]) if self.noise is not None else loop
         x0 = torch.zeros(rows, len(self.true.state), dtype=torch.float64)
         with torch.no_grad():
-            states, inputs, _ = Rollout(TracedPlantDynamics(self.true, step), source)(x0, w, x0[:, :0])
+            states, inputs, _ = Rollout(TracedPlantDynamics(self.true, step), source)(
+                x0, w, x0[:, :0]
+            )
             states = states[:, :-1]
             if not bool(torch.isfinite(states).all()):
-                raise DataError("the ferry left all bounds in closed loop: with these gains and models the loop is unstable")
+                raise DataError(
+                    "the ferry left all bounds in closed loop: with these gains and models the loop"
+                    " is unstable"
+                )
             references = self._replay(guidance, states, noise[..., :6])
-            return [self._flight(states[i], inputs[i], references[i], noise[i], pid) for i in range(rows)]
+            return [
+                self._flight(states[i], inputs[i], references[i], noise[i], pid)
+                for i in range(rows)
+            ]
 
     @staticmethod
     def _replay(guidance: Reference, states: Tensor, noise: Tensor) -> Tensor:
@@ -198,13 +264,22 @@ class Ferry:
             out.append(reference)
         return torch.stack(out, dim=1)
 
-    def _flight(self, x: Tensor, w: Tensor, reference: Tensor, noise: Tensor, pid: MotionPID) -> Flight:
+    def _flight(
+        self, x: Tensor, w: Tensor, reference: Tensor, noise: Tensor, pid: MotionPID
+    ) -> Flight:
         command = w[:, :3]
         seen_state = torch.cat((x[:, :6] + noise[:, :6], x[:, 6:]), dim=-1)
         error = pid.error(seen_state, reference)
         feedback, _ = pid(seen_state, reference[:, :9], (error.cumsum(0) - error) * self.loop.step)
         rate = self.true.rate(x, w)
-        metrics = tracking(x[:, :3], torch.cat((x[:, 3:6], rate[:, 3:6]), dim=-1), reference[:, :9], command, feedback, self.loop.step)
+        metrics = tracking(
+            x[:, :3],
+            torch.cat((x[:, 3:6], rate[:, 3:6]), dim=-1),
+            reference[:, :9],
+            command,
+            feedback,
+            self.loop.step,
+        )
         every, half = slice(None, None, self.loop.every), self.loop.every // 2
         ends = torch.cat((command[:1].expand(half, 3), command, command[-1:].expand(half, 3)))
         averaged = ends.unfold(0, 2 * half + 1, 1).mean(-1)

@@ -23,20 +23,33 @@ def coefficients_text(
         terms: basis functions.
         fit: coefficients.
         notes: what was chosen.
-        truth: what the believed hull really lacks, by basis function; empty or None where nobody knows.
+        truth: what the believed hull really lacks, by basis function; empty or None where nobody
+            knows.
         published: coefficients that a document found, by basis function.
     """
     lines = [f"{about}: tau = F_believed(nu_dot, nu) + sum of coefficient x basis function", ""]
     lines += [f"chosen: {notes_text(notes) or 'nothing'}", ""]
-    beside = {name: values for name, values in (("true", truth), ("published", published)) if values}
-    titles = ["basis function", "surge", "sway", "yaw", "weight", *(f"{name} surge / sway / yaw" for name in beside)]
+    beside = {
+        name: values for name, values in (("true", truth), ("published", published)) if values
+    }
+    titles = [
+        "basis function",
+        "surge",
+        "sway",
+        "yaw",
+        "weight",
+        *(f"{name} surge / sway / yaw" for name in beside),
+    ]
     lines += [f"| {' | '.join(titles)} |", "|---" * len(titles) + "|"]
     weights = dict(zip(terms, fit.pre.abs().tolist(), strict=True))
     rows = dict(table(terms, fit))
     for term in dict.fromkeys((*rows, *(name for values in beside.values() for name in values))):
         own = [f"{value:.4g}" for value in rows.get(term, (0.0, 0.0, 0.0))]
         weight = " / ".join(f"{value:.3f}" for value in weights[term]) if term in weights else ""
-        others = [" / ".join(f"{value:.4g}" for value in values.get(term, (0.0, 0.0, 0.0))) for values in beside.values()]
+        others = [
+            " / ".join(f"{value:.4g}" for value in values.get(term, (0.0, 0.0, 0.0)))
+            for values in beside.values()
+        ]
         lines.append(f"| {' | '.join([term.replace('|', '&#124;'), *own, weight, *others])} |")
     return "\n".join(lines) + "\n"
 

@@ -49,7 +49,8 @@ class ForceChannels(Config):
     """Channels of the logs beside x, y, psi, u, v and r.
 
     Attributes:
-        actual: forces that acted, from measured revolutions and angles of the thrusters, in N, N, N m.
+        actual: forces that acted, from measured revolutions and angles of the thrusters, in N, N, N
+            m.
         commanded: forces that were asked for.
         acceleration: measured accelerations of u, v and r; null where there are none.
     """
@@ -67,9 +68,11 @@ class FoldsConfig(Config):
     """Cross-validation: every sample is predicted by a model that saw nothing near it.
 
     Attributes:
-        folds: parts that are left out in turn; whole logs where there are at least three, else equal stretches of time of each log.
+        folds: parts that are left out in turn; whole logs where there are at least three, else
+            equal stretches of time of each log.
         gap: seconds before and after a left-out stretch that no model learns from either.
-        segment: seconds that belong together: a fold of the inner cross-validation that chooses orders and penalties, and what intervals resample.
+        segment: seconds that belong together: a fold of the inner cross-validation that chooses
+            orders and penalties, and what intervals resample.
     """
 
     folds: int = Field(default=5, ge=2)
@@ -82,7 +85,8 @@ class MeasuredModelConfig(ResidualModelConfig):
 
     Attributes:
         force: which force it explains.
-        published: MSE on the document's own test half without and with this model, in N^2, N^2, (N m)^2; another run of another ferry.
+        published: MSE on the document's own test half without and with this model, in N^2, N^2, (N
+            m)^2; another run of another ferry.
     """
 
     force: Literal["actual", "commanded"] = "actual"
@@ -91,14 +95,20 @@ class MeasuredModelConfig(ResidualModelConfig):
     @model_validator(mode="after")
     def _combination(self) -> MeasuredModelConfig:
         if self.lag and self.force != "commanded":
-            raise ValueError("lag: forces lag behind commands; set force to 'commanded', or leave lag out")
+            raise ValueError(
+                "lag: forces lag behind commands; set force to 'commanded', or leave lag out"
+            )
         if isinstance(self.fit, SurfaceRegression) and self.fit.choose == "test":
-            raise ValueError("fit.choose: 'test' lets the samples that judge a model choose it; take simplest or least")
+            raise ValueError(
+                "fit.choose: 'test' lets the samples that judge a model choose it; take simplest or"
+                " least"
+            )
         return self
 
 
 class ForceSettings(Config):
-    """The residual force of a believed hull on measured logs, explained by regressions and judged where they saw nothing.
+    """The residual force of a believed hull on measured logs, explained by regressions and judged
+    where they saw nothing.
 
     Attributes:
         name: of the run.
@@ -106,7 +116,8 @@ class ForceSettings(Config):
         data: logs.
         prepare: grid, masks, and how velocities are smoothed and differentiated.
         channels: forces and accelerations.
-        acceleration: `velocity`: derivative of the measured velocities; `measured`: the log's own, less its offset to that derivative.
+        acceleration: `velocity`: derivative of the measured velocities; `measured`: the log's own,
+            less its offset to that derivative.
         validation: cross-validation.
         models: by name.
     """
@@ -129,8 +140,13 @@ class ForceSettings(Config):
             raise ValueError("acceleration: 'measured' needs channels.acceleration")
         if self.prepare.hold != "start":
             raise ValueError("prepare.hold: nothing runs forward here, leave it out")
-        if self.validation.gap < self.prepare.grid.step or self.validation.segment < 10 * self.prepare.grid.step:
-            raise ValueError("validation: gap holds at least one step of the grid, segment at least ten")
+        if (
+            self.validation.gap < self.prepare.grid.step
+            or self.validation.segment < 10 * self.prepare.grid.step
+        ):
+            raise ValueError(
+                "validation: gap holds at least one step of the grid, segment at least ten"
+            )
         try:
             self.hull()
         except ConfigError as error:
@@ -146,5 +162,8 @@ class ForceSettings(Config):
         config = load_vessel(self.believed)
         vessel = config.build() if isinstance(config, HullConfig) else None
         if not isinstance(vessel, FossenVessel):
-            raise ConfigError(f"believed: '{self.believed}' is of kind '{config.kind}'; a believed hull needs one of kind fossen or mass_matrix")
+            raise ConfigError(
+                f"believed: '{self.believed}' is of kind '{config.kind}'; a believed hull needs one"
+                " of kind fossen or mass_matrix"
+            )
         return vessel.hull

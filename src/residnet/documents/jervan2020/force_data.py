@@ -1,4 +1,6 @@
-"""Measured logs as one record of motion and forces, with the folds that judge models honestly (document 002 section 5.2)."""
+"""Measured logs as one record of motion and forces, with the folds that judge models honestly
+(document 002 section 5.2).
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,8 @@ class Measured:
 
     Attributes:
         names: of the logs.
-        record: motion and commanded force, smoothed as `prepare` says; NaN where masked. Its folds are segments.
+        record: motion and commanded force, smoothed as `prepare` says; NaN where masked. Its folds
+            are segments.
         actual: forces that acted [N, 3].
         good: samples that may be learned from and judged on [N].
         part: number of the fold of the outer cross-validation [N].
@@ -57,7 +60,8 @@ class Measured:
         return self.actual if which == "actual" else self.record.command
 
     def split(self, part: int, gap: float) -> tuple[Record, Tensor]:
-        """The record that learns nothing from a part and `gap` seconds around it, and the samples [N] of the part that judge.
+        """The record that learns nothing from a part and `gap` seconds around it, and the samples
+        [N] of the part that judge.
 
         Raises:
             DataError: where either has no samples.
@@ -68,27 +72,44 @@ class Measured:
         start = 0
         for length in self.record.runs:
             inside = out[start : start + length].to(torch.float64)[None, None]
-            near[start : start + length] = torch.nn.functional.max_pool1d(inside, 2 * reach + 1, 1, reach)[0, 0] > 0
+            near[start : start + length] = (
+                torch.nn.functional.max_pool1d(inside, 2 * reach + 1, 1, reach)[0, 0] > 0
+            )
             start += length
         train, test = self.good & ~near, self.good & out
-        for name, samples in (("nothing left to learn from beside", train), ("no sample to judge on in", test)):
+        for name, samples in (
+            ("nothing left to learn from beside", train),
+            ("no sample to judge on in", test),
+        ):
             if not bool(samples.any()):
-                raise DataError(f"validation: {name} fold {part + 1}; check the masks, or lower validation.folds or validation.gap")
+                raise DataError(
+                    f"validation: {name} fold {part + 1}; check the masks, or lower"
+                    " validation.folds or validation.gap"
+                )
         return replace(self.record, train=train), test
 
     def segments(self) -> list[Tensor]:
-        """Indices of the good samples of each segment; one with less than half of the usual number is left out."""
-        found = [((self.record.fold == number) & self.good).nonzero()[:, 0] for number in torch.unique(self.record.fold)]
+        """Indices of the good samples of each segment; one with less than half of the usual number
+        is left out.
+        """
+        found = [
+            ((self.record.fold == number) & self.good).nonzero()[:, 0]
+            for number in torch.unique(self.record.fold)
+        ]
         least = max(len(one) for one in found) / 2
         return [one for one in found if len(one) >= least]
 
     def blocks(self) -> Blocks | None:
-        """What intervals resample: logs from five on, segments for fewer; None with fewer than five segments."""
+        """What intervals resample: logs from five on, segments for fewer; None with fewer than five
+        segments.
+        """
         log = torch.repeat_interleave(torch.arange(len(self.names)), torch.tensor(self.record.runs))
         of = [int(log[segment[0]]) for segment in self.segments()]
         if len(self.names) >= _RUNS_OF_A_LOG:
             return blocks(of)
-        return Blocks(np.arange(len(of)), "segments", len(of)) if len(of) >= _LEAST_SEGMENTS else None
+        return (
+            Blocks(np.arange(len(of)), "segments", len(of)) if len(of) >= _LEAST_SEGMENTS else None
+        )
 
 
 def read_measured(config: ForceSettings) -> Measured:
@@ -104,8 +125,14 @@ def read_measured(config: ForceSettings) -> Measured:
     logs = [prepare(log, "all", config.channels.columns(), config.prepare) for log in recorded]
     for log in logs:
         if not log.good.any():
-            raise DataError(f"log {log.log.name}: no stretch is as long as the derivative's window; leave it out or shorten prepare.derivative")
-    joined = {name: torch.from_numpy(np.concatenate([getattr(log, name) for log in logs])) for name in ("smooth", "nu_dot", "recorded", "good")}
+            raise DataError(
+                f"log {log.log.name}: no stretch is as long as the derivative's window; leave it"
+                " out or shorten prepare.derivative"
+            )
+    joined = {
+        name: torch.from_numpy(np.concatenate([getattr(log, name) for log in logs]))
+        for name in ("smooth", "nu_dot", "recorded", "good")
+    }
     good, columns = joined["good"], joined["recorded"]
     derived, fold = joined["nu_dot"], _segments(logs, config)
     sensed = columns[:, 6:9] if config.channels.acceleration is not None else None
@@ -113,7 +140,9 @@ def read_measured(config: ForceSettings) -> Measured:
     nu_dot = derived
     if sensed is not None:
         acceleration = compare_accelerations(derived[good], sensed[good], fold[good])
-        nu_dot = _calibrated(logs, derived, sensed) if config.acceleration == "measured" else derived
+        nu_dot = (
+            _calibrated(logs, derived, sensed) if config.acceleration == "measured" else derived
+        )
     part, parts = _parts(logs, config.validation)
     step, count = config.prepare.grid.step, len(fold)
     smooth = joined["smooth"]
@@ -130,12 +159,30 @@ def read_measured(config: ForceSettings) -> Measured:
         (0.0,) * 9,
         tuple(len(log) for log in logs),
     )
-    masked = {log.log.name: {reason: float(mask.mean()) for reason, mask in log.log.masks.items() if mask.any()} for log in logs}
-    return Measured(tuple(log.log.name for log in logs), record, columns[:, 3:6], good, part, parts, masked, derived, sensed, acceleration)
+    masked = {
+        log.log.name: {
+            reason: float(mask.mean()) for reason, mask in log.log.masks.items() if mask.any()
+        }
+        for log in logs
+    }
+    return Measured(
+        tuple(log.log.name for log in logs),
+        record,
+        columns[:, 3:6],
+        good,
+        part,
+        parts,
+        masked,
+        derived,
+        sensed,
+        acceleration,
+    )
 
 
 def _calibrated(logs: Sequence[Prepared], derived: Tensor, sensed: Tensor) -> Tensor:
-    """Measured accelerations [N, 3] less what they lie above the derivative of velocity, log by log."""
+    """Measured accelerations [N, 3] less what they lie above the derivative of velocity, log by
+    log.
+    """
     out, start = sensed.clone(), 0
     for log in logs:
         inside, good = slice(start, start + len(log)), torch.from_numpy(log.good)
@@ -145,7 +192,9 @@ def _calibrated(logs: Sequence[Prepared], derived: Tensor, sensed: Tensor) -> Te
 
 
 def _carried(values: np.ndarray) -> Tensor:
-    """Commands [T, 3] with the last value before in place of NaN, zero before the first: what the thrusters were told is not lost in a gap."""
+    """Commands [T, 3] with the last value before in place of NaN, zero before the first: what the
+    thrusters were told is not lost in a gap.
+    """
     import pandas as pd
 
     return torch.from_numpy(np.array(pd.DataFrame(values).ffill().fillna(0.0)))
@@ -164,15 +213,32 @@ def _segments(logs: Sequence[Prepared], config: ForceSettings) -> Tensor:
 def _parts(logs: Sequence[Prepared], config: FoldsConfig) -> tuple[Tensor, str]:
     if len(logs) >= _FEW_LOGS:
         folds = min(config.folds, len(logs))
-        return torch.cat([torch.full((len(log),), i * folds // len(logs)) for i, log in enumerate(logs)]), "logs"
-    return torch.cat([torch.arange(len(log)) * config.folds // len(log) for log in logs]), "stretches"
+        return (
+            torch.cat(
+                [torch.full((len(log),), i * folds // len(logs)) for i, log in enumerate(logs)]
+            ),
+            "logs",
+        )
+    return (
+        torch.cat([torch.arange(len(log)) * config.folds // len(log) for log in logs]),
+        "stretches",
+    )
 
 
 def compare_accelerations(derived: Tensor, measured: Tensor, segment: Tensor) -> dict[str, Any]:
-    """Measured accelerations [N, 3] against derivatives of velocity [N, 3]: by axis the offset with its interval, and what remains without it."""
+    """Measured accelerations [N, 3] against derivatives of velocity [N, 3]: by axis the offset with
+    its interval, and what remains without it.
+    """
     apart = measured - derived
     means = np.stack([apart[segment == number].mean(0).numpy() for number in torch.unique(segment)])
-    within = intervals(means, Blocks(np.arange(len(means)), "segments", len(means)) if len(means) >= _LEAST_SEGMENTS else None)
+    within = intervals(
+        means,
+        (
+            Blocks(np.arange(len(means)), "segments", len(means))
+            if len(means) >= _LEAST_SEGMENTS
+            else None
+        ),
+    )
     out: dict[str, Any] = {}
     for axis, name in enumerate(AXES):
         both = torch.corrcoef(torch.stack((derived[:, axis], measured[:, axis])))
@@ -187,11 +253,20 @@ def compare_accelerations(derived: Tensor, measured: Tensor, segment: Tensor) ->
 
 
 def compare_forces(measured: Measured) -> dict[str, Any]:
-    """Commanded against actual force: the thrusters' lag, and by axis how much of the actual force the command explains without and with it."""
+    """Commanded against actual force: the thrusters' lag, and by axis how much of the actual force
+    the command explains without and with it.
+    """
     record, good = measured.record, measured.good
     out: dict[str, Any] = {}
     try:
-        found = fit_lag(record.command, torch.nan_to_num(measured.actual), torch.zeros_like(record.command), record.dt, good, record.runs).lag
+        found = fit_lag(
+            record.command,
+            torch.nan_to_num(measured.actual),
+            torch.zeros_like(record.command),
+            record.dt,
+            good,
+            record.runs,
+        ).lag
         out["lag"] = {"frequency": found.frequency, "damping": found.damping, "delay": found.delay}
         after = followed(record.command, found, record.dt, record.runs)
     except FitError as error:
@@ -199,8 +274,14 @@ def compare_forces(measured: Measured) -> dict[str, Any]:
     actual = measured.actual[good]
     total = (actual - actual.mean(0)).square().mean(0)
     for axis, name in enumerate(AXES):
-        shares = [float(1 - (actual[:, axis] - force[good][:, axis]).square().mean() / total[axis]) for force in (record.command, after)]
-        slope = float((after[good][:, axis] * actual[:, axis]).sum() / after[good][:, axis].square().sum().clamp(min=1e-300))
+        shares = [
+            float(1 - (actual[:, axis] - force[good][:, axis]).square().mean() / total[axis])
+            for force in (record.command, after)
+        ]
+        slope = float(
+            (after[good][:, axis] * actual[:, axis]).sum()
+            / after[good][:, axis].square().sum().clamp(min=1e-300)
+        )
         out[name] = {
             "rms_commanded": float(record.command[good][:, axis].square().mean().sqrt()),
             "rms_actual": float(actual[:, axis].square().mean().sqrt()),

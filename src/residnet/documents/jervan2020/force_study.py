@@ -1,4 +1,6 @@
-"""Force residuals of measured logs: every sample predicted by a model that saw nothing near it, always beside no force and the believed model."""
+"""Force residuals of measured logs: every sample predicted by a model that saw nothing near it,
+always beside no force and the believed model.
+"""
 
 from __future__ import annotations
 
@@ -72,7 +74,8 @@ class ForceStudy:
 
 
 def force_study(config: ForceSettings) -> ForceStudy:
-    """Read the logs, fit and judge every model; one that the logs do not determine is set aside with the reason.
+    """Read the logs, fit and judge every model; one that the logs do not determine is set aside
+    with the reason.
 
     Raises:
         ResidnetError: where a log cannot be used or no model is determined.
@@ -83,7 +86,9 @@ def force_study(config: ForceSettings) -> ForceStudy:
     for name, wanted in config.models.items():
         try:
             errors = cross_validate(wanted, measured, believed, config.validation.gap)
-            model, _, fit, notes = fit_model(wanted, _for(wanted, measured, measured.record), believed)
+            model, _, fit, notes = fit_model(
+                wanted, _for(wanted, measured, measured.record), believed
+            )
         except FitError as error:
             failed[name] = f"model {name}: {error}"
             continue
@@ -91,7 +96,15 @@ def force_study(config: ForceSettings) -> ForceStudy:
         final[name] = Final(fit, notes, _forward(config, model, name))
     if not final:
         raise FitError(next(iter(failed.values())))
-    return ForceStudy(measured, judged, final, failed, table(config, measured, judged, believed), compare_forces(measured), measured.blocks())
+    return ForceStudy(
+        measured,
+        judged,
+        final,
+        failed,
+        table(config, measured, judged, believed),
+        compare_forces(measured),
+        measured.blocks(),
+    )
 
 
 def _for(wanted: MeasuredModelConfig, measured: Measured, record: Record) -> Record:
@@ -107,7 +120,9 @@ def _forward(config: ForceSettings, model: ForceModel, name: str) -> str:
     return ""
 
 
-def cross_validate(wanted: MeasuredModelConfig, measured: Measured, believed: ForceModel, gap: float) -> Judged:
+def cross_validate(
+    wanted: MeasuredModelConfig, measured: Measured, believed: ForceModel, gap: float
+) -> Judged:
     """Fit a model once for each fold, on what is not near it, and predict the fold.
 
     Raises:
@@ -118,13 +133,17 @@ def cross_validate(wanted: MeasuredModelConfig, measured: Measured, believed: Fo
     for part in range(int(measured.part.max()) + 1):
         record, test = measured.split(part, gap)
         model, _, _, said = fit_model(wanted, _for(wanted, measured, record), believed)
-        error[test] = model.residual(target[test], record.nu_dot[test], record.nu[test], record.pose[test, 2])
+        error[test] = model.residual(
+            target[test], record.nu_dot[test], record.nu[test], record.pose[test, 2]
+        )
         notes.append(said)
     return Judged(error, notes)
 
 
 def judge(wanted: MeasuredModelConfig) -> str:
-    """The force that a model is judged on. What a lag makes of a command can be small by the lag alone: such a model is held to the actual force."""
+    """The force that a model is judged on. What a lag makes of a command can be small by the lag
+    alone: such a model is held to the actual force.
+    """
     return "actual" if wanted.lag else wanted.force
 
 
@@ -134,8 +153,12 @@ def unmodelled(measured: Measured, believed: ForceModel, force: str) -> Tensor:
     return believed.residual(measured.force(force), record.nu_dot, record.nu, record.pose[:, 2])
 
 
-def table(config: ForceSettings, measured: Measured, judged: Mapping[str, Judged], believed: ForceModel) -> list[dict[str, Any]]:
-    """Rows of all models by the force that judges them; every group begins with `zero` and `believed` on the same samples."""
+def table(
+    config: ForceSettings, measured: Measured, judged: Mapping[str, Judged], believed: ForceModel
+) -> list[dict[str, Any]]:
+    """Rows of all models by the force that judges them; every group begins with `zero` and
+    `believed` on the same samples.
+    """
     groups: dict[str, list[str]] = {}
     for name in judged:
         groups.setdefault(judge(config.models[name]), []).append(name)
@@ -146,7 +169,10 @@ def table(config: ForceSettings, measured: Measured, judged: Mapping[str, Judged
 
     rows: list[dict[str, Any]] = []
     for force, names in groups.items():
-        errors = {"zero": by_segment(measured.force(force)), "believed": by_segment(unmodelled(measured, believed, force))}
+        errors = {
+            "zero": by_segment(measured.force(force)),
+            "believed": by_segment(unmodelled(measured, believed, force)),
+        }
         errors |= {name: by_segment(judged[name].error) for name in names}
         level = np.maximum(errors["zero"].mean(0), 1e-300)
         for name, error in errors.items():
@@ -157,18 +183,30 @@ def table(config: ForceSettings, measured: Measured, judged: Mapping[str, Judged
                     "mse": error.mean(0).tolist(),
                     "of_zero": (error.mean(0) / level).tolist(),
                     "segments": len(segments),
-                    **{f"minus_{other}": _apart((error - errors[other]) / level, parts) for other in ("zero", "believed") if other != name},
+                    **{
+                        f"minus_{other}": _apart((error - errors[other]) / level, parts)
+                        for other in ("zero", "believed")
+                        if other != name
+                    },
                 }
             )
     return rows
 
 
 def _apart(apart: np.ndarray, parts: Blocks | None) -> dict[str, Any]:
-    """Difference of errors [W, 3] in units of zero's mean square error, by axis and their mean: 95 % intervals, share of segments below."""
+    """Difference of errors [W, 3] in units of zero's mean square error, by axis and their mean: 95
+    % intervals, share of segments below.
+    """
     columns = np.concatenate((apart, apart.mean(1, keepdims=True)), axis=1)
-    return {"mean": columns.mean(0).tolist(), "ci95": intervals(columns, parts), "segments_below": (columns < 0).mean(0).tolist()}
+    return {
+        "mean": columns.mean(0).tolist(),
+        "ci95": intervals(columns, parts),
+        "segments_below": (columns < 0).mean(0).tolist(),
+    }
 
 
 def better(row: Mapping[str, Any], than: str) -> list[bool]:
-    """Whether a model's error is below another's with 95 % confidence: surge, sway, yaw, mean over axes."""
+    """Whether a model's error is below another's with 95 % confidence: surge, sway, yaw, mean over
+    axes.
+    """
     return [interval is not None and interval[1] < 0 for interval in row[f"minus_{than}"]["ci95"]]

@@ -1,8 +1,10 @@
-"""Figures 13 to 18 of Woo et al. 2018 (document 003) with our data, from a finished run of configs/studies/woo2018/woo2018.yaml.
+"""Figures 13 to 18 of Woo et al. 2018 (document 003) with our data, from a finished run of
+configs/studies/woo2018/woo2018.yaml.
 
-The document shows for single runs: simplified steering models in a zigzag (13), surge in an acceleration-deceleration test (14), sway and
-yaw rate in a zigzag and a 3-2-1-1 test (15), errors of the speed models (16) and of the steering models (17) on training and unseen data, and
-a zigzag with its track (18).
+The document shows for single runs: simplified steering models in a zigzag (13), surge in an
+acceleration-deceleration test (14), sway and yaw rate in a zigzag and a 3-2-1-1 test (15), errors
+of the speed models (16) and of the steering models (17) on training and unseen data, and a zigzag
+with its track (18).
 """
 
 from __future__ import annotations
@@ -57,24 +59,40 @@ def draw(run: Path) -> list[Path]:
     files = RunFiles(run)
     missing = [model for model in _LOOK if model not in files.kinds]
     if missing:
-        raise UsageError(f"{run}: study woo2018 needs the models {', '.join(_LOOK)}; '{missing[0]}' is absent")
-    zigzag, speed, steps = (_typical(files, kind) for kind in ("zigzag", "acceleration_deceleration", "three_two_one_one"))
+        raise UsageError(
+            f"{run}: study woo2018 needs the models {', '.join(_LOOK)}; '{missing[0]}' is absent"
+        )
+    zigzag, speed, steps = (
+        _typical(files, kind)
+        for kind in ("zigzag", "acceleration_deceleration", "three_two_one_one")
+    )
     with rc_context(RC):
         figures = {
-            13: ("Simplified steering models in a zigzag", _histories([(zigzag, "v"), (zigzag, "r")], _SIMPLE)),
-            14: ("Surge in an acceleration-deceleration test", _histories([(speed, "u")], _LEARNED)),
+            13: (
+                "Simplified steering models in a zigzag",
+                _histories([(zigzag, "v"), (zigzag, "r")], _SIMPLE),
+            ),
+            14: (
+                "Surge in an acceleration-deceleration test",
+                _histories([(speed, "u")], _LEARNED),
+            ),
             15: (
                 "Sway and yaw rate in a zigzag and a 3-2-1-1 test",
                 _histories([(zigzag, "v"), (zigzag, "r"), (steps, "v"), (steps, "r")], _LEARNED),
             ),
             16: ("Errors of the speed models", _bars(files, ("u",), "speed", _LEARNED)),
-            17: ("Errors of the steering models", _bars(files, ("v", "r"), "steering", (*_SIMPLE, *_LEARNED[1:]))),
+            17: (
+                "Errors of the steering models",
+                _bars(files, ("v", "r"), "steering", (*_SIMPLE, *_LEARNED[1:])),
+            ),
             18: ("A zigzag: track, yaw rate and sway velocity", _track(zigzag, (*_SIMPLE, "lstm"))),
         }
         out = []
         for number, (title, figure) in figures.items():
             path = run / "figures" / f"woo2018_{number}.png"
-            caption = "Unseen manoeuvres unless it says otherwise; simulated WAM-V, sensor noise only."
+            caption = (
+                "Unseen manoeuvres unless it says otherwise; simulated WAM-V, sensor noise only."
+            )
             save(figure, path, f"Figure {number} of document 003: {title}", caption)
             out.append(path)
     return out
@@ -82,7 +100,11 @@ def draw(run: Path) -> list[Path]:
 
 def _typical(files: RunFiles, kind: str) -> StoredWindow:
     """The unseen run of a kind in which the freely trained LSTM has its median error."""
-    own = [window for window in files.windows("test") if window.protocol == _PROTOCOL and window.manoeuvre == kind]
+    own = [
+        window
+        for window in files.windows("test")
+        if window.protocol == _PROTOCOL and window.manoeuvre == kind
+    ]
     if not own:
         raise UsageError(f"{files.path}: study woo2018 needs a test manoeuvre of kind {kind}")
     ranked = sorted(own, key=lambda window: (float(window.rmse("lstm").sum()), window.log))
@@ -128,13 +150,34 @@ def _bars(files: RunFiles, channels: Sequence[str], group: str, models: Sequence
             rows = [files.row(model, split, _PROTOCOL, group) for model in models]
             value = np.array([factor * row["rmse"][channel] if row else np.nan for row in rows])
             # too few manoeuvres have no interval
-            spans = [(row["rmse_ci95"][channel] if row else None) or [np.nan, np.nan] for row in rows]
+            spans = [
+                (row["rmse_ci95"][channel] if row else None) or [np.nan, np.nan] for row in rows
+            ]
             low, high = factor * np.array(spans).T
             name = {"train": "training data", "test": "unseen manoeuvres"}[split]
             error = np.abs(np.stack((value - low, high - value)))
-            axes.bar(np.arange(len(models)) + offset, value, 0.38, color=fill, edgecolor="black", linewidth=0.5, label=name)
-            axes.errorbar(np.arange(len(models)) + offset, value, yerr=error, fmt="none", ecolor="black", elinewidth=0.8, capsize=2)
-        axes.set_xticks(range(len(models)), [_NAMES[model].replace(", ", ",\n").replace(" with", "\nwith") for model in models])
+            axes.bar(
+                np.arange(len(models)) + offset,
+                value,
+                0.38,
+                color=fill,
+                edgecolor="black",
+                linewidth=0.5,
+                label=name,
+            )
+            axes.errorbar(
+                np.arange(len(models)) + offset,
+                value,
+                yerr=error,
+                fmt="none",
+                ecolor="black",
+                elinewidth=0.8,
+                capsize=2,
+            )
+        axes.set_xticks(
+            range(len(models)),
+            [_NAMES[model].replace(", ", ",\n").replace(" with", "\nwith") for model in models],
+        )
         axes.set_ylabel(f"RMSE, {text}")
         axes.grid(axis="x", visible=False)
         collect(handles, axes)
@@ -149,7 +192,9 @@ def _track(window: StoredWindow, models: Sequence[str]) -> Any:
     handles: dict[str, Any] = {}
     axes = figure.add_subplot(grid[:, 0])
     start = window.measured[0, 4:6]
-    for model, path in [("", window.measured)] + [(model, window.predicted[model]) for model in models]:
+    for model, path in [("", window.measured)] + [
+        (model, window.predicted[model]) for model in models
+    ]:
         look = _line(model) if model else MEASURED
         axes.plot(path[:, 5] - start[1], path[:, 4] - start[0], **look)
     axes.set_aspect("equal", adjustable="datalim")

@@ -1,4 +1,6 @@
-"""Azimuth thrusters: forces from revolutions and angles, and the allocation of wanted forces to them (document 002 eqs. (5.1), (5.2))."""
+"""Azimuth thrusters: forces from revolutions and angles, and the allocation of wanted forces to
+them (document 002 eqs. (5.1), (5.2)).
+"""
 
 from __future__ import annotations
 
@@ -23,14 +25,18 @@ class PropellerShaftConfig(ServoConfig):
 
 
 class AzimuthConfig(ServoConfig):
-    """Angle to either side of the bow, and how fast it turns (None for at once); it does not turn through its limit."""
+    """Angle to either side of the bow, and how fast it turns (None for at once); it does not turn
+    through its limit.
+    """
 
     limit: Radians = Field(default=3.141592653589793, gt=0)
     rate: RadiansPerSecond | None = Field(default=None, gt=0)
 
 
 class PlaceConfig(Config):
-    """One thruster: what ends the names of its channels, and its place from the body origin, forward and to starboard."""
+    """One thruster: what ends the names of its channels, and its place from the body origin,
+    forward and to starboard.
+    """
 
     name: str = Field(pattern=r"^[a-z0-9][a-z0-9_]*$")
     x: Metres
@@ -38,12 +44,14 @@ class PlaceConfig(Config):
 
 
 class AzimuthThrustersConfig(ActuatorConfig):
-    """Equal thrusters that turn; commands cmd_n_<name> [1/s], then cmd_alpha_<name> [rad] from the bow, clockwise.
+    """Equal thrusters that turn; commands cmd_n_<name> [1/s], then cmd_alpha_<name> [rad] from the
+    bow, clockwise.
 
     Attributes:
         places: of the thrusters.
         thrust: coefficients c0, c1, ... of the force T = c0 + c1 n + c2 n^2 + ... in N, n in 1/s.
-        curve_range: revolutions (astern, ahead) that the curve was measured between; it must rise between +-n_max.
+        curve_range: revolutions (astern, ahead) that the curve was measured between; it must rise
+            between +-n_max.
     """
 
     kind: Literal["azimuth_thrusters"]
@@ -67,9 +75,15 @@ class AzimuthThrustersConfig(ActuatorConfig):
         n = np.linspace(-self.n_max, self.n_max, 401)
         falling = n[np.polynomial.Polynomial(self.thrust).deriv()(n) <= 0]
         if len(falling):
-            raise ValueError(f"thrust falls with the revolutions at {falling[0] * 60:.0f} rpm: a force has no one speed there; lower n_max")
+            raise ValueError(
+                f"thrust falls with the revolutions at {falling[0] * 60:.0f} rpm: a force has no"
+                " one speed there; lower n_max"
+            )
         if len(self.places) == 1 or len({(place.x, place.y) for place in self.places}) == 1:
-            raise ValueError("thrusters at one place cannot make surge, sway and yaw independently; give two places")
+            raise ValueError(
+                "thrusters at one place cannot make surge, sway and yaw independently; give two"
+                " places"
+            )
         return self
 
     def build(self) -> AzimuthThrusters:
@@ -86,16 +100,25 @@ class AzimuthThrusters(Actuators):
         names = [place.name for place in config.places]
         self.count = len(names)
         shaft, azimuth = config.shaft, config.azimuth
-        servos: list[Servo] = [shaft.follow(f"n_{name}", shaft.n_max, shaft.n_rate) for name in names]
+        servos: list[Servo] = [
+            shaft.follow(f"n_{name}", shaft.n_max, shaft.n_rate) for name in names
+        ]
         servos += [azimuth.follow(f"alpha_{name}", azimuth.limit, azimuth.rate) for name in names]
         self.servos = Servos(servos)
         self.state = self.servos.state
-        self.commands = (*(f"cmd_n_{name}" for name in names), *(f"cmd_alpha_{name}" for name in names))
+        self.commands = (
+            *(f"cmd_n_{name}" for name in names),
+            *(f"cmd_alpha_{name}" for name in names),
+        )
         self.n_max = shaft.n_max
         self.coefficients = list(config.thrust)
         # tau = map [3, 2k] of the components forward, then to starboard, of every thruster
         one, zero = [1.0] * self.count, [0.0] * self.count
-        rows = [one + zero, zero + one, [-place.y for place in config.places] + [place.x for place in config.places]]
+        rows = [
+            one + zero,
+            zero + one,
+            [-place.y for place in config.places] + [place.x for place in config.places],
+        ]
         self.register_buffer("map", torch.tensor(rows, dtype=torch.float64), persistent=False)
         self.map: Tensor
         self.register_buffer("share", torch.linalg.pinv(self.map), persistent=False)
@@ -119,15 +142,22 @@ class AzimuthThrusters(Actuators):
         return 0.5 * (low + high)
 
     def allocate(self, tau: Tensor) -> Tensor:
-        """Commands [..., 2k] that make forces tau [..., 3] with the least sum of squared thrusts; thrusts beyond the largest saturate."""
+        """Commands [..., 2k] that make forces tau [..., 3] with the least sum of squared thrusts;
+        thrusts beyond the largest saturate.
+        """
         parts = tau @ self.share.to(tau.dtype).T
         return self._commands(parts[..., : self.count], parts[..., self.count :])
 
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Drive is surge force and steer the yaw moment, as shares of what the thrusters make together; each thruster saturates."""
+        """Drive is surge force and steer the yaw moment, as shares of what the thrusters make
+        together; each thruster saturates.
+        """
         zero = torch.zeros_like(drive)
         lever = self.map[2].abs().sum() / 2.0
-        both = torch.stack((drive.clamp(-1, 1) * self.count, zero, steer.clamp(-1, 1) * lever.to(drive.dtype)), dim=-1)
+        both = torch.stack(
+            (drive.clamp(-1, 1) * self.count, zero, steer.clamp(-1, 1) * lever.to(drive.dtype)),
+            dim=-1,
+        )
         return self.allocate(both * self.strongest)
 
     def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:

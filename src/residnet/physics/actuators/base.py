@@ -11,15 +11,18 @@ from residnet.core.config import Config
 
 
 class Actuators(nn.Module, ABC):
-    """All actuators of a vessel: commands [..., c] move their states a [..., k], and these push the hull.
+    """All actuators of a vessel: commands [..., c] move their states a [..., k], and these push the
+    hull.
 
-    A state may move continuously (`rate`, integrated with the hull: lags) or once per step (`advance`, after the hull has
-    moved with the states held: rate limits).
+    A state may move continuously (`rate`, integrated with the hull: lags) or once per step
+    (`advance`, after the hull has moved with the states held: rate limits).
 
     Attributes:
-        state: names of the states; empty where the commands act at once. What no sensor measures begins with `_` and enters no log.
+        state: names of the states; empty where the commands act at once. What no sensor measures
+            begins with `_` and enters no log.
         commands: names of the commands.
-        held: whether forces stay the same over a step: no state moves continuously, and the vessel's speed does not matter.
+        held: whether forces stay the same over a step: no state moves continuously, and the
+            vessel's speed does not matter.
     """
 
     state: tuple[str, ...] = ()
@@ -28,11 +31,15 @@ class Actuators(nn.Module, ABC):
 
     @abstractmethod
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Commands [..., c] from the normalised drive and steer [...] of a manoeuvre, each within +-1."""
+        """Commands [..., c] from the normalised drive and steer [...] of a manoeuvre, each within
+        +-1.
+        """
 
     @abstractmethod
     def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
-        """Forces tau [..., n] on the hull from states a [..., k], commands [..., c] and velocities through the water nu [..., n]."""
+        """Forces tau [..., n] on the hull from states a [..., k], commands [..., c] and velocities
+        through the water nu [..., n].
+        """
 
     def rate(self, a: Tensor, command: Tensor) -> Tensor:
         """Derivative [..., k] of the states."""

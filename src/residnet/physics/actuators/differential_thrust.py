@@ -1,4 +1,6 @@
-"""Two fixed thrusters side by side: thrust curves, rate limits and the forces that they make on the hull."""
+"""Two fixed thrusters side by side: thrust curves, rate limits and the forces that they make on the
+hull.
+"""
 
 from __future__ import annotations
 
@@ -10,16 +12,22 @@ from torch import Tensor
 
 from residnet.core.config import Metres, RevRate, RevsPerSecond
 from residnet.physics.actuators.base import ActuatorConfig, Actuators
-from residnet.physics.actuators.thrust_curve import Coefficients, CurveRange, ThrustCurve, require_range
+from residnet.physics.actuators.thrust_curve import (
+    Coefficients,
+    CurveRange,
+    ThrustCurve,
+    require_range,
+)
 
 
 class DifferentialThrustConfig(ActuatorConfig):
     """Two fixed thrusters side by side (document 003 section 4.1; revolutions in 1/s).
 
-    `forward` and `reverse` are the coefficients (c0 [N], c1 [N s], c2 [N s^2]) of T = c0 + c1 n + c2 n^2 per thruster,
-    for n > 0 and n < 0 (signed). The curve is clipped so that thrust never opposes the sense of rotation, which closes
-    the jump that the printed polynomials have at zero (ERRATA W5). `spacing` is the distance between the thrusters,
-    `curve_range` the revolutions (astern, ahead) that the curves were measured between, which must include +-n_max.
+    `forward` and `reverse` are the coefficients (c0 [N], c1 [N s], c2 [N s^2]) of T = c0 + c1 n +
+    c2 n^2 per thruster, for n > 0 and n < 0 (signed). The curve is clipped so that thrust never
+    opposes the sense of rotation, which closes the jump that the printed polynomials have at zero
+    (ERRATA W5). `spacing` is the distance between the thrusters, `curve_range` the revolutions
+    (astern, ahead) that the curves were measured between, which must include +-n_max.
     """
 
     kind: Literal["differential_thrust"] = "differential_thrust"
@@ -42,7 +50,9 @@ class DifferentialThrustConfig(ActuatorConfig):
 
 @final
 class DifferentialThrust(Actuators):
-    """Forces of two thrusters: revolutions n [..., 2] (port, starboard; 1/s) -> tau [..., 3] (N, N, N m), document 003 eq. (6)."""
+    """Forces of two thrusters: revolutions n [..., 2] (port, starboard; 1/s) -> tau [..., 3] (N, N,
+    N m), document 003 eq. (6).
+    """
 
     state = ("n_port", "n_stbd")
     commands = ("cmd_port", "cmd_stbd")
@@ -56,7 +66,9 @@ class DifferentialThrust(Actuators):
         self.curve = ThrustCurve(config.forward, config.reverse)
 
     def thrust(self, n: Tensor) -> Tensor:
-        """Thrust of one propeller [N] at revolutions n [1/s], any shape (document 003 eqs. (21), (22), clipped as in ERRATA W5)."""
+        """Thrust of one propeller [N] at revolutions n [1/s], any shape (document 003 eqs. (21),
+        (22), clipped as in ERRATA W5).
+        """
         thrust: Tensor = self.curve(n)
         return thrust
 
@@ -67,7 +79,9 @@ class DifferentialThrust(Actuators):
         return torch.stack((port + stbd, torch.zeros_like(port), self.arm * (port - stbd)), dim=-1)
 
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Commands [..., 2] in 1/s from the normalised mean and difference of revolutions (document 003 eqs. (30), (31)), clipped to +-1 per side."""
+        """Commands [..., 2] in 1/s from the normalised mean and difference of revolutions (document
+        003 eqs. (30), (31)), clipped to +-1 per side.
+        """
         both = torch.stack((drive + steer, drive - steer), dim=-1)
         return both.clamp(-1.0, 1.0) * self.n_max
 
@@ -76,7 +90,9 @@ class DifferentialThrust(Actuators):
         return self.forward(a)
 
     def advance(self, a: Tensor, command: Tensor, dt: float) -> Tensor:
-        """Revolutions [..., 2] after a step of dt seconds: towards the saturated command by at most the rate limit."""
+        """Revolutions [..., 2] after a step of dt seconds: towards the saturated command by at most
+        the rate limit.
+        """
         target = command.clamp(-self.n_max, self.n_max)
         step = self.n_rate * dt
         return a + (target - a).clamp(-step, step)

@@ -1,4 +1,6 @@
-"""Forces as commands: for plants whose actuators are not modelled but for their limits and their lag."""
+"""Forces as commands: for plants whose actuators are not modelled but for their limits and their
+lag.
+"""
 
 from __future__ import annotations
 
@@ -14,13 +16,17 @@ from residnet.physics.actuators.servo import FirstOrderConfig, ImmediateConfig, 
 
 
 class ForceCommandsConfig(ActuatorConfig):
-    """Commands tau_x, tau_y [N], tau_n [N m], each within its limit; without `response` they act at once, with it their forces lag behind."""
+    """Commands tau_x, tau_y [N], tau_n [N m], each within its limit; without `response` they act at
+    once, with it their forces lag behind.
+    """
 
     kind: Literal["forces"] = "forces"
     x_max: Newtons = Field(gt=0)
     y_max: Newtons = Field(ge=0)
     n_max: NewtonMetres = Field(gt=0)
-    response: Annotated[ImmediateConfig | FirstOrderConfig | SecondOrderConfig, Field(discriminator="kind")] = ImmediateConfig()
+    response: Annotated[
+        ImmediateConfig | FirstOrderConfig | SecondOrderConfig, Field(discriminator="kind")
+    ] = ImmediateConfig()
 
     def build(self) -> ForceCommands:
         """The module."""
@@ -29,7 +35,9 @@ class ForceCommandsConfig(ActuatorConfig):
 
 @final
 class ForceCommands(Actuators):
-    """tau [..., 3] follows the saturated command [..., 3]; with a lag the states are the forces, then what else the response needs."""
+    """tau [..., 3] follows the saturated command [..., 3]; with a lag the states are the forces,
+    then what else the response needs.
+    """
 
     commands = ("tau_x", "tau_y", "tau_n")
 
@@ -37,9 +45,17 @@ class ForceCommands(Actuators):
         super().__init__()
         self.response = config.response.build(None)
         axes = ("x", "y", "n")
-        self.state = tuple(f"{'_' if suffix else ''}acting_tau_{axis}{suffix}" for suffix in self.response.suffixes for axis in axes)
+        self.state = tuple(
+            f"{'_' if suffix else ''}acting_tau_{axis}{suffix}"
+            for suffix in self.response.suffixes
+            for axis in axes
+        )
         self.held = not self.state
-        self.register_buffer("limit", torch.tensor([config.x_max, config.y_max, config.n_max], dtype=torch.float64), persistent=False)
+        self.register_buffer(
+            "limit",
+            torch.tensor([config.x_max, config.y_max, config.n_max], dtype=torch.float64),
+            persistent=False,
+        )
         self.limit: Tensor
 
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:

@@ -1,4 +1,6 @@
-"""Actuators from tests of their own (document 003 section 4.1): throttle map, rate limit and dead time, thrust curves."""
+"""Actuators from tests of their own (document 003 section 4.1): throttle map, rate limit and dead
+time, thrust curves.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,9 @@ class Estimate(NamedTuple):
 
 
 class ThrottleMap(NamedTuple):
-    """n = slope * throttle + offset [1/s], bounded by +-n_max; n_max is the largest measured where nothing saturated."""
+    """n = slope * throttle + offset [1/s], bounded by +-n_max; n_max is the largest measured where
+    nothing saturated.
+    """
 
     slope: Estimate
     offset: Estimate
@@ -29,7 +33,9 @@ class ThrottleMap(NamedTuple):
 
     def __call__(self, throttle: np.ndarray) -> np.ndarray:
         """Revolutions [1/s]."""
-        return np.clip(self.slope.value * throttle + self.offset.value, -self.n_max.value, self.n_max.value)
+        return np.clip(
+            self.slope.value * throttle + self.offset.value, -self.n_max.value, self.n_max.value
+        )
 
 
 class StepAnswer(NamedTuple):
@@ -40,7 +46,9 @@ class StepAnswer(NamedTuple):
 
 
 class ThrustFit(NamedTuple):
-    """Coefficients c0 [N], c1 [N s], c2 [N s^2] of one direction, the revolutions that they were measured between, and the rms residual [N]."""
+    """Coefficients c0 [N], c1 [N s], c2 [N s^2] of one direction, the revolutions that they were
+    measured between, and the rms residual [N].
+    """
 
     coefficients: tuple[Estimate, Estimate, Estimate]
     low: float
@@ -58,30 +66,49 @@ _SATURATION_POINTS = 3
 
 
 def fit_throttle(throttle: np.ndarray, n: np.ndarray) -> ThrottleMap:
-    """Steady revolutions n [N] in 1/s over throttle [N]: a line with a bound, found together by least squares.
+    """Steady revolutions n [N] in 1/s over throttle [N]: a line with a bound, found together by
+    least squares.
 
     Raises:
-        FitError: with fewer than five points or fewer than three different throttles on the slope, throttle of one direction only, or
-            revolutions that fall with the throttle.
+        FitError: with fewer than five points or fewer than three different throttles on the slope,
+            throttle of one direction only, or revolutions that fall with the throttle.
     """
     if throttle.size < 5 or np.unique(throttle).size < 3:
-        raise FitError(f"throttle test: {throttle.size} points at {np.unique(throttle).size} throttles; at least 5 points at 3 throttles are needed")
+        raise FitError(
+            f"throttle test: {throttle.size} points at {np.unique(throttle).size} throttles; at"
+            " least 5 points at 3 throttles are needed"
+        )
     if throttle.min() >= 0 or throttle.max() <= 0:
-        raise FitError("throttle test: only one direction was measured; the map needs throttle ahead and astern")
+        raise FitError(
+            "throttle test: only one direction was measured; the map needs throttle ahead and"
+            " astern"
+        )
     if np.corrcoef(throttle, n)[0, 1] < 0.5:
-        raise FitError("throttle test: revolutions do not rise with the throttle; check the columns, their signs and units")
+        raise FitError(
+            "throttle test: revolutions do not rise with the throttle; check the columns, their"
+            " signs and units"
+        )
     reach, top = float(np.abs(throttle).max()), float(np.abs(n).max())
     slope = top / reach
     flat = np.abs(n) > 0.97 * top
     saturated = flat.sum() >= _SATURATION_POINTS and np.ptp(np.abs(throttle[flat])) > 0.05 * reach
     if saturated:
         free = ~flat
-        slope = float(np.polyfit(throttle[free], n[free], 1)[0]) if np.unique(throttle[free]).size >= 2 else slope
+        slope = (
+            float(np.polyfit(throttle[free], n[free], 1)[0])
+            if np.unique(throttle[free]).size >= 2
+            else slope
+        )
 
         def residual(p: np.ndarray) -> np.ndarray:
             return np.asarray(np.clip(p[0] * throttle + p[1], -p[2], p[2]) - n)
 
-        value, error = _least_squares(residual, [slope, 0.0, float(np.median(np.abs(n[flat])))], [slope, 0.1 * top, top], n.size)
+        value, error = _least_squares(
+            residual,
+            [slope, 0.0, float(np.median(np.abs(n[flat])))],
+            [slope, 0.1 * top, top],
+            n.size,
+        )
     else:
 
         def residual(p: np.ndarray) -> np.ndarray:
@@ -89,12 +116,18 @@ def fit_throttle(throttle: np.ndarray, n: np.ndarray) -> ThrottleMap:
 
         value, error = _least_squares(residual, [slope, 0.0], [slope, 0.1 * top], n.size)
         value, error = [*value, top], [*error, 0.0]
-    slope_, offset, n_max = (Estimate(v, v - e, v + e, "1/s") for v, e in zip(value, error, strict=True))
+    slope_, offset, n_max = (
+        Estimate(v, v - e, v + e, "1/s") for v, e in zip(value, error, strict=True)
+    )
     return ThrottleMap(slope_, offset, n_max, bool(saturated))
 
 
-def follow_command(t: np.ndarray, command: np.ndarray, rate: float, dead_time: float, start: float) -> np.ndarray:
-    """Revolutions [T] that move towards the command of dead_time ago by at most `rate`, held-command samples at t [T]."""
+def follow_command(
+    t: np.ndarray, command: np.ndarray, rate: float, dead_time: float, start: float
+) -> np.ndarray:
+    """Revolutions [T] that move towards the command of dead_time ago by at most `rate`,
+    held-command samples at t [T].
+    """
     late = t - dead_time
     index = np.searchsorted(t, late, side="right") - 1
     n = np.empty_like(t)
@@ -103,8 +136,12 @@ def follow_command(t: np.ndarray, command: np.ndarray, rate: float, dead_time: f
     for k in range(1, t.size):
         # the command that acted over the interval, with its share where it changed inside
         before, after = command[max(index[k - 1], 0)], command[max(index[k], 0)]
-        share = 1.0 if before == after else (late[k] - t[max(index[k], 0)]) / (late[k] - late[k - 1])
-        first = n[k - 1] + np.clip(before - n[k - 1], -step[k - 1] * (1 - share), step[k - 1] * (1 - share))
+        share = (
+            1.0 if before == after else (late[k] - t[max(index[k], 0)]) / (late[k] - late[k - 1])
+        )
+        first = n[k - 1] + np.clip(
+            before - n[k - 1], -step[k - 1] * (1 - share), step[k - 1] * (1 - share)
+        )
         n[k] = first + np.clip(after - first, -step[k - 1] * share, step[k - 1] * share)
     return n
 
@@ -113,7 +150,8 @@ def fit_step(runs: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> StepA
     """Rate limit and dead time from step responses, each (t [T] in s, command [T], n [T] in 1/s).
 
     Raises:
-        FitError: where a run is too short, its command does not step, or the revolutions do not follow.
+        FitError: where a run is too short, its command does not step, or the revolutions do not
+            follow.
     """
     for t, command, n in runs:
         if t.size < 20:
@@ -121,7 +159,10 @@ def fit_step(runs: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> StepA
         if np.ptp(command) == 0:
             raise FitError("step test: the command never changes; a step is needed")
         if np.ptp(n) < 0.3 * np.ptp(command):
-            raise FitError("step test: the revolutions hardly follow the command; check columns and units, and log until they settle")
+            raise FitError(
+                "step test: the revolutions hardly follow the command; check columns and units, and"
+                " log until they settle"
+            )
     t, command, n = max(runs, key=lambda run: np.ptp(run[1]))
     steep = float(np.percentile(np.abs(np.gradient(n, t)), 95))
     moved = t[np.flatnonzero(np.abs(command - command[0]) > 0.5 * np.ptp(command))[0]]
@@ -129,21 +170,39 @@ def fit_step(runs: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> StepA
     delay = max(float(t[rise[0]] - moved) - 0.1 * np.ptp(n) / steep, 0.0) if rise.size else 0.0
 
     def residual(p: np.ndarray) -> np.ndarray:
-        return np.concatenate([follow_command(t, c, abs(p[0]), max(p[1], 0.0), float(n[:3].mean())) - n for t, c, n in runs])
+        return np.concatenate(
+            [
+                follow_command(t, c, abs(p[0]), max(p[1], 0.0), float(n[:3].mean())) - n
+                for t, c, n in runs
+            ]
+        )
 
     size = sum(run[0].size for run in runs)
-    value, error = _least_squares(residual, [steep, delay], [steep, max(delay, 10 * float(np.median(np.diff(t))))], size, serial=True)
+    value, error = _least_squares(
+        residual,
+        [steep, delay],
+        [steep, max(delay, 10 * float(np.median(np.diff(t))))],
+        size,
+        serial=True,
+    )
     rate, dead = abs(value[0]), max(value[1], 0.0)
-    return StepAnswer(Estimate(rate, rate - error[0], rate + error[0], "1/s^2"), Estimate(dead, max(dead - error[1], 0.0), dead + error[1], "s"))
+    return StepAnswer(
+        Estimate(rate, rate - error[0], rate + error[0], "1/s^2"),
+        Estimate(dead, max(dead - error[1], 0.0), dead + error[1], "s"),
+    )
 
 
 def fit_thrust(n: np.ndarray, pull: np.ndarray, thrusters: int) -> tuple[ThrustFit, ThrustFit]:
-    """Thrust per thruster over revolutions ahead and astern from a bollard pull: n [N] in 1/s, pull [N] in N of all `thrusters` together.
+    """Thrust per thruster over revolutions ahead and astern from a bollard pull: n [N] in 1/s, pull
+    [N] in N of all `thrusters` together.
 
     Raises:
-        FitError: where a direction has fewer than five points or four revolutions, or pulls the wrong way.
+        FitError: where a direction has fewer than five points or four revolutions, or pulls the
+            wrong way.
     """
-    return _direction(n[n > 0], pull[n > 0] / thrusters, "ahead"), _direction(n[n < 0], pull[n < 0] / thrusters, "astern")
+    return _direction(n[n > 0], pull[n > 0] / thrusters, "ahead"), _direction(
+        n[n < 0], pull[n < 0] / thrusters, "astern"
+    )
 
 
 def _direction(n: np.ndarray, thrust: np.ndarray, name: str) -> ThrustFit:
@@ -152,27 +211,44 @@ def _direction(n: np.ndarray, thrust: np.ndarray, name: str) -> ThrustFit:
     levels = np.unique(np.round(n / max(float(np.abs(n).max(initial=0.0)), 1e-9), 2)).size
     if n.size < 5 or levels < 4:
         raise FitError(
-            f"bollard pull {name}: {n.size} points at {levels} revolutions; a quadratic with intervals needs 5 at 4 revolutions in each direction"
+            f"bollard pull {name}: {n.size} points at {levels} revolutions; a quadratic with"
+            " intervals needs 5 at 4 revolutions in each direction"
         )
     sign = 1.0 if name == "ahead" else -1.0
     if float(np.sum(thrust * np.abs(n))) * sign < 0:
-        raise FitError(f"bollard pull {name}: the pull has the wrong sign; thrust is positive ahead and negative astern")
+        raise FitError(
+            f"bollard pull {name}: the pull has the wrong sign; thrust is positive ahead and"
+            " negative astern"
+        )
     scale = float(np.abs(n).max())
     columns = np.stack((np.ones_like(n), n / scale, (n / scale) ** 2), axis=1)
     solution, *_ = np.linalg.lstsq(columns, thrust, rcond=None)
     residual = thrust - columns @ solution
     variance = float(residual @ residual) / (n.size - 3)
-    spread = np.sqrt(np.diag(np.linalg.inv(columns.T @ columns)) * variance) * float(student.ppf(0.975, n.size - 3))
+    spread = np.sqrt(np.diag(np.linalg.inv(columns.T @ columns)) * variance) * float(
+        student.ppf(0.975, n.size - 3)
+    )
     factors = np.array([1.0, scale, scale**2])
     parts = zip(solution / factors, spread / factors, ("N", "N s", "N s^2"), strict=True)
-    first, second, third = (Estimate(float(v), float(v - e), float(v + e), unit) for v, e, unit in parts)
-    return ThrustFit((first, second, third), float(n.min()), float(n.max()), float(np.sqrt(variance)))
+    first, second, third = (
+        Estimate(float(v), float(v - e), float(v + e), unit) for v, e, unit in parts
+    )
+    return ThrustFit(
+        (first, second, third), float(n.min()), float(n.max()), float(np.sqrt(variance))
+    )
 
 
 def _least_squares(
-    residual: Callable[[np.ndarray], np.ndarray], start: list[float], scale: list[float], size: int, *, serial: bool = False
+    residual: Callable[[np.ndarray], np.ndarray],
+    start: list[float],
+    scale: list[float],
+    size: int,
+    *,
+    serial: bool = False,
 ) -> tuple[list[float], list[float]]:
-    """Parameters and half widths of their 95 % intervals; widened for residuals that follow each other where they are a series."""
+    """Parameters and half widths of their 95 % intervals; widened for residuals that follow each
+    other where they are a series.
+    """
     from scipy.optimize import least_squares
     from scipy.stats import t as student
 

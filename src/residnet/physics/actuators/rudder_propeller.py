@@ -11,7 +11,12 @@ from torch import Tensor
 from residnet.core.config import Metres, Radians, RadiansPerSecond, RevRate, RevsPerSecond
 from residnet.physics.actuators.base import ActuatorConfig, Actuators
 from residnet.physics.actuators.servo import ServoConfig, Servos
-from residnet.physics.actuators.thrust_curve import Coefficients, CurveRange, ThrustCurve, require_range
+from residnet.physics.actuators.thrust_curve import (
+    Coefficients,
+    CurveRange,
+    ThrustCurve,
+    require_range,
+)
 from residnet.physics.parameters import Density, SquareMetres
 
 
@@ -20,12 +25,15 @@ class RudderConfig(ServoConfig):
 
     Attributes:
         area: movable area.
-        aspect_ratio: height over mean chord; the slope of the normal force is 6.13 L / (L + 2.25) (Fujii).
+        aspect_ratio: height over mean chord; the slope of the normal force is 6.13 L / (L + 2.25)
+            (Fujii).
         x: of the rudder stock from the body origin, negative aft.
         limit: largest angle of either side.
         rate: of the steering gear; None for no limit.
-        race_share: share of the area in the propeller's race; 0 for a force that grows with u^2 alone.
-        straightening: share of the local drift angle that reaches the rudder; 0 for a rudder that sees the flow from ahead only.
+        race_share: share of the area in the propeller's race; 0 for a force that grows with u^2
+            alone.
+        straightening: share of the local drift angle that reaches the rudder; 0 for a rudder that
+            sees the flow from ahead only.
     """
 
     area: SquareMetres = Field(gt=0)
@@ -42,11 +50,14 @@ class PropellerConfig(ServoConfig):
 
     Attributes:
         diameter: of the disc.
-        forward, reverse: thrust T = c0 + c1 n + c2 n^2 [N] at standstill for n > 0 and n < 0 [1/s]; it never opposes the rotation.
-        curve_range: revolutions (astern, ahead) that these were measured between; they must include +-n_max.
+        forward, reverse: thrust T = c0 + c1 n + c2 n^2 [N] at standstill for n > 0 and n < 0 [1/s];
+            it never opposes the rotation.
+        curve_range: revolutions (astern, ahead) that these were measured between; they must include
+            +-n_max.
         n_max: largest revolutions of either direction; commands beyond it saturate.
         n_rate: rate limit of the shaft; None for no limit.
-        advance_loss: thrust lost per revolution and speed, T = curve - advance_loss |n| u [N s^2/m], u >= 0; K_T falls linearly.
+        advance_loss: thrust lost per revolution and speed, T = curve - advance_loss |n| u [N
+            s^2/m], u >= 0; K_T falls linearly.
         thrust_deduction: share t of the thrust that the hull takes back.
     """
 
@@ -66,10 +77,12 @@ class PropellerConfig(ServoConfig):
 
 
 class RudderPropellerConfig(ActuatorConfig):
-    """A propeller and a rudder (normal force and inflow as in the MMG standard method, Yasukawa and Yoshimura 2015, without hull interaction).
+    """A propeller and a rudder (normal force and inflow as in the MMG standard method, Yasukawa and
+    Yoshimura 2015, without hull interaction).
 
-    F_N = 0.5 rho A f sin(delta_e) U_R^2, X = -F_N sin delta, Y = -F_N cos delta, N = x Y; delta > 0 turns to starboard. The inflow
-    is U_R^2 = u|u| + race_share 2 T / (rho A_p): the race of an actuator disc, fully contracted.
+    F_N = 0.5 rho A f sin(delta_e) U_R^2, X = -F_N sin delta, Y = -F_N cos delta, N = x Y; delta > 0
+    turns to starboard. The inflow is U_R^2 = u|u| + race_share 2 T / (rho A_p): the race of an
+    actuator disc, fully contracted.
     """
 
     kind: Literal["rudder_propeller"] = "rudder_propeller"
@@ -84,26 +97,46 @@ class RudderPropellerConfig(ActuatorConfig):
 
 @final
 class RudderPropeller(Actuators):
-    """Commands cmd_delta [rad], cmd_n [1/s]; states delta and n where they do not follow at once; forces tau [..., 3]."""
+    """Commands cmd_delta [rad], cmd_n [1/s]; states delta and n where they do not follow at once;
+    forces tau [..., 3].
+    """
 
     commands = ("cmd_delta", "cmd_n")
 
     def __init__(self, config: RudderPropellerConfig) -> None:
         super().__init__()
         rudder, propeller = config.rudder, config.propeller
-        self.servos = Servos([rudder.follow("delta", rudder.limit, rudder.rate), propeller.follow("n", propeller.n_max, propeller.n_rate)])
+        self.servos = Servos(
+            [
+                rudder.follow("delta", rudder.limit, rudder.rate),
+                propeller.follow("n", propeller.n_max, propeller.n_rate),
+            ]
+        )
         self.state = self.servos.state
         self.curve = ThrustCurve(propeller.forward, propeller.reverse)
         self.delta_max, self.n_max, self.x = rudder.limit, propeller.n_max, rudder.x
-        self.lift = 0.5 * config.density * rudder.area * 6.13 * rudder.aspect_ratio / (rudder.aspect_ratio + 2.25)
-        self.race = rudder.race_share * 2.0 / (config.density * 0.25 * torch.pi * propeller.diameter**2)
+        self.lift = (
+            0.5
+            * config.density
+            * rudder.area
+            * 6.13
+            * rudder.aspect_ratio
+            / (rudder.aspect_ratio + 2.25)
+        )
+        self.race = (
+            rudder.race_share * 2.0 / (config.density * 0.25 * torch.pi * propeller.diameter**2)
+        )
         self.straightening = rudder.straightening
         self.loss = propeller.advance_loss
         self.kept = 1.0 - propeller.thrust_deduction
 
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Rudder angle from steer and revolutions from drive, as shares of their limits; steer to starboard is positive."""
-        return torch.stack((steer.clamp(-1.0, 1.0) * self.delta_max, drive.clamp(-1.0, 1.0) * self.n_max), dim=-1)
+        """Rudder angle from steer and revolutions from drive, as shares of their limits; steer to
+        starboard is positive.
+        """
+        return torch.stack(
+            (steer.clamp(-1.0, 1.0) * self.delta_max, drive.clamp(-1.0, 1.0) * self.n_max), dim=-1
+        )
 
     def thrust(self, n: Tensor, u: Tensor) -> Tensor:
         """Thrust [N] of the propeller at n [1/s] and speed through the water u [m/s]."""
@@ -120,7 +153,9 @@ class RudderPropeller(Actuators):
         inflow = torch.sqrt(square.abs() + 1e-8)
         normal = self.lift * (square * torch.sin(delta) + inflow * across * torch.cos(delta))
         side = -normal * torch.cos(delta)
-        return torch.stack((self.kept * thrust - normal * torch.sin(delta), side, self.x * side), dim=-1)
+        return torch.stack(
+            (self.kept * thrust - normal * torch.sin(delta), side, self.x * side), dim=-1
+        )
 
     def rate(self, a: Tensor, command: Tensor) -> Tensor:
         """Derivative [..., k] of the states."""

@@ -1,4 +1,6 @@
-"""How a single actuator follows its command: saturation, dead time, rate limit, lag of first or second order."""
+"""How a single actuator follows its command: saturation, dead time, rate limit, lag of first or
+second order.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,9 @@ from residnet.core.errors import ConfigError
 
 
 class Response(nn.Module, ABC):
-    """Follows a target [...] with states a [..., k]; `suffixes` are appended to the actuator's name to name them."""
+    """Follows a target [...] with states a [..., k]; `suffixes` are appended to the actuator's name
+    to name them.
+    """
 
     suffixes: tuple[str, ...] = ("",)
 
@@ -131,26 +135,36 @@ class SecondOrderConfig(ResponseConfig):
 
 
 class ServoConfig(Config):
-    """What all actuators that follow a command share; limit and rate limit stand, with their units, in the subclass' own keys.
+    """What all actuators that follow a command share; limit and rate limit stand, with their units,
+    in the subclass' own keys.
 
     Attributes:
         response: lag.
         dead_time: between a command and its first effect; a whole number of `delay_step`.
-        delay_step: step of the plant that the delay line moves by, once per step; the simulation must step by just this.
+        delay_step: step of the plant that the delay line moves by, once per step; the simulation
+            must step by just this.
     """
 
-    response: Annotated[ImmediateConfig | FirstOrderConfig | SecondOrderConfig, Field(discriminator="kind")] = ImmediateConfig()
+    response: Annotated[
+        ImmediateConfig | FirstOrderConfig | SecondOrderConfig, Field(discriminator="kind")
+    ] = ImmediateConfig()
     dead_time: Seconds = Field(default=0.0, ge=0)
     delay_step: Seconds | None = Field(default=None, gt=0)
 
     @model_validator(mode="after")
     def _delay(self) -> ServoConfig:
         if (self.dead_time > 0) != (self.delay_step is not None):
-            raise ValueError("dead_time and delay_step belong together: delay_step is the step of the plant (data.step over data.substeps)")
+            raise ValueError(
+                "dead_time and delay_step belong together: delay_step is the step of the plant"
+                " (data.step over data.substeps)"
+            )
         if self.delay_step is not None:
             taps = self.dead_time / self.delay_step
             if abs(taps - round(taps)) > 1e-6 * taps or not 1 <= round(taps) <= 1000:
-                raise ValueError(f"dead_time ({self.dead_time:g} s) must be 1 to 1000 times delay_step ({self.delay_step:g} s)")
+                raise ValueError(
+                    f"dead_time ({self.dead_time:g} s) must be 1 to 1000 times delay_step"
+                    f" ({self.delay_step:g} s)"
+                )
         return self
 
     def follow(self, name: str, limit: float, rate: float | None) -> Servo:
@@ -163,11 +177,13 @@ class ServoConfig(Config):
 class Servo(nn.Module):
     """One actuator: its command [...] is saturated, waits in a delay line, and is followed.
 
-    States a [..., k]: the position and what else the response needs, then the delayed commands, newest first. Those that begin with
-    `_` are internal: no sensor measures them.
+    States a [..., k]: the position and what else the response needs, then the delayed commands,
+    newest first. Those that begin with `_` are internal: no sensor measures them.
     """
 
-    def __init__(self, name: str, limit: float, response: Response, taps: int, delay_step: float) -> None:
+    def __init__(
+        self, name: str, limit: float, response: Response, taps: int, delay_step: float
+    ) -> None:
         super().__init__()
         self.limit = limit
         self.response = response
@@ -183,7 +199,9 @@ class Servo(nn.Module):
 
     def value(self, a: Tensor, command: Tensor) -> Tensor:
         """Position [...], within the limit."""
-        return self.response.value(a[..., : self.own], self.target(a, command)).clamp(-self.limit, self.limit)
+        return self.response.value(a[..., : self.own], self.target(a, command)).clamp(
+            -self.limit, self.limit
+        )
 
     def rate(self, a: Tensor, command: Tensor) -> Tensor:
         """Derivative [..., k] of the states."""
@@ -201,8 +219,9 @@ class Servo(nn.Module):
             return moved
         if abs(dt - self.delay_step) > 1e-9:
             raise ConfigError(
-                f"actuator with dead time: its delay_step is {self.delay_step:g} s, but the plant steps by {dt:g} s; "
-                "set delay_step to the step of the plant (data.step over data.substeps)"
+                f"actuator with dead time: its delay_step is {self.delay_step:g} s, but the plant"
+                f" steps by {dt:g} s; set delay_step to the step of the plant (data.step over"
+                " data.substeps)"
             )
         newest = command.clamp(-self.limit, self.limit).unsqueeze(-1)
         return torch.cat((moved, newest, a[..., self.own : -1]), dim=-1)
@@ -224,14 +243,21 @@ class Servos(nn.Module):
     def value(self, a: Tensor, command: Tensor) -> Tensor:
         """Positions [..., c]."""
         parts = self._parts(a)
-        return torch.stack([servo.value(parts[i], command[..., i]) for i, servo in enumerate(self.servos)], dim=-1)  # type: ignore[operator]
+        return torch.stack(
+            [servo.value(parts[i], command[..., i]) for i, servo in enumerate(self.servos)], dim=-1
+        )  # type: ignore[operator]
 
     def rate(self, a: Tensor, command: Tensor) -> Tensor:
         """Derivatives [..., k]."""
         parts = self._parts(a)
-        return torch.cat([servo.rate(parts[i], command[..., i]) for i, servo in enumerate(self.servos)], dim=-1)  # type: ignore[operator]
+        return torch.cat(
+            [servo.rate(parts[i], command[..., i]) for i, servo in enumerate(self.servos)], dim=-1
+        )  # type: ignore[operator]
 
     def advance(self, a: Tensor, command: Tensor, dt: float) -> Tensor:
         """States [..., k] after a step of dt seconds."""
         parts = self._parts(a)
-        return torch.cat([servo.advance(parts[i], command[..., i], dt) for i, servo in enumerate(self.servos)], dim=-1)  # type: ignore[operator]
+        return torch.cat(
+            [servo.advance(parts[i], command[..., i], dt) for i, servo in enumerate(self.servos)],
+            dim=-1,
+        )  # type: ignore[operator]

@@ -1,4 +1,6 @@
-"""Rudders and propellers of the patrol vessel: foils in the race, or linear in the angle (document 004, section 5.2.2.3)."""
+"""Rudders and propellers of the patrol vessel: foils in the race, or linear in the angle (document
+004, section 5.2.2.3).
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,8 @@ class SternRuddersConfig(ServoConfig, ActuatorConfig, ABC):
         limit: largest rudder angle of either side.
         rate: of the steering gear; None where the rudder stands at its command at once.
         x, z: of the centre of pressure of the rudders from the body origin; z down.
-        thrust: of all propellers together at full drive; the source knows no astern thrust, so commands hold between zero and this.
+        thrust: of all propellers together at full drive; the source knows no astern thrust, so
+            commands hold between zero and this.
     """
 
     limit: Radians = Field(gt=0, lt=1.5707)
@@ -34,9 +37,11 @@ class SternRuddersConfig(ServoConfig, ActuatorConfig, ABC):
 
 
 class SternRudders(Actuators, ABC):
-    """Commands cmd_delta [rad], cmd_thrust [N]; state delta [rad] where the rudder has a rate; forces tau [..., 4] along x, y, about x, z.
+    """Commands cmd_delta [rad], cmd_thrust [N]; state delta [rad] where the rudder has a rate;
+    forces tau [..., 4] along x, y, about x, z.
 
-    delta > 0 turns to starboard: Y = -L, K = z L, N = -x L, X = T - D (document 004 eqs. (5.26)-(5.29), signs as in ERRATA G9, G10).
+    delta > 0 turns to starboard: Y = -L, K = z L, N = -x L, X = T - D (document 004 eqs.
+    (5.26)-(5.29), signs as in ERRATA G9, G10).
     """
 
     commands = ("cmd_delta", "cmd_thrust")
@@ -50,12 +55,19 @@ class SternRudders(Actuators, ABC):
 
     @abstractmethod
     def foil(self, delta: Tensor, u: Tensor, v: Tensor, thrust: Tensor) -> tuple[Tensor, Tensor]:
-        """Lift and drag [...] in N of all rudders at angle [rad], velocities through the water [m/s] and the thrust of all propellers [N]."""
+        """Lift and drag [...] in N of all rudders at angle [rad], velocities through the water
+        [m/s] and the thrust of all propellers [N].
+        """
 
     @final
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Rudder angle from steer and thrust from drive, as shares of their limits; no thrust astern."""
-        return torch.stack((steer.clamp(-1.0, 1.0) * self.delta_max, drive.clamp(0.0, 1.0) * self.thrust_max), dim=-1)
+        """Rudder angle from steer and thrust from drive, as shares of their limits; no thrust
+        astern.
+        """
+        return torch.stack(
+            (steer.clamp(-1.0, 1.0) * self.delta_max, drive.clamp(0.0, 1.0) * self.thrust_max),
+            dim=-1,
+        )
 
     @final
     def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
@@ -106,7 +118,9 @@ class FoilRuddersConfig(SternRuddersConfig):
 
 @final
 class FoilRudders(SternRudders):
-    """Foils in the open water's speed, corrected for the race; the drag at zero angle belongs to the hull's calm-water resistance."""
+    """Foils in the open water's speed, corrected for the race; the drag at zero angle belongs to
+    the hull's calm-water resistance.
+    """
 
     def __init__(self, config: FoilRuddersConfig) -> None:
         super().__init__(config)
@@ -132,7 +146,8 @@ class FoilRudders(SternRudders):
 
 
 class LinearRuddersConfig(SternRuddersConfig):
-    """Rudders whose side force is Y_delta_uu u^2 delta, without drag and race (document 004, Table 5.3).
+    """Rudders whose side force is Y_delta_uu u^2 delta, without drag and race (document 004, Table
+    5.3).
 
     Attributes:
         Y_delta_uu: of all rudders together, in kg/m per rad.

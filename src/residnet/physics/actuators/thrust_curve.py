@@ -1,4 +1,6 @@
-"""Thrust over revolutions: a polynomial per direction that never opposes the sense of rotation, and the range it was measured in."""
+"""Thrust over revolutions: a polynomial per direction that never opposes the sense of rotation, and
+the range it was measured in.
+"""
 
 from __future__ import annotations
 
@@ -37,14 +39,16 @@ def require_range(config: Curved) -> None:
     low, high = config.curve_range
     if low > -config.n_max or high < config.n_max:
         raise ValueError(
-            f"curve_range {low * 60:g} to {high * 60:g} rpm does not reach n_max (+-{config.n_max * 60:g} rpm); "
-            "lower n_max or measure the curve further"
+            f"curve_range {low * 60:g} to {high * 60:g} rpm does not reach n_max"
+            f" (+-{config.n_max * 60:g} rpm); lower n_max or measure the curve further"
         )
 
 
 @final
 class ThrustCurve(nn.Module):
-    """T = c0 + c1 n + c2 n^2 [N] for n > 0 and, with its own coefficients, n < 0 [1/s]; clipped at zero (ERRATA W5)."""
+    """T = c0 + c1 n + c2 n^2 [N] for n > 0 and, with its own coefficients, n < 0 [1/s]; clipped at
+    zero (ERRATA W5).
+    """
 
     def __init__(self, forward: Coefficients, reverse: Coefficients) -> None:
         super().__init__()

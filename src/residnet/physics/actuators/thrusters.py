@@ -11,7 +11,12 @@ from torch import Tensor
 from residnet.core.config import Metres, Radians, RevRate, RevsPerSecond
 from residnet.physics.actuators.base import ActuatorConfig, Actuators
 from residnet.physics.actuators.servo import ServoConfig, Servos
-from residnet.physics.actuators.thrust_curve import Coefficients, CurveRange, ThrustCurve, require_range
+from residnet.physics.actuators.thrust_curve import (
+    Coefficients,
+    CurveRange,
+    ThrustCurve,
+    require_range,
+)
 
 
 class ThrusterConfig(ServoConfig):
@@ -20,7 +25,8 @@ class ThrusterConfig(ServoConfig):
     Attributes:
         name: ends its channels, n_<name> and cmd_<name>, for example `port`.
         x, y: place from the body origin, forward and to starboard.
-        angle: of its thrust from the bow, clockwise; 90 deg for a bow thruster that pushes to starboard.
+        angle: of its thrust from the bow, clockwise; 90 deg for a bow thruster that pushes to
+            starboard.
         n_max, n_rate, forward, reverse, curve_range: as those of a propeller.
     """
 
@@ -41,7 +47,9 @@ class ThrusterConfig(ServoConfig):
 
 
 class ThrustersConfig(ActuatorConfig):
-    """Fixed thrusters; drive turns all of them ahead as far as they push forward, steer those with a lever about the origin."""
+    """Fixed thrusters; drive turns all of them ahead as far as they push forward, steer those with
+    a lever about the origin.
+    """
 
     kind: Literal["thrusters"] = "thrusters"
     thrusters: Annotated[tuple[ThrusterConfig, ...], Field(min_length=1)]
@@ -66,17 +74,36 @@ class Thrusters(Actuators):
         super().__init__()
         units = config.thrusters
         self.commands = tuple(f"cmd_{unit.name}" for unit in units)
-        self.servos = Servos([unit.follow(f"n_{unit.name}", unit.n_max, unit.n_rate) for unit in units])
+        self.servos = Servos(
+            [unit.follow(f"n_{unit.name}", unit.n_max, unit.n_rate) for unit in units]
+        )
         self.state = self.servos.state
-        self.curves = torch.nn.ModuleList([ThrustCurve(unit.forward, unit.reverse) for unit in units])
+        self.curves = torch.nn.ModuleList(
+            [ThrustCurve(unit.forward, unit.reverse) for unit in units]
+        )
         angle = torch.tensor([unit.angle for unit in units], dtype=torch.float64)
-        x, y = (torch.tensor([getattr(unit, axis) for unit in units], dtype=torch.float64) for axis in ("x", "y"))
+        x, y = (
+            torch.tensor([getattr(unit, axis) for unit in units], dtype=torch.float64)
+            for axis in ("x", "y")
+        )
         along, across = torch.cos(angle), torch.sin(angle)
         lever = x * across - y * along
         self.register_buffer("map", torch.stack((along, across, lever), dim=-1), persistent=False)
-        self.register_buffer("ahead", torch.where(along.abs() < 1e-9, torch.zeros_like(along), along), persistent=False)
-        self.register_buffer("turn", torch.where(lever.abs() < 1e-9, torch.zeros_like(lever), torch.sign(lever)), persistent=False)
-        self.register_buffer("n_max", torch.tensor([unit.n_max for unit in units], dtype=torch.float64), persistent=False)
+        self.register_buffer(
+            "ahead",
+            torch.where(along.abs() < 1e-9, torch.zeros_like(along), along),
+            persistent=False,
+        )
+        self.register_buffer(
+            "turn",
+            torch.where(lever.abs() < 1e-9, torch.zeros_like(lever), torch.sign(lever)),
+            persistent=False,
+        )
+        self.register_buffer(
+            "n_max",
+            torch.tensor([unit.n_max for unit in units], dtype=torch.float64),
+            persistent=False,
+        )
         self.map: Tensor
         self.ahead: Tensor
         self.turn: Tensor
@@ -84,7 +111,9 @@ class Thrusters(Actuators):
 
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
         """Revolutions [..., c]: each thruster's share of both demands, clipped to +-1."""
-        both = drive.unsqueeze(-1) * self.ahead.to(drive.dtype) + steer.unsqueeze(-1) * self.turn.to(drive.dtype)
+        both = drive.unsqueeze(-1) * self.ahead.to(drive.dtype) + steer.unsqueeze(
+            -1
+        ) * self.turn.to(drive.dtype)
         return both.clamp(-1.0, 1.0) * self.n_max.to(drive.dtype)
 
     def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:

@@ -1,4 +1,6 @@
-"""Water jets with a common nozzle angle and a common motor speed (document 000 eqs. (6.12)-(6.16), ERRATA H10-H16)."""
+"""Water jets with a common nozzle angle and a common motor speed (document 000 eqs. (6.12)-(6.16),
+ERRATA H10-H16).
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,9 @@ PerSquaredRevolutions = Annotated[Parameter, AfterValidator(of_dimension(0, 0, 2
 
 
 class SpeedCurve(Config):
-    """Thrust at the reference revolutions over the speed through the water in m/s: a0 + a1 u + a2 u^2."""
+    """Thrust at the reference revolutions over the speed through the water in m/s: a0 + a1 u + a2
+    u^2.
+    """
 
     a0: Force
     a1: ForcePerSpeed
@@ -41,7 +45,9 @@ class RevolutionsCurve(Config):
 
 
 class MotorConfig(ServoConfig):
-    """The motor of each jet: revolutions between zero and n_max, and how fast they may change (None for at once)."""
+    """The motor of each jet: revolutions between zero and n_max, and how fast they may change (None
+    for at once).
+    """
 
     n_max: RevsPerSecond = Field(gt=0)
     n_rate: RevRate | None = Field(default=None, gt=0)
@@ -55,12 +61,14 @@ class NozzleConfig(ServoConfig):
 
 
 class WaterJetsConfig(ActuatorConfig):
-    """Equal water jets that turn and run together; commands cmd_n [1/s] and cmd_nozzle [rad], whose thrust pushes to starboard where positive.
+    """Equal water jets that turn and run together; commands cmd_n [1/s] and cmd_nozzle [rad], whose
+    thrust pushes to starboard where positive.
 
     Attributes:
         jets: how many there are.
         x: place of the nozzles ahead of the body origin; negative astern.
-        speed, revolutions: the two parabolas whose product is the thrust of one jet (6.16); below some revolutions it may be negative (H15).
+        speed, revolutions: the two parabolas whose product is the thrust of one jet (6.16); below
+            some revolutions it may be negative (H15).
     """
 
     kind: Literal["water_jets"]
@@ -85,7 +93,12 @@ class WaterJets(Actuators):
     def __init__(self, config: WaterJetsConfig) -> None:
         super().__init__()
         motor, nozzle = config.motor, config.nozzle
-        self.servos = Servos([motor.follow("n", motor.n_max, motor.n_rate), nozzle.follow("nozzle", nozzle.limit, nozzle.rate)])
+        self.servos = Servos(
+            [
+                motor.follow("n", motor.n_max, motor.n_rate),
+                nozzle.follow("nozzle", nozzle.limit, nozzle.rate),
+            ]
+        )
         self.state = self.servos.state
         self.n_max = motor.n_max
         self.angle = nozzle.limit
@@ -93,7 +106,10 @@ class WaterJets(Actuators):
         self.x = config.x
         speed, revolutions = config.speed, config.revolutions
         self.a = [p.value for p in (speed.a0, speed.a1, speed.a2)]
-        self.c = [p.value / revolutions.reference.value for p in (revolutions.r0, revolutions.r1, revolutions.r2)]
+        self.c = [
+            p.value / revolutions.reference.value
+            for p in (revolutions.r0, revolutions.r1, revolutions.r2)
+        ]
 
     def thrust(self, n: Tensor, u: Tensor) -> Tensor:
         """Thrust [N] of one jet at revolutions n [1/s] and speed u [m/s], any shape (6.16)."""
@@ -101,9 +117,13 @@ class WaterJets(Actuators):
         return (a[0] + u * (a[1] + u * a[2])) * (c[0] + n * (c[1] + n * c[2]))
 
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Commands [..., 2]: drive ahead is the share of the motor's revolutions (jets do not push astern), steer the yaw moment's sense."""
+        """Commands [..., 2]: drive ahead is the share of the motor's revolutions (jets do not push
+        astern), steer the yaw moment's sense.
+        """
         side = self.angle if self.x > 0 else -self.angle
-        return torch.stack((drive.clamp(0.0, 1.0) * self.n_max, steer.clamp(-1.0, 1.0) * side), dim=-1)
+        return torch.stack(
+            (drive.clamp(0.0, 1.0) * self.n_max, steer.clamp(-1.0, 1.0) * side), dim=-1
+        )
 
     def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
         """tau [..., 3] in N, N, N m (6.12)-(6.14)."""

@@ -1,4 +1,6 @@
-"""Waves: spectra, a seaway as a sum of sines, and the first-order force on a box-shaped hull (document 004, eqs. (5.30)-(5.34))."""
+"""Waves: spectra, a seaway as a sum of sines, and the first-order force on a box-shaped hull
+(document 004, eqs. (5.30)-(5.34)).
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,9 @@ class Spectrum(Config, ABC):
 
     @final
     def density(self, omega: np.ndarray, height: float, period: float) -> np.ndarray:
-        """S(omega) [m^2 s] at omega [rad/s] for the significant height [m] and peak period [s], up to the peakedness' own area."""
+        """S(omega) [m^2 s] at omega [rad/s] for the significant height [m] and peak period [s], up
+        to the peakedness' own area.
+        """
         peak = 2 * np.pi / period
         ratio = omega / peak
         form: np.ndarray = 5 / 16 * height**2 / peak * ratio**-5.0 * np.exp(-1.25 * ratio**-4.0)
@@ -36,7 +40,9 @@ class Spectrum(Config, ABC):
 
 @final
 class IttcSpectrum(Spectrum):
-    """Fully developed sea: modified Pierson-Moskowitz spectrum in significant height and peak period (ITTC 1978)."""
+    """Fully developed sea: modified Pierson-Moskowitz spectrum in significant height and peak
+    period (ITTC 1978).
+    """
 
     kind: Literal["ittc"] = "ittc"
 
@@ -47,7 +53,9 @@ class IttcSpectrum(Spectrum):
 
 @final
 class JonswapSpectrum(Spectrum):
-    """Fetch-limited sea (Hasselmann et al. 1973): the ITTC form with its peak raised by gamma, scaled back to the significant height."""
+    """Fetch-limited sea (Hasselmann et al. 1973): the ITTC form with its peak raised by gamma,
+    scaled back to the significant height.
+    """
 
     kind: Literal["jonswap"] = "jonswap"
     gamma: float = Field(default=3.3, ge=1, le=7)
@@ -74,14 +82,18 @@ class WavesConfig(Config):
         spectrum: form.
         significant_height: 4 sqrt(m0).
         peak_period: 2 pi / omega_p.
-        direction: where the waves travel TO, clockwise from north (document 004 section 5.2.2.4); 0 deg are following seas on a northerly course.
+        direction: where the waves travel TO, clockwise from north (document 004 section 5.2.2.4); 0
+            deg are following seas on a northerly course.
         hull: dimensions under water.
         frequencies: number N of frequency intervals between 0.5 and 4 omega_p.
-        directions: number M of direction intervals; 1 for long-crested waves, else cos^2 over +-90 deg.
+        directions: number M of direction intervals; 1 for long-crested waves, else cos^2 over +-90
+            deg.
         water_density: of the water.
     """
 
-    spectrum: Annotated[IttcSpectrum | JonswapSpectrum, Field(discriminator="kind")] = JonswapSpectrum()
+    spectrum: Annotated[IttcSpectrum | JonswapSpectrum, Field(discriminator="kind")] = (
+        JonswapSpectrum()
+    )
     significant_height: Metres = Field(gt=0)
     peak_period: Seconds = Field(gt=0)
     direction: Radians
@@ -99,11 +111,13 @@ class WavesConfig(Config):
 class Waves(nn.Module):
     """A seaway of N x M sines in deep water, a realisation per row, and its force on the hull.
 
-    Frequencies and directions are drawn within their intervals (5.34) and used throughout, also where (5.30) writes the middle of
-    the interval, so that the seaway does not repeat itself; each component has its own random phase (one per frequency, as (5.32) has
-    it, would make a short-crested sea uneven over the place). Amplitudes (5.33) are scaled so that the components carry m0 exactly.
-    The phase follows the vessel's place, omega t - k . (x, y), so that the frequency of encounter (5.31) comes out by itself at any
-    speed and course. The response H_i is the Froude-Krylov force of a box: the undisturbed wave's pressure on its walls and bottom.
+    Frequencies and directions are drawn within their intervals (5.34) and used throughout, also
+    where (5.30) writes the middle of the interval, so that the seaway does not repeat itself; each
+    component has its own random phase (one per frequency, as (5.32) has it, would make a
+    short-crested sea uneven over the place). Amplitudes (5.33) are scaled so that the components
+    carry m0 exactly. The phase follows the vessel's place, omega t - k . (x, y), so that the
+    frequency of encounter (5.31) comes out by itself at any speed and course. The response H_i is
+    the Froude-Krylov force of a box: the undisturbed wave's pressure on its walls and bottom.
     Diffraction, radiation and drift are left out.
     """
 
@@ -113,19 +127,35 @@ class Waves(nn.Module):
         edges = np.linspace(0.5, 4.0, n + 1) * peak
         omega = edges[:-1, None] + np.diff(edges)[:, None] * random.random((rows, n, m))
         spread = np.linspace(-np.pi / 2, np.pi / 2, m + 1)
-        offset = spread[:-1] + np.diff(spread) * random.random((rows, n, m)) if m > 1 else np.zeros((rows, n, m))
-        energy = config.spectrum.density(omega, config.significant_height, config.peak_period) * np.cos(offset) ** 2
+        offset = (
+            spread[:-1] + np.diff(spread) * random.random((rows, n, m))
+            if m > 1
+            else np.zeros((rows, n, m))
+        )
+        energy = (
+            config.spectrum.density(omega, config.significant_height, config.peak_period)
+            * np.cos(offset) ** 2
+        )
         energy *= config.significant_height**2 / 16 / energy.sum(axis=(1, 2), keepdims=True)
         phase = 2 * np.pi * random.random((rows, n, m))
-        flat = [torch.from_numpy(part.reshape(rows, n * m)) for part in (omega, config.direction + offset, np.sqrt(2 * energy), phase)]
+        flat = [
+            torch.from_numpy(part.reshape(rows, n * m))
+            for part in (omega, config.direction + offset, np.sqrt(2 * energy), phase)
+        ]
         self.omega, self.direction, self.amplitude, self.phase = flat
         self.number = self.omega**2 / GRAVITY
         self.weight = config.water_density * GRAVITY
-        self.length, self.breadth, self.draught = config.hull.length, config.hull.breadth, config.hull.draught
+        self.length, self.breadth, self.draught = (
+            config.hull.length,
+            config.hull.breadth,
+            config.hull.draught,
+        )
 
     def phases(self, north: Tensor, east: Tensor, t: float) -> Tensor:
         """Phase [B, K] of every component at the places (north, east) [B] in m at time t in s."""
-        way = north.unsqueeze(-1) * torch.cos(self.direction) + east.unsqueeze(-1) * torch.sin(self.direction)
+        way = north.unsqueeze(-1) * torch.cos(self.direction) + east.unsqueeze(-1) * torch.sin(
+            self.direction
+        )
         return self.omega * t - self.number * way + self.phase
 
     def elevation(self, north: Tensor, east: Tensor, t: float) -> Tensor:
@@ -133,9 +163,11 @@ class Waves(nn.Module):
         return (self.amplitude * torch.cos(self.phases(north, east, t))).sum(-1)
 
     def response(self, psi: Tensor) -> tuple[Tensor, Tensor]:
-        """Force per amplitude in quadrature (X, Y, K: factors of sin) [B, K, 3] and in phase (N: factor of cos) [B, K] at headings psi [B].
+        """Force per amplitude in quadrature (X, Y, K: factors of sin) [B, K, 3] and in phase (N:
+        factor of cos) [B, K] at headings psi [B].
 
-        In N/m and N m/m; K about the waterline, N about midships. chi = direction - psi is 0 in following seas.
+        In N/m and N m/m; K about the waterline, N about midships. chi = direction - psi is 0 in
+        following seas.
         """
         chi = self.direction - psi.unsqueeze(-1)
         c, s, k = torch.cos(chi), torch.sin(chi), self.number
@@ -151,7 +183,9 @@ class Waves(nn.Module):
         return quadrature, pressure * (s * breadth * across * tilt_x - c * length * along * tilt_y)
 
     def forward(self, north: Tensor, east: Tensor, psi: Tensor, t: float) -> Tensor:
-        """Force X, Y [N], K, N [N m], stacked [B, 4], on the hull at (north, east) with heading psi [B] at time t."""
+        """Force X, Y [N], K, N [N m], stacked [B, 4], on the hull at (north, east) with heading psi
+        [B] at time t.
+        """
         phase = self.phases(north, east, t)
         quadrature, yaw = self.response(psi)
         side = (quadrature * (self.amplitude * torch.sin(phase)).unsqueeze(-1)).sum(-2)
@@ -165,7 +199,9 @@ def _sinc(x: Tensor) -> Tensor:
 
 
 def _first_moment(kappa: Tensor, width: float) -> Tensor:
-    """Integral of x sin(kappa x) over +-width / 2; its series near zero, where the closed form cancels."""
+    """Integral of x sin(kappa x) over +-width / 2; its series near zero, where the closed form
+    cancels.
+    """
     half = 0.5 * width
     small = kappa.abs() * half < 1e-2
     safe = torch.where(small, torch.ones_like(kappa), kappa)

@@ -1,4 +1,6 @@
-"""Wind on the hull above water: force coefficients of a vessel file, and the forces in the air that moves past the vessel."""
+"""Wind on the hull above water: force coefficients of a vessel file, and the forces in the air that
+moves past the vessel.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,9 @@ class WindLoads(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, along: Tensor, across: Tensor) -> Tensor:
-        """X, Y [N], K, N [N m], stacked [..., 4], from the velocity of the air relative to the vessel along body x and y [...] in m/s."""
+        """X, Y [N], K, N [N m], stacked [..., 4], from the velocity of the air relative to the
+        vessel along body x and y [...] in m/s.
+        """
 
 
 class WindLoadConfig(Config, ABC):
@@ -30,7 +34,8 @@ class WindLoadConfig(Config, ABC):
     Attributes:
         frontal_area, lateral_area: projected areas.
         length: overall, which the yaw coefficient refers to.
-        centre_height: of the lateral area's centre above the body origin, for the heeling moment of vessels that roll.
+        centre_height: of the lateral area's centre above the body origin, for the heeling moment of
+            vessels that roll.
         density: of the air.
         source: where the numbers come from.
     """
@@ -49,10 +54,11 @@ class WindLoadConfig(Config, ABC):
 
 
 class SymmetricWindConfig(WindLoadConfig):
-    """Ships that are nearly symmetric fore and aft (Fossen 2011, Handbook of Marine Craft Hydrodynamics, section 8.1, eqs. (8.29)-(8.31)).
+    """Ships that are nearly symmetric fore and aft (Fossen 2011, Handbook of Marine Craft
+    Hydrodynamics, section 8.1, eqs. (8.29)-(8.31)).
 
-    C_X = -c_x cos gamma, C_Y = c_y sin gamma, C_N = c_n sin 2 gamma, with gamma the relative wind's angle; typically
-    c_x is 0.5 to 0.9, c_y 0.7 to 0.95, c_n 0.05 to 0.2. All three are positive.
+    C_X = -c_x cos gamma, C_Y = c_y sin gamma, C_N = c_n sin 2 gamma, with gamma the relative wind's
+    angle; typically c_x is 0.5 to 0.9, c_y 0.7 to 0.95, c_n 0.05 to 0.2. All three are positive.
     """
 
     kind: Literal["symmetric"] = "symmetric"
@@ -67,7 +73,9 @@ class SymmetricWindConfig(WindLoadConfig):
 
 @final
 class SymmetricWind(WindLoads):
-    """The three coefficients written in the components of the relative air velocity, which needs no angle and is smooth in a calm."""
+    """The three coefficients written in the components of the relative air velocity, which needs no
+    angle and is smooth in a calm.
+    """
 
     def __init__(self, config: SymmetricWindConfig) -> None:
         super().__init__()
@@ -81,14 +89,18 @@ class SymmetricWind(WindLoads):
         """Forces [..., 4]."""
         speed = torch.sqrt(along * along + across * across + 1e-12)
         side = self.y * across * speed
-        return torch.stack((self.x * along * speed, side, self.height * side, self.n * along * across), dim=-1)
+        return torch.stack(
+            (self.x * along * speed, side, self.height * side, self.n * along * across), dim=-1
+        )
 
 
 class TabulatedWindConfig(WindLoadConfig):
-    """Coefficients at angles of the relative wind, as wind tunnels and Isherwood (1972) or Blendermann (1994) give them.
+    """Coefficients at angles of the relative wind, as wind tunnels and Isherwood (1972) or
+    Blendermann (1994) give them.
 
-    `angle` runs from 0 (head wind) to 180 deg for wind from STARBOARD; port follows by symmetry. Signs are those of the body
-    axes: C_X is negative in head wind, C_Y negative (towards port). Linear between the angles.
+    `angle` runs from 0 (head wind) to 180 deg for wind from STARBOARD; port follows by symmetry.
+    Signs are those of the body axes: C_X is negative in head wind, C_Y negative (towards port).
+    Linear between the angles.
     """
 
     kind: Literal["table"] = "table"
@@ -106,11 +118,18 @@ class TabulatedWindConfig(WindLoadConfig):
             if len(values) != len(self.angle):
                 raise ValueError(f"{name} has {len(values)} values for {len(self.angle)} angles")
         if max(self.C_Y) > 0:
-            raise ValueError("C_Y must not be positive: wind from starboard pushes to port (body y points to starboard)")
+            raise ValueError(
+                "C_Y must not be positive: wind from starboard pushes to port (body y points to"
+                " starboard)"
+            )
         if self.C_X[0] > 0:
-            raise ValueError("C_X must not be positive in head wind: it pushes aft (body x points forward)")
+            raise ValueError(
+                "C_X must not be positive in head wind: it pushes aft (body x points forward)"
+            )
         if any(abs(values[i]) > 1e-9 for values in (self.C_Y, self.C_N) for i in (0, -1)):
-            raise ValueError("C_Y and C_N must be zero at 0 and 180 deg: port and starboard mirror each other")
+            raise ValueError(
+                "C_Y and C_N must be zero at 0 and 180 deg: port and starboard mirror each other"
+            )
         return self
 
     def build(self) -> TabulatedWind:
@@ -125,9 +144,18 @@ class TabulatedWind(WindLoads):
     def __init__(self, config: TabulatedWindConfig) -> None:
         super().__init__()
         dynamic = 0.5 * config.density
-        areas = torch.tensor([config.frontal_area, config.lateral_area, config.lateral_area * config.length], dtype=torch.float64)
-        values = torch.tensor([config.C_X, config.C_Y, config.C_N], dtype=torch.float64).T * areas * dynamic
-        self.register_buffer("angle", torch.tensor(config.angle, dtype=torch.float64), persistent=False)
+        areas = torch.tensor(
+            [config.frontal_area, config.lateral_area, config.lateral_area * config.length],
+            dtype=torch.float64,
+        )
+        values = (
+            torch.tensor([config.C_X, config.C_Y, config.C_N], dtype=torch.float64).T
+            * areas
+            * dynamic
+        )
+        self.register_buffer(
+            "angle", torch.tensor(config.angle, dtype=torch.float64), persistent=False
+        )
         self.register_buffer("values", values, persistent=False)
         self.height = config.centre_height
         self.angle: Tensor
@@ -141,7 +169,9 @@ class TabulatedWind(WindLoads):
         ahead = torch.where(calm, torch.ones_like(along), -along)
         angle = torch.atan2(-across, ahead)
         turn = self.angle.to(angle.dtype)
-        upper = torch.searchsorted(turn, angle.abs().detach().contiguous(), right=True).clamp(1, turn.shape[0] - 1)
+        upper = torch.searchsorted(turn, angle.abs().detach().contiguous(), right=True).clamp(
+            1, turn.shape[0] - 1
+        )
         share = ((angle.abs() - turn[upper - 1]) / (turn[upper] - turn[upper - 1])).unsqueeze(-1)
         table = self.values.to(angle.dtype)
         force = (table[upper - 1] * (1.0 - share) + table[upper] * share) * square.unsqueeze(-1)

@@ -1,4 +1,6 @@
-"""Figures of the manoeuvring booklet: turning circles with all draws, measured zigzags beside their repetition by the model."""
+"""Figures of the manoeuvring booklet: turning circles with all draws, measured zigzags beside their
+repetition by the model.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,13 @@ from residnet.report.run_reader import RunFiles
 
 _DRAWN: dict[str, Any] = {"color": SOLID["color"], "alpha": 0.12, "linewidth": 0.7, "zorder": 1}
 _BAND: dict[str, Any] = {"color": SOLID["color"], "alpha": 0.22, "linewidth": 0, "zorder": 1}
-_RUDDER: dict[str, Any] = {"color": "0.45", "linestyle": (0, (1, 1)), "linewidth": 1.0, "zorder": 1, "label": "rudder"}
+_RUDDER: dict[str, Any] = {
+    "color": "0.45",
+    "linestyle": (0, (1, 1)),
+    "linewidth": 1.0,
+    "zorder": 1,
+    "label": "rudder",
+}
 _RULE: dict[str, Any] = {"color": "0.2", "linewidth": 0.8}
 _MOST_ZIGZAGS = 6
 _DEG = math.degrees(1.0)
@@ -34,8 +42,11 @@ def of_booklet(run: RunFiles) -> Iterator[tuple[str, str, str, Any]]:
         yield (
             "booklet_circles",
             "Turning circles",
-            f"North up, in hull lengths from the place of the order; thin lines are {run.booklet['draws']} draws of the model's parameters. "
-            "Lines mark advance (to 90 deg) and tactical diameter (to 180 deg) of the fitted model.",
+            (
+                "North up, in hull lengths from the place of the order; thin lines are"
+                f" {run.booklet['draws']} draws of the model's parameters. Lines mark advance (to"
+                " 90 deg) and tactical diameter (to 180 deg) of the fitted model."
+            ),
             _circles(frame, circles, float(run.booklet["length"])),
         )
     zigzags = [page for page in pages if page["manoeuvre"] == "zigzag"]
@@ -43,8 +54,11 @@ def of_booklet(run: RunFiles) -> Iterator[tuple[str, str, str, Any]]:
         yield (
             f"booklet_zigzags_{place // _MOST_ZIGZAGS + 1}",
             "Zigzags in closed loop",
-            "The model steers by its own heading with the rudder angle and the reversals of each trial; dotted: the rudder. Look for the height of "
-            f"the peaks (overshoot) and for periods that run apart. Band: {level} of the draws at each instant.",
+            (
+                "The model steers by its own heading with the rudder angle and the reversals of"
+                " each trial; dotted: the rudder. Look for the height of the peaks (overshoot) and"
+                f" for periods that run apart. Band: {level} of the draws at each instant."
+            ),
             _zigzags(frame, zigzags[place : place + _MOST_ZIGZAGS], float(run.booklet["level"])),
         )
 
@@ -56,7 +70,11 @@ def _circles(frame: Any, pages: Sequence[Mapping[str, Any]], length: float) -> A
     for page in pages:
         own = frame[frame["page"] == page["name"]]
         for draw, part in own[own["draw"] >= 0].groupby("draw"):
-            axes.plot(part["y"] / length, part["x"] / length, **({**SOLID, "label": "model"} if draw == 0 else {**_DRAWN, "label": "draws"}))
+            axes.plot(
+                part["y"] / length,
+                part["x"] / length,
+                **({**SOLID, "label": "model"} if draw == 0 else {**_DRAWN, "label": "draws"}),
+            )
         found = page["indices"]
         if "tactical_diameter" in found:
             fitted = own[own["draw"] == 0]
@@ -65,9 +83,19 @@ def _circles(frame: Any, pages: Sequence[Mapping[str, Any]], length: float) -> A
             diameter = side * found["tactical_diameter"]["lengths"]
             axes.hlines(advance, 0, transfer, **_RULE)
             axes.vlines(diameter, 0, advance, **_RULE)
-            axes.annotate(f"advance {advance:.2f}", (0, advance), (side * 3, 3), textcoords="offset points", ha="left" if side > 0 else "right")
             axes.annotate(
-                f"tactical diameter {abs(diameter):.2f}", (diameter, 0), (0, -11), textcoords="offset points", ha="right" if side > 0 else "left"
+                f"advance {advance:.2f}",
+                (0, advance),
+                (side * 3, 3),
+                textcoords="offset points",
+                ha="left" if side > 0 else "right",
+            )
+            axes.annotate(
+                f"tactical diameter {abs(diameter):.2f}",
+                (diameter, 0),
+                (0, -11),
+                textcoords="offset points",
+                ha="right" if side > 0 else "left",
             )
     collect(handles, axes)
     axes.plot(0, 0, "o", color="black", markerfacecolor="white", markersize=6, zorder=6)
@@ -87,19 +115,37 @@ def _zigzags(frame: Any, pages: Sequence[Mapping[str, Any]], level: float) -> An
         axes = figure.add_subplot(lines, columns, place + 1)
         own = frame[frame["page"] == page["name"]]
         fitted = own[own["draw"] == 0]
-        drawn = [_DEG * (part["psi"] - part["psi"].iloc[0]).to_numpy() for draw, part in own[own["draw"] > 0].groupby("draw")]
+        drawn = [
+            _DEG * (part["psi"] - part["psi"].iloc[0]).to_numpy()
+            for draw, part in own[own["draw"] > 0].groupby("draw")
+        ]
         if drawn:
-            # flights that end at their stop condition are of different length: the band ends with the shortest
+            # flights that end at their stop condition are of different length: the band ends with
+            # the shortest
             shortest = min(map(len, drawn))
-            bounds = np.quantile(np.stack([line[:shortest] for line in drawn]), (0.5 - level / 2, 0.5 + level / 2), axis=0)
-            t = own[own["draw"] == 1]["t"].to_numpy()[:shortest] if (own["draw"] == 1).any() else np.zeros(0)
+            bounds = np.quantile(
+                np.stack([line[:shortest] for line in drawn]),
+                (0.5 - level / 2, 0.5 + level / 2),
+                axis=0,
+            )
+            t = (
+                own[own["draw"] == 1]["t"].to_numpy()[:shortest]
+                if (own["draw"] == 1).any()
+                else np.zeros(0)
+            )
             if t.size == shortest:
                 axes.fill_between(t, *bounds, **_BAND)
-        axes.plot(fitted["t"], _DEG * (fitted["psi"] - fitted["psi"].iloc[0]), **SOLID, label="model")
+        axes.plot(
+            fitted["t"], _DEG * (fitted["psi"] - fitted["psi"].iloc[0]), **SOLID, label="model"
+        )
         axes.plot(fitted["t"], _DEG * fitted["rudder"], **_RUDDER)
         measured = own[own["draw"] == -1]
         if len(measured):
-            axes.plot(measured["t"], _DEG * (measured["psi"] - measured["psi"].iloc[0]), **{**MEASURED, "linewidth": 1.1, "zorder": 5})
+            axes.plot(
+                measured["t"],
+                _DEG * (measured["psi"] - measured["psi"].iloc[0]),
+                **{**MEASURED, "linewidth": 1.1, "zorder": 5},
+            )
         axes.set_title(page_title(page))
         axes.set_ylabel("heading, rudder [deg]")
         axes.set_xlabel("time [s]")
@@ -110,4 +156,8 @@ def _zigzags(frame: Any, pages: Sequence[Mapping[str, Any]], level: float) -> An
 
 def page_title(page: Mapping[str, Any]) -> str:
     """Name of a page, with the split of a measured log."""
-    return f"{page['name']} ({page['split']})" if page["split"] else str(page["name"]).replace("_", " ")
+    return (
+        f"{page['name']} ({page['split']})"
+        if page["split"]
+        else str(page["name"]).replace("_", " ")
+    )

@@ -1,4 +1,6 @@
-"""Figures of errors: against horizon, by model and split, over training, and of the residual itself."""
+"""Figures of errors: against horizon, by model and split, over training, and of the residual
+itself.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +15,16 @@ from residnet.report.run_reader import Row, RunFiles, StoredWindow
 
 _DEG = 180.0 / math.pi
 _BINS = 60
-_AXES = (("u_dot", "surge", "m/s²", 1.0), ("v_dot", "sway", "m/s²", 1.0), ("r_dot", "yaw", "deg/s²", _DEG))
-_VELOCITIES = (("u", "surge velocity u [m/s]", 1.0), ("v", "sway velocity v [m/s]", 1.0), ("r", "yaw rate r [deg/s]", _DEG))
+_AXES = (
+    ("u_dot", "surge", "m/s²", 1.0),
+    ("v_dot", "sway", "m/s²", 1.0),
+    ("r_dot", "yaw", "deg/s²", _DEG),
+)
+_VELOCITIES = (
+    ("u", "surge velocity u [m/s]", 1.0),
+    ("v", "sway velocity v [m/s]", 1.0),
+    ("r", "yaw rate r [deg/s]", _DEG),
+)
 _HORIZON = ("u [m/s]", "v [m/s]", "r [deg/s]", "position [m]", "heading [deg]")
 
 
@@ -22,8 +32,9 @@ def growth(windows: Sequence[StoredWindow], model: str) -> tuple[np.ndarray, np.
     """RMS errors over windows against the time since the start.
 
     Returns:
-        middles of time bins [K] in s, and errors [K, 5] of u, v (m/s), r (deg/s), position (m), heading (deg); bins that
-        fewer than half of the windows reach are left out. u, v and position count where usable.
+        middles of time bins [K] in s, and errors [K, 5] of u, v (m/s), r (deg/s), position (m),
+        heading (deg); bins that fewer than half of the windows reach are left out. u, v and
+        position count where usable.
     """
     own = [window for window in windows if model in window.predicted]
     longest = max(float(window.t[-1] - window.t[0]) for window in own)
@@ -31,7 +42,13 @@ def growth(windows: Sequence[StoredWindow], model: str) -> tuple[np.ndarray, np.
     squares, samples, reached = np.zeros((count, 5)), np.zeros((count, 5)), np.zeros(count)
     for window in own:
         error = window.predicted[model] - window.measured
-        columns = (error[:, 0], error[:, 1], _DEG * error[:, 2], np.hypot(error[:, 4], error[:, 5]), _DEG * error[:, 3])
+        columns = (
+            error[:, 0],
+            error[:, 1],
+            _DEG * error[:, 2],
+            np.hypot(error[:, 4], error[:, 5]),
+            _DEG * error[:, 3],
+        )
         index = np.minimum((count * (window.t - window.t[0]) / longest).astype(int), count - 1)
         reached[np.unique(index)] += 1
         for k, column in enumerate(columns):
@@ -50,13 +67,20 @@ def horizon(run: RunFiles, windows: Sequence[StoredWindow]) -> Any:
     grid = figure.subplots(3, 2, sharex=True)
     panels = [grid[0, 0], grid[1, 0], grid[2, 0], grid[1, 1], grid[2, 1]]
     handles: dict[str, Any] = {}
-    curves = {model: growth(windows, model) for model in run.kinds if any(model in window.predicted for window in windows)}
+    curves = {
+        model: growth(windows, model)
+        for model in run.kinds
+        if any(model in window.predicted for window in windows)
+    }
     look = styles(run)
     for k, (axes, text) in enumerate(zip(panels, _HORIZON, strict=True)):
         for model, (time, error) in curves.items():
             axes.plot(time, error[:, k], **look[model])
-        # the first bin, where every position and heading error starts from zero, would stretch the scale
-        later = np.concatenate([error[1:, k] if len(error) > 1 else error[:, k] for _, error in curves.values()])
+        # the first bin, where every position and heading error starts from zero, would stretch the
+        # scale
+        later = np.concatenate(
+            [error[1:, k] if len(error) > 1 else error[:, k] for _, error in curves.values()]
+        )
         later = later[np.isfinite(later) & (later > 0)]
         if later.size:
             axes.set_yscale("log")
@@ -77,13 +101,19 @@ def _plain_log(axes: Any) -> None:
 
     low, high = axes.get_ylim()
     decades = math.log10(high / low)
-    axes.yaxis.set_major_locator(LogLocator(subs=(1.0,) if decades > 2.5 else (1.0, 3.0) if decades > 1.5 else (1.0, 2.0, 5.0)))
+    axes.yaxis.set_major_locator(
+        LogLocator(
+            subs=(1.0,) if decades > 2.5 else (1.0, 3.0) if decades > 1.5 else (1.0, 2.0, 5.0)
+        )
+    )
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.yaxis.set_minor_formatter(NullFormatter())
 
 
 def bars(run: RunFiles, protocol: str) -> Any:
-    """RMSE by model, train beside test, with 95 % intervals; as figures 16 and 17 of document 003. `zero` is left out: it would flatten the rest."""
+    """RMSE by model, train beside test, with 95 % intervals; as figures 16 and 17 of document 003.
+    `zero` is left out: it would flatten the rest.
+    """
     from matplotlib.patches import Patch
 
     models = [model for model, kind in run.kinds.items() if kind != "zero"]
@@ -102,22 +132,38 @@ def bars(run: RunFiles, protocol: str) -> Any:
                 interval = (row.get("rmse_ci95") or {}).get(channel) or [row["rmse"][channel]] * 2
                 low, high = (factor * edge for edge in interval)
                 y = number + (place - 0.5 * (len(run.sides) - 1)) * thick
-                axes.barh(y, value, thick, color=look[model]["color"], alpha=_alpha(run, split), edgecolor="black", linewidth=0.5)
+                axes.barh(
+                    y,
+                    value,
+                    thick,
+                    color=look[model]["color"],
+                    alpha=_alpha(run, split),
+                    edgecolor="black",
+                    linewidth=0.5,
+                )
                 spread = [[max(value - low, 0.0)], [max(high - value, 0.0)]]
                 axes.errorbar(value, y, xerr=spread, color="black", linewidth=0.9, capsize=2)
         axes.set_xlabel(f"RMSE of {text.split()[-2]} {text.split()[-1]}")
-        axes.set_title(text.rsplit(" ", 2)[0] + (f"\n({group.replace('_', ' ')} runs)" if group != "all" else ""))
+        axes.set_title(
+            text.rsplit(" ", 2)[0]
+            + (f"\n({group.replace('_', ' ')} runs)" if group != "all" else "")
+        )
         axes.grid(False, axis="y")
         axes.set_xlim(left=0)
     panels[0].set_yticks(range(len(models)), [short_label(run, model) for model in models])
     panels[0].invert_yaxis()
-    handles = {split: Patch(facecolor="0.4", alpha=_alpha(run, split), edgecolor="black", linewidth=0.5) for split in run.sides}
+    handles = {
+        split: Patch(facecolor="0.4", alpha=_alpha(run, split), edgecolor="black", linewidth=0.5)
+        for split in run.sides
+    }
     legend_above(figure, handles)
     return figure
 
 
 def bar_group(run: RunFiles, protocol: str, channel: str) -> str:
-    """Manoeuvres that a channel is judged on: surge on the group `speed`, the others on `steering`, where a run has these groups."""
+    """Manoeuvres that a channel is judged on: surge on the group `speed`, the others on `steering`,
+    where a run has these groups.
+    """
     groups = set(run.manoeuvres(run.focus, protocol))
     return ("speed" if channel == "u" else "steering") if {"speed", "steering"} <= groups else "all"
 
@@ -127,7 +173,9 @@ def _alpha(run: RunFiles, split: str) -> float:
 
 
 def residuals(run: RunFiles, table: Mapping[str, np.ndarray], models: Sequence[str]) -> Any:
-    """Residual target against prediction, one line of panels for each head; table: columns model, axis, target, predicted (SI)."""
+    """Residual target against prediction, one line of panels for each head; table: columns model,
+    axis, target, predicted (SI).
+    """
     from matplotlib.ticker import MaxNLocator
 
     figure = new_figure(0.2 + 2.5 * len(models))
@@ -135,20 +183,35 @@ def residuals(run: RunFiles, table: Mapping[str, np.ndarray], models: Sequence[s
     for line, model in zip(panels, models, strict=True):
         for axes, (axis, name, unit, factor) in zip(line, _AXES, strict=True):
             chosen = (table["model"] == model) & (table["axis"] == axis)
-            target, predicted = factor * table["target"][chosen].astype(float), factor * table["predicted"][chosen].astype(float)
+            target, predicted = (
+                factor * table["target"][chosen].astype(float),
+                factor * table["predicted"][chosen].astype(float),
+            )
             if not target.size:
                 axes.set_axis_off()
                 continue
             # the outermost thousandth would shrink the cloud to a dot
-            reach = 1.08 * float(np.quantile(np.abs(np.concatenate((target, predicted))), 0.999)) or 1.0
+            reach = (
+                1.08 * float(np.quantile(np.abs(np.concatenate((target, predicted))), 0.999)) or 1.0
+            )
             axes.hexbin(
-                predicted, target, gridsize=45, extent=(-reach, reach, -reach, reach), bins="log", mincnt=1, cmap="Blues", vmin=0.3, linewidths=0.1
+                predicted,
+                target,
+                gridsize=45,
+                extent=(-reach, reach, -reach, reach),
+                bins="log",
+                mincnt=1,
+                cmap="Blues",
+                vmin=0.3,
+                linewidths=0.1,
             )
             axes.plot([-reach, reach], [-reach, reach], color="black", linewidth=0.9)
             axes.set_xlim(-reach, reach)
             axes.set_ylim(-reach, reach)
             axes.set_aspect("equal")
-            axes.set_title(f"{short_label(run, model)}\n{name}, R² = {r_squared(target, predicted):.2f}")
+            axes.set_title(
+                f"{short_label(run, model)}\n{name}, R² = {r_squared(target, predicted):.2f}"
+            )
             axes.xaxis.set_major_locator(MaxNLocator(4, symmetric=True))
             axes.yaxis.set_major_locator(MaxNLocator(4, symmetric=True))
             axes.set_xlabel(f"predicted [{unit}]")
@@ -163,7 +226,9 @@ def r_squared(target: np.ndarray, predicted: np.ndarray) -> float:
 
 
 def learning_curves(run: RunFiles, models: Sequence[str]) -> Any:
-    """Loss and free-run error on validation data by epoch, one column for each trained head; stages are parted by lines."""
+    """Loss and free-run error on validation data by epoch, one column for each trained head; stages
+    are parted by lines.
+    """
     from matplotlib.ticker import MaxNLocator
 
     figure = new_figure(4.2)
@@ -173,18 +238,48 @@ def learning_curves(run: RunFiles, models: Sequence[str]) -> Any:
         curve = run.fit(model)["curve"]
         epoch = np.array([point["epoch"] for point in curve]) + 1
         stage = np.array([point.get("stage", 0) for point in curve])
-        loss, validation = (np.array([_number(point.get(key)) for point in curve]) for key in ("loss", "validation"))
+        loss, validation = (
+            np.array([_number(point.get(key)) for point in curve]) for key in ("loss", "validation")
+        )
         top, bottom = panels[:, column]
         for number in np.unique(stage):
-            top.plot(epoch[stage == number], loss[stage == number], color=look[model]["color"], linewidth=1.4, marker=".", markersize=4)
+            top.plot(
+                epoch[stage == number],
+                loss[stage == number],
+                color=look[model]["color"],
+                linewidth=1.4,
+                marker=".",
+                markersize=4,
+            )
         finite = np.isfinite(validation)
-        bottom.plot(epoch[finite], validation[finite], color=look[model]["color"], linewidth=1.4, marker=".", markersize=4)
+        bottom.plot(
+            epoch[finite],
+            validation[finite],
+            color=look[model]["color"],
+            linewidth=1.4,
+            marker=".",
+            markersize=4,
+        )
         if finite.any():
             best = int(np.nanargmin(validation))
-            bottom.plot(epoch[best], validation[best], "o", color="black", markerfacecolor="none", markersize=7, label="best epoch")
+            bottom.plot(
+                epoch[best],
+                validation[best],
+                "o",
+                color="black",
+                markerfacecolor="none",
+                markersize=7,
+                label="best epoch",
+            )
         reference = run.row(run.baseline, "validation", run.protocols[0])
         if reference is not None:
-            bottom.axhline(reference["nrmse"]["mean"], color=look[str(run.baseline)]["color"], linestyle="--", linewidth=1.2, label=str(run.baseline))
+            bottom.axhline(
+                reference["nrmse"]["mean"],
+                color=look[str(run.baseline)]["color"],
+                linestyle="--",
+                linewidth=1.2,
+                label=str(run.baseline),
+            )
         _stages(top, bottom, epoch, stage, run.resolved, model)
         top.set_yscale("log")
         top.set_title(short_label(run, model), pad=14)
@@ -197,7 +292,9 @@ def learning_curves(run: RunFiles, models: Sequence[str]) -> Any:
     return figure
 
 
-def _stages(top: Any, bottom: Any, epoch: np.ndarray, stage: np.ndarray, resolved: Row, model: str) -> None:
+def _stages(
+    top: Any, bottom: Any, epoch: np.ndarray, stage: np.ndarray, resolved: Row, model: str
+) -> None:
     settings = (resolved.get("training") or {}).get(model) or {}
     steps = settings.get("multi_step") or []
     for number in np.unique(stage):
@@ -206,10 +303,23 @@ def _stages(top: Any, bottom: Any, epoch: np.ndarray, stage: np.ndarray, resolve
             top.axvline(begin, color="0.5", linewidth=0.8)
             bottom.axvline(begin, color="0.5", linewidth=0.8)
         index = int(number) - 1
-        text = "one-step" if index < 0 else f"{steps[index]['horizon']:g} s" if index < len(steps) else f"stage {index + 1}"
+        text = (
+            "one-step"
+            if index < 0
+            else f"{steps[index]['horizon']:g} s"
+            if index < len(steps)
+            else f"stage {index + 1}"
+        )
         middle = float(epoch[stage == number].mean())
         top.annotate(
-            text, (middle, 1.0), (0, 2), xycoords=("data", "axes fraction"), textcoords="offset points", ha="center", fontsize=8, color="0.25"
+            text,
+            (middle, 1.0),
+            (0, 2),
+            xycoords=("data", "axes fraction"),
+            textcoords="offset points",
+            ha="center",
+            fontsize=8,
+            color="0.25",
         )
 
 

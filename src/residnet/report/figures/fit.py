@@ -29,10 +29,12 @@ class FigureFile:
 
 
 def write_figures(run: Path) -> list[FigureFile]:
-    """Write `figures/*.png` of a run folder; what the folder has no data for is left out, and figures of an earlier call are replaced.
+    """Write `figures/*.png` of a run folder; what the folder has no data for is left out, and
+    figures of an earlier call are replaced.
 
     Args:
-        run: folder with metrics.json, and rollouts/, residuals.parquet, models/*/fit.json where there are any.
+        run: folder with metrics.json, and rollouts/, residuals.parquet, models/*/fit.json where
+            there are any.
 
     Returns:
         The figures in the order in which a report shows them.
@@ -56,7 +58,9 @@ def write_figures(run: Path) -> list[FigureFile]:
 
 
 def read_figures(run: Path) -> list[FigureFile]:
-    """The figures that stand in a run folder, in their order; pictures that do not carry a caption are not ours and are left out."""
+    """The figures that stand in a run folder, in their order; pictures that do not carry a caption
+    are not ours and are left out.
+    """
     from PIL import Image
 
     out = []
@@ -85,8 +89,11 @@ def _of_runs(run: RunFiles) -> Iterator[tuple[str, str, str, Any]]:
         yield (
             "tracks",
             "Tracks",
-            f"North up, each from its start: for every kind of manoeuvre in the {run.focus} data the run in which {judge} has its median error; "
-            "look for a predicted track that turns tighter, wider or later than the measured one.",
+            (
+                f"North up, each from its start: for every kind of manoeuvre in the {run.focus}"
+                f" data the run in which {judge} has its median error; look for a predicted track"
+                " that turns tighter, wider or later than the measured one."
+            ),
             figures_tracks.tracks(run, chosen),
         )
     for window in chosen:
@@ -94,8 +101,11 @@ def _of_runs(run: RunFiles) -> Iterator[tuple[str, str, str, Any]]:
         yield (
             f"history_{window.manoeuvre}",
             f"Time history: {kind}",
-            f"Free run of {window.log} from its first measured state and its inputs alone; look for lag at the reversals and for levels "
-            "that stay apart once the motion has settled. Grey: masked, u and v not scored.",
+            (
+                f"Free run of {window.log} from its first measured state and its inputs alone; look"
+                " for lag at the reversals and for levels that stay apart once the motion has"
+                " settled. Grey: masked, u and v not scored."
+            ),
             figures_tracks.history(run, window),
         )
     for name in run.protocols:
@@ -104,8 +114,12 @@ def _of_runs(run: RunFiles) -> Iterator[tuple[str, str, str, Any]]:
             yield (
                 f"horizon_{name}",
                 f"Error against horizon: {name}",
-                f"RMS over the {len(own)} free runs of protocol {name} ({run.focus} data), logarithmic; a curve that stays level predicts as well "
-                "late as early, one that climbs drifts; the level that no model undercuts is the measuring noise.",
+                (
+                    f"RMS over the {len(own)} free runs of protocol {name} ({run.focus} data),"
+                    " logarithmic; a curve that stays level predicts as well late as early, one"
+                    " that climbs drifts; the level that no model undercuts is the measuring"
+                    " noise."
+                ),
                 figures_errors.horizon(run, own),
             )
 
@@ -115,9 +129,15 @@ def _of_errors(run: RunFiles) -> Iterator[tuple[str, str, str, Any]]:
     yield (
         "bars",
         "Free-run error by model",
-        f"RMSE under protocol {protocol} with 95 % intervals over free runs; {run.focus} bars well beyond the train bars would mean overfitting."
-        if len(run.sides) > 1
-        else f"RMSE under protocol {protocol} with 95 % intervals over free runs ({run.focus} data).",
+        (
+            f"RMSE under protocol {protocol} with 95 % intervals over free runs; {run.focus} bars"
+            " well beyond the train bars would mean overfitting."
+            if len(run.sides) > 1
+            else (
+                f"RMSE under protocol {protocol} with 95 % intervals over free runs ({run.focus}"
+                " data)."
+            )
+        ),
         figures_errors.bars(run, protocol),
     )
     path = run.path / "residuals.parquet"
@@ -133,8 +153,11 @@ def _of_errors(run: RunFiles) -> Iterator[tuple[str, str, str, Any]]:
         yield (
             f"residuals_{place // _PER_FIGURE + 1}" if len(models) > _PER_FIGURE else "residuals",
             "Residual: target against prediction",
-            "Acceleration that the baseline leaves (from smoothed derivatives, so noisy itself) against what each head makes of it; "
-            "a cloud along the line is learned, a cloud upright on zero is not in the head's reach.",
+            (
+                "Acceleration that the baseline leaves (from smoothed derivatives, so noisy itself)"
+                " against what each head makes of it; a cloud along the line is learned, a cloud"
+                " upright on zero is not in the head's reach."
+            ),
             figures_errors.residuals(run, table, models[place : place + _PER_FIGURE]),
         )
 
@@ -145,7 +168,10 @@ def _of_training(run: RunFiles) -> Iterator[tuple[str, str, str, Any]]:
         yield (
             f"learning_{place // _PER_FIGURE + 1}" if len(models) > _PER_FIGURE else "learning",
             "Learning curves",
-            "Stages (one-step, then free runs of the stated length) have losses of their own, so only the slopes count; "
-            "the lower panels decide: the kept weights are those of the circled epoch, and a curve still falling at its end asks for more epochs.",
+            (
+                "Stages (one-step, then free runs of the stated length) have losses of their own,"
+                " so only the slopes count; the lower panels decide: the kept weights are those of"
+                " the circled epoch, and a curve still falling at its end asks for more epochs."
+            ),
             figures_errors.learning_curves(run, models[place : place + _PER_FIGURE]),
         )

@@ -1,4 +1,5 @@
-"""Figures of simulated manoeuvres: tracks and time histories of a vessel, a learned model, or both."""
+"""Figures of simulated manoeuvres: tracks and time histories of a vessel, a learned model, or both.
+"""
 
 from __future__ import annotations
 
@@ -12,12 +13,25 @@ import numpy as np
 from residnet.core.log import Log
 from residnet.data.simulated.flying import Flight
 from residnet.manoeuvres import Replay, Spiral, Waypoints, Zigzag
-from residnet.report.figures.style import DASHED, RC, SOLID, WIDTH, collect, legend_above, new_figure, save
+from residnet.report.figures.style import (
+    DASHED,
+    RC,
+    SOLID,
+    WIDTH,
+    collect,
+    legend_above,
+    new_figure,
+    save,
+)
 
 MOST = 12
 """Flights that have a time history of their own; of more, the first of each kind has."""
 _PER_FIGURE = 6
-_UNITS = {"rad": ("deg", math.degrees(1.0)), "rad/s": ("deg/s", math.degrees(1.0)), "1/s": ("rpm", 60.0)}
+_UNITS = {
+    "rad": ("deg", math.degrees(1.0)),
+    "rad/s": ("deg/s", math.degrees(1.0)),
+    "1/s": ("rpm", 60.0),
+}
 _NAMES = {
     "u": "surge velocity\nu", "v": "sway velocity\nv", "r": "yaw rate\nr", "p": "roll rate\np", "psi": "heading\n", "phi": "roll angle\n",
     "cmd_delta": "rudder\ncommand", "cmd_n": "revolutions\ncommand", "cmd_port": "port command\n", "cmd_stbd": "starboard\ncommand",
@@ -25,15 +39,19 @@ _NAMES = {
 
 
 def draw_flights(folder: Path, flown: Mapping[str, Sequence[Flight]]) -> list[Path]:
-    """Write `tracks_<n>.png`, `history_<log>.png` and, for spirals, `spiral_<log>.png`; returns the files.
+    """Write `tracks_<n>.png`, `history_<log>.png` and, for spirals, `spiral_<log>.png`; returns the
+    files.
 
     Args:
         folder: for the figures.
-        flown: flights of the same manoeuvres by what flew them; of two, the first is the solid line and the second the dashed one.
+        flown: flights of the same manoeuvres by what flew them; of two, the first is the solid line
+            and the second the dashed one.
     """
     from matplotlib import rc_context
 
-    logs = [[flights[i] for flights in flown.values()] for i in range(len(next(iter(flown.values()))))]
+    logs = [
+        [flights[i] for flights in flown.values()] for i in range(len(next(iter(flown.values()))))
+    ]
     kinds: dict[str, list[Flight]] = {}
     for group in logs:
         kinds.setdefault(group[0].manoeuvre.kind, group)
@@ -42,16 +60,31 @@ def draw_flights(folder: Path, flown: Mapping[str, Sequence[Flight]]) -> list[Pa
     with rc_context(RC):
         for place in range(0, len(chosen), _PER_FIGURE):
             path = folder / f"tracks_{place // _PER_FIGURE + 1}.png"
-            save(_tracks(list(flown), chosen[place : place + _PER_FIGURE]), path, "Tracks", "North up, equal scales, each from its start.")
+            save(
+                _tracks(list(flown), chosen[place : place + _PER_FIGURE]),
+                path,
+                "Tracks",
+                "North up, equal scales, each from its start.",
+            )
             out.append(path)
         for group in chosen:
             name = group[0].motion.name
             path = folder / f"history_{name}.png"
-            save(_history(list(flown), group), path, f"Time history: {name}", "The motion itself, without the noise of sensors, and the commands.")
+            save(
+                _history(list(flown), group),
+                path,
+                f"Time history: {name}",
+                "The motion itself, without the noise of sensors, and the commands.",
+            )
             out.append(path)
             if group[0].manoeuvre.kind == "spiral":
                 path = folder / f"spiral_{name}.png"
-                save(_spiral(list(flown), group), path, f"Spiral: {name}", "Steady yaw rate over helm; a loop about zero shows an unstable vessel.")
+                save(
+                    _spiral(list(flown), group),
+                    path,
+                    f"Spiral: {name}",
+                    "Steady yaw rate over helm; a loop about zero shows an unstable vessel.",
+                )
                 out.append(path)
     return out
 
@@ -66,7 +99,12 @@ def _recorded(flight: Flight) -> Log | None:
         return None
     log = flight.manoeuvre.recorded
     length = int(np.searchsorted(log.t - log.t[0], flight.motion.t[-1], side="right"))
-    return Log(log.name, log.t[:length], {name: values[:length] for name, values in log.channels.items()}, log.units)
+    return Log(
+        log.name,
+        log.t[:length],
+        {name: values[:length] for name, values in log.channels.items()},
+        log.units,
+    )
 
 
 def _tracks(crafts: Sequence[str], groups: Sequence[Sequence[Flight]]) -> Any:
@@ -80,13 +118,34 @@ def _tracks(crafts: Sequence[str], groups: Sequence[Sequence[Flight]]) -> Any:
         manoeuvre = group[0].manoeuvre
         x0, y0 = (float(group[0].motion[name][0]) for name in ("x", "y"))
         if (recorded := _recorded(group[0])) is not None:
-            axes.plot(recorded["y"] - y0, recorded["x"] - x0, color="0.5", linewidth=2.2, label="recorded")
+            axes.plot(
+                recorded["y"] - y0, recorded["x"] - x0, color="0.5", linewidth=2.2, label="recorded"
+            )
         for i, flight in enumerate(group):
             axes.plot(flight.motion["y"] - y0, flight.motion["x"] - x0, **_look(i, crafts[i]))
-        axes.plot(0, 0, "o", color="black", markerfacecolor="white", markersize=6, linestyle="none", label="start", zorder=6)
+        axes.plot(
+            0,
+            0,
+            "o",
+            color="black",
+            markerfacecolor="white",
+            markersize=6,
+            linestyle="none",
+            label="start",
+            zorder=6,
+        )
         if isinstance(manoeuvre, Waypoints):
             north, east = np.array(manoeuvre.points).T
-            axes.plot(east - y0, north - x0, "s", color="0.4", markersize=5, linestyle="none", label="way-point", zorder=5)
+            axes.plot(
+                east - y0,
+                north - x0,
+                "s",
+                color="0.4",
+                markersize=5,
+                linestyle="none",
+                label="way-point",
+                zorder=5,
+            )
         axes.set_aspect("equal", adjustable="datalim")
         axes.margins(0.08)
         axes.locator_params(axis="x", nbins=5)
@@ -100,7 +159,9 @@ def _tracks(crafts: Sequence[str], groups: Sequence[Sequence[Flight]]) -> Any:
 
 def _history(crafts: Sequence[str], group: Sequence[Flight]) -> Any:
     first = group[0].motion
-    names: list[str] = [name for name in ("u", "v", "r", "p", "psi", "phi") if name in first.channels]
+    names: list[str] = [
+        name for name in ("u", "v", "r", "p", "psi", "phi") if name in first.channels
+    ]
     names += [name for name in first.channels if name.startswith("cmd_")]
     figure = new_figure(0.6 + 1.3 * len(names))
     panels = figure.subplots(len(names), 1, sharex=True)
@@ -109,14 +170,27 @@ def _history(crafts: Sequence[str], group: Sequence[Flight]) -> Any:
     for axes, name in zip(panels, names, strict=True):
         unit, factor = _UNITS.get(first.units[name], (first.units[name], 1.0))
         if recorded is not None and name in recorded.channels:
-            axes.plot(recorded.t - recorded.t[0], factor * recorded[name], color="0.5", linewidth=2.2, label="recorded")
+            axes.plot(
+                recorded.t - recorded.t[0],
+                factor * recorded[name],
+                color="0.5",
+                linewidth=2.2,
+                label="recorded",
+            )
         if name == "psi" and isinstance(group[0].manoeuvre, Zigzag):
             for side in (-1.0, 1.0):
-                axes.axhline(factor * (first["psi"][0] + side * group[0].manoeuvre.heading), color="0.6", linewidth=0.8, linestyle=":")
+                axes.axhline(
+                    factor * (first["psi"][0] + side * group[0].manoeuvre.heading),
+                    color="0.6",
+                    linewidth=0.8,
+                    linestyle=":",
+                )
         for i, flight in enumerate(group):
             if name in flight.motion.channels:
                 step = {"drawstyle": "steps-post"} if name.startswith("cmd_") else {}
-                axes.plot(flight.motion.t, factor * flight.motion[name], **_look(i, crafts[i]), **step)
+                axes.plot(
+                    flight.motion.t, factor * flight.motion[name], **_look(i, crafts[i]), **step
+                )
         axes.set_ylabel(f"{_NAMES.get(name, name)} [{unit}]".replace("\n ", "\n"))
         collect(handles, axes)
     panels[-1].set_xlabel("time [s]")
@@ -135,7 +209,13 @@ def _spiral(crafts: Sequence[str], group: Sequence[Flight]) -> Any:
     for i, flight in enumerate(group):
         found = flight.manoeuvre.indices(flight.motion)
         helm, rates = np.asarray(found["steers"]), np.degrees(found["yaw_rates"])
-        axes.plot(np.degrees(helm) if by_angle else helm, rates, **_look(i, crafts[i]), marker="o", markersize=4)
+        axes.plot(
+            np.degrees(helm) if by_angle else helm,
+            rates,
+            **_look(i, crafts[i]),
+            marker="o",
+            markersize=4,
+        )
     axes.set_xlabel("rudder [deg]" if by_angle else "helm [share of full steer]")
     axes.set_ylabel("steady yaw rate [deg/s]")
     axes.set_title(group[0].motion.name)

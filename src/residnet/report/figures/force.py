@@ -1,4 +1,6 @@
-"""Pictures of force-space models: the surface of errors, and how much each basis function weighs (document 002 Figures 4.6, 4.20, 4.25)."""
+"""Pictures of force-space models: the surface of errors, and how much each basis function weighs
+(document 002 Figures 4.6, 4.20, 4.25).
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,12 @@ from residnet.report.figures.style import RC, new_figure, save
 _AXES = ("surge", "sway", "yaw")
 
 
-def draw_surface(error: Tensor, unmodelled: Sequence[float], chosen: Mapping[str, Sequence[tuple[int, int]]], path: Path) -> None:
+def draw_surface(
+    error: Tensor,
+    unmodelled: Sequence[float],
+    chosen: Mapping[str, Sequence[tuple[int, int]]],
+    path: Path,
+) -> None:
     """Share of the un-modelled MSE over model order and number of basis functions.
 
     Args:
@@ -29,10 +36,20 @@ def draw_surface(error: Tensor, unmodelled: Sequence[float], chosen: Mapping[str
         panels = figure.subplots(1, 3, sharey=True)
         for axis, axes in enumerate(panels):
             share = error[axis].numpy() / unmodelled[axis]
-            image = axes.imshow(np.log10(share), origin="lower", aspect="auto", cmap="viridis", vmin=-1.2, vmax=0.5, extent=_extent(share))
+            image = axes.imshow(
+                np.log10(share),
+                origin="lower",
+                aspect="auto",
+                cmap="viridis",
+                vmin=-1.2,
+                vmax=0.5,
+                extent=_extent(share),
+            )
             for (name, picks), mark in zip(chosen.items(), ("x", "o", "s"), strict=False):
                 order, count = picks[axis]
-                axes.plot(count, order, mark, color="#D55E00", fillstyle="none", label=name, markersize=7)
+                axes.plot(
+                    count, order, mark, color="#D55E00", fillstyle="none", label=name, markersize=7
+                )
             # room for marks at the edge
             axes.set_xlim(0.5, share.shape[1] + 0.5)
             axes.set_ylim(-0.5, share.shape[0] + 1.5)
@@ -48,7 +65,8 @@ def draw_surface(error: Tensor, unmodelled: Sequence[float], chosen: Mapping[str
             figure,
             path,
             "Surface analysis",
-            "Share of the un-modelled residual's mean square that is left, by model order and number of basis functions.",
+            "Share of the un-modelled residual's mean square that is left, by model order and"
+            " number of basis functions.",
         )
 
 
@@ -76,4 +94,10 @@ def draw_weights(terms: Sequence[str], pre: Tensor, title: str, path: Path) -> N
             axes.grid(axis="x", visible=False)
         panels[-1].set_xticks(range(len(terms)), list(terms), rotation=90)
         figure.supylabel("magnitude of the scaled coefficient [-]", fontsize=9)
-        save(figure, path, title, "Magnitude of the coefficients of scaled basis functions: how much each weighs in the model.")
+        save(
+            figure,
+            path,
+            title,
+            "Magnitude of the coefficients of scaled basis functions: how much each weighs in the"
+            " model.",
+        )

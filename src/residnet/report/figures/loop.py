@@ -1,4 +1,6 @@
-"""Pictures of closed loops: errors and forces over time, by the model of the feed-forward (document 002 Figures 4.31-4.39)."""
+"""Pictures of closed loops: errors and forces over time, by the model of the feed-forward (document
+002 Figures 4.31-4.39).
+"""
 
 from __future__ import annotations
 
@@ -15,8 +17,11 @@ _DEG = 180.0 / math.pi
 _FORCES = ("surge [N]", "sway [N]", "yaw [N m]")
 
 
-def draw_errors(t: Tensor, position: Mapping[str, Tensor], heading: Mapping[str, Tensor], path: Path) -> None:
-    """Distance to the desired position and heading error over time, one line for each model; logarithmic, for models differ by orders of magnitude.
+def draw_errors(
+    t: Tensor, position: Mapping[str, Tensor], heading: Mapping[str, Tensor], path: Path
+) -> None:
+    """Distance to the desired position and heading error over time, one line for each model;
+    logarithmic, for models differ by orders of magnitude.
 
     Args:
         t: [N] s.
@@ -36,7 +41,9 @@ def draw_errors(t: Tensor, position: Mapping[str, Tensor], heading: Mapping[str,
         ):
             for place, (model, error) in enumerate(series.items()):
                 look = FAMILY[place % len(FAMILY)]
-                handles[model] = axes.semilogy(t, (factor * error).clamp(min=least), **look, linewidth=1.1, label=model)[0]
+                handles[model] = axes.semilogy(
+                    t, (factor * error).clamp(min=least), **look, linewidth=1.1, label=model
+                )[0]
             axes.set_ylabel(name)
         panels[-1].set_xlabel("time [s]")
         panels[-1].set_xlim(float(t[0]), float(t[-1]))
@@ -45,11 +52,14 @@ def draw_errors(t: Tensor, position: Mapping[str, Tensor], heading: Mapping[str,
             figure,
             path,
             "Errors in closed loop",
-            "Distance to the desired position and magnitude of the heading error over time, by model of the feed-forward.",
+            "Distance to the desired position and magnitude of the heading error over time, by"
+            " model of the feed-forward.",
         )
 
 
-def draw_force_parts(t: Tensor, total: Mapping[str, Tensor], feedback: Mapping[str, Tensor], path: Path) -> None:
+def draw_force_parts(
+    t: Tensor, total: Mapping[str, Tensor], feedback: Mapping[str, Tensor], path: Path
+) -> None:
     """Commanded force and the part of it that is feedback, a column for each model.
 
     Args:
@@ -69,10 +79,19 @@ def draw_force_parts(t: Tensor, total: Mapping[str, Tensor], feedback: Mapping[s
             panels[2, column].set_xlabel("time [s]")
             for axis in range(3):
                 axes = panels[axis, column]
-                handles["commanded force"] = axes.plot(t, total[name][:, axis], **{**SOLID, "linewidth": 1.0, "zorder": 3})[0]
-                handles["feedback part"] = axes.plot(t, feedback[name][:, axis], **{**DASHED, "linewidth": 1.0, "zorder": 4})[0]
+                handles["commanded force"] = axes.plot(
+                    t, total[name][:, axis], **{**SOLID, "linewidth": 1.0, "zorder": 3}
+                )[0]
+                handles["feedback part"] = axes.plot(
+                    t, feedback[name][:, axis], **{**DASHED, "linewidth": 1.0, "zorder": 4}
+                )[0]
         for axis in range(3):
             panels[axis, 0].set_ylabel(_FORCES[axis])
         panels[-1, 0].set_xlim(float(t[0]), float(t[-1]))
         legend_above(figure, handles)
-        save(figure, path, "Forces in closed loop", "Commanded force and the part of it that is feedback, by model of the feed-forward.")
+        save(
+            figure,
+            path,
+            "Forces in closed loop",
+            "Commanded force and the part of it that is feedback, by model of the feed-forward.",
+        )

@@ -1,4 +1,6 @@
-"""Pictures of measured forces: over time, against each other, and what models leave of them (document 002 chapter 5)."""
+"""Pictures of measured forces: over time, against each other, and what models leave of them
+(document 002 chapter 5).
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,16 @@ FORCE_UNITS = ("surge [N]", "sway [N]", "yaw [N m]")
 ACCELERATION_UNITS = ("surge [m/s$^2$]", "sway [m/s$^2$]", "yaw [rad/s$^2$]")
 
 
-def draw_pair(t: Tensor, first: Tensor, second: Tensor, good: Tensor, names: Sequence[str], title: str, path: Path, labels: tuple[str, str]) -> None:
+def draw_pair(
+    t: Tensor,
+    first: Tensor,
+    second: Tensor,
+    good: Tensor,
+    names: Sequence[str],
+    title: str,
+    path: Path,
+    labels: tuple[str, str],
+) -> None:
     """Two signals of three axes over time, masked samples shaded.
 
     Args:
@@ -34,8 +45,12 @@ def draw_pair(t: Tensor, first: Tensor, second: Tensor, good: Tensor, names: Seq
         panels = figure.subplots(3, 1, sharex=True)
         handles: dict[str, Any] = {}
         for axis, axes in enumerate(panels):
-            handles[labels[0]] = axes.plot(t, first[:, axis], **{**DASHED, "linewidth": 1.1, "zorder": 3})[0]
-            handles[labels[1]] = axes.plot(t, second[:, axis], **{**SOLID, "linewidth": 1.1, "zorder": 4})[0]
+            handles[labels[0]] = axes.plot(
+                t, first[:, axis], **{**DASHED, "linewidth": 1.1, "zorder": 3}
+            )[0]
+            handles[labels[1]] = axes.plot(
+                t, second[:, axis], **{**SOLID, "linewidth": 1.1, "zorder": 4}
+            )[0]
             for a, b in _stretches(~good.numpy()):
                 handles["masked"] = axes.axvspan(float(t[a]), float(t[b - 1]), **MASKED)
             axes.set_ylabel(names[axis])
@@ -47,11 +62,14 @@ def draw_pair(t: Tensor, first: Tensor, second: Tensor, good: Tensor, names: Seq
 
 def _stretches(flags: np.ndarray) -> list[tuple[int, int]]:
     edges = np.diff(np.concatenate(([0], flags.astype(np.int8), [0])))
-    return list(zip(np.flatnonzero(edges == 1).tolist(), np.flatnonzero(edges == -1).tolist(), strict=True))
+    return list(
+        zip(np.flatnonzero(edges == 1).tolist(), np.flatnonzero(edges == -1).tolist(), strict=True)
+    )
 
 
 def draw_scores(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Error of every model less that of the believed one, in units of the force's mean square, with intervals; one panel for each force.
+    """Error of every model less that of the believed one, in units of the force's mean square, with
+    intervals; one panel for each force.
 
     Args:
         rows: of the tables, as in force_residual.json.
@@ -63,17 +81,30 @@ def draw_scores(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     with rc_context(RC):
         counts = [sum(row["force"] == group for row in rows) - 1 for group in groups]
         figure = new_figure(1.0 + 0.28 * sum(counts) + 0.45 * len(groups))
-        panels = figure.subplots(len(groups), 1, sharex=True, squeeze=False, gridspec_kw={"height_ratios": counts})[:, 0]
+        panels = figure.subplots(
+            len(groups), 1, sharex=True, squeeze=False, gridspec_kw={"height_ratios": counts}
+        )[:, 0]
         for axes, group in zip(panels, groups, strict=True):
-            members = [row for row in rows if row["force"] == group and row["model"] != "believed"][::-1]
+            members = [row for row in rows if row["force"] == group and row["model"] != "believed"][
+                ::-1
+            ]
             for place, row in enumerate(members):
                 apart = row["minus_believed"]
                 mean, within = 100 * apart["mean"][3], apart["ci95"][3]
                 beyond = within is not None and within[1] < 0
-                style = {"color": SOLID["color"] if beyond else "0.35", "marker": "o" if beyond else "s", "markersize": 4.5}
+                style = {
+                    "color": SOLID["color"] if beyond else "0.35",
+                    "marker": "o" if beyond else "s",
+                    "markersize": 4.5,
+                }
                 axes.plot([mean], [place], linestyle="none", **style)
                 if within is not None:
-                    axes.plot([100 * within[0], 100 * within[1]], [place, place], color=style["color"], linewidth=1.4)
+                    axes.plot(
+                        [100 * within[0], 100 * within[1]],
+                        [place, place],
+                        color=style["color"],
+                        linewidth=1.4,
+                    )
             axes.axvline(0.0, color="black", linewidth=0.8)
             axes.set_yticks(range(len(members)), [row["model"] for row in members])
             axes.set_ylim(-0.6, len(members) - 0.4)
@@ -81,10 +112,13 @@ def draw_scores(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
             axes.grid(axis="y", visible=False)
             axes.set_xscale("symlog", linthresh=10)
             axes.xaxis.set_major_formatter(lambda value, _: f"{value:+.0f}" if value else "0")
-        panels[-1].set_xlabel("squared error less the believed model's, mean over axes [% of the force's mean square]")
+        panels[-1].set_xlabel(
+            "squared error less the believed model's, mean over axes [% of the force's mean square]"
+        )
         save(
             figure,
             path,
             "Errors beside the believed model",
-            "Squared error of each model less that of the believed model where neither saw the data, with 95 % intervals.",
+            "Squared error of each model less that of the believed model where neither saw the"
+            " data, with 95 % intervals.",
         )

@@ -1,4 +1,6 @@
-"""How every figure looks: one colour and line style per role, sizes for print, saving as light PNG files."""
+"""How every figure looks: one colour and line style per role, sizes for print, saving as light PNG
+files.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +13,19 @@ from residnet.report.run_reader import RunFiles
 
 DPI = 140
 WIDTH = 7.0
-"""Width of every figure in inches: the text block of an A4 page, so that 9 pt stay 9 pt in print."""
+"""Width of every figure in inches: the text block of an A4 page, so that 9 pt stay 9 pt in print.
+"""
 
 # Okabe and Ito's palette, which stays distinct under the common colour-vision deficiencies
-_ORANGE, _SKY, _GREEN, _BLUE, _VERMILLION, _PURPLE, _GREY = "#E69F00", "#56B4E9", "#009E73", "#0072B2", "#D55E00", "#CC79A7", "#7F7F7F"
+_ORANGE, _SKY, _GREEN, _BLUE, _VERMILLION, _PURPLE, _GREY = (
+    "#E69F00",
+    "#56B4E9",
+    "#009E73",
+    "#0072B2",
+    "#D55E00",
+    "#CC79A7",
+    "#7F7F7F",
+)
 _HEADS: tuple[tuple[str, Any], ...] = (
     (_BLUE, "-"),
     (_VERMILLION, (0, (6, 1.5))),
@@ -32,7 +43,13 @@ FAMILY: tuple[dict[str, Any], ...] = (
 """Curves of a family, the reference first."""
 # the plant lies on the head that comes near it and shows it through its gaps
 _ORDER = {"zero": 3, "baseline": 3, "truth": 5}
-MEASURED: dict[str, Any] = {"color": "black", "linestyle": "-", "linewidth": 0.7, "label": "measured", "zorder": 2}
+MEASURED: dict[str, Any] = {
+    "color": "black",
+    "linestyle": "-",
+    "linewidth": 0.7,
+    "label": "measured",
+    "zorder": 2,
+}
 SOLID: dict[str, Any] = {"color": _BLUE, "linestyle": "-", "linewidth": 1.6, "zorder": 3}
 DASHED: dict[str, Any] = {"color": _ORANGE, "linestyle": (0, (4, 2)), "linewidth": 1.6, "zorder": 4}
 """Two curves of equal rank, told apart by colour and by line."""
@@ -74,8 +91,8 @@ def new_figure(height: float) -> Any:
 def save(figure: Any, path: Path, title: str, caption: str) -> None:
     """Write a PNG that carries its title and caption as text.
 
-    Its palette of 128 colours takes a third of the bytes; chosen by coverage, it keeps the thin lines' own colours, which a
-    palette chosen by frequency would mix.
+    Its palette of 128 colours takes a third of the bytes; chosen by coverage, it keeps the thin
+    lines' own colours, which a palette chosen by frequency would mix.
     """
     from PIL import Image
     from PIL.PngImagePlugin import PngInfo
@@ -96,16 +113,31 @@ def save(figure: Any, path: Path, title: str, caption: str) -> None:
 
 
 def styles(run: RunFiles) -> dict[str, dict[str, Any]]:
-    """Line properties of each model: zero, baseline and truth have their own; the selected head is always the solid blue one."""
-    fixed: dict[str, tuple[str, Any]] = {"zero": (_GREY, ":"), "baseline": (_ORANGE, "--"), "truth": (_GREEN, "-.")}
+    """Line properties of each model: zero, baseline and truth have their own; the selected head is
+    always the solid blue one.
+    """
+    fixed: dict[str, tuple[str, Any]] = {
+        "zero": (_GREY, ":"),
+        "baseline": (_ORANGE, "--"),
+        "truth": (_GREEN, "-."),
+    }
     out: dict[str, dict[str, Any]] = {}
     for model, kind in run.kinds.items():
         if kind in fixed:
             color, line = fixed[kind]
         else:
             place = run.heads.index(model)
-            color, line = _HEADS[place % len(_HEADS)][0], _HEADS[(place + place // len(_HEADS)) % len(_HEADS)][1]
-        out[model] = {"color": color, "linestyle": line, "linewidth": 1.4, "label": short_label(run, model), "zorder": _ORDER.get(kind, 4)}
+            color, line = (
+                _HEADS[place % len(_HEADS)][0],
+                _HEADS[(place + place // len(_HEADS)) % len(_HEADS)][1],
+            )
+        out[model] = {
+            "color": color,
+            "linestyle": line,
+            "linewidth": 1.4,
+            "label": short_label(run, model),
+            "zorder": _ORDER.get(kind, 4),
+        }
     return out
 
 
@@ -144,6 +176,7 @@ def _legend_width(widths: list[float], columns: int) -> float:
 
 
 def collect(handles: dict[str, Any], axes: Any) -> None:
-    """Add the labelled artists of some axes to the handles of a figure's legend, each label once."""
+    """Add the labelled artists of some axes to the handles of a figure's legend, each label once.
+    """
     for handle, text in zip(*axes.get_legend_handles_labels(), strict=True):
         handles.setdefault(text, handle)

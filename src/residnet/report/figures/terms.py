@@ -11,14 +11,20 @@ import numpy as np
 from residnet.report.figures.style import new_figure
 from residnet.report.run_reader import RunFiles
 
-_AXES = (("u_dot", "surge [m/s²]", 1.0), ("v_dot", "sway [m/s²]", 1.0), ("r_dot", "yaw [deg/s²]", 180.0 / math.pi))
+_AXES = (
+    ("u_dot", "surge [m/s²]", 1.0),
+    ("v_dot", "sway [m/s²]", 1.0),
+    ("r_dot", "yaw [deg/s²]", 180.0 / math.pi),
+)
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 _SHOWN = 6
-"""Most terms drawn for themselves in a panel, the largest ones; the others are drawn as their sum."""
+"""Most terms drawn for themselves in a panel, the largest ones; the others are drawn as their sum.
+"""
 
 
 def of_terms(run: RunFiles) -> Iterator[tuple[str, str, str, Any]]:
-    """Name, title, caption and figure for every model whose equations the folder holds along a log."""
+    """Name, title, caption and figure for every model whose equations the folder holds along a log.
+    """
     path = run.path / "terms.parquet"
     if not path.is_file():
         return
@@ -30,8 +36,12 @@ def of_terms(run: RunFiles) -> Iterator[tuple[str, str, str, Any]]:
         yield (
             f"terms_{model}",
             f"Equation of {model}, term by term",
-            f"What each term adds to the acceleration along {log}, and their sum (black) against the target (grey), what the baseline leaves; "
-            "two large terms that mirror each other mean that the data hardly tell them apart, a flat one could be left out.",
+            (
+                f"What each term adds to the acceleration along {log}, and their sum (black)"
+                " against the target (grey), what the baseline leaves; two large terms that mirror"
+                " each other mean that the data hardly tell them apart, a flat one could be left"
+                " out."
+            ),
             parts(own),
         )
 
@@ -46,15 +56,30 @@ def parts(frame: Any) -> Any:
     panels = figure.subplots(3, 1, sharex=True)
     for axes, (axis, text, factor) in zip(panels, _AXES, strict=True):
         own = frame[frame["axis"] == axis]
-        curves = {str(term): factor * np.asarray(rows["value"]) for term, rows in own.groupby("term", sort=False)}
+        curves = {
+            str(term): factor * np.asarray(rows["value"])
+            for term, rows in own.groupby("term", sort=False)
+        }
         time = np.asarray(own["t"])[: len(curves["target"])]
         axes.plot(time, curves.pop("target"), color="0.75", linewidth=2.2, label="target")
         ordered = sorted(curves, key=lambda term: -float(np.square(curves[term]).mean()))
         for term, colour in zip(ordered[:_SHOWN], _COLOURS, strict=False):
             axes.plot(time, curves[term], color=colour, linewidth=1.0, label=_short(term))
         if ordered[_SHOWN:]:
-            axes.plot(time, sum(curves[term] for term in ordered[_SHOWN:]), color="0.5", linestyle=":", label=f"{len(ordered) - _SHOWN} more")
-        axes.plot(time, sum(curves.values(), np.zeros_like(time)), color="black", linewidth=0.8, label="sum")
+            axes.plot(
+                time,
+                sum(curves[term] for term in ordered[_SHOWN:]),
+                color="0.5",
+                linestyle=":",
+                label=f"{len(ordered) - _SHOWN} more",
+            )
+        axes.plot(
+            time,
+            sum(curves.values(), np.zeros_like(time)),
+            color="black",
+            linewidth=0.8,
+            label="sum",
+        )
         axes.set_ylabel(text)
         axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=7, handlelength=1.4)
     panels[-1].set_xlabel("time [s]")

@@ -8,39 +8,66 @@ from typing import Any
 
 import numpy as np
 
-from residnet.report.figures.style import MASKED, MEASURED, WIDTH, collect, legend_above, new_figure, styles
+from residnet.report.figures.style import (
+    MASKED,
+    MEASURED,
+    WIDTH,
+    collect,
+    legend_above,
+    new_figure,
+    styles,
+)
 from residnet.report.run_reader import RunFiles, StoredWindow
 
 MOST_KINDS = 6
 MASKED_LABEL = "masked"
 _DEG = 180.0 / math.pi
-_PANELS = (("surge velocity\nu [m/s]", 1.0), ("sway velocity\nv [m/s]", 1.0), ("yaw rate\nr [deg/s]", _DEG), ("heading\n[deg]", _DEG))
+_PANELS = (
+    ("surge velocity\nu [m/s]", 1.0),
+    ("sway velocity\nv [m/s]", 1.0),
+    ("yaw rate\nr [deg/s]", _DEG),
+    ("heading\n[deg]", _DEG),
+)
 
 
-def representative(run: RunFiles, windows: Sequence[StoredWindow], protocol: str) -> list[StoredWindow]:
-    """For each kind of manoeuvre the window in which the leading model has its median error, by kind; neither the best nor the worst case."""
+def representative(
+    run: RunFiles, windows: Sequence[StoredWindow], protocol: str
+) -> list[StoredWindow]:
+    """For each kind of manoeuvre the window in which the leading model has its median error, by
+    kind; neither the best nor the worst case.
+    """
     judge = leading(run)
     scales = run.metrics.get("scales") or {}
     divisor = np.array([float(scales.get(name, 1.0)) for name in ("u", "v", "r")])
     chosen: list[StoredWindow] = []
-    of_protocol = [window for window in windows if window.protocol == protocol and judge in window.predicted]
+    of_protocol = [
+        window for window in windows if window.protocol == protocol and judge in window.predicted
+    ]
     for kind in sorted({window.manoeuvre for window in of_protocol}):
         ranked = sorted(
             (window for window in of_protocol if window.manoeuvre == kind),
-            key=lambda window: (float((window.rmse(judge) / divisor).mean()), window.log, window.number),
+            key=lambda window: (
+                float((window.rmse(judge) / divisor).mean()),
+                window.log,
+                window.number,
+            ),
         )
         chosen.append(ranked[(len(ranked) - 1) // 2])
     return chosen[:MOST_KINDS]
 
 
 def leading(run: RunFiles) -> str:
-    """The model that figures of single runs show: the selected one, else the first head, else the baseline."""
+    """The model that figures of single runs show: the selected one, else the first head, else the
+    baseline.
+    """
     names = [run.selected, *run.heads, run.baseline, *run.kinds]
     return next(name for name in names if name is not None and name in run.kinds)
 
 
 def shown(run: RunFiles) -> list[str]:
-    """Models in figures of single runs: baseline, plant where there is one, the leading head on top."""
+    """Models in figures of single runs: baseline, plant where there is one, the leading head on
+    top.
+    """
     head = leading(run)
     if head == run.baseline and run.heads:
         head = run.heads[0]
@@ -48,7 +75,9 @@ def shown(run: RunFiles) -> list[str]:
 
 
 def tracks(run: RunFiles, windows: Sequence[StoredWindow]) -> Any:
-    """Measured and predicted tracks, one panel for each window; north up, equal scales, the start at the origin."""
+    """Measured and predicted tracks, one panel for each window; north up, equal scales, the start
+    at the origin.
+    """
     columns = min(2, len(windows))
     lines = math.ceil(len(windows) / columns)
     side = WIDTH / columns if columns > 1 else 0.7 * WIDTH
@@ -58,14 +87,27 @@ def tracks(run: RunFiles, windows: Sequence[StoredWindow]) -> Any:
     for place, window in enumerate(windows):
         axes = figure.add_subplot(lines, columns, place + 1)
         start = window.measured[0, 4:6]
-        north, east = (np.where(window.usable, window.measured[:, i], np.nan) - window.measured[0, i] for i in (4, 5))
+        north, east = (
+            np.where(window.usable, window.measured[:, i], np.nan) - window.measured[0, i]
+            for i in (4, 5)
+        )
         # on top here, where there is no noise that would hide what lies beneath
         axes.plot(east, north, **(MEASURED | {"zorder": 5.5}))
         for model in shown(run):
             if model in window.predicted:
                 path = window.predicted[model][:, 4:6] - start
                 axes.plot(path[:, 1], path[:, 0], **look[model])
-        axes.plot(0, 0, "o", color="black", markerfacecolor="white", markersize=6, linestyle="none", label="start", zorder=6)
+        axes.plot(
+            0,
+            0,
+            "o",
+            color="black",
+            markerfacecolor="white",
+            markersize=6,
+            linestyle="none",
+            label="start",
+            zorder=6,
+        )
         axes.set_aspect("equal", adjustable="datalim")
         axes.margins(0.08)
         axes.locator_params(axis="x", nbins=5)
@@ -78,7 +120,9 @@ def tracks(run: RunFiles, windows: Sequence[StoredWindow]) -> Any:
 
 
 def history(run: RunFiles, window: StoredWindow) -> Any:
-    """Velocities and heading against time, measured and predicted; masked samples are gaps on a grey ground."""
+    """Velocities and heading against time, measured and predicted; masked samples are gaps on a
+    grey ground.
+    """
     figure = new_figure(6.6)
     panels = figure.subplots(4, 1, sharex=True)
     time = window.t - window.t[0]
@@ -100,7 +144,10 @@ def history(run: RunFiles, window: StoredWindow) -> Any:
     panels[0].set_title(_title(window).replace("\n", ": "))
     figure.align_ylabels(panels)
     # what was measured comes first
-    legend_above(figure, {text: handles[text] for text in sorted(handles, key=lambda text: text == MASKED_LABEL)})
+    legend_above(
+        figure,
+        {text: handles[text] for text in sorted(handles, key=lambda text: text == MASKED_LABEL)},
+    )
     return figure
 
 
@@ -114,4 +161,6 @@ def shade(axes: Any, time: np.ndarray, usable: np.ndarray) -> None:
 
 def _title(window: StoredWindow) -> str:
     name = window.log if len(window.log) <= 36 else f"{window.log[:20]}…{window.log[-15:]}"
-    return f"{window.manoeuvre.replace('_', ' ')}\n{name}" + (f", window {window.number + 1}" if window.number else "")
+    return f"{window.manoeuvre.replace('_', ' ')}\n{name}" + (
+        f", window {window.number + 1}" if window.number else ""
+    )

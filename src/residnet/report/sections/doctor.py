@@ -1,4 +1,6 @@
-"""The report's part on the data doctor: what would mislead a fit to these logs, and what it noted besides."""
+"""The report's part on the data doctor: what would mislead a fit to these logs, and what it noted
+besides.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,9 @@ _LEVELS = ("fatal", "will mislead")
 
 
 def section(run: RunFiles) -> dict[str, Any]:
-    """Table of findings above a note by kind, the number of logs, and the notes of each log; empty where the run has no doctor.json."""
+    """Table of findings above a note by kind, the number of logs, and the notes of each log; empty
+    where the run has no doctor.json.
+    """
     logs = run.doctor.get("logs") or []
     if not logs:
         return {}
@@ -23,14 +27,23 @@ def section(run: RunFiles) -> dict[str, Any]:
         if finding["level"] == "note":
             notes[name].append(finding)
     sick = len({name for name, _ in loud} - {"together"})
-    return {"table": _table(loud) if loud else None, "logs": len(logs), "sick": sick, "notes": list(notes.items())}
+    return {
+        "table": _table(loud) if loud else None,
+        "logs": len(logs),
+        "sick": sick,
+        "notes": list(notes.items()),
+    }
 
 
 def _table(loud: list[tuple[str, Row]]) -> Table:
     table = Table(heads=["level", "logs", "for example", "what to do"], corner="finding")
     kinds = sorted({(_LEVELS.index(finding["level"]), str(finding["code"])) for _, finding in loud})
     for level, code in kinds:
-        members = [(name, finding) for name, finding in loud if (finding["level"], finding["code"]) == (_LEVELS[level], code)]
+        members = [
+            (name, finding)
+            for name, finding in loud
+            if (finding["level"], finding["code"]) == (_LEVELS[level], code)
+        ]
         name, finding = members[0]
         cells = [
             Cell(_LEVELS[level], mark="bad" if level == 0 else ""),

@@ -31,22 +31,35 @@ def remarks(notes: Row) -> list[str]:
     out = []
     for name, equation in notes["equations"].items():
         out.append(
-            f"{name}: {equation['candidates']} candidates that differ, condition number {equation['condition']:.1e}; "
-            f"{100 * equation['error_share']:.2g} % of the target (RMS) unexplained."
+            f"{name}: {equation['candidates']} candidates that differ, condition number"
+            f" {equation['condition']:.1e}; {100 * equation['error_share']:.2g} % of the target"
+            " (RMS) unexplained."
         )
         for term, others in equation["cannot_tell_apart"].items():
             out.append(f"{name}: the data do not tell {term} from {_some(others)}.")
         if equation["undecided"]:
-            terms = [f"{term} ({100 * share:.0f} %)" for term, share in equation["undecided"].items()]
-            out.append(f"{name}: left out, but within two standard errors they could make up the stated share of the target: {_some(terms)}.")
+            terms = [
+                f"{term} ({100 * share:.0f} %)" for term, share in equation["undecided"].items()
+            ]
+            out.append(
+                f"{name}: left out, but within two standard errors they could make up the stated"
+                f" share of the target: {_some(terms)}."
+            )
     if notes["unexcited"]:
-        out.append(f"Zero in all samples, so nothing is known of them: {_some(notes['unexcited'])}.")
+        out.append(
+            f"Zero in all samples, so nothing is known of them: {_some(notes['unexcited'])}."
+        )
     same: dict[str, Row] = {}
     for equation in notes["equations"].values():
         same |= equation["same_as_simpler"]
     if same:
-        texts = [f"{term} = " + " + ".join(f"{value:.4g} ({other})" for other, value in parts.items()) for term, parts in same.items()]
-        out.append(f"On these data the same as simpler terms, which stand in their place: {_some(texts)}.")
+        texts = [
+            f"{term} = " + " + ".join(f"{value:.4g} ({other})" for other, value in parts.items())
+            for term, parts in same.items()
+        ]
+        out.append(
+            f"On these data the same as simpler terms, which stand in their place: {_some(texts)}."
+        )
     return out
 
 
@@ -56,7 +69,12 @@ def _coefficients(notes: Row) -> Table:
         value, error = entry["value"], entry["standard_error"]
         exact = error <= 1e-9 * abs(value)
         ratio = "exact" if exact else number(abs(value) / error, 2)
-        cells = [Cell(number(value, 4)), Cell(number(error, 2)), Cell(ratio), Cell(term_unit(entry["axis"], entry["term"]))]
+        cells = [
+            Cell(number(value, 4)),
+            Cell(number(error, 2)),
+            Cell(ratio),
+            Cell(term_unit(entry["axis"], entry["term"])),
+        ]
         table.rows.append((f"{entry['axis'].replace('_dot', '')}′: {entry['term']}", cells))
     return table
 
@@ -66,4 +84,6 @@ def _delay(found: Row | None) -> str:
 
 
 def _some(names: list[str]) -> str:
-    return ", ".join(names[:_NAMED]) + (f" and {len(names) - _NAMED} more" if len(names) > _NAMED else "")
+    return ", ".join(names[:_NAMED]) + (
+        f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    )

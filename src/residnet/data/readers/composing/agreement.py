@@ -1,4 +1,6 @@
-"""Topics that a log does not use, against the log: do they lag, do they speak of another point of the vessel?"""
+"""Topics that a log does not use, against the log: do they lag, do they speak of another point of
+the vessel?
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,9 @@ _LEVER = 0.2
 
 
 def agreement(recording: Recording, log: Log, start: float, idle: Iterable[str]) -> list[Remark]:
-    """Remarks on velocities and positions in topics that the log was not made of; `start` is the log's first sample on the recording's clock, s."""
+    """Remarks on velocities and positions in topics that the log was not made of; `start` is the
+    log's first sample on the recording's clock, s.
+    """
     out: list[Remark] = []
     rates = _rates(log)
     for name in idle:
@@ -35,30 +39,53 @@ def agreement(recording: Recording, log: Log, start: float, idle: Iterable[str])
 
 def _rates(log: Log) -> dict[str, np.ndarray]:
     """Velocities of the log by name, in body and earth axes."""
-    out: dict[str, np.ndarray] = {name: log[name] for name in ("u", "v", "r") if name in log.channels}
+    out: dict[str, np.ndarray] = {
+        name: log[name] for name in ("u", "v", "r") if name in log.channels
+    }
     if {"u", "v", "psi"} <= set(log.channels):
         c, s = np.cos(log["psi"]), np.sin(log["psi"])
-        out["north velocity"], out["east velocity"] = c * log["u"] - s * log["v"], s * log["u"] + c * log["v"]
+        out["north velocity"], out["east velocity"] = (
+            c * log["u"] - s * log["v"],
+            s * log["u"] + c * log["v"],
+        )
     return {name: values for name, values in out.items() if np.isfinite(values).sum() > _ENOUGH}
 
 
-def _lag(one: Series, path: str, t: np.ndarray, clock: np.ndarray, rates: dict[str, np.ndarray]) -> list[Remark]:
+def _lag(
+    one: Series, path: str, t: np.ndarray, clock: np.ndarray, rates: dict[str, np.ndarray]
+) -> list[Remark]:
     every = max(1, len(one) // _MOST_ROWS)
     at, values = t[::every], one[path][::every]
     best = (0.0, 0.0, "", 0.0)
     for name, rate in rates.items():
         known = np.isfinite(rate)
         for lag in np.arange(-_LONGEST, _LONGEST + _STEP / 2, _STEP):
-            size = abs(_correlation(values, np.interp(at - lag, clock[known], rate[known], left=np.nan, right=np.nan)))
+            size = abs(
+                _correlation(
+                    values,
+                    np.interp(at - lag, clock[known], rate[known], left=np.nan, right=np.nan),
+                )
+            )
             if size > best[0]:
-                still = abs(_correlation(values, np.interp(at, clock[known], rate[known], left=np.nan, right=np.nan)))
+                still = abs(
+                    _correlation(
+                        values, np.interp(at, clock[known], rate[known], left=np.nan, right=np.nan)
+                    )
+                )
                 best = (size, float(lag), name, still)
     size, lag, name, still = best
     # a lag is told only where it explains a good part of what the two differ by
     if size < _SAME or abs(lag) < _TELLING or 1.0 - size > 0.7 * (1.0 - still):
         return []
-    verb = f"lags {name} of the log by {lag:.2f} s" if lag > 0.0 else f"leads {name} of the log by {-lag:.2f} s"
-    text = f"topic {one.name}: {path} {verb} (correlation {size:.3f}, {still:.3f} without the lag); give the topic's `delays` before it is used"
+    verb = (
+        f"lags {name} of the log by {lag:.2f} s"
+        if lag > 0.0
+        else f"leads {name} of the log by {-lag:.2f} s"
+    )
+    text = (
+        f"topic {one.name}: {path} {verb} (correlation {size:.3f}, {still:.3f} without the lag);"
+        " give the topic's `delays` before it is used"
+    )
     return [remark("note", "topic_lag", text, lag=lag, correlation=size, correlation_without=still)]
 
 
@@ -70,33 +97,66 @@ def _correlation(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def _lever(one: Series, t: np.ndarray, log: Log) -> list[Remark]:
-    """Whether a topic's positions turn about the log's: both then belong to different points of the vessel."""
-    pair = next((p for p in ("pose.position", "pose.pose.position", "position") if one.has(f"{p}.x") and one.has(f"{p}.y")), None)
+    """Whether a topic's positions turn about the log's: both then belong to different points of the
+    vessel.
+    """
+    pair = next(
+        (
+            p
+            for p in ("pose.position", "pose.pose.position", "position")
+            if one.has(f"{p}.x") and one.has(f"{p}.y")
+        ),
+        None,
+    )
     if pair is None or not {"x", "y", "psi"} <= set(log.channels):
         return []
     first, second = one[f"{pair}.x"], one[f"{pair}.y"]
     known = np.isfinite(log["psi"]) & np.isfinite(log["x"]) & np.isfinite(log["y"])
     if known.sum() < _ENOUGH:
         return []
-    x, y, psi = (np.interp(t, log.t[known], log[name][known], left=np.nan, right=np.nan) for name in ("x", "y", "psi"))
+    x, y, psi = (
+        np.interp(t, log.t[known], log[name][known], left=np.nan, right=np.nan)
+        for name in ("x", "y", "psi")
+    )
     found = []
     for north, east in ((first, second), (second, first)):
         good = np.isfinite(north) & np.isfinite(east) & np.isfinite(x)
         if good.sum() < _ENOUGH or np.ptp(psi[good]) < np.pi / 3:
             return []
-        c, s, one_, none = np.cos(psi[good]), np.sin(psi[good]), np.ones(good.sum()), np.zeros(good.sum())
-        columns = np.concatenate((np.stack((c, -s, one_, none), axis=1), np.stack((s, c, none, one_), axis=1)))
+        c, s, one_, none = (
+            np.cos(psi[good]),
+            np.sin(psi[good]),
+            np.ones(good.sum()),
+            np.zeros(good.sum()),
+        )
+        columns = np.concatenate(
+            (np.stack((c, -s, one_, none), axis=1), np.stack((s, c, none, one_), axis=1))
+        )
         apart = np.concatenate((x[good] - north[good], y[good] - east[good]))
         lever, *_ = np.linalg.lstsq(columns, apart, rcond=None)
         found.append(
-            (float(np.sqrt(np.mean((columns @ lever - apart) ** 2))), lever, float(np.std(apart[: good.sum()]) + np.std(apart[good.sum() :])))
+            (
+                float(np.sqrt(np.mean((columns @ lever - apart) ** 2))),
+                lever,
+                float(np.std(apart[: good.sum()]) + np.std(apart[good.sum() :])),
+            )
         )
     rest, lever, spread = min(found, key=lambda one: one[0])
     length = float(np.hypot(lever[0], lever[1]))
     if length < _LEVER or rest > 0.5 * spread or rest > length:
         return []
     text = (
-        f"topic {one.name}: its positions and the log's belong to points {length:.2f} m apart: the log's lies at ({lever[0]:.2f}, {lever[1]:.2f}) m "
-        f"(forward, starboard) of it, rest {rest:.3f} m; give `position.antenna` where the log's is an antenna"
+        f"topic {one.name}: its positions and the log's belong to points {length:.2f} m apart: the"
+        f" log's lies at ({lever[0]:.2f}, {lever[1]:.2f}) m (forward, starboard) of it, rest"
+        f" {rest:.3f} m; give `position.antenna` where the log's is an antenna"
     )
-    return [remark("will mislead", "lever_arm", text, forward=float(lever[0]), starboard=float(lever[1]), rest=rest)]
+    return [
+        remark(
+            "will mislead",
+            "lever_arm",
+            text,
+            forward=float(lever[0]),
+            starboard=float(lever[1]),
+            rest=rest,
+        )
+    ]

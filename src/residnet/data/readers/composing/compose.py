@@ -1,4 +1,6 @@
-"""From a recording to a log: every channel on one clock, in SI, NED and body axes, at the vessel's centre."""
+"""From a recording to a log: every channel on one clock, in SI, NED and body axes, at the vessel's
+centre.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +16,20 @@ from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS
 from residnet.data.readers.composing.agreement import agreement
-from residnet.data.readers.composing.motion import at_centre, body_velocity, centre_velocity, derive_motion
-from residnet.data.readers.composing.parts import Part, channel_parts, heading_part, position_part, present, velocity_part
+from residnet.data.readers.composing.motion import (
+    at_centre,
+    body_velocity,
+    centre_velocity,
+    derive_motion,
+)
+from residnet.data.readers.composing.parts import (
+    Part,
+    channel_parts,
+    heading_part,
+    position_part,
+    present,
+    velocity_part,
+)
 from residnet.data.readers.composing.quantities import (
     ClockConfig,
     Derived,
@@ -57,29 +71,46 @@ class Plan:
 def compose(recording: Recording, plan: Plan, clock: ClockConfig, longest_gap: float) -> Log:
     """The log of a recording whose clocks are settled.
 
-    Time starts at 0 where the recording has dates (`meta["epoch"]`, Unix time in s), else it is the recording's own. psi starts in [0, 2 pi).
-    Samples at which a state channel has no value are masked as `hard:gap`.
+    Time starts at 0 where the recording has dates (`meta["epoch"]`, Unix time in s), else it is the
+    recording's own. psi starts in [0, 2 pi). Samples at which a state channel has no value are
+    masked as `hard:gap`.
 
     Raises:
         UsageError: where a topic, field or sender is missing, or a quantity that another one needs.
-        DataError: where a topic that is used has no usable time, or the topics share no stretch of time.
+        DataError: where a topic that is used has no usable time, or the topics share no stretch of
+            time.
     """
     parts = _parts(recording, plan, longest_gap)
     if not parts:
         held = ", ".join(recording.series) or "nothing"
-        raise UsageError(f"{recording.path}: no channel to read; name them under `channels`, `position`, `heading` (the recording holds {held})")
+        raise UsageError(
+            f"{recording.path}: no channel to read; name them under `channels`, `position`,"
+            f" `heading` (the recording holds {held})"
+        )
     times, step = _times(recording, parts, clock)
     values, units = _values(parts, plan, times, step)
     t = times if recording.epoch is None else _from_zero(times, clock)
     if len(t) < 2:
-        raise DataError(f"{recording.path}: {len(t)} samples on the log's clock, at least 2 are needed")
+        raise DataError(
+            f"{recording.path}: {len(t)} samples on the log's clock, at least 2 are needed"
+        )
     for name, one in values.items():
         if not np.isfinite(one).any():
-            raise DataError(f"{recording.path}: channel {name} holds no number on the log's clock; take it out of the map, or give its topic's delay")
+            raise DataError(
+                f"{recording.path}: channel {name} holds no number on the log's clock; take it out"
+                " of the map, or give its topic's delay"
+            )
     states = [values[name] for name in _STATE if name in values]
     lost = np.isnan(np.stack(states)).any(axis=0) if states else np.zeros(len(t), dtype=bool)
     masks = {"hard:gap": lost} if lost.any() else {}
-    log = Log(recording.path.stem, t, values, units, masks=masks, meta=_meta(recording, plan, parts, times))
+    log = Log(
+        recording.path.stem,
+        t,
+        values,
+        units,
+        masks=masks,
+        meta=_meta(recording, plan, parts, times),
+    )
     seen = agreement(recording, log, float(times[0]), log.meta["topics_not_used"])
     return log.replace(meta={**log.meta, "findings": [*log.meta["findings"], *seen]})
 
@@ -99,7 +130,9 @@ def _parts(recording: Recording, plan: Plan, longest_gap: float) -> list[Part]:
     return parts
 
 
-def _times(recording: Recording, parts: Sequence[Part], clock: ClockConfig) -> tuple[np.ndarray, float]:
+def _times(
+    recording: Recording, parts: Sequence[Part], clock: ClockConfig
+) -> tuple[np.ndarray, float]:
     """Times of the log's samples on the recording's clock, and their step, s."""
     if not isinstance(clock, Uniform):
         times = parts[0].log.t if clock.topic is None else recording[clock.topic].clock
@@ -108,11 +141,21 @@ def _times(recording: Recording, parts: Sequence[Part], clock: ClockConfig) -> t
     moving = state or [part for part in parts if not part.all_held] or list(parts)
     start, stop = max(part.log.t[0] for part in moving), min(part.log.t[-1] for part in moving)
     if stop - start < clock.step:
-        spans = "; ".join(f"{part.topic} {part.log.t[0]:.1f} to {part.log.t[-1]:.1f} s" for part in moving)
-        raise DataError(f"{recording.path}: the topics share no stretch of time ({spans}); check `zone` and `delays`")
-    # a grid that starts on whole multiples of the step in Unix time lets logs of one day lie on one grid
+        spans = "; ".join(
+            f"{part.topic} {part.log.t[0]:.1f} to {part.log.t[-1]:.1f} s" for part in moving
+        )
+        raise DataError(
+            f"{recording.path}: the topics share no stretch of time ({spans}); check `zone` and"
+            " `delays`"
+        )
+    # a grid that starts on whole multiples of the step in Unix time lets logs of one day lie on one
+    # grid
     ahead = 0.0 if recording.epoch is None else recording.epoch % round(clock.step * 1e9) * _NS
-    first = start if recording.epoch is None else math.ceil((start + ahead) / clock.step - 1e-6) * clock.step - ahead
+    first = (
+        start
+        if recording.epoch is None
+        else math.ceil((start + ahead) / clock.step - 1e-6) * clock.step - ahead
+    )
     count = math.floor((stop - first) / clock.step + 1e-6) + 1
     return first + clock.step * np.arange(count), clock.step
 
@@ -121,7 +164,9 @@ def _from_zero(times: np.ndarray, clock: ClockConfig) -> np.ndarray:
     return clock.step * np.arange(times.size) if isinstance(clock, Uniform) else times - times[:1]
 
 
-def _values(parts: Sequence[Part], plan: Plan, times: np.ndarray, step: float) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+def _values(
+    parts: Sequence[Part], plan: Plan, times: np.ndarray, step: float
+) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     """Channels [T] and their units on the log's clock."""
     derived = plan.velocity if isinstance(plan.velocity, Derived) else None
     values: dict[str, np.ndarray] = {}
@@ -146,16 +191,25 @@ def _finish(values: dict[str, np.ndarray], plan: Plan) -> None:
     lever = _lever(plan.position)
     if lever != Lever():
         if "psi" not in values:
-            raise UsageError("position.antenna: needs the heading to move the position to the vessel's centre; give `heading`")
+            raise UsageError(
+                "position.antenna: needs the heading to move the position to the vessel's centre;"
+                " give `heading`"
+            )
         values["x"], values["y"] = at_centre(values["x"], values["y"], values["psi"], lever)
     if plan.velocity is None or isinstance(plan.velocity, Derived):
         return
     if "psi" not in values:
-        raise UsageError("velocity: needs the heading to turn earth-fixed velocities into body axes; give `heading`")
+        raise UsageError(
+            "velocity: needs the heading to turn earth-fixed velocities into body axes; give"
+            " `heading`"
+        )
     u, v = body_velocity(values.pop("north_rate"), values.pop("east_rate"), values["psi"])
     if plan.velocity.antenna != Lever():
         if "r" not in values:
-            raise UsageError("velocity.antenna: needs the yaw rate to move the velocity to the vessel's centre; give channels.r")
+            raise UsageError(
+                "velocity.antenna: needs the yaw rate to move the velocity to the vessel's centre;"
+                " give channels.r"
+            )
         u, v = centre_velocity(u, v, values["r"], plan.velocity.antenna)
     values["u"], values["v"] = u, v
 
@@ -164,16 +218,25 @@ def _lever(position: PositionConfig | None) -> Lever:
     return Lever() if position is None else position.antenna
 
 
-def _meta(recording: Recording, plan: Plan, parts: Sequence[Part], times: np.ndarray) -> dict[str, Any]:
+def _meta(
+    recording: Recording, plan: Plan, parts: Sequence[Part], times: np.ndarray
+) -> dict[str, Any]:
     remarks: list[Remark] = [*recording.remarks, *plan.remarks]
     topics: dict[str, Any] = {}
     for one in recording.series.values():
         seen = traffic(one)
         remarks += [*one.remarks, *seen]
-        topics[one.name] = {"kind": one.kind, "rows": len(one), **next((r["figures"] for r in seen if r["code"] == "topic_rate"), {})}
+        topics[one.name] = {
+            "kind": one.kind,
+            "rows": len(one),
+            **next((r["figures"] for r in seen if r["code"] == "topic_rate"), {}),
+        }
     gone = [name for name in plan.channels if name not in present(recording, plan.channels)]
     if gone:
-        text = f"channels {', '.join(gone)} are not in the recording or hold no number; the log lacks them (they are not required)"
+        text = (
+            f"channels {', '.join(gone)} are not in the recording or hold no number; the log lacks"
+            " them (they are not required)"
+        )
         remarks.append(remark("note", "missing_channels", text, channels=len(gone)))
     used = {part.topic for part in parts}
     remarks += [one for part in parts for one in part.remarks if one not in remarks]
@@ -185,7 +248,11 @@ def _meta(recording: Recording, plan: Plan, parts: Sequence[Part], times: np.nda
         "frames": [*plan.said, *(s for p in parts for s in p.said)],
     }
     rows = {part.topic: len(part.log) for part in parts}
-    meta |= {"rows_read": sum(len(one) for one in recording.series.values()), "rows_dropped": 0, "rows_used": sum(rows.values())}
+    meta |= {
+        "rows_read": sum(len(one) for one in recording.series.values()),
+        "rows_dropped": 0,
+        "rows_used": sum(rows.values()),
+    }
     if recording.epoch is not None:
         start = recording.epoch + int(np.rint(times[0] * 1e9))
         meta |= {"epoch": start * _NS, "epoch_ns": start, "start_utc": _utc(start)}
@@ -194,4 +261,7 @@ def _meta(recording: Recording, plan: Plan, parts: Sequence[Part], times: np.nda
 
 def _utc(ns: int) -> str:
     """Date and time of Unix time in ns."""
-    return datetime.fromtimestamp(ns // 10**9, UTC).strftime("%Y-%m-%dT%H:%M:%S") + f".{ns % 10**9:09d}Z"
+    return (
+        datetime.fromtimestamp(ns // 10**9, UTC).strftime("%Y-%m-%dT%H:%M:%S")
+        + f".{ns % 10**9:09d}Z"
+    )

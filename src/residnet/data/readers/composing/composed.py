@@ -1,4 +1,6 @@
-"""What the readers of recordings share: the config that says what to take from a recording, and the reader that composes it."""
+"""What the readers of recordings share: the config that says what to take from a recording, and the
+reader that composes it.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,16 @@ from residnet.core.log import Log
 from residnet.data.readers.base import LogReader, require_samples
 from residnet.data.readers.composing.clocks import settle
 from residnet.data.readers.composing.compose import Plan, compose
-from residnet.data.readers.composing.quantities import ClockConfig, Derived, FieldMap, HeadingConfig, OfTopic, PositionConfig, Uniform, VelocityConfig
+from residnet.data.readers.composing.quantities import (
+    ClockConfig,
+    Derived,
+    FieldMap,
+    HeadingConfig,
+    OfTopic,
+    PositionConfig,
+    Uniform,
+    VelocityConfig,
+)
 from residnet.data.readers.composing.wanted import CLOCK_ONLY, EVERYTHING, Wanted
 from residnet.data.readers.files import digest
 from residnet.data.readers.messages.ros import standard_plan
@@ -28,13 +39,17 @@ class RecordingConfig(Config, ABC):
         position: source of x and y.
         heading: source of psi.
         velocity: source of u and v (and r) where they are not channels.
-        standard_messages: standard messages of ROS map themselves to what is not declared, by REP-103 (ENU, forward-left-up).
+        standard_messages: standard messages of ROS map themselves to what is not declared, by
+            REP-103 (ENU, forward-left-up).
         clock: the log's clock.
-        delays: topic -> time in s by which what it says is older than its time says; `estimated` takes, for a topic without header stamps, the usual
-            latency of those that have them.
-        zone: time by which the recorder's clock is ahead of UTC, s; null estimates it where topics have stamps and arrivals.
-        longest_gap: longest step that is interpolated across, s; slow topics may always step over three of their usual steps.
-        manoeuvre: kind of manoeuvre of every recording, `folder` takes the name of the folder it lies in, null says that nobody knows.
+        delays: topic -> time in s by which what it says is older than its time says; `estimated`
+            takes, for a topic without header stamps, the usual latency of those that have them.
+        zone: time by which the recorder's clock is ahead of UTC, s; null estimates it where topics
+            have stamps and arrivals.
+        longest_gap: longest step that is interpolated across, s; slow topics may always step over
+            three of their usual steps.
+        manoeuvre: kind of manoeuvre of every recording, `folder` takes the name of the folder it
+            lies in, null says that nobody knows.
     """
 
     channels: dict[str, FieldMap] = Field(default_factory=dict)
@@ -53,11 +68,25 @@ class RecordingConfig(Config, ABC):
         for name, entry in self.channels.items():
             entry.require_fit(name)
         if isinstance(self.velocity, Derived) and not isinstance(self.clock, Uniform):
-            raise ValueError("velocity: kind 'derived' needs a uniform clock; set clock: {kind: uniform, step: 0.1 s}")
-        given = [name for name, there in (("x, y", self.position), ("psi", self.heading), ("u, v", self.velocity)) if there is not None]
+            raise ValueError(
+                "velocity: kind 'derived' needs a uniform clock; set clock: {kind: uniform, step:"
+                " 0.1 s}"
+            )
+        given = [
+            name
+            for name, there in (
+                ("x, y", self.position),
+                ("psi", self.heading),
+                ("u, v", self.velocity),
+            )
+            if there is not None
+        ]
         double = [name for names in given for name in names.split(", ") if name in self.channels]
         if double:
-            raise ValueError(f"channels: {', '.join(double)} given here and by position, heading or velocity; take one of them away")
+            raise ValueError(
+                f"channels: {', '.join(double)} given here and by position, heading or velocity;"
+                " take one of them away"
+            )
         return self
 
     @abstractmethod
@@ -81,14 +110,18 @@ class RecordingReader(LogReader):
         self._config = config
 
     def read(self, path: Path) -> Log:
-        """The log in `path`; see `LogReader.read`. `meta["findings"]` says what was noticed and mended on the way in.
+        """The log in `path`; see `LogReader.read`. `meta["findings"]` says what was noticed and
+        mended on the way in.
 
         Raises:
-            UsageError: where the file, a topic or a field is missing, or a package that the format needs.
+            UsageError: where the file, a topic or a field is missing, or a package that the format
+                needs.
             DataError: where the contents cannot be used.
         """
         config = self._config
-        delays = {topic: None if delay == "estimated" else delay for topic, delay in config.delays.items()}
+        delays = {
+            topic: None if delay == "estimated" else delay for topic, delay in config.delays.items()
+        }
         recording = settle(config.load(path, self._wanted()), delays, config.zone)
         plan = Plan(config.channels, config.position, config.heading, config.velocity)
         if config.standard_messages:
@@ -109,5 +142,9 @@ class RecordingReader(LogReader):
         for source in (config.position, config.heading, config.velocity):
             if source is not None and not isinstance(source, Derived):
                 named += [(source.topic, field) for field in source.fields]
-        clock = [(config.clock.topic, CLOCK_ONLY)] if isinstance(config.clock, OfTopic) and config.clock.topic is not None else []
+        clock = (
+            [(config.clock.topic, CLOCK_ONLY)]
+            if isinstance(config.clock, OfTopic) and config.clock.topic is not None
+            else []
+        )
         return Wanted([*named, *clock])

@@ -1,4 +1,5 @@
-"""Motion at the vessel's centre: levers, earth-fixed to body velocities, velocities from positions."""
+"""Motion at the vessel's centre: levers, earth-fixed to body velocities, velocities from positions.
+"""
 
 from __future__ import annotations
 
@@ -12,27 +13,43 @@ from residnet.data.readers.composing.parts import Part
 from residnet.data.readers.composing.quantities import Derived, Lever
 
 
-def at_centre(north: np.ndarray, east: np.ndarray, psi: np.ndarray, lever: Lever) -> tuple[np.ndarray, np.ndarray]:
-    """Position of the vessel's centre from that of an antenna at `lever` (body axes), all [T], m and rad."""
+def at_centre(
+    north: np.ndarray, east: np.ndarray, psi: np.ndarray, lever: Lever
+) -> tuple[np.ndarray, np.ndarray]:
+    """Position of the vessel's centre from that of an antenna at `lever` (body axes), all [T], m
+    and rad.
+    """
     c, s = np.cos(psi), np.sin(psi)
     return north - c * lever.x + s * lever.y, east - s * lever.x - c * lever.y
 
 
-def body_velocity(north: np.ndarray, east: np.ndarray, psi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Components along body x and y of an earth-fixed velocity (document 003 eq. (4), transposed), all [T]."""
+def body_velocity(
+    north: np.ndarray, east: np.ndarray, psi: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Components along body x and y of an earth-fixed velocity (document 003 eq. (4), transposed),
+    all [T].
+    """
     c, s = np.cos(psi), np.sin(psi)
     return c * north + s * east, c * east - s * north
 
 
-def centre_velocity(u: np.ndarray, v: np.ndarray, r: np.ndarray, lever: Lever) -> tuple[np.ndarray, np.ndarray]:
-    """Velocity of the vessel's centre from that of a point at `lever`: a rigid body, u_P = u - r y, v_P = v + r x."""
+def centre_velocity(
+    u: np.ndarray, v: np.ndarray, r: np.ndarray, lever: Lever
+) -> tuple[np.ndarray, np.ndarray]:
+    """Velocity of the vessel's centre from that of a point at `lever`: a rigid body, u_P = u - r y,
+    v_P = v + r x.
+    """
     return u + r * lever.y, v - r * lever.x
 
 
-def derive_motion(pose: Sequence[Part], config: Derived, lever: Lever, times: np.ndarray, step: float) -> dict[str, np.ndarray]:
-    """x, y, psi, u, v, r [T] on a uniform clock, smoothed and differentiated at the rate of the positions.
+def derive_motion(
+    pose: Sequence[Part], config: Derived, lever: Lever, times: np.ndarray, step: float
+) -> dict[str, np.ndarray]:
+    """x, y, psi, u, v, r [T] on a uniform clock, smoothed and differentiated at the rate of the
+    positions.
 
-    The polynomials run on a grid that divides the log's step until it is as fine as the topics; nothing is smoothed across a gap.
+    The polynomials run on a grid that divides the log's step until it is as fine as the topics;
+    nothing is smoothed across a gap.
 
     Args:
         pose: the parts that hold x, y (of the antenna) and psi.
@@ -47,7 +64,9 @@ def derive_motion(pose: Sequence[Part], config: Derived, lever: Lever, times: np
     """
     held = {name for part in pose for name in part.log.channels}
     if not {"x", "y", "psi"} <= held:
-        raise UsageError("velocity: kind 'derived' needs position and heading; give both, or channels u, v, r")
+        raise UsageError(
+            "velocity: kind 'derived' needs position and heading; give both, or channels u, v, r"
+        )
     usual = min(part.step for part in pose)
     share = max(1, round(step / usual))
     fine = step / share
@@ -59,7 +78,9 @@ def derive_motion(pose: Sequence[Part], config: Derived, lever: Lever, times: np
         motion.update(part.at(grid, fine))
     x, y = at_centre(motion["x"], motion["y"], motion["psi"], lever)
     translation, yaw = SavitzkyGolay(window=config.window, order=config.order), _yaw(config)
-    place, place_rate, _ = translation.derive(np.stack((x, y), axis=1), fine, np.zeros(grid.size, dtype=int))
+    place, place_rate, _ = translation.derive(
+        np.stack((x, y), axis=1), fine, np.zeros(grid.size, dtype=int)
+    )
     angle, angle_rate, _ = yaw.derive(motion["psi"][:, None], fine, np.zeros(grid.size, dtype=int))
     psi = angle[:, 0]
     u, v = body_velocity(place_rate[:, 0], place_rate[:, 1], psi)

@@ -1,4 +1,6 @@
-"""Parts of a log, each on its topic's own clock: converted to SI and residnet's frames, not yet aligned."""
+"""Parts of a log, each on its topic's own clock: converted to SI and residnet's frames, not yet
+aligned.
+"""
 
 from __future__ import annotations
 
@@ -70,7 +72,9 @@ class Part:
         return float(np.median(np.diff(self.log.t)))
 
     def at(self, times: np.ndarray, step: float) -> dict[str, np.ndarray]:
-        """Channels at `times` [T], whose usual step is `step`, both s; NaN in gaps and beyond the ends."""
+        """Channels at `times` [T], whose usual step is `step`, both s; NaN in gaps and beyond the
+        ends.
+        """
         # the aligner imports masks, which import the readers
         from residnet.data.align import GridConfig, onto
 
@@ -82,12 +86,17 @@ class Part:
         for name, values in self.log.channels.items():
             alone = self.log.replace(channels={name: values})
             held = (name,) if name in self.held else ()
-            out.update(onto(alone, GridConfig(step=step, held=held, longest_gap=gap), times).channels)
+            out.update(
+                onto(alone, GridConfig(step=step, held=held, longest_gap=gap), times).channels
+            )
         return out
 
 
-def channel_parts(recording: Recording, channels: Mapping[str, FieldMap], longest_gap: float) -> list[Part]:
-    """One part for all channels of a topic that may share one; a channel with hardly a value has one of its own, of the rows that have any.
+def channel_parts(
+    recording: Recording, channels: Mapping[str, FieldMap], longest_gap: float
+) -> list[Part]:
+    """One part for all channels of a topic that may share one; a channel with hardly a value has
+    one of its own, of the rows that have any.
 
     Raises:
         UsageError: where a topic, field or sender is missing.
@@ -101,13 +110,22 @@ def channel_parts(recording: Recording, channels: Mapping[str, FieldMap], longes
         groups.setdefault(key, {})[name] = entry
     parts = []
     for (topic, sender, gap, alone), entries in groups.items():
-        one = recording.series[topic] if sender is None else recording.series[topic].of_sender(sender)
+        one = (
+            recording.series[topic] if sender is None else recording.series[topic].of_sender(sender)
+        )
         if alone:
             one = one.where(np.isfinite(one[entries[alone].field]))
-        values = {name: entry.convert(name, _numbers(recording, one, entry.field)) for name, entry in entries.items()}
+        values = {
+            name: entry.convert(name, _numbers(recording, one, entry.field))
+            for name, entry in entries.items()
+        }
         units = {name: si_unit(entry.unit) for name, entry in entries.items()}
         held = tuple(name for name, entry in entries.items() if entry.hold)
-        said = tuple(f"{name}: {entry.frame} of {topic}.{entry.field}" for name, entry in entries.items() if entry.frame != "as_measured")
+        said = tuple(
+            f"{name}: {entry.frame} of {topic}.{entry.field}"
+            for name, entry in entries.items()
+            if entry.frame != "as_measured"
+        )
         parts.append(_part(recording, one, values, units, gap, held, said=said))
     return parts
 
@@ -117,9 +135,18 @@ def present(recording: Recording, channels: Mapping[str, FieldMap]) -> dict[str,
     out = {}
     for name, entry in channels.items():
         if not entry.required:
-            topic = same_topic(entry.topic, recording.series) if entry.topic is not None else next(iter(recording.series), None)
+            topic = (
+                same_topic(entry.topic, recording.series)
+                if entry.topic is not None
+                else next(iter(recording.series), None)
+            )
             one = recording.series.get(topic or "")
-            if one is None or not one.has(entry.field) or len(one) < 2 or not np.isfinite(one[entry.field]).any():
+            if (
+                one is None
+                or not one.has(entry.field)
+                or len(one) < 2
+                or not np.isfinite(one[entry.field]).any()
+            ):
                 continue
         out[name] = entry
     return out
@@ -135,27 +162,47 @@ def position_part(recording: Recording, config: PositionConfig, longest_gap: flo
     one = recording[config.topic]
     if not isinstance(config, Geodetic):
         scale = to_si(config.unit)
-        values = {"x": scale * _numbers(recording, one, config.north), "y": scale * _numbers(recording, one, config.east)}
+        values = {
+            "x": scale * _numbers(recording, one, config.north),
+            "y": scale * _numbers(recording, one, config.east),
+        }
         return _part(recording, one, values, {}, longest_gap, said=_moved(config.antenna))
     to_radians = to_si(config.unit)
-    latitude, longitude = (to_radians * _numbers(recording, one, name) for name in (config.latitude, config.longitude))
+    latitude, longitude = (
+        to_radians * _numbers(recording, one, name) for name in (config.latitude, config.longitude)
+    )
     known = np.isfinite(latitude) & np.isfinite(longitude)
     none = known & (latitude == 0.0) & (longitude == 0.0)
     remarks: tuple[Remark, ...] = ()
     if none.any():
         # receivers without a fix report the origin
-        text = f"topic {one.name}: {int(none.sum())} fixes at latitude 0, longitude 0 are no fixes; left out"
+        text = (
+            f"topic {one.name}: {int(none.sum())} fixes at latitude 0, longitude 0 are no fixes;"
+            " left out"
+        )
         remarks = (remark("note", "no_fix", text, rows=int(none.sum())),)
         latitude, longitude = np.where(none, np.nan, latitude), np.where(none, np.nan, longitude)
         known &= ~none
     if not known.any() or float(np.abs(latitude[known]).max()) > np.pi / 2:
-        raise DataError(f"{recording.path}: topic {one.name}: '{config.latitude}' holds no latitude in {config.unit}; check field and unit")
+        raise DataError(
+            f"{recording.path}: topic {one.name}: '{config.latitude}' holds no latitude in"
+            f" {config.unit}; check field and unit"
+        )
     first = int(np.argmax(known))
-    origin = (float(latitude[first]), float(longitude[first])) if config.origin is None else (config.origin.latitude, config.origin.longitude)
+    origin = (
+        (float(latitude[first]), float(longitude[first]))
+        if config.origin is None
+        else (config.origin.latitude, config.origin.longitude)
+    )
     north, east = tangent_plane(latitude, longitude, *origin)
     degrees = np.degrees(origin)
-    said = (f"x, y: tangent plane of WGS 84 at {degrees[0]:.7f} deg N, {degrees[1]:.7f} deg E", *_moved(config.antenna))
-    return _part(recording, one, {"x": north, "y": east}, {}, longest_gap, remarks=remarks, said=said)
+    said = (
+        f"x, y: tangent plane of WGS 84 at {degrees[0]:.7f} deg N, {degrees[1]:.7f} deg E",
+        *_moved(config.antenna),
+    )
+    return _part(
+        recording, one, {"x": north, "y": east}, {}, longest_gap, remarks=remarks, said=said
+    )
 
 
 def heading_part(recording: Recording, config: HeadingConfig, longest_gap: float) -> Part:
@@ -176,11 +223,17 @@ def heading_part(recording: Recording, config: HeadingConfig, longest_gap: float
         offset = 0.0
     psi = (np.pi / 2 - yaw if config.frame == "enu" else yaw) + offset
     values["psi"] = _from_first_circle(unwrap(psi))
-    said = ("psi: counter-clockwise from east (REP-103) to clockwise from north",) if config.frame == "enu" else ()
+    said = (
+        ("psi: counter-clockwise from east (REP-103) to clockwise from north",)
+        if config.frame == "enu"
+        else ()
+    )
     return _part(recording, one, values, {}, longest_gap, remarks=remarks, said=said)
 
 
-def velocity_part(recording: Recording, config: EarthFixed | CourseSpeed, longest_gap: float) -> Part:
+def velocity_part(
+    recording: Recording, config: EarthFixed | CourseSpeed, longest_gap: float
+) -> Part:
     """Northward and eastward velocity of the antenna, m/s.
 
     Raises:
@@ -196,9 +249,14 @@ def velocity_part(recording: Recording, config: EarthFixed | CourseSpeed, longes
         undirected = np.isnan(course) & (speed > 0.3)
         north, east = np.where(undirected, np.nan, north), np.where(undirected, np.nan, east)
     else:
-        north, east = (to_si(config.unit) * _numbers(recording, one, name) for name in (config.north, config.east))
+        north, east = (
+            to_si(config.unit) * _numbers(recording, one, name)
+            for name in (config.north, config.east)
+        )
     said = ("u, v: earth-fixed velocity turned into body axes", *_moved(config.antenna, "u, v"))
-    return _part(recording, one, {"north_rate": north, "east_rate": east}, {}, longest_gap, said=said)
+    return _part(
+        recording, one, {"north_rate": north, "east_rate": east}, {}, longest_gap, said=said
+    )
 
 
 def _part(
@@ -212,31 +270,49 @@ def _part(
     said: tuple[str, ...] = (),
 ) -> Part:
     if len(one) < 2:
-        raise DataError(f"{recording.path}: topic {one.name} has {len(one)} rows, at least 2 are needed; take it out of the map")
+        raise DataError(
+            f"{recording.path}: topic {one.name} has {len(one)} rows, at least 2 are needed; take"
+            " it out of the map"
+        )
     units = {name: units.get(name) or CHANNEL_UNITS.get(name, "m/s") for name in values}
-    return Part(one.name, Log(one.name, one.clock, values, units), held, gap, (*one.remarks, *remarks), said)
+    return Part(
+        one.name, Log(one.name, one.clock, values, units), held, gap, (*one.remarks, *remarks), said
+    )
 
 
 def _numbers(recording: Recording, one: Series, path: str) -> np.ndarray:
     values = one[path]
     if not np.isfinite(values).any():
-        raise DataError(f"{recording.path}: topic {one.name}: field '{path}' holds no number in any of {values.size} rows; take it out of the map")
+        raise DataError(
+            f"{recording.path}: topic {one.name}: field '{path}' holds no number in any of"
+            f" {values.size} rows; take it out of the map"
+        )
     return values
 
 
-def _quaternion(recording: Recording, one: Series, config: Quaternion) -> tuple[np.ndarray, dict[str, np.ndarray], tuple[Remark, ...]]:
+def _quaternion(
+    recording: Recording, one: Series, config: Quaternion
+) -> tuple[np.ndarray, dict[str, np.ndarray], tuple[Remark, ...]]:
     """Yaw in the source's frame [T], roll where asked for, and what was noticed."""
     x, y, z, w = (_numbers(recording, one, f"{config.field}.{axis}") for axis in "xyzw")
     norm = np.sqrt(x * x + y * y + z * z + w * w)
     known = np.isfinite(norm) & (norm > 0.5)
     if not known.any():
-        raise DataError(f"{recording.path}: topic {one.name}: '{config.field}' holds no orientation, all quaternions are empty")
-    x, y, z, w = (np.where(known, part / np.where(known, norm, 1.0), np.nan) for part in (x, y, z, w))
+        raise DataError(
+            f"{recording.path}: topic {one.name}: '{config.field}' holds no orientation, all"
+            " quaternions are empty"
+        )
+    x, y, z, w = (
+        np.where(known, part / np.where(known, norm, 1.0), np.nan) for part in (x, y, z, w)
+    )
     yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
     remarks = []
     flips = int(((x[1:] * x[:-1] + y[1:] * y[:-1] + z[1:] * z[:-1] + w[1:] * w[:-1]) < 0.0).sum())
     if flips:
-        text = f"topic {one.name}: the quaternion changes sign {flips} times (both signs are one attitude); the heading is taken through"
+        text = (
+            f"topic {one.name}: the quaternion changes sign {flips} times (both signs are one"
+            " attitude); the heading is taken through"
+        )
         remarks.append(remark("note", "quaternion_flips", text, flips=flips))
     if not known.all():
         text = f"topic {one.name}: {int((~known).sum())} quaternions are empty; no heading there"
@@ -256,4 +332,10 @@ def _from_first_circle(psi: np.ndarray) -> np.ndarray:
 
 
 def _moved(lever: Lever, what: str = "x, y") -> tuple[str, ...]:
-    return () if lever == Lever() else (f"{what}: moved to the vessel's centre from ({lever.x:g}, {lever.y:g}) m in body axes",)
+    return (
+        ()
+        if lever == Lever()
+        else (
+            f"{what}: moved to the vessel's centre from ({lever.x:g}, {lever.y:g}) m in body axes",
+        )
+    )

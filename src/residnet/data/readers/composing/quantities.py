@@ -1,4 +1,6 @@
-"""Where a recording holds a channel, position, heading and velocity, and in which units and frames: what a config declares."""
+"""Where a recording holds a channel, position, heading and velocity, and in which units and frames:
+what a config declares.
+"""
 
 from __future__ import annotations
 
@@ -32,8 +34,10 @@ class FieldMap(Conversion):
         field: path of the field, for example `twist.linear.x`.
         sender: takes only the rows of one sender, where several publish to the topic.
         hold: the last value holds until the next (commands); otherwise values are interpolated.
-        longest_gap: longest step that is interpolated across or held over, s; null takes the reader's.
-        required: stops where the recording has no such topic or no number in it; otherwise the log lacks the channel, and says so.
+        longest_gap: longest step that is interpolated across or held over, s; null takes the
+            reader's.
+        required: stops where the recording has no such topic or no number in it; otherwise the log
+            lacks the channel, and says so.
     """
 
     topic: str | None = None
@@ -45,14 +49,18 @@ class FieldMap(Conversion):
 
 
 class Lever(Config):
-    """Where an antenna stands: metres forward (x) and to starboard (y) of the vessel's centre, in body axes."""
+    """Where an antenna stands: metres forward (x) and to starboard (y) of the vessel's centre, in
+    body axes.
+    """
 
     x: Metres = 0.0
     y: Metres = 0.0
 
 
 class Origin(Config):
-    """Origin of a local tangent plane on the WGS 84 ellipsoid; plain numbers are rad, so write `63.44 deg`."""
+    """Origin of a local tangent plane on the WGS 84 ellipsoid; plain numbers are rad, so write
+    `63.44 deg`.
+    """
 
     latitude: Radians = Field(ge=-1.5708, le=1.5708)
     longitude: Radians = Field(ge=-6.2832, le=6.2832)
@@ -94,7 +102,8 @@ class Local(Config):
         north: field of the northward component (in ENU the one that the source calls y).
         east: field of the eastward component.
         unit: of both.
-        antenna: where the measured point stands; the log's x and y are those of the vessel's centre.
+        antenna: where the measured point stands; the log's x and y are those of the vessel's
+            centre.
     """
 
     kind: Literal["local"] = "local"
@@ -146,7 +155,8 @@ class Angle(Config):
         field: its field.
         unit: its unit.
         frame: `ned` (clockwise from north, a compass) or `enu` (counter-clockwise from east).
-        offset: added after conversion, rad: the mounting angle of a compass or of a pair of antennas.
+        offset: added after conversion, rad: the mounting angle of a compass or of a pair of
+            antennas.
     """
 
     kind: Literal["angle"] = "angle"
@@ -168,7 +178,8 @@ HeadingConfig = Annotated[Quaternion | Angle, Field(discriminator="kind")]
 
 @final
 class Derived(Config):
-    """u, v, r from position and heading, and these smoothed, by Savitzky-Golay polynomials at the rate of the positions.
+    """u, v, r from position and heading, and these smoothed, by Savitzky-Golay polynomials at the
+    rate of the positions.
 
     Attributes:
         window: length of the polynomials for translation, s.
@@ -184,14 +195,16 @@ class Derived(Config):
 
 @final
 class EarthFixed(Config):
-    """u, v from northward and eastward velocity of the antenna, turned into body axes and moved to the vessel's centre.
+    """u, v from northward and eastward velocity of the antenna, turned into body axes and moved to
+    the vessel's centre.
 
     Attributes:
         topic: of the velocity.
         north: field of the northward component (in ENU the one that the source calls y).
         east: field of the eastward component.
         unit: of both.
-        antenna: where the measured point stands; needs the yaw rate r as a channel unless both are zero.
+        antenna: where the measured point stands; needs the yaw rate r as a channel unless both are
+            zero.
     """
 
     kind: Literal["earth_fixed"] = "earth_fixed"
@@ -209,7 +222,8 @@ class EarthFixed(Config):
 
 @final
 class CourseSpeed(Config):
-    """u, v from course and speed over ground of the antenna, turned into body axes and moved to the vessel's centre.
+    """u, v from course and speed over ground of the antenna, turned into body axes and moved to the
+    vessel's centre.
 
     Attributes:
         topic: of course and speed.
@@ -217,7 +231,8 @@ class CourseSpeed(Config):
         speed: field of the speed over ground.
         course_unit: of the course.
         speed_unit: of the speed.
-        antenna: where the measured point stands; needs the yaw rate r as a channel unless both are zero.
+        antenna: where the measured point stands; needs the yaw rate r as a channel unless both are
+            zero.
     """
 
     kind: Literal["course_speed"] = "course_speed"

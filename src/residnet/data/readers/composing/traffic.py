@@ -1,4 +1,6 @@
-"""What the rows of one series give away: rate, gaps, empty columns, several publishers on one topic."""
+"""What the rows of one series give away: rate, gaps, empty columns, several publishers on one
+topic.
+"""
 
 from __future__ import annotations
 
@@ -20,20 +22,33 @@ def traffic(one: Series) -> list[Remark]:
     empty = [path for path, values in one.fields.items() if np.isnan(values).all()]
     if empty:
         shown = ", ".join(empty[:6]) + (", ..." if len(empty) > 6 else "")
-        out.append(remark("note", "empty_columns", f"topic {one.name}: {len(empty)} fields hold no number ({shown})", fields=len(empty)))
+        out.append(
+            remark(
+                "note",
+                "empty_columns",
+                f"topic {one.name}: {len(empty)} fields hold no number ({shown})",
+                fields=len(empty),
+            )
+        )
     if len(one) < 3:
         return out
     step = np.diff(one.clock)
     usual, longest = float(np.median(step)), float(step.max())
     rate = (len(one) - 1) / float(one.clock[-1] - one.clock[0])
     text = (
-        f"topic {one.name}: {len(one)} rows, {rate:.3g} Hz, step {usual:.3g} s (median), spread {float(np.std(step)):.2g} s, longest {longest:.3g} s"
+        f"topic {one.name}: {len(one)} rows, {rate:.3g} Hz, step {usual:.3g} s (median), spread"
+        f" {float(np.std(step)):.2g} s, longest {longest:.3g} s"
     )
-    out.append(remark("note", "topic_rate", text, rows=len(one), rate=rate, step=usual, longest=longest))
+    out.append(
+        remark("note", "topic_rate", text, rows=len(one), rate=rate, step=usual, longest=longest)
+    )
     gaps = step > max(_GAP_STEPS * usual, _GAP_SECONDS)
     if gaps.any():
         at = float(one.clock[int(np.argmax(step))])
-        text = f"topic {one.name}: {int(gaps.sum())} gaps, the longest {longest:.3g} s at {at:.1f} s; nothing is interpolated across"
+        text = (
+            f"topic {one.name}: {int(gaps.sum())} gaps, the longest {longest:.3g} s at {at:.1f} s;"
+            " nothing is interpolated across"
+        )
         out.append(remark("note", "topic_gaps", text, gaps=int(gaps.sum()), longest=longest, at=at))
     return out + publishers(one, step)
 
@@ -41,15 +56,21 @@ def traffic(one: Series) -> list[Remark]:
 def publishers(one: Series, step: np.ndarray) -> list[Remark]:
     """Whether several publishers share the topic; step [T - 1] in s.
 
-    Told by what the source says of the sender, else by values that leap away and come straight back (A, B, A) while rows follow each other at
-    irregular short steps, as two trains of messages on one track do, or by such leaps alone where nearly every row is one and they are wide.
+    Told by what the source says of the sender, else by values that leap away and come straight back
+    (A, B, A) while rows follow each other at irregular short steps, as two trains of messages on
+    one track do, or by such leaps alone where nearly every row is one and they are wide.
     """
     if one.sender is not None and len(one) >= 2:
         names = [str(name) for name in dict.fromkeys(one.sender.tolist())]
         turns = int((one.sender[1:] != one.sender[:-1]).sum())
         if len(names) > 1 and turns >= len(names):
-            text = f"topic {one.name}: rows of {len(names)} senders alternate ({', '.join(names[:6])}); name one with `sender`"
-            return [remark("will mislead", "several_publishers", text, senders=len(names), turns=turns)]
+            text = (
+                f"topic {one.name}: rows of {len(names)} senders alternate"
+                f" ({', '.join(names[:6])}); name one with `sender`"
+            )
+            return [
+                remark("will mislead", "several_publishers", text, senders=len(names), turns=turns)
+            ]
     if len(one) < _ENOUGH:
         return []
     short = float((step < 0.2 * step.mean()).mean())
@@ -60,20 +81,32 @@ def publishers(one: Series, step: np.ndarray) -> list[Remark]:
         in_turns = returns > 0.3 and returns > 0.8 * leaps and width > 0.05
         if bursts or mixed or in_turns:
             text = (
-                f"topic {one.name}: several publishers seem to write to it: field {path} leaps away and straight back in {returns:.0%} of the rows, "
-                f"{short:.0%} of the steps are shorter than a fifth of the mean; do not use it unless the source tells its senders apart"
+                f"topic {one.name}: several publishers seem to write to it: field {path} leaps away"
+                f" and straight back in {returns:.0%} of the rows, {short:.0%} of the steps are"
+                " shorter than a fifth of the mean; do not use it unless the source tells its"
+                " senders apart"
             )
-            return [remark("will mislead", "several_publishers", text, returns=returns, short_steps=short)]
+            return [
+                remark(
+                    "will mislead", "several_publishers", text, returns=returns, short_steps=short
+                )
+            ]
     return []
 
 
 def _returns(values: np.ndarray) -> tuple[float, float, float]:
-    """Share of rows that change and change again, share that come back to the value before, and the leaps' width over the values' range."""
+    """Share of rows that change and change again, share that come back to the value before, and the
+    leaps' width over the values' range.
+    """
     known = values[np.isfinite(values)]
     if known.size < _ENOUGH:
         return 0.0, 0.0, 0.0
     low, high = np.quantile(known, (0.01, 0.99))
-    first, second, over = np.abs(np.diff(known))[:-1], np.abs(np.diff(known))[1:], np.abs(known[2:] - known[:-2])
+    first, second, over = (
+        np.abs(np.diff(known))[:-1],
+        np.abs(np.diff(known))[1:],
+        np.abs(known[2:] - known[:-2]),
+    )
     leap = (first > 0.0) & (second > 0.0)
     back = leap & (over <= 0.1 * np.minimum(first, second))
     width = float(np.median(first[back])) / float(high - low) if back.any() and high > low else 0.0

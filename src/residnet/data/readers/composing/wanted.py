@@ -16,7 +16,8 @@ class Wanted:
     """Topics and fields that are to be read.
 
     Args:
-        named: pairs of topic (None: the only one there is) and field; None wants everything. An empty field wants all of its topic.
+        named: pairs of topic (None: the only one there is) and field; None wants everything. An
+            empty field wants all of its topic.
     """
 
     def __init__(self, named: Iterable[tuple[str | None, str]] | None = None) -> None:
@@ -30,7 +31,9 @@ class Wanted:
         """Whether a field is wanted, itself or as a part (`orientation.w` of `orientation`)."""
         key = key_of(path)
         fields = [key_of(field) for name, field in self._named or () if self._same(name, topic)]
-        return self._named is None or any(not field or key == field or key.startswith(field + "_") for field in fields)
+        return self._named is None or any(
+            not field or key == field or key.startswith(field + "_") for field in fields
+        )
 
     @staticmethod
     def _same(name: str | None, topic: str) -> bool:

@@ -1,11 +1,21 @@
-"""Messages of PX4, ArduPilot and NMEA 0183 that map themselves; all three speak NED, and forward-right-down in the body."""
+"""Messages of PX4, ArduPilot and NMEA 0183 that map themselves; all three speak NED, and
+forward-right-down in the body.
+"""
 
 from __future__ import annotations
 
 from typing import ClassVar, final
 
 from residnet.data.readers.composing.compose import Plan
-from residnet.data.readers.composing.quantities import Angle, CourseSpeed, EarthFixed, FieldMap, Geodetic, Local, Quaternion
+from residnet.data.readers.composing.quantities import (
+    Angle,
+    CourseSpeed,
+    EarthFixed,
+    FieldMap,
+    Geodetic,
+    Local,
+    Quaternion,
+)
 from residnet.data.readers.messages.message import Message
 from residnet.data.readers.recording import Series
 
@@ -46,7 +56,12 @@ class Px4AngularVelocity(Message):
 
     def plan(self, one: Series) -> Plan:
         """See `Message.plan`."""
-        return Plan({name: FieldMap(topic=one.name, field=f"xyz[{axis}]", unit="rad/s") for name, axis in (("r", 2), ("p", 0))})
+        return Plan(
+            {
+                name: FieldMap(topic=one.name, field=f"xyz[{axis}]", unit="rad/s")
+                for name, axis in (("r", 2), ("p", 0))
+            }
+        )
 
 
 @final
@@ -59,8 +74,14 @@ class Px4Gps(Message):
     def plan(self, one: Series) -> Plan:
         """See `Message.plan`."""
         names = ("lat", "lon") if one.has("lat") else ("latitude_deg", "longitude_deg")
-        velocity = EarthFixed(topic=one.name, north="vel_n_m_s", east="vel_e_m_s") if one.has("vel_n_m_s") else None
-        return Plan({}, Geodetic(topic=one.name, latitude=names[0], longitude=names[1]), None, velocity)
+        velocity = (
+            EarthFixed(topic=one.name, north="vel_n_m_s", east="vel_e_m_s")
+            if one.has("vel_n_m_s")
+            else None
+        )
+        return Plan(
+            {}, Geodetic(topic=one.name, latitude=names[0], longitude=names[1]), None, velocity
+        )
 
 
 @final
@@ -72,7 +93,12 @@ class ArduPilotFilter(Message):
 
     def plan(self, one: Series) -> Plan:
         """See `Message.plan`."""
-        return Plan({}, Local(topic=one.name, north="PN", east="PE"), None, EarthFixed(topic=one.name, north="VN", east="VE"))
+        return Plan(
+            {},
+            Local(topic=one.name, north="PN", east="PE"),
+            None,
+            EarthFixed(topic=one.name, north="VN", east="VE"),
+        )
 
 
 @final
@@ -84,7 +110,11 @@ class ArduPilotAttitude(Message):
 
     def plan(self, one: Series) -> Plan:
         """See `Message.plan`."""
-        return Plan({"phi": FieldMap(topic=one.name, field="Roll", unit="deg")}, None, Angle(topic=one.name, field="Yaw", unit="deg"))
+        return Plan(
+            {"phi": FieldMap(topic=one.name, field="Roll", unit="deg")},
+            None,
+            Angle(topic=one.name, field="Yaw", unit="deg"),
+        )
 
 
 @final
@@ -96,7 +126,12 @@ class ArduPilotImu(Message):
 
     def plan(self, one: Series) -> Plan:
         """See `Message.plan`."""
-        return Plan({name: FieldMap(topic=one.name, field=field, unit="rad/s") for name, field in (("r", "GyrZ"), ("p", "GyrX"))})
+        return Plan(
+            {
+                name: FieldMap(topic=one.name, field=field, unit="rad/s")
+                for name, field in (("r", "GyrZ"), ("p", "GyrX"))
+            }
+        )
 
 
 @final
@@ -108,7 +143,12 @@ class ArduPilotGps(Message):
 
     def plan(self, one: Series) -> Plan:
         """See `Message.plan`."""
-        return Plan({}, Geodetic(topic=one.name, latitude="Lat", longitude="Lng"), None, CourseSpeed(topic=one.name, course="GCrs", speed="Spd"))
+        return Plan(
+            {},
+            Geodetic(topic=one.name, latitude="Lat", longitude="Lng"),
+            None,
+            CourseSpeed(topic=one.name, course="GCrs", speed="Spd"),
+        )
 
 
 @final
@@ -120,7 +160,13 @@ class NmeaFix(Message):
 
     def plan(self, one: Series) -> Plan:
         """See `Message.plan`."""
-        course = CourseSpeed(topic=one.name, course="true_course", speed="spd_over_grnd", speed_unit="kn") if one.has("spd_over_grnd") else None
+        course = (
+            CourseSpeed(
+                topic=one.name, course="true_course", speed="spd_over_grnd", speed_unit="kn"
+            )
+            if one.has("spd_over_grnd")
+            else None
+        )
         return Plan({}, Geodetic(topic=one.name), None, course)
 
 
@@ -133,7 +179,14 @@ class NmeaCourse(Message):
 
     def plan(self, one: Series) -> Plan:
         """See `Message.plan`."""
-        return Plan({}, None, None, CourseSpeed(topic=one.name, course="true_track", speed="spd_over_grnd_kts", speed_unit="kn"))
+        return Plan(
+            {},
+            None,
+            None,
+            CourseSpeed(
+                topic=one.name, course="true_track", speed="spd_over_grnd_kts", speed_unit="kn"
+            ),
+        )
 
 
 @final

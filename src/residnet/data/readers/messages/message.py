@@ -14,7 +14,8 @@ class Message(ABC):
 
     Attributes:
         types: names of the message's type, without its package.
-        signature: fields that tell it where the source has no types; none where it is known by its type only.
+        signature: fields that tell it where the source has no types; none where it is known by its
+            type only.
         said: how its frames become residnet's, for the log's meta.
     """
 

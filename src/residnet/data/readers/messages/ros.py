@@ -1,6 +1,8 @@
-"""Standard messages of ROS map themselves: which of their fields are which channels, by REP-103 (world ENU, body forward-left-up).
+"""Standard messages of ROS map themselves: which of their fields are which channels, by REP-103
+(world ENU, body forward-left-up).
 
-A topic's message type decides where the source has types; a table without one is recognised by its fields.
+A topic's message type decides where the source has types; a table without one is recognised by its
+fields.
 """
 
 from __future__ import annotations
@@ -13,7 +15,14 @@ import numpy as np
 
 from residnet.core.names import CHANNEL_UNITS
 from residnet.data.readers.composing.compose import Plan
-from residnet.data.readers.composing.quantities import Angle, Derived, FieldMap, Geodetic, Local, Quaternion
+from residnet.data.readers.composing.quantities import (
+    Angle,
+    Derived,
+    FieldMap,
+    Geodetic,
+    Local,
+    Quaternion,
+)
 from residnet.data.readers.messages.marine import MARINE
 from residnet.data.readers.messages.message import Message
 from residnet.data.readers.recording import Recording, Series, key_of, remark
@@ -27,7 +36,10 @@ def _body(one: Series, prefix: str) -> dict[str, FieldMap]:
     si = {"u": "m/s", "v": "m/s", "r": "rad/s", "p": "rad/s"}
     fields = {name: f"{prefix}{path}" for name, path in paths.items()}
     told = {name: path for name, path in fields.items() if one.has(path) and one[path].any()}
-    return {name: FieldMap(topic=one.name, field=path, unit=si[name], frame="body_fpu") for name, path in told.items()}
+    return {
+        name: FieldMap(topic=one.name, field=path, unit=si[name], frame="body_fpu")
+        for name, path in told.items()
+    }
 
 
 def _heading(one: Series, path: str) -> Quaternion | None:
@@ -73,7 +85,11 @@ class Twist(Message):
 
     def plan(self, one: Series) -> Plan:
         """See `Message.plan`; a twist that its frame places in the world is left to the config."""
-        if one.sender is not None and len(one.sender) and str(one.sender[0]).strip("/").lower() in _WORLD:
+        if (
+            one.sender is not None
+            and len(one.sender)
+            and str(one.sender[0]).strip("/").lower() in _WORLD
+        ):
             return Plan()
         prefix = next((p for p in ("twist.twist.", "twist.", "") if one.has(f"{p}linear.x")), "")
         return Plan(_body(one, prefix))
@@ -89,10 +105,20 @@ class Imu(Message):
     def plan(self, one: Series) -> Plan:
         """See `Message.plan`."""
         rates = {"r": "angular_velocity.z", "p": "angular_velocity.x"}
-        channels = {n: FieldMap(topic=one.name, field=path, unit="rad/s", frame="body_fpu") for n, path in rates.items() if one.has(path)}
+        channels = {
+            n: FieldMap(topic=one.name, field=path, unit="rad/s", frame="body_fpu")
+            for n, path in rates.items()
+            if one.has(path)
+        }
         # the message's own sign that there is no orientation
-        none = one.has("orientation_covariance.0") and bool((one["orientation_covariance.0"] == -1.0).all())
-        heading = None if none or not one.has("orientation.w") or not one["orientation.w"].any() else _heading(one, "orientation")
+        none = one.has("orientation_covariance.0") and bool(
+            (one["orientation_covariance.0"] == -1.0).all()
+        )
+        heading = (
+            None
+            if none or not one.has("orientation.w") or not one["orientation.w"].any()
+            else _heading(one, "orientation")
+        )
         return Plan(channels, None, heading)
 
 
@@ -119,7 +145,10 @@ class Wrench(Message):
         """See `Message.plan`."""
         prefix = "wrench." if one.has("wrench.force.x") else ""
         parts = {"tau_x": ("force.x", "N"), "tau_y": ("force.y", "N"), "tau_n": ("torque.z", "N m")}
-        channels = {n: FieldMap(topic=one.name, field=prefix + path, unit=unit, frame="body_fpu", hold=True) for n, (path, unit) in parts.items()}
+        channels = {
+            n: FieldMap(topic=one.name, field=prefix + path, unit=unit, frame="body_fpu", hold=True)
+            for n, (path, unit) in parts.items()
+        }
         return Plan(channels)
 
 
@@ -127,15 +156,36 @@ class Wrench(Message):
 class Number(Message):
     """std_msgs/Float64 and its kin: one number; the topic's name is the channel's."""
 
-    types = ("Float64", "Float32", "Int8", "Int16", "Int32", "Int64", "UInt8", "UInt16", "UInt32", "UInt64", "Float64Stamped", "Float32Stamped")
+    types = (
+        "Float64",
+        "Float32",
+        "Int8",
+        "Int16",
+        "Int32",
+        "Int64",
+        "UInt8",
+        "UInt16",
+        "UInt32",
+        "UInt64",
+        "Float64Stamped",
+        "Float32Stamped",
+    )
     signature = ("data",)
 
     def plan(self, one: Series) -> Plan:
-        """See `Message.plan`; a channel that residnet knows is taken to be in its SI unit, any other has none."""
+        """See `Message.plan`; a channel that residnet knows is taken to be in its SI unit, any
+        other has none.
+        """
         if not one.has("data"):
             return Plan()
         name = _channel_name(one.name)
-        return Plan({name: FieldMap(topic=one.name, field="data", unit=CHANNEL_UNITS.get(name, "-"), hold=True)})
+        return Plan(
+            {
+                name: FieldMap(
+                    topic=one.name, field="data", unit=CHANNEL_UNITS.get(name, "-"), hold=True
+                )
+            }
+        )
 
 
 @final
@@ -162,7 +212,9 @@ class Joints(Message):
 
 @final
 class Named(Message):
-    """A table without a type whose fields bear the names of residnet's channels: they are taken to be in SI, NED and body axes."""
+    """A table without a type whose fields bear the names of residnet's channels: they are taken to
+    be in SI, NED and body axes.
+    """
 
     types = ()
     signature = ()
@@ -180,27 +232,57 @@ class Named(Message):
         position = Local(topic=one.name, north="x", east="y") if {"x", "y"} <= set(names) else None
         taken = {"psi", *(("x", "y") if position else ())}
         plain = [name for name in names if name not in taken]
-        channels = {name: FieldMap(topic=one.name, field=name, unit=CHANNEL_UNITS[name], hold=name.startswith("cmd_")) for name in plain}
+        channels = {
+            name: FieldMap(
+                topic=one.name, field=name, unit=CHANNEL_UNITS[name], hold=name.startswith("cmd_")
+            )
+            for name in plain
+        }
         return Plan(channels, position, heading)
 
     @staticmethod
     def _names(one: Series) -> list[str]:
-        return [name for name in one.fields if name in CHANNEL_UNITS and name != "t" and one[name].size and not np.isnan(one[name]).all()]
+        return [
+            name
+            for name in one.fields
+            if name in CHANNEL_UNITS
+            and name != "t"
+            and one[name].size
+            and not np.isnan(one[name]).all()
+        ]
 
 
 # in the order in which they are asked: the one that says most first
-MESSAGES: tuple[Message, ...] = (Odometry(), Pose(), Twist(), Imu(), Fix(), Wrench(), *MARINE, Joints(), Number(), Named())
+MESSAGES: tuple[Message, ...] = (
+    Odometry(),
+    Pose(),
+    Twist(),
+    Imu(),
+    Fix(),
+    Wrench(),
+    *MARINE,
+    Joints(),
+    Number(),
+    Named(),
+)
 
 
 def standard_plan(recording: Recording, declared: Plan) -> Plan:
-    """The declared plan with what standard messages add to it, the ones that say most first, then the busiest topic of each kind."""
+    """The declared plan with what standard messages add to it, the ones that say most first, then
+    the busiest topic of each kind.
+    """
     plan, said, remarks = declared, [], []
     for message in MESSAGES:
         fitting = [one for one in recording.series.values() if len(one) > 1 and message.fits(one)]
-        alike = [one.name for one in fitting if isinstance(message, Named) and {"x", "y", "psi"} <= set(one.fields)]
+        alike = [
+            one.name
+            for one in fitting
+            if isinstance(message, Named) and {"x", "y", "psi"} <= set(one.fields)
+        ]
         if len(alike) > 1:
             text = (
-                f"{len(alike)} tables hold positions and headings ({', '.join(alike[:6])}): several experiments? name one with `table`, or map fields"
+                f"{len(alike)} tables hold positions and headings ({', '.join(alike[:6])}): several"
+                " experiments? name one with `table`, or map fields"
             )
             remarks.append(remark("will mislead", "several_tables", text, tables=len(alike)))
         for one in sorted(fitting, key=lambda one: (-len(one), one.name)):
@@ -208,24 +290,36 @@ def standard_plan(recording: Recording, declared: Plan) -> Plan:
             plan, taken = _joined(plan, offered)
             if taken:
                 said.append(
-                    f"{', '.join(taken)}: {type(message).__name__} of {one.name}, REP-103 (ENU, forward-left-up) to NED, forward-starboard-down"
+                    f"{', '.join(taken)}: {type(message).__name__} of {one.name}, REP-103 (ENU,"
+                    " forward-left-up) to NED, forward-starboard-down"
                 )
     if plan.heading is None and "psi" not in plan.channels and declared.velocity is None:
         # without a heading an earth-fixed velocity has no components in the body
         plan = dataclasses.replace(plan, velocity=None)
-    return dataclasses.replace(plan, said=(*declared.said, *said), remarks=(*declared.remarks, *remarks))
+    return dataclasses.replace(
+        plan, said=(*declared.said, *said), remarks=(*declared.remarks, *remarks)
+    )
 
 
 def _joined(plan: Plan, offered: Plan) -> tuple[Plan, Sequence[str]]:
     """A plan with what it lacks of another, and the names of that."""
-    given = set(plan.channels) | ({"x", "y"} if plan.position else set()) | ({"psi"} if plan.heading else set())
+    given = (
+        set(plan.channels)
+        | ({"x", "y"} if plan.position else set())
+        | ({"psi"} if plan.heading else set())
+    )
     given |= {"u", "v"} if plan.velocity else set()
     given |= {"r"} if isinstance(plan.velocity, Derived) else set()
     new = {name: entry for name, entry in offered.channels.items() if name not in given}
     position = offered.position if not {"x", "y"} & given else None
     heading = offered.heading if "psi" not in given else None
     velocity = offered.velocity if not {"u", "v"} & (given | set(new)) else None
-    taken = [*(["x", "y"] if position else []), *(["psi"] if heading else []), *(["u", "v"] if velocity else []), *new]
+    taken = [
+        *(["x", "y"] if position else []),
+        *(["psi"] if heading else []),
+        *(["u", "v"] if velocity else []),
+        *new,
+    ]
     joined = dataclasses.replace(
         plan,
         channels={**plan.channels, **new},

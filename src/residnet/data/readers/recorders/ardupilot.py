@@ -26,7 +26,9 @@ _DATED = 100_000_000.0
 
 @final
 class ArduPilotConfig(RecordingConfig):
-    """ArduPilot dataflash log; a series is named by its message (`ATT`, `GPS`, the second instance `GPS_1`), fields bear ArduPilot's names."""
+    """ArduPilot dataflash log; a series is named by its message (`ATT`, `GPS`, the second instance
+    `GPS_1`), fields bear ArduPilot's names.
+    """
 
     kind: Literal["ardupilot"] = "ardupilot"
 
@@ -36,10 +38,12 @@ class ArduPilotConfig(RecordingConfig):
 
 
 def load_ardupilot(path: Path, wanted: Wanted = EVERYTHING) -> Recording:
-    """The recording in a .bin file, on the boot clock (TimeUS); dated by the receiver's GPS time where it logged one.
+    """The recording in a .bin file, on the boot clock (TimeUS); dated by the receiver's GPS time
+    where it logged one.
 
     Raises:
-        UsageError: where the file is missing, nothing in it is wanted, or pymavlink is not installed.
+        UsageError: where the file is missing, nothing in it is wanted, or pymavlink is not
+            installed.
         DataError: where it cannot be read.
     """
     require_file(path)
@@ -58,10 +62,15 @@ def load_ardupilot(path: Path, wanted: Wanted = EVERYTHING) -> Recording:
         base = float(reader.clock.timebase or 0.0)
     # pymavlink fails in its own ways on damaged bytes
     except Exception as error:
-        raise DataError(f"{path}: damaged or not an ArduPilot log ({type(error).__name__}: {' '.join(str(error).split())[:200]})") from error
+        raise DataError(
+            f"{path}: damaged or not an ArduPilot log ({type(error).__name__}:"
+            f" {' '.join(str(error).split())[:200]})"
+        ) from error
     if not columns:
         if listed:
-            raise UsageError(f"{path}: none of its messages is wanted (it holds {', '.join(sorted(listed))})")
+            raise UsageError(
+                f"{path}: none of its messages is wanted (it holds {', '.join(sorted(listed))})"
+            )
         raise DataError(f"{path}: holds no message with a time; is it an ArduPilot .bin log?")
     start = min(one.time[0] for one in columns.values())
     boot = round(base * 1e6) * 1000 if base > _DATED else None
@@ -71,7 +80,9 @@ def load_ardupilot(path: Path, wanted: Wanted = EVERYTHING) -> Recording:
     return Recording(path, series, epoch, (path,), (), tuple(sorted(listed - set(series))))
 
 
-def _collect(reader: Any, columns: dict[str, _Columns], listed: set[str], wanted: Wanted, advance: Any) -> None:
+def _collect(
+    reader: Any, columns: dict[str, _Columns], listed: set[str], wanted: Wanted, advance: Any
+) -> None:
     count, quiet = 0, io.StringIO()
     while True:
         # what cannot be parsed is skipped, and printed
@@ -93,7 +104,9 @@ def _collect(reader: Any, columns: dict[str, _Columns], listed: set[str], wanted
         if not wanted(name):
             continue
         if name not in columns:
-            columns[name] = _Columns(kind, message, lambda path, name=name: wanted.field(name, path))
+            columns[name] = _Columns(
+                kind, message, lambda path, name=name: wanted.field(name, path)
+            )
         columns[name].add(message)
 
 
@@ -107,7 +120,10 @@ def _silence() -> Iterator[None]:
         for number, _ in kept:
             os.dup2(nowhere.fileno(), number)
         try:
-            with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+            with (
+                contextlib.redirect_stdout(io.StringIO()),
+                contextlib.redirect_stderr(io.StringIO()),
+            ):
                 yield
         finally:
             for number, copy in kept:
@@ -121,8 +137,12 @@ class _Columns:
 
     def __init__(self, kind: str, message: Any, wanted: Any) -> None:
         self._kind = kind
-        fields = [field for field in message.get_fieldnames() if field != "TimeUS" and wanted(field)]
-        self._names = [field for field in fields if isinstance(getattr(message, field), int | float)]
+        fields = [
+            field for field in message.get_fieldnames() if field != "TimeUS" and wanted(field)
+        ]
+        self._names = [
+            field for field in fields if isinstance(getattr(message, field), int | float)
+        ]
         self.time, self._rows = array("q"), array("d")
 
     def add(self, message: Any) -> None:
@@ -134,4 +154,9 @@ class _Columns:
         """With times in s from `origin` (ns since boot)."""
         rows = np.frombuffer(self._rows, dtype=np.float64).reshape(len(self.time), len(self._names))
         t = (np.frombuffer(self.time, dtype=np.int64) - origin) * 1e-9
-        return Series(name, f"ardupilot/{self._kind}", {field: rows[:, i] for i, field in enumerate(self._names)}, t)
+        return Series(
+            name,
+            f"ardupilot/{self._kind}",
+            {field: rows[:, i] for i, field in enumerate(self._names)},
+            t,
+        )

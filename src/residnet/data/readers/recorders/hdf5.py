@@ -28,7 +28,8 @@ class Hdf5Config(RecordingConfig):
 
     Attributes:
         time: which dataset of a group (or column of a table) holds time.
-        table: the only group or table that is read, where a file holds several experiments; null reads all.
+        table: the only group or table that is read, where a file holds several experiments; null
+            reads all.
     """
 
     kind: Literal["hdf5"] = "hdf5"
@@ -37,7 +38,9 @@ class Hdf5Config(RecordingConfig):
 
     def load(self, path: Path, wanted: Wanted) -> Recording:
         """See `RecordingConfig.load`."""
-        return load_hdf5(path, wanted if self.table is None else Wanted([(self.table, "")]), self.time)
+        return load_hdf5(
+            path, wanted if self.table is None else Wanted([(self.table, "")]), self.time
+        )
 
 
 def is_hdf5(path: Path) -> bool:
@@ -49,7 +52,12 @@ def is_hdf5(path: Path) -> bool:
     return head.startswith(_SIGNATURE) or head[512:520] == _SIGNATURE
 
 
-def load_hdf5(path: Path, wanted: Wanted = EVERYTHING, time: TreeTime | None = None, what: str = "an HDF5 file") -> Recording:
+def load_hdf5(
+    path: Path,
+    wanted: Wanted = EVERYTHING,
+    time: TreeTime | None = None,
+    what: str = "an HDF5 file",
+) -> Recording:
     """The recording in an HDF5 file.
 
     Raises:
@@ -65,23 +73,41 @@ def load_hdf5(path: Path, wanted: Wanted = EVERYTHING, time: TreeTime | None = N
     try:
         with h5py.File(path, "r") as file:
             found: list[h5py.Dataset] = []
-            file.visititems(lambda name, node: found.append(node) if isinstance(node, h5py.Dataset) and not name.startswith("#") else None)
+            file.visititems(
+                lambda name, node: (
+                    found.append(node)
+                    if isinstance(node, h5py.Dataset) and not name.startswith("#")
+                    else None
+                )
+            )
             for dataset in found:
                 leaves.update(_vectors(dataset))
             return tree_recording(path, leaves, time or TreeTime(), wanted)
     except (OSError, RuntimeError, KeyError, ValueError) as error:
-        raise DataError(f"{path}: damaged or not an HDF5 file ({' '.join(str(error).split())[:200]})") from error
+        raise DataError(
+            f"{path}: damaged or not an HDF5 file ({' '.join(str(error).split())[:200]})"
+        ) from error
 
 
 def _vectors(dataset: h5py.Dataset) -> dict[str, Vector]:
     """Arrays of one dataset by path, not yet read; a table gives one for each column."""
     name = dataset.name.strip("/")
     if dataset.dtype.names:
-        plain = [column for column in dataset.dtype.names if dataset.ndim == 1 and not dataset.dtype[column].shape]
+        plain = [
+            column
+            for column in dataset.dtype.names
+            if dataset.ndim == 1 and not dataset.dtype[column].shape
+        ]
         return {f"{name}/{column}": _Column(dataset, column) for column in plain}
-    if dataset.ndim == 0 or dataset.size == 0 or dataset.attrs.get("MATLAB_class") in (b"char", b"cell"):
+    if (
+        dataset.ndim == 0
+        or dataset.size == 0
+        or dataset.attrs.get("MATLAB_class") in (b"char", b"cell")
+    ):
         return {}
-    return {name: _plain(dataset[()]) if dataset.dtype.kind in "SO" and dataset.ndim == 1 else dataset}
+    return {
+        name: _plain(dataset[()]) if dataset.dtype.kind in "SO" and dataset.ndim == 1 else dataset
+    }
 
 
 @final
@@ -100,5 +126,8 @@ class _Column:
 def _plain(values: np.ndarray) -> np.ndarray:
     """Bytes as text, everything else as it is."""
     if values.dtype.kind in "SO" and values.ndim == 1:
-        return np.array([v.decode(errors="replace") if isinstance(v, bytes) else str(v) for v in values], dtype=object)
+        return np.array(
+            [v.decode(errors="replace") if isinstance(v, bytes) else str(v) for v in values],
+            dtype=object,
+        )
     return values

@@ -20,7 +20,8 @@ from residnet.data.readers.recording import Recording
 
 @final
 class MatConfig(RecordingConfig):
-    """MATLAB file, v5 or v7.3: vectors, matrices of one row per sample, structs, Simulink's structures with time.
+    """MATLAB file, v5 or v7.3: vectors, matrices of one row per sample, structs, Simulink's
+    structures with time.
 
     Attributes:
         time: which variable of a struct (or of the workspace) holds time.
@@ -33,7 +34,9 @@ class MatConfig(RecordingConfig):
 
     def load(self, path: Path, wanted: Wanted) -> Recording:
         """See `RecordingConfig.load`."""
-        return load_mat(path, wanted if self.table is None else Wanted([(self.table, "")]), self.time)
+        return load_mat(
+            path, wanted if self.table is None else Wanted([(self.table, "")]), self.time
+        )
 
 
 def load_mat(path: Path, wanted: Wanted = EVERYTHING, time: TreeTime | None = None) -> Recording:
@@ -52,7 +55,10 @@ def load_mat(path: Path, wanted: Wanted = EVERYTHING, time: TreeTime | None = No
         content = loadmat(path, simplify_cells=True)
     # SciPy's parser fails in its own ways on damaged bytes
     except Exception as error:
-        raise DataError(f"{path}: damaged or not a MATLAB file ({type(error).__name__}: {' '.join(str(error).split())[:200]})") from error
+        raise DataError(
+            f"{path}: damaged or not a MATLAB file ({type(error).__name__}:"
+            f" {' '.join(str(error).split())[:200]})"
+        ) from error
     leaves = dict(_leaves(content, ""))
     return tree_recording(path, leaves, time or TreeTime(), wanted)
 

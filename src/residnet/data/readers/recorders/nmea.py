@@ -1,4 +1,6 @@
-"""Reader of NMEA 0183 sentences as a receiver or a logger writes them to text, through the package pynmea2."""
+"""Reader of NMEA 0183 sentences as a receiver or a logger writes them to text, through the package
+pynmea2.
+"""
 
 from __future__ import annotations
 
@@ -26,9 +28,11 @@ _REPORT_EVERY = 5000
 
 @final
 class NmeaConfig(RecordingConfig):
-    """NMEA 0183 text, one sentence per line, with or without a time in front of it; a series is named by its sentence (`RMC`, `HDT`).
+    """NMEA 0183 text, one sentence per line, with or without a time in front of it; a series is
+    named by its sentence (`RMC`, `HDT`).
 
-    Fields bear the names of pynmea2; `latitude` and `longitude` are in signed degrees, `rate_of_turn` is in deg/s (the sentence has deg/min).
+    Fields bear the names of pynmea2; `latitude` and `longitude` are in signed degrees,
+    `rate_of_turn` is in deg/s (the sentence has deg/min).
     """
 
     kind: Literal["nmea"] = "nmea"
@@ -41,8 +45,8 @@ class NmeaConfig(RecordingConfig):
 def load_nmea(path: Path, wanted: Wanted = EVERYTHING) -> Recording:
     """The recording in a file of sentences.
 
-    Sentences with a time of day are dated by the last RMC or ZDA; those without a time lie between the ones around them in the order of the lines,
-    unless every line begins with a time of its own.
+    Sentences with a time of day are dated by the last RMC or ZDA; those without a time lie between
+    the ones around them in the order of the lines, unless every line begins with a time of its own.
 
     Raises:
         UsageError: where the file is missing or pynmea2 is not installed.
@@ -66,17 +70,25 @@ def load_nmea(path: Path, wanted: Wanted = EVERYTHING) -> Recording:
                 continue
             try:
                 message = pynmea2.parse(match["sentence"].decode("ascii").strip())
-                lines.add(message, match["before"].decode("ascii", errors="replace").strip(" ,;\t[]"), wanted)
+                lines.add(
+                    message,
+                    match["before"].decode("ascii", errors="replace").strip(" ,;\t[]"),
+                    wanted,
+                )
             except (pynmea2.ParseError, ValueError):
                 bad += 1
     if not lines.series:
-        raise DataError(f"{path}: holds no NMEA 0183 sentence ({bad} lines are none, or fail their checksum)")
+        raise DataError(
+            f"{path}: holds no NMEA 0183 sentence ({bad} lines are none, or fail their checksum)"
+        )
     return lines.recording(path, bad)
 
 
 @final
 class _Sentence:
-    """Sentences of one kind: numbers row by row, their own time or -1, and how many timed sentences went before."""
+    """Sentences of one kind: numbers row by row, their own time or -1, and how many timed sentences
+    went before.
+    """
 
     def __init__(self) -> None:
         self.names: list[str] = []
@@ -121,7 +133,9 @@ class _Lines:
             return None
         if not isinstance(moment, datetime.time):
             return None
-        ns = ((moment.hour * 60 + moment.minute) * 60 + moment.second) * 10**9 + moment.microsecond * 1000
+        ns = (
+            (moment.hour * 60 + moment.minute) * 60 + moment.second
+        ) * 10**9 + moment.microsecond * 1000
         if date is not None:
             self._day, self._dated = (date - datetime.date(1970, 1, 1)).days * _DAY, True
         day = self._day or 0
@@ -141,17 +155,31 @@ class _Lines:
         ticks = np.frombuffer(self._ticks, dtype=np.int64)
         stamped = all(all(one.before) for one in self.series.values())
         if not ticks.size and not stamped:
-            raise DataError(f"{path}: no sentence tells the time (RMC, GGA, ZDA, ...), and the lines do not begin with one")
+            raise DataError(
+                f"{path}: no sentence tells the time (RMC, GGA, ZDA, ...), and the lines do not"
+                " begin with one"
+            )
         remarks: list[Remark] = []
         if bad:
             text = f"{bad} lines are no NMEA sentence or fail their checksum; left out"
             remarks.append(remark("note", "bad_lines", text, lines=bad))
-        arrivals = {name: parse_texts(np.array(one.before, dtype=object)) for name, one in self.series.items()} if stamped else {}
+        arrivals = (
+            {
+                name: parse_texts(np.array(one.before, dtype=object))
+                for name, one in self.series.items()
+            }
+            if stamped
+            else {}
+        )
         absolute = self._dated or any(stamps.absolute for stamps in arrivals.values())
-        first = [int(ticks.min())] * bool(ticks.size) + [int(stamps.ns.min()) for stamps in arrivals.values() if stamps.absolute]
+        first = [int(ticks.min())] * bool(ticks.size) + [
+            int(stamps.ns.min()) for stamps in arrivals.values() if stamps.absolute
+        ]
         epoch = min(first) // 10**9 * 10**9 if absolute else None
         if not self._dated and ticks.size:
-            remarks.append(remark("note", "undated", "no sentence tells the date; time counts from midnight"))
+            remarks.append(
+                remark("note", "undated", "no sentence tells the date; time counts from midnight")
+            )
         series = {}
         for name, one in sorted(self.series.items()):
             own = np.frombuffer(one.own, dtype=np.int64)
@@ -159,18 +187,27 @@ class _Lines:
             timed = bool((own >= 0).all())
             if not timed and not stamped:
                 own = _between(np.frombuffer(one.epoch_number, dtype=np.int64), ticks)
-                text = f"topic {name}: its sentences tell no time; they are spread between the timed ones before and after"
+                text = (
+                    f"topic {name}: its sentences tell no time; they are spread between the timed"
+                    " ones before and after"
+                )
                 said = (remark("note", "estimated_times", text, rows=own.size),)
             zero = epoch or 0
             stamp = (own - zero) * 1e-9 if timed or not stamped else None
-            arrival = (arrivals[name].ns - (zero if arrivals[name].absolute else 0)) * 1e-9 if stamped else None
+            arrival = (
+                (arrivals[name].ns - (zero if arrivals[name].absolute else 0)) * 1e-9
+                if stamped
+                else None
+            )
             fields = {field: one.column(i) for i, field in enumerate(one.names)}
             series[name] = Series(name, f"nmea/{name}", fields, stamp, arrival, None, said)
         return Recording(path, series, epoch, (path,), tuple(remarks))
 
 
 def _between(number: np.ndarray, ticks: np.ndarray) -> np.ndarray:
-    """Times [T] of sentences, of which `number` says after which tick each came: evenly over the time to the next tick."""
+    """Times [T] of sentences, of which `number` says after which tick each came: evenly over the
+    time to the next tick.
+    """
     number = np.clip(number, 0, ticks.size - 1)
     first = np.append(True, number[1:] != number[:-1])
     start = np.maximum.accumulate(np.where(first, np.arange(number.size), 0))
@@ -193,7 +230,9 @@ def _date(message: Any) -> datetime.date | None:
 
 
 def _numbers(message: Any) -> dict[str, float]:
-    """The numbers in a sentence by name; positions in signed degrees, NaN where the receiver says that there is no fix."""
+    """The numbers in a sentence by name; positions in signed degrees, NaN where the receiver says
+    that there is no fix.
+    """
     out: dict[str, float] = {}
     for entry, cell in zip(message.fields, message.data, strict=False):
         name = str(entry[1])
@@ -206,6 +245,12 @@ def _numbers(message: Any) -> dict[str, float]:
                 out[name] = float("nan")
     names = {str(entry[1]) for entry in message.fields}
     if {"lat", "lon"} <= names:
-        fix = bool(message.lat and message.lon) and getattr(message, "status", "A") != "V" and str(getattr(message, "gps_qual", "1")) != "0"
-        out["latitude"], out["longitude"] = (message.latitude, message.longitude) if fix else (float("nan"), float("nan"))
+        fix = (
+            bool(message.lat and message.lon)
+            and getattr(message, "status", "A") != "V"
+            and str(getattr(message, "gps_qual", "1")) != "0"
+        )
+        out["latitude"], out["longitude"] = (
+            (message.latitude, message.longitude) if fix else (float("nan"), float("nan"))
+        )
     return out

@@ -1,4 +1,6 @@
-"""Reader of ROS 1 bags, ROS 2 bags (SQLite, MCAP) and plain MCAP files, through the package rosbags; no ROS is needed."""
+"""Reader of ROS 1 bags, ROS 2 bags (SQLite, MCAP) and plain MCAP files, through the package
+rosbags; no ROS is needed.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,9 @@ _REPORT_EVERY = 5000
 
 @final
 class RosbagConfig(RecordingConfig):
-    """ROS 1 bag, ROS 2 bag (a folder with metadata.yaml, .db3 or .mcap), or plain MCAP file with ROS 2 messages."""
+    """ROS 1 bag, ROS 2 bag (a folder with metadata.yaml, .db3 or .mcap), or plain MCAP file with
+    ROS 2 messages.
+    """
 
     kind: Literal["rosbag"] = "rosbag"
 
@@ -39,7 +43,8 @@ class RosbagConfig(RecordingConfig):
 
 
 def load_bag(path: Path, wanted: Wanted = EVERYTHING) -> Recording:
-    """The recording in a bag, message by message; memory grows with the numbers kept, not with the file.
+    """The recording in a bag, message by message; memory grows with the numbers kept, not with the
+    file.
 
     Raises:
         UsageError: where the bag is missing or rosbags is not installed.
@@ -60,19 +65,26 @@ def load_bag(path: Path, wanted: Wanted = EVERYTHING) -> Recording:
         with AnyReader([path], default_typestore=store) as reader:
             return _read(path, reader, wanted)
     except AnyReaderError as error:
-        raise DataError(f"{path}: not a readable bag ({' '.join(str(error).split())[:200]})") from error
+        raise DataError(
+            f"{path}: not a readable bag ({' '.join(str(error).split())[:200]})"
+        ) from error
     except DataError:
         raise
     # a damaged bag fails in many ways inside rosbags and SQLite, none of them a fault of residnet
     except Exception as error:
-        raise DataError(f"{path}: damaged or not a bag ({type(error).__name__}: {' '.join(str(error).split())[:200]})") from error
+        raise DataError(
+            f"{path}: damaged or not a bag ({type(error).__name__}:"
+            f" {' '.join(str(error).split())[:200]})"
+        ) from error
 
 
 def _read(path: Path, reader: AnyReader, wanted: Wanted) -> Recording:
     chosen = [one for one in reader.connections if wanted(one.topic)]
     left = tuple(sorted({one.topic for one in reader.connections} - {one.topic for one in chosen}))
     if not chosen:
-        raise UsageError(f"{path}: none of its topics is wanted (it holds {', '.join(left) or 'none'})")
+        raise UsageError(
+            f"{path}: none of its topics is wanted (it holds {', '.join(left) or 'none'})"
+        )
     columns: dict[str, _Columns] = {}
     failed: dict[str, str] = {}
     files = tuple(files_of(path))
@@ -86,7 +98,9 @@ def _read(path: Path, reader: AnyReader, wanted: Wanted) -> Recording:
                 continue
             if name not in columns:
                 shared = sum(one.topic == name for one in chosen) > 1
-                columns[name] = _Columns(name, connection.msgtype, wanted=wanted, by_connection=shared)
+                columns[name] = _Columns(
+                    name, connection.msgtype, wanted=wanted, by_connection=shared
+                )
             try:
                 columns[name].add(reader.deserialize(raw, connection.msgtype), arrival, connection)
             except Exception as error:
@@ -97,9 +111,18 @@ def _read(path: Path, reader: AnyReader, wanted: Wanted) -> Recording:
         text = f"topic {name}: message {kept + 1} cannot be read ({why}); the topic is left out"
         remarks.append(remark("will mislead", "unreadable", text, rows=kept))
     silent = sorted({one.topic for one in chosen} - set(columns) - set(failed))
-    remarks += [remark("note", "empty_topic", f"topic {name}: holds no messages") for name in silent]
+    remarks += [
+        remark("note", "empty_topic", f"topic {name}: holds no messages") for name in silent
+    ]
     epoch = int(min((min(one.arrival) for one in columns.values()), default=0)) // 10**9 * 10**9
-    return Recording(path, {name: one.series(epoch) for name, one in sorted(columns.items())}, epoch, files, tuple(remarks), left)
+    return Recording(
+        path,
+        {name: one.series(epoch) for name, one in sorted(columns.items())},
+        epoch,
+        files,
+        tuple(remarks),
+        left,
+    )
 
 
 @final
@@ -133,19 +156,36 @@ class _Columns:
         stamps = np.frombuffer(self._stamp, dtype=np.int64)
         sender = None
         if len(self._senders) > 1 or (self._senders and next(iter(self._senders))):
-            sender = np.array(list(self._senders), dtype=object)[np.frombuffer(self._sender, dtype=np.uint16)]
+            sender = np.array(list(self._senders), dtype=object)[
+                np.frombuffer(self._sender, dtype=np.uint16)
+            ]
         remarks = []
         if stamps.any() and not stamps.all():
-            text = f"topic {self.name}: {int((stamps == 0).sum())} of {stamps.size} header stamps are zero; arrival times are used"
-            remarks.append(remark("will mislead", "empty_stamps", text, rows=int((stamps == 0).sum())))
+            text = (
+                f"topic {self.name}: {int((stamps == 0).sum())} of {stamps.size} header stamps are"
+                " zero; arrival times are used"
+            )
+            remarks.append(
+                remark("will mislead", "empty_stamps", text, rows=int((stamps == 0).sum()))
+            )
         stamp = (stamps - epoch) * 1e-9 if stamps.all() else None
         arrival = (np.frombuffer(self.arrival, dtype=np.int64) - epoch) * 1e-9
-        return Series(self.name, self.kind, {name: rows[:, i] for i, name in enumerate(names)}, stamp, arrival, sender, tuple(remarks))
+        return Series(
+            self.name,
+            self.kind,
+            {name: rows[:, i] for i, name in enumerate(names)},
+            stamp,
+            arrival,
+            sender,
+            tuple(remarks),
+        )
 
 
 @final
 class _Leaves:
-    """The numbers in a message: their paths, and the way to them; the first message of a topic decides."""
+    """The numbers in a message: their paths, and the way to them; the first message of a topic
+    decides.
+    """
 
     def __init__(self, message: Any, wanted: Callable[[str], bool]) -> None:
         scalars: list[str] = []
@@ -155,10 +195,17 @@ class _Leaves:
                 continue
             if isinstance(value, int | float | bool):
                 scalars.append(path)
-            elif isinstance(value, np.ndarray) and value.dtype.kind in "biuf" and 0 < value.size <= _ELEMENTS:
+            elif (
+                isinstance(value, np.ndarray)
+                and value.dtype.kind in "biuf"
+                and 0 < value.size <= _ELEMENTS
+            ):
                 arrays.append((path, value.size))
         joints = list(message.name) if type(message).__name__.endswith("JointState") else None
-        self.names = [*scalars, *(f"{path}.{_element(path, i, joints)}" for path, size in arrays for i in range(size))]
+        self.names = [
+            *scalars,
+            *(f"{path}.{_element(path, i, joints)}" for path, size in arrays for i in range(size)),
+        ]
         self._scalars: Callable[[Any], Any] | None = attrgetter(*scalars) if scalars else None
         self._single = len(scalars) == 1
         self._arrays = [(attrgetter(path), size) for path, size in arrays]
@@ -170,12 +217,20 @@ class _Leaves:
             out = [self._scalars(message)] if self._single else list(self._scalars(message))
         for way, size in self._arrays:
             values = way(message)
-            out += values.tolist() if values.size == size else [*values.tolist(), *[np.nan] * size][:size]
+            out += (
+                values.tolist()
+                if values.size == size
+                else [*values.tolist(), *[np.nan] * size][:size]
+            )
         return out
 
 
 def _element(path: str, i: int, joints: list[str] | None) -> str:
-    return joints[i] if joints is not None and path in ("position", "velocity", "effort") and i < len(joints) else str(i)
+    return (
+        joints[i]
+        if joints is not None and path in ("position", "velocity", "effort") and i < len(joints)
+        else str(i)
+    )
 
 
 def _walk(message: Any, prefix: str) -> Iterator[tuple[str, Any]]:

@@ -27,7 +27,8 @@ _CHUNK = 200_000
 
 @final
 class TopicFolderConfig(RecordingConfig):
-    """A folder of csv files, one per topic, each with its own clock, or one csv file with dates, latitudes, quaternions.
+    """A folder of csv files, one per topic, each with its own clock, or one csv file with dates,
+    latitudes, quaternions.
 
     A topic is named by its path below the folder, without the ending.
 
@@ -41,11 +42,15 @@ class TopicFolderConfig(RecordingConfig):
     delimiter: str = Field(default=",", min_length=1, max_length=1)
 
     def load(self, path: Path, wanted: Wanted) -> Recording:
-        """See `RecordingConfig.load`; unwanted topics of a small folder are read too, so that what is wrong with them is said."""
+        """See `RecordingConfig.load`; unwanted topics of a small folder are read too, so that what
+        is wrong with them is said.
+        """
         return load_folder(path, wanted, self.time, self.delimiter)
 
 
-def load_folder(path: Path, wanted: Wanted = EVERYTHING, time: tuple[str, ...] = _ARRIVAL, delimiter: str = ",") -> Recording:
+def load_folder(
+    path: Path, wanted: Wanted = EVERYTHING, time: tuple[str, ...] = _ARRIVAL, delimiter: str = ","
+) -> Recording:
     """The recording in a folder of csv files, or in one such file.
 
     Raises:
@@ -55,7 +60,14 @@ def load_folder(path: Path, wanted: Wanted = EVERYTHING, time: tuple[str, ...] =
     if path.is_file():
         files, root = [path], path.parent
     elif path.is_dir():
-        files, root = sorted(file for file in path.rglob("*") if file.suffix.lower() in _ENDINGS and file.is_file()), path
+        files, root = (
+            sorted(
+                file
+                for file in path.rglob("*")
+                if file.suffix.lower() in _ENDINGS and file.is_file()
+            ),
+            path,
+        )
     else:
         require_file(path)
     if not files:
@@ -77,19 +89,37 @@ def load_folder(path: Path, wanted: Wanted = EVERYTHING, time: tuple[str, ...] =
             if table is not None:
                 raw[name] = table
     if not raw:
-        raise DataError(f"{path}: none of {len(files)} csv files holds a topic ({remarks[0]['text']})")
-    dated = [stamps for table in raw.values() for stamps in (table.arrival, table.stamp) if stamps is not None and stamps.absolute]
+        raise DataError(
+            f"{path}: none of {len(files)} csv files holds a topic ({remarks[0]['text']})"
+        )
+    dated = [
+        stamps
+        for table in raw.values()
+        for stamps in (table.arrival, table.stamp)
+        if stamps is not None and stamps.absolute
+    ]
     epoch = min((int(stamps.ns.min()) for stamps in dated), default=None)
     whole = None if epoch is None else epoch // 10**9 * 10**9
-    return Recording(path, {name: table.series(name, whole) for name, table in raw.items()}, whole, tuple(files), tuple(remarks), tuple(listed))
+    return Recording(
+        path,
+        {name: table.series(name, whole) for name, table in raw.items()},
+        whole,
+        tuple(files),
+        tuple(remarks),
+        tuple(listed),
+    )
 
 
 def is_topic_folder(path: Path) -> bool:
-    """Whether a folder's csv files are topics of one recording, and not logs of their own: stamped headers, or headers that differ."""
+    """Whether a folder's csv files are topics of one recording, and not logs of their own: stamped
+    headers, or headers that differ.
+    """
     if not path.is_dir():
         return False
     heads = []
-    for file in sorted(file for file in path.rglob("*") if file.suffix.lower() in _ENDINGS and file.is_file())[:200]:
+    for file in sorted(
+        file for file in path.rglob("*") if file.suffix.lower() in _ENDINGS and file.is_file()
+    )[:200]:
         with file.open("rb") as stream:
             heads.append(stream.readline(10_000).decode("utf-8", errors="replace").strip())
     full = [head for head in heads if head]
@@ -103,9 +133,20 @@ class _Table:
     """One csv as read: times as whole ns, fields as float64."""
 
     def __init__(
-        self, arrival: Stamps | None, stamp: Stamps | None, fields: dict[str, np.ndarray], sender: np.ndarray | None, said: list[Remark]
+        self,
+        arrival: Stamps | None,
+        stamp: Stamps | None,
+        fields: dict[str, np.ndarray],
+        sender: np.ndarray | None,
+        said: list[Remark],
     ) -> None:
-        self.arrival, self.stamp, self.fields, self.sender, self.said = arrival, stamp, fields, sender, said
+        self.arrival, self.stamp, self.fields, self.sender, self.said = (
+            arrival,
+            stamp,
+            fields,
+            sender,
+            said,
+        )
 
     def series(self, name: str, epoch: int | None) -> Series:
         """With times in s from the epoch."""
@@ -117,11 +158,24 @@ class _Table:
 
         remarks = [*self.said]
         for stamps in (self.arrival, self.stamp):
-            remarks += [{**one, "text": f"topic {name}: {one['text']}"} for one in (stamps.remarks if stamps is not None else ())]
-        return Series(name, "", self.fields, seconds(self.stamp), seconds(self.arrival), self.sender, tuple(remarks))
+            remarks += [
+                {**one, "text": f"topic {name}: {one['text']}"}
+                for one in (stamps.remarks if stamps is not None else ())
+            ]
+        return Series(
+            name,
+            "",
+            self.fields,
+            seconds(self.stamp),
+            seconds(self.arrival),
+            self.sender,
+            tuple(remarks),
+        )
 
 
-def _read(file: Path, name: str, time: tuple[str, ...], delimiter: str, wanted: Wanted) -> tuple[_Table | None, list[Remark]]:
+def _read(
+    file: Path, name: str, time: tuple[str, ...], delimiter: str, wanted: Wanted
+) -> tuple[_Table | None, list[Remark]]:
     """One topic; None and a remark where the file holds none."""
     import pandas as pd
 
@@ -134,19 +188,43 @@ def _read(file: Path, name: str, time: tuple[str, ...], delimiter: str, wanted: 
         clock = next((column for column in time if column in header), None)
         stamp = _stamp_columns(header)
         if clock is None and stamp is None:
-            text = f"topic {name}: no column for time (looked for {', '.join(time)} and a header stamp); the file is left out"
+            text = (
+                f"topic {name}: no column for time (looked for {', '.join(time)} and a header"
+                " stamp); the file is left out"
+            )
             return None, [remark("note", "no_time", text)]
-        columns = _columns(file, header, sep, clock, lambda column: column in (stamp or ()) or names_sender(column) or wanted.field(name, column))
+        columns = _columns(
+            file,
+            header,
+            sep,
+            clock,
+            lambda column: (
+                column in (stamp or ()) or names_sender(column) or wanted.field(name, column)
+            ),
+        )
     except (UnicodeDecodeError, pd.errors.ParserError) as error:
-        return None, [remark("will mislead", "unreadable", f"topic {name}: not a regular UTF-8 table ({' '.join(str(error).split())}); left out")]
+        return None, [
+            remark(
+                "will mislead",
+                "unreadable",
+                f"topic {name}: not a regular UTF-8 table ({' '.join(str(error).split())});"
+                " left out",
+            )
+        ]
     except DataError as error:
-        return None, [remark("will mislead", "no_time", f"topic {name}: {error}; the file is left out")]
+        return None, [
+            remark("will mislead", "no_time", f"topic {name}: {error}; the file is left out")
+        ]
     if not any(one.rows for one in columns.values()):
-        return None, [remark("note", "empty_topic", f"topic {name}: the file has a header and no rows")]
+        return None, [
+            remark("note", "empty_topic", f"topic {name}: the file has a header and no rows")
+        ]
     return _table(name, columns, clock, stamp), []
 
 
-def _columns(file: Path, header: list[str], sep: str, clock: str | None, wanted: Callable[[str], bool]) -> dict[str, Cells]:
+def _columns(
+    file: Path, header: list[str], sep: str, clock: str | None, wanted: Callable[[str], bool]
+) -> dict[str, Cells]:
     """The columns of a file that are wanted, and its time, chunk by chunk.
 
     Raises:
@@ -154,7 +232,11 @@ def _columns(file: Path, header: list[str], sep: str, clock: str | None, wanted:
     """
     import pandas as pd
 
-    kept = {i: Cells(column, is_time=column == clock) for i, column in enumerate(header) if column == clock or wanted(column)}
+    kept = {
+        i: Cells(column, is_time=column == clock)
+        for i, column in enumerate(header)
+        if column == clock or wanted(column)
+    }
     chunks = pd.read_csv(
         file,
         sep=sep,
@@ -173,22 +255,48 @@ def _columns(file: Path, header: list[str], sep: str, clock: str | None, wanted:
     return {one.name: one for one in kept.values()}
 
 
-def _table(name: str, columns: dict[str, Cells], clock: str | None, stamp: tuple[str, str] | None) -> _Table:
+def _table(
+    name: str, columns: dict[str, Cells], clock: str | None, stamp: tuple[str, str] | None
+) -> _Table:
     """Times and fields from the columns of a file."""
     arrival = None if clock is None else columns[clock].times()
     rows = None if arrival is None else len(arrival.ns)
     numbers = {column: one.numbers()[:rows] for column, one in columns.items() if one.numeric}
     stamped = None if stamp is None else _stamps(numbers, stamp)
-    sender = next((one.words()[:rows] for column, one in columns.items() if not one.numeric and names_sender(column)), None)
-    said = [one.remark(name) for column, one in columns.items() if not one.numeric and not names_sender(column) and column != clock]
+    sender = next(
+        (
+            one.words()[:rows]
+            for column, one in columns.items()
+            if not one.numeric and names_sender(column)
+        ),
+        None,
+    )
+    said = [
+        one.remark(name)
+        for column, one in columns.items()
+        if not one.numeric and not names_sender(column) and column != clock
+    ]
     if clock is not None and columns[clock].cut:
-        said.append(remark("note", "cut_short", f"topic {name}: the last row is cut short; left out", rows=1.0))
+        said.append(
+            remark(
+                "note", "cut_short", f"topic {name}: the last row is cut short; left out", rows=1.0
+            )
+        )
     for column, one in columns.items():
         if one.numeric and one.spoilt:
-            text = f"topic {name}: column '{column}' holds {one.spoilt} cells that are not numbers; they count as missing"
+            text = (
+                f"topic {name}: column '{column}' holds {one.spoilt} cells that are not numbers;"
+                " they count as missing"
+            )
             said.append(remark("will mislead", "not_numbers", text, cells=one.spoilt))
     taken = {*(stamp or ()), clock}
-    return _Table(arrival, stamped, {column: values for column, values in numbers.items() if column not in taken}, sender, said)
+    return _Table(
+        arrival,
+        stamped,
+        {column: values for column, values in numbers.items() if column not in taken},
+        sender,
+        said,
+    )
 
 
 def _stamp_columns(header: list[str]) -> tuple[str, str] | None:

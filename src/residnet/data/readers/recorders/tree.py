@@ -1,4 +1,6 @@
-"""Vectors in a tree of groups or structs, as MATLAB and HDF5 files hold them, to a recording: every group with a time is one series."""
+"""Vectors in a tree of groups or structs, as MATLAB and HDF5 files hold them, to a recording: every
+group with a time is one series.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,19 @@ from residnet.data.readers.recording import Recording, Remark, Series, remark
 from residnet.data.readers.stamps import Stamps, parse_numbers, parse_texts
 from residnet.data.readers.tables.channel_map import factor
 
-TIME_NAMES = ("t", "time", "Time", "timestamp", "TIME", "T", "stamp", "time_s", "t_s", "utc", "datenum")
+TIME_NAMES = (
+    "t",
+    "time",
+    "Time",
+    "timestamp",
+    "TIME",
+    "T",
+    "stamp",
+    "time_s",
+    "t_s",
+    "utc",
+    "datenum",
+)
 # MATLAB's day 719529 is 1 January 1970
 _DATENUM_1970, _DAY = 719_529.0, 86_400.0
 _MOST_COLUMNS = 64
@@ -41,7 +55,8 @@ class TreeTime(Config):
 
     Attributes:
         column: its name; null looks for the usual ones (t, time, timestamp, ...).
-        unit: its unit, or `datenum` for MATLAB's days since year 0; null reads Unix time in s, ms, us or ns by its size, and anything else as s.
+        unit: its unit, or `datenum` for MATLAB's days since year 0; null reads Unix time in s, ms,
+            us or ns by its size, and anything else as s.
     """
 
     column: str | None = Field(default=None, min_length=1)
@@ -64,17 +79,23 @@ class TreeTime(Config):
             return parse_texts(values)
         if self.unit == "datenum":
             days = np.floor(values)
-            ns = ((days - _DATENUM_1970) * _DAY * 1e9).astype(np.int64) + np.rint((values - days) * _DAY * 1e9).astype(np.int64)
+            ns = ((days - _DATENUM_1970) * _DAY * 1e9).astype(np.int64) + np.rint(
+                (values - days) * _DAY * 1e9
+            ).astype(np.int64)
             return Stamps(ns, True, False)
         return parse_numbers(values, None if self.unit is None else to_si(self.unit))
 
 
-def tree_recording(path: Path, leaves: Mapping[str, Vector], time: TreeTime, wanted: Wanted) -> Recording:
-    """The recording of vectors by their path (`trial/u`): each belongs to the nearest group above it whose time has its length.
+def tree_recording(
+    path: Path, leaves: Mapping[str, Vector], time: TreeTime, wanted: Wanted
+) -> Recording:
+    """The recording of vectors by their path (`trial/u`): each belongs to the nearest group above
+    it whose time has its length.
 
     Args:
         path: the file.
-        leaves: path -> array [T], [T, 1], [1, T] or [T, k] (whose columns become `name.0`, `name.1`, ...).
+        leaves: path -> array [T], [T, 1], [1, T] or [T, k] (whose columns become `name.0`,
+            `name.1`, ...).
         time: how time is found.
         wanted: whether a group is to be read.
 
@@ -84,9 +105,14 @@ def tree_recording(path: Path, leaves: Mapping[str, Vector], time: TreeTime, wan
     """
     clocks = dict(_clocks(leaves, time))
     if not clocks:
-        what = f"'{time.column}'" if time.column is not None else "of time (t, time, timestamp, ...)"
+        what = (
+            f"'{time.column}'" if time.column is not None else "of time (t, time, timestamp, ...)"
+        )
         near = ", ".join(list(leaves)[:12]) or "nothing"
-        raise UsageError(f"{path}: no vector {what} in it; name it with time: {{column: ...}} (the file holds {near})")
+        raise UsageError(
+            f"{path}: no vector {what} in it; name it with time: {{column: ...}} (the file holds"
+            f" {near})"
+        )
     fields: dict[str, dict[str, np.ndarray]] = {group: {} for group in clocks}
     remarks: list[Remark] = []
     left = []
@@ -94,10 +120,17 @@ def tree_recording(path: Path, leaves: Mapping[str, Vector], time: TreeTime, wan
         group = _home(name, values, clocks)
         if group is None:
             left.append(f"{name} {list(values.shape)}")
-        elif name != clocks[group][0] and wanted.field(group or "/", path_in := name[len(group) :].lstrip("/")) and wanted(group or "/"):
+        elif (
+            name != clocks[group][0]
+            and wanted.field(group or "/", path_in := name[len(group) :].lstrip("/"))
+            and wanted(group or "/")
+        ):
             fields[group].update(_columns(path_in, values, len(clocks[group][1])))
     if left:
-        text = f"{len(left)} arrays belong to no time ({', '.join(left[:6])}{', ...' if len(left) > 6 else ''}); left out"
+        text = (
+            f"{len(left)} arrays belong to no time"
+            f" ({', '.join(left[:6])}{', ...' if len(left) > 6 else ''}); left out"
+        )
         remarks.append(remark("note", "no_time", text, arrays=len(left)))
     parsed = {}
     for group, (name, values) in clocks.items():
@@ -107,22 +140,32 @@ def tree_recording(path: Path, leaves: Mapping[str, Vector], time: TreeTime, wan
             parsed[group] = time.parse(values)
         except DataError as error:
             raise DataError(f"{path}: {name}: {error}") from error
-    dated = [int(stamps.ns.min()) for stamps in parsed.values() if stamps.absolute and stamps.ns.size]
+    dated = [
+        int(stamps.ns.min()) for stamps in parsed.values() if stamps.absolute and stamps.ns.size
+    ]
     epoch = min(dated) // 10**9 * 10**9 if dated else None
     series = {}
     for group, stamps in parsed.items():
         raw = clocks[group][1]
         # seconds as they stand keep every bit
         plain = not stamps.absolute and raw.dtype.kind == "f" and time.unit in (None, "s")
-        t = raw.astype(np.float64) if plain else (stamps.ns - (epoch if stamps.absolute and epoch is not None else 0)) * 1e-9
-        series[group or "/"] = Series(group or "/", "", fields[group], t, None, None, stamps.remarks)
+        t = (
+            raw.astype(np.float64)
+            if plain
+            else (stamps.ns - (epoch if stamps.absolute and epoch is not None else 0)) * 1e-9
+        )
+        series[group or "/"] = Series(
+            group or "/", "", fields[group], t, None, None, stamps.remarks
+        )
     listed = tuple(group or "/" for group in clocks if group not in parsed)
     if not series:
         raise UsageError(f"{path}: none of its groups is wanted (it holds {', '.join(listed)})")
     return Recording(path, series, epoch, (path,), tuple(remarks), listed)
 
 
-def _clocks(leaves: Mapping[str, Vector], time: TreeTime) -> Iterable[tuple[str, tuple[str, np.ndarray]]]:
+def _clocks(
+    leaves: Mapping[str, Vector], time: TreeTime
+) -> Iterable[tuple[str, tuple[str, np.ndarray]]]:
     """Group -> path of its time and the time itself."""
     names = TIME_NAMES if time.column is None else (time.column,)
     for rank in names:
@@ -155,7 +198,11 @@ def _columns(name: str, values: Vector, length: int) -> dict[str, np.ndarray]:
     if values.dtype.kind not in "biuf":
         return {}
     axis = _rows(values, length)
-    table = np.moveaxis(np.asarray(values), axis or 0, 0).reshape(length, -1).astype(np.float64, copy=False)
+    table = (
+        np.moveaxis(np.asarray(values), axis or 0, 0)
+        .reshape(length, -1)
+        .astype(np.float64, copy=False)
+    )
     if table.shape[1] == 1:
         return {name.replace("/", "."): table[:, 0]}
     return {f"{name.replace('/', '.')}.{i}": table[:, i] for i in range(table.shape[1])}

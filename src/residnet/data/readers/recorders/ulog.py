@@ -19,10 +19,11 @@ from residnet.data.readers.recording import Recording, Remark, Series, remark
 
 @final
 class UlogConfig(RecordingConfig):
-    """PX4 ULog; a series is named by its message (`vehicle_local_position`, the second instance `vehicle_gps_position_1`).
+    """PX4 ULog; a series is named by its message (`vehicle_local_position`, the second instance
+    `vehicle_gps_position_1`).
 
-    Fields bear PX4's names; the parts of a quaternion `q[0]` to `q[3]` are `q.w`, `q.x`, `q.y`, `q.z` too, whole-number latitudes in 1e-7 deg become
-    degrees.
+    Fields bear PX4's names; the parts of a quaternion `q[0]` to `q[3]` are `q.w`, `q.x`, `q.y`,
+    `q.z` too, whole-number latitudes in 1e-7 deg become degrees.
     """
 
     kind: Literal["ulog"] = "ulog"
@@ -33,7 +34,8 @@ class UlogConfig(RecordingConfig):
 
 
 def load_ulog(path: Path, wanted: Wanted = EVERYTHING) -> Recording:
-    """The recording in a ULog file, on the boot clock; dated by the receiver's UTC where it logged one.
+    """The recording in a ULog file, on the boot clock; dated by the receiver's UTC where it logged
+    one.
 
     Raises:
         UsageError: where the file is missing, nothing in it is wanted, or pyulog is not installed.
@@ -50,18 +52,38 @@ def load_ulog(path: Path, wanted: Wanted = EVERYTHING) -> Recording:
             log = ULog(str(path), None, disable_str_exceptions=True)
     # pyulog fails in its own ways on damaged bytes
     except Exception as error:
-        raise DataError(f"{path}: damaged or not a ULog file ({type(error).__name__}: {' '.join(str(error).split())[:200]})") from error
+        raise DataError(
+            f"{path}: damaged or not a ULog file ({type(error).__name__}:"
+            f" {' '.join(str(error).split())[:200]})"
+        ) from error
     remarks: list[Remark] = []
     if log.file_corruption:
-        remarks.append(remark("will mislead", "damaged", "the file is damaged in places; messages there are lost"))
+        remarks.append(
+            remark(
+                "will mislead", "damaged", "the file is damaged in places; messages there are lost"
+            )
+        )
     if log.dropouts:
         lost = sum(one.duration for one in log.dropouts) * 1e-3
-        text = f"the logger dropped data {len(log.dropouts)} times, {lost:.3g} s in all; gaps stay gaps"
+        text = (
+            f"the logger dropped data {len(log.dropouts)} times, {lost:.3g} s in all; gaps stay"
+            " gaps"
+        )
         remarks.append(remark("note", "dropouts", text, dropouts=len(log.dropouts), seconds=lost))
-    names = {id(data): data.name + (f"_{data.multi_id}" if data.multi_id else "") for data in log.data_list}
-    chosen = [data for data in log.data_list if wanted(names[id(data)]) and len(data.data.get("timestamp", ()))]
+    names = {
+        id(data): data.name + (f"_{data.multi_id}" if data.multi_id else "")
+        for data in log.data_list
+    }
+    chosen = [
+        data
+        for data in log.data_list
+        if wanted(names[id(data)]) and len(data.data.get("timestamp", ()))
+    ]
     if not chosen:
-        raise UsageError(f"{path}: none of its messages is wanted (it holds {', '.join(sorted(names.values())) or 'none'})")
+        raise UsageError(
+            f"{path}: none of its messages is wanted (it holds"
+            f" {', '.join(sorted(names.values())) or 'none'})"
+        )
     boot = _boot_time(log.data_list)
     start = min(int(data.data["timestamp"][0]) for data in chosen) * 1000
     epoch = None if boot is None else (boot + start) // 10**9 * 10**9
@@ -70,7 +92,9 @@ def load_ulog(path: Path, wanted: Wanted = EVERYTHING) -> Recording:
     for data in sorted(chosen, key=lambda data: names[id(data)]):
         name = names[id(data)]
         ns = data.data["timestamp"].astype(np.int64) * 1000 - origin
-        fields = {path: values for path, values in _fields(data.data).items() if wanted.field(name, path)}
+        fields = {
+            path: values for path, values in _fields(data.data).items() if wanted.field(name, path)
+        }
         series[name] = Series(name, f"px4/{data.name}", fields, ns * 1e-9)
     listed = tuple(sorted(set(names.values()) - set(series)))
     return Recording(path, series, epoch, (path,), tuple(remarks), listed)

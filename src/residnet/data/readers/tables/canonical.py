@@ -11,11 +11,19 @@ from residnet.core.config import Config
 from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS
-from residnet.data.readers.base import LogReader, provenance, require_file, require_increasing, require_samples, require_values
+from residnet.data.readers.base import (
+    LogReader,
+    provenance,
+    require_file,
+    require_increasing,
+    require_samples,
+    require_values,
+)
 
 
 class CanonicalConfig(Config):
-    """Logs that residnet wrote: names, units and masks are inside, so there is nothing to declare."""
+    """Logs that residnet wrote: names, units and masks are inside, so there is nothing to declare.
+    """
 
     kind: Literal["canonical"] = "canonical"
 
@@ -32,18 +40,23 @@ class CanonicalReader(LogReader):
         """The log in `path`; see `LogReader.read`.
 
         Raises:
-            UsageError: where the file is missing, is no canonical log, or gives a known channel another unit than its SI unit.
-            DataError: where time does not increase, the file holds no samples, or a channel holds no number.
+            UsageError: where the file is missing, is no canonical log, or gives a known channel
+                another unit than its SI unit.
+            DataError: where time does not increase, the file holds no samples, or a channel holds
+                no number.
         """
         require_file(path)
         try:
             log = Log.load(path)
         except KeyError as error:
-            raise DataError(f"{path}: canonical log without {error}; the file is damaged, write it again") from error
+            raise DataError(
+                f"{path}: canonical log without {error}; the file is damaged, write it again"
+            ) from error
         for name, unit in log.units.items():
             if unit != CHANNEL_UNITS.get(name, unit):
                 raise UsageError(
-                    f"{path}: channel {name} is in [{unit}], a canonical log holds it in [{CHANNEL_UNITS[name]}]; convert it and save again"
+                    f"{path}: channel {name} is in [{unit}], a canonical log holds it in"
+                    f" [{CHANNEL_UNITS[name]}]; convert it and save again"
                 )
         t = log.t.astype(np.float64)
         require_samples(path, t)
@@ -51,5 +64,9 @@ class CanonicalReader(LogReader):
         for name, values in log.channels.items():
             require_values(path, name, name, values)
         origin = {key: log.meta[key] for key in ("source", "sha256") if key in log.meta}
-        meta = {**log.meta, **({"origin": origin} if origin else {}), **provenance(path, len(log), 0)}
+        meta = {
+            **log.meta,
+            **({"origin": origin} if origin else {}),
+            **provenance(path, len(log), 0),
+        }
         return log.replace(name=path.stem, t=t, meta=meta)

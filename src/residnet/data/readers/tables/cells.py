@@ -25,11 +25,20 @@ def names_sender(column: str) -> bool:
 
 @final
 class Cells:
-    """One column as its chunks come: times as whole ns, numbers as float64 (whole stamps int64), of text only what is said of it."""
+    """One column as its chunks come: times as whole ns, numbers as float64 (whole stamps int64), of
+    text only what is said of it.
+    """
 
     def __init__(self, name: str, *, is_time: bool) -> None:
         self.name, self.rows, self.spoilt, self.cut = name, 0, 0, False
-        self._is_time, self._whole = is_time, key_of(name).rsplit("_", 1)[-1] in (*SECONDS, *NANOSECONDS)
+        self._is_time, self._whole = (
+            is_time,
+            key_of(name).rsplit("_", 1)[-1]
+            in (
+                *SECONDS,
+                *NANOSECONDS,
+            ),
+        )
         self._parts: list[np.ndarray] = []
         self._filled, self._sample = 0, ""
         self._stamps: list[Stamps] = []
@@ -49,7 +58,9 @@ class Cells:
         if names_sender(self.name) and not pd.api.types.is_numeric_dtype(cells.dtype):
             # one object per name, not per row
             names = cells.fillna("").astype(str).astype("category")
-            self._parts.append(np.array(names.cat.categories, dtype=object)[names.cat.codes.to_numpy()])
+            self._parts.append(
+                np.array(names.cat.categories, dtype=object)[names.cat.codes.to_numpy()]
+            )
             self._sample, self._filled = "name", self._filled + len(cells)
             self.spoilt += len(cells)
             return
@@ -58,7 +69,9 @@ class Cells:
             self._parts.append(cells.to_numpy() if whole else cells.to_numpy(dtype=np.float64))
             self._filled += int(cells.notna().sum())
             return
-        numbers = pd.to_numeric(cells.astype("string"), errors="coerce").to_numpy(dtype=np.float64, na_value=np.nan)
+        numbers = pd.to_numeric(cells.astype("string"), errors="coerce").to_numpy(
+            dtype=np.float64, na_value=np.nan
+        )
         self._parts.append(numbers)
         filled = cells.notna().to_numpy()
         self._filled += int(filled.sum())
@@ -89,19 +102,40 @@ class Cells:
 
     def words(self) -> np.ndarray:
         """The column [T] as text."""
-        return np.concatenate([part if part.dtype == object else np.full(part.size, "", dtype=object) for part in self._parts])
+        return np.concatenate(
+            [
+                part if part.dtype == object else np.full(part.size, "", dtype=object)
+                for part in self._parts
+            ]
+        )
 
     def times(self) -> Stamps:
         """The column as times."""
         first = self._stamps[0]
         said = tuple(one for stamps in self._stamps for one in stamps.remarks)
         # one remark for all chunks
-        merged = [{**said[0], "figures": {key: sum(one["figures"][key] for one in said) for key in said[0]["figures"]}}] if said else []
-        return dataclasses.replace(first, ns=np.concatenate([stamps.ns for stamps in self._stamps]), remarks=tuple(merged))
+        merged = (
+            [
+                {
+                    **said[0],
+                    "figures": {
+                        key: sum(one["figures"][key] for one in said) for key in said[0]["figures"]
+                    },
+                }
+            ]
+            if said
+            else []
+        )
+        return dataclasses.replace(
+            first, ns=np.concatenate([stamps.ns for stamps in self._stamps]), remarks=tuple(merged)
+        )
 
     def remark(self, topic: str) -> Remark:
         """What is said of a column of text."""
         kind = "structures" if self._sample.startswith(("{", "[", "(")) else "text"
         shown = self._sample if len(self._sample) <= 40 else self._sample[:37] + "..."
-        text = f"topic {topic}: column '{self.name}' holds {kind} ('{shown}'), not numbers; it is left out"
+        text = (
+            f"topic {topic}: column '{self.name}' holds {kind} ('{shown}'), not numbers; it is"
+            " left out"
+        )
         return remark("note", "not_numbers", text, rows=float(self.rows))

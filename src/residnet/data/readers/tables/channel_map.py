@@ -1,4 +1,5 @@
-"""How one foreign channel becomes one of a log: unit, sign and frame, converted once, at the door."""
+"""How one foreign channel becomes one of a log: unit, sign and frame, converted once, at the door.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +22,8 @@ _EARTH = ("x", "y", "psi", "wind_dir", "current_north", "current_east")
 _FORWARD = ("u", "p", "phi", "u_dot", "tau_x")
 _SIDEWAYS_OR_DOWN = ("v", "r", "v_dot", "r_dot", "tau_y", "tau_n")
 # frame -> channel -> (factor, offset [SI]) that brings the channel to residnet's frame.
-# x and y have no entry in enu: "x" there means east to some and the north column to others, so the map must name the north column itself.
+# x and y have no entry in enu: "x" there means east to some and the north column to others, so the
+# map must name the north column itself.
 _FRAMES: dict[str, dict[str, tuple[float, float]]] = {
     "ned": dict.fromkeys(_EARTH, _SAME),
     "enu": {"psi": _FROM_EAST, "wind_dir": _FROM_EAST},
@@ -36,8 +38,8 @@ class Conversion(Config):
     Attributes:
         unit: its unit, for example `deg/s`.
         sign: -1 turns it around before anything else.
-        frame: `as_measured` (nothing to convert), `ned`, `body_fsd` (forward, starboard, down), `enu` (angles counter-clockwise from east) or
-            `body_fpu` (forward, port, up).
+        frame: `as_measured` (nothing to convert), `ned`, `body_fsd` (forward, starboard, down),
+            `enu` (angles counter-clockwise from east) or `body_fpu` (forward, port, up).
     """
 
     unit: str
@@ -48,7 +50,8 @@ class Conversion(Config):
         """Stop where this cannot be the channel `name`.
 
         Raises:
-            ValueError: where the name is no channel's, the unit is unknown or of another dimension, or the frame says nothing about the channel.
+            ValueError: where the name is no channel's, the unit is unknown or of another dimension,
+                or the frame says nothing about the channel.
         """
         if name == "t" or name.startswith("mask:"):
             raise ValueError(f"'{name}' cannot name a channel; time has its own key")
@@ -57,10 +60,13 @@ class Conversion(Config):
         except ValueError as error:
             raise ValueError(f"channel {name}: {error}") from error
         if self.frame != "as_measured" and name not in _FRAMES[self.frame]:
-            fitting = ", ".join(frame for frame, table in _FRAMES.items() if name in table) or "none"
+            fitting = (
+                ", ".join(frame for frame, table in _FRAMES.items() if name in table) or "none"
+            )
             raise ValueError(
-                f"channel {name}: frame '{self.frame}' says nothing about it (frames that do: {fitting}); "
-                "map the column that already holds this quantity, with sign: -1 where it points the other way"
+                f"channel {name}: frame '{self.frame}' says nothing about it (frames that do:"
+                f" {fitting}); map the column that already holds this quantity, with sign: -1 where"
+                " it points the other way"
             )
 
     def convert(self, name: str, raw: np.ndarray) -> np.ndarray:

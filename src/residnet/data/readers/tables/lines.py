@@ -1,6 +1,8 @@
-"""The lines of a text table before anything parses them: as many cells in each as in the header, no zero bytes, a last line that is whole.
+"""The lines of a text table before anything parses them: as many cells in each as in the header, no
+zero bytes, a last line that is whole.
 
-A parser fills short lines with nothing and reads on; cells that slipped by one column would be numbers like any other.
+A parser fills short lines with nothing and reads on; cells that slipped by one column would be
+numbers like any other.
 """
 
 from __future__ import annotations
@@ -23,8 +25,8 @@ def check_lines(path: Path, delimiter: str, wide: int) -> bool:
     """Look at every line below the header, `wide` cells each; blank lines do not count.
 
     Returns:
-        Whether the last line must be left out because the file was cut within it: it has no end, and too few cells or a last cell shorter than any
-        in that column shortly before.
+        Whether the last line must be left out because the file was cut within it: it has no end,
+        and too few cells or a last cell shorter than any in that column shortly before.
 
     Raises:
         DataError: where a line has more or fewer cells than the header, or a byte is zero.
@@ -33,8 +35,13 @@ def check_lines(path: Path, delimiter: str, wide: int) -> bool:
     for block, last in _blocks(path):
         if b"\x00" in block:
             at = line + block[: block.index(b"\x00")].count(b"\n") + 1
-            raise DataError(f"{path}: line {at} holds a zero byte, which no text has; the file is damaged or not UTF-8, write it again")
-        cells, blank = _quoted(block, delimiter) if _QUOTE in block else _counted(block, delimiter, wide)
+            raise DataError(
+                f"{path}: line {at} holds a zero byte, which no text has; the file is damaged or"
+                " not UTF-8, write it again"
+            )
+        cells, blank = (
+            _quoted(block, delimiter) if _QUOTE in block else _counted(block, delimiter, wide)
+        )
         odd = (cells != wide) & ~blank
         odd[: max(1 - line, 0)] = False
         if last and cut:
@@ -42,8 +49,9 @@ def check_lines(path: Path, delimiter: str, wide: int) -> bool:
         if odd.any():
             at = int(np.argmax(odd))
             raise DataError(
-                f"{path}: line {line + at + 1} has {cells[at]} cells, the header {wide} ({int(odd.sum())} such lines nearby); "
-                "check `delimiter` and `decimal`, or delete the damaged lines"
+                f"{path}: line {line + at + 1} has {cells[at]} cells, the header {wide}"
+                f" ({int(odd.sum())} such lines nearby); check `delimiter` and `decimal`, or delete"
+                " the damaged lines"
             )
         line += cells.size
     return cut
@@ -81,7 +89,10 @@ def _counted(block: bytes, delimiter: str, wide: int) -> tuple[np.ndarray, np.nd
     marks = values[np.flatnonzero((values == _NEWLINE) | (values == ord(delimiter)))]
     if marks.size % wide == 0 and block.endswith(b"\n") and wide > 1:
         rows = marks.reshape(-1, wide)
-        if bool((rows[:, -1] == _NEWLINE).all()) and int((marks == _NEWLINE).sum()) == rows.shape[0]:
+        if (
+            bool((rows[:, -1] == _NEWLINE).all())
+            and int((marks == _NEWLINE).sum()) == rows.shape[0]
+        ):
             return np.full(rows.shape[0], wide, dtype=np.int64), np.zeros(rows.shape[0], dtype=bool)
     ends = np.flatnonzero(values == _NEWLINE)
     if not ends.size or ends[-1] != values.size - 1:
@@ -99,12 +110,20 @@ def _counted(block: bytes, delimiter: str, wide: int) -> tuple[np.ndarray, np.nd
 def _quoted(block: bytes, delimiter: str) -> tuple[np.ndarray, np.ndarray]:
     """The same where quotes may hold delimiters; line ends within quotes make no new line."""
     try:
-        rows = list(csv.reader(io.StringIO(block.decode("utf-8", errors="replace"), newline=""), delimiter=delimiter, skipinitialspace=True))
+        rows = list(
+            csv.reader(
+                io.StringIO(block.decode("utf-8", errors="replace"), newline=""),
+                delimiter=delimiter,
+                skipinitialspace=True,
+            )
+        )
     except csv.Error:
         # a cell of more than 128 kB: an open quote has swallowed the lines after it
         return np.zeros(1, dtype=np.int64), np.zeros(1, dtype=bool)
     cells = np.array([len(row) for row in rows], dtype=np.int64)
-    return cells, np.array([not row or (len(row) == 1 and not row[0].strip()) for row in rows], dtype=bool)
+    return cells, np.array(
+        [not row or (len(row) == 1 and not row[0].strip()) for row in rows], dtype=bool
+    )
 
 
 def _cut_short(path: Path, delimiter: str, wide: int) -> bool:
@@ -116,9 +135,16 @@ def _cut_short(path: Path, delimiter: str, wide: int) -> bool:
     if not tail or tail.endswith((b"\n", b"\r")):
         return False
     lines = [line for line in tail.replace(_RETURN, b"\n").split(b"\n") if line.strip()]
-    last, before = lines[-1].split(delimiter.encode()), [line.split(delimiter.encode()) for line in lines[-51:-1]]
+    last, before = (
+        lines[-1].split(delimiter.encode()),
+        [line.split(delimiter.encode()) for line in lines[-51:-1]],
+    )
     # the first of several lines may itself be cut, by the tail, or be the header
-    known = [len(cells[-1].strip()) for cells in before[1:] if len(cells) == wide and cells[-1].strip()]
+    known = [
+        len(cells[-1].strip()) for cells in before[1:] if len(cells) == wide and cells[-1].strip()
+    ]
     if size <= _TAIL and len(lines) < 2:
         return False
-    return len(last) < wide or (bool(known) and len(last) == wide and len(last[-1].strip()) < min(known))
+    return len(last) < wide or (
+        bool(known) and len(last) == wide and len(last[-1].strip()) < min(known)
+    )

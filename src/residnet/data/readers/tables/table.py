@@ -1,6 +1,8 @@
-"""Reader of foreign tables (csv, Parquet): a channel map names each column, its unit, sign and frame.
+"""Reader of foreign tables (csv, Parquet): a channel map names each column, its unit, sign and
+frame.
 
-Everything foreign is converted here, once: units to SI, signs and frames to NED and body axes forward-starboard-down, psi unwrapped.
+Everything foreign is converted here, once: units to SI, signs and frames to NED and body axes
+forward-starboard-down, psi unwrapped.
 """
 
 from __future__ import annotations
@@ -18,7 +20,14 @@ from residnet.core.config import Config
 from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
 from residnet.core.names import nearest, shown, si_unit, to_si
-from residnet.data.readers.base import LogReader, provenance, require_file, require_increasing, require_samples, require_values
+from residnet.data.readers.base import (
+    LogReader,
+    provenance,
+    require_file,
+    require_increasing,
+    require_samples,
+    require_values,
+)
 from residnet.data.readers.files import progress
 from residnet.data.readers.recording import remark
 from residnet.data.readers.spool import LARGE, Spool
@@ -47,9 +56,11 @@ class TimeColumn(Config):
 
 
 class _TableConfig(Config, ABC):
-    """What csv and Parquet have in common; `channels` maps canonical names (or names of your own) to columns, all of which must exist.
+    """What csv and Parquet have in common; `channels` maps canonical names (or names of your own)
+    to columns, all of which must exist.
 
-    `manoeuvre` is the kind of manoeuvre of every file, `folder` takes the name of each file's folder, null says that nobody knows.
+    `manoeuvre` is the kind of manoeuvre of every file, `folder` takes the name of each file's
+    folder, null says that nobody knows.
     """
 
     time: TimeColumn
@@ -78,7 +89,11 @@ class CsvConfig(_TableConfig):
 
     def build(self) -> TableReader:
         """The reader."""
-        return TableReader(self, lambda path, names: _read_csv(path, names, self.delimiter, self.decimal), lambda i: f"line {i + 2}")
+        return TableReader(
+            self,
+            lambda path, names: _read_csv(path, names, self.delimiter, self.decimal),
+            lambda i: f"line {i + 2}",
+        )
 
 
 @final
@@ -98,22 +113,30 @@ class TableReader(LogReader):
 
     Args:
         config: time column, channel map and manoeuvre.
-        load: (path, columns) -> pieces of the columns side by side, in that order, each with the share of the file that is read by then; raises
-            UsageError where a column is missing.
+        load: (path, columns) -> pieces of the columns side by side, in that order, each with the
+            share of the file that is read by then; raises UsageError where a column is missing.
         row: index of a row of the table -> how the file's user would call it.
     """
 
-    def __init__(self, config: CsvConfig | ParquetConfig, load: Callable[[Path, Sequence[str]], Pieces], row: Callable[[int], str]) -> None:
+    def __init__(
+        self,
+        config: CsvConfig | ParquetConfig,
+        load: Callable[[Path, Sequence[str]], Pieces],
+        row: Callable[[int], str],
+    ) -> None:
         self._config, self._load, self._row = config, load, row
 
     def read(self, path: Path) -> Log:
-        """The log in `path`; see `LogReader.read`. A large file's channels lie in temporary files, not in memory.
+        """The log in `path`; see `LogReader.read`. A large file's channels lie in temporary files,
+        not in memory.
 
-        Rows without a measurement at either end, and blank rows, are dropped and counted; other rows keep NaN where a channel was not measured.
+        Rows without a measurement at either end, and blank rows, are dropped and counted; other
+        rows keep NaN where a channel was not measured.
 
         Raises:
             UsageError: where the file or a column is missing.
-            DataError: where the file is empty, a cell is no finite number, a channel holds no number, or time is missing, repeats or runs backwards.
+            DataError: where the file is empty, a cell is no finite number, a channel holds no
+                number, or time is missing, repeats or runs backwards.
         """
         require_file(path)
         maps = self._config.channels
@@ -124,22 +147,40 @@ class TableReader(LogReader):
         with progress(path.name, size, 1.0) as advance:
             for piece, share in self._load(path, columns):
                 cut |= bool(piece.attrs.get("cut"))
-                rows.add([self._numbers(path, piece.iloc[:, i], column, read) for i, column in enumerate(columns)], read)
+                rows.add(
+                    [
+                        self._numbers(path, piece.iloc[:, i], column, read)
+                        for i, column in enumerate(columns)
+                    ],
+                    read,
+                )
                 read += len(piece)
                 advance(share)
         t, channels = rows.finish()
-        manoeuvre = path.resolve().parent.name if self._config.manoeuvre == "folder" else self._config.manoeuvre
+        manoeuvre = (
+            path.resolve().parent.name
+            if self._config.manoeuvre == "folder"
+            else self._config.manoeuvre
+        )
         units = {name: si_unit(entry.unit) for name, entry in maps.items()}
         meta = provenance(path, read + cut, read + cut - t.size)
         if cut:
-            meta["findings"] = [remark("note", "cut_line", "the file ends within its last line, which is left out")]
+            meta["findings"] = [
+                remark("note", "cut_line", "the file ends within its last line, which is left out")
+            ]
         return Log(path.stem, t, channels, units, manoeuvre or "unknown", meta=meta)
 
     def _numbers(self, path: Path, column: pd.Series, name: str, first: int) -> np.ndarray:
-        """Cells of one column as float64 [T], NaN where empty; `first` is the index of the first row."""
+        """Cells of one column as float64 [T], NaN where empty; `first` is the index of the first
+        row.
+        """
         import pandas as pd
 
-        numeric = column if pd.api.types.is_numeric_dtype(column) else pd.to_numeric(column.astype("string"), errors="coerce")
+        numeric = (
+            column
+            if pd.api.types.is_numeric_dtype(column)
+            else pd.to_numeric(column.astype("string"), errors="coerce")
+        )
         values = numeric.to_numpy(dtype=np.float64, na_value=np.nan)
         if np.isfinite(values).all():
             return values
@@ -147,17 +188,27 @@ class TableReader(LogReader):
         if bad.size:
             i = int(bad[0])
             raise DataError(
-                f"{path}: {self._row(first + i)}, column '{name}': '{shown(column.iloc[i])}' is not a finite number ({bad.size} such cells in "
-                f"{len(column)} rows); leave cells without a measurement empty, and check `delimiter` and `decimal`"
+                f"{path}: {self._row(first + i)}, column '{name}': '{shown(column.iloc[i])}' is not"
+                f" a finite number ({bad.size} such cells in {len(column)} rows); leave cells"
+                " without a measurement empty, and check `delimiter` and `decimal`"
             )
         return values
 
 
 @final
 class _Rows:
-    """Rows as they come: measured ones are kept, in SI; what must hold over the whole table is watched."""
+    """Rows as they come: measured ones are kept, in SI; what must hold over the whole table is
+    watched.
+    """
 
-    def __init__(self, path: Path, config: CsvConfig | ParquetConfig, row: Callable[[int], str], *, on_disk: bool) -> None:
+    def __init__(
+        self,
+        path: Path,
+        config: CsvConfig | ParquetConfig,
+        row: Callable[[int], str],
+        *,
+        on_disk: bool,
+    ) -> None:
         self._path, self._config, self._row = path, config, row
         self._spool = Spool(1 + len(config.channels), on_disk=on_disk)
         self._kept, self._until = 0, 0
@@ -166,7 +217,8 @@ class _Rows:
         self._places: list[tuple[int, range | np.ndarray]] = []
 
     def add(self, values: list[np.ndarray], first: int) -> None:
-        """One more piece: time and channels as they stand in the table; `first` is the index of the first row.
+        """One more piece: time and channels as they stand in the table; `first` is the index of the
+        first row.
 
         Raises:
             DataError: where a row has measurements but no time.
@@ -176,8 +228,9 @@ class _Rows:
         undated = np.flatnonzero(known & ~clock)
         if undated.size:
             raise DataError(
-                f"{self._path}: {self._row(first + int(undated[0]))} has measurements but no time in column '{self._config.time.column}' "
-                f"({undated.size} such rows); delete them or restore their time"
+                f"{self._path}: {self._row(first + int(undated[0]))} has measurements but no time"
+                f" in column '{self._config.time.column}' ({undated.size} such rows); delete them"
+                " or restore their time"
             )
         keep = clock
         if not self._until:
@@ -186,9 +239,13 @@ class _Rows:
             return
         whole = bool(keep.all())
         index = slice(None) if whole else np.flatnonzero(keep)
-        self._places.append((self._kept, range(first, first + len(keep)) if whole else np.flatnonzero(keep) + first))
+        self._places.append(
+            (self._kept, range(first, first + len(keep)) if whole else np.flatnonzero(keep) + first)
+        )
         channels = []
-        for (name, entry), raw, there in zip(self._config.channels.items(), values[1:], finite, strict=True):
+        for (name, entry), raw, there in zip(
+            self._config.channels.items(), values[1:], finite, strict=True
+        ):
             self._any[name] |= bool(there.any())
             channels.append(self._continued(name, entry.convert(name, raw[index])))
         self._spool.add([values[0][index] * to_si(self._config.time.unit), *channels])
@@ -201,12 +258,15 @@ class _Rows:
         """Time and channels up to the last measurement.
 
         Raises:
-            DataError: where there are too few rows, time does not increase, or a channel holds no number.
+            DataError: where there are too few rows, time does not increase, or a channel holds no
+                number.
         """
         t, *values = (column[: self._until] for column in self._spool.finish())
         require_samples(self._path, t)
         require_increasing(self._path, t, lambda i: self._row(self._table_row(i)))
-        for (name, entry), there in zip(self._config.channels.items(), self._any.values(), strict=True):
+        for (name, entry), there in zip(
+            self._config.channels.items(), self._any.values(), strict=True
+        ):
             if not there:
                 require_values(self._path, name, entry.column, np.full(t.size, np.nan))
         return t, dict(zip(self._config.channels, values, strict=True))
@@ -226,18 +286,25 @@ class _Rows:
 
     def _table_row(self, i: int) -> int:
         """Index in the table of a kept row."""
-        start, places = next((start, places) for start, places in reversed(self._places) if start <= i)
+        start, places = next(
+            (start, places) for start, places in reversed(self._places) if start <= i
+        )
         return int(places[i - start])
 
 
-def _positions(path: Path, header: Sequence[str], columns: Sequence[str], hint: str = "") -> list[int]:
+def _positions(
+    path: Path, header: Sequence[str], columns: Sequence[str], hint: str = ""
+) -> list[int]:
     """Where the wanted columns stand in the header."""
     for column in columns:
         count = list(header).count(column)
         if count == 0:
             raise UsageError(f"{path}: no column '{column}'{nearest(column, header)}{hint}")
         if count > 1:
-            raise DataError(f"{path}: column '{column}' stands {count} times in the header; rename the copies so that one is meant")
+            raise DataError(
+                f"{path}: column '{column}' stands {count} times in the header; rename the copies"
+                " so that one is meant"
+            )
     return [list(header).index(column) for column in columns]
 
 
@@ -248,10 +315,18 @@ def _read_csv(path: Path, columns: Sequence[str], delimiter: str, decimal: str) 
         with path.open(newline="", encoding="utf-8-sig") as stream:
             header = [cell.strip() for cell in next(csv.reader(stream, delimiter=delimiter), [])]
         if not any(header):
-            raise DataError(f"{path}: the file is empty or its first line is blank; a header line with column names was expected")
-        hint = f" (only one column found; is the delimiter really '{delimiter}'?)" if len(header) == 1 else ""
+            raise DataError(
+                f"{path}: the file is empty or its first line is blank; a header line with column"
+                " names was expected"
+            )
+        hint = (
+            f" (only one column found; is the delimiter really '{delimiter}'?)"
+            if len(header) == 1
+            else ""
+        )
         where = _positions(path, header, columns, hint)
-        # one column more than the header: cells beyond it would shift or vanish silently (a decimal comma in a comma table does that)
+        # one column more than the header: cells beyond it would shift or vanish silently (a decimal
+        # comma in a comma table does that)
         wide, size = len(header), max(1, path.stat().st_size)
         cut = check_lines(path, delimiter, wide)
         with path.open("rb") as stream_of_bytes:
@@ -273,8 +348,9 @@ def _read_csv(path: Path, columns: Sequence[str], delimiter: str, decimal: str) 
                 beyond = np.flatnonzero(table[wide].notna().to_numpy())
                 if beyond.size:
                     raise DataError(
-                        f"{path}: line {int(table.index[beyond[0]]) + 2} has more cells than the {wide} columns of the header "
-                        f"({beyond.size} such lines); check `delimiter` and `decimal`"
+                        f"{path}: line {int(table.index[beyond[0]]) + 2} has more cells than the"
+                        f" {wide} columns of the header ({beyond.size} such lines); check"
+                        " `delimiter` and `decimal`"
                     )
                 kept = table[where]
                 if last and cut:
@@ -282,12 +358,17 @@ def _read_csv(path: Path, columns: Sequence[str], delimiter: str, decimal: str) 
                     kept.attrs["cut"] = True
                 yield kept, min(1.0, stream_of_bytes.tell() / size)
     except UnicodeDecodeError as error:
-        raise DataError(f"{path}: not UTF-8 text (byte {error.start}); save the file as UTF-8") from error
+        raise DataError(
+            f"{path}: not UTF-8 text (byte {error.start}); save the file as UTF-8"
+        ) from error
     except pd.errors.EmptyDataError:
         return
     except pd.errors.ParserError as error:
         said = shown(" ".join(str(error).split()), 200)
-        raise DataError(f"{path}: not a regular table, its header has {len(header)} columns ({said}); check `delimiter` and `decimal`") from error
+        raise DataError(
+            f"{path}: not a regular table, its header has {len(header)} columns ({said}); check"
+            " `delimiter` and `decimal`"
+        ) from error
 
 
 def _with_last(pieces: Iterable[pd.DataFrame]) -> Iterator[tuple[pd.DataFrame, bool]]:
@@ -313,6 +394,17 @@ def _read_parquet(path: Path, columns: Sequence[str]) -> Pieces:
                 read += batch.num_rows
                 table = pa.Table.from_batches([batch]).to_pandas(ignore_metadata=True)
                 yield table[list(columns)], read / rows
-    except (pa.ArrowException, OSError, ValueError, TypeError, LookupError, ArithmeticError, MemoryError) as error:
+    except (
+        pa.ArrowException,
+        OSError,
+        ValueError,
+        TypeError,
+        LookupError,
+        ArithmeticError,
+        MemoryError,
+    ) as error:
         # damaged metadata reaches every layer of the library
-        raise DataError(f"{path}: not a readable Parquet file ({shown(str(error) or type(error).__name__, 200)})") from error
+        raise DataError(
+            f"{path}: not a readable Parquet file"
+            f" ({shown(str(error) or type(error).__name__, 200)})"
+        ) from error
