@@ -1,0 +1,59 @@
+"""Progress of long work: one callback hears of it, on the command line and in Python alike.
+
+Code that takes long calls `report`. Who wants to hear of it installs a callback with `listen`;
+without one nothing is printed. The callback is held in a context variable, so that it need not be
+handed through every function, and so that two threads can listen apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Progress:
+    """One report of long work.
+
+    Attributes:
+        stage: what is being done, for example `training lstm`.
+        done: how much of it is done, in any unit; None where the work cannot be counted.
+        total: how much there is to do in the same unit; None where it is not known.
+        message: a line for the log; empty where there is only a count.
+    """
+
+    stage: str
+    done: float | None = None
+    total: float | None = None
+    message: str = ""
+
+
+ProgressCallback = Callable[[Progress], None]
+
+_callback: ContextVar[ProgressCallback | None] = ContextVar("residnet_progress", default=None)
+
+
+def report(
+    stage: str, done: float | None = None, total: float | None = None, message: str = ""
+) -> None:
+    """Tell the callback that listens, if there is one, how far a stage is."""
+    callback = _callback.get()
+    if callback is not None:
+        callback(Progress(stage, done, total, message))
+
+
+def say(message: str) -> None:
+    """Tell the callback that listens, if there is one, a line about the work."""
+    report("", message=message)
+
+
+@contextmanager
+def listen(callback: ProgressCallback | None) -> Iterator[None]:
+    """Send the progress of everything within the context to `callback`; None keeps silent."""
+    token = _callback.set(callback)
+    try:
+        yield
+    finally:
+        _callback.reset(token)
