@@ -16,13 +16,13 @@ import yaml
 import residnet
 from residnet.core.config import load_config
 from residnet.core.errors import ConfigError, DataError, FitError, UsageError
-from residnet.documents.jervan2020.force_config import ForceSettings
-from residnet.documents.jervan2020.force_data import compare_accelerations, read_measured
-from residnet.documents.jervan2020.force_report import write
-from residnet.documents.jervan2020.force_study import better, force_study
+from residnet.documents.jervan2020.measured.config import ForceSettings
+from residnet.documents.jervan2020.measured.data import compare_accelerations, read_measured
+from residnet.documents.jervan2020.measured.report import write
+from residnet.documents.jervan2020.measured.study import better, force_study
+from residnet.documents.jervan2020.measured.task import ForceResidualConfig
 from residnet.physics.force_model import FERRY_TERMS
 from residnet.runs.folder import RunFolder
-from residnet.tasks.force_residual import ForceResidualConfig
 
 CONFIG = Path(residnet.__file__).parents[2] / "configs" / "studies" / "jervan2020" / "measured.yaml"
 STEP = 0.1

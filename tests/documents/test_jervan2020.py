@@ -16,17 +16,17 @@ from residnet.baselines.believed import BelievedConfig
 from residnet.control.motion.anticipation import Derivatives, Lag, course, needed_force
 from residnet.core.config import load_config
 from residnet.core.errors import ConfigError, FitError
-from residnet.documents.jervan2020.ferry_fit import constant_force, identify
-from residnet.documents.jervan2020.ferry_forward import forward_equations, missing_coefficients
-from residnet.documents.jervan2020.ferry_report import write
-from residnet.documents.jervan2020.ferry_runs import MotionNoise
-from residnet.documents.jervan2020.ferry_study import Study, record_of, study
+from residnet.documents.jervan2020.ferry.flights import MotionNoise
+from residnet.documents.jervan2020.ferry.report import write
+from residnet.documents.jervan2020.ferry.study import Study, record_of, study
+from residnet.documents.jervan2020.ferry.task import FerryStudyConfig
+from residnet.documents.jervan2020.forward import forward_equations, missing_coefficients
+from residnet.documents.jervan2020.residual_model import constant_force, identify
 from residnet.export.feed_forward import export_feed_forward
 from residnet.physics.force_model import FERRY_TERMS, ForceModel
 from residnet.physics.fossen import FossenVessel
 from residnet.physics.vessel import load_vessel
 from residnet.runs.folder import RunFolder
-from residnet.tasks.ferry_study import FerryStudyConfig
 
 CONFIGS = [
     path

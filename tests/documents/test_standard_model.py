@@ -15,15 +15,20 @@ from scipy.signal import butter, filtfilt
 
 from residnet.core.errors import FitError
 from residnet.core.log import Log
-from residnet.documents.halvorsen2019.odin_phases import BlackConfig, PhasesSettings
-from residnet.documents.halvorsen2019.sea_trial import CHANNELS, PreparationConfig, odin, prepared
-from residnet.documents.halvorsen2019.standard_model import (
+from residnet.documents.halvorsen2019.sea_trial.standard_model import (
     NAMES,
     PARAMETERS,
     StandardFitConfig,
     accelerations,
     fit,
     truth,
+)
+from residnet.documents.halvorsen2019.sea_trial.study import BlackConfig, PhasesSettings
+from residnet.documents.halvorsen2019.sea_trial.trial import (
+    CHANNELS,
+    PreparationConfig,
+    odin,
+    prepared,
 )
 from residnet.physics.odin import AccelerationHull
 from residnet.tasks import load_task

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from residnet.core.config import load_config
+from residnet.documents.halvorsen2019.breeding.task import BreedingTaskConfig
 from residnet.tasks.actuators import ActuatorsTaskConfig
-from residnet.tasks.breeding import BreedingTaskConfig
 from residnet.tasks.fit import FitConfig
 from residnet.tasks.simulate import SimulateConfig
 from residnet.tasks.study import StudyConfig

@@ -16,12 +16,12 @@ from residnet.control.heading.controllers import AnyController, BangBangConfig
 from residnet.core.config import Config, MetresPerSecond, Radians, Seconds, dump_config
 from residnet.core.names import nearest
 from residnet.data.simulated.environment import Disturbance, WindField
+from residnet.documents.gouletas2020.config import PredictiveConfig
 from residnet.dynamics.learned import chosen_model
 from residnet.physics.environment.waves import WavesConfig
 from residnet.physics.vessel import VesselName, load_vessel
 from residnet.runs.folder import RunFolder
 from residnet.training.autopilot_config import AutopilotTraining, SpreadConfig
-from residnet.training.predictor_config import PredictorTraining
 
 _Units = Annotated[int, Field(ge=1)]
 _Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
@@ -57,28 +57,6 @@ class PolicyConfig(Config):
     training: AutopilotTraining = AutopilotTraining()
     learned: LearnedConfig | None = None
     imitate: _Name | None = None
-
-
-class PredictiveConfig(Config):
-    """The autopilot of document 004 as it stands there: a perceptron that predicts what each rudder
-    angle leads to, and the law (6.4).
-
-    Attributes:
-        horizon: of the prediction; the source's 0.01 s cannot settle (ERRATA 004).
-        candidates: rudder angles.
-        weight: of the choice for the heading error.
-        hidden: widths of the layers; the source has 20 for Nomoto's model and 30 for the 4-DOF
-            vessel.
-        linear: without activations, as in the source's listing.
-        training: of the perceptron.
-    """
-
-    horizon: Seconds = Field(gt=0)
-    candidates: int = Field(default=41, ge=3)
-    weight: float = Field(default=0.2, ge=0, le=1)
-    hidden: Annotated[tuple[_Units, ...], Field(min_length=1)] = (20,)
-    linear: bool = False
-    training: PredictorTraining = PredictorTraining()
 
 
 class StepTestConfig(Config):

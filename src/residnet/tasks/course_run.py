@@ -33,13 +33,13 @@ from residnet.control.heading.turning import Turning
 from residnet.core.config import load_config
 from residnet.core.errors import ConfigError, UsageError
 from residnet.core.names import nearest
+from residnet.documents.gouletas2020.autopilot import load_predictive
 from residnet.judge.courses import CourseFlight, row, spread_row, table
 from residnet.judge.metrics import SCHEMA
 from residnet.physics.vessel import load_vessel
 from residnet.report.course import COURSES, SPREAD, TRACKS, write_course_report
 from residnet.runs.folder import RunFolder
 from residnet.tasks.autopilot import AutopilotConfig
-from residnet.tasks.autopilot_predictive import load_predictive
 from residnet.tasks.course import CourseTaskConfig
 from residnet.tasks.course_flights import NOMINAL, Vessels, fly
 from residnet.tasks.pipeline import say

@@ -6,15 +6,15 @@ from typing import Annotated
 
 from pydantic import Field
 
+from residnet.documents.halvorsen2019.breeding.task import BreedingTaskConfig
+from residnet.documents.halvorsen2019.sea_trial.task import SeaTrialTaskConfig
+from residnet.documents.jervan2020.ferry.task import FerryStudyConfig
+from residnet.documents.jervan2020.measured.task import ForceResidualConfig
 from residnet.tasks.actuators import ActuatorsTaskConfig
 from residnet.tasks.autopilot import AutopilotConfig
-from residnet.tasks.breeding import BreedingTaskConfig
 from residnet.tasks.course import CourseTaskConfig
-from residnet.tasks.ferry_study import FerryStudyConfig
 from residnet.tasks.fit import FitConfig
-from residnet.tasks.force_residual import ForceResidualConfig
 from residnet.tasks.import_logs import ImportConfig
-from residnet.tasks.sea_trial import SeaTrialTaskConfig
 from residnet.tasks.simulate import SimulateConfig
 from residnet.tasks.study import StudyConfig
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Literal, final
 
 from residnet.core.config import dump_config
-from residnet.documents.halvorsen2019.odin_phases import PhasesSettings
+from residnet.documents.halvorsen2019.sea_trial.study import PhasesSettings
 from residnet.runs.folder import RunFolder
 
 
@@ -35,8 +35,8 @@ class SeaTrialTaskConfig(PhasesSettings):
         """
         import torch
 
-        from residnet.documents.halvorsen2019.odin_phases import study
-        from residnet.documents.halvorsen2019.odin_report import write
+        from residnet.documents.halvorsen2019.sea_trial.report import write
+        from residnet.documents.halvorsen2019.sea_trial.study import study
 
         started = time.time()
         torch.set_num_threads(1)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Literal, final
 
 from residnet.core.config import dump_config
-from residnet.documents.jervan2020.force_config import ForceSettings
+from residnet.documents.jervan2020.measured.config import ForceSettings
 from residnet.runs.folder import RunFolder
 
 
@@ -41,8 +41,8 @@ class ForceResidualConfig(ForceSettings):
         """
         import torch
 
-        from residnet.documents.jervan2020.force_report import write
-        from residnet.documents.jervan2020.force_study import force_study
+        from residnet.documents.jervan2020.measured.report import write
+        from residnet.documents.jervan2020.measured.study import force_study
 
         started = time.time()
         torch.set_num_threads(1)

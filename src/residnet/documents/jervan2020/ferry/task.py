@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Literal, final
 
 from residnet.core.config import dump_config
-from residnet.documents.jervan2020.ferry_config import FerrySettings
+from residnet.documents.jervan2020.ferry.config import FerrySettings
 from residnet.runs.folder import RunFolder
 
 
@@ -35,8 +35,8 @@ class FerryStudyConfig(FerrySettings):
         """
         import torch
 
-        from residnet.documents.jervan2020.ferry_report import write
-        from residnet.documents.jervan2020.ferry_study import study
+        from residnet.documents.jervan2020.ferry.report import write
+        from residnet.documents.jervan2020.ferry.study import study
 
         started = time.time()
         torch.set_num_threads(1)

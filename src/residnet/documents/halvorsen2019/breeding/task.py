@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, ValidationError, model_validator
 
 from residnet.core.config import Config, dump_config
-from residnet.documents.halvorsen2019.breeding import (
+from residnet.documents.halvorsen2019.breeding.search import (
     NoiseConfig,
     RecordConfig,
     Trial,

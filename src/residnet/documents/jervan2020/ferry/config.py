@@ -11,8 +11,8 @@ from residnet.control.motion.reference_filter import ReferenceFilterConfig
 from residnet.core.config import Config
 from residnet.core.errors import ConfigError
 from residnet.core.names import nearest
-from residnet.documents.jervan2020.ferry_fit import FerryModelConfig, Published
-from residnet.documents.jervan2020.ferry_runs import Disturbance, Ferry, LoopConfig, MotionNoise
+from residnet.documents.jervan2020.ferry.flights import Disturbance, Ferry, LoopConfig, MotionNoise
+from residnet.documents.jervan2020.residual_model import FerryModelConfig, Published
 from residnet.judge.still_fits import StillFitsConfig
 
 _Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import torch
 
 from residnet.control.motion.anticipation import Lag
-from residnet.documents.jervan2020.ferry_config import FerrySettings
-from residnet.documents.jervan2020.ferry_fit import FerryModel, Record, identify, remaining
-from residnet.documents.jervan2020.ferry_runs import Flight, MotionNoise
+from residnet.documents.jervan2020.ferry.config import FerrySettings
+from residnet.documents.jervan2020.ferry.flights import Flight, MotionNoise
+from residnet.documents.jervan2020.residual_model import FerryModel, Record, identify, remaining
 from residnet.judge.still_fits import Verdict, still_fits
 from residnet.judge.tracking import mse
 from residnet.physics.force_model import ForceModel

@@ -13,8 +13,8 @@ from scipy.integrate import solve_ivp
 from tiny import call
 
 from residnet.core.config import load_config
-from residnet.documents.halvorsen2019.breeding import NoiseConfig, RecordConfig
-from residnet.tasks.breeding import BreedingTaskConfig
+from residnet.documents.halvorsen2019.breeding.search import NoiseConfig, RecordConfig
+from residnet.documents.halvorsen2019.breeding.task import BreedingTaskConfig
 
 STUDIES = Path(__file__).parents[2] / "configs" / "studies" / "halvorsen2019"
 SMALL: dict[str, Any] = {

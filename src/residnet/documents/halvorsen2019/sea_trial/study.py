@@ -15,7 +15,13 @@ from pydantic import Field, model_validator
 from residnet.core.config import Config
 from residnet.core.errors import ConfigError
 from residnet.core.names import VELOCITY, nearest
-from residnet.documents.halvorsen2019.sea_trial import (
+from residnet.documents.halvorsen2019.sea_trial.standard_model import (
+    StandardFit,
+    StandardFitConfig,
+    fit,
+    truth,
+)
+from residnet.documents.halvorsen2019.sea_trial.trial import (
     CHANNELS,
     CONTROLS,
     FORCES,
@@ -23,12 +29,6 @@ from residnet.documents.halvorsen2019.sea_trial import (
     TrialConfig,
     odin,
     sail,
-)
-from residnet.documents.halvorsen2019.standard_model import (
-    StandardFit,
-    StandardFitConfig,
-    fit,
-    truth,
 )
 from residnet.heads.base import ClosedFormHead
 from residnet.heads.genetic import GeneticConfig

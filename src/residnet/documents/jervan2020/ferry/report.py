@@ -12,16 +12,16 @@ import torch
 
 from residnet.core.errors import ConfigError, FitError
 from residnet.core.frames import wrap
-from residnet.documents.jervan2020.ferry_config import FerrySettings
-from residnet.documents.jervan2020.ferry_fit import Published
-from residnet.documents.jervan2020.ferry_forward import (
+from residnet.documents.jervan2020.ferry.config import FerrySettings
+from residnet.documents.jervan2020.ferry.flights import Flight
+from residnet.documents.jervan2020.ferry.study import Study, Update
+from residnet.documents.jervan2020.forward import (
     as_vessel_lines,
     forward_equations,
     missing_coefficients,
 )
-from residnet.documents.jervan2020.ferry_runs import Flight
-from residnet.documents.jervan2020.ferry_study import Study, Update
-from residnet.documents.jervan2020.ferry_text import coefficients_text, notes_text
+from residnet.documents.jervan2020.model_table import coefficients_text, notes_text
+from residnet.documents.jervan2020.residual_model import Published
 from residnet.export.feed_forward import export_feed_forward
 from residnet.heads.regressions import SurfaceRegression
 from residnet.report.figures.force import draw_surface, draw_weights

@@ -7,10 +7,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from residnet.documents.jervan2020.ferry_text import coefficients_text, notes_text
-from residnet.documents.jervan2020.force_config import ForceSettings
-from residnet.documents.jervan2020.force_data import AXES
-from residnet.documents.jervan2020.force_study import ForceStudy, better, judge, unmodelled
+from residnet.documents.jervan2020.measured.config import ForceSettings
+from residnet.documents.jervan2020.measured.data import AXES
+from residnet.documents.jervan2020.measured.study import ForceStudy, better, judge, unmodelled
+from residnet.documents.jervan2020.model_table import coefficients_text, notes_text
 from residnet.heads.regressions import SurfaceRegression
 from residnet.physics.force_model import ForceModel
 from residnet.report.figures.force import draw_surface, draw_weights

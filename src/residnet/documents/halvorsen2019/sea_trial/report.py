@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 
 from residnet.core.names import ACCELERATION
-from residnet.documents.halvorsen2019.odin_phases import (
+from residnet.documents.halvorsen2019.sea_trial.standard_model import NAMES, PARAMETERS, StandardFit
+from residnet.documents.halvorsen2019.sea_trial.study import (
     ALL,
     PLANT,
     STANDARD,
     PhasesSettings,
     PhaseStudy,
 )
-from residnet.documents.halvorsen2019.sea_trial import CHANNELS
-from residnet.documents.halvorsen2019.standard_model import NAMES, PARAMETERS, StandardFit
+from residnet.documents.halvorsen2019.sea_trial.trial import CHANNELS
 from residnet.physics.froude import PHASES
 from residnet.report.figures.style import (
     DASHED,
@@ -244,8 +244,7 @@ def _fit(fit: StandardFit) -> dict[str, Any]:
 
 
 def draw_trial(study: PhaseStudy, file: Path) -> None:
-    """Velocities and commands of all logs one after another, phases shaded (Figures 7.1 and 7.2).
-    """
+    """Velocities and commands of all logs one after another, phases shaded (Figures 7.1 and 7.2)."""
     from matplotlib import rc_context
 
     trial, z = study.trial, study.trial.samples.z.numpy()

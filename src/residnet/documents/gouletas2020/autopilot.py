@@ -14,10 +14,10 @@ from residnet.control.base import Policy
 from residnet.control.heading.controllers import DocumentConfig, Steering
 from residnet.control.heading.document_autopilot import NetworkPredictor
 from residnet.core.errors import UsageError
+from residnet.core.progress import say
+from residnet.documents.gouletas2020.config import PredictiveConfig
 from residnet.runs.folder import RunFolder
 from residnet.runs.trained import store_weights, stored_weights
-from residnet.tasks.autopilot import PredictiveConfig
-from residnet.tasks.pipeline import say
 from residnet.training.predictor import train_predictor
 
 

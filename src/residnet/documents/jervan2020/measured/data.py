@@ -15,8 +15,8 @@ from torch import Tensor
 from residnet.core.errors import DataError, FitError
 from residnet.data.prepare import Prepared, prepare
 from residnet.data.split import check_leaks
-from residnet.documents.jervan2020.ferry_fit import Record
-from residnet.documents.jervan2020.force_config import FoldsConfig, ForceSettings
+from residnet.documents.jervan2020.measured.config import FoldsConfig, ForceSettings
+from residnet.documents.jervan2020.residual_model import Record
 from residnet.judge.bootstrap import Blocks, blocks, intervals
 from residnet.training.lag import fit_lag, followed
 
