@@ -33,8 +33,10 @@ def channels(seed: int = 0) -> torch.Tensor:
 def believed(**changes: object) -> ModelSpec:
     fields: dict[str, object] = {"kind": "believed", "vessel": "milliampere", "scale": 0.5}
     content = {
-        "schema": "residnet.model/1", "name": "baseline", "role": "baseline", "signals": SignalsConfig(inputs=NAMES[3:]).model_dump(),
-        "baseline": BelievedConfig.model_validate(fields | changes).resolved().model_dump(), "dt": 0.1, "integrator": "rk4",
+        "schema": "residnet.model/1", "name": "baseline", "role": "baseline",
+        "signals": SignalsConfig(inputs=NAMES[3:]).model_dump(),
+        "baseline": BelievedConfig.model_validate(fields | changes).resolved().model_dump(),
+        "dt": 0.1, "integrator": "rk4",
         "low": [-1.0, -0.5, -0.3, -100, -50, -80], "high": [2.0, 0.5, 0.3, 300, 50, 80],
     }  # fmt: skip
     return ModelSpec.model_validate(content)

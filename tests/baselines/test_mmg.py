@@ -27,11 +27,13 @@ TANKER = {
 # KVLCC2 as Yasukawa and Yoshimura (2015) print it, tables 3 and 4; their flow straightening is the
 # other way round in sign of the drift
 PUBLISHED = {
-    "m_x": 0.022, "m_y": 0.223, "J_z": 0.011, "R_0": 0.022, "X_vv": -0.040, "X_vr": 0.002, "X_rr": 0.011, "X_vvvv": 0.771,
+    "m_x": 0.022, "m_y": 0.223, "J_z": 0.011, "R_0": 0.022, "X_vv": -0.040, "X_vr": 0.002,
+    "X_rr": 0.011, "X_vvvv": 0.771,
     "Y_v": -0.315, "Y_r": 0.083, "Y_vvv": -1.607, "Y_vvr": 0.379, "Y_vrr": -0.391, "Y_rrr": 0.008,
     "N_v": -0.137, "N_r": -0.049, "N_vvv": -0.030, "N_vvr": -0.294, "N_vrr": 0.055, "N_rrr": -0.013,
     "t_P": 0.220, "w_P0": 0.35, "C_2p": 1.6, "C_2n": 1.1, "t_R": 0.387, "a_H": 0.312, "x_H": -0.464,
-    "gamma_p": 0.640, "gamma_n": 0.395, "l_R": -0.710, "epsilon": 1.09, "kappa": 0.50, "Y_0": 0.0, "N_0": 0.0,
+    "gamma_p": 0.640, "gamma_n": 0.395, "l_R": -0.710, "epsilon": 1.09, "kappa": 0.50, "Y_0": 0.0,
+    "N_0": 0.0,
 }  # fmt: skip
 
 

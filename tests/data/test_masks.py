@@ -170,9 +170,7 @@ def test_hampel_equals_an_independent_loop_on_random_logs() -> None:
             np.testing.assert_array_equal(found, hampel_by_loop(u, 4.0, samples))
 
 
-def test_hampel_finds_outliers_in_groups_where_the_moving_rule_is_blind_and_leaves_motion_alone() -> (
-    None
-):
+def test_hampel_finds_grouped_outliers_where_the_moving_rule_is_blind_and_leaves_motion() -> None:
     rng = np.random.default_rng(5)
     t = np.arange(4000) * 0.1
     motion = np.sin(0.3 * t) + 3.0 * t

@@ -154,7 +154,8 @@ def flights() -> list[tuple[Flight, Flight]]:
             {"kind": "zigzag", "count": 12, "heading": ["10 deg", "30 deg"]},
             {"kind": "three_two_one_one", "count": 6},
         ],
-        "duration": 40, "step": step, "substeps": 1, "noise": {"u": 0.01, "v": 0.01, "r": "0.1 deg/s"},
+        "duration": 40, "step": step, "substeps": 1,
+        "noise": {"u": 0.01, "v": 0.01, "r": "0.1 deg/s"},
         "identification": {}, "validation": {},
     }  # fmt: skip
     trials = validate(content, SimulatedTrials, "trials")

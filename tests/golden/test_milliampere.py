@@ -156,7 +156,8 @@ def flights(folder: Path, scale: float, disturbed: bool) -> dict[str, pd.DataFra
 
 
 NAMES = (
-    *STATE, "du", "dv", "dr", "tc_u", "tc_v", "tc_r", "ff_u", "ff_v", "ff_r", "fb_u", "fb_v", "fb_r",
+    *STATE, "du", "dv", "dr", "tc_u", "tc_v", "tc_r", "ff_u", "ff_v", "ff_r", "fb_u", "fb_v",
+    "fb_r",
     "xd", "yd", "psid", "ud", "vd", "rd", "dud", "dvd", "drd", "wx", "wy", "wpsi",
 )  # fmt: skip
 

@@ -33,8 +33,10 @@ VESSELS = {"force": "odin_forces", "jet": "odin_jets"}
 # (golden/README.md)
 EDGES = ("jet1", "jetA1", "jetA2")
 STEPS = np.array([
-    [0, 0, 0], [4000, 0, 0], [4000, 800, 0], [4000, -800, 0], [4000, 0, 1000], [4000, 0, -1000], [2500, 600, 800], [2500, -600, -800],
-    [5000, 500, -1200], [1000, 0, 600], [0, 0, 0], [3000, -700, 900], [6000, 0, 0], [2000, 900, -500], [0, 0, 0],
+    [0, 0, 0], [4000, 0, 0], [4000, 800, 0], [4000, -800, 0], [4000, 0, 1000], [4000, 0, -1000],
+    [2500, 600, 800], [2500, -600, -800],
+    [5000, 500, -1200], [1000, 0, 600], [0, 0, 0], [3000, -700, 900], [6000, 0, 0],
+    [2000, 900, -500], [0, 0, 0],
 ], dtype=float)  # fmt: skip
 Inputs = Callable[[np.ndarray], np.ndarray]
 
@@ -84,8 +86,14 @@ DESIGNS: dict[str, Callable[[np.ndarray], tuple[np.ndarray, ...]]] = {
         1000 * wave(t, 19, 0.3) + 400 * wave(t, 6.3),
         1800 * wave(t, 31) + 800 * wave(t, 8.9, 2),
     ),
-    "jet1": lambda t: (np.where(t <= 20, 500.0, 1000 + 500 * square(t / 3)), np.where(t > 50, 0.1 * square(t / 7 + 0.5), 0.0)),
-    "jet2": lambda t: (900 + 350 * wave(t, 41) + 200 * wave(t, 13), 0.12 * wave(t, 17) + 0.08 * wave(t, 5.3, 1)),
+    "jet1": lambda t: (
+        np.where(t <= 20, 500.0, 1000 + 500 * square(t / 3)),
+        np.where(t > 50, 0.1 * square(t / 7 + 0.5), 0.0),
+    ),
+    "jet2": lambda t: (
+        900 + 350 * wave(t, 41) + 200 * wave(t, 13),
+        0.12 * wave(t, 17) + 0.08 * wave(t, 5.3, 1),
+    ),
     "jet3": lambda t: (800 + 800 * np.sin(t / 3), 0.1 * np.sin(t)),
     "jetA1": author1,
     "jetA2": author2,

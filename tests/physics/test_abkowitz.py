@@ -38,11 +38,13 @@ def mariner(u: float, v: float, r: float, delta: float) -> np.ndarray:
         + 93 * e * v * d
     )
     y = (
-        -1160 * v - 499 * r - 8078 * v**3 + 15356 * v**2 * r - 1160 * v * e - 499 * r * e + 278 * d - 90 * d**3
+        -1160 * v - 499 * r - 8078 * v**3 + 15356 * v**2 * r - 1160 * v * e - 499 * r * e + 278 * d
+        - 90 * d**3
         + 556 * e * d + 278 * e**2 * d - 4 * v * d**2 + 1190 * v**2 * d - 4 - 8 * e - 4 * e**2
     )  # fmt: skip
     n = (
-        -264 * v - 166 * r + 1636 * v**3 - 5483 * v**2 * r - 264 * v * e - 166 * r * e - 139 * d + 45 * d**3
+        -264 * v - 166 * r + 1636 * v**3 - 5483 * v**2 * r - 264 * v * e - 166 * r * e - 139 * d
+        + 45 * d**3
         - 278 * e * d - 139 * e**2 * d + 13 * v * d**2 - 489 * v**2 * d + 3 + 6 * e + 3 * e**2
     )  # fmt: skip
     m11, m22 = 798 + 42.0, 798 + 748.0
@@ -119,8 +121,10 @@ def test_prime_and_si_are_the_same_vessel() -> None:
     }
     kilo, body = 0.5 * 1025 * length**3, prime.mass
     mass = {
-        "m": body.m * kilo, "I_z": body.I_z * kilo * length**2, "x_G": body.x_G * length, "X_udot": body.X_udot * kilo,
-        "Y_vdot": body.Y_vdot * kilo, "Y_rdot": body.Y_rdot * kilo * length, "N_vdot": body.N_vdot * kilo * length,
+        "m": body.m * kilo, "I_z": body.I_z * kilo * length**2, "x_G": body.x_G * length,
+        "X_udot": body.X_udot * kilo,
+        "Y_vdot": body.Y_vdot * kilo, "Y_rdot": body.Y_rdot * kilo * length,
+        "N_vdot": body.N_vdot * kilo * length,
         "N_rdot": body.N_rdot * kilo * length**2,
     }  # fmt: skip
     si = AbkowitzConfig.model_validate(

@@ -43,8 +43,16 @@ def test_matrices_written_out(name: str, delta: float) -> None:
         coriolis = np.array([[0, 0, c13], [0, 0, c23], [-c13, -c23, 0]])
         damping = np.array([
             [27.632 + 110.064 * abs(u) + 13.965 * u**2, 0, 0],
-            [0, 52.947 + 116.486 * abs(v) + 1540.383 * abs(r) + 24.313 * v**2, -24.732 - 572.141 * abs(v) + 115.457 * abs(r)],
-            [0, -3.524 + 0.832 * abs(v) - 336.827 * abs(r), 122.860 + 121.957 * abs(v) + 874.428 * abs(r)],
+            [
+                0,
+                52.947 + 116.486 * abs(v) + 1540.383 * abs(r) + 24.313 * v**2,
+                -24.732 - 572.141 * abs(v) + 115.457 * abs(r),
+            ],
+            [
+                0,
+                -3.524 + 0.832 * abs(v) - 336.827 * abs(r),
+                122.860 + 121.957 * abs(v) + 874.428 * abs(r),
+            ],
         ])  # fmt: skip
         wanted = delta * (mass @ out + coriolis @ [u, v, r] + damping @ [u, v, r])
         np.testing.assert_allclose(wanted, force, atol=1e-10 * np.abs(force).max())

@@ -63,8 +63,10 @@ def test_right_hand_side_written_out(vessel: FossenConfig) -> None:
     mass = np.array([[m11, 0, 0], [0, m22, m23], [0, m32, m33]])
     nu, tau = motions().numpy(), np.random.default_rng(1).normal(size=(200, 3)) * 300
     value = {
-        "u": lambda u, v, r: u, "v": lambda u, v, r: v, "r": lambda u, v, r: r, "u|u|": lambda u, v, r: u * abs(u),
-        "v|v|": lambda u, v, r: v * abs(v), "r|r|": lambda u, v, r: r * abs(r), "|u|v": lambda u, v, r: abs(u) * v,
+        "u": lambda u, v, r: u, "v": lambda u, v, r: v, "r": lambda u, v, r: r,
+        "u|u|": lambda u, v, r: u * abs(u),
+        "v|v|": lambda u, v, r: v * abs(v), "r|r|": lambda u, v, r: r * abs(r),
+        "|u|v": lambda u, v, r: abs(u) * v,
     }  # fmt: skip
     hull = Fossen3(vessel)
     got = hull(torch.from_numpy(nu), torch.from_numpy(tau)).numpy()

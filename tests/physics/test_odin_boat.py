@@ -230,7 +230,8 @@ def test_froude_phases() -> None:
     froude = froude_number(u, v, vessel.length.value)
     assert float(froude[3]) == pytest.approx(1.0, abs=0.005)
     assert [PHASES[i] for i in phase_of(froude).tolist()] == [
-        "displacement", "displacement", "semi_displacement", "semi_displacement", "planing", "semi_displacement",
+        "displacement", "displacement", "semi_displacement", "semi_displacement", "planing",
+        "semi_displacement",
     ]  # fmt: skip
     assert phase_of(torch.tensor([0.4, 1.0, 1.1])).tolist() == [1, 2, 2]
     assert phase_of(torch.tensor([1.1]), (0.4, 1.2)).tolist() == [1]

@@ -62,11 +62,15 @@ def navalvessel(c: Numbers, nu: np.ndarray, b: float, tau: np.ndarray) -> np.nda
     m, x_g, z_g, g = c.m, -3.38, c.z_g, 9.81
     hull = np.array([
         -1960 * u * au + 0.33 * m * v * r,
-        -11800 * au * v + 131000 * u * r - 3700 * v * av - 794000 * v * ar - 182000 * r * av + 10800 * b * abs(u * v) + 251000 * b * abs(u * r)
+        -11800 * au * v + 131000 * u * r - 3700 * v * av - 794000 * v * ar - 182000 * r * av
+        + 10800 * b * abs(u * v) + 251000 * b * abs(u * r)
         - 74 * b * u**2,
-        9260 * au * v - 102000 * u * r + 29300 * v * av + 621000 * v * ar + 142000 * r * av - 8400 * b * abs(u * v) - 196000 * b * abs(u * r)
-        - 1180 * b * u**2 - 15500 * au * p - 416000 * p * ap - 500000 * p - 0.325 * c.rho * g * c.volume * b**3 - c.rho * g * c.gm * c.volume * b,
-        -92000 * au * v - 4710000 * au * r - 202e6 * r * ar - 15.6e6 * r * av - 214000 * b * abs(u * v) - 4980000 * b * u * ar - 8000 * b * u * au,
+        9260 * au * v - 102000 * u * r + 29300 * v * av + 621000 * v * ar + 142000 * r * av
+        - 8400 * b * abs(u * v) - 196000 * b * abs(u * r)
+        - 1180 * b * u**2 - 15500 * au * p - 416000 * p * ap - 500000 * p
+        - 0.325 * c.rho * g * c.volume * b**3 - c.rho * g * c.gm * c.volume * b,
+        -92000 * au * v - 4710000 * au * r - 202e6 * r * ar - 15.6e6 * r * av
+        - 214000 * b * abs(u * v) - 4980000 * b * u * ar - 8000 * b * u * au,
     ])  # fmt: skip
     centripetal = m * np.array(
         [r * v + x_g * r**2 - z_g * p * r, -u * r, z_g * u * r, -x_g * u * r]
@@ -222,9 +226,12 @@ DISSIPATIVE = (
     "added_mass.K_vdot.value=-296000",
     "added_mass.N_vdot.value=-1.4e6",
     "forces.X={u|u|: {value: -1960, unit: kg/m, source: made}}",
-    "forces.Y={v|v|: {value: -3700, unit: kg/m, source: made}, \"|u|v\": {value: -11800, unit: kg/m, source: made}}",
-    "forces.K={p: {value: -5e5, unit: kg m^2/s, source: made}, p|p|: {value: -4e5, unit: kg m^2, source: made}}",
-    "forces.N={r|r|: {value: -2e8, unit: kg m^2, source: made}, \"|u|r\": {value: -4.7e6, unit: kg m, source: made}}",
+    "forces.Y={v|v|: {value: -3700, unit: kg/m, source: made},"
+    ' "|u|v": {value: -11800, unit: kg/m, source: made}}',
+    "forces.K={p: {value: -5e5, unit: kg m^2/s, source: made},"
+    " p|p|: {value: -4e5, unit: kg m^2, source: made}}",
+    "forces.N={r|r|: {value: -2e8, unit: kg m^2, source: made},"
+    ' "|u|r": {value: -4.7e6, unit: kg m, source: made}}',
 )  # fmt: skip
 
 

@@ -47,7 +47,8 @@ booklet:
   draws: 20
   manoeuvres:
     - {kind: turning_circle, name: circle, until: 360 deg, rudder: 25 deg, drive: 0.8, start: 0 s}
-    - {kind: zigzag, name: ten_ten, rudder: 10 deg, heading: 10 deg, drive: 0.8, start: 0 s, reversals: 2}
+    - {kind: zigzag, name: ten_ten, rudder: 10 deg, heading: 10 deg, drive: 0.8, start: 0 s,
+       reversals: 2}
 """
 
 

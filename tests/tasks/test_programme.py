@@ -176,8 +176,11 @@ def test_a_model_with_given_inputs(
         },
     }
     content = VESSEL | {
-        "programme": {"model": model, "duration": 20, "length": 4.88, "noise": {"u": 0, "v": 0, "r": 0},
-                      "manoeuvres": [{"kind": "zigzag", "drive": 0.5, "steer": 0.3, "heading": "20 deg"}]}
+        "programme": {
+            "model": model, "duration": 20, "length": 4.88,
+            "noise": {"u": 0, "v": 0, "r": 0},
+            "manoeuvres": [{"kind": "zigzag", "drive": 0.5, "steer": 0.3, "heading": "20 deg"}],
+        }
     }  # fmt: skip
     assert call(monkeypatch, "run", written(tmp_path, content), "--out", tmp_path / "run") == 0
     log = Log.load(tmp_path / "run" / "logs" / "zigzag_01.parquet")

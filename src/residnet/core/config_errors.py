@@ -89,10 +89,8 @@ def _fault(details: ErrorDetails, model: Any) -> _Fault:
             text = f"unknown key{nearest(str(path[-1]), _keys(parents))}{_of_kind(parents)}"
         case "union_tag_invalid":
             path += _discriminator(context)
-            text = (
-                "unknown value"
-                f" '{context['tag']}'{nearest(str(context['tag']), _quoted(context['expected_tags']))}"
-            )
+            tag = str(context["tag"])
+            text = f"unknown value '{tag}'{nearest(tag, _quoted(context['expected_tags']))}"
         case "union_tag_not_found":
             path += _discriminator(context)
             text = f"missing{nearest('', _tags(here, path[-1]))}"

@@ -21,15 +21,18 @@ from residnet.core.log import Log
 UNITS: dict[str, str] = {
     "approach_speed": "m/s",
     "advance": "m", "transfer": "m", "tactical_diameter": "m", "time_90": "s", "time_180": "s",
-    "steady_diameter": "m", "steady_speed": "m/s", "steady_speed_ratio": "-", "steady_drift_angle": "rad", "steady_yaw_rate": "rad/s",
+    "steady_diameter": "m", "steady_speed": "m/s", "steady_speed_ratio": "-",
+    "steady_drift_angle": "rad", "steady_yaw_rate": "rad/s",
     "pull_out_yaw_rate": "rad/s",
     "initial_turning_time": "s", "initial_turning_distance": "m",
-    "first_overshoot": "rad", "second_overshoot": "rad", "time_to_check_yaw": "s", "overshoot_width": "m",
+    "first_overshoot": "rad", "second_overshoot": "rad", "time_to_check_yaw": "s",
+    "overshoot_width": "m",
     "reach": "s", "period": "s", "largest_yaw_rate": "rad/s",
     "track_reach": "m", "head_reach": "m", "lateral_deviation": "m", "stopping_time": "s",
     "steers": "-", "yaw_rates": "rad/s", "loop_height": "rad/s",
     "largest_cross_track_error": "m", "rms_cross_track_error": "m", "course_time": "s",
-    "rmse_u": "m/s", "rmse_v": "m/s", "rmse_r": "rad/s", "position_error_end": "m", "heading_error_end": "rad",
+    "rmse_u": "m/s", "rmse_v": "m/s", "rmse_r": "rad/s", "position_error_end": "m",
+    "heading_error_end": "rad",
     "mean_position_error": "m", "mean_heading_error": "rad",
 }  # fmt: skip
 """Unit of each index."""

@@ -195,7 +195,8 @@ class MMGForces(nn.Module):
         `PARAMETERS`).
         """
         (
-            m_x, m_y, J_z, R_0, X_vv, X_vr, X_rr, X_vvvv, Y_0, Y_v, Y_r, Y_vvv, Y_vvr, Y_vrr, Y_rrr, N_0, N_v, N_r, N_vvv, N_vvr, N_vrr, N_rrr,
+            m_x, m_y, J_z, R_0, X_vv, X_vr, X_rr, X_vvvv, Y_0, Y_v, Y_r, Y_vvv, Y_vvr, Y_vrr, Y_rrr,
+            N_0, N_v, N_r, N_vvv, N_vvr, N_vrr, N_rrr,
             t_P, w_P0, C_2p, C_2n, t_R, a_H, x_H, gamma_p, gamma_n, l_R, epsilon, kappa,
         ) = theta.unbind(-1)  # fmt: skip
         chosen = [z[..., c] for c in self.columns]

@@ -49,7 +49,8 @@ def write_page(run: Path, before: Sequence[Part], after: Sequence[Part] = ()) ->
     title = html.escape(config["name"])
     figures = "".join(
         f'<figure><img alt="{html.escape(f.title)}"'
-        f' src="data:image/png;base64,{base64.b64encode(f.path.read_bytes()).decode("ascii")}"><figcaption><b>{html.escape(f.title)}.</b>'
+        f' src="data:image/png;base64,{base64.b64encode(f.path.read_bytes()).decode("ascii")}">'
+        f"<figcaption><b>{html.escape(f.title)}.</b>"
         f" {html.escape(f.caption)}</figcaption></figure>"
         for f in read_figures(run)
     )

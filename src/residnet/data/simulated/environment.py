@@ -123,9 +123,11 @@ class Disturbance(Config):
         """
         north, east = self.current()
         asked = {
-            "force_x": self.force_x != 0, "force_y": self.force_y != 0, "force_n": self.force_n != 0,
+            "force_x": self.force_x != 0, "force_y": self.force_y != 0,
+            "force_n": self.force_n != 0,
             "force_north": self.force_north != 0, "force_east": self.force_east != 0,
-            "current_north": north != 0 or self.current_each is not None, "current_east": east != 0 or self.current_each is not None,
+            "current_north": north != 0 or self.current_each is not None,
+            "current_east": east != 0 or self.current_each is not None,
         }  # fmt: skip
         needs = {name: name for name, wanted in asked.items() if wanted}
         needs |= dict.fromkeys(WIND_INPUTS, "wind") if self.wind is not None else {}

@@ -33,8 +33,10 @@ _UNITS = {
     "1/s": ("rpm", 60.0),
 }
 _NAMES = {
-    "u": "surge velocity\nu", "v": "sway velocity\nv", "r": "yaw rate\nr", "p": "roll rate\np", "psi": "heading\n", "phi": "roll angle\n",
-    "cmd_delta": "rudder\ncommand", "cmd_n": "revolutions\ncommand", "cmd_port": "port command\n", "cmd_stbd": "starboard\ncommand",
+    "u": "surge velocity\nu", "v": "sway velocity\nv", "r": "yaw rate\nr", "p": "roll rate\np",
+    "psi": "heading\n", "phi": "roll angle\n",
+    "cmd_delta": "rudder\ncommand", "cmd_n": "revolutions\ncommand", "cmd_port": "port command\n",
+    "cmd_stbd": "starboard\ncommand",
 }  # fmt: skip
 
 

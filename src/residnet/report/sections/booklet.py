@@ -14,13 +14,20 @@ from residnet.report.tables import Cell, Table, number
 
 _SHOWN = {"rad": ("deg", math.degrees(1.0)), "rad/s": ("deg/s", math.degrees(1.0))}
 _WORDS = {
-    "approach_speed": "approach speed", "advance": "advance", "transfer": "transfer", "tactical_diameter": "tactical diameter",
-    "time_90": "time to 90 deg", "time_180": "time to 180 deg", "steady_diameter": "steady diameter", "steady_speed": "steady speed",
-    "steady_speed_ratio": "steady speed over approach speed", "steady_drift_angle": "steady drift angle", "steady_yaw_rate": "steady yaw rate",
-    "initial_turning_time": "initial turning time", "initial_turning_distance": "initial turning distance", "first_overshoot": "first overshoot",
-    "second_overshoot": "second overshoot", "time_to_check_yaw": "time to check yaw", "overshoot_width": "overshoot width", "reach": "reach",
-    "period": "period", "largest_yaw_rate": "largest yaw rate", "track_reach": "track reach", "head_reach": "head reach",
-    "lateral_deviation": "lateral deviation", "stopping_time": "stopping time", "pull_out_yaw_rate": "yaw rate after pull-out",
+    "approach_speed": "approach speed", "advance": "advance", "transfer": "transfer",
+    "tactical_diameter": "tactical diameter",
+    "time_90": "time to 90 deg", "time_180": "time to 180 deg",
+    "steady_diameter": "steady diameter", "steady_speed": "steady speed",
+    "steady_speed_ratio": "steady speed over approach speed",
+    "steady_drift_angle": "steady drift angle", "steady_yaw_rate": "steady yaw rate",
+    "initial_turning_time": "initial turning time",
+    "initial_turning_distance": "initial turning distance", "first_overshoot": "first overshoot",
+    "second_overshoot": "second overshoot", "time_to_check_yaw": "time to check yaw",
+    "overshoot_width": "overshoot width", "reach": "reach",
+    "period": "period", "largest_yaw_rate": "largest yaw rate", "track_reach": "track reach",
+    "head_reach": "head reach",
+    "lateral_deviation": "lateral deviation", "stopping_time": "stopping time",
+    "pull_out_yaw_rate": "yaw rate after pull-out",
 }  # fmt: skip
 _COMPARED = (
     "first_overshoot",

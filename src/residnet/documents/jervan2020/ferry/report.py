@@ -228,10 +228,8 @@ def alone_text(config: FerrySettings, flights: dict[str, Flight]) -> str:
     for name, flight in flights.items():
         said = config.published if name == "believed" else config.models[name].published
         own = flight.tracking.motion_mse
-        lines.append(
-            f"| {name} |"
-            f" {' | '.join(_beside(own[i], said.alone[i] if said.alone else None) for i in range(6))} |"
-        )
+        cells = (_beside(own[i], said.alone[i] if said.alone else None) for i in range(6))
+        lines.append(f"| {name} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
