@@ -17,7 +17,7 @@ from made_run import DEG, LEVEL, made_run, metrics, residuals, row, write_json
 from residnet.core.errors import DataError, UsageError
 from residnet.dynamics.store import ModelSpec, save_model
 from residnet.report.figures.fit import write_figures
-from residnet.report.page import write_report
+from residnet.report.fit import write_report
 from residnet.report.tables import change, number, term_unit
 
 _VOID = {"meta", "img", "br", "hr", "link"}

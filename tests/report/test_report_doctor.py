@@ -10,7 +10,7 @@ from made_run import made_run
 
 from residnet.core.log import Log
 from residnet.data.doctor import inspect, inspect_together, inspection
-from residnet.report.page import write_report
+from residnet.report.fit import write_report
 
 
 def sick(name: str, gyro: float) -> Log:

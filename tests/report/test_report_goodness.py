@@ -10,7 +10,7 @@ from made_run import DEG, made_run, write_json
 from made_series import autoregressive
 
 from residnet.judge.goodness import OneStep, content, table
-from residnet.report.page import write_report
+from residnet.report.fit import write_report
 from residnet.report.run_reader import RunFiles
 from residnet.report.sections.goodness import section
 from residnet.report.tables import number

@@ -1,59 +1,65 @@
-"""The report: one self-contained HTML file, from the run folder alone."""
+"""The one page builder: every task's `report.html` is written here."""
 
 from __future__ import annotations
 
 import base64
+import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from residnet.judge.sanity import CHECKS, Finding, check_run
-from residnet.report import tables
-from residnet.report.figures.fit import FigureFile, read_figures
-from residnet.report.run_reader import RunFiles
-from residnet.report.sections import booklet as report_booklet
-from residnet.report.sections import doctor as report_doctor
-from residnet.report.sections import equations as report_equations
-from residnet.report.sections import goodness as report_goodness
-from residnet.report.sections import limits as report_limits
-from residnet.report.sections import offsets as report_offsets
-from residnet.report.text import cautions, fitted_on, verdict
+import yaml
+from markupsafe import Markup, escape
 
-_TEMPLATE = "report.html.j2"
+from residnet.report.blocks import Block, Code, Facts, Section
+
+_FACT_TITLES = {"git": "git revision", "python": "Python", "started": "started (UTC)"}
+_FACTS = ("residnet", "git", "seed", "python", "machine", "started")
 
 
-def write_report(run: Path) -> Path:
-    """Write `report.html` into a run folder (or what `residnet evaluate` wrote) from what stands
-    there; sections without data are left out.
+def write_page(
+    run: Path, title: str, description: str, verdict: Sequence[str], sections: Sequence[Section]
+) -> Path:
+    """Write `report.html` of a run folder, whole or not at all.
 
-    Figures are taken from `figures/`: call `residnet.report.figures.fit.write_figures` before.
+    The page stands alone: pictures and styles are inside, nothing is loaded and nothing runs.
+    Provenance and configuration are added at its end where the folder holds `provenance.json` and
+    `resolved.yaml`.
 
     Args:
-        run: folder with metrics.json.
+        run: run folder.
+        title: of the page.
+        description: what the run was made for, empty where nothing is to be said.
+        verdict: sentences that stand first, the first of them in bold.
+        sections: from top to bottom.
 
     Returns:
-        Path of the report.
+        Path of the page.
 
     Raises:
-        UsageError: where the folder holds no metrics.json.
-        DataError: where a file in it cannot be read.
+        OSError: where a figure cannot be read or the page cannot be written.
     """
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+    # jinja2 is only needed where a page is written, not where a config is checked
+    from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    files = RunFiles(run)
-    divergence = float(files.evaluation.get("divergence") or 3.0)
-    findings = check_run(run, divergence=divergence)
-    loader = FileSystemLoader(Path(__file__).parent)
+    record = _record(run)
     environment = Environment(
-        loader=loader,
+        loader=PackageLoader("residnet.report", "templates"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["minus"] = _minus
-    text = environment.get_template(_TEMPLATE).render(_context(files, findings, read_figures(run)))
+    environment.filters |= {"breakable": _breakable, "embedded": _embedded, "anchor": _anchor}
+    text = environment.get_template("page.html.j2").render(
+        title=title,
+        description=description,
+        version=str(record.get("residnet") or ""),
+        date=str(record.get("started") or "")[:10],
+        verdict=[sentence for sentence in verdict if sentence],
+        sections=[*sections, *_made_of(run, record)],
+    )
     path = run / "report.html"
     partial = path.with_name(path.name + ".partial")
     partial.write_text(text, encoding="utf-8")
@@ -61,79 +67,63 @@ def write_report(run: Path) -> Path:
     return path
 
 
-def _context(
-    run: RunFiles, findings: Sequence[Finding], figures: Sequence[FigureFile]
-) -> dict[str, Any]:
-    protocols = [
-        {
-            "name": name,
-            "table": tables.free_runs(run, name),
-            "kinds": tables.by_manoeuvre(run, name, run.focus),
-            "first": name == run.protocols[0],
-        }
-        for name in run.protocols
+def title_and_description(run: Path) -> tuple[str, str]:
+    """Return name and description of a run as its `resolved.yaml` gives them."""
+    path = run / "resolved.yaml"
+    resolved = yaml.safe_load(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    return str(resolved.get("name") or run.name), str(resolved.get("description") or "")
+
+
+def _record(run: Path) -> Mapping[str, Any]:
+    path = run / "provenance.json"
+    record: Mapping[str, Any] = json.loads(path.read_text()) if path.is_file() else {}
+    return record
+
+
+def _made_of(run: Path, record: Mapping[str, Any]) -> list[Section]:
+    """Return the section on provenance and configuration, none where the folder holds neither."""
+    blocks: list[Block] = []
+    if facts := provenance_facts(record):
+        blocks.append(Section("How this run was made", [Facts(facts)], folded=True))
+    if inputs := record.get("inputs"):
+        pairs = [(str(name), str(checksum)) for name, checksum in inputs.items()]
+        title = f"SHA-256 of {len(inputs)} input file{'' if len(inputs) == 1 else 's'}"
+        blocks.append(Section(title, [Facts(pairs, code=True)], folded=True))
+    resolved = run / "resolved.yaml"
+    if resolved.is_file():
+        text = resolved.read_text(encoding="utf-8")
+        blocks.append(Section("Resolved configuration", [Code(text)], folded=True))
+    return [Section("Provenance", blocks)] if blocks else []
+
+
+def provenance_facts(record: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return name and text of each fact of `provenance.json` that a reader may want."""
+    facts = [
+        (_FACT_TITLES.get(key, key), str(record[key]))
+        for key in _FACTS
+        if record.get(key) is not None
     ]
-    return {
-        "title": str(run.metrics.get("run") or run.path.name),
-        "description": str(run.resolved.get("description") or ""),
-        "date": str(run.provenance.get("started") or "")[:10],
-        "version": run.provenance.get("residnet"),
-        "selected": run.selected,
-        "verdict": [sentence for sentence in verdict(run) if sentence],
-        "cautions": cautions(run, findings),
-        "focus": run.focus,
-        "sides": run.sides,
-        "has_baseline": run.baseline is not None,
-        "fitted_on": fitted_on(run),
-        "quality": tables.quality(run),
-        "doctor": report_doctor.section(run),
-        "good": report_limits.section(run),
-        "baselines": _coefficients(run),
-        "heads": tables.heads(run),
-        "equations": report_equations.section(run),
-        "goodness": report_goodness.section(run),
-        "booklet": report_booklet.section(run),
-        "protocols": [entry for entry in protocols if entry["table"] is not None],
-        "figures": [
-            {"title": f.title, "caption": f.caption, "name": f.path.name, "data": _embedded(f.path)}
-            for f in figures
-        ],
-        "checks": CHECKS,
-        "sanity": _by_model(findings),
-        "provenance": tables.provenance(run),
-        "inputs": list((run.provenance.get("inputs") or {}).items()),
-        "resolved": run.resolved_text,
-    }
+    if record.get("seconds") is not None:
+        facts.append(("duration", f"{record['seconds']:.0f} s"))
+    packages = record.get("packages") or {}
+    if packages:
+        known = [f"{name} {version}" for name, version in packages.items() if version]
+        facts.append(("packages", ", ".join(known)))
+    if record.get("config"):
+        facts.append(("configuration", str(record["config"])))
+    if record.get("overrides"):
+        facts.append(("overrides", " ".join(record["overrides"])))
+    return facts
 
 
-def _coefficients(run: RunFiles) -> list[dict[str, Any]]:
-    """Tables of identified coefficients, the first baseline's first."""
-    names = [
-        run.baseline or "baseline",
-        *(model for model, kind in run.kinds.items() if kind == "further"),
-    ]
-    found = [
-        {
-            "name": name,
-            "table": tables.baseline_parameters(run, name),
-            "refitted": bool(run.fit(name).get("refit")),
-            "offsets": report_offsets.section(run, name),
-        }
-        for name in names
-    ]
-    return [entry for entry in found if entry["table"] is not None]
+def _anchor(title: str) -> str:
+    """Return the name by which a section is linked."""
+    return re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
 
 
-def _by_model(findings: Sequence[Finding]) -> list[tuple[str, list[Finding]]]:
-    return [
-        (model, [f for f in findings if f.model == model])
-        for model in dict.fromkeys(f.model for f in findings)
-    ]
-
-
-def _minus(text: str) -> str:
-    """Hyphens before numbers as minus signs."""
-    return re.sub(r"(?<![\w-])-(?=\d)", "−", text)
+def _breakable(text: str) -> Markup:
+    """Return escaped text that may break after underscores and slashes, never inside words."""
+    return Markup(re.sub(r"([_/])", r"\1<wbr>", str(escape(text))))
 
 
 def _embedded(path: Path) -> str:

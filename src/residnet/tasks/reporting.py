@@ -7,7 +7,7 @@ from pathlib import Path
 from residnet.report.autopilot import FLIGHTS, write_autopilot_report
 from residnet.report.course import TRACKS, write_course_report
 from residnet.report.figures.fit import write_figures
-from residnet.report.page import write_report
+from residnet.report.fit import write_report
 from residnet.runs.folder import RunFolder
 
 

@@ -1,0 +1,242 @@
+"""What a report page is made of: sections of text, tables, figures and code.
+
+The same objects serve the page (`residnet.report.page.write_page`) and the terminal
+(`Table.text`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import ClassVar, Literal, Protocol, TypeAlias
+
+Mark: TypeAlias = Literal["", "bad", "best", "weak", "text"]
+
+
+class Block(Protocol):
+    """A part of a section, drawn by the template macro that bears its `kind`."""
+
+    kind: ClassVar[str]
+
+
+@dataclass(frozen=True)
+class Text:
+    """Paragraphs of plain text.
+
+    Attributes:
+        paragraphs: one string or several.
+        quiet: printed in grey, for explanations that most readers skip.
+    """
+
+    kind: ClassVar[str] = "text"
+    paragraphs: str | Sequence[str]
+    quiet: bool = False
+
+    @property
+    def lines(self) -> list[str]:
+        """Return the paragraphs that are not empty."""
+        given = [self.paragraphs] if isinstance(self.paragraphs, str) else self.paragraphs
+        return [paragraph for paragraph in given if paragraph]
+
+
+@dataclass(frozen=True)
+class Bullets:
+    """A list of short texts.
+
+    Attributes:
+        items: one string for each entry.
+        warning: set off by colour, for what a reader must know before using a result.
+    """
+
+    kind: ClassVar[str] = "bullets"
+    items: Sequence[str]
+    warning: bool = False
+
+
+@dataclass(frozen=True)
+class Facts:
+    """Names with what is to be said of each.
+
+    Attributes:
+        pairs: (name, text); the text of a check may be marked as failed by `failed`.
+        failed: names that are set off by colour.
+        code: names and texts are printed as code (file names and checksums).
+    """
+
+    kind: ClassVar[str] = "facts"
+    pairs: Sequence[tuple[str, str]]
+    failed: Sequence[str] = ()
+    code: bool = False
+
+
+@dataclass(frozen=True)
+class Code:
+    """Text in a fixed-width font, exactly as it stands.
+
+    Attributes:
+        text: with its line breaks.
+        wrap: long lines break at spaces instead of scrolling sideways.
+    """
+
+    kind: ClassVar[str] = "code"
+    text: str
+    wrap: bool = False
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A picture of the run folder with its title and caption.
+
+    Attributes:
+        path: of a PNG file.
+        title: a few words.
+        caption: whole sentences that say what to look for.
+    """
+
+    kind: ClassVar[str] = "figure"
+    path: Path
+    title: str
+    caption: str
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One cell of a table.
+
+    Attributes:
+        text: a formatted number or a few words.
+        note: small print below it.
+        mark: `bad`, `best` or `weak` set it off; `text` is aligned to the left and may wrap.
+    """
+
+    text: str
+    note: str = ""
+    mark: Mark = ""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of a table.
+
+    Attributes:
+        label: its first cell.
+        cells: the others, in the order of the columns.
+        rule: a line is drawn above it, where a group of rows begins.
+        selected: it is set off as the one that was chosen.
+    """
+
+    label: str
+    cells: Sequence[Cell]
+    rule: bool = False
+    selected: bool = False
+
+
+class Table:
+    """A table with a header, labelled rows and an optional second header line of groups."""
+
+    kind: ClassVar[str] = "table"
+
+    def __init__(
+        self,
+        columns: Sequence[str],
+        rows: Iterable[Row | Sequence[Cell | str]] = (),
+        caption: str = "",
+        groups: Sequence[tuple[str, int]] = (),
+    ) -> None:
+        """Make a table; more rows can be added with `add`.
+
+        Args:
+            columns: titles with units, the first above the row labels.
+            rows: each a `Row`, or its label and cells in one sequence.
+            caption: a sentence above the table.
+            groups: titles that span several columns after the first, with how many they span.
+        """
+        self.columns = list(columns)
+        self.caption = caption
+        self.groups = list(groups)
+        self.rows: list[Row] = []
+        for row in rows:
+            if isinstance(row, Row):
+                self.rows.append(row)
+            else:
+                label, *cells = row
+                self.add(label.text if isinstance(label, Cell) else label, cells)
+
+    def add(
+        self,
+        label: str,
+        cells: Iterable[Cell | str],
+        *,
+        rule: bool = False,
+        selected: bool = False,
+    ) -> None:
+        """Add a row; plain strings become cells."""
+        made = [cell if isinstance(cell, Cell) else Cell(cell) for cell in cells]
+        if len(made) != len(self.columns) - 1:
+            raise ValueError(
+                f"row '{label}': {len(made)} cells for {len(self.columns) - 1} columns"
+            )
+        self.rows.append(Row(label, made, rule, selected))
+
+    @property
+    def aligned_left(self) -> list[bool]:
+        """Return for each column whether it holds words rather than numbers."""
+        left = [True]
+        for column in range(len(self.columns) - 1):
+            marks = [row.cells[column].mark for row in self.rows]
+            left.append(bool(marks) and all(mark == "text" for mark in marks))
+        return left
+
+    def text(self) -> str:
+        """Return the table for a terminal: columns aligned, notes in brackets, groups above."""
+        lines = [self.columns]
+        lines += [[row.label, *(_plain(cell) for cell in row.cells)] for row in self.rows]
+        widths = [max(len(line[k]) for line in lines) for k in range(len(self.columns))]
+        start = 1
+        spans: list[tuple[str, int]] = []
+        for title, count in self.groups:
+            # a group is as wide as its columns and the gaps between them
+            wanted = len(title) - (sum(widths[start : start + count]) + 2 * (count - 1))
+            widths[start] += max(wanted, 0)
+            spans.append((title, sum(widths[start : start + count]) + 2 * (count - 1)))
+            start += count
+        left = self.aligned_left
+        out = [self.caption] if self.caption else []
+        if spans:
+            out.append(
+                "  ".join([" " * widths[0], *(f"{title:^{width}}" for title, width in spans)])
+            )
+        for line in lines:
+            parts = [
+                f"{text:<{width}}" if to_left else f"{text:>{width}}"
+                for text, width, to_left in zip(line, widths, left, strict=True)
+            ]
+            out.append("  ".join(parts))
+        return "\n".join(line.rstrip() for line in out)
+
+
+def _plain(cell: Cell) -> str:
+    text = f"{cell.text} ({cell.note})" if cell.note else cell.text
+    return f"{text} !" if cell.mark == "bad" else text
+
+
+@dataclass(frozen=True)
+class Section:
+    """A titled part of a page; it may hold sections itself.
+
+    Attributes:
+        title: a few words.
+        blocks: what it shows, from top to bottom.
+        folded: closed at first, for what most readers skip.
+    """
+
+    kind: ClassVar[str] = "section"
+    title: str
+    blocks: Sequence[Block | None] = field(default_factory=tuple)
+    folded: bool = False
+
+    @property
+    def shown(self) -> list[Block]:
+        """Return the blocks that are there; a section may be handed None for an absent part."""
+        return [block for block in self.blocks if block is not None]

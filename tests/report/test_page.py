@@ -1,0 +1,128 @@
+"""The page builder: every block is drawn, the file stands alone, and what stands in it is escaped."""
+
+from __future__ import annotations
+
+import html
+import json
+import re
+from pathlib import Path
+
+import pytest
+from PIL import Image
+from read_page import Page
+
+from residnet.report.blocks import (
+    Bullets,
+    Cell,
+    Code,
+    Facts,
+    Figure,
+    Row,
+    Section,
+    Table,
+    Text,
+)
+from residnet.report.page import write_page
+
+
+def table() -> Table:
+    return Table(
+        ["controller", "settling [s]", "remark"],
+        [
+            [
+                "pd_with_filter",
+                Cell("12.5", "best of 5"),
+                Cell("tuned at the corners", mark="text"),
+            ],
+            Row("net", [Cell("10.1", mark="best"), Cell("learned", mark="text")], selected=True),
+        ],
+        "Changes of 10 deg.",
+    )
+
+
+def every_block(folder: Path) -> list[Section]:
+    picture = folder / "figures" / "track.png"
+    picture.parent.mkdir(parents=True, exist_ok=True)
+    Image.new("RGB", (900, 300), "white").save(picture)
+    return [
+        Section("Results of <all>", [Text(["First.", "", "Second."]), table()]),
+        Section("Pictures", [Figure(picture, "Track", "Look for a wide turn."), None]),
+        Section(
+            "Details",
+            [
+                Bullets(["mind the gap"], warning=True),
+                Facts([("damping", "is wrong"), ("gain", "is right")], failed=["damping"]),
+                Section("Inside", [Code("a: 1\nb: 2")], folded=True),
+            ],
+            folded=True,
+        ),
+    ]
+
+
+def test_every_block_is_drawn_and_nothing_is_loaded_or_run(tmp_path: Path) -> None:
+    path = write_page(
+        tmp_path, "run & all", "A <b>.", ["It works.", "", "Well."], every_block(tmp_path)
+    )
+    text = path.read_text()
+    page = Page(text)
+    assert path == tmp_path / "report.html"
+    assert "<strong>It works.</strong> Well." in text
+    assert "run &amp; all" in text
+    assert "A &lt;b&gt;." in text
+    assert page.tables == [
+        [
+            ["controller", "settling [s]", "remark"],
+            ["pd_with_filter", "12.5|best of 5", "tuned at the corners"],
+            ["net", "10.1", "learned"],
+        ]
+    ]
+    assert [section for section in page.sections if section] == [
+        "verdict",
+        "results-of-all",
+        "pictures",
+        "details",
+    ]
+    assert sum(source.startswith("data:image/png;base64,") for source in page.sources) == 1
+    assert all(source.startswith(("data:image/png;base64,", "#")) for source in page.sources)
+    assert not re.search(r"<script|url\(|@import|https?://", text)
+    assert "pd_<wbr>with_<wbr>filter" in text
+    assert text.count("<details>") == 2
+    assert "a: 1\nb: 2" in html.unescape(text)
+    assert not list(tmp_path.glob("*.partial"))
+
+
+def test_provenance_and_configuration_come_last_and_folded(tmp_path: Path) -> None:
+    record = {"residnet": "9.8.7", "started": "2026-01-02T03:04:05Z", "inputs": {"a.csv": "f00d"}}
+    (tmp_path / "provenance.json").write_text(json.dumps(record))
+    (tmp_path / "resolved.yaml").write_text("name: made\n")
+    text = write_page(tmp_path, "made", "", ["Done."], [Section("Table", [table()])]).read_text()
+    assert Page(text).sections == ["verdict", "table", "provenance"]
+    last = text[text.index('id="provenance"') :]
+    assert last.count("<details>") == 3
+    for part in ("9.8.7", "f00d", "name: made", "SHA-256 of 1 input file<"):
+        assert part in last
+    assert "run of 2026-01-02" in text
+
+
+def test_a_table_for_the_terminal_has_its_columns_below_each_other() -> None:
+    assert table().text().splitlines() == [
+        "Changes of 10 deg.",
+        "controller          settling [s]  remark",
+        "pd_with_filter  12.5 (best of 5)  tuned at the corners",
+        "net                         10.1  learned",
+    ]
+    grouped = Table(
+        ["model", "train", "test"],
+        [["plsr", "1", Cell("2", mark="bad")]],
+        groups=[("surge u [m/s]", 2)],
+    )
+    assert grouped.text().splitlines() == [
+        "       surge u [m/s]",
+        "model    train  test",
+        "plsr         1   2 !",
+    ]
+
+
+def test_a_row_of_another_length_is_refused() -> None:
+    with pytest.raises(ValueError, match="row 'net': 1 cells for 2 columns"):
+        Table(["model", "u", "v"], [["net", "1"]])
