@@ -38,7 +38,7 @@ def test_values_by_hand() -> None:
         rtol=1e-12,
     )
     assert not out[:, 1].any()
-    assert baseline.freedom() == [4, 0, 4]
+    assert baseline.parameter_count() == [4, 0, 4]
 
 
 def test_channels_in_other_units() -> None:
@@ -73,4 +73,4 @@ def test_channels_in_other_units() -> None:
 def test_terms_of_the_published_models(file: str, model: str, counts: list[int]) -> None:
     """ERRATA E9: (7.2) 14, (7.3) 8, (7.4) 14, (7.5) 14, (7.6) 10, (7.7) 11 terms."""
     config = load_config(STUDIES / f"{file}.yaml", [], FitConfig)
-    assert config.baselines[model].build(config.signals.build().names).freedom() == counts
+    assert config.baselines[model].build(config.signals.build().names).parameter_count() == counts

@@ -9,7 +9,7 @@ from torch import Tensor
 from residnet.baselines import MMGBaseline, MMGConfig
 from residnet.core.errors import ConfigError
 from residnet.core.samples import Samples
-from residnet.physics.mmg import PARAMETERS, usual_beliefs
+from residnet.physics.mmg import PARAMETERS, usual_priors
 
 NAMES = ("u", "v", "r", "n", "delta")
 TANKER = {
@@ -146,14 +146,14 @@ def test_accelerations_of_a_known_ship_move_the_beliefs_to_it() -> None:
     assert float(worst.max()) < 2e-3
     for name in ("N_v", "N_r", "Y_v", "w_P0", "C_2p"):
         assert abs(table[name].value - PUBLISHED[name]) < 5 * table[name].error + 1e-3, name
-        assert table[name].error < 0.5 * usual_beliefs(config.hull)[name].sd
+        assert table[name].error < 0.5 * usual_priors(config.hull)[name].sd
 
 
 def test_a_fixed_parameter_stays() -> None:
     baseline = built(t_P=(0.2, 0.0))
-    assert baseline.movable().numel() == len(PARAMETERS) - 1
+    assert baseline.free_indices().numel() == len(PARAMETERS) - 1
     assert baseline.sensitivity(channels(3)).shape == (3, 3, len(PARAMETERS) - 1)
-    assert baseline.belief()[0].shape == (len(PARAMETERS) - 1,)
+    assert baseline.prior()[0].shape == (len(PARAMETERS) - 1,)
 
 
 def test_config_names_what_is_wrong() -> None:

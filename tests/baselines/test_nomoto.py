@@ -124,10 +124,10 @@ def test_a_refit_may_not_move_what_nothing_determines() -> None:
     baseline = NomotoConfig().build(NAMES)
     movable = {
         (int(i) // baseline.library.count, baseline.library.terms[int(i) % baseline.library.count])
-        for i in baseline.movable()
+        for i in baseline.free_indices()
     }
     assert movable == {(0, "u"), (0, "n"), (0, "1"), (2, "r"), (2, "delta"), (2, "1")}
-    assert len(NomotoSideslipConfig().build(NAMES).movable()) == 9
+    assert len(NomotoSideslipConfig().build(NAMES).free_indices()) == 9
 
 
 def test_parameters_follow_moved_coefficients() -> None:
@@ -139,8 +139,8 @@ def test_parameters_follow_moved_coefficients() -> None:
     with torch.no_grad():
         baseline.theta[2, terms.index("r")] = -0.5
         baseline.theta[2, terms.index("delta")] = 0.4
-    errors = torch.full((baseline.movable().numel(),), 0.125, dtype=torch.float64)
-    restated = baseline.restated(table, errors)
+    errors = torch.full((baseline.free_indices().numel(),), 0.125, dtype=torch.float64)
+    restated = baseline.updated_table(table, errors)
     after = {(c.axis, c.term): c.value for c in restated}
     assert after["r_dot", "T"] == pytest.approx(2.0)
     assert after["r_dot", "K"] == pytest.approx(0.8)

@@ -93,7 +93,7 @@ def spec(head: Any, name: str = "force") -> ModelSpec:
 def fitted(head: Any, of: Samples) -> HybridDynamics:
     model = spec(head).build()
     with torch.no_grad():
-        residual = model.head.lacking(of, model.baseline(of.z))
+        residual = model.head.residual_target(of, model.baseline(of.z))
     model.head.calibrate(residual)
     model.head.solve(residual)
     return model.eval()
@@ -192,7 +192,7 @@ def test_only_the_solutions_that_run_forward_are_offered() -> None:
     head = spec(RidgeConfig(space="force", terms=TERMS, penalties=(1e-8, 100.0))).build()
     of = samples(mass_sign=-1.0)
     with torch.no_grad():
-        residual = head.head.lacking(of, head.baseline(of.z))
+        residual = head.head.residual_target(of, head.baseline(of.z))
     head.head.calibrate(residual)
     offered = [solution.choice["penalty"] for solution in head.head.solutions(residual)]
     assert offered == [[100.0] * 3, []]
@@ -227,7 +227,7 @@ def test_refused(build: Any, said: str) -> None:
 def _on(baseline: Any) -> None:
     head = RidgeConfig(space="force").build(NAMES)
     assert isinstance(head, ForceHead)
-    head.stand_on(baseline.build(NAMES).mass())
+    head.set_mass(baseline.build(NAMES).mass())
 
 
 def test_believed_mass_is_the_hulls_times_its_factor() -> None:

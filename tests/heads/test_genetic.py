@@ -66,7 +66,7 @@ def test_force_equations_of_odin() -> None:
     with torch.no_grad():
         out = head.sequence(data.z)
     torch.testing.assert_close(out, data.target, rtol=1e-9, atol=1e-12)
-    parts = head.parts(data.z, 0)
+    parts = head.contributions(data.z, 0)
     assert list(parts) == [name for name in head.names() if name in FORCE_TRUTH["u_dot"]]
     np.testing.assert_allclose(sum(parts.values()), data.target[:, 0], rtol=1e-9, atol=1e-12)
 

@@ -202,8 +202,8 @@ def test_free_runs_are_offered_joint_settings_then_single_steps_around_the_best(
     head.load_state_dict(found[-1].state, strict=False)
     assert found[-1].choice == {"penalty": []}
     assert np.abs(answer(head, NEW)).max() == 0.0
-    assert found[5].around is not None
-    near = list(found[5].around())
+    assert found[5].neighbours is not None
+    near = list(found[5].neighbours())
     assert {tuple(s.choice["penalty"]) for s in near} == {
         tuple(p if axis == k else 1e-4 for k in range(3)) for axis in range(3) for p in (1e-6, 1e-2)
     }

@@ -157,7 +157,7 @@ def test_scales_are_those_of_both_sides() -> None:
     assert inner.mean[1] == pytest.approx(0.0, abs=1e-12)
     torch.testing.assert_close(inner.low[[1, 2, 4]], -inner.high[[1, 2, 4]])
     target = torch.cat((known.target, known.target * TURNED))
-    torch.testing.assert_close(head.spread(), target.std(0, correction=0))
+    torch.testing.assert_close(head.residual_std(), target.std(0, correction=0))
 
 
 @pytest.mark.parametrize("kind", ["mlp", "lstm"])

@@ -1,5 +1,4 @@
-"""The surface analysis against the same surface from scikit-learn's PLSRegression, model by model.
-"""
+"""The surface analysis against the same surface from scikit-learn's PLSRegression, model by model."""
 
 from __future__ import annotations
 

@@ -93,8 +93,7 @@ def test_the_jets_equations_from_steps(file: Path) -> None:
 
 
 def test_two_levels_of_an_input_do_not_tell_its_square() -> None:
-    """What the data cannot identify is said: with two motor speeds, rpm^2 is a line through both.
-    """
+    """What the data cannot identify is said: with two motor speeds, rpm^2 is a line through both."""
     log = jet_logs(1)[0]
     log["rpm"] = np.where(log["t"] % 20 < 10, 600.0, 1400.0)
     _, notes = fitted(JET, samples(log, JETS))
@@ -395,6 +394,6 @@ def test_parts_add_up_to_the_residual() -> None:
     with torch.no_grad():
         rho = head.sequence(data.z)
     for axis, name in enumerate(ACCELERATION):
-        parts = head.parts(data.z, axis)
+        parts = head.contributions(data.z, axis)
         assert set(parts) == set(FORCE_TRUTH[name])
         np.testing.assert_allclose(sum(parts.values()), rho[:, axis], atol=1e-12)

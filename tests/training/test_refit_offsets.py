@@ -56,7 +56,7 @@ def refitted(
     own = torch.zeros_like(baseline.theta)
     for column, term in enumerate(baseline.library.terms):
         own[:, column] = THETA[:, QUADRATIC.index(term)]
-    free = baseline.movable()
+    free = baseline.free_indices()
     return (baseline.theta.detach() - own).flatten()[free], found.errors, found
 
 

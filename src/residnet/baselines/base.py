@@ -24,7 +24,7 @@ class Baseline(nn.Module, ABC):
         """nu_dot [..., 3] at channels z [..., nz] (see `residnet.physics.signals`)."""
 
     @abstractmethod
-    def freedom(self) -> list[float]:
+    def parameter_count(self) -> list[float]:
         """Number of fitted parameters of each axis."""
 
     def mass(self) -> Tensor | None:
@@ -40,7 +40,7 @@ class ParametricBaseline(Baseline, ABC):
 
     Args:
         theta: numbers of any shape, kept as the parameter `theta`; the P of them that may move are
-            named by `movable`.
+            named by `free_indices`.
     """
 
     def __init__(self, theta: Tensor) -> None:
@@ -48,36 +48,36 @@ class ParametricBaseline(Baseline, ABC):
         self.theta = nn.Parameter(theta, requires_grad=False)
 
     @abstractmethod
-    def movable(self) -> Tensor:
+    def free_indices(self) -> Tensor:
         """Numbers of the parameters, in theta flattened, that may move, [P]."""
 
     @abstractmethod
     def sensitivity(self, z: Tensor) -> Tensor:
-        """Derivative of nu_dot with respect to the movable parameters at channels z [B, nz], [B, 3,
+        """Derivative of nu_dot with respect to the free parameters at channels z [B, nz], [B, 3,
         P].
         """
 
     @abstractmethod
     def information(self, samples: Samples) -> Tensor:
-        """Information that a sample's accelerations hold about the movable parameters, mean over
+        """Information that a sample's accelerations hold about the free parameters, mean over
         the samples, [P, P].
         """
 
     @abstractmethod
-    def belief(self) -> tuple[Tensor, Tensor]:
-        """Mean [P] and precision [P] of what is thought of the movable parameters before any trial;
+    def prior(self) -> tuple[Tensor, Tensor]:
+        """Mean [P] and precision [P] of what is thought of the free parameters before any trial;
         zero precision where nothing is.
         """
 
     @abstractmethod
     def asymmetry(self, samples: Samples) -> Tensor:
-        """Information [P] about those movable parameters that a mirror-symmetric vessel cannot
+        """Information [P] about those free parameters that a mirror-symmetric vessel cannot
         have; zero for all others.
         """
 
     @abstractmethod
-    def restated(self, table: Sequence[Coefficient], errors: Tensor) -> list[Coefficient]:
-        """The table of coefficients as theta is now, with standard errors [P] of the movable
+    def updated_table(self, table: Sequence[Coefficient], errors: Tensor) -> list[Coefficient]:
+        """The table of coefficients as theta is now, with standard errors [P] of the free
         parameters; errors of ratios stay as they were.
         """
 

@@ -73,7 +73,7 @@ class BelievedBaseline(Baseline):
         """nu_dot [..., 3] at channels z [..., nz]."""
         return self.library(z) @ self.theta.to(z.dtype).T
 
-    def freedom(self) -> list[float]:
+    def parameter_count(self) -> list[float]:
         """None: nothing was fitted."""
         return [0.0, 0.0, 0.0]
 

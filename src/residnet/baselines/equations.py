@@ -39,7 +39,7 @@ class EquationsBaseline(Baseline):
         """nu_dot [..., 3] at channels z [..., nz]."""
         return self.library(z) @ self.theta.to(z.dtype).T
 
-    def freedom(self) -> list[float]:
+    def parameter_count(self) -> list[float]:
         """Number of terms of each axis: they were fitted, if to other data (ERRATA E9 of document
         000).
         """

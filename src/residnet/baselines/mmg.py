@@ -23,12 +23,12 @@ from residnet.core.names import VELOCITY, nearest
 from residnet.core.samples import Samples
 from residnet.physics.mmg import (
     PARAMETERS,
-    Belief,
     MMGForces,
     MMGHull,
     MMGPropeller,
     MMGRudder,
-    usual_beliefs,
+    Prior,
+    usual_priors,
 )
 from residnet.regression.solutions import Coefficient, Solution
 
@@ -43,7 +43,7 @@ _AXIS = {"X": "u_dot", "R": "u_dot", "t": "u_dot", "Y": "v_dot", "N": "r_dot"}
 class MMGBaseline(ParametricBaseline):
     """nu_dot [..., 3] of the MMG model; theta [34] as `PARAMETERS` names them."""
 
-    def __init__(self, forces: MMGForces, beliefs: Sequence[Belief]) -> None:
+    def __init__(self, forces: MMGForces, beliefs: Sequence[Prior]) -> None:
         super().__init__(torch.tensor([belief.mean for belief in beliefs], dtype=torch.float64))
         self.forces = forces
         self.mean = [belief.mean for belief in beliefs]
@@ -53,16 +53,16 @@ class MMGBaseline(ParametricBaseline):
         """nu_dot [..., 3] at channels z [..., nz]."""
         return self.forces(z, self.theta.to(z.dtype))
 
-    def freedom(self) -> list[float]:
+    def parameter_count(self) -> list[float]:
         """Parameters that are not fixed, by the axis that they are listed under; those of propeller
         and rudder count in every axis.
         """
-        free = [PARAMETERS[i] for i in self.movable().tolist()]
+        free = [PARAMETERS[i] for i in self.free_indices().tolist()]
         return [
             float(sum(axis_of(name) in (f"{axis}_dot", "") for name in free)) for axis in VELOCITY
         ]
 
-    def movable(self) -> Tensor:
+    def free_indices(self) -> Tensor:
         """Numbers of the parameters whose spread is not zero, [P]."""
         return torch.nonzero(torch.tensor(self.spread) > 0).squeeze(1)
 
@@ -70,7 +70,7 @@ class MMGBaseline(ParametricBaseline):
         """d nu_dot / d theta [B, 3, P], by central differences of all parameters at once: as exact
         as needed and 20 times as fast as torch.func.
         """
-        free = self.movable()
+        free = self.free_indices()
         steps = _STEP * torch.tensor(self.spread, dtype=z.dtype)[free]
         moves = torch.zeros(free.numel(), self.theta.numel(), dtype=z.dtype)
         moves[torch.arange(free.numel()), free] = steps
@@ -90,9 +90,9 @@ class MMGBaseline(ParametricBaseline):
             )
         return torch.einsum("bip,biq,i->pq", slopes, slopes, 1.0 / variance) / len(part)
 
-    def belief(self) -> tuple[Tensor, Tensor]:
+    def prior(self) -> tuple[Tensor, Tensor]:
         """Mean and precision [P] as the config gives them."""
-        free = self.movable()
+        free = self.free_indices()
         return (
             torch.tensor(self.mean, dtype=torch.float64)[free],
             torch.tensor(self.spread, dtype=torch.float64)[free] ** -2,
@@ -100,11 +100,11 @@ class MMGBaseline(ParametricBaseline):
 
     def asymmetry(self, samples: Samples) -> Tensor:
         """None: what is asymmetric here has a belief of its own."""
-        return torch.zeros(self.movable().numel(), dtype=torch.float64)
+        return torch.zeros(self.free_indices().numel(), dtype=torch.float64)
 
-    def restated(self, table: Sequence[Coefficient], errors: Tensor) -> list[Coefficient]:
+    def updated_table(self, table: Sequence[Coefficient], errors: Tensor) -> list[Coefficient]:
         """Every parameter as it is now."""
-        known = dict(zip(self.movable().tolist(), errors.tolist(), strict=True))
+        known = dict(zip(self.free_indices().tolist(), errors.tolist(), strict=True))
         return [
             Coefficient(axis_of(name), name, float(self.theta[i]), known.get(i, 0.0))
             for i, name in enumerate(PARAMETERS)
@@ -163,10 +163,10 @@ class MMGConfig(IdentifiedConfig):
         wanted = (*VELOCITY, self.revolutions, self.angle)
         require(names, wanted, "the baseline 'mmg'")
         u, v, r, n, delta = (list(names).index(name) for name in wanted)
-        usual = usual_beliefs(self.hull)
+        usual = usual_priors(self.hull)
         beliefs = [
             (
-                Belief(*self.beliefs[name], usual[name].meaning)
+                Prior(*self.beliefs[name], usual[name].meaning)
                 if name in self.beliefs
                 else usual[name]
             )
@@ -184,7 +184,7 @@ class MMGConfig(IdentifiedConfig):
         """
         assert isinstance(baseline, MMGBaseline)
         chosen = _thinned(of_manoeuvres(samples, self.manoeuvres))
-        free, (mean, precision) = baseline.movable(), baseline.belief()
+        free, (mean, precision) = baseline.free_indices(), baseline.prior()
         count = len(of_manoeuvres(samples, self.manoeuvres)) / self.correlation
         baseline.theta[free] = mean
         for _ in range(20):
@@ -209,6 +209,8 @@ class MMGConfig(IdentifiedConfig):
         errors = torch.linalg.inv(hessian).diagonal().sqrt()
         return [
             Solution(
-                {}, {"theta": baseline.theta.detach().clone()}, tuple(baseline.restated((), errors))
+                {},
+                {"theta": baseline.theta.detach().clone()},
+                tuple(baseline.updated_table((), errors)),
             )
         ]

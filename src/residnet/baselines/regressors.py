@@ -1,5 +1,4 @@
-"""Baselines that are linear in their coefficients: nu_dot = Theta phi(z), with regressors by name.
-"""
+"""Baselines that are linear in their coefficients: nu_dot = Theta phi(z), with regressors by name."""
 
 from __future__ import annotations
 
@@ -54,7 +53,7 @@ class RegressorBaseline(ParametricBaseline):
         weights = self.theta * self.allowed
         return self.library(z) @ weights.to(z.dtype).T
 
-    def freedom(self) -> list[float]:
+    def parameter_count(self) -> list[float]:
         """Coefficients of each axis that are not zero."""
         return [float(count) for count in ((self.theta * self.allowed) != 0).sum(1)]
 
@@ -62,7 +61,7 @@ class RegressorBaseline(ParametricBaseline):
         """Numbers of the terms that an axis has."""
         return [j for j in range(self.library.count) if bool(self.allowed[axis, j] > 0)]
 
-    def movable(self) -> Tensor:
+    def free_indices(self) -> Tensor:
         """Numbers of the coefficients, in theta flattened, that a refit may move, [P]."""
         free = self.allowed > 0
         for axis, column in self.held:
@@ -71,7 +70,7 @@ class RegressorBaseline(ParametricBaseline):
 
     def sensitivity(self, z: Tensor) -> Tensor:
         """d nu_dot / d theta [B, 3, P]: each coefficient moves its own axis by its term."""
-        free = self.movable()
+        free = self.free_indices()
         axis, column = free // self.library.count, free % self.library.count
         out = torch.zeros(z.shape[0], 3, free.numel(), dtype=z.dtype)
         out[:, axis, torch.arange(free.numel())] = self.library(z)[:, column]
@@ -83,12 +82,12 @@ class RegressorBaseline(ParametricBaseline):
         """
         phi, variance = self._residual(samples)
         gram = phi.T @ phi / len(samples)
-        free = self.movable()
+        free = self.free_indices()
         return torch.block_diag(*[gram / variance[axis] for axis in range(3)])[free][:, free]
 
-    def belief(self) -> tuple[Tensor, Tensor]:
+    def prior(self) -> tuple[Tensor, Tensor]:
         """Nothing is thought before."""
-        none = torch.zeros(self.movable().numel(), dtype=torch.float64)
+        none = torch.zeros(self.free_indices().numel(), dtype=torch.float64)
         return none, none
 
     def asymmetry(self, samples: Samples) -> Tensor:
@@ -99,9 +98,9 @@ class RegressorBaseline(ParametricBaseline):
             for axis in range(3)
         ]
         pull = torch.tensor(odd, dtype=torch.float64) * phi.square().mean(0) / variance[:, None]
-        return pull.flatten()[self.movable()]
+        return pull.flatten()[self.free_indices()]
 
-    def restated(self, table: Sequence[Coefficient], errors: Tensor) -> list[Coefficient]:
+    def updated_table(self, table: Sequence[Coefficient], errors: Tensor) -> list[Coefficient]:
         """Coefficients and ratios as theta is now; a ratio keeps its error."""
         terms = self.library.terms
         rows = {
@@ -110,7 +109,7 @@ class RegressorBaseline(ParametricBaseline):
         }
         names = [
             (f"{VELOCITY[i // len(terms)]}_dot", terms[i % len(terms)])
-            for i in self.movable().tolist()
+            for i in self.free_indices().tolist()
         ]
         known = dict(zip(names, errors.tolist(), strict=True))
         return [

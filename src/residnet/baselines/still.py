@@ -23,7 +23,7 @@ class StillBaseline(Baseline):
         """Zeros [..., 3] for channels z [..., nz]."""
         return torch.zeros_like(z[..., :3])
 
-    def freedom(self) -> list[float]:
+    def parameter_count(self) -> list[float]:
         """None."""
         return [0.0, 0.0, 0.0]
 

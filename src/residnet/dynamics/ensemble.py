@@ -30,9 +30,9 @@ class MeanBaseline(Baseline):
             total = total + member(z)
         return total / len(self.members)
 
-    def freedom(self) -> list[float]:
+    def parameter_count(self) -> list[float]:
         """Those of all members."""
-        return _summed([member.freedom() for member in self.members])  # type: ignore[operator]
+        return _summed([member.parameter_count() for member in self.members])  # type: ignore[operator]
 
 
 @final
@@ -71,9 +71,9 @@ class MeanHead(ResidualHead):
             memory.append(member.warmup(z))  # type: ignore[operator]
         return torch.cat(memory, dim=-1)
 
-    def freedom(self) -> list[float]:
+    def parameter_count(self) -> list[float]:
         """Those of all members."""
-        return _summed([member.freedom() for member in self.members])  # type: ignore[operator]
+        return _summed([member.parameter_count() for member in self.members])  # type: ignore[operator]
 
 
 def _summed(counts: Sequence[Sequence[float]]) -> list[float]:
@@ -84,7 +84,7 @@ def mean_of(members: Sequence[HybridDynamics]) -> HybridDynamics:
     """The mean of models with the same signals, step and integrator."""
     first = members[0]
     baseline, head = (
-        MeanBaseline([member.head.carried(member.baseline) for member in members]),
+        MeanBaseline([member.head.effective_baseline(member.baseline) for member in members]),
         MeanHead([member.head for member in members]),
     )
     return HybridDynamics(first.signals, baseline, head, first.dt, first.integrator)

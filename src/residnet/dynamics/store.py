@@ -19,7 +19,7 @@ from residnet.core.names import VELOCITY, nearest
 from residnet.dynamics.base import Integrator
 from residnet.dynamics.ensemble import mean_of
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.heads import ForceHead, HeadConfig, ZeroHead
+from residnet.heads import HeadConfig, ZeroHead
 from residnet.physics.signals import SignalsConfig
 
 
@@ -63,8 +63,7 @@ class ModelSpec(Config):
         signals = self.signals.build()
         head = ZeroHead() if self.head is None else self.head.build(signals.names)
         known = self.baseline.build(signals.names)
-        if isinstance(head, ForceHead):
-            head.stand_on(known.mass())
+        head.set_mass(known.mass())
         return HybridDynamics(signals, known, head, self.dt, self.integrator)
 
     @property

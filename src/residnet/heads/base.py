@@ -47,34 +47,40 @@ class ResidualHead(nn.Module, ABC):
         """
         return known + rho
 
-    def lacking(self, of: Samples, known: Tensor) -> Samples:
+    def residual_target(self, samples: Samples, known: Tensor) -> Samples:
         """Samples whose target is what the baseline's accelerations `known` [N, 3] leave, in the
         space that this head lives in.
         """
-        return of.with_target(of.target - known)
+        return samples.with_target(samples.target - known)
 
-    def carried(self, baseline: nn.Module) -> nn.Module:
+    def set_mass(self, mass: Tensor | None) -> None:
+        """Take the inertia [3, 3] of the baseline, None where it knows no forces; most heads need
+        none.
+
+        Raises:
+            ConfigError: where a head needs one and there is none.
+        """
+
+    def effective_baseline(self, baseline: nn.Module) -> nn.Module:
         """The baseline as this head leaves it, so that nu_dot is its acceleration plus the
         residual.
         """
         return baseline
 
     def warmup(self, z: Tensor) -> Tensor:
-        """Memory [B, n_state] that past channels [B, T, nz] leave, oldest first; zeros where T = 0.
-        """
+        """Memory [B, n_state] that past channels [B, T, nz] leave, oldest first; zeros where T = 0."""
         return torch.zeros(z.shape[0], self.n_state, dtype=z.dtype, device=z.device)
 
     def calibrate(self, samples: Samples) -> None:
-        """Take scales and ranges from the training samples; called once, before anything is fitted.
-        """
+        """Take scales and ranges from the training samples; called once, before anything is fitted."""
 
-    def spread(self) -> Tensor:
+    def residual_std(self) -> Tensor:
         """Spread of the residual on the training samples, [3], float64: what a one-step loss is
         measured in; ones where a head keeps none.
         """
         return torch.ones(3, dtype=torch.float64)
 
-    def freedom(self) -> list[float]:
+    def parameter_count(self) -> list[float]:
         """Number of fitted parameters of each axis: all trained ones, which the axes share."""
         return [float(sum(parameter.numel() for parameter in self.parameters()))] * 3
 
@@ -99,7 +105,7 @@ class ClosedFormHead(ResidualHead):
         self.load_state_dict(first.state, strict=False)
         return first.choice | first.notes
 
-    def freedom(self) -> list[float]:
+    def parameter_count(self) -> list[float]:
         """Number of fitted parameters of each axis: coefficients [J, 3] and intercepts [3] that are
         not zero, where a head says nothing else.
         """
@@ -115,9 +121,8 @@ class EquationHead(ClosedFormHead):
     """A closed-form head that is a sum of few terms."""
 
     @abstractmethod
-    def parts(self, z: Tensor, axis: int) -> dict[str, np.ndarray]:
-        """Every term of one axis times its coefficient along measured channels [T, nz], [T] each.
-        """
+    def contributions(self, z: Tensor, axis: int) -> dict[str, np.ndarray]:
+        """Every term of one axis times its coefficient along measured channels [T, nz], [T] each."""
 
 
 class FeatureConfig(Config):

@@ -65,7 +65,7 @@ class ForceHead(ClosedFormHead):
         self.lowest: Tensor
         self.highest: Tensor
 
-    def stand_on(self, mass: Tensor | None) -> None:
+    def set_mass(self, mass: Tensor | None) -> None:
         """Take the believed mass [3, 3].
 
         Raises:
@@ -79,18 +79,18 @@ class ForceHead(ClosedFormHead):
         self.mass.copy_(mass)
         self.inverse.copy_(torch.linalg.inv(mass))
 
-    def lacking(self, of: Samples, known: Tensor) -> Samples:
+    def residual_target(self, samples: Samples, known: Tensor) -> Samples:
         """Samples over accelerations and channels whose target is the lack-of-fit tau - F(nu_dot,
         nu) = M (nu_dot_0 - nu_dot) (3.20).
         """
-        force = (known - of.target) @ self.mass.T
+        force = (known - samples.target) @ self.mass.T
         return Samples(
-            torch.cat((of.target, of.z), dim=-1),
+            torch.cat((samples.target, samples.z), dim=-1),
             force,
-            of.group,
-            of.t,
-            of.kinds,
-            (*ACCELERATION, *of.names),
+            samples.group,
+            samples.t,
+            samples.kinds,
+            (*ACCELERATION, *samples.names),
         )
 
     def calibrate(self, samples: Samples) -> None:
@@ -119,7 +119,7 @@ class ForceHead(ClosedFormHead):
         found, refused = [], list[FitError]()
         for solution in self.inner.solutions(samples):
             try:
-                found.append(self._carried(solution))
+                found.append(self._with_mass(solution))
             except FitError as error:
                 refused.append(error)
         if refused and not any(
@@ -128,7 +128,7 @@ class ForceHead(ClosedFormHead):
             raise refused[0]
         return found
 
-    def _carried(self, solution: Solution) -> Solution:
+    def _with_mass(self, solution: Solution) -> Solution:
         """A solution with the mass that it makes, in the names of this head's numbers."""
         coefficients = solution.state["coefficients"].clone()
         for j, axis in self.moving.items():
@@ -166,17 +166,17 @@ class ForceHead(ClosedFormHead):
         out: Tensor = self.inner(torch.cat((nu_dot, z), dim=-1), z[..., :0])[0]
         return out
 
-    def carried(self, baseline: nn.Module) -> nn.Module:
+    def effective_baseline(self, baseline: nn.Module) -> nn.Module:
         """The baseline with the mass that this head gives it."""
-        return CarriedBaseline(baseline, self.gain)
+        return AugmentedMassBaseline(baseline, self.gain)
 
-    def freedom(self) -> list[float]:
+    def parameter_count(self) -> list[float]:
         """Number of fitted parameters of each axis."""
-        return self.inner.freedom()
+        return self.inner.parameter_count()
 
 
 @final
-class CarriedBaseline(nn.Module):
+class AugmentedMassBaseline(nn.Module):
     """A baseline's acceleration [..., 3] under another mass: (M + A)^-1 M nu_dot_0."""
 
     def __init__(self, baseline: nn.Module, gain: Tensor) -> None:
@@ -190,6 +190,6 @@ class CarriedBaseline(nn.Module):
         known: Tensor = self.baseline(z)
         return known @ self.gain.to(z.dtype).T
 
-    def freedom(self) -> list[float]:
+    def parameter_count(self) -> list[float]:
         """The baseline's."""
-        return self.baseline.freedom()  # type: ignore[operator]
+        return self.baseline.parameter_count()  # type: ignore[operator]

@@ -106,7 +106,7 @@ def breed(
         products,
         tuple(equation.values.tolist()),
         tuple(equation.errors.tolist()),
-        equation.told(within),
+        equation.summary(within),
     )
 
 
@@ -152,13 +152,12 @@ class GeneticHead(EquationHead):
         """Residual [..., 3] at channels z [..., nz]; the memory is empty."""
         return self.library(self.features.guarded(z)) @ self.weights.values.to(z.dtype), s
 
-    def freedom(self) -> list[float]:
+    def parameter_count(self) -> list[float]:
         """Coefficients of each axis that are not zero."""
         return [float(count) for count in (self.weights.values != 0).sum(0)]
 
-    def parts(self, z: Tensor, axis: int) -> dict[str, np.ndarray]:
-        """Every term of one axis times its coefficient along measured channels [T, nz], [T] each.
-        """
+    def contributions(self, z: Tensor, axis: int) -> dict[str, np.ndarray]:
+        """Every term of one axis times its coefficient along measured channels [T, nz], [T] each."""
         with torch.no_grad():
             values = (
                 self.library(self.features.guarded(z)) * self.weights.values[:, axis].to(z.dtype)

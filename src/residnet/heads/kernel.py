@@ -133,7 +133,7 @@ class KernelHead(ClosedFormHead):
             else torch.cat((x, self.terms(self.features.guarded(z))), dim=-1)
         )
 
-    def freedom(self) -> list[float]:
+    def parameter_count(self) -> list[float]:
         """Effective number of parameters of each axis, the trace of the smoother."""
         return [float(count) for count in self.effective]
 
@@ -202,12 +202,12 @@ class KernelHead(ClosedFormHead):
         coefficients = torch.stack(
             [paths[i].coefficients[j, :, axis] for axis, (i, j) in parts], dim=1
         )
-        effective = torch.stack([paths[i].freedom[j] for _, (i, j) in parts])
+        effective = torch.stack([paths[i].effective[j] for _, (i, j) in parts])
         said, state = self.kernel.chosen([paths[i] for i in pick.settings], coefficients)
         choice = said | {"penalty": [self.penalties[j] for j in pick.penalties]}
         told = notes | {"effective_parameters": effective.tolist()}
 
-        def around() -> list[Solution]:
+        def neighbours() -> list[Solution]:
             moved = [
                 (axis, j + step)
                 for axis, (_, j) in parts
@@ -224,5 +224,5 @@ class KernelHead(ClosedFormHead):
             choice,
             {f"kernel.{name}": value for name, value in state.items()} | {"effective": effective},
             notes=told,
-            around=around if self.by_free_run else None,
+            neighbours=neighbours if self.by_free_run else None,
         )

@@ -209,7 +209,7 @@ class LstmHead(ResidualHead):
             network.features.calibrate(samples)
         self.scale.calibrate(samples)
 
-    def spread(self) -> Tensor:
+    def residual_std(self) -> Tensor:
         """Spread of the residual on the training samples, [3]."""
         return self.scale.spread
 

@@ -62,9 +62,9 @@ class MirroredHead(ResidualHead):
         )
         self.inner.calibrate(both)
 
-    def spread(self) -> Tensor:
+    def residual_std(self) -> Tensor:
         """Spread of the residual on the training samples, [3]."""
-        return self.inner.spread()
+        return self.inner.residual_std()
 
     def both(self, z: Tensor) -> Tensor:
         """Channels and their mirror images, [2 B, ...]."""

@@ -70,7 +70,7 @@ class MlpHead(ResidualHead):
         self.features.calibrate(samples)
         self.scale.calibrate(samples)
 
-    def spread(self) -> Tensor:
+    def residual_std(self) -> Tensor:
         """Spread of the residual on the training samples, [3]."""
         return self.scale.spread
 

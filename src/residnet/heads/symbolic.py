@@ -113,9 +113,8 @@ class SymbolicHead(EquationHead):
         """Memory [B, n_state] that past channels [B, T, nz] leave, oldest first."""
         return self.line.warmup(z.index_select(-1, self.features.index))
 
-    def parts(self, z: Tensor, axis: int) -> dict[str, np.ndarray]:
-        """Every term of one axis times its coefficient along measured channels [T, nz], [T] each.
-        """
+    def contributions(self, z: Tensor, axis: int) -> dict[str, np.ndarray]:
+        """Every term of one axis times its coefficient along measured channels [T, nz], [T] each."""
         with torch.no_grad():
             values = (
                 self.basis(self.line.sequence(z.index_select(-1, self.features.index)))
@@ -293,7 +292,7 @@ class SymbolicHead(EquationHead):
             "c": c_function(
                 written, f"{name} in SI units, valid within the range of the training data{late}"
             ),
-            **equation.told(within),
+            **equation.summary(within),
         }
 
 

@@ -85,7 +85,7 @@ class MMGRudder(Config):
         return 6.13 * self.aspect / (2.25 + self.aspect)
 
 
-class Belief(NamedTuple):
+class Prior(NamedTuple):
     """What is thought of a parameter before any trial: `mean`, standard deviation `sd`, and what
     the parameter is.
     """
@@ -95,7 +95,7 @@ class Belief(NamedTuple):
     meaning: str
 
 
-def usual_beliefs(hull: MMGHull) -> dict[str, Belief]:
+def usual_priors(hull: MMGHull) -> dict[str, Prior]:
     """Every parameter of the model, dimensionless, as one would expect of a merchant ship with
     these particulars.
 
@@ -106,48 +106,48 @@ def usual_beliefs(hull: MMGHull) -> dict[str, Belief]:
     fullness = hull.block * hull.beam / hull.length
     mass = 2.0 * hull.mass / (hull.density * hull.length**2 * hull.draught)
     return {
-        "m_x": Belief(0.022, 0.01, "added mass in surge"),
-        "m_y": Belief(0.2, 0.06, "added mass in sway"),
-        "J_z": Belief(0.011, 0.004, "added moment of inertia in yaw"),
-        "R_0": Belief(0.02, 0.01, "resistance straight ahead"),
-        "X_vv": Belief(0.0, 0.1, "surge force of drift"),
-        "X_vr": Belief(0.0, 0.1, "surge force of drift in a turn, beyond the added mass's"),
-        "X_rr": Belief(0.0, 0.03, "surge force of turning"),
-        "X_vvvv": Belief(0.5, 0.5, "surge force of large drift"),
-        "Y_0": Belief(0.0, 0.005, "sway force of asymmetry"),
-        "Y_v": Belief(-(0.5 * math.pi * k + 1.4 * fullness), 0.15, "sway force of drift"),
-        "Y_r": Belief(mass + 0.022 - 1.5 * fullness, 0.06, "sway force of turning"),
-        "Y_vvv": Belief(-1.0, 1.0, "sway force of large drift"),
-        "Y_vvr": Belief(0.0, 0.8, "sway force of large drift and turning"),
-        "Y_vrr": Belief(0.0, 0.5, "sway force of drift and fast turning"),
-        "Y_rrr": Belief(0.0, 0.05, "sway force of fast turning"),
-        "N_0": Belief(0.0, 0.002, "yaw moment of asymmetry"),
-        "N_v": Belief(-k, 0.05, "yaw moment of drift"),
-        "N_r": Belief(-0.54 * k + k * k, 0.02, "yaw moment of turning"),
-        "N_vvv": Belief(0.0, 0.3, "yaw moment of large drift"),
-        "N_vvr": Belief(0.0, 0.3, "yaw moment of large drift and turning"),
-        "N_vrr": Belief(0.0, 0.1, "yaw moment of drift and fast turning"),
-        "N_rrr": Belief(0.0, 0.02, "yaw moment of fast turning"),
-        "t_P": Belief(0.22, 0.03, "thrust deduction"),
-        "w_P0": Belief(0.4, 0.06, "wake fraction straight ahead"),
-        "C_2p": Belief(
+        "m_x": Prior(0.022, 0.01, "added mass in surge"),
+        "m_y": Prior(0.2, 0.06, "added mass in sway"),
+        "J_z": Prior(0.011, 0.004, "added moment of inertia in yaw"),
+        "R_0": Prior(0.02, 0.01, "resistance straight ahead"),
+        "X_vv": Prior(0.0, 0.1, "surge force of drift"),
+        "X_vr": Prior(0.0, 0.1, "surge force of drift in a turn, beyond the added mass's"),
+        "X_rr": Prior(0.0, 0.03, "surge force of turning"),
+        "X_vvvv": Prior(0.5, 0.5, "surge force of large drift"),
+        "Y_0": Prior(0.0, 0.005, "sway force of asymmetry"),
+        "Y_v": Prior(-(0.5 * math.pi * k + 1.4 * fullness), 0.15, "sway force of drift"),
+        "Y_r": Prior(mass + 0.022 - 1.5 * fullness, 0.06, "sway force of turning"),
+        "Y_vvv": Prior(-1.0, 1.0, "sway force of large drift"),
+        "Y_vvr": Prior(0.0, 0.8, "sway force of large drift and turning"),
+        "Y_vrr": Prior(0.0, 0.5, "sway force of drift and fast turning"),
+        "Y_rrr": Prior(0.0, 0.05, "sway force of fast turning"),
+        "N_0": Prior(0.0, 0.002, "yaw moment of asymmetry"),
+        "N_v": Prior(-k, 0.05, "yaw moment of drift"),
+        "N_r": Prior(-0.54 * k + k * k, 0.02, "yaw moment of turning"),
+        "N_vvv": Prior(0.0, 0.3, "yaw moment of large drift"),
+        "N_vvr": Prior(0.0, 0.3, "yaw moment of large drift and turning"),
+        "N_vrr": Prior(0.0, 0.1, "yaw moment of drift and fast turning"),
+        "N_rrr": Prior(0.0, 0.02, "yaw moment of fast turning"),
+        "t_P": Prior(0.22, 0.03, "thrust deduction"),
+        "w_P0": Prior(0.4, 0.06, "wake fraction straight ahead"),
+        "C_2p": Prior(
             1.3,
             0.25,
             "inflow far aside over inflow straight ahead, drift towards port or turn to starboard",
         ),
-        "C_2n": Belief(1.1, 0.25, "the same, drift towards starboard or turn to port"),
-        "t_R": Belief(0.35, 0.15, "steering resistance deduction"),
-        "a_H": Belief(0.3, 0.2, "sway force that the rudder raises on the hull, over its own"),
-        "x_H": Belief(-0.45, 0.1, "where that force acts, lengths ahead of midship"),
-        "gamma_p": Belief(0.5, 0.2, "flow straightening, inflow from port"),
-        "gamma_n": Belief(0.5, 0.2, "flow straightening, inflow from starboard"),
-        "l_R": Belief(-0.8, 0.3, "where the rudder feels the turning, lengths ahead of midship"),
-        "epsilon": Belief(1.05, 0.2, "wake at the propeller over wake at the rudder"),
-        "kappa": Belief(0.5, 0.1, "how much of the race's acceleration reaches the rudder"),
+        "C_2n": Prior(1.1, 0.25, "the same, drift towards starboard or turn to port"),
+        "t_R": Prior(0.35, 0.15, "steering resistance deduction"),
+        "a_H": Prior(0.3, 0.2, "sway force that the rudder raises on the hull, over its own"),
+        "x_H": Prior(-0.45, 0.1, "where that force acts, lengths ahead of midship"),
+        "gamma_p": Prior(0.5, 0.2, "flow straightening, inflow from port"),
+        "gamma_n": Prior(0.5, 0.2, "flow straightening, inflow from starboard"),
+        "l_R": Prior(-0.8, 0.3, "where the rudder feels the turning, lengths ahead of midship"),
+        "epsilon": Prior(1.05, 0.2, "wake at the propeller over wake at the rudder"),
+        "kappa": Prior(0.5, 0.1, "how much of the race's acceleration reaches the rudder"),
     }
 
 
-PARAMETERS = tuple(usual_beliefs(MMGHull(length=1.0, beam=0.2, draught=0.1, mass=10.0)))
+PARAMETERS = tuple(usual_priors(MMGHull(length=1.0, beam=0.2, draught=0.1, mass=10.0)))
 """Names of the parameters, in the order of the columns of theta."""
 
 

@@ -21,14 +21,14 @@ class Path:
     Attributes:
         coefficients: of the raw features, [C, P, 3].
         errors: mean squared cross-validated errors [C, 3].
-        freedom: effective number of parameters, the trace of the smoother, [C].
+        effective: effective number of parameters, the trace of the smoother, [C].
         sigma: of the kernel, where it has one.
         points: samples that carry the function [P, F], where it has such.
     """
 
     coefficients: Tensor
     errors: Tensor
-    freedom: Tensor
+    effective: Tensor
     sigma: float = 0.0
     points: Tensor = field(default_factory=lambda: torch.zeros(0))
 
@@ -53,7 +53,7 @@ def dual_path(
     values = values.clamp(min=0.0)
     projected = vectors.T @ y
     members = [torch.nonzero(fold == f).squeeze(1) for f in range(folds)]
-    coefficients, errors, freedom = [], [], []
+    coefficients, errors, effective = [], [], []
     for penalty in penalties:
         alpha = vectors @ (projected / (values + penalty)[:, None])
         total = torch.zeros(y.shape[1], dtype=y.dtype)
@@ -64,8 +64,8 @@ def dual_path(
             total += left.square().sum(0)
         coefficients.append(alpha)
         errors.append(total / len(y))
-        freedom.append((values / (values + penalty)).sum())
-    return Path(torch.stack(coefficients), torch.stack(errors), torch.stack(freedom))
+        effective.append((values / (values + penalty)).sum())
+    return Path(torch.stack(coefficients), torch.stack(errors), torch.stack(effective))
 
 
 def primal_path(
@@ -104,8 +104,8 @@ def primal_path(
             (weights, -torch.eye(y.shape[1], dtype=y.dtype).expand(len(penalties), -1, -1)), dim=1
         )
         errors += (own @ joined).square().sum(1)
-    weights, freedom = _weights(_triangle(torch.cat(factors)), y.shape[1], penalties)
-    return Path(whiten @ weights, errors / len(y), freedom)
+    weights, effective = _weights(_triangle(torch.cat(factors)), y.shape[1], penalties)
+    return Path(whiten @ weights, errors / len(y), effective)
 
 
 def _factor(features: Callable[[Tensor], Tensor], whiten: Tensor, x: Tensor, y: Tensor) -> Tensor:

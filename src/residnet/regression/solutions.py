@@ -55,7 +55,7 @@ class Solution:
         state: numbers of the module that was fitted, by name, as in its state_dict.
         table: the same with names and standard errors, where the fit knows them.
         notes: what else there is to say about the fit.
-        around: solutions near this one, made when free runs find it best, to be tried next; None
+        neighbours: solutions near this one, made when free runs find it best, to be tried next; None
             where there are none.
     """
 
@@ -63,4 +63,4 @@ class Solution:
     state: dict[str, Tensor]
     table: tuple[Coefficient, ...] = ()
     notes: dict[str, Any] = field(default_factory=dict)
-    around: Callable[[], Sequence[Solution]] | None = None
+    neighbours: Callable[[], Sequence[Solution]] | None = None

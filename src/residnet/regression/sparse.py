@@ -112,7 +112,7 @@ class Equation:
     alternatives: dict[str, list[str]]
     undecided: dict[str, float]
 
-    def told(self, within: Reduced) -> dict[str, Any]:
+    def summary(self, within: Reduced) -> dict[str, Any]:
         """What the data say about it, among the candidates that were searched: for fit.json."""
         return {
             "error_share": self.share,

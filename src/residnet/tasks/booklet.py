@@ -155,7 +155,7 @@ def drawn(fitted: Fitted, draws: int, seed: int) -> torch.Tensor:
     )
     moves = random * values.clamp(min=0.0).sqrt() @ vectors.T
     theta = baseline.theta.detach().double().flatten().repeat(1 + draws, 1)
-    theta[1:, baseline.movable()] += moves
+    theta[1:, baseline.free_indices()] += moves
     return theta.reshape(1 + draws, *baseline.theta.shape)
 
 

@@ -39,9 +39,9 @@ def choose(
 
     attempt(solutions if len(solutions) > 1 else ())
     centre = _best(tried)
-    while centre is not None and centre[0].around is not None:
+    while centre is not None and centre[0].neighbours is not None:
         seen = [solution.choice for solution, _ in tried]
-        attempt([solution for solution in centre[0].around() if solution.choice not in seen])
+        attempt([solution for solution in centre[0].neighbours() if solution.choice not in seen])
         further = _best(tried)
         if further is centre:
             break
@@ -60,4 +60,4 @@ def _best(tried: Sequence[tuple[Solution, float]]) -> tuple[Solution, float] | N
     """The best of those that others lie around; one that stands alone, such as no residual at all,
     does not end the search.
     """
-    return min((pair for pair in tried if pair[0].around is not None), key=_error, default=None)
+    return min((pair for pair in tried if pair[0].neighbours is not None), key=_error, default=None)

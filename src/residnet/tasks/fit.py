@@ -17,7 +17,7 @@ from residnet.data.simulated.trials import SimulatedTrials
 from residnet.data.sources import DataConfig, MeasuredLogs
 from residnet.documents import StudyName
 from residnet.dynamics.base import Integrator
-from residnet.heads import ForceHead, HeadConfig
+from residnet.heads import HeadConfig
 from residnet.judge.booklet import BookletConfig
 from residnet.judge.config import EvaluationConfig
 from residnet.physics.signals import SignalsConfig
@@ -136,8 +136,7 @@ class FitConfig(Config):
                 baselines[self.base_of.get(key, "baseline")].build(names),
             )
             try:
-                if isinstance(head, ForceHead):
-                    head.stand_on(below.mass())
+                head.set_mass(below.mass())
             except ConfigError as error:
                 raise ValueError(f"heads.{key}: {error}") from None
         if self.current is not None:

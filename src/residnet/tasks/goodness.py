@@ -40,7 +40,11 @@ def write_goodness(
                 f.spec.role,
                 [
                     a + b
-                    for a, b in zip(f.model.baseline.freedom(), f.model.head.freedom(), strict=True)
+                    for a, b in zip(
+                        f.model.baseline.parameter_count(),
+                        f.model.head.parameter_count(),
+                        strict=True,
+                    )
                 ],
                 [
                     part

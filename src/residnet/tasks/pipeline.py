@@ -207,7 +207,7 @@ class Fitter:
             notes["refit"], covariance = refitted.notes, refitted.covariance
             if refitted.offsets.axes:
                 notes["offsets"] = refitted.offsets.table([p.log.name for p in self.train])
-            table = model.baseline.restated(table, refitted.errors)
+            table = model.baseline.updated_table(table, refitted.errors)
         notes |= {"coefficients": [_row(entry) for entry in table], "validation": self.bench(model)}
         notes["seconds"] = round(time.perf_counter() - started, 1)
         return self._keep(Fitted(spec, model, notes, covariance))
@@ -267,7 +267,7 @@ class Fitter:
         (19)) or the force (document 002 (3.20)).
         """
         with torch.no_grad():
-            return model.head.lacking(of, model.baseline(of.z))
+            return model.head.residual_target(of, model.baseline(of.z))
 
     def _train(
         self, name: str, model: HybridDynamics, residual: Samples, seed: int

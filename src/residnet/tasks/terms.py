@@ -45,7 +45,7 @@ def write_terms(file: Path, fitted: Sequence[Fitted], logs: Sequence[Prepared]) 
             z = f.model.signals(x, f.model.signals.prepare(w))
             left = np.where(log.good[:, None], log.nu_dot - f.model.baseline(z).numpy(), np.nan)
         for axis, name in enumerate(ACCELERATION):
-            for term, value in {"target": left[:, axis], **head.parts(z, axis)}.items():
+            for term, value in {"target": left[:, axis], **head.contributions(z, axis)}.items():
                 parts["value"].append(value)
                 parts["t"].append(log.log.t - log.log.t[0])
                 for column, text in (

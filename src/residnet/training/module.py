@@ -117,7 +117,7 @@ class HeadTraining(EpochTraining):
             washout[self.store.depth[starts] == 0] = 0
         counted = take(self.store.good, starts, length) & (torch.arange(length) >= washout[:, None])
         y, w = take(self.store.smooth, starts, length), take(self.store.w, starts, length)
-        spread = self.model.head.spread().to(y.dtype)
+        spread = self.model.head.residual_std().to(y.dtype)
         return one_step_loss(
             self.model, y, w, take(self.store.nu_dot, starts, length), counted, spread
         )

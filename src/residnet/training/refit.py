@@ -61,7 +61,7 @@ class Refitted:
     """What a refit hands back.
 
     Attributes:
-        covariance: of the movable parameters, [P, P]; what offsets leave open is in it.
+        covariance: of the free parameters, [P, P]; what offsets leave open is in it.
         notes: cost before and after, iterations, windows, horizon, independent errors.
         offsets: of each log in the store.
     """
@@ -79,7 +79,7 @@ class Refitted:
 @dataclass(frozen=True)
 class _Problem:
     """Windows x0 [B, 6], w [B, T, m], measured nu [B, T, 3], weights [B, T, 3] (0 or 1/scale);
-    numbers of the movable parameters [P]; precision [P, P] about where least squares put them [P],
+    numbers of the free parameters [P]; precision [P, P] about where least squares put them [P],
     pull to zero [P]; beliefs, mean and precision [P]; count of independent errors per channel; log
     of each window [B]; speed at which offsets are what they are said to be.
     """
@@ -203,7 +203,7 @@ def _descend(
 
 
 def _place(baseline: ParametricBaseline, values: Tensor, active: Tensor) -> None:
-    """Set the movable parameters."""
+    """Set the free parameters."""
     with torch.no_grad():
         flat = baseline.theta.detach().clone().flatten()
         flat[active] = values
@@ -231,9 +231,9 @@ def _problem(
     usable = take(store.usable, starts + 1, steps).to(scales.dtype).unsqueeze(-1)
     # r comes from a gyro, which a frozen position does not disturb
     weight = torch.cat((usable, usable, torch.ones_like(usable)), dim=-1) / scales
-    active = baseline.movable()
+    active = baseline.free_indices()
     covered = (starts[:, None] + torch.arange(1, steps + 1)).unique().numel()
-    believed, belief = baseline.belief()
+    believed, belief = baseline.prior()
     return _Problem(
         store.y[starts],
         take(store.w, starts, steps),

@@ -45,12 +45,12 @@ class Shifted(Baseline):
         """Square of the speed over that at which the values hold, [B, 1]."""
         return z[:, :2].square().sum(1, keepdim=True) / self.speed**2
 
-    def freedom(self) -> list[float]:
+    def parameter_count(self) -> list[float]:
         """Parameters of each axis; the offsets are no part of the model."""
-        return self.baseline.freedom()
+        return self.baseline.parameter_count()
 
     def sensitivity(self, z: Tensor) -> Tensor:
-        """Derivative of nu_dot [B, 3, P + a] with respect to the baseline's movable parameters and
+        """Derivative of nu_dot [B, 3, P + a] with respect to the baseline's free parameters and
         to the row's own offsets.
         """
         return torch.cat(

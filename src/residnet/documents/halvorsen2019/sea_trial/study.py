@@ -217,7 +217,7 @@ def _found(config: BlackConfig, trial: Trial, own: np.ndarray) -> Fitted:
         predicted = head(trial.samples.z, trial.samples.z[:, :0])[0].numpy()
     return Fitted(
         predicted,
-        tuple(head.freedom()),
+        tuple(head.parameter_count()),
         {"equations": {axis: own["text"] for axis, own in notes["equations"].items()}},
     )
 
