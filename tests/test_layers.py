@@ -30,6 +30,7 @@ LAYERS = [
     {"runs"},
     {"documents"},
     {"tasks"},
+    {"terminal"},
     {"cli", "__main__"},
 ]
 ALLOWED = {("__main__", "cli")}

@@ -1,16 +1,19 @@
-"""The command line. Imports stay inside the commands: `residnet --help` must not wait for PyTorch.
-"""
+"""The command line. Imports stay inside the commands: `residnet --help` must not wait for PyTorch."""
 
 from __future__ import annotations
 
 import os
 import sys
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from residnet.core.errors import ResidnetError
+from residnet.terminal import drawn_progress
+
+if TYPE_CHECKING:
+    from residnet.runs.task import Finished
 
 app = typer.Typer(
     name="residnet",
@@ -49,11 +52,15 @@ def run(
     ] = False,
 ) -> None:
     """Carry out a run: fit, evaluate, report and export, or any other task."""
+    from residnet.runs.task import Finished
     from residnet.tasks import load_task
 
     _limit_threads()
     task = load_task(config, overrides or [])
-    task.run(source=config, overrides=overrides or [], out=out, resume=resume)
+    with drawn_progress():
+        finished = task.run(source=config, overrides=overrides or [], out=out, resume=resume)
+    if isinstance(finished, Finished):
+        _show(finished)
 
 
 @app.command()
@@ -180,6 +187,18 @@ def list_names(
 
     for name, about in catalogue(what):
         print(f"{name:28s} {about}")
+
+
+def _show(finished: Finished) -> None:
+    """Print what a run found, and where it stands."""
+    if finished.outcome.table:
+        print(finished.outcome.table)
+    for sentence in finished.outcome.verdict:
+        print(sentence)
+    for file in finished.exports:
+        print(f"exported: {file}")
+    if finished.folder.report.is_file():
+        print(f"report: {finished.folder.report}")
 
 
 def _limit_threads() -> None:

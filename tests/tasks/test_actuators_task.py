@@ -139,7 +139,7 @@ def test_one_direction_only_and_no_test(
     table[table["rpm"] > 0].to_csv(tmp_path / "bollard.csv", index=False)
     assert call(monkeypatch, "run", written(tmp_path, config), "--out", tmp_path / "run") == 1
     assert "bollard pull astern: 0 points" in capsys.readouterr().err
-    assert not (tmp_path / "run").exists()
+    assert not (tmp_path / "run" / "summary.json").exists()
     empty = {key: config[key] for key in ("task", "name")}
     assert call(monkeypatch, "check", written(tmp_path, empty)) == 2
     assert "no test is named" in capsys.readouterr().err

@@ -1,35 +1,51 @@
-"""The run folder: what a run leaves behind, and what other programs may rely on (DESIGN section 5).
-"""
+"""The run folder: what a run leaves behind, and what other programs may rely on."""
 
 from __future__ import annotations
 
-import hashlib
 import json
-import platform
-import subprocess
-import sys
-import time
+import shutil
 from collections.abc import Mapping, Sequence
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from residnet import __version__
 from residnet.core.errors import UsageError
 
-_PACKAGES = ("torch", "lightning", "numpy", "scipy", "pandas", "scikit-learn", "pydantic", "pyarrow", "safetensors")
+SUMMARY = "residnet.summary/1"
+"""Schema of summary.json."""
+
+_BEFORE_RESULTS = {"resolved.yaml", "provenance.json", "doctor.json", "data_quality.json"}
+"""Files that a run writes before its first result; a folder of these alone may be used again."""
 
 
 class RunFolder:
-    """Paths and writers of one run; every file is written beside its place and then put there,
-    whole.
+    """The folder of one run: its paths, and writers that put a file in its place whole or not at
+    all.
+
+    Attributes:
+        path: the folder itself.
+        resolved: the complete configuration, with every default and in SI units.
+        provenance: versions, seed, revision and the SHA-256 of every input file.
+        summary: task, finished mark, verdict and main figures.
+        report: the page for people.
+        metrics: free-run errors of a fit, or what the task compares.
+        models: one folder for each model.
+        figures: pictures of the report.
+        rollouts: stored free runs by split.
+        exports: models for controllers.
+        data_quality: what each log contributes.
+        residuals: residual targets and predictions.
+        limits: where models fail, and what limits them.
+        goodness: goodness of fit of the regressions.
+        booklet: standard manoeuvres of the identified model.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.resolved = path / "resolved.yaml"
-        self.metrics = path / "metrics.json"
+        self.provenance = path / "provenance.json"
+        self.summary = path / "summary.json"
         self.report = path / "report.html"
+        self.metrics = path / "metrics.json"
         self.models = path / "models"
         self.figures = path / "figures"
         self.rollouts = path / "rollouts"
@@ -41,102 +57,154 @@ class RunFolder:
         self.booklet = path / "booklet.json"
 
     @classmethod
-    def create(cls, path: Path, resolved: str, *, resume: bool) -> RunFolder:
-        """Make a new folder, or take up an unfinished one with the same configuration.
+    def create(
+        cls, path: Path, resolved: str, *, resume: bool = False, overwrite: bool = False
+    ) -> RunFolder:
+        """Make the folder of a run, or take up one that is there.
+
+        A folder that an earlier run left without any result is used again.
+
+        Args:
+            path: the folder.
+            resolved: text of the complete configuration.
+            resume: continue a run of the same configuration.
+            overwrite: remove what an earlier run left.
 
         Raises:
-            UsageError: where the folder exists and is not to be resumed, or was made by another
+            UsageError: where the folder exists and may not be used, or holds a run of another
                 configuration.
         """
         folder = cls(path)
-        if folder.resolved.is_file() and resume:
+        if resume and overwrite:
+            raise UsageError(f"{path}: give --resume or --overwrite, not both")
+        if resume and folder.resolved.is_file() and folder._has_results():
             if folder.resolved.read_text() != resolved:
                 raise UsageError(
-                    f"{path}: was made with another configuration ({folder.resolved} differs); resume with the same one or give another --out"
+                    f"{path}: was made with another configuration ({folder.resolved} differs);"
+                    " resume with the same one or give another --out"
                 )
+            # what is done again must not look finished meanwhile
+            folder.summary.unlink(missing_ok=True)
             return folder
-        if path.exists() and (not path.is_dir() or any(path.iterdir())):
-            raise UsageError(f"{path}: exists already; give another --out, remove it, or continue it with --resume")
+        if path.exists() and not path.is_dir():
+            raise UsageError(f"{path}: exists already and is no folder; give another --out")
+        if path.is_dir() and folder._has_results():
+            folder._make_way(overwrite)
         path.mkdir(parents=True, exist_ok=True)
         folder.write(folder.resolved, resolved)
         return folder
 
     @classmethod
     def open(cls, path: Path) -> RunFolder:
-        """A finished run.
+        """Open the folder of a finished run.
 
         Raises:
-            UsageError: where there is none.
+            UsageError: where there is no run, or it is not finished.
         """
         folder = cls(path)
         if not folder.resolved.is_file():
             raise UsageError(f"{path}: not a run folder (no resolved.yaml)")
-        if not folder.metrics.is_file():
-            raise UsageError(f"{path}: the run is not finished (no metrics.json); continue it with residnet run CONFIG --out {path} --resume")
+        if not (folder.finished or folder.metrics.is_file()):
+            raise UsageError(
+                f"{path}: the run is not finished (summary.json does not say so); continue it with"
+                f" residnet run CONFIG --out {path} --resume"
+            )
         return folder
+
+    @property
+    def finished(self) -> bool:
+        """Whether the run came to its end."""
+        return self.summary.is_file() and bool(self.read_summary().get("finished"))
 
     def write(self, path: Path, text: str) -> None:
         """Write a text file, whole or not at all."""
         path.parent.mkdir(parents=True, exist_ok=True)
         partial = path.with_name(path.name + ".partial")
-        partial.write_text(text)
+        partial.write_text(text, encoding="utf-8")
         partial.replace(path)
 
     def write_json(self, path: Path, content: Any) -> None:
         """Write JSON that every reader takes (no NaN)."""
         self.write(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
 
-    def write_provenance(self, *, config: Path, overrides: Sequence[str], seed: int, files: Sequence[Path], started: float) -> None:
-        """Who made this run, with what, from which files."""
+    def write_summary(
+        self,
+        task: str,
+        verdict: Sequence[str],
+        figures: Mapping[str, Mapping[str, Any]],
+        *,
+        finished: bool,
+    ) -> None:
+        """Write summary.json; its `finished` is the mark that the run came to its end."""
         content = {
-            "residnet": __version__,
-            "command": sys.argv,
-            "config": str(config),
-            "overrides": list(overrides),
-            "seed": seed,
-            "git": git_revision(),
-            "python": platform.python_version(),
-            "machine": f"{platform.system()} {platform.machine()}",
-            "packages": {name: _version(name) for name in _PACKAGES},
-            "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(started)),
-            "seconds": round(time.time() - started, 1),
-            "inputs": {str(path): sha256(path) for path in files},
+            "schema": SUMMARY,
+            "task": task,
+            "finished": finished,
+            "verdict": list(verdict),
+            "figures": {name: dict(figure) for name, figure in figures.items()},
         }
-        self.write_json(self.path / "provenance.json", content)
+        self.write_json(self.summary, content)
+
+    def write_provenance(
+        self,
+        *,
+        config: Path,
+        overrides: Sequence[str],
+        seed: int,
+        files: Sequence[Path],
+        started: float,
+    ) -> None:
+        """Write who made this run, with what, from which files."""
+        from residnet.runs.provenance import Provenance
+
+        Provenance(config, overrides, seed, files, started).write(self)
+
+    def read_summary(self) -> Mapping[str, Any]:
+        """Return the contents of summary.json.
+
+        Raises:
+            UsageError: where the file is not readable.
+        """
+        return self._read(self.summary)
 
     def read_metrics(self) -> Mapping[str, Any]:
-        """Contents of metrics.json."""
-        content: Mapping[str, Any] = json.loads(self.metrics.read_text())
-        return content
+        """Return the contents of metrics.json.
+
+        Raises:
+            UsageError: where there is no such file, or it is not readable.
+        """
+        return self._read(self.metrics)
 
     def fit_notes(self, model: str) -> dict[str, Any]:
-        """What models/<model>/fit.json says about a model's fit; empty where there is none."""
+        """Return what models/<model>/fit.json tells of a model's fit; empty where there is none."""
         path = self.models / model / "fit.json"
-        content: dict[str, Any] = json.loads(path.read_text()) if path.is_file() else {}
+        return dict(self._read(path)) if path.is_file() else {}
+
+    def _read(self, path: Path) -> Mapping[str, Any]:
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            raise UsageError(f"{path}: no such file; is {self.path} a finished run?") from None
+        except (OSError, ValueError) as error:
+            raise UsageError(f"{path}: not readable as JSON ({error})") from None
+        if not isinstance(content, dict):
+            raise UsageError(f"{path}: expected a JSON object, found {type(content).__name__}")
         return content
 
+    def _has_results(self) -> bool:
+        return any(entry.name not in _BEFORE_RESULTS for entry in self.path.iterdir()) or (
+            # without a configuration the files are somebody else's
+            any(self.path.iterdir()) and not self.resolved.is_file()
+        )
 
-def sha256(path: Path) -> str:
-    """Hexadecimal SHA-256 of a file."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def git_revision() -> str | None:
-    """Revision of the checkout that residnet runs from, with `+changes` where it is not clean; None
-    outside a checkout.
-    """
-    here = Path(__file__).parent
-    try:
-        revision = subprocess.run(["git", "rev-parse", "HEAD"], cwd=here, capture_output=True, text=True, timeout=10, check=True).stdout.strip()
-        dirty = subprocess.run(["git", "status", "--porcelain"], cwd=here, capture_output=True, text=True, timeout=10, check=True).stdout.strip()
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return revision + ("+changes" if dirty else "")
-
-
-def _version(name: str) -> str | None:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return None
+    def _make_way(self, overwrite: bool) -> None:
+        if not self.resolved.is_file():
+            raise UsageError(
+                f"{self.path}: exists already and is not the folder of a run; give another --out"
+            )
+        if not overwrite:
+            raise UsageError(
+                f"{self.path}: exists already; give another --out, continue it with --resume, or"
+                " replace it with --overwrite"
+            )
+        shutil.rmtree(self.path)

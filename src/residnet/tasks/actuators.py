@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -13,7 +12,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from residnet.core.config import Config, ExistingPath, dump_config
+from residnet.core.config import Config, ExistingPath
 from residnet.core.errors import DataError, UsageError
 from residnet.core.names import nearest, to_si
 from residnet.physics.actuators.identify import (
@@ -24,7 +23,9 @@ from residnet.physics.actuators.identify import (
     fit_throttle,
     fit_thrust,
 )
+from residnet.report.plain_page import Part
 from residnet.runs.folder import RunFolder
+from residnet.runs.task import MainFigure, Outcome, Task
 
 
 class Column(Config):
@@ -102,18 +103,15 @@ class BollardTest(_Test):
         return self
 
 
-class ActuatorsTaskConfig(Config):
+class ActuatorsTaskConfig(Task):
     """Throttle map, rate limit and thrust curves from tests of the actuators, as lines for a vessel
     file.
 
     Attributes:
-        name: of the run.
         throttle, step, bollard: the tests; at least one.
     """
 
     task: Literal["actuators"]
-    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")
-    description: str = ""
     throttle: ThrottleTest | None = None
     step: StepTest | None = None
     bollard: BollardTest | None = None
@@ -137,15 +135,18 @@ class ActuatorsTaskConfig(Config):
         """
         _Logs(self)
 
-    def run(
-        self, *, source: Path, overrides: Sequence[str], out: Path | None, resume: bool
-    ) -> RunFolder:
-        """Identify, then write actuators.yaml, actuators.json and a figure.
+    def input_files(self) -> list[Path]:
+        """Return all logs."""
+        return self.files()
+
+    def carry_out(self, folder: RunFolder) -> Outcome:
+        """Identify the actuators, and write actuators.yaml, actuators.json and a figure.
 
         Raises:
             ResidnetError: where the logs cannot be used or do not determine the actuators.
         """
-        started = time.time()
+        from residnet.report.figures.actuators import draw_actuators
+
         logs = _Logs(self)
         throttle = fit_throttle(logs.throttle[0], logs.throttle[1]) if logs.throttle else None
         step = fit_step(logs.steps) if logs.steps else None
@@ -154,20 +155,35 @@ class ActuatorsTaskConfig(Config):
             if self.bollard is not None and logs.bollard
             else None
         )
-        folder = RunFolder.create(out or Path("runs") / self.name, dump_config(self), resume=resume)
         text = vessel_lines(self, throttle, step, thrust)
         folder.write(folder.path / "actuators.yaml", text)
         folder.write_json(folder.path / "actuators.json", _numbers(throttle, step, thrust))
-        from residnet.report.figures.actuators import draw_actuators
-
         draw_actuators(folder.figures / "actuators.png", self, logs, throttle, step, thrust)
-        folder.write_provenance(
-            config=source, overrides=overrides, seed=0, files=self.files(), started=started
-        )
-        print(
-            text + f"written: {folder.path / 'actuators.yaml'}, {folder.figures / 'actuators.png'}"
-        )
-        return folder
+        figures = {}
+        if throttle is not None:
+            figures["n_max"] = MainFigure(throttle.n_max.value, "1/s")
+        if step is not None:
+            figures["n_rate"] = MainFigure(step.rate.value, "1/s^2")
+            figures["dead_time"] = MainFigure(step.dead_time.value, "s")
+        tests = [
+            name
+            for name, found in (
+                ("throttle map", throttle),
+                ("step response", step),
+                ("thrust curves", thrust),
+            )
+            if found is not None
+        ]
+        verdict = [
+            f"The tests gave {' and '.join(tests)}; actuators.yaml holds the lines for a vessel"
+            " file."
+        ]
+        return Outcome(verdict, figures, text)
+
+    @classmethod
+    def report_sections(cls, run: RunFolder) -> Sequence[Part]:
+        """Return the lines for a vessel file; the figure is that of the run."""
+        return [Part("", (run.path / "actuators.yaml").read_text(), "Lines of a vessel file")]
 
 
 class _Logs:

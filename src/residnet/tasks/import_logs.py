@@ -1,38 +1,36 @@
-"""Task `import`: recordings of any format to canonical logs, with what was noticed on the way in.
-"""
+"""Task `import`: recordings of any format to canonical logs, with what was noticed on the way in."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import Field
 
-from residnet.core.config import Config, ConfigPath, dump_config
+from residnet.core.config import ConfigPath
 from residnet.core.errors import ConfigError, UsageError
 from residnet.core.log import Log
 from residnet.core.names import nearest
+from residnet.core.progress import report
 from residnet.data.readers import ReaderConfig
 from residnet.data.readers.files import files_of
+from residnet.report.plain_page import Part
 from residnet.runs.folder import RunFolder
+from residnet.runs.task import MainFigure, Outcome, Task
 
 
-class ImportConfig(Config):
+class ImportConfig(Task):
     """Recordings read once and kept as logs/<name>.parquet; findings.json says what was noticed and
     mended.
 
     Attributes:
-        name: of the run.
         reader: how the recordings are read.
         root: folder that `logs` start from; the current folder where not given.
         logs: files, folders (for readers of folders) or patterns such as `raw_*`.
     """
 
     task: Literal["import"]
-    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")
-    description: str = ""
     reader: ReaderConfig
     root: ConfigPath | None = None
     logs: tuple[str, ...] = Field(min_length=1)
@@ -45,38 +43,45 @@ class ImportConfig(Config):
         """
         self._paths()
 
-    def run(
-        self, *, source: Path, overrides: Sequence[str], out: Path | None, resume: bool
-    ) -> RunFolder:
-        """Read, write logs and findings, print one line for each log and each finding above a note.
+    def input_files(self) -> list[Path]:
+        """Return the files of all recordings."""
+        return [file for path in self._paths() for file in files_of(path)]
+
+    def carry_out(self, folder: RunFolder) -> Outcome:
+        """Read the recordings, and write logs and findings.
 
         Raises:
-            UsageError: where the run folder exists or a recording, topic or package is missing.
+            UsageError: where a recording, topic or package is missing.
             DataError: where a recording cannot be used; those before it have been written.
         """
-        started = time.time()
         paths = self._paths()
-        folder = RunFolder.create(out or Path("runs") / self.name, dump_config(self), resume=resume)
         reader = self.reader.build()
         findings: dict[str, Any] = {}
-        for path in paths:
+        lines: list[str] = []
+        for number, path in enumerate(paths):
+            report("reading recordings", number, len(paths))
             log = reader.read(path)
             _write(log, folder)
             findings[log.name] = log.meta.get("findings", [])
-            print("\n".join(_lines(log)), flush=True)
+            lines += _lines(log)
+        report("reading recordings", len(paths), len(paths))
         folder.write_json(folder.path / "findings.json", findings)
-        folder.write_provenance(
-            config=source,
-            overrides=overrides,
-            seed=0,
-            files=[file for path in paths for file in files_of(path)],
-            started=started,
+        folder.write(folder.path / "import.txt", "\n".join(lines) + "\n")
+        loud = sum(
+            any(finding["level"] != "note" for finding in found) for found in findings.values()
         )
-        print(
-            f"{folder.path}: {len(paths)} log{'s' if len(paths) > 1 else ''} in"
-            f" {folder.path / 'logs'}, findings in findings.json"
-        )
-        return folder
+        verdict = [
+            f"{len(paths)} recording{'s were' if len(paths) > 1 else ' was'} read;"
+            f" {loud or 'none'} of them {'have findings' if loud != 1 else 'has findings'} that"
+            " need a look."
+        ]
+        figures = {"logs": MainFigure(len(paths)), "logs_with_findings": MainFigure(loud)}
+        return Outcome(verdict, figures, "\n".join(lines))
+
+    @classmethod
+    def report_sections(cls, run: RunFolder) -> Sequence[Part]:
+        """Return what was read, and what was noticed on the way in."""
+        return [Part("", (run.path / "import.txt").read_text(), "Recordings")]
 
     def _paths(self) -> list[Path]:
         root = self.root or Path.cwd()

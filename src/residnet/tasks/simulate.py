@@ -4,39 +4,36 @@ indices and figures.
 
 from __future__ import annotations
 
-import sys
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
-from pydantic import Field, model_validator
+from pydantic import model_validator
 
-from residnet.core.config import Config, dump_config
-from residnet.core.errors import DataError
+from residnet.core.progress import say
 from residnet.data.simulated.flying import Craft, Flight
 from residnet.data.simulated.trials import SimulatedTrials, fly_trials, trials_craft
 from residnet.manoeuvres import Replay
 from residnet.physics.vessel import load_vessel
+from residnet.report.plain_page import Part
 from residnet.runs.folder import RunFolder
+from residnet.runs.task import ComputingTask, MainFigure, Outcome
 from residnet.tasks.programme import Programme
 
-_PRINTED = 24
+_SHOWN = 24
+"""Manoeuvres whose indices are shown on the terminal; more stand in a file."""
 
 
-class SimulateConfig(Config):
+class SimulateConfig(ComputingTask):
     """Simulated trials with their indices and figures; give `programme` or `data`.
 
     Attributes:
-        name: of the run.
         programme: a list of manoeuvres on a vessel, a learned model, or both: logs/<log>.parquet,
             those of a model beside a vessel in model_logs.
         data: trials as the task `fit` draws and splits them: logs/<split>/<log>.parquet.
     """
 
     task: Literal["simulate"]
-    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")
-    description: str = ""
     programme: Programme | None = None
     data: SimulatedTrials | None = None
 
@@ -59,23 +56,36 @@ class SimulateConfig(Config):
         if self.programme is not None:
             self.programme.check()
 
-    def run(
-        self, *, source: Path, overrides: Sequence[str], out: Path | None, resume: bool
-    ) -> RunFolder:
-        """Fly, write logs, indices and figures, print the indices.
+    def input_files(self) -> list[Path]:
+        """Return the logs that are replayed, and the files of the learned model."""
+        if self.programme is None:
+            return []
+        files = [
+            manoeuvre.log
+            for manoeuvre in self.programme.manoeuvres
+            if isinstance(manoeuvre, Replay)
+        ]
+        model = self.programme.model
+        if model is None:
+            return files
+        return [*files, *sorted((model.run / "models" / model.chosen).glob("model.*"))]
+
+    def recorded_seed(self) -> int:
+        """Return the seed of everything random in the trials."""
+        given = self.programme or self.data
+        assert given is not None
+        return given.seed
+
+    def carry_out(self, folder: RunFolder) -> Outcome:
+        """Fly the manoeuvres, and write logs, indices and figures.
 
         Raises:
-            UsageError: where the folder exists or something cannot fly the manoeuvres.
-            DataError: where a manoeuvre of the list did not reach its stop condition; everything
-                has been written by then.
+            UsageError: where something cannot fly the manoeuvres.
         """
         from residnet.judge.index_table import contents, index_rows, table
         from residnet.report.figures.flights import draw_flights
 
-        started = time.time()
-        self.check()
-        folder = RunFolder.create(out or Path("runs") / self.name, dump_config(self), resume=resume)
-        flown, places, length, seed = (
+        flown, places, length = (
             self._drawn() if self.programme is None else self._listed(self.programme)
         )
         count = 0
@@ -88,25 +98,28 @@ class SimulateConfig(Config):
         folder.write_json(folder.path / "indices.json", contents(self.name, length, rows))
         text = table(rows)
         folder.write(folder.path / "indices.txt", text + "\n")
-        figures = draw_flights(folder.figures, {craft.name: flights for craft, flights in flown})
-        folder.write_provenance(
-            config=source, overrides=overrides, seed=seed, files=self._files(), started=started
+        draw_flights(folder.figures, {craft.name: flights for craft, flights in flown})
+        faults = [row for row in rows if row["fault"]]
+        verdict = [
+            f"{count} manoeuvres were flown by {' and '.join(craft.name for craft, _ in flown)};"
+            " their logs are in the folder logs."
+        ]
+        verdict += [f"{row['craft']}, {row['log']}: {row['fault']}." for row in faults[:5]]
+        return Outcome(
+            verdict,
+            {"logs": MainFigure(count), "flights_with_a_fault": MainFigure(len(faults))},
+            text if len(rows) <= _SHOWN else f"indices of {len(rows)} manoeuvres: indices.txt",
+            self._failure(flown),
         )
-        print(
-            text
-            if len(rows) <= _PRINTED
-            else f"indices of {len(rows)} manoeuvres: {folder.path / 'indices.txt'}"
-        )
-        print(
-            f"{count} logs in {folder.path / 'logs'}, indices in {folder.path / 'indices.json'},"
-            f" {len(figures)} figures in {folder.figures}"
-        )
-        self._report_faults(flown)
-        return folder
+
+    @classmethod
+    def report_sections(cls, run: RunFolder) -> Sequence[Part]:
+        """Return the table of manoeuvring indices; the figures are those of the run."""
+        return [Part("", (run.path / "indices.txt").read_text(), "Manoeuvring indices")]
 
     def _drawn(
         self,
-    ) -> tuple[list[tuple[Craft, list[Flight]]], dict[str, list[Flight]], float, int]:
+    ) -> tuple[list[tuple[Craft, list[Flight]]], dict[str, list[Flight]], float]:
         assert self.data is not None
         manoeuvres = self.data.draw()
         flights = fly_trials(manoeuvres, self.data)
@@ -117,48 +130,34 @@ class SimulateConfig(Config):
             [(trials_craft(self.data), flights)],
             places,
             load_vessel(self.data.vessel).length.value,
-            self.data.seed,
         )
 
     def _listed(
         self, programme: Programme
-    ) -> tuple[list[tuple[Craft, list[Flight]]], dict[str, list[Flight]], float | None, int]:
+    ) -> tuple[list[tuple[Craft, list[Flight]]], dict[str, list[Flight]], float | None]:
         flown = [(craft, programme.fly(craft, sea)) for craft, sea in programme.crafts()]
         places = dict(zip(("logs", "model_logs"), (flights for _, flights in flown), strict=False))
-        return flown, places, programme.hull_length, programme.seed
+        return flown, places, programme.hull_length
 
-    def _files(self) -> list[Path]:
-        if self.programme is None:
-            return []
-        files = [
-            manoeuvre.log
-            for manoeuvre in self.programme.manoeuvres
-            if isinstance(manoeuvre, Replay)
-        ]
-        model = self.programme.model
-        return (
-            files
-            if model is None
-            else [*files, *sorted((model.run / "models" / model.chosen).glob("model.*"))]
-        )
+    def _failure(self, flown: Sequence[tuple[Craft, Sequence[Flight]]]) -> str:
+        """Return a line where flights did not end as they should.
 
-    def _report_faults(self, flown: Sequence[tuple[Craft, Sequence[Flight]]]) -> None:
-        """Name the flights that did not end as they should; only those that the config lists are an
-        error.
+        Flights that were drawn at random may do so; only those that the config lists are a failure.
         """
         listed = len(self.programme.manoeuvres) if self.programme is not None else 0
-        faults = [
-            (i < listed, f"{craft.name}, {f.log.name}: {f.fault}")
-            for craft, flights in flown
-            for i, f in enumerate(flights)
-            if f.fault
-        ]
-        wrong = [fault for own, fault in faults if own]
-        for fault in [fault for own, fault in faults if not own] + wrong[:-1]:
-            print(f"residnet: {fault}", file=sys.stderr)
-        if wrong:
-            flights_count = sum(len(flights) for _, flights in flown)
-            raise DataError(
-                f"{wrong[-1]} ({len(wrong)} of {flights_count} flights did not end as they should;"
-                " give more duration, drive or steer)"
-            )
+        failures: list[str] = []
+        for craft, flights in flown:
+            for number, flight in enumerate(flights):
+                if not flight.fault:
+                    continue
+                line = f"{craft.name}, {flight.log.name}: {flight.fault}"
+                say(line)
+                if number < listed:
+                    failures.append(line)
+        if not failures:
+            return ""
+        count = sum(len(flights) for _, flights in flown)
+        return (
+            f"{failures[-1]} ({len(failures)} of {count} flights did not end as they should; give"
+            " more duration, drive or steer)"
+        )

@@ -1,21 +1,15 @@
-"""The run folder: whose it is, what it records, and that nothing half written stands in it."""
+"""The run folder: whose it is, and that nothing half written stands in it."""
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
-import platform
-import subprocess
-import time
 from pathlib import Path
 
 import pytest
 
-import residnet.runs.folder as folder_module
-from residnet import __version__
 from residnet.core.errors import UsageError
-from residnet.runs.folder import RunFolder, git_revision, sha256
+from residnet.runs.folder import RunFolder
 
 
 def one_line(wanted: str, path: Path, resolved: str = "a: 1\n", *, resume: bool = False) -> None:
@@ -39,13 +33,42 @@ def test_a_new_folder_holds_the_configuration(tmp_path: Path) -> None:
 
 def test_a_folder_is_taken_up_only_by_its_own_configuration(tmp_path: Path) -> None:
     path = tmp_path / "run"
-    RunFolder.create(path, "a: 1\n", resume=False)
+    folder = RunFolder.create(path, "a: 1\n", resume=False)
     (path / "kept.txt").write_text("mine")
+    folder.write_summary("fit", [], {}, finished=True)
     one_line("exists already; give another --out", path)
     one_line("was made with another configuration", path, "a: 2\n", resume=True)
+    assert RunFolder(path).finished
     assert RunFolder.create(path, "a: 1\n", resume=True).path == path
     assert (path / "kept.txt").read_text() == "mine"
     assert (path / "resolved.yaml").read_text() == "a: 1\n"
+    assert not RunFolder(path).finished, "a run that is taken up does not look finished"
+
+
+def test_a_folder_without_results_is_used_again(tmp_path: Path) -> None:
+    path = tmp_path / "run"
+    folder = RunFolder.create(path, "a: 1\n")
+    folder.write_json(folder.provenance, {})
+    assert RunFolder.create(path, "a: 2\n").resolved.read_text() == "a: 2\n"
+    folder.write_json(folder.models / "zero" / "fit.json", {})
+    one_line("exists already", path, "a: 2\n")
+
+
+def test_a_run_is_replaced_where_that_is_asked_for(tmp_path: Path) -> None:
+    path = tmp_path / "run"
+    (RunFolder.create(path, "a: 1\n").path / "old.txt").write_text("old")
+    folder = RunFolder.create(path, "a: 2\n", overwrite=True)
+    assert [entry.name for entry in path.iterdir()] == ["resolved.yaml"]
+    assert folder.resolved.read_text() == "a: 2\n"
+    with pytest.raises(UsageError, match="not both"):
+        RunFolder.create(path, "a: 2\n", overwrite=True, resume=True)
+    # a folder of somebody else's files is never removed
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "notes.txt").write_text("precious")
+    with pytest.raises(UsageError, match="not the folder of a run"):
+        RunFolder.create(other, "a: 2\n", overwrite=True)
+    assert (other / "notes.txt").read_text() == "precious"
 
 
 def test_what_is_no_run_is_left_alone(tmp_path: Path) -> None:
@@ -67,8 +90,32 @@ def test_open_wants_a_finished_run(tmp_path: Path) -> None:
     folder = RunFolder.create(tmp_path / "run", "a: 1\n", resume=False)
     with pytest.raises(UsageError, match=r"is not finished .* --resume"):
         RunFolder.open(tmp_path / "run")
+    folder.write_summary("fit", ["Good."], {"error": {"value": 1.0, "unit": "m"}}, finished=False)
+    with pytest.raises(UsageError, match="is not finished"):
+        RunFolder.open(tmp_path / "run")
+    folder.write_summary("fit", ["Good."], {"error": {"value": 1.0, "unit": "m"}}, finished=True)
     folder.write_json(folder.metrics, {"rows": [1]})
-    assert RunFolder.open(tmp_path / "run").read_metrics() == {"rows": [1]}
+    run = RunFolder.open(tmp_path / "run")
+    assert run.read_metrics() == {"rows": [1]}
+    assert run.read_summary() == {
+        "schema": "residnet.summary/1",
+        "task": "fit",
+        "finished": True,
+        "verdict": ["Good."],
+        "figures": {"error": {"value": 1.0, "unit": "m"}},
+    }
+
+
+def test_a_damaged_file_is_one_line(tmp_path: Path) -> None:
+    folder = RunFolder.create(tmp_path / "run", "a: 1\n")
+    folder.summary.write_text('{"finished": tr')
+    with pytest.raises(UsageError, match=r"summary.json: not readable as JSON"):
+        RunFolder.open(tmp_path / "run")
+    folder.summary.write_text("[]")
+    with pytest.raises(UsageError, match="expected a JSON object, found list"):
+        RunFolder.open(tmp_path / "run")
+    with pytest.raises(UsageError, match="no such file"):
+        folder.read_metrics()
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
@@ -92,7 +139,7 @@ def test_a_write_that_fails_leaves_the_old_file(
     folder = RunFolder.create(tmp_path / "run", "a: 1\n", resume=False)
     folder.write(folder.report, "old")
 
-    def full(self: Path, text: str) -> int:
+    def full(self: Path, text: str, encoding: str) -> int:
         with self.open("w") as stream:
             stream.write(text[: len(text) // 2])
         raise OSError(28, "No space left on device")
@@ -101,52 +148,3 @@ def test_a_write_that_fails_leaves_the_old_file(
     with pytest.raises(OSError, match="No space"):
         folder.write(folder.report, "new and longer")
     assert folder.report.read_text() == "old"
-
-
-def test_provenance_names_every_input_by_its_hash(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = RunFolder.create(tmp_path / "run", "a: 1\n", resume=False)
-    files = [tmp_path / name for name in ("a.csv", "b.csv", "empty.csv")]
-    contents = [b"t,u\n0,1\n", bytes(range(256)) * 5000, b""]
-    for file, content in zip(files, contents, strict=True):
-        file.write_bytes(content)
-    monkeypatch.setattr("sys.argv", ["residnet", "run", "x.yaml"])
-    started = time.time() - 12.0
-    folder.write_provenance(
-        config=tmp_path / "x.yaml", overrides=["seed=3"], seed=3, files=files, started=started
-    )
-    content = json.loads((folder.path / "provenance.json").read_text())
-    assert content["inputs"] == {
-        str(file): hashlib.sha256(data).hexdigest()
-        for file, data in zip(files, contents, strict=True)
-    }
-    assert (content["seed"], content["overrides"], content["config"]) == (
-        3,
-        ["seed=3"],
-        str(tmp_path / "x.yaml"),
-    )
-    assert content["command"] == ["residnet", "run", "x.yaml"]
-    assert (content["residnet"], content["python"]) == (__version__, platform.python_version())
-    assert content["started"] == time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(started))
-    assert 12.0 <= content["seconds"] < 60.0
-    import torch
-
-    assert (
-        content["packages"]["torch"] == torch.__version__.split("+")[0]
-        or content["packages"]["torch"] == torch.__version__
-    )
-    assert sha256(files[1]) == content["inputs"][str(files[1])]
-
-
-def test_revision_is_that_of_git(monkeypatch: pytest.MonkeyPatch) -> None:
-    here = Path(folder_module.__file__).parent
-    told = subprocess.run(
-        ["git", "rev-parse", "HEAD"], cwd=here, capture_output=True, text=True, check=False
-    )
-    expected = told.stdout.strip() if told.returncode == 0 else None
-    found = git_revision()
-    assert (found.removesuffix("+changes") if found else None) == expected
-    # outside a checkout, or without git, nobody can say
-    monkeypatch.setenv("PATH", "")
-    assert git_revision() is None

@@ -1,0 +1,102 @@
+"""Where a run comes from: versions, machine, revision, seed and the hash of every input file."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from residnet import __version__
+
+if TYPE_CHECKING:
+    from residnet.runs.folder import RunFolder
+
+_PACKAGES = (
+    "torch",
+    "lightning",
+    "numpy",
+    "scipy",
+    "pandas",
+    "scikit-learn",
+    "pydantic",
+    "pyarrow",
+    "safetensors",
+)
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """What a run is made from.
+
+    Attributes:
+        config: the file that describes it; None where Python called.
+        overrides: of the config's keys.
+        seed: of everything random.
+        files: inputs whose contents the run depends on.
+        started: seconds since the epoch.
+    """
+
+    config: Path | None
+    overrides: Sequence[str]
+    seed: int
+    files: Sequence[Path]
+    started: float
+
+    def write(self, folder: RunFolder) -> None:
+        """Write provenance.json, with the seconds since the start."""
+        content = {
+            "residnet": __version__,
+            "command": sys.argv,
+            "config": None if self.config is None else str(self.config),
+            "overrides": list(self.overrides),
+            "seed": self.seed,
+            "git": git_revision(),
+            "python": platform.python_version(),
+            "machine": f"{platform.system()} {platform.machine()}",
+            "packages": {name: _version(name) for name in _PACKAGES},
+            "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(self.started)),
+            "seconds": round(time.time() - self.started, 1),
+            "inputs": {str(path): sha256(path) for path in self.files},
+        }
+        folder.write_json(folder.provenance, content)
+
+
+def sha256(path: Path) -> str:
+    """Return the hexadecimal SHA-256 of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def git_revision() -> str | None:
+    """Return the revision of the checkout that residnet runs from; None outside a checkout.
+
+    It ends in `+changes` where the checkout is not clean.
+    """
+    here = Path(__file__).parent
+    try:
+        revision = _git("rev-parse", "HEAD", folder=here)
+        changes = _git("status", "--porcelain", folder=here)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return revision + ("+changes" if changes else "")
+
+
+def _git(*words: str, folder: Path) -> str:
+    done = subprocess.run(
+        ["git", *words], cwd=folder, capture_output=True, text=True, timeout=10, check=True
+    )
+    return done.stdout.strip()
+
+
+def _version(name: str) -> str | None:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None

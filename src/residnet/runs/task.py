@@ -1,0 +1,252 @@
+"""What every kind of run has in common: its folder, its order of work and its verbs."""
+
+from __future__ import annotations
+
+import math
+import time
+from abc import abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple, final
+
+from pydantic import Field
+
+from residnet.core.config import Config, dump_config
+from residnet.core.errors import DataError, UsageError
+from residnet.report.plain_page import Part, write_page
+from residnet.runs.folder import RunFolder
+from residnet.runs.provenance import Provenance
+
+
+class MainFigure(NamedTuple):
+    """A number that sums a run up, in SI units.
+
+    Attributes:
+        value: the number.
+        unit: its unit; `-` for a number without one.
+    """
+
+    value: float
+    unit: str = "-"
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the figure as summary.json holds it; a value that is not finite becomes null."""
+        value = float(self.value)
+        return {"value": value if math.isfinite(value) else None, "unit": self.unit}
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a run found.
+
+    Attributes:
+        verdict: whole sentences for a reader who reads nothing else.
+        figures: main figures by name.
+        table: text for the terminal; empty for none.
+        failure: a line where a result fails a check; the run is complete, and ends as a `DataError`
+            with this line.
+    """
+
+    verdict: Sequence[str] = ()
+    figures: Mapping[str, MainFigure] = field(default_factory=dict)
+    table: str = ""
+    failure: str = ""
+
+
+@dataclass(frozen=True)
+class Finished:
+    """A run that came to its end.
+
+    Attributes:
+        folder: where everything stands.
+        outcome: what the run found.
+        exports: files for controllers that it wrote.
+    """
+
+    folder: RunFolder
+    outcome: Outcome
+    exports: Sequence[Path] = ()
+
+
+class Task(Config):
+    """A kind of run: one YAML file that is checked, carried out in a folder and reported.
+
+    A subclass adds a `task` of type `Literal["its_name"]` and the keys of its own, and says how it
+    is carried out and which sections its report has.
+
+    Attributes:
+        task: the kind of run.
+        name: of the run; its folder is runs/<name> unless another is given.
+        description: a sentence for the head of the report.
+    """
+
+    task: str
+    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")
+    description: str = ""
+
+    verbs: ClassVar[tuple[str, ...]] = ("report",)
+    """Commands that a finished run of this task answers to."""
+
+    @abstractmethod
+    def carry_out(self, folder: RunFolder) -> Outcome:
+        """Do the work, and write the results into the folder.
+
+        What the folder holds already from an interrupted run may be used.
+
+        Raises:
+            ResidnetError: where the input does not allow it.
+        """
+
+    @classmethod
+    @abstractmethod
+    def report_sections(cls, run: RunFolder) -> Sequence[Part]:
+        """Draw the figures of a finished run and return the sections of its report.
+
+        Everything is taken from the folder alone.
+        """
+
+    def check(self) -> None:
+        """Check what reading the config does not show, without running.
+
+        Raises:
+            ResidnetError: where a file, a model or a package is missing or does not fit.
+        """
+
+    def input_files(self) -> Sequence[Path]:
+        """Return the files whose contents the run depends on."""
+        return ()
+
+    def recorded_seed(self) -> int:
+        """Return the seed that stands in the provenance."""
+        return 0
+
+    def write_exports(self, folder: RunFolder) -> Sequence[Path]:
+        """Export models for controllers at the end of the run; returns the files."""
+        return ()
+
+    def evaluate_on(self, run: RunFolder, logs: Sequence[Path], out: Path | None) -> Finished:
+        """Judge the models of a finished run on other logs.
+
+        Raises:
+            UsageError: where runs of this task have no such models.
+            ResidnetError: where a log cannot be used.
+        """
+        raise self._no_such_verb(run)
+
+    def export_model(self, run: RunFolder, model: str, out: Path | None, file_format: str) -> Path:
+        """Export one model of a finished run for controllers; returns the file.
+
+        Raises:
+            UsageError: where runs of this task have nothing to export, or there is no such model.
+            ExportError: where the exported model does not agree with the one that it came from.
+        """
+        raise self._no_such_verb(run)
+
+    @final
+    def run(
+        self,
+        *,
+        source: Path | None = None,
+        overrides: Sequence[str] = (),
+        out: Path | None = None,
+        resume: bool = False,
+        overwrite: bool = False,
+        report: bool = True,
+    ) -> Finished:
+        """Carry the task out, from an empty folder to the finished mark.
+
+        Args:
+            source: the config's file, for the record.
+            overrides: of its keys, likewise.
+            out: run folder; runs/<name> where not given.
+            resume: continue an interrupted run in its folder.
+            overwrite: replace an earlier run in its folder.
+            report: draw the report and export; without them a run ends after its results.
+
+        Raises:
+            ResidnetError: where the input does not allow it, or a result fails a check.
+        """
+        self.check()
+        made_from = Provenance(
+            source, overrides, self.recorded_seed(), self.input_files(), time.time()
+        )
+        folder = RunFolder.create(
+            out or Path("runs") / self.name,
+            dump_config(self),
+            resume=resume,
+            overwrite=overwrite,
+        )
+        return self.conduct(
+            folder, made_from, self.carry_out, self.write_exports if report else None, report=report
+        )
+
+    @final
+    def conduct(
+        self,
+        folder: RunFolder,
+        made_from: Provenance,
+        work: Callable[[RunFolder], Outcome],
+        exports: Callable[[RunFolder], Sequence[Path]] | None = None,
+        *,
+        report: bool = True,
+    ) -> Finished:
+        """Carry work out in the one order: provenance, work, report, exports, finished mark.
+
+        Raises:
+            ResidnetError: where the work does, or where its outcome fails a check.
+        """
+        made_from.write(folder)
+        with self.resources():
+            outcome = work(folder)
+            figures = {name: figure.as_json() for name, figure in outcome.figures.items()}
+            folder.write_summary(self.task, outcome.verdict, figures, finished=False)
+            made_from.write(folder)
+            if report:
+                self.write_report(folder)
+            files = exports(folder) if exports is not None else ()
+        made_from.write(folder)
+        folder.write_summary(self.task, outcome.verdict, figures, finished=True)
+        if outcome.failure:
+            raise DataError(outcome.failure)
+        return Finished(folder, outcome, files)
+
+    @classmethod
+    def write_report(cls, run: RunFolder) -> Path:
+        """Write figures and report from the run folder alone; returns the page's path."""
+        verdict = [Part(sentence) for sentence in run.read_summary()["verdict"]]
+        return write_page(run.path, [*verdict, *cls.report_sections(run)])
+
+    @contextmanager
+    def resources(self) -> Iterator[None]:
+        """Hold what the work needs of the machine while it is carried out."""
+        yield
+
+    def _no_such_verb(self, run: RunFolder) -> UsageError:
+        return UsageError(
+            f"{run.path}: the run is of task '{self.task}'; it has: {', '.join(self.verbs)}"
+        )
+
+
+class ComputingTask(Task):
+    """A task that computes with PyTorch.
+
+    Attributes:
+        threads: of PyTorch; part of what makes a run repeatable. One is fastest for the small
+            products of these models.
+    """
+
+    threads: int = Field(default=1, ge=1)
+
+    @contextmanager
+    def resources(self) -> Iterator[None]:
+        """Set the number of threads, and put it back in the end."""
+        import torch
+
+        before = torch.get_num_threads()
+        torch.set_num_threads(self.threads)
+        try:
+            yield
+        finally:
+            torch.set_num_threads(before)

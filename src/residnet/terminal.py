@@ -1,0 +1,74 @@
+"""Progress of long work on the command line: bars on a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from residnet.core.progress import Progress, listen
+
+if TYPE_CHECKING:
+    from rich.progress import Progress as Bars
+    from rich.progress import TaskID
+
+
+@contextmanager
+def drawn_progress() -> Iterator[None]:
+    """Draw the progress of everything within the context on standard error."""
+    if not sys.stderr.isatty():
+        with listen(_Lines()):
+            yield
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bars
+
+    console = Console(stderr=True, highlight=False, markup=False)
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+    )
+    with Bars(*columns, console=console, transient=True) as bars, listen(_Bars(bars)):
+        yield
+
+
+class _Lines:
+    """One line for each message, and one for each counted stage when it is complete."""
+
+    def __init__(self) -> None:
+        self._complete: set[str] = set()
+
+    def __call__(self, progress: Progress) -> None:
+        if progress.message:
+            print(progress.message, file=sys.stderr, flush=True)
+        if progress.done is None or progress.total is None:
+            return
+        if progress.done < progress.total:
+            self._complete.discard(progress.stage)
+        elif progress.stage not in self._complete:
+            self._complete.add(progress.stage)
+            print(f"  {progress.stage}: {progress.total:g}", file=sys.stderr, flush=True)
+
+
+class _Bars:
+    """One bar for each stage that is under way; messages stand above the bars."""
+
+    def __init__(self, bars: Bars) -> None:
+        self._bars = bars
+        self._stages: dict[str, TaskID] = {}
+
+    def __call__(self, progress: Progress) -> None:
+        if progress.message:
+            self._bars.console.print(progress.message)
+        if progress.done is None and progress.total is None:
+            return
+        if progress.stage not in self._stages:
+            self._stages[progress.stage] = self._bars.add_task(progress.stage, total=None)
+        bar = self._stages[progress.stage]
+        self._bars.update(bar, completed=progress.done or 0, total=progress.total)
+        if progress.total is not None and (progress.done or 0) >= progress.total:
+            self._bars.remove_task(self._stages.pop(progress.stage))

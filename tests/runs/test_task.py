@@ -1,0 +1,122 @@
+"""The one order of work of every run: provenance first, the finished mark last."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+import pytest
+import torch
+
+from residnet.core.errors import DataError, FitError, UsageError
+from residnet.report.plain_page import Part
+from residnet.runs.folder import RunFolder
+from residnet.runs.task import ComputingTask, MainFigure, Outcome
+
+
+class SampleTask(ComputingTask):
+    """A task that notes what its folder holds when it is called."""
+
+    task: Literal["sample"] = "sample"
+    seed: int = 7
+    fault: Literal["", "raises", "fails a check"] = ""
+
+    def recorded_seed(self) -> int:
+        return self.seed
+
+    def carry_out(self, folder: RunFolder) -> Outcome:
+        assert json.loads(folder.provenance.read_text())["seed"] == self.seed
+        assert not folder.finished
+        if self.fault == "raises":
+            raise FitError("nothing can be fitted")
+        folder.write_json(folder.path / "found.json", {"threads": torch.get_num_threads()})
+        failure = "a flight did not end" if self.fault else ""
+        return Outcome(["It works."], {"speed": MainFigure(1.5, "m/s")}, "a table", failure)
+
+    @classmethod
+    def report_sections(cls, run: RunFolder) -> Sequence[Part]:
+        assert not run.finished
+        return [Part("", (run.path / "found.json").read_text(), "What was found")]
+
+    def write_exports(self, folder: RunFolder) -> Sequence[Path]:
+        assert folder.report.is_file()
+        assert not folder.finished
+        folder.write(folder.exports / "model.txt", "exported")
+        return [folder.exports / "model.txt"]
+
+
+def test_a_run_leaves_report_summary_and_mark(tmp_path: Path) -> None:
+    finished = SampleTask(name="first", threads=1).run(out=tmp_path / "run")
+    folder = RunFolder.open(tmp_path / "run")
+    assert finished.folder.path == folder.path
+    assert [file.read_text() for file in finished.exports] == ["exported"]
+    assert folder.read_summary() == {
+        "schema": "residnet.summary/1",
+        "task": "sample",
+        "finished": True,
+        "verdict": ["It works."],
+        "figures": {"speed": {"value": 1.5, "unit": "m/s"}},
+    }
+    page = folder.report.read_text()
+    assert "It works." in page
+    assert "What was found" in page
+    assert sorted(path.name for path in folder.path.iterdir()) == [
+        "exports",
+        "found.json",
+        "provenance.json",
+        "report.html",
+        "resolved.yaml",
+        "summary.json",
+    ]
+
+
+def test_the_folder_is_named_after_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert SampleTask(name="mine").run().folder.path == Path("runs") / "mine"
+    with pytest.raises(UsageError, match="exists already"):
+        SampleTask(name="mine").run()
+    SampleTask(name="mine").run(resume=True)
+    SampleTask(name="mine", seed=8).run(overwrite=True)
+
+
+def test_threads_are_those_of_the_task_and_put_back(tmp_path: Path) -> None:
+    before = torch.get_num_threads()
+    SampleTask(name="two", threads=before + 1).run(out=tmp_path / "run")
+    assert json.loads((tmp_path / "run" / "found.json").read_text())["threads"] == before + 1
+    assert torch.get_num_threads() == before
+
+
+def test_a_run_that_fails_is_not_finished_and_is_run_again(tmp_path: Path) -> None:
+    with pytest.raises(FitError, match="nothing can be fitted"):
+        SampleTask(name="fails", fault="raises").run(out=tmp_path / "run")
+    with pytest.raises(UsageError, match="is not finished"):
+        RunFolder.open(tmp_path / "run")
+    # nothing was found, so that a corrected configuration may use the folder
+    assert SampleTask(name="fails").run(out=tmp_path / "run").folder.finished
+
+
+def test_a_result_that_fails_a_check_is_reported_first(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="a flight did not end"):
+        SampleTask(name="checked", fault="fails a check").run(out=tmp_path / "run")
+    assert RunFolder.open(tmp_path / "run").report.is_file()
+
+
+def test_without_a_report_a_run_ends_after_its_results(tmp_path: Path) -> None:
+    finished = SampleTask(name="brief").run(out=tmp_path / "run", report=False)
+    assert finished.folder.finished
+    assert not finished.folder.report.exists()
+    assert not finished.folder.exports.exists()
+
+
+def test_a_value_that_is_not_finite_is_null() -> None:
+    assert MainFigure(float("nan"), "s").as_json() == {"value": None, "unit": "s"}
+
+
+def test_a_verb_that_a_run_does_not_have_names_those_that_it_has(tmp_path: Path) -> None:
+    finished = SampleTask(name="verbs").run(out=tmp_path / "run")
+    with pytest.raises(UsageError, match="of task 'sample'; it has: report"):
+        SampleTask(name="verbs").export_model(finished.folder, "selected", None, "torchscript")
+    with pytest.raises(UsageError, match="of task 'sample'; it has: report"):
+        SampleTask(name="verbs").evaluate_on(finished.folder, [], None)
