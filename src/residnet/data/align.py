@@ -146,8 +146,7 @@ class _Reach:
         self._last = self._high + (self._w_high > 0.0)
 
     def _place(self, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Index of the sample before each time, and how far towards the next one it lies, 0 to 1.
-        """
+        """Index of the sample before each time, and how far towards the next one it lies, 0 to 1."""
         left = np.clip(np.searchsorted(self._t, at, side="right") - 1, 0, self._t.size - 2)
         weight = np.clip((at - self._t[left]) / (self._t[left + 1] - self._t[left]), 0.0, 1.0)
         return left, np.where(
@@ -156,7 +155,8 @@ class _Reach:
 
     def previous(self, x: np.ndarray) -> np.ndarray:
         """Last value at or before each grid point, [G, n] from [T, n]."""
-        return x[self._low + (self._w_low == 1.0)]
+        held: np.ndarray = x[self._low + (self._w_low == 1.0)]
+        return held
 
     def mean(self, x: np.ndarray) -> np.ndarray:
         """Mean of the linear interpolant over each point's reach, [G, n] from finite [T, n]."""
@@ -169,7 +169,8 @@ class _Reach:
 
         def integral(left: np.ndarray, weight: np.ndarray) -> np.ndarray:
             w, a, b = weight[:, None], centred[left], centred[left + 1]
-            return area[left] + dt[left] * w * (a + 0.5 * w * (b - a))
+            integral: np.ndarray = area[left] + dt[left] * w * (a + 0.5 * w * (b - a))
+            return integral
 
         w = self._w_low[:, None]
         point = np.where(
@@ -182,7 +183,8 @@ class _Reach:
         mean = (integral(self._high, self._w_high) - integral(self._low, self._w_low)) / np.where(
             wide, span, 1.0
         )[:, None] + offset
-        return np.where(wide[:, None], mean, point)
+        means: np.ndarray = np.where(wide[:, None], mean, point)
+        return means
 
     def touched(self, flags: np.ndarray) -> np.ndarray:
         """[G, k] bool: any flagged sample carries weight; flags [T, k]."""
@@ -190,7 +192,10 @@ class _Reach:
 
     def broken(self, missing: np.ndarray) -> np.ndarray:
         """[G, n] bool: a missing sample [T, n] carries weight, or the reach crosses a gap."""
-        return self.touched(missing) | _any_between(self._gap[:, None], self._first, self._last)
+        untrusted: np.ndarray = self.touched(missing) | _any_between(
+            self._gap[:, None], self._first, self._last
+        )
+        return untrusted
 
 
 def _any_between(flags: np.ndarray, first: np.ndarray, stop: np.ndarray) -> np.ndarray:
@@ -198,7 +203,8 @@ def _any_between(flags: np.ndarray, first: np.ndarray, stop: np.ndarray) -> np.n
     count = np.concatenate(
         [np.zeros((1, flags.shape[1]), dtype=np.int64), np.cumsum(flags, axis=0)]
     )
-    return count[stop] > count[first]
+    between: np.ndarray = count[stop] > count[first]
+    return between
 
 
 def _rewrapped(original: np.ndarray, continuous: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -213,7 +219,8 @@ def _rewrapped(original: np.ndarray, continuous: np.ndarray, values: np.ndarray)
 
 def _incomplete(channels: dict[str, np.ndarray]) -> np.ndarray:
     """[T] bool: NaN in any channel."""
-    return np.isnan(np.stack(list(channels.values()))).any(axis=0)
+    missing: np.ndarray = np.isnan(np.stack(list(channels.values()))).any(axis=0)
+    return missing
 
 
 def _with_gap_mask(log: Log, missing: np.ndarray) -> Log:

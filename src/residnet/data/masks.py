@@ -40,7 +40,7 @@ class Mask(Config, ABC):
     @property
     def reason(self) -> str:
         """Key in `Log.masks`; rules of one kind share it."""
-        return self.prefix + type(self).model_fields["kind"].default
+        return self.prefix + str(type(self).model_fields["kind"].default)
 
     @abstractmethod
     def apply(self, log: Log) -> np.ndarray:
@@ -98,7 +98,8 @@ class Missing(Mask):
 
     def apply(self, log: Log) -> np.ndarray:
         """[T] bool; see `Mask.apply`."""
-        return np.isnan(log.stack(self.channels or tuple(log.channels))).any(axis=1)
+        missing: np.ndarray = np.isnan(log.stack(self.channels or tuple(log.channels))).any(axis=1)
+        return missing
 
 
 @final
@@ -159,7 +160,10 @@ class Outlier(Mask):
         common = 1.4826 * float(np.median(deviation))
         # a spread at the level of rounding is none
         floor = 1e-9 * float(np.abs(values).max())
-        return deviation > self.sigmas * np.maximum(others.std(axis=1, ddof=1), max(common, floor))
+        outliers: np.ndarray = deviation > self.sigmas * np.maximum(
+            others.std(axis=1, ddof=1), max(common, floor)
+        )
+        return outliers
 
 
 @final

@@ -49,7 +49,8 @@ class ExportedModel(nn.Module):
         """Memory s [B, n_state] that a measured past leaves: states [B, T, 6] and inputs [B, T, m],
         oldest first.
         """
-        return self.simulate.model.warmup(y_history, w_history)  # type: ignore[operator]
+        s: Tensor = self.simulate.model.warmup(y_history, w_history)  # type: ignore[operator]
+        return s
 
     @torch.jit.export
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -64,7 +65,8 @@ class ExportedModel(nn.Module):
     @torch.jit.export
     def rollout(self, x0: Tensor, w: Tensor, s: Tensor) -> Tensor:
         """States [B, T+1, 6] from x0 [B, 6] on under inputs w [B, T, m]."""
-        return self.simulate(x0, w, s)[0]
+        states: Tensor = self.simulate(x0, w, s)[0]
+        return states
 
     def forward(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """As `step`."""

@@ -64,4 +64,5 @@ class StoppingSource(Source):
 
     def finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
         """Rows that make no way."""
-        return (self.times[k] > self.start) & (x[:, self.u] <= 0)
+        stopped: Tensor = (self.times[k] > self.start) & (x[:, self.u] <= 0)
+        return stopped

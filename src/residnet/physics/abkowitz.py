@@ -211,14 +211,18 @@ class SeriesForces(Actuators):
         dn = position[..., 1] - self.n_0 if self.turns else torch.zeros_like(u)
         coefficients = self.coefficients.to(nu.dtype)
         if not self.prime:
-            return self.terms(torch.stack((u - self.speed, v, r, delta, dn), dim=-1)) @ coefficients
+            force: Tensor = (
+                self.terms(torch.stack((u - self.speed, v, r, delta, dn), dim=-1)) @ coefficients
+            )
+            return force
         speed = torch.sqrt((u * u + v * v).clamp(min=(0.1 * self.speed) ** 2))
         motion = torch.stack(
             ((u - self.speed) / speed, v / speed, r * self.length / speed, delta, dn / self.n_0),
             dim=-1,
         )
         force = self.dynamic * (speed * speed).unsqueeze(-1) * (self.terms(motion) @ coefficients)
-        return force * self.lengths.to(nu.dtype)
+        scaled: Tensor = force * self.lengths.to(nu.dtype)
+        return scaled
 
     def rate(self, a: Tensor, command: Tensor) -> Tensor:
         """Derivative [..., k] of the states."""
@@ -280,7 +284,8 @@ class AbkowitzVessel(HullPlant):
 
     def acceleration(self, pose: Tensor, nu: Tensor, tau: Tensor) -> Tensor:
         """nu_dot [B, 3]."""
-        return self.inertia(nu, tau)
+        acceleration: Tensor = self.inertia(nu, tau)
+        return acceleration
 
     def approach(self, rows: int) -> Tensor:
         """Straight ahead at service speed and service revolutions, [B, nx]."""

@@ -88,7 +88,8 @@ class Correction(nn.Module):
     def forward(self, nu_dot: Tensor, nu: Tensor) -> Tensor:
         """Force [..., 3] at nu_dot [..., 3] and nu [..., 3]."""
         basis = self.library(torch.cat((nu_dot, nu), dim=-1))
-        return basis @ self.coefficients.to(nu.dtype) + self.intercept.to(nu.dtype)
+        force: Tensor = basis @ self.coefficients.to(nu.dtype) + self.intercept.to(nu.dtype)
+        return force
 
 
 @final
@@ -129,7 +130,10 @@ class ForceModel(nn.Module):
         """
         earth = self.earth.to(nu.dtype)
         along, across = to_body(earth[0], earth[1], psi)
-        return self(nu_dot, nu) - torch.stack((along, across, torch.zeros_like(along)), dim=-1)
+        residual: Tensor = self(nu_dot, nu) - torch.stack(
+            (along, across, torch.zeros_like(along)), dim=-1
+        )
+        return residual
 
     def residual(self, tau: Tensor, nu_dot: Tensor, nu: Tensor, psi: Tensor) -> Tensor:
         """eps = tau - F(nu_dot, nu) [..., 3], what the model does not explain (3.20), (3.25)."""

@@ -44,8 +44,7 @@ class RigidBody(Config):
 
 
 class AddedMass(Config):
-    """Hydrodynamic derivatives with respect to accelerations (SNAME: negative for a normal hull).
-    """
+    """Hydrodynamic derivatives with respect to accelerations (SNAME: negative for a normal hull)."""
 
     X_udot: Mass
     Y_vdot: Mass
@@ -227,7 +226,8 @@ class Fossen3(nn.Module):
 
     def drag(self, nu: Tensor) -> Tensor:
         """D(nu) nu [..., 3] in N, N, N m for velocities nu [..., 3] through the water."""
-        return self.terms(nu) @ self.damping.to(nu.dtype).T
+        damping: Tensor = self.terms(nu) @ self.damping.to(nu.dtype).T
+        return damping
 
     def required(self, nu_dot: Tensor, nu: Tensor) -> Tensor:
         """Forces [..., 3] that accelerate the vessel by nu_dot [..., 3] at velocities nu [..., 3]
@@ -306,4 +306,5 @@ class FossenVessel(HullPlant):
 
     def acceleration(self, pose: Tensor, nu: Tensor, tau: Tensor) -> Tensor:
         """nu_dot [B, 3] from velocities through the water [B, 3] and forces [B, 3]."""
-        return self.hull(nu, tau)
+        acceleration: Tensor = self.hull(nu, tau)
+        return acceleration

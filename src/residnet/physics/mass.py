@@ -29,4 +29,5 @@ def inverse_mass(mass: Tensor, vessel: str) -> Tensor:
             f"vessel {vessel}: the mass matrix is singular (condition {condition:.1e} after"
             " scaling); check the coupling terms x_G, Y_rdot, N_vdot"
         )
-    return torch.linalg.inv(mass)
+    inverse: Tensor = torch.linalg.inv(mass)
+    return inverse

@@ -128,7 +128,10 @@ class AccelerationHull(nn.Module):
         """Acceleration nu_dot [..., 3] from velocities through the water nu [..., 3] and forces tau
         [..., 3] in N, N, N m.
         """
-        return tau * self.gain.to(nu.dtype) + self.terms(nu) @ self.coefficients.to(nu.dtype)
+        force: Tensor = tau * self.gain.to(nu.dtype) + self.terms(nu) @ self.coefficients.to(
+            nu.dtype
+        )
+        return force
 
 
 @final
@@ -149,4 +152,5 @@ class OdinVessel(HullPlant):
 
     def acceleration(self, pose: Tensor, nu: Tensor, tau: Tensor) -> Tensor:
         """nu_dot [B, 3] from velocities through the water [B, 3] and forces [B, 3]."""
-        return self.hull(nu, tau)
+        acceleration: Tensor = self.hull(nu, tau)
+        return acceleration

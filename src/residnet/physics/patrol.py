@@ -215,9 +215,10 @@ class PatrolHull(nn.Module):
         """Forces [..., 4] in N, N, N m, N m of water, weight and rotation at roll phi [...] and
         velocities through the water nu [..., 4].
         """
-        return self.terms(torch.cat((nu, phi.unsqueeze(-1)), dim=-1)) @ self.coefficients.to(
-            nu.dtype
-        )
+        force: Tensor = self.terms(
+            torch.cat((nu, phi.unsqueeze(-1)), dim=-1)
+        ) @ self.coefficients.to(nu.dtype)
+        return force
 
     def forward(self, phi: Tensor, nu: Tensor, tau: Tensor) -> Tensor:
         """Acceleration nu_dot [..., 4] under the further forces tau [..., 4]."""
@@ -242,9 +243,9 @@ class PatrolVessel(HullPlant):
         self.speed = vessel.speed
 
     def acceleration(self, pose: Tensor, nu: Tensor, tau: Tensor) -> Tensor:
-        """nu_dot [B, 4] at pose [B, 4] from velocities through the water [B, 4] and forces [B, 4].
-        """
-        return self.hull(pose[..., 2], nu, tau)
+        """nu_dot [B, 4] at pose [B, 4] from velocities through the water [B, 4] and forces [B, 4]."""
+        acceleration: Tensor = self.hull(pose[..., 2], nu, tau)
+        return acceleration
 
     def approach(self, rows: int) -> Tensor:
         """Straight ahead at service speed, [rows, nx]: the source's thrust compensates the

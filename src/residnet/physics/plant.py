@@ -1,5 +1,4 @@
-"""Plants: a vessel with its actuators and environment, as a right-hand side that a simulator steps.
-"""
+"""Plants: a vessel with its actuators and environment, as a right-hand side that a simulator steps."""
 
 from __future__ import annotations
 
@@ -101,8 +100,7 @@ class HullPlant(Plant, ABC):
 
     @abstractmethod
     def acceleration(self, pose: Tensor, nu: Tensor, tau: Tensor) -> Tensor:
-        """nu_dot [B, n] at pose [B, n] from velocities through the water [B, n] and forces [B, n].
-        """
+        """nu_dot [B, n] at pose [B, n] from velocities through the water [B, n] and forces [B, n]."""
 
     @final
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
@@ -172,7 +170,10 @@ class HullPlant(Plant, ABC):
         air = self.kinematics.pushed(
             -speed * torch.cos(direction), -speed * torch.sin(direction), pose
         )
-        return self.wind(air[:, 0] - nu[:, 0], air[:, 1] - nu[:, 1]).index_select(-1, self.blown)
+        force: Tensor = self.wind(air[:, 0] - nu[:, 0], air[:, 1] - nu[:, 1]).index_select(
+            -1, self.blown
+        )
+        return force
 
     @final
     def settle(self, x: Tensor, w: Tensor, dt: float) -> Tensor:

@@ -45,13 +45,16 @@ def load_vessel(name: str) -> AnyVessel:
     """
     files = vessel_files()
     if name in files:
-        return load_config(files[name], [], VesselConfig)
-    path = Path(name)
-    if path.suffix in {".yaml", ".yml"}:
-        return load_config(path, [], VesselConfig)
-    raise ConfigError(
-        f"no vessel '{name}'{nearest(name, files)}; or give the path of a vessel's yaml file"
-    )
+        path = files[name]
+    else:
+        path = Path(name)
+        if path.suffix not in {".yaml", ".yml"}:
+            raise ConfigError(
+                f"no vessel '{name}'{nearest(name, files)};"
+                " or give the path of a vessel's yaml file"
+            )
+    vessel: AnyVessel = load_config(path, [], VesselConfig)
+    return vessel
 
 
 def _loadable(name: str) -> str:

@@ -89,8 +89,8 @@ def _end(run: RunFiles, row: Row, base: Row | None, lead: str) -> str:
             number(DEG * of["heading_error_end"], 2) + " deg",
         )
 
-    text = "At the end of a free run the position is off by {} and the heading by {}".format(*off(row))
-    text += " on average"
+    text = "At the end of a free run the position is off by {} and the heading by {} on average"
+    text = text.format(*off(row))
     if base is not None and lead != run.baseline:
         text += " (baseline: {}, {})".format(*off(base))
     return text + "."

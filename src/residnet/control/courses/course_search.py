@@ -140,12 +140,12 @@ class Family:
 def turned(points: Array, heading: float) -> Array:
     """Points [N, 2] of a frame with that heading in the earth's."""
     c, s = math.cos(heading), math.sin(heading)
-    return points @ np.array([[c, s], [-s, c]])
+    rotated: Array = points @ np.array([[c, s], [-s, c]])
+    return rotated
 
 
 def _clearance(mark: Mark, track: Array) -> float:
-    """Distance of a mark from a track of straight pieces, positive on the inner side of its turn.
-    """
+    """Distance of a mark from a track of straight pieces, positive on the inner side of its turn."""
     place = np.array([mark.north, mark.east])
     begin, piece = track[:-1], np.diff(track, axis=0)
     square = (piece**2).sum(axis=1)

@@ -135,7 +135,8 @@ class TurnMaker:
         before = np.maximum(after - 1, 0)
         share = yaw[before, rows] / np.maximum(yaw[before, rows] - yaw[after, rows], 1e-12)
         stops = countered.x[before] + np.where(after > 0, share, 0.0) * self.dt
-        return np.where(yaw[-1] > 0, countered.x[-1], stops)
+        distance: Array = np.where(yaw[-1] > 0, countered.x[-1], stops)
+        return distance
 
 
 def _of_rows(states: CubicSpline, times: Array, rows: NDArray[np.intp]) -> Array:

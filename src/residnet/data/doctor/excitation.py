@@ -50,8 +50,7 @@ def excitation_findings(log: Log, inputs: Sequence[str]) -> Iterator[Finding]:
 
 
 def still(log: Log) -> np.ndarray | None:
-    """[T] bool: no motion beyond the noise over two seconds; None where u, v or r is not measured.
-    """
+    """[T] bool: no motion beyond the noise over two seconds; None where u, v or r is not measured."""
     if any(name not in log.channels for name in VELOCITY):
         return None
     step = float(np.median(np.diff(log.t)))
@@ -249,7 +248,7 @@ def _awake(log: Log, name: str) -> float:
         0.02 * scale if name != "r" else np.radians(0.05),
         1e-9,
     )
-    return float(known.std()) / least
+    return float(known.std() / least)
 
 
 def _relative(values: np.ndarray) -> float:

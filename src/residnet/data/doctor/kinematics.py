@@ -90,7 +90,8 @@ def position_causes(log: Log) -> dict[str, Cause]:
     ground = turn * (u + 1j * v)
 
     def area(rate: np.ndarray) -> np.ndarray:
-        return 0.5 * dt * (rate[1:] + rate[:-1])
+        increments: np.ndarray = 0.5 * dt * (rate[1:] + rate[:-1])
+        return increments
 
     measured = area(turn * (log["u"] + 1j * log["v"]))
     along, across = area(turn * u), area(1j * turn * v)
@@ -240,7 +241,10 @@ class _Rows:
         scale = np.maximum(np.abs(x).max(axis=0), 1e-300)
         coefficients = np.linalg.lstsq(x / scale, y, rcond=1e-9)[0]
         rest = np.abs(y - (x / scale) @ coefficients)
-        return (rest <= 8.0 * 1.4826 * max(float(np.median(rest)), 1e-300)).astype(float)
+        kept: np.ndarray = (rest <= 8.0 * 1.4826 * max(float(np.median(rest)), 1e-300)).astype(
+            float
+        )
+        return kept
 
 
 def _pursuit(

@@ -168,7 +168,8 @@ def _answer(log: Log, steer: np.ndarray) -> _Answer | None:
         return None
 
     def change(values: np.ndarray, shift: int = 0) -> np.ndarray:
-        return values[first + block - shift] - values[first - shift]
+        difference: np.ndarray = values[first + block - shift] - values[first - shift]
+        return difference
 
     columns = [
         log.t - log.t[0],
@@ -196,13 +197,12 @@ def _answer(log: Log, steer: np.ndarray) -> _Answer | None:
 
 def _reach(r: np.ndarray, step: float) -> int:
     """Samples after which the yaw rate has forgotten what it was: as far as a shift can be told."""
-    known = np.nan_to_num(r - np.nanmean(r))
+    known: np.ndarray = np.nan_to_num(r - np.nanmean(r))
     power = np.abs(np.fft.rfft(known, 2 * known.size)) ** 2
     memory = np.fft.irfft(power)[: known.size]
     below = np.flatnonzero(memory < 0.0)
-    return max(
-        min(int(below[0]) if below.size else known.size, known.size // 8, round(30.0 / step)), 3
-    )
+    first: int = int(below[0]) if below.size else known.size
+    return max(min(first, known.size // 8, round(30.0 / step)), 3)
 
 
 def _fit(x: np.ndarray, y: np.ndarray) -> tuple[float, float, float]:

@@ -23,7 +23,7 @@ def noise_of(values: np.ndarray) -> float:
     known = values[np.isfinite(values)]
     if known.size < 8:
         return 0.0
-    return _SIGMA * float(np.median(np.abs(np.diff(known, 3)))) / np.sqrt(20.0)
+    return float(_SIGMA * float(np.median(np.abs(np.diff(known, 3)))) / np.sqrt(20.0))
 
 
 def spikes(values: np.ndarray) -> np.ndarray:

@@ -283,7 +283,8 @@ def _never_rests(values: np.ndarray, run: slice) -> bool:
 def _grown(flags: np.ndarray) -> np.ndarray:
     """Flags [T] widened by one sample to either side."""
     padded = np.pad(flags, 1)
-    return padded[:-2] | padded[1:-1] | padded[2:]
+    widened: np.ndarray = padded[:-2] | padded[1:-1] | padded[2:]
+    return widened
 
 
 def _outliers(log: Log, measured: Sequence[str]) -> Iterator[Finding]:

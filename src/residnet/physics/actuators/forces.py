@@ -78,4 +78,5 @@ class ForceCommands(Actuators):
 
     def _by_axis(self, a: Tensor) -> Tensor:
         """States [..., k] as [..., 3, k / 3]: a row for each axis."""
-        return a.unflatten(-1, (len(self.response.suffixes), 3)).mT
+        by_axis: Tensor = a.unflatten(-1, (len(self.response.suffixes), 3)).mT
+        return by_axis

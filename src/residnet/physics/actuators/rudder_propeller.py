@@ -140,7 +140,8 @@ class RudderPropeller(Actuators):
 
     def thrust(self, n: Tensor, u: Tensor) -> Tensor:
         """Thrust [N] of the propeller at n [1/s] and speed through the water u [m/s]."""
-        return self.curve(n) - self.loss * n.abs() * u.clamp(min=0.0)
+        thrust: Tensor = self.curve(n) - self.loss * n.abs() * u.clamp(min=0.0)
+        return thrust
 
     def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
         """tau [..., 3] in N, N, N m."""

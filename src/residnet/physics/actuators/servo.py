@@ -243,21 +243,23 @@ class Servos(nn.Module):
     def value(self, a: Tensor, command: Tensor) -> Tensor:
         """Positions [..., c]."""
         parts = self._parts(a)
-        return torch.stack(
-            [servo.value(parts[i], command[..., i]) for i, servo in enumerate(self.servos)], dim=-1
-        )  # type: ignore[operator]
+        each: list[Tensor] = []
+        for i, servo in enumerate(self.servos):
+            each.append(servo.value(parts[i], command[..., i]))  # type: ignore[operator]
+        return torch.stack(each, dim=-1)
 
     def rate(self, a: Tensor, command: Tensor) -> Tensor:
         """Derivatives [..., k]."""
         parts = self._parts(a)
-        return torch.cat(
-            [servo.rate(parts[i], command[..., i]) for i, servo in enumerate(self.servos)], dim=-1
-        )  # type: ignore[operator]
+        each: list[Tensor] = []
+        for i, servo in enumerate(self.servos):
+            each.append(servo.rate(parts[i], command[..., i]))  # type: ignore[operator]
+        return torch.cat(each, dim=-1)
 
     def advance(self, a: Tensor, command: Tensor, dt: float) -> Tensor:
         """States [..., k] after a step of dt seconds."""
         parts = self._parts(a)
-        return torch.cat(
-            [servo.advance(parts[i], command[..., i], dt) for i, servo in enumerate(self.servos)],
-            dim=-1,
-        )  # type: ignore[operator]
+        each: list[Tensor] = []
+        for i, servo in enumerate(self.servos):
+            each.append(servo.advance(parts[i], command[..., i], dt))  # type: ignore[operator]
+        return torch.cat(each, dim=-1)

@@ -35,7 +35,8 @@ class Spectrum(Config, ABC):
         peak = 2 * np.pi / period
         ratio = omega / peak
         form: np.ndarray = 5 / 16 * height**2 / peak * ratio**-5.0 * np.exp(-1.25 * ratio**-4.0)
-        return form * self.peakedness(ratio)
+        density: np.ndarray = form * self.peakedness(ratio)
+        return density
 
 
 @final

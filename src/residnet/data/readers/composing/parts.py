@@ -328,7 +328,8 @@ def _from_first_circle(psi: np.ndarray) -> np.ndarray:
         return psi
     # a heading of zero with rounding stays zero
     turns = np.floor((psi[known[0]] + 1e-6) / (2.0 * np.pi))
-    return psi - 2.0 * np.pi * turns
+    unwound: np.ndarray = psi - 2.0 * np.pi * turns
+    return unwound
 
 
 def _moved(lever: Lever, what: str = "x, y") -> tuple[str, ...]:
