@@ -1,4 +1,4 @@
-"""The command line. Imports stay inside the commands: `residnet --help` must not wait for PyTorch."""
+"""The command line; imports stay inside the commands: `--help` must not wait for PyTorch."""
 
 from __future__ import annotations
 
@@ -143,14 +143,8 @@ def export(
         ),
     ],
     file_format: Annotated[
-        Literal["torchscript", "feed_forward"],
-        typer.Option(
-            "--format",
-            help=(
-                "torchscript: the model; feed_forward: tau = F(nu_dot, nu) of a model in force"
-                " space."
-            ),
-        ),
+        str,
+        typer.Option("--format", metavar="FORMAT", help="One of `residnet list formats`."),
     ] = "torchscript",
     out: Annotated[
         Path | None,
@@ -178,7 +172,7 @@ def report(folder: RunPath) -> None:
 @app.command(name="list")
 def list_names(
     what: Annotated[
-        Literal["vessels", "heads", "manoeuvres", "readers", "tasks", "baselines"],
+        Literal["vessels", "heads", "manoeuvres", "readers", "tasks", "baselines", "formats"],
         typer.Argument(help="What to list."),
     ],
 ) -> None:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import Field
-
-from residnet.baselines.base import Baseline, ParametricBaseline
+from residnet.baselines.base import Baseline, IdentifiedConfig, ParametricBaseline
 from residnet.baselines.believed import BelievedConfig
 from residnet.baselines.equations import EquationsConfig
 from residnet.baselines.linear_steady import LinearSteadyConfig
@@ -14,6 +12,7 @@ from residnet.baselines.mmg import MMGBaseline, MMGConfig
 from residnet.baselines.nomoto import NomotoConfig, NomotoSideslipConfig
 from residnet.baselines.regressors import RegressorBaseline, RegressorsConfig
 from residnet.baselines.still import StillConfig
+from residnet.core.registry import Kinds
 from residnet.regression.solutions import Coefficient
 
 BaselineConfig = Annotated[
@@ -25,8 +24,9 @@ BaselineConfig = Annotated[
     | NomotoSideslipConfig
     | RegressorsConfig
     | StillConfig,
-    Field(discriminator="kind"),
+    Kinds("residnet.baselines", IdentifiedConfig),
 ]
+"""Config of any baseline, those of other packages included; its `kind` says which."""
 
 __all__ = [
     "Baseline",
@@ -34,6 +34,7 @@ __all__ = [
     "BelievedConfig",
     "Coefficient",
     "EquationsConfig",
+    "IdentifiedConfig",
     "LinearSteadyConfig",
     "MMGBaseline",
     "MMGConfig",

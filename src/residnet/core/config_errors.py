@@ -11,10 +11,12 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
 from residnet.core.config_yaml import KeyPath
 from residnet.core.names import nearest
+from residnet.core.registry import Kinds
 
 _EXPECTED = {
     "int_type": "a whole number",
@@ -162,7 +164,10 @@ def _plain(annotation: Any) -> Any:
     """
     while True:
         if get_origin(annotation) is Annotated:
-            annotation = get_args(annotation)[0]
+            inside, *metadata = get_args(annotation)
+            kinds = next((part for part in metadata if isinstance(part, Kinds)), None)
+            # the kinds of other packages are no part of the annotation itself
+            annotation = inside if kinds is None else get_args(kinds.union(inside))[0]
         elif _is_union(annotation) and len(_options(annotation)) == 1:
             annotation = _options(annotation)[0]
         else:
@@ -216,7 +221,13 @@ def _is_model(kind: Any) -> bool:
 
 
 def _fields(model: type[BaseModel]) -> dict[str, Any]:
-    return {field.alias or name: field.annotation for name, field in model.model_fields.items()}
+    return {field.alias or name: _marked(field) for name, field in model.model_fields.items()}
+
+
+def _marked(field: FieldInfo) -> Any:
+    """The annotation of a field with the marker that pydantic has moved into its metadata."""
+    kinds = next((part for part in field.metadata if isinstance(part, Kinds)), None)
+    return field.annotation if kinds is None else Annotated[field.annotation, kinds]
 
 
 def _keys(kinds: tuple[Any, ...]) -> list[str]:

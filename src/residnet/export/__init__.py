@@ -1,2 +1,28 @@
-"""Leaving residnet: TorchScript modules for controllers, each with its card and its parity check.
-"""
+"""Export of models for controllers: one file per format, found by name in `exporters`."""
+
+from __future__ import annotations
+
+from residnet.core.registry import ThirdParty, objects, usable
+from residnet.export.base import Exporter
+from residnet.export.feed_forward import FeedForwardExporter
+from residnet.export.torchscript import TorchScriptExporter
+
+__all__ = ["Exporter", "exporter", "exporters"]
+
+_BUILTIN: tuple[Exporter, ...] = (TorchScriptExporter(), FeedForwardExporter())
+
+
+def exporters() -> dict[str, Exporter | ThirdParty]:
+    """Return all formats by name, those of other packages included; a broken one is kept."""
+    builtin = {format.name: format for format in _BUILTIN}
+    return objects("residnet.exporters", builtin, Exporter)
+
+
+def exporter(name: str) -> Exporter:
+    """Return the format of that name.
+
+    Raises:
+        ConfigError: where there is none, or the package that offers it is broken.
+    """
+    found: Exporter = usable(exporters(), name, "export format")
+    return found

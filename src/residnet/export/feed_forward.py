@@ -4,9 +4,9 @@ eq. (3.24)), as TorchScript.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, final
+from typing import Any, ClassVar, final
 
 import torch
 from torch import Tensor, nn
@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from residnet.core.errors import ExportError, UsageError
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
+from residnet.export.base import Exporter
 from residnet.export.scripting import write_scripted
 from residnet.heads import ForceHead
 from residnet.physics.force_model import MOTION
@@ -75,7 +76,7 @@ def export_feed_forward(
     lag: dict[str, float] | None,
     ranges: Sequence[tuple[float, float]],
     file: Path,
-) -> None:
+) -> dict[str, Any]:
     """Write F(nu_dot, nu) as TorchScript with its card.
 
     Args:
@@ -83,6 +84,9 @@ def export_feed_forward(
         lag: of the thrusters, for the card; None where it was not fitted.
         ranges: of nu_dot and nu in the training data, six.
         file: where to write.
+
+    Returns:
+        The card.
 
     Raises:
         ExportError: where the exported module differs from the model.
@@ -126,4 +130,24 @@ def export_feed_forward(
             "safety": "TorchScript is code that runs when loaded: load only files that you trust.",
         }
 
-    write_scripted(file, model, (), check, card)
+    return write_scripted(file, model, (), check, card)
+
+
+@final
+class FeedForwardExporter(Exporter):
+    """The force that a motion needs, as TorchScript, of a model in force space."""
+
+    name: ClassVar[str] = "feed_forward"
+    suffix: ClassVar[str] = "_feed_forward.pt"
+    about: ClassVar[str] = "tau = F(nu_dot, nu) of a model in force space, as TorchScript"
+
+    def export(
+        self,
+        spec: ModelSpec,
+        model: HybridDynamics,
+        file: Path,
+        rows: Sequence[Mapping[str, Any]],
+    ) -> Mapping[str, Any]:
+        """Write the feed-forward of a model and return its card; `rows` are not part of it."""
+        force, ranges = required_force(spec, model)
+        return export_feed_forward(force, None, ranges, file)

@@ -7,9 +7,9 @@ archive. TorchScript is code: load only files that you trust.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, final
 
 import torch
 from torch import Tensor, nn
@@ -20,6 +20,7 @@ from residnet.core.names import STATE
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.store import ModelSpec
+from residnet.export.base import Exporter
 from residnet.export.scripting import write_scripted
 
 PARITY_STEPS = 1000
@@ -74,7 +75,7 @@ class ExportedModel(nn.Module):
 
 
 def export_torchscript(
-    spec: ModelSpec, model: HybridDynamics, file: Path, metrics: list[Mapping[str, Any]]
+    spec: ModelSpec, model: HybridDynamics, file: Path, metrics: Sequence[Mapping[str, Any]]
 ) -> dict[str, Any]:
     """Write one model as TorchScript with its card, after a parity check.
 
@@ -143,7 +144,7 @@ def check_parity(spec: ModelSpec, model: HybridDynamics, exported: Any) -> dict[
 def make_card(
     spec: ModelSpec,
     model: HybridDynamics,
-    metrics: list[Mapping[str, Any]],
+    metrics: Sequence[Mapping[str, Any]],
     parity: Mapping[str, float],
 ) -> dict[str, Any]:
     """The model card: all that a user needs to drive the module, and how good it is."""
@@ -188,3 +189,22 @@ def make_card(
             " under models/ hold numbers only."
         ),
     }
+
+
+@final
+class TorchScriptExporter(Exporter):
+    """One file that a controller loads with torch alone."""
+
+    name: ClassVar[str] = "torchscript"
+    suffix: ClassVar[str] = ".pt"
+    about: ClassVar[str] = "the model as TorchScript, for Python and C++ with torch alone"
+
+    def export(
+        self,
+        spec: ModelSpec,
+        model: HybridDynamics,
+        file: Path,
+        rows: Sequence[Mapping[str, Any]],
+    ) -> Mapping[str, Any]:
+        """Write the model in float32 and return its card."""
+        return export_torchscript(spec, model, file, rows)

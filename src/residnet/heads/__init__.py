@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import Field
-
-from residnet.heads.base import ClosedFormHead, EquationHead, ResidualHead
+from residnet.core.registry import Kinds
+from residnet.heads.base import ClosedFormHead, EquationHead, HeadKind, ResidualHead
 from residnet.heads.force import ForceHead
 from residnet.heads.genetic import GeneticConfig
 from residnet.heads.kernel import KernelConfig
@@ -25,8 +24,9 @@ HeadConfig = Annotated[
     | GeneticConfig
     | MlpConfig
     | LstmConfig,
-    Field(discriminator="kind"),
+    Kinds("residnet.heads", HeadKind),
 ]
+"""Config of any head, those of other packages included; its `kind` says which."""
 
 __all__ = [
     "ClosedFormHead",
@@ -34,6 +34,7 @@ __all__ = [
     "ForceHead",
     "GeneticConfig",
     "HeadConfig",
+    "HeadKind",
     "KernelConfig",
     "LstmConfig",
     "MlpConfig",

@@ -156,6 +156,24 @@ class FeatureConfig(Config):
         return self.features or tuple(names)
 
 
+class HeadKind(FeatureConfig, ABC):
+    """The config of a head that another package offers: its `kind` and how the head is built.
+
+    Attributes:
+        kind: a `Literal` with the name of the entry point in the group `residnet.heads`.
+    """
+
+    kind: str
+
+    @abstractmethod
+    def build(self, names: Sequence[str]) -> ResidualHead:
+        """Return the head, its numbers not yet found, for channels `names`.
+
+        Raises:
+            ConfigError: where a channel that it needs is missing.
+        """
+
+
 class Features(nn.Module):
     """Selected, guarded and standardised channels: z [..., nz] -> [..., F], near zero mean and unit
     variance on the training data.

@@ -8,11 +8,12 @@ from typing import Annotated
 
 from pydantic import Field
 
+from residnet.core.registry import Kinds
 from residnet.manoeuvres.acceleration_deceleration import (
     AccelerationDeceleration,
     AccelerationDecelerationFamily,
 )
-from residnet.manoeuvres.base import Helm, Manoeuvre, StackedSource, Watched
+from residnet.manoeuvres.base import Helm, Manoeuvre, Scheduled, StackedSource, Watched
 from residnet.manoeuvres.constant import ConstantFamily, ConstantInput
 from residnet.manoeuvres.excitation import (
     MultiSine,
@@ -43,7 +44,9 @@ AnyManoeuvre = (
     | FourCorner
     | Replay
 )
-ManoeuvreConfig = Annotated[AnyManoeuvre, Field(discriminator="kind")]
+ManoeuvreConfig = Annotated[AnyManoeuvre, Kinds("residnet.manoeuvres", Manoeuvre)]
+"""Config of any manoeuvre, those of other packages included; its `kind` says which."""
+
 FamilyConfig = Annotated[
     ConstantFamily
     | ZigzagFamily
@@ -66,6 +69,7 @@ __all__ = [
     "MultiSine",
     "RandomSteps",
     "Replay",
+    "Scheduled",
     "Spiral",
     "StackedSource",
     "Stopping",

@@ -12,12 +12,21 @@ from pydantic import AfterValidator, Field
 from residnet.core.config import load_config
 from residnet.core.errors import ConfigError
 from residnet.core.names import nearest
-from residnet.core.resources import config_folder
 from residnet.physics.abkowitz import AbkowitzConfig
 from residnet.physics.fossen import FossenConfig, MassMatrixConfig
 from residnet.physics.nomoto import NomotoConfig, SecondOrderNomotoConfig, SideslipNomotoConfig
 from residnet.physics.odin import OdinConfig
 from residnet.physics.patrol import PatrolConfig
+from residnet.physics.vessel_file import broken_vessels, vessel_files
+
+__all__ = [
+    "AnyVessel",
+    "VesselConfig",
+    "VesselName",
+    "broken_vessels",
+    "load_vessel",
+    "vessel_files",
+]
 
 AnyVessel = (
     FossenConfig
@@ -30,11 +39,6 @@ AnyVessel = (
     | SideslipNomotoConfig
 )
 VesselConfig = Annotated[AnyVessel, Field(discriminator="kind")]
-
-
-def vessel_files() -> dict[str, Path]:
-    """Names and files of the vessels that come with residnet."""
-    return {path.stem: path for path in sorted((config_folder() / "vessels").glob("*.yaml"))}
 
 
 def load_vessel(name: str) -> AnyVessel:

@@ -2,22 +2,33 @@
 
 from __future__ import annotations
 
-from typing import Any, get_args
+from typing import Any
 
 from residnet.baselines import BaselineConfig
+from residnet.core.errors import ResidnetError
+from residnet.core.registry import ThirdParty, broken_kinds, kinds
 from residnet.data.readers import ReaderConfig
+from residnet.export import exporters
 from residnet.heads import HeadConfig
 from residnet.manoeuvres import ManoeuvreConfig
-from residnet.physics.vessel import load_vessel, vessel_files
+from residnet.physics.vessel import broken_vessels, load_vessel, vessel_files
 from residnet.tasks.union import TaskConfig
 
 
 def catalogue(what: str) -> list[tuple[str, str]]:
-    """Names and one-line descriptions of `vessels`, `heads`, `manoeuvres`, `readers`, `tasks` or
-    `baselines`.
+    """Return names and one-line descriptions of what there is, third-party parts included.
+
+    Args:
+        what: `vessels`, `heads`, `manoeuvres`, `readers`, `tasks`, `baselines` or `formats`.
     """
     if what == "vessels":
-        return [(name, load_vessel(name).description) for name in vessel_files()]
+        found = [(name, _description(name)) for name in vessel_files()]
+        return found + [_broken(part) for part in broken_vessels()]
+    if what == "formats":
+        return [
+            _broken(part) if isinstance(part, ThirdParty) else (name, part.about)
+            for name, part in exporters().items()
+        ]
     unions: dict[str, Any] = {
         "heads": HeadConfig,
         "manoeuvres": ManoeuvreConfig,
@@ -25,10 +36,22 @@ def catalogue(what: str) -> list[tuple[str, str]]:
         "tasks": TaskConfig,
         "baselines": BaselineConfig,
     }
-    members = get_args(get_args(unions[what])[0])
-    return [(_tag(member), (member.__doc__ or "").strip().splitlines()[0]) for member in members]
+    union = unions[what]
+    known = [(name, _first_line(config)) for name, config in kinds(union).items()]
+    return known + [_broken(part) for part in broken_kinds(union).values()]
 
 
-def _tag(member: Any) -> str:
-    field = member.model_fields.get("kind") or member.model_fields["task"]
-    return str(get_args(field.annotation)[0])
+def _description(vessel: str) -> str:
+    try:
+        return load_vessel(vessel).description
+    except ResidnetError as error:
+        # one wrong file of another package must not hide all others
+        return f"(cannot be used: {error})"
+
+
+def _first_line(config: type[Any]) -> str:
+    return (config.__doc__ or "").strip().splitlines()[0]
+
+
+def _broken(part: ThirdParty) -> tuple[str, str]:
+    return part.name, f"(cannot be used: {part.fault}; from {part.package})"

@@ -9,19 +9,19 @@ from residnet.core.config import load_mapping
 from residnet.core.errors import UsageError
 from residnet.core.names import nearest
 from residnet.dynamics.store import load_model, model_names
-from residnet.export.feed_forward import export_feed_forward, required_force
-from residnet.export.torchscript import export_torchscript
+from residnet.export import exporter
 from residnet.runs.folder import RunFolder
 
 
 def export_model(path: Path, name: str, out: Path | None, form: str = "torchscript") -> Path:
-    """Export one model of a finished run, `torchscript` to run it or `feed_forward` for the force
-    that a motion needs; returns the file.
+    """Export one model of a finished run in the format of that name, and return the file.
 
     Raises:
+        ConfigError: where there is no such format.
         UsageError: where the run or the model does not exist.
         ExportError: where the exported module differs from the model.
     """
+    format = exporter(form)
     folder = RunFolder.open(path)
     content = folder.read_metrics()
     policies = load_mapping(folder.resolved).get("policies")
@@ -33,14 +33,9 @@ def export_model(path: Path, name: str, out: Path | None, form: str = "torchscri
             f"{path}: no model '{name}'{nearest(name, ['selected', *model_names(folder.models)])}"
         )
     spec, model = load_model(folder.models / chosen)
-    if form == "feed_forward":
-        force, ranges = required_force(spec, model)
-        file = out or folder.exports / f"{chosen}_feed_forward.pt"
-        export_feed_forward(force, None, ranges, file)
-        return file
     rows = [row for row in content["rows"] if row["model"] == chosen and row["manoeuvre"] == "all"]
-    file = out or folder.exports / f"{chosen}.pt"
-    export_torchscript(spec, model, file, rows)
+    file = out or folder.exports / f"{chosen}{format.suffix}"
+    format.export(spec, model, file, rows)
     return file
 
 

@@ -1,11 +1,11 @@
-"""All kinds of run."""
+"""All kinds of run, those of other packages included."""
 
 from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import Field
-
+from residnet.core.config import Config
+from residnet.core.registry import Kinds
 from residnet.documents.halvorsen2019.breeding.task import BreedingTaskConfig
 from residnet.documents.halvorsen2019.sea_trial.task import SeaTrialTaskConfig
 from residnet.documents.jervan2020.ferry.task import FerryStudyConfig
@@ -30,5 +30,5 @@ TaskConfig = Annotated[
     | ForceResidualConfig
     | BreedingTaskConfig
     | SeaTrialTaskConfig,
-    Field(discriminator="task"),
+    Kinds("residnet.tasks", Config, key="task"),
 ]

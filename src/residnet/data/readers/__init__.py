@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import Field
-
-from residnet.data.readers.base import LogReader
+from residnet.core.registry import Kinds
+from residnet.data.readers.base import LogReader, ReaderKind
 from residnet.data.readers.detect import AutoConfig
 from residnet.data.readers.recorders.ardupilot import ArduPilotConfig
 from residnet.data.readers.recorders.hdf5 import Hdf5Config
@@ -31,9 +30,9 @@ ReaderConfig = Annotated[
     | UlogConfig
     | ArduPilotConfig
     | AutoConfig,
-    Field(discriminator="kind"),
+    Kinds("residnet.readers", ReaderKind),
 ]
-"""Config of any reader; its `kind` says which."""
+"""Config of any reader, those of other packages included; its `kind` says which."""
 
 __all__ = [
     "ArduPilotConfig",
@@ -48,6 +47,7 @@ __all__ = [
     "NmeaConfig",
     "ParquetConfig",
     "ReaderConfig",
+    "ReaderKind",
     "RosbagConfig",
     "TableReader",
     "TimeColumn",

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from residnet.core.config import Config
 from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
 from residnet.core.names import nearest
@@ -30,6 +31,20 @@ class LogReader(ABC):
             UsageError: where the file or a column is missing, or a unit does not fit.
             DataError: where the contents cannot be used.
         """
+
+
+class ReaderKind(Config, ABC):
+    """The config of a reader that another package offers: its `kind` and how the reader is built.
+
+    Attributes:
+        kind: a `Literal` with the name of the entry point in the group `residnet.readers`.
+    """
+
+    kind: str
+
+    @abstractmethod
+    def build(self) -> LogReader:
+        """Return the reader."""
 
 
 def require_file(path: Path) -> None:

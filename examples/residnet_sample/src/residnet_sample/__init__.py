@@ -1,0 +1,1 @@
+"""An example of a package that adds parts of its own to residnet."""

@@ -1,0 +1,65 @@
+"""A reader of the plain tables of one logger: time, pose, speed in knots, yaw rate, commands."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Literal, final
+
+import numpy as np
+
+from residnet.core.errors import DataError
+from residnet.core.log import Log
+from residnet.data.readers import LogReader, ReaderKind
+from residnet.data.readers.base import (
+    provenance,
+    require_file,
+    require_increasing,
+    require_samples,
+    unwrap,
+)
+
+_KNOT = 1852.0 / 3600.0
+
+
+class KnotsConfig(ReaderKind):
+    """Tables whose columns are t [s], x [m], y [m], heading [deg], u [kn], v [kn], yaw [deg/s].
+
+    Attributes:
+        kind: names this reader in a config.
+    """
+
+    kind: Literal["knots"] = "knots"
+
+    def build(self) -> LogReader:
+        """Return the reader."""
+        return KnotsReader()
+
+
+@final
+class KnotsReader(LogReader):
+    """Reads one table without a header line; columns after the seventh are commands in 1/s."""
+
+    def read(self, path: Path) -> Log:
+        """Return the log in one file, in SI units, psi unwrapped."""
+        require_file(path)
+        try:
+            table = np.loadtxt(path, delimiter=",", ndmin=2)
+        except ValueError as error:
+            raise DataError(f"{path}: not a table of numbers ({error})") from error
+        if table.shape[1] < 7:
+            raise DataError(f"{path}: {table.shape[1]} columns, at least 7 are needed")
+        t = table[:, 0]
+        require_samples(path, t)
+        require_increasing(path, t, lambda i: f"line {i + 1}")
+        channels = {
+            "x": table[:, 1],
+            "y": table[:, 2],
+            "psi": unwrap(table[:, 3] * math.pi / 180.0),
+            "u": table[:, 4] * _KNOT,
+            "v": table[:, 5] * _KNOT,
+            "r": table[:, 6] * math.pi / 180.0,
+        }
+        commands = dict(zip(("n_port", "n_stbd"), table[:, 7:].T, strict=False))
+        meta = provenance(path, len(t), 0)
+        return Log(path.stem, t, channels | commands, meta=meta)

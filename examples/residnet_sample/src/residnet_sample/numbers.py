@@ -1,0 +1,43 @@
+"""An export format: the parameters of a model as one table of text, one number a line."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar, final
+
+import numpy as np
+
+from residnet.core.errors import ExportError
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.store import ModelSpec
+from residnet.export import Exporter
+
+
+@final
+class NumbersExporter(Exporter):
+    """Every number of a model, as `name,index,value` lines."""
+
+    name: ClassVar[str] = "numbers"
+    suffix: ClassVar[str] = ".csv"
+    about: ClassVar[str] = "every number of a model as a table of text (sample package)"
+
+    def export(
+        self,
+        spec: ModelSpec,
+        model: HybridDynamics,
+        file: Path,
+        rows: Sequence[Mapping[str, Any]],
+    ) -> Mapping[str, Any]:
+        """Write the table, read it back, and return how many numbers it holds."""
+        numbers = [
+            (f"{name},{index}", float(value))
+            for name, tensor in model.state_dict().items()
+            for index, value in enumerate(tensor.reshape(-1).tolist())
+        ]
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text("".join(f"{name},{value!r}\n" for name, value in numbers))
+        back = [float(line.rsplit(",", 1)[1]) for line in file.read_text().splitlines()]
+        if not np.array_equal(back, [value for _, value in numbers], equal_nan=True):
+            raise ExportError(f"{file}: the table does not give the model's numbers back")
+        return {"model": spec.name, "numbers": len(numbers)}

@@ -1,0 +1,1 @@
+"""Vessel files of this package; each is found by its name."""

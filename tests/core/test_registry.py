@@ -1,0 +1,107 @@
+"""Parts of other installed packages, with the sample package of examples/ as one."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from sample_package import install
+
+from residnet.core import registry
+from residnet.core.config import validate
+from residnet.core.errors import ConfigError
+from residnet.data.readers import ReaderConfig
+from residnet.export import exporter, exporters
+from residnet.heads import HeadConfig, PlsrConfig
+from residnet.manoeuvres import ManoeuvreConfig
+from residnet.physics.vessel import load_vessel
+from residnet.tasks.catalogue import catalogue
+
+
+@pytest.fixture
+def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder on the path that the sample package is installed in."""
+    monkeypatch.syspath_prepend(install(tmp_path / "site"))
+    registry.forget()
+    yield tmp_path
+    monkeypatch.undo()
+    registry.forget()
+    for name in [name for name in sys.modules if name.startswith("residnet_sample")]:
+        del sys.modules[name]
+
+
+def declare(site: Path, group: str, **points: str) -> None:
+    """Add a made package with entry points in one group."""
+    info = site / "made-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: made\nVersion: 1.0\n")
+    lines = "".join(f"{name} = {target}\n" for name, target in points.items())
+    (info / "entry_points.txt").write_text(f"[{group}]\n{lines}")
+    registry.forget()
+
+
+@pytest.mark.usefixtures("installed")
+def test_parts_are_found_by_name() -> None:
+    head = validate({"kind": "slow_water", "time_constant": "3 s"}, HeadConfig, "here")
+    assert type(head).__module__ == "residnet_sample.slow_water"
+    assert head.time_constant == 3.0
+    assert validate({"kind": "knots"}, ReaderConfig, "here").build() is not None
+    assert validate({"kind": "pulse"}, ManoeuvreConfig, "here").kind == "pulse"
+    assert load_vessel("sample_ferry").build().commands == 2
+    assert exporter("numbers").suffix == ".csv"
+    assert isinstance(validate({"kind": "plsr"}, HeadConfig, "here"), PlsrConfig)
+
+
+@pytest.mark.usefixtures("installed")
+def test_errors_know_the_keys_of_third_party_kinds() -> None:
+    with pytest.raises(ConfigError, match="time_konstant: unknown key; did you mean 'time_const"):
+        validate({"kind": "slow_water", "time_konstant": 3}, HeadConfig, "here")
+    with pytest.raises(ConfigError, match="'slow_watr'; did you mean 'slow_water'"):
+        validate({"kind": "slow_watr"}, HeadConfig, "here")
+
+
+@pytest.mark.usefixtures("installed")
+def test_a_broken_part_says_so_where_it_is_used_and_disturbs_nothing_else() -> None:
+    with pytest.raises(ConfigError, match=r"residnet-sample 0\.1\.0 cannot be used: ModuleNotF"):
+        validate({"kind": "absent", "anything": 1}, HeadConfig, "here")
+    listed = dict(catalogue("heads"))
+    assert listed["absent"].startswith("(cannot be used: ModuleNotFoundError")
+    assert listed["slow_water"] == "A linear map of the channels and of their running means."
+
+
+@pytest.mark.parametrize(
+    ("target", "fault"),
+    [
+        ("residnet.heads:PlsrConfig", "no subclass of residnet.heads.base.HeadKind"),
+        ("residnet.heads:HeadKind", "HeadKind lacks build"),
+        ("residnet_sample.slow_water:SlowWaterConfig", "has no field `kind: Literal['odd']`"),
+        ("residnet_sample.slow_water:Nothing", "AttributeError"),
+        ("os", "no subclass"),
+    ],
+)
+def test_faults_of_kinds(installed: Path, target: str, fault: str) -> None:
+    declare(installed / "site", "residnet.heads", odd=target)
+    assert fault in registry.broken_kinds(HeadConfig)["odd"].fault
+
+
+def test_no_package_takes_a_name_away(installed: Path) -> None:
+    declare(installed / "site", "residnet.heads", plsr="residnet_sample.slow_water:SlowWaterConfig")
+    assert isinstance(validate({"kind": "plsr"}, HeadConfig, "here"), PlsrConfig)
+    assert "residnet has a kind of that name" in registry.broken_kinds(HeadConfig)["plsr"].fault
+
+
+def test_faults_of_formats_and_vessels(installed: Path) -> None:
+    declare(installed / "site", "residnet.exporters", odd="residnet_sample.knots:KnotsReader")
+    assert isinstance(exporters()["odd"], registry.ThirdParty)
+    with pytest.raises(ConfigError, match=r"format 'odd' of the package made 1\.0 cannot be"):
+        exporter("odd")
+    with pytest.raises(ConfigError, match=r"no export format 'onxx'; valid: .*torchscript"):
+        exporter("onxx")
+
+
+def test_a_vessel_package_without_files(installed: Path) -> None:
+    declare(installed / "site", "residnet.vessels", odd="residnet_sample.pulse:Pulse")
+    assert "no package with files" in dict(catalogue("vessels"))["odd"]
+    assert "sample package" in dict(catalogue("vessels"))["sample_ferry"]
