@@ -18,8 +18,8 @@ import torch
 from sklearn.cross_decomposition import PLSRegression
 from threadpoolctl import threadpool_limits
 
-from residnet.heads.basis import FoldMoments
-from residnet.heads.surface import surface
+from residnet.regression.moments import FoldMoments
+from residnet.regression.surface import surface
 
 FOLDS = 5
 

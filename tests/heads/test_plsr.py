@@ -11,7 +11,8 @@ from sklearn.cross_decomposition import PLSRegression
 from residnet.core.errors import FitError
 from residnet.heads import PlsrConfig
 from residnet.heads.basis import BasisHead
-from residnet.heads.plsr import PlsrHead, pls_path
+from residnet.heads.plsr import PlsrHead
+from residnet.regression.plsr import pls_path
 
 
 def sklearn_fit(x: np.ndarray, y: np.ndarray, order: int) -> PLSRegression:

@@ -12,9 +12,15 @@ import numpy as np
 import pytest
 
 from residnet.core.errors import FitError, UsageError
-from residnet.regression.expressions import Algebra, Limits, Product
-from residnet.regression.genetic import EvolutionConfig, Found, evolve, limits_of, require_deap
-from residnet.regression.genetic_fitness import Fitness
+from residnet.regression.expressions.algebra import Algebra, Limits, Product
+from residnet.regression.genetic.evolution import (
+    EvolutionConfig,
+    Found,
+    evolve,
+    limits_of,
+    require_deap,
+)
+from residnet.regression.genetic.fitness import Fitness
 
 NAMES = ("a", "b", "c")
 DATA = {name: np.random.default_rng(i).normal(size=200) for i, name in enumerate(NAMES)}

@@ -108,7 +108,9 @@ def test_what_lies_around_the_best_is_tried_while_it_gains() -> None:
     def at(value: float) -> Solution:
         theta = torch.full((3, 1), value, dtype=torch.float64)
         return Solution(
-            {"value": value}, {"theta": theta}, neighbours=lambda: [at(value - 1.0), at(value + 1.0)]
+            {"value": value},
+            {"theta": theta},
+            neighbours=lambda: [at(value - 1.0), at(value + 1.0)],
         )
 
     def bench(candidate: HybridDynamics) -> float:
@@ -130,7 +132,9 @@ def test_what_stands_alone_does_not_end_the_search() -> None:
     def at(value: float) -> Solution:
         theta = torch.full((3, 1), value, dtype=torch.float64)
         return Solution(
-            {"value": value}, {"theta": theta}, neighbours=lambda: [at(value - 1.0), at(value + 1.0)]
+            {"value": value},
+            {"theta": theta},
+            neighbours=lambda: [at(value - 1.0), at(value + 1.0)],
         )
 
     def bench(candidate: HybridDynamics) -> float:

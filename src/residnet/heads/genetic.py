@@ -16,11 +16,11 @@ from torch import Tensor
 from residnet.core.names import ACCELERATION
 from residnet.core.samples import Samples
 from residnet.heads.base import EquationHead, FeatureConfig, Features
-from residnet.heads.expression_library import ExpressionLibrary, Weights, tables
-from residnet.heads.expression_text import c_function, term, total
-from residnet.regression.expressions import Algebra, Product
-from residnet.regression.genetic import EvolutionConfig, Found, evolve, limits_of
-from residnet.regression.notation import LATEX, PLAIN, SYMPY, latex_left
+from residnet.regression.expressions.algebra import Algebra, Product
+from residnet.regression.expressions.library import ExpressionLibrary, Weights, tables
+from residnet.regression.expressions.notation import LATEX, PLAIN, SYMPY, latex_left
+from residnet.regression.expressions.text import c_function, term, total
+from residnet.regression.genetic.evolution import EvolutionConfig, Found, evolve, limits_of
 from residnet.regression.solutions import Coefficient, Solution
 from residnet.regression.sparse import Equation, Reduced, SearchConfig, find, reduce
 from residnet.regression.sparse_search import coefficients

@@ -15,9 +15,9 @@ from residnet.core.errors import FitError
 from residnet.core.samples import Samples
 from residnet.heads.base import ClosedFormHead, FeatureConfig, Features
 from residnet.physics.terms import TermLibrary
-from residnet.regression.kernel_fit import Path
-from residnet.regression.kernel_functions import Polynomial, Rbf
-from residnet.regression.kernel_recursion import Recursion
+from residnet.regression.kernel.functions import Polynomial, Rbf
+from residnet.regression.kernel.path import Path
+from residnet.regression.kernel.recursion import Recursion
 from residnet.regression.solutions import Solution
 
 

@@ -16,7 +16,6 @@ from residnet.core.names import ACCELERATION
 from residnet.core.samples import Samples
 from residnet.heads.base import EquationHead, FeatureConfig, Features
 from residnet.heads.delay_line import DelayConfig, DelayLine, Past, best_delay
-from residnet.heads.equation_text import Written, c_function, latex, plain, sympy_text
 from residnet.physics.candidates import Candidate, CandidatesConfig, rated
 from residnet.physics.symmetry import wrong_parity
 from residnet.physics.terms import TermLibrary, parse_term
@@ -26,6 +25,14 @@ from residnet.regression.equation_rows import (
     Rows,
     step_of,
     stretches,
+)
+from residnet.regression.expressions.equations import (
+    Factor,
+    Written,
+    c_function,
+    latex,
+    plain,
+    sympy_text,
 )
 from residnet.regression.solutions import Coefficient, Solution
 from residnet.regression.sparse import NOTHING, Equation, Reduced, SearchConfig, find, reduce
@@ -281,7 +288,15 @@ class SymbolicHead(EquationHead):
         self, name: str, equation: Equation, within: Reduced, steps: int
     ) -> dict[str, Any]:
         """One equation in writing, with what the data say about it."""
-        written = Written(name, equation.terms, equation.values.tolist(), self.features.names)
+        channels = self.features.names
+        factors = [
+            [
+                Factor("abs" if factor.magnitude else factor.function, factor.name, factor.power)
+                for factor in parse_term(term, channels)
+            ]
+            for term in equation.terms
+        ]
+        written = Written(name, equation.terms, factors, equation.values.tolist(), channels)
         late = (
             f"; {', '.join(self.line.channels)}: {steps} steps earlier" if self.line.count else ""
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from residnet.heads.regressions import Fit, table
+from residnet.documents.jervan2020.regressions import Fit, table
 
 
 def coefficients_text(

@@ -13,7 +13,7 @@ from residnet.control.motion.anticipation import Lag
 from residnet.core.config import Config
 from residnet.core.errors import FitError
 from residnet.core.frames import to_body
-from residnet.heads.regressions import Fit, Regression, RegressionConfig
+from residnet.documents.jervan2020.regressions import Fit, Regression, RegressionConfig
 from residnet.judge.tracking import mse
 from residnet.physics.force_model import FERRY_TERMS, MOTION, Correction, ForceModel, column_scale
 from residnet.physics.terms import TermLibrary, parse_term

@@ -127,7 +127,7 @@ class BreedingTaskConfig(Config):
         Raises:
             UsageError: where it is not installed.
         """
-        from residnet.regression.genetic import require_deap
+        from residnet.regression.genetic.evolution import require_deap
 
         require_deap()
 

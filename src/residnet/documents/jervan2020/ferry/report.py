@@ -21,9 +21,9 @@ from residnet.documents.jervan2020.forward import (
     missing_coefficients,
 )
 from residnet.documents.jervan2020.model_table import coefficients_text, notes_text
+from residnet.documents.jervan2020.regressions import SurfaceRegression
 from residnet.documents.jervan2020.residual_model import Published
 from residnet.export.feed_forward import export_feed_forward
-from residnet.heads.regressions import SurfaceRegression
 from residnet.report.figures.force import draw_surface, draw_weights
 from residnet.report.figures.loop import draw_errors, draw_force_parts
 from residnet.runs.folder import RunFolder

@@ -12,8 +12,8 @@ from residnet.core.errors import ConfigError
 from residnet.data.prepare import PrepareConfig
 from residnet.data.readers import ReaderConfig
 from residnet.data.split import matches
+from residnet.documents.jervan2020.regressions import SurfaceRegression
 from residnet.documents.jervan2020.residual_model import ResidualModelConfig
-from residnet.heads.regressions import SurfaceRegression
 from residnet.physics.fossen import Fossen3, FossenVessel, HullConfig
 from residnet.physics.vessel import load_vessel
 

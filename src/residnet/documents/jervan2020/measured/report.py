@@ -11,7 +11,7 @@ from residnet.documents.jervan2020.measured.config import ForceSettings
 from residnet.documents.jervan2020.measured.data import AXES
 from residnet.documents.jervan2020.measured.study import ForceStudy, better, judge, unmodelled
 from residnet.documents.jervan2020.model_table import coefficients_text, notes_text
-from residnet.heads.regressions import SurfaceRegression
+from residnet.documents.jervan2020.regressions import SurfaceRegression
 from residnet.physics.force_model import ForceModel
 from residnet.report.figures.force import draw_surface, draw_weights
 from residnet.report.figures.measured import ACCELERATION_UNITS, FORCE_UNITS, draw_pair, draw_scores

@@ -16,8 +16,8 @@ from residnet.core.errors import ConfigError, FitError
 from residnet.documents.jervan2020.forward import forward_equations
 from residnet.documents.jervan2020.measured.config import ForceSettings, MeasuredModelConfig
 from residnet.documents.jervan2020.measured.data import Measured, compare_forces, read_measured
+from residnet.documents.jervan2020.regressions import Fit
 from residnet.documents.jervan2020.residual_model import Record, fit_model
-from residnet.heads.regressions import Fit
 from residnet.judge.bootstrap import Blocks, intervals
 from residnet.physics.force_model import ForceModel
 

@@ -22,7 +22,7 @@ from pydantic import Field, model_validator
 
 from residnet.core.config import Config
 from residnet.core.errors import FitError, UsageError
-from residnet.regression.expressions import (
+from residnet.regression.expressions.algebra import (
     ONE,
     Algebra,
     Function,
@@ -31,7 +31,7 @@ from residnet.regression.expressions import (
     Sum,
     TooLargeError,
 )
-from residnet.regression.genetic_fitness import Fitness, Terms
+from residnet.regression.genetic.fitness import Fitness, Terms
 
 Operator = Literal["+", "-", "*", "/", "abs", "sin", "cos", "sqrt"]
 _NAMES = {

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from residnet.regression.expressions import FUNCTIONS, Algebra, Atom, Limits, Product
+from residnet.regression.expressions.algebra import FUNCTIONS, Algebra, Atom, Limits, Product
 
 _ROOT_FLOOR = 1e-24
 

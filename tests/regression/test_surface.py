@@ -8,8 +8,8 @@ import torch
 from sklearn.cross_decomposition import PLSRegression
 
 from residnet.core.errors import FitError
-from residnet.heads.basis import FoldMoments
-from residnet.heads.surface import surface
+from residnet.regression.moments import FoldMoments
+from residnet.regression.surface import surface
 
 
 def data(

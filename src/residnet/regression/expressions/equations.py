@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from residnet.physics.terms import Factor, parse_term
-from residnet.regression.notation import (
+from residnet.regression.expressions.notation import (
     LATEX,
     PLAIN,
     SYMPY,
@@ -18,13 +17,28 @@ from residnet.regression.notation import (
 )
 
 
+class Factor(NamedTuple):
+    """A function of a channel to a whole power; no function stands for the channel itself."""
+
+    function: str
+    channel: str
+    power: int
+
+
 class Written(NamedTuple):
-    """One equation: the name of its left side, its terms, their coefficients, and the channels that
-    may appear.
+    """An equation to be written: a sum of terms with coefficients.
+
+    Attributes:
+        name: left side, for example `u_dot`.
+        terms: names of the terms.
+        factors: factors of each term.
+        values: coefficients of the terms.
+        channels: channels that may appear, in the order of a function's arguments.
     """
 
     name: str
     terms: Sequence[str]
+    factors: Sequence[Sequence[Factor]]
     values: Sequence[float]
     channels: Sequence[str]
 
@@ -54,9 +68,7 @@ def c_function(equation: Written, comment: str = "") -> str:
     """A C99 function `double <name>(double <channel>, ...)` with all channels as arguments, all
     digits; needs <math.h>.
     """
-    used = {
-        factor.name for term in equation.terms for factor in parse_term(term, equation.channels)
-    }
+    used = {factor.channel for factors in equation.factors for factor in factors}
     value = signed_sum(_parts(equation, C), equation.values) if equation.terms else "0.0"
     return c_body(equation.name, equation.channels, sorted(used), value, comment)
 
@@ -67,15 +79,14 @@ def _parts(equation: Written, style: Style) -> list[str]:
         style.times.join(
             [
                 style.number(abs(value)),
-                *(_factor(factor, style) for factor in parse_term(term, equation.channels)),
+                *(_factor(factor, style) for factor in factors),
             ]
         )
-        for term, value in zip(equation.terms, equation.values, strict=True)
+        for factors, value in zip(equation.factors, equation.values, strict=True)
     ]
 
 
 def _factor(factor: Factor, style: Style) -> str:
-    function = "abs" if factor.magnitude else factor.function
-    name = style.channel(factor.name)
-    symbol = style.functions[function](name) if function else name
+    name = style.channel(factor.channel)
+    symbol = style.functions[factor.function](name) if factor.function else name
     return symbol if factor.power == 1 else style.power(symbol, factor.power)

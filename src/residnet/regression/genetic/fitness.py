@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from residnet.regression.expressions import Algebra, Columns, Product
+from residnet.regression.expressions.algebra import Algebra, Columns, Product
 
 Terms = tuple[Product, ...]
 _SINGULAR = 1e-13

@@ -14,9 +14,9 @@ from sklearn.cross_decomposition import PLSRegression
 from sklearn.linear_model import LinearRegression, Ridge
 
 from residnet.core.errors import FitError
-from residnet.heads.nipals import nipals
-from residnet.heads.plsr import pls_path
-from residnet.heads.regressions import Fit, Regression, RegressionConfig, segments
+from residnet.documents.jervan2020.regressions import Fit, Regression, RegressionConfig, segments
+from residnet.regression.nipals import nipals
+from residnet.regression.plsr import pls_path
 
 TERMS = tuple("abcdef")
 

@@ -16,7 +16,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from residnet.core.config import Config
-from residnet.regression.kernel_fit import Path, dual_path, primal_path
+from residnet.regression.kernel.path import Path, dual_path, primal_path
 
 _RANK = 1e-12
 """Eigenvalues of the landmarks' kernel below this share of the largest are rounding."""

@@ -15,10 +15,10 @@ from torch import Tensor
 
 from residnet.core.config import Config
 from residnet.core.errors import FitError
-from residnet.heads.basis import FoldMoments
-from residnet.heads.nipals import nipals
-from residnet.heads.plsr import pls_path
-from residnet.heads.surface import Surface, surface
+from residnet.regression.moments import FoldMoments
+from residnet.regression.nipals import nipals
+from residnet.regression.plsr import pls_path
+from residnet.regression.surface import Surface, surface
 
 
 @dataclass(frozen=True)

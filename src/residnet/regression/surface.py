@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from residnet.core.errors import FitError
-from residnet.heads.basis import FoldMoments
-from residnet.heads.plsr import LEAST_ENERGY
+from residnet.regression.moments import FoldMoments
+from residnet.regression.plsr import LEAST_ENERGY
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from residnet.regression.expressions import Algebra, Product
-from residnet.regression.notation import PLAIN, C, Style, c_body, signed_sum
+from residnet.regression.expressions.algebra import Algebra, Product
+from residnet.regression.expressions.notation import PLAIN, C, Style, c_body, signed_sum
 
 
 def term(algebra: Algebra, product: Product, style: Style = PLAIN) -> str:

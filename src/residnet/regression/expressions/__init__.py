@@ -1,0 +1,1 @@
+"""Expressions in normal form, how they are written and evaluated."""

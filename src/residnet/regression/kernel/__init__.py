@@ -1,0 +1,1 @@
+"""Kernel ridge regression: kernels, fits with every penalty, and the estimator."""
