@@ -1,5 +1,6 @@
-"""One line out of pydantic's validation errors: which key, what is wrong, what was given, the
-nearest valid name.
+"""One line out of pydantic's validation errors.
+
+The line says which key, what is wrong, what was given, and the nearest valid name.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ class _Fault:
 
 
 def describe(error: ValidationError, model: Any, where: Callable[[KeyPath], str]) -> str:
-    """The first fault of `error` as one line.
+    """Return the first fault of a validation error as one line.
 
     Args:
         error: what pydantic raised.
@@ -70,7 +71,7 @@ def describe(error: ValidationError, model: Any, where: Callable[[KeyPath], str]
 
 
 def _either(texts: list[str]) -> str:
-    """Complaints of all members of a union about one value, in one phrase."""
+    """Join what the members of a union say about one value into one phrase."""
     texts = list(dict.fromkeys(texts))
     split = [re.fullmatch(r"expected (.*?)( \(given .*\))", text) for text in texts]
     if all(split):
@@ -121,9 +122,7 @@ def _own_text(text: str, value: Any) -> str:
 
 
 def given(value: Any) -> str:
-    """Text `(given 'x')` with the value as YAML would have it, cut where it is long; for error
-    messages.
-    """
+    """Return `(given 'x')` for error messages: the value as YAML writes it, cut where long."""
     names = {None: "null", True: "true", False: "false"}
     text = names[value] if value is None or isinstance(value, bool) else repr(value)
     return f"(given {text if len(text) <= _LONGEST_VALUE else text[: _LONGEST_VALUE - 4] + ' ...'})"
@@ -159,9 +158,7 @@ def _locate(
 
 
 def _plain(annotation: Any) -> Any:
-    """The type without the wrappers that add nothing to an error's location: Annotated and `|
-    None`.
-    """
+    """Return the type without wrappers that leave an error's location alone (Annotated, None)."""
     while True:
         if get_origin(annotation) is Annotated:
             inside, *metadata = get_args(annotation)
@@ -187,8 +184,9 @@ def _members(annotation: Any) -> tuple[Any, ...]:
 
 
 def _chosen(kinds: tuple[Any, ...], label: str) -> tuple[Any, ...]:
-    """Members of unions that pydantic's label stands for: a discriminator's value or the name of a
-    type; all where none fits.
+    """Return the members of unions that pydantic's label stands for; all where none fits.
+
+    A label is a discriminator's value or the name of a type.
     """
     options = [_plain(member) for kind in kinds if _is_union(kind) for member in _options(kind)]
     by_tag = [
@@ -206,7 +204,7 @@ def _chosen(kinds: tuple[Any, ...], label: str) -> tuple[Any, ...]:
 
 
 def _inner(kind: Any, element: str | int) -> list[Any]:
-    """Types of what stands under `element` in a value of type `kind`."""
+    """Return the types of what stands under `element` in a value of type `kind`."""
     if _is_model(kind):
         return [_plain(annotation) for key, annotation in _fields(kind).items() if key == element]
     arguments = get_args(kind)
@@ -235,7 +233,7 @@ def _keys(kinds: tuple[Any, ...]) -> list[str]:
 
 
 def _literals(kind: Any) -> dict[str, tuple[Any, ...]]:
-    """Fields of a model that take only fixed values, with these values."""
+    """Return the fields of a model that take only fixed values, with these values."""
     if not _is_model(kind):
         return {}
     plain = {key: _plain(annotation) for key, annotation in _fields(kind).items()}

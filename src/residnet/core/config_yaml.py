@@ -1,9 +1,8 @@
-"""YAML as configs use it: YAML 1.2 scalars, no duplicate keys, and the line on which every key
-stands.
+"""YAML as configs use it: YAML 1.2 scalars, no duplicate keys, and the line of every key.
 
 PyYAML follows YAML 1.1, where `1e-3` is text, `off` is a boolean, `12:30` is 750 and `010` is 8.
-Each of these would put a wrong value into a run without a word, so scalars are read by the YAML 1.2
-core schema, and keys are always text.
+Each of these would silently put a wrong value into a run, so scalars are read by the YAML 1.2 core
+schema, and keys are always text.
 """
 
 from __future__ import annotations
@@ -105,8 +104,10 @@ _Dumper.add_representer(list, _Dumper.represent_short_list)
 
 
 def parse(text: str, where: str, *, located: bool = True) -> tuple[Any, Node | None]:
-    """Plain value (dict with text keys, list, scalar) and node tree of one YAML document; (None,
-    None) where there is none.
+    """Return the plain value and the node tree of one YAML document.
+
+    The value consists of dicts with text keys, lists and scalars; both are None where the text
+    holds no document.
 
     Args:
         text: the document.
@@ -144,7 +145,7 @@ def _unshared(value: Any) -> Any:
 
 
 def line_of(root: Node, path: KeyPath) -> int:
-    """Line (from 1) of the key at `path`, or of its nearest ancestor that is in the document."""
+    """Return the line (from 1) of the key at `path`, or of its nearest ancestor in the document."""
     node, line = root, root.start_mark.line
     for element in path:
         child: Node | None = None
@@ -166,5 +167,5 @@ def line_of(root: Node, path: KeyPath) -> int:
 
 
 def dump(data: Any) -> str:
-    """YAML text of plain values; keys keep their order, lists of scalars stand on one line."""
+    """Write plain values as YAML text; keys keep their order, lists of scalars take one line."""
     return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=120)

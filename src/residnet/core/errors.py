@@ -1,5 +1,4 @@
-"""The one way to fail: every error that a user can cause is a `ResidnetError` and reads as one
-line.
+"""The errors that a user can cause: every one is a `ResidnetError` and reads as one line.
 
 A message says what is wrong, where (file, row, column, key), what was expected and what to do about
 it. The command line prints the message without a traceback and exits with the class's `exit_code`.
@@ -9,8 +8,12 @@ from __future__ import annotations
 
 
 class ResidnetError(Exception):
-    """Base of all errors that residnet raises on purpose; whatever a message quotes from a file, it
-    stays one printable line.
+    """The base of all errors that residnet raises on purpose.
+
+    Whatever a message quotes from a file, it stays one printable line.
+
+    Attributes:
+        exit_code: exit status of the command line.
     """
 
     exit_code: int = 1
@@ -25,22 +28,22 @@ class ResidnetError(Exception):
 
 
 class UsageError(ResidnetError):
-    """The call, a path or a unit is wrong (exit code 2)."""
+    """The error of a wrong call, path or unit (exit code 2)."""
 
     exit_code = 2
 
 
 class ConfigError(UsageError):
-    """A configuration key, value or combination is wrong (exit code 2)."""
+    """The error of a wrong configuration key, value or combination (exit code 2)."""
 
 
 class DataError(ResidnetError):
-    """The contents of a log cannot be used (exit code 1)."""
+    """The error of a log whose contents cannot be used (exit code 1)."""
 
 
 class FitError(ResidnetError):
-    """The data do not determine a model, or the fitted model is not usable (exit code 1)."""
+    """The error of data that do not determine a model, or of an unusable model (exit code 1)."""
 
 
 class ExportError(ResidnetError):
-    """An exported model does not reproduce the model that it came from (exit code 1)."""
+    """The error of an exported model that does not reproduce the original (exit code 1)."""

@@ -1,6 +1,4 @@
-"""The canonical log: named SI channels over one clock, as it lies on disk (Parquet, metadata
-inside).
-"""
+"""The canonical log: named SI channels over one clock, kept as a Parquet file."""
 
 from __future__ import annotations
 
@@ -21,8 +19,9 @@ _PIECE = 500_000
 
 
 def forget_pages(values: np.ndarray) -> None:
-    """Give back the memory of a read-only array that lies in a file; it is read again when it is
-    next used. Other arrays stay as they are.
+    """Give back the memory of a read-only array that lies in a file.
+
+    The array is read again when it is next used; other arrays stay as they are.
     """
     owner: Any = values
     while isinstance(owner, np.ndarray):
@@ -80,7 +79,7 @@ class Log:
         return self.channels[name]
 
     def stack(self, names: tuple[str, ...] | list[str]) -> np.ndarray:
-        """Channels side by side, [T, len(names)]."""
+        """Return channels side by side, [T, len(names)]."""
         return (
             np.stack([self[name] for name in names], axis=-1) if names else np.zeros((len(self), 0))
         )
@@ -94,12 +93,14 @@ class Log:
         return ~bad
 
     def replace(self, **changes: Any) -> Log:
-        """A copy with some attributes changed."""
+        """Return a copy with some attributes changed."""
         return dataclasses.replace(self, **changes)
 
     def save(self, path: Path) -> None:
-        """Write the canonical Parquet file: columns t, channels, `mask:<reason>`; the rest as JSON
-        in its metadata.
+        """Write the log as a canonical Parquet file.
+
+        Its columns are t, the channels and `mask:<reason>`; the rest stands as JSON in its
+        metadata.
         """
         import pyarrow as pa
         import pyarrow.parquet as pq
@@ -133,7 +134,7 @@ class Log:
 
     @staticmethod
     def recognises(path: Path) -> bool:
-        """Whether a file is a canonical log."""
+        """Return whether a file is a canonical log."""
         import pyarrow as pa
         import pyarrow.parquet as pq
 

@@ -1,4 +1,4 @@
-"""Names and units of the channels, and the one table that converts units at the door.
+"""Names and units of the channels, and the one table of unit conversions.
 
 Inside residnet everything is SI with angles in radians; propeller revolutions are in 1/s. A channel
 that enters declares its unit once (in the log's channel map or in a config value such as `"20
@@ -111,18 +111,18 @@ CHANNEL_UNITS: dict[str, str] = {
 
 
 def units() -> tuple[str, ...]:
-    """Names of all units that residnet converts."""
+    """Return the names of all units that residnet converts."""
     return tuple(_UNITS)
 
 
 def shown(text: object, most: int = 60) -> str:
-    """What a message quotes from a file, cut to a length that people read."""
+    """Return what a message quotes from a file, cut to `most` characters."""
     whole = str(text)
     return whole if len(whole) <= most else f"{whole[: most - 3]}..."
 
 
 def nearest(name: str, valid: Iterable[str]) -> str:
-    """Text `; did you mean 'x'?` or, where nothing is near, the valid names; for error messages."""
+    """Return `; did you mean 'x'?` for error messages, or the valid names where none is near."""
     names = sorted({shown(other) for other in valid})
     close = difflib.get_close_matches(name, names, n=1, cutoff=0.6)
     if close:
@@ -131,7 +131,7 @@ def nearest(name: str, valid: Iterable[str]) -> str:
 
 
 def si_unit(unit: str) -> str:
-    """SI unit of the dimension of `unit`.
+    """Return the SI unit of the dimension of `unit`.
 
     Raises:
         UsageError: where the unit is not known.
@@ -142,7 +142,7 @@ def si_unit(unit: str) -> str:
 
 
 def to_si(unit: str, expected: str | None = None) -> float:
-    """Factor that converts values in `unit` to SI.
+    """Return the factor that converts values in `unit` to SI.
 
     Args:
         unit: name of a unit, for example `deg/s`.

@@ -1,8 +1,8 @@
 """Progress of long work: one callback hears of it, on the command line and in Python alike.
 
-Code that takes long calls `report`. Who wants to hear of it installs a callback with `listen`;
+Code that takes long calls `report`. Whoever wants to hear of it installs a callback with `listen`;
 without one nothing is printed. The callback is held in a context variable, so that it need not be
-handed through every function, and so that two threads can listen apart.
+handed through every function, and so that two threads can listen separately.
 """
 
 from __future__ import annotations
@@ -38,7 +38,14 @@ _callback: ContextVar[ProgressCallback | None] = ContextVar("residnet_progress",
 def report(
     stage: str, done: float | None = None, total: float | None = None, message: str = ""
 ) -> None:
-    """Tell the callback that listens, if there is one, how far a stage is."""
+    """Tell the callback that listens, if there is one, how far a stage is.
+
+    Args:
+        stage: what is being done.
+        done: how much of it is done, in any unit; None where the work cannot be counted.
+        total: how much there is to do in the same unit; None where it is not known.
+        message: a line for the log.
+    """
     callback = _callback.get()
     if callback is not None:
         callback(Progress(stage, done, total, message))

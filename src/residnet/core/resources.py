@@ -1,4 +1,4 @@
-"""Where the files that come with residnet lie, installed or in a checkout."""
+"""Where the files that come with residnet lie, in an installed package or in a checkout."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ import residnet
 
 
 def config_folder() -> Path:
-    """Folder `configs`: inside the installed package, or at the top of the checkout that it is
-    installed from.
+    """Return the folder `configs` that comes with residnet.
+
+    It lies inside an installed package, or at the top of the checkout that is installed.
     """
     package = Path(residnet.__file__).parent
     inside = package / "configs"

@@ -1,4 +1,4 @@
-"""Samples of identification: channels and accelerations of many manoeuvres, side by side."""
+"""Samples to identify baselines and heads from: channels and accelerations, side by side."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Samples:
-    """N good samples.
+    """The usable samples of all manoeuvres, one below the other.
 
     Attributes:
         z: channels [N, nz], float64 (columns named by `names`).
-        target: what a fit explains, [N, 3]: accelerations, or what a baseline leaves of them.
+        target: what a fit explains, [N, 3]: accelerations in m/s^2, m/s^2, rad/s^2, or what a
+            baseline leaves of them.
         group: number of the manoeuvre of each sample, [N], ascending.
         t: time since the manoeuvre's start [N] in s.
         kinds: kind of each manoeuvre, by number.
@@ -33,22 +34,22 @@ class Samples:
         return int(self.z.shape[0])
 
     def of_kinds(self, kinds: Collection[str]) -> Samples:
-        """The samples of manoeuvres of some kinds; all where `kinds` is empty."""
+        """Return the samples of manoeuvres of some kinds; all where `kinds` is empty."""
         if not kinds:
             return self
         wanted = torch.tensor([kind in kinds for kind in self.kinds], dtype=torch.bool)
         return self.where(wanted[self.group])
 
     def where(self, keep: Tensor) -> Samples:
-        """The samples at which `keep` [N] is True."""
+        """Return the samples at which `keep` [N] is True."""
         return Samples(
             self.z[keep], self.target[keep], self.group[keep], self.t[keep], self.kinds, self.names
         )
 
     def with_target(self, target: Tensor) -> Samples:
-        """The same samples with another target [N, 3]."""
+        """Return the same samples with another target [N, 3]."""
         return Samples(self.z, target, self.group, self.t, self.kinds, self.names)
 
     def column(self, name: str) -> Tensor:
-        """One channel [N]."""
+        """Return one channel [N] by its name."""
         return self.z[:, self.names.index(name)]
