@@ -22,8 +22,12 @@ class Scales(Config):
     r: Annotated[RadiansPerSecond, Field(gt=0)]
 
     def array(self) -> np.ndarray:
-        """[3], m/s, m/s, rad/s."""
+        """Return the scales of u, v, r as one array [3], in m/s, m/s, rad/s."""
         return np.array([self.u, self.v, self.r])
+
+    def named(self) -> dict[str, float]:
+        """Return the scales by the name of the velocity."""
+        return {"u": float(self.u), "v": float(self.v), "r": float(self.r)}
 
 
 class EvaluationConfig(Config):

@@ -16,6 +16,7 @@ from residnet.control.heading.steered_model import SteeredModel
 from residnet.control.heading.steering import SteeredPlant, fly
 from residnet.control.heading.tuning import TuningTask, tune
 from residnet.core.errors import ConfigError
+from residnet.core.progress import say
 from residnet.documents.gouletas2020.autopilot import predictive
 from residnet.dynamics.learned import chosen_model
 from residnet.dynamics.rollout import Source
@@ -29,7 +30,6 @@ from residnet.runs.folder import RunFolder
 from residnet.runs.trained import store_weights, stored_weights
 from residnet.tasks.autopilot import AutopilotConfig, PolicyConfig
 from residnet.tasks.autopilot_compare import compare
-from residnet.tasks.pipeline import say
 from residnet.training.autopilot import train_autopilot
 
 

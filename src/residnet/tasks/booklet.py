@@ -22,11 +22,11 @@ from residnet.data.simulated.sensors import SensorNoise
 from residnet.dynamics.actuated import ActuatedDynamics
 from residnet.dynamics.drawn import DrawnDynamics
 from residnet.dynamics.gear import GivenGear, InputShare
+from residnet.identification.models import FittedModel
 from residnet.judge.booklet import BookletConfig, Page, contents
 from residnet.manoeuvres import Helm, Manoeuvre, Zigzag
 from residnet.manoeuvres.recognise import steered_zigzag
 from residnet.runs.folder import RunFolder
-from residnet.tasks.pipeline import Fitted
 
 _PARAMETER = "model.baseline.theta"
 
@@ -34,7 +34,7 @@ _PARAMETER = "model.baseline.theta"
 def write_booklet(
     folder: RunFolder,
     config: BookletConfig,
-    fitted: Fitted,
+    fitted: FittedModel,
     logs: Mapping[str, Sequence[Prepared]],
     limit: np.ndarray,
 ) -> str:
@@ -95,7 +95,7 @@ def write_booklet(
     )
 
 
-def _craft(config: BookletConfig, fitted: Fitted, inputs: Mapping[str, InputShare]) -> Craft:
+def _craft(config: BookletConfig, fitted: FittedModel, inputs: Mapping[str, InputShare]) -> Craft:
     """The model in front of which the inputs' gear stands; its rows are draws."""
     spec, model = fitted.spec, fitted.model.double()
     gear = GivenGear(inputs, spec.signals.exogenous, spec.dt)
@@ -114,10 +114,9 @@ def _craft(config: BookletConfig, fitted: Fitted, inputs: Mapping[str, InputShar
 
 
 def _flown(
-    craft: Craft, config: BookletConfig, fitted: Fitted, manoeuvres: Sequence[Manoeuvre]
+    craft: Craft, config: BookletConfig, fitted: FittedModel, manoeuvres: Sequence[Manoeuvre]
 ) -> Iterator[list[Flight]]:
-    """For each manoeuvre its flights: with the fitted parameters first, then with the drawn ones.
-    """
+    """Yield the flights of each manoeuvre: fitted parameters first, then the drawn ones."""
     theta = drawn(fitted, config.draws, config.seed)
     rows = [manoeuvre for manoeuvre in manoeuvres for _ in range(len(theta))]
     start = craft.start.repeat_interleave(len(theta), 0) if len(craft.start) > 1 else craft.start
@@ -142,7 +141,7 @@ def _began(craft: Craft, log: Log) -> torch.Tensor:
     return x
 
 
-def drawn(fitted: Fitted, draws: int, seed: int) -> torch.Tensor:
+def drawn(fitted: FittedModel, draws: int, seed: int) -> torch.Tensor:
     """Parameters of a refitted baseline: as fitted, then `draws` times from their normal
     distribution, [1 + draws, ...].
     """

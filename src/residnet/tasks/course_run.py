@@ -33,6 +33,7 @@ from residnet.control.heading.turning import Turning
 from residnet.core.config import load_config
 from residnet.core.errors import ConfigError, UsageError
 from residnet.core.names import nearest
+from residnet.core.progress import say
 from residnet.documents.gouletas2020.autopilot import load_predictive
 from residnet.judge.courses import CourseFlight, row, spread_row, table
 from residnet.judge.metrics import SCHEMA
@@ -42,7 +43,6 @@ from residnet.runs.folder import RunFolder
 from residnet.tasks.autopilot import AutopilotConfig
 from residnet.tasks.course import CourseTaskConfig
 from residnet.tasks.course_flights import NOMINAL, Vessels, fly
-from residnet.tasks.pipeline import say
 
 _KEPT = 0.1
 """Seconds between the stored samples of a track."""

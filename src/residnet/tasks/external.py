@@ -12,14 +12,17 @@ import torch
 from residnet.core.config import dump_config, load_config, load_mapping
 from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
+from residnet.core.progress import say
 from residnet.data.prepare import prepare
 from residnet.data.readers import CanonicalConfig
 from residnet.data.simulated.trials import SimulatedTrials
-from residnet.dynamics.store import load_model, model_names
+from residnet.identification.evaluation import candidates, evaluate
+from residnet.identification.prepared import require_window, velocity_limit
+from residnet.judge.rollout_files import write_rollouts
+from residnet.runs.fit_store import FolderStore
 from residnet.runs.folder import RunFolder
 from residnet.tasks.fit import FitConfig
 from residnet.tasks.inspection import log_files
-from residnet.tasks.pipeline import Fitted, candidates, evaluate, require_window, say
 from residnet.tasks.reporting import report_run
 from residnet.tasks.run import print_table, write_data_quality, write_limits, write_metrics
 
@@ -55,30 +58,27 @@ def evaluate_external(run: Path, paths: Sequence[Path], out: Path | None) -> Run
     folder = RunFolder.create(
         out or run / time.strftime("external-%Y%m%dT%H%M%S"), dump_config(config), resume=False
     )
-    fitted = [
-        Fitted(*load_model(source.models / name), notes=source.fit_notes(name))
-        for name in model_names(source.models)
-    ]
-    order = ["zero", "baseline", *config.baselines, *config.heads, *config.ensembles]
-    fitted.sort(key=lambda f: order.index(f.spec.name) if f.spec.name in order else len(order))
-    low, high = np.array(fitted[0].spec.low[:3]), np.array(fitted[0].spec.high[:3])
-    limit = config.evaluation.divergence * np.maximum(np.abs(low), np.abs(high))
+    store = FolderStore(source)
+    fitted = [store.load(name) for name in store.names()]
+    order = ["zero", *config.model_names]
+    fitted.sort(key=lambda entry: order.index(entry.name) if entry.name in order else len(order))
+    low, high = np.array(fitted[0].spec.low), np.array(fitted[0].spec.high)
+    limit = velocity_limit(low, high, config.evaluation.divergence)
     say(f"{config.name}: {len(logs)} logs, {len(fitted)} models")
     simulated = isinstance(config.data, SimulatedTrials) and all(
         "vessel" in log.log.meta for log in logs
     )
     models = [c for c in candidates(fitted, config.data) if c.kind != "truth" or simulated]
-    table, limiting = evaluate(
-        models, logs, config.evaluation, config.prepare.grid.step, limit, folder
-    )
+    judged = evaluate(models, logs, config.evaluation, config.prepare.grid.step, limit)
+    write_rollouts(folder.rollouts / "external", judged.runs, logs)
     write_data_quality(folder, {"external": logs})
-    write_metrics(folder, config, table, str(source.read_metrics()["selected"]))
-    write_limits(folder, config, {"external": limiting}, logs)
+    write_metrics(folder, config, judged.rows, str(source.read_metrics()["selected"]))
+    write_limits(folder, config, {"external": judged.limits}, logs)
     folder.write_provenance(
         config=source.resolved, overrides=[], seed=config.seed, files=files, started=started
     )
     report = report_run(folder.path)
-    print_table(table, "external")
+    print_table(judged.rows, "external")
     print(f"report: {report}")
     return folder
 

@@ -6,38 +6,38 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
 from residnet.core.config import dump_config
 from residnet.core.names import STATE, si_unit
+from residnet.core.progress import say
 from residnet.data.prepare import Prepared
 from residnet.data.sources import input_files, read_logs
 from residnet.documents import draw_study
+from residnet.identification.currents import through_currents
+from residnet.identification.evaluation import candidates, evaluate, select
+from residnet.identification.fit import Identified, fit
+from residnet.identification.goodness import goodness_rows
+from residnet.identification.prepared import PreparedSplits, prepare_logs
+from residnet.identification.teacher_forced import residual_table, term_table
+from residnet.judge.goodness import content
 from residnet.judge.limits import SCHEMA as LIMITS
-from residnet.judge.metrics import SCHEMA, find
+from residnet.judge.metrics import SCHEMA
 from residnet.judge.repeats import repeatability
+from residnet.judge.rollout_files import write_rollouts
+from residnet.runs.fit_store import FolderStore
 from residnet.runs.folder import RunFolder
 from residnet.tasks.booklet import write_booklet
-from residnet.tasks.drifting import summary, through_currents
 from residnet.tasks.exporting import export_model
 from residnet.tasks.fit import FitConfig
-from residnet.tasks.goodness import write_goodness
 from residnet.tasks.inspection import write_inspection
-from residnet.tasks.pipeline import (
-    Fitted,
-    Fitter,
-    PreparedSplits,
-    candidates,
-    evaluate,
-    prepare_logs,
-    say,
-    write_residuals,
-)
 from residnet.tasks.reporting import report_run
-from residnet.tasks.terms import write_terms
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 def run_fit(
@@ -70,9 +70,8 @@ def run_fit(
         config=source, overrides=overrides, seed=config.seed, files=files, started=started
     )
     logs = _prepared(config, folder)
-    fitter = Fitter(config, logs, folder)
-    fitted = _fitted(config, fitter)
-    _judged(config, folder, fitter, fitted, logs)
+    identified = fit(logs, config, store=FolderStore(folder))
+    _judged(config, folder, identified, logs)
     if report:
         finish(folder, config)
     folder.write_provenance(
@@ -90,75 +89,44 @@ def _prepared(config: FitConfig, folder: RunFolder) -> PreparedSplits:
     write_inspection(folder, read, config)
     logs = prepare_logs(read, config)
     say("  " + ", ".join(f"{split} {len(members)} logs" for split, members in logs.items()))
+    logs, currents = through_currents(logs, config)
     if config.current is not None:
-        logs, currents = through_currents(logs, config, config.current)
         folder.write_json(folder.path / "currents.json", currents)
-        say(f"  {summary(currents)}")
     write_data_quality(folder, logs)
     return logs
 
 
-def _fitted(config: FitConfig, fitter: Fitter) -> list[Fitted]:
-    """Zero, baselines, heads and ensembles, in this order."""
-    baselines = {name: fitter.baseline(name) for name in ("baseline", *config.baselines)}
-    fitted = [fitter.zero(), *baselines.values()]
-    for name, known in baselines.items():
-        say(f"  {name}: validation free-run error {known.notes['validation']:.4f}")
-    for name in config.heads:
-        say(f"  fitting {name}")
-        head = fitter.head(name, baselines[config.base_of.get(name, "baseline")].model)
-        say(
-            f"  {name}: validation free-run error {head.notes['validation']:.4f} after"
-            f" {head.notes['seconds']:.1f} s"
-        )
-        fitted.append(head)
-    by_name = {f.spec.name: f for f in fitted}
-    for name, members in config.ensembles.items():
-        fitted.append(fitter.ensemble(name, [by_name[member] for member in members]))
-        say(f"  {name}: validation free-run error {fitted[-1].notes['validation']:.4f}")
-    return fitted
-
-
 def _judged(
-    config: FitConfig,
-    folder: RunFolder,
-    fitter: Fitter,
-    fitted: Sequence[Fitted],
-    logs: PreparedSplits,
+    config: FitConfig, folder: RunFolder, identified: Identified, logs: PreparedSplits
 ) -> None:
     """Free runs of all models, and everything that is written of them."""
     say("  free runs")
+    fitted, step = list(identified.values()), config.prepare.grid.step
     models = candidates(fitted, config.data)
     table: list[dict[str, Any]] = []
     limiting: dict[str, Any] = {}
     for split in config.evaluation.splits:
-        found, limiting[split] = evaluate(
-            models, logs[split], config.evaluation, config.prepare.grid.step, fitter.limit, folder
-        )
-        table += found
+        judged = evaluate(models, logs[split], config.evaluation, step, identified.limit)
+        write_rollouts(folder.rollouts / split, judged.runs, judged.logs)
+        limiting[split] = judged.limits
+        table += judged.rows
     write_metrics(folder, config, table, select(table, fitted, config.evaluation.selection))
     write_limits(
         folder, config, limiting, [log for split in config.evaluation.splits for log in logs[split]]
     )
-    write_residuals(folder.residuals, fitter, fitted, logs["test"])
-    write_terms(folder.path / "terms.parquet", fitted, logs["test"])
-    write_goodness(folder.goodness, config.name, fitted, logs, config.prepare.grid.step)
+    _write_table(folder.residuals, residual_table(fitted, logs["test"]))
+    _write_table(folder.path / "terms.parquet", term_table(fitted, logs["test"]))
+    splits = goodness_rows(fitted, logs, step)
+    folder.write_json(folder.goodness, content(config.name, splits, step))
     if config.booklet is not None:
-        named = next(f for f in fitted if f.spec.name == config.booklet.model)
-        say("  " + write_booklet(folder, config.booklet, named, logs, fitter.limit))
+        refitted = identified[config.booklet.model]
+        say("  " + write_booklet(folder, config.booklet, refitted, logs, identified.limit))
 
 
-def select(table: Sequence[dict[str, Any]], fitted: Sequence[Fitted], protocol: str) -> str:
-    """Name of the model (a head, or the baseline where no head beats it) with the least mean nrmse
-    on validation.
-    """
-    names = [f.spec.name for f in fitted if f.spec.role != "zero"]
-    return min(
-        names,
-        key=lambda name: float(
-            find(table, model=name, split="validation", protocol=protocol)["nrmse"]["mean"]
-        ),
-    )
+def _write_table(file: Path, table: pd.DataFrame) -> None:
+    """A table that has rows, as parquet."""
+    if len(table):
+        table.to_parquet(file, index=False)
 
 
 def write_metrics(
@@ -168,7 +136,7 @@ def write_metrics(
     for row in table:
         row["selected"] = row["model"] == selected
     units = {name: si_unit(unit) for name, unit in config.signals.units().items() if name in STATE}
-    scales = {name: float(value) for name, value in config.evaluation.scales.model_dump().items()}
+    scales = config.evaluation.scales.named()
     content = {
         "schema": SCHEMA,
         "run": config.name,
@@ -186,7 +154,7 @@ def write_limits(
     """limits.json: where models fail and what limits them, by split and protocol, and how well the
     vessel repeats itself over all logs.
     """
-    scales = {name: float(value) for name, value in config.evaluation.scales.model_dump().items()}
+    scales = config.evaluation.scales.named()
     commands, step = len(config.signals.inputs), config.prepare.grid.step
     repeats = {
         name: repeatability(protocol, logs, commands, scales, step)

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import logging
 import math
-import sys
 import warnings
 from abc import ABC, abstractmethod
 from pathlib import Path
@@ -18,6 +17,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor, nn
 
 from residnet.core.errors import FitError
+from residnet.core.progress import report
 
 
 class Epochs(Protocol):
@@ -118,8 +118,7 @@ class EpochTraining(L.LightningModule, ABC):
         self._losses: list[float] = []
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Beside weights and optimiser: the best weights, the curve, random state and thread count.
-        """
+        """Keep the best weights, the curve, random state and thread count in the checkpoint."""
         checkpoint["residnet"] = {
             "best_score": self.best_score,
             "best_state": self.best_state,
@@ -171,38 +170,31 @@ class KeepCheckpoint(L.Callback):
         partial.replace(self.path)
 
 
-class ProgressLine(L.Callback):
-    """One line that is rewritten on a terminal; a line every tenth of the epochs elsewhere."""
+class ReportProgress(L.Callback):
+    """Reports every epoch; every tenth of the epochs with a line about loss and validation."""
 
     def __init__(self, name: str, epochs: int) -> None:
         self.name = name
         self.epochs = epochs
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Show epoch, loss and the best validation."""
+        """Report the epoch, and now and then loss and the best validation."""
         assert isinstance(pl_module, EpochTraining)
         done, last = trainer.current_epoch + 1, pl_module.history[-1]
-        text = (
+        line = (
             f"  {self.name}: epoch {done}/{self.epochs}, stage {int(last['stage'])}, loss"
-            f" {last['loss']:.4g}"
+            f" {last['loss']:.4g}, best validation {pl_module.best_score:.4g}"
         )
-        text += f", best validation {pl_module.best_score:.4g}"
-        if sys.stderr.isatty():
-            print(
-                f"\r{text}\033[K",
-                end="\n" if done == self.epochs or trainer.should_stop else "",
-                file=sys.stderr,
-                flush=True,
-            )
-        elif done % max(self.epochs // 10, 1) == 0 or done == self.epochs:
-            print(text, file=sys.stderr, flush=True)
+        shown = done % max(self.epochs // 10, 1) == 0 or done == self.epochs
+        report(f"training {self.name}", done, self.epochs, line if shown else "")
 
 
 def run_epochs(
-    name: str, module: EpochTraining, model: nn.Module, trained: nn.Module, folder: Path
+    name: str, module: EpochTraining, model: nn.Module, trained: nn.Module, folder: Path | None
 ) -> dict[str, Any]:
-    """Train to the last epoch, from the last checkpoint where there is one, and leave the best
-    state in the model; Ctrl-C can be resumed.
+    """Train to the last epoch and leave the best state in the model.
+
+    Where a folder holds a checkpoint of an interrupted training, that training goes on.
 
     Args:
         name: of what is trained; `checkpoints/<name>/last.ckpt` in the folder is resumed where it
@@ -210,39 +202,49 @@ def run_epochs(
         module: that trains it.
         model: that is validated; it ends frozen, with the weights that scored best.
         trained: its part whose parameters are counted.
-        folder: of the run.
+        folder: for checkpoints and the TensorBoard log; None for neither.
 
     Returns:
-        What there is to say: the curve by epoch, the best score, the number of parameters.
+        Notes about the training: the curve by epoch, the best score, the number of parameters.
 
     Raises:
         FitError: where no epoch gave a finite validation.
     """
     logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
     settings: Epochs = module.settings
-    checkpoints = folder / "checkpoints" / name
-    checkpoints.mkdir(parents=True, exist_ok=True)
-    last = checkpoints / "last.ckpt"
+    callbacks: list[L.Callback] = [FinishEpoch(), ReportProgress(name, settings.epochs)]
+    logger, last = None, None
+    if folder is not None:
+        last = folder / "checkpoints" / name / "last.ckpt"
+        last.parent.mkdir(parents=True, exist_ok=True)
+        callbacks.insert(1, KeepCheckpoint(last))
+        logger = TensorBoardLogger(folder / "tensorboard", name=name, version="")
+    # a checkpoint that is there is taken up
+    checkpoint = last if last is not None and last.is_file() else None
     trainer = L.Trainer(
         accelerator="cpu",
         devices=1,
         max_epochs=settings.epochs,
         gradient_clip_val=settings.gradient_clip,
-        logger=TensorBoardLogger(folder / "tensorboard", name=name, version=""),
-        callbacks=[FinishEpoch(), KeepCheckpoint(last), ProgressLine(name, settings.epochs)],
+        logger=logger if logger is not None else False,
+        callbacks=callbacks,
         enable_checkpointing=False,
         enable_progress_bar=False,
         enable_model_summary=False,
         num_sanity_val_steps=0,
         log_every_n_steps=10**9,
     )
-    if last.is_file():
-        module.restore(torch.load(last, weights_only=True)["residnet"])
+    if checkpoint is not None:
+        module.restore(torch.load(checkpoint, weights_only=True)["residnet"])
     # killed between the last epoch and the model's file: there is nothing left to train
     if not module.finished:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            trainer.fit(module, ckpt_path=str(last) if last.is_file() else None, weights_only=True)
+            trainer.fit(
+                module,
+                ckpt_path=str(checkpoint) if checkpoint is not None else None,
+                weights_only=True,
+            )
     if trainer.interrupted:
         raise KeyboardInterrupt
     if not module.best_state:

@@ -24,7 +24,7 @@ def train(
     scales: torch.Tensor,
     validate: Validate,
     seed: int,
-    folder: Path,
+    folder: Path | None,
 ) -> dict[str, Any]:
     """Train the head of a model and leave the weights that validated best in it (float32).
 
@@ -37,10 +37,11 @@ def train(
         scales: of the velocities, [3].
         validate: free-run error of a model on the validation data.
         seed: of weights and batches.
-        folder: of the run; `checkpoints/<name>/last.ckpt` is resumed from where it exists.
+        folder: for checkpoints (`checkpoints/<name>/last.ckpt` is resumed from where it exists) and
+            the TensorBoard log; None for neither.
 
     Returns:
-        What there is to say: the curve by epoch, the best score, the number of parameters.
+        Notes about the training: the curve by epoch, the best score, the number of parameters.
 
     Raises:
         FitError: where training never gave a finite free run.

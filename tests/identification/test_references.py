@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from residnet.tasks.references import references
+from residnet.identification.references import references
 
 ROLES = {
     "zero": "zero",

@@ -11,20 +11,21 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.regression.solutions import Solution
 
 
-def choose(
+def choose_solution(
     model: HybridDynamics,
     part: nn.Module,
     solutions: Sequence[Solution],
-    bench: Callable[[HybridDynamics], float],
+    score: Callable[[HybridDynamics], float],
 ) -> tuple[Solution, dict[str, Any]]:
-    """Fill a part of the model with the solution whose free run is best; what lies around the best
-    is tried for as long as it gains.
+    """Fill a part of the model with the solution whose free run is best.
+
+    What lies around the best is tried for as long as it gains.
 
     Args:
         model: the model that runs.
         part: its baseline or head, which the solutions belong to.
         solutions: at least one; a single one is taken as it is.
-        bench: error of a model's free runs on validation data.
+        score: error of a model's free runs on validation data.
 
     Returns:
         The solution, and for fit.json the free-run error of each; empty where there was nothing to
@@ -35,29 +36,31 @@ def choose(
     def attempt(batch: Sequence[Solution]) -> None:
         for solution in batch:
             part.load_state_dict(solution.state, strict=False)
-            tried.append((solution, bench(model)))
+            tried.append((solution, score(model)))
 
     attempt(solutions if len(solutions) > 1 else ())
-    centre = _best(tried)
+    centre = _best_with_neighbours(tried)
     while centre is not None and centre[0].neighbours is not None:
-        seen = [solution.choice for solution, _ in tried]
-        attempt([solution for solution in centre[0].neighbours() if solution.choice not in seen])
-        further = _best(tried)
-        if further is centre:
+        choices = [solution.choice for solution, _ in tried]
+        attempt([solution for solution in centre[0].neighbours() if solution.choice not in choices])
+        better = _best_with_neighbours(tried)
+        if better is centre:
             break
-        centre = further
+        centre = better
     best = min(tried, key=_error, default=(solutions[0], 0.0))
     part.load_state_dict(best[0].state, strict=False)
-    told = [{**solution.choice, "validation": error} for solution, error in tried]
-    return best[0], {"free_run_choice": told} if told else {}
+    scores = [{**solution.choice, "validation": error} for solution, error in tried]
+    return best[0], {"free_run_choice": scores} if scores else {}
 
 
 def _error(tried: tuple[Solution, float]) -> float:
     return tried[1]
 
 
-def _best(tried: Sequence[tuple[Solution, float]]) -> tuple[Solution, float] | None:
-    """The best of those that others lie around; one that stands alone, such as no residual at all,
-    does not end the search.
+def _best_with_neighbours(
+    tried: Sequence[tuple[Solution, float]],
+) -> tuple[Solution, float] | None:
+    """The best of those that have neighbours; one that has none, such as no residual at all, does
+    not end the search.
     """
     return min((pair for pair in tried if pair[0].neighbours is not None), key=_error, default=None)

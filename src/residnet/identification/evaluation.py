@@ -1,0 +1,123 @@
+"""Fitted models judged: free runs over all protocols of a split, their metrics, the selection."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from residnet.data.prepare import Prepared
+from residnet.data.simulated.trials import SimulatedTrials
+from residnet.data.sources import MeasuredLogs
+from residnet.dynamics.simulated import PlantDynamics
+from residnet.identification.models import FittedModel
+from residnet.identification.references import references
+from residnet.judge.config import EvaluationConfig
+from residnet.judge.freerun import Candidate, FreeRun, free_run
+from residnet.judge.limits import limits
+from residnet.judge.metrics import find, rows
+from residnet.physics.vessel import load_vessel
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Free runs of models over the logs of one split.
+
+    Attributes:
+        split: train, validation, test or external.
+        logs: of the split, in the order that the windows count them in.
+        runs: free runs by protocol; protocols without a window are left out.
+        rows: of metrics.json, without `selected`.
+        limits: contents of limits.json by protocol.
+    """
+
+    split: str
+    logs: Sequence[Prepared]
+    runs: list[FreeRun]
+    rows: list[dict[str, Any]]
+    limits: dict[str, Any]
+
+
+def evaluate(
+    models: Sequence[Candidate],
+    logs: Sequence[Prepared],
+    config: EvaluationConfig,
+    step: float,
+    limit: np.ndarray,
+) -> Evaluation:
+    """Free-run models over all protocols of one split.
+
+    Args:
+        models: to be judged, see `candidates`.
+        logs: of one split, at least one.
+        config: protocols, scales and groups.
+        step: of the grid in s.
+        limit: of |u, v, r| [3] beyond which a free run has diverged.
+    """
+    out = Evaluation(logs[0].split, logs, [], [], {})
+    scales = config.scales.named()
+    for name, protocol in config.protocols.items():
+        windows = [
+            window
+            for number, log in enumerate(logs)
+            for window in protocol.windows(log, number, step)
+        ]
+        if not windows:
+            continue
+        run = FreeRun(name, out.split, windows, free_run(models, windows, logs, step, limit))
+        out.runs.append(run)
+        out.rows.extend(rows(run, models, logs, scales, config.groups))
+        out.limits[name] = limits(run, models, logs, scales, step)
+    return out
+
+
+def candidates(
+    fitted: Iterable[FittedModel], data: MeasuredLogs | SimulatedTrials | None = None
+) -> list[Candidate]:
+    """Return the models to judge, each with the one that it is compared with.
+
+    Args:
+        fitted: models of one fit.
+        data: where the logs came from; simulated trials add the plant that made them as `truth`.
+    """
+    models = {entry.name: entry for entry in fitted}
+    compared_with = references(
+        {name: entry.spec.role for name, entry in models.items()},
+        {name: entry.notes for name, entry in models.items()},
+    )
+    out = [
+        Candidate(name, entry.spec.role, entry.model, reference=compared_with.get(name))
+        for name, entry in models.items()
+    ]
+    truth = _truth(data) if isinstance(data, SimulatedTrials) else None
+    return out if truth is None else [*out, truth]
+
+
+def _truth(data: SimulatedTrials) -> Candidate | None:
+    """The plant that made the logs; None where a log does not show all of its state."""
+    plant = load_vessel(data.vessel).build()
+    if any(name.startswith("_") for name in plant.state):
+        # no log shows what is under way in a delay line, so that the plant could not start from one
+        return None
+    commands = plant.inputs[: plant.commands]
+    model = PlantDynamics(plant, data.step, data.substeps)
+    unknown = len(plant.inputs) - len(commands)
+    return Candidate("truth", "truth", model, plant.state, commands, unknown, "baseline")
+
+
+def select(rows: Sequence[dict[str, Any]], fitted: Iterable[FittedModel], protocol: str) -> str:
+    """Return the name of the model with the least mean nrmse on validation, `zero` left out.
+
+    Args:
+        rows: of metrics.json, those of the validation split among them.
+        fitted: models to choose from.
+        protocol: whose rows decide.
+    """
+
+    def error(name: str) -> float:
+        row = find(rows, model=name, split="validation", protocol=protocol)
+        return float(row["nrmse"]["mean"])
+
+    return min((entry.name for entry in fitted if entry.spec.role != "zero"), key=error)

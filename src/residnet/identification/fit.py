@@ -1,0 +1,270 @@
+"""The fit: prepared logs to baselines, heads and ensembles, judged in free run."""
+
+from __future__ import annotations
+
+import copy
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from residnet.baselines import BaselineConfig, Coefficient, ParametricBaseline, StillConfig
+from residnet.core.errors import FitError
+from residnet.core.progress import say
+from residnet.core.samples import Samples
+from residnet.data.prepare import Prepared, envelope, samples
+from residnet.data.windows import WindowStore
+from residnet.dynamics.ensemble import mean_of
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.store import ModelSpec
+from residnet.heads import ClosedFormHead
+from residnet.identification.models import FitStore, FittedModel, NoStore
+from residnet.identification.prepared import velocity_limit
+from residnet.identification.settings import FitSettings
+from residnet.identification.solution_choice import choose_solution
+from residnet.identification.validation import ValidationScore
+from residnet.training.config import TrainingConfig
+from residnet.training.refit import refit
+
+
+@dataclass(frozen=True)
+class Identified(Mapping[str, FittedModel]):
+    """Fitted models by name: zero, baselines, heads and ensembles, in this order.
+
+    Attributes:
+        settings: of the fit.
+        models: by name.
+        limit: of |u, v, r| [3] beyond which a free run has diverged.
+    """
+
+    settings: FitSettings
+    models: dict[str, FittedModel]
+    limit: np.ndarray
+
+    def __getitem__(self, name: str) -> FittedModel:
+        return self.models[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.models)
+
+    def __len__(self) -> int:
+        return len(self.models)
+
+
+def fit(
+    logs: Mapping[str, Sequence[Prepared]], settings: FitSettings, *, store: FitStore | None = None
+) -> Identified:
+    """Fit the baselines, then heads on what each leaves, then ensembles.
+
+    Args:
+        logs: prepared logs by split; `train` is fitted, `validation` chooses and stops early.
+        settings: of the fit.
+        store: keeps every model as it is done and hands finished heads back; None to keep none.
+
+    Raises:
+        FitError: where the data do not determine a part, or a training never ran freely.
+        DataError: where a split holds no sample or no window.
+    """
+    fitter = Fitter(logs, settings, store or NoStore())
+    baselines = {name: fitter.baseline(name) for name in settings.all_baselines}
+    models = {"zero": fitter.zero(), **baselines}
+    for name, baseline in baselines.items():
+        say(f"  {name}: validation free-run error {baseline.notes['validation']:.4f}")
+    for name in settings.heads:
+        say(f"  fitting {name}")
+        head = fitter.head(name, baselines[settings.baseline_name_of(name)].model)
+        say(
+            f"  {name}: validation free-run error {head.notes['validation']:.4f} after"
+            f" {head.notes['seconds']:.1f} s"
+        )
+        models[name] = head
+    for name, members in settings.ensembles.items():
+        models[name] = fitter.ensemble(name, [models[member] for member in members])
+        say(f"  {name}: validation free-run error {models[name].notes['validation']:.4f}")
+    return Identified(settings, models, fitter.limit)
+
+
+class Fitter:
+    """The single steps of a fit on one set of logs.
+
+    Args:
+        logs: prepared logs by split; `train` and `validation` are used.
+        settings: of the fit.
+        store: keeps every model as it is done.
+    """
+
+    def __init__(
+        self, logs: Mapping[str, Sequence[Prepared]], settings: FitSettings, store: FitStore
+    ) -> None:
+        self.settings = settings
+        self.store = store
+        self.train = logs["train"]
+        self.signals = settings.signals.build()
+        self.low, self.high = envelope(self.train)
+        self.limit = velocity_limit(self.low, self.high, settings.evaluation.divergence)
+        self.samples = samples(self.train, self.signals)
+        self.scales = torch.from_numpy(settings.evaluation.scales.array())
+        self.validate = ValidationScore(
+            logs["validation"], settings.evaluation, settings.prepare.grid.step, self.limit
+        )
+
+    def spec(self, name: str, role: str, baseline: BaselineConfig) -> ModelSpec:
+        """Return the description of a model of this fit.
+
+        Args:
+            name: of the model.
+            role: zero, baseline, head or ensemble.
+            baseline: that it is or stands on.
+        """
+        settings = self.settings
+        return ModelSpec.model_validate(
+            {
+                "schema": "residnet.model/1",
+                "name": name,
+                "role": role,
+                "signals": settings.signals.resolved().model_dump(),
+                "baseline": baseline.resolved().model_dump(),
+                "head": settings.heads[name].model_dump() if role == "head" else None,
+                "dt": settings.prepare.grid.step,
+                "integrator": settings.integrator,
+                "hold": settings.prepare.hold,
+                "low": self.low.tolist(),
+                "high": self.high.tolist(),
+            }
+        )
+
+    def zero(self) -> FittedModel:
+        """Return the model that holds the velocities."""
+        spec = self.spec("zero", "zero", StillConfig())
+        return self._kept(FittedModel(spec, spec.build(), {}))
+
+    def baseline(self, name: str = "baseline") -> FittedModel:
+        """Identify a baseline; refit it through rollouts where the settings ask for it."""
+        spec = self.spec(name, "baseline", self.settings.all_baselines[name])
+        model = spec.build()
+        started = time.perf_counter()
+        solutions = spec.baseline.solutions(model.baseline, self.samples)
+        solution, tried = choose_solution(model, model.baseline, solutions, self.validate)
+        table, covariance = list(solution.table), None
+        notes: dict[str, Any] = {
+            "samples": len(self.samples),
+            **solution.choice,
+            **tried,
+            "least_squares": self.validate(model),
+        }
+        if name in self.settings.refit:
+            table, covariance = self._refit(name, model, table, notes)
+        notes["coefficients"] = [_coefficient_row(entry) for entry in table]
+        notes["validation"] = self.validate(model)
+        notes["seconds"] = round(time.perf_counter() - started, 1)
+        return self._kept(FittedModel(spec, model, notes, covariance))
+
+    def _refit(
+        self, name: str, model: HybridDynamics, table: list[Coefficient], notes: dict[str, Any]
+    ) -> tuple[list[Coefficient], torch.Tensor | None]:
+        """Move a baseline's coefficients through rollouts; returns their new table and covariance
+        and adds to the notes.
+        """
+        refitted = refit(
+            model,
+            self.samples,
+            WindowStore.gather(self.train, torch.float64),
+            self.settings.refit[name],
+            self.scales,
+        )
+        assert isinstance(model.baseline, ParametricBaseline)
+        notes["refit"] = refitted.notes
+        if refitted.offsets.axes:
+            notes["offsets"] = refitted.offsets.table([log.log.name for log in self.train])
+        return model.baseline.updated_table(table, refitted.errors), refitted.covariance
+
+    def head(self, name: str, baseline: HybridDynamics) -> FittedModel:
+        """Fit one head on top of a baseline, or take it from the store where it is finished there.
+
+        Args:
+            name: of the head in the settings.
+            baseline: the fitted model that the head stands on.
+
+        Raises:
+            FitError: where the data do not determine the head.
+        """
+        finished = self.store.finished(name)
+        if finished is not None:
+            return finished
+        spec = self.spec(name, "head", self.settings.baseline_of(name))
+        # seeded by the head's name, so that adding a head changes no other
+        seed = self.settings.seed * 1_000 + sum(map(ord, name))
+        torch.manual_seed(seed)
+        model = spec.build()
+        model.baseline.load_state_dict(copy.deepcopy(baseline.baseline.state_dict()))
+        residual = residual_samples(model, self.samples)
+        started = time.perf_counter()
+        if isinstance(model.head, ClosedFormHead):
+            model.head.calibrate(residual)
+            try:
+                solutions = model.head.solutions(residual)
+                solution, tried = choose_solution(model, model.head, solutions, self.validate)
+            except FitError as error:
+                raise FitError(f"head {name}: {error}") from None
+            notes = solution.choice | solution.notes | tried
+        else:
+            notes = self._train(name, model, residual, seed)
+        notes |= {
+            "baseline": self.settings.baseline_name_of(name),
+            "seconds": round(time.perf_counter() - started, 1),
+            "validation": self.validate(model),
+        }
+        return self._kept(FittedModel(spec, model, notes))
+
+    def ensemble(self, name: str, members: Sequence[FittedModel]) -> FittedModel:
+        """Return the mean of fitted models as one model."""
+        spec = self.spec(name, "ensemble", StillConfig()).model_copy(
+            update={"members": tuple(member.spec for member in members)}
+        )
+        model = mean_of([copy.deepcopy(member.model).to(torch.float64) for member in members])
+        notes: dict[str, Any] = {
+            "members": [member.name for member in members],
+            "validation": self.validate(model),
+        }
+        return self._kept(FittedModel(spec, model, notes))
+
+    def _train(
+        self, name: str, model: HybridDynamics, residual: Samples, seed: int
+    ) -> dict[str, Any]:
+        from residnet.training.trainer import train
+
+        settings = self.settings.training.get(name, TrainingConfig())
+        windows, folder = WindowStore.gather(self.train), self.store.training_folder
+        return train(
+            name, model, residual, windows, settings, self.scales, self.validate, seed, folder
+        )
+
+    def _kept(self, fitted: FittedModel) -> FittedModel:
+        self.store.keep(fitted)
+        return fitted
+
+
+def residual_samples(model: HybridDynamics, known: Samples) -> Samples:
+    """Return samples whose target is what the model's baseline leaves.
+
+    That is an acceleration (document 003 (19)) or a force (document 002 (3.20)), as the model's
+    head wants it.
+
+    Args:
+        model: with its baseline filled in.
+        known: samples whose target is the measured acceleration.
+    """
+    with torch.no_grad():
+        return model.head.residual_target(known, model.baseline(known.z))
+
+
+def _coefficient_row(entry: Coefficient) -> dict[str, Any]:
+    return {
+        "axis": entry.axis,
+        "term": entry.term,
+        "value": entry.value,
+        "standard_error": entry.error,
+    }

@@ -1,0 +1,83 @@
+"""Goodness of one-step predictions of fitted models along the logs of a split."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from residnet.data.prepare import Prepared
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.identification.models import FittedModel
+from residnet.identification.references import references
+from residnet.judge.goodness import OneStep, table
+
+SPLITS = ("train", "test")
+
+
+def goodness_rows(
+    fitted: Iterable[FittedModel], logs: Mapping[str, Sequence[Prepared]], step: float
+) -> dict[str, list[dict[str, Any]]]:
+    """Return statistics of what each model leaves of the measured accelerations, by split.
+
+    Args:
+        fitted: models of one fit.
+        logs: by split; training and test logs are used.
+        step: of the grid in s.
+    """
+    models = {entry.name: entry for entry in fitted}
+    compared_with = references(
+        {name: entry.spec.role for name, entry in models.items()},
+        {name: entry.notes for name, entry in models.items()},
+    )
+    splits = {}
+    for split in SPLITS:
+        measured = [piece for log in logs[split] for piece in stretches(log)]
+        predictions = [
+            OneStep(
+                name,
+                entry.spec.role,
+                _parameter_counts(entry.model),
+                [
+                    part
+                    for log in logs[split]
+                    for part in _residuals(entry.model.to(torch.float64), log)
+                ],
+                compared_with.get(name),
+            )
+            for name, entry in models.items()
+        ]
+        splits[split] = table(predictions, measured, step) if measured else []
+    return splits
+
+
+def stretches(log: Prepared) -> list[np.ndarray]:
+    """Return the measured accelerations [T, 3] of each stretch that may be learned from."""
+    return [log.nu_dot[begin:end] for begin, end in _bounds(log)]
+
+
+def _parameter_counts(model: HybridDynamics) -> list[float]:
+    """Fitted parameters of each axis, baseline and head together."""
+    return [
+        of_baseline + of_head
+        for of_baseline, of_head in zip(model.baseline.parameter_count(), model.head.parameter_count(), strict=True)
+    ]
+
+
+def _residuals(model: HybridDynamics, log: Prepared) -> list[np.ndarray]:
+    """Measured minus predicted acceleration [T, 3] of each stretch; a head runs along the whole
+    log, as its memory needs.
+    """
+    with torch.no_grad():
+        x = torch.from_numpy(np.nan_to_num(log.smooth))[None]
+        w = torch.from_numpy(np.nan_to_num(log.recorded))[None]
+        z = model.signals(x, model.signals.prepare(w))
+        predicted = model.one_step(z)[0].numpy()
+    return [log.nu_dot[begin:end] - predicted[begin:end] for begin, end in _bounds(log)]
+
+
+def _bounds(log: Prepared) -> list[tuple[int, int]]:
+    edges = np.flatnonzero(np.diff(log.good, prepend=False, append=False)).tolist()
+    return list(zip(edges[::2], edges[1::2], strict=True))

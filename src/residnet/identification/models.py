@@ -1,0 +1,62 @@
+"""What an identification makes: fitted models, and who keeps them while it runs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from torch import Tensor
+
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.store import ModelSpec
+
+
+@dataclass(frozen=True)
+class FittedModel:
+    """A model with the notes of its fit.
+
+    Attributes:
+        spec: everything that determines the model but its numbers.
+        model: with its numbers filled in.
+        notes: about the fit, as JSON takes them: coefficients, validation error, seconds, ...
+        covariance: of the coefficients of a baseline that was refitted through rollouts, [P, P];
+            None where there was no refit.
+    """
+
+    spec: ModelSpec
+    model: HybridDynamics
+    notes: dict[str, Any]
+    covariance: Tensor | None = None
+
+    @property
+    def name(self) -> str:
+        """Name of the model."""
+        return self.spec.name
+
+
+class FitStore(Protocol):
+    """Where the models of a fit are kept as they are done, so that a broken fit can go on."""
+
+    @property
+    def training_folder(self) -> Path | None:
+        """Folder for checkpoints and the TensorBoard log; None for neither."""
+
+    def finished(self, name: str) -> FittedModel | None:
+        """Return a head that an earlier, interrupted fit had finished; None where it had not."""
+
+    def keep(self, fitted: FittedModel) -> None:
+        """Keep a model that is done."""
+
+
+class NoStore:
+    """A fit that keeps nothing on disk."""
+
+    training_folder: Path | None = None
+
+    def finished(self, name: str) -> FittedModel | None:
+        """Return None: every head is fitted anew."""
+        return None
+
+    def keep(self, fitted: FittedModel) -> None:
+        """Keep nothing."""

@@ -1,0 +1,75 @@
+"""Logs of a fit, prepared by split, and the checks that they can be learned from and judged on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from residnet.core.errors import DataError
+from residnet.core.log import Log
+from residnet.data.prepare import Prepared, prepare
+from residnet.identification.settings import FitSettings
+
+PreparedSplits = dict[str, list[Prepared]]
+
+
+def prepare_logs(splits: Mapping[str, Sequence[Log]], settings: FitSettings) -> PreparedSplits:
+    """Prepare every log of every split.
+
+    Args:
+        splits: canonical logs by split (train, validation, test).
+        settings: whose grid, masks, derivatives and inputs are used.
+
+    Raises:
+        DataError: where a log has nothing to learn from or to predict.
+    """
+    prepared = {
+        split: [prepare(log, split, settings.signals.columns, settings.prepare) for log in logs]
+        for split, logs in splits.items()
+    }
+    for logs in prepared.values():
+        for log in logs:
+            require_length(log, settings)
+    return prepared
+
+
+def require_length(log: Prepared, settings: FitSettings) -> None:
+    """Check that a log can be learned from and, unless it is for training, be judged on.
+
+    Raises:
+        DataError: where it holds no sample to learn from, or no window of any protocol.
+    """
+    if not log.good.any():
+        seconds = len(log) * settings.prepare.grid.step
+        raise DataError(
+            f"log {log.log.name}: its {seconds:.1f} s hold no stretch as long as the derivative's"
+            " window; leave it out or shorten prepare.derivative.window"
+        )
+    if log.split != "train":
+        require_window(log, settings)
+
+
+def require_window(log: Prepared, settings: FitSettings) -> None:
+    """Check that a log holds at least one window of some protocol.
+
+    Raises:
+        DataError: where it does not.
+    """
+    step, protocols = settings.prepare.grid.step, settings.evaluation.protocols
+    if not any(protocol.windows(log, 0, step) for protocol in protocols.values()):
+        raise DataError(
+            f"log {log.log.name}: its {len(log) * step:.1f} s are shorter than a window of every"
+            f" protocol ({', '.join(protocols)}); leave it out or shorten evaluation.protocols"
+        )
+
+
+def velocity_limit(low: np.ndarray, high: np.ndarray, divergence: float) -> np.ndarray:
+    """Return the |u, v, r| [3] beyond which a free run has diverged.
+
+    Args:
+        low: smallest training velocities (and inputs, which are not used), [3 + m].
+        high: largest ones, [3 + m].
+        divergence: the multiple of the largest training value.
+    """
+    return np.asarray(divergence * np.maximum(np.abs(low[:3]), np.abs(high[:3])))

@@ -1,0 +1,139 @@
+"""Settings of an identification: everything but where logs come from and where results go."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Annotated
+
+from pydantic import Field, model_validator
+
+from residnet.baselines import BaselineConfig, RegressorBaseline
+from residnet.core.config import Config
+from residnet.core.errors import ConfigError
+from residnet.core.names import nearest
+from residnet.data.prepare import PrepareConfig
+from residnet.dynamics.base import Integrator
+from residnet.heads import HeadConfig
+from residnet.judge.config import EvaluationConfig
+from residnet.physics.signals import SignalsConfig
+from residnet.training.config import TrainingConfig
+from residnet.training.current import CurrentConfig
+from residnet.training.refit import RefitConfig
+
+_RESERVED = ("zero", "baseline", "truth")
+
+
+class FitSettings(Config):
+    """Settings of an identification.
+
+    Attributes:
+        seed: of weights and batches.
+        prepare: grid, masks, derivatives.
+        signals: inputs of the models.
+        integrator: of the models; their step is the grid's.
+        baseline: the known part.
+        baselines: further baselines by name; free-run beside the first, and heads may stand on
+            them.
+        current: training and validation logs ran in constant currents that are estimated first;
+            null for water at rest.
+        refit: baselines (by name, `baseline` for the first) whose coefficients are moved through
+            rollouts after least squares.
+        heads: residual heads by name.
+        base_of: the baseline that a head stands on, by the head's name; `baseline` where absent.
+        ensembles: models whose mean acceleration makes another model, by its name.
+        training: of network heads by the name of the head; the defaults where absent.
+        evaluation: protocols and scales.
+    """
+
+    seed: int = Field(default=0, ge=0)
+    prepare: PrepareConfig
+    signals: SignalsConfig
+    integrator: Integrator = "rk4"
+    baseline: BaselineConfig
+    baselines: dict[str, BaselineConfig] = Field(default_factory=dict)
+    current: CurrentConfig | None = None
+    refit: dict[str, RefitConfig] = Field(default_factory=dict)
+    heads: dict[str, HeadConfig] = Field(default_factory=dict)
+    base_of: dict[str, str] = Field(default_factory=dict)
+    ensembles: dict[str, Annotated[tuple[str, ...], Field(min_length=2)]] = Field(
+        default_factory=dict
+    )
+    training: dict[str, TrainingConfig] = Field(default_factory=dict)
+    evaluation: EvaluationConfig
+
+    @model_validator(mode="after")
+    def _combination(self) -> FitSettings:
+        baselines = self.all_baselines
+        single = (*baselines, *self.heads)
+        models = (*single, *self.ensembles)
+        for name in (*self.baselines, *self.heads, *self.ensembles):
+            if (
+                name in _RESERVED
+                or models.count(name) > 1
+                or not name.replace("_", "").replace("-", "").isalnum()
+            ):
+                raise ValueError(
+                    f"'{name}' cannot name a model; use letters, digits, '-', '_', each name once"
+                    f" and none of {', '.join(_RESERVED)}"
+                )
+        require_known("training", self.training, self.heads, "head")
+        require_known("base_of", self.base_of, self.heads, "head")
+        require_known("base_of", self.base_of.values(), baselines, "baseline")
+        require_known("refit", self.refit, baselines, "baseline")
+        members = (name for names in self.ensembles.values() for name in names)
+        require_known("ensembles", members, single, "model")
+        self._parts_fit_together()
+        return self
+
+    def _parts_fit_together(self) -> None:
+        """Build every part once, so that what does not fit together is refused before any work."""
+        names = self.signals.build().names
+        for key, part in {**self.all_baselines, **self.heads}.items():
+            try:
+                part.build(names)
+            except ConfigError as error:
+                raise ValueError(f"{key}: {error}") from None
+        for key, config in self.heads.items():
+            head, baseline = config.build(names), self.baseline_of(key).build(names)
+            try:
+                head.set_mass(baseline.mass())
+            except ConfigError as error:
+                raise ValueError(f"heads.{key}: {error}") from None
+        if self.current is not None:
+            name, baselines = self.current.baseline, self.all_baselines
+            require_known("current.baseline", (name,), baselines, "baseline")
+            if not isinstance(baselines[name].build(names), RegressorBaseline):
+                raise ValueError(
+                    f"current.baseline: '{name}' has no regressors to tell a current by; name a"
+                    " baseline that has"
+                )
+
+    @property
+    def all_baselines(self) -> dict[str, BaselineConfig]:
+        """Every baseline by name, the first as `baseline`."""
+        return {"baseline": self.baseline, **self.baselines}
+
+    @property
+    def model_names(self) -> tuple[str, ...]:
+        """Names of all models but `zero`: baselines, heads, ensembles."""
+        return (*self.all_baselines, *self.heads, *self.ensembles)
+
+    def baseline_name_of(self, head: str) -> str:
+        """Return the name of the baseline that a head stands on."""
+        return self.base_of.get(head, "baseline")
+
+    def baseline_of(self, head: str) -> BaselineConfig:
+        """Return the settings of the baseline that a head stands on."""
+        return self.all_baselines[self.baseline_name_of(head)]
+
+
+def require_known(key: str, given: Iterable[str], valid: Iterable[str], what: str) -> None:
+    """Check that every given name is one of the valid ones.
+
+    Raises:
+        ValueError: where one is not; the message names the nearest.
+    """
+    valid = tuple(valid)
+    for name in given:
+        if name not in valid:
+            raise ValueError(f"{key}: no {what} is named '{name}'{nearest(name, valid)}")

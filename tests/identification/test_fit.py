@@ -1,0 +1,136 @@
+"""A fit in Python: no config file, no run folder, the numbers of the command line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from tiny import TINY, call
+
+from residnet.core.config import validate
+from residnet.core.progress import Progress, listen
+from residnet.data.simulated.trials import SimulatedTrials
+from residnet.data.sources import read_logs
+from residnet.identification.evaluation import candidates, evaluate, select
+from residnet.identification.fit import Identified, fit
+from residnet.identification.models import FittedModel
+from residnet.identification.prepared import PreparedSplits, prepare_logs
+from residnet.identification.settings import FitSettings
+
+DATA = validate(TINY["data"], SimulatedTrials, "here")
+SETTINGS = {
+    key: value
+    for key, value in TINY.items()
+    if key in ("prepare", "signals", "baseline", "heads", "ensembles", "training", "evaluation")
+}
+
+
+class MemoryStore:
+    """Keeps models in memory and hands heads back."""
+
+    training_folder: Path | None = None
+
+    def __init__(self) -> None:
+        self.models: dict[str, FittedModel] = {}
+
+    def finished(self, name: str) -> FittedModel | None:
+        return self.models.get(name)
+
+    def keep(self, fitted: FittedModel) -> None:
+        self.models[fitted.name] = fitted
+
+
+@pytest.fixture(scope="module")
+def settings() -> FitSettings:
+    return validate(SETTINGS, FitSettings, "here")
+
+
+@pytest.fixture(scope="module")
+def logs(settings: FitSettings) -> PreparedSplits:
+    return prepare_logs(read_logs(DATA), settings)
+
+
+@pytest.fixture(scope="module")
+def store() -> MemoryStore:
+    return MemoryStore()
+
+
+@pytest.fixture(scope="module")
+def identified(settings: FitSettings, logs: PreparedSplits, store: MemoryStore) -> Identified:
+    return fit(logs, settings, store=store)
+
+
+def test_python_and_command_line_give_the_same_metrics(
+    identified: Identified,
+    settings: FitSettings,
+    logs: PreparedSplits,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    path = tmp_path / "tiny.yaml"
+    path.write_text(yaml.safe_dump({**TINY, "export": {"models": []}}, sort_keys=False))
+    assert call(monkeypatch, "run", path, "--out", tmp_path / "run") == 0
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    models = candidates(identified.values(), DATA)
+    rows: list[dict[str, Any]] = []
+    for split in settings.evaluation.splits:
+        step = settings.prepare.grid.step
+        rows += evaluate(models, logs[split], settings.evaluation, step, identified.limit).rows
+    chosen = select(rows, identified.values(), settings.evaluation.selection)
+    assert chosen == metrics["selected"]
+    for row in metrics["rows"]:
+        row.pop("selected")
+    # JSON holds every float exactly
+    assert json.loads(json.dumps(rows)) == metrics["rows"]
+
+
+def test_models_stand_in_order(identified: Identified) -> None:
+    assert list(identified) == ["zero", "baseline", "ridge", "lstm", "mean"]
+    assert [entry.spec.role for entry in identified.values()] == [
+        "zero",
+        "baseline",
+        "head",
+        "head",
+        "ensemble",
+    ]
+    assert identified.limit.shape == (3,)
+    assert np.all(identified.limit > 0)
+
+
+def test_finished_heads_are_taken_from_the_store(
+    identified: Identified,
+    settings: FitSettings,
+    logs: PreparedSplits,
+    store: MemoryStore,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    heard: list[Progress] = []
+    with listen(heard.append):
+        again = fit(logs, settings, store=store)
+    assert again["lstm"] is identified["lstm"]
+    assert again["baseline"] is not identified["baseline"]
+    assert not any(event.stage == "training lstm" for event in heard)
+    assert any("validation free-run error" in event.message for event in heard)
+    assert not list(tmp_path.iterdir())
+
+
+def test_training_reports_every_epoch_and_writes_nothing(
+    settings: FitSettings,
+    logs: PreparedSplits,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    only = settings.model_copy(update={"heads": {"lstm": settings.heads["lstm"]}, "ensembles": {}})
+    heard: list[Progress] = []
+    with listen(heard.append):
+        fit(logs, only)
+    epochs = [event.done for event in heard if event.stage == "training lstm"]
+    assert epochs == list(range(1, 8))
+    assert not list(tmp_path.iterdir())
