@@ -13,7 +13,8 @@ from PIL import Image
 
 from residnet.core.errors import UsageError
 from residnet.report.figures.errors import bar_group, growth, r_squared
-from residnet.report.figures.fit import read_figures, write_figures
+from residnet.report.figures.files import read_figures
+from residnet.report.figures.fit import write_figures
 from residnet.report.figures.style import styles
 from residnet.report.figures.tracks import representative, shown
 from residnet.report.run_reader import RunFiles
@@ -23,12 +24,12 @@ from residnet.report.run_reader import RunFiles
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = made_run(tmp_path_factory.mktemp("runs") / "made")
     residuals().to_parquet(folder / "residuals.parquet")
-    write_figures(folder)
+    write_figures(RunFiles(folder))
     return folder
 
 
 def test_every_figure_is_a_light_picture_that_shows_something(run: Path) -> None:
-    figures = read_figures(run)
+    figures = read_figures(run / "figures")
     names = [figure.path.stem[3:] for figure in figures]
     assert names == [
         "tracks",
@@ -63,10 +64,10 @@ def test_figures_are_replaced_and_foreign_pictures_left_alone(run: Path) -> None
     stale.write_bytes((run / "figures" / "01_tracks.png").read_bytes())
     Image.new("RGB", (10, 10)).save(foreign)
     before = (run / "figures" / "06_bars.png").read_bytes()
-    written = write_figures(run)
+    written = write_figures(RunFiles(run))
     assert not stale.exists()
     assert foreign.exists()
-    assert [figure.path for figure in read_figures(run)] == [figure.path for figure in written]
+    assert read_figures(run / "figures") == written
     assert (run / "figures" / "06_bars.png").read_bytes() == before
 
 
@@ -145,9 +146,9 @@ def test_r_squared() -> None:
 
 def test_a_folder_with_metrics_alone_gives_the_bars_alone(tmp_path: Path) -> None:
     write_json(tmp_path / "metrics.json", metrics(("external",), ("baseline", "plsr")))
-    assert [figure.path.name for figure in write_figures(tmp_path)] == ["01_bars.png"]
+    assert [figure.path.name for figure in write_figures(RunFiles(tmp_path))] == ["01_bars.png"]
 
 
 def test_a_folder_without_metrics_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"no metrics\.json"):
-        write_figures(tmp_path)
+        write_figures(RunFiles(tmp_path))

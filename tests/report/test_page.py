@@ -1,4 +1,4 @@
-"""The page builder: every block is drawn, the file stands alone, and what stands in it is escaped."""
+"""The page builder: every block is drawn, the file stands alone, its contents are escaped."""
 
 from __future__ import annotations
 

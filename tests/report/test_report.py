@@ -7,61 +7,19 @@ from __future__ import annotations
 import html
 import json
 import re
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
 import pytest
 from made_run import DEG, LEVEL, made_run, metrics, residuals, row, write_json
+from read_page import Page
 
 from residnet.core.errors import DataError, UsageError
 from residnet.dynamics.store import ModelSpec, save_model
-from residnet.report.figures.fit import write_figures
-from residnet.report.fit import write_report
-from residnet.report.tables import change, number, term_unit
-
-_VOID = {"meta", "img", "br", "hr", "link"}
-
-
-class Page(HTMLParser):
-    """Tables as lists of lines of cell texts, and whether every tag is closed where it should be.
-    """
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.tables: list[list[list[str]]] = []
-        self.sources: list[str] = []
-        self.feed(text)
-        assert self.open == []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        if tag not in _VOID:
-            self.open.append(tag)
-        self.sources += [value or "" for name, value in attrs if name in ("src", "href")]
-        if tag == "table":
-            self.tables.append([])
-        elif tag == "tr":
-            self.tables[-1].append([])
-        elif tag in ("td", "th"):
-            self.tables[-1][-1].append("")
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        if "td" in self.open or "th" in self.open:
-            self.tables[-1][-1][-1] += ("|" if "small" in self.open else "") + data
-
-    def table(self, corner: str, first: str) -> dict[str, list[str]]:
-        """Cells by the label of their line, of the table with that corner and that label in its
-        first line.
-        """
-        for table in self.tables:
-            lines = {line[0]: line[1:] for line in table}
-            if table[0][0] == corner and first in lines:
-                return lines
-        raise AssertionError(f"no table {corner} with {first}")
+from residnet.report.fit import write_fit_page, write_fit_report
+from residnet.report.format import change, number
+from residnet.report.run_reader import RunFiles
+from residnet.report.sections.fit.coefficients import term_unit
 
 
 @pytest.fixture
@@ -70,7 +28,7 @@ def run(tmp_path: Path) -> Path:
 
 
 def test_free_run_numbers_are_those_of_metrics(run: Path) -> None:
-    text = write_report(run).read_text()
+    text = write_fit_page(RunFiles(run)).read_text()
     cells = Page(text).table("model", "plsr (selected)")
     # train and test of u, v, r, then nrmse with its interval, position, heading, diverged; the
     # protocol that selects comes first
@@ -93,13 +51,15 @@ def test_free_run_numbers_are_those_of_metrics(run: Path) -> None:
 
 
 def test_manoeuvres_stand_apart(run: Path) -> None:
-    cells = Page(write_report(run).read_text()).table("manoeuvre, model", "turning: baseline")
+    cells = Page(write_fit_page(RunFiles(run)).read_text()).table(
+        "manoeuvre, model", "turning: baseline"
+    )
     assert cells["turning: baseline"][1] == "0.110"
     assert cells["zigzag: baseline"][1] == "0.120"
 
 
 def test_verdict(run: Path) -> None:
-    page = html.unescape(write_report(run).read_text())
+    page = html.unescape(write_fit_page(RunFiles(run)).read_text())
     verdict = re.search(r'<section class="verdict".*?</section>', page, re.DOTALL)
     assert verdict is not None
     for part in (
@@ -128,7 +88,7 @@ def test_bad_news_is_told(run: Path) -> None:
             line["rmse"] = line["rmse"] | {"v": 0.06}
             line["nrmse"] = line["nrmse"] | {"mean": 0.3}
     write_json(run / "metrics.json", content)
-    page = html.unescape(write_report(run).read_text())
+    page = html.unescape(write_fit_page(RunFiles(run)).read_text())
     assert (
         "DIVERGED on test data, counted with the error of held velocities: plsr 2 of 6 (T30), plsr"
         " 2 of 6 (whole)." in page
@@ -139,7 +99,7 @@ def test_bad_news_is_told(run: Path) -> None:
 
 
 def test_parameters_heads_data_and_provenance(run: Path) -> None:
-    text = write_report(run).read_text()
+    text = write_fit_page(RunFiles(run)).read_text()
     page = Page(text)
     terms = page.table("term", "u′: u")
     assert terms["u′: u"] == ["−0.914", "0.076", "12", "1/s"]
@@ -249,7 +209,7 @@ def compared(change: dict[str, float]) -> dict[str, Any]:
 def test_how_good_where_it_fails_and_what_limits_it(run: Path) -> None:
     write_json(run / "metrics.json", compared({"turning": 1.2}))
     write_json(run / "limits.json", limits_file())
-    text = write_report(run).read_text()
+    text = write_fit_page(RunFiles(run)).read_text()
     cells = Page(text).table("windows of", "all")
     # plsr has 0.08, 0.8 times its reference, so that has 0.1
     assert cells["all"] == ["6", "0.0800", "0.100", "−20 %", "−0.0200", "−0.0300 to −0.0100"]
@@ -269,7 +229,7 @@ def test_how_good_where_it_fails_and_what_limits_it(run: Path) -> None:
         "plsr: NRMSE 0.0800, 95 % interval 0.0720 to 0.0880 (bootstrap of 6 blocks: whole logs).",
         (
             "Against baseline over the same windows: −0.0200 (−20 %), paired 95 % interval −0.0300"
-            " to −0.0100, without zero: better."
+            " to −0.0100. The interval excludes zero: plsr is better."
         ),
         (
             "end 0.37 m and 1.4 deg from the measured pose on average (root mean square 0.47 m, 1.8"
@@ -280,8 +240,8 @@ def test_how_good_where_it_fails_and_what_limits_it(run: Path) -> None:
             " % of their range"
         ),
         (
-            "differ by u 0.0400 m/s, v 0.0200 m/s, r 1.00 deg/s (root mean square), 2.0 m and 5.0"
-            " deg at the end"
+            "differ by u 0.0400 m/s, v 0.0200 m/s, r 1.00 deg/s (root mean square), and by 2.0 m"
+            " and 5.0 deg at the end"
         ),
         "an NRMSE of 0.141 and 1.4 m",
         (
@@ -309,8 +269,7 @@ def test_no_repeats_no_reference_and_no_interval_are_said(run: Path) -> None:
         "logs": 0,
     }
     write_json(run / "limits.json", found)
-    write_figures(run)
-    text = html.unescape(write_report(run).read_text())
+    text = html.unescape(write_fit_page(RunFiles(run)).read_text())
     assert "plsr: NRMSE 0.0800; too few logs for an interval." in text
     assert "hold no two stretches as long as a window" in text
     assert "worse by more than 5 %" not in text
@@ -318,10 +277,10 @@ def test_no_repeats_no_reference_and_no_interval_are_said(run: Path) -> None:
 
 def test_standard_errors_of_a_refitted_baseline_are_named(run: Path) -> None:
     note = "values and standard errors are those after the refit through rollouts"
-    assert note not in write_report(run).read_text()
+    assert note not in write_fit_page(RunFiles(run)).read_text()
     path = run / "models" / "baseline" / "fit.json"
     write_json(path, json.loads(path.read_text()) | {"refit": {"iterations": 3}})
-    assert note in write_report(run).read_text()
+    assert note in write_fit_page(RunFiles(run)).read_text()
 
 
 def test_accelerations_of_logs_stand_log_by_log(run: Path) -> None:
@@ -336,11 +295,11 @@ def test_accelerations_of_logs_stand_log_by_log(run: Path) -> None:
     offsets = [
         {"log": log, "axis": axis, "value": value} | own for (log, axis), value in values.items()
     ]
-    assert "Accelerations of each training log" not in write_report(run).read_text()
+    assert "Accelerations of each training log" not in write_fit_page(RunFiles(run)).read_text()
     write_json(
         path, json.loads(path.read_text()) | {"refit": {"iterations": 3}, "offsets": offsets}
     )
-    text = write_report(run).read_text()
+    text = write_fit_page(RunFiles(run)).read_text()
     cells = Page(text).table("log", "first")
     assert cells["first"] == ["−0.00055", "0.00010", "0.00015", "0.00010"]
     assert cells["second"] == ["0", "0.00010", "0.00030", "0.00010"]
@@ -351,8 +310,7 @@ def test_accelerations_of_logs_stand_log_by_log(run: Path) -> None:
 
 def test_the_file_stands_alone_and_nothing_in_it_runs(run: Path) -> None:
     residuals().to_parquet(run / "residuals.parquet")
-    figures = write_figures(run)
-    path = write_report(run)
+    path = write_fit_report(run)
     assert path == run / "report.html"
     text = path.read_text()
     assert "<script" not in text
@@ -360,11 +318,11 @@ def test_the_file_stands_alone_and_nothing_in_it_runs(run: Path) -> None:
     assert '<meta name="viewport"' in text
     page = Page(text)
     assert all(source.startswith(("data:image/png;base64,", "#")) for source in page.sources)
-    assert sum(source.startswith("data:") for source in page.sources) == len(figures) == 8
+    assert sum(source.startswith("data:") for source in page.sources) == 8
     assert not re.search(r"url\(|@import|https?://", text)
     assert not list(run.glob("*.partial"))
     path.unlink()
-    assert write_report(run).read_text() == text
+    assert write_fit_page(RunFiles(run)).read_text() == text
 
 
 def test_physical_sanity_is_shown_where_models_can_be_loaded(run: Path) -> None:
@@ -385,7 +343,7 @@ def test_physical_sanity_is_shown_where_models_can_be_loaded(run: Path) -> None:
     # surge that feeds itself
     model.baseline.theta.data[0, 0] = 0.3
     save_model(run / "models" / "plsr", spec, model)
-    page = html.unescape(write_report(run).read_text())
+    page = html.unescape(write_fit_page(RunFiles(run)).read_text())
     assert "Physical sanity" in page
     assert (
         "plsr, damping: not damped (wrong sign or none): u at rest, v at rest, r at rest, u at"
@@ -398,8 +356,7 @@ def test_a_folder_of_evaluate_has_other_splits_and_no_models(tmp_path: Path) -> 
     for path in (folder / "models").rglob("*.json"):
         path.unlink()
     write_json(folder / "metrics.json", metrics(("external",), ("zero", "baseline", "plsr")))
-    write_figures(folder)
-    text = write_report(folder).read_text()
+    text = write_fit_page(RunFiles(folder)).read_text()
     page = Page(text)
     assert page.table("model", "plsr (selected)")["plsr (selected)"][0] == "0.0400|−60 %"
     assert "that no fit has seen" in text
@@ -421,7 +378,7 @@ def test_metrics_alone_make_a_report(tmp_path: Path) -> None:
         if line["manoeuvre"] == "all"
     ]
     write_json(tmp_path / "metrics.json", content)
-    text = write_report(tmp_path).read_text()
+    text = write_fit_page(RunFiles(tmp_path)).read_text()
     Page(text)
     assert "of the validation data (not unseen: read with care)" in text
     assert "Provenance" not in text
@@ -429,13 +386,13 @@ def test_metrics_alone_make_a_report(tmp_path: Path) -> None:
 
 def test_folders_that_cannot_be_read_are_refused_by_name(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"no metrics\.json"):
-        write_report(tmp_path)
+        write_fit_page(RunFiles(tmp_path))
     (tmp_path / "metrics.json").write_text("{")
     with pytest.raises(DataError, match="not readable as JSON"):
-        write_report(tmp_path)
+        write_fit_page(RunFiles(tmp_path))
     (tmp_path / "metrics.json").write_text("{}")
     with pytest.raises(DataError, match="holds no rows"):
-        write_report(tmp_path)
+        write_fit_page(RunFiles(tmp_path))
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,8 @@ from made_run import made_run
 
 from residnet.core.log import Log
 from residnet.data.doctor import inspect, inspect_together, inspection
-from residnet.report.fit import write_report
+from residnet.report.fit import write_fit_page
+from residnet.report.run_reader import RunFiles
 
 
 def sick(name: str, gyro: float) -> Log:
@@ -32,24 +33,24 @@ def sick(name: str, gyro: float) -> Log:
 
 def test_findings_above_a_note_stand_in_a_table_and_notes_below(tmp_path: Path) -> None:
     run = made_run(tmp_path / "run")
-    assert 'id="doctor"' not in write_report(run).read_text()
+    assert 'id="data-doctor"' not in write_fit_page(RunFiles(run)).read_text()
     logs = [sick("first", np.radians(0.5)), sick("second", 0.0)]
     clock = logs[1].t.copy()
     clock[500:] += 7.0
     logs[1] = logs[1].replace(t=clock)
     reports = [inspect(log) for log in logs]
     (run / "doctor.json").write_text(json.dumps(inspection(reports, inspect_together(logs))))
-    text = write_report(run).read_text()
+    text = write_fit_page(RunFiles(run)).read_text()
     loud = {
         finding.code for report in reports for finding in report.findings if finding.level != "note"
     }
     assert "gaps" in loud
     page = text[
-        text.index('<section id="doctor">') : text.index(
-            "</section>", text.index('<section id="doctor">')
+        text.index('<section id="data-doctor">') : text.index(
+            "</section>", text.index('<section id="data-doctor">')
         )
     ]
-    assert '<a href="#doctor">Data doctor</a>' in text
+    assert '<a href="#data-doctor">Data doctor</a>' in text
     assert all(f'<th class="label">{code.replace("_", " ")}</th>' in page for code in loud)
     assert "split the log there (mask kind: gap)" in page
     assert "10 Hz over" in page

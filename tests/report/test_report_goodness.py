@@ -1,5 +1,4 @@
-"""The section on goodness of fit shows the numbers of goodness.json; a folder without it has none.
-"""
+"""The section on goodness of fit shows the numbers of goodness.json."""
 
 from __future__ import annotations
 
@@ -10,16 +9,17 @@ from made_run import DEG, made_run, write_json
 from made_series import autoregressive
 
 from residnet.judge.goodness import OneStep, content, table
-from residnet.report.fit import write_report
+from residnet.report.blocks import Table, Text
+from residnet.report.fit import write_fit_page
+from residnet.report.format import number
 from residnet.report.run_reader import RunFiles
-from residnet.report.sections.goodness import section
-from residnet.report.tables import number
+from residnet.report.sections.fit.goodness import axes
 
 
 def test_section_shows_what_the_file_says(tmp_path: Path) -> None:
     run = made_run(tmp_path)
-    assert section(RunFiles(run)) == []
-    assert 'id="goodness"' not in write_report(run).read_text()
+    assert axes(RunFiles(run)) == []
+    assert 'id="goodness-of-fit"' not in write_fit_page(RunFiles(run)).read_text()
     target = autoregressive(0.9, 3, 800, seed=0).T
     models = [
         OneStep("baseline", "baseline", [4, 4, 4], [0.5 * target]),
@@ -33,13 +33,15 @@ def test_section_shows_what_the_file_says(tmp_path: Path) -> None:
     ]
     rows = table(models, [target], 0.1)
     write_json(run / "goodness.json", content("made", {"train": rows, "test": rows}, 0.1))
-    parts = section(RunFiles(run))
-    assert [part["title"] for part in parts] == [
-        "surge u′ [m/s/s], test data",
-        "sway v′ [m/s/s], test data",
-        "yaw r′ [deg/s/s], test data",
+    parts = axes(RunFiles(run))
+    assert [part.title for part in parts] == [
+        "surge u′ [m/s²], test data",
+        "sway v′ [m/s²], test data",
+        "yaw r′ [deg/s²], test data",
     ]
-    yaw = dict(parts[2]["table"].rows)
+    table_block, _ = parts[2].shown
+    assert isinstance(table_block, Table)
+    yaw = {line.label: line.cells for line in table_block.rows}
     row = next(row for row in rows if row["model"] == "plsr" and row["axis"] == "r_dot")
     texts = [cell.text for cell in yaw["plsr"]]
     assert texts[:3] == ["9.00", number(DEG * row["rmse"]), number(row["r2"])]
@@ -47,5 +49,7 @@ def test_section_shows_what_the_file_says(tmp_path: Path) -> None:
     assert yaw["plsr"][-1].note == "baseline"
     assert yaw["plsr"][-1].mark == "best"
     assert yaw["baseline"][-1].text == "–"
-    assert "times too narrow" in parts[0]["sentences"][0]
-    assert 'id="goodness"' in write_report(run).read_text()
+    sentences = parts[0].shown[1]
+    assert isinstance(sentences, Text)
+    assert "times too narrow" in sentences.lines[0]
+    assert 'id="goodness-of-fit"' in write_fit_page(RunFiles(run)).read_text()

@@ -17,7 +17,7 @@ import yaml
 from tiny import TINY, call
 
 from residnet.dynamics.store import load_model
-from residnet.report.figures.fit import read_figures
+from residnet.report.figures.files import read_figures
 
 FEATURES = ["u", "v", "r", "tau_x", "tau_n"]
 
@@ -105,15 +105,15 @@ def test_terms_along_a_log_add_up_to_what_the_head_says(run: Path) -> None:
 
 
 def test_report_and_figures_show_the_equations(run: Path) -> None:
-    titles = [figure.title for figure in read_figures(run)]
+    titles = [figure.title for figure in read_figures(run / "figures")]
     assert {f"Equation of {model}, term by term" for model in ("equation", "whole", "late")} <= set(
         titles
     )
     text = (run / "report.html").read_text()
     assert "Equations of equation" in text
-    assert "candidates that differ, condition number" in text
+    assert "candidate terms differ on these data (condition number" in text
     seconds = notes(run, "late")["delay"]["seconds"]
-    assert f"Late inputs act {seconds:g} s after they are given." in text
+    assert f"Delayed inputs act {seconds:g} s after they are given." in text
     term = notes(run, "whole")["coefficients"][0]["term"]
     assert term in text
 

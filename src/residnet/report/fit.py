@@ -1,140 +1,90 @@
-"""The report: one self-contained HTML file, from the run folder alone."""
+"""The report of a fit, and of its evaluation on other logs."""
 
 from __future__ import annotations
 
-import base64
-import re
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-from residnet.judge.sanity import CHECKS, Finding, check_run
-from residnet.report import tables
-from residnet.report.figures.fit import FigureFile, read_figures
+from residnet.judge.sanity import check_run
+from residnet.report.blocks import Section
+from residnet.report.figures.files import figures_section
+from residnet.report.figures.fit import write_figures
+from residnet.report.page import write_page
 from residnet.report.run_reader import RunFiles
-from residnet.report.sections import booklet as report_booklet
-from residnet.report.sections import doctor as report_doctor
-from residnet.report.sections import equations as report_equations
-from residnet.report.sections import goodness as report_goodness
-from residnet.report.sections import limits as report_limits
-from residnet.report.sections import offsets as report_offsets
-from residnet.report.text import cautions, fitted_on, verdict
+from residnet.report.sections.fit import (
+    booklet,
+    coefficients,
+    data,
+    doctor,
+    equations,
+    free_runs,
+    goodness,
+    limits,
+    models,
+    sanity,
+)
+from residnet.report.sections.fit.verdict import caution_section, verdict
 
-_TEMPLATE = "report.html.j2"
+_DIVERGENCE = 3.0
+"""Times the training envelope beyond which a run has diverged, where the config says nothing."""
 
 
-def write_report(run: Path) -> Path:
-    """Write `report.html` into a run folder (or what `residnet evaluate` wrote) from what stands
-    there; sections without data are left out.
+def write_fit_report(path: Path) -> Path:
+    """Write figures and `report.html` of a fit or an evaluation from its folder alone.
 
-    Figures are taken from `figures/`: call `residnet.report.figures.fit.write_figures` before.
+    Parts that the folder holds nothing of are left out.
 
     Args:
-        run: folder with metrics.json.
+        path: folder with metrics.json.
 
     Returns:
-        Path of the report.
+        Path of the page.
 
     Raises:
         UsageError: where the folder holds no metrics.json.
         DataError: where a file in it cannot be read.
     """
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
-    files = RunFiles(run)
-    divergence = float(files.evaluation.get("divergence") or 3.0)
-    findings = check_run(run, divergence=divergence)
-    loader = FileSystemLoader(Path(__file__).parent)
-    environment = Environment(
-        loader=loader,
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters["minus"] = _minus
-    text = environment.get_template(_TEMPLATE).render(_context(files, findings, read_figures(run)))
-    path = run / "report.html"
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(text, encoding="utf-8")
-    partial.replace(path)
-    return path
+    run = RunFiles(path)
+    write_figures(run)
+    return write_fit_page(run)
 
 
-def _context(
-    run: RunFiles, findings: Sequence[Finding], figures: Sequence[FigureFile]
-) -> dict[str, Any]:
-    protocols = [
-        {
-            "name": name,
-            "table": tables.free_runs(run, name),
-            "kinds": tables.by_manoeuvre(run, name, run.focus),
-            "first": name == run.protocols[0],
-        }
-        for name in run.protocols
-    ]
-    return {
-        "title": str(run.metrics.get("run") or run.path.name),
-        "description": str(run.resolved.get("description") or ""),
-        "date": str(run.provenance.get("started") or "")[:10],
-        "version": run.provenance.get("residnet"),
-        "selected": run.selected,
-        "verdict": [sentence for sentence in verdict(run) if sentence],
-        "cautions": cautions(run, findings),
-        "focus": run.focus,
-        "sides": run.sides,
-        "has_baseline": run.baseline is not None,
-        "fitted_on": fitted_on(run),
-        "quality": tables.quality(run),
-        "doctor": report_doctor.section(run),
-        "good": report_limits.section(run),
-        "baselines": _coefficients(run),
-        "heads": tables.heads(run),
-        "equations": report_equations.section(run),
-        "goodness": report_goodness.section(run),
-        "booklet": report_booklet.section(run),
-        "protocols": [entry for entry in protocols if entry["table"] is not None],
-        "figures": [
-            {"title": f.title, "caption": f.caption, "name": f.path.name, "data": _embedded(f.path)}
-            for f in figures
-        ],
-        "checks": CHECKS,
-        "sanity": _by_model(findings),
-        "provenance": tables.provenance(run),
-        "inputs": list((run.provenance.get("inputs") or {}).items()),
-        "resolved": run.resolved_text,
-    }
+def write_fit_page(run: RunFiles) -> Path:
+    """Write `report.html` of a fit or an evaluation with the figures that stand in its folder.
+
+    Raises:
+        UsageError: where the folder holds no metrics.json.
+        DataError: where a file in it cannot be read.
+    """
+    title = str(run.metrics.get("run") or run.path.name)
+    return write_page(run.path, title, run.description, verdict(run), fit_sections(run))
 
 
-def _coefficients(run: RunFiles) -> list[dict[str, Any]]:
-    """Tables of identified coefficients, the first baseline's first."""
-    names = [
-        run.baseline or "baseline",
-        *(model for model, kind in run.kinds.items() if kind == "further"),
-    ]
+def fit_sections(run: RunFiles) -> list[Section]:
+    """Return the sections of the page of a fit, with the figures that stand in its folder.
+
+    Raises:
+        UsageError: where the folder holds no metrics.json.
+        DataError: where a file in it cannot be read.
+    """
+    divergence = float(run.evaluation.get("divergence") or _DIVERGENCE)
+    findings = check_run(run.path, divergence=divergence)
     found = [
-        {
-            "name": name,
-            "table": tables.baseline_parameters(run, name),
-            "refitted": bool(run.fit(name).get("refit")),
-            "offsets": report_offsets.section(run, name),
-        }
-        for name in names
+        caution_section(run, findings),
+        limits.section(run),
+        data.section(run),
+        doctor.section(run),
+        _models(run),
+        booklet.section(run),
+        goodness.section(run),
+        free_runs.section(run),
+        figures_section(run.path / "figures"),
+        sanity.section(run, findings),
     ]
-    return [entry for entry in found if entry["table"] is not None]
+    return [section for section in found if section is not None]
 
 
-def _by_model(findings: Sequence[Finding]) -> list[tuple[str, list[Finding]]]:
-    return [
-        (model, [f for f in findings if f.model == model])
-        for model in dict.fromkeys(f.model for f in findings)
-    ]
-
-
-def _minus(text: str) -> str:
-    """Hyphens before numbers as minus signs."""
-    return re.sub(r"(?<![\w-])-(?=\d)", "−", text)
-
-
-def _embedded(path: Path) -> str:
-    return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode("ascii")
+def _models(run: RunFiles) -> Section | None:
+    """Return the section on what was identified and learned."""
+    parts = [coefficients.section(run), models.section(run), *equations.sections(run)]
+    there = [part for part in parts if part is not None]
+    return Section("Models", there) if there else None

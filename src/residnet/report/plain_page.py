@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from residnet.core.config import load_mapping
-from residnet.report.figures.fit import read_figures
+from residnet.report.figures.files import read_figures
 
 _STYLE = (
     "body{margin:0 auto;max-width:60rem;padding:1rem;font:1rem/1.5"
@@ -52,7 +52,7 @@ def write_page(run: Path, before: Sequence[Part], after: Sequence[Part] = ()) ->
         f' src="data:image/png;base64,{base64.b64encode(f.path.read_bytes()).decode("ascii")}">'
         f"<figcaption><b>{html.escape(f.title)}.</b>"
         f" {html.escape(f.caption)}</figcaption></figure>"
-        for f in read_figures(run)
+        for f in read_figures(run / "figures")
     )
     last = Part("", (run / "resolved.yaml").read_text(), "Configuration")
     text = (

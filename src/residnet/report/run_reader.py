@@ -1,6 +1,4 @@
-"""Reading a run folder back: metrics, rollouts and what stands beside them; parts that a folder
-does not have are empty.
-"""
+"""A run folder read back: configuration, metrics, rollouts and what stands beside them."""
 
 from __future__ import annotations
 
@@ -16,16 +14,30 @@ import numpy as np
 import yaml
 
 from residnet.core.errors import DataError, UsageError
+from residnet.core.names import CHANNEL_UNITS
+from residnet.report.format import shown_unit
 
-Row = Mapping[str, Any]
+Content = Mapping[str, Any]
+"""What a JSON object holds."""
 COLUMNS = ("u", "v", "r", "psi", "x", "y")
 _FOCUS = ("test", "external", "validation", "train")
+"""Splits by how much they say about data that no fit has seen."""
 
 
 @dataclass(frozen=True)
 class StoredWindow:
-    """One free run of a log under every model: t [T] s, usable [T], measured and predicted [T, 6] =
-    (u, v, r, psi, x, y), SI and rad.
+    """A free run of one log over one window under every model.
+
+    Attributes:
+        log: name of the log.
+        manoeuvre: its kind.
+        protocol: name of the protocol.
+        number: of the window in its log, from 0.
+        t: [T] in s.
+        usable: [T], whether u, v and the position are scored.
+        measured: [T, 6] of u, v, r, psi, x, y in SI and rad.
+        predicted: the same by model.
+        diverged: by model.
     """
 
     log: str
@@ -39,7 +51,7 @@ class StoredWindow:
     diverged: dict[str, bool]
 
     def rmse(self, model: str) -> np.ndarray:
-        """Root mean square errors [3] of u, v (usable samples) and r (all), as in metrics.json."""
+        """Return the root mean square errors [3] of u, v (usable samples) and r (all samples)."""
         error = self.predicted[model][:, :3] - self.measured[:, :3]
         good = self.usable if self.usable.any() else np.ones_like(self.usable)
         return np.sqrt(
@@ -48,37 +60,105 @@ class StoredWindow:
 
 
 class RunFiles:
-    """Contents of a run folder, or of what `residnet evaluate` writes.
+    """The contents of a run folder of any task, or of what `residnet evaluate` writes.
 
-    Raises:
-        UsageError: where the folder holds no metrics.json.
-        DataError: where metrics.json cannot be read.
+    Parts that a folder does not have are empty. What belongs to a fit (`rows`, `kinds`, `row` and
+    so on) needs its metrics.json.
     """
 
     def __init__(self, path: Path) -> None:
+        """Look at a folder; files are read when they are first asked for.
+
+        Raises:
+            UsageError: where there is no such folder.
+        """
+        if not path.is_dir():
+            raise UsageError(f"{path}: no such folder; give the folder of a run")
         self.path = path
-        if not (path / "metrics.json").is_file():
-            raise UsageError(f"{path}: no metrics.json here; give the folder of a finished run")
-        self.metrics: Mapping[str, Any] = _json(path / "metrics.json", {})
-        if not isinstance(self.metrics, dict) or not self.metrics.get("rows"):
-            raise DataError(f"{path / 'metrics.json'}: holds no rows")
-        self.rows: Sequence[Row] = self.metrics["rows"]
-        self.quality: Sequence[Row] = _json(path / "data_quality.json", [])
-        self.provenance: Row = _json(path / "provenance.json", {})
-        self.limits: Row = _json(path / "limits.json", {})
-        self.goodness: Row = _json(path / "goodness.json", {})
-        self.doctor: Row = _json(path / "doctor.json", {})
-        self.booklet: Row = _json(path / "booklet.json", {})
-        resolved = path / "resolved.yaml"
-        self.resolved_text = resolved.read_text() if resolved.is_file() else ""
-        self.resolved: Row = yaml.safe_load(self.resolved_text) or {}
+
+    def json(self, name: str) -> Any:
+        """Return what a JSON file of the folder holds, an empty object where there is none.
+
+        Raises:
+            DataError: where the file cannot be read.
+        """
+        path = self.path / name
+        if not path.is_file():
+            return {}
+        try:
+            return json.loads(path.read_text())
+        except ValueError as error:
+            raise DataError(f"{path}: not readable as JSON ({error})") from None
+
+    def frame(self, name: str) -> Any:
+        """Return a parquet file of the folder as a pandas table, None where there is none."""
+        import pandas as pd
+
+        path = self.path / name
+        return pd.read_parquet(path) if path.is_file() else None
+
+    @cached_property
+    def metrics(self) -> Content:
+        """The contents of metrics.json.
+
+        Raises:
+            UsageError: where the folder holds none.
+            DataError: where it cannot be read.
+        """
+        path = self.path / "metrics.json"
+        if not path.is_file():
+            raise UsageError(
+                f"{self.path}: no metrics.json here; give the folder of a finished run"
+            )
+        content = self.json("metrics.json")
+        if not isinstance(content, dict) or not content.get("rows"):
+            raise DataError(f"{path}: holds no rows")
+        return content
+
+    @property
+    def rows(self) -> Sequence[Content]:
+        """The rows of metrics.json."""
+        rows: Sequence[Content] = self.metrics["rows"]
+        return rows
+
+    @cached_property
+    def resolved(self) -> Content:
+        """The configuration of the run."""
+        path = self.path / "resolved.yaml"
+        return (yaml.safe_load(path.read_text()) or {}) if path.is_file() else {}
+
+    @cached_property
+    def quality(self) -> Sequence[Content]:
+        """What each log holds (data_quality.json)."""
+        return self.json("data_quality.json") or []
+
+    @cached_property
+    def provenance(self) -> Content:
+        """How the run was made (provenance.json)."""
+        provenance: Content = self.json("provenance.json")
+        return provenance
+
+    @cached_property
+    def limits(self) -> Content:
+        """What limits the models (limits.json)."""
+        limits: Content = self.json("limits.json")
+        return limits
+
+    @property
+    def title(self) -> str:
+        """The name of the run, else that of its folder."""
+        return str(self.resolved.get("name") or self.path.name)
+
+    @property
+    def description(self) -> str:
+        """What the run was made for."""
+        return str(self.resolved.get("description") or "")
 
     @cached_property
     def kinds(self) -> dict[str, str]:
-        """Kind (zero, baseline, head, truth, ...) of each model, in the order of metrics.json.
+        """The kind (zero, baseline, head, truth, ...) of each model, in the order of metrics.json.
 
-        Only the first baseline is one here, what reductions refer to; others are `further` models,
-        judged like heads.
+        Reductions refer to the first baseline; the others are `further` models, judged like heads.
         """
         kinds = {row["model"]: row.get("kind", "head") for row in self.rows}
         first = next((model for model, kind in kinds.items() if kind == "baseline"), None)
@@ -89,7 +169,7 @@ class RunFiles:
 
     @cached_property
     def selected(self) -> str | None:
-        """The model chosen on validation data, if any."""
+        """The model chosen on validation data, None where none was."""
         chosen = [row["model"] for row in self.rows if row.get("selected")]
         return self.metrics.get("selected") or (chosen[0] if chosen else None)
 
@@ -105,7 +185,7 @@ class RunFiles:
 
     @cached_property
     def heads(self) -> list[str]:
-        """Models that are neither zero, baseline nor truth; the selected one first."""
+        """The models that are neither zero, baseline nor truth, the selected one first."""
         heads = [
             model for model, kind in self.kinds.items() if kind not in ("zero", "baseline", "truth")
         ]
@@ -113,7 +193,7 @@ class RunFiles:
 
     @cached_property
     def splits(self) -> list[str]:
-        """Splits of the rows, in their order."""
+        """The splits of the rows, in their order."""
         return list(dict.fromkeys(row["split"] for row in self.rows))
 
     @cached_property
@@ -123,31 +203,31 @@ class RunFiles:
 
     @cached_property
     def sides(self) -> list[str]:
-        """Splits that stand side by side: train, where there is one, and the focus."""
+        """The splits that stand side by side: train, where there is one, and the focus."""
         return [split for split in ("train",) if split in self.splits and split != self.focus] + [
             self.focus
         ]
 
     @cached_property
     def protocols(self) -> list[str]:
-        """Protocols of the rows, the one that selects first."""
+        """The protocols of the rows, the one that selects first."""
         names = list(dict.fromkeys(row["protocol"] for row in self.rows))
         return sorted(names, key=lambda name: name != self.evaluation.get("selection"))
 
     @property
-    def evaluation(self) -> Row:
+    def evaluation(self) -> Content:
         """The section `evaluation` of the configuration."""
         return self.resolved.get("evaluation") or {}
 
     @cached_property
     def channels(self) -> list[str]:
-        """Channels that are scored."""
+        """The channels that are scored."""
         return [name for name in self.rows[0]["rmse"] if name != "mean"]
 
     def row(
         self, model: str | None, split: str, protocol: str, manoeuvre: str = "all"
-    ) -> Row | None:
-        """The row of metrics.json, None where there is none."""
+    ) -> Content | None:
+        """Return a row of metrics.json, None where there is none."""
         wanted = (model, split, protocol, manoeuvre)
         return next(
             (
@@ -160,7 +240,7 @@ class RunFiles:
         )
 
     def manoeuvres(self, split: str, protocol: str) -> list[str]:
-        """Kinds and named groups of manoeuvres that have rows; without `all`."""
+        """Return the kinds and named groups of manoeuvres that have rows, without `all`."""
         names = [
             row.get("manoeuvre", "all")
             for row in self.rows
@@ -168,17 +248,32 @@ class RunFiles:
         ]
         return [name for name in dict.fromkeys(names) if name != "all"]
 
-    def card(self, model: str) -> Row:
-        """models/<model>/model.json."""
-        return _json(self.path / "models" / model / "model.json", {})
+    def label(self, model: str) -> str:
+        """Return the name of a model in tables, with its role where it has a special one."""
+        if self.kinds.get(model) == "truth":
+            return f"{model} (plant)"
+        return f"{model} (selected)" if model == self.selected else model
 
-    def fit(self, model: str) -> Row:
-        """models/<model>/fit.json."""
-        return _json(self.path / "models" / model / "fit.json", {})
+    def unit(self, channel: str) -> tuple[str, float]:
+        """Return the unit in which a channel is shown and the factor to it from SI."""
+        known = self.metrics.get("channels") or {}
+        return shown_unit(known.get(channel) or CHANNEL_UNITS.get(channel, "-"))
+
+    def card(self, model: str) -> Content:
+        """Return what models/<model>/model.json holds."""
+        card: Content = self.json(f"models/{model}/model.json")
+        return card
+
+    def fit(self, model: str) -> Content:
+        """Return what models/<model>/fit.json holds."""
+        notes: Content = self.json(f"models/{model}/fit.json")
+        return notes
 
     def manoeuvre_of(self, log: str) -> str:
-        """Kind of manoeuvre of a log: as recorded, else the kind that its name begins with, else
-        its name without a number.
+        """Return the kind of manoeuvre of a log.
+
+        It is the recorded one, else the one that its name begins with, else its name without a
+        number.
         """
         recorded = {entry["log"]: entry.get("manoeuvre") for entry in self.quality}
         if recorded.get(log):
@@ -188,7 +283,7 @@ class RunFiles:
         return fitting[-1] if fitting else re.sub(r"[_-]?\d+$", "", log) or log
 
     def windows(self, split: str) -> list[StoredWindow]:
-        """All stored free runs of a split, by file name; empty where none are stored."""
+        """Return all stored free runs of a split, in the order of the file names."""
         import pandas as pd
 
         out: list[StoredWindow] = []
@@ -216,12 +311,3 @@ class RunFiles:
                     )
                 )
         return out
-
-
-def _json(path: Path, absent: Any) -> Any:
-    if not path.is_file():
-        return absent
-    try:
-        return json.loads(path.read_text())
-    except ValueError as error:
-        raise DataError(f"{path}: not readable as JSON ({error})") from None

@@ -6,8 +6,7 @@ from pathlib import Path
 
 from residnet.report.autopilot import FLIGHTS, write_autopilot_report
 from residnet.report.course import TRACKS, write_course_report
-from residnet.report.figures.fit import write_figures
-from residnet.report.fit import write_report
+from residnet.report.fit import write_fit_report
 from residnet.runs.folder import RunFolder
 
 
@@ -22,5 +21,4 @@ def report_run(path: Path) -> Path:
         return write_autopilot_report(folder.path)
     if (folder.path / TRACKS).is_file():
         return write_course_report(folder.path)
-    write_figures(folder.path)
-    return write_report(folder.path)
+    return write_fit_report(folder.path)

@@ -1,6 +1,4 @@
-"""Figures of the manoeuvring booklet: turning circles with all draws, measured zigzags beside their
-repetition by the model.
-"""
+"""Figures of the manoeuvring booklet: turning circles with all draws, and repeated zigzags."""
 
 from __future__ import annotations
 
@@ -10,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from residnet.report.figures.files import Drawing
 from residnet.report.figures.style import MEASURED, SOLID, WIDTH, collect, legend_above, new_figure
 from residnet.report.run_reader import RunFiles
 
@@ -27,39 +26,37 @@ _MOST_ZIGZAGS = 6
 _DEG = math.degrees(1.0)
 
 
-def of_booklet(run: RunFiles) -> Iterator[tuple[str, str, str, Any]]:
-    """Name, title, caption and figure of each; none where the run has no booklet."""
-    path = run.path / "booklet.parquet"
-    if not run.booklet or not path.is_file():
+def of_booklet(run: RunFiles) -> Iterator[Drawing]:
+    """Draw the circles and zigzags of a booklet; nothing where the run has none."""
+    booklet, frame = run.json("booklet.json"), run.frame("booklet.parquet")
+    if not booklet or frame is None:
         return
-    import pandas as pd
-
-    frame = pd.read_parquet(path)
-    pages: list[Mapping[str, Any]] = run.booklet["pages"]
-    level = f"{100 * run.booklet['level']:.0f} %"
+    pages: list[Mapping[str, Any]] = booklet["pages"]
+    level = f"{100 * booklet['level']:.0f} %"
     circles = [page for page in pages if page["manoeuvre"] == "turning_circle"]
     if circles:
-        yield (
+        yield Drawing(
             "booklet_circles",
             "Turning circles",
             (
-                "North up, in hull lengths from the place of the order; thin lines are"
-                f" {run.booklet['draws']} draws of the model's parameters. Lines mark advance (to"
-                " 90 deg) and tactical diameter (to 180 deg) of the fitted model."
+                "North is up; distances are in hull lengths from the place of the order. Thin"
+                f" lines are {booklet['draws']} draws of the model's parameters. Black lines mark"
+                " advance (to 90 deg) and tactical diameter (to 180 deg) of the fitted model."
             ),
-            _circles(frame, circles, float(run.booklet["length"])),
+            _circles(frame, circles, float(booklet["length"])),
         )
     zigzags = [page for page in pages if page["manoeuvre"] == "zigzag"]
     for place in range(0, len(zigzags), _MOST_ZIGZAGS):
-        yield (
+        yield Drawing(
             f"booklet_zigzags_{place // _MOST_ZIGZAGS + 1}",
             "Zigzags in closed loop",
             (
                 "The model steers by its own heading with the rudder angle and the reversals of"
-                " each trial; dotted: the rudder. Look for the height of the peaks (overshoot) and"
-                f" for periods that run apart. Band: {level} of the draws at each instant."
+                " each trial; the rudder is dotted. Look for the height of the peaks (overshoot)"
+                f" and for periods that run apart. The band holds {level} of the draws at each"
+                " instant."
             ),
-            _zigzags(frame, zigzags[place : place + _MOST_ZIGZAGS], float(run.booklet["level"])),
+            _zigzags(frame, zigzags[place : place + _MOST_ZIGZAGS], float(booklet["level"])),
         )
 
 
@@ -155,7 +152,7 @@ def _zigzags(frame: Any, pages: Sequence[Mapping[str, Any]], level: float) -> An
 
 
 def page_title(page: Mapping[str, Any]) -> str:
-    """Name of a page, with the split of a measured log."""
+    """Return the name of a page, with the split of a measured log."""
     return (
         f"{page['name']} ({page['split']})"
         if page["split"]

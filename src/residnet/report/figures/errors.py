@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from residnet.report.figures.style import collect, legend_above, new_figure, short_label, styles
-from residnet.report.run_reader import Row, RunFiles, StoredWindow
+from residnet.report.run_reader import Content, RunFiles, StoredWindow
 
 _DEG = 180.0 / math.pi
 _BINS = 60
@@ -293,7 +293,7 @@ def learning_curves(run: RunFiles, models: Sequence[str]) -> Any:
 
 
 def _stages(
-    top: Any, bottom: Any, epoch: np.ndarray, stage: np.ndarray, resolved: Row, model: str
+    top: Any, bottom: Any, epoch: np.ndarray, stage: np.ndarray, resolved: Content, model: str
 ) -> None:
     settings = (resolved.get("training") or {}).get(model) or {}
     steps = settings.get("multi_step") or []

@@ -1,5 +1,4 @@
-"""Figures of simulated manoeuvres: tracks and time histories of a vessel, a learned model, or both.
-"""
+"""Figures of simulated manoeuvres: tracks and time histories of a vessel, a model, or both."""
 
 from __future__ import annotations
 

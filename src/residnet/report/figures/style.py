@@ -1,6 +1,4 @@
-"""How every figure looks: one colour and line style per role, sizes for print, saving as light PNG
-files.
-"""
+"""How every figure looks: colours and lines by role, sizes for print, light PNG files."""
 
 from __future__ import annotations
 
@@ -141,16 +139,9 @@ def styles(run: RunFiles) -> dict[str, dict[str, Any]]:
     return out
 
 
-def label(run: RunFiles, model: str) -> str:
-    """Name of a model in tables."""
-    if run.kinds.get(model) == "truth":
-        return f"{model} (plant)"
-    return f"{model} (selected)" if model == run.selected else model
-
-
 def short_label(run: RunFiles, model: str) -> str:
     """Name of a model in figures, where a long one would run over its neighbours."""
-    full = label(run, model)
+    full = run.label(model)
     return full if len(model) <= 20 else full.replace(model, model[:19] + "…")
 
 
@@ -176,7 +167,6 @@ def _legend_width(widths: list[float], columns: int) -> float:
 
 
 def collect(handles: dict[str, Any], axes: Any) -> None:
-    """Add the labelled artists of some axes to the handles of a figure's legend, each label once.
-    """
+    """Add the labelled artists of some axes to the handles of a legend, each label once."""
     for handle, text in zip(*axes.get_legend_handles_labels(), strict=True):
         handles.setdefault(text, handle)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from residnet.report.figures.files import Drawing
 from residnet.report.figures.style import new_figure
 from residnet.report.run_reader import RunFiles
 
@@ -22,25 +23,21 @@ _SHOWN = 6
 """
 
 
-def of_terms(run: RunFiles) -> Iterator[tuple[str, str, str, Any]]:
-    """Name, title, caption and figure for every model whose equations the folder holds along a log.
-    """
-    path = run.path / "terms.parquet"
-    if not path.is_file():
+def of_terms(run: RunFiles) -> Iterator[Drawing]:
+    """Draw the equations of every model that the folder holds along a log."""
+    frame = run.frame("terms.parquet")
+    if frame is None:
         return
-    import pandas as pd
-
-    frame = pd.read_parquet(path)
     for model, own in frame.groupby("model", sort=False):
         log = str(own["log"].iloc[0])
-        yield (
+        yield Drawing(
             f"terms_{model}",
             f"Equation of {model}, term by term",
             (
                 f"What each term adds to the acceleration along {log}, and their sum (black)"
-                " against the target (grey), what the baseline leaves; two large terms that mirror"
-                " each other mean that the data hardly tell them apart, a flat one could be left"
-                " out."
+                " against the target (grey), which is what the baseline leaves. Two large terms"
+                " that mirror each other mean that the data can hardly tell them apart. A flat term"
+                " could be left out."
             ),
             parts(own),
         )

@@ -1,1 +1,1 @@
-"""Sections of a report, one file each."""
+"""The sections of a report, by task."""

@@ -1,16 +1,24 @@
-"""Sentences of the report: the verdict, and what was fitted on what."""
+"""The verdict on a fit, and what a reader must know before using its selected model."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 from residnet.judge.sanity import Finding
-from residnet.report.run_reader import Row, RunFiles
-from residnet.report.tables import DEG, distinct, number, percent, title_of, unit_of
+from residnet.report.blocks import Bullets, Section
+from residnet.report.format import DEG, minus, number, percent, title_of
+from residnet.report.run_reader import Content, RunFiles
+from residnet.report.sections.fit.manoeuvres import distinct
 
 
 def verdict(run: RunFiles) -> list[str]:
-    """A paragraph in plain words, sentence by sentence."""
+    """Return how good the selected model is, sentence by sentence.
+
+    It is compared with the baseline and, where the logs are simulated, with the plant.
+
+    Raises:
+        UsageError: where the folder holds no metrics.json.
+    """
     protocol, split = run.protocols[0], run.focus
     lead = run.selected or (run.heads[0] if run.heads else run.baseline)
     row = run.row(lead, split, protocol)
@@ -41,10 +49,10 @@ def verdict(run: RunFiles) -> list[str]:
     return out
 
 
-def _level(run: RunFiles, lead: str, row: Row, base: Row | None) -> str:
+def _level(run: RunFiles, lead: str, row: Content, base: Content | None) -> str:
     parts = []
     for channel in run.channels:
-        unit, factor = unit_of(run, channel)
+        unit, factor = run.unit(channel)
         text = f"{title_of(channel)} {number(factor * row['rmse'][channel])} {unit}"
         interval = (row.get("rmse_ci95") or {}).get(channel)
         if interval:
@@ -61,10 +69,10 @@ def _level(run: RunFiles, lead: str, row: Row, base: Row | None) -> str:
     )
 
 
-def _against_plant(run: RunFiles, row: Row, truth: Row, base: Row | None) -> str:
+def _against_plant(run: RunFiles, row: Content, truth: Content, base: Content | None) -> str:
     parts = []
     for channel in run.channels:
-        unit, factor = unit_of(run, channel)
+        unit, factor = run.unit(channel)
         text = f"{title_of(channel)} {number(factor * truth['rmse'][channel])} {unit}"
         if base is not None and base["rmse"][channel] > 1.02 * truth["rmse"][channel]:
             share = (base["rmse"][channel] - row["rmse"][channel]) / (
@@ -79,20 +87,24 @@ def _against_plant(run: RunFiles, row: Row, truth: Row, base: Row | None) -> str
     return intro + "; ".join(parts) + "."
 
 
-def _end(run: RunFiles, row: Row, base: Row | None, lead: str) -> str:
+def _end(run: RunFiles, row: Content, base: Content | None, lead: str) -> str:
     if "position_error_end" not in row:
         return ""
 
-    def off(of: Row) -> tuple[str, str]:
+    def off(judged: Content) -> tuple[str, str]:
         return (
-            number(of["position_error_end"], 2) + " m",
-            number(DEG * of["heading_error_end"], 2) + " deg",
+            number(judged["position_error_end"], 2) + " m",
+            number(DEG * judged["heading_error_end"], 2) + " deg",
         )
 
-    text = "At the end of a free run the position is off by {} and the heading by {} on average"
-    text = text.format(*off(row))
+    position, heading = off(row)
+    text = (
+        f"At the end of a free run the position is off by {position} and the heading by {heading}"
+        " on average"
+    )
     if base is not None and lead != run.baseline:
-        text += " (baseline: {}, {})".format(*off(base))
+        position, heading = off(base)
+        text += f" (baseline: {position}, {heading})"
     return text + "."
 
 
@@ -112,9 +124,20 @@ def _divergence(run: RunFiles, split: str) -> str:
     )
 
 
+def caution_section(run: RunFiles, findings: Sequence[Finding]) -> Section | None:
+    """Return what speaks against using the selected model, None where nothing does."""
+    found = cautions(run, findings)
+    if not found:
+        return None
+    return Section("Before you use it", [Bullets([minus(text) for text in found], warning=True)])
+
+
 def cautions(run: RunFiles, findings: Sequence[Finding]) -> list[str]:
-    """What a reader must know before using the selected model; empty where nothing speaks against
-    it.
+    """Return sentences on what speaks against using the selected model.
+
+    Args:
+        run: folder of a fit, or of its evaluation.
+        findings: of the checks for physical sanity.
     """
     out = []
     lead = run.selected
@@ -164,8 +187,9 @@ def cautions(run: RunFiles, findings: Sequence[Finding]) -> list[str]:
 
 
 def worse_than_reference(run: RunFiles, protocol: str) -> str:
-    """Heads and ensembles that are worse than what they are compared with by more than 5 %, by kind
-    of manoeuvre; empty where there are none.
+    """Return which heads and ensembles are worse than their reference by more than 5 %, and where.
+
+    The sentence names the kinds of manoeuvre; it is empty where no model is worse.
     """
     lost = []
     for model in run.heads:
@@ -193,104 +217,3 @@ def worse_than_reference(run: RunFiles, protocol: str) -> str:
         if lost
         else ""
     )
-
-
-def fitted_on(run: RunFiles) -> list[tuple[str, str]]:
-    """What was fitted on what, as pairs of a name and a sentence."""
-    baseline = run.resolved.get("baseline") or {}
-    samples = run.fit(run.baseline or "baseline").get("samples")
-    fit = f", fitted on {samples} samples" if samples else ""
-    logs: dict[str, list[Row]] = {}
-    for entry in run.quality:
-        logs.setdefault(entry["split"], []).append(entry)
-    splits = [
-        f"{split} {len(members)} logs, {sum(log['seconds'] for log in members) / 60:.1f} min"
-        for split, members in logs.items()
-    ]
-    protocols = run.evaluation.get("protocols") or {}
-    scales = [
-        f"{name} {number(unit_of(run, name)[1] * value)} {unit_of(run, name)[0]}"
-        for name, value in (run.metrics.get("scales") or {}).items()
-    ]
-    facts = [
-        ("data", _data(run)),
-        ("splits", "; ".join(splits)),
-        ("inputs", _inputs(run)),
-        *_model(run),
-    ]
-    facts.append(("baseline", str(baseline.get("kind", "")) + fit if baseline else ""))
-    for name, protocol in protocols.items():
-        facts.append(
-            (
-                f"protocol {name}",
-                _protocol(protocol)
-                + ("; selects the model" if name == run.evaluation.get("selection") else ""),
-            )
-        )
-    facts.append(("NRMSE divides by", ", ".join(scales)))
-    return [(name, text) for name, text in facts if text]
-
-
-def _data(run: RunFiles) -> str:
-    data = run.resolved.get("data") or {}
-    if not data:
-        return ""
-    if data.get("kind") != "simulated":
-        return (
-            f"measured logs ({(data.get('reader') or {}).get('kind', 'files')}),"
-            f" {len(run.provenance.get('inputs') or {})} files"
-        )
-    text = f"simulated sea trials of vessel {data.get('vessel')}"
-    noise = data.get("noise") or {}
-    if noise:
-        text += (
-            f", noise u {number(noise.get('u'), 2)} m/s, v {number(noise.get('v'), 2)} m/s, r"
-            f" {number(DEG * noise.get('r', 0), 2)} deg/s"
-        )
-    return text + f"; data seed {data.get('seed')}"
-
-
-def _inputs(run: RunFiles) -> str:
-    signals = run.resolved.get("signals") or {}
-    text = ", ".join(signals.get("inputs") or [])
-    if signals.get("exogenous"):
-        text += "; exogenous: " + ", ".join(signals["exogenous"])
-    if signals.get("forces"):
-        text += (
-            f"; forces from the thrusters of {signals['forces']}"
-            if isinstance(signals["forces"], str)
-            else "; forces from given thrusters"
-        )
-    return text
-
-
-def _model(run: RunFiles) -> list[tuple[str, str]]:
-    card = run.card(run.baseline or "baseline")
-    if not card:
-        return []
-    signals = card.get("signals") or {}
-    names = ["u", "v", "r", *(signals.get("inputs") or []), *(signals.get("exogenous") or [])]
-    ranges = []
-    for name, low, high in zip(names, card["low"], card["high"], strict=False):
-        unit, factor = unit_of(run, name)
-        ranges.append(
-            f"{name} {number(factor * low)} to {number(factor * high)} {unit}".removesuffix(" -")
-        )
-    return [
-        ("model step", f"{card['dt']:g} s, {card['integrator']}; inputs held over a step"),
-        ("training range", "; ".join(ranges)),
-    ]
-
-
-def _protocol(protocol: Row) -> str:
-    if protocol.get("kind") == "windows":
-        return (
-            f"back-to-back windows of {protocol['length']:g} s, the first from"
-            f" {protocol.get('first', 0):g} s on, each from the measured state"
-        )
-    if protocol.get("kind") == "manoeuvre":
-        return (
-            "whole manoeuvres; they start from the mean velocities of the first"
-            f" {protocol['initial']:g} s and are scored after them"
-        )
-    return str(protocol.get("kind", "not described"))
