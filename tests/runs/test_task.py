@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from residnet.core.errors import DataError, FitError, UsageError
-from residnet.report.plain_page import Part
+from residnet.report.blocks import Code, Section
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import ComputingTask, MainFigure, Outcome
 
@@ -33,18 +33,20 @@ class SampleTask(ComputingTask):
             raise FitError("nothing can be fitted")
         folder.write_json(folder.path / "found.json", {"threads": torch.get_num_threads()})
         failure = "a flight did not end" if self.fault else ""
-        return Outcome(["It works."], {"speed": MainFigure(1.5, "m/s")}, "a table", failure)
+        figures = {"speed": MainFigure(1.5, "m/s")}
+
+        def export() -> Sequence[Path]:
+            assert folder.report.is_file()
+            assert not folder.finished
+            folder.write(folder.exports / "model.txt", "exported")
+            return [folder.exports / "model.txt"]
+
+        return Outcome(["It works."], figures, "a table", failure, export)
 
     @classmethod
-    def report_sections(cls, run: RunFolder) -> Sequence[Part]:
+    def report_sections(cls, run: RunFolder) -> Sequence[Section]:
         assert not run.finished
-        return [Part("", (run.path / "found.json").read_text(), "What was found")]
-
-    def write_exports(self, folder: RunFolder) -> Sequence[Path]:
-        assert folder.report.is_file()
-        assert not folder.finished
-        folder.write(folder.exports / "model.txt", "exported")
-        return [folder.exports / "model.txt"]
+        return [Section("What was found", [Code((run.path / "found.json").read_text())])]
 
 
 def test_a_run_leaves_report_summary_and_mark(tmp_path: Path) -> None:

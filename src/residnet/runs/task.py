@@ -15,7 +15,8 @@ from pydantic import Field
 
 from residnet.core.config import Config, dump_config
 from residnet.core.errors import DataError, UsageError
-from residnet.report.plain_page import Part, write_page
+from residnet.report.blocks import Section
+from residnet.report.page import title_and_description, write_page
 from residnet.runs.folder import RunFolder
 from residnet.runs.provenance import Provenance
 
@@ -47,12 +48,14 @@ class Outcome:
         table: text for the terminal; empty for none.
         failure: a line where a result fails a check; the run is complete, and ends as a `DataError`
             with this line.
+        export: writes models for controllers once the report stands, and returns their files.
     """
 
     verdict: Sequence[str] = ()
     figures: Mapping[str, MainFigure] = field(default_factory=dict)
     table: str = ""
     failure: str = ""
+    export: Callable[[], Sequence[Path]] | None = None
 
 
 @dataclass(frozen=True)
@@ -101,10 +104,10 @@ class Task(Config):
 
     @classmethod
     @abstractmethod
-    def report_sections(cls, run: RunFolder) -> Sequence[Part]:
+    def report_sections(cls, run: RunFolder) -> Sequence[Section]:
         """Draw the figures of a finished run and return the sections of its report.
 
-        Everything is taken from the folder alone.
+        Everything is taken from the folder alone; verdict, provenance and configuration are added.
         """
 
     def check(self) -> None:
@@ -121,10 +124,6 @@ class Task(Config):
     def recorded_seed(self) -> int:
         """Return the seed that stands in the provenance."""
         return 0
-
-    def write_exports(self, folder: RunFolder) -> Sequence[Path]:
-        """Export models for controllers at the end of the run; returns the files."""
-        return ()
 
     def evaluate_on(self, run: RunFolder, logs: Sequence[Path], out: Path | None) -> Finished:
         """Judge the models of a finished run on other logs.
@@ -178,9 +177,7 @@ class Task(Config):
             resume=resume,
             overwrite=overwrite,
         )
-        return self.conduct(
-            folder, made_from, self.carry_out, self.write_exports if report else None, report=report
-        )
+        return self.conduct(folder, made_from, self.carry_out, report=report)
 
     @final
     def conduct(
@@ -188,7 +185,6 @@ class Task(Config):
         folder: RunFolder,
         made_from: Provenance,
         work: Callable[[RunFolder], Outcome],
-        exports: Callable[[RunFolder], Sequence[Path]] | None = None,
         *,
         report: bool = True,
     ) -> Finished:
@@ -205,7 +201,7 @@ class Task(Config):
             made_from.write(folder)
             if report:
                 self.write_report(folder)
-            files = exports(folder) if exports is not None else ()
+            files = outcome.export() if report and outcome.export is not None else ()
         made_from.write(folder)
         folder.write_summary(self.task, outcome.verdict, figures, finished=True)
         if outcome.failure:
@@ -215,8 +211,9 @@ class Task(Config):
     @classmethod
     def write_report(cls, run: RunFolder) -> Path:
         """Write figures and report from the run folder alone; returns the page's path."""
-        verdict = [Part(sentence) for sentence in run.read_summary()["verdict"]]
-        return write_page(run.path, [*verdict, *cls.report_sections(run)])
+        title, description = title_and_description(run.path)
+        verdict = run.read_summary()["verdict"]
+        return write_page(run.path, title, description, verdict, cls.report_sections(run))
 
     @contextmanager
     def resources(self) -> Iterator[None]:

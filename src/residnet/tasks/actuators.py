@@ -23,9 +23,10 @@ from residnet.physics.actuators.identify import (
     fit_throttle,
     fit_thrust,
 )
-from residnet.report.plain_page import Part
+from residnet.report.blocks import Code, Section
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import MainFigure, Outcome, Task
+from residnet.tasks.pictures import figures_section
 
 
 class Column(Config):
@@ -181,9 +182,10 @@ class ActuatorsTaskConfig(Task):
         return Outcome(verdict, figures, text)
 
     @classmethod
-    def report_sections(cls, run: RunFolder) -> Sequence[Part]:
+    def report_sections(cls, run: RunFolder) -> Sequence[Section]:
         """Return the lines for a vessel file; the figure is that of the run."""
-        return [Part("", (run.path / "actuators.yaml").read_text(), "Lines of a vessel file")]
+        text = (run.path / "actuators.yaml").read_text()
+        return [Section("Lines of a vessel file", [Code(text)]), figures_section(run)]
 
 
 class _Logs:

@@ -1,4 +1,4 @@
-"""Task `import`: recordings of any format to canonical logs, with what was noticed on the way in."""
+"""Task `import`: recordings of any format become canonical logs with findings."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from residnet.core.names import nearest
 from residnet.core.progress import report
 from residnet.data.readers import ReaderConfig
 from residnet.data.readers.files import files_of
-from residnet.report.plain_page import Part
+from residnet.report.blocks import Code, Section
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import MainFigure, Outcome, Task
 
@@ -79,9 +79,9 @@ class ImportConfig(Task):
         return Outcome(verdict, figures, "\n".join(lines))
 
     @classmethod
-    def report_sections(cls, run: RunFolder) -> Sequence[Part]:
+    def report_sections(cls, run: RunFolder) -> Sequence[Section]:
         """Return what was read, and what was noticed on the way in."""
-        return [Part("", (run.path / "import.txt").read_text(), "Recordings")]
+        return [Section("Recordings", [Code((run.path / "import.txt").read_text())])]
 
     def _paths(self) -> list[Path]:
         root = self.root or Path.cwd()

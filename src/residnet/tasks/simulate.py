@@ -15,9 +15,10 @@ from residnet.data.simulated.flying import Craft, Flight
 from residnet.data.simulated.trials import SimulatedTrials, fly_trials, trials_craft
 from residnet.manoeuvres import Replay
 from residnet.physics.vessel import load_vessel
-from residnet.report.plain_page import Part
+from residnet.report.blocks import Code, Section
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import ComputingTask, MainFigure, Outcome
+from residnet.tasks.pictures import figures_section
 from residnet.tasks.programme import Programme
 
 _SHOWN = 24
@@ -113,9 +114,10 @@ class SimulateConfig(ComputingTask):
         )
 
     @classmethod
-    def report_sections(cls, run: RunFolder) -> Sequence[Part]:
+    def report_sections(cls, run: RunFolder) -> Sequence[Section]:
         """Return the table of manoeuvring indices; the figures are those of the run."""
-        return [Part("", (run.path / "indices.txt").read_text(), "Manoeuvring indices")]
+        text = (run.path / "indices.txt").read_text()
+        return [Section("Manoeuvring indices", [Code(text)]), figures_section(run)]
 
     def _drawn(
         self,

@@ -11,8 +11,8 @@ from residnet.documents.halvorsen2019.sea_trial.task import SeaTrialTaskConfig
 from residnet.documents.jervan2020.ferry.task import FerryStudyConfig
 from residnet.documents.jervan2020.measured.task import ForceResidualConfig
 from residnet.tasks.actuators import ActuatorsTaskConfig
-from residnet.tasks.autopilot import AutopilotConfig
-from residnet.tasks.course import CourseTaskConfig
+from residnet.tasks.autopilot.task import AutopilotConfig
+from residnet.tasks.course.task import CourseTaskConfig
 from residnet.tasks.fit import FitConfig
 from residnet.tasks.import_logs import ImportConfig
 from residnet.tasks.simulate import SimulateConfig

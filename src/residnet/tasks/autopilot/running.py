@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -25,17 +26,17 @@ from residnet.export.autopilot import export_autopilot
 from residnet.judge.autopilots import QUANTITIES, effort_table, step_flights, table
 from residnet.judge.metrics import SCHEMA
 from residnet.physics.vessel import load_vessel
-from residnet.report.autopilot import FLIGHTS, PLANTS, write_autopilot_report
+from residnet.report.autopilot import FLIGHTS, PLANTS
 from residnet.runs.folder import RunFolder
+from residnet.runs.task import MainFigure, Outcome
 from residnet.runs.trained import store_weights, stored_weights
-from residnet.tasks.autopilot import AutopilotConfig, PolicyConfig
-from residnet.tasks.autopilot_compare import compare
+from residnet.tasks.autopilot.comparison import compare
+from residnet.tasks.autopilot.config import AutopilotSettings, PolicyConfig
 from residnet.training.autopilot import train_autopilot
 
 
-def run_autopilot(config: AutopilotConfig, folder: RunFolder) -> None:
-    """Tune, train, compare, draw, report, export."""
-    torch.set_num_threads(config.threads)
+def run_autopilot(config: AutopilotSettings, folder: RunFolder) -> Outcome:
+    """Tune, train and compare."""
     vessel = SteeredPlant(load_vessel(config.vessel).build())
     turning = vessel.turning(config.rudder, config.turning_time)
     say(
@@ -84,28 +85,74 @@ def run_autopilot(config: AutopilotConfig, folder: RunFolder) -> None:
     )
     series.to_parquet(folder.path / FLIGHTS)
     plants.to_parquet(folder.path / PLANTS)
-    for name in config.policies:
-        trained = controllers[name][1]
-        assert isinstance(trained, HeadingPolicy)
-        learned = config.policies[name].learned
-        about = {"vessel": config.vessel, "spread": config.spread.model_dump(mode="json")}
-        about |= {} if learned is None else {"learned": learned.model_dump(mode="json")}
-        found = [entry for entry in rows if entry["model"] == name]
-        export_autopilot(
-            name,
-            trained,
-            folder.exports / f"{name}.pt",
-            safe=config.safe,
-            about=about,
-            metrics=found,
+    policies = {name: controllers[name][1] for name in config.policies}
+    return Outcome(
+        _verdict(config, rows),
+        _main_figures(config, rows),
+        f"{table(rows, config.floor)}\n{effort_table(rows)}",
+        export=lambda: [_export(config, folder, name, policies[name], rows) for name in policies],
+    )
+
+
+def _settling(
+    config: AutopilotSettings, rows: list[dict[str, Any]]
+) -> dict[str, tuple[float, float]]:
+    """Return the settling times of each policy in s: nominal vessel, and worst corner."""
+    found = {(row["model"], row["protocol"]): row["settling"] for row in rows if "settling" in row}
+    return {
+        name: (found[name, "nominal"]["max"], found[name, "corners"]["max"])
+        for name in config.policies
+    }
+
+
+def _verdict(config: AutopilotSettings, rows: list[dict[str, Any]]) -> list[str]:
+    step = math.degrees(config.test.heading)
+    sentences = [
+        f"'{name}' settles on a new heading {step:.3g} deg away in {nominal:.2f} s on the nominal"
+        f" vessel, and in {worst:.2f} s on the slowest vessel at the corners of the spread."
+        for name, (nominal, worst) in _settling(config, rows).items()
+    ]
+    if config.floor is not None:
+        floor = next(
+            row["settling"]["max"]
+            for row in rows
+            if (row["model"], row["protocol"]) == (config.floor, "nominal")
         )
-        print(f"exported: {folder.exports / f'{name}.pt'}")
-    write_autopilot_report(folder.path)
-    print(table(rows, config.floor), effort_table(rows), sep="\n")
+        sentences.append(
+            f"The fastest possible change, by '{config.floor}' that knows the vessel exactly, takes"
+            f" {floor:.2f} s."
+        )
+    return sentences
+
+
+def _main_figures(config: AutopilotSettings, rows: list[dict[str, Any]]) -> dict[str, MainFigure]:
+    figures = {}
+    for name, (nominal, worst) in _settling(config, rows).items():
+        figures[f"{name}_settling_nominal"] = MainFigure(nominal, "s")
+        figures[f"{name}_settling_worst"] = MainFigure(worst, "s")
+    return figures
+
+
+def _export(
+    config: AutopilotSettings,
+    folder: RunFolder,
+    name: str,
+    policy: Policy,
+    rows: list[dict[str, Any]],
+) -> Path:
+    """Export a policy, with its rows of metrics.json in the card; returns the file."""
+    assert isinstance(policy, HeadingPolicy)
+    learned = config.policies[name].learned
+    about = {"vessel": config.vessel, "spread": config.spread.model_dump(mode="json")}
+    about |= {} if learned is None else {"learned": learned.model_dump(mode="json")}
+    metrics = [row for row in rows if row["model"] == name]
+    file = folder.exports / f"{name}.pt"
+    export_autopilot(name, policy, file, safe=config.safe, about=about, metrics=metrics)
+    return file
 
 
 def _peer(
-    name: str, peer: AnyController, steering: Steering, config: AutopilotConfig
+    name: str, peer: AnyController, steering: Steering, config: AutopilotSettings
 ) -> tuple[AnyController, dict[str, Any]]:
     """A peer with all its gains, and what there is to say about it."""
     if not isinstance(peer, TunedConfig):
@@ -140,7 +187,7 @@ def _peer(
 
 
 def _school(
-    name: str, wanted: PolicyConfig, steering: Steering, config: AutopilotConfig
+    name: str, wanted: PolicyConfig, steering: Steering, config: AutopilotSettings
 ) -> Steering:
     """What a policy is trained on: the vessel, in wind and current where the spread has them, or a
     learned model of it.
@@ -176,7 +223,7 @@ def _policy(
     name: str,
     wanted: PolicyConfig,
     steering: Steering,
-    config: AutopilotConfig,
+    config: AutopilotSettings,
     folder: RunFolder,
     teacher: AnyController | None,
 ) -> tuple[HeadingPolicy, dict[str, Any]]:
@@ -200,7 +247,7 @@ def _policy(
         score = (
             _Score(steering, config)
             if teacher is None
-            else _Unlikeness(steering, config, teacher.build(steering))
+            else _CommandDifference(steering, config, teacher.build(steering))
         )
         notes = train_autopilot(
             name,
@@ -225,7 +272,7 @@ class _Score:
     limit costs; seconds.
     """
 
-    def __init__(self, steering: Steering, config: AutopilotConfig) -> None:
+    def __init__(self, steering: Steering, config: AutopilotSettings) -> None:
         self.steering, self.test, self.corners = steering, config.test, config.spread.corners()
 
     def __call__(self, policy: HeadingPolicy) -> float:
@@ -239,12 +286,12 @@ class _Score:
         return float(settled.mean() + 2.0 * settled.max() + 0.5 * test.duration * beyond.amax())
 
 
-class _Unlikeness:
+class _CommandDifference:
     """Root mean square of the difference between the commands of a policy and of its teacher, which
     sees what the policy flies; radians.
     """
 
-    def __init__(self, steering: Steering, config: AutopilotConfig, teacher: Policy) -> None:
+    def __init__(self, steering: Steering, config: AutopilotSettings, teacher: Policy) -> None:
         self.steering, self.test, self.corners, self.teacher = (
             steering,
             config.test,

@@ -1,11 +1,7 @@
-"""Task `autopilot`: train heading policies, tune their classical peers, and compare all of them
-over random vessels.
-"""
+"""What a run of the task `autopilot` is told: vessel, test, policies and their peers."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -13,14 +9,14 @@ import torch
 from pydantic import Field, model_validator
 
 from residnet.control.heading.controllers import AnyController, BangBangConfig
-from residnet.core.config import Config, MetresPerSecond, Radians, Seconds, dump_config
+from residnet.core.config import Config, MetresPerSecond, Radians, Seconds
 from residnet.core.names import nearest
 from residnet.data.simulated.environment import Disturbance, WindField
 from residnet.documents.gouletas2020.config import PredictiveConfig
 from residnet.dynamics.learned import chosen_model
 from residnet.physics.environment.waves import WavesConfig
 from residnet.physics.vessel import VesselName, load_vessel
-from residnet.runs.folder import RunFolder
+from residnet.runs.task import ComputingTask
 from residnet.training.autopilot_config import AutopilotTraining, SpreadConfig
 
 _Units = Annotated[int, Field(ge=1)]
@@ -100,13 +96,11 @@ class StepTestConfig(Config):
         )
 
 
-class AutopilotConfig(Config):
+class AutopilotSettings(ComputingTask):
     """Heading policies trained through the vessel, beside tuned classical controllers.
 
     Attributes:
-        name: of the run.
         seed: of weights, batches and random vessels.
-        threads: of PyTorch.
         vessel: name or file.
         rudder: largest rudder angle that controllers may use.
         turning_time: until the turn at that angle is steady.
@@ -122,11 +116,7 @@ class AutopilotConfig(Config):
             rudder amidships.
     """
 
-    task: Literal["autopilot"]
-    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")
-    description: str = ""
     seed: int = Field(default=0, ge=0)
-    threads: int = Field(default=1, ge=1)
     vessel: VesselName
     rudder: Radians = Field(gt=0, lt=1.5)
     turning_time: Seconds = Field(default=100.0, gt=0)
@@ -140,7 +130,7 @@ class AutopilotConfig(Config):
     safe: Literal["hold", "amidships"] = "amidships"
 
     @model_validator(mode="after")
-    def _names(self) -> AutopilotConfig:
+    def _names(self) -> AutopilotSettings:
         names = [*self.policies, *self.predictive, *self.peers]
         if twice := sorted({name for name in names if names.count(name) > 1}):
             raise ValueError(f"'{twice[0]}' names two controllers; names are unique in a run")
@@ -155,7 +145,7 @@ class AutopilotConfig(Config):
         return self
 
     @model_validator(mode="after")
-    def _felt(self) -> AutopilotConfig:
+    def _felt(self) -> AutopilotSettings:
         plant = load_vessel(self.vessel).build()
         one = torch.ones(1, dtype=torch.float64)
         most = float(plant.demand(one, one)[0, 0])
@@ -183,23 +173,6 @@ class AutopilotConfig(Config):
             if policy.learned is not None:
                 chosen_model(policy.learned.run, policy.learned.model)
 
-    def run(
-        self, *, source: Path, overrides: Sequence[str], out: Path | None, resume: bool
-    ) -> RunFolder:
-        """Train, tune, compare, export.
-
-        Raises:
-            UsageError: where the folder exists, or the run of a learned model is missing.
-            FitError: where tuning or training fails.
-        """
-        from residnet.tasks.autopilot_run import run_autopilot
-
-        self.check()
-        started = time.time()
-        folder = RunFolder.create(out or Path("runs") / self.name, dump_config(self), resume=resume)
-        run_autopilot(self, folder)
-        folder.write_provenance(
-            config=source, overrides=overrides, seed=self.seed, files=[], started=started
-        )
-        print(f"report: {folder.report}")
-        return folder
+    def recorded_seed(self) -> int:
+        """Return the seed of weights, batches and random vessels."""
+        return self.seed

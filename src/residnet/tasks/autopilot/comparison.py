@@ -20,11 +20,11 @@ from residnet.judge.autopilots import (
     wind_flights,
 )
 from residnet.physics.vessel import load_vessel
-from residnet.tasks.autopilot import AutopilotConfig
+from residnet.tasks.autopilot.config import AutopilotSettings
 
 
 def compare(
-    controllers: dict[str, tuple[str, Policy]], vessel: SteeredPlant, config: AutopilotConfig
+    controllers: dict[str, tuple[str, Policy]], vessel: SteeredPlant, config: AutopilotSettings
 ) -> tuple[list[dict[str, Any]], pd.DataFrame, pd.DataFrame]:
     """Rows of metrics.json, the flights over the corners of the spread as a table, and what each
     random vessel gave as another.
@@ -58,7 +58,7 @@ def compare(
     return rows, pd.concat(series, ignore_index=True), pd.concat(plants, ignore_index=True)
 
 
-def _random(config: AutopilotConfig) -> tuple[Tensor, Tensor]:
+def _random(config: AutopilotSettings) -> tuple[Tensor, Tensor]:
     """Variations [B, 3] and speeds [B]: the same for all controllers."""
     low, high = config.spread.speed
     count, seed = config.test.plants, config.seed + 1
@@ -72,7 +72,7 @@ def _random(config: AutopilotConfig) -> tuple[Tensor, Tensor]:
 
 
 def _disturbed(
-    name: str, kind: str, policy: Policy, vessel: SteeredPlant, config: AutopilotConfig
+    name: str, kind: str, policy: Policy, vessel: SteeredPlant, config: AutopilotSettings
 ) -> list[dict[str, Any]]:
     """Rows under a constant rudder bias, in wind and in waves."""
     test = config.test

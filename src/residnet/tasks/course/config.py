@@ -1,10 +1,7 @@
-"""Task `course`: fly a trained heading policy and its peers along a course past buoys."""
+"""What a run of the task `course` is told: an autopilot, a course past buoys, and guidance laws."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Sequence
-from pathlib import Path
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
@@ -12,20 +9,18 @@ from pydantic import Field, model_validator
 from residnet.control.courses.config import BuoyCourseConfig, Protocol
 from residnet.control.guidance.line_of_sight import AnyLineOfSight
 from residnet.control.heading.controllers import AnyController
-from residnet.core.config import Config, ExistingPath, MetresPerSecond, Seconds, dump_config
-from residnet.runs.folder import RunFolder
-from residnet.tasks.course_flights import CourseSpreadConfig
+from residnet.core.config import ExistingPath, MetresPerSecond, Seconds
+from residnet.runs.task import ComputingTask
+from residnet.tasks.course.flights import CourseSpreadConfig
 
 _Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
 
 
-class CourseTaskConfig(Config):
+class CourseSettings(ComputingTask):
     """A course past buoys, flown by a policy, by peers of its autopilot run, and by line of sight
     from way-point to way-point.
 
     Attributes:
-        name: of the run.
-        threads: of PyTorch.
         autopilot: folder of a finished autopilot run, or the config of one, which is then carried
             out first, in this run's own folder. Vessel, rudder, policy and tuned peers come from
             there.
@@ -48,10 +43,6 @@ class CourseTaskConfig(Config):
             or rudder amidships.
     """
 
-    task: Literal["course"]
-    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")
-    description: str = ""
-    threads: int = Field(default=1, ge=1)
     autopilot: ExistingPath
     policy: _Name = "policy"
     peers: tuple[_Name, ...] = ("pid",)
@@ -73,39 +64,6 @@ class CourseTaskConfig(Config):
             raise ValueError(f"line_of_sight: each kind once, given {', '.join(kinds)}")
         return self
 
-    def check(self) -> None:
-        """The autopilot's run folder or config.
-
-        Raises:
-            UsageError: where it is a folder of something else, or of an unfinished run.
-            ConfigError: where it is no config of an autopilot, or has no such policy or peer.
-        """
-        from residnet.tasks.course_run import autopilot_of
-
-        autopilot_of(self)
-
-    def run(
-        self, *, source: Path, overrides: Sequence[str], out: Path | None, resume: bool
-    ) -> RunFolder:
-        """Train where there is no trained policy yet, plan, fly, compare, export.
-
-        Raises:
-            UsageError: where the folder exists.
-            ConfigError: where no course fits the vessel's turns.
-            FitError: where training fails.
-        """
-        from residnet.tasks.course_run import run_course
-
-        self.check()
-        started = time.time()
-        folder = RunFolder.create(out or Path("runs") / self.name, dump_config(self), resume=resume)
-        run_course(self, folder, resume=resume)
-        folder.write_provenance(
-            config=source,
-            overrides=overrides,
-            seed=self.spread.seed if self.spread else 0,
-            files=[],
-            started=started,
-        )
-        print(f"report: {folder.report}")
-        return folder
+    def recorded_seed(self) -> int:
+        """Return the seed of the random vessels."""
+        return self.spread.seed if self.spread else 0

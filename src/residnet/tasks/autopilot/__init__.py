@@ -1,0 +1,1 @@
+"""Task `autopilot`: heading policies and their classical peers."""

@@ -1,0 +1,67 @@
+"""Task `autopilot`: train heading policies, tune classical peers, and compare all of them."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import ClassVar, Literal, final
+
+from residnet.core.errors import UsageError
+from residnet.core.names import nearest
+from residnet.report.blocks import Section
+from residnet.runs.folder import RunFolder
+from residnet.runs.task import Outcome
+from residnet.tasks.autopilot.config import AutopilotSettings
+
+
+@final
+class AutopilotConfig(AutopilotSettings):
+    """Heading policies trained through the vessel, beside tuned classical controllers."""
+
+    task: Literal["autopilot"]
+
+    verbs: ClassVar[tuple[str, ...]] = ("report", "export")
+
+    def carry_out(self, folder: RunFolder) -> Outcome:
+        """Train, tune and compare.
+
+        Raises:
+            FitError: where tuning or training fails.
+        """
+        from residnet.tasks.autopilot.running import run_autopilot
+
+        return run_autopilot(self, folder)
+
+    @classmethod
+    def report_sections(cls, run: RunFolder) -> Sequence[Section]:
+        """Return the comparison of the controllers."""
+        return []
+
+    @classmethod
+    def write_report(cls, run: RunFolder) -> Path:
+        """Write figures and report from the run folder alone; returns the page's path."""
+        from residnet.report.autopilot import write_autopilot_report
+
+        return write_autopilot_report(run.path)
+
+    def export_model(self, run: RunFolder, model: str, out: Path | None, file_format: str) -> Path:
+        """Return the file of a policy, which was exported and checked when the run ended.
+
+        Raises:
+            UsageError: where there is no such policy, or another format is given.
+        """
+        if model not in self.policies:
+            raise UsageError(f"{run.path}: no policy '{model}'{nearest(model, self.policies)}")
+        if file_format != "torchscript":
+            raise UsageError(
+                f"{run.path}: policies are exported as torchscript, not as {file_format}"
+            )
+        file = run.exports / f"{model}.pt"
+        if not file.is_file():
+            raise UsageError(f"{file}: no such file; the run writes it at its end")
+        if out is None:
+            return file
+        out.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(file, out)
+        return out

@@ -1,0 +1,1 @@
+"""Task `course`: heading policies along a course past buoys."""

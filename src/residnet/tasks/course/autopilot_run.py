@@ -1,0 +1,143 @@
+"""The finished autopilot run that a course is flown with: vessel, policy and peers."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from pydantic import TypeAdapter
+
+from residnet.control.base import Policy
+from residnet.control.courses.config import smallest_turn
+from residnet.control.courses.turns import SteadyTurn
+from residnet.control.heading.controllers import AnyController, Steering
+from residnet.control.heading.policy import HeadingPolicy
+from residnet.control.heading.steering import SteeredPlant
+from residnet.control.heading.turning import Turning
+from residnet.core.config import load_config
+from residnet.core.errors import ConfigError, UsageError
+from residnet.core.names import nearest
+from residnet.documents.gouletas2020.autopilot import load_predictive
+from residnet.physics.vessel import load_vessel
+from residnet.runs.folder import RunFolder
+from residnet.tasks.autopilot.task import AutopilotConfig
+from residnet.tasks.course.config import CourseSettings
+
+
+def autopilot_of(config: CourseSettings) -> AutopilotConfig:
+    """The autopilot's config, from its run folder or its file.
+
+    Raises:
+        UsageError: where the folder is not that of a finished autopilot run.
+        ConfigError: where the file is no config of an autopilot, or has no such policy or peer.
+    """
+    given = config.autopilot
+    file = RunFolder.open(given).resolved if given.is_dir() else given
+    autopilot = load_config(file, [], AutopilotConfig)
+    if config.policy not in autopilot.policies:
+        raise ConfigError(
+            f"policy: '{config.policy}' is none of"
+            f" {given}{nearest(config.policy, autopilot.policies)}"
+        )
+    for name in config.peers:
+        if name not in (known := {**autopilot.peers, **autopilot.predictive}):
+            raise ConfigError(f"peers: '{name}' is none of {given}{nearest(name, known)}")
+    if taken := sorted({config.policy, *config.peers} & set(config.others)):
+        raise ConfigError(
+            f"others: '{taken[0]}' is a policy or peer already; names are unique in a run"
+        )
+    return autopilot
+
+
+class AutopilotRun(NamedTuple):
+    """What courses are planned and flown with.
+
+    Attributes:
+        autopilot: config of the autopilot run.
+        run: its folder.
+        steering: vessel, K and T, rudder limit and step.
+        steady: the smallest turn.
+        controllers: configs of its peers as tuned, by name.
+    """
+
+    autopilot: AutopilotConfig
+    run: RunFolder
+    steering: Steering
+    steady: SteadyTurn
+    controllers: dict[str, Any]
+
+
+def ready(config: CourseSettings, folder: RunFolder) -> AutopilotRun:
+    """From the finished run of the autopilot: the one that is given, or the one in the course's own
+    folder.
+
+    Raises:
+        UsageError: where it is not finished.
+    """
+    autopilot = autopilot_of(config)
+    run = RunFolder.open(
+        config.autopilot if config.autopilot.is_dir() else folder.path / "autopilot"
+    )
+    notes = json.loads((run.path / "controllers.json").read_text())
+    steering = Steering(
+        SteeredPlant(load_vessel(autopilot.vessel).build()),
+        Turning(**notes["turning"]),
+        autopilot.rudder,
+        config.dt,
+    )
+    return AutopilotRun(
+        autopilot,
+        run,
+        steering,
+        smallest_turn(config.course, steering.vessel, steering.limit),
+        notes["controllers"],
+    )
+
+
+def load_policy(run: Path, name: str, steering: Steering) -> HeadingPolicy:
+    """A trained policy from the run folder of an autopilot, at the step of `steering`.
+
+    Raises:
+        UsageError: where the run lacks it.
+    """
+    from safetensors.torch import load_file
+
+    file, weights = run / "exports" / f"{name}.pt", run / "models" / name / "weights.safetensors"
+    if not file.is_file() or not weights.is_file():
+        raise UsageError(
+            f"{run}: no policy '{name}' (models/{name}/weights.safetensors and exports/{name}.pt)"
+        )
+    extra = {"card.json": ""}
+    torch.jit.load(str(file), _extra_files=extra)
+    card = json.loads(extra["card.json"])
+    turning, command = card["turning"], card["command"][0]
+    policy = HeadingPolicy(
+        steering.vessel.state,
+        turning=Turning(turning["K"], turning["T"], turning["speed"]),
+        limit=command["limit"],
+        dt=steering.dt,
+        rate=command["rate"],
+        hidden=card["hidden"],
+        observer=card["observer"],
+    )
+    policy.load_state_dict(load_file(weights))
+    return policy.eval().requires_grad_(False).double()
+
+
+def load_peers(config: CourseSettings, known: AutopilotRun) -> dict[str, Policy]:
+    """Peers as the autopilot run tuned or trained them, then the others."""
+    reader: TypeAdapter[AnyController] = TypeAdapter(AnyController)
+    built: dict[str, Policy] = {}
+    for name in config.peers:
+        if name in known.autopilot.predictive:
+            built[name] = load_predictive(
+                name, known.autopilot.predictive[name], known.steering, known.run
+            )
+        else:
+            built[name] = reader.validate_python(known.controllers[name]["config"]).build(
+                known.steering
+            )
+    built |= {name: law.build(known.steering) for name, law in config.others.items()}
+    return {name: law.double() for name, law in built.items()}

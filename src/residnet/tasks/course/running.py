@@ -1,0 +1,271 @@
+"""Carrying out a course run, into a run folder."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pandas as pd
+
+from residnet.control.base import Policy, Reference
+from residnet.control.courses.config import (
+    PlannedCourse,
+    Protocol,
+    plan_course,
+    report_feasibility,
+)
+from residnet.control.guidance.course_guidance import CourseGuidance
+from residnet.control.guidance.drift import DriftEstimate
+from residnet.control.guidance.line_of_sight import AnyLineOfSight
+from residnet.control.guidance.waypoints import WaypointGuidance
+from residnet.control.guidance.wheel_over import WheelOver
+from residnet.control.heading.controllers import Steering
+from residnet.control.heading.following import Following
+from residnet.control.heading.policy import HeadingPolicy
+from residnet.core.progress import say
+from residnet.judge.courses import CourseFlight, row, spread_row, table
+from residnet.judge.metrics import SCHEMA
+from residnet.report.course import COURSES, SPREAD, TRACKS
+from residnet.runs.folder import RunFolder
+from residnet.runs.task import MainFigure, Outcome
+from residnet.tasks.autopilot.config import AutopilotSettings
+from residnet.tasks.course.autopilot_run import (
+    AutopilotRun,
+    autopilot_of,
+    load_peers,
+    load_policy,
+    ready,
+)
+from residnet.tasks.course.config import CourseSettings
+from residnet.tasks.course.flights import NOMINAL, Vessels, fly
+from residnet.tasks.course.tables import plan_table, spread_table, track_table
+
+_UNITS = {
+    "course_time": "s",
+    "floor_time": "s",
+    "cross_track_rms": "m",
+    "cross_track_max": "m",
+    "distances": "m",
+    "clearance": "m",
+    "margin": "m",
+    "tightest_turn": "m",
+    "travel": "rad",
+}
+
+
+def plan_for(
+    config: CourseSettings, known: AutopilotRun, protocol: Protocol
+) -> tuple[PlannedCourse, CourseGuidance]:
+    """The plan of a protocol, and the guidance along it.
+
+    Raises:
+        ConfigError: where no course fits the vessel's turns.
+    """
+    steering = known.steering
+    planned = plan_course(
+        config.course, protocol, steering.vessel, steering.turning, steering.limit, known.steady
+    )
+    return planned, _guidance(config, planned, steering)
+
+
+def run_course(config: CourseSettings, folder: RunFolder) -> Outcome:
+    """Train where there is no trained policy yet, plan, fly and compare."""
+    if not config.autopilot.is_dir() and not RunFolder(folder.path / "autopilot").finished:
+        autopilot_of(config).run(
+            source=config.autopilot, out=folder.path / "autopilot", resume=True
+        )
+    known = ready(config, folder)
+    steering, steady = known.steering, known.steady
+    feasible = report_feasibility(config.course, steady)
+    for circle in feasible:
+        if not circle["possible"]:
+            say(
+                f"buoy {circle['buoy']}: {circle['radius']:.4g} m cannot be followed; the smallest"
+                f" radius possible is {circle['smallest']:.2f} m"
+            )
+    trained = load_policy(known.run.path, config.policy, steering)
+    controllers = {config.policy: trained, **load_peers(config, known)}
+    done = _Flown([], [], [])
+    plans, exports = [], []
+    for protocol in config.protocols:
+        planned, guidance = plan_for(config, known, protocol)
+        say(
+            f"{protocol}: planned {planned.course.length:.1f} m, shortest possible"
+            f" {planned.floor:.1f} m"
+        )
+        plans.append(plan_table(planned))
+        for name in controllers:
+            for sight in (None, *(config.line_of_sight if protocol == "enter" else ())):
+                _fly(config, planned, steering, name, controllers[name], sight, done)
+        exports.append(_Export(folder.exports, config, planned, guidance, trained, known.autopilot))
+    shown = {
+        "schema": SCHEMA,
+        "run": config.name,
+        "channels": _UNITS,
+        "speed": steering.turning.speed,
+        "rudder": steering.limit,
+        "smallest": vars(steady),
+        "feasibility": feasible,
+    }
+    folder.write_json(folder.metrics, shown | {"rows": done.rows})
+    pd.concat(done.tracks, ignore_index=True).to_parquet(folder.path / TRACKS)
+    pd.concat(plans, ignore_index=True).to_parquet(folder.path / COURSES)
+    if done.spread:
+        pd.concat(done.spread, ignore_index=True).to_parquet(folder.path / SPREAD)
+    return Outcome(
+        _verdict(config, done.rows),
+        _main_figures(config, done.rows),
+        table(done.rows),
+        export=lambda: [export.write(done.rows) for export in exports],
+    )
+
+
+def _nominal(config: CourseSettings, rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Return the policy's row of the nominal vessel along the plan, by protocol."""
+    return {
+        row["protocol"]: row
+        for row in rows
+        if (row["model"], row["guidance"], row["split"]) == (config.policy, "course", "simulated")
+    }
+
+
+def _verdict(config: CourseSettings, rows: Sequence[dict[str, Any]]) -> list[str]:
+    sentences = []
+    for protocol, flight in _nominal(config, rows).items():
+        if not flight["finished"]:
+            sentences.append(
+                f"{protocol}: '{config.policy}' did not come to the end of the course."
+            )
+            continue
+        sentences.append(
+            f"{protocol}: '{config.policy}' needs {flight['course_time']:.1f} s,"
+            f" {flight['ratio']:.3f} times the shortest possible time, and passes"
+            f" {flight['passed']} of {len(config.course.buoys)} buoys as the protocol asks."
+        )
+    return sentences
+
+
+def _main_figures(config: CourseSettings, rows: Sequence[dict[str, Any]]) -> dict[str, MainFigure]:
+    figures = {}
+    for protocol, flight in _nominal(config, rows).items():
+        figures[f"{protocol}_course_time"] = MainFigure(flight["course_time"], "s")
+        figures[f"{protocol}_ratio"] = MainFigure(flight["ratio"])
+        figures[f"{protocol}_cross_track_rms"] = MainFigure(flight["cross_track_rms"], "m")
+    return figures
+
+
+class _Export(NamedTuple):
+    """A policy with the guidance along one plan, to be exported when the run ends."""
+
+    folder: Path
+    config: CourseSettings
+    planned: PlannedCourse
+    guidance: CourseGuidance
+    policy: HeadingPolicy
+    autopilot: AutopilotSettings
+
+    def write(self, rows: Sequence[dict[str, Any]]) -> Path:
+        """Export, with the policy's rows of metrics.json in the card; returns the file."""
+        from residnet.export.course import export_course
+
+        config, protocol = self.config, self.planned.protocol
+        file = self.folder / f"{config.policy}_{protocol}.pt"
+        about = {
+            "vessel": self.autopilot.vessel,
+            "course": config.course.model_dump(mode="json"),
+            "protocol": protocol,
+        }
+        metrics = [
+            row for row in rows if row["protocol"] == protocol and row["model"] == config.policy
+        ]
+        export_course(
+            config.policy,
+            self.policy,
+            self.guidance,
+            self.planned.course,
+            file,
+            safe=config.safe,
+            about=about,
+            metrics=metrics,
+        )
+        return file
+
+
+class _Flown(NamedTuple):
+    """Rows of metrics.json, tracks of nominal flights, and flights of the spread."""
+
+    rows: list[dict[str, Any]]
+    tracks: list[pd.DataFrame]
+    spread: list[pd.DataFrame]
+
+
+def _fly(
+    config: CourseSettings,
+    planned: PlannedCourse,
+    steering: Steering,
+    name: str,
+    law: Policy,
+    sight: AnyLineOfSight | None,
+    done: _Flown,
+) -> None:
+    """The nominal flight, then those of the spread, of one controller under one guidance."""
+    kind = "policy" if name == config.policy else "classical"
+    guidance = "course" if sight is None else sight.kind
+    steered = _steered(config, planned, steering, law, sight)
+
+    def flown(vessels: Vessels) -> tuple[list[CourseFlight], list[dict[str, Any]]]:
+        flights = fly(
+            steering, *steered, planned, config.course.lookahead, config.duration, vessels
+        )
+        return flights, [
+            row(
+                name, kind, guidance, planned, one, config.course.acceptance, steering.turning.speed
+            )
+            for one in flights
+        ]
+
+    flights, rows = flown(NOMINAL)
+    done.rows.extend(rows)
+    done.tracks.append(track_table(name, guidance, planned.protocol, flights[0]))
+    if config.spread is not None:
+        vessels = config.spread.draw()
+        rows = flown(vessels)[1]
+        done.rows.append(spread_row(rows))
+        done.spread.append(spread_table(rows, vessels))
+
+
+def _guidance(config: CourseSettings, planned: PlannedCourse, steering: Steering) -> CourseGuidance:
+    """Along the plan."""
+    lookahead = config.course.lookahead
+    drift = (
+        None if config.integral is None else DriftEstimate(lookahead, config.integral, steering.dt)
+    )
+    return CourseGuidance(planned.course, lookahead, steering.vessel.state, drift)
+
+
+def _steered(
+    config: CourseSettings,
+    planned: PlannedCourse,
+    steering: Steering,
+    law: Policy,
+    sight: AnyLineOfSight | None,
+) -> tuple[Policy, Reference]:
+    """Controller and guidance along the plan, or under a line of sight on the legs from buoy to
+    buoy instead.
+    """
+    vessel = steering.vessel
+    if sight is None:
+        return Following(
+            law, vessel.state, limit=steering.limit, dt=steering.dt, rate=vessel.rate
+        ), _guidance(config, planned, steering)
+    points, acceptance = (
+        [(buoy.north, buoy.east) for buoy in planned.buoys],
+        config.course.acceptance,
+    )
+    over = (
+        WheelOver(steering.turning, steering.limit, acceptance, rate=vessel.rate)
+        if config.legs_change == "wheel_over"
+        else None
+    )
+    return law, WaypointGuidance(points, acceptance, sight.build(steering.dt), vessel.state, over)
