@@ -24,9 +24,9 @@ from residnet.physics.actuators.identify import (
     fit_thrust,
 )
 from residnet.report.blocks import Code, Section
+from residnet.report.figures.files import figures_section
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import MainFigure, Outcome, Task
-from residnet.tasks.pictures import figures_section
 
 
 class Column(Config):
@@ -185,7 +185,8 @@ class ActuatorsTaskConfig(Task):
     def report_sections(cls, run: RunFolder) -> Sequence[Section]:
         """Return the lines for a vessel file; the figure is that of the run."""
         text = (run.path / "actuators.yaml").read_text()
-        return [Section("Lines of a vessel file", [Code(text)]), figures_section(run)]
+        figures = figures_section(run.figures)
+        return [Section("Lines of a vessel file", [Code(text)]), *([figures] if figures else [])]
 
 
 class _Logs:

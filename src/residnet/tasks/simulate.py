@@ -16,9 +16,9 @@ from residnet.data.simulated.trials import SimulatedTrials, fly_trials, trials_c
 from residnet.manoeuvres import Replay
 from residnet.physics.vessel import load_vessel
 from residnet.report.blocks import Code, Section
+from residnet.report.figures.files import figures_section
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import ComputingTask, MainFigure, Outcome
-from residnet.tasks.pictures import figures_section
 from residnet.tasks.programme import Programme
 
 _SHOWN = 24
@@ -117,7 +117,8 @@ class SimulateConfig(ComputingTask):
     def report_sections(cls, run: RunFolder) -> Sequence[Section]:
         """Return the table of manoeuvring indices; the figures are those of the run."""
         text = (run.path / "indices.txt").read_text()
-        return [Section("Manoeuvring indices", [Code(text)]), figures_section(run)]
+        figures = figures_section(run.figures)
+        return [Section("Manoeuvring indices", [Code(text)]), *([figures] if figures else [])]
 
     def _drawn(
         self,
