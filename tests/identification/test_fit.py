@@ -15,7 +15,6 @@ from residnet.core.config import validate
 from residnet.core.progress import Progress, listen
 from residnet.data.simulated.trials import SimulatedTrials
 from residnet.data.sources import read_logs
-from residnet.identification.evaluation import candidates, evaluate, select
 from residnet.identification.fit import Identified, fit
 from residnet.identification.models import FittedModel
 from residnet.identification.prepared import PreparedSplits, prepare_logs
@@ -75,13 +74,10 @@ def test_python_and_command_line_give_the_same_metrics(
     path.write_text(yaml.safe_dump({**TINY, "export": {"models": []}}, sort_keys=False))
     assert call(monkeypatch, "run", path, "--out", tmp_path / "run") == 0
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
-    models = candidates(identified.values(), DATA)
     rows: list[dict[str, Any]] = []
     for split in settings.evaluation.splits:
-        step = settings.prepare.grid.step
-        rows += evaluate(models, logs[split], settings.evaluation, step, identified.limit).rows
-    chosen = select(rows, identified.values(), settings.evaluation.selection)
-    assert chosen == metrics["selected"]
+        rows += identified.evaluate(logs[split], DATA).rows
+    assert identified.select(rows) == metrics["selected"]
     for row in metrics["rows"]:
         row.pop("selected")
     # JSON holds every float exactly

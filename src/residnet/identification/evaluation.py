@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,7 +18,11 @@ from residnet.judge.config import EvaluationConfig
 from residnet.judge.freerun import Candidate, FreeRun, free_run
 from residnet.judge.limits import limits
 from residnet.judge.metrics import find, rows
+from residnet.judge.tables import metrics_table
 from residnet.physics.vessel import load_vessel
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 @dataclass(frozen=True)
@@ -38,6 +42,11 @@ class Evaluation:
     runs: list[FreeRun]
     rows: list[dict[str, Any]]
     limits: dict[str, Any]
+
+    @property
+    def metrics(self) -> pd.DataFrame:
+        """The rows as a table, see `residnet.judge.tables.metrics_table`."""
+        return metrics_table(self.rows)
 
 
 def evaluate(

@@ -16,11 +16,14 @@ from residnet.core.errors import FitError
 from residnet.core.progress import say
 from residnet.core.samples import Samples
 from residnet.data.prepare import Prepared, envelope, samples
+from residnet.data.simulated.trials import SimulatedTrials
+from residnet.data.sources import MeasuredLogs
 from residnet.data.windows import WindowStore
 from residnet.dynamics.ensemble import mean_of
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
 from residnet.heads import ClosedFormHead
+from residnet.identification.evaluation import Evaluation, candidates, evaluate, select
 from residnet.identification.models import FitStore, FittedModel, NoStore
 from residnet.identification.prepared import velocity_limit
 from residnet.identification.settings import FitSettings
@@ -43,6 +46,23 @@ class Identified(Mapping[str, FittedModel]):
     settings: FitSettings
     models: dict[str, FittedModel]
     limit: np.ndarray
+
+    def evaluate(
+        self, logs: Sequence[Prepared], data: MeasuredLogs | SimulatedTrials | None = None
+    ) -> Evaluation:
+        """Free-run all models over the logs of one split.
+
+        Args:
+            logs: of one split, prepared as those of the fit.
+            data: where the logs came from; simulated trials add the plant as `truth`.
+        """
+        settings = self.settings
+        models = candidates(self.values(), data)
+        return evaluate(models, logs, settings.evaluation, settings.prepare.grid.step, self.limit)
+
+    def select(self, rows: Sequence[dict[str, Any]]) -> str:
+        """Return the name of the model that does best on the validation rows."""
+        return select(rows, self.values(), self.settings.evaluation.selection)
 
     def __getitem__(self, name: str) -> FittedModel:
         return self.models[name]

@@ -62,7 +62,9 @@ def _parameter_counts(model: HybridDynamics) -> list[float]:
     """Fitted parameters of each axis, baseline and head together."""
     return [
         of_baseline + of_head
-        for of_baseline, of_head in zip(model.baseline.parameter_count(), model.head.parameter_count(), strict=True)
+        for of_baseline, of_head in zip(
+            model.baseline.parameter_count(), model.head.parameter_count(), strict=True
+        )
     ]
 
 

@@ -24,7 +24,8 @@ def channels_along(model: HybridDynamics, log: Prepared) -> Tensor:
     with torch.no_grad():
         x = torch.from_numpy(np.nan_to_num(log.smooth))[None]
         w = torch.from_numpy(np.nan_to_num(log.w))[None]
-        return model.signals(x, model.signals.prepare(w))
+        channels: Tensor = model.signals(x, model.signals.prepare(w))
+    return channels
 
 
 def residual_table(

@@ -78,7 +78,7 @@ def evaluate_external(run: Path, paths: Sequence[Path], out: Path | None) -> Run
         config=source.resolved, overrides=[], seed=config.seed, files=files, started=started
     )
     report = report_run(folder.path)
-    print_table(judged.rows, "external")
+    print_table(folder.read_metrics()["rows"], "external")
     print(f"report: {report}")
     return folder
 

@@ -18,16 +18,15 @@ from residnet.data.prepare import Prepared
 from residnet.data.sources import input_files, read_logs
 from residnet.documents import draw_study
 from residnet.identification.currents import through_currents
-from residnet.identification.evaluation import candidates, evaluate, select
 from residnet.identification.fit import Identified, fit
 from residnet.identification.goodness import goodness_rows
 from residnet.identification.prepared import PreparedSplits, prepare_logs
 from residnet.identification.teacher_forced import residual_table, term_table
 from residnet.judge.goodness import content
 from residnet.judge.limits import SCHEMA as LIMITS
-from residnet.judge.metrics import SCHEMA
 from residnet.judge.repeats import repeatability
 from residnet.judge.rollout_files import write_rollouts
+from residnet.judge.tables import metrics_content
 from residnet.runs.fit_store import FolderStore
 from residnet.runs.folder import RunFolder
 from residnet.tasks.booklet import write_booklet
@@ -102,15 +101,14 @@ def _judged(
     """Free runs of all models, and everything that is written of them."""
     say("  free runs")
     fitted, step = list(identified.values()), config.prepare.grid.step
-    models = candidates(fitted, config.data)
     table: list[dict[str, Any]] = []
     limiting: dict[str, Any] = {}
     for split in config.evaluation.splits:
-        judged = evaluate(models, logs[split], config.evaluation, step, identified.limit)
+        judged = identified.evaluate(logs[split], config.data)
         write_rollouts(folder.rollouts / split, judged.runs, judged.logs)
         limiting[split] = judged.limits
         table += judged.rows
-    write_metrics(folder, config, table, select(table, fitted, config.evaluation.selection))
+    write_metrics(folder, config, table, identified.select(table))
     write_limits(
         folder, config, limiting, [log for split in config.evaluation.splits for log in logs[split]]
     )
@@ -133,19 +131,9 @@ def write_metrics(
     folder: RunFolder, config: FitConfig, table: Sequence[dict[str, Any]], selected: str
 ) -> None:
     """metrics.json with schema, units, scales and rows."""
-    for row in table:
-        row["selected"] = row["model"] == selected
     units = {name: si_unit(unit) for name, unit in config.signals.units().items() if name in STATE}
     scales = config.evaluation.scales.named()
-    content = {
-        "schema": SCHEMA,
-        "run": config.name,
-        "channels": units,
-        "scales": scales,
-        "selected": selected,
-        "rows": list(table),
-    }
-    folder.write_json(folder.metrics, content)
+    folder.write_json(folder.metrics, metrics_content(config.name, units, scales, selected, table))
 
 
 def write_limits(
