@@ -197,7 +197,7 @@ def test_commands_are_kept_within_their_limits(plant: PatrolVessel) -> None:
     x = plant.approach(2)
     far, most = inputs(plant, 2, 0.0, 2 * THRUST), inputs(plant, 2, 0.0, THRUST)
     assert torch.equal(plant.rate(x, far), plant.rate(x, most))
-    moved = plant.settle(x, inputs(plant, 2, -9.0), 0.1)
+    moved = plant.end_step(x, inputs(plant, 2, -9.0), 0.1)
     np.testing.assert_allclose(moved[:, 8], -np.radians(1.0), rtol=1e-12)
 
 

@@ -32,7 +32,7 @@ def test_every_vessel_file(name: str) -> None:
     rate = plant.rate(x, w)
     assert rate.shape == x.shape
     assert bool(torch.isfinite(rate).all())
-    assert plant.settle(x, w, 0.01).shape == x.shape
+    assert plant.end_step(x, w, 0.01).shape == x.shape
     # what a log may hold has a unit; thrusters are named by the vessel file, so that no table can
     # hold their channels
     named_by_file = ("_", "n_", "alpha_", "cmd_n_", "cmd_alpha_")
@@ -68,7 +68,7 @@ def test_every_vessel_in_a_batch_with_gradients(name: str) -> None:
             plant.rate(x[row : row + 1], w[row : row + 1])[0], rate[row], rtol=1e-9, atol=1e-12
         )
         torch.testing.assert_close(
-            plant.settle(x[row : row + 1], w[row : row + 1], 0.01)[0], plant.settle(x, w, 0.01)[row]
+            plant.end_step(x[row : row + 1], w[row : row + 1], 0.01)[0], plant.end_step(x, w, 0.01)[row]
         )
 
 

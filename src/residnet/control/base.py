@@ -1,5 +1,4 @@
-"""The interface of controllers and guidance, and the source that flies them in the one time loop.
-"""
+"""The interface of controllers and guidance, and the source that flies them in the one time loop."""
 
 from __future__ import annotations
 
@@ -22,14 +21,12 @@ class Policy(nn.Module, ABC):
         self.n_state = 0
 
     def initial_state(self, x: Tensor) -> Tensor:
-        """Memory [B, n_state] at the first state x [B, nx]: zeros."""
+        """Return the memory [B, n_state] at the first state x [B, nx]: zeros."""
         return torch.zeros(x.shape[0], self.n_state, dtype=x.dtype, device=x.device)
 
     @abstractmethod
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Command [B, c] and new memory from the state x [B, nx], the reference [B, r] of this step
-        and the memory s [B, n_state].
-        """
+        """Return the command [B, c] and new memory from the state x [B, nx], the reference [B, r] of this step and the memory s [B, n_state]."""
 
 
 class Reference(nn.Module, ABC):
@@ -41,17 +38,15 @@ class Reference(nn.Module, ABC):
         self.may_finish = False
 
     def initial_state(self, x: Tensor) -> Tensor:
-        """Memory [B, n_state] at the first state x [B, nx]: zeros."""
+        """Return the memory [B, n_state] at the first state x [B, nx]: zeros."""
         return torch.zeros(x.shape[0], self.n_state, dtype=x.dtype, device=x.device)
 
     @abstractmethod
     def forward(self, x: Tensor, k: int, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Reference [B, r] for step k and new memory, from the state x [B, nx] and the memory s [B,
-        n_state].
-        """
+        """Return the reference [B, r] for step k and new memory, from the state x [B, nx] and the memory s [B, n_state]."""
 
     def finished(self, x: Tensor, k: int, s: Tensor) -> Tensor:
-        """[B] bool: rows that have arrived; asked only where `may_finish`."""
+        """Return [B] bool: rows that have arrived; asked only where `may_finish`."""
         return torch.zeros(x.shape[0], dtype=torch.bool, device=x.device)
 
 
@@ -64,7 +59,7 @@ class GivenReference(Reference):
         self.values = values
 
     def forward(self, x: Tensor, k: int, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Row k of the values."""
+        """Return the row k of the values."""
         return self.values[:, min(k, self.values.shape[1] - 1)].to(x.dtype), s
 
 
@@ -81,11 +76,11 @@ class ClosedLoop(Source):
         self.may_stop = reference.may_finish
 
     def initial(self, x: Tensor) -> Tensor:
-        """Memories of guidance and controller side by side."""
+        """Return the memories of guidance and controller side by side."""
         return torch.cat((self.reference.initial_state(x), self.policy.initial_state(x)), dim=-1)
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Inputs [B, m]: the command, then what else was given."""
+        """Return the inputs [B, m]: the command, then what else was given."""
         n = self.reference.n_state
         target, guided = self.reference(x, k, memory[:, :n])
         command, s = self.policy(x, target, memory[:, n:])
@@ -94,5 +89,5 @@ class ClosedLoop(Source):
         )
 
     def finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
-        """Rows whose guidance has arrived."""
+        """Return the rows whose guidance has arrived."""
         return self.reference.finished(x, k, memory[:, : self.reference.n_state])

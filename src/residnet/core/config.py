@@ -141,7 +141,7 @@ def load_config(path: Path, overrides: Sequence[str], model: Any) -> Any: ...
 
 
 def load_config(path: Path, overrides: Sequence[str], model: Any) -> Any:
-    """Config of type `model` from a YAML file and overrides.
+    """Return the config of type `model` from a YAML file and overrides.
 
     Args:
         path: YAML file.

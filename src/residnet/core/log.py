@@ -69,7 +69,7 @@ class Log:
         return int(self.t.size)
 
     def __getitem__(self, name: str) -> np.ndarray:
-        """Values [T] of one channel.
+        """Return the values [T] of one channel.
 
         Raises:
             UsageError: where the log has no such channel.

@@ -37,7 +37,7 @@ class Quantity:
     def __get_pydantic_core_schema__(
         self, source: Any, handler: GetCoreSchemaHandler
     ) -> CoreSchema:
-        """The float's own schema, constraints included, behind the conversion."""
+        """Return the float's own schema, constraints included, behind the conversion."""
         return core_schema.no_info_before_validator_function(self.convert, handler(source))
 
     def convert(self, value: object) -> float:

@@ -37,7 +37,7 @@ class GridConfig(Config):
 
 
 def align(log: Log, config: GridConfig) -> Log:
-    """The log on the grid.
+    """Return the log on the grid.
 
     A log that lies on the grid to a thousandth of a step keeps its times and samples exactly. Where
     the grid is coarser than the log by a factor of two or more, every channel that is not held is
@@ -74,8 +74,9 @@ def align(log: Log, config: GridConfig) -> Log:
 
 
 def onto(log: Log, config: GridConfig, times: np.ndarray) -> Log:
-    """The log at given times [G], increasing, in s on its clock, by the rules of `align`; NaN
-    before its first sample and after its last.
+    """Return the log at given times [G], increasing, in s on its clock, by the rules of `align`.
+
+    NaN before its first sample and after its last.
 
     The length that is averaged over is the config's step.
     """
@@ -146,7 +147,7 @@ class _Reach:
         self._last = self._high + (self._w_high > 0.0)
 
     def _place(self, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Index of the sample before each time, and how far towards the next one it lies, 0 to 1."""
+        """Return the index of the sample before each time, and how far towards the next one it lies, 0 to 1."""
         left = np.clip(np.searchsorted(self._t, at, side="right") - 1, 0, self._t.size - 2)
         weight = np.clip((at - self._t[left]) / (self._t[left + 1] - self._t[left]), 0.0, 1.0)
         return left, np.where(
@@ -154,12 +155,12 @@ class _Reach:
         )
 
     def previous(self, x: np.ndarray) -> np.ndarray:
-        """Last value at or before each grid point, [G, n] from [T, n]."""
+        """Return the last value at or before each grid point, [G, n] from [T, n]."""
         held: np.ndarray = x[self._low + (self._w_low == 1.0)]
         return held
 
     def mean(self, x: np.ndarray) -> np.ndarray:
-        """Mean of the linear interpolant over each point's reach, [G, n] from finite [T, n]."""
+        """Return the mean of the linear interpolant over each point's reach, [G, n] from finite [T, n]."""
         # without its mean the running integral keeps its digits for positions far from the origin
         offset = x.mean(axis=0)
         centred, dt = x - offset, np.diff(self._t)[:, None]
@@ -187,11 +188,11 @@ class _Reach:
         return means
 
     def touched(self, flags: np.ndarray) -> np.ndarray:
-        """[G, k] bool: any flagged sample carries weight; flags [T, k]."""
+        """Return [G, k] bool: any flagged sample carries weight; flags [T, k]."""
         return _any_between(flags, self._first, self._last + 1)
 
     def broken(self, missing: np.ndarray) -> np.ndarray:
-        """[G, n] bool: a missing sample [T, n] carries weight, or the reach crosses a gap."""
+        """Return [G, n] bool: a missing sample [T, n] carries weight, or the reach crosses a gap."""
         untrusted: np.ndarray = self.touched(missing) | _any_between(
             self._gap[:, None], self._first, self._last
         )
@@ -199,7 +200,7 @@ class _Reach:
 
 
 def _any_between(flags: np.ndarray, first: np.ndarray, stop: np.ndarray) -> np.ndarray:
-    """[G, k] bool: any of flags[first:stop], for index arrays [G]."""
+    """Return [G, k] bool: any of flags[first:stop], for index arrays [G]."""
     count = np.concatenate(
         [np.zeros((1, flags.shape[1]), dtype=np.int64), np.cumsum(flags, axis=0)]
     )
@@ -208,9 +209,7 @@ def _any_between(flags: np.ndarray, first: np.ndarray, stop: np.ndarray) -> np.n
 
 
 def _rewrapped(original: np.ndarray, continuous: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Grid values [G] in the range of the original channel [T], where unwrapping had left that
-    range.
-    """
+    """Return the grid values [G] in the range of the original channel [T], where unwrapping had left that range."""
     if np.array_equal(original, continuous, equal_nan=True):
         return values
     low = 0.0 if np.nanmin(original) >= 0.0 else -np.pi
@@ -218,7 +217,7 @@ def _rewrapped(original: np.ndarray, continuous: np.ndarray, values: np.ndarray)
 
 
 def _incomplete(channels: dict[str, np.ndarray]) -> np.ndarray:
-    """[T] bool: NaN in any channel."""
+    """Return [T] bool: NaN in any channel."""
     missing: np.ndarray = np.isnan(np.stack(list(channels.values()))).any(axis=0)
     return missing
 

@@ -23,7 +23,7 @@ class Derivative(Config, ABC):
     def derive(
         self, values: np.ndarray, step: float, pieces: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Smoothed values and their rates.
+        """Return the smoothed values and their rates.
 
         A piece is a run of samples with one number >= 0; it is cut further at samples that are not
         finite, and nothing is smoothed across its ends.
@@ -56,11 +56,11 @@ class Derivative(Config, ABC):
 
     @abstractmethod
     def _shortest(self, step: float) -> int:
-        """Fewest samples of a piece that the rule can treat."""
+        """Return fewest samples of a piece that the rule can treat."""
 
     @abstractmethod
     def _piece(self, values: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
-        """Smoothed values and rates of one piece, NaN where the rule has no rate."""
+        """Return the smoothed values and rates of one piece, NaN where the rule has no rate."""
 
 
 @final
@@ -77,7 +77,7 @@ class SavitzkyGolay(Derivative):
     order: int = Field(default=2, ge=1)
 
     def samples(self, step: float) -> int:
-        """Samples in the window at a time step in s."""
+        """Return the samples in the window at a time step in s."""
         return round(self.window / step) // 2 * 2 + 1
 
     def _check(self, step: float) -> None:
@@ -184,7 +184,7 @@ def _forward(values: np.ndarray, step: float) -> np.ndarray:
 
 
 def _runs(values: np.ndarray, pieces: np.ndarray) -> list[tuple[int, int]]:
-    """First index and index past the last of every contiguous, finite run of one piece."""
+    """Return the first index and index past the last of every contiguous, finite run of one piece."""
     number = np.where(np.isfinite(values).all(axis=1), pieces, -1)
     edges = np.flatnonzero(np.diff(number)) + 1
     bounds = np.concatenate(([0], edges, [number.size]))

@@ -44,7 +44,7 @@ class Mask(Config, ABC):
 
     @abstractmethod
     def apply(self, log: Log) -> np.ndarray:
-        """[T] bool, True where a sample is bad.
+        """Return [T] bool, True where a sample is bad.
 
         Raises:
             UsageError: where the log lacks a channel that the rule names.
@@ -66,7 +66,7 @@ class Frozen(Mask):
     after: Seconds = Field(default=2.0, ge=0.0)
 
     def apply(self, log: Log) -> np.ndarray:
-        """[T] bool; see `Mask.apply`."""
+        """Return [T] bool; see `Mask.apply`."""
         starts, stops = true_runs((np.diff(log.stack(self.channels), axis=0) == 0.0).all(axis=1))
         long = stops - starts >= self.samples
         starts, last = starts[long], stops[long]
@@ -84,7 +84,7 @@ class Gap(Mask):
     longest: Seconds = Field(gt=0.0)
 
     def apply(self, log: Log) -> np.ndarray:
-        """[T] bool; see `Mask.apply`."""
+        """Return [T] bool; see `Mask.apply`."""
         return np.append(False, np.diff(log.t) > self.longest * (1.0 + 1e-9))
 
 
@@ -97,7 +97,7 @@ class Missing(Mask):
     channels: tuple[str, ...] = ()
 
     def apply(self, log: Log) -> np.ndarray:
-        """[T] bool; see `Mask.apply`."""
+        """Return [T] bool; see `Mask.apply`."""
         missing: np.ndarray = np.isnan(log.stack(self.channels or tuple(log.channels))).any(axis=1)
         return missing
 
@@ -116,7 +116,7 @@ class Jump(Mask):
     after: int = Field(default=1, ge=0)
 
     def apply(self, log: Log) -> np.ndarray:
-        """[T] bool; see `Mask.apply`."""
+        """Return [T] bool; see `Mask.apply`."""
         landed = steps_above(log, self.channel, self.limit)
         return _cover(len(log), landed - self.before, landed + self.after)
 
@@ -139,7 +139,7 @@ class Outlier(Mask):
     samples: int = Field(default=10, ge=4)
 
     def apply(self, log: Log) -> np.ndarray:
-        """[T] bool; see `Mask.apply`."""
+        """Return [T] bool; see `Mask.apply`."""
         bad = np.zeros(len(log), dtype=bool)
         for name in self.channels:
             values = unwrap(log[name]) if log.units[name] == "rad" else log[name]
@@ -149,7 +149,7 @@ class Outlier(Mask):
         return bad
 
     def _outliers(self, values: np.ndarray) -> np.ndarray:
-        """[T] bool for finite values [T], T > samples."""
+        """Return [T] bool for finite values [T], T > samples."""
         count = np.arange(values.size)
         first = np.clip(count - self.samples // 2, 0, values.size - self.samples - 1)
         windows = np.lib.stride_tricks.sliding_window_view(values, self.samples + 1)[first]
@@ -185,7 +185,7 @@ class Hampel(Mask):
     samples: int = Field(default=11, ge=5)
 
     def apply(self, log: Log) -> np.ndarray:
-        """[T] bool; see `Mask.apply`."""
+        """Return [T] bool; see `Mask.apply`."""
         bad = np.zeros(len(log), dtype=bool)
         for name in self.channels:
             bad |= far_from_median(
@@ -213,7 +213,7 @@ class InputJump(Mask):
     after: Seconds = Field(ge=0.0)
 
     def apply(self, log: Log) -> np.ndarray:
-        """[T] bool; see `Mask.apply`."""
+        """Return [T] bool; see `Mask.apply`."""
         landed = np.concatenate([steps_above(log, name, self.limit) for name in self.channels])
         margin = 1e-6 * _step(log.t)
         starts = np.searchsorted(log.t, log.t[landed] - self.before - margin)
@@ -231,8 +231,9 @@ MaskConfig = Annotated[
 
 
 def apply_masks(log: Log, rules: Sequence[Mask]) -> Log:
-    """The log with the masks of all rules added to those that it has; rules of one kind share one
-    mask.
+    """Return the log with the masks of all rules added to those that it has.
+
+    Rules of one kind share one mask.
 
     Masks are found best on the log as recorded: interpolation hides what is bit-identical.
 
@@ -248,38 +249,30 @@ def apply_masks(log: Log, rules: Sequence[Mask]) -> Log:
 
 
 def hard_mask(log: Log) -> np.ndarray:
-    """[T] bool: samples at which the log is split."""
+    """Return [T] bool: samples at which the log is split."""
     return _any(log, [name for name in log.masks if name.startswith(HARD)])
 
 
 def scored(log: Log) -> np.ndarray:
-    """[T] bool: samples that a free run is scored on, all that neither a hard nor a soft mask
-    excludes.
-    """
+    """Return [T] bool: samples that a free run is scored on, all that neither a hard nor a soft mask excludes."""
     return ~_any(log, [name for name in log.masks if not name.startswith(RATE)])
 
 
 def segments(log: Log) -> np.ndarray:
-    """Number of the contiguous piece that each sample belongs to, [T] int, counted from 0; -1 at
-    hard-masked samples.
-    """
+    """Return the number of the contiguous piece that each sample belongs to, [T] int, counted from 0; -1 at hard-masked samples."""
     hard = hard_mask(log)
     starts = ~hard & np.append(True, hard[:-1])
     return np.where(hard, -1, np.cumsum(starts) - 1)
 
 
 def steps_above(log: Log, channel: str, limit: float) -> np.ndarray:
-    """Indices [K] of the samples at which `channel` arrives after a step of more than `limit` (SI;
-    angles the short way round).
-    """
+    """Return the indices [K] of the samples at which `channel` arrives after a step of more than `limit` (SI; angles the short way round)."""
     values = unwrap(log[channel]) if log.units[channel] == "rad" else log[channel]
     return np.flatnonzero(np.abs(np.diff(values)) > limit) + 1
 
 
 def far_from_median(values: np.ndarray, sigmas: float, samples: int) -> np.ndarray:
-    """[T] bool: known values [T] that stand out of their `samples` (made odd) neighbours, by the
-    rule of `Hampel`.
-    """
+    """Return [T] bool: known values [T] that stand out of their `samples` (made odd) neighbours, by the rule of `Hampel`."""
     out = np.zeros(values.size, dtype=bool)
     at, half = np.flatnonzero(np.isfinite(values)), samples // 2
     reach = 2 * half
@@ -310,7 +303,7 @@ def far_from_median(values: np.ndarray, sigmas: float, samples: int) -> np.ndarr
 
 
 def true_runs(flags: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """First index and index past the last of every run of True in flags [T]."""
+    """Return the first index and index past the last of every run of True in flags [T]."""
     edges = np.diff(np.concatenate(([0], flags.astype(np.int8), [0])))
     return np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
 
@@ -324,12 +317,12 @@ def _any(log: Log, names: Sequence[str]) -> np.ndarray:
 
 
 def _step(t: np.ndarray) -> float:
-    """The usual time step in s."""
+    """Return the usual time step in s."""
     return float(np.median(np.diff(t))) if t.size > 1 else 0.0
 
 
 def _cover(size: int, starts: np.ndarray, stops: np.ndarray) -> np.ndarray:
-    """[size] bool, True inside any of the half-open ranges."""
+    """Return [size] bool, True inside any of the half-open ranges."""
     marks = np.zeros(size + 1, dtype=np.int64)
     np.add.at(marks, np.clip(starts, 0, size), 1)
     np.add.at(marks, np.clip(stops, 0, size), -1)

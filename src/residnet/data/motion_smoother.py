@@ -14,7 +14,7 @@ _JERKS = tuple(10.0 ** (0.5 * k) for k in range(-6, 3))
 
 
 def smooth_motion(seen: np.ndarray, noise: Sequence[float], dt: float) -> np.ndarray:
-    """Smoothed motion [N, 9] from x, y, psi, u, v, r, u_dot, v_dot, r_dot [N, 9], SI.
+    """Return the smoothed motion [N, 9] from x, y, psi, u, v, r, u_dot, v_dot, r_dot [N, 9], SI.
 
     Each axis is a triple integrator driven by white jerk, north and east in the earth with the
     smoothed heading; the intensity of the jerk is the one under which the measurements are
@@ -58,7 +58,7 @@ def smooth_motion(seen: np.ndarray, noise: Sequence[float], dt: float) -> np.nda
 
 
 def _axis(z: np.ndarray, spread: np.ndarray, dt: float) -> np.ndarray:
-    """Smoothed position, velocity and acceleration [N, 3]."""
+    """Return the smoothed position, velocity and acceleration [N, 3]."""
     step = np.array([[1.0, dt, dt * dt / 2], [0.0, 1.0, dt], [0.0, 0.0, 1.0]])
     driven = np.array(
         [
@@ -84,7 +84,7 @@ def _axis(z: np.ndarray, spread: np.ndarray, dt: float) -> np.ndarray:
 
 
 def _riccati(step: np.ndarray, driven: np.ndarray, h: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """Covariance of the prediction that the filter settles at."""
+    """Return the covariance of the prediction that the filter settles at."""
     from scipy.linalg import solve_discrete_are
 
     out: np.ndarray = solve_discrete_are(step.T, h.T, driven, noise)
@@ -94,7 +94,7 @@ def _riccati(step: np.ndarray, driven: np.ndarray, h: np.ndarray, noise: np.ndar
 def _filter(
     z: np.ndarray, step: np.ndarray, h: np.ndarray, gain: np.ndarray, innovation: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """Filtered states [N, 3], and minus twice the mean log-likelihood of the innovations."""
+    """Return the filtered states [N, 3], and minus twice the mean log-likelihood of the innovations."""
     x = np.zeros(3)
     x[: h.shape[1]] = h.T @ z[0]
     out, misses = np.empty((len(z), 3)), np.empty_like(z)

@@ -113,7 +113,7 @@ def prepare(log: Log, split: str, columns: Sequence[str], config: PrepareConfig)
 
 
 def _means(w: np.ndarray, piece: np.ndarray) -> np.ndarray:
-    """Mean of each sample and the next [T, m]; the sample itself where its piece ends."""
+    """Return the mean of each sample and the next [T, m]; the sample itself where its piece ends."""
     out = w.copy()
     on = (piece[:-1] >= 0) & (piece[1:] == piece[:-1])
     out[:-1][on] = 0.5 * (w[:-1] + w[1:])[on]
@@ -121,14 +121,13 @@ def _means(w: np.ndarray, piece: np.ndarray) -> np.ndarray:
 
 
 def _renumber(labels: np.ndarray) -> np.ndarray:
-    """Contiguous runs of equal labels numbered from 0; -1 stays."""
+    """Return the contiguous runs of equal labels numbered from 0; -1 stays."""
     change = np.concatenate(([True], labels[1:] != labels[:-1]))
     return np.where(labels >= 0, np.cumsum(change) - 1, -1)
 
 
 def samples(logs: Sequence[Prepared], signals: Signals) -> Samples:
-    """Samples of identification from prepared logs: smoothed channels and measured accelerations,
-    float64.
+    """Return the samples of identification from prepared logs: smoothed channels and measured accelerations, float64.
 
     Raises:
         DataError: where no log has a sample to learn from.
@@ -157,9 +156,7 @@ def samples(logs: Sequence[Prepared], signals: Signals) -> Samples:
 
 
 def envelope(logs: Sequence[Prepared]) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest measured velocities and inputs, [3 + m] each, over the usable samples of
-    logs.
-    """
+    """Return the lowest and highest measured velocities and inputs, [3 + m] each, over the usable samples of logs."""
     joined = np.concatenate(
         [np.concatenate((p.y[p.usable, 3:], p.w[p.usable]), axis=1) for p in logs]
     )

@@ -28,7 +28,7 @@ DataConfig = Annotated[MeasuredLogs | SimulatedTrials, Field(discriminator="kind
 
 
 def read_logs(config: MeasuredLogs | SimulatedTrials) -> Splits:
-    """The logs of a run by split (train, validation, test).
+    """Return the logs of a run by split (train, validation, test).
 
     Raises:
         ResidnetError: where a file is missing or its contents cannot be used, or two splits share
@@ -50,7 +50,7 @@ def read_logs(config: MeasuredLogs | SimulatedTrials) -> Splits:
 
 
 def input_files(config: MeasuredLogs | SimulatedTrials) -> list[Path]:
-    """Files whose contents the run depends on."""
+    """Return files whose contents the run depends on."""
     if isinstance(config, SimulatedTrials):
         return []
     return [path for paths in config.split.resolve().values() for path in paths]

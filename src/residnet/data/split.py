@@ -97,7 +97,7 @@ def _from_file(file: Path) -> dict[str, tuple[str, ...]]:
 
 
 def matches(root: Path, patterns: Sequence[str], where: str) -> list[Path]:
-    """Files of all patterns, each once."""
+    """Return files of all patterns, each once."""
     found: dict[Path, None] = {}
     for pattern in patterns:
         # a plain path may hold characters that a pattern would read otherwise
@@ -115,7 +115,7 @@ def matches(root: Path, patterns: Sequence[str], where: str) -> list[Path]:
 
 
 def _globbed(root: Path, pattern: str, where: str) -> list[Path]:
-    """Files below `root` that a pattern matches, in order."""
+    """Return files below `root` that a pattern matches, in order."""
     why = "it is an absolute path" if Path(pattern).is_absolute() else ""
     try:
         if not why:
@@ -185,7 +185,7 @@ def check_leaks(logs: Mapping[str, Sequence[Log]], rows: int = 100) -> None:
 
 
 def row_hashes(log: Log, channels: Sequence[str]) -> np.ndarray:
-    """Hash of each row of some channels, uint64 [T]."""
+    """Return the hash of each row of some channels, uint64 [T]."""
     import pandas as pd
 
     columns = {}

@@ -74,8 +74,7 @@ class WindowStore:
         )
 
     def starts(self, length: int, share: float = 0.5) -> Tensor:
-        """Rows at which a window of `length` samples may start: within one stretch, the first
-        sample good, at least `share` of all usable.
+        """Return the rows at which a window of `length` samples may start: within one stretch, the first sample good, at least `share` of all usable.
 
         Raises:
             DataError: where no log holds such a window.
@@ -92,8 +91,7 @@ class WindowStore:
         return rows
 
     def beginnings(self, length: int, lead: int) -> Tensor:
-        """Rows `lead` samples after the beginning of a stretch at which a window of `length`
-        samples may start.
+        """Return the rows `lead` samples after the beginning of a stretch at which a window of `length` samples may start.
 
         Raises:
             DataError: where no stretch is long enough.
@@ -108,15 +106,16 @@ class WindowStore:
         return rows
 
     def take(self, values: Tensor, starts: Tensor, length: int) -> Tensor:
-        """Windows [B, length, ...] of one of the tensors, from rows `starts` [B] on."""
+        """Return the windows [B, length, ...] of one of the tensors, from rows `starts` [B] on."""
         index = starts[:, None] + torch.arange(length)
         return values.index_select(0, index.reshape(-1)).reshape(
             starts.numel(), length, *values.shape[1:]
         )
 
     def history(self, starts: Tensor, length: int) -> tuple[Tensor, Tensor]:
-        """Measured states and inputs of the `length` samples before each start; where the stretch
-        is shorter, its first sample is repeated.
+        """Return the measured states and inputs of the `length` samples before each start.
+
+        Where the stretch is shorter, its first sample is repeated.
         """
         back = torch.arange(-length, 0)
         index = starts[:, None] + torch.maximum(back, -self.depth[starts][:, None])
@@ -138,7 +137,7 @@ class WindowBatches:
         self.steps = steps
 
     def epoch(self, seed: int, epoch: int) -> Tensor:
-        """Starts [steps, batch] of one epoch, drawn without replacement as far as they last."""
+        """Return the starts [steps, batch] of one epoch, drawn without replacement as far as they last."""
         generator = torch.Generator().manual_seed((seed * 1_000_003 + epoch) % (2**63))
         need = self.batch * self.steps
         rounds = -(-need // self.starts.numel())

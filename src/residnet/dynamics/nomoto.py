@@ -76,4 +76,4 @@ class NomotoDynamics(Dynamics):
         after = torch.cat(
             (torch.stack((north, east, end[:, 0], speed), dim=-1), end[:, 1:], rudder), dim=-1
         )
-        return plant.settle(after, w, self.dt), s
+        return plant.end_step(after, w, self.dt), s

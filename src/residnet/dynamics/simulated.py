@@ -33,7 +33,7 @@ class PlantDynamics(Dynamics):
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """State after a step of the log; the memory passes through."""
         for _ in range(self.substeps):
-            x = self.plant.settle(self.integrate(x, self.plant.prepare(x, w), s), w, self.dt)
+            x = self.plant.end_step(self.integrate(x, self.plant.prepare(x, w), s), w, self.dt)
         return x, s
 
 
@@ -61,7 +61,7 @@ class StagedPlantDynamics(Dynamics):
         k3 = self.rate(x + 0.5 * self.dt * k2, middle, s)
         k4 = self.rate(x + self.dt * k3, end, s)
         return (
-            self.plant.settle(x + self.dt / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4), end, self.dt),
+            self.plant.end_step(x + self.dt / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4), end, self.dt),
             s,
         )
 

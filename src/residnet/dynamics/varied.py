@@ -82,7 +82,7 @@ class VariedPlant(Dynamics):
         held = torch.cat((angle, w[:, 1:]), dim=-1)
         p = self.plant.prepare(self._felt(x, angle), held)
         moved = self.integrate(x, p, torch.cat((angle, 1.0 / s[:, 1:2] - 1.0), dim=-1))
-        return self.plant.settle(moved, w, self.dt), s
+        return self.plant.end_step(moved, w, self.dt), s
 
 
 @final

@@ -35,8 +35,7 @@ class Limits(NamedTuple):
 
 
 def memory_limits(policy: HeadingPolicy, turn: float) -> list[tuple[float, float]]:
-    """Ranges [low, high] of an exported policy's memory, by `MEMORY` and the last command: what its
-    own steps can lead to, and some room.
+    """Return the ranges [low, high] of an exported policy's memory, by `MEMORY` and the last command: what its own steps can lead to, and some room.
 
     Args:
         policy: see there.
@@ -114,7 +113,7 @@ class ExportedPolicy(nn.Module):
 
     @torch.jit.export
     def initial_state(self, y: Tensor) -> Tensor:
-        """Memory s [B, 10] at the first measurement y [B, 3], rudder amidships."""
+        """Return the memory s [B, 10] at the first measurement y [B, 3], rudder amidships."""
         good = self._good(y).unsqueeze(-1)
         return torch.cat(
             (
@@ -129,9 +128,7 @@ class ExportedPolicy(nn.Module):
 
     @torch.jit.export
     def step(self, y: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Rudder command [B, 1] in rad, memory [B, 10] and fault [B] from y [B, 3] = (psi, u, r),
-        reference heading [B, 1] and memory.
-        """
+        """Return the rudder command [B, 1] in rad, memory [B, 10] and fault [B] from y [B, 3] = (psi, u, r), reference heading [B, 1] and memory."""
         good = (
             self._good(y)
             & torch.isfinite(reference[:, 0])
@@ -156,9 +153,7 @@ class ExportedPolicy(nn.Module):
 
 
 def for_export(policy: HeadingPolicy, safe: Literal["hold", "amidships"]) -> ExportedPolicy:
-    """The policy in float32 with its checks: headings up to 1000 turns, three times its speed, five
-    times the steady turn at full rudder.
-    """
+    """Return the policy in float32 with its checks: headings up to 1000 turns, three times its speed, five times the steady turn at full rudder."""
     policy = copy.deepcopy(policy).float().eval().requires_grad_(False)
     policy.read_from(MEASURED)
     turn = 5.0 * policy.gain * policy.limit
@@ -206,8 +201,7 @@ def export_autopilot(
 
 
 def check_parity(name: str, module: ExportedPolicy, exported: Any) -> float:
-    """Largest difference of the command from the eager module over 1,000 steps, as a share of the
-    rudder's limit; wrong inputs are among them.
+    """Return the largest difference of the command from the eager module over 1,000 steps, as a share of the rudder's limit; wrong inputs are among them.
 
     Raises:
         ExportError: where it exceeds 1e-4, a command is no number, or a wrong input raises no flag.
@@ -276,7 +270,7 @@ def measured_entries(
 
 
 def policy_entries(policy: HeadingPolicy) -> dict[str, Any]:
-    """What the cards of all exported heading policies say."""
+    """Return what the cards of all exported heading policies say."""
     return {
         "command": [
             {

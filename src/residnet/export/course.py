@@ -93,9 +93,7 @@ class ExportedCourse(nn.Module):
 
     @torch.jit.export
     def initial_state(self, y: Tensor) -> Tensor:
-        """Memory [B, n] at the first measurement y [B, 6]: the beginning of the course, rudder
-        amidships.
-        """
+        """Return the memory [B, n] at the first measurement y [B, 6]: the beginning of the course, rudder amidships."""
         y = torch.where(self._good(y).unsqueeze(-1), y, torch.zeros_like(y))
         return torch.cat(
             (
@@ -111,9 +109,7 @@ class ExportedCourse(nn.Module):
 
     @torch.jit.export
     def step(self, y: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Rudder command [B, 1] in rad, memory [B, n], fault [B] and arrived [B] from y [B, 6] =
-        `MEASURED` and the memory.
-        """
+        """Return the rudder command [B, 1] in rad, memory [B, n], fault [B] and arrived [B] from y [B, 6] = `MEASURED` and the memory."""
         good = self._good(y).unsqueeze(-1)
         y = torch.where(good, y, torch.zeros_like(y))
         last = torch.nan_to_num(s[:, -1:]).clamp(-self.limit, self.limit)
@@ -175,8 +171,7 @@ def export_course(
 
 
 def check_parity(name: str, module: ExportedCourse, exported: Any, course: Course) -> float:
-    """Largest difference of the command from the eager module along the course, as a share of the
-    rudder's limit; wrong inputs are among them.
+    """Return the largest difference of the command from the eager module along the course, as a share of the rudder's limit; wrong inputs are among them.
 
     The vessel is put beside the course, off its heading, at varying speed, and moves on at the
     service speed.

@@ -32,7 +32,7 @@ class RequiredForce(nn.Module):
         self.baseline, self.head = baseline, head
 
     def forward(self, nu_dot: Tensor, nu: Tensor) -> Tensor:
-        """What the motion needs."""
+        """Return what the motion needs."""
         z = torch.cat((nu, torch.zeros_like(nu)), dim=-1)
         known: Tensor = self.baseline(z)
         force: Tensor = (nu_dot - known) @ self.head.mass.to(nu.dtype).T + self.head.force(
@@ -44,7 +44,7 @@ class RequiredForce(nn.Module):
 def required_force(
     spec: ModelSpec, model: HybridDynamics
 ) -> tuple[RequiredForce, list[tuple[float, float]]]:
-    """The feed-forward of a model, with the ranges of nu_dot and nu that it was fitted on.
+    """Return the feed-forward of a model, with the ranges of nu_dot and nu that it was fitted on.
 
     Raises:
         UsageError: where the model is not in force space, or its inputs are not the forces.
@@ -94,9 +94,7 @@ def export_feed_forward(
     model = model.eval()
 
     def check(exported: Any) -> float:
-        """Largest difference at random motions within the training ranges, as a share of each
-        force's range.
-        """
+        """Return the largest difference at random motions within the training ranges, as a share of each force's range."""
         low, high = torch.tensor(ranges, dtype=torch.float64).T
         motion = low + torch.rand(
             200, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64

@@ -42,21 +42,20 @@ class ExportedModel(nn.Module):
 
     @torch.jit.export
     def initial_state(self, batch: int) -> Tensor:
-        """Memory s [batch, n_state] without a past."""
+        """Return the memory s [batch, n_state] without a past."""
         return self.simulate.model.initial_state(batch)
 
     @torch.jit.export
     def warmup(self, y_history: Tensor, w_history: Tensor) -> Tensor:
-        """Memory s [B, n_state] that a measured past leaves: states [B, T, 6] and inputs [B, T, m],
-        oldest first.
-        """
+        """Return the memory s [B, n_state] that a measured past leaves: states [B, T, 6] and inputs [B, T, m], oldest first."""
         s: Tensor = self.simulate.model.warmup(y_history, w_history)  # type: ignore[operator]
         return s
 
     @torch.jit.export
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """State [B, 6] and memory after one step under inputs w [B, m]; `outside` [B] is True
-        beyond the training range.
+        """Return the state [B, 6] and memory after one step under inputs w [B, m].
+
+        `outside` [B] is True beyond the training range.
         """
         seen = torch.cat((x[:, 3:6], w), dim=-1)
         outside = ((seen < self.low) | (seen > self.high)).any(dim=-1)
@@ -65,7 +64,7 @@ class ExportedModel(nn.Module):
 
     @torch.jit.export
     def rollout(self, x0: Tensor, w: Tensor, s: Tensor) -> Tensor:
-        """States [B, T+1, 6] from x0 [B, 6] on under inputs w [B, T, m]."""
+        """Return the states [B, T+1, 6] from x0 [B, 6] on under inputs w [B, T, m]."""
         states: Tensor = self.simulate(x0, w, s)[0]
         return states
 
@@ -102,8 +101,7 @@ def export_torchscript(
 
 
 def check_parity(spec: ModelSpec, model: HybridDynamics, exported: Any) -> dict[str, float]:
-    """Largest difference of each state between the model and the exported module over 1,000 steps
-    from a warmed-up memory, as a share of its range.
+    """Return the largest difference of each state between the model and the exported module over 1,000 steps from a warmed-up memory, as a share of its range.
 
     Inputs sweep the training range as slow sines, so that the run passes through what the model
     knows.
@@ -147,7 +145,7 @@ def make_card(
     metrics: Sequence[Mapping[str, Any]],
     parity: Mapping[str, float],
 ) -> dict[str, Any]:
-    """The model card: all that a user needs to drive the module, and how good it is."""
+    """Return the model card: all that a user needs to drive the module, and how good it is."""
     units = spec.signals.units()
     return {
         "schema": "residnet.card/1",

@@ -27,7 +27,7 @@ class AccelerationDeceleration(Scheduled):
         return self
 
     def demands(self, t: Tensor) -> tuple[Tensor, Tensor]:
-        """Stepped drive [T], zero before the first time; zero steer [T]."""
+        """Return the stepped drive [T], zero before the first time; zero steer [T]."""
         index = torch.searchsorted(torch.tensor(self.times, dtype=t.dtype), t, right=True)
         return torch.tensor((0.0, *self.levels), dtype=t.dtype)[index], torch.zeros_like(t)
 
@@ -44,7 +44,7 @@ class AccelerationDecelerationFamily(Config):
     hold: tuple[Seconds, Seconds] = (6.0, 12.0)
 
     def draw(self, random: np.random.Generator, duration: float) -> list[Manoeuvre]:
-        """`count` manoeuvres of `duration` seconds."""
+        """Return `count` manoeuvres of `duration` seconds."""
         most = int(duration / self.hold[0]) + 2
         out: list[Manoeuvre] = []
         for _ in range(self.count):

@@ -50,7 +50,7 @@ class Helm:
 
     @classmethod
     def of(cls, plant: Plant) -> Helm:
-        """The helm of a plant."""
+        """Return the helm of a plant."""
         forces: Callable[[Tensor], Tensor] | None = None
         if plant.inputs[: plant.commands] == ForceCommands.commands:
             forces = torch.Tensor.clone
@@ -59,7 +59,7 @@ class Helm:
         return cls(plant.demand, plant.state, plant.inputs, forces)
 
     def column(self, name: str) -> int:
-        """Column of a state.
+        """Return the column of a state.
 
         Raises:
             UsageError: where the vessel has no such state.
@@ -90,7 +90,7 @@ class ScheduleSource(Source):
         self.commands = demand(drive, steer)
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Inputs [B, m] with the scheduled commands in the first columns."""
+        """Return the inputs [B, m] with the scheduled commands in the first columns."""
         command = self.commands[:, k].to(w.dtype)
         return torch.cat((command, w[:, command.shape[-1] :]), dim=-1), memory
 
@@ -107,7 +107,7 @@ class StackedSource(Source):
         self.may_stop = any(source.may_stop for source in sources)
 
     def initial(self, x: Tensor) -> Tensor:
-        """Memories of all sources, padded to the widest, [B, k]."""
+        """Return the memories of all sources, padded to the widest, [B, k]."""
         parts = [
             source.initial(part)
             for source, part in zip(self.sources, x.split(self.rows), strict=True)
@@ -118,7 +118,7 @@ class StackedSource(Source):
         )
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Inputs [B, m], each block of rows from its source."""
+        """Return the inputs [B, m], each block of rows from its source."""
         inputs, memories = [], []
         for source, xs, ws, ms in zip(
             self.sources, x.split(self.rows), w.split(self.rows), self._own(memory), strict=True
@@ -130,7 +130,7 @@ class StackedSource(Source):
         return torch.cat(inputs), torch.cat(memories)
 
     def finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
-        """[B] bool, each block of rows by its source."""
+        """Return [B] bool, each block of rows by its source."""
         parts = zip(self.sources, x.split(self.rows), self._own(memory), strict=True)
         return torch.cat([source.finished(xs, k, ms) for source, xs, ms in parts])
 
@@ -154,17 +154,17 @@ class Watched(Source):
         self.stopped = torch.full((rows,), -1)
 
     def initial(self, x: Tensor) -> Tensor:
-        """Memory of the source inside."""
+        """Return the memory of the source inside."""
         self.stopped = torch.full((x.shape[0],), -1)
         return self.source.initial(x)
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Inputs [B, m] of the source inside."""
+        """Return the inputs [B, m] of the source inside."""
         out: tuple[Tensor, Tensor] = self.source(x, w, k, memory)
         return out
 
     def finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
-        """Rows that have stopped now or before."""
+        """Return the rows that have stopped now or before."""
         now = self.source.finished(x, k, memory) & (self.stopped < 0)
         self.stopped = torch.where(now, k, self.stopped)
         return self.stopped >= 0
@@ -186,8 +186,9 @@ class Manoeuvre(Config, ABC):
     @classmethod
     @abstractmethod
     def source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
-        """The source that flies several manoeuvres of this kind side by side; t [T] are the times
-        of the steps.
+        """Return the source that flies several manoeuvres of this kind side by side.
+
+        t [T] are the times of the steps.
         """
 
     @property
@@ -196,17 +197,17 @@ class Manoeuvre(Config, ABC):
         return None
 
     def lasts(self, duration: float) -> float:
-        """Seconds that the manoeuvre is given, in a programme of `duration`."""
+        """Return the seconds that the manoeuvre is given, in a programme of `duration`."""
         return duration if self.duration is None else self.duration
 
     def begin(self, x: Tensor, state: tuple[str, ...]) -> Tensor:
-        """State [nx] that the manoeuvre starts from, where trials of the vessel start from x [nx].
-        """
+        """Return the state [nx] that the manoeuvre starts from, where trials of the vessel start from x [nx]."""
         return x
 
     def indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
-        """Manoeuvring indices by name, SI and rad (units in `indices.UNITS`); those that the log is
-        too short for are left out.
+        """Return the manoeuvring indices by name, SI and rad (units in `indices.UNITS`).
+
+        Those that the log is too short for are left out.
 
         Args:
             log: what was flown: t, x, y, psi, u, v, r.
@@ -215,9 +216,7 @@ class Manoeuvre(Config, ABC):
         return {}
 
     def limits(self, helm: Helm, length: float, speed: float) -> dict[str, float]:
-        """Largest values of indices that IMO resolution MSC.137(76) allows a ship of `length` [m]
-        at approach `speed` [m/s], by index.
-        """
+        """Return the largest values of indices that IMO resolution MSC.137(76) allows a ship of `length` [m] at approach `speed` [m/s], by index."""
         return {}
 
 
@@ -230,7 +229,7 @@ class Scheduled(Manoeuvre):
 
     @classmethod
     def source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
-        """Playback of the demands."""
+        """Return the playback of the demands."""
         pairs = [
             manoeuvre.demands(t) for manoeuvre in manoeuvres if isinstance(manoeuvre, Scheduled)
         ]
@@ -277,7 +276,7 @@ class RudderSteering(Config):
         return -1.0 if (self.steer if self.steer is not None else self.rudder or 0.0) < 0 else 1.0
 
     def share(self, helm: Helm) -> float:
-        """Share of full steer on a vessel.
+        """Return the share of full steer on a vessel.
 
         Raises:
             UsageError: where an angle is asked of a vessel without rudder, or more than its
@@ -287,7 +286,7 @@ class RudderSteering(Config):
 
 
 def rudder_share(angle: float, helm: Helm) -> float:
-    """Share of full steer that commands a rudder angle [rad].
+    """Return the share of full steer that commands a rudder angle [rad].
 
     Raises:
         UsageError: where the vessel has no rudder or one that does not go so far.

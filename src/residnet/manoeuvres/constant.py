@@ -1,5 +1,4 @@
-"""Constant input: from rest to the steady state of a speed or a turn (document 003 section 4.2.2).
-"""
+"""Constant input: from rest to the steady state of a speed or a turn (document 003 section 4.2.2)."""
 
 from __future__ import annotations
 
@@ -23,7 +22,7 @@ class ConstantInput(Scheduled):
     steer: float = Field(ge=-1, le=1)
 
     def demands(self, t: Tensor) -> tuple[Tensor, Tensor]:
-        """Constant drive and steer [T]."""
+        """Return constant drive and steer [T]."""
         return torch.full_like(t, self.drive), torch.full_like(t, self.steer)
 
 
@@ -35,5 +34,5 @@ class ConstantFamily(Config):
     steer: tuple[float, ...] = Field(min_length=1)
 
     def draw(self, random: np.random.Generator, duration: float) -> list[Manoeuvre]:
-        """One manoeuvre per combination; nothing is left to chance."""
+        """Return one manoeuvre per combination; nothing is left to chance."""
         return [ConstantInput(drive=d, steer=s) for d, s in product(self.drive, self.steer)]

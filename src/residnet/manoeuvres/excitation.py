@@ -51,7 +51,7 @@ class Excitation(Scheduled, ABC):
 
     @abstractmethod
     def _wave(self, t: Tensor, which: int) -> Tensor:
-        """Wave [T] within +-1 of the drive (0) or steer (1) at times t [T] since the start."""
+        """Return the wave [T] within +-1 of the drive (0) or steer (1) at times t [T] since the start."""
 
     def demands(self, t: Tensor) -> tuple[Tensor, Tensor]:
         """Drive and steer [T], clipped to +-1."""
@@ -75,7 +75,7 @@ class RandomSteps(Excitation):
     kind: Literal["random_steps"] = "random_steps"
 
     def _wave(self, t: Tensor, which: int) -> Tensor:
-        """Levels [T] within +-1."""
+        """Return the levels [T] within +-1."""
         random = np.random.default_rng([self.seed, which])
         span, times, levels = float(t[-1]), [0.0], [random.uniform(-1.0, 1.0)]
         while times[-1] <= span:
@@ -100,7 +100,7 @@ class MultiSine(Excitation):
     tones: int = Field(default=8, ge=2, le=200)
 
     def _wave(self, t: Tensor, which: int) -> Tensor:
-        """Sum of sines [T], +-1 at most over ten periods of the lowest and clipped there beyond."""
+        """Return the sum of sines [T], +-1 at most over ten periods of the lowest and clipped there beyond."""
         frequencies = np.geomspace(*self.band, 2 * self.tones)[which::2]
         random = np.random.default_rng([self.seed, which])
         trial = np.arange(0.0, 10.0 / self.band[0], min(0.05 / self.band[1], 0.005 / self.band[0]))
@@ -144,7 +144,7 @@ class RandomStepsFamily(_Family):
     kind: Literal["random_steps"] = "random_steps"
 
     def draw(self, random: np.random.Generator, duration: float) -> list[Manoeuvre]:
-        """`count` manoeuvres."""
+        """Return `count` manoeuvres."""
         return [RandomSteps.model_validate(self._one(random)) for _ in range(self.count)]
 
 
@@ -155,7 +155,7 @@ class MultiSineFamily(_Family):
     tones: int = Field(default=8, ge=2, le=200)
 
     def draw(self, random: np.random.Generator, duration: float) -> list[Manoeuvre]:
-        """`count` manoeuvres."""
+        """Return `count` manoeuvres."""
         return [
             MultiSine.model_validate({**self._one(random), "tones": self.tones})
             for _ in range(self.count)

@@ -59,12 +59,12 @@ class FourCorner(Manoeuvre):
         )
 
     def lasts(self, duration: float) -> float:
-        """One interval for each pose, or `self.duration` where that is less."""
+        """Return one interval for each pose, or `self.duration` where that is less."""
         return min(self.filter.duration, self.duration or math.inf)
 
     @classmethod
     def source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
-        """Closed loop on the pose; each row has a course and gains of its own.
+        """Return the closed loop on the pose; each row has a course and gains of its own.
 
         Raises:
             UsageError: where the vessel has no command for each of the three forces.
@@ -76,7 +76,7 @@ class FourCorner(Manoeuvre):
         )
 
     def indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
-        """Mean distance from the reference, and mean absolute error of the heading."""
+        """Return the mean distance from the reference, and mean absolute error of the heading."""
         reference = self.filter.build(float(log.t[1] - log.t[0]))
         x = torch.from_numpy(log.stack(("x", "y", "psi")))
         s = reference.initial_state(x[:1])
@@ -108,11 +108,11 @@ class FourCornerSource(Source):
         self.policy = manoeuvre.control.build(step)
 
     def initial(self, x: Tensor) -> Tensor:
-        """The filter at the vessel's pose, no integral."""
+        """Return the filter at the vessel's pose, no integral."""
         return torch.cat((self.reference.initial_state(x), self.policy.initial_state(x)), dim=-1)
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Inputs [B, m]."""
+        """Return the inputs [B, m]."""
         n = self.reference.n_state
         target, guided = self.reference(x, k, memory[:, :n])
         tau, s = self.policy(x, target, memory[:, n:])

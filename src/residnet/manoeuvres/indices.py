@@ -80,17 +80,18 @@ class Track:
         return float(self.t[-1])
 
     def approach(self, start: float) -> float:
-        """Speed at the last sample before or at the order at `start`."""
+        """Return the speed at the last sample before or at the order at `start`."""
         return float(self.speed[max(int(np.searchsorted(self.t, start + 1e-9)) - 1, 0)])
 
     def crossing(self, level: float, after: float, sign: float = 1.0) -> float | None:
-        """First time after `after` at which sign * heading rises to sign * `level`; None where it
-        does not.
+        """Return the first time after `after` at which sign * heading rises to sign * `level`.
+
+        None where it does not.
         """
         return first_crossing(lambda t: sign * (self.psi(t) - level), self.t, after)
 
     def peak(self, begin: float, end: float, sign: float) -> tuple[float, float]:
-        """Time and value of the largest sign * heading within begin .. end."""
+        """Return the time and value of the largest sign * heading within begin .. end."""
         inside = self.t[(self.t > begin) & (self.t < end)]
         times = np.concatenate(([begin], inside, [end]))
         best = int(np.argmax(sign * self.psi(times)))
@@ -102,18 +103,14 @@ class Track:
         return time, float(sign * self.psi(time))
 
     def beside(self, time: float, origin: float) -> tuple[float, float]:
-        """Place at `time` ahead and to starboard of where the vessel was at `origin`, along the
-        heading that it had there.
-        """
+        """Return the place at `time` ahead and to starboard of where the vessel was at `origin`, along the heading that it had there."""
         north, east = float(self.x(time) - self.x(origin)), float(self.y(time) - self.y(origin))
         c, s = math.cos(float(self.psi(origin))), math.sin(float(self.psi(origin)))
         return north * c + east * s, east * c - north * s
 
 
 def first_crossing(function: Callable[[Any], Any], t: np.ndarray, after: float) -> float | None:
-    """First time after `after` at which a function rises through zero, between samples at t [T];
-    None where it does not.
-    """
+    """Return the first time after `after` at which a function rises through zero, between samples at t [T]; None where it does not."""
     times = np.concatenate(([after], t[t > after]))
     values = function(times)
     rising = np.flatnonzero((values[:-1] < 0) & (values[1:] >= 0))
@@ -128,7 +125,7 @@ def first_crossing(function: Callable[[Any], Any], t: np.ndarray, after: float) 
 
 
 def in_lengths(found: dict[str, Any], length: float | None) -> dict[str, Any]:
-    """Indices with the distances among them in hull lengths as well, `<index>_lengths`."""
+    """Return the indices with the distances among them in hull lengths as well, `<index>_lengths`."""
     if length is None:
         return found
     return found | {
@@ -139,7 +136,7 @@ def in_lengths(found: dict[str, Any], length: float | None) -> dict[str, Any]:
 def turning(
     log: Log, start: float, side: float, until: float, length: float | None
 ) -> dict[str, Any]:
-    """Indices of a turning circle.
+    """Return the indices of a turning circle.
 
     Advance is along, transfer and tactical diameter are across the heading at `start`, towards the
     turn. The steady turn is the last half turn before the heading has changed by `until`, where
@@ -192,7 +189,7 @@ def turning(
 def zigzag(
     log: Log, start: float, side: float, heading: float, length: float | None
 ) -> dict[str, Any]:
-    """Indices of a zigzag.
+    """Return the indices of a zigzag.
 
     An overshoot is how far the heading goes beyond its bound after a reversal. The time to check
     yaw is from the first reversal to the peak of the heading; the overshoot width is how far the
@@ -251,9 +248,7 @@ def zigzag(
 
 
 def stopping(log: Log, start: float, length: float | None) -> dict[str, Any]:
-    """Indices of a stopping trial from the order at `start` [s] to where the surge velocity is
-    zero: along the track, ahead and across.
-    """
+    """Return the indices of a stopping trial from the order at `start` [s] to where the surge velocity is zero: along the track, ahead and across."""
     track = Track(log)
     surge = CubicSpline(track.t, track.u)
     found: dict[str, Any] = {"approach_speed": track.approach(start)}

@@ -38,7 +38,7 @@ class SteeredZigzag(NamedTuple):
 
 
 def steered_zigzag(log: Log, rudder: str) -> SteeredZigzag:
-    """The zigzag of a log that holds t, psi and a rudder angle.
+    """Return the zigzag of a log that holds t, psi and a rudder angle.
 
     An order is given at the last sample before the rudder moves, at a tenth of its largest rate.
     When the rudder left its side is told to a fraction of a sample, by its rate on the way across:
@@ -94,8 +94,6 @@ def steered_zigzag(log: Log, rudder: str) -> SteeredZigzag:
 
 
 def _left(t: np.ndarray, way: np.ndarray) -> float:
-    """Time at which the rudder leaves -1 for +1, from samples that begin below -1/2 and end above
-    +1/2.
-    """
+    """Return the time at which the rudder leaves -1 for +1, from samples that begin below -1/2 and end above +1/2."""
     below, above = np.interp((-_OVER, _OVER), np.maximum.accumulate(way), t)
     return float(below - (1.0 - _OVER) / (2.0 * _OVER) * (above - below))

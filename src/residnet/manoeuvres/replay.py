@@ -50,7 +50,9 @@ class Replay(Manoeuvre):
         return self._recorded
 
     def channel(self, name: str) -> np.ndarray | None:
-        """What the log has for an input or state of the vessel, [T]; None where it has nothing.
+        """Return what the log has for an input or state of the vessel, [T].
+
+        None where it has nothing.
 
         Raises:
             UsageError: where `channels` names a channel that the log does not have.
@@ -71,8 +73,9 @@ class Replay(Manoeuvre):
         return span if self.duration is None else min(span, self.duration)
 
     def begin(self, x: Tensor, state: tuple[str, ...]) -> Tensor:
-        """State [nx] at the log's first sample; what the log does not have stays as it is in x
-        [nx].
+        """Return the state [nx] at the log's first sample.
+
+        What the log does not have stays as it is in x [nx].
 
         Raises:
             UsageError: where the log lacks position, heading or a velocity.
@@ -97,8 +100,9 @@ class Replay(Manoeuvre):
         return out
 
     def inputs(self, helm: Helm, t: Tensor) -> Tensor:
-        """Inputs [T, m] at times t [T]; NaN in the columns that nobody commands and that the log
-        does not have.
+        """Return the inputs [T, m] at times t [T].
+
+        NaN in the columns that nobody commands and that the log does not have.
 
         Raises:
             UsageError: where the log lacks a command.
@@ -122,9 +126,7 @@ class Replay(Manoeuvre):
         return torch.from_numpy(out)
 
     def indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
-        """How far the motion is from the recorded one: root mean square errors of u, v, r, and
-        where it ends.
-        """
+        """Return how far the motion is from the recorded one: root mean square errors of u, v, r, and where it ends."""
         clock = self.recorded.t - self.recorded.t[0]
         errors: dict[str, np.ndarray] = {}
         for name in STATE:
@@ -143,7 +145,7 @@ class Replay(Manoeuvre):
 
     @classmethod
     def source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
-        """Playback of the recorded inputs."""
+        """Return the playback of the recorded inputs."""
         return RecordedSource(
             torch.stack([m.inputs(helm, t) for m in manoeuvres if isinstance(m, Replay)])
         )
@@ -158,6 +160,6 @@ class RecordedSource(Source):
         self.values = values
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Inputs [B, m] of step k."""
+        """Return the inputs [B, m] of step k."""
         given = self.values[:, k].to(w.dtype)
         return torch.where(torch.isnan(given), w, given), memory

@@ -49,7 +49,10 @@ class Spiral(Manoeuvre):
         return self
 
     def shares(self, helm: Helm) -> tuple[float, ...]:
-        """Shares of full steer; from one side to the other and back where none are given."""
+        """Return the shares of full steer.
+
+        From one side to the other and back where none are given.
+        """
         if self.rudders:
             return tuple(rudder_share(angle, helm) for angle in self.rudders)
         return self.steers or _DOWN + _DOWN[-2::-1]
@@ -62,14 +65,11 @@ class Spiral(Manoeuvre):
 
     @classmethod
     def source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
-        """Closed loop on the yaw rate of each row."""
+        """Return the closed loop on the yaw rate of each row."""
         return SpiralSource([m for m in manoeuvres if isinstance(m, Spiral)], helm, t)
 
     def indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
-        """Steady yaw rate of each angle that was finished, in order, and the height of the loop
-        amidships: the largest difference of the yaw rates that the angle nearest to zero had;
-        `steers` are shares of full steer (rad where the log has a rudder).
-        """
+        """Return the steady yaw rate of each angle that was finished, in order, and the height of the loop amidships: the largest difference of the yaw rates that the angle nearest to zero had; `steers` are shares of full steer (rad where the log has a rudder)."""
         commands = [name for name in log.channels if name.startswith("cmd_")]
         table = log.stack(commands)
         active = log.t - log.t[0] >= self.start - 1e-9
@@ -111,11 +111,11 @@ class SpiralSource(Source):
         self.may_stop = True
 
     def initial(self, x: Tensor) -> Tensor:
-        """The first angle."""
+        """Return the first angle."""
         return torch.cat((torch.zeros_like(x[:, :1]), self.steady.initial(x[:, self.r])), dim=-1)
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Inputs [B, m]."""
+        """Return the inputs [B, m]."""
         over = self.times[k] >= self.start
         kept = self.steady.again(self.steady(x[:, self.r], memory[:, 1:]), ~over)
         settled = self.steady.reached(kept)
@@ -130,5 +130,5 @@ class SpiralSource(Source):
         )
 
     def finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
-        """Rows that have held their last angle."""
+        """Return the rows that have held their last angle."""
         return memory[:, 0] >= self.count.to(x.dtype)

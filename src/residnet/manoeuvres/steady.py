@@ -44,7 +44,7 @@ class Steady(nn.Module):
         return torch.stack((r, r.abs(), torch.zeros_like(r)), dim=-1)
 
     def forward(self, r: Tensor, memory: Tensor) -> Tensor:
-        """Memory one step later, with yaw rate r [B]."""
+        """Return the memory one step later, with yaw rate r [B]."""
         mean, largest, calm = memory.unbind(-1)
         mean = mean + (self.dt / self.window).clamp(max=1.0).to(r.dtype) * (r - mean)
         largest = torch.maximum(largest, r.abs())
@@ -54,11 +54,11 @@ class Steady(nn.Module):
         )
 
     def reached(self, memory: Tensor) -> Tensor:
-        """[B] bool."""
+        """Return [B] bool."""
         return memory[:, 2] >= self.window.to(memory.dtype) - 1e-9
 
     def again(self, memory: Tensor, where: Tensor) -> Tensor:
-        """The memory with the wait begun anew in rows [B] bool."""
+        """Return the memory with the wait begun anew in rows [B] bool."""
         return torch.cat(
             (memory[:, :2], memory[:, 2:].masked_fill(where.unsqueeze(-1), 0.0)), dim=-1
         )

@@ -26,7 +26,7 @@ class Stopping(Manoeuvre):
 
     @classmethod
     def source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
-        """Closed loop on the surge velocity of each row."""
+        """Return the closed loop on the surge velocity of each row."""
         return StoppingSource([m for m in manoeuvres if isinstance(m, Stopping)], helm, t)
 
     @property
@@ -35,11 +35,11 @@ class Stopping(Manoeuvre):
         return "a surge velocity of zero"
 
     def indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
-        """Track reach, head reach, deviation, time; see `indices.stopping`."""
+        """Return the track reach, head reach, deviation, time; see `indices.stopping`."""
         return indices.stopping(log, self.start, length)
 
     def limits(self, helm: Helm, length: float, speed: float) -> dict[str, float]:
-        """IMO's limit, which holds for full astern."""
+        """Return IMO's limit, which holds for full astern."""
         return imo.stopping(length) if self.astern <= -0.999 else {}
 
 
@@ -57,12 +57,12 @@ class StoppingSource(Source):
         self.may_stop = True
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Inputs [B, m]."""
+        """Return the inputs [B, m]."""
         drive = torch.where(self.times[k] >= self.start, self.astern, self.drive).to(x.dtype)
         command = self.demand(drive, torch.zeros_like(drive))
         return torch.cat((command, w[:, command.shape[-1] :]), dim=-1), memory
 
     def finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
-        """Rows that make no way."""
+        """Return the rows that make no way."""
         stopped: Tensor = (self.times[k] > self.start) & (x[:, self.u] <= 0)
         return stopped

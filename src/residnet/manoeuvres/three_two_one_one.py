@@ -25,7 +25,7 @@ class ThreeTwoOneOne(Steering, Scheduled):
     repeat: bool = True
 
     def demands(self, t: Tensor) -> tuple[Tensor, Tensor]:
-        """Constant drive, patterned steer [T]."""
+        """Return constant drive, patterned steer [T]."""
         # times on the grid must not fall short of their unit by rounding
         units = torch.floor((t - self.start) / self.unit + 1e-9).long()
         pattern = torch.tensor(_PATTERN, dtype=t.dtype)
@@ -35,8 +35,7 @@ class ThreeTwoOneOne(Steering, Scheduled):
 
 
 class ThreeTwoOneOneFamily(Config):
-    """3-2-1-1 manoeuvres with unit, steer and drive uniform in their ranges, repeated to the end.
-    """
+    """3-2-1-1 manoeuvres with unit, steer and drive uniform in their ranges, repeated to the end."""
 
     kind: Literal["three_two_one_one"] = "three_two_one_one"
     count: int = Field(ge=1)
@@ -46,7 +45,7 @@ class ThreeTwoOneOneFamily(Config):
     start: Seconds = 5.0
 
     def draw(self, random: np.random.Generator, duration: float) -> list[Manoeuvre]:
-        """`count` manoeuvres."""
+        """Return `count` manoeuvres."""
         return [
             ThreeTwoOneOne(
                 unit=float(random.uniform(*self.unit)),

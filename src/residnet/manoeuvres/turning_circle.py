@@ -39,7 +39,7 @@ class TurningCircle(RudderSteering, Manoeuvre):
 
     @classmethod
     def source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
-        """Closed loop on the heading of each row."""
+        """Return the closed loop on the heading of each row."""
         return TurningSource([m for m in manoeuvres if isinstance(m, TurningCircle)], helm, t)
 
     @property
@@ -49,14 +49,14 @@ class TurningCircle(RudderSteering, Manoeuvre):
         return f"{turned} and a steady pull-out" if self.pull_out else turned
 
     def indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
-        """Advance, transfer, diameters and the steady turn; see `indices.turning`."""
+        """Return the advance, transfer, diameters and the steady turn; see `indices.turning`."""
         found = indices.turning(log, self.start, self.side, self.until, length)
         if self.pull_out and "advance" in found:
             found["pull_out_yaw_rate"] = self.side * float(log["r"][np.isfinite(log["r"])][-1])
         return found
 
     def limits(self, helm: Helm, length: float, speed: float) -> dict[str, float]:
-        """IMO's limits, which hold for 35 deg of rudder or as much as it goes."""
+        """Return IMO's limits, which hold for 35 deg of rudder or as much as it goes."""
         share = abs(self.share(helm))
         angle = share * (helm.hard_over or 0.0)
         return imo.turning(length) if share > 0.999 or math.degrees(angle) > 34.9 else {}
@@ -84,14 +84,14 @@ class TurningSource(Source):
         self.may_stop = True
 
     def initial(self, x: Tensor) -> Tensor:
-        """Present heading, approaching."""
+        """Return the present heading, approaching."""
         return torch.cat(
             (x[:, self.psi, None], torch.zeros_like(x[:, :1]), self.steady.initial(x[:, self.r])),
             dim=-1,
         )
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Inputs [B, m]; the heading change is tested at the start of the step."""
+        """Return the inputs [B, m]; the heading change is tested at the start of the step."""
         origin, phase = memory[:, 0], memory[:, 1]
         kept = self.steady(x[:, self.r], memory[:, 2:])
         over = self.times[k] >= self.start
@@ -113,7 +113,7 @@ class TurningSource(Source):
         return torch.cat((command, w[:, command.shape[-1] :]), dim=-1), memory
 
     def finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
-        """Rows that have turned, and pulled out."""
+        """Return the rows that have turned, and pulled out."""
         return memory[:, 1] == 2
 
 
@@ -128,7 +128,7 @@ class TurningCircleFamily(Config):
     until: Radians = Field(default=3.0 * math.pi, gt=0)
 
     def draw(self, random: np.random.Generator, duration: float) -> list[Manoeuvre]:
-        """`count` manoeuvres."""
+        """Return `count` manoeuvres."""
         out: list[Manoeuvre] = []
         for _ in range(self.count):
             side = 1.0 if random.random() < 0.5 else -1.0

@@ -43,7 +43,7 @@ class Waypoints(Manoeuvre):
 
     @classmethod
     def source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
-        """Closed loop on position and heading; each row has a course of its own."""
+        """Return the closed loop on position and heading; each row has a course of its own."""
         return StackedSource(
             [WaypointSource(m, helm) for m in manoeuvres if isinstance(m, Waypoints)],
             [1] * len(manoeuvres),
@@ -55,7 +55,7 @@ class Waypoints(Manoeuvre):
         return f"the last of {len(self.points)} way-points"
 
     def indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
-        """Cross-track errors from the leg that was sailed, and the time that the course took."""
+        """Return Cross-track errors from the leg that was sailed, and the time that the course took."""
         x = torch.from_numpy(np.nan_to_num(log.stack(("x", "y"))))
         guidance = WaypointGuidance(
             self.points, self.acceptance, LookAhead(self.lookahead), ("x", "y")
@@ -94,11 +94,11 @@ class WaypointSource(Source):
         self.may_stop = True
 
     def initial(self, x: Tensor) -> Tensor:
-        """Memory [B, 3] of the guidance."""
+        """Return the memory [B, 3] of the guidance."""
         return self.guidance.initial_state(x)
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Inputs [B, m]."""
+        """Return the inputs [B, m]."""
         heading, memory = self.guidance(x, k, memory)
         steer, _ = self.autopilot(x, heading, x[:, :0])
         command = self.demand(torch.full_like(steer[:, 0], self.drive), steer[:, 0])

@@ -37,7 +37,7 @@ class Zigzag(RudderSteering, Manoeuvre):
 
     @classmethod
     def source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
-        """Closed loop on the heading of each row."""
+        """Return the closed loop on the heading of each row."""
         chosen = [m for m in manoeuvres if isinstance(m, Zigzag)]
         return ZigzagSource(chosen, helm, t)
 
@@ -57,12 +57,13 @@ class Zigzag(RudderSteering, Manoeuvre):
         return self.side if self.first == "starboard" else -self.side
 
     def indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
-        """Overshoots, times and distances; see `indices.zigzag`."""
+        """Return the overshoots, times and distances; see `indices.zigzag`."""
         return indices.zigzag(log, self.start, self.begins, self.heading, length)
 
     def limits(self, helm: Helm, length: float, speed: float) -> dict[str, float]:
-        """IMO's limits of the 10/10 and 20/20 zigzag; where there is no rudder the heading alone
-        tells which of them it is.
+        """Return IMO's limits of the 10/10 and 20/20 zigzag.
+
+        Where there is no rudder the heading alone tells which of them it is.
         """
         angle = self.heading if helm.hard_over is None else abs(self.share(helm)) * helm.hard_over
         for nominal, limits in ((10.0, imo.zigzag_10(length, speed)), (20.0, imo.zigzag_20())):
@@ -101,13 +102,13 @@ class ZigzagSource(Source):
         self.times = t.tolist()
 
     def initial(self, x: Tensor) -> Tensor:
-        """First side, present heading and no reversals, [B, 3]."""
+        """Return the first side, present heading and no reversals, [B, 3]."""
         return torch.stack(
             (self.first.to(x.dtype), x[:, self.psi], torch.zeros_like(x[:, 0])), dim=-1
         )
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Inputs [B, m]; the bound is tested on the heading at the start of the step."""
+        """Return the inputs [B, m]; the bound is tested on the heading at the start of the step."""
         side, origin, count = memory.unbind(-1)
         reached = side * self.sense.to(x.dtype) * (x[:, self.psi] - origin) >= self.heading.to(
             x.dtype
@@ -121,7 +122,7 @@ class ZigzagSource(Source):
         return torch.cat((command, w[:, command.shape[-1] :]), dim=-1), memory
 
     def finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
-        """Rows whose heading is back after their last reversal."""
+        """Return the rows whose heading is back after their last reversal."""
         side, origin, count = memory.unbind(-1)
         return (count >= self.most.to(x.dtype)) & (
             side * self.sense.to(x.dtype) * (x[:, self.psi] - origin) >= 0
@@ -141,7 +142,7 @@ class ZigzagFamily(Config):
     start: Seconds = 5.0
 
     def draw(self, random: np.random.Generator, duration: float) -> list[Manoeuvre]:
-        """`count` manoeuvres."""
+        """Return `count` manoeuvres."""
         return [
             Zigzag(
                 heading=float(random.choice(self.heading)),

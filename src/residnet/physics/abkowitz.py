@@ -85,7 +85,7 @@ class Derivatives(Config):
         return self
 
     def rows(self) -> tuple[dict[str, float], ...]:
-        """X, Y, N."""
+        """Return X, Y, N."""
         return self.X, self.Y, self.N
 
 
@@ -148,7 +148,7 @@ class AbkowitzConfig(VesselFile):
         return self
 
     def build(self) -> AbkowitzVessel:
-        """The plant.
+        """Return the plant.
 
         Raises:
             ConfigError: where the mass matrix is not positive definite or is singular.
@@ -198,14 +198,15 @@ class SeriesForces(Actuators):
         self.lengths: Tensor
 
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Rudder angle from steer; revolutions from drive where the series knows them (else it
-        keeps its service power).
+        """Return the rudder angle from steer.
+
+        Revolutions from drive where the series knows them (else it keeps its service power).
         """
         both = torch.stack((steer, drive) if self.turns else (steer,), dim=-1)
         return both.clamp(-1.0, 1.0) * self.limits.to(drive.dtype)
 
     def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
-        """tau [..., 3] of the whole series at velocities through the water nu [..., 3]."""
+        """Return tau [..., 3] of the whole series at velocities through the water nu [..., 3]."""
         position = self.servos.value(a, command)
         u, v, r, delta = nu[..., 0], nu[..., 1], nu[..., 2], self.sign * position[..., 0]
         dn = position[..., 1] - self.n_0 if self.turns else torch.zeros_like(u)
@@ -225,11 +226,11 @@ class SeriesForces(Actuators):
         return scaled
 
     def rate(self, a: Tensor, command: Tensor) -> Tensor:
-        """Derivative [..., k] of the states."""
+        """Return the derivative [..., k] of the states."""
         return self.servos.rate(a, command)
 
     def advance(self, a: Tensor, command: Tensor, dt: float) -> Tensor:
-        """States [..., k] after a step of dt seconds."""
+        """Return the states [..., k] after a step of dt seconds."""
         return self.servos.advance(a, command, dt)
 
 
@@ -259,7 +260,7 @@ class SeriesInertia(nn.Module):
         self.inverse: Tensor
 
     def forward(self, nu: Tensor, tau: Tensor) -> Tensor:
-        """nu_dot [..., 3]."""
+        """Return nu_dot [..., 3]."""
         if self.added:
             u, v, r = nu[..., 0], nu[..., 1], nu[..., 2]
             tau = tau + self.m * torch.stack(
@@ -283,12 +284,12 @@ class AbkowitzVessel(HullPlant):
         self.n_0 = config.shaft.n_0 if config.shaft is not None else 0.0
 
     def acceleration(self, pose: Tensor, nu: Tensor, tau: Tensor) -> Tensor:
-        """nu_dot [B, 3]."""
+        """Return nu_dot [B, 3]."""
         acceleration: Tensor = self.inertia(nu, tau)
         return acceleration
 
     def approach(self, rows: int) -> Tensor:
-        """Straight ahead at service speed and service revolutions, [B, nx]."""
+        """Return straight ahead at service speed and service revolutions, [B, nx]."""
         x = super().approach(rows)
         x[:, 3] = self.speed
         if "n" in self.state:

@@ -57,7 +57,7 @@ class CandidatesConfig(Config):
     extra: tuple[str, ...] = ()
 
     def candidates(self, names: Sequence[str]) -> tuple[Candidate, ...]:
-        """Candidates for a model with channels `names`, simplest first within each degree.
+        """Return the candidates for a model with channels `names`, simplest first within each degree.
 
         Raises:
             ConfigError: where a channel is named that the model lacks.
@@ -89,7 +89,7 @@ class CandidatesConfig(Config):
 
 
 def rated(terms: Iterable[str], names: Sequence[str]) -> tuple[Candidate, ...]:
-    """Terms with degree and effort, by degree and then by effort.
+    """Return the terms with degree and effort, by degree and then by effort.
 
     Raises:
         ConfigError: where a term cannot be read.
@@ -106,8 +106,9 @@ def rated(terms: Iterable[str], names: Sequence[str]) -> tuple[Candidate, ...]:
 
 
 def _products(names: Sequence[str], degree: int, *, magnitudes: bool = False) -> list[str]:
-    """Products up to a degree, the empty one first; of one channel's factors at most one stands as
-    a magnitude, since |x|^2 is x^2.
+    """Return the products up to a degree, the empty one first.
+
+    Of one channel's factors at most one stands as a magnitude, since |x|^2 is x^2.
     """
     symbols = [(name, False) for name in names] + (
         [(name, True) for name in names] if magnitudes else []

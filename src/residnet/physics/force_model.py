@@ -51,15 +51,12 @@ another has, and none in truth.
 
 
 def order_of(term: str) -> int:
-    """beta of a basis function: how many channels are multiplied in it (document 002 section
-    4.3.4).
-    """
+    """Return beta of a basis function: how many channels are multiplied in it (document 002 section 4.3.4)."""
     return max(sum(abs(factor.power) for factor in parse_term(term, MOTION)), 1)
 
 
 def column_scale(terms: Sequence[str], x: Tensor) -> Tensor:
-    """What the columns x [N, J] of basis functions are divided by, beta std(x) [J], so that higher
-    orders weigh less (4.8), (4.9), ERRATA J15.
+    """Return what the columns x [N, J] of basis functions are divided by, beta std(x) [J], so that higher orders weigh less (4.8), (4.9), ERRATA J15.
 
     Raises:
         FitError: where a column is constant.
@@ -86,7 +83,7 @@ class Correction(nn.Module):
         self.intercept: Tensor
 
     def forward(self, nu_dot: Tensor, nu: Tensor) -> Tensor:
-        """Force [..., 3] at nu_dot [..., 3] and nu [..., 3]."""
+        """Return the force [..., 3] at nu_dot [..., 3] and nu [..., 3]."""
         basis = self.library(torch.cat((nu_dot, nu), dim=-1))
         force: Tensor = basis @ self.coefficients.to(nu.dtype) + self.intercept.to(nu.dtype)
         return force
@@ -113,21 +110,19 @@ class ForceModel(nn.Module):
         self.earth: Tensor
 
     def extended(self, correction: Correction, earth: Tensor | None = None) -> ForceModel:
-        """The next model of the chain."""
+        """Return the next model of the chain."""
         more = self.earth if earth is None else self.earth + earth
         return ForceModel(self.hull, [*self.corrections, correction], more)
 
     def forward(self, nu_dot: Tensor, nu: Tensor) -> Tensor:
-        """tau [..., 3] in N, N, N m that the motion needs in water at rest."""
+        """Return tau [..., 3] in N, N, N m that the motion needs in water at rest."""
         tau = self.hull.required(nu_dot, nu)
         for correction in self.corrections:
             tau = tau + correction(nu_dot, nu)
         return tau
 
     def at_heading(self, nu_dot: Tensor, nu: Tensor, psi: Tensor) -> Tensor:
-        """tau [..., 3] that the thrusters have to give at heading psi [...] rad, against the force
-        that is constant in earth axes.
-        """
+        """Return tau [..., 3] that the thrusters have to give at heading psi [...] rad, against the force that is constant in earth axes."""
         earth = self.earth.to(nu.dtype)
         along, across = to_body(earth[0], earth[1], psi)
         residual: Tensor = self(nu_dot, nu) - torch.stack(
@@ -136,13 +131,14 @@ class ForceModel(nn.Module):
         return residual
 
     def residual(self, tau: Tensor, nu_dot: Tensor, nu: Tensor, psi: Tensor) -> Tensor:
-        """eps = tau - F(nu_dot, nu) [..., 3], what the model does not explain (3.20), (3.25)."""
+        """Return eps = tau - F(nu_dot, nu) [..., 3], what the model does not explain (3.20), (3.25)."""
         return tau - self.at_heading(nu_dot, nu, psi)
 
 
 def accelerating(terms: Sequence[str], names: Sequence[str] = MOTION) -> dict[int, int]:
-    """Numbers of the terms that are an acceleration, each with its axis; the others are free of
-    accelerations.
+    """Return the numbers of the terms that are an acceleration, each with its axis.
+
+    The others are free of accelerations.
 
     Raises:
         ConfigError: where a term is not affine in nu_dot with a constant factor.
@@ -169,7 +165,7 @@ def augmented(
     who: str,
     names: Sequence[str] = MOTION,
 ) -> tuple[Tensor, list[int]]:
-    """M + A [3, 3] of eps = A nu_dot + b(nu), and the numbers of the terms that make b.
+    """Return M + A [3, 3] of eps = A nu_dot + b(nu), and the numbers of the terms that make b.
 
     Raises:
         ConfigError: where a term is not affine in nu_dot with a constant factor.

@@ -104,22 +104,20 @@ class HullConfig(VesselFile, ABC):
 
     @abstractmethod
     def mass_matrix(self) -> list[list[float]]:
-        """M [3, 3], without the scale."""
+        """Return M [3, 3], without the scale."""
 
     @abstractmethod
     def coupling(self) -> float:
-        """What r is multiplied by in the sway momentum of C(nu), in kg m, without the scale."""
+        """Return what r is multiplied by in the sway momentum of C(nu), in kg m, without the scale."""
 
     def equations(self) -> tuple[tuple[str, ...], list[list[float]]]:
-        """nu_dot as terms of (u, v, r), and the coefficients of these, then of tau_x, tau_y, tau_n,
-        on each axis.
-        """
+        """Return nu_dot as terms of (u, v, r), and the coefficients of these, then of tau_x, tau_y, tau_n, on each axis."""
         terms, response = Fossen3(self).products()
         return terms, response.tolist()
 
     @final
     def build(self) -> FossenVessel:
-        """The plant.
+        """Return the plant.
 
         Raises:
             ConfigError: where the mass matrix is not positive definite or is singular.
@@ -135,7 +133,7 @@ class FossenConfig(HullConfig):
     added_mass: AddedMass
 
     def mass_matrix(self) -> list[list[float]]:
-        """Rigid body and added mass."""
+        """Return the rigid body and added mass."""
         body, added = self.rigid_body, self.added_mass
         m, arm = body.m.value, body.m.value * body.x_G.value
         return [
@@ -145,9 +143,7 @@ class FossenConfig(HullConfig):
         ]
 
     def coupling(self) -> float:
-        """The mean of m23 and m32, which makes C that of the symmetric part of M (Fossen 2011
-        section 6.3).
-        """
+        """Return the mean of m23 and m32, which makes C that of the symmetric part of M (Fossen 2011 section 6.3)."""
         mass = self.mass_matrix()
         return 0.5 * (mass[1][2] + mass[2][1])
 
@@ -180,7 +176,7 @@ class MassMatrixConfig(HullConfig):
         ]
 
     def coupling(self) -> float:
-        """m23 alone, as (2.5) has it (ERRATA J4)."""
+        """Return m23 alone, as (2.5) has it (ERRATA J4)."""
         return self.mass.m23.value
 
 
@@ -217,7 +213,7 @@ class Fossen3(nn.Module):
         self.damping: Tensor
 
     def coriolis(self, nu: Tensor) -> Tensor:
-        """C(nu) nu [..., 3] in N, N, N m for velocities nu [..., 3]."""
+        """Return C(nu) nu [..., 3] in N, N, N m for velocities nu [..., 3]."""
         mass = self.mass.to(nu.dtype)
         u, v, r = nu[..., 0], nu[..., 1], nu[..., 2]
         a = mass[1, 1] * v + self.coupling * r
@@ -225,20 +221,16 @@ class Fossen3(nn.Module):
         return torch.stack((-a * r, b * r, a * u - b * v), dim=-1)
 
     def drag(self, nu: Tensor) -> Tensor:
-        """D(nu) nu [..., 3] in N, N, N m for velocities nu [..., 3] through the water."""
+        """Return D(nu) nu [..., 3] in N, N, N m for velocities nu [..., 3] through the water."""
         damping: Tensor = self.terms(nu) @ self.damping.to(nu.dtype).T
         return damping
 
     def required(self, nu_dot: Tensor, nu: Tensor) -> Tensor:
-        """Forces [..., 3] that accelerate the vessel by nu_dot [..., 3] at velocities nu [..., 3]
-        (document 002 eq. (2.10)).
-        """
+        """Return the forces [..., 3] that accelerate the vessel by nu_dot [..., 3] at velocities nu [..., 3] (document 002 eq. (2.10))."""
         return nu_dot @ self.mass.to(nu.dtype).T + self.coriolis(nu) + self.drag(nu)
 
     def products(self) -> tuple[tuple[str, ...], Tensor]:
-        """nu_dot as products: J terms of (u, v, r), and their coefficients with those of tau behind
-        them, [3, J + 3].
-        """
+        """Return nu_dot as products: J terms of (u, v, r), and their coefficients with those of tau behind them, [3, J + 3]."""
         m, cross = self.mass.tolist(), self.coupling
         coriolis = {
             "v r": (0, -m[1][1]),
@@ -267,9 +259,7 @@ class Fossen3(nn.Module):
         self.compacted = True
 
     def forward(self, nu: Tensor, tau: Tensor) -> Tensor:
-        """Acceleration nu_dot [..., 3] from velocities through the water nu [..., 3] and forces tau
-        [..., 3]; [B, 3] once compacted.
-        """
+        """Return the acceleration nu_dot [..., 3] from velocities through the water nu [..., 3] and forces tau [..., 3]; [B, 3] once compacted."""
         if self.compacted:
             # terms as rows: gathering rows and a product of few long rows cost a third of gathering
             # columns
@@ -305,6 +295,6 @@ class FossenVessel(HullPlant):
         return super().in_calm_water()
 
     def acceleration(self, pose: Tensor, nu: Tensor, tau: Tensor) -> Tensor:
-        """nu_dot [B, 3] from velocities through the water [B, 3] and forces [B, 3]."""
+        """Return nu_dot [B, 3] from velocities through the water [B, 3] and forces [B, 3]."""
         acceleration: Tensor = self.hull(nu, tau)
         return acceleration

@@ -18,7 +18,7 @@ GRAVITY = 9.81
 
 
 def froude_number(u: Tensor, v: Tensor, length: float) -> Tensor:
-    """Fn = sqrt(u^2 + v^2) / sqrt(g L) (9.10), any shape, for a hull of `length` in m.
+    """Return the fn = sqrt(u^2 + v^2) / sqrt(g L) (9.10), any shape, for a hull of `length` in m.
 
     Raises:
         ValueError: where the length is not positive.
@@ -29,8 +29,9 @@ def froude_number(u: Tensor, v: Tensor, length: float) -> Tensor:
 
 
 def phase_of(froude: Tensor, boundaries: tuple[float, float] = BOUNDARIES) -> Tensor:
-    """Number of the phase in `PHASES` at each Froude number, integers of the same shape; a boundary
-    belongs to the phase above it.
+    """Return the number of the phase in `PHASES` at each Froude number, integers of the same shape.
+
+    a boundary belongs to the phase above it.
     """
     return torch.bucketize(
         froude, torch.tensor(boundaries, dtype=froude.dtype, device=froude.device), right=True

@@ -27,19 +27,17 @@ class Kinematics(nn.Module, ABC):
 
     @abstractmethod
     def rate(self, pose: Tensor, nu: Tensor) -> Tensor:
-        """Derivative [..., n] of the pose."""
+        """Return the derivative [..., n] of the pose."""
 
     @abstractmethod
-    def carried(
+    def body_components_and_rate(
         self, north: Tensor, east: Tensor, pose: Tensor, nu: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """A constant earth-fixed velocity (north, east) [...] in body axes [..., n], and how that
-        changes while the body turns [..., n].
-        """
+        """Return a constant earth-fixed velocity (north, east) [...] in body axes [..., n], and how that changes while the body turns [..., n]."""
 
     @abstractmethod
-    def pushed(self, north: Tensor, east: Tensor, pose: Tensor) -> Tensor:
-        """An earth-fixed horizontal force in body axes, [..., n]."""
+    def body_components(self, north: Tensor, east: Tensor, pose: Tensor) -> Tensor:
+        """Return an earth-fixed horizontal force in body axes, [..., n]."""
 
 
 @final
@@ -52,15 +50,15 @@ class Planar(Kinematics):
     heading = 2
 
     def rate(self, pose: Tensor, nu: Tensor) -> Tensor:
-        """x_dot = u cos psi - v sin psi, y_dot = u sin psi + v cos psi, psi_dot = r."""
+        """Return x_dot = u cos psi - v sin psi, y_dot = u sin psi + v cos psi, psi_dot = r."""
         u, v, r = torch.unbind(nu, dim=-1)
         north, east = to_earth(u, v, pose[..., 2])
         return torch.stack((north, east, r), dim=-1)
 
-    def carried(
+    def body_components_and_rate(
         self, north: Tensor, east: Tensor, pose: Tensor, nu: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Body components and their derivative: the vector turns by -r."""
+        """Return the body components and their derivative: the vector turns by -r."""
         along, across = to_body(north, east, pose[..., 2])
         zero = torch.zeros_like(along)
         r = nu[..., 2]
@@ -68,8 +66,8 @@ class Planar(Kinematics):
             (r * across, -r * along, zero), dim=-1
         )
 
-    def pushed(self, north: Tensor, east: Tensor, pose: Tensor) -> Tensor:
-        """Force along x and y; no moment."""
+    def body_components(self, north: Tensor, east: Tensor, pose: Tensor) -> Tensor:
+        """Return the force along x and y; no moment."""
         along, across = to_body(north, east, pose[..., 2])
         return torch.stack((along, across, torch.zeros_like(along)), dim=-1)
 
@@ -86,17 +84,15 @@ class Rolling(Kinematics):
     heading = 3
 
     def rate(self, pose: Tensor, nu: Tensor) -> Tensor:
-        """x_dot = u cos psi - v sin psi cos phi, y_dot = u sin psi + v cos psi cos phi, phi_dot =
-        p, psi_dot = r cos phi.
-        """
+        """Return x_dot = u cos psi - v sin psi cos phi, y_dot = u sin psi + v cos psi cos phi, phi_dot = p, psi_dot = r cos phi."""
         cos_phi = torch.cos(pose[..., 2])
         north, east = to_earth(nu[..., 0], nu[..., 1] * cos_phi, pose[..., 3])
         return torch.stack((north, east, nu[..., 2], nu[..., 3] * cos_phi), dim=-1)
 
-    def carried(
+    def body_components_and_rate(
         self, north: Tensor, east: Tensor, pose: Tensor, nu: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Components along the rolled body axes x and y, and their derivative."""
+        """Return the components along the rolled body axes x and y, and their derivative."""
         along, across = to_body(north, east, pose[..., 3])
         cos_phi, sin_phi = torch.cos(pose[..., 2]), torch.sin(pose[..., 2])
         zero = torch.zeros_like(along)
@@ -113,8 +109,8 @@ class Rolling(Kinematics):
         )
         return body, change
 
-    def pushed(self, north: Tensor, east: Tensor, pose: Tensor) -> Tensor:
-        """Force along the rolled body axes x and y; no moments."""
+    def body_components(self, north: Tensor, east: Tensor, pose: Tensor) -> Tensor:
+        """Return the force along the rolled body axes x and y; no moments."""
         along, across = to_body(north, east, pose[..., 3])
         zero = torch.zeros_like(along)
         return torch.stack((along, across * torch.cos(pose[..., 2]), zero, zero), dim=-1)

@@ -11,7 +11,7 @@ from residnet.core.errors import ConfigError
 
 
 def inverse_mass(mass: Tensor, vessel: str) -> Tensor:
-    """Inverse [n, n] of a mass matrix [n, n] in float64.
+    """Return the inverse [n, n] of a mass matrix [n, n] in float64.
 
     Raises:
         ConfigError: where an eigenvalue is zero or has no positive real part, or the matrix is as

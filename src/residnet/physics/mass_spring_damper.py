@@ -37,7 +37,7 @@ class MassSpringDamperConfig(Config):
     tau_max: Newtons = Field(default=1.0, gt=0)
 
     def build(self) -> MassSpringDamper:
-        """The plant."""
+        """Return the plant."""
         return MassSpringDamper(self)
 
 
@@ -55,11 +55,11 @@ class MassSpringDamper(Plant):
         self.tau_max = config.tau_max
 
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Force [..., 1] from the drive [...]; there is nothing to steer."""
+        """Return the force [..., 1] from the drive [...]; there is nothing to steer."""
         return (drive.clamp(-1.0, 1.0) * self.tau_max).unsqueeze(-1)
 
     def rate(self, x: Tensor, w: Tensor) -> Tensor:
-        """x_dot [B, 2] under the force w [B, 1]."""
+        """Return x_dot [B, 2] under the force w [B, 1]."""
         displacement, speed = x[:, 0], x[:, 1]
         return torch.stack(
             (speed, (w[:, 0] - self.d * speed - self.k * displacement) / self.m), dim=-1

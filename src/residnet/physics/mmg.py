@@ -96,8 +96,7 @@ class Prior(NamedTuple):
 
 
 def usual_priors(hull: MMGHull) -> dict[str, Prior]:
-    """Every parameter of the model, dimensionless, as one would expect of a merchant ship with
-    these particulars.
+    """Return every parameter of the model, dimensionless, as one would expect of a merchant ship with these particulars.
 
     Linear hull derivatives by Kijima's formulas; those of higher order are thought to be near zero,
     so that the trials speak for themselves.
@@ -191,9 +190,7 @@ class MMGForces(nn.Module):
         )
 
     def forward(self, z: Tensor, theta: Tensor) -> Tensor:
-        """nu_dot [..., 3] at channels z [..., nz] with parameters theta [..., 34] (see
-        `PARAMETERS`).
-        """
+        """Return nu_dot [..., 3] at channels z [..., nz] with parameters theta [..., 34] (see `PARAMETERS`)."""
         (
             m_x, m_y, J_z, R_0, X_vv, X_vr, X_rr, X_vvvv, Y_0, Y_v, Y_r, Y_vvv, Y_vvr, Y_vrr, Y_rrr,
             N_0, N_v, N_r, N_vvv, N_vvr, N_vrr, N_rrr,

@@ -48,11 +48,11 @@ class SteeringConfig(VesselFile, ABC):
 
     @abstractmethod
     def steering(self) -> LinearSteering:
-        """The model in state space."""
+        """Return the model in state space."""
 
     @abstractmethod
     def times(self) -> dict[str, float]:
-        """Time constants of the poles in s, by name."""
+        """Return the time constants of the poles in s, by name."""
 
     @model_validator(mode="after")
     def _sense(self) -> SteeringConfig:
@@ -70,7 +70,7 @@ class SteeringConfig(VesselFile, ABC):
 
     @final
     def build(self) -> SteeringVessel:
-        """The plant."""
+        """Return the plant."""
         return SteeringVessel(self)
 
 
@@ -81,11 +81,11 @@ class NomotoConfig(SteeringConfig):
     T: TimeConstant
 
     def times(self) -> dict[str, float]:
-        """T."""
+        """Return T."""
         return {"T": self.T.value}
 
     def steering(self) -> LinearSteering:
-        """r alone; v stays as it is."""
+        """Return r alone; v stays as it is."""
         return LinearSteering(
             np.diag([0.0, -1.0 / self.T.value]), np.array([0.0, self.K.value / self.T.value])
         )
@@ -102,7 +102,7 @@ class SecondOrderConfig(SteeringConfig, ABC):
 
     @final
     def times(self) -> dict[str, float]:
-        """T1 and T2."""
+        """Return T1 and T2."""
         return {"T1": self.T1.value, "T2": self.T2.value}
 
 
@@ -117,7 +117,7 @@ class SecondOrderNomotoConfig(SecondOrderConfig):
     kind: Literal["nomoto_second_order"]
 
     def steering(self) -> LinearSteering:
-        """v, r and q."""
+        """Return v, r and q."""
         product, total = self.T1.value * self.T2.value, self.T1.value + self.T2.value
         direct = self.K.value * self.T3.value / product
         a = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0 / product, -total / product]])
@@ -150,7 +150,7 @@ class SideslipNomotoConfig(SecondOrderConfig):
         return self
 
     def steering(self) -> LinearSteering:
-        """v and r, from the companion form of the common denominator."""
+        """Return v and r, from the companion form of the common denominator."""
         product, total = self.T1.value * self.T2.value, self.T1.value + self.T2.value
         k, k_v = self.K.value, self.K_v.value
         out = np.array([[k_v, k_v * self.T_v.value], [k, k * self.T3.value]])
@@ -183,29 +183,31 @@ class SteeringVessel(Plant):
         self.b: Tensor
 
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Rudder angle [..., 1] as a share of its limit; the speed is constant whatever the drive.
+        """Return the rudder angle [..., 1] as a share of its limit.
+
+        The speed is constant whatever the drive.
         """
         return (steer.clamp(-1.0, 1.0) * self.delta_max).unsqueeze(-1)
 
     def delta(self, x: Tensor, w: Tensor) -> Tensor:
-        """Rudder angle [B]."""
+        """Return the rudder angle [B]."""
         return self.servo.value(x[:, 4 + self.free :], w[:, 0])
 
     def rate(self, x: Tensor, w: Tensor) -> Tensor:
-        """x_dot [B, nx] under inputs w [B, 1]."""
+        """Return x_dot [B, nx] under inputs w [B, 1]."""
         z, rudder = x[:, 4 : 4 + self.free], x[:, 4 + self.free :]
         turning = z @ self.a.to(x.dtype).T + self.delta(x, w).unsqueeze(-1) * self.b.to(x.dtype)
         north, east = to_earth(x[:, 3], x[:, 4], x[:, 2])
         pose = torch.stack((north, east, x[:, 5], torch.zeros_like(north)), dim=-1)
         return torch.cat((pose, turning, self.servo.rate(rudder, w[:, 0])), dim=-1)
 
-    def settle(self, x: Tensor, w: Tensor, dt: float) -> Tensor:
-        """State [B, nx] with the rudder moved on by a step of dt seconds."""
+    def end_step(self, x: Tensor, w: Tensor, dt: float) -> Tensor:
+        """Return the state [B, nx] with the rudder moved on by a step of dt seconds."""
         split = 4 + self.free
         return torch.cat((x[:, :split], self.servo.advance(x[:, split:], w[:, 0], dt)), dim=-1)
 
     def approach(self, rows: int) -> Tensor:
-        """Straight ahead at its speed, [rows, nx]."""
+        """Return straight ahead at its speed, [rows, nx]."""
         x = super().approach(rows)
         x[:, 3] = self.speed
         return x

@@ -44,7 +44,7 @@ class AccelerationTerms(Config):
     r: dict[str, Parameter] = Field(default_factory=dict)
 
     def rows(self) -> tuple[dict[str, Parameter], ...]:
-        """Terms of u_dot, v_dot, r_dot."""
+        """Return the terms of u_dot, v_dot, r_dot."""
         return self.u, self.v, self.r
 
     @model_validator(mode="after")
@@ -89,9 +89,7 @@ class OdinConfig(VesselFile):
     wind: WindLoadsConfig | None = None
 
     def equations(self) -> tuple[tuple[str, ...], list[list[float]]]:
-        """nu_dot as terms of (u, v, r), and the coefficients of these, then of tau_x, tau_y, tau_n,
-        on each axis.
-        """
+        """Return nu_dot as terms of (u, v, r), and the coefficients of these, then of tau_x, tau_y, tau_n, on each axis."""
         hull = AccelerationHull(self.gains, self.terms)
         return (
             hull.terms.terms,
@@ -99,7 +97,7 @@ class OdinConfig(VesselFile):
         )
 
     def build(self) -> OdinVessel:
-        """The plant."""
+        """Return the plant."""
         return OdinVessel(self)
 
 
@@ -125,9 +123,7 @@ class AccelerationHull(nn.Module):
         self.gain: Tensor
 
     def forward(self, nu: Tensor, tau: Tensor) -> Tensor:
-        """Acceleration nu_dot [..., 3] from velocities through the water nu [..., 3] and forces tau
-        [..., 3] in N, N, N m.
-        """
+        """Return the acceleration nu_dot [..., 3] from velocities through the water nu [..., 3] and forces tau [..., 3] in N, N, N m."""
         force: Tensor = tau * self.gain.to(nu.dtype) + self.terms(nu) @ self.coefficients.to(
             nu.dtype
         )
@@ -151,6 +147,6 @@ class OdinVessel(HullPlant):
         self.hull = AccelerationHull(vessel.gains, vessel.terms)
 
     def acceleration(self, pose: Tensor, nu: Tensor, tau: Tensor) -> Tensor:
-        """nu_dot [B, 3] from velocities through the water [B, 3] and forces [B, 3]."""
+        """Return nu_dot [B, 3] from velocities through the water [B, 3] and forces [B, 3]."""
         acceleration: Tensor = self.hull(nu, tau)
         return acceleration

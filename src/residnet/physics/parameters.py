@@ -36,7 +36,10 @@ class Parameter(Config):
 
 
 def measured_in(unit: str) -> Callable[[Parameter], Parameter]:
-    """Validator of a parameter whose unit must measure `unit`; the value is converted to it."""
+    """Return a validator of a parameter whose unit must measure `unit`.
+
+    The value is converted to it.
+    """
 
     def convert(parameter: Parameter) -> Parameter:
         try:
@@ -57,7 +60,7 @@ MassDensity = Annotated[Parameter, AfterValidator(measured_in("kg/m^3"))]
 
 
 def above_zero(parameter: Parameter) -> Parameter:
-    """Validator of a parameter that must be positive."""
+    """Return a validator of a parameter that must be positive."""
     if not parameter.value > 0:
         raise ValueError(f"must be positive, given {parameter.value:g}")
     return parameter
@@ -75,9 +78,7 @@ _BASE = {
 
 
 def dimension(unit: str, mass: int = 1) -> tuple[int, int] | None:
-    """Powers of metre and second in an SI unit with `mass` times mass, for example (2, -1) for `kg
-    m^2/s` or `N m s/rad`; None for any other.
-    """
+    """Return the powers of metre and second in an SI unit with `mass` times mass, for example (2, -1) for `kg m^2/s` or `N m s/rad`; None for any other."""
     metres = seconds = masses = 0
     for sign, name, power in re.findall(r"([/ ]?)([^/ ^]*)(?:\^([1-9]))?", unit.strip()):
         if not name:
@@ -91,7 +92,7 @@ def dimension(unit: str, mass: int = 1) -> tuple[int, int] | None:
 
 
 def of_dimension(mass: int, metres: int, seconds: int) -> Callable[[Parameter], Parameter]:
-    """Validator of a parameter in an SI unit of kilogram, metre and second to these powers."""
+    """Return a validator of a parameter in an SI unit of kilogram, metre and second to these powers."""
 
     def check(parameter: Parameter) -> Parameter:
         if dimension(parameter.unit, mass) != (metres, seconds):
@@ -104,7 +105,7 @@ def of_dimension(mass: int, metres: int, seconds: int) -> Callable[[Parameter], 
 
 
 def unit_text(metres: int, seconds: int, mass: int = 1) -> str:
-    """SI unit `kg^c m^a s^b` as text."""
+    """Return SI unit `kg^c m^a s^b` as text."""
 
     def powers(sign: int) -> list[str]:
         given = (("kg", mass), ("m", metres), ("s", seconds))

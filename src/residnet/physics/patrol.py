@@ -79,7 +79,7 @@ class HullForces(Config):
     N: dict[str, Parameter] = Field(default_factory=dict)
 
     def rows(self) -> tuple[dict[str, Parameter], ...]:
-        """X, Y, K, N."""
+        """Return X, Y, K, N."""
         return self.X, self.Y, self.K, self.N
 
     @model_validator(mode="after")
@@ -144,7 +144,7 @@ class PatrolConfig(VesselFile):
     wind: WindLoadsConfig | None = None
 
     def build(self) -> PatrolVessel:
-        """The plant.
+        """Return the plant.
 
         Raises:
             ConfigError: where the mass matrix is not positive definite or is singular.
@@ -212,16 +212,14 @@ class PatrolHull(nn.Module):
         self.coefficients: Tensor
 
     def load(self, phi: Tensor, nu: Tensor) -> Tensor:
-        """Forces [..., 4] in N, N, N m, N m of water, weight and rotation at roll phi [...] and
-        velocities through the water nu [..., 4].
-        """
+        """Return the forces [..., 4] in N, N, N m, N m of water, weight and rotation at roll phi [...] and velocities through the water nu [..., 4]."""
         force: Tensor = self.terms(
             torch.cat((nu, phi.unsqueeze(-1)), dim=-1)
         ) @ self.coefficients.to(nu.dtype)
         return force
 
     def forward(self, phi: Tensor, nu: Tensor, tau: Tensor) -> Tensor:
-        """Acceleration nu_dot [..., 4] under the further forces tau [..., 4]."""
+        """Return the acceleration nu_dot [..., 4] under the further forces tau [..., 4]."""
         return (self.load(phi, nu) + tau) @ self.inverse.to(nu.dtype).T
 
 
@@ -243,14 +241,12 @@ class PatrolVessel(HullPlant):
         self.speed = vessel.speed
 
     def acceleration(self, pose: Tensor, nu: Tensor, tau: Tensor) -> Tensor:
-        """nu_dot [B, 4] at pose [B, 4] from velocities through the water [B, 4] and forces [B, 4]."""
+        """Return nu_dot [B, 4] at pose [B, 4] from velocities through the water [B, 4] and forces [B, 4]."""
         acceleration: Tensor = self.hull(pose[..., 2], nu, tau)
         return acceleration
 
     def approach(self, rows: int) -> Tensor:
-        """Straight ahead at service speed, [rows, nx]: the source's thrust compensates the
-        resistance there.
-        """
+        """Return straight ahead at service speed, [rows, nx]: the source's thrust compensates the resistance there."""
         x = super().approach(rows)
         x[:, self.state.index("u")] = self.speed
         return x

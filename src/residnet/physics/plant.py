@@ -28,32 +28,32 @@ class Plant(nn.Module, ABC):
 
     @abstractmethod
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Commands [..., c] from the normalised drive and steer [...] of a manoeuvre."""
+        """Return the commands [..., c] from the normalised drive and steer [...] of a manoeuvre."""
 
     @abstractmethod
     def rate(self, x: Tensor, w: Tensor) -> Tensor:
-        """x_dot [B, nx] under inputs w [B, m]."""
+        """Return x_dot [B, nx] under inputs w [B, m]."""
 
     def prepare(self, x: Tensor, w: Tensor) -> Tensor:
-        """What a step holds fixed, p [B, k], from the state x [B, nx] at its start and its inputs w
-        [B, m].
-        """
+        """Return what a step holds fixed, p [B, k], from the state x [B, nx] at its start and its inputs w [B, m]."""
         return w
 
     def held_rate(self, x: Tensor, p: Tensor) -> Tensor:
-        """x_dot [B, nx] within a step that holds p = prepare(x, w); equals `rate` under the same
-        inputs.
+        """Return x_dot [B, nx] within a step that holds p = prepare(x, w).
+
+        Equals `rate` under the same inputs.
         """
         return self.rate(x, p)
 
     def approach(self, rows: int) -> Tensor:
-        """State [rows, nx] that trials start from, float64: at rest; a model that only holds near
-        its service speed starts there.
+        """Return the state [rows, nx] that trials start from, float64: at rest.
+
+        a model that only holds near its service speed starts there.
         """
         return torch.zeros(rows, len(self.state), dtype=torch.float64)
 
-    def settle(self, x: Tensor, w: Tensor, dt: float) -> Tensor:
-        """State [B, nx] after what moves once per step of dt seconds has moved."""
+    def end_step(self, x: Tensor, w: Tensor, dt: float) -> Tensor:
+        """Return the state [B, nx] after what moves once per step of dt seconds has moved."""
         return x
 
 
@@ -100,26 +100,22 @@ class HullPlant(Plant, ABC):
 
     @abstractmethod
     def acceleration(self, pose: Tensor, nu: Tensor, tau: Tensor) -> Tensor:
-        """nu_dot [B, n] at pose [B, n] from velocities through the water [B, n] and forces [B, n]."""
+        """Return nu_dot [B, n] at pose [B, n] from velocities through the water [B, n] and forces [B, n]."""
 
     @final
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Commands [..., c] from the normalised drive and steer [...] of a manoeuvre."""
+        """Return the commands [..., c] from the normalised drive and steer [...] of a manoeuvre."""
         return self.actuators.demand(drive, steer)
 
     def in_calm_water(self) -> HullPlant:
-        """This plant without its exogenous inputs: no body or earth-fixed forces, current, wind or
-        air resistance; faster.
-        """
+        """Return this plant without its exogenous inputs: no body or earth-fixed forces, current, wind or air resistance; faster."""
         self.weather = False
         self.inputs = self.actuators.commands
         return self
 
     @final
     def prepare(self, x: Tensor, w: Tensor) -> Tensor:
-        """Inputs with the actuators' forces, where these stay the same over a step, added to the
-        body forces; w itself elsewhere.
-        """
+        """Return the inputs with the actuators' forces, where these stay the same over a step, added to the body forces; w itself elsewhere."""
         if not self.actuators.held:
             return w
         n, c = self.n, self.commands
@@ -130,17 +126,19 @@ class HullPlant(Plant, ABC):
 
     @final
     def held_rate(self, x: Tensor, p: Tensor) -> Tensor:
-        """x_dot [B, nx] within a step, from p = prepare(x, w)."""
+        """Return x_dot [B, nx] within a step, from p = prepare(x, w)."""
         return self._rate(x, p, self.actuators.held)
 
     @final
     def rate(self, x: Tensor, w: Tensor) -> Tensor:
-        """x_dot [B, nx] under inputs w [B, m]."""
+        """Return x_dot [B, nx] under inputs w [B, m]."""
         return self._rate(x, w, False)
 
     def _rate(self, x: Tensor, w: Tensor, held: bool) -> Tensor:
-        """x_dot; `held`: the actuators' forces are among the body forces already, and their states
-        stand still.
+        """Return x_dot.
+
+        `held`: the actuators' forces are among the body forces already, and their states stand
+        still.
         """
         n, c = self.n, self.commands
         pose, nu, a = torch.split(x, self.parts, dim=-1)
@@ -151,23 +149,25 @@ class HullPlant(Plant, ABC):
             return torch.cat(
                 (self.kinematics.rate(pose, nu), self.acceleration(pose, nu, tau), moving), dim=-1
             )
-        water, turned = self.kinematics.carried(w[:, c + n], w[:, c + n + 1], pose, nu)
+        water, turned = self.kinematics.body_components_and_rate(
+            w[:, c + n], w[:, c + n + 1], pose, nu
+        )
         relative = nu - water
         body = (
             w[:, c : c + n]
             if held
             else self.actuators.force(a, command, relative) + w[:, c : c + n]
         )
-        tau = body + self.kinematics.pushed(w[:, c + n + 2], w[:, c + n + 3], pose)
+        tau = body + self.kinematics.body_components(w[:, c + n + 2], w[:, c + n + 3], pose)
         if self.wind is not None:
             tau = tau + self._wind(w[:, c + n + 4], w[:, c + n + 5], pose, nu)
         nu_dot = self.acceleration(pose, relative, tau) + turned
         return torch.cat((self.kinematics.rate(pose, nu), nu_dot, moving), dim=-1)
 
     def _wind(self, speed: Tensor, direction: Tensor, pose: Tensor, nu: Tensor) -> Tensor:
-        """Forces [B, n] of the true wind on the vessel that moves over ground with nu [B, n]."""
+        """Return the forces [B, n] of the true wind on the vessel that moves over ground with nu [B, n]."""
         assert self.wind is not None
-        air = self.kinematics.pushed(
+        air = self.kinematics.body_components(
             -speed * torch.cos(direction), -speed * torch.sin(direction), pose
         )
         force: Tensor = self.wind(air[:, 0] - nu[:, 0], air[:, 1] - nu[:, 1]).index_select(
@@ -176,9 +176,7 @@ class HullPlant(Plant, ABC):
         return force
 
     @final
-    def settle(self, x: Tensor, w: Tensor, dt: float) -> Tensor:
-        """State [B, nx] with the actuators moved on by a step of dt seconds (they are held while
-        the hull moves).
-        """
+    def end_step(self, x: Tensor, w: Tensor, dt: float) -> Tensor:
+        """Return the state [B, nx] with the actuators moved on by a step of dt seconds (they are held while the hull moves)."""
         after = self.actuators.advance(x[:, 2 * self.n :], w[:, : self.commands], dt)
         return torch.cat((x[:, : 2 * self.n], after), dim=-1)

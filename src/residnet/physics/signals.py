@@ -79,8 +79,7 @@ class SignalsConfig(Config):
         return self.inputs + self.exogenous
 
     def resolved(self) -> SignalsConfig:
-        """The same with the vessel's name replaced by its thrusters, so that a saved model needs no
-        vessel file.
+        """Return the same with the vessel's name replaced by its thrusters, so that a saved model needs no vessel file.
 
         Raises:
             ValueError: where there is no such vessel.
@@ -100,11 +99,11 @@ class SignalsConfig(Config):
         return self.model_copy(update={"forces": actuators})
 
     def units(self) -> dict[str, str]:
-        """SI unit of each state and input."""
+        """Return SI unit of each state and input."""
         return {name: CHANNEL_UNITS.get(name, "-") for name in STATE + self.columns}
 
     def build(self) -> Signals:
-        """The module."""
+        """Return the module."""
         return Signals(self.resolved())
 
 
@@ -133,9 +132,7 @@ class Signals(nn.Module):
         self.count = len(names)
 
     def prepare(self, w: Tensor) -> Tensor:
-        """What a step holds fixed: inputs, forces and the air's velocity over ground (north, east),
-        [..., k].
-        """
+        """Return what a step holds fixed: inputs, forces and the air's velocity over ground (north, east), [..., k]."""
         parts = [w[..., : self.inputs]]
         if self.forces:
             parts.append(self.thrusters(w[..., : self.inputs]))
@@ -147,9 +144,7 @@ class Signals(nn.Module):
         return torch.cat(parts, dim=-1)
 
     def forward(self, x: Tensor, p: Tensor) -> Tensor:
-        """Channels z [..., nz] from state x [..., nx] (x, y, psi, u, v, r first) and p =
-        prepare(w).
-        """
+        """Return the channels z [..., nz] from state x [..., nx] (x, y, psi, u, v, r first) and p = prepare(w)."""
         if not self.wind:
             return torch.cat((x[..., 3:6], p), dim=-1)
         known = p.shape[-1] - 2

@@ -15,14 +15,12 @@ _OTHER_SIDE = {"port": "stbd", "stbd": "port"}
 
 
 def channel_parity(name: str) -> int | None:
-    """+1 where a channel keeps its sign in the mirror, -1 where it changes it, None where nobody
-    said.
-    """
+    """Return +1 where a channel keeps its sign in the mirror, -1 where it changes it, None where nobody said."""
     return -1 if name in _ODD else 1 if name in _EVEN else None
 
 
 def term_parity(term: str, names: Sequence[str]) -> int | None:
-    """Parity of a product of channels; None where a channel's is not known."""
+    """Return the parity of a product of channels; None where a channel's is not known."""
     parity = 1
     for factor in parse_term(term, names):
         own = channel_parity(factor.name)
@@ -39,16 +37,13 @@ def term_parity(term: str, names: Sequence[str]) -> int | None:
 
 
 def wrong_parity(term: str, axis: int, names: Sequence[str]) -> bool:
-    """Whether a mirror-symmetric vessel cannot have this term in the acceleration of this axis (0
-    surge, 1 sway, 2 yaw).
-    """
+    """Return whether a mirror-symmetric vessel cannot have this term in the acceleration of this axis (0 surge, 1 sway, 2 yaw)."""
     parity = term_parity(term, names)
     return parity is not None and parity != (1 if VELOCITY[axis] == "u" else -1)
 
 
 def mirrored_channels(names: Sequence[str]) -> tuple[list[int], list[float]] | None:
-    """How channels look in the mirror: the column that each takes its value from, and the sign;
-    None where one is not known.
+    """Return how channels look in the mirror: the column that each takes its value from, and the sign; None where one is not known.
 
     Channels of a port/starboard pair change places.
     """

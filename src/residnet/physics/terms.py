@@ -46,7 +46,7 @@ class Factor(NamedTuple):
 
 
 def parse_term(term: str, names: Sequence[str], *, functions: bool = True) -> tuple[Factor, ...]:
-    """Factors of a term.
+    """Return the factors of a term.
 
     Args:
         term: product of channels; factors stand apart by spaces, `*` or the bars of a magnitude;
@@ -97,9 +97,7 @@ def parse_term(term: str, names: Sequence[str], *, functions: bool = True) -> tu
 def polynomial_terms(
     names: Sequence[str], degree: int, *, magnitudes: Sequence[str] = ()
 ) -> tuple[str, ...]:
-    """All products of `names` up to `degree` (without the constant), then x|x| of every name in
-    `magnitudes`.
-    """
+    """Return all products of `names` up to `degree` (without the constant), then x|x| of every name in `magnitudes`."""
     from itertools import combinations_with_replacement
 
     out = [
@@ -166,7 +164,7 @@ class TermLibrary(nn.Module):
         self.count = len(columns)
 
     def forward(self, z: Tensor) -> Tensor:
-        """Channels z [..., nz] -> terms [..., J]."""
+        """Return the channels z [..., nz] -> terms [..., J]."""
         one = torch.ones_like(z[..., :1])
         parts = [one, z, z.abs()]
         if self.divides:
@@ -196,7 +194,7 @@ class TermLibrary(nn.Module):
 
 
 def _columns(factor: Factor, base: dict[tuple[str, bool, str], int]) -> list[int]:
-    """Columns whose product is the factor."""
+    """Return the columns whose product is the factor."""
     if factor.power > 0:
         return [base[factor.name, factor.magnitude, factor.function]] * factor.power
     inverse = base[factor.name, False, "^-1"]

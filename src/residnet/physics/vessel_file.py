@@ -42,7 +42,7 @@ class VesselFile(Config, ABC):
 
     @abstractmethod
     def build(self) -> Plant:
-        """The plant.
+        """Return the plant.
 
         Raises:
             ConfigError: where the parameters make no plant, for example a singular mass matrix.
@@ -74,7 +74,7 @@ def broken_vessels() -> list[ThirdParty]:
 
 
 def with_base(data: Any, folder: Path | None) -> Any:
-    """Content of a vessel file laid over that of its `base`, which may have one of its own.
+    """Return the content of a vessel file laid over that of its `base`, which may have one of its own.
 
     Sections are merged key by key; a section of another `kind` takes the place of the base's.
     `base` is the name of a file in `configs/vessels`, or the path of a YAML file, looked for beside
@@ -121,9 +121,7 @@ def _file(name: object, folder: Path | None) -> Path:
 
 
 def _frozen(data: Any) -> Any:
-    """The same with tuples for lists: what a validator of a whole model hands on is taken for
-    Python, not for YAML, and lists are no tuples.
-    """
+    """Return the same with tuples for lists: what a validator of a whole model hands on is taken for Python, not for YAML, and lists are no tuples."""
     if isinstance(data, dict):
         return {key: _frozen(value) for key, value in data.items()}
     return tuple(_frozen(value) for value in data) if isinstance(data, list) else data

@@ -201,7 +201,7 @@ class Programme(Config):
 
         plant = load_vessel(self.vessel).build()
         # actuators with dead time move by a step of their own
-        plant.settle(
+        plant.end_step(
             plant.approach(1),
             torch.zeros(1, len(plant.inputs), dtype=torch.float64),
             step / self.substeps,

@@ -66,20 +66,17 @@ class Feasibility(NamedTuple):
 
 
 def feasibility(buoys: Sequence[BuoyConfig], smallest: float) -> list[Feasibility]:
-    """Each buoy's radius beside the vessel's smallest turning radius in m (ERRATA 004 G18: both
-    printed courses ask for less).
-    """
+    """Return each buoy's radius beside the vessel's smallest turning radius in m (ERRATA 004 G18: both printed courses ask for less)."""
     return [Feasibility(number + 1, buoy.radius, smallest) for number, buoy in enumerate(buoys)]
 
 
 def widened(buoys: Sequence[BuoyConfig], smallest: float) -> list[BuoyConfig]:
-    """The buoys with radii that the vessel can follow."""
+    """Return the buoys with radii that the vessel can follow."""
     return [buoy.model_copy(update={"radius": max(buoy.radius, smallest)}) for buoy in buoys]
 
 
 def course_round(start: tuple[float, float], buoys: Sequence[BuoyConfig]) -> list[Piece]:
-    """The taut course from a point past the buoys in their order, to the last one's circle:
-    tangents and arcs in turn.
+    """Return the taut course from a point past the buoys in their order, to the last one's circle: tangents and arcs in turn.
 
     A buoy that the course turns away from is left on its side at a distance: the course is drawn
     without it.
@@ -105,9 +102,7 @@ def course_round(start: tuple[float, float], buoys: Sequence[BuoyConfig]) -> lis
 def _bends_round(
     start: tuple[float, float], buoys: Sequence[tuple[int, BuoyConfig]], place: int
 ) -> bool:
-    """Whether the line from the point before a buoy over it to the next one bends towards the side
-    that it is left on.
-    """
+    """Return whether the line from the point before a buoy over it to the next one bends towards the side that it is left on."""
     own, after = buoys[place][1], buoys[place + 1][1]
     north, east = start if place == 0 else (buoys[place - 1][1].north, buoys[place - 1][1].east)
     bend = (own.north - north) * (after.east - own.east) - (own.east - east) * (
@@ -117,7 +112,7 @@ def _bends_round(
 
 
 def _tangents(start: tuple[float, float], buoys: Sequence[tuple[int, BuoyConfig]]) -> list[Piece]:
-    """The course that touches every circle of numbered buoys."""
+    """Return the course that touches every circle of numbered buoys."""
     signs = [1 if buoy.leave_to == "starboard" else -1 for _, buoy in buoys]
     lines: list[tuple[float, float, float, float]] = []
     north, east, radius, sign = start[0], start[1], 0.0, 0

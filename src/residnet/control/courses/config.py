@@ -105,7 +105,7 @@ def plan_course(
     limit: float,
     steady: SteadyTurn,
 ) -> PlannedCourse:
-    """The shortest course that the nominal vessel can follow with a share of its rudder.
+    """Return the shortest course that the nominal vessel can follow with a share of its rudder.
 
     Raises:
         ConfigError: where there is none.
@@ -132,8 +132,9 @@ def plan_course(
 
 
 def _to_enter(config: BuoyCourseConfig, rudder: float) -> list[Mark]:
-    """Turns where the line from way-point to way-point bends; one that the line enters anyway needs
-    none.
+    """Return the turns where the line from way-point to way-point bends.
+
+    One that the line enters anyway needs none.
     """
     depth = -(1.0 - config.reach) * config.acceptance
     places = [config.start, *((buoy.north, buoy.east) for buoy in config.buoys)]
@@ -161,7 +162,7 @@ def _to_enter(config: BuoyCourseConfig, rudder: float) -> list[Mark]:
 def _to_pass(
     config: BuoyCourseConfig, buoys: tuple[BuoyConfig, ...], rudder: float, smallest: float
 ) -> list[Mark]:
-    """Turns where the taut course bends round a circle."""
+    """Return the turns where the taut course bends round a circle."""
     arcs = [piece for piece in course_round(config.start, buoys) if piece.turn != 0]
     marks = []
     for number, buoy in enumerate(buoys, start=1):

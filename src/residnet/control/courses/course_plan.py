@@ -69,7 +69,7 @@ def plan(
     step: float,
     beyond: float,
 ) -> Course:
-    """The quickest course of turns and legs from a start past the marks to the goal.
+    """Return the quickest course of turns and legs from a start past the marks to the goal.
 
     Args:
         start: (north, east) in m.
@@ -127,9 +127,7 @@ class _Search:
         )
 
     def begin(self, guesses: Sequence[tuple[Array, Array]]) -> tuple[Array, Array]:
-        """Times and rudder angles of the best course of turns from straight ahead: searched for
-        from each guess, and mark by mark where none of these passes all marks.
-        """
+        """Return the times and rudder angles of the best course of turns from straight ahead: searched for from each guess, and mark by mark where none of these passes all marks."""
         problems: dict[bytes, Problem] = {}
         tries = []
         for z, rudder in guesses:
@@ -148,8 +146,7 @@ class _Search:
         return z, rudder
 
     def _grown(self, whole: Problem, guess: Array, rudder: Array) -> Array:
-        """Times of a course that is searched for to the first mark, then on to the next, and so on.
-        """
+        """Return the times of a course that is searched for to the first mark, then on to the next, and so on."""
         asked, first = self.asked, self.asked.first
         marks = (*asked.marks, asked.goal)
         z = guess[: 2 + 2 * first]
@@ -183,7 +180,7 @@ class _Search:
         return z
 
     def chain(self, z: Array, rudder: Array) -> list[Turn]:
-        """The turns of z, each from the motion at the end of the leg before it."""
+        """Return the turns of z, each from the motion at the end of the leg before it."""
         made: list[Turn] = []
         state = self.make.straight
         for hold, leg, angle in zip(
@@ -196,7 +193,7 @@ class _Search:
         return made
 
     def settle(self, z: Array, rudder: Array) -> tuple[Array, list[Turn]]:
-        """The best of rounds in which turns and legs come to belong to each other."""
+        """Return the best of rounds in which turns and legs come to belong to each other."""
         made = self.chain(z, rudder)
         best, cost = (z, made), self.fixed(made).cost(z)
         for width in _NARROW if len(rudder) else ():
@@ -235,9 +232,7 @@ def _holds(angles: Array, rudder: float, turning: Turning) -> Array:
 
 
 def _guess(asked: Asked, turning: Turning, wide: float, short: float) -> tuple[Array, Array]:
-    """Tangents of circles about the marks, wider than they are or, where they are entered, a share
-    of the turning radius: times, and rudder angles with their signs.
-    """
+    """Return the tangents of circles about the marks, wider than they are or, where they are entered, a share of the turning radius: times, and rudder angles with their signs."""
     points = np.array(
         [asked.start, *[(mark.north, mark.east) for mark in (*asked.marks, asked.goal)]]
     )
@@ -271,7 +266,7 @@ def _guess(asked: Asked, turning: Turning, wide: float, short: float) -> tuple[A
 def _composed(
     asked: Asked, z: Array, made: Sequence[Turn], speed: float, step: float, beyond: float
 ) -> Course:
-    """Legs and turns as one course."""
+    """Return the legs and turns as one course."""
     level, unit = float(z[0]), asked.unit
     at = asked.start + speed * unit * float(z[1]) * np.array([math.cos(level), math.sin(level)])
     parts = [(np.stack((asked.start, at)), np.full(2, level), np.zeros(2))]

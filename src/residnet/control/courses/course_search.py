@@ -124,9 +124,7 @@ class Family:
         self.spline = CubicSpline(holds, np.array(rows)) if len(turns) > 1 else None
 
     def __call__(self, hold: float) -> tuple[Array, Array, Array, float]:
-        """Track [N, 2] until the counter-rudder ends, the leg's [M, 2] and its headings [M] by
-        `times`, and when it begins.
-        """
+        """Return the track [N, 2] until the counter-rudder ends, the leg's [M, 2] and its headings [M] by `times`, and when it begins."""
         row = self.row if self.spline is None else self.spline(hold)
         split, end = 2 * self.points, 2 * (self.points + len(self.times))
         return (
@@ -138,14 +136,14 @@ class Family:
 
 
 def turned(points: Array, heading: float) -> Array:
-    """Points [N, 2] of a frame with that heading in the earth's."""
+    """Return the points [N, 2] of a frame with that heading in the earth's."""
     c, s = math.cos(heading), math.sin(heading)
     rotated: Array = points @ np.array([[c, s], [-s, c]])
     return rotated
 
 
 def _clearance(mark: Mark, track: Array) -> float:
-    """Distance of a mark from a track of straight pieces, positive on the inner side of its turn."""
+    """Return the distance of a mark from a track of straight pieces, positive on the inner side of its turn."""
     place = np.array([mark.north, mark.east])
     begin, piece = track[:-1], np.diff(track, axis=0)
     square = (piece**2).sum(axis=1)
@@ -171,9 +169,7 @@ class Problem:
         self.asked, self.families, self.straight = asked, families, straight
 
     def legs(self, z: Array) -> tuple[list[tuple[Array, Array]], float, float]:
-        """Tracks of each turn (of none before the first leg) and of the leg behind it in the
-        earth's frame, the heading at the end, and the time of all.
-        """
+        """Return the tracks of each turn (of none before the first leg) and of the leg behind it in the earth's frame, the heading at the end, and the time of all."""
         level, unit = float(z[0]), self.asked.unit
         along = np.array([math.cos(level), math.sin(level)])
         at = self.asked.start + self.straight * unit * float(z[1]) * along
@@ -190,9 +186,7 @@ class Problem:
         return parts, level, time
 
     def results(self, z: Array) -> Array:
-        """Time of the course, clearances of the marks and of the goal, and the distance left along
-        the last leg, where it ends abeam.
-        """
+        """Return the time of the course, clearances of the marks and of the goal, and the distance left along the last leg, where it ends abeam."""
         asked = self.asked
         parts, level, time = self.legs(z)
         found = []
@@ -208,9 +202,7 @@ class Problem:
         return np.array([time, *(value / asked.radius for value in found)])
 
     def missed(self, z: Array) -> Array:
-        """How far the clearances lie outside their limits, and the course's end from where it
-        should be, in turning radii.
-        """
+        """Return how far the clearances lie outside their limits, and the course's end from where it should be, in turning radii."""
         found = self.results(z)[1:]
         outside = np.maximum(
             np.maximum(self.asked.low - found[:-1], found[:-1] - self.asked.high), 0.0
@@ -218,7 +210,7 @@ class Problem:
         return np.append(outside, abs(found[-1]))
 
     def cost(self, z: Array) -> float:
-        """Its time, and what it misses as a penalty."""
+        """Return its time, and what it misses as a penalty."""
         return float(self.results(z)[0] + _PENALTY * self.missed(z).max())
 
 
@@ -242,8 +234,7 @@ class _Differences:
 
 
 def quickest(problem: Problem, z: Array, reach: float) -> Array:
-    """The best that sequential quadratic programming finds from z, within the times that the
-    families know; a single turn's time stays.
+    """Return the best that sequential quadratic programming finds from z, within the times that the families know; a single turn's time stays.
 
     The time is linear in z: how far its first steps go depends on the weight of the time beside the
     constraints, so that several are tried.

@@ -13,7 +13,7 @@ _TURN = 2.0 * math.pi
 
 
 def _arc(side: float, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Angle turned from one heading to another, side +1 to starboard and -1 to port."""
+    """Return the angle turned from one heading to another, side +1 to starboard and -1 to port."""
     # a full turn that is none but for rounding
     turned = (side * (end - begin)) % _TURN
     return np.where(turned > _TURN - 1e-9, 0.0, turned)
@@ -26,10 +26,7 @@ def _centre(pose: np.ndarray, side: float, radius: float) -> np.ndarray:
 
 
 def dubins_length(start: np.ndarray, end: np.ndarray, radius: float) -> np.ndarray:
-    """Length [...] in m of the shortest path between poses [..., 3] = (north, east, heading),
-    shapes broadcast, whose turns have a radius of at least `radius` (L. E. Dubins 1957): two arcs
-    and their common tangent, or three arcs.
-    """
+    """Return the length [...] in m of the shortest path between poses [..., 3] = (north, east, heading), shapes broadcast, whose turns have a radius of at least `radius` (L. E. Dubins 1957): two arcs and their common tangent, or three arcs."""
     start, end = np.broadcast_arrays(np.asarray(start, dtype=float), np.asarray(end, dtype=float))
     h0, h1 = start[..., 2], end[..., 2]
     best = np.full(h0.shape, np.inf)
@@ -71,8 +68,7 @@ def shortest_course(
     places: int = 24,
     headings: int = 36,
 ) -> float:
-    """Length in m of the shortest path from a pose (heading None: any) that enters the circles of
-    acceptance of way-points in their order.
+    """Return the length in m of the shortest path from a pose (heading None: any) that enters the circles of acceptance of way-points in their order.
 
     Dynamic programming over `places` on each circle and `headings` there: an upper bound of the
     shortest, which falls as both grow.

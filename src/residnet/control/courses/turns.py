@@ -48,7 +48,7 @@ class Turn:
     columns: tuple[int, int, int]
 
     def along(self, times: Array) -> tuple[Array, Array]:
-        """Track [M, 2] and heading [M] of the leg at times [M] in s since it began."""
+        """Return the track [M, 2] and heading [M] of the leg at times [M] in s since it began."""
         states = self.leg(times)
         return states[:, list(self.columns[:2])], states[:, self.columns[2]]
 
@@ -77,7 +77,7 @@ class TurnMaker:
     def __call__(
         self, holds: Array, rudder: Array, begin: Sequence[Array], leg: float
     ) -> list[list[Turn]]:
-        """Turns of n rudder angles, each held for K times.
+        """Return the turns of n rudder angles, each held for K times.
 
         Args:
             holds: [n, K] in s.
@@ -119,7 +119,7 @@ class TurnMaker:
         return [turns[k * i : k * i + k] for i in range(n)]
 
     def _phase(self, x: Array, rudder: Array, duration: float) -> CubicSpline:
-        """States [B, nx] by the time from x [B, nx] on, under rudder angles [B]."""
+        """Return the states [B, nx] by the time from x [B, nx] on, under rudder angles [B]."""
         steps = max(math.ceil(duration / self.dt), 3)
         w = self.inputs.unsqueeze(1).repeat(len(x), steps, 1)
         w[:, :, 0] = torch.from_numpy(rudder).unsqueeze(-1)
@@ -129,7 +129,10 @@ class TurnMaker:
         return CubicSpline(self.dt * np.arange(steps + 1), states.transpose(0, 1).numpy())
 
     def _stops(self, countered: CubicSpline, side: Array) -> Array:
-        """Times [B] at which the yaw towards a side has stopped; the end where it does not."""
+        """Return the times [B] at which the yaw towards a side has stopped.
+
+        The end where it does not.
+        """
         yaw = countered(countered.x)[:, :, self.vessel.column("r")] * side
         after, rows = np.argmax(yaw <= 0.0, axis=0), np.arange(len(side))
         before = np.maximum(after - 1, 0)
@@ -140,7 +143,7 @@ class TurnMaker:
 
 
 def _of_rows(states: CubicSpline, times: Array, rows: NDArray[np.intp]) -> Array:
-    """States [M, nx] of rows [M] at times [M]."""
+    """Return the states [M, nx] of rows [M] at times [M]."""
     found: Array = states(times)[np.arange(len(times)), rows]
     return found
 
@@ -155,9 +158,7 @@ class SteadyTurn:
 
 
 def steady_turn(vessel: SteeredVessel, rudder: float, duration: float, dt: float) -> SteadyTurn:
-    """What is left after `duration` s of a held rudder angle in rad: at the rudder's limit, the
-    smallest turn that the vessel makes.
-    """
+    """Return what is left after `duration` s of a held rudder angle in rad: at the rudder's limit, the smallest turn that the vessel makes."""
     x, w = vessel.start(torch.ones(1, dtype=torch.float64))
     w[:, 0] = rudder
     variation = torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64)

@@ -73,9 +73,7 @@ class CourseGuidance(Reference):
         self.may_finish = True
 
     def at(self, place: Tensor) -> Tensor:
-        """North, east, direction, heading, rudder, and the curvatures of direction and heading [B,
-        7] at places [B] in m.
-        """
+        """Return the north, east, direction, heading, rudder, and the curvatures of direction and heading [B, 7] at places [B] in m."""
         along = (place / self.spacing).clamp(0.0, float(self.table.shape[0]) - 1.001)
         before = along.floor()
         share = (along - before).unsqueeze(-1)
@@ -85,14 +83,14 @@ class CourseGuidance(Reference):
         ].to(place.dtype)
 
     def error(self, x: Tensor, place: Tensor) -> tuple[Tensor, Tensor]:
-        """Distance ahead [B] of a place along the course, and cross-track error [B], in m."""
+        """Return the distance ahead [B] of a place along the course, and cross-track error [B], in m."""
         known = self.at(place)
         north, east = x[:, self.x] - known[:, 0], x[:, self.y] - known[:, 1]
         c, s = torch.cos(known[:, 2]), torch.sin(known[:, 2])
         return c * north + s * east, c * east - s * north
 
     def forward(self, x: Tensor, k: int, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Reference [B, 3] and memory."""
+        """Return the reference [B, 3] and memory."""
         place = s[:, 0]
         ahead, aside = self.error(x, place)
         closeness = (1.0 - self.at(place)[:, 5] * aside).clamp(min=self.least)
@@ -122,5 +120,5 @@ class CourseGuidance(Reference):
         return reference, torch.cat((place.unsqueeze(-1), memory), dim=-1)
 
     def finished(self, x: Tensor, k: int, s: Tensor) -> Tensor:
-        """Rows behind the end of the course."""
+        """Return the rows behind the end of the course."""
         return s[:, 0] >= self.length

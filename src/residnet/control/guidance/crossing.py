@@ -51,7 +51,7 @@ class CrossingConfig(Config):
         return self
 
     def filter(self) -> ReferenceFilterConfig:
-        """The filter behind the guidance."""
+        """Return the filter behind the guidance."""
         last = (*self.points[-1], 0.0)
         three = (self.frequency,) * 3
         return ReferenceFilterConfig(
@@ -79,16 +79,14 @@ class Crossing(Reference):
         self.points = torch.tensor(config.points, dtype=torch.float64)
 
     def initial_state(self, x: Tensor) -> Tensor:
-        """At rest where the ferry is, on the first leg; NaN for no point yet."""
+        """Return at rest where the ferry is, on the first leg; NaN for no point yet."""
         rest = torch.zeros_like(x[:, :1])
         return torch.cat(
             (x[:, :3], rest.expand(-1, 7), torch.full_like(x[:, :3], torch.nan)), dim=-1
         )
 
     def target(self, x: Tensor, heading: Tensor, leg: Tensor) -> tuple[Tensor, Tensor]:
-        """Point and heading [B, 3] to steer for from states x [B, nx], and the leg [B] after a
-        change; `heading` [B] is the desired one.
-        """
+        """Return the point and heading [B, 3] to steer for from states x [B, nx], and the leg [B] after a change; `heading` [B] is the desired one."""
         last = len(self.points) - 2
         place = x[:, :2]
         near = (self.points[leg + 1] - place).norm(dim=-1) < self.config.circle
@@ -106,7 +104,7 @@ class Crossing(Reference):
         return torch.cat((point, (heading + wrap(wanted - heading))[:, None]), dim=-1), leg
 
     def forward(self, x: Tensor, k: int, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Reference [B, 18] of step k and the memory one step later."""
+        """Return the reference [B, 18] of step k and the memory one step later."""
         old = s[:, 9].long()
         target, leg = self.target(x, s[:, 2], old)
         # where the point jumps (first step, change of leg, the stop) it has no rate

@@ -53,17 +53,15 @@ class DriftEstimate(nn.Module):
         self.most = _MOST
 
     def across(self, direction: Tensor, s: Tensor) -> Tensor:
-        """Part [B] to starboard of a direction [B] in rad."""
+        """Return the part [B] to starboard of a direction [B] in rad."""
         return torch.cos(direction) * s[:, 1] - torch.sin(direction) * s[:, 0]
 
     def along(self, direction: Tensor, s: Tensor) -> Tensor:
-        """Part [B] along a direction [B] in rad."""
+        """Return the part [B] along a direction [B] in rad."""
         return torch.cos(direction) * s[:, 0] + torch.sin(direction) * s[:, 1]
 
     def forward(self, error: Tensor, direction: Tensor, s: Tensor) -> Tensor:
-        """Memory after a step at the cross-track error [B] in m from a way in a direction [B] in
-        rad.
-        """
+        """Return the memory after a step at the cross-track error [B] in m from a way in a direction [B] in rad."""
         aim = error + self.distance * self.across(direction, s)
         grown = self.dt * self.gain * error / (self.distance**2 + aim.square())
         s = s + grown.unsqueeze(-1) * torch.stack(

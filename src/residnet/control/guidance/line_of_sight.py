@@ -22,9 +22,7 @@ class LineOfSight(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, error: Tensor, direction: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Angle [B] in rad, added to the leg's direction [B] in rad, from the cross-track error [B]
-        in m, positive to starboard of the leg; and the memory [B, n_state], zeros at the start.
-        """
+        """Return the angle [B] in rad, added to the leg's direction [B] in rad, from the cross-track error [B] in m, positive to starboard of the leg; and the memory [B, n_state], zeros at the start."""
 
 
 @final
@@ -41,7 +39,7 @@ class LookAhead(LineOfSight):
         self.distance = distance
 
     def forward(self, error: Tensor, direction: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Angle [B]; never a right angle."""
+        """Return the angle [B]; never a right angle."""
         return -torch.atan(error / self.distance), s
 
 
@@ -61,7 +59,7 @@ class Enclosure(LineOfSight):
         self.radius = radius
 
     def forward(self, error: Tensor, direction: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Angle [B]; a right angle from the radius on."""
+        """Return the angle [B]; a right angle from the radius on."""
         return -torch.asin((error / self.radius).clamp(-1.0, 1.0)), s
 
 
@@ -85,7 +83,7 @@ class IntegralLookAhead(LineOfSight):
         self.n_state = 2
 
     def forward(self, error: Tensor, direction: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Angle [B]; never a right angle."""
+        """Return the angle [B]; never a right angle."""
         return -torch.atan(error / self.distance + self.drift.across(direction, s)), self.drift(
             error, direction, s
         )
@@ -102,7 +100,7 @@ class LookAheadConfig(Config):
     distance: Metres = Field(gt=0)
 
     def build(self, dt: float) -> LineOfSight:
-        """The law, for steps of dt seconds."""
+        """Return the law, for steps of dt seconds."""
         return LookAhead(self.distance)
 
 
@@ -117,7 +115,7 @@ class EnclosureConfig(Config):
     radius: Metres = Field(gt=0)
 
     def build(self, dt: float) -> LineOfSight:
-        """The law, for steps of dt seconds."""
+        """Return the law, for steps of dt seconds."""
         return Enclosure(self.radius)
 
 
@@ -135,7 +133,7 @@ class IntegralLookAheadConfig(Config):
     gain: MetresPerSecond = Field(gt=0)
 
     def build(self, dt: float) -> LineOfSight:
-        """The law, for steps of dt seconds."""
+        """Return the law, for steps of dt seconds."""
         return IntegralLookAhead(self.distance, self.gain, dt)
 
 

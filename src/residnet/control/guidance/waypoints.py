@@ -63,7 +63,7 @@ class WaypointGuidance(Reference):
         self.may_finish = True
 
     def initial_state(self, x: Tensor) -> Tensor:
-        """The first way-point, from here."""
+        """Return the first way-point, from here."""
         rest = torch.zeros(x.shape[0], self.n_state - 3, dtype=x.dtype, device=x.device)
         return torch.cat(
             (
@@ -76,9 +76,7 @@ class WaypointGuidance(Reference):
         )
 
     def leg(self, x: Tensor, number: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Direction [B] of the leg that ends at a way-point in rad, distance [B] still to go along
-        it, and cross-track error [B] in m, positive to starboard of it.
-        """
+        """Return the direction [B] of the leg that ends at a way-point in rad, distance [B] still to go along it, and cross-track error [B] in m, positive to starboard of it."""
         points = self.points.to(x.dtype)
         target = points[number.clamp(max=len(points) - 1)]
         before = torch.where(
@@ -91,7 +89,7 @@ class WaypointGuidance(Reference):
         return direction, ahead, north * torch.sin(direction) - east * torch.cos(direction)
 
     def forward(self, x: Tensor, k: int, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Reference heading [B, 1] in rad and the memory."""
+        """Return the reference heading [B, 1] in rad and the memory."""
         number = s[:, 0].long()
         direction, ahead, error = self.leg(x, number, s)
         reached = (ahead <= 0) | (ahead * ahead + error * error <= self.acceptance**2)
@@ -111,5 +109,5 @@ class WaypointGuidance(Reference):
         return heading, torch.cat((number.to(x.dtype).unsqueeze(-1), s[:, 1:3], memory), dim=-1)
 
     def finished(self, x: Tensor, k: int, s: Tensor) -> Tensor:
-        """Rows behind their last way-point."""
+        """Return the rows behind their last way-point."""
         return s[:, 0] >= self.points.shape[0]

@@ -67,7 +67,7 @@ class WheelOver(nn.Module):
         self.table: Tensor
 
     def forward(self, change: Tensor) -> Tensor:
-        """Distance [B] in m for changes of course [B] in rad, within +-pi."""
+        """Return the distance [B] in m for changes of course [B] in rad, within +-pi."""
         table = self.table.to(change.dtype)
         along = change.abs() * (float(table.shape[0] - 1) / math.pi)
         before = along.floor().clamp(max=float(table.shape[0] - 2))
@@ -76,9 +76,7 @@ class WheelOver(nn.Module):
 
 
 def _turns(turning: Turning, limit: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Heading changes [N] in rad from 0 to past pi, where the lines before and after each turn meet
-    [N] in m from its beginning, and its track [N, M, 2] in m, ahead and aside.
-    """
+    """Return the heading changes [N] in rad from 0 to past pi, where the lines before and after each turn meet [N] in m from its beginning, and its track [N, M, 2] in m, ahead and aside."""
     full, time = turning.gain * limit, turning.time
     held = np.concatenate(
         ([0.0], np.geomspace(1e-3 * time, math.pi / full + 2.0 * time, 4 * _ANGLES))

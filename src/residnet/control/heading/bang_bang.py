@@ -58,9 +58,7 @@ class BangBangHeading(Policy):
         self.kp, self.kd = kp, time / (2.0 * gain) if kd is None else kd
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Rudder command [B, 1] in rad from the state x [B, nx] and the reference heading [B, 1] in
-        rad; it keeps no memory.
-        """
+        """Return the rudder command [B, 1] in rad from the state x [B, nx] and the reference heading [B, 1] in rad; it keeps no memory."""
         r = x[:, self.r : self.r + 1]
         error = wrap(reference - x[:, self.psi : self.psi + 1])
         braking = self.time * (r - r.sign() * self.steady * torch.log1p(r.abs() / self.steady))

@@ -1,5 +1,4 @@
-"""Time-optimal heading changes of Nomoto's first-order model with a rudder that takes time to move.
-"""
+"""Time-optimal heading changes of Nomoto's first-order model with a rudder that takes time to move."""
 
 from __future__ import annotations
 
@@ -68,9 +67,7 @@ class RatedBangBangHeading(Policy):
         self.near, self.slow = capture
 
     def _ramp(self, r: Tensor, start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
-        """Yaw rate after the rudder has moved from one angle to another at its rate, and the
-        integral of the angle.
-        """
+        """Return the yaw rate after the rudder has moved from one angle to another at its rate, and the integral of the angle."""
         wait = (end - start).abs() / self.rate
         slope = (end - start).sign() * self.rate
         steady = self.gain * (start - slope * self.time)
@@ -80,9 +77,7 @@ class RatedBangBangHeading(Policy):
         )
 
     def _braked(self, r: Tensor, rudder: Tensor, effort: Tensor) -> tuple[Tensor, Tensor]:
-        """Yaw rate after a braking programme of some effort [rad], and the heading gained in it;
-        effort beyond the limit is time held there.
-        """
+        """Return the yaw rate after a braking programme of some effort [rad], and the heading gained in it; effort beyond the limit is time held there."""
         most = effort.clamp(max=self.limit)
         after, first = self._ramp(r, rudder, -most)
         wait = (effort - most) / self.rate
@@ -91,9 +86,7 @@ class RatedBangBangHeading(Policy):
         return end, self.gain * (first - most * wait + last) + self.time * (r - end)
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Rudder command [B, 1] in rad from the state x [B, nx] and the reference heading [B, 1] in
-        rad; it keeps no memory.
-        """
+        """Return the rudder command [B, 1] in rad from the state x [B, nx] and the reference heading [B, 1] in rad; it keeps no memory."""
         error = wrap(reference - x[:, self.psi : self.psi + 1])
         turn, angle = x[:, self.r : self.r + 1], x[:, self.delta : self.delta + 1]
         # this step goes by as it is: the rudder answers at its end

@@ -48,7 +48,7 @@ class ControllerConfig(Config, ABC):
 
     @abstractmethod
     def build(self, steering: Steering) -> Policy:
-        """The controller.
+        """Return the controller.
 
         Raises:
             ConfigError: where a gain is missing that tuning should have filled in.
@@ -60,20 +60,20 @@ class TunedConfig(ControllerConfig, ABC):
 
     @abstractmethod
     def parameters(self) -> dict[str, float | None]:
-        """Parameters by name; None where they are to be tuned."""
+        """Return the parameters by name; None where they are to be tuned."""
 
     @abstractmethod
     def axes(self, turning: Turning) -> dict[str, Axis]:
-        """Where tuning searches."""
+        """Return where tuning searches."""
 
     @abstractmethod
     def gains(
         self, parameters: dict[str, Tensor], turning: Turning
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """kp, kd, ki of parameters, any shape."""
+        """Return kp, kd, ki of parameters, any shape."""
 
     def build(self, steering: Steering) -> Policy:
-        """A PID controller with these gains."""
+        """Return a PID controller with these gains."""
         missing = [name for name, value in self.parameters().items() if value is None]
         if missing:
             raise ConfigError(
@@ -107,11 +107,11 @@ class PdConfig(TunedConfig):
     damping_time: Seconds | None = Field(default=None, gt=0)
 
     def parameters(self) -> dict[str, float | None]:
-        """kp and damping_time."""
+        """Return kp and damping_time."""
         return {"kp": self.kp, "damping_time": self.damping_time}
 
     def axes(self, turning: Turning) -> dict[str, Axis]:
-        """Two decades of kp, damping within a tenth to twice T."""
+        """Return two decades of kp, damping within a tenth to twice T."""
         return {
             "kp": Axis(0.3, 60.0),
             "damping_time": Axis(0.05 * turning.time, 2.0 * turning.time),
@@ -143,7 +143,7 @@ class PidConfig(TunedConfig):
     integral_time: Seconds | None = Field(default=None, gt=0)
 
     def parameters(self) -> dict[str, float | None]:
-        """kp, damping_time, integral_time."""
+        """Return kp, damping_time, integral_time."""
         return {
             "kp": self.kp,
             "damping_time": self.damping_time,
@@ -176,17 +176,17 @@ class LqrConfig(TunedConfig):
     rate_weight: float | None = Field(default=None, ge=0)
 
     def parameters(self) -> dict[str, float | None]:
-        """heading_weight, rate_weight."""
+        """Return heading_weight, rate_weight."""
         return {"heading_weight": self.heading_weight, "rate_weight": self.rate_weight}
 
     def axes(self, turning: Turning) -> dict[str, Axis]:
-        """Both weights over decades."""
+        """Return both weights over decades."""
         return {"heading_weight": Axis(0.1, 3600.0), "rate_weight": Axis(1e-3, 3600.0)}
 
     def gains(
         self, parameters: dict[str, Tensor], turning: Turning
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """kp and kd of the weights."""
+        """Return kp and kd of the weights."""
         kp = parameters["heading_weight"].sqrt()
         square = (
             1.0
@@ -204,7 +204,7 @@ class BangBangConfig(ControllerConfig):
     kind: Literal["bang_bang"] = "bang_bang"
 
     def build(self, steering: Steering) -> Policy:
-        """The controller."""
+        """Return the controller."""
         vessel, turning = steering.vessel, steering.turning
         if vessel.rate is not None:
             return RatedBangBangHeading(
@@ -238,19 +238,22 @@ class DocumentConfig(ControllerConfig):
     weight: float = Field(default=0.2, ge=0, le=1)
 
     def predictor(self, steering: Steering) -> SimulatedPredictor:
-        """The nominal vessel; long horizons are predicted in steps of at most a twentieth of T."""
+        """Return the nominal vessel.
+
+        Long horizons are predicted in steps of at most a twentieth of T.
+        """
         steps = math.ceil(self.horizon / max(steering.turning.time / 20.0, steering.dt))
         model = NominalSteering(steering.vessel, self.horizon / steps)
         return SimulatedPredictor(model, steering.vessel.state, steps, model.others)
 
     def law(self, predictor: Predictor, steering: Steering) -> DocumentAutopilot:
-        """The controller with some predictor of this horizon."""
+        """Return the controller with some predictor of this horizon."""
         return DocumentAutopilot(
             predictor, limit=steering.limit, candidates=self.candidates, weight=self.weight
         )
 
     def build(self, steering: Steering) -> Policy:
-        """The controller with the exact predictor."""
+        """Return the controller with the exact predictor."""
         return self.law(self.predictor(steering), steering)
 
 

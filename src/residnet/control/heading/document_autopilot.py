@@ -1,5 +1,4 @@
-"""The predictive heading autopilot of document 004 (section 6.1.3, eqs. (6.3), (6.4), ERRATA 004).
-"""
+"""The predictive heading autopilot of document 004 (section 6.1.3, eqs. (6.3), (6.4), ERRATA 004)."""
 
 from __future__ import annotations
 
@@ -23,7 +22,7 @@ class Predictor(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, x: Tensor, heading: Tensor, rudder: Tensor) -> tuple[Tensor, Tensor]:
-        """Heading errors and yaw rates [B, C] in rad and rad/s.
+        """Return the heading errors and yaw rates [B, C] in rad and rad/s.
 
         Args:
             x: states [B, nx].
@@ -60,7 +59,7 @@ class SimulatedPredictor(Predictor):
         self.others: Tensor
 
     def forward(self, x: Tensor, heading: Tensor, rudder: Tensor) -> tuple[Tensor, Tensor]:
-        """Heading errors and yaw rates [B, C], all candidates of all rows in one batch."""
+        """Return the heading errors and yaw rates [B, C], all candidates of all rows in one batch."""
         rows, candidates = x.shape[0], rudder.shape[0]
         command = rudder.to(x.dtype).repeat(rows).unsqueeze(-1)
         w = torch.cat((command, self.others.to(x.dtype).expand(rows * candidates, -1)), dim=-1)
@@ -123,12 +122,15 @@ class NetworkPredictor(Predictor):
         )
 
     def changes(self, x: Tensor) -> Tensor:
-        """Changes of heading and yaw rate [B, 2, C] over the horizon from states x [B, nx]."""
+        """Return the changes of heading and yaw rate [B, 2, C] over the horizon from states x [B, nx]."""
         out: Tensor = self.network((x[:, self.take] - self.centre) / self.spread)
         return out.reshape(len(x), 2, -1) * self.scale + self.offset
 
     def forward(self, x: Tensor, heading: Tensor, rudder: Tensor) -> tuple[Tensor, Tensor]:
-        """Heading errors and yaw rates [B, C]; the angles are those that it was trained for."""
+        """Return the heading errors and yaw rates [B, C].
+
+        The angles are those that it was trained for.
+        """
         change = self.changes(x)
         return (heading - x[:, self.psi]).unsqueeze(-1) - change[:, 0], x[:, self.r].unsqueeze(
             -1
@@ -171,9 +173,7 @@ class DocumentAutopilot(Policy):
         self.rudder: Tensor
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Rudder command [B, 1] in rad from the state x [B, nx] and the reference heading [B, 1] in
-        rad; it keeps no memory.
-        """
+        """Return the rudder command [B, 1] in rad from the state x [B, nx] and the reference heading [B, 1] in rad; it keeps no memory."""
         error, rate = self.predictor(x, reference[:, 0], self.rudder)
         rudder = self.rudder.to(x.dtype)
         toward, calm = rudder[wrap(error).abs().argmin(-1)], rudder[rate.abs().argmin(-1)]

@@ -55,13 +55,11 @@ class Following(Policy):
         self.psi, self.r = state.index("psi"), state.index("r")
 
     def initial_state(self, x: Tensor) -> Tensor:
-        """Rudder amidships, then the law's memory."""
+        """Return the rudder amidships, then the law's memory."""
         return torch.cat((torch.zeros_like(x[:, :1]), self.law.initial_state(x)), dim=-1)
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Rudder command [B, 1] in rad and memory from the state x [B, nx], the reference [B, 3]
-        and the memory.
-        """
+        """Return the rudder command [B, 1] in rad and memory from the state x [B, nx], the reference [B, 3] and the memory."""
         needed = reference[:, 2:3]
         away = x.clone()
         away[:, self.psi] = x[:, self.psi] - reference[:, 0]

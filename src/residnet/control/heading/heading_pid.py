@@ -64,9 +64,7 @@ class HeadingPID(Policy):
         damping: float,
         limit: float,
     ) -> HeadingPID:
-        """PD that gives T r_dot + r = K delta (document 004 eq. (5.9)) poles of natural frequency
-        [rad/s] and relative damping.
-        """
+        """Return the pD that gives T r_dot + r = K delta (document 004 eq. (5.9)) poles of natural frequency [rad/s] and relative damping."""
         return cls(
             state,
             kp=time * frequency**2 / gain,
@@ -75,9 +73,7 @@ class HeadingPID(Policy):
         )
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Rudder command [B, 1] in rad and the integral [B, 0 or 1] from the state x [B, nx] and
-        the reference heading [B, 1] in rad.
-        """
+        """Return the rudder command [B, 1] in rad and the integral [B, 0 or 1] from the state x [B, nx] and the reference heading [B, 1] in rad."""
         error = wrap(reference - x[:, self.psi : self.psi + 1])
         wish = self.kp * error - self.kd * x[:, self.r : self.r + 1]
         if self.n_state == 0:

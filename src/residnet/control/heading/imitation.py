@@ -30,14 +30,14 @@ class SideBySide(Source):
         self.total = torch.zeros(())
 
     def initial(self, x: Tensor) -> Tensor:
-        """Memories of guidance, pupil and teacher side by side."""
+        """Return the memories of guidance, pupil and teacher side by side."""
         self.total = torch.zeros((), dtype=x.dtype)
         return torch.cat(
             [part.initial_state(x) for part in (self.reference, self.pupil, self.teacher)], dim=-1
         )
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Inputs [B, m] with the pupil's command."""
+        """Return the inputs [B, m] with the pupil's command."""
         sizes = [self.reference.n_state, self.pupil.n_state, self.teacher.n_state]
         guided, own, other = memory.split(sizes, dim=-1)
         target, guided = self.reference(x, k, guided)

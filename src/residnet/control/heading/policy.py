@@ -108,9 +108,7 @@ class HeadingPolicy(Policy):
         self.psi, self.u, self.r = state.index("psi"), state.index("u"), state.index("r")
 
     def initial_state(self, x: Tensor) -> Tensor:
-        """Memory [B, 9]: rudder amidships, the yaw rate as if it had been steady, no push, the
-        vessel as expected.
-        """
+        """Return the memory [B, 9]: rudder amidships, the yaw rate as if it had been steady, no push, the vessel as expected."""
         r = x[:, self.r : self.r + 1]
         gain = self.gain * self._ratio(x)
         none, one = torch.zeros_like(r), torch.ones_like(r)
@@ -130,13 +128,11 @@ class HeadingPolicy(Policy):
         )
 
     def _ratio(self, x: Tensor) -> Tensor:
-        """Speed [B, 1] as a multiple of the service speed; K goes with it, T against it."""
+        """Return the speed [B, 1] as a multiple of the service speed; K goes with it, T against it."""
         return (x[:, self.u : self.u + 1] / self.speed).clamp(0.3, 3.0)
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Rudder command [B, 1] in rad and memory from the state x [B, nx] and the reference
-        heading [B, 1] in rad.
-        """
+        """Return the rudder command [B, 1] in rad and memory from the state x [B, nx] and the reference heading [B, 1] in rad."""
         error = wrap(reference - x[:, self.psi : self.psi + 1])
         r = x[:, self.r : self.r + 1]
         ratio = self._ratio(x)
@@ -176,7 +172,7 @@ class HeadingPolicy(Policy):
         return command, torch.cat((follows, known[:, 1:]), dim=-1)
 
     def _estimate(self, r: Tensor, per_time: Tensor, steady: Tensor, s: Tensor) -> Tensor:
-        """Memory [B, 9] with the yaw rate r [B, 1] taken in; the rudder still as it was."""
+        """Return the memory [B, 9] with the yaw rate r [B, 1] taken in; the rudder still as it was."""
         rudder, slow, share, push, effect, damping, p, c, q = s.split(1, dim=-1)
         pace = 2.0 * self.observer * per_time
         keep = torch.exp(-pace * self.dt)
@@ -216,9 +212,7 @@ class HeadingPolicy(Policy):
     def _centred(
         self, error: Tensor, r: Tensor, acting: Tensor, force: Tensor, decay: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Error and yaw rate [B, 1] that will be left once the rudder, which acts with a share of
-        its limit, has gone to where it does nothing.
-        """
+        """Return the error and yaw rate [B, 1] that will be left once the rudder, which acts with a share of its limit, has gone to where it does nothing."""
         wait = acting.abs() * self.swing
         later = r + wait * (0.5 * force * acting - decay * r)
         return error - wait * (r + wait * (force * acting / 3.0 - 0.5 * decay * r)), later
@@ -226,8 +220,7 @@ class HeadingPolicy(Policy):
     def _braking(
         self, r: Tensor, force: Tensor, decay: Tensor, stiffness: Tensor, stiff: Tensor
     ) -> Tensor:
-        """Heading [B, 1] that passes while r_dot = -force - decay r stops the yaw rate r [B, 1]; r
-        / nu near zero, with the same slope there.
+        """Return the heading [B, 1] that passes while r_dot = -force - decay r stops the yaw rate r [B, 1]; r / nu near zero, with the same slope there.
 
         The rudder starts from amidships and comes back there: that takes half of its swing more, or
         a pulse that does not reach the limit. nu is chosen such that e'' + (decay + stiffness / nu)
@@ -248,9 +241,7 @@ class HeadingPolicy(Policy):
         return r.sign() * torch.where(size < end, size * line, curve)
 
     def _distance(self, r: Tensor, force: Tensor, decay: Tensor) -> Tensor:
-        """Heading [B, 1] in which a yaw rate r > 0 is stopped: the integral of r dr / (force +
-        decay r), and what the rudder's swing adds.
-        """
+        """Return the heading [B, 1] in which a yaw rate r > 0 is stopped: the integral of r dr / (force + decay r), and what the rudder's swing adds."""
         own = (r - force / decay * torch.log1p(decay * r / force)) / decay
         if self.swing == 0.0:
             return own

@@ -56,12 +56,14 @@ class SteeredModel(SteeredVessel):
             self.take.append(vessel.inputs.index(command))
 
     def model(self, dt: float, integrator: str = "rk4") -> Dynamics:
-        """The model, varied, with its own integrator; one without memory takes steps of any length.
+        """Return the model, varied, with its own integrator.
+
+        One without memory takes steps of any length.
         """
         return VariedModel(self.hull, dt, self.take, self.mean, self.rate)
 
     def memory(self, variation: Tensor) -> Tensor:
-        """Variation, then the head's memory without a past."""
+        """Return the variation, then the head's memory without a past."""
         return torch.cat((variation, variation.new_zeros(len(variation), self.hull.n_state)), dim=1)
 
     def start(self, speed: Tensor) -> tuple[Tensor, Tensor]:

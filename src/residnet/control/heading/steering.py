@@ -36,8 +36,9 @@ class SteeredVessel(ABC):
 
     @abstractmethod
     def model(self, dt: float, integrator: str = "rk4") -> Dynamics:
-        """Steps of dt seconds; the first columns of its memory are the variation of each row
-        (`dynamics.varied.VARIATION`).
+        """Return the steps of dt seconds.
+
+        The first columns of its memory are the variation of each row (`dynamics.varied.VARIATION`).
         """
 
     def memory(self, variation: Tensor) -> Tensor:
@@ -46,9 +47,7 @@ class SteeredVessel(ABC):
 
     @abstractmethod
     def start(self, speed: Tensor) -> tuple[Tensor, Tensor]:
-        """States [B, nx] and inputs [B, m] of straight courses at multiples [B] of the service
-        speed.
-        """
+        """Return the states [B, nx] and inputs [B, m] of straight courses at multiples [B] of the service speed."""
 
     @final
     def column(self, name: str) -> int:
@@ -57,7 +56,7 @@ class SteeredVessel(ABC):
 
     @final
     def turning(self, angle: float, duration: float, dt: float = 0.02) -> Turning:
-        """K and T at the service speed, from the answer to a held rudder angle [rad]."""
+        """Return K and T at the service speed, from the answer to a held rudder angle [rad]."""
         x, w = self.start(torch.ones(1, dtype=torch.float64))
         variation = torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64)
         return measure_turning(
@@ -83,11 +82,11 @@ class SteeredPlant(SteeredVessel):
         self.rate = _rudder_rate(plant)
 
     def model(self, dt: float, integrator: str = "rk4") -> Dynamics:
-        """The plant, varied."""
+        """Return the plant, varied."""
         return VariedPlant(self.plant, dt, integrator)
 
     def start(self, speed: Tensor) -> tuple[Tensor, Tensor]:
-        """Thrust goes with the square of the speed."""
+        """Return the thrust goes with the square of the speed."""
         x = self.plant.approach(len(speed)).to(speed.dtype).clone()
         x[:, self.column("u")] *= speed
         command = self.plant.demand(speed.square(), torch.zeros_like(speed))
@@ -117,7 +116,7 @@ class NominalSteering(Dynamics):
         return self.inner.rate(x, p, rho)
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """State [B, nx] after a step."""
+        """Return the state [B, nx] after a step."""
         return self.inner.step(x, w, self.nominal.to(x.dtype).expand(x.shape[0], -1))[0], s
 
 
@@ -130,7 +129,7 @@ def _rudder_rate(plant: Plant) -> float | None:
     column, dt = plant.state.index("delta"), 1e-3
     x, w = plant.approach(1), torch.zeros(1, len(plant.inputs), dtype=torch.float64)
     w[:, 0] = 1.0
-    return float(plant.settle(x, w, dt)[0, column]) / dt
+    return float(plant.end_step(x, w, dt)[0, column]) / dt
 
 
 @final
@@ -177,7 +176,7 @@ class Flights:
     names: tuple[str, ...]
 
     def of(self, name: str) -> Tensor:
-        """A state [B, T+1]."""
+        """Return a state [B, T+1]."""
         return self.states[:, :, self.names.index(name)]
 
     @property
@@ -186,9 +185,7 @@ class Flights:
         return wrap(self.heading[:, None] - self.of("psi"))
 
     def settled(self, band: float) -> Tensor:
-        """Time [B] of the last entry into +-band [rad], between samples along a straight line; the
-        flight's length where it ends outside.
-        """
+        """Return the time [B] of the last entry into +-band [rad], between samples along a straight line; the flight's length where it ends outside."""
         size = self.error.abs()
         outside = ~(size <= band)
         inside = outside.flip(1).to(torch.int64).argmax(1)
@@ -200,30 +197,31 @@ class Flights:
         return torch.where(outside.any(1), last[:, 0] + share, 0.0) * self.dt
 
     def overshoot(self) -> Tensor:
-        """Largest heading beyond the reference [B] in rad, seen from the first heading; zero where
-        there is none.
+        """Return the largest heading beyond the reference [B] in rad, seen from the first heading.
+
+        Zero where there is none.
         """
         error = self.error
         return (-error * error[:, :1].sign()).amax(1).clamp(min=0.0)
 
     def absolute_error(self) -> Tensor:
-        """Integral of |error| [B] in rad s."""
+        """Return the integral of |error| [B] in rad s."""
         return self.error[:, :-1].abs().sum(1) * self.dt
 
     def effort(self) -> Tensor:
-        """Integral of the squared rudder command [B] in rad^2 s: the control energy."""
+        """Return the integral of the squared rudder command [B] in rad^2 s: the control energy."""
         return self.inputs[:, :, 0].square().sum(1) * self.dt
 
     def rms(self, name: str, start: float = 0.0) -> Tensor:
-        """Root of the mean square [B] of a state from a time [s] on."""
+        """Return the root of the mean square [B] of a state from a time [s] on."""
         return self.of(name)[:, round(start / self.dt) :].square().mean(1).sqrt()
 
     def rudder_rms(self, start: float = 0.0) -> Tensor:
-        """Root of the mean square [B] of the rudder command in rad from a time [s] on."""
+        """Return the root of the mean square [B] of the rudder command in rad from a time [s] on."""
         return self.inputs[:, round(start / self.dt) :, 0].square().mean(1).sqrt()
 
     def travel(self) -> Tensor:
-        """How far the rudder command travels [B] in rad, from amidships on."""
+        """Return how far the rudder command travels [B] in rad, from amidships on."""
         command = self.inputs[:, :, 0]
         return command[:, 0].abs() + command.diff(dim=1).abs().sum(1)
 
@@ -240,8 +238,7 @@ def fly(
     weather: Mapping[str, float | Tensor] | None = None,
     surround: Callable[[Source], Source] | None = None,
 ) -> Flights:
-    """Heading changes [B] in rad from straight ahead of vessels varied by [B, 3], float64, without
-    gradients.
+    """Return the heading changes [B] in rad from straight ahead of vessels varied by [B, 3], float64, without gradients.
 
     Args:
         speed: multiples [B] of the service speed.

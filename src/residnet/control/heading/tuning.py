@@ -66,7 +66,7 @@ class LinearRows(Policy):
         self.n_state = 1
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Rudder command [B, 1] and integral [B, 1]."""
+        """Return the rudder command [B, 1] and integral [B, 1]."""
         error = wrap(reference - x[:, self.psi : self.psi + 1])
         wish = self.kp * error - self.kd * x[:, self.r : self.r + 1] + self.ki * s
         winding = (wish.abs() > self.limit) & (wish * error > 0)
@@ -142,8 +142,9 @@ def tune(
 def _judge(
     config: TunedConfig, steering: Steering, task: TuningTask, parameters: dict[str, Tensor]
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Cost, worst settling time [s] and worst overshoot [rad] of each candidate [C]; an infinite
-    cost breaks a limit.
+    """Return the cost, worst settling time [s] and worst overshoot [rad] of each candidate [C].
+
+    An infinite cost breaks a limit.
     """
     gains = config.gains(parameters, steering.turning)
     many, size = len(task.variations), len(gains[0])

@@ -31,7 +31,7 @@ def measure_turning(
     angle: float,
     duration: float,
 ) -> Turning:
-    """K and T from the answer to a rudder angle that is held.
+    """Return K and T from the answer to a rudder angle that is held.
 
     Args:
         model: of the vessel.

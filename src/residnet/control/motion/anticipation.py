@@ -50,9 +50,7 @@ class Derivatives(NamedTuple):
     snap: Tensor
 
     def later(self, h: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Heading [...], nu_d and nu_dot_d [..., 3] in body axes h seconds later, along the Taylor
-        series.
-        """
+        """Return the heading [...], nu_d and nu_dot_d [..., 3] in body axes h seconds later, along the Taylor series."""
         pose = self.pose + h * (
             self.rate + h / 2 * (self.acceleration + h / 3 * (self.jerk + h / 4 * self.snap))
         )
@@ -72,9 +70,7 @@ class Derivatives(NamedTuple):
 def derivatives(
     config: ReferenceFilterConfig, memory: Tensor, target: Tensor, target_rate: Tensor
 ) -> Derivatives:
-    """Jerk and snap of the third-order filter (2.15) at its memory [..., 9] under a target [..., 3]
-    that moves by `target_rate`.
-    """
+    """Return the jerk and snap of the third-order filter (2.15) at its memory [..., 9] under a target [..., 3] that moves by `target_rate`."""
     w = torch.tensor(config.frequency, dtype=memory.dtype)
     d = 2.0 * torch.tensor(config.damping, dtype=memory.dtype) + 1.0
     pose, rate, change = memory[..., :3], memory[..., 3:6], memory[..., 6:]
@@ -84,8 +80,7 @@ def derivatives(
 
 
 def needed_force(model: ForceModel, motion: Derivatives, lag: Lag | None, held: float) -> Tensor:
-    """What a model needs for the motion when a command given now takes effect, and its first and
-    second derivative: [..., 9].
+    """Return what a model needs for the motion when a command given now takes effect, and its first and second derivative: [..., 9].
 
     Args:
         model: of the vessel.
@@ -148,7 +143,7 @@ class Assisted(Policy):
         self.step = torch.linalg.matrix_exp(torch.tensor(rows, dtype=torch.float64) * dt)
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Command tau [B, 3] and the memory one step later."""
+        """Return the command tau [B, 3] and the memory one step later."""
         n = self.feedback.n_state
         correction, integral = self.feedback(x, reference[:, :9], s[:, :n])
         needed = reference[:, 9:12]
@@ -180,14 +175,13 @@ class Assisted(Policy):
 
 
 def reference_row(motion: Derivatives, needed: Tensor) -> Tensor:
-    """[..., 18] for `Assisted` from the desired motion and `needed_force` [..., 9]."""
+    """Return [..., 18] for `Assisted` from the desired motion and `needed_force` [..., 9]."""
     _, nu, nu_dot = motion.later(0.0)
     return torch.cat((motion.pose, nu, nu_dot, needed), dim=-1)
 
 
 def course(config: ReferenceFilterConfig, dt: float) -> Derivatives:
-    """The desired motion [T, 3] of a whole course from rest at the origin: what the filter of
-    `config` gives step by step.
+    """Return the desired motion [T, 3] of a whole course from rest at the origin: what the filter of `config` gives step by step.
 
     The filter is linear and its target constant over an interval, so that powers of its step matrix
     give each interval at once.

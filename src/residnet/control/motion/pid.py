@@ -27,7 +27,7 @@ class FeedForward(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, nu_dot: Tensor, nu: Tensor) -> Tensor:
-        """tau [B, 3] for the desired nu_dot [B, 3] and nu [B, 3] in body axes."""
+        """Return tau [B, 3] for the desired nu_dot [B, 3] and nu [B, 3] in body axes."""
 
 
 @final
@@ -35,7 +35,7 @@ class NoFeedForward(FeedForward):
     """Nothing: feedback alone."""
 
     def forward(self, nu_dot: Tensor, nu: Tensor) -> Tensor:
-        """Zeros [B, 3]."""
+        """Return zeros [B, 3]."""
         return torch.zeros_like(nu)
 
 
@@ -48,7 +48,7 @@ class HullFeedForward(FeedForward):
         self.hull = hull
 
     def forward(self, nu_dot: Tensor, nu: Tensor) -> Tensor:
-        """tau [B, 3] in N, N, N m."""
+        """Return tau [B, 3] in N, N, N m."""
         return self.hull.required(nu_dot, nu)
 
 
@@ -67,7 +67,7 @@ class MotionPIDConfig(Config):
     derivative: Gains = (0.0, 0.0, 0.0)
 
     def build(self, dt: float, feed_forward: FeedForward | None = None) -> MotionPID:
-        """The controller for a loop with steps of dt seconds."""
+        """Return the controller for a loop with steps of dt seconds."""
         return MotionPID([self], dt, NoFeedForward() if feed_forward is None else feed_forward)
 
 
@@ -97,13 +97,13 @@ class MotionPID(Policy):
         self.gains: Tensor
 
     def error(self, x: Tensor, reference: Tensor) -> Tensor:
-        """e [B, 3] in body axes: m, m, rad."""
+        """Return e [B, 3] in body axes: m, m, rad."""
         away = reference[:, :3] - x[:, :3]
         along, across = to_body(away[:, 0], away[:, 1], x[:, 2])
         return torch.stack((along, across, wrap(away[:, 2])), dim=-1)
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Command tau [B, 3] in N, N, N m, and the integral with this step's error."""
+        """Return the command tau [B, 3] in N, N, N m, and the integral with this step's error."""
         error = self.error(x, reference)
         nu_d = reference[:, 3:6]
         gains = self.gains.to(x.dtype)
@@ -124,10 +124,10 @@ class Allocated(Policy):
         self.n_state = policy.n_state
 
     def initial_state(self, x: Tensor) -> Tensor:
-        """Memory [B, n_state] of the controller at the first state x [B, nx]."""
+        """Return the memory [B, n_state] of the controller at the first state x [B, nx]."""
         return self.policy.initial_state(x)
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Commands [B, 2k] of the thrusters, and the controller's memory."""
+        """Return the commands [B, 2k] of the thrusters, and the controller's memory."""
         tau, s = self.policy(x, reference, s)
         return self.thrusters.allocate(tau), s

@@ -47,7 +47,7 @@ class ReferenceFilterConfig(Config):
         return self.interval * len(self.waypoints)
 
     def build(self, dt: float) -> ReferenceFilter:
-        """The guidance for a loop with steps of dt seconds.
+        """Return the guidance for a loop with steps of dt seconds.
 
         Raises:
             ConfigError: where the interval is no whole number of steps.
@@ -97,9 +97,7 @@ class ReferenceFilter(Reference):
 
     @staticmethod
     def _step_matrix(config: ReferenceFilterConfig, dt: float) -> Tensor:
-        """What a step of RK4 does to (error, rate, acceleration) of each axis, [3, 3, 3]: exact for
-        a linear filter.
-        """
+        """Return what a step of RK4 does to (error, rate, acceleration) of each axis, [3, 3, 3]: exact for a linear filter."""
         matrices = []
         for w, d in zip(config.frequency, config.damping, strict=True):
             a = (
@@ -114,15 +112,15 @@ class ReferenceFilter(Reference):
         return torch.stack(matrices)
 
     def initial_state(self, x: Tensor) -> Tensor:
-        """Memory [B, 9]: at rest at the vessel's pose."""
+        """Return the memory [B, 9]: at rest at the vessel's pose."""
         return torch.cat((x[:, :3], torch.zeros_like(x[:, :1]).expand(-1, 6)), dim=-1)
 
     def waypoint(self, k: int) -> Tensor:
-        """Waypoint [B or 1, 3] that is given at step k."""
+        """Return the waypoint [B or 1, 3] that is given at step k."""
         return self.waypoints[:, min(k // self.every, self.count - 1)]
 
     def forward(self, x: Tensor, k: int, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Reference [B, 9] of step k and the memory one step later."""
+        """Return the reference [B, 9] of step k and the memory one step later."""
         place, rate, change = s[:, :3], s[:, 3:6], s[:, 6:]
         u, v = to_body(rate[:, 0], rate[:, 1], place[:, 2])
         along, across = to_body(change[:, 0], change[:, 1], place[:, 2])

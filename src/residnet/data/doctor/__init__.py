@@ -62,7 +62,7 @@ def inspect(log: Log, inputs: Sequence[str] | None = None, masks: Sequence[Mask]
 
 
 def _contents(log: Log, driving: Sequence[str]) -> list[Finding]:
-    """Findings about what the channels of a log with an increasing clock hold."""
+    """Return the findings about what the channels of a log with an increasing clock hold."""
     findings = wrap_findings(log)
     log = unwrapped(log)
     values = value_findings(log, driving)
@@ -76,9 +76,7 @@ def _contents(log: Log, driving: Sequence[str]) -> list[Finding]:
 
 
 def _trusted(log: Log, findings: Sequence[Finding]) -> Log:
-    """The log with NaN in the pose and velocities where a finding about values already says that
-    they are wrong.
-    """
+    """Return the log with NaN in the pose and velocities where a finding about values already says that they are wrong."""
     doubted = [
         finding.at
         for finding in findings

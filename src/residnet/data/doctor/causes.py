@@ -82,7 +82,7 @@ POSITION_LIMITS = {
 
 
 def told(causes: dict[str, Cause], limits: dict[str, Limit], log: Log) -> Iterator[Finding]:
-    """Findings for the causes that are certain and large enough to matter."""
+    """Return the findings for the causes that are certain and large enough to matter."""
     step = float(np.median(np.diff(log.t)))
     speed = (
         float(np.sqrt(np.nanmean(log["u"] ** 2 + log["v"] ** 2)))

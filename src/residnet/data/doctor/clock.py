@@ -18,7 +18,7 @@ _EPOCH = 1e8
 
 
 def order_findings(log: Log) -> list[Finding]:
-    """Why nothing else can be looked at: times that are no numbers, repeat or run backwards."""
+    """Return why nothing else can be looked at: times that are no numbers, repeat or run backwards."""
     if not np.isfinite(log.t).all():
         count = int((~np.isfinite(log.t)).sum())
         text = f"{count} of {len(log)} samples have no time"
@@ -54,7 +54,7 @@ def order_findings(log: Log) -> list[Finding]:
 
 
 def clock_findings(log: Log) -> Iterator[Finding]:
-    """Findings about an increasing clock."""
+    """Return the findings about an increasing clock."""
     dt = np.diff(log.t)
     step, span = float(np.median(dt)), float(log.t[-1] - log.t[0])
     near = dt[dt <= 1.5 * step]

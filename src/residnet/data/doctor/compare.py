@@ -25,7 +25,7 @@ _OUTSIDE = 0.25
 def comparison_findings(
     logs: Sequence[Log], splits: Mapping[str, str] | None = None
 ) -> list[Finding]:
-    """Findings between logs.
+    """Return the findings between logs.
 
     Args:
         logs: all logs that are looked at together.
@@ -41,7 +41,7 @@ def comparison_findings(
 
 
 def _copies(logs: Sequence[Log], splits: Mapping[str, str]) -> Iterator[Finding]:
-    """Stretches that two logs, or two places of one log, have in common."""
+    """Return the stretches that two logs, or two places of one log, have in common."""
     names = [name for name in VELOCITY if all(name in log.channels for log in logs)]
     names = (
         names if len(names) > 1 else sorted(set.intersection(*(set(log.channels) for log in logs)))
@@ -114,7 +114,7 @@ def _copy(
 
 
 def _continued(a: Log, b: Log, splits: Mapping[str, str]) -> Iterator[Finding]:
-    """A log that goes on where another ended: one run, cut into files."""
+    """Return a log that goes on where another ended: one run, cut into files."""
     states = [
         name for name in ("x", "y", "u", "v", "r") if name in a.channels and name in b.channels
     ]
@@ -196,7 +196,7 @@ def _same_commands(a: Log, b: Log, splits: Mapping[str, str]) -> Iterator[Findin
 
 
 def _ranges(logs: Sequence[Log], splits: Mapping[str, str]) -> Iterator[Finding]:
-    """How much of the test logs lies outside what the training logs cover."""
+    """Return how much of the test logs lies outside what the training logs cover."""
     train = [log for log in logs if splits.get(log.name) == "train"]
     others = [log for log in logs if splits.get(log.name) in ("validation", "test")]
     if not train or not others:

@@ -71,12 +71,12 @@ class Draft:
     remarks: tuple[dict[str, Any], ...]
 
     def reader(self) -> LogReader:
-        """The reader that it describes."""
+        """Return the reader that it describes."""
         kind = CsvConfig if self.content["kind"] == "csv" else ParquetConfig
         return validate(self.content, kind, "draft channel map").build()
 
     def lines(self) -> list[str]:
-        """The map as YAML, to paste under `data:`."""
+        """Return the map as YAML, to paste under `data:`."""
         out = ["reader:", f"  kind: {self.content['kind']}"]
         out += [
             f"  {key}: {self.content[key]!r}".replace("'", '"')
@@ -169,7 +169,7 @@ def _comma_decimals(path: Path, delimiter: str) -> bool:
 
 
 def _numeric(table: pd.DataFrame) -> tuple[dict[str, np.ndarray], list[dict[str, Any]]]:
-    """Columns that hold numbers, and remarks about those that do not."""
+    """Return the columns that hold numbers, and remarks about those that do not."""
     import pandas as pd
 
     numbers: dict[str, np.ndarray] = {}
@@ -220,7 +220,7 @@ def _bare(column: str) -> str:
 
 
 def _channel(column: str, taken: dict[str, Any]) -> str:
-    """Canonical name, else the column's own made fit to be one."""
+    """Return the canonical name, else the column's own made fit to be one."""
     bare = _bare(column)
     if not re.search(r"\d", column):
         for name, pattern in _NAMES.items():
@@ -234,8 +234,7 @@ def _channel(column: str, taken: dict[str, Any]) -> str:
 
 
 def _unit(name: str, column: str, values: np.ndarray) -> str:
-    """Unit from the header, else the SI unit, else degrees where an angle is too large for radians.
-    """
+    """Return the unit from the header, else the SI unit, else degrees where an angle is too large for radians."""
     declared = _IN_BRACKETS.search(column)
     expected = CHANNEL_UNITS.get(name)
     candidates = [

@@ -19,9 +19,7 @@ _RECORD = "record manoeuvres: zigzag, 3-2-1-1"
 
 
 def excitation_findings(log: Log, inputs: Sequence[str]) -> Iterator[Finding]:
-    """Findings about ranges, spectrum, standstill and collinearity of velocities and inputs in one
-    log.
-    """
+    """Return the findings about ranges, spectrum, standstill and collinearity of velocities and inputs in one log."""
     moving = []
     for name in (*(name for name in VELOCITY if name in log.channels), *inputs):
         values, unit = log[name][np.isfinite(log[name])], log.units[name]
@@ -50,7 +48,10 @@ def excitation_findings(log: Log, inputs: Sequence[str]) -> Iterator[Finding]:
 
 
 def still(log: Log) -> np.ndarray | None:
-    """[T] bool: no motion beyond the noise over two seconds; None where u, v or r is not measured."""
+    """Return [T] bool: no motion beyond the noise over two seconds.
+
+    None where u, v or r is not measured.
+    """
     if any(name not in log.channels for name in VELOCITY):
         return None
     step = float(np.median(np.diff(log.t)))
@@ -106,7 +107,10 @@ def _rest(log: Log) -> Iterator[Finding]:
 
 
 def _band(log: Log, name: str) -> float:
-    """Frequency in Hz below which 95 % of a channel's power lies; 0 where it is too short."""
+    """Return the frequency in Hz below which 95 % of a channel's power lies.
+
+    0 where it is too short.
+    """
     values, step = log[name], float(np.median(np.diff(log.t)))
     known = np.isfinite(values)
     if known.sum() < 20:
@@ -145,9 +149,7 @@ def _list(names: Sequence[str]) -> str:
 
 
 def conditioning(columns: np.ndarray, names: Sequence[str]) -> tuple[float, list[str]]:
-    """Condition number of columns [N, k], centred and scaled, and the up to three names that move
-    together most.
-    """
+    """Return the condition number of columns [N, k], centred and scaled, and the up to three names that move together most."""
     scaled = (columns - columns.mean(axis=0)) / np.maximum(
         columns.std(axis=0), np.finfo(float).tiny
     )
@@ -159,7 +161,7 @@ def conditioning(columns: np.ndarray, names: Sequence[str]) -> tuple[float, list
 
 
 def set_findings(logs: Sequence[Log], inputs: Sequence[str] | None) -> Iterator[Finding]:
-    """Whether a fit to all logs together has something to learn from."""
+    """Return whether a fit to all logs together has something to learn from."""
     driving = _common(logs, inputs)
     awake = {
         name: max(_awake(log, name) for log in logs)
@@ -229,9 +231,7 @@ def _common(logs: Sequence[Log], inputs: Sequence[str] | None) -> list[str]:
 
 
 def _awake(log: Log, name: str) -> float:
-    """Spread of a velocity beyond what its averaged noise explains, over the least that counts;
-    below 1 it does not vary.
-    """
+    """Return the spread of a velocity beyond what its averaged noise explains, over the least that counts; below 1 it does not vary."""
     step = float(np.median(np.diff(log.t)))
     samples = max(round(2.0 / step), 5)
     smooth = averaged(log[name], samples)
@@ -252,12 +252,12 @@ def _awake(log: Log, name: str) -> float:
 
 
 def _relative(values: np.ndarray) -> float:
-    """Spread of a channel over its size, beyond its noise."""
+    """Return the spread of a channel over its size, beyond its noise."""
     known = values[np.isfinite(values)]
     size = float(np.abs(known).max(initial=0.0))
     return max(float(known.std()) - 1.5 * noise_of(known), 0.0) / size if size > 0.0 else 0.0
 
 
 def _between(logs: Sequence[Log], name: str) -> float:
-    """Spread of a channel over all logs, over its size."""
+    """Return the spread of a channel over all logs, over its size."""
     return _relative(np.concatenate([log[name] for log in logs]))

@@ -42,7 +42,7 @@ class Finding:
         return f"{self.level}: {self.text}" + (f"; {self.action}" if self.action else "")
 
     def excused(self, masked: np.ndarray) -> Finding:
-        """The finding as a note where masks [T] leave out every sample that it concerns."""
+        """Return the finding as a note where masks [T] leave out every sample that it concerns."""
         if (
             self.at is None
             or self.level == "note"
@@ -87,11 +87,11 @@ class Report:
         return any(finding.level != "note" for finding in self.findings)
 
     def find(self, code: str) -> tuple[Finding, ...]:
-        """Findings of one code."""
+        """Return the findings of one code."""
         return tuple(finding for finding in self.findings if finding.code == code)
 
     def lines(self) -> list[str]:
-        """The report as text, one line per finding, the worst first."""
+        """Return the report as text, one line per finding, the worst first."""
         order = sorted(self.findings, key=lambda finding: -LEVELS.index(finding.level))
         return [f"{self.name}: {finding.line}" for finding in order]
 
@@ -106,7 +106,7 @@ class Report:
 
 
 def inspection(reports: Sequence[Report], together: Report) -> dict[str, Any]:
-    """All reports for JSON, schema residnet.inspection/1."""
+    """Return all reports for JSON, schema residnet.inspection/1."""
     misled = any(report.misled for report in (*reports, together))
     return {
         "schema": SCHEMA,
@@ -117,7 +117,7 @@ def inspection(reports: Sequence[Report], together: Report) -> dict[str, Any]:
 
 
 def imported(remarks: Iterable[dict[str, Any]]) -> list[Finding]:
-    """What a reader noted on the way in (`Log.meta["findings"]`)."""
+    """Return what a reader noted on the way in (`Log.meta["findings"]`)."""
     return [
         Finding(
             entry["level"],
@@ -131,14 +131,14 @@ def imported(remarks: Iterable[dict[str, Any]]) -> list[Finding]:
 
 
 def show(value: float, unit: str) -> str:
-    """A value in SI as text; angles in degrees, which people read more easily."""
+    """Return a value in SI as text; angles in degrees, which people read more easily."""
     if unit.startswith("rad"):
         return f"{math.degrees(value):.3g} {unit.replace('rad', 'deg', 1)}"
     return f"{value:.3g} {unit}" if unit != "-" else f"{value:.3g}"
 
 
 def share_of(part: float) -> str:
-    """A share in per cent."""
+    """Return a share in per cent."""
     return f"{100.0 * part:.2g} %" if part < 0.1 else f"{100.0 * part:.0f} %"
 
 
@@ -160,7 +160,7 @@ _SLIPS = {
 
 
 def unit_slip(factor: float) -> str:
-    """What mistake of units makes values too large by `factor`; empty where none is near."""
+    """Return what mistake of units makes values too large by `factor`; empty where none is near."""
     if factor <= 0.0:
         return ""
     best = min(_SLIPS, key=lambda known: abs(math.log(known / factor)))

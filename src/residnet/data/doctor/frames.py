@@ -62,9 +62,7 @@ class _Motion:
 
 
 def frame_findings(log: Log) -> list[Finding]:
-    """Whether position, heading and velocities of a log on a uniform grid describe one motion; NaN
-    where a channel is not to be trusted.
-    """
+    """Return whether position, heading and velocities of a log on a uniform grid describe one motion; NaN where a channel is not to be trusted."""
     absent = [name for name in ("x", "y", "psi") if name not in log.channels]
     moving = [name for name in VELOCITY if name in log.channels]
     if absent or not moving:
@@ -94,7 +92,7 @@ def frame_findings(log: Log) -> list[Finding]:
 
 
 def _motion(log: Log, moving: list[str]) -> _Motion:
-    """Rates over windows in which the pose moves by several times its noise."""
+    """Return the rates over windows in which the pose moves by several times its noise."""
     step, span = float(np.median(np.diff(log.t))), float(log.t[-1] - log.t[0])
     speed = (
         float(np.sqrt(np.nanmean(log["u"] ** 2 + log["v"] ** 2)))
@@ -132,7 +130,7 @@ def _motion(log: Log, moving: list[str]) -> _Motion:
 
 
 def _rate(values: np.ndarray, half: int, step: float) -> np.ndarray:
-    """Central differences [T] over 2 half steps, NaN at the ends."""
+    """Return the central differences [T] over 2 half steps, NaN at the ends."""
     out = np.full(values.shape, np.nan, dtype=values.dtype)
     if values.size > 2 * half:
         out[half:-half] = (values[2 * half :] - values[: -2 * half]) / (2 * half * step)
@@ -140,7 +138,7 @@ def _rate(values: np.ndarray, half: int, step: float) -> np.ndarray:
 
 
 def _mean(values: np.ndarray, half: int) -> np.ndarray:
-    """Trapezoidal means [T] over 2 half steps, NaN at the ends and where a sample is missing."""
+    """Return the trapezoidal means [T] over 2 half steps, NaN at the ends and where a sample is missing."""
     out = np.full(values.shape, np.nan, dtype=values.dtype)
     if values.size > 2 * half:
         weights = np.ones(2 * half + 1)
@@ -178,8 +176,7 @@ def _velocity(motion: _Motion) -> list[Finding]:
 
 
 def _convention(ground: np.ndarray, sailed: dict[str, np.ndarray]) -> Finding:
-    """Velocity over ground [N] against R(psi) [u, v], as declared and under other conventions;
-    vectors as complex numbers.
+    """Return the velocity over ground [N] against R(psi) [u, v], as declared and under other conventions; vectors as complex numbers.
 
     The coherence is 1 where both agree, and the angle of the complex overlap is what would have to
     be added to psi.
@@ -261,8 +258,7 @@ def _follows_ground(log: Log, motion: _Motion, causes: dict[str, Cause]) -> Iter
 def _follows(
     name: str, reference: np.ndarray, motion: _Motion, least: float, what: str, certain: bool
 ) -> Iterator[Finding]:
-    """Sign, gain and lag of a channel against a reference [T], unless that varies by less than
-    `least`.
+    """Return the sign, gain and lag of a channel against a reference [T], unless that varies by less than `least`.
 
     A lag alone misleads where the finer look is `certain` that pose and velocities differ at all:
     slow channels correlate at any lag.
@@ -307,7 +303,7 @@ def _follows(
 def _agreement(
     reference: np.ndarray, measured: np.ndarray, good: np.ndarray, step: float
 ) -> tuple[float, float, float, float] | None:
-    """How `measured` [T] follows `reference` [T] where `good` [T].
+    """Return how `measured` [T] follows `reference` [T] where `good` [T].
 
     Returns:
         Correlation (means removed) and gain (least squares through the origin) at the lag with the
@@ -347,7 +343,7 @@ def _agreement(
 
 
 def _position_jumps(log: Log, step: float) -> Iterator[Finding]:
-    """Steps of the position that the velocities do not explain."""
+    """Return the steps of the position that the velocities do not explain."""
     velocity = (log["u"] + 1j * log["v"]) * np.exp(1j * log["psi"])
     explained = 0.5 * step * (velocity[1:] + velocity[:-1])
     excess = np.abs(np.nan_to_num(np.diff(log["x"] + 1j * log["y"]) - explained))
@@ -414,7 +410,7 @@ def _yaw(log: Log, motion: _Motion) -> Iterator[Finding]:
 
 
 def _drift(log: Log, causes: dict[str, Cause]) -> Iterator[Finding]:
-    """Bias, lag and gain of r against psi."""
+    """Return the bias, lag and gain of r against psi."""
     psi, r = (
         np.interp(log.t, log.t[np.isfinite(values)], values[np.isfinite(values)])
         for values in (log["psi"], log["r"])

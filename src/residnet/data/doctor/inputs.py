@@ -29,7 +29,7 @@ _STEERING = ("delta", "cmd_delta", "nozzle", "cmd_nozzle")
 
 
 def input_findings(log: Log, inputs: Sequence[str]) -> Iterator[Finding]:
-    """Findings about the inputs."""
+    """Return the findings about the inputs."""
     driving = [name for name in inputs if np.isfinite(log[name]).sum() > 1]
     for name in driving:
         yield from _jumps(log, name)
@@ -126,7 +126,7 @@ def _astern(log: Log, name: str) -> Iterator[Finding]:
 
 
 def _size(log: Log, name: str) -> Iterator[Finding]:
-    """A rudder angle that no rudder has."""
+    """Return a rudder angle that no rudder has."""
     if name not in ("delta", "cmd_delta"):
         return
     largest = float(np.nanquantile(np.abs(log[name]), 0.99))
@@ -142,9 +142,7 @@ def _size(log: Log, name: str) -> Iterator[Finding]:
 
 
 def _excursions(log: Log, name: str) -> Iterator[Finding]:
-    """Values far outside the rest of the channel that return to where they came from, for a second
-    or less, held or not.
-    """
+    """Return the values far outside the rest of the channel that return to where they came from, for a second or less, held or not."""
     values = log[name]
     step = float(np.median(np.diff(log.t)))
     half = max(round(1.5 / step), 3)
@@ -182,8 +180,9 @@ def _excursions(log: Log, name: str) -> Iterator[Finding]:
 
 
 def _abrupt(values: np.ndarray, away: np.ndarray, far: np.ndarray) -> np.ndarray:
-    """The excursions among far [T] that go and come within a step or two; an actuator takes its
-    time.
+    """Return the excursions among far [T] that go and come within a step or two.
+
+    An actuator takes its time.
     """
     change = np.abs(np.diff(values, prepend=values[0], append=values[-1]))
     out = far.copy()
@@ -194,7 +193,7 @@ def _abrupt(values: np.ndarray, away: np.ndarray, far: np.ndarray) -> np.ndarray
 
 
 def _stuck(log: Log, inputs: Sequence[str]) -> Iterator[Finding]:
-    """Actuators that rest although their demand goes elsewhere."""
+    """Return the actuators that rest although their demand goes elsewhere."""
     for demand in log.channels:
         actual = _actual_of(demand, log)
         if actual is None or log.units[actual] != log.units[demand]:
@@ -236,8 +235,9 @@ def _stuck(log: Log, inputs: Sequence[str]) -> Iterator[Finding]:
 
 
 def _actual_of(demand: str, log: Log) -> str | None:
-    """The channel that says what an actuator does, for that which says what it should; None where
-    there is none.
+    """Return the channel that says what an actuator does, for that which says what it should.
+
+    None where there is none.
     """
     bare = _DEMAND.sub("", demand)
     if bare == demand:
@@ -248,7 +248,7 @@ def _actual_of(demand: str, log: Log) -> str | None:
 
 
 def _idle(log: Log, inputs: Sequence[str]) -> Iterator[Finding]:
-    """A vessel that weaves although nothing that drives it moves."""
+    """Return a vessel that weaves although nothing that drives it moves."""
     driving = [name for name in inputs if not name.startswith(("wind", "current"))]
     if not driving or "psi" not in log.channels or np.isfinite(log["psi"]).sum() < 50:
         return
@@ -285,7 +285,7 @@ def _idle(log: Log, inputs: Sequence[str]) -> Iterator[Finding]:
 
 
 def _swings(angle: np.ndarray) -> int:
-    """How often an angle [T] turns round after going more than `_SWING` one way."""
+    """Return how often an angle [T] turns round after going more than `_SWING` one way."""
     count, low, high, way = 0, float(angle[0]), float(angle[0]), 0
     for value in angle.tolist():
         low, high = min(low, value), max(high, value)
@@ -297,7 +297,7 @@ def _swings(angle: np.ndarray) -> int:
 
 
 def _relative_wind(log: Log, inputs: Sequence[str]) -> Iterator[Finding]:
-    """Wind directions that turn against the heading: they are relative, and contain the motion."""
+    """Return the wind directions that turn against the heading: they are relative, and contain the motion."""
     if "psi" not in log.channels:
         return
     directions = [name for name in log.channels if "wind" in name and log.units[name] == "rad"]
@@ -329,7 +329,7 @@ def _relative_wind(log: Log, inputs: Sequence[str]) -> Iterator[Finding]:
 
 
 def _same_direction(log: Log, relative: str, true: str) -> bool:
-    """Whether one direction plus the heading is the other, where the heading tells."""
+    """Return whether one direction plus the heading is the other, where the heading tells."""
     both, alone = (np.exp(1j * (log[relative] + turn - log[true])) for turn in (log["psi"], 0.0))
     return bool(
         abs(np.nanmean(both)) > 0.9 and abs(np.nanmean(alone)) < abs(np.nanmean(both)) - 0.02

@@ -51,7 +51,7 @@ class Cause:
 
 
 def yaw_causes(log: Log) -> dict[str, Cause]:
-    """What makes the increments of psi differ from the integral of r.
+    """Return what makes the increments of psi differ from the integral of r.
 
     Causes: `gain` (r is too large by 1 + value), `lag` (r trails psi, s), `bias` (of r, rad/s, the
     negative of what psi gains over it) and `ramp` (its growth over the log, rad/s from start to
@@ -74,7 +74,7 @@ def yaw_causes(log: Log) -> dict[str, Cause]:
 
 
 def position_causes(log: Log) -> dict[str, Cause]:
-    """What makes the increments of x, y differ from the integral of R(psi) [u, v].
+    """Return what makes the increments of x, y differ from the integral of R(psi) [u, v].
 
     Causes: `gain_u`, `gain_v`, `gain` (u, v, or both too large by 1 + value), `heading` (to be
     added to psi, rad), `lag_u`, `lag_v`, `lag` (they trail the position, s), `lag_psi` (psi trails,
@@ -140,15 +140,13 @@ _NEEDS = {
 
 
 def _stands_out(values: np.ndarray) -> bool:
-    """Whether a channel does more than its noise."""
+    """Return whether a channel does more than its noise."""
     smooth = _smoothed(values)
     return float(np.sqrt(np.nanmean(smooth**2))) > 1.2 * noise_of(values)
 
 
 def _smoothed(values: np.ndarray) -> np.ndarray:
-    """Values [T] smoothed by a parabola over 15 samples, so that columns share no noise with what
-    they explain; NaN stay where they are.
-    """
+    """Return the values [T] smoothed by a parabola over 15 samples, so that columns share no noise with what they explain; NaN stay where they are."""
     known = np.isfinite(values)
     if known.sum() < 15:
         return values
@@ -177,9 +175,7 @@ class _Rows:
         self._dt, self._rate, self._noise = dt, rate, noise
 
     def _between(self, steps: np.ndarray) -> np.ndarray:
-        """Sums [K, ...] of steps [T - 1, ...] between neighbouring samples of the pose, NaN where
-        one of them is.
-        """
+        """Return the sums [K, ...] of steps [T - 1, ...] between neighbouring samples of the pose, NaN where one of them is."""
         unknown = ~np.isfinite(steps)
         start = np.zeros((1, *steps.shape[1:]))
         total = np.concatenate((start, np.cumsum(np.where(unknown, 0.0, steps), axis=0)))[self._at]
@@ -187,8 +183,9 @@ class _Rows:
         return np.where(np.diff(count, axis=0) > 0, np.nan, np.diff(total, axis=0))
 
     def explained(self, columns: Mapping[str, np.ndarray]) -> dict[str, Cause]:
-        """The causes that it takes, in the order of their weight; columns [T - 1, m] real or
-        complex.
+        """Return the causes that it takes, in the order of their weight.
+
+        Columns [T - 1, m] real or complex.
         """
         if self._at.size < _FEWEST:
             return {}
@@ -237,7 +234,7 @@ class _Rows:
 
     @staticmethod
     def _trimmed(y: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """[K] 1 or 0: rows that no cause explains and that stand far out (a jump) are left out."""
+        """Return [K] 1 or 0: rows that no cause explains and that stand far out (a jump) are left out."""
         scale = np.maximum(np.abs(x).max(axis=0), 1e-300)
         coefficients = np.linalg.lstsq(x / scale, y, rcond=1e-9)[0]
         rest = np.abs(y - (x / scale) @ coefficients)
@@ -250,9 +247,7 @@ class _Rows:
 def _pursuit(
     y: np.ndarray, x: np.ndarray, names: np.ndarray, section: np.ndarray
 ) -> dict[str, Cause]:
-    """Forward one group of columns at a time, then backward: a cause that others made superfluous
-    goes.
-    """
+    """Return the forward one group of columns at a time, then backward: a cause that others made superfluous goes."""
     scale = np.linalg.norm(x, axis=0)
     alive = scale > 0.0
     x, names, scale = x[:, alive] / scale[alive], names[alive], scale[alive]

@@ -24,7 +24,7 @@ _WORTH = 1.2
 
 
 def response_findings(log: Log, inputs: Sequence[str]) -> Iterator[Finding]:
-    """Sign and timing of the yaw rate's answer to what steers."""
+    """Return the sign and timing of the yaw rate's answer to what steers."""
     found = (
         _steering(log, inputs)
         if "r" in log.channels and np.isfinite(log["r"]).sum() >= _FEWEST
@@ -110,7 +110,7 @@ class _Answer:
 
 
 def _opposite(log: Log, steer: np.ndarray) -> bool:
-    """Whether steering and yaw rate both stay on one side, and not on the same."""
+    """Return whether steering and yaw rate both stay on one side, and not on the same."""
     good = np.isfinite(log["r"]) & np.isfinite(steer)
     r, given = _smoothed(log["r"])[good], steer[good]
     if r.size < _FEWEST or float(np.abs(r).mean()) < 6.0 * noise_of(log["r"]):
@@ -122,7 +122,7 @@ def _opposite(log: Log, steer: np.ndarray) -> bool:
 
 
 def _steering(log: Log, inputs: Sequence[str]) -> tuple[str, np.ndarray] | None:
-    """The channel that steers and its values [T]; None where there is none of known sense."""
+    """Return the channel that steers and its values [T]; None where there is none of known sense."""
     known = (*inputs, *(name for name in log.channels if name not in inputs))
     for name in _STEERING:
         if name in known and float(np.nanstd(log[name])) > 1e-9:
@@ -136,7 +136,7 @@ def _steering(log: Log, inputs: Sequence[str]) -> tuple[str, np.ndarray] | None:
 
 
 def _answer(log: Log, steer: np.ndarray) -> _Answer | None:
-    """Effect and timing of steering [T] on the yaw rate; None where nothing can be said.
+    """Return the effect and timing of steering [T] on the yaw rate; None where nothing can be said.
 
     Over blocks of a second or so: the change of r on the integrals of 1, r, r|r|, v, v|v| and the
     steering, with the steering shifted in time.
@@ -196,7 +196,7 @@ def _answer(log: Log, steer: np.ndarray) -> _Answer | None:
 
 
 def _reach(r: np.ndarray, step: float) -> int:
-    """Samples after which the yaw rate has forgotten what it was: as far as a shift can be told."""
+    """Return the samples after which the yaw rate has forgotten what it was: as far as a shift can be told."""
     known: np.ndarray = np.nan_to_num(r - np.nanmean(r))
     power = np.abs(np.fft.rfft(known, 2 * known.size)) ** 2
     memory = np.fft.irfft(power)[: known.size]
@@ -206,7 +206,7 @@ def _reach(r: np.ndarray, step: float) -> int:
 
 
 def _fit(x: np.ndarray, y: np.ndarray) -> tuple[float, float, float]:
-    """Sum of squares left, last coefficient, and that in standard errors over twenty sections."""
+    """Return the sum of squares left, last coefficient, and that in standard errors over twenty sections."""
     size = np.maximum(np.linalg.norm(x, axis=0), 1e-300)
     x = x / size
     inverse = np.linalg.pinv(x.T @ x, rcond=1e-10)
@@ -219,6 +219,6 @@ def _fit(x: np.ndarray, y: np.ndarray) -> tuple[float, float, float]:
 
 
 def _smoothed(values: np.ndarray) -> np.ndarray:
-    """Values [T] smoothed by a parabola over 15 samples, NaN bridged."""
+    """Return the values [T] smoothed by a parabola over 15 samples, NaN bridged."""
     at, known = np.arange(values.size), np.isfinite(values)
     return np.asarray(savgol_filter(np.interp(at, at[known], values[known]), 15, 2))

@@ -14,8 +14,7 @@ _SIGMA = 1.4826
 
 
 def noise_of(values: np.ndarray) -> float:
-    """Standard deviation of the white noise of a channel [T]: from its third differences, which
-    hardly see the motion.
+    """Return the standard deviation of the white noise of a channel [T]: from its third differences, which hardly see the motion.
 
     The differences are taken over the known samples only; 0 where there are fewer than 8, or where
     most third differences vanish.
@@ -27,14 +26,12 @@ def noise_of(values: np.ndarray) -> float:
 
 
 def spikes(values: np.ndarray) -> np.ndarray:
-    """[T] bool: samples that stand far out of their neighbours (the rule of the mask `hampel` as it
-    is without settings).
-    """
+    """Return [T] bool: samples that stand far out of their neighbours (the rule of the mask `hampel` as it is without settings)."""
     return far_from_median(values, 6.0, 11)
 
 
 def averaged(values: np.ndarray, samples: int) -> np.ndarray:
-    """Moving average [T] over so many samples, NaN left out; NaN where none is known."""
+    """Return the moving average [T] over so many samples, NaN left out; NaN where none is known."""
     kernel = np.ones(min(samples, values.size))
     known = np.isfinite(values)
     count = np.convolve(known, kernel, mode="same")
@@ -43,5 +40,5 @@ def averaged(values: np.ndarray, samples: int) -> np.ndarray:
 
 
 def without(values: np.ndarray, bad: np.ndarray) -> np.ndarray:
-    """Values [T] with NaN where bad [T]."""
+    """Return the values [T] with NaN where bad [T]."""
     return np.where(bad, np.nan, values)

@@ -26,7 +26,7 @@ _FEWEST_LEVELS = 50
 
 
 def channel_findings(log: Log) -> Iterator[Finding]:
-    """Names and units of the channels, and which of the state are absent."""
+    """Return the names and units of the channels, and which of the state are absent."""
     named = ", ".join(f"{name} [{unit}]" for name, unit in log.units.items())
     yield Finding(
         "note",
@@ -43,8 +43,9 @@ def channel_findings(log: Log) -> Iterator[Finding]:
 
 
 def value_findings(log: Log, inputs: Sequence[str]) -> list[Finding]:
-    """Findings about the values of a log as recorded; `inputs` drive the vessel and may jump, hold
-    and rest at their limits.
+    """Return the findings about the values of a log as recorded.
+
+    `inputs` drive the vessel and may jump, hold and rest at their limits.
     """
     measured = [name for name in log.channels if name not in inputs and name in MEASURED]
     return [
@@ -110,7 +111,7 @@ def _missing(log: Log) -> Iterator[Finding]:
 
 
 def _repeats(log: Log) -> Iterator[Finding]:
-    """Rows that repeat the row before in every channel, which noise never does."""
+    """Return the rows that repeat the row before in every channel, which noise never does."""
     same = np.append(False, (np.diff(log.stack(tuple(log.channels)), axis=0) == 0.0).all(axis=1))
     moving = [
         name
@@ -136,7 +137,7 @@ def _repeats(log: Log) -> Iterator[Finding]:
 
 
 def frozen_findings(log: Log, measured: Sequence[str]) -> Iterator[Finding]:
-    """Sensors that hold their last value although the vessel moves on."""
+    """Return the sensors that hold their last value although the vessel moves on."""
     pair = [name for name in ("x", "y") if name in measured]
     position = np.zeros(len(log), dtype=bool)
     if len(pair) == 2:
@@ -152,7 +153,7 @@ def frozen_findings(log: Log, measured: Sequence[str]) -> Iterator[Finding]:
 
 
 def _sample_and_hold(log: Log, name: str) -> Iterator[Finding]:
-    """A slow sensor whose last value is repeated until the next."""
+    """Return a slow sensor whose last value is repeated until the next."""
     changes = np.flatnonzero(np.diff(log[name]) != 0.0)
     every = np.diff(changes)
     if every.size < 20 or float(np.median(every)) < 2.0:
@@ -201,7 +202,7 @@ def _frozen(log: Log, name: str, held: np.ndarray) -> Finding:
 
 
 def _held(log: Log, names: Sequence[str]) -> np.ndarray:
-    """[T] bool: inside runs of equal values that neither chance nor a vessel at rest explains."""
+    """Return [T] bool: inside runs of equal values that neither chance nor a vessel at rest explains."""
     out = np.zeros(len(log), dtype=bool)
     same = (np.diff(log.stack(tuple(names)), axis=0) == 0.0).all(axis=1)
     starts, stops = true_runs(same)
@@ -230,9 +231,7 @@ def _held(log: Log, names: Sequence[str]) -> np.ndarray:
 
 
 def _moves(log: Log, names: Sequence[str], run: slice) -> bool:
-    """Whether a channel must have changed over a run: a pose by what the velocities say, any other
-    wherever it is noisy elsewhere.
-    """
+    """Return whether a channel must have changed over a run: a pose by what the velocities say, any other wherever it is noisy elsewhere."""
     rates = {"psi": ("r",), "phi": ("p",)}.get(
         names[0], ("u", "v", "psi") if names[0] in ("x", "y") else ()
     )
@@ -265,15 +264,13 @@ def _moves(log: Log, names: Sequence[str], run: slice) -> bool:
 
 
 def _noisy(values: np.ndarray) -> bool:
-    """Whether noise is a good part of what a channel does from sample to sample."""
+    """Return whether noise is a good part of what a channel does from sample to sample."""
     change = np.diff(values)
     return noise_of(values) > 0.05 * float(np.nanstd(change))
 
 
 def _never_rests(values: np.ndarray, run: slice) -> bool:
-    """Whether a channel that is no pose cannot have rested over a run: it is noisy, or it lands far
-    off where it goes on.
-    """
+    """Return whether a channel that is no pose cannot have rested over a run: it is noisy, or it lands far off where it goes on."""
     if _noisy(values):
         return True
     after = np.abs(np.diff(values[run.stop - 1 : run.stop + 6]))
@@ -281,7 +278,7 @@ def _never_rests(values: np.ndarray, run: slice) -> bool:
 
 
 def _grown(flags: np.ndarray) -> np.ndarray:
-    """Flags [T] widened by one sample to either side."""
+    """Return the flags [T] widened by one sample to either side."""
     padded = np.pad(flags, 1)
     widened: np.ndarray = padded[:-2] | padded[1:-1] | padded[2:]
     return widened
@@ -320,7 +317,7 @@ def _worst(values: np.ndarray, far: np.ndarray) -> int:
 
 
 def _clipping(log: Log, name: str) -> Iterator[Finding]:
-    """Samples exactly at the largest or smallest value, many more than at the levels beside it."""
+    """Return the samples exactly at the largest or smallest value, many more than at the levels beside it."""
     known = log[name][np.isfinite(log[name])]
     levels, counts = np.unique(known, return_counts=True)
     if levels.size < 10:
@@ -341,7 +338,7 @@ def _clipping(log: Log, name: str) -> Iterator[Finding]:
 
 
 def _resolution(log: Log, name: str) -> Iterator[Finding]:
-    """Decimals that were dropped: few levels between the ends of what a channel does."""
+    """Return the decimals that were dropped: few levels between the ends of what a channel does."""
     known = log[name][np.isfinite(log[name])]
     low, high = (float(value) for value in np.quantile(known, (0.05, 0.95)))
     levels = np.unique(known)
@@ -369,7 +366,7 @@ def _resolution(log: Log, name: str) -> Iterator[Finding]:
 
 
 def _steps(log: Log, name: str) -> Iterator[Finding]:
-    """Changes of level within one sample, which a mass does not make."""
+    """Return the changes of level within one sample, which a mass does not make."""
     values = without(log[name], spikes(log[name]))
     change = np.abs(np.diff(values))
     if np.isfinite(change).sum() < 50:

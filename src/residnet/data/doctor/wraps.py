@@ -16,7 +16,7 @@ _CIRCLES = ((2.0 * math.pi, ""), (360.0, " of 360: degrees taken as rad"))
 
 
 def wrap_findings(log: Log) -> list[Finding]:
-    """Jumps of a heading by a full circle."""
+    """Return the jumps of a heading by a full circle."""
     out = []
     for name in _ANGLES:
         if name not in log.channels:
@@ -42,9 +42,7 @@ def wrap_findings(log: Log) -> list[Finding]:
 
 
 def _wraps(log: Log, name: str, circle: float) -> np.ndarray:
-    """[T] bool: samples that arrive by about a full circle from the one before or the one before
-    that (a wrap with a sample in between).
-    """
+    """Return [T] bool: samples that arrive by about a full circle from the one before or the one before that (a wrap with a sample in between)."""
     known = np.isfinite(log[name])
     change = np.diff(log[name][known], prepend=log[name][known][:1])
     out = np.zeros(len(log), dtype=bool)
@@ -53,7 +51,7 @@ def _wraps(log: Log, name: str, circle: float) -> np.ndarray:
 
 
 def unwrapped(log: Log) -> Log:
-    """The log with its headings continuous."""
+    """Return the log with its headings continuous."""
     channels = {
         name: unwrap(values) if name in _ANGLES else values for name, values in log.channels.items()
     }

@@ -1,5 +1,4 @@
-"""What every reader of logs shares: the interface, the file's identity, and the checks at the door.
-"""
+"""What every reader of logs shares: the interface, the file's identity, and the checks at the door."""
 
 from __future__ import annotations
 
@@ -22,7 +21,7 @@ class LogReader(ABC):
 
     @abstractmethod
     def read(self, path: Path) -> Log:
-        """The log in one file, in SI units, psi unwrapped, time strictly increasing.
+        """Return the log in one file, in SI units, psi unwrapped, time strictly increasing.
 
         The log's name is the file's stem; `meta` holds `source`, `sha256`, `rows_read` and
         `rows_dropped`.
@@ -68,8 +67,7 @@ def require_file(path: Path) -> None:
 
 
 def provenance(path: Path, rows_read: int, rows_dropped: int) -> dict[str, Any]:
-    """Where a log comes from: `source`, `sha256` of the file's bytes, `rows_read`, `rows_dropped`.
-    """
+    """Return where a log comes from: `source`, `sha256` of the file's bytes, `rows_read`, `rows_dropped`."""
     with path.open("rb") as stream:
         digest = hashlib.file_digest(stream, "sha256").hexdigest()
     return {
@@ -81,7 +79,7 @@ def provenance(path: Path, rows_read: int, rows_dropped: int) -> dict[str, Any]:
 
 
 def unwrap(angle: np.ndarray) -> np.ndarray:
-    """Angle [T] in rad made continuous over its finite samples; NaN stay where they are.
+    """Return the angle [T] in rad made continuous over its finite samples; NaN stay where they are.
 
     A turn of more than half a circle between two finite samples cannot be told from its complement.
     """

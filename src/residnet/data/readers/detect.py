@@ -1,5 +1,4 @@
-"""Which reader a file needs, by its content first and its ending second, where no config says so.
-"""
+"""Which reader a file needs, by its content first and its ending second, where no config says so."""
 
 from __future__ import annotations
 
@@ -86,8 +85,10 @@ class AutoConfig(RecordingConfig):
 
 
 def format_of(path: Path) -> Format | None:
-    """The format of a recording; None where it is none that describes itself (a csv table, a
-    foreign Parquet file, anything else).
+    """Return the format of a recording.
+
+    None where it is none that describes itself (a csv table, a foreign Parquet file, anything
+    else).
 
     Raises:
         UsageError: where there is nothing at `path`.
@@ -101,7 +102,7 @@ def format_of(path: Path) -> Format | None:
 
 
 def reader_for(path: Path) -> LogReader:
-    """A reader for a file or folder that describes itself.
+    """Return a reader for a file or folder that describes itself.
 
     Raises:
         UsageError: where there is nothing at `path`, or it needs a channel map.
@@ -112,7 +113,7 @@ def reader_for(path: Path) -> LogReader:
 
 
 def recording_for(path: Path) -> Recording:
-    """Everything that a file or folder holds, its clocks settled, before it is composed to a log.
+    """Return everything that a file or folder holds, its clocks settled, before it is composed to a log.
 
     Raises:
         UsageError: where there is nothing at `path`, or its format describes no channels.

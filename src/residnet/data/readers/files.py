@@ -15,7 +15,7 @@ _LARGE = 50_000_000
 
 
 def digest(files: Sequence[Path]) -> str:
-    """Hexadecimal SHA-256 of one file's bytes, or of the digests of several, in order."""
+    """Return the hexadecimal SHA-256 of one file's bytes, or of the digests of several, in order."""
     if len(files) == 1:
         return _one(files[0])
     return hashlib.sha256("".join(_one(file) for file in files).encode()).hexdigest()
@@ -27,12 +27,12 @@ def _one(file: Path) -> str:
 
 
 def files_of(path: Path) -> list[Path]:
-    """A file itself, or all files below a folder, in order."""
+    """Return a file itself, or all files below a folder, in order."""
     return sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]
 
 
 def total_size(files: Iterable[Path]) -> int:
-    """Bytes of all files."""
+    """Return the bytes of all files."""
     return sum(file.stat().st_size for file in files)
 
 
@@ -44,8 +44,9 @@ class Advance(Protocol):
 
 @contextmanager
 def progress(what: str, size: int, total: float) -> Iterator[Advance]:
-    """A bar on standard error while a recording of `size` bytes is read; none where it is small or
-    nobody watches.
+    """Return a bar on standard error while a recording of `size` bytes is read.
+
+    None where it is small or nobody watches.
 
     Args:
         what: name of the file.
@@ -78,7 +79,7 @@ def progress(what: str, size: int, total: float) -> Iterator[Advance]:
 
 
 def missing_package(extra: str, package: str, what: str) -> UsageError:
-    """The error for a format whose package is not installed."""
+    """Return the error for a format whose package is not installed."""
     return UsageError(
         f"{what} needs the package {package}, which is not installed; install it with: pip install"
         f' "residnet[{extra}]"'

@@ -20,9 +20,7 @@ Remark = dict[str, Any]
 
 
 def remark(level: Level, code: str, text: str, **figures: float) -> Remark:
-    """One thing noticed on the way in, as `Log.meta["findings"]` holds it: level, code, text,
-    figures (SI).
-    """
+    """Return one thing noticed on the way in, as `Log.meta["findings"]` holds it: level, code, text, figures (SI)."""
     return {"level": level, "code": code, "text": text, "figures": figures}
 
 
@@ -65,13 +63,14 @@ class Series:
         return {key_of(path): path for path in reversed(self.fields)}
 
     def has(self, path: str) -> bool:
-        """Whether there is a field of this path; `pose.position.x`, `pose/position/x` and
-        `pose_position_x` are the same.
+        """Return whether there is a field of this path.
+
+        `pose.position.x`, `pose/position/x` and `pose_position_x` are the same.
         """
         return path in self.fields or key_of(path) in self._by_key
 
     def __getitem__(self, path: str) -> np.ndarray:
-        """Values [T] of one field.
+        """Return the values [T] of one field.
 
         Raises:
             UsageError: where there is none.
@@ -82,7 +81,7 @@ class Series:
         return self.fields[name]
 
     def where(self, keep: np.ndarray) -> Series:
-        """The rows at which `keep` ([T] bool, or indices) points."""
+        """Return the rows at which `keep` ([T] bool, or indices) points."""
         stamp, arrival, sender = (
             None if part is None else part[keep] for part in (self.stamp, self.arrival, self.sender)
         )
@@ -90,7 +89,7 @@ class Series:
         return dataclasses.replace(self, fields=fields, stamp=stamp, arrival=arrival, sender=sender)
 
     def of_sender(self, sender: str) -> Series:
-        """The rows of one sender.
+        """Return the rows of one sender.
 
         Raises:
             UsageError: where no row has this sender.
@@ -107,7 +106,7 @@ class Series:
         return self.where(self.sender == sender)
 
     def noting(self, *remarks: Remark) -> Series:
-        """The series with further remarks."""
+        """Return the series with further remarks."""
         return dataclasses.replace(self, remarks=(*self.remarks, *remarks))
 
 
@@ -133,7 +132,7 @@ class Recording:
     listed: tuple[str, ...] = field(default=())
 
     def __getitem__(self, topic: str | None) -> Series:
-        """One series; None names the only one. A leading slash may be left out.
+        """Return one series; None names the only one. A leading slash may be left out.
 
         Raises:
             UsageError: where there is no such series, or several and none was named.
@@ -154,12 +153,13 @@ class Recording:
 
 
 def same_topic(topic: str, names: Iterable[str]) -> str | None:
-    """The one of `names` that means `topic`, a leading slash aside; None where there is none."""
+    """Return the one of `names` that means `topic`, a leading slash aside.
+
+    None where there is none.
+    """
     return next((name for name in names if name.strip("/") == topic.strip("/")), None)
 
 
 def key_of(path: str) -> str:
-    """A field's path with every separator as one underscore: exporters write `pose.position.x`,
-    `pose/position/x` or `pose_position_x`.
-    """
+    """Return a field's path with every separator as one underscore: exporters write `pose.position.x`, `pose/position/x` or `pose_position_x`."""
     return re.sub(r"[./\[\]_]+", "_", path).strip("_").removeprefix("field_")

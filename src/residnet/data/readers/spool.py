@@ -34,7 +34,7 @@ class Spool:
         ]
 
     def add(self, columns: list[np.ndarray]) -> None:
-        """One more piece of each column.
+        """Return one more piece of each column.
 
         Raises:
             DataError: where the disk is full.
@@ -53,7 +53,7 @@ class Spool:
             ) from error
 
     def finish(self) -> list[np.ndarray]:
-        """The columns [T], read-only where they lie on disk; the spool is empty then."""
+        """Return the columns [T], read-only where they lie on disk; the spool is empty then."""
         out = []
         for file in self._files:
             file.flush()

@@ -43,8 +43,9 @@ class Stamps:
 
 
 def parse_numbers(values: np.ndarray, factor: float | None = None) -> Stamps:
-    """Times from numbers [T], in units of `factor` seconds; None reads Unix time in s, ms, us or ns
-    by its size, and anything smaller as s.
+    """Return the times from numbers [T], in units of `factor` seconds.
+
+    None reads Unix time in s, ms, us or ns by its size, and anything smaller as s.
 
     Raises:
         DataError: where a value is not finite.
@@ -63,7 +64,7 @@ def parse_numbers(values: np.ndarray, factor: float | None = None) -> Stamps:
 
 
 def parse_texts(texts: np.ndarray, unpadded: bool | None = None) -> Stamps:
-    """Times from text [T]: dates with or without a zone, or plain numbers, one style throughout.
+    """Return the times from text [T]: dates with or without a zone, or plain numbers, one style throughout.
 
     A fraction of a second printed as an integer without its leading zeros (`09.70533347` for
     9.070533347 s) is recognised by the whole column: it makes time run backwards where the padded
@@ -116,7 +117,7 @@ def parse_texts(texts: np.ndarray, unpadded: bool | None = None) -> Stamps:
 
 
 def _whole(parts: object, dated: bool) -> np.ndarray:
-    """Whole seconds (or whole units of a number) [T] int64; dates in UTC."""
+    """Return the whole seconds (or whole units of a number) [T] int64; dates in UTC."""
     import pandas as pd
 
     assert isinstance(parts, pd.DataFrame)
@@ -151,7 +152,7 @@ def _zone_seconds(zone: str) -> int:
 def _fractions(
     column: object, whole: np.ndarray, known: bool | None
 ) -> tuple[np.ndarray, tuple[Remark, ...]]:
-    """Fractions of the unit in ns [T] int64."""
+    """Return the fractions of the unit in ns [T] int64."""
     import pandas as pd
 
     assert isinstance(column, pd.Series)

@@ -93,7 +93,7 @@ class Disturbance(Config):
         return self
 
     def currents(self, rows: int, seed: int) -> np.ndarray:
-        """The current of each trial towards north and east in m/s, [B, 2]."""
+        """Return the current of each trial towards north and east in m/s, [B, 2]."""
         out = np.tile(self.current(), (rows, 1))
         if self.current_each is not None:
             random = np.random.default_rng([seed, 7])
@@ -105,7 +105,7 @@ class Disturbance(Config):
         return out
 
     def current(self) -> tuple[float, float]:
-        """The current of all trials towards north and east in m/s."""
+        """Return the current of all trials towards north and east in m/s."""
         if self.current_speed is None or self.current_direction is None:
             return self.current_north, self.current_east
         return self.current_speed * float(
@@ -118,9 +118,7 @@ class Disturbance(Config):
         return WIND_INPUTS if self.wind is not None else ()
 
     def needs(self) -> dict[str, str]:
-        """Inputs that a plant must have for this disturbance to reach it, each with the key that
-        asks for it.
-        """
+        """Return the inputs that a plant must have for this disturbance to reach it, each with the key that asks for it."""
         north, east = self.current()
         asked = {
             "force_x": self.force_x != 0, "force_y": self.force_y != 0,
@@ -165,8 +163,7 @@ class Disturbance(Config):
         seed: int,
         random: np.random.Generator,
     ) -> np.ndarray:
-        """Inputs of the plant [B, T, m] with the commands zero, of all that does not depend on
-        where the vessel is.
+        """Return the inputs of the plant [B, T, m] with the commands zero, of all that does not depend on where the vessel is.
 
         The random forces are drawn from `random` (three values per step whatever their sizes, so
         that data of one seed stay the same), the gusts from generators of their own under `seed`.
@@ -196,7 +193,7 @@ class Disturbance(Config):
         return w
 
     def surround(self, source: Source, plant: Plant, rows: int, step: float, seed: int) -> Source:
-        """The source of inputs with the waves added to what it gives; itself in calm water."""
+        """Return the source of inputs with the waves added to what it gives; itself in calm water."""
         if self.waves is None:
             return source
         return Seaway(source, self.waves.build(rows, np.random.default_rng([seed, 5])), plant, step)
@@ -224,11 +221,11 @@ class Seaway(Source):
         self.spread: Tensor
 
     def initial(self, x: Tensor) -> Tensor:
-        """Memory of the source inside."""
+        """Return the memory of the source inside."""
         return self.source.initial(x)
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Inputs [B, m] with the force of the waves at the time of step k."""
+        """Return the inputs [B, m] with the force of the waves at the time of step k."""
         acting, memory = self.source(x, w, k, memory)
         force = self.waves(
             x[:, self.place[0]], x[:, self.place[1]], x[:, self.place[2]], k * self.step
@@ -236,14 +233,14 @@ class Seaway(Source):
         return acting + (force @ self.spread).to(acting.dtype), memory
 
     def finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
-        """Rows that the source inside stops."""
+        """Return the rows that the source inside stops."""
         return self.source.finished(x, k, memory)
 
 
 def ornstein_uhlenbeck(
     random: np.random.Generator, shape: tuple[int, int, int], step: float, correlation: float
 ) -> np.ndarray:
-    """Stationary first-order processes [B, T, k] of unit variance along T, discretised exactly."""
+    """Return the stationary first-order processes [B, T, k] of unit variance along T, discretised exactly."""
     from scipy.signal import lfilter
 
     keep = np.exp(-step / correlation)
@@ -256,9 +253,7 @@ def ornstein_uhlenbeck(
 def gusty_wind(
     wind: WindField, rows: int, steps: int, step: float, random: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Speed [B, T] in m/s and direction [B, T] in rad (where it comes from) of the mean wind with
-    its gusts.
-    """
+    """Return the speed [B, T] in m/s and direction [B, T] in rad (where it comes from) of the mean wind with its gusts."""
     gust = wind.gust * ornstein_uhlenbeck(random, (rows, steps, 2), step, wind.correlation)
     along = wind.speed + gust[:, :, 0]
     return np.hypot(along, gust[:, :, 1]), wind.direction + np.arctan2(gust[:, :, 1], along)

@@ -91,7 +91,9 @@ class Flight:
 
 
 def source_of(manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
-    """The source that flies manoeuvres of any kinds side by side; t [T] are the times of the steps.
+    """Return the source that flies manoeuvres of any kinds side by side.
+
+    t [T] are the times of the steps.
 
     Raises:
         UsageError: where the vessel lacks what a manoeuvre needs.
@@ -189,7 +191,7 @@ def fly(
 def _surroundings(
     sea: Sea, craft: Craft, rows: int, steps: int, step: float, random: np.random.Generator
 ) -> Tensor:
-    """Inputs [B, T, m] with the commands zero."""
+    """Return the inputs [B, T, m] with the commands zero."""
     if sea.plant is not None:
         return torch.from_numpy(
             sea.disturbance.series(sea.plant, rows, steps, step, sea.seed, random)
@@ -205,7 +207,7 @@ def _surroundings(
 
 
 def log_names(manoeuvres: Sequence[Manoeuvre]) -> list[str]:
-    """Names of the logs: as given, else the kind with its number."""
+    """Return the names of the logs: as given, else the kind with its number."""
     count: dict[str, int] = {}
     out = []
     for manoeuvre in manoeuvres:

@@ -91,7 +91,7 @@ class SensorNoise(Config):
         white: np.ndarray,
         seed: tuple[int, ...],
     ) -> dict[str, np.ndarray]:
-        """What the log holds.
+        """Return what the log holds.
 
         Args:
             clean: channels [T] as they were.

@@ -56,7 +56,7 @@ class SimulatedTrials(Config):
         try:
             plant = load_vessel(self.vessel).build()
             # actuators with dead time move by a step of their own
-            plant.settle(
+            plant.end_step(
                 plant.approach(1),
                 torch.zeros(1, len(plant.inputs), dtype=torch.float64),
                 self.step / self.substeps,
@@ -72,14 +72,14 @@ class SimulatedTrials(Config):
         return self
 
     def draw(self) -> list[Manoeuvre]:
-        """The manoeuvres, by family."""
+        """Return the manoeuvres, by family."""
         random = np.random.default_rng([self.seed, 1])
         return [
             manoeuvre for family in self.trials for manoeuvre in family.draw(random, self.duration)
         ]
 
     def splits(self, manoeuvres: Sequence[Manoeuvre]) -> list[str]:
-        """`train`, `validation` or `test` of each manoeuvre; whole manoeuvres only.
+        """Return `train`, `validation` or `test` of each manoeuvre; whole manoeuvres only.
 
         Raises:
             ValueError: where a split asks for more manoeuvres than there are.
@@ -116,7 +116,7 @@ def fly_trials(manoeuvres: Sequence[Manoeuvre], config: SimulatedTrials) -> list
 
 
 def trials_craft(config: SimulatedTrials) -> Craft:
-    """The vessel of the trials."""
+    """Return the vessel of the trials."""
     plant = load_vessel(config.vessel).build()
     return Craft(
         config.vessel,
@@ -128,5 +128,5 @@ def trials_craft(config: SimulatedTrials) -> Craft:
 
 
 def simulate(manoeuvres: Sequence[Manoeuvre], config: SimulatedTrials) -> list[Log]:
-    """The logs of `fly_trials`."""
+    """Return the logs of `fly_trials`."""
     return [flight.log for flight in fly_trials(manoeuvres, config)]

@@ -87,7 +87,7 @@ class AzimuthThrustersConfig(ActuatorConfig):
         return self
 
     def build(self) -> AzimuthThrusters:
-        """The module."""
+        """Return the module."""
         return AzimuthThrusters(self)
 
 
@@ -126,14 +126,17 @@ class AzimuthThrusters(Actuators):
         self.strongest = float(self.thrust(torch.tensor(self.n_max, dtype=torch.float64)))
 
     def thrust(self, n: Tensor) -> Tensor:
-        """Force [N] of one thruster along its axis at revolutions n [1/s], any shape (5.1)."""
+        """Return the force [N] of one thruster along its axis at revolutions n [1/s], any shape (5.1)."""
         out = torch.full_like(n, self.coefficients[-1])
         for c in self.coefficients[-2::-1]:
             out = c + n * out
         return out
 
     def revolutions(self, force: Tensor) -> Tensor:
-        """Revolutions n [1/s] within +-n_max that make a force [N], any shape; without gradient."""
+        """Return the revolutions n [1/s] within +-n_max that make a force [N], any shape.
+
+        Without gradient.
+        """
         low, high = torch.full_like(force, -self.n_max), torch.full_like(force, self.n_max)
         for _ in range(52):
             middle = 0.5 * (low + high)
@@ -142,9 +145,7 @@ class AzimuthThrusters(Actuators):
         return 0.5 * (low + high)
 
     def allocate(self, tau: Tensor) -> Tensor:
-        """Commands [..., 2k] that make forces tau [..., 3] with the least sum of squared thrusts;
-        thrusts beyond the largest saturate.
-        """
+        """Return the commands [..., 2k] that make forces tau [..., 3] with the least sum of squared thrusts; thrusts beyond the largest saturate."""
         parts = tau @ self.share.to(tau.dtype).T
         return self._commands(parts[..., : self.count], parts[..., self.count :])
 
@@ -161,22 +162,22 @@ class AzimuthThrusters(Actuators):
         return self.allocate(both * self.strongest)
 
     def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
-        """tau [..., 3] in N, N, N m (5.2)."""
+        """Return tau [..., 3] in N, N, N m (5.2)."""
         state = self.servos.value(a, command)
         thrust, angle = self.thrust(state[..., : self.count]), state[..., self.count :]
         parts = torch.cat((thrust * torch.cos(angle), thrust * torch.sin(angle)), dim=-1)
         return parts @ self.map.to(parts.dtype).T
 
     def rate(self, a: Tensor, command: Tensor) -> Tensor:
-        """Derivative [..., k] of the states."""
+        """Return the derivative [..., k] of the states."""
         return self.servos.rate(a, command)
 
     def advance(self, a: Tensor, command: Tensor, dt: float) -> Tensor:
-        """States [..., k] after a step of dt seconds."""
+        """Return the states [..., k] after a step of dt seconds."""
         return self.servos.advance(a, command, dt)
 
     def _commands(self, along: Tensor, across: Tensor) -> Tensor:
-        """Revolutions and angles from components [..., k]."""
+        """Return the revolutions and angles from components [..., k]."""
         size = torch.hypot(along, across)
         angle = torch.where(size > 0, torch.atan2(across, along), torch.zeros_like(size))
         return torch.cat((self.revolutions(size.clamp(max=self.strongest)), angle), dim=-1)

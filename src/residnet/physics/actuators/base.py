@@ -31,22 +31,18 @@ class Actuators(nn.Module, ABC):
 
     @abstractmethod
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Commands [..., c] from the normalised drive and steer [...] of a manoeuvre, each within
-        +-1.
-        """
+        """Return the commands [..., c] from the normalised drive and steer [...] of a manoeuvre, each within +-1."""
 
     @abstractmethod
     def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
-        """Forces tau [..., n] on the hull from states a [..., k], commands [..., c] and velocities
-        through the water nu [..., n].
-        """
+        """Return the forces tau [..., n] on the hull from states a [..., k], commands [..., c] and velocities through the water nu [..., n]."""
 
     def rate(self, a: Tensor, command: Tensor) -> Tensor:
-        """Derivative [..., k] of the states."""
+        """Return the derivative [..., k] of the states."""
         return torch.zeros_like(a)
 
     def advance(self, a: Tensor, command: Tensor, dt: float) -> Tensor:
-        """States [..., k] after a step of dt seconds, of what moves once per step."""
+        """Return the states [..., k] after a step of dt seconds, of what moves once per step."""
         return a
 
 
@@ -58,4 +54,4 @@ class ActuatorConfig(Config, ABC):
 
     @abstractmethod
     def build(self) -> Actuators:
-        """The module."""
+        """Return the module."""

@@ -44,7 +44,7 @@ class DifferentialThrustConfig(ActuatorConfig):
         return self
 
     def build(self) -> DifferentialThrust:
-        """The force map."""
+        """Return the force map."""
         return DifferentialThrust(self)
 
 
@@ -66,33 +66,27 @@ class DifferentialThrust(Actuators):
         self.curve = ThrustCurve(config.forward, config.reverse)
 
     def thrust(self, n: Tensor) -> Tensor:
-        """Thrust of one propeller [N] at revolutions n [1/s], any shape (document 003 eqs. (21),
-        (22), clipped as in ERRATA W5).
-        """
+        """Return the thrust of one propeller [N] at revolutions n [1/s], any shape (document 003 eqs. (21), (22), clipped as in ERRATA W5)."""
         thrust: Tensor = self.curve(n)
         return thrust
 
     def forward(self, n: Tensor) -> Tensor:
-        """n [..., 2] -> tau [..., 3]."""
+        """Return n [..., 2] -> tau [..., 3]."""
         t = self.thrust(n)
         port, stbd = t[..., 0], t[..., 1]
         return torch.stack((port + stbd, torch.zeros_like(port), self.arm * (port - stbd)), dim=-1)
 
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Commands [..., 2] in 1/s from the normalised mean and difference of revolutions (document
-        003 eqs. (30), (31)), clipped to +-1 per side.
-        """
+        """Return the commands [..., 2] in 1/s from the normalised mean and difference of revolutions (document 003 eqs. (30), (31)), clipped to +-1 per side."""
         both = torch.stack((drive + steer, drive - steer), dim=-1)
         return both.clamp(-1.0, 1.0) * self.n_max
 
     def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
-        """tau [..., 3] of the present revolutions a [..., 2], whatever is commanded."""
+        """Return tau [..., 3] of the present revolutions a [..., 2], whatever is commanded."""
         return self.forward(a)
 
     def advance(self, a: Tensor, command: Tensor, dt: float) -> Tensor:
-        """Revolutions [..., 2] after a step of dt seconds: towards the saturated command by at most
-        the rate limit.
-        """
+        """Return the revolutions [..., 2] after a step of dt seconds: towards the saturated command by at most the rate limit."""
         target = command.clamp(-self.n_max, self.n_max)
         step = self.n_rate * dt
         return a + (target - a).clamp(-step, step)

@@ -29,7 +29,7 @@ class ForceCommandsConfig(ActuatorConfig):
     ] = ImmediateConfig()
 
     def build(self) -> ForceCommands:
-        """The module."""
+        """Return the module."""
         return ForceCommands(self)
 
 
@@ -64,19 +64,19 @@ class ForceCommands(Actuators):
         return both.clamp(-1.0, 1.0) * self.limit.to(drive.dtype)
 
     def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
-        """tau [..., 3]."""
+        """Return tau [..., 3]."""
         return self.response.value(self._by_axis(a), self._target(command))
 
     def rate(self, a: Tensor, command: Tensor) -> Tensor:
-        """Derivative [..., k] of the states."""
+        """Return the derivative [..., k] of the states."""
         return self.response.rate(self._by_axis(a), self._target(command)).mT.reshape(a.shape)
 
     def _target(self, command: Tensor) -> Tensor:
-        """The command [..., 3] within the limits."""
+        """Return the command [..., 3] within the limits."""
         limit = self.limit.to(command.dtype)
         return torch.maximum(torch.minimum(command, limit), -limit)
 
     def _by_axis(self, a: Tensor) -> Tensor:
-        """States [..., k] as [..., 3, k / 3]: a row for each axis."""
+        """Return the states [..., k] as [..., 3, k / 3]: a row for each axis."""
         by_axis: Tensor = a.unflatten(-1, (len(self.response.suffixes), 3)).mT
         return by_axis

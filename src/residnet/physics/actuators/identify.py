@@ -32,7 +32,7 @@ class ThrottleMap(NamedTuple):
     saturated: bool
 
     def __call__(self, throttle: np.ndarray) -> np.ndarray:
-        """Revolutions [1/s]."""
+        """Return the revolutions [1/s]."""
         return np.clip(
             self.slope.value * throttle + self.offset.value, -self.n_max.value, self.n_max.value
         )
@@ -56,7 +56,7 @@ class ThrustFit(NamedTuple):
     rms: float
 
     def __call__(self, n: np.ndarray) -> np.ndarray:
-        """Thrust [N] per thruster at n [1/s]."""
+        """Return the thrust [N] per thruster at n [1/s]."""
         c = [estimate.value for estimate in self.coefficients]
         out: np.ndarray = c[0] + n * (c[1] + n * c[2])
         return out
@@ -66,8 +66,7 @@ _SATURATION_POINTS = 3
 
 
 def fit_throttle(throttle: np.ndarray, n: np.ndarray) -> ThrottleMap:
-    """Steady revolutions n [N] in 1/s over throttle [N]: a line with a bound, found together by
-    least squares.
+    """Return the steady revolutions n [N] in 1/s over throttle [N]: a line with a bound, found together by least squares.
 
     Raises:
         FitError: with fewer than five points or fewer than three different throttles on the slope,
@@ -125,9 +124,7 @@ def fit_throttle(throttle: np.ndarray, n: np.ndarray) -> ThrottleMap:
 def follow_command(
     t: np.ndarray, command: np.ndarray, rate: float, dead_time: float, start: float
 ) -> np.ndarray:
-    """Revolutions [T] that move towards the command of dead_time ago by at most `rate`,
-    held-command samples at t [T].
-    """
+    """Return the revolutions [T] that move towards the command of dead_time ago by at most `rate`, held-command samples at t [T]."""
     late = t - dead_time
     index = np.searchsorted(t, late, side="right") - 1
     n = np.empty_like(t)
@@ -147,7 +144,7 @@ def follow_command(
 
 
 def fit_step(runs: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> StepAnswer:
-    """Rate limit and dead time from step responses, each (t [T] in s, command [T], n [T] in 1/s).
+    """Return the rate limit and dead time from step responses, each (t [T] in s, command [T], n [T] in 1/s).
 
     Raises:
         FitError: where a run is too short, its command does not step, or the revolutions do not
@@ -193,8 +190,7 @@ def fit_step(runs: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> StepA
 
 
 def fit_thrust(n: np.ndarray, pull: np.ndarray, thrusters: int) -> tuple[ThrustFit, ThrustFit]:
-    """Thrust per thruster over revolutions ahead and astern from a bollard pull: n [N] in 1/s, pull
-    [N] in N of all `thrusters` together.
+    """Return the thrust per thruster over revolutions ahead and astern from a bollard pull: n [N] in 1/s, pull [N] in N of all `thrusters` together.
 
     Raises:
         FitError: where a direction has fewer than five points or four revolutions, or pulls the
@@ -246,8 +242,9 @@ def _least_squares(
     *,
     serial: bool = False,
 ) -> tuple[list[float], list[float]]:
-    """Parameters and half widths of their 95 % intervals; widened for residuals that follow each
-    other where they are a series.
+    """Return the parameters and half widths of their 95 % intervals.
+
+    Widened for residuals that follow each other where they are a series.
     """
     from scipy.optimize import least_squares
     from scipy.stats import t as student

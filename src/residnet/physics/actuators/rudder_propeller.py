@@ -91,7 +91,7 @@ class RudderPropellerConfig(ActuatorConfig):
     density: Density = Field(default=1025.0, gt=0)
 
     def build(self) -> RudderPropeller:
-        """The module."""
+        """Return the module."""
         return RudderPropeller(self)
 
 
@@ -131,20 +131,21 @@ class RudderPropeller(Actuators):
         self.kept = 1.0 - propeller.thrust_deduction
 
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Rudder angle from steer and revolutions from drive, as shares of their limits; steer to
-        starboard is positive.
+        """Return the rudder angle from steer and revolutions from drive, as shares of their limits.
+
+        Steer to starboard is positive.
         """
         return torch.stack(
             (steer.clamp(-1.0, 1.0) * self.delta_max, drive.clamp(-1.0, 1.0) * self.n_max), dim=-1
         )
 
     def thrust(self, n: Tensor, u: Tensor) -> Tensor:
-        """Thrust [N] of the propeller at n [1/s] and speed through the water u [m/s]."""
+        """Return the thrust [N] of the propeller at n [1/s] and speed through the water u [m/s]."""
         thrust: Tensor = self.curve(n) - self.loss * n.abs() * u.clamp(min=0.0)
         return thrust
 
     def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
-        """tau [..., 3] in N, N, N m."""
+        """Return tau [..., 3] in N, N, N m."""
         position = self.servos.value(a, command)
         delta, u = position[..., 0], nu[..., 0]
         thrust = self.thrust(position[..., 1], u)
@@ -159,9 +160,9 @@ class RudderPropeller(Actuators):
         )
 
     def rate(self, a: Tensor, command: Tensor) -> Tensor:
-        """Derivative [..., k] of the states."""
+        """Return the derivative [..., k] of the states."""
         return self.servos.rate(a, command)
 
     def advance(self, a: Tensor, command: Tensor, dt: float) -> Tensor:
-        """States [..., k] after a step of dt seconds."""
+        """Return the states [..., k] after a step of dt seconds."""
         return self.servos.advance(a, command, dt)

@@ -23,15 +23,15 @@ class Response(nn.Module, ABC):
     suffixes: tuple[str, ...] = ("",)
 
     def value(self, a: Tensor, target: Tensor) -> Tensor:
-        """Position [...]."""
+        """Return the position [...]."""
         return a[..., 0]
 
     def rate(self, a: Tensor, target: Tensor) -> Tensor:
-        """Derivative [..., k] of the states."""
+        """Return the derivative [..., k] of the states."""
         return torch.zeros_like(a)
 
     def advance(self, a: Tensor, target: Tensor, dt: float) -> Tensor:
-        """States [..., k] after what moves once per step."""
+        """Return the states [..., k] after what moves once per step."""
         return a
 
 
@@ -42,7 +42,7 @@ class Immediate(Response):
     suffixes = ()
 
     def value(self, a: Tensor, target: Tensor) -> Tensor:
-        """The target."""
+        """Return the target."""
         return target
 
 
@@ -55,7 +55,7 @@ class RateLimited(Response):
         self.limit = rate
 
     def advance(self, a: Tensor, target: Tensor, dt: float) -> Tensor:
-        """The position moved."""
+        """Return the position moved."""
         step = self.limit * dt
         return a + (target.unsqueeze(-1) - a).clamp(-step, step)
 
@@ -69,7 +69,7 @@ class FirstOrder(Response):
         self.time, self.limit = time, rate
 
     def rate(self, a: Tensor, target: Tensor) -> Tensor:
-        """Derivative of the position."""
+        """Return the derivative of the position."""
         return ((target.unsqueeze(-1) - a) / self.time).clamp(-self.limit, self.limit)
 
 
@@ -84,7 +84,7 @@ class SecondOrder(Response):
         self.frequency, self.damping, self.limit = frequency, damping, rate
 
     def rate(self, a: Tensor, target: Tensor) -> Tensor:
-        """Derivatives of position and rate."""
+        """Return the derivatives of position and rate."""
         position, speed = a[..., 0], a[..., 1].clamp(-self.limit, self.limit)
         pull = self.frequency**2 * (target - position) - 2.0 * self.damping * self.frequency * speed
         held = (a[..., 1].abs() >= self.limit) & (pull * a[..., 1] > 0)
@@ -98,7 +98,7 @@ class ResponseConfig(Config, ABC):
 
     @abstractmethod
     def build(self, rate: float | None) -> Response:
-        """The response within a rate limit."""
+        """Return the response within a rate limit."""
 
 
 class ImmediateConfig(ResponseConfig):
@@ -107,7 +107,7 @@ class ImmediateConfig(ResponseConfig):
     kind: Literal["immediate"] = "immediate"
 
     def build(self, rate: float | None) -> Response:
-        """The response."""
+        """Return the response."""
         return Immediate() if rate is None else RateLimited(rate)
 
 
@@ -118,7 +118,7 @@ class FirstOrderConfig(ResponseConfig):
     time: Seconds = Field(gt=0)
 
     def build(self, rate: float | None) -> Response:
-        """The response."""
+        """Return the response."""
         return FirstOrder(self.time, float("inf") if rate is None else rate)
 
 
@@ -130,7 +130,7 @@ class SecondOrderConfig(ResponseConfig):
     damping: float = Field(gt=0)
 
     def build(self, rate: float | None) -> Response:
-        """The response."""
+        """Return the response."""
         return SecondOrder(self.frequency, self.damping, float("inf") if rate is None else rate)
 
 
@@ -168,7 +168,7 @@ class ServoConfig(Config):
         return self
 
     def follow(self, name: str, limit: float, rate: float | None) -> Servo:
-        """The servo of the actuator `name` within its limits."""
+        """Return the servo of the actuator `name` within its limits."""
         taps = 0 if self.delay_step is None else round(self.dead_time / self.delay_step)
         return Servo(name, limit, self.response.build(rate), taps, self.delay_step or 0.0)
 
@@ -194,22 +194,22 @@ class Servo(nn.Module):
         self.state += tuple(f"_{name}_delay{i + 1}" for i in range(taps))
 
     def target(self, a: Tensor, command: Tensor) -> Tensor:
-        """What the actuator follows now, [...]."""
+        """Return what the actuator follows now, [...]."""
         return command.clamp(-self.limit, self.limit) if self.taps == 0 else a[..., -1]
 
     def value(self, a: Tensor, command: Tensor) -> Tensor:
-        """Position [...], within the limit."""
+        """Return the position [...], within the limit."""
         return self.response.value(a[..., : self.own], self.target(a, command)).clamp(
             -self.limit, self.limit
         )
 
     def rate(self, a: Tensor, command: Tensor) -> Tensor:
-        """Derivative [..., k] of the states."""
+        """Return the derivative [..., k] of the states."""
         moving = self.response.rate(a[..., : self.own], self.target(a, command))
         return torch.cat((moving, torch.zeros_like(a[..., self.own :])), dim=-1)
 
     def advance(self, a: Tensor, command: Tensor, dt: float) -> Tensor:
-        """States [..., k] after a step of dt seconds.
+        """Return the states [..., k] after a step of dt seconds.
 
         Raises:
             ConfigError: where the delay line does not move by dt.
@@ -241,7 +241,7 @@ class Servos(nn.Module):
         return list(torch.split(a, self.widths, dim=-1))
 
     def value(self, a: Tensor, command: Tensor) -> Tensor:
-        """Positions [..., c]."""
+        """Return the positions [..., c]."""
         parts = self._parts(a)
         each: list[Tensor] = []
         for i, servo in enumerate(self.servos):
@@ -249,7 +249,7 @@ class Servos(nn.Module):
         return torch.stack(each, dim=-1)
 
     def rate(self, a: Tensor, command: Tensor) -> Tensor:
-        """Derivatives [..., k]."""
+        """Return the derivatives [..., k]."""
         parts = self._parts(a)
         each: list[Tensor] = []
         for i, servo in enumerate(self.servos):
@@ -257,7 +257,7 @@ class Servos(nn.Module):
         return torch.cat(each, dim=-1)
 
     def advance(self, a: Tensor, command: Tensor, dt: float) -> Tensor:
-        """States [..., k] after a step of dt seconds."""
+        """Return the states [..., k] after a step of dt seconds."""
         parts = self._parts(a)
         each: list[Tensor] = []
         for i, servo in enumerate(self.servos):

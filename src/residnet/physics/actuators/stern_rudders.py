@@ -55,14 +55,13 @@ class SternRudders(Actuators, ABC):
 
     @abstractmethod
     def foil(self, delta: Tensor, u: Tensor, v: Tensor, thrust: Tensor) -> tuple[Tensor, Tensor]:
-        """Lift and drag [...] in N of all rudders at angle [rad], velocities through the water
-        [m/s] and the thrust of all propellers [N].
-        """
+        """Return the lift and drag [...] in N of all rudders at angle [rad], velocities through the water [m/s] and the thrust of all propellers [N]."""
 
     @final
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Rudder angle from steer and thrust from drive, as shares of their limits; no thrust
-        astern.
+        """Return the rudder angle from steer and thrust from drive, as shares of their limits.
+
+        No thrust astern.
         """
         return torch.stack(
             (steer.clamp(-1.0, 1.0) * self.delta_max, drive.clamp(0.0, 1.0) * self.thrust_max),
@@ -71,7 +70,7 @@ class SternRudders(Actuators, ABC):
 
     @final
     def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
-        """tau [..., 4] in N, N, N m, N m."""
+        """Return tau [..., 4] in N, N, N m, N m."""
         delta = self.servos.value(a, command[..., :1])[..., 0]
         thrust = command[..., 1].clamp(0.0, self.thrust_max)
         lift, drag = self.foil(delta, nu[..., 0], nu[..., 1], thrust)
@@ -79,12 +78,12 @@ class SternRudders(Actuators, ABC):
 
     @final
     def rate(self, a: Tensor, command: Tensor) -> Tensor:
-        """Derivative [..., k] of the states."""
+        """Return the derivative [..., k] of the states."""
         return self.servos.rate(a, command[..., :1])
 
     @final
     def advance(self, a: Tensor, command: Tensor, dt: float) -> Tensor:
-        """States [..., k] after a step of dt seconds."""
+        """Return the states [..., k] after a step of dt seconds."""
         return self.servos.advance(a, command[..., :1], dt)
 
 
@@ -112,7 +111,7 @@ class FoilRuddersConfig(SternRuddersConfig):
     density: Density = Field(gt=0)
 
     def build(self) -> FoilRudders:
-        """The module."""
+        """Return the module."""
         return FoilRudders(self)
 
 
@@ -132,7 +131,7 @@ class FoilRudders(SternRudders):
         self.loading = 2.0 / (config.propellers * config.density * disc)
 
     def foil(self, delta: Tensor, u: Tensor, v: Tensor, thrust: Tensor) -> tuple[Tensor, Tensor]:
-        """Lift and drag [...] in N."""
+        """Return the lift and drag [...] in N."""
         angle = delta.clamp(-self.stall, self.stall)
         square = u * u + v * v
         # 1/sqrt(1 + C_Th); the offset keeps it and its gradient finite at rest
@@ -157,7 +156,7 @@ class LinearRuddersConfig(SternRuddersConfig):
     Y_delta_uu: float = Field(gt=0)
 
     def build(self) -> LinearRudders:
-        """The module."""
+        """Return the module."""
         return LinearRudders(self)
 
 
@@ -170,5 +169,5 @@ class LinearRudders(SternRudders):
         self.slope = config.Y_delta_uu
 
     def foil(self, delta: Tensor, u: Tensor, v: Tensor, thrust: Tensor) -> tuple[Tensor, Tensor]:
-        """Lift and no drag [...] in N."""
+        """Return the lift and no drag [...] in N."""
         return self.slope * u * u * delta, torch.zeros_like(delta)

@@ -58,7 +58,7 @@ class ThrustCurve(nn.Module):
         self.astern: Tensor
 
     def forward(self, n: Tensor) -> Tensor:
-        """Thrust [N] at revolutions n [1/s], any shape."""
+        """Return the thrust [N] at revolutions n [1/s], any shape."""
         f, b = self.ahead.to(n.dtype), self.astern.to(n.dtype)
         ahead = (f[0] + n * (f[1] + n * f[2])).clamp(min=0.0)
         astern = (b[0] + n * (b[1] + n * b[2])).clamp(max=0.0)

@@ -62,7 +62,7 @@ class ThrustersConfig(ActuatorConfig):
         return self
 
     def build(self) -> Thrusters:
-        """The module."""
+        """Return the module."""
         return Thrusters(self)
 
 
@@ -110,22 +110,22 @@ class Thrusters(Actuators):
         self.n_max: Tensor
 
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Revolutions [..., c]: each thruster's share of both demands, clipped to +-1."""
+        """Return the revolutions [..., c]: each thruster's share of both demands, clipped to +-1."""
         both = drive.unsqueeze(-1) * self.ahead.to(drive.dtype) + steer.unsqueeze(
             -1
         ) * self.turn.to(drive.dtype)
         return both.clamp(-1.0, 1.0) * self.n_max.to(drive.dtype)
 
     def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
-        """tau [..., 3] in N, N, N m."""
+        """Return tau [..., 3] in N, N, N m."""
         n = self.servos.value(a, command)
         thrust = torch.stack([curve(n[..., i]) for i, curve in enumerate(self.curves)], dim=-1)
         return thrust @ self.map.to(thrust.dtype)
 
     def rate(self, a: Tensor, command: Tensor) -> Tensor:
-        """Derivative [..., k] of the states."""
+        """Return the derivative [..., k] of the states."""
         return self.servos.rate(a, command)
 
     def advance(self, a: Tensor, command: Tensor, dt: float) -> Tensor:
-        """States [..., k] after a step of dt seconds."""
+        """Return the states [..., k] after a step of dt seconds."""
         return self.servos.advance(a, command, dt)

@@ -80,7 +80,7 @@ class WaterJetsConfig(ActuatorConfig):
     nozzle: NozzleConfig
 
     def build(self) -> WaterJets:
-        """The module."""
+        """Return the module."""
         return WaterJets(self)
 
 
@@ -112,34 +112,32 @@ class WaterJets(Actuators):
         ]
 
     def thrust(self, n: Tensor, u: Tensor) -> Tensor:
-        """Thrust [N] of one jet at revolutions n [1/s] and speed u [m/s], any shape (6.16)."""
+        """Return the thrust [N] of one jet at revolutions n [1/s] and speed u [m/s], any shape (6.16)."""
         a, c = self.a, self.c
         return (a[0] + u * (a[1] + u * a[2])) * (c[0] + n * (c[1] + n * c[2]))
 
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Commands [..., 2]: drive ahead is the share of the motor's revolutions (jets do not push
-        astern), steer the yaw moment's sense.
-        """
+        """Return the commands [..., 2]: drive ahead is the share of the motor's revolutions (jets do not push astern), steer the yaw moment's sense."""
         side = self.angle if self.x > 0 else -self.angle
         return torch.stack(
             (drive.clamp(0.0, 1.0) * self.n_max, steer.clamp(-1.0, 1.0) * side), dim=-1
         )
 
     def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
-        """tau [..., 3] in N, N, N m (6.12)-(6.14)."""
+        """Return tau [..., 3] in N, N, N m (6.12)-(6.14)."""
         state = self.servos.value(a, self._ahead(command))
         total = self.jets * self.thrust(state[..., 0], nu[..., 0])
         across = total * torch.sin(state[..., 1])
         return torch.stack((total * torch.cos(state[..., 1]), across, self.x * across), dim=-1)
 
     def rate(self, a: Tensor, command: Tensor) -> Tensor:
-        """Derivative [..., k] of the states."""
+        """Return the derivative [..., k] of the states."""
         return self.servos.rate(a, self._ahead(command))
 
     def advance(self, a: Tensor, command: Tensor, dt: float) -> Tensor:
-        """States [..., k] after a step of dt seconds."""
+        """Return the states [..., k] after a step of dt seconds."""
         return self.servos.advance(a, self._ahead(command), dt)
 
     def _ahead(self, command: Tensor) -> Tensor:
-        """Commands [..., 2] without negative revolutions."""
+        """Return the commands [..., 2] without negative revolutions."""
         return torch.stack((command[..., 0].clamp(min=0.0), command[..., 1]), dim=-1)

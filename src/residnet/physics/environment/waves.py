@@ -25,13 +25,11 @@ class Spectrum(Config, ABC):
 
     @abstractmethod
     def peakedness(self, ratio: np.ndarray) -> np.ndarray:
-        """Factor on the ITTC form at omega / omega_p = ratio, any shape."""
+        """Return the factor on the ITTC form at omega / omega_p = ratio, any shape."""
 
     @final
     def density(self, omega: np.ndarray, height: float, period: float) -> np.ndarray:
-        """S(omega) [m^2 s] at omega [rad/s] for the significant height [m] and peak period [s], up
-        to the peakedness' own area.
-        """
+        """Return S(omega) [m^2 s] at omega [rad/s] for the significant height [m] and peak period [s], up to the peakedness' own area."""
         peak = 2 * np.pi / period
         ratio = omega / peak
         form: np.ndarray = 5 / 16 * height**2 / peak * ratio**-5.0 * np.exp(-1.25 * ratio**-4.0)
@@ -48,7 +46,7 @@ class IttcSpectrum(Spectrum):
     kind: Literal["ittc"] = "ittc"
 
     def peakedness(self, ratio: np.ndarray) -> np.ndarray:
-        """One."""
+        """Return one."""
         return np.ones_like(ratio)
 
 
@@ -62,7 +60,7 @@ class JonswapSpectrum(Spectrum):
     gamma: float = Field(default=3.3, ge=1, le=7)
 
     def peakedness(self, ratio: np.ndarray) -> np.ndarray:
-        """gamma^exp(-(ratio - 1)^2 / (2 sigma^2)) with sigma 0.07 below the peak and 0.09 above."""
+        """Return gamma^exp(-(ratio - 1)^2 / (2 sigma^2)) with sigma 0.07 below the peak and 0.09 above."""
         width = np.where(ratio <= 1, 0.07, 0.09)
         peaked: np.ndarray = self.gamma ** np.exp(-((ratio - 1) ** 2) / (2 * width**2))
         return peaked
@@ -104,7 +102,7 @@ class WavesConfig(Config):
     water_density: Density = Field(default=1025.0, gt=0)
 
     def build(self, rows: int, random: np.random.Generator) -> Waves:
-        """One realisation of the seaway for each of several rows."""
+        """Return one realisation of the seaway for each of several rows."""
         return Waves(self, rows, random)
 
 
@@ -153,19 +151,18 @@ class Waves(nn.Module):
         )
 
     def phases(self, north: Tensor, east: Tensor, t: float) -> Tensor:
-        """Phase [B, K] of every component at the places (north, east) [B] in m at time t in s."""
+        """Return the phase [B, K] of every component at the places (north, east) [B] in m at time t in s."""
         way = north.unsqueeze(-1) * torch.cos(self.direction) + east.unsqueeze(-1) * torch.sin(
             self.direction
         )
         return self.omega * t - self.number * way + self.phase
 
     def elevation(self, north: Tensor, east: Tensor, t: float) -> Tensor:
-        """Elevation of the surface [B] in m, upwards."""
+        """Return the elevation of the surface [B] in m, upwards."""
         return (self.amplitude * torch.cos(self.phases(north, east, t))).sum(-1)
 
     def response(self, psi: Tensor) -> tuple[Tensor, Tensor]:
-        """Force per amplitude in quadrature (X, Y, K: factors of sin) [B, K, 3] and in phase (N:
-        factor of cos) [B, K] at headings psi [B].
+        """Return the force per amplitude in quadrature (X, Y, K: factors of sin) [B, K, 3] and in phase (N: factor of cos) [B, K] at headings psi [B].
 
         In N/m and N m/m; K about the waterline, N about midships. chi = direction - psi is 0 in
         following seas.
@@ -184,9 +181,7 @@ class Waves(nn.Module):
         return quadrature, pressure * (s * breadth * across * tilt_x - c * length * along * tilt_y)
 
     def forward(self, north: Tensor, east: Tensor, psi: Tensor, t: float) -> Tensor:
-        """Force X, Y [N], K, N [N m], stacked [B, 4], on the hull at (north, east) with heading psi
-        [B] at time t.
-        """
+        """Return the force X, Y [N], K, N [N m], stacked [B, 4], on the hull at (north, east) with heading psi [B] at time t."""
         phase = self.phases(north, east, t)
         quadrature, yaw = self.response(psi)
         side = (quadrature * (self.amplitude * torch.sin(phase)).unsqueeze(-1)).sum(-2)
@@ -195,13 +190,14 @@ class Waves(nn.Module):
 
 
 def _sinc(x: Tensor) -> Tensor:
-    """sin x / x."""
+    """Return sin x / x."""
     return torch.sinc(x / torch.pi)
 
 
 def _first_moment(kappa: Tensor, width: float) -> Tensor:
-    """Integral of x sin(kappa x) over +-width / 2; its series near zero, where the closed form
-    cancels.
+    """Return the integral of x sin(kappa x) over +-width / 2.
+
+    Its series near zero, where the closed form cancels.
     """
     half = 0.5 * width
     small = kappa.abs() * half < 1e-2

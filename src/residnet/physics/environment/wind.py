@@ -23,9 +23,7 @@ class WindLoads(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, along: Tensor, across: Tensor) -> Tensor:
-        """X, Y [N], K, N [N m], stacked [..., 4], from the velocity of the air relative to the
-        vessel along body x and y [...] in m/s.
-        """
+        """Return X, Y [N], K, N [N m], stacked [..., 4], from the velocity of the air relative to the vessel along body x and y [...] in m/s."""
 
 
 class WindLoadConfig(Config, ABC):
@@ -50,7 +48,7 @@ class WindLoadConfig(Config, ABC):
 
     @abstractmethod
     def build(self) -> WindLoads:
-        """The module."""
+        """Return the module."""
 
 
 class SymmetricWindConfig(WindLoadConfig):
@@ -67,7 +65,7 @@ class SymmetricWindConfig(WindLoadConfig):
     c_n: float = Field(ge=0, le=1)
 
     def build(self) -> SymmetricWind:
-        """The module."""
+        """Return the module."""
         return SymmetricWind(self)
 
 
@@ -86,7 +84,7 @@ class SymmetricWind(WindLoads):
         self.height = config.centre_height
 
     def forward(self, along: Tensor, across: Tensor) -> Tensor:
-        """Forces [..., 4]."""
+        """Return the forces [..., 4]."""
         speed = torch.sqrt(along * along + across * across + 1e-12)
         side = self.y * across * speed
         return torch.stack(
@@ -133,7 +131,7 @@ class TabulatedWindConfig(WindLoadConfig):
         return self
 
     def build(self) -> TabulatedWind:
-        """The module."""
+        """Return the module."""
         return TabulatedWind(self)
 
 
@@ -162,7 +160,7 @@ class TabulatedWind(WindLoads):
         self.values: Tensor
 
     def forward(self, along: Tensor, across: Tensor) -> Tensor:
-        """Forces [..., 4]."""
+        """Return the forces [..., 4]."""
         square = along * along + across * across
         calm = square < 1e-12
         # the angle of a calm is any; a fixed one keeps the gradient finite

@@ -20,8 +20,9 @@ _LEVER = 0.2
 
 
 def agreement(recording: Recording, log: Log, start: float, idle: Iterable[str]) -> list[Remark]:
-    """Remarks on velocities and positions in topics that the log was not made of; `start` is the
-    log's first sample on the recording's clock, s.
+    """Return the remarks on velocities and positions in topics that the log was not made of.
+
+    `start` is the log's first sample on the recording's clock, s.
     """
     out: list[Remark] = []
     rates = _rates(log)
@@ -38,7 +39,7 @@ def agreement(recording: Recording, log: Log, start: float, idle: Iterable[str])
 
 
 def _rates(log: Log) -> dict[str, np.ndarray]:
-    """Velocities of the log by name, in body and earth axes."""
+    """Return the velocities of the log by name, in body and earth axes."""
     out: dict[str, np.ndarray] = {
         name: log[name] for name in ("u", "v", "r") if name in log.channels
     }
@@ -97,9 +98,7 @@ def _correlation(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def _lever(one: Series, t: np.ndarray, log: Log) -> list[Remark]:
-    """Whether a topic's positions turn about the log's: both then belong to different points of the
-    vessel.
-    """
+    """Return whether a topic's positions turn about the log's: both then belong to different points of the vessel."""
     pair = next(
         (
             p

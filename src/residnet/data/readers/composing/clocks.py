@@ -27,7 +27,7 @@ _FEW, _NEAR = 0.01, 1.0
 def settle(
     recording: Recording, delays: Mapping[str, float | None], zone: float | None = None
 ) -> Recording:
-    """The recording with one clock for all: offsets removed, rows of every series in order.
+    """Return the recording with one clock for all: offsets removed, rows of every series in order.
 
     Args:
         recording: as read.
@@ -76,14 +76,14 @@ def _plausible(one: Series) -> Series:
 
 
 def _offset(one: Series) -> float:
-    """Arrival less stamp of the promptest messages, s."""
+    """Return the arrival less stamp of the promptest messages, s."""
     assert one.stamp is not None
     assert one.arrival is not None
     return float(np.quantile(one.arrival - one.stamp, _PROMPT))
 
 
 def _recorder(offsets: Mapping[str, float], zone: float | None) -> tuple[float, tuple[Remark, ...]]:
-    """Seconds that the recorder's clock is ahead of the senders', and what to say about it."""
+    """Return the seconds that the recorder's clock is ahead of the senders', and what to say about it."""
     if not offsets:
         return zone or 0.0, ()
     common = float(np.median(list(offsets.values())))
@@ -132,7 +132,7 @@ def _latency(one: Series, offset: float) -> list[Remark]:
 
 
 def _ordered(one: Series) -> Series:
-    """Rows in order of time, none twice."""
+    """Return the rows in order of time, none twice."""
     if len(one) < 2:
         return one
     back = np.diff(one.clock)

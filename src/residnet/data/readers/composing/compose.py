@@ -69,7 +69,7 @@ class Plan:
 
 
 def compose(recording: Recording, plan: Plan, clock: ClockConfig, longest_gap: float) -> Log:
-    """The log of a recording whose clocks are settled.
+    """Return the log of a recording whose clocks are settled.
 
     Time starts at 0 where the recording has dates (`meta["epoch"]`, Unix time in s), else it is the
     recording's own. psi starts in [0, 2 pi). Samples at which a state channel has no value are
@@ -133,7 +133,7 @@ def _parts(recording: Recording, plan: Plan, longest_gap: float) -> list[Part]:
 def _times(
     recording: Recording, parts: Sequence[Part], clock: ClockConfig
 ) -> tuple[np.ndarray, float]:
-    """Times of the log's samples on the recording's clock, and their step, s."""
+    """Return the times of the log's samples on the recording's clock, and their step, s."""
     if not isinstance(clock, Uniform):
         times = parts[0].log.t if clock.topic is None else recording[clock.topic].clock
         return times, float(np.median(np.diff(times))) if times.size > 1 else 1.0
@@ -167,7 +167,7 @@ def _from_zero(times: np.ndarray, clock: ClockConfig) -> np.ndarray:
 def _values(
     parts: Sequence[Part], plan: Plan, times: np.ndarray, step: float
 ) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """Channels [T] and their units on the log's clock."""
+    """Return the channels [T] and their units on the log's clock."""
     derived = plan.velocity if isinstance(plan.velocity, Derived) else None
     values: dict[str, np.ndarray] = {}
     units: dict[str, str] = {}
@@ -187,7 +187,7 @@ def _values(
 
 
 def _finish(values: dict[str, np.ndarray], plan: Plan) -> None:
-    """Levers and turned velocities, in place."""
+    """Return the levers and turned velocities, in place."""
     lever = _lever(plan.position)
     if lever != Lever():
         if "psi" not in values:
@@ -260,7 +260,7 @@ def _meta(
 
 
 def _utc(ns: int) -> str:
-    """Date and time of Unix time in ns."""
+    """Return the date and time of Unix time in ns."""
     return (
         datetime.fromtimestamp(ns // 10**9, UTC).strftime("%Y-%m-%dT%H:%M:%S")
         + f".{ns % 10**9:09d}Z"

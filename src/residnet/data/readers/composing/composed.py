@@ -91,14 +91,14 @@ class RecordingConfig(Config, ABC):
 
     @abstractmethod
     def load(self, path: Path, wanted: Wanted) -> Recording:
-        """The recording in `path`, at least the series that are wanted.
+        """Return the recording in `path`, at least the series that are wanted.
 
         Raises:
             ResidnetError: where it cannot be read.
         """
 
     def build(self) -> RecordingReader:
-        """The reader."""
+        """Return the reader."""
         return RecordingReader(self)
 
 
@@ -110,8 +110,9 @@ class RecordingReader(LogReader):
         self._config = config
 
     def read(self, path: Path) -> Log:
-        """The log in `path`; see `LogReader.read`. `meta["findings"]` says what was noticed and
-        mended on the way in.
+        """Return the log in `path`.
+
+        See `LogReader.read`. `meta["findings"]` says what was noticed and mended on the way in.
 
         Raises:
             UsageError: where the file, a topic or a field is missing, or a package that the format
@@ -134,7 +135,7 @@ class RecordingReader(LogReader):
         return log.replace(name=name, manoeuvre=manoeuvre or "unknown", meta=meta)
 
     def _wanted(self) -> Wanted:
-        """What the config names; everything where standard messages may add to it."""
+        """Return what the config names; everything where standard messages may add to it."""
         config = self._config
         if config.standard_messages:
             return EVERYTHING

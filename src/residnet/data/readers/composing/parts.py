@@ -72,8 +72,9 @@ class Part:
         return float(np.median(np.diff(self.log.t)))
 
     def at(self, times: np.ndarray, step: float) -> dict[str, np.ndarray]:
-        """Channels at `times` [T], whose usual step is `step`, both s; NaN in gaps and beyond the
-        ends.
+        """Return the channels at `times` [T], whose usual step is `step`, both s.
+
+        NaN in gaps and beyond the ends.
         """
         # the aligner imports masks, which import the readers
         from residnet.data.align import GridConfig, onto
@@ -95,8 +96,9 @@ class Part:
 def channel_parts(
     recording: Recording, channels: Mapping[str, FieldMap], longest_gap: float
 ) -> list[Part]:
-    """One part for all channels of a topic that may share one; a channel with hardly a value has
-    one of its own, of the rows that have any.
+    """Return one part for all channels of a topic that may share one.
+
+    a channel with hardly a value has one of its own, of the rows that have any.
 
     Raises:
         UsageError: where a topic, field or sender is missing.
@@ -131,7 +133,7 @@ def channel_parts(
 
 
 def present(recording: Recording, channels: Mapping[str, FieldMap]) -> dict[str, FieldMap]:
-    """The channels without those that may be missing and are."""
+    """Return the channels without those that may be missing and are."""
     out = {}
     for name, entry in channels.items():
         if not entry.required:
@@ -153,7 +155,7 @@ def present(recording: Recording, channels: Mapping[str, FieldMap]) -> dict[str,
 
 
 def position_part(recording: Recording, config: PositionConfig, longest_gap: float) -> Part:
-    """x and y of the antenna, m.
+    """Return x and y of the antenna, m.
 
     Raises:
         UsageError: where topic or field is missing, or PROJ is not installed.
@@ -206,7 +208,7 @@ def position_part(recording: Recording, config: PositionConfig, longest_gap: flo
 
 
 def heading_part(recording: Recording, config: HeadingConfig, longest_gap: float) -> Part:
-    """psi, unwrapped from its first value in [0, 2 pi); phi where asked for.
+    """Return psi, unwrapped from its first value in [0, 2 pi); phi where asked for.
 
     Raises:
         UsageError: where topic or field is missing.
@@ -234,7 +236,7 @@ def heading_part(recording: Recording, config: HeadingConfig, longest_gap: float
 def velocity_part(
     recording: Recording, config: EarthFixed | CourseSpeed, longest_gap: float
 ) -> Part:
-    """Northward and eastward velocity of the antenna, m/s.
+    """Return the northward and eastward velocity of the antenna, m/s.
 
     Raises:
         UsageError: where topic or field is missing.
@@ -293,7 +295,7 @@ def _numbers(recording: Recording, one: Series, path: str) -> np.ndarray:
 def _quaternion(
     recording: Recording, one: Series, config: Quaternion
 ) -> tuple[np.ndarray, dict[str, np.ndarray], tuple[Remark, ...]]:
-    """Yaw in the source's frame [T], roll where asked for, and what was noticed."""
+    """Return the yaw in the source's frame [T], roll where asked for, and what was noticed."""
     x, y, z, w = (_numbers(recording, one, f"{config.field}.{axis}") for axis in "xyzw")
     norm = np.sqrt(x * x + y * y + z * z + w * w)
     known = np.isfinite(norm) & (norm > 0.5)

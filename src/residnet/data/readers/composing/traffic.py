@@ -15,7 +15,7 @@ _ENOUGH = 100
 
 
 def traffic(one: Series) -> list[Remark]:
-    """Remarks on a series whose rows are in order."""
+    """Return the remarks on a series whose rows are in order."""
     if not len(one):
         return [remark("note", "empty_topic", f"topic {one.name}: holds no rows")]
     out = []
@@ -54,7 +54,7 @@ def traffic(one: Series) -> list[Remark]:
 
 
 def publishers(one: Series, step: np.ndarray) -> list[Remark]:
-    """Whether several publishers share the topic; step [T - 1] in s.
+    """Return whether several publishers share the topic; step [T - 1] in s.
 
     Told by what the source says of the sender, else by values that leap away and come straight back
     (A, B, A) while rows follow each other at irregular short steps, as two trains of messages on
@@ -95,9 +95,7 @@ def publishers(one: Series, step: np.ndarray) -> list[Remark]:
 
 
 def _returns(values: np.ndarray) -> tuple[float, float, float]:
-    """Share of rows that change and change again, share that come back to the value before, and the
-    leaps' width over the values' range.
-    """
+    """Return the share of rows that change and change again, share that come back to the value before, and the leaps' width over the values' range."""
     known = values[np.isfinite(values)]
     if known.size < _ENOUGH:
         return 0.0, 0.0, 0.0

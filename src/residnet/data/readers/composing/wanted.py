@@ -24,11 +24,11 @@ class Wanted:
         self._named = None if named is None else tuple(named)
 
     def __call__(self, topic: str) -> bool:
-        """Whether anything of a topic is wanted."""
+        """Return whether anything of a topic is wanted."""
         return self._named is None or any(self._same(name, topic) for name, _ in self._named)
 
     def field(self, topic: str, path: str) -> bool:
-        """Whether a field is wanted, itself or as a part (`orientation.w` of `orientation`)."""
+        """Return whether a field is wanted, itself or as a part (`orientation.w` of `orientation`)."""
         key = key_of(path)
         fields = [key_of(field) for name, field in self._named or () if self._same(name, topic)]
         return self._named is None or any(

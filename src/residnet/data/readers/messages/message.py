@@ -24,11 +24,11 @@ class Message(ABC):
     said: ClassVar[str] = "REP-103 (ENU, forward-left-up) to NED, forward-starboard-down"
 
     def fits(self, one: Series) -> bool:
-        """Whether a series holds messages of this kind."""
+        """Return whether a series holds messages of this kind."""
         if one.kind:
             return one.kind.rsplit("/", 1)[-1] in self.types
         return bool(self.signature) and all(one.has(field) for field in self.signature)
 
     @abstractmethod
     def plan(self, one: Series) -> Plan:
-        """What a series of this kind says of the vessel."""
+        """Return what a series of this kind says of the vessel."""

@@ -31,7 +31,7 @@ _WORLD = ("map", "odom", "earth", "world", "enu", "ned")
 
 
 def _body(one: Series, prefix: str) -> dict[str, FieldMap]:
-    """Velocities in forward-left-up axes."""
+    """Return the velocities in forward-left-up axes."""
     paths = {"u": "linear.x", "v": "linear.y", "r": "angular.z", "p": "angular.x"}
     si = {"u": "m/s", "v": "m/s", "r": "rad/s", "p": "rad/s"}
     fields = {name: f"{prefix}{path}" for name, path in paths.items()}
@@ -268,9 +268,7 @@ MESSAGES: tuple[Message, ...] = (
 
 
 def standard_plan(recording: Recording, declared: Plan) -> Plan:
-    """The declared plan with what standard messages add to it, the ones that say most first, then
-    the busiest topic of each kind.
-    """
+    """Return the declared plan with what standard messages add to it, the ones that say most first, then the busiest topic of each kind."""
     plan, said, remarks = declared, [], []
     for message in MESSAGES:
         fitting = [one for one in recording.series.values() if len(one) > 1 and message.fits(one)]
@@ -302,7 +300,7 @@ def standard_plan(recording: Recording, declared: Plan) -> Plan:
 
 
 def _joined(plan: Plan, offered: Plan) -> tuple[Plan, Sequence[str]]:
-    """A plan with what it lacks of another, and the names of that."""
+    """Return a plan with what it lacks of another, and the names of that."""
     given = (
         set(plan.channels)
         | ({"x", "y"} if plan.position else set())
@@ -331,7 +329,7 @@ def _joined(plan: Plan, offered: Plan) -> tuple[Plan, Sequence[str]]:
 
 
 def _channel_name(topic: str) -> str:
-    """A channel's name from a topic's: its last part where residnet knows that, else all parts."""
+    """Return a channel's name from a topic's: its last part where residnet knows that, else all parts."""
     parts = [part for part in key_of(topic).split("_") if part]
     for k in range(len(parts)):
         name = "_".join(parts[k:])

@@ -38,8 +38,9 @@ class ArduPilotConfig(RecordingConfig):
 
 
 def load_ardupilot(path: Path, wanted: Wanted = EVERYTHING) -> Recording:
-    """The recording in a .bin file, on the boot clock (TimeUS); dated by the receiver's GPS time
-    where it logged one.
+    """Return the recording in a .bin file, on the boot clock (TimeUS).
+
+    Dated by the receiver's GPS time where it logged one.
 
     Raises:
         UsageError: where the file is missing, nothing in it is wanted, or pymavlink is not
@@ -146,7 +147,7 @@ class _Columns:
         self.time, self._rows = array("q"), array("d")
 
     def add(self, message: Any) -> None:
-        """One more message."""
+        """Return one more message."""
         self.time.append(int(message.TimeUS) * 1000)
         self._rows.extend([getattr(message, name) for name in self._names])
 

@@ -44,7 +44,7 @@ class Hdf5Config(RecordingConfig):
 
 
 def is_hdf5(path: Path) -> bool:
-    """Whether a file starts as HDF5 does, at once or behind MATLAB's header of 512 bytes."""
+    """Return whether a file starts as HDF5 does, at once or behind MATLAB's header of 512 bytes."""
     if not path.is_file():
         return False
     with path.open("rb") as stream:
@@ -58,7 +58,7 @@ def load_hdf5(
     time: TreeTime | None = None,
     what: str = "an HDF5 file",
 ) -> Recording:
-    """The recording in an HDF5 file.
+    """Return the recording in an HDF5 file.
 
     Raises:
         UsageError: where the file is missing, has no time, or h5py is not installed.
@@ -90,7 +90,7 @@ def load_hdf5(
 
 
 def _vectors(dataset: h5py.Dataset) -> dict[str, Vector]:
-    """Arrays of one dataset by path, not yet read; a table gives one for each column."""
+    """Return the arrays of one dataset by path, not yet read; a table gives one for each column."""
     name = dataset.name.strip("/")
     if dataset.dtype.names:
         plain = [
@@ -124,7 +124,7 @@ class _Column:
 
 
 def _plain(values: np.ndarray) -> np.ndarray:
-    """Bytes as text, everything else as it is."""
+    """Return the bytes as text, everything else as it is."""
     if values.dtype.kind in "SO" and values.ndim == 1:
         return np.array(
             [v.decode(errors="replace") if isinstance(v, bytes) else str(v) for v in values],

@@ -40,7 +40,7 @@ class MatConfig(RecordingConfig):
 
 
 def load_mat(path: Path, wanted: Wanted = EVERYTHING, time: TreeTime | None = None) -> Recording:
-    """The recording in a MATLAB file.
+    """Return the recording in a MATLAB file.
 
     Raises:
         UsageError: where the file is missing, has no time, or is v7.3 and h5py is not installed.
@@ -64,7 +64,7 @@ def load_mat(path: Path, wanted: Wanted = EVERYTHING, time: TreeTime | None = No
 
 
 def _leaves(node: Any, prefix: str) -> Iterator[tuple[str, np.ndarray]]:
-    """Paths and arrays below a struct."""
+    """Return the paths and arrays below a struct."""
     if isinstance(node, dict):
         for name, value in node.items():
             if not name.startswith("__"):

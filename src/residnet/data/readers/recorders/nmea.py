@@ -43,7 +43,7 @@ class NmeaConfig(RecordingConfig):
 
 
 def load_nmea(path: Path, wanted: Wanted = EVERYTHING) -> Recording:
-    """The recording in a file of sentences.
+    """Return the recording in a file of sentences.
 
     Sentences with a time of day are dated by the last RMC or ZDA; those without a time lie between
     the ones around them in the order of the lines, unless every line begins with a time of its own.
@@ -96,7 +96,7 @@ class _Sentence:
         self.before: list[str] = []
 
     def column(self, i: int) -> np.ndarray:
-        """One field [T]."""
+        """Return one field [T]."""
         return np.frombuffer(self.rows, dtype=np.float64).reshape(-1, len(self.names))[:, i]
 
 
@@ -111,7 +111,7 @@ class _Lines:
         self._dated = False
 
     def add(self, message: Any, before: str, wanted: Wanted) -> None:
-        """One more sentence with the text before it."""
+        """Return one more sentence with the text before it."""
         at = self._tick(message)
         name = str(message.sentence_type)
         values = _numbers(message)
@@ -126,7 +126,7 @@ class _Lines:
         one.before.append(before)
 
     def _tick(self, message: Any) -> int | None:
-        """Time of a sentence in ns (Unix time once a date is known), None where it tells none."""
+        """Return the time of a sentence in ns (Unix time once a date is known), None where it tells none."""
         try:
             moment, date = message.timestamp, _date(message)
         except (AttributeError, ValueError, TypeError):
@@ -147,7 +147,7 @@ class _Lines:
         return day + ns
 
     def recording(self, path: Path, bad: int) -> Recording:
-        """The recording of what was added.
+        """Return the recording of what was added.
 
         Raises:
             DataError: where nothing tells the time.
@@ -205,9 +205,7 @@ class _Lines:
 
 
 def _between(number: np.ndarray, ticks: np.ndarray) -> np.ndarray:
-    """Times [T] of sentences, of which `number` says after which tick each came: evenly over the
-    time to the next tick.
-    """
+    """Return the times [T] of sentences, of which `number` says after which tick each came: evenly over the time to the next tick."""
     number = np.clip(number, 0, ticks.size - 1)
     first = np.append(True, number[1:] != number[:-1])
     start = np.maximum.accumulate(np.where(first, np.arange(number.size), 0))
@@ -220,7 +218,7 @@ def _between(number: np.ndarray, ticks: np.ndarray) -> np.ndarray:
 
 
 def _date(message: Any) -> datetime.date | None:
-    """The date that a sentence tells."""
+    """Return the date that a sentence tells."""
     if message.sentence_type == "RMC":
         day = message.datestamp
         return day if isinstance(day, datetime.date) else None
@@ -230,8 +228,9 @@ def _date(message: Any) -> datetime.date | None:
 
 
 def _numbers(message: Any) -> dict[str, float]:
-    """The numbers in a sentence by name; positions in signed degrees, NaN where the receiver says
-    that there is no fix.
+    """Return the numbers in a sentence by name.
+
+    Positions in signed degrees, NaN where the receiver says that there is no fix.
     """
     out: dict[str, float] = {}
     for entry, cell in zip(message.fields, message.data, strict=False):

@@ -43,8 +43,9 @@ class RosbagConfig(RecordingConfig):
 
 
 def load_bag(path: Path, wanted: Wanted = EVERYTHING) -> Recording:
-    """The recording in a bag, message by message; memory grows with the numbers kept, not with the
-    file.
+    """Return the recording in a bag, message by message.
+
+    Memory grows with the numbers kept, not with the file.
 
     Raises:
         UsageError: where the bag is missing or rosbags is not installed.
@@ -137,7 +138,7 @@ class _Columns:
         self._leaves: _Leaves | None = None
 
     def add(self, message: Any, arrival: int, connection: Connection) -> None:
-        """One more message."""
+        """Return one more message."""
         if self._leaves is None:
             self._leaves = _Leaves(message, lambda path: self._wanted.field(self.name, path))
         self._rows.extend(self._leaves.numbers(message))
@@ -149,7 +150,7 @@ class _Columns:
         self.arrival.append(arrival)
 
     def series(self, epoch: int) -> Series:
-        """The topic, times in s from the epoch (ns)."""
+        """Return the topic, times in s from the epoch (ns)."""
         assert self._leaves is not None
         names = self._leaves.names
         rows = np.frombuffer(self._rows, dtype=np.float64).reshape(len(self.arrival), len(names))
@@ -211,7 +212,7 @@ class _Leaves:
         self._arrays = [(attrgetter(path), size) for path, size in arrays]
 
     def numbers(self, message: Any) -> list[float]:
-        """Their values."""
+        """Return their values."""
         out: list[float] = []
         if self._scalars is not None:
             out = [self._scalars(message)] if self._single else list(self._scalars(message))
@@ -234,7 +235,7 @@ def _element(path: str, i: int, joints: list[str] | None) -> str:
 
 
 def _walk(message: Any, prefix: str) -> Iterator[tuple[str, Any]]:
-    """Paths and values of a message's leaves, the stamp aside."""
+    """Return the paths and values of a message's leaves, the stamp aside."""
     for entry in dataclasses.fields(message):
         if entry.name == "__msgtype__" or (not prefix and entry.name == "header"):
             continue

@@ -51,7 +51,7 @@ class TopicFolderConfig(RecordingConfig):
 def load_folder(
     path: Path, wanted: Wanted = EVERYTHING, time: tuple[str, ...] = _ARRIVAL, delimiter: str = ","
 ) -> Recording:
-    """The recording in a folder of csv files, or in one such file.
+    """Return the recording in a folder of csv files, or in one such file.
 
     Raises:
         UsageError: where there is nothing at `path`.
@@ -111,9 +111,7 @@ def load_folder(
 
 
 def is_topic_folder(path: Path) -> bool:
-    """Whether a folder's csv files are topics of one recording, and not logs of their own: stamped
-    headers, or headers that differ.
-    """
+    """Return whether a folder's csv files are topics of one recording, and not logs of their own: stamped headers, or headers that differ."""
     if not path.is_dir():
         return False
     heads = []
@@ -176,7 +174,7 @@ class _Table:
 def _read(
     file: Path, name: str, time: tuple[str, ...], delimiter: str, wanted: Wanted
 ) -> tuple[_Table | None, list[Remark]]:
-    """One topic; None and a remark where the file holds none."""
+    """Return one topic; None and a remark where the file holds none."""
     import pandas as pd
 
     if not file.stat().st_size:
@@ -225,7 +223,7 @@ def _read(
 def _columns(
     file: Path, header: list[str], sep: str, clock: str | None, wanted: Callable[[str], bool]
 ) -> dict[str, Cells]:
-    """The columns of a file that are wanted, and its time, chunk by chunk.
+    """Return the columns of a file that are wanted, and its time, chunk by chunk.
 
     Raises:
         DataError: where a cell of the time column is no time.
@@ -258,7 +256,7 @@ def _columns(
 def _table(
     name: str, columns: dict[str, Cells], clock: str | None, stamp: tuple[str, str] | None
 ) -> _Table:
-    """Times and fields from the columns of a file."""
+    """Return the times and fields from the columns of a file."""
     arrival = None if clock is None else columns[clock].times()
     rows = None if arrival is None else len(arrival.ns)
     numbers = {column: one.numbers()[:rows] for column, one in columns.items() if one.numeric}
@@ -300,7 +298,7 @@ def _table(
 
 
 def _stamp_columns(header: list[str]) -> tuple[str, str] | None:
-    """Columns of a header stamp's seconds and nanoseconds."""
+    """Return the columns of a header stamp's seconds and nanoseconds."""
     keys = {key_of(column): column for column in header}
     for seconds, rest in zip(SECONDS, NANOSECONDS, strict=True):
         for prefix in ("header_stamp_", "stamp_"):
@@ -310,7 +308,7 @@ def _stamp_columns(header: list[str]) -> tuple[str, str] | None:
 
 
 def _stamps(numbers: dict[str, np.ndarray], columns: tuple[str, str]) -> Stamps | None:
-    """A header stamp from its two columns; None where it is empty."""
+    """Return a header stamp from its two columns; None where it is empty."""
     if any(column not in numbers for column in columns):
         return None
     seconds, rest = (numbers[column] for column in columns)

@@ -70,7 +70,7 @@ class TreeTime(Config):
         return unit
 
     def parse(self, values: np.ndarray) -> Stamps:
-        """Times from one vector.
+        """Return the times from one vector.
 
         Raises:
             DataError: where a cell is no time.
@@ -89,8 +89,7 @@ class TreeTime(Config):
 def tree_recording(
     path: Path, leaves: Mapping[str, Vector], time: TreeTime, wanted: Wanted
 ) -> Recording:
-    """The recording of vectors by their path (`trial/u`): each belongs to the nearest group above
-    it whose time has its length.
+    """Return the recording of vectors by their path (`trial/u`): each belongs to the nearest group above it whose time has its length.
 
     Args:
         path: the file.
@@ -166,7 +165,7 @@ def tree_recording(
 def _clocks(
     leaves: Mapping[str, Vector], time: TreeTime
 ) -> Iterable[tuple[str, tuple[str, np.ndarray]]]:
-    """Group -> path of its time and the time itself."""
+    """Return the group -> path of its time and the time itself."""
     names = TIME_NAMES if time.column is None else (time.column,)
     for rank in names:
         for path, values in leaves.items():
@@ -176,7 +175,7 @@ def _clocks(
 
 
 def _home(path: str, values: Vector, clocks: Mapping[str, tuple[str, np.ndarray]]) -> str | None:
-    """The nearest group above whose time has the length of `values`."""
+    """Return the nearest group above whose time has the length of `values`."""
     group = path
     while group:
         group = group.rpartition("/")[0]
@@ -186,7 +185,7 @@ def _home(path: str, values: Vector, clocks: Mapping[str, tuple[str, np.ndarray]
 
 
 def _rows(values: Vector, length: int) -> int | None:
-    """Which axis of an array runs over time; None where none does."""
+    """Return which axis of an array runs over time; None where none does."""
     if values.dtype.kind not in "biuf" or len(values.shape) > 2:
         return None if values.dtype.kind in "biuf" or values.size != length else 0
     axis = next((i for i, size in enumerate(values.shape) if size == length), None)
@@ -194,7 +193,7 @@ def _rows(values: Vector, length: int) -> int | None:
 
 
 def _columns(name: str, values: Vector, length: int) -> dict[str, np.ndarray]:
-    """Fields of one array."""
+    """Return the fields of one array."""
     if values.dtype.kind not in "biuf":
         return {}
     axis = _rows(values, length)

@@ -34,8 +34,9 @@ class UlogConfig(RecordingConfig):
 
 
 def load_ulog(path: Path, wanted: Wanted = EVERYTHING) -> Recording:
-    """The recording in a ULog file, on the boot clock; dated by the receiver's UTC where it logged
-    one.
+    """Return the recording in a ULog file, on the boot clock.
+
+    Dated by the receiver's UTC where it logged one.
 
     Raises:
         UsageError: where the file is missing, nothing in it is wanted, or pyulog is not installed.
@@ -101,7 +102,7 @@ def load_ulog(path: Path, wanted: Wanted = EVERYTHING) -> Recording:
 
 
 def _boot_time(messages: list[Any]) -> int | None:
-    """Unix time of the boot in ns, from the first fix that has UTC."""
+    """Return Unix time of the boot in ns, from the first fix that has UTC."""
     for data in messages:
         utc = data.data.get("time_utc_usec")
         known = np.flatnonzero(utc) if utc is not None else np.zeros(0, dtype=int)
@@ -112,7 +113,7 @@ def _boot_time(messages: list[Any]) -> int | None:
 
 
 def _fields(data: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Numbers of a message as float64."""
+    """Return the numbers of a message as float64."""
     out = {}
     for name, values in data.items():
         if name == "timestamp":

@@ -22,13 +22,12 @@ from residnet.data.readers.base import (
 
 
 class CanonicalConfig(Config):
-    """Logs that residnet wrote: names, units and masks are inside, so there is nothing to declare.
-    """
+    """Logs that residnet wrote: names, units and masks are inside, so there is nothing to declare."""
 
     kind: Literal["canonical"] = "canonical"
 
     def build(self) -> CanonicalReader:
-        """The reader."""
+        """Return the reader."""
         return CanonicalReader()
 
 
@@ -37,7 +36,7 @@ class CanonicalReader(LogReader):
     """Reads what `Log.save` wrote; where the log itself came from stays in `meta["origin"]`."""
 
     def read(self, path: Path) -> Log:
-        """The log in `path`; see `LogReader.read`.
+        """Return the log in `path`; see `LogReader.read`.
 
         Raises:
             UsageError: where the file is missing, is no canonical log, or gives a known channel

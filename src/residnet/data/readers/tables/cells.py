@@ -19,7 +19,7 @@ SECONDS, NANOSECONDS = ("secs", "sec"), ("nsecs", "nanosec")
 
 
 def names_sender(column: str) -> bool:
-    """Whether a column says who sent a row."""
+    """Return whether a column says who sent a row."""
     return key_of(column).endswith("frame_id")
 
 
@@ -44,7 +44,7 @@ class Cells:
         self._stamps: list[Stamps] = []
 
     def add(self, cells: pd.Series) -> None:
-        """One more chunk.
+        """Return one more chunk.
 
         Raises:
             DataError: where a cell of the time column is no time.
@@ -97,11 +97,11 @@ class Cells:
         return not self._is_time and (not self.spoilt or 2 * self.spoilt < self._filled)
 
     def numbers(self) -> np.ndarray:
-        """The column [T]."""
+        """Return the column [T]."""
         return np.concatenate(self._parts)
 
     def words(self) -> np.ndarray:
-        """The column [T] as text."""
+        """Return the column [T] as text."""
         return np.concatenate(
             [
                 part if part.dtype == object else np.full(part.size, "", dtype=object)
@@ -110,7 +110,7 @@ class Cells:
         )
 
     def times(self) -> Stamps:
-        """The column as times."""
+        """Return the column as times."""
         first = self._stamps[0]
         said = tuple(one for stamps in self._stamps for one in stamps.remarks)
         # one remark for all chunks
@@ -131,7 +131,7 @@ class Cells:
         )
 
     def remark(self, topic: str) -> Remark:
-        """What is said of a column of text."""
+        """Return what is said of a column of text."""
         kind = "structures" if self._sample.startswith(("{", "[", "(")) else "text"
         shown = self._sample if len(self._sample) <= 40 else self._sample[:37] + "..."
         text = (

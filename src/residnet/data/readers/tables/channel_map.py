@@ -1,5 +1,4 @@
-"""How one foreign channel becomes one of a log: unit, sign and frame, converted once, at the door.
-"""
+"""How one foreign channel becomes one of a log: unit, sign and frame, converted once, at the door."""
 
 from __future__ import annotations
 
@@ -70,7 +69,10 @@ class Conversion(Config):
             )
 
     def convert(self, name: str, raw: np.ndarray) -> np.ndarray:
-        """Values [T] of channel `name` in residnet's unit, sign and frame; psi unwrapped."""
+        """Return the values [T] of channel `name` in residnet's unit, sign and frame.
+
+        psi unwrapped.
+        """
         scale, offset = _FRAMES[self.frame][name] if self.frame != "as_measured" else _SAME
         values = scale * self.sign * to_si(self.unit) * raw + offset
         return unwrap(values) if name == "psi" else values
@@ -87,7 +89,7 @@ class ChannelMap(Conversion):
 
 
 def factor(unit: str, expected: str | None) -> float:
-    """`to_si` for validators: pydantic adds the key path to a ValueError only."""
+    """Return `to_si` for validators: pydantic adds the key path to a ValueError only."""
     try:
         return to_si(unit, expected)
     except UsageError as error:

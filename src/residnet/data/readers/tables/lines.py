@@ -58,7 +58,7 @@ def check_lines(path: Path, delimiter: str, wide: int) -> bool:
 
 
 def _blocks(path: Path) -> Iterator[tuple[bytes, bool]]:
-    """Blocks of whole lines with line ends of one byte, and whether it is the last."""
+    """Return the blocks of whole lines with line ends of one byte, and whether it is the last."""
     with path.open("rb") as stream:
         rest = b""
         while True:
@@ -83,7 +83,7 @@ def _blocks(path: Path) -> Iterator[tuple[bytes, bool]]:
 
 
 def _counted(block: bytes, delimiter: str, wide: int) -> tuple[np.ndarray, np.ndarray]:
-    """Cells of each line, and whether it is blank."""
+    """Return the cells of each line, and whether it is blank."""
     values = np.frombuffer(block, dtype=np.uint8)
     # the usual block: every so many marks one is the end of a line, the others are delimiters
     marks = values[np.flatnonzero((values == _NEWLINE) | (values == ord(delimiter)))]
@@ -108,7 +108,7 @@ def _counted(block: bytes, delimiter: str, wide: int) -> tuple[np.ndarray, np.nd
 
 
 def _quoted(block: bytes, delimiter: str) -> tuple[np.ndarray, np.ndarray]:
-    """The same where quotes may hold delimiters; line ends within quotes make no new line."""
+    """Return the same where quotes may hold delimiters; line ends within quotes make no new line."""
     try:
         rows = list(
             csv.reader(
@@ -127,7 +127,7 @@ def _quoted(block: bytes, delimiter: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _cut_short(path: Path, delimiter: str, wide: int) -> bool:
-    """Whether the file ends within its last line."""
+    """Return whether the file ends within its last line."""
     with path.open("rb") as stream:
         size = stream.seek(0, io.SEEK_END)
         stream.seek(max(0, size - _TAIL))

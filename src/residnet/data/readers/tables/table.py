@@ -76,7 +76,7 @@ class _TableConfig(Config, ABC):
 
     @abstractmethod
     def build(self) -> LogReader:
-        """The reader."""
+        """Return the reader."""
 
 
 @final
@@ -88,7 +88,7 @@ class CsvConfig(_TableConfig):
     decimal: Literal[".", ","] = "."
 
     def build(self) -> TableReader:
-        """The reader."""
+        """Return the reader."""
         return TableReader(
             self,
             lambda path, names: _read_csv(path, names, self.delimiter, self.decimal),
@@ -103,7 +103,7 @@ class ParquetConfig(_TableConfig):
     kind: Literal["parquet"] = "parquet"
 
     def build(self) -> TableReader:
-        """The reader."""
+        """Return the reader."""
         return TableReader(self, _read_parquet, lambda i: f"row {i + 1}")
 
 
@@ -127,8 +127,9 @@ class TableReader(LogReader):
         self._config, self._load, self._row = config, load, row
 
     def read(self, path: Path) -> Log:
-        """The log in `path`; see `LogReader.read`. A large file's channels lie in temporary files,
-        not in memory.
+        """Return the log in `path`.
+
+        See `LogReader.read`. A large file's channels lie in temporary files, not in memory.
 
         Rows without a measurement at either end, and blank rows, are dropped and counted; other
         rows keep NaN where a channel was not measured.
@@ -171,8 +172,9 @@ class TableReader(LogReader):
         return Log(path.stem, t, channels, units, manoeuvre or "unknown", meta=meta)
 
     def _numbers(self, path: Path, column: pd.Series, name: str, first: int) -> np.ndarray:
-        """Cells of one column as float64 [T], NaN where empty; `first` is the index of the first
-        row.
+        """Return the cells of one column as float64 [T], NaN where empty.
+
+        `first` is the index of the first row.
         """
         import pandas as pd
 
@@ -217,8 +219,9 @@ class _Rows:
         self._places: list[tuple[int, range | np.ndarray]] = []
 
     def add(self, values: list[np.ndarray], first: int) -> None:
-        """One more piece: time and channels as they stand in the table; `first` is the index of the
-        first row.
+        """Return one more piece: time and channels as they stand in the table.
+
+        `first` is the index of the first row.
 
         Raises:
             DataError: where a row has measurements but no time.
@@ -255,7 +258,7 @@ class _Rows:
         self._kept += int(keep.sum())
 
     def finish(self) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """Time and channels up to the last measurement.
+        """Return the time and channels up to the last measurement.
 
         Raises:
             DataError: where there are too few rows, time does not increase, or a channel holds no
@@ -272,7 +275,7 @@ class _Rows:
         return t, dict(zip(self._config.channels, values, strict=True))
 
     def _continued(self, name: str, values: np.ndarray) -> np.ndarray:
-        """A piece of a channel; a heading goes on from the piece before."""
+        """Return a piece of a channel; a heading goes on from the piece before."""
         if name != "psi":
             return values
         known = np.flatnonzero(np.isfinite(values))
@@ -285,7 +288,7 @@ class _Rows:
         return values
 
     def _table_row(self, i: int) -> int:
-        """Index in the table of a kept row."""
+        """Return the index in the table of a kept row."""
         start, places = next(
             (start, places) for start, places in reversed(self._places) if start <= i
         )
@@ -295,7 +298,7 @@ class _Rows:
 def _positions(
     path: Path, header: Sequence[str], columns: Sequence[str], hint: str = ""
 ) -> list[int]:
-    """Where the wanted columns stand in the header."""
+    """Return where the wanted columns stand in the header."""
     for column in columns:
         count = list(header).count(column)
         if count == 0:
@@ -372,7 +375,7 @@ def _read_csv(path: Path, columns: Sequence[str], delimiter: str, decimal: str) 
 
 
 def _with_last(pieces: Iterable[pd.DataFrame]) -> Iterator[tuple[pd.DataFrame, bool]]:
-    """Each piece, and whether it is the last."""
+    """Return each piece, and whether it is the last."""
     held: pd.DataFrame | None = None
     for piece in pieces:
         if held is not None:
