@@ -1,3 +1,1 @@
-"""What everything else stands on: errors, names and units, frames, the canonical log,
-configuration.
-"""
+"""What all packages build on: errors, names and units, frames, the canonical log, configs."""

@@ -140,7 +140,7 @@ def _discriminator(context: dict[str, Any]) -> KeyPath:
 def _locate(
     loc: tuple[str | int, ...], model: Any
 ) -> tuple[KeyPath, tuple[Any, ...], tuple[Any, ...]]:
-    """Return the key path that the user wrote, types that may hold its last key, and types of its value.
+    """Return the key path that the user wrote, the types around its last key, and of its value.
 
     pydantic puts the chosen member of a union between the keys; only the types tell such a label
     from a key.
@@ -223,7 +223,7 @@ def _fields(model: type[BaseModel]) -> dict[str, Any]:
 
 
 def _marked(field: FieldInfo) -> Any:
-    """Return the annotation of a field with the marker that pydantic has moved into its metadata."""
+    """Return a field's annotation with the marker that pydantic has moved into its metadata."""
     kinds = next((part for part in field.metadata if isinstance(part, Kinds)), None)
     return field.annotation if kinds is None else Annotated[field.annotation, kinds]
 

@@ -1,3 +1,4 @@
-"""What is known of a vessel: rigid body, hydrodynamics, actuators, environment. Everything batched
-and differentiable.
+"""What is known of a vessel before any data: hull, actuators, environment.
+
+Everything is batched and differentiable.
 """

@@ -1,5 +1,6 @@
-"""Abkowitz vessels: Taylor series of the forces about straight motion at service speed, from a
-vessel file alone (Abkowitz 1964).
+"""Abkowitz vessels: Taylor series of the forces about straight motion at service speed.
+
+A vessel file holds all coefficients (Abkowitz 1964).
 """
 
 from __future__ import annotations
@@ -34,15 +35,24 @@ SERIES = ("du", "v", "r", "delta", "dn")
 
 
 class SteeringGearConfig(ServoConfig):
-    """The rudder: largest angle and rate (None for no limit)."""
+    """The steering gear: how far and how fast the rudder turns.
+
+    Attributes:
+        limit: largest rudder angle of either side in rad.
+        rate: largest rudder rate in rad/s; None for no limit.
+    """
 
     limit: Radians = Field(gt=0, lt=1.5707)
     rate: RadiansPerSecond | None = Field(default=None, gt=0)
 
 
 class ShaftConfig(ServoConfig):
-    """The propeller's shaft, for series with terms in dn: service revolutions n_0, largest
-    revolutions and rate.
+    """The propeller's shaft, for series with terms in dn.
+
+    Attributes:
+        n_0: revolutions at service speed in 1/s.
+        n_max: largest revolutions in 1/s.
+        n_rate: largest change of revolutions in 1/s^2; None for no limit.
     """
 
     n_0: RevsPerSecond = Field(gt=0)
@@ -51,7 +61,18 @@ class ShaftConfig(ServoConfig):
 
 
 class SeriesMass(Config):
-    """Rigid body and added mass, in the units of the series."""
+    """Rigid body and added mass, in the units of the series.
+
+    Attributes:
+        m: mass (kg, or dimensionless in the prime system, as all that follow).
+        I_z: moment of inertia in yaw about the body origin (kg m^2).
+        x_G: centre of gravity ahead of the body origin (m).
+        X_udot: added mass in surge, negative for a normal hull (kg).
+        Y_vdot: added mass in sway (kg).
+        Y_rdot: sway force by yaw acceleration (kg m).
+        N_vdot: yaw moment by sway acceleration (kg m).
+        N_rdot: added moment of inertia in yaw (kg m^2).
+    """
 
     m: float = Field(gt=0)
     I_z: float = Field(gt=0)
@@ -64,8 +85,12 @@ class SeriesMass(Config):
 
 
 class Derivatives(Config):
-    """Coefficients of the force on each axis by term, for example `Y: {v: ..., v^2 r: ..., "1":
-    ...}`.
+    """The coefficients of the force on each axis by term, such as `Y: {v: ..., v^2 r: ...}`.
+
+    Attributes:
+        X: coefficients of the surge force, in the units of the series.
+        Y: coefficients of the sway force.
+        N: coefficients of the yaw moment.
     """
 
     X: dict[str, float] = Field(default_factory=dict)
@@ -90,8 +115,9 @@ class Derivatives(Config):
 
 
 class AbkowitzConfig(VesselFile):
-    """A vessel given by its hydrodynamic derivatives: M nu_dot = sum of terms in (du, v, r, delta,
-    dn).
+    """A vessel given by its hydrodynamic derivatives.
+
+    M nu_dot = sum of terms in (du, v, r, delta, dn).
 
     Attributes:
         name: of the vessel, as its file is called.
@@ -111,6 +137,7 @@ class AbkowitzConfig(VesselFile):
         mass, coefficients: with the source of all of them.
         rudder, shaft: how these follow their commands; `shaft` only where there are terms in dn.
         wind: coefficients of the hull above water.
+        source: where all coefficients come from.
     """
 
     kind: Literal["abkowitz"]
@@ -148,7 +175,7 @@ class AbkowitzConfig(VesselFile):
         return self
 
     def build(self) -> AbkowitzVessel:
-        """Return the plant.
+        """Build the plant of this vessel.
 
         Raises:
             ConfigError: where the mass matrix is not positive definite or is singular.
@@ -235,8 +262,9 @@ class SeriesForces(Actuators):
 
 
 class SeriesInertia(nn.Module):
-    """Mass matrix of the series in SI, its inverse, and the rigid body's Coriolis force where the
-    series leaves it out.
+    """The mass matrix of the series in SI, its inverse, and the rigid body's Coriolis force.
+
+    The Coriolis force is added only where the series leaves it out.
     """
 
     def __init__(self, config: AbkowitzConfig) -> None:
@@ -271,8 +299,9 @@ class SeriesInertia(nn.Module):
 
 @final
 class AbkowitzVessel(HullPlant):
-    """The series in current, wind and external force. State x [B, 6 + k]: x, y, psi, u, v, r, then
-    rudder and shaft.
+    """The vessel of an Abkowitz series in current, wind and external force.
+
+    State x [B, 6 + k]: x, y, psi, u, v, r, then rudder and shaft.
     """
 
     def __init__(self, config: AbkowitzConfig) -> None:

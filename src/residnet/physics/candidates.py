@@ -1,5 +1,6 @@
-"""Candidate terms of an equation, by type: motions multiply motions, inputs multiply inputs, and
-only what is named couples the two.
+"""Candidate terms of an equation, put together from motions and inputs.
+
+Motions multiply motions, inputs multiply inputs, and only what is named couples the two.
 """
 
 from __future__ import annotations
@@ -17,8 +18,9 @@ from residnet.physics.terms import parse_term
 
 
 class Candidate(NamedTuple):
-    """A term, its degree (a function counts one) and how complicated it is among those of its
-    degree.
+    """A candidate term with its degree and how complicated it is among those of its degree.
+
+    A function counts as one degree.
     """
 
     term: str
@@ -57,7 +59,7 @@ class CandidatesConfig(Config):
     extra: tuple[str, ...] = ()
 
     def candidates(self, names: Sequence[str]) -> tuple[Candidate, ...]:
-        """Return the candidates for a model with channels `names`, simplest first within each degree.
+        """Return the candidates for a model with channels `names`, simplest first in each degree.
 
         Raises:
             ConfigError: where a channel is named that the model lacks.
@@ -107,6 +109,8 @@ def rated(terms: Iterable[str], names: Sequence[str]) -> tuple[Candidate, ...]:
 
 def _products(names: Sequence[str], degree: int, *, magnitudes: bool = False) -> list[str]:
     """Return the products up to a degree, the empty one first.
+
+    Of one channel's factors at most one stands as a magnitude, since |x|^2 is x^2.
 
     Of one channel's factors at most one stands as a magnitude, since |x|^2 is x^2.
     """

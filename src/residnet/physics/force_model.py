@@ -1,5 +1,6 @@
-"""Models in force space: tau = F(nu_dot, nu), a believed hull and what was found to be missing in
-it (document 002 eqs. (3.19)-(3.27)).
+"""Models in force space: tau = F(nu_dot, nu), a believed hull and corrections to it.
+
+Source: document 002 eqs. (3.19)-(3.27).
 """
 
 from __future__ import annotations
@@ -51,12 +52,17 @@ another has, and none in truth.
 
 
 def order_of(term: str) -> int:
-    """Return beta of a basis function: how many channels are multiplied in it (document 002 section 4.3.4)."""
+    """Return the order of a basis function: how many channels are multiplied in it.
+
+    It is called beta in document 002 section 4.3.4.
+    """
     return max(sum(abs(factor.power) for factor in parse_term(term, MOTION)), 1)
 
 
 def column_scale(terms: Sequence[str], x: Tensor) -> Tensor:
-    """Return what the columns x [N, J] of basis functions are divided by, beta std(x) [J], so that higher orders weigh less (4.8), (4.9), ERRATA J15.
+    """Return what the columns x [N, J] of basis functions are divided by: beta std(x) [J].
+
+    Higher orders weigh less by it; (4.8), (4.9), ERRATA J15.
 
     Raises:
         FitError: where a column is constant.
@@ -72,7 +78,7 @@ def column_scale(terms: Sequence[str], x: Tensor) -> Tensor:
 
 
 class Correction(nn.Module):
-    """theta_0 + Theta' phi(nu_dot, nu): a force [..., 3] that is linear in basis functions."""
+    """A force [..., 3] that is linear in basis functions: theta_0 + Theta' phi(nu_dot, nu)."""
 
     def __init__(self, terms: Sequence[str], coefficients: Tensor, intercept: Tensor) -> None:
         super().__init__()
@@ -91,7 +97,7 @@ class Correction(nn.Module):
 
 @final
 class ForceModel(nn.Module):
-    """F_k = F_(k-1) + Theta phi on a believed hull; the chain of (3.26) is a list of corrections.
+    """A believed hull with a list of corrections: F_k = F_(k-1) + Theta phi, the chain of (3.26).
 
     Attributes:
         earth: a force constant in earth axes [2] (north, east) in N that acts on the vessel beside
@@ -122,7 +128,10 @@ class ForceModel(nn.Module):
         return tau
 
     def at_heading(self, nu_dot: Tensor, nu: Tensor, psi: Tensor) -> Tensor:
-        """Return tau [..., 3] that the thrusters have to give at heading psi [...] rad, against the force that is constant in earth axes."""
+        """Return tau [..., 3] that the thrusters have to give at heading psi [...] rad.
+
+        The force that is constant in earth axes acts beside them.
+        """
         earth = self.earth.to(nu.dtype)
         along, across = to_body(earth[0], earth[1], psi)
         residual: Tensor = self(nu_dot, nu) - torch.stack(
@@ -131,12 +140,17 @@ class ForceModel(nn.Module):
         return residual
 
     def residual(self, tau: Tensor, nu_dot: Tensor, nu: Tensor, psi: Tensor) -> Tensor:
-        """Return eps = tau - F(nu_dot, nu) [..., 3], what the model does not explain (3.20), (3.25)."""
+        """Return eps = tau - F(nu_dot, nu) [..., 3], which the model leaves unexplained.
+
+        Source: document 002 eqs. (3.20), (3.25).
+        """
         return tau - self.at_heading(nu_dot, nu, psi)
 
 
 def accelerating(terms: Sequence[str], names: Sequence[str] = MOTION) -> dict[int, int]:
     """Return the numbers of the terms that are an acceleration, each with its axis.
+
+    The other terms are free of accelerations.
 
     The others are free of accelerations.
 

@@ -1,5 +1,6 @@
-"""The 3-DOF Fossen model M nu_dot + C(nu) nu + D(nu) nu = tau, from a vessel file alone (document
-003 eqs. (5)-(9), ERRATA W1, W2).
+"""The 3-DOF Fossen model M nu_dot + C(nu) nu + D(nu) nu = tau, from a vessel file alone.
+
+Source: document 003 eqs. (5)-(9), ERRATA W1, W2.
 """
 
 from __future__ import annotations
@@ -34,7 +35,13 @@ from residnet.physics.vessel_file import VesselFile
 
 
 class RigidBody(Config):
-    """Mass, yaw inertia about the body origin and longitudinal centre of gravity."""
+    """The rigid body: mass, yaw inertia and centre of gravity.
+
+    Attributes:
+        m: mass in kg.
+        I_z: moment of inertia in yaw about the body origin in kg m^2.
+        x_G: centre of gravity ahead of the body origin in m.
+    """
 
     m: Mass
     I_z: Inertia
@@ -44,7 +51,15 @@ class RigidBody(Config):
 
 
 class AddedMass(Config):
-    """Hydrodynamic derivatives with respect to accelerations (SNAME: negative for a normal hull)."""
+    """The hydrodynamic derivatives of the accelerations (SNAME: negative for a normal hull).
+
+    Attributes:
+        X_udot: surge force by surge acceleration in kg.
+        Y_vdot: sway force by sway acceleration in kg.
+        Y_rdot: sway force by yaw acceleration in kg m.
+        N_vdot: yaw moment by sway acceleration in kg m.
+        N_rdot: yaw moment by yaw acceleration in kg m^2.
+    """
 
     X_udot: Mass
     Y_vdot: Mass
@@ -54,8 +69,14 @@ class AddedMass(Config):
 
 
 class Damping(Config):
-    """Damping force of each axis as terms of (u, v, r), positive = damping, e.g. `X: {u: ...,
-    "u|u|": ...}`.
+    """The damping force of each axis as terms of (u, v, r), for example `X: {u: ..., "u|u|": ...}`.
+
+    Positive coefficients brake.
+
+    Attributes:
+        X: coefficients of the surge force, each in the SI unit that its term asks for.
+        Y: coefficients of the sway force.
+        N: coefficients of the yaw moment.
     """
 
     X: dict[str, Parameter] = Field(default_factory=dict)
@@ -88,13 +109,16 @@ class Damping(Config):
 
 
 class HullConfig(VesselFile, ABC):
-    """A 3-DOF vessel M nu_dot + C(nu) nu + D(nu) nu = tau; a file may name another one as `base`
-    and give only what differs.
+    """A 3-DOF vessel M nu_dot + C(nu) nu + D(nu) nu = tau.
+
+    A file may name another one as `base` and give only what differs.
 
     Attributes:
         scale: what M, C and D are all multiplied by: a true vessel beside the believed one of its
             `base` (document 002 eq. (4.2)).
         wind: coefficients of the hull above water; without them the vessel feels no wind.
+        damping: terms of D(nu) nu.
+        actuators: what the vessel is driven and steered by.
     """
 
     scale: float = Field(default=1.0, gt=0)
@@ -108,16 +132,19 @@ class HullConfig(VesselFile, ABC):
 
     @abstractmethod
     def coupling(self) -> float:
-        """Return what r is multiplied by in the sway momentum of C(nu), in kg m, without the scale."""
+        """Return the factor of r in the sway momentum of C(nu), in kg m, without the scale."""
 
     def equations(self) -> tuple[tuple[str, ...], list[list[float]]]:
-        """Return nu_dot as terms of (u, v, r), and the coefficients of these, then of tau_x, tau_y, tau_n, on each axis."""
+        """Return nu_dot as terms of (u, v, r), and the coefficients on each axis.
+
+        The coefficients of the terms come first, then those of tau_x, tau_y, tau_n.
+        """
         terms, response = Fossen3(self).products()
         return terms, response.tolist()
 
     @final
     def build(self) -> FossenVessel:
-        """Return the plant.
+        """Build the plant of this vessel.
 
         Raises:
             ConfigError: where the mass matrix is not positive definite or is singular.
@@ -126,14 +153,19 @@ class HullConfig(VesselFile, ABC):
 
 
 class FossenConfig(HullConfig):
-    """A 3-DOF vessel: inertia, added mass, damping by terms, actuators."""
+    """A 3-DOF vessel given by rigid body, added mass, damping terms and actuators.
+
+    Attributes:
+        rigid_body: mass, inertia and centre of gravity.
+        added_mass: hydrodynamic derivatives of the accelerations.
+    """
 
     kind: Literal["fossen"] = "fossen"
     rigid_body: RigidBody
     added_mass: AddedMass
 
     def mass_matrix(self) -> list[list[float]]:
-        """Return the rigid body and added mass."""
+        """Return the sum of rigid body and added mass, [3, 3]."""
         body, added = self.rigid_body, self.added_mass
         m, arm = body.m.value, body.m.value * body.x_G.value
         return [
@@ -143,13 +175,24 @@ class FossenConfig(HullConfig):
         ]
 
     def coupling(self) -> float:
-        """Return the mean of m23 and m32, which makes C that of the symmetric part of M (Fossen 2011 section 6.3)."""
+        """Return the mean of m23 and m32, which makes C that of the symmetric part of M.
+
+        Source: Fossen 2011, section 6.3.
+        """
         mass = self.mass_matrix()
         return 0.5 * (mass[1][2] + mass[2][1])
 
 
 class MassEntries(Config):
-    """Mass matrix with added mass; the entries that are not here are zero."""
+    """The mass matrix with added mass; the entries that are not here are zero.
+
+    Attributes:
+        m11: surge in kg.
+        m22: sway in kg.
+        m23: sway force by yaw acceleration in kg m.
+        m32: yaw moment by sway acceleration in kg m.
+        m33: yaw in kg m^2.
+    """
 
     m11: Mass
     m22: Mass
@@ -159,15 +202,19 @@ class MassEntries(Config):
 
 
 class MassMatrixConfig(HullConfig):
-    """A 3-DOF vessel whose mass matrix was identified as a whole, as that of milliAmpere (document
-    002 eqs. (2.3)-(2.6), appendix A).
+    """A 3-DOF vessel whose mass matrix was identified as a whole, as that of milliAmpere.
+
+    Attributes:
+        mass: entries of the mass matrix.
+
+    Source: document 002 eqs. (2.3)-(2.6), appendix A.
     """
 
     kind: Literal["mass_matrix"]
     mass: MassEntries
 
     def mass_matrix(self) -> list[list[float]]:
-        """As given; it need not be symmetric."""
+        """Return the mass matrix [3, 3] of the file; it need not be symmetric."""
         m = self.mass
         return [
             [m.m11.value, 0.0, 0.0],
@@ -181,7 +228,7 @@ class MassMatrixConfig(HullConfig):
 
 
 class Fossen3(nn.Module):
-    """Acceleration of a vessel in surge, sway and yaw.
+    """The acceleration of a vessel in surge, sway and yaw.
 
     The Coriolis matrix is Fossen's skew form of the whole mass matrix, so inertia does no work
     where that is symmetric. Buffers are float64; results take the dtype of the input.
@@ -226,11 +273,17 @@ class Fossen3(nn.Module):
         return damping
 
     def required(self, nu_dot: Tensor, nu: Tensor) -> Tensor:
-        """Return the forces [..., 3] that accelerate the vessel by nu_dot [..., 3] at velocities nu [..., 3] (document 002 eq. (2.10))."""
+        """Return the forces [..., 3] that accelerate the vessel by nu_dot [..., 3].
+
+        Source: document 002 eq. (2.10).
+        """
         return nu_dot @ self.mass.to(nu.dtype).T + self.coriolis(nu) + self.drag(nu)
 
     def products(self) -> tuple[tuple[str, ...], Tensor]:
-        """Return nu_dot as products: J terms of (u, v, r), and their coefficients with those of tau behind them, [3, J + 3]."""
+        """Return nu_dot as products: J terms of (u, v, r) and coefficients [3, J + 3].
+
+        The coefficients of tau stand behind those of the terms.
+        """
         m, cross = self.mass.tolist(), self.coupling
         coriolis = {
             "v r": (0, -m[1][1]),
@@ -247,8 +300,9 @@ class Fossen3(nn.Module):
         return terms, torch.cat((-(self.inverse @ force), self.inverse), dim=1)
 
     def compact(self) -> None:
-        """Write Coriolis force, drag and tau as one product of terms and a matrix: the same to
-        rounding, with a third of the operations.
+        """Rewrite Coriolis force, drag and tau as one product of terms and a matrix.
+
+        Results are the same to rounding, with a third of the operations.
         """
         terms, self.response = self.products()
         library = TermLibrary(terms, VELOCITY)
@@ -259,7 +313,12 @@ class Fossen3(nn.Module):
         self.compacted = True
 
     def forward(self, nu: Tensor, tau: Tensor) -> Tensor:
-        """Return the acceleration nu_dot [..., 3] from velocities through the water nu [..., 3] and forces tau [..., 3]; [B, 3] once compacted."""
+        """Return the acceleration nu_dot [..., 3]; [B, 3] once compacted.
+
+        Args:
+            nu: velocities through the water [..., 3].
+            tau: forces [..., 3] in N, N, N m.
+        """
         if self.compacted:
             # terms as rows: gathering rows and a product of few long rows cost a third of gathering
             # columns
@@ -275,7 +334,7 @@ class Fossen3(nn.Module):
 
 @final
 class FossenVessel(HullPlant):
-    """The hull with its actuators, in current and external force.
+    """A hull with its actuators, in current and external force.
 
     State x [B, 6 + k]: x, y [m], psi [rad], u, v [m/s] over ground, r [rad/s], then the actuators'
     states.
@@ -290,7 +349,7 @@ class FossenVessel(HullPlant):
         self.hull = Fossen3(vessel)
 
     def in_calm_water(self) -> HullPlant:
-        """As for every plant, and the hull's forces in one product."""
+        """Return this plant without its exogenous inputs, and the hull's forces in one product."""
         self.hull.compact()
         return super().in_calm_water()
 

@@ -31,6 +31,8 @@ def froude_number(u: Tensor, v: Tensor, length: float) -> Tensor:
 def phase_of(froude: Tensor, boundaries: tuple[float, float] = BOUNDARIES) -> Tensor:
     """Return the number of the phase in `PHASES` at each Froude number, integers of the same shape.
 
+    A boundary belongs to the phase above it.
+
     a boundary belongs to the phase above it.
     """
     return torch.bucketize(

@@ -12,7 +12,7 @@ from residnet.core.frames import to_body, to_earth
 
 
 class Kinematics(nn.Module, ABC):
-    """Pose [..., n] and velocities [..., n] of a vessel with n degrees of freedom.
+    """The relation of pose [..., n] and velocities [..., n] with n degrees of freedom.
 
     Attributes:
         pose, velocity: names.
@@ -33,7 +33,16 @@ class Kinematics(nn.Module, ABC):
     def body_components_and_rate(
         self, north: Tensor, east: Tensor, pose: Tensor, nu: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return a constant earth-fixed velocity (north, east) [...] in body axes [..., n], and how that changes while the body turns [..., n]."""
+        """Return an earth-fixed constant velocity in body axes, and its derivative, each [..., n].
+
+        The derivative is not zero while the body turns.
+
+        Args:
+            north: velocity along north [...] in m/s.
+            east: velocity along east [...] in m/s.
+            pose: pose [..., n].
+            nu: velocities [..., n].
+        """
 
     @abstractmethod
     def body_components(self, north: Tensor, east: Tensor, pose: Tensor) -> Tensor:
@@ -42,7 +51,7 @@ class Kinematics(nn.Module, ABC):
 
 @final
 class Planar(Kinematics):
-    """Surge, sway, yaw (document 003 eq. (1))."""
+    """Surge, sway and yaw (document 003 eq. (1))."""
 
     pose = ("x", "y", "psi")
     velocity = ("u", "v", "r")
@@ -74,8 +83,9 @@ class Planar(Kinematics):
 
 @final
 class Rolling(Kinematics):
-    """Surge, sway, roll, yaw without heave and pitch (document 004, ERRATA 004): pose x, y, phi,
-    psi; velocities u, v, p, r.
+    """Surge, sway, roll and yaw, without heave and pitch (document 004, ERRATA 004).
+
+    The pose is x, y, phi, psi; the velocities are u, v, p, r.
     """
 
     pose = ("x", "y", "phi", "psi")
@@ -84,7 +94,11 @@ class Rolling(Kinematics):
     heading = 3
 
     def rate(self, pose: Tensor, nu: Tensor) -> Tensor:
-        """Return x_dot = u cos psi - v sin psi cos phi, y_dot = u sin psi + v cos psi cos phi, phi_dot = p, psi_dot = r cos phi."""
+        """Return the derivative [..., 4] of the pose.
+
+        x_dot = u cos psi - v sin psi cos phi, y_dot = u sin psi + v cos psi cos phi, phi_dot = p,
+        psi_dot = r cos phi.
+        """
         cos_phi = torch.cos(pose[..., 2])
         north, east = to_earth(nu[..., 0], nu[..., 1] * cos_phi, pose[..., 3])
         return torch.stack((north, east, nu[..., 2], nu[..., 3] * cos_phi), dim=-1)

@@ -1,6 +1,4 @@
-"""Mass matrices: what a vessel file gives must be invertible, and positive as that of a body in
-water is.
-"""
+"""Mass matrices: they must be invertible, and positive as that of a body in water is."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""The mass-spring-damper of document 000 (eqs. (4.1), (4.2)): the plant that its methods are tried
-on first.
-"""
+"""The mass-spring-damper of document 000 (eqs. (4.1), (4.2)), the first plant of its methods."""
 
 from __future__ import annotations
 
@@ -16,7 +14,7 @@ from residnet.physics.plant import Plant
 
 
 class MassSpringDamperConfig(Config):
-    """m x_ddot + d x_dot + k x = tau.
+    """The mass-spring-damper m x_ddot + d x_dot + k x = tau.
 
     Attributes:
         m, d, k: mass, damping, stiffness; by default those of section 5.3. (4.3) is another system:
@@ -37,13 +35,13 @@ class MassSpringDamperConfig(Config):
     tau_max: Newtons = Field(default=1.0, gt=0)
 
     def build(self) -> MassSpringDamper:
-        """Return the plant."""
+        """Build the plant of this vessel."""
         return MassSpringDamper(self)
 
 
 @final
 class MassSpringDamper(Plant):
-    """State x [B, 2]: displacement x [m] and its rate u [m/s]; input tau_x [N]."""
+    """A mass on a spring: displacement x [m] and its rate u [m/s] in x [B, 2]; input tau_x [N]."""
 
     state = ("x", "u")
     inputs = ("tau_x",)

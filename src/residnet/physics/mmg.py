@@ -1,5 +1,6 @@
-"""The MMG standard model of a ship with one propeller and one rudder: hull, propeller and rudder
-apart, and what each does to the others.
+"""The MMG standard model of a ship with one propeller and one rudder.
+
+Hull, propeller and rudder stand apart, with what each does to the others.
 
 Source: Yasukawa and Yoshimura, Introduction of MMG standard method for ship maneuvering
 predictions, J Mar Sci Technol 20 (2015) 37-52. Starting values of the hull's linear derivatives:
@@ -46,7 +47,7 @@ class MMGHull(Config):
 
     @property
     def block(self) -> float:
-        """Block coefficient."""
+        """The block coefficient, dimensionless."""
         return self.mass / (self.density * self.length * self.beam * self.draught)
 
 
@@ -81,14 +82,12 @@ class MMGRudder(Config):
 
     @property
     def lift(self) -> float:
-        """Slope of the normal force, Fujii's formula."""
+        """The slope of the normal force by Fujii's formula, dimensionless."""
         return 6.13 * self.aspect / (2.25 + self.aspect)
 
 
 class Prior(NamedTuple):
-    """What is thought of a parameter before any trial: `mean`, standard deviation `sd`, and what
-    the parameter is.
-    """
+    """What is believed of a parameter before any trial: mean, standard deviation and meaning."""
 
     mean: float
     sd: float
@@ -96,7 +95,7 @@ class Prior(NamedTuple):
 
 
 def usual_priors(hull: MMGHull) -> dict[str, Prior]:
-    """Return every parameter of the model, dimensionless, as one would expect of a merchant ship with these particulars.
+    """Return the prior of every parameter, as one would expect of a merchant ship of this form.
 
     Linear hull derivatives by Kijima's formulas; those of higher order are thought to be near zero,
     so that the trials speak for themselves.
@@ -152,7 +151,7 @@ PARAMETERS = tuple(usual_priors(MMGHull(length=1.0, beam=0.2, draught=0.1, mass=
 
 @final
 class MMGForces(nn.Module):
-    """Accelerations of the ship.
+    """The accelerations of the ship.
 
     Holds ahead, propeller turning ahead. Hull forces are divided by rho/2 L d U^2, moments by rho/2
     L^2 d U^2, with v' = v/U and r' = r L/U.
@@ -190,7 +189,10 @@ class MMGForces(nn.Module):
         )
 
     def forward(self, z: Tensor, theta: Tensor) -> Tensor:
-        """Return nu_dot [..., 3] at channels z [..., nz] with parameters theta [..., 34] (see `PARAMETERS`)."""
+        """Return nu_dot [..., 3] at channels z [..., nz] with parameters theta [..., 34].
+
+        The order of the parameters is that of `PARAMETERS`.
+        """
         (
             m_x, m_y, J_z, R_0, X_vv, X_vr, X_rr, X_vvvv, Y_0, Y_v, Y_r, Y_vvv, Y_vvr, Y_vrr, Y_rrr,
             N_0, N_v, N_r, N_vvv, N_vvr, N_vrr, N_rrr,

@@ -1,5 +1,6 @@
-"""Nomoto's steering models at constant speed: first order, second order, and second order with
-sideslip (document 004, section 5.1).
+"""Nomoto's steering models at constant speed: first and second order, and with sideslip.
+
+Source: document 004, section 5.1.
 """
 
 from __future__ import annotations
@@ -25,7 +26,10 @@ SwayGain = Annotated[Parameter, AfterValidator(measured_in("m/s"))]
 
 
 class LinearSteering(NamedTuple):
-    """z_dot = A z + b delta with z = (v, r, then `extra` internal states): A [k, k], b [k]."""
+    """A state-space model z_dot = A z + b delta with z = (v, r, then `extra` internal states).
+
+    A is [k, k], b [k].
+    """
 
     a: np.ndarray
     b: np.ndarray
@@ -33,7 +37,7 @@ class LinearSteering(NamedTuple):
 
 
 class SteeringConfig(VesselFile, ABC):
-    """What all steering models have.
+    """The part that all steering models share.
 
     Attributes:
         speed: u, which nothing changes.
@@ -70,30 +74,40 @@ class SteeringConfig(VesselFile, ABC):
 
     @final
     def build(self) -> SteeringVessel:
-        """Return the plant."""
+        """Build the plant of this vessel."""
         return SteeringVessel(self)
 
 
 class NomotoConfig(SteeringConfig):
-    """T r_dot + r = K delta (document 004 eq. (5.9)); no sideslip."""
+    """The first-order model T r_dot + r = K delta (document 004 eq. (5.9)); no sideslip.
+
+    Attributes:
+        T: time constant in s.
+    """
 
     kind: Literal["nomoto"]
     T: TimeConstant
 
     def times(self) -> dict[str, float]:
-        """Return T."""
+        """Return the time constant T in s."""
         return {"T": self.T.value}
 
     def steering(self) -> LinearSteering:
-        """Return r alone; v stays as it is."""
+        """Return the model of r alone; v stays as it is."""
         return LinearSteering(
             np.diag([0.0, -1.0 / self.T.value]), np.array([0.0, self.K.value / self.T.value])
         )
 
 
 class SecondOrderConfig(SteeringConfig, ABC):
-    """The three time constants of r/delta = K (1 + T3 s) / ((1 + T1 s)(1 + T2 s)), document 004 eq.
-    (5.3).
+    """The time constants of r/delta = K (1 + T3 s) / ((1 + T1 s)(1 + T2 s)).
+
+    Attributes:
+        T1: first time constant of the denominator in s.
+        T2: second time constant of the denominator in s.
+        T3: time constant of the numerator in s.
+
+    Source: document 004 eq. (5.3).
     """
 
     T1: TimeConstant
@@ -107,8 +121,10 @@ class SecondOrderConfig(SteeringConfig, ABC):
 
 
 class SecondOrderNomotoConfig(SecondOrderConfig):
-    """T1 T2 r_ddot + (T1 + T2) r_dot + r = K (delta + T3 delta_dot) (document 004 eq. (5.5), ERRATA
-    G12); no sideslip.
+    """The second-order model of the yaw rate; no sideslip.
+
+    T1 T2 r_ddot + (T1 + T2) r_dot + r = K (delta + T3 delta_dot) (document 004 eq. (5.5), ERRATA
+    G12).
 
     The internal state is q = r_dot - K T3 / (T1 T2) delta, which needs no derivative of the rudder
     angle.
@@ -129,11 +145,16 @@ class SecondOrderNomotoConfig(SecondOrderConfig):
 
 
 class SideslipNomotoConfig(SecondOrderConfig):
-    """Second order in yaw and sway: M nu_dot + N(u) nu = b delta with nu = (v, r) (document 004 eq.
-    (5.1)), given by its transfer functions (5.3) and v/delta = K_v (1 + T_v s) / ((1 + T1 s)(1 + T2
-    s)), (5.4) as in ERRATA G12.
+    """The second-order model in yaw and sway, given by its transfer functions.
+
+    M nu_dot + N(u) nu = b delta with nu = (v, r) (document 004 eq. (5.1)) has the transfer
+    functions (5.3) and v/delta = K_v (1 + T_v s) / ((1 + T1 s)(1 + T2 s)), (5.4) as in ERRATA G12.
 
     K_v and T_v belong to v, in m/s per rad and s.
+
+    Attributes:
+        K_v: steady sway velocity per rudder angle in m/s per rad.
+        T_v: time constant of the numerator of sway in s.
     """
 
     kind: Literal["nomoto_sideslip"]
@@ -183,14 +204,16 @@ class SteeringVessel(Plant):
         self.b: Tensor
 
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Return the rudder angle [..., 1] as a share of its limit.
+        """Return the rudder angle [..., 1] for a steer [...] as a share of the limit.
+
+        The speed is constant whatever the drive.
 
         The speed is constant whatever the drive.
         """
         return (steer.clamp(-1.0, 1.0) * self.delta_max).unsqueeze(-1)
 
     def delta(self, x: Tensor, w: Tensor) -> Tensor:
-        """Return the rudder angle [B]."""
+        """Return the rudder angle [B] in rad."""
         return self.servo.value(x[:, 4 + self.free :], w[:, 0])
 
     def rate(self, x: Tensor, w: Tensor) -> Tensor:
@@ -207,7 +230,7 @@ class SteeringVessel(Plant):
         return torch.cat((x[:, :split], self.servo.advance(x[:, split:], w[:, 0], dt)), dim=-1)
 
     def approach(self, rows: int) -> Tensor:
-        """Return straight ahead at its speed, [rows, nx]."""
+        """Return the state straight ahead at the model's speed, [rows, nx]."""
         x = super().approach(rows)
         x[:, 3] = self.speed
         return x

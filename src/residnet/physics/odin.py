@@ -1,5 +1,6 @@
-"""The USV Odin: accelerations as terms of the velocities, and forces by their gains (document 000
-eqs. (6.6)-(6.8), ERRATA H1-H5).
+"""The USV Odin: accelerations as terms of the velocities, and forces by their gains.
+
+Source: document 000 eqs. (6.6)-(6.8), ERRATA H1-H5.
 """
 
 from __future__ import annotations
@@ -23,7 +24,13 @@ from residnet.physics.vessel_file import VesselFile
 
 
 class Gains(Config):
-    """Acceleration per force or moment on each axis: x, y in 1/kg, n in 1/(kg m^2)."""
+    """The acceleration per force or moment on each axis.
+
+    Attributes:
+        x: surge in 1/kg.
+        y: sway in 1/kg.
+        n: yaw in 1/(kg m^2).
+    """
 
     x: Parameter
     y: Parameter
@@ -35,8 +42,12 @@ class Gains(Config):
 
 
 class AccelerationTerms(Config):
-    """Accelerations without force as terms of (u, v, r), with the sign that they act with: what
-    brakes is negative.
+    """The accelerations without force as terms of (u, v, r); terms that brake are negative.
+
+    Attributes:
+        u: terms of the surge acceleration, each in the SI unit that its term asks for.
+        v: terms of the sway acceleration.
+        r: terms of the yaw acceleration.
     """
 
     u: dict[str, Parameter] = Field(default_factory=dict)
@@ -70,8 +81,9 @@ class AccelerationTerms(Config):
 
 
 class OdinConfig(VesselFile):
-    """A 3-DOF vessel known by its accelerations; a file may name another one as `base` and give
-    only what differs.
+    """A 3-DOF vessel known by its accelerations.
+
+    A file may name another one as `base` and give only what differs.
 
     Attributes:
         name: of the vessel, as its file is called.
@@ -80,6 +92,7 @@ class OdinConfig(VesselFile):
         gains: acceleration per force.
         terms: acceleration without force.
         wind: coefficients of the hull above water; without them the vessel feels no wind.
+        actuators: what the vessel is driven and steered by.
     """
 
     kind: Literal["odin"]
@@ -89,7 +102,10 @@ class OdinConfig(VesselFile):
     wind: WindLoadsConfig | None = None
 
     def equations(self) -> tuple[tuple[str, ...], list[list[float]]]:
-        """Return nu_dot as terms of (u, v, r), and the coefficients of these, then of tau_x, tau_y, tau_n, on each axis."""
+        """Return nu_dot as terms of (u, v, r), and the coefficients on each axis.
+
+        The coefficients of the terms come first, then those of tau_x, tau_y, tau_n.
+        """
         hull = AccelerationHull(self.gains, self.terms)
         return (
             hull.terms.terms,
@@ -97,13 +113,14 @@ class OdinConfig(VesselFile):
         )
 
     def build(self) -> OdinVessel:
-        """Return the plant."""
+        """Build the plant of this vessel."""
         return OdinVessel(self)
 
 
 class AccelerationHull(nn.Module):
-    """nu_dot = gain tau + terms of the velocities. Buffers are float64; results take the dtype of
-    the input.
+    """A hull given by nu_dot = gain tau + terms of the velocities.
+
+    Buffers are float64; results take the dtype of the input.
     """
 
     def __init__(self, gains: Gains, terms: AccelerationTerms) -> None:
@@ -123,7 +140,12 @@ class AccelerationHull(nn.Module):
         self.gain: Tensor
 
     def forward(self, nu: Tensor, tau: Tensor) -> Tensor:
-        """Return the acceleration nu_dot [..., 3] from velocities through the water nu [..., 3] and forces tau [..., 3] in N, N, N m."""
+        """Return the acceleration nu_dot [..., 3].
+
+        Args:
+            nu: velocities through the water [..., 3].
+            tau: forces [..., 3] in N, N, N m.
+        """
         force: Tensor = tau * self.gain.to(nu.dtype) + self.terms(nu) @ self.coefficients.to(
             nu.dtype
         )
@@ -132,7 +154,7 @@ class AccelerationHull(nn.Module):
 
 @final
 class OdinVessel(HullPlant):
-    """The hull with its actuators, in current and external force.
+    """A hull with its actuators, in current and external force.
 
     State x [B, 6 + k]: x, y [m], psi [rad], u, v [m/s] over ground, r [rad/s], then the actuators'
     states.

@@ -1,6 +1,4 @@
-"""Numbers of vessel files: SI parameters, each with its unit and source, converted once when the
-file is read.
-"""
+"""Numbers of vessel files: each with its unit and source, converted to SI once, when read."""
 
 from __future__ import annotations
 
@@ -19,7 +17,13 @@ Density = Annotated[float, Quantity("kg/m^3")]
 
 
 class Parameter(Config):
-    """A number, its unit and where it comes from."""
+    """A number with its unit and source.
+
+    Attributes:
+        value: the number, in `unit`.
+        unit: its unit; the value is converted to SI when the file is read.
+        source: where it comes from.
+    """
 
     value: float
     unit: str
@@ -37,6 +41,8 @@ class Parameter(Config):
 
 def measured_in(unit: str) -> Callable[[Parameter], Parameter]:
     """Return a validator of a parameter whose unit must measure `unit`.
+
+    The validator converts the value to `unit`.
 
     The value is converted to it.
     """
@@ -78,7 +84,10 @@ _BASE = {
 
 
 def dimension(unit: str, mass: int = 1) -> tuple[int, int] | None:
-    """Return the powers of metre and second in an SI unit with `mass` times mass, for example (2, -1) for `kg m^2/s` or `N m s/rad`; None for any other."""
+    """Return the powers of metre and second in an SI unit with `mass` times mass.
+
+    For example (2, -1) for `kg m^2/s` or `N m s/rad`; None for any other unit.
+    """
     metres = seconds = masses = 0
     for sign, name, power in re.findall(r"([/ ]?)([^/ ^]*)(?:\^([1-9]))?", unit.strip()):
         if not name:
@@ -92,7 +101,7 @@ def dimension(unit: str, mass: int = 1) -> tuple[int, int] | None:
 
 
 def of_dimension(mass: int, metres: int, seconds: int) -> Callable[[Parameter], Parameter]:
-    """Return a validator of a parameter in an SI unit of kilogram, metre and second to these powers."""
+    """Return a validator of a parameter in kilogram, metre and second to these powers."""
 
     def check(parameter: Parameter) -> Parameter:
         if dimension(parameter.unit, mass) != (metres, seconds):

@@ -1,5 +1,6 @@
-"""The 4-DOF patrol vessel: surge, sway, roll and yaw with roll restoring (document 004, section
-5.2, as corrected in ERRATA 004).
+"""The 4-DOF patrol vessel: surge, sway, roll and yaw with roll restoring.
+
+Source: document 004, section 5.2, as corrected in ERRATA 004.
 """
 
 from __future__ import annotations
@@ -40,8 +41,14 @@ GRAVITY = 9.81
 
 
 class RollingBody(Config):
-    """Mass, moments of inertia about the body origin and centre of gravity (z down: above the
-    origin is negative).
+    """The rigid body of a vessel that rolls.
+
+    Attributes:
+        m: mass in kg.
+        I_x: moment of inertia in roll about the body origin in kg m^2.
+        I_z: moment of inertia in yaw about the body origin in kg m^2.
+        x_G: centre of gravity ahead of the body origin in m.
+        z_G: centre of gravity below the body origin in m; negative above it.
     """
 
     m: Mass
@@ -54,7 +61,20 @@ class RollingBody(Config):
 
 
 class RollingAddedMass(Config):
-    """Hydrodynamic derivatives with respect to accelerations in sway, roll and yaw (SNAME)."""
+    """The hydrodynamic derivatives of the accelerations in surge, sway, roll and yaw (SNAME).
+
+    Attributes:
+        X_udot: surge force by surge acceleration in kg.
+        Y_vdot: sway force by sway acceleration in kg.
+        Y_pdot: sway force by roll acceleration in kg m.
+        Y_rdot: sway force by yaw acceleration in kg m.
+        K_vdot: roll moment by sway acceleration in kg m.
+        K_pdot: roll moment by roll acceleration in kg m^2.
+        K_rdot: roll moment by yaw acceleration in kg m^2.
+        N_vdot: yaw moment by sway acceleration in kg m.
+        N_pdot: yaw moment by roll acceleration in kg m^2.
+        N_rdot: yaw moment by yaw acceleration in kg m^2.
+    """
 
     X_udot: Mass
     Y_vdot: Mass
@@ -69,8 +89,15 @@ class RollingAddedMass(Config):
 
 
 class HullForces(Config):
-    """Forces of the water on the hull as terms of (u, v, p, r, phi), with the sign that they act
-    with: braking is negative.
+    """The forces of the water on the hull as terms of (u, v, p, r, phi).
+
+    Terms that brake are negative.
+
+    Attributes:
+        X: terms of the surge force, each in the SI unit that its term asks for.
+        Y: terms of the sway force.
+        K: terms of the roll moment.
+        N: terms of the yaw moment.
     """
 
     X: dict[str, Parameter] = Field(default_factory=dict)
@@ -126,12 +153,16 @@ class Hydrostatics(Config):
 
 
 class PatrolConfig(VesselFile):
-    """A vessel in surge, sway, roll and yaw, by its derivatives.
+    """A vessel in surge, sway, roll and yaw, given by its derivatives.
 
     Attributes:
         speed: service speed, which trials start from.
         actuators: rudders as foils in the propellers' race, or linear ones.
         wind: coefficients of the hull above water; without them the vessel feels no wind.
+        hydrostatics: roll restoring.
+        rigid_body: mass, inertia and centre of gravity.
+        added_mass: hydrodynamic derivatives of the accelerations.
+        forces: terms of the forces of the water.
     """
 
     kind: Literal["patrol"]
@@ -144,7 +175,7 @@ class PatrolConfig(VesselFile):
     wind: WindLoadsConfig | None = None
 
     def build(self) -> PatrolVessel:
-        """Return the plant.
+        """Build the plant of this vessel.
 
         Raises:
             ConfigError: where the mass matrix is not positive definite or is singular.
@@ -153,9 +184,11 @@ class PatrolConfig(VesselFile):
 
 
 class PatrolHull(nn.Module):
-    """Acceleration of the hull. Inertia is that of the rigid body about the origin (eq. (5.12));
-    the water's Coriolis forces are among the terms, as far as the source has them (X_vr). Buffers
-    are float64; results take the dtype of the input.
+    """The acceleration of a hull that rolls.
+
+    Inertia is that of the rigid body about the origin (eq. (5.12)); the water's Coriolis forces are
+    among the terms, as far as the source has them (X_vr). Buffers are float64; results take the
+    dtype of the input.
     """
 
     def __init__(self, vessel: PatrolConfig) -> None:
@@ -212,7 +245,12 @@ class PatrolHull(nn.Module):
         self.coefficients: Tensor
 
     def load(self, phi: Tensor, nu: Tensor) -> Tensor:
-        """Return the forces [..., 4] in N, N, N m, N m of water, weight and rotation at roll phi [...] and velocities through the water nu [..., 4]."""
+        """Return the forces [..., 4] in N, N, N m, N m of water, weight and rotation.
+
+        Args:
+            phi: roll angle [...] in rad.
+            nu: velocities through the water [..., 4].
+        """
         force: Tensor = self.terms(
             torch.cat((nu, phi.unsqueeze(-1)), dim=-1)
         ) @ self.coefficients.to(nu.dtype)
@@ -225,7 +263,7 @@ class PatrolHull(nn.Module):
 
 @final
 class PatrolVessel(HullPlant):
-    """The hull with rudders and propellers, in current, wind and external force.
+    """A hull with rudders and propellers, in current, wind and external force.
 
     State x [B, 8 + k]: x, y [m], phi, psi [rad], u, v [m/s] over ground, p, r [rad/s], then the
     rudder angle where it has a rate.
@@ -241,12 +279,21 @@ class PatrolVessel(HullPlant):
         self.speed = vessel.speed
 
     def acceleration(self, pose: Tensor, nu: Tensor, tau: Tensor) -> Tensor:
-        """Return nu_dot [B, 4] at pose [B, 4] from velocities through the water [B, 4] and forces [B, 4]."""
+        """Return nu_dot [B, 4].
+
+        Args:
+            pose: pose [B, 4].
+            nu: velocities through the water [B, 4].
+            tau: forces [B, 4] in N, N, N m, N m.
+        """
         acceleration: Tensor = self.hull(pose[..., 2], nu, tau)
         return acceleration
 
     def approach(self, rows: int) -> Tensor:
-        """Return straight ahead at service speed, [rows, nx]: the source's thrust compensates the resistance there."""
+        """Return the state straight ahead at service speed, [rows, nx].
+
+        The source's thrust compensates the resistance there.
+        """
         x = super().approach(rows)
         x[:, self.state.index("u")] = self.speed
         return x

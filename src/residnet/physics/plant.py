@@ -1,4 +1,4 @@
-"""Plants: a vessel with its actuators and environment, as a right-hand side that a simulator steps."""
+"""Plants: a vessel with actuators and environment, as equations that a simulator integrates."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from residnet.physics.kinematics import Kinematics
 
 
 class Plant(nn.Module, ABC):
-    """The truth of a simulation.
+    """The true vessel of a simulation.
 
     Attributes:
         state: names of the columns of x [B, nx]: pose, velocities, then states of the actuators.
@@ -35,18 +35,27 @@ class Plant(nn.Module, ABC):
         """Return x_dot [B, nx] under inputs w [B, m]."""
 
     def prepare(self, x: Tensor, w: Tensor) -> Tensor:
-        """Return what a step holds fixed, p [B, k], from the state x [B, nx] at its start and its inputs w [B, m]."""
+        """Return what a step holds fixed, p [B, k].
+
+        Args:
+            x: state [B, nx] at the step's start.
+            w: inputs [B, m].
+        """
         return w
 
     def held_rate(self, x: Tensor, p: Tensor) -> Tensor:
         """Return x_dot [B, nx] within a step that holds p = prepare(x, w).
+
+        It equals `rate` under the same inputs.
 
         Equals `rate` under the same inputs.
         """
         return self.rate(x, p)
 
     def approach(self, rows: int) -> Tensor:
-        """Return the state [rows, nx] that trials start from, float64: at rest.
+        """Return the state [rows, nx] that trials start from, float64.
+
+        It is at rest; a model that only holds near its service speed starts there.
 
         a model that only holds near its service speed starts there.
         """
@@ -58,8 +67,9 @@ class Plant(nn.Module, ABC):
 
 
 class HullPlant(Plant, ABC):
-    """A hull with actuators in current and external forces; a subclass gives the acceleration of
-    the hull.
+    """A hull with actuators in current, wind and external forces.
+
+    A subclass gives the acceleration of the hull.
 
     Inputs: commands; force_x, force_y, (force_k,) force_n in body axes [N, N, (N m,) N m];
     current_north, current_east [m/s]; force_north, force_east [N], constant in earth axes; where
@@ -100,7 +110,13 @@ class HullPlant(Plant, ABC):
 
     @abstractmethod
     def acceleration(self, pose: Tensor, nu: Tensor, tau: Tensor) -> Tensor:
-        """Return nu_dot [B, n] at pose [B, n] from velocities through the water [B, n] and forces [B, n]."""
+        """Return nu_dot [B, n].
+
+        Args:
+            pose: pose [B, n].
+            nu: velocities through the water [B, n].
+            tau: forces [B, n] in N and N m.
+        """
 
     @final
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
@@ -108,14 +124,20 @@ class HullPlant(Plant, ABC):
         return self.actuators.demand(drive, steer)
 
     def in_calm_water(self) -> HullPlant:
-        """Return this plant without its exogenous inputs: no body or earth-fixed forces, current, wind or air resistance; faster."""
+        """Return this plant without its exogenous inputs, which is faster.
+
+        There are no body or earth-fixed forces, current, wind or air resistance.
+        """
         self.weather = False
         self.inputs = self.actuators.commands
         return self
 
     @final
     def prepare(self, x: Tensor, w: Tensor) -> Tensor:
-        """Return the inputs with the actuators' forces, where these stay the same over a step, added to the body forces; w itself elsewhere."""
+        """Return the inputs with the actuators' forces added to the body forces.
+
+        This holds where these forces stay the same over a step; elsewhere it returns w itself.
+        """
         if not self.actuators.held:
             return w
         n, c = self.n, self.commands
@@ -135,7 +157,7 @@ class HullPlant(Plant, ABC):
         return self._rate(x, w, False)
 
     def _rate(self, x: Tensor, w: Tensor, held: bool) -> Tensor:
-        """Return x_dot.
+        """Return x_dot [B, nx].
 
         `held`: the actuators' forces are among the body forces already, and their states stand
         still.
@@ -165,7 +187,7 @@ class HullPlant(Plant, ABC):
         return torch.cat((self.kinematics.rate(pose, nu), nu_dot, moving), dim=-1)
 
     def _wind(self, speed: Tensor, direction: Tensor, pose: Tensor, nu: Tensor) -> Tensor:
-        """Return the forces [B, n] of the true wind on the vessel that moves over ground with nu [B, n]."""
+        """Return the forces [B, n] of the true wind on a vessel with velocities over ground nu."""
         assert self.wind is not None
         air = self.kinematics.body_components(
             -speed * torch.cos(direction), -speed * torch.sin(direction), pose
@@ -177,6 +199,9 @@ class HullPlant(Plant, ABC):
 
     @final
     def end_step(self, x: Tensor, w: Tensor, dt: float) -> Tensor:
-        """Return the state [B, nx] with the actuators moved on by a step of dt seconds (they are held while the hull moves)."""
+        """Return the state [B, nx] with the actuators moved on by a step of dt seconds.
+
+        They are held while the hull moves.
+        """
         after = self.actuators.advance(x[:, 2 * self.n :], w[:, : self.commands], dt)
         return torch.cat((x[:, : 2 * self.n], after), dim=-1)

@@ -1,5 +1,4 @@
-"""From state and inputs to the channels that baselines and heads may use: velocities, commands,
-forces, relative wind.
+"""The channels that baselines and heads may use: velocities, commands, forces, relative wind.
 
 Position and heading are not offered: a model in body axes must not depend on where the vessel is or
 where it points. True wind enters earth-fixed and is turned into wind relative to the vessel with
@@ -26,7 +25,7 @@ FORCE_CHANNELS = ("tau_x", "tau_y", "tau_n")
 
 
 class SignalsConfig(Config):
-    """What drives the model.
+    """The inputs that drive a model.
 
     Attributes:
         inputs: command channels of the log, in order; held over a step.
@@ -79,7 +78,9 @@ class SignalsConfig(Config):
         return self.inputs + self.exogenous
 
     def resolved(self) -> SignalsConfig:
-        """Return the same with the vessel's name replaced by its thrusters, so that a saved model needs no vessel file.
+        """Return the same config with the vessel's name replaced by its thrusters.
+
+        A saved model then needs no vessel file.
 
         Raises:
             ValueError: where there is no such vessel.
@@ -103,13 +104,14 @@ class SignalsConfig(Config):
         return {name: CHANNEL_UNITS.get(name, "-") for name in STATE + self.columns}
 
     def build(self) -> Signals:
-        """Return the module."""
+        """Build the module that computes the channels."""
         return Signals(self.resolved())
 
 
 class Signals(nn.Module):
-    """Channels z [B, nz] from state x [B, nx] and inputs w [B, m]; `names` holds the names of the
-    columns of z.
+    """The channels z [B, nz] from state x [B, nx] and inputs w [B, m].
+
+    `names` holds the names of the columns of z.
 
     `prepare` does what depends on the inputs alone, once per step; `forward` does the rest at every
     stage of the integrator.
@@ -132,7 +134,10 @@ class Signals(nn.Module):
         self.count = len(names)
 
     def prepare(self, w: Tensor) -> Tensor:
-        """Return what a step holds fixed: inputs, forces and the air's velocity over ground (north, east), [..., k]."""
+        """Return what a step holds fixed, [..., k], from inputs w [..., m].
+
+        These are inputs, forces and the air's velocity over ground (north, east).
+        """
         parts = [w[..., : self.inputs]]
         if self.forces:
             parts.append(self.thrusters(w[..., : self.inputs]))
@@ -144,7 +149,12 @@ class Signals(nn.Module):
         return torch.cat(parts, dim=-1)
 
     def forward(self, x: Tensor, p: Tensor) -> Tensor:
-        """Return the channels z [..., nz] from state x [..., nx] (x, y, psi, u, v, r first) and p = prepare(w)."""
+        """Return the channels z [..., nz].
+
+        Args:
+            x: state [..., nx] (x, y, psi, u, v, r first).
+            p: what `prepare` returned for the step's inputs.
+        """
         if not self.wind:
             return torch.cat((x[..., 3:6], p), dim=-1)
         known = p.shape[-1] - 2

@@ -1,6 +1,4 @@
-"""Port/starboard symmetry: how channels and terms change when a vessel and all that happens to it
-are mirrored.
-"""
+"""Port/starboard symmetry: how channels and terms change when all is mirrored."""
 
 from __future__ import annotations
 
@@ -15,7 +13,10 @@ _OTHER_SIDE = {"port": "stbd", "stbd": "port"}
 
 
 def channel_parity(name: str) -> int | None:
-    """Return +1 where a channel keeps its sign in the mirror, -1 where it changes it, None where nobody said."""
+    """Return +1 where a channel keeps its sign in the mirror, -1 where it changes it, else None.
+
+    None means that the channel's parity is not known.
+    """
     return -1 if name in _ODD else 1 if name in _EVEN else None
 
 
@@ -37,13 +38,18 @@ def term_parity(term: str, names: Sequence[str]) -> int | None:
 
 
 def wrong_parity(term: str, axis: int, names: Sequence[str]) -> bool:
-    """Return whether a mirror-symmetric vessel cannot have this term in the acceleration of this axis (0 surge, 1 sway, 2 yaw)."""
+    """Return whether a mirror-symmetric vessel cannot have this term in an axis' acceleration.
+
+    The axes are 0 surge, 1 sway, 2 yaw.
+    """
     parity = term_parity(term, names)
     return parity is not None and parity != (1 if VELOCITY[axis] == "u" else -1)
 
 
 def mirrored_channels(names: Sequence[str]) -> tuple[list[int], list[float]] | None:
-    """Return how channels look in the mirror: the column that each takes its value from, and the sign; None where one is not known.
+    """Return how channels look in the mirror: the column that each is taken from, and the sign.
+
+    The result is None where the parity of one is not known.
 
     Channels of a port/starboard pair change places.
     """

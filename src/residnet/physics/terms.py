@@ -1,5 +1,6 @@
-"""Regressors by name: products of channels and of functions of one channel, such as `u|u|`, `v
-|r|`, `n^2 sin(delta)` or `1`.
+"""Regressors by name: products of channels and of functions of one channel.
+
+Names are such as `u|u|`, `v |r|`, `n^2 sin(delta)` or `1`.
 
 One library serves the baselines (hydrodynamic derivatives) and the closed-form heads (basis
 functions), so that a name means the same number everywhere.
@@ -97,7 +98,10 @@ def parse_term(term: str, names: Sequence[str], *, functions: bool = True) -> tu
 def polynomial_terms(
     names: Sequence[str], degree: int, *, magnitudes: Sequence[str] = ()
 ) -> tuple[str, ...]:
-    """Return all products of `names` up to `degree` (without the constant), then x|x| of every name in `magnitudes`."""
+    """Return all products of `names` up to `degree`, without the constant.
+
+    Behind them stands x|x| of every name in `magnitudes`.
+    """
     from itertools import combinations_with_replacement
 
     out = [
@@ -107,7 +111,7 @@ def polynomial_terms(
 
 
 class TermLibrary(nn.Module):
-    """Values of J terms from channels: [..., nz] -> [..., J].
+    """The values [..., J] of J terms from channels [..., nz].
 
     Every term is a product of columns of [1, z, |z|, 1/z, functions of z], gathered by index, so
     that the number of tensor operations is the largest number of factors and not the number of

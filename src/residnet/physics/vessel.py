@@ -1,6 +1,4 @@
-"""Vessel files (`configs/vessels/*.yaml`): every kind of plant, its parameters in SI, each with its
-source.
-"""
+"""Vessel files (`configs/vessels/*.yaml`): every kind of plant, its SI parameters with sources."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""What every vessel file has, and files that say only what differs from another one: `base:
-patrol_p06`.
-"""
+"""The part that every vessel file has, and files that give only what differs from a `base`."""
 
 from __future__ import annotations
 
@@ -20,8 +18,9 @@ from residnet.physics.plant import Plant
 
 
 class VesselFile(Config, ABC):
-    """A vessel of any kind; a file may name another one of its kind as `base` and give only what
-    differs.
+    """A vessel of any kind.
+
+    A file may name another one of its kind as `base` and give only what differs.
 
     Attributes:
         name: of the vessel, as its file is called.
@@ -42,7 +41,7 @@ class VesselFile(Config, ABC):
 
     @abstractmethod
     def build(self) -> Plant:
-        """Return the plant.
+        """Build the plant of this vessel.
 
         Raises:
             ConfigError: where the parameters make no plant, for example a singular mass matrix.
@@ -74,7 +73,7 @@ def broken_vessels() -> list[ThirdParty]:
 
 
 def with_base(data: Any, folder: Path | None) -> Any:
-    """Return the content of a vessel file laid over that of its `base`, which may have one of its own.
+    """Return the content of a vessel file laid over that of its `base`.
 
     Sections are merged key by key; a section of another `kind` takes the place of the base's.
     `base` is the name of a file in `configs/vessels`, or the path of a YAML file, looked for beside
@@ -121,7 +120,11 @@ def _file(name: object, folder: Path | None) -> Path:
 
 
 def _frozen(data: Any) -> Any:
-    """Return the same with tuples for lists: what a validator of a whole model hands on is taken for Python, not for YAML, and lists are no tuples."""
+    """Return the same content with tuples for lists.
+
+    What a validator of a whole model hands on is taken for Python, not for YAML, and lists are no
+    tuples.
+    """
     if isinstance(data, dict):
         return {key: _frozen(value) for key, value in data.items()}
     return tuple(_frozen(value) for value in data) if isinstance(data, list) else data

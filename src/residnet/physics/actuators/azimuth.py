@@ -1,5 +1,6 @@
-"""Azimuth thrusters: forces from revolutions and angles, and the allocation of wanted forces to
-them (document 002 eqs. (5.1), (5.2)).
+"""Azimuth thrusters: forces from revolutions and angles, and thrust allocation.
+
+Source: document 002 eqs. (5.1), (5.2).
 """
 
 from __future__ import annotations
@@ -18,15 +19,23 @@ from residnet.physics.actuators.thrust_curve import CurveRange, require_range
 
 
 class PropellerShaftConfig(ServoConfig):
-    """Revolutions of either direction, and how fast they change (None for at once)."""
+    """A propeller shaft that turns in either direction.
+
+    Attributes:
+        n_max: largest revolutions of either direction in 1/s.
+        n_rate: largest change of revolutions in 1/s^2; None for at once.
+    """
 
     n_max: RevsPerSecond = Field(gt=0)
     n_rate: RevRate | None = Field(default=None, gt=0)
 
 
 class AzimuthConfig(ServoConfig):
-    """Angle to either side of the bow, and how fast it turns (None for at once); it does not turn
-    through its limit.
+    """The drive that turns a thruster to either side of the bow, not through its limit.
+
+    Attributes:
+        limit: largest angle from the bow in rad.
+        rate: largest rate of turn in rad/s; None for at once.
     """
 
     limit: Radians = Field(default=3.141592653589793, gt=0)
@@ -34,8 +43,12 @@ class AzimuthConfig(ServoConfig):
 
 
 class PlaceConfig(Config):
-    """One thruster: what ends the names of its channels, and its place from the body origin,
-    forward and to starboard.
+    """The name and place of one thruster.
+
+    Attributes:
+        name: what ends the names of its channels.
+        x: distance forward of the body origin in m.
+        y: distance to starboard of the body origin in m.
     """
 
     name: str = Field(pattern=r"^[a-z0-9][a-z0-9_]*$")
@@ -44,14 +57,17 @@ class PlaceConfig(Config):
 
 
 class AzimuthThrustersConfig(ActuatorConfig):
-    """Equal thrusters that turn; commands cmd_n_<name> [1/s], then cmd_alpha_<name> [rad] from the
-    bow, clockwise.
+    """Equal thrusters that turn, commanded by revolutions and angles.
+
+    The commands are cmd_n_<name> [1/s], then cmd_alpha_<name> [rad] from the bow, clockwise.
 
     Attributes:
         places: of the thrusters.
         thrust: coefficients c0, c1, ... of the force T = c0 + c1 n + c2 n^2 + ... in N, n in 1/s.
         curve_range: revolutions (astern, ahead) that the curve was measured between; it must rise
             between +-n_max.
+        shaft: limits of the revolutions.
+        azimuth: limits of the angles.
     """
 
     kind: Literal["azimuth_thrusters"]
@@ -87,7 +103,7 @@ class AzimuthThrustersConfig(ActuatorConfig):
         return self
 
     def build(self) -> AzimuthThrusters:
-        """Return the module."""
+        """Build the module that turns commands into forces."""
         return AzimuthThrusters(self)
 
 
@@ -126,7 +142,10 @@ class AzimuthThrusters(Actuators):
         self.strongest = float(self.thrust(torch.tensor(self.n_max, dtype=torch.float64)))
 
     def thrust(self, n: Tensor) -> Tensor:
-        """Return the force [N] of one thruster along its axis at revolutions n [1/s], any shape (5.1)."""
+        """Return the force [N] of one thruster along its axis at revolutions n [1/s], any shape.
+
+        Source: document 002 eq. (5.1).
+        """
         out = torch.full_like(n, self.coefficients[-1])
         for c in self.coefficients[-2::-1]:
             out = c + n * out
@@ -145,12 +164,17 @@ class AzimuthThrusters(Actuators):
         return 0.5 * (low + high)
 
     def allocate(self, tau: Tensor) -> Tensor:
-        """Return the commands [..., 2k] that make forces tau [..., 3] with the least sum of squared thrusts; thrusts beyond the largest saturate."""
+        """Return the commands [..., 2k] that make forces tau [..., 3] with the least thrust.
+
+        The sum of squared thrusts is smallest; thrusts beyond the largest saturate.
+        """
         parts = tau @ self.share.to(tau.dtype).T
         return self._commands(parts[..., : self.count], parts[..., self.count :])
 
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Drive is surge force and steer the yaw moment, as shares of what the thrusters make
+        """Return the commands [..., 2k] for drive and steer, each within +-1.
+
+        Drive is surge force and steer the yaw moment, as shares of what the thrusters make
         together; each thruster saturates.
         """
         zero = torch.zeros_like(drive)

@@ -11,8 +11,9 @@ from residnet.core.config import Config
 
 
 class Actuators(nn.Module, ABC):
-    """All actuators of a vessel: commands [..., c] move their states a [..., k], and these push the
-    hull.
+    """All actuators of a vessel: commands move their states, and the states push the hull.
+
+    Commands are [..., c], states a [..., k].
 
     A state may move continuously (`rate`, integrated with the hull: lags) or once per step
     (`advance`, after the hull has moved with the states held: rate limits).
@@ -31,11 +32,17 @@ class Actuators(nn.Module, ABC):
 
     @abstractmethod
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Return the commands [..., c] from the normalised drive and steer [...] of a manoeuvre, each within +-1."""
+        """Return the commands [..., c] for a manoeuvre's drive and steer [...], each within +-1."""
 
     @abstractmethod
     def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
-        """Return the forces tau [..., n] on the hull from states a [..., k], commands [..., c] and velocities through the water nu [..., n]."""
+        """Return the forces tau [..., n] on the hull in N and N m.
+
+        Args:
+            a: states [..., k].
+            command: commands [..., c].
+            nu: velocities through the water [..., n].
+        """
 
     def rate(self, a: Tensor, command: Tensor) -> Tensor:
         """Return the derivative [..., k] of the states."""
@@ -47,11 +54,16 @@ class Actuators(nn.Module, ABC):
 
 
 class ActuatorConfig(Config, ABC):
-    """What all actuators of a vessel file have."""
+    """The part of a vessel file that all kinds of actuators share.
+
+    Attributes:
+        kind: kind of the actuators.
+        source: where their numbers come from.
+    """
 
     kind: str
     source: str
 
     @abstractmethod
     def build(self) -> Actuators:
-        """Return the module."""
+        """Build the module that turns commands into forces."""

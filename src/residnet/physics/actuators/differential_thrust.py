@@ -1,6 +1,4 @@
-"""Two fixed thrusters side by side: thrust curves, rate limits and the forces that they make on the
-hull.
-"""
+"""Two fixed thrusters side by side: thrust curves, rate limits and forces on the hull."""
 
 from __future__ import annotations
 
@@ -23,11 +21,18 @@ from residnet.physics.actuators.thrust_curve import (
 class DifferentialThrustConfig(ActuatorConfig):
     """Two fixed thrusters side by side (document 003 section 4.1; revolutions in 1/s).
 
-    `forward` and `reverse` are the coefficients (c0 [N], c1 [N s], c2 [N s^2]) of T = c0 + c1 n +
-    c2 n^2 per thruster, for n > 0 and n < 0 (signed). The curve is clipped so that thrust never
-    opposes the sense of rotation, which closes the jump that the printed polynomials have at zero
-    (ERRATA W5). `spacing` is the distance between the thrusters, `curve_range` the revolutions
-    (astern, ahead) that the curves were measured between, which must include +-n_max.
+    The thrust curve is clipped so that thrust never opposes the sense of rotation, which closes the
+    jump that the printed polynomials have at zero (ERRATA W5).
+
+    Attributes:
+        spacing: distance between the thrusters in m.
+        n_max: largest revolutions of either direction in 1/s.
+        n_rate: largest change of revolutions in 1/s^2.
+        forward: coefficients (c0 [N], c1 [N s], c2 [N s^2]) of T = c0 + c1 n + c2 n^2 per thruster,
+            for n > 0.
+        reverse: coefficients for n < 0 (signed).
+        curve_range: revolutions (astern, ahead) in 1/s that the curves were measured between; they
+            must include +-n_max.
     """
 
     kind: Literal["differential_thrust"] = "differential_thrust"
@@ -50,8 +55,9 @@ class DifferentialThrustConfig(ActuatorConfig):
 
 @final
 class DifferentialThrust(Actuators):
-    """Forces of two thrusters: revolutions n [..., 2] (port, starboard; 1/s) -> tau [..., 3] (N, N,
-    N m), document 003 eq. (6).
+    """Two thrusters: revolutions n [..., 2] (port, starboard) in 1/s make forces tau [..., 3].
+
+    Source: document 003 eq. (6).
     """
 
     state = ("n_port", "n_stbd")
@@ -66,18 +72,24 @@ class DifferentialThrust(Actuators):
         self.curve = ThrustCurve(config.forward, config.reverse)
 
     def thrust(self, n: Tensor) -> Tensor:
-        """Return the thrust of one propeller [N] at revolutions n [1/s], any shape (document 003 eqs. (21), (22), clipped as in ERRATA W5)."""
+        """Return the thrust of one propeller [N] at revolutions n [1/s], any shape.
+
+        Source: document 003 eqs. (21), (22), clipped as in ERRATA W5.
+        """
         thrust: Tensor = self.curve(n)
         return thrust
 
     def forward(self, n: Tensor) -> Tensor:
-        """Return n [..., 2] -> tau [..., 3]."""
+        """Return tau [..., 3] in N, N, N m of revolutions n [..., 2] in 1/s."""
         t = self.thrust(n)
         port, stbd = t[..., 0], t[..., 1]
         return torch.stack((port + stbd, torch.zeros_like(port), self.arm * (port - stbd)), dim=-1)
 
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Return the commands [..., 2] in 1/s from the normalised mean and difference of revolutions (document 003 eqs. (30), (31)), clipped to +-1 per side."""
+        """Return the commands [..., 2] in 1/s for a normalised mean and difference of revolutions.
+
+        Each side is clipped to +-1 (document 003 eqs. (30), (31)).
+        """
         both = torch.stack((drive + steer, drive - steer), dim=-1)
         return both.clamp(-1.0, 1.0) * self.n_max
 
@@ -86,7 +98,10 @@ class DifferentialThrust(Actuators):
         return self.forward(a)
 
     def advance(self, a: Tensor, command: Tensor, dt: float) -> Tensor:
-        """Return the revolutions [..., 2] after a step of dt seconds: towards the saturated command by at most the rate limit."""
+        """Return the revolutions [..., 2] after a step of dt seconds.
+
+        They move towards the saturated command by at most the rate limit.
+        """
         target = command.clamp(-self.n_max, self.n_max)
         step = self.n_rate * dt
         return a + (target - a).clamp(-step, step)

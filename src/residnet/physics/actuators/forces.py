@@ -1,6 +1,4 @@
-"""Forces as commands: for plants whose actuators are not modelled but for their limits and their
-lag.
-"""
+"""Forces as commands, for plants whose actuators are known by their limits and lag only."""
 
 from __future__ import annotations
 
@@ -16,8 +14,13 @@ from residnet.physics.actuators.servo import FirstOrderConfig, ImmediateConfig, 
 
 
 class ForceCommandsConfig(ActuatorConfig):
-    """Commands tau_x, tau_y [N], tau_n [N m], each within its limit; without `response` they act at
-    once, with it their forces lag behind.
+    """The commands tau_x, tau_y [N], tau_n [N m], each within its limit.
+
+    Attributes:
+        x_max: largest surge force of either direction in N.
+        y_max: largest sway force of either side in N.
+        n_max: largest yaw moment of either side in N m.
+        response: lag of the forces behind the commands; immediate by default.
     """
 
     kind: Literal["forces"] = "forces"
@@ -29,14 +32,15 @@ class ForceCommandsConfig(ActuatorConfig):
     ] = ImmediateConfig()
 
     def build(self) -> ForceCommands:
-        """Return the module."""
+        """Build the module that turns commands into forces."""
         return ForceCommands(self)
 
 
 @final
 class ForceCommands(Actuators):
-    """tau [..., 3] follows the saturated command [..., 3]; with a lag the states are the forces,
-    then what else the response needs.
+    """The forces tau [..., 3], which follow the saturated commands [..., 3].
+
+    With a lag the states are the forces, then what else the response needs.
     """
 
     commands = ("tau_x", "tau_y", "tau_n")
@@ -59,12 +63,12 @@ class ForceCommands(Actuators):
         self.limit: Tensor
 
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Drive is surge force, steer the yaw moment, as shares of their limits."""
+        """Return tau [..., 3] for drive (surge force) and steer (yaw moment), each within +-1."""
         both = torch.stack((drive, torch.zeros_like(drive), steer), dim=-1)
         return both.clamp(-1.0, 1.0) * self.limit.to(drive.dtype)
 
     def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
-        """Return tau [..., 3]."""
+        """Return the forces tau [..., 3] in N, N, N m."""
         return self.response.value(self._by_axis(a), self._target(command))
 
     def rate(self, a: Tensor, command: Tensor) -> Tensor:

@@ -1,5 +1,6 @@
-"""Actuators from tests of their own (document 003 section 4.1): throttle map, rate limit and dead
-time, thrust curves.
+"""Actuators identified from tests: throttle map, rate limit and dead time, thrust curves.
+
+Source: document 003 section 4.1.
 """
 
 from __future__ import annotations
@@ -22,8 +23,9 @@ class Estimate(NamedTuple):
 
 
 class ThrottleMap(NamedTuple):
-    """n = slope * throttle + offset [1/s], bounded by +-n_max; n_max is the largest measured where
-    nothing saturated.
+    """The revolutions n = slope * throttle + offset [1/s], bounded by +-n_max.
+
+    n_max is the largest value measured where nothing saturated.
     """
 
     slope: Estimate
@@ -46,8 +48,9 @@ class StepAnswer(NamedTuple):
 
 
 class ThrustFit(NamedTuple):
-    """Coefficients c0 [N], c1 [N s], c2 [N s^2] of one direction, the revolutions that they were
-    measured between, and the rms residual [N].
+    """The thrust curve of one direction: coefficients, range of revolutions and rms residual.
+
+    The coefficients are c0 [N], c1 [N s], c2 [N s^2]; the residual is in N.
     """
 
     coefficients: tuple[Estimate, Estimate, Estimate]
@@ -66,7 +69,9 @@ _SATURATION_POINTS = 3
 
 
 def fit_throttle(throttle: np.ndarray, n: np.ndarray) -> ThrottleMap:
-    """Return the steady revolutions n [N] in 1/s over throttle [N]: a line with a bound, found together by least squares.
+    """Fit the steady revolutions n [N] in 1/s over the throttle [N]: a line with a bound.
+
+    Slope, offset and bound are found together by least squares.
 
     Raises:
         FitError: with fewer than five points or fewer than three different throttles on the slope,
@@ -124,7 +129,15 @@ def fit_throttle(throttle: np.ndarray, n: np.ndarray) -> ThrottleMap:
 def follow_command(
     t: np.ndarray, command: np.ndarray, rate: float, dead_time: float, start: float
 ) -> np.ndarray:
-    """Return the revolutions [T] that move towards the command of dead_time ago by at most `rate`, held-command samples at t [T]."""
+    """Return the revolutions [T] that follow a command with dead time and rate limit.
+
+    Args:
+        t: times [T] in s.
+        command: commanded revolutions [T] in 1/s, held between samples.
+        rate: largest change in 1/s^2.
+        dead_time: between a command and its first effect, in s.
+        start: revolutions at the first sample in 1/s.
+    """
     late = t - dead_time
     index = np.searchsorted(t, late, side="right") - 1
     n = np.empty_like(t)
@@ -144,7 +157,10 @@ def follow_command(
 
 
 def fit_step(runs: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> StepAnswer:
-    """Return the rate limit and dead time from step responses, each (t [T] in s, command [T], n [T] in 1/s).
+    """Fit rate limit and dead time to step responses.
+
+    Args:
+        runs: for each response t [T] in s, command [T] and n [T] in 1/s.
 
     Raises:
         FitError: where a run is too short, its command does not step, or the revolutions do not
@@ -190,7 +206,12 @@ def fit_step(runs: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> StepA
 
 
 def fit_thrust(n: np.ndarray, pull: np.ndarray, thrusters: int) -> tuple[ThrustFit, ThrustFit]:
-    """Return the thrust per thruster over revolutions ahead and astern from a bollard pull: n [N] in 1/s, pull [N] in N of all `thrusters` together.
+    """Fit the thrust per thruster over revolutions, ahead and astern, to a bollard pull.
+
+    Args:
+        n: revolutions [N] in 1/s.
+        pull: pull [N] in N of all thrusters together.
+        thrusters: how many there are.
 
     Raises:
         FitError: where a direction has fewer than five points or four revolutions, or pulls the

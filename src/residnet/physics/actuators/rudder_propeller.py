@@ -21,7 +21,7 @@ from residnet.physics.parameters import Density, SquareMetres
 
 
 class RudderConfig(ServoConfig):
-    """A rudder.
+    """A rudder with its steering gear.
 
     Attributes:
         area: movable area.
@@ -77,12 +77,18 @@ class PropellerConfig(ServoConfig):
 
 
 class RudderPropellerConfig(ActuatorConfig):
-    """A propeller and a rudder (normal force and inflow as in the MMG standard method, Yasukawa and
-    Yoshimura 2015, without hull interaction).
+    """A propeller and a rudder, without hull interaction.
+
+    Normal force and inflow are those of the MMG standard method (Yasukawa and Yoshimura 2015).
 
     F_N = 0.5 rho A f sin(delta_e) U_R^2, X = -F_N sin delta, Y = -F_N cos delta, N = x Y; delta > 0
     turns to starboard. The inflow is U_R^2 = u|u| + race_share 2 T / (rho A_p): the race of an
     actuator disc, fully contracted.
+
+    Attributes:
+        rudder: the rudder.
+        propeller: the propeller.
+        density: of the water in kg/m^3.
     """
 
     kind: Literal["rudder_propeller"] = "rudder_propeller"
@@ -91,14 +97,16 @@ class RudderPropellerConfig(ActuatorConfig):
     density: Density = Field(default=1025.0, gt=0)
 
     def build(self) -> RudderPropeller:
-        """Return the module."""
+        """Build the module that turns commands into forces."""
         return RudderPropeller(self)
 
 
 @final
 class RudderPropeller(Actuators):
-    """Commands cmd_delta [rad], cmd_n [1/s]; states delta and n where they do not follow at once;
-    forces tau [..., 3].
+    """The forces tau [..., 3] of a propeller and a rudder.
+
+    Commands are cmd_delta [rad] and cmd_n [1/s]; states are delta and n where they do not follow at
+    once.
     """
 
     commands = ("cmd_delta", "cmd_n")

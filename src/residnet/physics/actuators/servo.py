@@ -1,6 +1,4 @@
-"""How a single actuator follows its command: saturation, dead time, rate limit, lag of first or
-second order.
-"""
+"""How a single actuator follows its command: saturation, dead time, rate limit and lag."""
 
 from __future__ import annotations
 
@@ -16,14 +14,15 @@ from residnet.core.errors import ConfigError
 
 
 class Response(nn.Module, ABC):
-    """Follows a target [...] with states a [..., k]; `suffixes` are appended to the actuator's name
-    to name them.
+    """The way in which a position follows a target [...] with states a [..., k].
+
+    `suffixes` are appended to the actuator's name to name the states.
     """
 
     suffixes: tuple[str, ...] = ("",)
 
     def value(self, a: Tensor, target: Tensor) -> Tensor:
-        """Return the position [...]."""
+        """Return the position [...] that the states a [..., k] stand for."""
         return a[..., 0]
 
     def rate(self, a: Tensor, target: Tensor) -> Tensor:
@@ -37,25 +36,25 @@ class Response(nn.Module, ABC):
 
 @final
 class Immediate(Response):
-    """Stands where it shall, at once."""
+    """A response that stands at its target at once."""
 
     suffixes = ()
 
     def value(self, a: Tensor, target: Tensor) -> Tensor:
-        """Return the target."""
+        """Return the target itself."""
         return target
 
 
 @final
 class RateLimited(Response):
-    """Moves towards its target by at most rate * dt, once per step."""
+    """A response that moves towards its target by at most rate * dt, once per step."""
 
     def __init__(self, rate: float) -> None:
         super().__init__()
         self.limit = rate
 
     def advance(self, a: Tensor, target: Tensor, dt: float) -> Tensor:
-        """Return the position moved."""
+        """Return the position after a step of dt seconds."""
         step = self.limit * dt
         return a + (target.unsqueeze(-1) - a).clamp(-step, step)
 
@@ -92,7 +91,11 @@ class SecondOrder(Response):
 
 
 class ResponseConfig(Config, ABC):
-    """How the position follows."""
+    """The lag between a command and the position.
+
+    Attributes:
+        kind: kind of the lag.
+    """
 
     kind: str
 
@@ -102,41 +105,51 @@ class ResponseConfig(Config, ABC):
 
 
 class ImmediateConfig(ResponseConfig):
-    """Follows at once, or as fast as the rate limit allows."""
+    """A position that follows at once, or as fast as the rate limit allows."""
 
     kind: Literal["immediate"] = "immediate"
 
     def build(self, rate: float | None) -> Response:
-        """Return the response."""
+        """Build the response within a rate limit; None for no limit."""
         return Immediate() if rate is None else RateLimited(rate)
 
 
 class FirstOrderConfig(ResponseConfig):
-    """Lag with a time constant."""
+    """A lag of first order.
+
+    Attributes:
+        time: time constant in s.
+    """
 
     kind: Literal["first_order"] = "first_order"
     time: Seconds = Field(gt=0)
 
     def build(self, rate: float | None) -> Response:
-        """Return the response."""
+        """Build the response within a rate limit; None for no limit."""
         return FirstOrder(self.time, float("inf") if rate is None else rate)
 
 
 class SecondOrderConfig(ResponseConfig):
-    """Lag with a natural frequency and relative damping."""
+    """A lag of second order.
+
+    Attributes:
+        frequency: natural frequency in rad/s.
+        damping: relative damping.
+    """
 
     kind: Literal["second_order"] = "second_order"
     frequency: RadiansPerSecond = Field(gt=0)
     damping: float = Field(gt=0)
 
     def build(self, rate: float | None) -> Response:
-        """Return the response."""
+        """Build the response within a rate limit; None for no limit."""
         return SecondOrder(self.frequency, self.damping, float("inf") if rate is None else rate)
 
 
 class ServoConfig(Config):
-    """What all actuators that follow a command share; limit and rate limit stand, with their units,
-    in the subclass' own keys.
+    """The part that all actuators which follow a command share.
+
+    Limit and rate limit stand, with their units, in the subclass' own keys.
 
     Attributes:
         response: lag.
@@ -241,7 +254,7 @@ class Servos(nn.Module):
         return list(torch.split(a, self.widths, dim=-1))
 
     def value(self, a: Tensor, command: Tensor) -> Tensor:
-        """Return the positions [..., c]."""
+        """Return the positions [..., c] of all actuators."""
         parts = self._parts(a)
         each: list[Tensor] = []
         for i, servo in enumerate(self.servos):

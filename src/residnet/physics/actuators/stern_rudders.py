@@ -1,5 +1,6 @@
-"""Rudders and propellers of the patrol vessel: foils in the race, or linear in the angle (document
-004, section 5.2.2.3).
+"""Rudders and propellers of the patrol vessel: foils in the race, or linear in the angle.
+
+Source: document 004, section 5.2.2.3.
 """
 
 from __future__ import annotations
@@ -37,8 +38,10 @@ class SternRuddersConfig(ServoConfig, ActuatorConfig, ABC):
 
 
 class SternRudders(Actuators, ABC):
-    """Commands cmd_delta [rad], cmd_thrust [N]; state delta [rad] where the rudder has a rate;
-    forces tau [..., 4] along x, y, about x, z.
+    """The forces tau [..., 4] along x, y and about x, z of rudders and propellers at the stern.
+
+    Commands are cmd_delta [rad] and cmd_thrust [N]; delta [rad] is a state where the rudder has a
+    rate.
 
     delta > 0 turns to starboard: Y = -L, K = z L, N = -x L, X = T - D (document 004 eqs.
     (5.26)-(5.29), signs as in ERRATA G9, G10).
@@ -55,11 +58,20 @@ class SternRudders(Actuators, ABC):
 
     @abstractmethod
     def foil(self, delta: Tensor, u: Tensor, v: Tensor, thrust: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the lift and drag [...] in N of all rudders at angle [rad], velocities through the water [m/s] and the thrust of all propellers [N]."""
+        """Return the lift and drag [...] in N of all rudders.
+
+        Args:
+            delta: rudder angle [...] in rad.
+            u: surge velocity through the water [...] in m/s.
+            v: sway velocity through the water [...] in m/s.
+            thrust: of all propellers [...] in N.
+        """
 
     @final
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Return the rudder angle from steer and thrust from drive, as shares of their limits.
+        """Return rudder angle and thrust [..., 2] for steer and drive, shares of their limits.
+
+        There is no thrust astern.
 
         No thrust astern.
         """
@@ -111,14 +123,15 @@ class FoilRuddersConfig(SternRuddersConfig):
     density: Density = Field(gt=0)
 
     def build(self) -> FoilRudders:
-        """Return the module."""
+        """Build the module that turns commands into forces."""
         return FoilRudders(self)
 
 
 @final
 class FoilRudders(SternRudders):
-    """Foils in the open water's speed, corrected for the race; the drag at zero angle belongs to
-    the hull's calm-water resistance.
+    """Rudders as foils in the open water's speed, corrected for the propellers' race.
+
+    The drag at zero angle belongs to the hull's calm-water resistance.
     """
 
     def __init__(self, config: FoilRuddersConfig) -> None:
@@ -145,8 +158,9 @@ class FoilRudders(SternRudders):
 
 
 class LinearRuddersConfig(SternRuddersConfig):
-    """Rudders whose side force is Y_delta_uu u^2 delta, without drag and race (document 004, Table
-    5.3).
+    """Rudders whose side force is Y_delta_uu u^2 delta, without drag and race.
+
+    Source: document 004, Table 5.3.
 
     Attributes:
         Y_delta_uu: of all rudders together, in kg/m per rad.
@@ -156,13 +170,13 @@ class LinearRuddersConfig(SternRuddersConfig):
     Y_delta_uu: float = Field(gt=0)
 
     def build(self) -> LinearRudders:
-        """Return the module."""
+        """Build the module that turns commands into forces."""
         return LinearRudders(self)
 
 
 @final
 class LinearRudders(SternRudders):
-    """Lift proportional to u^2 delta."""
+    """Rudders whose lift is proportional to u^2 delta."""
 
     def __init__(self, config: LinearRuddersConfig) -> None:
         super().__init__(config)

@@ -1,5 +1,6 @@
-"""Thrust over revolutions: a polynomial per direction that never opposes the sense of rotation, and
-the range it was measured in.
+"""Thrust over revolutions: a polynomial per direction and the range it was measured in.
+
+Thrust never opposes the sense of rotation.
 """
 
 from __future__ import annotations
@@ -46,8 +47,9 @@ def require_range(config: Curved) -> None:
 
 @final
 class ThrustCurve(nn.Module):
-    """T = c0 + c1 n + c2 n^2 [N] for n > 0 and, with its own coefficients, n < 0 [1/s]; clipped at
-    zero (ERRATA W5).
+    """The curve T = c0 + c1 n + c2 n^2 [N], with coefficients of its own for n < 0 [1/s].
+
+    It is clipped at zero (ERRATA W5).
     """
 
     def __init__(self, forward: Coefficients, reverse: Coefficients) -> None:

@@ -20,7 +20,7 @@ from residnet.physics.actuators.thrust_curve import (
 
 
 class ThrusterConfig(ServoConfig):
-    """One thruster.
+    """One fixed thruster of several.
 
     Attributes:
         name: ends its channels, n_<name> and cmd_<name>, for example `port`.
@@ -47,8 +47,13 @@ class ThrusterConfig(ServoConfig):
 
 
 class ThrustersConfig(ActuatorConfig):
-    """Fixed thrusters; drive turns all of them ahead as far as they push forward, steer those with
-    a lever about the origin.
+    """Fixed thrusters anywhere on the hull.
+
+    Drive turns all of them ahead as far as they push forward, steer those with a lever about the
+    origin.
+
+    Attributes:
+        thrusters: the thrusters, in the order of the commands.
     """
 
     kind: Literal["thrusters"] = "thrusters"
@@ -62,7 +67,7 @@ class ThrustersConfig(ActuatorConfig):
         return self
 
     def build(self) -> Thrusters:
-        """Return the module."""
+        """Build the module that turns commands into forces."""
         return Thrusters(self)
 
 
@@ -110,7 +115,7 @@ class Thrusters(Actuators):
         self.n_max: Tensor
 
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Return the revolutions [..., c]: each thruster's share of both demands, clipped to +-1."""
+        """Return the revolutions [..., c]: each thruster's share of drive and steer, within +-1."""
         both = drive.unsqueeze(-1) * self.ahead.to(drive.dtype) + steer.unsqueeze(
             -1
         ) * self.turn.to(drive.dtype)

@@ -1,5 +1,6 @@
-"""Water jets with a common nozzle angle and a common motor speed (document 000 eqs. (6.12)-(6.16),
-ERRATA H10-H16).
+"""Water jets with a common nozzle angle and a common motor speed.
+
+Source: document 000 eqs. (6.12)-(6.16), ERRATA H10-H16.
 """
 
 from __future__ import annotations
@@ -24,8 +25,12 @@ PerSquaredRevolutions = Annotated[Parameter, AfterValidator(of_dimension(0, 0, 2
 
 
 class SpeedCurve(Config):
-    """Thrust at the reference revolutions over the speed through the water in m/s: a0 + a1 u + a2
-    u^2.
+    """The thrust at reference revolutions over the speed through the water: a0 + a1 u + a2 u^2.
+
+    Attributes:
+        a0: thrust at rest in N.
+        a1: slope in N s/m.
+        a2: curvature in N s^2/m^2.
     """
 
     a0: Force
@@ -34,7 +39,14 @@ class SpeedCurve(Config):
 
 
 class RevolutionsCurve(Config):
-    """Share of it at n revolutions per second: (r0 + r1 n + r2 n^2) / reference."""
+    """The share of that thrust at n revolutions per second: (r0 + r1 n + r2 n^2) / reference.
+
+    Attributes:
+        r0: share at rest, dimensionless.
+        r1: slope in s.
+        r2: curvature in s^2.
+        reference: value of the polynomial at the reference revolutions, dimensionless.
+    """
 
     r0: Ratio
     r1: PerRevolutions
@@ -45,8 +57,11 @@ class RevolutionsCurve(Config):
 
 
 class MotorConfig(ServoConfig):
-    """The motor of each jet: revolutions between zero and n_max, and how fast they may change (None
-    for at once).
+    """The motor of each jet, which turns in one direction.
+
+    Attributes:
+        n_max: largest revolutions in 1/s.
+        n_rate: largest change of revolutions in 1/s^2; None for at once.
     """
 
     n_max: RevsPerSecond = Field(gt=0)
@@ -54,21 +69,29 @@ class MotorConfig(ServoConfig):
 
 
 class NozzleConfig(ServoConfig):
-    """The nozzles: largest angle to either side, and how fast they turn (None for at once)."""
+    """The nozzles that direct the jets.
+
+    Attributes:
+        limit: largest angle of either side in rad.
+        rate: largest rate of turn in rad/s; None for at once.
+    """
 
     limit: Radians = Field(gt=0, lt=1.5707)
     rate: RadiansPerSecond | None = Field(default=None, gt=0)
 
 
 class WaterJetsConfig(ActuatorConfig):
-    """Equal water jets that turn and run together; commands cmd_n [1/s] and cmd_nozzle [rad], whose
-    thrust pushes to starboard where positive.
+    """Equal water jets that turn and run together.
+
+    Commands are cmd_n [1/s] and cmd_nozzle [rad], whose thrust pushes to starboard where positive.
 
     Attributes:
         jets: how many there are.
         x: place of the nozzles ahead of the body origin; negative astern.
         speed, revolutions: the two parabolas whose product is the thrust of one jet (6.16); below
             some revolutions it may be negative (H15).
+        motor: limits of the revolutions.
+        nozzle: limits of the nozzle angle.
     """
 
     kind: Literal["water_jets"]
@@ -80,13 +103,13 @@ class WaterJetsConfig(ActuatorConfig):
     nozzle: NozzleConfig
 
     def build(self) -> WaterJets:
-        """Return the module."""
+        """Build the module that turns commands into forces."""
         return WaterJets(self)
 
 
 @final
 class WaterJets(Actuators):
-    """Motor speed and nozzle angle -> tau [..., 3]."""
+    """The forces tau [..., 3] of water jets from motor speed and nozzle angle."""
 
     commands = ("cmd_n", "cmd_nozzle")
 
@@ -112,12 +135,19 @@ class WaterJets(Actuators):
         ]
 
     def thrust(self, n: Tensor, u: Tensor) -> Tensor:
-        """Return the thrust [N] of one jet at revolutions n [1/s] and speed u [m/s], any shape (6.16)."""
+        """Return the thrust [N] of one jet at revolutions n [1/s] and speed u [m/s], any shape.
+
+        Source: document 000 eq. (6.16).
+        """
         a, c = self.a, self.c
         return (a[0] + u * (a[1] + u * a[2])) * (c[0] + n * (c[1] + n * c[2]))
 
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Return the commands [..., 2]: drive ahead is the share of the motor's revolutions (jets do not push astern), steer the yaw moment's sense."""
+        """Return the commands [..., 2] for drive and steer.
+
+        Drive ahead is the share of the motor's revolutions (jets do not push astern), steer the yaw
+        moment's sense.
+        """
         side = self.angle if self.x > 0 else -self.angle
         return torch.stack(
             (drive.clamp(0.0, 1.0) * self.n_max, steer.clamp(-1.0, 1.0) * side), dim=-1

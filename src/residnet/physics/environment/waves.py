@@ -1,5 +1,6 @@
-"""Waves: spectra, a seaway as a sum of sines, and the first-order force on a box-shaped hull
-(document 004, eqs. (5.30)-(5.34)).
+"""Waves: spectra, a seaway as a sum of sines, and the first-order force on a hull.
+
+The hull is a box (document 004, eqs. (5.30)-(5.34)).
 """
 
 from __future__ import annotations
@@ -19,7 +20,11 @@ GRAVITY = 9.81
 
 
 class Spectrum(Config, ABC):
-    """Shape of a wave spectrum of significant height 4 sqrt(m0)."""
+    """A wave spectrum's shape, for a significant height of 4 sqrt(m0).
+
+    Attributes:
+        kind: kind of the spectrum.
+    """
 
     kind: str
 
@@ -29,7 +34,13 @@ class Spectrum(Config, ABC):
 
     @final
     def density(self, omega: np.ndarray, height: float, period: float) -> np.ndarray:
-        """Return S(omega) [m^2 s] at omega [rad/s] for the significant height [m] and peak period [s], up to the peakedness' own area."""
+        """Return S(omega) [m^2 s] at omega [rad/s], up to the peakedness' own area.
+
+        Args:
+            omega: frequencies in rad/s, any shape.
+            height: significant wave height in m.
+            period: peak period in s.
+        """
         peak = 2 * np.pi / period
         ratio = omega / peak
         form: np.ndarray = 5 / 16 * height**2 / peak * ratio**-5.0 * np.exp(-1.25 * ratio**-4.0)
@@ -39,35 +50,49 @@ class Spectrum(Config, ABC):
 
 @final
 class IttcSpectrum(Spectrum):
-    """Fully developed sea: modified Pierson-Moskowitz spectrum in significant height and peak
-    period (ITTC 1978).
+    """The spectrum of a fully developed sea: modified Pierson-Moskowitz (ITTC 1978).
+
+    It is given by significant height and peak period.
     """
 
     kind: Literal["ittc"] = "ittc"
 
     def peakedness(self, ratio: np.ndarray) -> np.ndarray:
-        """Return one."""
+        """Return ones in the shape of `ratio`."""
         return np.ones_like(ratio)
 
 
 @final
 class JonswapSpectrum(Spectrum):
-    """Fetch-limited sea (Hasselmann et al. 1973): the ITTC form with its peak raised by gamma,
-    scaled back to the significant height.
+    """The spectrum of a fetch-limited sea (JONSWAP, Hasselmann et al. 1973).
+
+    It is the ITTC form with its peak raised by gamma, scaled back to the significant height.
+
+    Attributes:
+        gamma: peak enhancement factor, dimensionless.
     """
 
     kind: Literal["jonswap"] = "jonswap"
     gamma: float = Field(default=3.3, ge=1, le=7)
 
     def peakedness(self, ratio: np.ndarray) -> np.ndarray:
-        """Return gamma^exp(-(ratio - 1)^2 / (2 sigma^2)) with sigma 0.07 below the peak and 0.09 above."""
+        """Return gamma^exp(-(ratio - 1)^2 / (2 sigma^2)), any shape.
+
+        sigma is 0.07 below the peak and 0.09 above.
+        """
         width = np.where(ratio <= 1, 0.07, 0.09)
         peaked: np.ndarray = self.gamma ** np.exp(-((ratio - 1) ** 2) / (2 * width**2))
         return peaked
 
 
 class Box(Config):
-    """Underwater hull as a box, which the wave force is computed for."""
+    """The underwater hull as a box, which the wave force is computed for.
+
+    Attributes:
+        length: of the box in m.
+        breadth: of the box in m.
+        draught: of the box in m.
+    """
 
     length: Metres = Field(gt=0)
     breadth: Metres = Field(gt=0)
@@ -151,7 +176,13 @@ class Waves(nn.Module):
         )
 
     def phases(self, north: Tensor, east: Tensor, t: float) -> Tensor:
-        """Return the phase [B, K] of every component at the places (north, east) [B] in m at time t in s."""
+        """Return the phase [B, K] in rad of every component at a place and time.
+
+        Args:
+            north: place [B] in m.
+            east: place [B] in m.
+            t: time in s.
+        """
         way = north.unsqueeze(-1) * torch.cos(self.direction) + east.unsqueeze(-1) * torch.sin(
             self.direction
         )
@@ -162,7 +193,9 @@ class Waves(nn.Module):
         return (self.amplitude * torch.cos(self.phases(north, east, t))).sum(-1)
 
     def response(self, psi: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the force per amplitude in quadrature (X, Y, K: factors of sin) [B, K, 3] and in phase (N: factor of cos) [B, K] at headings psi [B].
+        """Return the force per wave amplitude in quadrature [B, K, 3] and in phase [B, K].
+
+        In quadrature (factors of sin) are X, Y, K; in phase (factor of cos) is N.
 
         In N/m and N m/m; K about the waterline, N about midships. chi = direction - psi is 0 in
         following seas.
@@ -181,7 +214,14 @@ class Waves(nn.Module):
         return quadrature, pressure * (s * breadth * across * tilt_x - c * length * along * tilt_y)
 
     def forward(self, north: Tensor, east: Tensor, psi: Tensor, t: float) -> Tensor:
-        """Return the force X, Y [N], K, N [N m], stacked [B, 4], on the hull at (north, east) with heading psi [B] at time t."""
+        """Return the force X, Y [N], K, N [N m], stacked [B, 4], on the hull at a place and time.
+
+        Args:
+            north: place [B] in m.
+            east: place [B] in m.
+            psi: heading [B] in rad.
+            t: time in s.
+        """
         phase = self.phases(north, east, t)
         quadrature, yaw = self.response(psi)
         side = (quadrature * (self.amplitude * torch.sin(phase)).unsqueeze(-1)).sum(-2)

@@ -1,6 +1,4 @@
-"""Wind on the hull above water: force coefficients of a vessel file, and the forces in the air that
-moves past the vessel.
-"""
+"""Wind on the hull above water: force coefficients, and forces in the relative wind."""
 
 from __future__ import annotations
 
@@ -23,11 +21,16 @@ class WindLoads(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, along: Tensor, across: Tensor) -> Tensor:
-        """Return X, Y [N], K, N [N m], stacked [..., 4], from the velocity of the air relative to the vessel along body x and y [...] in m/s."""
+        """Return X, Y [N], K, N [N m], stacked [..., 4], in a relative wind.
+
+        Args:
+            u: velocity of the air relative to the vessel along body x [...] in m/s.
+            v: the same along body y [...] in m/s.
+        """
 
 
 class WindLoadConfig(Config, ABC):
-    """The hull above water.
+    """The part of a vessel file that describes the hull above water.
 
     Attributes:
         frontal_area, lateral_area: projected areas.
@@ -36,6 +39,7 @@ class WindLoadConfig(Config, ABC):
             vessels that roll.
         density: of the air.
         source: where the numbers come from.
+        kind: kind of the coefficients.
     """
 
     kind: str
@@ -48,15 +52,19 @@ class WindLoadConfig(Config, ABC):
 
     @abstractmethod
     def build(self) -> WindLoads:
-        """Return the module."""
+        """Build the module that computes the wind forces."""
 
 
 class SymmetricWindConfig(WindLoadConfig):
-    """Ships that are nearly symmetric fore and aft (Fossen 2011, Handbook of Marine Craft
-    Hydrodynamics, section 8.1, eqs. (8.29)-(8.31)).
+    """Wind coefficients of ships that are nearly symmetric fore and aft.
 
     C_X = -c_x cos gamma, C_Y = c_y sin gamma, C_N = c_n sin 2 gamma, with gamma the relative wind's
     angle; typically c_x is 0.5 to 0.9, c_y 0.7 to 0.95, c_n 0.05 to 0.2. All three are positive.
+
+    Attributes:
+        c_x: amplitude of the longitudinal force coefficient, dimensionless.
+        c_y: amplitude of the lateral force coefficient.
+        c_n: amplitude of the yaw moment coefficient.
     """
 
     kind: Literal["symmetric"] = "symmetric"
@@ -65,14 +73,15 @@ class SymmetricWindConfig(WindLoadConfig):
     c_n: float = Field(ge=0, le=1)
 
     def build(self) -> SymmetricWind:
-        """Return the module."""
+        """Build the module that computes the wind forces."""
         return SymmetricWind(self)
 
 
 @final
 class SymmetricWind(WindLoads):
-    """The three coefficients written in the components of the relative air velocity, which needs no
-    angle and is smooth in a calm.
+    """The three coefficients, written in the components of the relative air velocity.
+
+    This needs no angle and is smooth in a calm.
     """
 
     def __init__(self, config: SymmetricWindConfig) -> None:
@@ -93,12 +102,19 @@ class SymmetricWind(WindLoads):
 
 
 class TabulatedWindConfig(WindLoadConfig):
-    """Coefficients at angles of the relative wind, as wind tunnels and Isherwood (1972) or
-    Blendermann (1994) give them.
+    """Wind coefficients at angles of the relative wind, as wind tunnels give them.
+
+    Isherwood (1972) and Blendermann (1994) publish such tables.
 
     `angle` runs from 0 (head wind) to 180 deg for wind from STARBOARD; port follows by symmetry.
     Signs are those of the body axes: C_X is negative in head wind, C_Y negative (towards port).
     Linear between the angles.
+
+    Attributes:
+        angle: angles of the relative wind in rad, from 0 to pi.
+        C_X: longitudinal force coefficient at each angle, dimensionless.
+        C_Y: lateral force coefficient at each angle.
+        C_N: yaw moment coefficient at each angle.
     """
 
     kind: Literal["table"] = "table"
@@ -131,7 +147,7 @@ class TabulatedWindConfig(WindLoadConfig):
         return self
 
     def build(self) -> TabulatedWind:
-        """Return the module."""
+        """Build the module that computes the wind forces."""
         return TabulatedWind(self)
 
 
