@@ -31,7 +31,7 @@ LAYERS = [
     {"documents"},
     {"tasks"},
     {"terminal"},
-    {"cli", "__main__"},
+    {"cli", "__main__", "face", "testing"},
 ]
 ALLOWED = {("__main__", "cli")}
 RANK = {package: rank for rank, packages in enumerate(LAYERS) for package in packages}

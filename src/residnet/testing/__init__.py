@@ -1,0 +1,31 @@
+"""Contracts of every kind of part, to be run by residnet and by packages that add parts to it.
+
+Each function takes a part and raises an `AssertionError` of one line where it breaks a contract:
+
+    from residnet.testing import check_head
+    from my_package.heads import TideConfig
+
+    def test_my_head() -> None:
+        check_head(TideConfig())
+"""
+
+from __future__ import annotations
+
+from residnet.testing.baselines import check_baseline
+from residnet.testing.examples import example_models, example_samples
+from residnet.testing.exporters import check_exporter
+from residnet.testing.heads import check_head
+from residnet.testing.manoeuvres import check_manoeuvre
+from residnet.testing.readers import check_reader
+from residnet.testing.vessels import check_vessel
+
+__all__ = [
+    "check_baseline",
+    "check_exporter",
+    "check_head",
+    "check_manoeuvre",
+    "check_reader",
+    "check_vessel",
+    "example_models",
+    "example_samples",
+]

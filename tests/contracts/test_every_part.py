@@ -1,0 +1,158 @@
+"""The contracts that residnet offers to other packages, run over every part of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import written_logs
+import written_recorders
+
+from residnet.baselines import BaselineConfig
+from residnet.core.config import validate
+from residnet.core.log import Log
+from residnet.core.names import CHANNEL_UNITS
+from residnet.core.registry import kinds
+from residnet.data.readers import ReaderConfig
+from residnet.export import exporter, exporters
+from residnet.heads import HeadConfig
+from residnet.manoeuvres import ManoeuvreConfig
+from residnet.physics.signals import SignalsConfig
+from residnet.physics.vessel import vessel_files
+from residnet.testing import (
+    check_baseline,
+    check_exporter,
+    check_head,
+    check_manoeuvre,
+    check_reader,
+    check_vessel,
+    example_samples,
+)
+
+# what makes a kind quick enough for a contract
+HEADS: dict[str, dict[str, Any]] = {
+    "genetic": {"evolution": {"population": 60, "generations": 3}},
+    "kernel": {"folds": 2, "penalties": [0.1]},
+    "mlp": {"hidden": [8]},
+    "lstm": {"hidden_size": 6},
+}
+RUDDER = SignalsConfig(inputs=("n", "delta"))
+# what a baseline cannot do without, and whose trials it is identified from
+BASELINES: dict[str, tuple[dict[str, Any], str]] = {
+    "believed": ({"vessel": "wam_v_cal"}, "wam_v_cal"),
+    "equations": ({"u": {"u": -0.4, "tau_x": 0.003}, "r": {"r": -1.0}}, "wam_v_cal"),
+    "linear_steady": (
+        {"settled": 10, "speed": ["random_steps"], "steering": ["zigzag"]},
+        "wam_v_cal",
+    ),
+    "regressors": ({"terms": ["u", "v", "r", "tau_x", "tau_n"]}, "wam_v_cal"),
+    "mmg": (
+        {
+            "hull": {"length": 6, "beam": 2, "draught": 0.4, "mass": 1500, "x_G": 0},
+            "propeller": {"diameter": 0.3, "x": -0.48, "thrust": [0.29, -0.28, -0.14]},
+            "rudder": {"area": 0.1, "aspect": 1.5, "race": 0.6},
+        },
+        "example_rudder_boat",
+    ),
+    "nomoto": ({}, "example_rudder_boat"),
+    "nomoto_sideslip": ({}, "example_rudder_boat"),
+}
+MANOEUVRES: dict[str, dict[str, Any]] = {
+    "constant": {"drive": 0.6, "steer": 0.2},
+    "zigzag": {"drive": 0.6, "steer": 0.4, "heading": "15 deg", "start": 2},
+    "turning_circle": {"drive": 0.6, "steer": 0.4, "start": 2},
+    "acceleration_deceleration": {"times": [0, 8], "levels": [0.7, 0.2]},
+    "three_two_one_one": {"drive": 0.5, "steer": 0.3, "start": 2, "unit": 2},
+    "random_steps": {"drive": 0.5, "band": [0.05, 0.3], "steer_amplitude": 0.3},
+    "multi_sine": {"drive": 0.5, "band": [0.05, 0.3], "steer_amplitude": 0.3},
+    "spiral": {"drive": 0.5, "start": 2, "steady": {"window": 1.5, "tolerance": 0.05}},
+    "stopping": {"drive": 0.6, "start": 8},
+    "waypoints": {"drive": 0.7, "points": [[8, 0], [8, 10]], "acceptance": 2, "lookahead": 4},
+    "four_corner": {
+        "duration": 60,
+        "control": {
+            "proportional": [200, 200, 800],
+            "integral": [5, 5, 30],
+            "derivative": [1500, 1500, 4000],
+        },
+    },
+}
+# of those that need a vessel with three forces of its own
+FERRY = "milliampere"
+
+
+def _canonical(log: Log, folder: Path) -> Path:
+    log.save(folder / f"{log.name}.parquet")
+    return folder / f"{log.name}.parquet"
+
+
+@pytest.mark.parametrize("kind", kinds(HeadConfig))
+def test_head(kind: str) -> None:
+    if kind == "genetic":
+        pytest.importorskip("deap", reason="genetic programming needs the extra gp")
+    check_head(validate({"kind": kind, **HEADS.get(kind, {})}, HeadConfig, "here"))
+
+
+@pytest.mark.parametrize("kind", kinds(BaselineConfig))
+def test_baseline(kind: str) -> None:
+    settings, vessel = BASELINES.get(kind, ({}, "wam_v_cal"))
+    config = validate({"kind": kind, **settings}, BaselineConfig, "here")
+    boat = vessel == "example_rudder_boat"
+    check_baseline(config, example_samples(vessel, RUDDER) if boat else None)
+
+
+@pytest.mark.parametrize("kind", kinds(ManoeuvreConfig))
+def test_manoeuvre(kind: str, tmp_path: Path) -> None:
+    settings = dict(MANOEUVRES.get(kind, {}))
+    if kind == "replay":
+        t = np.arange(0.0, 20.0, 0.1)
+        channels = {name: np.zeros(t.size) for name in ("x", "y", "psi", "u", "v", "r")}
+        channels |= {"cmd_port": 20 + 5 * np.sin(t), "cmd_stbd": 15 * np.cos(t)}
+        Log("flown", t, channels).save(tmp_path / "flown.parquet")
+        settings = {"log": str(tmp_path / "flown.parquet")}
+    manoeuvre = validate({"kind": kind, **settings}, ManoeuvreConfig, "here")
+    check_manoeuvre(manoeuvre, FERRY if kind == "four_corner" else "wam_v_cal")
+
+
+READERS: dict[str, tuple[Callable[[Log, Path], Path], str]] = {
+    "csv": (written_logs.csv, ""),
+    "parquet": (written_logs.parquet, ""),
+    "csv_topics": (written_logs.topics, "rosbags"),
+    "rosbag": (written_logs.bag2_mcap, "rosbags"),
+    "mat": (written_logs.mat5, ""),
+    "hdf5": (written_logs.hdf5, "h5py"),
+    "nmea": (written_recorders.nmea, "pynmea2"),
+    "ulog": (written_recorders.ulog, "pyulog"),
+    "ardupilot": (written_recorders.ardupilot, "pymavlink"),
+    "canonical": (_canonical, ""),
+    "auto": (written_logs.bag2_mcap, "rosbags"),
+}
+
+
+@pytest.mark.parametrize("kind", kinds(ReaderConfig))
+def test_reader(kind: str, tmp_path: Path) -> None:
+    write, needs = READERS[kind]
+    if needs:
+        pytest.importorskip(needs)
+    log = written_logs.trial(20.0)
+    settings: dict[str, Any] = {}
+    if kind in ("csv", "parquet"):
+        channels = {name: {"column": name, "unit": CHANNEL_UNITS[name]} for name in log.channels}
+        settings = {"time": {"column": "t"}, "channels": channels}
+    read = check_reader(
+        validate({"kind": kind, **settings}, ReaderConfig, "here"), write(log, tmp_path)
+    )
+    assert set(log.channels) & set(read.channels) >= {"u", "psi"}
+
+
+@pytest.mark.parametrize("name", exporters())
+def test_export_format(name: str) -> None:
+    check_exporter(exporter(name))
+
+
+@pytest.mark.parametrize("name", vessel_files())
+def test_vessel(name: str) -> None:
+    check_vessel(name)
