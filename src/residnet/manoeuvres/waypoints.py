@@ -55,11 +55,10 @@ class Waypoints(Manoeuvre):
         return f"the last of {len(self.points)} way-points"
 
     def indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
-        """Return Cross-track errors from the leg that was sailed, and the time that the course took."""
-        x = torch.from_numpy(np.nan_to_num(log.stack(("x", "y"))))
-        guidance = WaypointGuidance(
-            self.points, self.acceptance, LookAhead(self.lookahead), ("x", "y")
-        )
+        """Return cross-track errors from the leg that was sailed, and the time that the course took."""
+        names = ("x", "y", "psi")
+        x = torch.from_numpy(np.nan_to_num(log.stack(names)))
+        guidance = WaypointGuidance(self.points, self.acceptance, LookAhead(self.lookahead), names)
         s = guidance.initial_state(x[:1])
         errors = []
         for k in range(len(log)):
