@@ -86,7 +86,7 @@ class _Origin:
     root: Node | None = None
     overrides: tuple[Override, ...] = ()
 
-    def of(self, path: KeyPath) -> str:
+    def source(self, path: KeyPath) -> str:
         """Return where the value at `path` was set: an override, or a line of the file.
 
         The last override that set the whole value counts; one that changed a part of it is named
@@ -190,7 +190,7 @@ def _validated(data: Any, model: Any, origin: _Origin, folder: Path | None) -> A
             to_json(data), strict=True, context={"folder": folder}
         )
     except ValidationError as error:
-        raise ConfigError(describe(error, model, origin.of)) from error
+        raise ConfigError(describe(error, model, origin.source)) from error
     except PydanticSerializationError as error:
         raise ConfigError(f"{origin.where}: holds a value that YAML cannot ({error})") from error
 

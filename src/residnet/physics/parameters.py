@@ -117,9 +117,11 @@ def unit_text(metres: int, seconds: int, mass: int = 1) -> str:
     """Return SI unit `kg^c m^a s^b` as text."""
 
     def powers(sign: int) -> list[str]:
-        given = (("kg", mass), ("m", metres), ("s", seconds))
+        dimensions = (("kg", mass), ("m", metres), ("s", seconds))
         return [
-            name + (f"^{sign * p}" if sign * p > 1 else "") for name, p in given if sign * p > 0
+            name + (f"^{sign * p}" if sign * p > 1 else "")
+            for name, p in dimensions
+            if sign * p > 0
         ]
 
     above = powers(1) or (["1"] if powers(-1) else ["-"])

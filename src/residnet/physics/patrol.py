@@ -230,9 +230,11 @@ class PatrolHull(nn.Module):
             "phi": (0.0, 0.0, -vessel.hydrostatics.stiffness, 0.0),
         }
         rows = vessel.forces.rows()
-        given = sorted({term for row in rows for term in row})
-        coefficients = [[row[term].value if term in row else 0.0 for row in rows] for term in given]
-        self.terms = TermLibrary([*inertia, *given], MOTION)
+        force_terms = sorted({term for row in rows for term in row})
+        coefficients = [
+            [row[term].value if term in row else 0.0 for row in rows] for term in force_terms
+        ]
+        self.terms = TermLibrary([*inertia, *force_terms], MOTION)
         self.register_buffer("mass", mass, persistent=False)
         self.register_buffer("inverse", inverse_mass(mass, vessel.name), persistent=False)
         self.register_buffer(

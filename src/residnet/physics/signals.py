@@ -60,12 +60,12 @@ class SignalsConfig(Config):
         }
         if repeated:
             raise ValueError(f"inputs {sorted(repeated)} are named twice")
-        made = (
+        computed = (
             STATE
             + (FORCE_CHANNELS if self.forces is not None else ())
             + (WIND_CHANNELS if self.exogenous else ())
         )
-        if taken := [name for name in self.inputs if name in made]:
+        if taken := [name for name in self.inputs if name in computed]:
             raise ValueError(
                 f"input '{taken[0]}' is a channel that the model has or makes itself; leave it out"
                 " or rename it in the channel map"

@@ -24,11 +24,11 @@ def term_parity(term: str, names: Sequence[str]) -> int | None:
     """Return the parity of a product of channels; None where a channel's is not known."""
     parity = 1
     for factor in parse_term(term, names):
-        own = channel_parity(factor.name)
-        if own is None:
+        factor_parity = channel_parity(factor.name)
+        if factor_parity is None:
             return None
         if (
-            own < 0
+            factor_parity < 0
             and not factor.magnitude
             and factor.function not in EVEN_FUNCTIONS
             and factor.power % 2 == 1

@@ -169,8 +169,8 @@ class TermLibrary(nn.Module):
 
     def forward(self, z: Tensor) -> Tensor:
         """Return the channels z [..., nz] -> terms [..., J]."""
-        one = torch.ones_like(z[..., :1])
-        parts = [one, z, z.abs()]
+        ones = torch.ones_like(z[..., :1])
+        parts = [ones, z, z.abs()]
         if self.divides:
             parts.append(z.index_select(-1, self.of_divisors).reciprocal())
         if self.turns:
@@ -190,7 +190,7 @@ class TermLibrary(nn.Module):
             )
         base = torch.cat(parts, dim=-1)
         if self.depth == 0:
-            return one.expand(z.shape[:-1] + (self.count,))  # noqa: RUF005 (TorchScript)
+            return ones.expand(z.shape[:-1] + (self.count,))  # noqa: RUF005 (TorchScript)
         out = base.index_select(-1, self.index[0])
         for d in range(1, self.depth):
             out = out * base.index_select(-1, self.index[d])

@@ -129,10 +129,10 @@ class AzimuthThrusters(Actuators):
         self.n_max = shaft.n_max
         self.coefficients = list(config.thrust)
         # tau = map [3, 2k] of the components forward, then to starboard, of every thruster
-        one, zero = [1.0] * self.count, [0.0] * self.count
+        ones, zeros = [1.0] * self.count, [0.0] * self.count
         rows = [
-            one + zero,
-            zero + one,
+            ones + zeros,
+            zeros + ones,
             [-place.y for place in config.places] + [place.x for place in config.places],
         ]
         self.register_buffer("map", torch.tensor(rows, dtype=torch.float64), persistent=False)

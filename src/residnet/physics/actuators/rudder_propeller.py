@@ -136,7 +136,7 @@ class RudderPropeller(Actuators):
         )
         self.straightening = rudder.straightening
         self.loss = propeller.advance_loss
-        self.kept = 1.0 - propeller.thrust_deduction
+        self.thrust_factor = 1.0 - propeller.thrust_deduction
 
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
         """Return the rudder angle from steer and revolutions from drive, as shares of their limits.
@@ -164,7 +164,7 @@ class RudderPropeller(Actuators):
         normal = self.lift * (square * torch.sin(delta) + inflow * across * torch.cos(delta))
         side = -normal * torch.cos(delta)
         return torch.stack(
-            (self.kept * thrust - normal * torch.sin(delta), side, self.x * side), dim=-1
+            (self.thrust_factor * thrust - normal * torch.sin(delta), side, self.x * side), dim=-1
         )
 
     def rate(self, a: Tensor, command: Tensor) -> Tensor:

@@ -200,7 +200,7 @@ class Servo(nn.Module):
         super().__init__()
         self.limit = limit
         self.response = response
-        self.own = len(response.suffixes)
+        self.width = len(response.suffixes)
         self.taps = taps
         self.delay_step = delay_step
         self.state = tuple(f"{'_' if suffix else ''}{name}{suffix}" for suffix in response.suffixes)
@@ -212,14 +212,14 @@ class Servo(nn.Module):
 
     def value(self, a: Tensor, command: Tensor) -> Tensor:
         """Return the position [...], within the limit."""
-        return self.response.value(a[..., : self.own], self.target(a, command)).clamp(
+        return self.response.value(a[..., : self.width], self.target(a, command)).clamp(
             -self.limit, self.limit
         )
 
     def rate(self, a: Tensor, command: Tensor) -> Tensor:
         """Return the derivative [..., k] of the states."""
-        moving = self.response.rate(a[..., : self.own], self.target(a, command))
-        return torch.cat((moving, torch.zeros_like(a[..., self.own :])), dim=-1)
+        moving = self.response.rate(a[..., : self.width], self.target(a, command))
+        return torch.cat((moving, torch.zeros_like(a[..., self.width :])), dim=-1)
 
     def advance(self, a: Tensor, command: Tensor, dt: float) -> Tensor:
         """Return the states [..., k] after a step of dt seconds.
@@ -227,7 +227,7 @@ class Servo(nn.Module):
         Raises:
             ConfigError: where the delay line does not move by dt.
         """
-        moved = self.response.advance(a[..., : self.own], self.target(a, command), dt)
+        moved = self.response.advance(a[..., : self.width], self.target(a, command), dt)
         if self.taps == 0:
             return moved
         if abs(dt - self.delay_step) > 1e-9:
@@ -237,7 +237,7 @@ class Servo(nn.Module):
                 " data.substeps)"
             )
         newest = command.clamp(-self.limit, self.limit).unsqueeze(-1)
-        return torch.cat((moved, newest, a[..., self.own : -1]), dim=-1)
+        return torch.cat((moved, newest, a[..., self.width : -1]), dim=-1)
 
 
 @final

@@ -183,10 +183,10 @@ class Waves(nn.Module):
             east: place [B] in m.
             t: time in s.
         """
-        way = north.unsqueeze(-1) * torch.cos(self.direction) + east.unsqueeze(-1) * torch.sin(
+        along = north.unsqueeze(-1) * torch.cos(self.direction) + east.unsqueeze(-1) * torch.sin(
             self.direction
         )
-        return self.omega * t - self.number * way + self.phase
+        return self.omega * t - self.number * along + self.phase
 
     def elevation(self, north: Tensor, east: Tensor, t: float) -> Tensor:
         """Return the elevation of the surface [B] in m, upwards."""
