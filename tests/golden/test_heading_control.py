@@ -113,7 +113,7 @@ def zigzag(angle: str, heading: str, rate: str | None) -> Case:
         heading=float(np.radians(float(heading))),
     )
     return Case(
-        plant, NomotoDynamics(plant, 0.01), lambda t: Zigzag.source([manoeuvre], Helm.of(plant), t)
+        plant, NomotoDynamics(plant, 0.01), lambda t: Zigzag.source([manoeuvre], Helm.from_plant(plant), t)
     )
 
 

@@ -111,7 +111,7 @@ def source_of(runs: list[Run], plant: PatrolVessel, t: torch.Tensor) -> Source:
             )
         )
     if zigzags:
-        sources.append(Zigzag.source(zigzags, Helm.of(plant), t))
+        sources.append(Zigzag.source(zigzags, Helm.from_plant(plant), t))
     return StackedSource(sources, [count for count in (len(steps), len(zigzags)) if count])
 
 

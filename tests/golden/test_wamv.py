@@ -104,7 +104,7 @@ def trajectories(vessel: str, folder: Path) -> dict[str, tuple[np.ndarray, np.nd
     plant = load_vessel(vessel).build()
     manoeuvres = [case_of(path).manoeuvre for path in files]
     source = StackedSource(
-        [type(m).source([m], Helm.of(plant), t) for m in manoeuvres], [1] * len(files)
+        [type(m).source([m], Helm.from_plant(plant), t) for m in manoeuvres], [1] * len(files)
     )
     x0 = torch.zeros(len(files), len(plant.state), dtype=torch.float64)
     w = torch.zeros(len(files), steps, len(plant.inputs), dtype=torch.float64)

@@ -1,5 +1,4 @@
-"""Stop conditions, spirals and excitation: what ends when, and which frequencies are in a demand.
-"""
+"""Stop conditions, spirals and excitation: what ends when, and the frequencies of demands."""
 
 from __future__ import annotations
 
@@ -161,7 +160,7 @@ def test_steady_by_hand() -> None:
         (0.9688, True),
         (0.9844, True),
     ]
-    assert not bool(steady.reached(steady.again(memory, torch.tensor([True]))))
+    assert not bool(steady.reached(steady.restart(memory, torch.tensor([True]))))
 
 
 def test_spiral_of_a_linear_vessel_has_no_loop() -> None:
@@ -256,7 +255,7 @@ def test_four_corner_course_of_the_ferry(vessel: str) -> None:
     craft = Craft(
         vessel,
         TracedPlantDynamics(plant, 0.2, 2),
-        Helm.of(plant),
+        Helm.from_plant(plant),
         plant.commands,
         plant.approach(1),
     )

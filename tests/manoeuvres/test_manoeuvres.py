@@ -4,15 +4,22 @@ each kind.
 
 from __future__ import annotations
 
-from functools import lru_cache
-from pathlib import Path
-from tempfile import mkdtemp
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
+from flown_manoeuvres import (
+    DT,
+    DURATION,
+    EXAMPLES,
+    FAMILIES,
+    FLOWN,
+    MANOEUVRES,
+    drawn,
+    fly,
+    times,
+)
 
 from residnet.core.config import validate
 from residnet.core.errors import ConfigError
@@ -23,83 +30,18 @@ from residnet.dynamics.simulated import PlantDynamics
 from residnet.manoeuvres import (
     AccelerationDeceleration,
     ConstantInput,
-    FamilyConfig,
     Helm,
-    Manoeuvre,
     ManoeuvreConfig,
-    Replay,
     StackedSource,
     ThreeTwoOneOne,
     Zigzag,
 )
+from residnet.manoeuvres.indices import UNITS
 from residnet.physics.plant import Plant
 from residnet.physics.vessel import load_vessel
 
-
-def kinds(union: Any) -> dict[str, Any]:
-    return {config.model_fields["kind"].default: config for config in get_args(get_args(union)[0])}
-
-
-FAMILIES, MANOEUVRES = kinds(FamilyConfig), kinds(ManoeuvreConfig)
-# what a family cannot do without; a new family whose fields have defaults beyond these needs no
-# line here
-NEEDS: dict[str, Any] = {
-    "count": 5,
-    "heading": (0.2, 0.4),
-    "drive": (0.3, 0.8),
-    "steer": (-0.5, 0.4),
-}
-# of kinds that nothing draws at random
-EXAMPLES: dict[str, list[dict[str, Any]]] = {
-    "spiral": [
-        {"drive": 0.5, "start": 2, "steady": {"window": 1.5, "tolerance": 0.05}},
-        {"drive": 0.6, "steers": [0.4, -0.4], "start": 1},
-    ],
-    "stopping": [{"drive": 0.6, "start": 8}, {"drive": 0.9, "astern": -0.5, "start": 11}],
-    "waypoints": [
-        {"drive": 0.7, "points": [[8, 0], [8, 10]], "acceptance": 2, "lookahead": 4},
-        {"drive": 0.5, "points": [[10, -5]], "acceptance": 2, "lookahead": 4},
-    ],
-}
-DURATION, DT = 15.0, 0.1
-
-
-def family(kind: str) -> Any:
-    required = {
-        name: NEEDS[name]
-        for name, info in FAMILIES[kind].model_fields.items()
-        if info.is_required()
-    }
-    return FAMILIES[kind](**required)
-
-
-def drawn(kind: str, seed: int = 0) -> list[Manoeuvre]:
-    if kind == "replay":
-        return replays()
-    if kind in EXAMPLES:
-        return [MANOEUVRES[kind](**example) for example in EXAMPLES[kind]]
-    return family(kind).draw(np.random.default_rng(seed), DURATION)
-
-
-@lru_cache
-def replays() -> list[Manoeuvre]:
-    """Two recorded logs, flown from where they begin."""
-    folder = Path(mkdtemp())
-    out: list[Manoeuvre] = []
-    for i in range(2):
-        t = np.arange(0.0, DURATION, 0.25)
-        channels = {
-            name: np.full(t.size, 0.1 * (i + j))
-            for j, name in enumerate(("x", "y", "psi", "u", "v", "r"))
-        }
-        channels |= {"cmd_port": 20.0 + 5.0 * np.sin(t + i), "cmd_stbd": 15.0 * np.cos(t)}
-        Log(f"log{i}", t, channels).save(folder / f"log{i}.parquet")
-        out.append(Replay(log=folder / f"log{i}.parquet"))
-    return out
-
-
-# needs a vessel with all three forces; see test_closed_loop
-FLOWN = [kind for kind in MANOEUVRES if kind != "four_corner"]
+# the other kinds are open-loop excitation, which no index is defined for
+WITH_INDICES = {"zigzag", "turning_circle", "spiral", "stopping", "waypoints", "replay"}
 
 
 @pytest.fixture(params=FLOWN)
@@ -117,28 +59,6 @@ def plant() -> Plant:
     return load_vessel("wam_v_cal").build()
 
 
-def times(seconds: float = DURATION, dt: float = DT) -> Tensor:
-    return torch.arange(round(seconds / dt), dtype=torch.float64) * dt
-
-
-def fly(
-    plant: Plant,
-    manoeuvres: list[Manoeuvre],
-    dt: float = DT,
-    seconds: float = DURATION,
-    psi: float = 0.0,
-) -> tuple[Tensor, Tensor]:
-    """States [B, T+1, 8] and commands [B, T, 2]."""
-    t = times(seconds, dt)
-    source = type(manoeuvres[0]).source(manoeuvres, Helm.of(plant), t)
-    x0 = torch.zeros(len(manoeuvres), 8, dtype=torch.float64)
-    x0[:, 2] = psi
-    w = torch.zeros(len(manoeuvres), len(t), len(plant.inputs), dtype=torch.float64)
-    with torch.no_grad():
-        states, inputs, _ = Rollout(PlantDynamics(plant, dt), source)(x0, w, x0[:, :0])
-    return states, inputs[:, :, :2]
-
-
 def test_every_family_draws_a_manoeuvre_of_its_kind() -> None:
     assert set(FAMILIES) | set(EXAMPLES) | {"replay"} == set(FLOWN), (
         "a kind without a family needs an example here"
@@ -154,6 +74,18 @@ def test_draws_are_repeatable_by_seed(random_kind: str) -> None:
         assert drawn(kind) != drawn(kind, seed=1)
         assert len(drawn(kind)) == 5
         assert len({m.model_dump_json() for m in drawn(kind)}) == 5
+
+
+def test_indices_follow_from_what_was_flown(kind: str, plant: Plant) -> None:
+    """Every kind reads its indices off its own flight: finite numbers with a unit."""
+    manoeuvre = drawn(kind)[0]
+    states, commands = fly(plant, [manoeuvre])
+    channels = dict(zip(plant.state, states[0, :-1].T.numpy(), strict=True))
+    channels |= dict(zip(("cmd_port", "cmd_stbd"), commands[0].T.numpy(), strict=True))
+    indices = manoeuvre.indices(Log(kind, times().numpy(), channels), length=5.0)
+    assert {name.removesuffix("_lengths") for name in indices} <= set(UNITS)
+    assert all(np.isfinite(value).all() for value in indices.values())
+    assert bool(indices) == (kind in WITH_INDICES)
 
 
 def test_what_was_drawn_can_be_written_down_and_read_back(kind: str) -> None:
@@ -183,7 +115,7 @@ def test_all_kinds_side_by_side_equal_each_alone(plant: Plant) -> None:
     groups = [drawn(kind)[:2] for kind in FLOWN]
     t = times()
     source = StackedSource(
-        [type(g[0]).source(g, Helm.of(plant), t) for g in groups], [2] * len(groups)
+        [type(g[0]).source(g, Helm.from_plant(plant), t) for g in groups], [2] * len(groups)
     )
     x0 = torch.zeros(2 * len(groups), 8, dtype=torch.float64)
     w = torch.zeros(len(x0), len(t), len(plant.inputs), dtype=torch.float64)
@@ -193,7 +125,7 @@ def test_all_kinds_side_by_side_equal_each_alone(plant: Plant) -> None:
         assert bool((inputs[:, :, 2] == 5.0).all()), "disturbances pass through a manoeuvre"
         for i, group in enumerate(groups):
             alone, _, _ = Rollout(
-                PlantDynamics(plant, DT), type(group[0]).source(group, Helm.of(plant), t)
+                PlantDynamics(plant, DT), type(group[0]).source(group, Helm.from_plant(plant), t)
             )(x0[:2], w[:2], x0[:2, :0])
             torch.testing.assert_close(alone, states[2 * i : 2 * i + 2], rtol=1e-10, atol=1e-12)
 

@@ -8,7 +8,7 @@ _VOID = {"meta", "img", "br", "hr", "link", "wbr"}
 
 
 class Page(HTMLParser):
-    """Tables as lists of lines of cell texts, and whether every tag is closed where it should be."""
+    """Tables as lists of lines of cell texts, and whether every tag closes where it should."""
 
     def __init__(self, text: str) -> None:
         super().__init__()

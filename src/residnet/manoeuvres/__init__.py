@@ -1,6 +1,4 @@
-"""Manoeuvres, one file each: the manoeuvre, its source of inputs, and where it is drawn at random
-the family that does so.
-"""
+"""Manoeuvres, one file each: the manoeuvre, its source of inputs, and the family that draws it."""
 
 from __future__ import annotations
 

@@ -14,7 +14,12 @@ from residnet.manoeuvres.base import Manoeuvre, Range, Scheduled
 
 
 class AccelerationDeceleration(Scheduled):
-    """Drive levels, each held from its time on; the steer is zero."""
+    """Drive levels, each held from its time on; the steer is zero.
+
+    Attributes:
+        times: when each level begins in s, ascending.
+        levels: drive from -1 to 1 from that time on.
+    """
 
     kind: Literal["acceleration_deceleration"] = "acceleration_deceleration"
     times: tuple[Seconds, ...] = Field(min_length=1)
@@ -33,8 +38,15 @@ class AccelerationDeceleration(Scheduled):
 
 
 class AccelerationDecelerationFamily(Config):
-    """Steps between a high level, lowered by a quarter and by half in turn, and a low level; all
-    uniform in their ranges.
+    """Steps between a high and a low level, drawn at random.
+
+    The high level is lowered by a quarter and by half in turn; all is uniform in its range.
+
+    Attributes:
+        count: how many manoeuvres.
+        high: range of the high level of the drive.
+        low: range of the low level of the drive.
+        hold: range of the time for which a level is held in s.
     """
 
     kind: Literal["acceleration_deceleration"] = "acceleration_deceleration"
@@ -44,7 +56,7 @@ class AccelerationDecelerationFamily(Config):
     hold: tuple[Seconds, Seconds] = (6.0, 12.0)
 
     def draw(self, random: np.random.Generator, duration: float) -> list[Manoeuvre]:
-        """Return `count` manoeuvres of `duration` seconds."""
+        """Draw `count` manoeuvres of `duration` seconds with a random generator."""
         most = int(duration / self.hold[0]) + 2
         out: list[Manoeuvre] = []
         for _ in range(self.count):

@@ -49,7 +49,7 @@ class Helm:
     forces: Callable[[Tensor], Tensor] | None = None
 
     @classmethod
-    def of(cls, plant: Plant) -> Helm:
+    def from_plant(cls, plant: Plant) -> Helm:
         """Return the helm of a plant."""
         forces: Callable[[Tensor], Tensor] | None = None
         if plant.inputs[: plant.commands] == ForceCommands.commands:
@@ -121,7 +121,7 @@ class StackedSource(Source):
         """Return the inputs [B, m], each block of rows from its source."""
         inputs, memories = [], []
         for source, xs, ws, ms in zip(
-            self.sources, x.split(self.rows), w.split(self.rows), self._own(memory), strict=True
+            self.sources, x.split(self.rows), w.split(self.rows), self._split(memory), strict=True
         ):
             acting, after = source(xs, ws, k, ms)
             inputs.append(acting)
@@ -130,11 +130,11 @@ class StackedSource(Source):
         return torch.cat(inputs), torch.cat(memories)
 
     def finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
-        """Return [B] bool, each block of rows by its source."""
-        parts = zip(self.sources, x.split(self.rows), self._own(memory), strict=True)
+        """Return which rows [B] have finished, each block of rows by its source."""
+        parts = zip(self.sources, x.split(self.rows), self._split(memory), strict=True)
         return torch.cat([source.finished(xs, k, ms) for source, xs, ms in parts])
 
-    def _own(self, memory: Tensor) -> list[Tensor]:
+    def _split(self, memory: Tensor) -> list[Tensor]:
         return [
             part[:, :width]
             for part, width in zip(memory.split(self.rows), self.widths, strict=True)
@@ -143,8 +143,9 @@ class StackedSource(Source):
 
 @final
 class Watched(Source):
-    """A source that remembers when its rows stopped: `stopped` [B] is the sample at which each did,
-    -1 where it did not.
+    """A source that remembers when its rows stopped.
+
+    `stopped` [B] is the sample at which each did, -1 where it did not.
     """
 
     def __init__(self, source: Source, rows: int) -> None:
@@ -177,6 +178,7 @@ class Manoeuvre(Config, ABC):
         name: of its log; the kind with a number where None.
         duration: its length, or for a manoeuvre with a stop condition the time after which it has
             failed; that of the programme where None.
+        kind: kind of the manoeuvre.
     """
 
     kind: str
@@ -186,9 +188,12 @@ class Manoeuvre(Config, ABC):
     @classmethod
     @abstractmethod
     def source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
-        """Return the source that flies several manoeuvres of this kind side by side.
+        """Build the source that flies several manoeuvres of this kind side by side.
 
-        t [T] are the times of the steps.
+        Args:
+            manoeuvres: of this kind, one for each row.
+            helm: of the vessel.
+            t: times [T] of the steps in s.
         """
 
     @property
@@ -201,7 +206,12 @@ class Manoeuvre(Config, ABC):
         return duration if self.duration is None else self.duration
 
     def begin(self, x: Tensor, state: tuple[str, ...]) -> Tensor:
-        """Return the state [nx] that the manoeuvre starts from, where trials of the vessel start from x [nx]."""
+        """Return the state [nx] that the manoeuvre starts from.
+
+        Args:
+            x: state [nx] that trials of the vessel start from.
+            state: names of its entries.
+        """
         return x
 
     def indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
@@ -216,7 +226,13 @@ class Manoeuvre(Config, ABC):
         return {}
 
     def limits(self, helm: Helm, length: float, speed: float) -> dict[str, float]:
-        """Return the largest values of indices that IMO resolution MSC.137(76) allows a ship of `length` [m] at approach `speed` [m/s], by index."""
+        """Return the largest values of indices that IMO resolution MSC.137(76) allows, by index.
+
+        Args:
+            helm: of the vessel.
+            length: of the ship in m.
+            speed: approach speed in m/s.
+        """
         return {}
 
 
@@ -225,7 +241,7 @@ class Scheduled(Manoeuvre):
 
     @abstractmethod
     def demands(self, t: Tensor) -> tuple[Tensor, Tensor]:
-        """Drive and steer [T] at times t [T] in s."""
+        """Return drive and steer [T] at times t [T] in s."""
 
     @classmethod
     def source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
@@ -239,7 +255,13 @@ class Scheduled(Manoeuvre):
 
 
 class Steering(Config):
-    """What manoeuvres share that hold the drive and steer from `start` on."""
+    """The part that manoeuvres share which hold drive and steer from `start` on.
+
+    Attributes:
+        drive: share of full drive, -1 to 1.
+        steer: share of full steer, -1 to 1; positive turns to starboard.
+        start: when the steering begins in s; before, the vessel goes straight ahead.
+    """
 
     drive: float = Field(ge=-1, le=1)
     steer: float = Field(ge=-1, le=1)
@@ -247,7 +269,7 @@ class Steering(Config):
 
 
 class RudderSteering(Config):
-    """What manoeuvres share that a vessel with a rudder may also fly by the angle of it.
+    """The part that manoeuvres share which a vessel with a rudder may fly by its angle.
 
     Attributes:
         drive: held from the beginning, as the approach.
@@ -262,7 +284,7 @@ class RudderSteering(Config):
     start: Seconds = Field(default=5.0, ge=0)
 
     @model_validator(mode="after")
-    def _one(self) -> RudderSteering:
+    def _steer_or_rudder(self) -> RudderSteering:
         if (self.steer is None) == (self.rudder is None):
             raise ValueError(
                 "give either steer (share of full steer, -1 to 1) or rudder (an angle such as '10"
@@ -272,7 +294,7 @@ class RudderSteering(Config):
 
     @property
     def side(self) -> float:
-        """+1 where a positive demand is given, -1 where a negative one."""
+        """The side of the demand: +1 where it is positive, -1 where it is negative."""
         return -1.0 if (self.steer if self.steer is not None else self.rudder or 0.0) < 0 else 1.0
 
     def share(self, helm: Helm) -> float:

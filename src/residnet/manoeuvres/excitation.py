@@ -1,6 +1,4 @@
-"""Random excitation over a band of frequencies: steps of random height and length, and sums of
-sines.
-"""
+"""Random excitation over a band of frequencies: random steps, and sums of sines."""
 
 from __future__ import annotations
 
@@ -31,7 +29,7 @@ Band = Annotated[tuple[Hertz, Hertz], AfterValidator(_ordered)]
 
 
 class Excitation(Scheduled, ABC):
-    """What both kinds share.
+    """The part that both kinds of excitation share.
 
     Attributes:
         drive: mean drive.
@@ -40,6 +38,7 @@ class Excitation(Scheduled, ABC):
         band: frequencies that the demands excite.
         seed: of everything random.
         start: when they begin; before, the drive is held and the steer is zero.
+        kind: kind of the manoeuvre.
     """
 
     drive: float = Field(ge=-1, le=1)
@@ -51,10 +50,15 @@ class Excitation(Scheduled, ABC):
 
     @abstractmethod
     def _wave(self, t: Tensor, which: int) -> Tensor:
-        """Return the wave [T] within +-1 of the drive (0) or steer (1) at times t [T] since the start."""
+        """Return the wave [T] within +-1 of the drive (0) or steer (1).
+
+        Args:
+            t: times [T] since the start in s.
+            which: 0 for the drive, 1 for the steer.
+        """
 
     def demands(self, t: Tensor) -> tuple[Tensor, Tensor]:
-        """Drive and steer [T], clipped to +-1."""
+        """Return drive and steer [T], clipped to +-1."""
         active = t >= self.start - 1e-9
         waves = [
             torch.where(
@@ -68,8 +72,10 @@ class Excitation(Scheduled, ABC):
 
 
 class RandomSteps(Excitation):
-    """Drive and steer jump to levels uniform within their amplitudes; each is held for half a
-    period of a random frequency of the band.
+    """Drive and steer that jump to random levels.
+
+    Levels are uniform within their amplitudes; each is held for half a period of a random frequency
+    of the band.
     """
 
     kind: Literal["random_steps"] = "random_steps"
@@ -86,8 +92,10 @@ class RandomSteps(Excitation):
 
 
 class MultiSine(Excitation):
-    """Sums of sines at frequencies spread evenly in their logarithm over the band, drive and steer
-    at frequencies of their own.
+    """Sums of sines at frequencies spread evenly in their logarithm over the band.
+
+    Drive and steer have frequencies of their own. The phases are the ones with the flattest sum of
+    some random draws, so that the amplitude is well used.
 
     The phases are the ones with the flattest sum of some random draws, so that the amplitude is
     well used.
@@ -100,7 +108,7 @@ class MultiSine(Excitation):
     tones: int = Field(default=8, ge=2, le=200)
 
     def _wave(self, t: Tensor, which: int) -> Tensor:
-        """Return the sum of sines [T], +-1 at most over ten periods of the lowest and clipped there beyond."""
+        """Return the sum of sines [T], within +-1 over ten periods of the lowest; clipped."""
         frequencies = np.geomspace(*self.band, 2 * self.tones)[which::2]
         random = np.random.default_rng([self.seed, which])
         trial = np.arange(0.0, 10.0 / self.band[0], min(0.05 / self.band[1], 0.005 / self.band[0]))
@@ -118,7 +126,16 @@ class MultiSine(Excitation):
 
 
 class _Family(Config):
-    """What the families share; everything uniform in its range, the band as given."""
+    """The part that the families share: everything uniform in its range, the band as given.
+
+    Attributes:
+        count: how many manoeuvres.
+        drive: range of the mean drive.
+        drive_amplitude: range of the drive's amplitude.
+        steer_amplitude: range of the steer's amplitude.
+        band: lowest and highest frequency that the demands excite in Hz.
+        start: when they begin in s.
+    """
 
     count: int = Field(ge=1)
     drive: Range = (0.3, 0.7)
@@ -127,7 +144,9 @@ class _Family(Config):
     band: Band = (0.02, 0.2)
     start: Seconds = 5.0
 
-    def _one(self, random: np.random.Generator) -> dict[str, float | int | tuple[float, float]]:
+    def _draw_common(
+        self, random: np.random.Generator
+    ) -> dict[str, float | int | tuple[float, float]]:
         return {
             "drive": float(random.uniform(*self.drive)),
             "drive_amplitude": float(random.uniform(*self.drive_amplitude)),
@@ -144,19 +163,23 @@ class RandomStepsFamily(_Family):
     kind: Literal["random_steps"] = "random_steps"
 
     def draw(self, random: np.random.Generator, duration: float) -> list[Manoeuvre]:
-        """Return `count` manoeuvres."""
-        return [RandomSteps.model_validate(self._one(random)) for _ in range(self.count)]
+        """Draw `count` manoeuvres with a random generator."""
+        return [RandomSteps.model_validate(self._draw_common(random)) for _ in range(self.count)]
 
 
 class MultiSineFamily(_Family):
-    """Multi-sines with means and amplitudes uniform in their ranges."""
+    """Multi-sines with means and amplitudes uniform in their ranges.
+
+    Attributes:
+        tones: frequencies of each of drive and steer.
+    """
 
     kind: Literal["multi_sine"] = "multi_sine"
     tones: int = Field(default=8, ge=2, le=200)
 
     def draw(self, random: np.random.Generator, duration: float) -> list[Manoeuvre]:
-        """Return `count` manoeuvres."""
+        """Draw `count` manoeuvres with a random generator."""
         return [
-            MultiSine.model_validate({**self._one(random), "tones": self.tones})
+            MultiSine.model_validate({**self._draw_common(random), "tones": self.tones})
             for _ in range(self.count)
         ]

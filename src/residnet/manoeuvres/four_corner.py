@@ -1,5 +1,6 @@
-"""The four-corner course: twelve segments of surge, sway and yaw, alone and together (document 002
-section 4.1, Table 4.1).
+"""The four-corner course: twelve segments of surge, sway and yaw, alone and together.
+
+Source: document 002 section 4.1, Table 4.1.
 """
 
 from __future__ import annotations
@@ -31,8 +32,9 @@ SEGMENTS: tuple[Waypoint, ...] = (
 
 
 class FourCorner(Manoeuvre):
-    """Poses given one after the other through a reference filter, followed by a PID; for vessels
-    that are commanded in all three forces.
+    """Poses given one after the other through a reference filter, followed by a PID.
+
+    The vessel must be commanded in all three forces.
 
     Attributes:
         poses: (north, east, heading); the twelve of the document where absent.
@@ -50,7 +52,7 @@ class FourCorner(Manoeuvre):
 
     @property
     def filter(self) -> ReferenceFilterConfig:
-        """The reference filter."""
+        """The config of the reference filter."""
         return ReferenceFilterConfig(
             waypoints=self.poses,
             interval=self.interval,
@@ -80,14 +82,14 @@ class FourCorner(Manoeuvre):
         reference = self.filter.build(float(log.t[1] - log.t[0]))
         x = torch.from_numpy(log.stack(("x", "y", "psi")))
         s = reference.initial_state(x[:1])
-        wanted = []
+        desired = []
         for k in range(len(log)):
             pose, s = reference(x[k : k + 1], k, s)
-            wanted.append(pose[0, :3].numpy())
-        away = x.numpy() - np.stack(wanted)
-        heading = np.abs((away[:, 2] + math.pi) % (2 * math.pi) - math.pi)
+            desired.append(pose[0, :3].numpy())
+        error = x.numpy() - np.stack(desired)
+        heading = np.abs((error[:, 2] + math.pi) % (2 * math.pi) - math.pi)
         return {
-            "mean_position_error": float(np.hypot(away[:, 0], away[:, 1]).mean()),
+            "mean_position_error": float(np.hypot(error[:, 0], error[:, 1]).mean()),
             "mean_heading_error": float(heading.mean()),
         }
 
@@ -112,7 +114,7 @@ class FourCornerSource(Source):
         return torch.cat((self.reference.initial_state(x), self.policy.initial_state(x)), dim=-1)
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the inputs [B, m]."""
+        """Return the inputs [B, m] and the memory one step later."""
         n = self.reference.n_state
         target, guided = self.reference(x, k, memory[:, :n])
         tau, s = self.policy(x, target, memory[:, n:])

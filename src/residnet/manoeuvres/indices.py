@@ -1,5 +1,7 @@
-"""Manoeuvring indices from logged motion: crossings and peaks between samples, turning circle,
-zigzag, stopping.
+"""Manoeuvring indices from logged motion: turning circle, zigzag, stopping.
+
+Crossings and peaks are found between samples. Definitions as in IMO resolution MSC.137(76) and
+ITTC procedure 7.5-02-06-01. All SI and rad; lengths also in hull lengths.
 
 Definitions as in IMO resolution MSC.137(76) and ITTC procedure 7.5-02-06-01. All SI and rad;
 lengths also in hull lengths.
@@ -51,8 +53,9 @@ _TURN = math.pi / 2
 
 
 class Track:
-    """Motion of a log as smooth functions of its time; samples at which a channel is empty are left
-    out.
+    """The motion of a log as smooth functions of its time.
+
+    Samples at which a channel is empty are left out.
 
     Raises:
         DataError: where fewer than four samples hold all of x, y, psi, u, v, r.
@@ -76,7 +79,7 @@ class Track:
 
     @property
     def end(self) -> float:
-        """Last time."""
+        """The last time in s."""
         return float(self.t[-1])
 
     def approach(self, start: float) -> float:
@@ -102,15 +105,21 @@ class Track:
         time = float(brentq(lambda at: float(rate(at)), low, high, xtol=1e-12))
         return time, float(sign * self.psi(time))
 
-    def beside(self, time: float, origin: float) -> tuple[float, float]:
-        """Return the place at `time` ahead and to starboard of where the vessel was at `origin`, along the heading that it had there."""
+    def relative_position(self, time: float, origin: float) -> tuple[float, float]:
+        """Return the place at `time` in m ahead and to starboard of the vessel's place at `origin`.
+
+        Ahead is along the heading that the vessel had at `origin`; both times are in s.
+        """
         north, east = float(self.x(time) - self.x(origin)), float(self.y(time) - self.y(origin))
         c, s = math.cos(float(self.psi(origin))), math.sin(float(self.psi(origin)))
         return north * c + east * s, east * c - north * s
 
 
 def first_crossing(function: Callable[[Any], Any], t: np.ndarray, after: float) -> float | None:
-    """Return the first time after `after` at which a function rises through zero, between samples at t [T]; None where it does not."""
+    """Return the first time after `after` at which a function rises through zero.
+
+    The time lies between samples at t [T]; None where the function does not rise through zero.
+    """
     times = np.concatenate(([after], t[t > after]))
     values = function(times)
     rising = np.flatnonzero((values[:-1] < 0) & (values[1:] >= 0))
@@ -124,12 +133,12 @@ def first_crossing(function: Callable[[Any], Any], t: np.ndarray, after: float) 
     )
 
 
-def in_lengths(found: dict[str, Any], length: float | None) -> dict[str, Any]:
-    """Return the indices with the distances among them in hull lengths as well, `<index>_lengths`."""
+def in_lengths(indices: dict[str, Any], length: float | None) -> dict[str, Any]:
+    """Return the indices with their distances in hull lengths as well, `<index>_lengths`."""
     if length is None:
-        return found
-    return found | {
-        f"{name}_lengths": value / length for name, value in found.items() if name in IN_LENGTHS
+        return indices
+    return indices | {
+        f"{name}_lengths": value / length for name, value in indices.items() if name in IN_LENGTHS
     }
 
 
@@ -153,16 +162,16 @@ def turning(
     if track.end <= start:
         return {}
     origin = float(track.psi(start))
-    found: dict[str, Any] = {"approach_speed": track.approach(start)}
+    indices: dict[str, Any] = {"approach_speed": track.approach(start)}
     quarter, half = (
         track.crossing(origin + side * angle, start, side) for angle in (_TURN, 2 * _TURN)
     )
     if quarter is not None:
-        ahead, across = track.beside(quarter, start)
-        found |= {"advance": ahead, "transfer": side * across, "time_90": quarter - start}
+        ahead, across = track.relative_position(quarter, start)
+        indices |= {"advance": ahead, "transfer": side * across, "time_90": quarter - start}
     if half is not None:
-        found |= {
-            "tactical_diameter": side * track.beside(half, start)[1],
+        indices |= {
+            "tactical_diameter": side * track.relative_position(half, start)[1],
             "time_180": half - start,
         }
     begin, end = (
@@ -175,15 +184,15 @@ def turning(
     if inside.any():
         speed, rate = float(track.speed[inside].mean()), float(np.abs(track.r[inside].mean()))
         drift = np.arctan2(-side * track.v[inside], track.u[inside])
-        found |= {
+        indices |= {
             "steady_diameter": 2 * speed / rate,
             "steady_speed": speed,
             "steady_yaw_rate": rate,
             "steady_drift_angle": float(drift.mean()),
         }
-        if found["approach_speed"] > 0:
-            found["steady_speed_ratio"] = speed / found["approach_speed"]
-    return in_lengths(found, length)
+        if indices["approach_speed"] > 0:
+            indices["steady_speed_ratio"] = speed / indices["approach_speed"]
+    return in_lengths(indices, length)
 
 
 def zigzag(
@@ -219,46 +228,52 @@ def zigzag(
             time, value = track.peak(reversal, back, towards)
             overshoots.append((time, value - towards * origin - heading))
         now, towards = reversal, -towards
-    found: dict[str, Any] = {
+    indices: dict[str, Any] = {
         "approach_speed": track.approach(start),
         "largest_yaw_rate": float(np.abs(track.r[track.t >= start]).max()),
     }
     if reversals:
-        found["initial_turning_time"] = reversals[0] - start
-        found["initial_turning_distance"] = float(
+        indices["initial_turning_time"] = reversals[0] - start
+        indices["initial_turning_distance"] = float(
             track.travelled(reversals[0]) - track.travelled(start)
         )
         back = track.crossing(origin, reversals[0], -side)
-        found |= {} if back is None else {"reach": back - start}
-    found |= {
+        indices |= {} if back is None else {"reach": back - start}
+    indices |= {
         name: value
         for name, (_, value) in zip(
             ("first_overshoot", "second_overshoot"), overshoots, strict=False
         )
     }
     if overshoots:
-        found["time_to_check_yaw"] = overshoots[0][0] - reversals[0]
+        indices["time_to_check_yaw"] = overshoots[0][0] - reversals[0]
     if len(reversals) > 1:
         times = np.linspace(reversals[0], reversals[1], 500)
-        aside = np.array([side * track.beside(time, start)[1] for time in times])
-        found["overshoot_width"] = float(aside.max() - aside[0])
+        aside = np.array([side * track.relative_position(time, start)[1] for time in times])
+        indices["overshoot_width"] = float(aside.max() - aside[0])
     if len(reversals) > 2:
-        found["period"] = float(np.mean(np.array(reversals[2:]) - np.array(reversals[:-2])))
-    return in_lengths(found, length)
+        indices["period"] = float(np.mean(np.array(reversals[2:]) - np.array(reversals[:-2])))
+    return in_lengths(indices, length)
 
 
 def stopping(log: Log, start: float, length: float | None) -> dict[str, Any]:
-    """Return the indices of a stopping trial from the order at `start` [s] to where the surge velocity is zero: along the track, ahead and across."""
+    """Return the indices of a stopping trial: distances along the track, ahead and across.
+
+    Args:
+        log: t, x, y, psi, u, v, r.
+        start: time of the order astern in s; the trial ends where the surge velocity is zero.
+        length: of the hull in m.
+    """
     track = Track(log)
     surge = CubicSpline(track.t, track.u)
-    found: dict[str, Any] = {"approach_speed": track.approach(start)}
+    indices: dict[str, Any] = {"approach_speed": track.approach(start)}
     stop = first_crossing(lambda t: -surge(t), track.t, start)
     if stop is None:
-        return found
-    ahead, across = track.beside(stop, start)
-    found |= {
+        return indices
+    ahead, across = track.relative_position(stop, start)
+    indices |= {
         "track_reach": float(track.travelled(stop) - track.travelled(start)),
         "head_reach": ahead,
         "lateral_deviation": abs(across),
     }
-    return in_lengths(found | {"stopping_time": stop - start}, length)
+    return in_lengths(indices | {"stopping_time": stop - start}, length)

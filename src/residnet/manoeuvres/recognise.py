@@ -1,6 +1,4 @@
-"""Reading off a measured log which zigzag was steered, so that a model can repeat it in closed
-loop.
-"""
+"""Recognition of the zigzag in a measured log, so that a model can repeat it in closed loop."""
 
 from __future__ import annotations
 
@@ -41,7 +39,7 @@ def steered_zigzag(log: Log, rudder: str) -> SteeredZigzag:
     """Return the zigzag of a log that holds t, psi and a rudder angle.
 
     An order is given at the last sample before the rudder moves, at a tenth of its largest rate.
-    When the rudder left its side is told to a fraction of a sample, by its rate on the way across:
+    When the rudder left its side is known to a fraction of a sample, by its rate on the way across:
     a sample of a coarse grid can be worth half a degree of heading.
 
     Raises:
@@ -52,11 +50,11 @@ def steered_zigzag(log: Log, rudder: str) -> SteeredZigzag:
     middle, angle = 0.5 * (low + high), 0.5 * (high - low)
     rate = np.abs(np.gradient(delta, log.t))
     moving = rate > _MOVING * rate.max()
-    # -1, 0 or +1: the side that the rudder stands on, 0 on its way
-    stands = np.where(np.abs(delta - middle) > _OVER * angle, np.sign(delta - middle), 0.0)
-    over = np.flatnonzero(stands)
-    turned = stands[over[1:]] != stands[over[:-1]]
-    changes = list(zip(over[:-1][turned], over[1:][turned], strict=True))
+    # -1, 0 or +1: the side that the rudder is held on, 0 between them
+    side_held = np.where(np.abs(delta - middle) > _OVER * angle, np.sign(delta - middle), 0.0)
+    over = np.flatnonzero(side_held)
+    changed = side_held[over[1:]] != side_held[over[:-1]]
+    changes = list(zip(over[:-1][changed], over[1:][changed], strict=True))
     if angle == 0.0 or len(changes) < 2:
         raise DataError(
             f"log {log.name}: the rudder is reversed {len(changes)} times; a zigzag needs at"
@@ -74,15 +72,15 @@ def steered_zigzag(log: Log, rudder: str) -> SteeredZigzag:
         )
     towards = side * (-1.0) ** np.arange(len(reversals))
     orders = [int(np.flatnonzero(~moving[:b])[-1]) for _, b in reversals]
-    left = [
-        _left(log.t[a : b + 1], stands[b] * (delta[a : b + 1] - middle) / angle)
+    crossed = [
+        _crossing_time(log.t[a : b + 1], side_held[b] * (delta[a : b + 1] - middle) / angle)
         for a, b in reversals
     ]
     heading, leaves = (
         float(np.mean(towards * psi[orders])),
-        float(np.mean(towards * np.interp(left, log.t, psi))),
+        float(np.mean(towards * np.interp(crossed, log.t, psi))),
     )
-    turning = float(np.mean(towards * np.interp(left, log.t, np.gradient(psi, log.t))))
+    turning = float(np.mean(towards * np.interp(crossed, log.t, np.gradient(psi, log.t))))
     if heading <= 0.0:
         raise DataError(
             f"log {log.name}: the heading does not follow the rudder at the reversals; check the"
@@ -93,7 +91,10 @@ def steered_zigzag(log: Log, rudder: str) -> SteeredZigzag:
     )
 
 
-def _left(t: np.ndarray, way: np.ndarray) -> float:
-    """Return the time at which the rudder leaves -1 for +1, from samples that begin below -1/2 and end above +1/2."""
-    below, above = np.interp((-_OVER, _OVER), np.maximum.accumulate(way), t)
+def _crossing_time(t: np.ndarray, travel: np.ndarray) -> float:
+    """Return the time at which the rudder leaves -1 for +1.
+
+    `travel` [N] goes from below -1/2 to above +1/2 at times t [N].
+    """
+    below, above = np.interp((-_OVER, _OVER), np.maximum.accumulate(travel), t)
     return float(below - (1.0 - _OVER) / (2.0 * _OVER) * (above - below))

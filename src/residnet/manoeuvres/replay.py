@@ -19,8 +19,9 @@ from residnet.manoeuvres.base import Helm, Manoeuvre
 
 
 class Replay(Manoeuvre):
-    """The recorded inputs, each held until the next sample, from the recorded initial state; lasts
-    as long as the log unless `duration` is less.
+    """The recorded inputs, each held until the next sample, from the recorded initial state.
+
+    It lasts as long as the log unless `duration` is less.
 
     Attributes:
         log: file of the log; canonical, or any that the reader of the programme reads.
@@ -40,7 +41,7 @@ class Replay(Manoeuvre):
 
     @property
     def recorded(self) -> Log:
-        """The log.
+        """The log that is replayed.
 
         Raises:
             UsageError: where the file is not canonical and nobody has read it.
@@ -57,18 +58,18 @@ class Replay(Manoeuvre):
         Raises:
             UsageError: where `channels` names a channel that the log does not have.
         """
-        wanted = self.channels.get(name, name)
-        if wanted in self.recorded.channels:
-            return self.recorded[wanted]
+        channel = self.channels.get(name, name)
+        if channel in self.recorded.channels:
+            return self.recorded[channel]
         if name in self.channels:
             raise UsageError(
                 f"replay.channels: log {self.recorded.name} has no channel"
-                f" '{wanted}'{nearest(wanted, self.recorded.channels)}"
+                f" '{channel}'{nearest(channel, self.recorded.channels)}"
             )
         return None
 
     def lasts(self, duration: float) -> float:
-        """As long as the log, or `self.duration` where that is less."""
+        """Return the seconds that the log lasts, or `self.duration` where that is less."""
         span = float(self.recorded.t[-1] - self.recorded.t[0])
         return span if self.duration is None else min(span, self.duration)
 
@@ -107,8 +108,8 @@ class Replay(Manoeuvre):
         Raises:
             UsageError: where the log lacks a command.
         """
-        none = torch.zeros(1, dtype=torch.float64)
-        commands = helm.demand(none, none).shape[-1]
+        no_demand = torch.zeros(1, dtype=torch.float64)
+        commands = helm.demand(no_demand, no_demand).shape[-1]
         clock = self.recorded.t - self.recorded.t[0]
         out = np.full((t.numel(), len(helm.inputs)), np.nan)
         for i, name in enumerate(helm.inputs):
@@ -126,7 +127,11 @@ class Replay(Manoeuvre):
         return torch.from_numpy(out)
 
     def indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
-        """Return how far the motion is from the recorded one: root mean square errors of u, v, r, and where it ends."""
+        """Return how far the motion is from the recorded one.
+
+        These are root mean square errors of u, v, r, and the errors of position and heading at the
+        end.
+        """
         clock = self.recorded.t - self.recorded.t[0]
         errors: dict[str, np.ndarray] = {}
         for name in STATE:
@@ -137,9 +142,9 @@ class Replay(Manoeuvre):
         found: dict[str, Any] = {
             f"rmse_{name}": float(np.sqrt(np.mean(errors[name] ** 2))) for name in VELOCITY
         }
-        away = float(np.hypot(errors["x"][-1], errors["y"][-1]))
+        distance = float(np.hypot(errors["x"][-1], errors["y"][-1]))
         return found | {
-            "position_error_end": away,
+            "position_error_end": distance,
             "heading_error_end": float(abs((errors["psi"][-1] + np.pi) % (2 * np.pi) - np.pi)),
         }
 
@@ -153,7 +158,7 @@ class Replay(Manoeuvre):
 
 @final
 class RecordedSource(Source):
-    """Given inputs [B, T, m]; where they are NaN, what the surroundings give."""
+    """A source of given inputs [B, T, m]; where they are NaN, what the surroundings give."""
 
     def __init__(self, values: Tensor) -> None:
         super().__init__()

@@ -1,5 +1,6 @@
-"""Dieudonne's spiral: a sequence of helm angles, each held until the yaw rate is steady; shows
-whether a vessel keeps its course.
+"""Dieudonne's spiral: a sequence of helm angles, each held until the yaw rate is steady.
+
+It shows whether a vessel is stable on a straight course.
 """
 
 from __future__ import annotations
@@ -22,8 +23,9 @@ _DOWN = (1.0, 0.6, 0.4, 0.2, 0.1, 0.0, -0.1, -0.2, -0.4, -0.6, -1.0)
 
 
 class Spiral(Manoeuvre):
-    """Helm angles from one side to the other and back; an unstable vessel shows a loop of yaw rate
-    over angle.
+    """Helm angles from one side to the other and back.
+
+    An unstable vessel shows a loop of yaw rate over angle.
 
     Attributes:
         drive: held throughout.
@@ -41,7 +43,7 @@ class Spiral(Manoeuvre):
     steady: SteadyConfig = SteadyConfig()
 
     @model_validator(mode="after")
-    def _one(self) -> Spiral:
+    def _steers_or_rudders(self) -> Spiral:
         if self.steers and self.rudders:
             raise ValueError("give steers or rudders, not both")
         if any(abs(steer) > 1 for steer in self.steers):
@@ -59,7 +61,7 @@ class Spiral(Manoeuvre):
 
     @property
     def goal(self) -> str:
-        """All of the angles."""
+        """The steady yaw rate at all of the angles."""
         count = len(self.steers or self.rudders) or 2 * len(_DOWN) - 1
         return f"a steady yaw rate at each of {count} helm angles"
 
@@ -69,7 +71,11 @@ class Spiral(Manoeuvre):
         return SpiralSource([m for m in manoeuvres if isinstance(m, Spiral)], helm, t)
 
     def indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
-        """Return the steady yaw rate of each angle that was finished, in order, and the height of the loop amidships: the largest difference of the yaw rates that the angle nearest to zero had; `steers` are shares of full steer (rad where the log has a rudder)."""
+        """Return the steady yaw rate of each angle that was finished, and the height of the loop.
+
+        The height is the largest difference of the yaw rates that the angle nearest to zero had;
+        `steers` are shares of full steer (rad where the log has a rudder).
+        """
         commands = [name for name in log.channels if name.startswith("cmd_")]
         table = log.stack(commands)
         active = log.t - log.t[0] >= self.start - 1e-9
@@ -91,7 +97,10 @@ class Spiral(Manoeuvre):
 
 @final
 class SpiralSource(Source):
-    """Memory [B, 1 + 3]: number of the present angle, and what `Steady` keeps."""
+    """The source of spirals.
+
+    Memory [B, 1 + 3]: number of the present angle, and the memory of `Steady`.
+    """
 
     def __init__(self, manoeuvres: Sequence[Spiral], helm: Helm, t: Tensor) -> None:
         super().__init__()
@@ -111,22 +120,22 @@ class SpiralSource(Source):
         self.may_stop = True
 
     def initial(self, x: Tensor) -> Tensor:
-        """Return the first angle."""
+        """Return the memory at the first angle."""
         return torch.cat((torch.zeros_like(x[:, :1]), self.steady.initial(x[:, self.r])), dim=-1)
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the inputs [B, m]."""
+        """Return the inputs [B, m] and the memory one step later."""
         over = self.times[k] >= self.start
-        kept = self.steady.again(self.steady(x[:, self.r], memory[:, 1:]), ~over)
-        settled = self.steady.reached(kept)
+        steadiness = self.steady.restart(self.steady(x[:, self.r], memory[:, 1:]), ~over)
+        settled = self.steady.reached(steadiness)
         number = torch.minimum(memory[:, 0] + settled.to(x.dtype), self.count.to(x.dtype))
-        kept = self.steady.again(kept, settled)
+        steadiness = self.steady.restart(steadiness, settled)
         share = self.shares.to(x.dtype).gather(1, number.long().unsqueeze(-1))[:, 0]
         command = self.demand(
             self.drive.to(x.dtype), torch.where(over, share, torch.zeros_like(share))
         )
         return torch.cat((command, w[:, command.shape[-1] :]), dim=-1), torch.cat(
-            (number.unsqueeze(-1), kept), dim=-1
+            (number.unsqueeze(-1), steadiness), dim=-1
         )
 
     def finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:

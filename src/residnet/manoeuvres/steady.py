@@ -12,7 +12,7 @@ from residnet.core.config import Config, Seconds
 
 
 class SteadyConfig(Config):
-    """Steady: for `window` seconds the yaw rate stays near its running mean.
+    """The condition that a turn is steady: for `window` seconds r stays near its running mean.
 
     Attributes:
         window: how long it must stay, and time constant of the running mean; a few times what the
@@ -27,8 +27,9 @@ class SteadyConfig(Config):
 
 @final
 class Steady(nn.Module):
-    """Memory [B, 3]: running mean of r, largest |r| so far, and for how long r has been near the
-    mean.
+    """The recognition of a steady yaw rate.
+
+    Memory [B, 3]: running mean of r, largest |r| so far, and for how long r has been near the mean.
     """
 
     width = 3
@@ -40,7 +41,7 @@ class Steady(nn.Module):
         self.dt = dt
 
     def initial(self, r: Tensor) -> Tensor:
-        """From the first yaw rate [B]."""
+        """Return the memory [B, 3] at the first yaw rate [B]."""
         return torch.stack((r, r.abs(), torch.zeros_like(r)), dim=-1)
 
     def forward(self, r: Tensor, memory: Tensor) -> Tensor:
@@ -54,10 +55,10 @@ class Steady(nn.Module):
         )
 
     def reached(self, memory: Tensor) -> Tensor:
-        """Return [B] bool."""
+        """Return which rows [B] are steady."""
         return memory[:, 2] >= self.window.to(memory.dtype) - 1e-9
 
-    def again(self, memory: Tensor, where: Tensor) -> Tensor:
+    def restart(self, memory: Tensor, where: Tensor) -> Tensor:
         """Return the memory with the wait begun anew in rows [B] bool."""
         return torch.cat(
             (memory[:, :2], memory[:, 2:].masked_fill(where.unsqueeze(-1), 0.0)), dim=-1

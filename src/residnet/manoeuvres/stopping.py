@@ -17,7 +17,15 @@ from residnet.manoeuvres.base import Helm, Manoeuvre
 
 
 class Stopping(Manoeuvre):
-    """`drive` until `start`, then `astern` until the surge velocity is zero; the steer is zero."""
+    """Stopping: `drive` until `start`, then `astern` until the surge velocity is zero.
+
+    The steer is zero.
+
+    Attributes:
+        drive: share of full drive of the approach.
+        astern: share of full drive after the order, negative.
+        start: time of the order in s.
+    """
 
     kind: Literal["stopping"] = "stopping"
     drive: float = Field(gt=0, le=1)
@@ -31,7 +39,7 @@ class Stopping(Manoeuvre):
 
     @property
     def goal(self) -> str:
-        """Rest."""
+        """The end of the manoeuvre: rest."""
         return "a surge velocity of zero"
 
     def indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
@@ -45,7 +53,7 @@ class Stopping(Manoeuvre):
 
 @final
 class StoppingSource(Source):
-    """No memory: what stops is told by the time and the surge velocity."""
+    """The source of stopping trials; time and surge velocity tell all, without memory."""
 
     def __init__(self, manoeuvres: Sequence[Stopping], helm: Helm, t: Tensor) -> None:
         super().__init__()
@@ -57,12 +65,12 @@ class StoppingSource(Source):
         self.may_stop = True
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the inputs [B, m]."""
+        """Return the inputs [B, m]; there is no memory."""
         drive = torch.where(self.times[k] >= self.start, self.astern, self.drive).to(x.dtype)
         command = self.demand(drive, torch.zeros_like(drive))
         return torch.cat((command, w[:, command.shape[-1] :]), dim=-1), memory
 
     def finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
-        """Return the rows that make no way."""
+        """Return which rows [B] make no way any more."""
         stopped: Tensor = (self.times[k] > self.start) & (x[:, self.u] <= 0)
         return stopped

@@ -1,5 +1,6 @@
-"""3-2-1-1: steering steps of 3, 2, 1 and 1 units to alternating sides, rich over a broad band
-(document 003 section 4.2.2).
+"""3-2-1-1: steering steps of 3, 2, 1 and 1 units to alternating sides, rich over a broad band.
+
+Source: document 003 section 4.2.2.
 """
 
 from __future__ import annotations
@@ -18,14 +19,19 @@ _PATTERN = (1.0, 1.0, 1.0, -1.0, -1.0, 1.0, -1.0)
 
 
 class ThreeTwoOneOne(Steering, Scheduled):
-    """The pattern in units of `unit` seconds, once or again and again; zero steer after it."""
+    """The 3-2-1-1 pattern in units of `unit` seconds; zero steer after it.
+
+    Attributes:
+        unit: length of the shortest step in s.
+        repeat: whether the pattern is repeated to the end.
+    """
 
     kind: Literal["three_two_one_one"] = "three_two_one_one"
     unit: Seconds = Field(gt=0)
     repeat: bool = True
 
     def demands(self, t: Tensor) -> tuple[Tensor, Tensor]:
-        """Return constant drive, patterned steer [T]."""
+        """Return constant drive and patterned steer [T]."""
         # times on the grid must not fall short of their unit by rounding
         units = torch.floor((t - self.start) / self.unit + 1e-9).long()
         pattern = torch.tensor(_PATTERN, dtype=t.dtype)
@@ -35,7 +41,15 @@ class ThreeTwoOneOne(Steering, Scheduled):
 
 
 class ThreeTwoOneOneFamily(Config):
-    """3-2-1-1 manoeuvres with unit, steer and drive uniform in their ranges, repeated to the end."""
+    """3-2-1-1 manoeuvres with unit, steer and drive uniform in their ranges, repeated.
+
+    Attributes:
+        count: how many manoeuvres.
+        unit: range of the shortest step in s.
+        steer: range of the share of full steer.
+        drive: range of the share of full drive.
+        start: when the steering begins in s.
+    """
 
     kind: Literal["three_two_one_one"] = "three_two_one_one"
     count: int = Field(ge=1)
@@ -45,7 +59,7 @@ class ThreeTwoOneOneFamily(Config):
     start: Seconds = 5.0
 
     def draw(self, random: np.random.Generator, duration: float) -> list[Manoeuvre]:
-        """Return `count` manoeuvres."""
+        """Draw `count` manoeuvres with a random generator."""
         return [
             ThreeTwoOneOne(
                 unit=float(random.uniform(*self.unit)),

@@ -1,5 +1,6 @@
-"""Turning circle: approach, helm over until the heading has changed by so much, and where asked for
-a pull-out.
+"""Turning circle: approach, then helm over until the heading has changed by an angle.
+
+A pull-out may follow.
 """
 
 from __future__ import annotations
@@ -22,8 +23,9 @@ from residnet.manoeuvres.steady import Steady, SteadyConfig
 
 
 class TurningCircle(RudderSteering, Manoeuvre):
-    """Straight ahead until `start`, then the helm held until the heading has changed by `until`
-    (IMO asks for 540 deg and full rudder).
+    """Straight ahead until `start`, then the helm held until the heading has changed by `until`.
+
+    IMO asks for 540 deg and full rudder.
 
     Attributes:
         until: change of heading.
@@ -64,8 +66,10 @@ class TurningCircle(RudderSteering, Manoeuvre):
 
 @final
 class TurningSource(Source):
-    """Memory [B, 2 + 3]: heading at the helm order; 0 before the heading change is reached, then 1,
-    then 2; what `Steady` keeps.
+    """The source of turning circles.
+
+    Memory [B, 2 + 3]: heading at the helm order; 0 before the heading change is reached, then 1,
+    then 2; the memory of `Steady`.
     """
 
     def __init__(self, manoeuvres: Sequence[TurningCircle], helm: Helm, t: Tensor) -> None:
@@ -84,7 +88,7 @@ class TurningSource(Source):
         self.may_stop = True
 
     def initial(self, x: Tensor) -> Tensor:
-        """Return the present heading, approaching."""
+        """Return the memory [B, 5] at the present heading, in the approach."""
         return torch.cat(
             (x[:, self.psi, None], torch.zeros_like(x[:, :1]), self.steady.initial(x[:, self.r])),
             dim=-1,
@@ -93,7 +97,7 @@ class TurningSource(Source):
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Return the inputs [B, m]; the heading change is tested at the start of the step."""
         origin, phase = memory[:, 0], memory[:, 1]
-        kept = self.steady(x[:, self.r], memory[:, 2:])
+        steadiness = self.steady(x[:, self.r], memory[:, 2:])
         over = self.times[k] >= self.start
         origin = torch.where(over, origin, x[:, self.psi])
         turned = (
@@ -101,15 +105,15 @@ class TurningSource(Source):
             & over
             & (self.side.to(x.dtype) * (x[:, self.psi] - origin) >= self.until.to(x.dtype))
         )
-        kept = self.steady.again(kept, turned)
-        settled = (phase == 1) & self.steady.reached(kept)
+        steadiness = self.steady.restart(steadiness, turned)
+        settled = (phase == 1) & self.steady.reached(steadiness)
         # without a pull-out the heading change is the end
         phase = torch.where(
             turned, 2.0 - self.pull_out.to(x.dtype), torch.where(settled, 2.0, phase)
         )
         steer = torch.where(over & (phase == 0), self.steer.to(x.dtype), torch.zeros_like(phase))
         command = self.demand(self.drive.to(x.dtype), steer)
-        memory = torch.cat((torch.stack((origin, phase), dim=-1), kept), dim=-1)
+        memory = torch.cat((torch.stack((origin, phase), dim=-1), steadiness), dim=-1)
         return torch.cat((command, w[:, command.shape[-1] :]), dim=-1), memory
 
     def finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
@@ -118,7 +122,15 @@ class TurningSource(Source):
 
 
 class TurningCircleFamily(Config):
-    """Turning circles drawn at random: steer and drive uniform in their ranges, to either side."""
+    """Turning circles drawn at random: steer and drive uniform in their ranges, to either side.
+
+    Attributes:
+        count: how many manoeuvres.
+        steer: range of the share of full steer.
+        drive: range of the share of full drive.
+        start: time of the helm order in s.
+        until: change of heading that ends the manoeuvre in rad.
+    """
 
     kind: Literal["turning_circle"] = "turning_circle"
     count: int = Field(ge=1)
@@ -128,7 +140,7 @@ class TurningCircleFamily(Config):
     until: Radians = Field(default=3.0 * math.pi, gt=0)
 
     def draw(self, random: np.random.Generator, duration: float) -> list[Manoeuvre]:
-        """Return `count` manoeuvres."""
+        """Draw `count` manoeuvres with a random generator."""
         out: list[Manoeuvre] = []
         for _ in range(self.count):
             side = 1.0 if random.random() < 0.5 else -1.0

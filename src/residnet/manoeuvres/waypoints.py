@@ -21,8 +21,9 @@ from residnet.manoeuvres.base import Helm, Manoeuvre, StackedSource
 
 
 class Waypoints(Manoeuvre):
-    """Straight legs between way-points: line-of-sight guidance, and steer in proportion to heading
-    error and yaw rate.
+    """Straight legs between way-points, under line-of-sight guidance.
+
+    The steer is in proportion to heading error and yaw rate.
 
     Attributes:
         drive: held throughout.
@@ -51,11 +52,11 @@ class Waypoints(Manoeuvre):
 
     @property
     def goal(self) -> str:
-        """The last of them."""
+        """The end of the manoeuvre: the last way-point."""
         return f"the last of {len(self.points)} way-points"
 
     def indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
-        """Return cross-track errors from the leg that was sailed, and the time that the course took."""
+        """Return cross-track errors from the leg that was sailed, and the time of the course."""
         names = ("x", "y", "psi")
         x = torch.from_numpy(np.nan_to_num(log.stack(names)))
         guidance = WaypointGuidance(self.points, self.acceptance, LookAhead(self.lookahead), names)
@@ -76,7 +77,7 @@ class Waypoints(Manoeuvre):
 
 @final
 class WaypointSource(Source):
-    """Guidance and autopilot of one course; the memory is the guidance's."""
+    """The source of one way-point course; its memory is the guidance's."""
 
     def __init__(self, manoeuvre: Waypoints, helm: Helm) -> None:
         super().__init__()
@@ -97,12 +98,12 @@ class WaypointSource(Source):
         return self.guidance.initial_state(x)
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the inputs [B, m]."""
+        """Return the inputs [B, m] and the memory one step later."""
         heading, memory = self.guidance(x, k, memory)
         steer, _ = self.autopilot(x, heading, x[:, :0])
         command = self.demand(torch.full_like(steer[:, 0], self.drive), steer[:, 0])
         return torch.cat((command, w[:, command.shape[-1] :]), dim=-1), memory
 
     def finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
-        """Arrived at the last way-point."""
+        """Return which rows [B] have arrived at the last way-point."""
         return self.guidance.finished(x, k, memory)

@@ -1,5 +1,6 @@
-"""Zigzag: the steering command changes side whenever the heading reaches its bound (document 003
-section 4.2.2).
+"""Zigzag: the steering changes side whenever the heading reaches its bound.
+
+Source: document 003 section 4.2.2.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from residnet.manoeuvres.base import Helm, Manoeuvre, Range, RudderSteering, Sid
 
 
 class Zigzag(RudderSteering, Manoeuvre):
-    """Steer to one side until the heading has changed by `heading`, then to the other, and so on.
+    """Steering to one side until the heading has changed by `heading`, then to the other, repeated.
 
     Attributes:
         heading: change of heading at which the steering is reversed.
@@ -43,7 +44,7 @@ class Zigzag(RudderSteering, Manoeuvre):
 
     @property
     def goal(self) -> str | None:
-        """So many reversals."""
+        """The end of the manoeuvre: a number of reversals, and the way back."""
         if self.reversals is None:
             return None
         return (
@@ -53,7 +54,7 @@ class Zigzag(RudderSteering, Manoeuvre):
 
     @property
     def begins(self) -> float:
-        """Side of the first execute, +1 starboard or -1 port."""
+        """The side of the first execute, +1 starboard or -1 port."""
         return self.side if self.first == "starboard" else -self.side
 
     def indices(self, log: Log, length: float | None = None) -> dict[str, Any]:
@@ -77,8 +78,10 @@ class Zigzag(RudderSteering, Manoeuvre):
 
 @final
 class ZigzagSource(Source):
-    """Memory [B, 3]: side of the command (+1 starboard, -1 port), heading at the start, reversals
-    so far.
+    """The source of zigzags.
+
+    Memory [B, 3]: side of the command (+1 starboard, -1 port), heading at the start, reversals so
+    far.
     """
 
     def __init__(self, manoeuvres: Sequence[Zigzag], helm: Helm, t: Tensor) -> None:
@@ -130,8 +133,17 @@ class ZigzagSource(Source):
 
 
 class ZigzagFamily(Config):
-    """Zigzags drawn at random: one of the headings, steer and drive uniform in their ranges, either
-    side first.
+    """Zigzags drawn at random.
+
+    The heading is one of some, steer and drive are uniform in their ranges, either side comes
+    first.
+
+    Attributes:
+        count: how many manoeuvres.
+        heading: changes of heading to choose from in rad.
+        steer: range of the share of full steer.
+        drive: range of the share of full drive.
+        start: time of the first execute in s.
     """
 
     kind: Literal["zigzag"] = "zigzag"
@@ -142,7 +154,7 @@ class ZigzagFamily(Config):
     start: Seconds = 5.0
 
     def draw(self, random: np.random.Generator, duration: float) -> list[Manoeuvre]:
-        """Return `count` manoeuvres."""
+        """Draw `count` manoeuvres with a random generator."""
         return [
             Zigzag(
                 heading=float(random.choice(self.heading)),

@@ -216,7 +216,7 @@ class Programme(Config):
         craft = Craft(
             plant_name(self.vessel),
             TracedPlantDynamics(plant, step, self.substeps),
-            Helm.of(plant),
+            Helm.from_plant(plant),
             plant.commands,
             start,
         )
@@ -247,7 +247,7 @@ class Programme(Config):
                 PlantGear(plant, step, self.substeps),
                 Sea(plant, calm, self.noise, self.seed),
             )
-            forces = Helm.of(plant).forces
+            forces = Helm.from_plant(plant).forces
         else:
             raise ConfigError(
                 "a model flies with actuators: name a vessel's in programme.model.actuators, or"

@@ -121,7 +121,7 @@ def trials_craft(config: SimulatedTrials) -> Craft:
     return Craft(
         config.vessel,
         PlantDynamics(plant, config.step, config.substeps),
-        Helm.of(plant),
+        Helm.from_plant(plant),
         plant.commands,
         plant.approach(1),
     )

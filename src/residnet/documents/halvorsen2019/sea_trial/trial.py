@@ -197,7 +197,7 @@ def sail(name: str, config: TrialConfig) -> Trial:
         craft = Craft(
             name,
             TracedPlantDynamics(plant, config.step),
-            Helm.of(plant),
+            Helm.from_plant(plant),
             plant.commands,
             plant.approach(1),
         )
