@@ -42,7 +42,7 @@ def test_a_perfect_model_flies_as_its_vessel(name: str) -> None:
             fly(steered, pd, torch.tensor([0.5, 0.3, -0.4]), VARIED, dt=0.01, duration=8.0)
         )
     # the model divides what a step changes by `time`, which is of first order in the step
-    assert float((flights[0].of("psi") - flights[1].of("psi")).abs().max()) < 1e-3
+    assert float((flights[0].state("psi") - flights[1].state("psi")).abs().max()) < 1e-3
     assert float((flights[0].inputs - flights[1].inputs).abs().max()) < 0.1 * DEG
 
 

@@ -137,5 +137,5 @@ def test_a_flight_is_what_an_ode_solver_says() -> None:
 
     truth = solve_ivp(rates, (0.0, 3.0), [0.0, 0.0], rtol=1e-9, atol=1e-12, max_step=0.01).y[:, -1]
     # the rudder moves in steps, which is half a step late
-    assert float(flights.of("psi")[0, -1]) == pytest.approx(truth[0], rel=5e-3)
-    assert float(flights.of("r")[0, -1]) == pytest.approx(truth[1], rel=5e-3)
+    assert float(flights.state("psi")[0, -1]) == pytest.approx(truth[0], rel=5e-3)
+    assert float(flights.state("r")[0, -1]) == pytest.approx(truth[1], rel=5e-3)

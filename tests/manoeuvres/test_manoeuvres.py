@@ -78,7 +78,7 @@ def test_draws_are_repeatable_by_seed(random_kind: str) -> None:
 
 def test_indices_follow_from_what_was_flown(kind: str, plant: Plant) -> None:
     """Every kind reads its indices off its own flight: finite numbers with a unit."""
-    manoeuvre = drawn(kind)[0]
+    manoeuvre = drawn(kind)[0].model_copy()
     states, commands = fly(plant, [manoeuvre])
     channels = dict(zip(plant.state, states[0, :-1].T.numpy(), strict=True))
     channels |= dict(zip(("cmd_port", "cmd_stbd"), commands[0].T.numpy(), strict=True))

@@ -1,4 +1,4 @@
-"""The interface of controllers and guidance, and the source that flies them in the one time loop."""
+"""The interface of controllers and guidance, and the source that puts them into a rollout."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from residnet.dynamics.rollout import Source
 
 
 class Policy(nn.Module, ABC):
-    """A controller: commands from the state and a reference, once per step; the same tensor code
-    trains, flies and is exported.
+    """A controller: commands from the state and a reference, once per step.
+
+    The same tensor code trains, flies and is exported.
     """
 
     def __init__(self) -> None:
@@ -26,7 +27,13 @@ class Policy(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the command [B, c] and new memory from the state x [B, nx], the reference [B, r] of this step and the memory s [B, n_state]."""
+        """Return the command [B, c] and the new memory.
+
+        Args:
+            x: state [B, nx].
+            reference: reference [B, r] of this step.
+            s: memory [B, n_state].
+        """
 
 
 class Reference(nn.Module, ABC):
@@ -43,7 +50,13 @@ class Reference(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, x: Tensor, k: int, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the reference [B, r] for step k and new memory, from the state x [B, nx] and the memory s [B, n_state]."""
+        """Return the reference [B, r] for step k and the new memory.
+
+        Args:
+            x: state [B, nx].
+            k: number of the step.
+            s: memory [B, n_state].
+        """
 
     def finished(self, x: Tensor, k: int, s: Tensor) -> Tensor:
         """Return [B] bool: rows that have arrived; asked only where `may_finish`."""
@@ -65,8 +78,9 @@ class GivenReference(Reference):
 
 @final
 class ClosedLoop(Source):
-    """A controller under guidance as the source of a rollout's inputs: its commands take the first
-    columns of w.
+    """A controller under guidance as the source of a rollout's inputs.
+
+    Its commands take the first columns of w.
     """
 
     def __init__(self, policy: Policy, reference: Reference) -> None:

@@ -1,5 +1,6 @@
-"""A heading policy as TorchScript for a control loop: input checks and rate limits inside, never a
-command that is no number.
+"""A heading policy as TorchScript for a control loop, with input checks and rate limits inside.
+
+No command is ever NaN or infinite.
 """
 
 from __future__ import annotations
@@ -35,7 +36,9 @@ class Limits(NamedTuple):
 
 
 def memory_limits(policy: HeadingPolicy, turn: float) -> list[tuple[float, float]]:
-    """Return the ranges [low, high] of an exported policy's memory, by `MEMORY` and the last command: what its own steps can lead to, and some room.
+    """Return the ranges [low, high] of an exported policy's memory, by `MEMORY` and last command.
+
+    They hold what its own steps can lead to, with some room.
 
     Args:
         policy: see there.
@@ -87,12 +90,12 @@ class ExportedPolicy(nn.Module):
         )
         self.low: Tensor
         self.high: Tensor
-        kept = memory_limits(policy, limits.r[1])
+        memory_ranges = memory_limits(policy, limits.r[1])
         self.register_buffer(
-            "memory_low", torch.tensor([limit[0] for limit in kept], dtype=torch.float32)
+            "memory_low", torch.tensor([limit[0] for limit in memory_ranges], dtype=torch.float32)
         )
         self.register_buffer(
-            "memory_high", torch.tensor([limit[1] for limit in kept], dtype=torch.float32)
+            "memory_high", torch.tensor([limit[1] for limit in memory_ranges], dtype=torch.float32)
         )
         self.memory_low: Tensor
         self.memory_high: Tensor
@@ -128,7 +131,13 @@ class ExportedPolicy(nn.Module):
 
     @torch.jit.export
     def step(self, y: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the rudder command [B, 1] in rad, memory [B, 10] and fault [B] from y [B, 3] = (psi, u, r), reference heading [B, 1] and memory."""
+        """Return the rudder command [B, 1] in rad, memory [B, 10] and fault [B].
+
+        Args:
+            measured: y [B, 3] = (psi, u, r).
+            reference: heading [B, 1] in rad.
+            s: memory [B, 10].
+        """
         good = (
             self._good(y)
             & torch.isfinite(reference[:, 0])
@@ -148,12 +157,16 @@ class ExportedPolicy(nn.Module):
         return command, torch.cat((memory, command), dim=-1), ~good[:, 0]
 
     def forward(self, y: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """As `step`."""
+        """Return what `step` returns."""
         return self.step(y, reference, s)
 
 
 def for_export(policy: HeadingPolicy, safe: Literal["hold", "amidships"]) -> ExportedPolicy:
-    """Return the policy in float32 with its checks: headings up to 1000 turns, three times its speed, five times the steady turn at full rudder."""
+    """Return the policy in float32 with its checks.
+
+    It takes headings up to 1000 turns, three times its speed, five times the steady turn at full
+    rudder.
+    """
     policy = copy.deepcopy(policy).float().eval().requires_grad_(False)
     policy.read_from(MEASURED)
     turn = 5.0 * policy.gain * policy.limit
@@ -201,7 +214,9 @@ def export_autopilot(
 
 
 def check_parity(name: str, module: ExportedPolicy, exported: Any) -> float:
-    """Return the largest difference of the command from the eager module over 1,000 steps, as a share of the rudder's limit; wrong inputs are among them.
+    """Return the largest difference of the command from the eager module over 1,000 steps.
+
+    It is a share of the rudder's limit; wrong inputs are among the steps.
 
     Raises:
         ExportError: where it exceeds 1e-4, a command is no number, or a wrong input raises no flag.
@@ -213,12 +228,12 @@ def check_parity(name: str, module: ExportedPolicy, exported: Any) -> float:
     reference = (0.5 * torch.sign(torch.sin(0.004 * steps))).reshape(-1, 1, 1)
     wrong = torch.arange(PARITY_STEPS) % 97 == 50
     y[wrong, 0, 2] = torch.nan
-    mine, theirs = module.initial_state(y[0]), exported.initial_state(y[0])
+    eager, scripted = module.initial_state(y[0]), exported.initial_state(y[0])
     worst = 0.0
     with torch.no_grad():
         for k in range(PARITY_STEPS):
-            a, mine, _ = module.step(y[k], reference[k], mine)
-            b, theirs, fault = exported.step(y[k], reference[k], theirs)
+            a, eager, _ = module.step(y[k], reference[k], eager)
+            b, scripted, fault = exported.step(y[k], reference[k], scripted)
             difference = float((a - b).abs().max()) / module.limit
             if not math.isfinite(difference) or bool(fault[0]) != bool(wrong[k]):
                 raise ExportError(
@@ -262,7 +277,7 @@ def _card(
 def measured_entries(
     names: Sequence[str], units: Sequence[str], low: Tensor, high: Tensor
 ) -> list[dict[str, Any]]:
-    """Of a card: names, units and ranges of what an exported controller sees."""
+    """Return the entries of a card for what an exported controller sees: names, units, ranges."""
     return [
         {"name": n, "unit": u, "range": [a, b]}
         for n, u, a, b in zip(names, units, low.tolist(), high.tolist(), strict=True)

@@ -1,5 +1,6 @@
-"""A heading policy and the guidance of a planned course as one TorchScript module: measurements in,
-rudder out.
+"""A heading policy and the guidance of a planned course as one TorchScript module.
+
+Measurements go in, the rudder command comes out.
 """
 
 from __future__ import annotations
@@ -65,7 +66,7 @@ class ExportedCourse(nn.Module):
         self.low: Tensor
         self.high: Tensor
         # relative to the course's motion: rudder and yaw rate may differ by twice their ranges
-        kept = memory_limits(policy, 2.0 * turn)
+        memory_ranges = memory_limits(policy, 2.0 * turn)
         angle = 1.001 * policy.limit
         drift = [(-1.01, 1.01)] * (guidance.n_state - 1)
         ranges = [
@@ -73,7 +74,7 @@ class ExportedCourse(nn.Module):
             *drift,
             (-angle, angle),
             (-2.0 * angle, 2.0 * angle),
-            *kept[1:],
+            *memory_ranges[1:],
         ]
         self.register_buffer(
             "memory_low", torch.tensor([limit[0] for limit in ranges], dtype=torch.float32)
@@ -93,7 +94,10 @@ class ExportedCourse(nn.Module):
 
     @torch.jit.export
     def initial_state(self, y: Tensor) -> Tensor:
-        """Return the memory [B, n] at the first measurement y [B, 6]: the beginning of the course, rudder amidships."""
+        """Return the memory [B, n] at the first measurement y [B, 6].
+
+        It stands at the beginning of the course, rudder amidships.
+        """
         y = torch.where(self._good(y).unsqueeze(-1), y, torch.zeros_like(y))
         return torch.cat(
             (
@@ -109,7 +113,12 @@ class ExportedCourse(nn.Module):
 
     @torch.jit.export
     def step(self, y: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return the rudder command [B, 1] in rad, memory [B, n], fault [B] and arrived [B] from y [B, 6] = `MEASURED` and the memory."""
+        """Return the rudder command [B, 1] in rad, memory [B, n], fault [B] and arrived [B].
+
+        Args:
+            measured: y [B, 6], `MEASURED`.
+            s: memory [B, n].
+        """
         good = self._good(y).unsqueeze(-1)
         y = torch.where(good, y, torch.zeros_like(y))
         last = torch.nan_to_num(s[:, -1:]).clamp(-self.limit, self.limit)
@@ -126,7 +135,7 @@ class ExportedCourse(nn.Module):
         return command, torch.cat((after, command), dim=-1), ~good[:, 0], arrived
 
     def forward(self, y: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """As `step`."""
+        """Return what `step` returns."""
         return self.step(y, s)
 
 
@@ -171,7 +180,9 @@ def export_course(
 
 
 def check_parity(name: str, module: ExportedCourse, exported: Any, course: Course) -> float:
-    """Return the largest difference of the command from the eager module along the course, as a share of the rudder's limit; wrong inputs are among them.
+    """Return the largest difference of the command from the eager module along the course.
+
+    It is a share of the rudder's limit; wrong inputs are among the steps.
 
     The vessel is put beside the course, off its heading, at varying speed, and moves on at the
     service speed.
@@ -199,12 +210,12 @@ def check_parity(name: str, module: ExportedCourse, exported: Any, course: Cours
     ).unsqueeze(1)
     wrong = torch.arange(PARITY_STEPS) % 97 == 50
     y[wrong, 0, 1] = torch.nan
-    mine, theirs = module.initial_state(y[0]), exported.initial_state(y[0])
+    eager, scripted = module.initial_state(y[0]), exported.initial_state(y[0])
     worst = 0.0
     with torch.no_grad():
         for k in range(PARITY_STEPS):
-            a, mine, _, _ = module.step(y[k], mine)
-            b, theirs, fault, _ = exported.step(y[k], theirs)
+            a, eager, _, _ = module.step(y[k], eager)
+            b, scripted, fault, _ = exported.step(y[k], scripted)
             difference = float((a - b).abs().max()) / module.limit
             if not math.isfinite(difference) or bool(fault[0]) != bool(wrong[k]):
                 raise ExportError(

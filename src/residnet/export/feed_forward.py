@@ -1,5 +1,6 @@
-"""Export of a force-space model as a controller's feed-forward tau = F(nu_dot, nu) (document 002
-eq. (3.24)), as TorchScript.
+"""Export of a force-space model as a controller's feed-forward tau = F(nu_dot, nu).
+
+Source: document 002 eq. (3.24).
 """
 
 from __future__ import annotations
@@ -23,8 +24,9 @@ from residnet.physics.signals import FORCE_CHANNELS
 
 @final
 class RequiredForce(nn.Module):
-    """tau [B, 3] = F(nu_dot [B, 3], nu [B, 3]) of a hybrid model in force space: M (nu_dot -
-    nu_dot_0 without forces) + eps, float64, SI.
+    """The force tau [B, 3] = F(nu_dot [B, 3], nu [B, 3]) of a hybrid model in force space.
+
+    It is M (nu_dot - nu_dot_0 without forces) + eps, float64, SI.
     """
 
     def __init__(self, baseline: nn.Module, head: ForceHead) -> None:
@@ -32,10 +34,10 @@ class RequiredForce(nn.Module):
         self.baseline, self.head = baseline, head
 
     def forward(self, nu_dot: Tensor, nu: Tensor) -> Tensor:
-        """Return what the motion needs."""
+        """Return the force tau [B, 3] in N, N, N m that the motion needs."""
         z = torch.cat((nu, torch.zeros_like(nu)), dim=-1)
-        known: Tensor = self.baseline(z)
-        force: Tensor = (nu_dot - known) @ self.head.mass.to(nu.dtype).T + self.head.force(
+        baseline: Tensor = self.baseline(z)
+        force: Tensor = (nu_dot - baseline) @ self.head.mass.to(nu.dtype).T + self.head.force(
             nu_dot, z
         )
         return force
@@ -94,17 +96,20 @@ def export_feed_forward(
     model = model.eval()
 
     def check(exported: Any) -> float:
-        """Return the largest difference at random motions within the training ranges, as a share of each force's range."""
+        """Return the largest difference at random motions within the training ranges.
+
+        It is a share of each force's range.
+        """
         low, high = torch.tensor(ranges, dtype=torch.float64).T
         motion = low + torch.rand(
             200, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64
         ) * (high - low)
         with torch.no_grad():
-            mine, theirs = (
+            eager, scripted = (
                 model(motion[:, :3], motion[:, 3:]),
                 exported(motion[:, :3], motion[:, 3:]),
             )
-        share = float(((mine - theirs).abs().amax(0) / (mine.amax(0) - mine.amin(0))).max())
+        share = float(((eager - scripted).abs().amax(0) / (eager.amax(0) - eager.amin(0))).max())
         if not share < 1e-9:
             raise ExportError(
                 f"{file.name}: the exported feed-forward differs from the model by {share:.1e} of"

@@ -1,5 +1,6 @@
-"""TorchScript files, written one way: scripted, frozen, checked against the eager module, and
-checked again as they lie on disk.
+"""TorchScript files, written one way: scripted, frozen, and checked against the eager module.
+
+They are checked again as they lie on disk.
 """
 
 from __future__ import annotations
@@ -23,8 +24,9 @@ def write_scripted(
     check: Callable[[Any], Parity],
     card: Callable[[Parity], dict[str, Any]],
 ) -> dict[str, Any]:
-    """Write a module as TorchScript with `card.json` as an extra file; the file appears once
-    everything has been checked.
+    """Write a module as TorchScript with `card.json` as an extra file.
+
+    The file appears once everything has been checked.
 
     Args:
         file: where to write.

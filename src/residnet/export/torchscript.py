@@ -47,7 +47,12 @@ class ExportedModel(nn.Module):
 
     @torch.jit.export
     def warmup(self, y_history: Tensor, w_history: Tensor) -> Tensor:
-        """Return the memory s [B, n_state] that a measured past leaves: states [B, T, 6] and inputs [B, T, m], oldest first."""
+        """Return the memory s [B, n_state] that a measured past leaves.
+
+        Args:
+            y_history: states [B, T, 6], oldest first.
+            w_history: inputs [B, T, m], oldest first.
+        """
         s: Tensor = self.simulate.model.warmup(y_history, w_history)  # type: ignore[operator]
         return s
 
@@ -69,7 +74,7 @@ class ExportedModel(nn.Module):
         return states
 
     def forward(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """As `step`."""
+        """Return what `step` returns."""
         return self.step(x, w, s)
 
 
@@ -101,7 +106,11 @@ def export_torchscript(
 
 
 def check_parity(spec: ModelSpec, model: HybridDynamics, exported: Any) -> dict[str, float]:
-    """Return the largest difference of each state between the model and the exported module over 1,000 steps from a warmed-up memory, as a share of its range.
+    """Return the largest difference of each state between model and exported module.
+
+    It is a share of the state's range.
+
+    They run 1,000 steps from a warmed-up memory.
 
     Inputs sweep the training range as slow sines, so that the run passes through what the model
     knows.
@@ -120,16 +129,16 @@ def check_parity(spec: ModelSpec, model: HybridDynamics, exported: Any) -> dict[
     x = y[:, -1].clone()
     with torch.no_grad():
         s = model.warmup(y, w[:, :past])
-        mine, _, _ = Rollout(model)(x, w[:, past:], s)
-        theirs = [x]
+        eager, _, _ = Rollout(model)(x, w[:, past:], s)
+        scripted = [x]
         memory = exported.warmup(y, w[:, :past])
         for k in range(PARITY_STEPS):
             x, memory, _ = exported.step(x, w[:, past + k], memory)
-            theirs.append(x)
-        together = exported.rollout(theirs[0], w[:, past:], exported.warmup(y, w[:, :past]))
-    single = torch.stack(theirs, dim=1)
-    span = (mine.amax(1) - mine.amin(1)).clamp(min=1e-6)
-    worst = torch.maximum((single - mine).abs(), (together - mine).abs()).amax(1) / span
+            scripted.append(x)
+        together = exported.rollout(scripted[0], w[:, past:], exported.warmup(y, w[:, :past]))
+    single = torch.stack(scripted, dim=1)
+    span = (eager.amax(1) - eager.amin(1)).clamp(min=1e-6)
+    worst = torch.maximum((single - eager).abs(), (together - eager).abs()).amax(1) / span
     shares = {name: float(value) for name, value in zip(STATE, worst[0], strict=True)}
     if not torch.isfinite(single).all() or not bool((worst <= PARITY_TOLERANCE).all()):
         raise ExportError(

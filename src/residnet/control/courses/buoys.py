@@ -1,5 +1,6 @@
-"""Courses round buoys, each with a side to pass and a radius to keep: arcs and their common
-tangents (document 004 sections 6.1.4.2, 6.2.4.2).
+"""Courses round buoys, each with a side to pass and a radius to keep: arcs and their tangents.
+
+Source: document 004 sections 6.1.4.2, 6.2.4.2.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ Side = Literal["starboard", "port"]
 
 
 class BuoyConfig(Config):
-    """A buoy.
+    """A buoy with the side to pass it on and the circle to keep out of.
 
     Attributes:
         north, east: where it is.
@@ -32,8 +33,9 @@ class BuoyConfig(Config):
 
 
 class Piece(NamedTuple):
-    """A part of a course: a straight line where `turn` is 0, else an arc to starboard (+1) or port
-    (-1) about a centre.
+    """A part of a course: a straight line (`turn` 0) or an arc about a centre.
+
+    An arc turns to starboard (+1) or port (-1).
 
     Attributes:
         length: in m.
@@ -51,9 +53,7 @@ class Piece(NamedTuple):
 
 
 class Feasibility(NamedTuple):
-    """Whether a vessel can follow a buoy's circle: by number, the radius asked for and the smallest
-    possible one, in m.
-    """
+    """The radius of a buoy's circle beside the smallest that a vessel can turn with, in m."""
 
     buoy: int
     radius: float
@@ -66,7 +66,10 @@ class Feasibility(NamedTuple):
 
 
 def feasibility(buoys: Sequence[BuoyConfig], smallest: float) -> list[Feasibility]:
-    """Return each buoy's radius beside the vessel's smallest turning radius in m (ERRATA 004 G18: both printed courses ask for less)."""
+    """Return each buoy's radius beside the vessel's smallest turning radius in m.
+
+    Both printed courses ask for less than the vessel can do (ERRATA 004 G18).
+    """
     return [Feasibility(number + 1, buoy.radius, smallest) for number, buoy in enumerate(buoys)]
 
 
@@ -76,7 +79,9 @@ def widened(buoys: Sequence[BuoyConfig], smallest: float) -> list[BuoyConfig]:
 
 
 def course_round(start: tuple[float, float], buoys: Sequence[BuoyConfig]) -> list[Piece]:
-    """Return the taut course from a point past the buoys in their order, to the last one's circle: tangents and arcs in turn.
+    """Return the taut course from a point past the buoys in their order, to the last one's circle.
+
+    It consists of tangents and arcs in turn.
 
     A buoy that the course turns away from is left on its side at a distance: the course is drawn
     without it.
@@ -87,28 +92,33 @@ def course_round(start: tuple[float, float], buoys: Sequence[BuoyConfig]) -> lis
     """
     if not buoys:
         raise ConfigError("a course needs at least one buoy")
-    left = list(enumerate(buoys, start=1))
+    remaining = list(enumerate(buoys, start=1))
     while True:
-        pieces = _tangents(start, left)
+        pieces = _tangents(start, remaining)
         arcs = [piece.length / piece.radius for piece in pieces if piece.turn != 0]
-        away = [
-            i for i, arc in enumerate(arcs) if arc > math.pi and not _bends_round(start, left, i)
+        turned_from = [
+            i
+            for i, arc in enumerate(arcs)
+            if arc > math.pi and not _bends_round(start, remaining, i)
         ]
-        if not away:
+        if not turned_from:
             return pieces
-        del left[max(away, key=lambda i: arcs[i])]
+        del remaining[max(turned_from, key=lambda i: arcs[i])]
 
 
 def _bends_round(
     start: tuple[float, float], buoys: Sequence[tuple[int, BuoyConfig]], place: int
 ) -> bool:
-    """Return whether the line from the point before a buoy over it to the next one bends towards the side that it is left on."""
-    own, after = buoys[place][1], buoys[place + 1][1]
+    """Return whether the line over a buoy bends towards the side that the buoy is left on.
+
+    The line runs from the point before the buoy over it to the next one.
+    """
+    buoy, after = buoys[place][1], buoys[place + 1][1]
     north, east = start if place == 0 else (buoys[place - 1][1].north, buoys[place - 1][1].east)
-    bend = (own.north - north) * (after.east - own.east) - (own.east - east) * (
-        after.north - own.north
+    bend = (buoy.north - north) * (after.east - buoy.east) - (buoy.east - east) * (
+        after.north - buoy.north
     )
-    return (bend > 0) == (own.leave_to == "starboard")
+    return (bend > 0) == (buoy.leave_to == "starboard")
 
 
 def _tangents(start: tuple[float, float], buoys: Sequence[tuple[int, BuoyConfig]]) -> list[Piece]:

@@ -1,6 +1,4 @@
-"""Buoy courses as configs: what is asked for, what a vessel can do of it, the plan, and the
-shortest possible course.
-"""
+"""Buoy courses as configs: the request, the plan that a vessel can follow, the shortest course."""
 
 from __future__ import annotations
 
@@ -76,16 +74,14 @@ class PlannedCourse:
 
 
 def smallest_turn(config: BuoyCourseConfig, vessel: SteeredVessel, limit: float) -> SteadyTurn:
-    """Of the nominal vessel at the rudder's limit in rad."""
+    """Return the smallest turn of the nominal vessel, at the rudder's limit in rad."""
     return steady_turn(vessel, limit, config.turning_time, config.planning_dt)
 
 
 def report_feasibility(
     config: BuoyCourseConfig, steady: SteadyTurn
 ) -> list[dict[str, float | bool]]:
-    """Of each buoy: radius asked for, smallest possible radius, in m, and whether the former is
-    possible.
-    """
+    """Return each buoy's radius and the smallest possible one in m, and whether it is possible."""
     return [
         {
             "buoy": found.buoy,
@@ -132,37 +128,37 @@ def plan_course(
 
 
 def _to_enter(config: BuoyCourseConfig, rudder: float) -> list[Mark]:
-    """Return the turns where the line from way-point to way-point bends.
+    """Return the marks where the line from way-point to way-point bends.
 
     One that the line enters anyway needs none.
     """
     depth = -(1.0 - config.reach) * config.acceptance
     places = [config.start, *((buoy.north, buoy.east) for buoy in config.buoys)]
-    left = list(range(1, len(places)))
+    numbers = list(range(1, len(places)))
     marks: list[Mark] = []
     before = places[0]
-    for number, after in itertools.pairwise(left):
-        here, there = places[number], places[after]
+    for number, after in itertools.pairwise(numbers):
+        place, target = places[number], places[after]
         along, across = (
-            (there[0] - before[0], there[1] - before[1]),
+            (target[0] - before[0], target[1] - before[1]),
             (
-                here[0] - before[0],
-                here[1] - before[1],
+                place[0] - before[0],
+                place[1] - before[1],
             ),
         )
         offset = along[0] * across[1] - along[1] * across[0]
         inside = 0 <= along[0] * across[0] + along[1] * across[1] <= along[0] ** 2 + along[1] ** 2
         if inside and abs(offset) <= -depth * math.hypot(*along):
             continue
-        marks.append(Mark(number, *here, -1 if offset > 0 else 1, depth, rudder))
-        before = here
-    return [*marks, Mark(left[-1], *places[-1], 1, depth, rudder)]
+        marks.append(Mark(number, *place, -1 if offset > 0 else 1, depth, rudder))
+        before = place
+    return [*marks, Mark(numbers[-1], *places[-1], 1, depth, rudder)]
 
 
 def _to_pass(
     config: BuoyCourseConfig, buoys: tuple[BuoyConfig, ...], rudder: float, smallest: float
 ) -> list[Mark]:
-    """Return the turns where the taut course bends round a circle."""
+    """Return the marks where the taut course bends round a circle."""
     arcs = [piece for piece in course_round(config.start, buoys) if piece.turn != 0]
     marks = []
     for number, buoy in enumerate(buoys, start=1):
@@ -193,7 +189,7 @@ def _floor(
     config: BuoyCourseConfig, protocol: Protocol, buoys: tuple[BuoyConfig, ...], steady: SteadyTurn
 ) -> float:
     if protocol == "sides":
-        line, *others = course_round(config.start, buoys)
+        line, *rest = course_round(config.start, buoys)
         onto = line.length
         if config.heading is not None:
             end = (
@@ -206,7 +202,7 @@ def _floor(
                     np.array([*config.start, config.heading]), np.array(end), steady.radius
                 )
             )
-        return onto + sum(piece.length for piece in others)
+        return onto + sum(piece.length for piece in rest)
     points = [(buoy.north, buoy.east) for buoy in config.buoys]
     return shortest_course(
         (*config.start, config.heading), points, config.acceptance, steady.radius

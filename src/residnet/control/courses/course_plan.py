@@ -1,5 +1,6 @@
-"""Courses that a vessel can follow: its own turns and the straight legs between, timed so that they
-keep out of circles or reach into them.
+"""Courses that a vessel can follow: its own turns and the straight legs between.
+
+They are timed so that they keep out of circles or reach into them.
 
 A course of arcs and tangents asks for a yaw rate that jumps. A vessel with a yaw time constant T
 runs U T past the point where such an arc begins; here every turn is one that the vessel makes
@@ -15,7 +16,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from residnet.control.courses.course_search import Asked, Family, Mark, Problem, quickest, turned
+from residnet.control.courses.course_search import (
+    CourseRequest,
+    Family,
+    Mark,
+    Problem,
+    quickest,
+    rotated,
+)
 from residnet.control.courses.turns import Array, SteadyTurn, Turn, TurnMaker
 from residnet.control.heading.turning import Turning
 from residnet.core.errors import ConfigError
@@ -85,49 +93,59 @@ def plan(
     Raises:
         ConfigError: where marks lie too close together for the vessel's turns.
     """
-    asked = Asked(np.array(start), heading, tuple(marks), goal, steady.radius, make.turning.speed)
-    search = _Search(asked, make)
-    z, made = search.settle(
-        *search.begin([_guess(asked, make.turning, wide, short) for wide, short in _GUESSES])
+    request = CourseRequest(
+        np.array(start), heading, tuple(marks), goal, steady.radius, make.turning.speed
     )
-    found = search.fixed(made).missed(z)
-    if float(found.max()) > _TOLERANCE:
-        worst = (*marks, goal)[min(int(found.argmax()), len(marks))].number
+    search = _Search(request, make)
+    z, turns = search.converge(
+        *search.begin([_guess(request, make.turning, wide, short) for wide, short in _GUESSES])
+    )
+    missed = search.fixed(turns).missed(z)
+    if float(missed.max()) > _TOLERANCE:
+        worst = (*marks, goal)[min(int(missed.argmax()), len(marks))].number
         raise ConfigError(
             f"no course found that passes mark {worst} as asked for with this vessel's turns; move"
             " it, or allow more rudder"
         )
-    return _composed(asked, z, made, make.turning.speed, step, beyond)
+    return _joined(request, z, turns, make.turning.speed, step, beyond)
 
 
 class _Search:
-    """Rounds of search among turns that are made ever closer to the ones chosen, each from the
-    motion that the one before it leaves.
+    """Rounds of search among turns that are made ever closer to the ones chosen.
+
+    Each turn starts from the motion that the one before it leaves.
     """
 
-    def __init__(self, asked: Asked, make: TurnMaker) -> None:
-        self.asked, self.make = asked, make
+    def __init__(self, request: CourseRequest, make: TurnMaker) -> None:
+        self.request, self.make = request, make
         points = np.array(
-            [asked.start, *[(mark.north, mark.east) for mark in (*asked.marks, asked.goal)]]
+            [request.start, *[(mark.north, mark.east) for mark in (*request.marks, request.goal)]]
         )
         # no leg takes longer
         self.leg = 1.2 * float(np.hypot(*np.diff(points, axis=0).T).max()) / make.turning.speed
 
     def problem(self, holds: Array, rudder: Array, begin: Sequence[Array]) -> Problem:
-        """Of turns made with holds [n, K] in s from the motions given."""
+        """Return the problem of turns made with holds [n, K] in s from the given motions."""
         turns = self.make(holds, rudder, begin, self.leg) if len(holds) else []
         return Problem(
-            self.asked, [Family(own, self.asked.unit) for own in turns], self.make.turning.speed
+            self.request,
+            [Family(group, self.request.unit) for group in turns],
+            self.make.turning.speed,
         )
 
-    def fixed(self, made: Sequence[Turn]) -> Problem:
-        """Of turns as they are."""
+    def fixed(self, turns: Sequence[Turn]) -> Problem:
+        """Return the problem of given turns, whose holds do not change."""
         return Problem(
-            self.asked, [Family([turn], self.asked.unit) for turn in made], self.make.turning.speed
+            self.request,
+            [Family([turn], self.request.unit) for turn in turns],
+            self.make.turning.speed,
         )
 
     def begin(self, guesses: Sequence[tuple[Array, Array]]) -> tuple[Array, Array]:
-        """Return the times and rudder angles of the best course of turns from straight ahead: searched for from each guess, and mark by mark where none of these passes all marks."""
+        """Return the times and rudder angles of the best course of turns from straight ahead.
+
+        It is searched for from each guess, and mark by mark where none of these passes all marks.
+        """
         problems: dict[bytes, Problem] = {}
         tries = []
         for z, rudder in guesses:
@@ -139,20 +157,20 @@ class _Search:
             problem = problems[rudder.tobytes()]
             z = quickest(problem, z, math.inf)
             tries.append((problem.cost(z), z, rudder))
-        _, z, rudder = min(tries, key=lambda one: one[0])
+        _, z, rudder = min(tries, key=lambda attempt: attempt[0])
         problem = problems[rudder.tobytes()]
         if float(problem.missed(z).max()) > _FAR:
-            z = min((z, self._grown(problem, guesses[0][0], rudder)), key=problem.cost)
+            z = min((z, self._mark_by_mark(problem, guesses[0][0], rudder)), key=problem.cost)
         return z, rudder
 
-    def _grown(self, whole: Problem, guess: Array, rudder: Array) -> Array:
-        """Return the times of a course that is searched for to the first mark, then on to the next, and so on."""
-        asked, first = self.asked, self.asked.first
-        marks = (*asked.marks, asked.goal)
+    def _mark_by_mark(self, whole: Problem, guess: Array, rudder: Array) -> Array:
+        """Return the times of a course that is searched for to one mark after the other."""
+        request, first = self.request, self.request.first
+        marks = (*request.marks, request.goal)
         z = guess[: 2 + 2 * first]
         for k, (mark, after) in enumerate(zip(marks, (*marks[1:], None), strict=True)):
             problem = Problem(
-                replace(asked, marks=marks[:k], goal=mark),
+                replace(request, marks=marks[:k], goal=mark),
                 whole.families[: first + k],
                 whole.straight,
             )
@@ -172,57 +190,58 @@ class _Search:
                     abs(float(rudder[first + k])),
                     self.make.turning,
                 )[0]
-                / asked.unit
+                / request.unit
             )
             z = np.array(
-                [*z[:-1], max(z[-1] - 0.5, 0.0), hold, max(size / asked.radius - 0.5, 0.0)]
+                [*z[:-1], max(z[-1] - 0.5, 0.0), hold, max(size / request.radius - 0.5, 0.0)]
             )
         return z
 
     def chain(self, z: Array, rudder: Array) -> list[Turn]:
         """Return the turns of z, each from the motion at the end of the leg before it."""
-        made: list[Turn] = []
+        turns: list[Turn] = []
         state = self.make.straight
         for hold, leg, angle in zip(
-            self.asked.unit * z[2::2], self.asked.unit * z[3::2], rudder, strict=True
+            self.request.unit * z[2::2], self.request.unit * z[3::2], rudder, strict=True
         ):
-            made += self.make(
+            turns += self.make(
                 np.array([[hold]]), np.array([angle]), [state], float(leg) + self.make.turning.time
             )[0]
-            state = made[-1].leg(leg)
-        return made
+            state = turns[-1].leg(leg)
+        return turns
 
-    def settle(self, z: Array, rudder: Array) -> tuple[Array, list[Turn]]:
-        """Return the best of rounds in which turns and legs come to belong to each other."""
-        made = self.chain(z, rudder)
-        best, cost = (z, made), self.fixed(made).cost(z)
+    def converge(self, z: Array, rudder: Array) -> tuple[Array, list[Turn]]:
+        """Return the best of rounds in which turns and legs come to fit each other."""
+        turns = self.chain(z, rudder)
+        best, cost = (z, turns), self.fixed(turns).cost(z)
         for width in _NARROW if len(rudder) else ():
-            left = [
-                turn.leg(self.asked.unit * leg) for turn, leg in zip(made, z[3::2], strict=True)
+            states = [
+                turn.leg(self.request.unit * leg) for turn, leg in zip(turns, z[3::2], strict=True)
             ]
-            apart = width / (self.make.turning.gain * np.abs(rudder))
-            holds = np.maximum(self.asked.unit * z[2::2], 2.0 * apart)[:, None] + apart[
+            spacing = width / (self.make.turning.gain * np.abs(rudder))
+            holds = np.maximum(self.request.unit * z[2::2], 2.0 * spacing)[:, None] + spacing[
                 :, None
             ] * np.arange(-2, 3)
             z = quickest(
-                self.problem(holds, rudder, [self.make.straight, *left[:-1]]), z, 6.0 * width
+                self.problem(holds, rudder, [self.make.straight, *states[:-1]]), z, 6.0 * width
             )
-            made = self.chain(z, rudder)
-            before, now = cost, self.fixed(made).cost(z)
+            turns = self.chain(z, rudder)
+            before, now = cost, self.fixed(turns).cost(z)
             if now < cost:
-                best, cost = (z, made), now
+                best, cost = (z, turns), now
             if (
                 abs(now - before) < _SETTLED * before
-                and float(self.fixed(made).missed(z).max()) < _TOLERANCE
+                and float(self.fixed(turns).missed(z).max()) < _TOLERANCE
             ):
                 break
-        z, made = best
-        return quickest(self.fixed(made), z, _NARROW[-1]), made
+        z, turns = best
+        return quickest(self.fixed(turns), z, _NARROW[-1]), turns
 
 
 def _holds(angles: Array, rudder: float, turning: Turning) -> Array:
-    """For how long [s] the rudder is held for turns of angles [K] in rad by Nomoto's model: K d (t1
-    - t2), t2 = T ln(2 - exp(-t1 / T)).
+    """Return the times in s for which the rudder is held for turns of angles [K] in rad.
+
+    By Nomoto's model they are K d (t1 - t2), t2 = T ln(2 - exp(-t1 / T)).
     """
     plain = angles / (turning.gain * rudder)
     holds = plain
@@ -231,50 +250,61 @@ def _holds(angles: Array, rudder: float, turning: Turning) -> Array:
     return holds
 
 
-def _guess(asked: Asked, turning: Turning, wide: float, short: float) -> tuple[Array, Array]:
-    """Return the tangents of circles about the marks, wider than they are or, where they are entered, a share of the turning radius: times, and rudder angles with their signs."""
+def _guess(
+    request: CourseRequest, turning: Turning, wide: float, short: float
+) -> tuple[Array, Array]:
+    """Return the times and signed rudder angles of tangents of circles about the marks.
+
+    The circles are wider than the marks' or, where these are entered, a share of the turning
+    radius.
+    """
     points = np.array(
-        [asked.start, *[(mark.north, mark.east) for mark in (*asked.marks, asked.goal)]]
+        [request.start, *[(mark.north, mark.east) for mark in (*request.marks, request.goal)]]
     )
     lines = np.diff(points, axis=0)
     sizes = np.hypot(*lines.T)
     circles = [
-        mark.turn * wide * (mark.clearance if mark.clearance > 0 else asked.radius)
-        for mark in asked.marks
+        mark.turn * wide * (mark.clearance if mark.clearance > 0 else request.radius)
+        for mark in request.marks
     ]
-    radii = np.array([0.0, *circles, asked.goal.turn * max(asked.goal.clearance, 0.0)])
+    radii = np.array([0.0, *circles, request.goal.turn * max(request.goal.clearance, 0.0)])
     aside = np.arcsin(np.clip(np.diff(radii) / sizes, -0.99, 0.99))
     headings = np.arctan2(lines[:, 1], lines[:, 0]) - aside
-    signs = np.array([mark.turn for mark in asked.marks], dtype=float)
-    rudder = signs * np.array([mark.rudder for mark in asked.marks])
+    signs = np.array([mark.turn for mark in request.marks], dtype=float)
+    rudder = signs * np.array([mark.rudder for mark in request.marks])
     angles = (signs * np.diff(headings)) % (2.0 * math.pi)
-    legs = np.maximum(sizes * np.cos(aside) / asked.radius - short, 0.0)
-    if asked.heading is not None:
-        first = math.remainder(float(headings[0]) - asked.heading, 2.0 * math.pi)
+    legs = np.maximum(sizes * np.cos(aside) / request.radius - short, 0.0)
+    if request.heading is not None:
+        first = math.remainder(float(headings[0]) - request.heading, 2.0 * math.pi)
         angles = np.concatenate(([abs(first)], angles))
-        rudder = np.concatenate(([math.copysign(asked.goal.rudder, first)], rudder))
-        headings, legs = np.array([asked.heading]), np.concatenate(([0.0], legs))
+        rudder = np.concatenate(([math.copysign(request.goal.rudder, first)], rudder))
+        headings, legs = np.array([request.heading]), np.concatenate(([0.0], legs))
     z = np.zeros(2 + 2 * len(angles))
     z[0], z[1::2] = headings[0], legs
     z[2::2] = [
-        _holds(np.array([angle]), abs(one), turning)[0] / asked.unit
-        for angle, one in zip(angles, rudder, strict=True)
+        _holds(np.array([angle]), abs(rudder_angle), turning)[0] / request.unit
+        for angle, rudder_angle in zip(angles, rudder, strict=True)
     ]
     return z, rudder
 
 
-def _composed(
-    asked: Asked, z: Array, made: Sequence[Turn], speed: float, step: float, beyond: float
+def _joined(
+    request: CourseRequest,
+    z: Array,
+    turns: Sequence[Turn],
+    speed: float,
+    step: float,
+    beyond: float,
 ) -> Course:
     """Return the legs and turns as one course."""
-    level, unit = float(z[0]), asked.unit
-    at = asked.start + speed * unit * float(z[1]) * np.array([math.cos(level), math.sin(level)])
-    parts = [(np.stack((asked.start, at)), np.full(2, level), np.zeros(2))]
-    for turn, leg in zip(made, z[3::2], strict=True):
+    level, unit = float(z[0]), request.unit
+    at = request.start + speed * unit * float(z[1]) * np.array([math.cos(level), math.sin(level)])
+    parts = [(np.stack((request.start, at)), np.full(2, level), np.zeros(2))]
+    for turn, leg in zip(turns, z[3::2], strict=True):
         held = np.where(turn.times < turn.hold, turn.rudder, -turn.rudder)
-        parts.append((at + turned(turn.track, level), level + turn.heading, held))
+        parts.append((at + rotated(turn.track, level), level + turn.heading, held))
         track, heading = turn.along(np.linspace(0.0, unit * float(leg), 500))
-        parts.append((at + turned(track, level), level + heading, np.zeros(500)))
+        parts.append((at + rotated(track, level), level + heading, np.zeros(500)))
         at, level = parts[-1][0][-1], float(parts[-1][1][-1])
     direction = np.array([math.cos(level), math.sin(level)])
     parts.append((np.stack((at, at + beyond * direction)), np.full(2, level), np.zeros(2)))

@@ -1,5 +1,6 @@
-"""The search for the quickest course of turns and legs: what a choice of times gives, by splines
-through simulated turns, and its best choice.
+"""The search for the quickest course of turns and legs.
+
+Splines through simulated turns give what a choice of times leads to.
 """
 
 from __future__ import annotations
@@ -50,8 +51,8 @@ class Mark(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Asked:
-    """Of a course.
+class CourseRequest:
+    """The start, the marks and the end of a course.
 
     Attributes:
         start: north, east [2] in m.
@@ -71,7 +72,7 @@ class Asked:
 
     @property
     def unit(self) -> float:
-        """Of times in s."""
+        """The unit of times in s."""
         return self.radius / self.speed
 
     @property
@@ -95,8 +96,10 @@ class Asked:
 
 @final
 class Family:
-    """A turn and the leg behind it as functions of the time for which the rudder is held: cubic
-    splines through turns made, in units of the course's time; a single turn stands for itself.
+    """A turn and the leg behind it as functions of the time for which the rudder is held.
+
+    They are cubic splines through simulated turns, in units of the course's time; a single turn
+    stands for itself.
 
     Args:
         turns: from one and the same motion, held ever longer.
@@ -124,7 +127,10 @@ class Family:
         self.spline = CubicSpline(holds, np.array(rows)) if len(turns) > 1 else None
 
     def __call__(self, hold: float) -> tuple[Array, Array, Array, float]:
-        """Return the track [N, 2] until the counter-rudder ends, the leg's [M, 2] and its headings [M] by `times`, and when it begins."""
+        """Return the turn's track [N, 2], the leg's [M, 2], its headings [M] and beginning.
+
+        The turn's track ends with the counter-rudder; the leg is sampled at `times`.
+        """
         row = self.row if self.spline is None else self.spline(hold)
         split, end = 2 * self.points, 2 * (self.points + len(self.times))
         return (
@@ -135,82 +141,91 @@ class Family:
         )
 
 
-def turned(points: Array, heading: float) -> Array:
-    """Return the points [N, 2] of a frame with that heading in the earth's."""
+def rotated(points: Array, heading: float) -> Array:
+    """Return the points [N, 2] of a frame with that heading in the earth's frame."""
     c, s = math.cos(heading), math.sin(heading)
     rotated: Array = points @ np.array([[c, s], [-s, c]])
     return rotated
 
 
 def _clearance(mark: Mark, track: Array) -> float:
-    """Return the distance of a mark from a track of straight pieces, positive on the inner side of its turn."""
+    """Return the distance of a mark from a track of straight pieces, positive on the inner side."""
     place = np.array([mark.north, mark.east])
     begin, piece = track[:-1], np.diff(track, axis=0)
     square = (piece**2).sum(axis=1)
     share = np.clip(((place - begin) * piece).sum(axis=1) / np.maximum(square, 1e-12), 0.0, 1.0)
-    away = place - begin - share[:, None] * piece
-    near = int((away**2).sum(axis=1).argmin())
-    side = piece[near, 0] * away[near, 1] - piece[near, 1] * away[near, 0]
-    return math.copysign(math.hypot(*away[near]), side * mark.turn)
+    offset = place - begin - share[:, None] * piece
+    near = int((offset**2).sum(axis=1).argmin())
+    side = piece[near, 0] * offset[near, 1] - piece[near, 1] * offset[near, 0]
+    return math.copysign(math.hypot(*offset[near]), side * mark.turn)
 
 
 @final
 class Problem:
-    """What times give: z = (first heading, leg, hold, leg, hold, ..., leg), in rad and in the
-    course's unit of time.
+    """What a choice of times leads to: z = (first heading, leg, hold, leg, hold, ..., leg).
+
+    Headings are in rad, times in the course's unit of time.
 
     Args:
-        asked: of the course.
+        request: the course that is asked for.
         families: of its turns.
         straight: speed of the first leg in m/s.
     """
 
-    def __init__(self, asked: Asked, families: Sequence[Family], straight: float) -> None:
-        self.asked, self.families, self.straight = asked, families, straight
+    def __init__(self, request: CourseRequest, families: Sequence[Family], straight: float) -> None:
+        self.request, self.families, self.straight = request, families, straight
 
     def legs(self, z: Array) -> tuple[list[tuple[Array, Array]], float, float]:
-        """Return the tracks of each turn (of none before the first leg) and of the leg behind it in the earth's frame, the heading at the end, and the time of all."""
-        level, unit = float(z[0]), self.asked.unit
+        """Return the tracks of turns and legs in the earth's frame, the last heading and the time.
+
+        Before the first leg there is no turn.
+        """
+        level, unit = float(z[0]), self.request.unit
         along = np.array([math.cos(level), math.sin(level)])
-        at = self.asked.start + self.straight * unit * float(z[1]) * along
-        parts, time = [(self.asked.start[None], np.stack((self.asked.start, at)))], float(z[1])
+        at = self.request.start + self.straight * unit * float(z[1]) * along
+        parts, time = [(self.request.start[None], np.stack((self.request.start, at)))], float(z[1])
         for family, hold, leg in zip(self.families, z[2::2], z[3::2], strict=True):
             track, after, heading, begin = family(float(hold))
             passed = int(np.searchsorted(family.times, leg))
             end = np.array([np.interp(leg, family.times, after[:, i]) for i in range(2)])
-            left = np.concatenate((after[:passed], end[None]))
-            parts.append((at + turned(track, level), at + turned(left, level)))
+            remaining = np.concatenate((after[:passed], end[None]))
+            parts.append((at + rotated(track, level), at + rotated(remaining, level)))
             at = parts[-1][1][-1]
             level += float(np.interp(leg, family.times, heading))
             time += begin + float(leg)
         return parts, level, time
 
     def results(self, z: Array) -> Array:
-        """Return the time of the course, clearances of the marks and of the goal, and the distance left along the last leg, where it ends abeam."""
-        asked = self.asked
+        """Return the time, the clearances of marks and goal, and the distance left on the last leg.
+
+        The course ends where that distance is zero: abeam of the goal.
+        """
+        request = self.request
         parts, level, time = self.legs(z)
-        found = []
-        for i, mark in enumerate(asked.marks, start=asked.first):
-            found.append(_clearance(mark, np.concatenate((parts[i][1], *parts[i + 1]))))
-        left = np.array([asked.goal.north, asked.goal.east]) - parts[-1][1][-1]
-        along = left[0] * math.cos(level) + left[1] * math.sin(level)
-        across = asked.goal.turn * (left[1] * math.cos(level) - left[0] * math.sin(level))
-        if asked.goal.clearance > 0:
-            found += [across, along]
+        results = []
+        for i, mark in enumerate(request.marks, start=request.first):
+            results.append(_clearance(mark, np.concatenate((parts[i][1], *parts[i + 1]))))
+        remaining = np.array([request.goal.north, request.goal.east]) - parts[-1][1][-1]
+        along = remaining[0] * math.cos(level) + remaining[1] * math.sin(level)
+        across = request.goal.turn * (
+            remaining[1] * math.cos(level) - remaining[0] * math.sin(level)
+        )
+        if request.goal.clearance > 0:
+            results += [across, along]
         else:
-            found += [math.hypot(along, across), 0.0]
-        return np.array([time, *(value / asked.radius for value in found)])
+            results += [math.hypot(along, across), 0.0]
+        return np.array([time, *(value / request.radius for value in results)])
 
     def missed(self, z: Array) -> Array:
-        """Return how far the clearances lie outside their limits, and the course's end from where it should be, in turning radii."""
-        found = self.results(z)[1:]
+        """Return by how much clearances and the end miss their limits, in turning radii."""
+        results = self.results(z)[1:]
         outside = np.maximum(
-            np.maximum(self.asked.low - found[:-1], found[:-1] - self.asked.high), 0.0
+            np.maximum(self.request.low - results[:-1], results[:-1] - self.request.high), 0.0
         )
-        return np.append(outside, abs(found[-1]))
+        return np.append(outside, abs(results[-1]))
 
     def cost(self, z: Array) -> float:
-        """Return its time, and what it misses as a penalty."""
+        """Return the time of the course, and by how much it misses as a penalty."""
         return float(self.results(z)[0] + _PENALTY * self.missed(z).max())
 
 
@@ -229,12 +244,14 @@ class _Differences:
                 (self.function(z + _DIFFERENCE * unit) - value) / _DIFFERENCE
                 for unit in np.eye(len(z))
             ]
-            self.known = (value, np.stack(columns, axis=-1))
-        return self.known
+            self.last = (value, np.stack(columns, axis=-1))
+        return self.last
 
 
 def quickest(problem: Problem, z: Array, reach: float) -> Array:
-    """Return the best that sequential quadratic programming finds from z, within the times that the families know; a single turn's time stays.
+    """Return the best z that sequential quadratic programming finds from a start.
+
+    Times stay within those that the families know; a single turn's time stays.
 
     The time is linear in z: how far its first steps go depends on the weight of the time beside the
     constraints, so that several are tried.
@@ -244,7 +261,7 @@ def quickest(problem: Problem, z: Array, reach: float) -> Array:
         z: [2 + 2 n] to begin from.
         reach: by which legs may change, in units of time.
     """
-    asked, both = problem.asked, _Differences(problem.results)
+    request, values = problem.request, _Differences(problem.results)
     least, most = z - reach, z + reach
     least[2::2], most[2::2] = (
         [family.low for family in problem.families],
@@ -252,33 +269,33 @@ def quickest(problem: Problem, z: Array, reach: float) -> Array:
     )
     least[3::2] = np.maximum(least[3::2], 0.0)
     most[3::2] = np.minimum(most[3::2], [family.times[-1] for family in problem.families])
-    aside = _ASIDE if asked.heading is None else 0.0
+    aside = _ASIDE if request.heading is None else 0.0
     least[0], most[0] = z[0] - aside, z[0] + aside
     least[1], most[1] = (
-        (max(float(least[1]), 0.0), float(most[1])) if asked.heading is None else (0.0, 0.0)
+        (max(float(least[1]), 0.0), float(most[1])) if request.heading is None else (0.0, 0.0)
     )
     begin = np.clip(z, least, most)
     # its types know no constraints with Jacobians
     solve: Any = minimize
-    found = [begin]
+    candidates = [begin]
     for weight in _WEIGHTS:
         result = solve(
-            lambda z, weight=weight: weight * both(z)[0][0],
+            lambda z, weight=weight: weight * values(z)[0][0],
             begin,
-            jac=lambda z, weight=weight: weight * both(z)[1][0],
+            jac=lambda z, weight=weight: weight * values(z)[1][0],
             method="SLSQP",
             bounds=Bounds(least, most),
-            constraints=_constraints(asked, both),
+            constraints=_constraints(request, values),
             options={"maxiter": _ROUNDS, "ftol": 1e-6 * weight},
         )
-        found.append(np.clip(result.x, least, most))
-    return min(found, key=problem.cost)
+        candidates.append(np.clip(result.x, least, most))
+    return min(candidates, key=problem.cost)
 
 
-def _constraints(asked: Asked, both: _Differences) -> list[dict[str, Any]]:
-    low, high = asked.low, asked.high
+def _constraints(request: CourseRequest, values: _Differences) -> list[dict[str, Any]]:
+    low, high = request.low, request.high
     n, bounded = len(low), np.flatnonzero(np.isfinite(high))
-    if asked.goal.clearance > 0:
+    if request.goal.clearance > 0:
         bounded = bounded[:-1]
         kinds = [
             ("ineq", 1.0, np.arange(1, n), -low[:-1]),
@@ -290,8 +307,8 @@ def _constraints(asked: Asked, both: _Differences) -> list[dict[str, Any]]:
     return [
         {
             "type": kind,
-            "fun": lambda z, sign=sign, rows=rows, shift=shift: sign * both(z)[0][rows] + shift,
-            "jac": lambda z, sign=sign, rows=rows: sign * both(z)[1][rows],
+            "fun": lambda z, sign=sign, rows=rows, shift=shift: sign * values(z)[0][rows] + shift,
+            "jac": lambda z, sign=sign, rows=rows: sign * values(z)[1][rows],
         }
         for kind, sign, rows, shift in kinds
         if len(rows)

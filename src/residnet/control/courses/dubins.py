@@ -1,5 +1,6 @@
-"""Shortest paths of bounded curvature: between poses, and through circles of acceptance. Over the
-speed they are the floor of a course's time.
+"""Shortest paths of bounded curvature: between poses, and through circles of acceptance.
+
+Over the speed they are a lower bound of a course's time.
 """
 
 from __future__ import annotations
@@ -26,13 +27,17 @@ def _centre(pose: np.ndarray, side: float, radius: float) -> np.ndarray:
 
 
 def dubins_length(start: np.ndarray, end: np.ndarray, radius: float) -> np.ndarray:
-    """Return the length [...] in m of the shortest path between poses [..., 3] = (north, east, heading), shapes broadcast, whose turns have a radius of at least `radius` (L. E. Dubins 1957): two arcs and their common tangent, or three arcs."""
+    """Return the length [...] in m of the shortest path between poses of bounded curvature.
+
+    The path is two arcs and their common tangent, or three arcs (L. E. Dubins 1957). Poses [..., 3]
+    = (north, east, heading) broadcast; turns have a radius of at least `radius`.
+    """
     start, end = np.broadcast_arrays(np.asarray(start, dtype=float), np.asarray(end, dtype=float))
     h0, h1 = start[..., 2], end[..., 2]
     best = np.full(h0.shape, np.inf)
     for side in (1.0, -1.0):
-        own = _centre(start, side, radius)
-        line = _centre(end, side, radius) - own
+        centre = _centre(start, side, radius)
+        line = _centre(end, side, radius) - centre
         distance, bearing = (
             np.hypot(line[..., 0], line[..., 1]),
             np.arctan2(line[..., 1], line[..., 0]),
@@ -48,7 +53,7 @@ def dubins_length(start: np.ndarray, end: np.ndarray, radius: float) -> np.ndarr
             first, second = out + side * 0.5 * math.pi, back + side * 0.5 * math.pi
             turned = _arc(side, h0, first) + _arc(-side, first, second) + _arc(side, second, h1)
             best = np.where(distance <= 4.0 * radius, np.minimum(best, radius * turned), best)
-        line = _centre(end, -side, radius) - own
+        line = _centre(end, -side, radius) - centre
         distance, bearing = (
             np.hypot(line[..., 0], line[..., 1]),
             np.arctan2(line[..., 1], line[..., 0]),
@@ -68,7 +73,9 @@ def shortest_course(
     places: int = 24,
     headings: int = 36,
 ) -> float:
-    """Return the length in m of the shortest path from a pose (heading None: any) that enters the circles of acceptance of way-points in their order.
+    """Return the length in m of the shortest path that enters circles of acceptance in their order.
+
+    It begins at a pose (heading None: any).
 
     Dynamic programming over `places` on each circle and `headings` there: an upper bound of the
     shortest, which falls as both grow.

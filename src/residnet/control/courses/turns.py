@@ -1,5 +1,6 @@
-"""Turns as a vessel makes them: rudder held, then counter-rudder until the yaw stops, then
-amidships; from any motion that it comes with.
+"""Turns as a vessel makes them: rudder held, counter-rudder until the yaw stops, amidships.
+
+They begin with any motion.
 """
 
 from __future__ import annotations
@@ -25,8 +26,9 @@ _COUNTER = 1.5
 
 @dataclass(frozen=True)
 class Turn:
-    """A turn from the origin, heading north at the beginning, and the leg behind it with the rudder
-    amidships.
+    """A turn from the origin, heading north at first, and the leg behind it.
+
+    The rudder is amidships on the leg.
 
     Attributes:
         rudder: angle held in rad, positive to starboard; then the same to the other side.
@@ -55,8 +57,7 @@ class Turn:
 
 @final
 class TurnMaker:
-    """Turns of the nominal vessel: rudder held, counter-rudder until the yaw stops, rudder
-    amidships.
+    """Simulated turns of the nominal vessel: rudder held, counter-rudder, rudder amidships.
 
     The three follow from simulations that begin where they do, so that what comes of a turn changes
     smoothly with its time.
@@ -95,7 +96,7 @@ class TurnMaker:
         )
         stops = self._stops(countered, np.sign(rudder)[rows])
         rows = np.arange(n * k)
-        left = self._phase(_of_rows(countered, stops, rows), np.zeros(n * k), leg)
+        leg_motion = self._phase(_of_rows(countered, stops, rows), np.zeros(n * k), leg)
         turns = []
         for row, (hold, stop) in enumerate(zip(holds.ravel(), stops, strict=True)):
             first, then = (
@@ -104,7 +105,7 @@ class TurnMaker:
             )
             states = np.concatenate((held(first)[:-1, row // k], countered(then)[:, row]))
             times = np.concatenate((first[:-1], hold + then))
-            after = PPoly(left.c[:, :, row], left.x)
+            after = PPoly(leg_motion.c[:, :, row], leg_motion.x)
             turns.append(
                 Turn(
                     float(rudder[row // k]),
@@ -158,7 +159,10 @@ class SteadyTurn:
 
 
 def steady_turn(vessel: SteeredVessel, rudder: float, duration: float, dt: float) -> SteadyTurn:
-    """Return what is left after `duration` s of a held rudder angle in rad: at the rudder's limit, the smallest turn that the vessel makes."""
+    """Return the steady turn after `duration` s of a held rudder angle in rad.
+
+    At the rudder's limit it is the smallest turn that the vessel makes.
+    """
     x, w = vessel.start(torch.ones(1, dtype=torch.float64))
     w[:, 0] = rudder
     variation = torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64)

@@ -1,6 +1,4 @@
-"""Guidance along a planned course: where the vessel is along it, and what heading, yaw rate and
-rudder it asks for there.
-"""
+"""Guidance along a planned course: place, heading, yaw rate and rudder that the plan has there."""
 
 from __future__ import annotations
 
@@ -73,7 +71,11 @@ class CourseGuidance(Reference):
         self.may_finish = True
 
     def at(self, place: Tensor) -> Tensor:
-        """Return the north, east, direction, heading, rudder, and the curvatures of direction and heading [B, 7] at places [B] in m."""
+        """Return the plan [B, 7] at places [B] in m along the course.
+
+        The columns are north, east, direction, heading, rudder, and the curvatures of direction and
+        heading.
+        """
         along = (place / self.spacing).clamp(0.0, float(self.table.shape[0]) - 1.001)
         before = along.floor()
         share = (along - before).unsqueeze(-1)
@@ -83,10 +85,10 @@ class CourseGuidance(Reference):
         ].to(place.dtype)
 
     def error(self, x: Tensor, place: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the distance ahead [B] of a place along the course, and cross-track error [B], in m."""
-        known = self.at(place)
-        north, east = x[:, self.x] - known[:, 0], x[:, self.y] - known[:, 1]
-        c, s = torch.cos(known[:, 2]), torch.sin(known[:, 2])
+        """Return the distance ahead [B] of a place on the course and its cross-track error in m."""
+        planned = self.at(place)
+        north, east = x[:, self.x] - planned[:, 0], x[:, self.y] - planned[:, 1]
+        c, s = torch.cos(planned[:, 2]), torch.sin(planned[:, 2])
         return c * north + s * east, c * east - s * north
 
     def forward(self, x: Tensor, k: int, s: Tensor) -> tuple[Tensor, Tensor]:
@@ -95,9 +97,9 @@ class CourseGuidance(Reference):
         ahead, aside = self.error(x, place)
         closeness = (1.0 - self.at(place)[:, 5] * aside).clamp(min=self.least)
         place = (place + (ahead / closeness).clamp(0.0, self.lookahead)).clamp(max=self.farthest)
-        known = self.at(place)
+        planned = self.at(place)
         _, aside = self.error(x, place)
-        direction, heading = known[:, 2], known[:, 3]
+        direction, heading = planned[:, 2], planned[:, 3]
         slope, memory = aside / self.lookahead, s[:, 1:]
         across, along = torch.zeros_like(aside), torch.zeros_like(aside)
         if self.drift is not None:
@@ -109,14 +111,14 @@ class CourseGuidance(Reference):
         slope = slope + across
         speed = torch.sqrt(x[:, self.u].square() + x[:, self.v].square())
         stream = speed / torch.sqrt(1.0 + across.square())
-        away = torch.remainder(x[:, self.psi] - heading + math.pi, 2.0 * math.pi) - math.pi
-        closeness = (1.0 - known[:, 5] * aside).clamp(min=self.least)
-        progress = (speed * torch.cos(away) + stream * along).clamp(min=0.0) / closeness
-        sliding = (speed * torch.sin(away) + stream * across) / self.lookahead - along * known[
-            :, 5
-        ] * progress
-        rate = known[:, 6] * progress - sliding / (1.0 + slope.square())
-        reference = torch.stack((heading - torch.atan(slope), rate, known[:, 4]), dim=-1)
+        heading_error = torch.remainder(x[:, self.psi] - heading + math.pi, 2.0 * math.pi) - math.pi
+        closeness = (1.0 - planned[:, 5] * aside).clamp(min=self.least)
+        progress = (speed * torch.cos(heading_error) + stream * along).clamp(min=0.0) / closeness
+        sliding = (
+            speed * torch.sin(heading_error) + stream * across
+        ) / self.lookahead - along * planned[:, 5] * progress
+        rate = planned[:, 6] * progress - sliding / (1.0 + slope.square())
+        reference = torch.stack((heading - torch.atan(slope), rate, planned[:, 4]), dim=-1)
         return reference, torch.cat((place.unsqueeze(-1), memory), dim=-1)
 
     def finished(self, x: Tensor, k: int, s: Tensor) -> Tensor:

@@ -1,5 +1,6 @@
-"""Line-of-sight guidance with a circle of acceptance that feeds a reference filter (document 002
-section 2.2.2).
+"""Line-of-sight guidance with a circle of acceptance that feeds a reference filter.
+
+Source: document 002 section 2.2.2.
 """
 
 from __future__ import annotations
@@ -61,8 +62,7 @@ class CrossingConfig(Config):
 
 @final
 class Crossing(Reference):
-    """Reference [B, 18] for `Assisted`: the filtered line-of-sight point and what each row's own
-    model needs.
+    """Reference [B, 18] for `Assisted`: the filtered line-of-sight point and each model's force.
 
     Memory [B, 13]: the filter's nine, the number of the leg, the point and heading that were
     steered for last.
@@ -79,14 +79,17 @@ class Crossing(Reference):
         self.points = torch.tensor(config.points, dtype=torch.float64)
 
     def initial_state(self, x: Tensor) -> Tensor:
-        """Return at rest where the ferry is, on the first leg; NaN for no point yet."""
+        """Return the memory at rest where the ferry is, on the first leg; NaN for no point yet."""
         rest = torch.zeros_like(x[:, :1])
         return torch.cat(
             (x[:, :3], rest.expand(-1, 7), torch.full_like(x[:, :3], torch.nan)), dim=-1
         )
 
     def target(self, x: Tensor, heading: Tensor, leg: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the point and heading [B, 3] to steer for from states x [B, nx], and the leg [B] after a change; `heading` [B] is the desired one."""
+        """Return the point and heading [B, 3] to steer for, and the leg [B] after a change.
+
+        `heading` [B] is the desired heading in rad, x [B, nx] the state.
+        """
         last = len(self.points) - 2
         place = x[:, :2]
         near = (self.points[leg + 1] - place).norm(dim=-1) < self.config.circle
@@ -94,14 +97,14 @@ class Crossing(Reference):
         leg = torch.where(near & (leg < last), leg + 1, leg)
         start, end = self.points[leg], self.points[leg + 1]
         along = (end - start) / (end - start).norm(dim=-1, keepdim=True)
-        away = place - start
-        travelled = (away * along).sum(-1)
-        across = away[:, 0] * along[:, 1] - away[:, 1] * along[:, 0]
+        offset = place - start
+        travelled = (offset * along).sum(-1)
+        across = offset[:, 0] * along[:, 1] - offset[:, 1] * along[:, 0]
         reach = (self.config.circle**2 - across.square()).clamp(min=0.0).sqrt()
         point = torch.where(arrived[:, None], end, start + (travelled + reach)[:, None] * along)
         aim = torch.where(arrived[:, None], along, point - place)
-        wanted = torch.atan2(aim[:, 1], aim[:, 0])
-        return torch.cat((point, (heading + wrap(wanted - heading))[:, None]), dim=-1), leg
+        direction = torch.atan2(aim[:, 1], aim[:, 0])
+        return torch.cat((point, (heading + wrap(direction - heading))[:, None]), dim=-1), leg
 
     def forward(self, x: Tensor, k: int, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return the reference [B, 18] of step k and the memory one step later."""

@@ -1,6 +1,4 @@
-"""Integral action of line-of-sight guidance: how far a current that nobody measures sets the vessel
-across its way.
-"""
+"""Integral action of line-of-sight guidance against an unmeasured current."""
 
 from __future__ import annotations
 
@@ -17,7 +15,9 @@ _MOST = 1.0
 
 @final
 class DriftEstimate(nn.Module):
-    """The integral of E. Borhaug, A. Pavlov and K. Y. Pettersen (Integral LOS control for path
+    """An estimate of how a steady current sets the vessel across its way.
+
+    It is the integral of E. Borhaug, A. Pavlov and K. Y. Pettersen (Integral LOS control for path
     following of underactuated marine surface vessels in the presence of constant ocean currents,
     CDC 2008; T. I. Fossen, Handbook of Marine Craft Hydrodynamics and Motion Control, section
     12.3).
@@ -61,7 +61,13 @@ class DriftEstimate(nn.Module):
         return torch.cos(direction) * s[:, 0] + torch.sin(direction) * s[:, 1]
 
     def forward(self, error: Tensor, direction: Tensor, s: Tensor) -> Tensor:
-        """Return the memory after a step at the cross-track error [B] in m from a way in a direction [B] in rad."""
+        """Return the memory after a step.
+
+        Args:
+            s: memory [B, 2].
+            error: cross-track error [B] in m.
+            direction: of the way [B] in rad.
+        """
         aim = error + self.distance * self.across(direction, s)
         grown = self.dt * self.gain * error / (self.distance**2 + aim.square())
         s = s + grown.unsqueeze(-1) * torch.stack(

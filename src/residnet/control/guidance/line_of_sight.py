@@ -22,13 +22,20 @@ class LineOfSight(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, error: Tensor, direction: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the angle [B] in rad, added to the leg's direction [B] in rad, from the cross-track error [B] in m, positive to starboard of the leg; and the memory [B, n_state], zeros at the start."""
+        """Return the angle [B] in rad that is added to the leg's direction, and the memory.
+
+        Args:
+            error: cross-track error [B] in m, positive to starboard of the leg.
+            direction: of the leg [B] in rad.
+            s: memory [B, n_state], zeros at the start.
+        """
 
 
 @final
 class LookAhead(LineOfSight):
-    """Towards the point of the leg that lies a distance before the vessel: -atan(error / distance)
-    (T. I. Fossen, Handbook of Marine Craft Hydrodynamics and Motion Control, section 12.3).
+    """Steering for the point of the leg a distance ahead of the vessel: -atan(error / distance).
+
+    Source: T. I. Fossen, Handbook of Marine Craft Hydrodynamics and Motion Control, section 12.3.
 
     Args:
         distance: along the leg in m.
@@ -45,8 +52,9 @@ class LookAhead(LineOfSight):
 
 @final
 class Enclosure(LineOfSight):
-    """Towards the forward one of the points where a circle about the vessel meets the leg:
-    -asin(error / radius) (Fossen, section 12.3).
+    """Steering for the forward point where a circle about the vessel meets the leg.
+
+    The angle is -asin(error / radius) (Fossen, section 12.3).
 
     Further from the leg than the radius there is none; the vessel then steers straight for the leg.
 
@@ -65,8 +73,9 @@ class Enclosure(LineOfSight):
 
 @final
 class IntegralLookAhead(LineOfSight):
-    """As `LookAhead`, turned further by the crab angle that a steady current asks for: -atan(error
-    / distance + D).
+    """Look-ahead steering with the crab angle that a steady current asks for.
+
+    The angle is -atan(error / distance + D).
 
     Memory [B, 2]: of `DriftEstimate`, whose D across the leg this is.
 

@@ -22,8 +22,9 @@ on from there, for the turn to count on.
 
 @final
 class WaypointGuidance(Reference):
-    """Reference heading [B, 1]: the leg's direction and the angle by which a law of the line of
-    sight steers back to it.
+    """Reference heading [B, 1] along straight legs between way-points.
+
+    It is the leg's direction and the angle by which a law of the line of sight steers back to it.
 
     The leg changes when the vessel enters the circle of acceptance of its way-point, or has passed
     it; with a wheel-over, before that, where the vessel runs along its leg: its cross-track error,
@@ -63,7 +64,7 @@ class WaypointGuidance(Reference):
         self.may_finish = True
 
     def initial_state(self, x: Tensor) -> Tensor:
-        """Return the first way-point, from here."""
+        """Return the memory at the start of the first leg, which begins where the vessel is."""
         rest = torch.zeros(x.shape[0], self.n_state - 3, dtype=x.dtype, device=x.device)
         return torch.cat(
             (
@@ -76,7 +77,10 @@ class WaypointGuidance(Reference):
         )
 
     def leg(self, x: Tensor, number: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the direction [B] of the leg that ends at a way-point in rad, distance [B] still to go along it, and cross-track error [B] in m, positive to starboard of it."""
+        """Return a leg's direction [B] in rad, distance left [B] and cross-track error [B] in m.
+
+        The distance is along the leg; the cross-track error is positive to starboard of it.
+        """
         points = self.points.to(x.dtype)
         target = points[number.clamp(max=len(points) - 1)]
         before = torch.where(

@@ -1,6 +1,4 @@
-"""Wheel-over: how far before a way-point the rudder is put over, so that the vessel comes out of
-its turn on the next leg.
-"""
+"""Wheel-over: how far before a way-point the rudder is put over to come out on the next leg."""
 
 from __future__ import annotations
 
@@ -76,7 +74,11 @@ class WheelOver(nn.Module):
 
 
 def _turns(turning: Turning, limit: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the heading changes [N] in rad from 0 to past pi, where the lines before and after each turn meet [N] in m from its beginning, and its track [N, M, 2] in m, ahead and aside."""
+    """Return heading changes [N], distances to the corner [N] and tracks [N, M, 2] of turns.
+
+    The heading changes go from 0 to past pi in rad; a distance is from a turn's beginning to where
+    the lines before and after it meet, in m; tracks are ahead and aside, in m.
+    """
     full, time = turning.gain * limit, turning.time
     held = np.concatenate(
         ([0.0], np.geomspace(1e-3 * time, math.pi / full + 2.0 * time, 4 * _ANGLES))

@@ -1,1 +1,1 @@
-"""Heading controllers: classical laws, the neural policy, and the vessels that they are flown on."""
+"""Heading controllers: classical laws, the neural policy, and the vessels that they steer."""

@@ -1,5 +1,6 @@
-"""Time-optimal heading changes of Nomoto's first-order model: full rudder, full counter-rudder,
-then a linear law at the target.
+"""Time-optimal heading changes of Nomoto's first-order model.
+
+Full rudder, full counter-rudder, then a linear law at the target.
 """
 
 from __future__ import annotations
@@ -58,7 +59,13 @@ class BangBangHeading(Policy):
         self.kp, self.kd = kp, time / (2.0 * gain) if kd is None else kd
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the rudder command [B, 1] in rad from the state x [B, nx] and the reference heading [B, 1] in rad; it keeps no memory."""
+        """Return the rudder command [B, 1] in rad; there is no memory.
+
+        Args:
+            x: state [B, nx].
+            reference: heading [B, 1] in rad.
+            s: memory [B, 0].
+        """
         r = x[:, self.r : self.r + 1]
         error = wrap(reference - x[:, self.psi : self.psi + 1])
         braking = self.time * (r - r.sign() * self.steady * torch.log1p(r.abs() / self.steady))

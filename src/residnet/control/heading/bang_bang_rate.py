@@ -1,4 +1,4 @@
-"""Time-optimal heading changes of Nomoto's first-order model with a rudder that takes time to move."""
+"""Time-optimal heading changes of Nomoto's first-order model with a rate-limited rudder."""
 
 from __future__ import annotations
 
@@ -18,8 +18,9 @@ _HALVINGS = 40
 
 @final
 class RatedBangBangHeading(Policy):
-    """Full rudder towards the reference until only the braking programme is left, with the rudder
-    moving at its rate.
+    """Full rudder towards the reference until only the braking programme is left.
+
+    The rudder moves at its rate.
 
     The braking programme takes the rudder to an angle on the other side, holds it where that is the
     largest one, and brings it amidships, such that T r_dot + r = K delta (document 004 eq. (5.9))
@@ -67,7 +68,7 @@ class RatedBangBangHeading(Policy):
         self.near, self.slow = capture
 
     def _ramp(self, r: Tensor, start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the yaw rate after the rudder has moved from one angle to another at its rate, and the integral of the angle."""
+        """Return yaw rate and integral of the angle after the rudder has gone to another angle."""
         wait = (end - start).abs() / self.rate
         slope = (end - start).sign() * self.rate
         steady = self.gain * (start - slope * self.time)
@@ -77,7 +78,10 @@ class RatedBangBangHeading(Policy):
         )
 
     def _braked(self, r: Tensor, rudder: Tensor, effort: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the yaw rate after a braking programme of some effort [rad], and the heading gained in it; effort beyond the limit is time held there."""
+        """Return the yaw rate after a braking programme, and the heading gained in it.
+
+        The effort is in rad; beyond the rudder's limit it is time held there.
+        """
         most = effort.clamp(max=self.limit)
         after, first = self._ramp(r, rudder, -most)
         wait = (effort - most) / self.rate
@@ -86,7 +90,13 @@ class RatedBangBangHeading(Policy):
         return end, self.gain * (first - most * wait + last) + self.time * (r - end)
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the rudder command [B, 1] in rad from the state x [B, nx] and the reference heading [B, 1] in rad; it keeps no memory."""
+        """Return the rudder command [B, 1] in rad; there is no memory.
+
+        Args:
+            x: state [B, nx].
+            reference: heading [B, 1] in rad.
+            s: memory [B, 0].
+        """
         error = wrap(reference - x[:, self.psi : self.psi + 1])
         turn, angle = x[:, self.r : self.r + 1], x[:, self.delta : self.delta + 1]
         # this step goes by as it is: the rudder answers at its end

@@ -26,9 +26,7 @@ from residnet.core.errors import ConfigError
 
 
 class Steering(NamedTuple):
-    """What a controller is built for: the vessel, its K and T, the rudder's limit [rad] and the
-    controller's step [s].
-    """
+    """The task of a controller: vessel, K and T, largest rudder angle [rad] and step [s]."""
 
     vessel: SteeredVessel
     turning: Turning
@@ -37,18 +35,18 @@ class Steering(NamedTuple):
 
 
 class Axis(NamedTuple):
-    """Range of a parameter that tuning searches, by its logarithm."""
+    """A range of a parameter that tuning searches, by its logarithm."""
 
     low: float
     high: float
 
 
 class ControllerConfig(Config, ABC):
-    """A heading controller."""
+    """The config of a heading controller."""
 
     @abstractmethod
     def build(self, steering: Steering) -> Policy:
-        """Return the controller.
+        """Build the controller for a vessel.
 
         Raises:
             ConfigError: where a gain is missing that tuning should have filled in.
@@ -64,7 +62,7 @@ class TunedConfig(ControllerConfig, ABC):
 
     @abstractmethod
     def axes(self, turning: Turning) -> dict[str, Axis]:
-        """Return where tuning searches."""
+        """Return the ranges that tuning searches, by parameter."""
 
     @abstractmethod
     def gains(
@@ -79,11 +77,11 @@ class TunedConfig(ControllerConfig, ABC):
             raise ConfigError(
                 f"controller without {', '.join(missing)}: tune it first or give them"
             )
-        given = {
+        parameters = {
             name: torch.tensor(value or 0.0, dtype=torch.float64)
             for name, value in self.parameters().items()
         }
-        kp, kd, ki = (float(gain) for gain in self.gains(given, steering.turning))
+        kp, kd, ki = (float(gain) for gain in self.gains(parameters, steering.turning))
         return HeadingPID(
             steering.vessel.state,
             kp=kp,
@@ -107,11 +105,11 @@ class PdConfig(TunedConfig):
     damping_time: Seconds | None = Field(default=None, gt=0)
 
     def parameters(self) -> dict[str, float | None]:
-        """Return kp and damping_time."""
+        """Return kp and damping_time; None where they are to be tuned."""
         return {"kp": self.kp, "damping_time": self.damping_time}
 
     def axes(self, turning: Turning) -> dict[str, Axis]:
-        """Return two decades of kp, damping within a tenth to twice T."""
+        """Return the ranges: two decades of kp, damping_time from a twentieth of T to twice T."""
         return {
             "kp": Axis(0.3, 60.0),
             "damping_time": Axis(0.05 * turning.time, 2.0 * turning.time),
@@ -120,7 +118,7 @@ class PdConfig(TunedConfig):
     def gains(
         self, parameters: dict[str, Tensor], turning: Turning
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """As given."""
+        """Return kp and kd of the parameters; ki is zero."""
         return (
             parameters["kp"],
             parameters["kp"] * parameters["damping_time"],
@@ -129,7 +127,7 @@ class PdConfig(TunedConfig):
 
 
 class PidConfig(TunedConfig):
-    """As PD, with integral action that stops while the rudder is saturated.
+    """A PD law with integral action that stops while the rudder is saturated.
 
     Attributes:
         kp: rad of rudder per rad of error.
@@ -143,7 +141,7 @@ class PidConfig(TunedConfig):
     integral_time: Seconds | None = Field(default=None, gt=0)
 
     def parameters(self) -> dict[str, float | None]:
-        """Return kp, damping_time, integral_time."""
+        """Return kp, damping_time and integral_time; None where they are to be tuned."""
         return {
             "kp": self.kp,
             "damping_time": self.damping_time,
@@ -151,24 +149,29 @@ class PidConfig(TunedConfig):
         }
 
     def axes(self, turning: Turning) -> dict[str, Axis]:
-        """As PD; the integral takes T to 50 T."""
+        """Return the ranges of a PD law, and an integral_time from T to 50 T."""
         pd = PdConfig().axes(turning)
         return {**pd, "integral_time": Axis(turning.time, 50.0 * turning.time)}
 
     def gains(
         self, parameters: dict[str, Tensor], turning: Turning
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """As given."""
+        """Return kp, kd and ki of the parameters."""
         kp = parameters["kp"]
         return kp, kp * parameters["damping_time"], kp / parameters["integral_time"]
 
 
 class LqrConfig(TunedConfig):
-    """Linear-quadratic regulator of T r_dot + r = K delta: the integral of heading_weight e^2 +
-    rate_weight (T r)^2 + delta^2 is least.
+    """A linear-quadratic regulator of T r_dot + r = K delta.
+
+    The integral of heading_weight e^2 + rate_weight (T r)^2 + delta^2 is least.
 
     The Riccati equation of this model has the solution kp = sqrt(heading_weight), (1 + K kd)^2 = 1
     + K^2 T^2 rate_weight + 2 K T kp.
+
+    Attributes:
+        heading_weight: weight of the squared heading error, dimensionless; None to tune it.
+        rate_weight: weight of the squared yaw rate times T, dimensionless; None to tune it.
     """
 
     kind: Literal["lqr"] = "lqr"
@@ -176,7 +179,7 @@ class LqrConfig(TunedConfig):
     rate_weight: float | None = Field(default=None, ge=0)
 
     def parameters(self) -> dict[str, float | None]:
-        """Return heading_weight, rate_weight."""
+        """Return heading_weight and rate_weight; None where they are to be tuned."""
         return {"heading_weight": self.heading_weight, "rate_weight": self.rate_weight}
 
     def axes(self, turning: Turning) -> dict[str, Axis]:
@@ -197,14 +200,15 @@ class LqrConfig(TunedConfig):
 
 
 class BangBangConfig(ControllerConfig):
-    """Time-optimal control of T r_dot + r = K delta, which knows the vessel and its rudder's rate
-    exactly: the floor.
+    """Time-optimal control of T r_dot + r = K delta, which knows vessel and rudder rate exactly.
+
+    No controller of the nominal vessel can be faster.
     """
 
     kind: Literal["bang_bang"] = "bang_bang"
 
     def build(self, steering: Steering) -> Policy:
-        """Return the controller."""
+        """Build the time-optimal controller of the vessel."""
         vessel, turning = steering.vessel, steering.turning
         if vessel.rate is not None:
             return RatedBangBangHeading(
@@ -238,7 +242,7 @@ class DocumentConfig(ControllerConfig):
     weight: float = Field(default=0.2, ge=0, le=1)
 
     def predictor(self, steering: Steering) -> SimulatedPredictor:
-        """Return the nominal vessel.
+        """Return the exact predictor: a simulation of the nominal vessel.
 
         Long horizons are predicted in steps of at most a twentieth of T.
         """

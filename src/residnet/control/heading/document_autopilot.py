@@ -1,4 +1,7 @@
-"""The predictive heading autopilot of document 004 (section 6.1.3, eqs. (6.3), (6.4), ERRATA 004)."""
+"""The predictive heading autopilot of document 004.
+
+Source: section 6.1.3, eqs. (6.3), (6.4), ERRATA 004.
+"""
 
 from __future__ import annotations
 
@@ -16,8 +19,9 @@ from residnet.dynamics.base import Dynamics
 
 
 class Predictor(nn.Module, ABC):
-    """What heading error and yaw rate each of C rudder angles would lead to, a horizon ahead: a
-    network, or a model that is simulated.
+    """A prediction of heading error and yaw rate after a horizon, for each of C rudder angles.
+
+    It is a network, or a model that is simulated.
     """
 
     @abstractmethod
@@ -59,7 +63,7 @@ class SimulatedPredictor(Predictor):
         self.others: Tensor
 
     def forward(self, x: Tensor, heading: Tensor, rudder: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the heading errors and yaw rates [B, C], all candidates of all rows in one batch."""
+        """Return the heading errors and yaw rates [B, C], all candidates in one batch."""
         rows, candidates = x.shape[0], rudder.shape[0]
         command = rudder.to(x.dtype).repeat(rows).unsqueeze(-1)
         w = torch.cat((command, self.others.to(x.dtype).expand(rows * candidates, -1)), dim=-1)
@@ -73,8 +77,9 @@ class SimulatedPredictor(Predictor):
 
 @final
 class NetworkPredictor(Predictor):
-    """A perceptron with one output for each rudder angle: how heading and yaw rate change over the
-    horizon (sections 6.1.2 and 6.2.2).
+    """A perceptron that predicts the changes of heading and yaw rate over the horizon.
+
+    It has outputs for each rudder angle (sections 6.1.2 and 6.2.2).
 
     What moves the vessel goes in: velocities, heel, and the rudder's angle where it takes time to
     move. Where the vessel is and heads changes nothing in calm water, so that the heading error
@@ -111,9 +116,9 @@ class NetworkPredictor(Predictor):
 
     def calibrate(self, x: Tensor, change: Tensor) -> None:
         """Take the scales from states [S, nx] and their changes [S, 2, C]."""
-        seen = x[:, self.take]
-        self.centre.copy_(seen.mean(0))
-        spread = seen.std(0)
+        inputs = x[:, self.take]
+        self.centre.copy_(inputs.mean(0))
+        spread = inputs.std(0)
         # what does not vary says nothing; Nomoto's speed is one
         self.spread.copy_(torch.where(spread > 1e-9 * (1.0 + self.centre.abs()), spread, 1.0))
         self.offset.copy_(change.mean(0))
@@ -122,7 +127,7 @@ class NetworkPredictor(Predictor):
         )
 
     def changes(self, x: Tensor) -> Tensor:
-        """Return the changes of heading and yaw rate [B, 2, C] over the horizon from states x [B, nx]."""
+        """Return the changes of heading and yaw rate [B, 2, C] over the horizon."""
         out: Tensor = self.network((x[:, self.take] - self.centre) / self.spread)
         return out.reshape(len(x), 2, -1) * self.scale + self.offset
 
@@ -139,8 +144,9 @@ class NetworkPredictor(Predictor):
 
 @final
 class DocumentAutopilot(Policy):
-    """delta = weight d_e + (1 - weight) d_r: of the candidates, d_e leads to the smallest heading
-    error and d_r to the smallest yaw rate.
+    """The law delta = weight d_e + (1 - weight) d_r among candidate rudder angles.
+
+    d_e leads to the smallest heading error and d_r to the smallest yaw rate.
 
     The source takes 41 candidates between -5 and 5 deg, weight 0.2 and a horizon of one step of
     0.01 s. There the first choice saturates and the second stops the yaw, so that it turns at 0.011
@@ -173,7 +179,13 @@ class DocumentAutopilot(Policy):
         self.rudder: Tensor
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the rudder command [B, 1] in rad from the state x [B, nx] and the reference heading [B, 1] in rad; it keeps no memory."""
+        """Return the rudder command [B, 1] in rad; there is no memory.
+
+        Args:
+            x: state [B, nx].
+            reference: heading [B, 1] in rad.
+            s: memory [B, 0].
+        """
         error, rate = self.predictor(x, reference[:, 0], self.rudder)
         rudder = self.rudder.to(x.dtype)
         toward, calm = rudder[wrap(error).abs().argmin(-1)], rudder[rate.abs().argmin(-1)]

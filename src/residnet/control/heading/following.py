@@ -1,6 +1,4 @@
-"""Heading controllers on a moving reference: they see where they are against it, and the rudder
-that the motion itself needs is added.
-"""
+"""Heading controllers on a moving reference: the rudder that the motion itself needs is added."""
 
 from __future__ import annotations
 
@@ -19,8 +17,9 @@ FOLLOWED = ("heading", "yaw_rate", "rudder")
 
 @final
 class Following(Policy):
-    """delta = delta_d + law(psi - psi_d, r - r_d), saturated: any heading controller follows turns
-    as it holds a course.
+    """The law delta = delta_d + law(psi - psi_d, r - r_d), saturated.
+
+    Any heading controller follows turns with it as it holds a course.
 
     T r_dot + r = K delta has the same form for the differences from a motion that fulfils it, so
     that a law for steps of the heading corrects them and lags behind nothing. A law with an
@@ -59,12 +58,18 @@ class Following(Policy):
         return torch.cat((torch.zeros_like(x[:, :1]), self.law.initial_state(x)), dim=-1)
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the rudder command [B, 1] in rad and memory from the state x [B, nx], the reference [B, 3] and the memory."""
+        """Return the rudder command [B, 1] in rad and the memory.
+
+        Args:
+            x: state [B, nx].
+            reference: reference [B, 3], `FOLLOWED`.
+            s: memory [B, 1 + n_state of the law].
+        """
         needed = reference[:, 2:3]
-        away = x.clone()
-        away[:, self.psi] = x[:, self.psi] - reference[:, 0]
-        away[:, self.r] = x[:, self.r] - reference[:, 1]
-        correction, memory = self.law(away, torch.zeros_like(needed), s[:, 1:])
+        relative = x.clone()
+        relative[:, self.psi] = x[:, self.psi] - reference[:, 0]
+        relative[:, self.r] = x[:, self.r] - reference[:, 1]
+        correction, memory = self.law(relative, torch.zeros_like(needed), s[:, 1:])
         command = (needed + correction).clamp(-self.limit, self.limit)
         rudder = s[:, 0:1] + (command - s[:, 0:1]).clamp(-self.travel, self.travel)
         if self.observes:

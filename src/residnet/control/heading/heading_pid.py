@@ -1,6 +1,4 @@
-"""Heading autopilot: proportional, derivative and integral action on the heading error, within the
-rudder's limit.
-"""
+"""A heading autopilot: proportional, derivative and integral action on the heading error."""
 
 from __future__ import annotations
 
@@ -17,8 +15,9 @@ from residnet.core.frames import wrap
 
 @final
 class HeadingPID(Policy):
-    """delta = kp e - kd r + ki I, saturated, with e the wrapped heading error and I_dot = e while
-    the command is not saturated by it.
+    """The law delta = kp e - kd r + ki I, saturated, with e the wrapped heading error.
+
+    I_dot = e while the command is not saturated by it.
 
     Memory: I [rad s], where ki > 0. The command of a step uses the integral before that step's
     error enters it.
@@ -64,7 +63,10 @@ class HeadingPID(Policy):
         damping: float,
         limit: float,
     ) -> HeadingPID:
-        """Return the pD that gives T r_dot + r = K delta (document 004 eq. (5.9)) poles of natural frequency [rad/s] and relative damping."""
+        """Return the PD law that gives T r_dot + r = K delta a natural frequency and damping.
+
+        The frequency is in rad/s, the damping relative (document 004 eq. (5.9)).
+        """
         return cls(
             state,
             kp=time * frequency**2 / gain,
@@ -73,7 +75,13 @@ class HeadingPID(Policy):
         )
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the rudder command [B, 1] in rad and the integral [B, 0 or 1] from the state x [B, nx] and the reference heading [B, 1] in rad."""
+        """Return the rudder command [B, 1] in rad and the integral [B, 0 or 1] in rad s.
+
+        Args:
+            x: state [B, nx].
+            reference: heading [B, 1] in rad.
+            s: integral [B, 0 or 1] in rad s.
+        """
         error = wrap(reference - x[:, self.psi : self.psi + 1])
         wish = self.kp * error - self.kd * x[:, self.r : self.r + 1]
         if self.n_state == 0:

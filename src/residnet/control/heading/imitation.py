@@ -39,13 +39,13 @@ class SideBySide(Source):
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Return the inputs [B, m] with the pupil's command."""
         sizes = [self.reference.n_state, self.pupil.n_state, self.teacher.n_state]
-        guided, own, other = memory.split(sizes, dim=-1)
-        target, guided = self.reference(x, k, guided)
+        reference_memory, pupil_memory, teacher_memory = memory.split(sizes, dim=-1)
+        target, reference_memory = self.reference(x, k, reference_memory)
         x = x.detach()
-        command, own = self.pupil(x, target, own.detach())
+        command, pupil_memory = self.pupil(x, target, pupil_memory.detach())
         with torch.no_grad():
-            shown, other = self.teacher(x, target, other)
-        self.total = self.total + (command - shown).square().mean()
+            example, teacher_memory = self.teacher(x, target, teacher_memory)
+        self.total = self.total + (command - example).square().mean()
         return torch.cat((command.detach(), w[:, command.shape[-1] :]), dim=-1), torch.cat(
-            (guided, own, other), dim=-1
+            (reference_memory, pupil_memory, teacher_memory), dim=-1
         )

@@ -1,5 +1,6 @@
-"""The neural heading autopilot: a small network around a linear law, with an observer of what
-pushes the bow.
+"""The neural heading autopilot: a small network around a linear law, with an observer.
+
+The observer estimates what pushes the bow.
 """
 
 from __future__ import annotations
@@ -35,8 +36,9 @@ _DOUBT = 0.02
 
 @final
 class HeadingPolicy(Policy):
-    """delta = k (e - g(r)) + phi - b, saturated: a proximate time-optimal law, a network phi that
-    corrects it, and a push b taken away.
+    """The law delta = k (e - g(r)) + phi - b, saturated: time-optimal law, network and observer.
+
+    phi is a network that corrects a proximate time-optimal law, b a push that is taken away.
 
     g(r) is the heading in which full counter-rudder still stops the yaw rate r: the braking
     distance of T r_dot + r = K delta far away, a straight line near the reference (M. L. Workman,
@@ -102,52 +104,72 @@ class HeadingPolicy(Policy):
         self.law = nn.Parameter(torch.tensor([steep, 0.98, 0.92, 0.2]).log())
 
     def read_from(self, state: Sequence[str]) -> None:
-        """Take heading, speed and yaw rate from a state with these names, for a vessel other than
-        the one that it was trained on.
+        """Take heading, speed and yaw rate from a state with these names.
+
+        This serves a vessel other than the one that the policy was trained on.
         """
         self.psi, self.u, self.r = state.index("psi"), state.index("u"), state.index("r")
 
     def initial_state(self, x: Tensor) -> Tensor:
-        """Return the memory [B, 9]: rudder amidships, the yaw rate as if it had been steady, no push, the vessel as expected."""
+        """Return the memory [B, 9] at the start: rudder amidships, a steady yaw rate, no push.
+
+        The vessel is taken to be as expected.
+        """
         r = x[:, self.r : self.r + 1]
         gain = self.gain * self._ratio(x)
-        none, one = torch.zeros_like(r), torch.ones_like(r)
+        zeros, ones = torch.zeros_like(r), torch.ones_like(r)
         return torch.cat(
             (
-                none,
+                zeros,
                 r,
                 r / (gain * self.limit),
-                none,
-                one,
-                one,
-                self.prior * one,
-                none,
-                self.prior * one,
+                zeros,
+                ones,
+                ones,
+                self.prior * ones,
+                zeros,
+                self.prior * ones,
             ),
             dim=-1,
         )
 
     def _ratio(self, x: Tensor) -> Tensor:
-        """Return the speed [B, 1] as a multiple of the service speed; K goes with it, T against it."""
+        """Return the speed [B, 1] as a multiple of the service speed.
+
+        K grows with it, T falls with it.
+        """
         return (x[:, self.u : self.u + 1] / self.speed).clamp(0.3, 3.0)
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the rudder command [B, 1] in rad and memory from the state x [B, nx] and the reference heading [B, 1] in rad."""
+        """Return the rudder command [B, 1] in rad and the memory.
+
+        Args:
+            x: state [B, nx].
+            reference: heading [B, 1] in rad.
+            s: memory [B, 9].
+        """
         error = wrap(reference - x[:, self.psi : self.psi + 1])
         r = x[:, self.r : self.r + 1]
         ratio = self._ratio(x)
         per_time = ratio / self.time
         steady = self.gain * ratio * self.limit
-        known = self._estimate(r, per_time, steady, s)
-        rudder, push, effect, damping = known[:, 0:1], known[:, 3:4], known[:, 4:5], known[:, 5:6]
+        estimate = self._estimate(r, per_time, steady, s)
+        rudder, push, effect, damping = (
+            estimate[:, 0:1],
+            estimate[:, 3:4],
+            estimate[:, 4:5],
+            estimate[:, 5:6],
+        )
         acting, turn = (rudder + push) / self.limit, r / steady
         force, decay = effect * per_time * steady, damping * per_time
         steep, share, stiff, caution = torch.exp(self.law).unbind()
-        counted = share * force * torch.exp(-caution * known[:, 6:7] / self.prior)
-        ahead, turned = self._centred(error, r, acting, force, decay)
-        wanted = steep * (ahead - self._braking(turned, counted, decay, steep * force, stiff))
+        counted = share * force * torch.exp(-caution * estimate[:, 6:7] / self.prior)
+        ahead, turn_rate_left = self._centred(error, r, acting, force, decay)
+        command_share = steep * (
+            ahead - self._braking(turn_rate_left, counted, decay, steep * force, stiff)
+        )
         near = torch.tanh(6.0 * error)
-        seen = torch.cat(
+        features = torch.cat(
             (
                 2.0 * error,
                 near,
@@ -155,7 +177,7 @@ class HeadingPolicy(Policy):
                 2.0 * turn,
                 torch.tanh(6.0 * turn),
                 acting,
-                torch.tanh(0.5 * wanted),
+                torch.tanh(0.5 * command_share),
                 3.0 * (effect - 1.0) * near,
                 5.0 * (effect - 1.0) * turn,
                 (effect - 1.0) * acting,
@@ -164,15 +186,15 @@ class HeadingPolicy(Policy):
             ),
             dim=-1,
         )
-        command = (self.limit * (wanted + 3.0 * self.network(seen)) - push).clamp(
+        command = (self.limit * (command_share + 3.0 * self.network(features)) - push).clamp(
             -self.limit, self.limit
         )
         step = self.rate * self.dt
         follows = rudder + (command - rudder).clamp(-step, step)
-        return command, torch.cat((follows, known[:, 1:]), dim=-1)
+        return command, torch.cat((follows, estimate[:, 1:]), dim=-1)
 
     def _estimate(self, r: Tensor, per_time: Tensor, steady: Tensor, s: Tensor) -> Tensor:
-        """Return the memory [B, 9] with the yaw rate r [B, 1] taken in; the rudder still as it was."""
+        """Return the memory [B, 9] with the yaw rate r [B, 1] taken in, the rudder unchanged."""
         rudder, slow, share, push, effect, damping, p, c, q = s.split(1, dim=-1)
         pace = 2.0 * self.observer * per_time
         keep = torch.exp(-pace * self.dt)
@@ -212,7 +234,10 @@ class HeadingPolicy(Policy):
     def _centred(
         self, error: Tensor, r: Tensor, acting: Tensor, force: Tensor, decay: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return the error and yaw rate [B, 1] that will be left once the rudder, which acts with a share of its limit, has gone to where it does nothing."""
+        """Return the error and yaw rate [B, 1] that will be left once the rudder is centred.
+
+        The rudder acts with a share of its limit until it has gone to where it does nothing.
+        """
         wait = acting.abs() * self.swing
         later = r + wait * (0.5 * force * acting - decay * r)
         return error - wait * (r + wait * (force * acting / 3.0 - 0.5 * decay * r)), later
@@ -220,7 +245,9 @@ class HeadingPolicy(Policy):
     def _braking(
         self, r: Tensor, force: Tensor, decay: Tensor, stiffness: Tensor, stiff: Tensor
     ) -> Tensor:
-        """Return the heading [B, 1] that passes while r_dot = -force - decay r stops the yaw rate r [B, 1]; r / nu near zero, with the same slope there.
+        """Return the heading [B, 1] that passes while r_dot = -force - decay r stops the yaw rate.
+
+        It is r / nu near zero, with the same slope there.
 
         The rudder starts from amidships and comes back there: that takes half of its swing more, or
         a pulse that does not reach the limit. nu is chosen such that e'' + (decay + stiffness / nu)
@@ -241,9 +268,12 @@ class HeadingPolicy(Policy):
         return r.sign() * torch.where(size < end, size * line, curve)
 
     def _distance(self, r: Tensor, force: Tensor, decay: Tensor) -> Tensor:
-        """Return the heading [B, 1] in which a yaw rate r > 0 is stopped: the integral of r dr / (force + decay r), and what the rudder's swing adds."""
-        own = (r - force / decay * torch.log1p(decay * r / force)) / decay
+        """Return the heading [B, 1] in which a yaw rate r > 0 is stopped.
+
+        It is the integral of r dr / (force + decay r), and what the rudder's swing adds.
+        """
+        braking_angle = (r - force / decay * torch.log1p(decay * r / force)) / decay
         if self.swing == 0.0:
-            return own
+            return braking_angle
         pulse = r * torch.sqrt(r * self.swing / force) - 0.5 * r.square() / force
-        return own + torch.where(r < force * self.swing, pulse, 0.5 * self.swing * r)
+        return braking_angle + torch.where(r < force * self.swing, pulse, 0.5 * self.swing * r)

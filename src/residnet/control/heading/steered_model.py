@@ -1,6 +1,4 @@
-"""A learned model as heading controllers see it: policies are trained on it and flown on the vessel
-itself.
-"""
+"""A learned model as heading controllers see it, to train policies on."""
 
 from __future__ import annotations
 
@@ -20,8 +18,7 @@ from residnet.dynamics.varied import VariedModel
 
 @final
 class SteeredModel(SteeredVessel):
-    """A learned model, with the steering gear and the straight courses of the vessel that it was
-    identified on.
+    """A learned model with the steering gear and straight courses of the vessel that it models.
 
     Args:
         model: hybrid model of the hull.
@@ -67,6 +64,6 @@ class SteeredModel(SteeredVessel):
         return torch.cat((variation, variation.new_zeros(len(variation), self.hull.n_state)), dim=1)
 
     def start(self, speed: Tensor) -> tuple[Tensor, Tensor]:
-        """As the vessel's."""
+        """Return the states [B, nx] and inputs [B, m] of straight courses."""
         x, w = self.vessel.start(speed)
         return x[:, [self.vessel.column(name) for name in self.state]], w

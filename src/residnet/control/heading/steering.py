@@ -1,6 +1,4 @@
-"""Vessels as heading controllers see them, and flights: heading changes of many varied vessels at
-once.
-"""
+"""Vessels as heading controllers see them, and heading changes of many varied vessels at once."""
 
 from __future__ import annotations
 
@@ -42,16 +40,19 @@ class SteeredVessel(ABC):
         """
 
     def memory(self, variation: Tensor) -> Tensor:
-        """Of `model`, for variations [B, 3]."""
+        """Return the memory of `model` for variations [B, 3]."""
         return variation
 
     @abstractmethod
     def start(self, speed: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the states [B, nx] and inputs [B, m] of straight courses at multiples [B] of the service speed."""
+        """Return the states [B, nx] and inputs [B, m] of straight courses.
+
+        `speed` [B] are multiples of the service speed.
+        """
 
     @final
     def column(self, name: str) -> int:
-        """Of a state."""
+        """Return the column of a state."""
         return self.state.index(name)
 
     @final
@@ -82,11 +83,11 @@ class SteeredPlant(SteeredVessel):
         self.rate = _rudder_rate(plant)
 
     def model(self, dt: float, integrator: str = "rk4") -> Dynamics:
-        """Return the plant, varied."""
+        """Return the varied plant, for steps of dt seconds."""
         return VariedPlant(self.plant, dt, integrator)
 
     def start(self, speed: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the thrust goes with the square of the speed."""
+        """Return states and inputs of straight courses; thrust grows with the speed squared."""
         x = self.plant.approach(len(speed)).to(speed.dtype).clone()
         x[:, self.column("u")] *= speed
         command = self.plant.demand(speed.square(), torch.zeros_like(speed))
@@ -97,7 +98,7 @@ class SteeredPlant(SteeredVessel):
 
 @final
 class NominalSteering(Dynamics):
-    """The vessel as it is without variation, with the memory that predictors expect: none.
+    """The vessel without variation, and without memory, as predictors expect it.
 
     Attributes:
         others: inputs beside the rudder command at service speed [m - 1].
@@ -112,7 +113,7 @@ class NominalSteering(Dynamics):
         self.nominal: Tensor
 
     def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
-        """Of the vessel; steps do not need it."""
+        """Return the derivative of the vessel's state; steps do not need it."""
         return self.inner.rate(x, p, rho)
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
@@ -121,8 +122,9 @@ class NominalSteering(Dynamics):
 
 
 def _rudder_rate(plant: Plant) -> float | None:
-    """Of the steering gear [rad/s], by what it does in a short time when asked for a small and a
-    large angle.
+    """Return the rate of the steering gear in rad/s; None for a rudder that follows at once.
+
+    It is seen from what a small and a large angle lead to in a short time.
     """
     if "delta" not in plant.state:
         return None
@@ -152,11 +154,11 @@ class Measured(Policy):
         self.spread: Tensor
 
     def initial_state(self, x: Tensor) -> Tensor:
-        """Of the controller."""
+        """Return the memory of the controller."""
         return self.policy.initial_state(x)
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """As the controller, with noise on what it sees."""
+        """Return the controller's command and memory, with noise on the state that it sees."""
         command: tuple[Tensor, Tensor] = self.policy(
             x + torch.randn_like(x) * self.spread.to(x.dtype), reference, s
         )
@@ -165,8 +167,14 @@ class Measured(Policy):
 
 @dataclass(frozen=True)
 class Flights:
-    """B heading changes of T steps: states [B, T+1, nx] and their names, inputs [B, T, m],
-    reference [B] in rad, and the step in s.
+    """B heading changes of T steps.
+
+    Attributes:
+        states: [B, T+1, nx].
+        inputs: [B, T, m].
+        heading: reference [B] in rad.
+        dt: step in s.
+        names: of the states.
     """
 
     states: Tensor
@@ -175,17 +183,21 @@ class Flights:
     dt: float
     names: tuple[str, ...]
 
-    def of(self, name: str) -> Tensor:
-        """Return a state [B, T+1]."""
+    def state(self, name: str) -> Tensor:
+        """Return a state [B, T+1] by its name."""
         return self.states[:, :, self.names.index(name)]
 
     @property
     def error(self) -> Tensor:
         """Reference less heading [B, T+1], wrapped."""
-        return wrap(self.heading[:, None] - self.of("psi"))
+        return wrap(self.heading[:, None] - self.state("psi"))
 
     def settled(self, band: float) -> Tensor:
-        """Return the time [B] of the last entry into +-band [rad], between samples along a straight line; the flight's length where it ends outside."""
+        """Return the time [B] in s of the last entry into +-band [rad] about the reference.
+
+        It lies between samples along a straight line; it is the flight's length where it ends
+        outside.
+        """
         size = self.error.abs()
         outside = ~(size <= band)
         inside = outside.flip(1).to(torch.int64).argmax(1)
@@ -214,10 +226,10 @@ class Flights:
 
     def rms(self, name: str, start: float = 0.0) -> Tensor:
         """Return the root of the mean square [B] of a state from a time [s] on."""
-        return self.of(name)[:, round(start / self.dt) :].square().mean(1).sqrt()
+        return self.state(name)[:, round(start / self.dt) :].square().mean(1).sqrt()
 
     def rudder_rms(self, start: float = 0.0) -> Tensor:
-        """Return the root of the mean square [B] of the rudder command in rad from a time [s] on."""
+        """Return the root mean square [B] of the rudder command in rad from a time [s] on."""
         return self.inputs[:, round(start / self.dt) :, 0].square().mean(1).sqrt()
 
     def travel(self) -> Tensor:
@@ -238,7 +250,9 @@ def fly(
     weather: Mapping[str, float | Tensor] | None = None,
     surround: Callable[[Source], Source] | None = None,
 ) -> Flights:
-    """Return the heading changes [B] in rad from straight ahead of vessels varied by [B, 3], float64, without gradients.
+    """Return the flights of heading changes [B] in rad from straight ahead, without gradients.
+
+    The vessels are varied by [B, 3]; all is float64.
 
     Args:
         speed: multiples [B] of the service speed.

@@ -1,5 +1,6 @@
-"""Gains of linear heading controllers: the fastest in the worst case among those that keep an
-overshoot limit over a spread of vessels.
+"""Tuning of linear heading controllers over a spread of vessels.
+
+The gains are the fastest in the worst case among those that keep an overshoot limit.
 """
 
 from __future__ import annotations
@@ -43,8 +44,9 @@ class TuningTask:
 
 @dataclass(frozen=True)
 class Tuned:
-    """Parameters, the gains that they make, and what tuning found: worst settling time [s] and
-    overshoot [rad], candidates tried.
+    """Tuned parameters with their gains, worst settling time [s] and overshoot [rad].
+
+    It counts the candidates that were tried.
     """
 
     parameters: dict[str, float]
@@ -76,8 +78,9 @@ class LinearRows(Policy):
 def tune(
     config: TunedConfig, steering: Steering, task: TuningTask, points: int = 400, rounds: int = 6
 ) -> Tuned:
-    """Search the missing parameters on grids, each a fifth of the one before around the best so
-    far.
+    """Search the missing parameters on grids around the best so far.
+
+    Each grid is a fifth of the one before.
 
     Raises:
         FitError: where no candidate keeps the limits.
@@ -147,10 +150,10 @@ def _judge(
     An infinite cost breaks a limit.
     """
     gains = config.gains(parameters, steering.turning)
-    many, size = len(task.variations), len(gains[0])
-    each = tuple(gain.repeat_interleave(many) for gain in gains)
-    rows = LinearRows(steering, (each[0], each[1], each[2]))
-    heading = torch.full((size * many,), task.heading)
+    vessels, size = len(task.variations), len(gains[0])
+    repeated = tuple(gain.repeat_interleave(vessels) for gain in gains)
+    rows = LinearRows(steering, (repeated[0], repeated[1], repeated[2]))
+    heading = torch.full((size * vessels,), task.heading)
     flights = fly(
         steering.vessel,
         rows,
@@ -160,7 +163,7 @@ def _judge(
         duration=task.duration,
     )
     settled, over = (
-        values.reshape(size, many)
+        values.reshape(size, vessels)
         for values in (flights.settled(task.band).double(), flights.overshoot())
     )
     cost = settled.amax(1) + 0.01 * settled.mean(1)

@@ -1,6 +1,4 @@
-"""How a vessel answers its rudder about straight ahead, as Nomoto's K and T: the scales of heading
-controllers.
-"""
+"""A vessel's response to its rudder about straight ahead, as Nomoto's K and T."""
 
 from __future__ import annotations
 

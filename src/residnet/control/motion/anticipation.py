@@ -1,5 +1,6 @@
-"""Feed-forward through lagging actuators: the force that a model needs a little later, led by what
-the actuators lag behind.
+"""Feed-forward through lagging actuators.
+
+The force that a model needs a little later is led by what the actuators lag behind.
 """
 
 from __future__ import annotations
@@ -29,8 +30,14 @@ command's peaks grow with it.
 
 
 class Lag(Config):
-    """tau'' + 2 zeta omega tau' + omega^2 tau = omega^2 tau_c(t - delay): how forces follow
-    commands (document 002 eq. (4.3)).
+    """The lag of forces behind commands: tau'' + 2 zeta omega tau' + omega^2 tau = omega^2 tau_c.
+
+    tau_c is taken at t - delay (document 002 eq. (4.3)).
+
+    Attributes:
+        frequency: omega in rad/s.
+        damping: zeta, dimensionless.
+        delay: in s.
     """
 
     frequency: RadiansPerSecond = Field(gt=0)
@@ -39,9 +46,7 @@ class Lag(Config):
 
 
 class Derivatives(NamedTuple):
-    """A desired pose and its derivatives in earth axes (north [m], east [m], heading [rad]), each
-    [..., 3].
-    """
+    """A desired pose in earth axes (north, east [m], heading [rad]) with derivatives, [..., 3]."""
 
     pose: Tensor
     rate: Tensor
@@ -50,7 +55,10 @@ class Derivatives(NamedTuple):
     snap: Tensor
 
     def later(self, h: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the heading [...], nu_d and nu_dot_d [..., 3] in body axes h seconds later, along the Taylor series."""
+        """Return heading [...], nu_d and nu_dot_d [..., 3] in body axes h seconds later.
+
+        They follow the Taylor series.
+        """
         pose = self.pose + h * (
             self.rate + h / 2 * (self.acceleration + h / 3 * (self.jerk + h / 4 * self.snap))
         )
@@ -70,7 +78,11 @@ class Derivatives(NamedTuple):
 def derivatives(
     config: ReferenceFilterConfig, memory: Tensor, target: Tensor, target_rate: Tensor
 ) -> Derivatives:
-    """Return the jerk and snap of the third-order filter (2.15) at its memory [..., 9] under a target [..., 3] that moves by `target_rate`."""
+    """Return the desired pose and its derivatives up to the snap, from the filter's memory.
+
+    The third-order filter (2.15) has memory [..., 9] and a target [..., 3] that moves by
+    `target_rate`.
+    """
     w = torch.tensor(config.frequency, dtype=memory.dtype)
     d = 2.0 * torch.tensor(config.damping, dtype=memory.dtype) + 1.0
     pose, rate, change = memory[..., :3], memory[..., 3:6], memory[..., 6:]
@@ -80,7 +92,9 @@ def derivatives(
 
 
 def needed_force(model: ForceModel, motion: Derivatives, lag: Lag | None, held: float) -> Tensor:
-    """Return what a model needs for the motion when a command given now takes effect, and its first and second derivative: [..., 9].
+    """Return the force that a model needs when a command given now takes effect, [..., 9].
+
+    Its first and second derivative stand behind it.
 
     Args:
         model: of the vessel.
@@ -181,7 +195,9 @@ def reference_row(motion: Derivatives, needed: Tensor) -> Tensor:
 
 
 def course(config: ReferenceFilterConfig, dt: float) -> Derivatives:
-    """Return the desired motion [T, 3] of a whole course from rest at the origin: what the filter of `config` gives step by step.
+    """Return the desired motion [T, 3] of a whole course from rest at the origin.
+
+    It is what the filter of `config` gives step by step.
 
     The filter is linear and its target constant over an interval, so that powers of its step matrix
     give each interval at once.

@@ -1,5 +1,6 @@
-"""Position and heading control in three degrees of freedom: PID in the body frame with a
-feed-forward (document 002 section 2.2).
+"""Position and heading control in surge, sway and yaw: PID in the body frame with feed-forward.
+
+Source: document 002 section 2.2.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ class FeedForward(nn.Module, ABC):
 
 @final
 class NoFeedForward(FeedForward):
-    """Nothing: feedback alone."""
+    """No feed-forward: feedback alone."""
 
     def forward(self, nu_dot: Tensor, nu: Tensor) -> Tensor:
         """Return zeros [B, 3]."""
@@ -73,8 +74,9 @@ class MotionPIDConfig(Config):
 
 @final
 class MotionPID(Policy):
-    """tau = F(nu_dot_d, nu_d) + Kp e + Ki I + Kd (nu_d - nu), e = R^T(psi) (eta_d - eta) with its
-    heading wrapped (2.9)-(2.14).
+    """The law tau = F(nu_dot_d, nu_d) + Kp e + Ki I + Kd (nu_d - nu).
+
+    e = R^T(psi) (eta_d - eta) with its heading wrapped (2.9)-(2.14).
 
     Reference [B, 9]: eta_d, nu_d, nu_dot_d, as `ReferenceFilter` gives it. The memory [B, 3] is I,
     the sum of e dt of the steps before. There is one config for all rows, or one for each row of
@@ -98,9 +100,9 @@ class MotionPID(Policy):
 
     def error(self, x: Tensor, reference: Tensor) -> Tensor:
         """Return e [B, 3] in body axes: m, m, rad."""
-        away = reference[:, :3] - x[:, :3]
-        along, across = to_body(away[:, 0], away[:, 1], x[:, 2])
-        return torch.stack((along, across, wrap(away[:, 2])), dim=-1)
+        difference = reference[:, :3] - x[:, :3]
+        along, across = to_body(difference[:, 0], difference[:, 1], x[:, 2])
+        return torch.stack((along, across, wrap(difference[:, 2])), dim=-1)
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return the command tau [B, 3] in N, N, N m, and the integral with this step's error."""
@@ -113,8 +115,9 @@ class MotionPID(Policy):
 
 @final
 class Allocated(Policy):
-    """A controller of forces for a vessel with azimuth thrusters: its tau is allocated to their
-    revolutions and angles.
+    """A controller of forces for a vessel with azimuth thrusters.
+
+    Its tau is allocated to their revolutions and angles.
     """
 
     def __init__(self, policy: Policy, thrusters: AzimuthThrusters) -> None:

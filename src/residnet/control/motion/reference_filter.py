@@ -1,5 +1,6 @@
-"""Waypoints through a third-order reference filter (document 002 section 2.2.1, eq. (2.15), ERRATA
-J7, J9, J13).
+"""Way-points through a third-order reference filter.
+
+Source: document 002 section 2.2.1, eq. (2.15), ERRATA J7, J9, J13.
 """
 
 from __future__ import annotations
@@ -25,8 +26,7 @@ Damping = Annotated[float, Field(gt=0)]
 
 
 class ReferenceFilterConfig(Config):
-    """A trajectory through waypoints that are given one after the other, smoothed to what a vessel
-    can follow.
+    """A trajectory through way-points that are given one after the other, smoothed by a filter.
 
     Attributes:
         waypoints: (north, east, heading), the first from the start on.
@@ -57,8 +57,9 @@ class ReferenceFilterConfig(Config):
 
 @final
 class ReferenceFilter(Reference):
-    """(s + W)(s^2 + 2 D W s + W^2) on each of north, east and heading, stepped by RK4 with the
-    waypoint held over a step.
+    """The filter (s + W)(s^2 + 2 D W s + W^2) on each of north, east and heading.
+
+    It is stepped by RK4 with the way-point held over a step.
 
     The reference [B, 9] of a step is where the filter stands at its start: eta_d (north, east [m],
     heading [rad], not wrapped), then nu_d and nu_d_dot in body axes along the desired heading. The
@@ -97,7 +98,10 @@ class ReferenceFilter(Reference):
 
     @staticmethod
     def _step_matrix(config: ReferenceFilterConfig, dt: float) -> Tensor:
-        """Return what a step of RK4 does to (error, rate, acceleration) of each axis, [3, 3, 3]: exact for a linear filter."""
+        """Return the matrix [3, 3, 3] of an RK4 step for (error, rate, acceleration) of each axis.
+
+        It is exact for a linear filter.
+        """
         matrices = []
         for w, d in zip(config.frequency, config.damping, strict=True):
             a = (
@@ -107,8 +111,8 @@ class ReferenceFilter(Reference):
                 )
                 * dt
             )
-            one = torch.eye(3, dtype=torch.float64)
-            matrices.append(one + a @ (one + a @ (one + a @ (one + a / 4.0) / 3.0) / 2.0))
+            eye = torch.eye(3, dtype=torch.float64)
+            matrices.append(eye + a @ (eye + a @ (eye + a @ (eye + a / 4.0) / 3.0) / 2.0))
         return torch.stack(matrices)
 
     def initial_state(self, x: Tensor) -> Tensor:

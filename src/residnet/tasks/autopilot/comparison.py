@@ -127,8 +127,8 @@ def _series(name: str, flights: Flights, corners: Tensor) -> pd.DataFrame:
                     "effect": float(variation[0]),
                     "time": float(variation[1]),
                     "t": torch.arange(0, flights.inputs.shape[1], every).numpy() * flights.dt,
-                    "psi": side * flights.of("psi")[i, :-1:every].numpy(),
-                    "r": side * flights.of("r")[i, :-1:every].numpy(),
+                    "psi": side * flights.state("psi")[i, :-1:every].numpy(),
+                    "r": side * flights.state("r")[i, :-1:every].numpy(),
                     "rudder": side * flights.inputs[i, ::every, 0].numpy(),
                 }
             )
