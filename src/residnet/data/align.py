@@ -147,7 +147,7 @@ class _Reach:
         self._last = self._high + (self._w_high > 0.0)
 
     def _place(self, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the index of the sample before each time, and how far towards the next one it lies, 0 to 1."""
+        """Return the index of the sample before each time, and the share of the way to the next."""
         left = np.clip(np.searchsorted(self._t, at, side="right") - 1, 0, self._t.size - 2)
         weight = np.clip((at - self._t[left]) / (self._t[left + 1] - self._t[left]), 0.0, 1.0)
         return left, np.where(
@@ -160,7 +160,7 @@ class _Reach:
         return held
 
     def mean(self, x: np.ndarray) -> np.ndarray:
-        """Return the mean of the linear interpolant over each point's reach, [G, n] from finite [T, n]."""
+        """Return the mean of the linear interpolant over each point's reach, [G, n] from [T, n]."""
         # without its mean the running integral keeps its digits for positions far from the origin
         offset = x.mean(axis=0)
         centred, dt = x - offset, np.diff(self._t)[:, None]
@@ -192,7 +192,7 @@ class _Reach:
         return _any_between(flags, self._first, self._last + 1)
 
     def broken(self, missing: np.ndarray) -> np.ndarray:
-        """Return [G, n] bool: a missing sample [T, n] carries weight, or the reach crosses a gap."""
+        """Return [G, n] bool: a missing sample carries weight, or the reach crosses a gap."""
         untrusted: np.ndarray = self.touched(missing) | _any_between(
             self._gap[:, None], self._first, self._last
         )
@@ -209,7 +209,10 @@ def _any_between(flags: np.ndarray, first: np.ndarray, stop: np.ndarray) -> np.n
 
 
 def _rewrapped(original: np.ndarray, continuous: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the grid values [G] in the range of the original channel [T], where unwrapping had left that range."""
+    """Return the grid values [G] in the range of the original channel [T].
+
+    Unwrapping may have left that range.
+    """
     if np.array_equal(original, continuous, equal_nan=True):
         return values
     low = 0.0 if np.nanmin(original) >= 0.0 else -np.pi

@@ -65,11 +65,16 @@ class Derivative(Config, ABC):
 
 @final
 class SavitzkyGolay(Derivative):
-    """Polynomials of `order` fitted to a moving window of `window` seconds (made an odd number of
-    samples, rounded up).
+    """Savitzky-Golay smoothing: polynomials fitted to a moving window.
+
+    The window is made an odd number of samples, rounded up.
 
     Near the ends of a piece the polynomial of the last full window is evaluated; a piece shorter
     than the window is invalid.
+
+    Attributes:
+        window: length of the window in s.
+        order: of the polynomials.
     """
 
     kind: Literal["savitzky_golay"] = "savitzky_golay"
@@ -104,8 +109,9 @@ class SavitzkyGolay(Derivative):
 
 @final
 class BackwardDifference(Derivative):
-    """Difference to the sample before; the first sample of a piece is invalid. Values are not
-    smoothed.
+    """The difference to the sample before; values are not smoothed.
+
+    The first sample of a piece is invalid.
     """
 
     kind: Literal["backward"] = "backward"
@@ -121,8 +127,9 @@ class BackwardDifference(Derivative):
 
 @final
 class ForwardDifference(Derivative):
-    """Difference to the next sample; the last sample of a piece is invalid. Values are not
-    smoothed.
+    """The difference to the next sample; values are not smoothed.
+
+    The last sample of a piece is invalid.
     """
 
     kind: Literal["forward"] = "forward"
@@ -136,8 +143,13 @@ class ForwardDifference(Derivative):
 
 @final
 class Butterworth(Derivative):
-    """Butterworth low-pass run forward and backward (zero phase), then the forward difference
-    (document 000, section 7.3; ERRATA H27).
+    """A Butterworth low-pass run forward and backward (zero phase), then the forward difference.
+
+    Attributes:
+        order: of the filter, for one of the two passes.
+        cutoff: frequency of half gain in Hz.
+
+    Source: document 000, section 7.3; ERRATA H27.
 
     The two passes square the magnitude: the gain at `cutoff` is 1/2, not 1/sqrt(2). The document's
     normalised cut-off is a share of the Nyquist frequency: its 0.1 at 20 Hz is 1 Hz here. The last
@@ -184,7 +196,7 @@ def _forward(values: np.ndarray, step: float) -> np.ndarray:
 
 
 def _runs(values: np.ndarray, pieces: np.ndarray) -> list[tuple[int, int]]:
-    """Return the first index and index past the last of every contiguous, finite run of one piece."""
+    """Return the first index and the index past the last of every contiguous, finite run."""
     number = np.where(np.isfinite(values).all(axis=1), pieces, -1)
     edges = np.flatnonzero(np.diff(number)) + 1
     bounds = np.concatenate(([0], edges, [number.size]))

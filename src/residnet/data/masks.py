@@ -53,11 +53,15 @@ class Mask(Config, ABC):
 
 @final
 class Frozen(Mask):
-    """A receiver that holds its last fix: all `channels` bit-identical over `samples` steps or
-    more.
+    """A receiver that holds its last fix: all `channels` bit-identical over several steps.
 
     From the first of the equal samples until `after` seconds past the last of them: the filters
     behind the receiver need that long to recover.
+
+    Attributes:
+        channels: that the receiver gives.
+        samples: least number of equal steps.
+        after: seconds that stay masked behind them.
     """
 
     kind: Literal["frozen"] = "frozen"
@@ -77,7 +81,11 @@ class Frozen(Mask):
 
 @final
 class Gap(Mask):
-    """Time steps longer than `longest`; the first sample after each is the one marked."""
+    """Time steps longer than `longest`; the first sample after each is the one marked.
+
+    Attributes:
+        longest: longest time step that is no gap, in s.
+    """
 
     prefix: ClassVar[str] = HARD
     kind: Literal["gap"] = "gap"
@@ -90,7 +98,11 @@ class Gap(Mask):
 
 @final
 class Missing(Mask):
-    """NaN in any of `channels` (all channels where empty)."""
+    """NaN in any of `channels` (all channels where empty).
+
+    Attributes:
+        channels: to look at; all where empty.
+    """
 
     prefix: ClassVar[str] = HARD
     kind: Literal["nan"] = "nan"
@@ -107,6 +119,12 @@ class Jump(Mask):
     """Differences of more than `limit` in `channel` (SI, per sample; angles the short way round).
 
     Marked are the `before` last samples ahead of the difference and the `after` first ones past it.
+
+    Attributes:
+        channel: to look at.
+        limit: largest difference from sample to sample, SI.
+        before: samples before the jump that are masked too.
+        after: samples behind it that are masked too.
     """
 
     kind: Literal["jump"] = "jump"
@@ -123,8 +141,14 @@ class Jump(Mask):
 
 @final
 class Outlier(Mask):
-    """Samples more than `sigmas` standard deviations away from the moving average of `samples`
-    (document 002, section 5.2).
+    """Samples many standard deviations away from the moving average of their neighbours.
+
+    Attributes:
+        channels: to look at.
+        sigmas: distance in standard deviations from which on a sample is an outlier.
+        samples: number of neighbours.
+
+    Source: document 002, section 5.2.
 
     Average and deviation are taken over the `samples` nearest *other* samples. Over a window of n
     that holds the sample itself no distance can exceed (n - 1) / sqrt(n) standard deviations, 2.85
@@ -168,8 +192,9 @@ class Outlier(Mask):
 
 @final
 class Hampel(Mask):
-    """Samples that stand out of their neighbours by more than `sigmas` robust standard deviations
-    (Hampel filter; Pearson, 2002).
+    """Samples that stand out of their neighbours by many robust standard deviations.
+
+    This is the Hampel filter (Pearson, 2002).
 
     What is looked at is the distance of a sample from the median of the straight lines between its
     neighbours on either side, up to `samples` away, so that a moving channel is judged as one at
@@ -177,6 +202,11 @@ class Hampel(Mask):
     is 1.4826 times the median absolute deviation of those neighbours, and at least that of the
     whole channel. A few bad samples move neither median, where they move average and deviation of
     the rule of document 002 (`outlier`).
+
+    Attributes:
+        channels: to look at.
+        sigmas: distance in robust standard deviations from which on a sample is an outlier.
+        samples: neighbours on either side that are looked at.
     """
 
     kind: Literal["hampel"] = "hampel"
@@ -198,11 +228,16 @@ class Hampel(Mask):
 
 @final
 class InputJump(Mask):
-    """Steps of more than `limit` (SI, per sample) in any of `channels`, from `before` to `after`
-    seconds around each.
+    """Steps of the inputs of more than `limit` per sample, with the seconds around them.
 
     A smoothed derivative spreads the response to a step over the time before it, so that the
     derivatives there are biased; the samples are good.
+
+    Attributes:
+        channels: inputs to look at.
+        limit: largest step from sample to sample, SI.
+        before: seconds before the step that are masked.
+        after: seconds behind it that are masked.
     """
 
     prefix: ClassVar[str] = RATE
@@ -254,25 +289,34 @@ def hard_mask(log: Log) -> np.ndarray:
 
 
 def scored(log: Log) -> np.ndarray:
-    """Return [T] bool: samples that a free run is scored on, all that neither a hard nor a soft mask excludes."""
+    """Return [T] bool: samples that a free run is scored on.
+
+    Neither a hard nor a soft mask excludes them.
+    """
     return ~_any(log, [name for name in log.masks if not name.startswith(RATE)])
 
 
 def segments(log: Log) -> np.ndarray:
-    """Return the number of the contiguous piece that each sample belongs to, [T] int, counted from 0; -1 at hard-masked samples."""
+    """Return the number of the contiguous piece of each sample, [T] int from 0; -1 if masked."""
     hard = hard_mask(log)
     starts = ~hard & np.append(True, hard[:-1])
     return np.where(hard, -1, np.cumsum(starts) - 1)
 
 
 def steps_above(log: Log, channel: str, limit: float) -> np.ndarray:
-    """Return the indices [K] of the samples at which `channel` arrives after a step of more than `limit` (SI; angles the short way round)."""
+    """Return the indices [K] of samples at which `channel` arrives after a large step.
+
+    Large is more than `limit` (SI; angles the short way round).
+    """
     values = unwrap(log[channel]) if log.units[channel] == "rad" else log[channel]
     return np.flatnonzero(np.abs(np.diff(values)) > limit) + 1
 
 
 def far_from_median(values: np.ndarray, sigmas: float, samples: int) -> np.ndarray:
-    """Return [T] bool: known values [T] that stand out of their `samples` (made odd) neighbours, by the rule of `Hampel`."""
+    """Return [T] bool: known values [T] that stand out of their neighbours by `Hampel`'s rule.
+
+    `samples`, made odd, is the number of neighbours.
+    """
     out = np.zeros(values.size, dtype=bool)
     at, half = np.flatnonzero(np.isfinite(values)), samples // 2
     reach = 2 * half

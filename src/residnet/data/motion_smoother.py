@@ -1,5 +1,6 @@
-"""Pose, velocity and acceleration, all measured with known noise, brought into one motion: a
-fixed-interval smoother along each earth axis.
+"""A fixed-interval smoother of pose, velocity and acceleration along each earth axis.
+
+All three are measured with known noise and brought into one motion.
 """
 
 from __future__ import annotations
@@ -94,7 +95,7 @@ def _riccati(step: np.ndarray, driven: np.ndarray, h: np.ndarray, noise: np.ndar
 def _filter(
     z: np.ndarray, step: np.ndarray, h: np.ndarray, gain: np.ndarray, innovation: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """Return the filtered states [N, 3], and minus twice the mean log-likelihood of the innovations."""
+    """Return the filtered states [N, 3], and minus twice the mean log-likelihood."""
     x = np.zeros(3)
     x[: h.shape[1]] = h.T @ z[0]
     out, misses = np.empty((len(z), 3)), np.empty_like(z)

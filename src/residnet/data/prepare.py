@@ -45,8 +45,9 @@ class PrepareConfig(Config):
 
 @dataclass(frozen=True)
 class Prepared:
-    """One log on the grid, with what identification and evaluation need (float64 arrays of T
-    samples).
+    """One log on the grid, with all that identification and evaluation need.
+
+    Arrays are float64 with T samples.
 
     Attributes:
         log: the aligned log with its masks.
@@ -113,7 +114,7 @@ def prepare(log: Log, split: str, columns: Sequence[str], config: PrepareConfig)
 
 
 def _means(w: np.ndarray, piece: np.ndarray) -> np.ndarray:
-    """Return the mean of each sample and the next [T, m]; the sample itself where its piece ends."""
+    """Return the mean of each sample and the next [T, m]; the sample itself at a piece's end."""
     out = w.copy()
     on = (piece[:-1] >= 0) & (piece[1:] == piece[:-1])
     out[:-1][on] = 0.5 * (w[:-1] + w[1:])[on]
@@ -127,7 +128,9 @@ def _renumber(labels: np.ndarray) -> np.ndarray:
 
 
 def samples(logs: Sequence[Prepared], signals: Signals) -> Samples:
-    """Return the samples of identification from prepared logs: smoothed channels and measured accelerations, float64.
+    """Return the samples of identification from prepared logs, float64.
+
+    They hold smoothed channels and measured accelerations.
 
     Raises:
         DataError: where no log has a sample to learn from.
@@ -156,7 +159,10 @@ def samples(logs: Sequence[Prepared], signals: Signals) -> Samples:
 
 
 def envelope(logs: Sequence[Prepared]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lowest and highest measured velocities and inputs, [3 + m] each, over the usable samples of logs."""
+    """Return the lowest and highest measured velocities and inputs, [3 + m] each.
+
+    Only usable samples count.
+    """
     joined = np.concatenate(
         [np.concatenate((p.y[p.usable, 3:], p.w[p.usable]), axis=1) for p in logs]
     )

@@ -17,7 +17,12 @@ Splits = dict[str, list[Log]]
 
 
 class MeasuredLogs(Config):
-    """Logs on disk, read through one channel map and split by file."""
+    """Logs on disk, read through one channel map and split by file.
+
+    Attributes:
+        reader: format of the files and the channel map.
+        split: which files are for training, validation and test.
+    """
 
     kind: Literal["measured"] = "measured"
     reader: ReaderConfig

@@ -1,6 +1,4 @@
-"""Which log files are for training, for choosing and for the final test, and proof that the three
-share no data.
-"""
+"""The split of log files into training, validation and test, and the check that none share data."""
 
 from __future__ import annotations
 
@@ -54,8 +52,9 @@ class SplitConfig(Config):
         return self
 
     def resolve(self) -> dict[str, list[Path]]:
-        """Split -> its files, each split in the order of its patterns, the matches of a pattern
-        sorted.
+        """Return the files of each split, in the order of its patterns.
+
+        The matches of a pattern are sorted.
 
         Raises:
             ConfigError: where a split is empty, a pattern matches nothing, or a file or the name of

@@ -42,8 +42,9 @@ class WindowStore:
 
     @classmethod
     def gather(cls, logs: Sequence[Prepared], dtype: torch.dtype = torch.float32) -> WindowStore:
-        """From prepared logs; positions are counted from each log's start so that float32 keeps
-        them exact enough.
+        """Build the store from prepared logs.
+
+        Positions are counted from each log's start so that float32 keeps them exact enough.
         """
         y = np.concatenate([p.y - p.y[0] * [1, 1, 0, 0, 0, 0] for p in logs])
         smooth = np.concatenate([p.smooth - p.y[0] * [1, 1, 0, 0, 0, 0] for p in logs])
@@ -74,7 +75,10 @@ class WindowStore:
         )
 
     def starts(self, length: int, share: float = 0.5) -> Tensor:
-        """Return the rows at which a window of `length` samples may start: within one stretch, the first sample good, at least `share` of all usable.
+        """Return the rows at which a window of `length` samples may start.
+
+        It lies within one stretch, its first sample is good, and at least `share` of all are
+        usable.
 
         Raises:
             DataError: where no log holds such a window.
@@ -91,7 +95,7 @@ class WindowStore:
         return rows
 
     def beginnings(self, length: int, lead: int) -> Tensor:
-        """Return the rows `lead` samples after the beginning of a stretch at which a window of `length` samples may start.
+        """Return the rows `lead` samples after the beginning of a stretch where a window may start.
 
         Raises:
             DataError: where no stretch is long enough.
@@ -127,8 +131,9 @@ class WindowStore:
 
 
 class WindowBatches:
-    """Random batches of window starts, the same for the same seed, stage and epoch: a resumed run
-    sees what the undisturbed one did.
+    """Random batches of window starts, the same for the same seed, stage and epoch.
+
+    A resumed run sees what an undisturbed one did.
     """
 
     def __init__(self, starts: Tensor, batch: int, steps: int) -> None:
@@ -137,7 +142,7 @@ class WindowBatches:
         self.steps = steps
 
     def epoch(self, seed: int, epoch: int) -> Tensor:
-        """Return the starts [steps, batch] of one epoch, drawn without replacement as far as they last."""
+        """Return the starts [steps, batch] of one epoch, drawn without replacement."""
         generator = torch.Generator().manual_seed((seed * 1_000_003 + epoch) % (2**63))
         need = self.batch * self.steps
         rounds = -(-need // self.starts.numel())

@@ -76,7 +76,7 @@ def _contents(log: Log, driving: Sequence[str]) -> list[Finding]:
 
 
 def _trusted(log: Log, findings: Sequence[Finding]) -> Log:
-    """Return the log with NaN in the pose and velocities where a finding about values already says that they are wrong."""
+    """Return the log with NaN where a finding about values says that pose or velocity is wrong."""
     doubted = [
         finding.at
         for finding in findings
@@ -105,8 +105,9 @@ def inspect_together(
     inputs: Sequence[str] | None = None,
     splits: Mapping[str, str] | None = None,
 ) -> Report:
-    """Examine logs beside each other: copies, runs cut into files, ranges, and whether a fit to all
-    of them has something to learn from.
+    """Examine logs beside each other: copies, runs cut into files, ranges, excitation.
+
+    The last is whether a fit to all of them has something to learn from.
 
     Args:
         logs: at least one, each with an increasing clock.

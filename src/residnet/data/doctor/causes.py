@@ -18,8 +18,9 @@ LEAST_LAG = 0.2
 
 @dataclass(frozen=True)
 class Limit:
-    """What a cause is called, and from what size on it misleads: `least`, so many time steps, or
-    such a share of the speed.
+    """The name of a cause of disagreement, and the size from which on it misleads.
+
+    `least` is a number of time steps, or a share of the speed.
     """
 
     text: str

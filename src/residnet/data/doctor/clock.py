@@ -18,7 +18,7 @@ _EPOCH = 1e8
 
 
 def order_findings(log: Log) -> list[Finding]:
-    """Return why nothing else can be looked at: times that are no numbers, repeat or run backwards."""
+    """Return why nothing else can be examined: times that are NaN, repeat or run backwards."""
     if not np.isfinite(log.t).all():
         count = int((~np.isfinite(log.t)).sum())
         text = f"{count} of {len(log)} samples have no time"

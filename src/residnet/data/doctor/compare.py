@@ -1,6 +1,4 @@
-"""What the data doctor sees between logs: copies, overlaps, runs that were cut into files, the same
-commands, ranges not covered.
-"""
+"""Findings between logs: copies, overlaps, runs cut into files, same commands, ranges."""
 
 from __future__ import annotations
 
@@ -25,7 +23,7 @@ _OUTSIDE = 0.25
 def comparison_findings(
     logs: Sequence[Log], splits: Mapping[str, str] | None = None
 ) -> list[Finding]:
-    """Return the findings between logs.
+    """Return the findings between logs, each of which has an increasing clock.
 
     Args:
         logs: all logs that are looked at together.

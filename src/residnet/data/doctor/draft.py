@@ -1,5 +1,6 @@
-"""A first channel map for a table that nobody has described: guessed from names, units in the
-header and values, to be checked and pasted.
+"""A first channel map for an undescribed table, to be checked and pasted into a config.
+
+It is guessed from names, units in the header and values.
 """
 
 from __future__ import annotations
@@ -234,7 +235,7 @@ def _channel(column: str, taken: dict[str, Any]) -> str:
 
 
 def _unit(name: str, column: str, values: np.ndarray) -> str:
-    """Return the unit from the header, else the SI unit, else degrees where an angle is too large for radians."""
+    """Return the unit from the header, else the SI unit, else degrees for large angles."""
     declared = _IN_BRACKETS.search(column)
     expected = CHANNEL_UNITS.get(name)
     candidates = [

@@ -19,7 +19,7 @@ _RECORD = "record manoeuvres: zigzag, 3-2-1-1"
 
 
 def excitation_findings(log: Log, inputs: Sequence[str]) -> Iterator[Finding]:
-    """Return the findings about ranges, spectrum, standstill and collinearity of velocities and inputs in one log."""
+    """Return the findings about ranges, spectrum, standstill and collinearity of one log."""
     moving = []
     for name in (*(name for name in VELOCITY if name in log.channels), *inputs):
         values, unit = log[name][np.isfinite(log[name])], log.units[name]
@@ -149,7 +149,10 @@ def _list(names: Sequence[str]) -> str:
 
 
 def conditioning(columns: np.ndarray, names: Sequence[str]) -> tuple[float, list[str]]:
-    """Return the condition number of columns [N, k], centred and scaled, and the up to three names that move together most."""
+    """Return the condition number of columns [N, k], and the names that move together most.
+
+    Columns are centred and scaled; there are up to three names.
+    """
     scaled = (columns - columns.mean(axis=0)) / np.maximum(
         columns.std(axis=0), np.finfo(float).tiny
     )
@@ -231,7 +234,10 @@ def _common(logs: Sequence[Log], inputs: Sequence[str] | None) -> list[str]:
 
 
 def _awake(log: Log, name: str) -> float:
-    """Return the spread of a velocity beyond what its averaged noise explains, over the least that counts; below 1 it does not vary."""
+    """Return the spread of a velocity over the least that counts; below 1 it does not vary.
+
+    Only what its averaged noise does not explain counts.
+    """
     step = float(np.median(np.diff(log.t)))
     samples = max(round(2.0 / step), 5)
     smooth = averaged(log[name], samples)

@@ -53,7 +53,7 @@ class Finding:
         return dataclasses.replace(self, level="note", action="the config masks these samples")
 
     def content(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the finding as plain values for JSON."""
         figures = {
             name: float(value) if math.isfinite(value) else None
             for name, value in self.figures.items()
@@ -96,7 +96,7 @@ class Report:
         return [f"{self.name}: {finding.line}" for finding in order]
 
     def content(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the report as plain values for JSON."""
         return {
             "name": self.name,
             "source": self.source,

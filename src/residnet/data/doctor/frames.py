@@ -1,5 +1,6 @@
-"""Whether position, heading and velocities of a log describe one motion: frames, signs and units
-first, then what is finer.
+"""Whether position, heading and velocities of a log describe one motion.
+
+Frames, signs and units come first, then what is finer.
 """
 
 from __future__ import annotations
@@ -41,8 +42,9 @@ _CONVENTIONS = {
 
 @dataclass(frozen=True)
 class _Motion:
-    """Rates of a log on a uniform grid, all averaged over the same few seconds, so that pose and
-    velocities are filtered alike.
+    """The rates of a log on a uniform grid, all averaged over the same few seconds.
+
+    Pose and velocities are thus filtered alike.
 
     Attributes:
         step: time between samples, s.
@@ -62,7 +64,10 @@ class _Motion:
 
 
 def frame_findings(log: Log) -> list[Finding]:
-    """Return whether position, heading and velocities of a log on a uniform grid describe one motion; NaN where a channel is not to be trusted."""
+    """Return whether position, heading and velocities of a log describe one motion.
+
+    The log is on a uniform grid, with NaN where a channel is not to be trusted.
+    """
     absent = [name for name in ("x", "y", "psi") if name not in log.channels]
     moving = [name for name in VELOCITY if name in log.channels]
     if absent or not moving:
@@ -138,7 +143,10 @@ def _rate(values: np.ndarray, half: int, step: float) -> np.ndarray:
 
 
 def _mean(values: np.ndarray, half: int) -> np.ndarray:
-    """Return the trapezoidal means [T] over 2 half steps, NaN at the ends and where a sample is missing."""
+    """Return the trapezoidal means [T] over 2 half steps.
+
+    They are NaN at the ends and where a sample is missing.
+    """
     out = np.full(values.shape, np.nan, dtype=values.dtype)
     if values.size > 2 * half:
         weights = np.ones(2 * half + 1)
@@ -176,7 +184,9 @@ def _velocity(motion: _Motion) -> list[Finding]:
 
 
 def _convention(ground: np.ndarray, sailed: dict[str, np.ndarray]) -> Finding:
-    """Return the velocity over ground [N] against R(psi) [u, v], as declared and under other conventions; vectors as complex numbers.
+    """Return how the velocity over ground [N] agrees with R(psi) [u, v] under each convention.
+
+    Vectors are complex numbers.
 
     The coherence is 1 where both agree, and the angle of the complex overlap is what would have to
     be added to psi.
@@ -258,7 +268,9 @@ def _follows_ground(log: Log, motion: _Motion, causes: dict[str, Cause]) -> Iter
 def _follows(
     name: str, reference: np.ndarray, motion: _Motion, least: float, what: str, certain: bool
 ) -> Iterator[Finding]:
-    """Return the sign, gain and lag of a channel against a reference [T], unless that varies by less than `least`.
+    """Return the sign, gain and lag of a channel against a reference [T].
+
+    Nothing is returned where the reference varies by less than `least`.
 
     A lag alone misleads where the finer look is `certain` that pose and velocities differ at all:
     slow channels correlate at any lag.

@@ -1,5 +1,6 @@
-"""What the data doctor sees in the channels that drive the vessel: jumps, limits, offset, astern,
-stuck, wind that contains the motion.
+"""Findings about the channels that drive the vessel.
+
+These are jumps, limits, offset, astern, stuck actuators and wind that contains the motion.
 """
 
 from __future__ import annotations
@@ -142,7 +143,7 @@ def _size(log: Log, name: str) -> Iterator[Finding]:
 
 
 def _excursions(log: Log, name: str) -> Iterator[Finding]:
-    """Return the values far outside the rest of the channel that return to where they came from, for a second or less, held or not."""
+    """Return the values far outside the rest of the channel that return within a second."""
     values = log[name]
     step = float(np.median(np.diff(log.t)))
     half = max(round(1.5 / step), 3)
@@ -297,7 +298,7 @@ def _swings(angle: np.ndarray) -> int:
 
 
 def _relative_wind(log: Log, inputs: Sequence[str]) -> Iterator[Finding]:
-    """Return the wind directions that turn against the heading: they are relative, and contain the motion."""
+    """Return the wind directions that turn against the heading: relative wind, not true wind."""
     if "psi" not in log.channels:
         return
     directions = [name for name in log.channels if "wind" in name and log.units[name] == "rad"]
@@ -337,8 +338,9 @@ def _same_direction(log: Log, relative: str, true: str) -> bool:
 
 
 def _slope_against_heading(log: Log, name: str) -> tuple[float, float]:
-    """Change of a direction over ten seconds for each rad that the heading changes, and its
-    standard error; 0, 0 where nothing can be said.
+    """Return the change of a direction over ten seconds per rad of heading, and its error.
+
+    The error is a standard error; both are 0 where nothing can be said.
     """
     hop = max(round(10.0 / float(np.median(np.diff(log.t)))), 1)
     if len(log) < 5 * hop:

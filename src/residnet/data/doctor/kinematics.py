@@ -1,5 +1,6 @@
-"""Whether position, heading and velocities describe one motion, to the accuracy of their noise:
-gains, lags, biases, lever arm, drift.
+"""Whether position, heading and velocities describe one motion, to the accuracy of their noise.
+
+Gains, lags, biases, lever arm and drift are estimated.
 
 Increments of the pose between neighbouring samples are compared with the integral of the velocities
 over them. White noise on pose and velocities gives the increments a tridiagonal covariance, by
@@ -146,7 +147,10 @@ def _stands_out(values: np.ndarray) -> bool:
 
 
 def _smoothed(values: np.ndarray) -> np.ndarray:
-    """Return the values [T] smoothed by a parabola over 15 samples, so that columns share no noise with what they explain; NaN stay where they are."""
+    """Return the values [T] smoothed by a parabola over 15 samples; NaN stay where they are.
+
+    Columns then share no noise with what they explain.
+    """
     known = np.isfinite(values)
     if known.sum() < 15:
         return values
@@ -175,7 +179,10 @@ class _Rows:
         self._dt, self._rate, self._noise = dt, rate, noise
 
     def _between(self, steps: np.ndarray) -> np.ndarray:
-        """Return the sums [K, ...] of steps [T - 1, ...] between neighbouring samples of the pose, NaN where one of them is."""
+        """Return the sums [K, ...] of steps [T - 1, ...] between neighbouring pose samples.
+
+        They are NaN where one of the steps is.
+        """
         unknown = ~np.isfinite(steps)
         start = np.zeros((1, *steps.shape[1:]))
         total = np.concatenate((start, np.cumsum(np.where(unknown, 0.0, steps), axis=0)))[self._at]
@@ -234,7 +241,7 @@ class _Rows:
 
     @staticmethod
     def _trimmed(y: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """Return [K] 1 or 0: rows that no cause explains and that stand far out (a jump) are left out."""
+        """Return [K] 1 or 0: 0 for rows that stand far out and that no cause explains (jumps)."""
         scale = np.maximum(np.abs(x).max(axis=0), 1e-300)
         coefficients = np.linalg.lstsq(x / scale, y, rcond=1e-9)[0]
         rest = np.abs(y - (x / scale) @ coefficients)
@@ -247,7 +254,7 @@ class _Rows:
 def _pursuit(
     y: np.ndarray, x: np.ndarray, names: np.ndarray, section: np.ndarray
 ) -> dict[str, Cause]:
-    """Return the forward one group of columns at a time, then backward: a cause that others made superfluous goes."""
+    """Select groups of columns one at a time, then drop those that others made superfluous."""
     scale = np.linalg.norm(x, axis=0)
     alive = scale > 0.0
     x, names, scale = x[:, alive] / scale[alive], names[alive], scale[alive]

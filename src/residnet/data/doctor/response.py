@@ -122,7 +122,7 @@ def _opposite(log: Log, steer: np.ndarray) -> bool:
 
 
 def _steering(log: Log, inputs: Sequence[str]) -> tuple[str, np.ndarray] | None:
-    """Return the channel that steers and its values [T]; None where there is none of known sense."""
+    """Return the channel that steers and its values [T]; None where no sense is known."""
     known = (*inputs, *(name for name in log.channels if name not in inputs))
     for name in _STEERING:
         if name in known and float(np.nanstd(log[name])) > 1e-9:
@@ -196,7 +196,10 @@ def _answer(log: Log, steer: np.ndarray) -> _Answer | None:
 
 
 def _reach(r: np.ndarray, step: float) -> int:
-    """Return the samples after which the yaw rate has forgotten what it was: as far as a shift can be told."""
+    """Return the number of samples after which the yaw rate is no longer correlated with itself.
+
+    A shift can be recognised as far as that.
+    """
     known: np.ndarray = np.nan_to_num(r - np.nanmean(r))
     power = np.abs(np.fft.rfft(known, 2 * known.size)) ** 2
     memory = np.fft.irfft(power)[: known.size]
@@ -206,7 +209,10 @@ def _reach(r: np.ndarray, step: float) -> int:
 
 
 def _fit(x: np.ndarray, y: np.ndarray) -> tuple[float, float, float]:
-    """Return the sum of squares left, last coefficient, and that in standard errors over twenty sections."""
+    """Return the sum of squared residuals, the last coefficient, and its t-value.
+
+    The standard error is that over twenty sections.
+    """
     size = np.maximum(np.linalg.norm(x, axis=0), 1e-300)
     x = x / size
     inverse = np.linalg.pinv(x.T @ x, rcond=1e-10)

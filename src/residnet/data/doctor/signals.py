@@ -14,7 +14,9 @@ _SIGMA = 1.4826
 
 
 def noise_of(values: np.ndarray) -> float:
-    """Return the standard deviation of the white noise of a channel [T]: from its third differences, which hardly see the motion.
+    """Return the standard deviation of a channel's white noise, from third differences.
+
+    These hardly see the motion.
 
     The differences are taken over the known samples only; 0 where there are fewer than 8, or where
     most third differences vanish.
@@ -26,7 +28,10 @@ def noise_of(values: np.ndarray) -> float:
 
 
 def spikes(values: np.ndarray) -> np.ndarray:
-    """Return [T] bool: samples that stand far out of their neighbours (the rule of the mask `hampel` as it is without settings)."""
+    """Return [T] bool: samples that stand far out of their neighbours.
+
+    The rule is that of the mask `hampel` with its defaults.
+    """
     return far_from_median(values, 6.0, 11)
 
 

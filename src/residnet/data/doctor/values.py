@@ -1,6 +1,4 @@
-"""What the data doctor sees in single channels: missing, repeated, frozen, outlying, clipped and
-coarse values.
-"""
+"""Findings about single channels: missing, repeated, frozen, outlying, clipped, coarse values."""
 
 from __future__ import annotations
 
@@ -202,7 +200,7 @@ def _frozen(log: Log, name: str, held: np.ndarray) -> Finding:
 
 
 def _held(log: Log, names: Sequence[str]) -> np.ndarray:
-    """Return [T] bool: inside runs of equal values that neither chance nor a vessel at rest explains."""
+    """Return [T] bool: runs of equal values that neither chance nor rest explains."""
     out = np.zeros(len(log), dtype=bool)
     same = (np.diff(log.stack(tuple(names)), axis=0) == 0.0).all(axis=1)
     starts, stops = true_runs(same)
@@ -231,7 +229,10 @@ def _held(log: Log, names: Sequence[str]) -> np.ndarray:
 
 
 def _moves(log: Log, names: Sequence[str], run: slice) -> bool:
-    """Return whether a channel must have changed over a run: a pose by what the velocities say, any other wherever it is noisy elsewhere."""
+    """Return whether a channel must have changed over a run.
+
+    A pose must by what the velocities say, any other where it is noisy elsewhere.
+    """
     rates = {"psi": ("r",), "phi": ("p",)}.get(
         names[0], ("u", "v", "psi") if names[0] in ("x", "y") else ()
     )
@@ -270,7 +271,10 @@ def _noisy(values: np.ndarray) -> bool:
 
 
 def _never_rests(values: np.ndarray, run: slice) -> bool:
-    """Return whether a channel that is no pose cannot have rested over a run: it is noisy, or it lands far off where it goes on."""
+    """Return whether a channel that is no pose cannot have rested over a run.
+
+    It is noisy, or it goes on far from where it stood.
+    """
     if _noisy(values):
         return True
     after = np.abs(np.diff(values[run.stop - 1 : run.stop + 6]))
@@ -317,7 +321,10 @@ def _worst(values: np.ndarray, far: np.ndarray) -> int:
 
 
 def _clipping(log: Log, name: str) -> Iterator[Finding]:
-    """Return the samples exactly at the largest or smallest value, many more than at the levels beside it."""
+    """Return the samples exactly at the largest or smallest value, where these are many.
+
+    Many is compared with the levels beside it.
+    """
     known = log[name][np.isfinite(log[name])]
     levels, counts = np.unique(known, return_counts=True)
     if levels.size < 10:

@@ -42,7 +42,10 @@ def wrap_findings(log: Log) -> list[Finding]:
 
 
 def _wraps(log: Log, name: str, circle: float) -> np.ndarray:
-    """Return [T] bool: samples that arrive by about a full circle from the one before or the one before that (a wrap with a sample in between)."""
+    """Return [T] bool: samples that arrive by about a full circle.
+
+    The step is from the sample before, or the one before that (a wrap with a sample in between).
+    """
     known = np.isfinite(log[name])
     change = np.diff(log[name][known], prepend=log[name][known][:1])
     out = np.zeros(len(log), dtype=bool)

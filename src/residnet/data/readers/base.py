@@ -1,4 +1,4 @@
-"""What every reader of logs shares: the interface, the file's identity, and the checks at the door."""
+"""The part that all readers of logs share: interface, identity of files, checks at the door."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class ReaderKind(Config, ABC):
 
     @abstractmethod
     def build(self) -> LogReader:
-        """Return the reader."""
+        """Build the reader of this config."""
 
 
 def require_file(path: Path) -> None:
@@ -67,7 +67,10 @@ def require_file(path: Path) -> None:
 
 
 def provenance(path: Path, rows_read: int, rows_dropped: int) -> dict[str, Any]:
-    """Return where a log comes from: `source`, `sha256` of the file's bytes, `rows_read`, `rows_dropped`."""
+    """Return where a log comes from: `source`, `sha256`, `rows_read`, `rows_dropped`.
+
+    The SHA-256 is that of the file's bytes.
+    """
     with path.open("rb") as stream:
         digest = hashlib.file_digest(stream, "sha256").hexdigest()
     return {
@@ -100,8 +103,9 @@ def require_samples(path: Path, t: np.ndarray) -> None:
 
 
 def require_increasing(path: Path, t: np.ndarray, row: Callable[[int], str]) -> None:
-    """Stop where time [T] in s repeats or runs backwards; `row` names the row of a sample in the
-    file.
+    """Stop where time [T] in s repeats or runs backwards.
+
+    `row` names the row of a sample in the file.
 
     Raises:
         DataError: naming the first two rows concerned.

@@ -1,4 +1,4 @@
-"""Which reader a file needs, by its content first and its ending second, where no config says so."""
+"""Recognition of a file's reader, by content first and ending second, without a config."""
 
 from __future__ import annotations
 
@@ -35,9 +35,7 @@ _NMEA = re.compile(rb"(?m)^[^$!\n]{0,40}[$!][A-Z]{2}[A-Z]{3},[\x20-\x7e]*\*[0-9A
 
 @dataclass(frozen=True)
 class Format:
-    """A format of recordings: how it is recognised, and the reader's config with everything left to
-    standard messages.
-    """
+    """A format of recordings: how it is recognised, and its config for standard messages."""
 
     name: str
     fits: Callable[[Path, bytes], bool]
@@ -73,14 +71,15 @@ FORMATS: tuple[Format, ...] = (
 
 @final
 class AutoConfig(RecordingConfig):
-    """Any recording that describes itself, by its content and ending; the other kinds have settings
-    of their own.
+    """Any recording that describes itself, recognised by its content and ending.
+
+    The kinds of single formats have settings of their own.
     """
 
     kind: Literal["auto"] = "auto"
 
     def load(self, path: Path, wanted: Wanted) -> Recording:
-        """See `RecordingConfig.load`."""
+        """Read a recording of any format that describes itself."""
         return _config_for(path).load(path, wanted)
 
 
@@ -113,7 +112,7 @@ def reader_for(path: Path) -> LogReader:
 
 
 def recording_for(path: Path) -> Recording:
-    """Return everything that a file or folder holds, its clocks settled, before it is composed to a log.
+    """Return all that a file or folder holds, its clocks settled, before it becomes a log.
 
     Raises:
         UsageError: where there is nothing at `path`, or its format describes no channels.

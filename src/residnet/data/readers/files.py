@@ -15,7 +15,7 @@ _LARGE = 50_000_000
 
 
 def digest(files: Sequence[Path]) -> str:
-    """Return the hexadecimal SHA-256 of one file's bytes, or of the digests of several, in order."""
+    """Return the SHA-256 of one file's bytes, or of the digests of several in order, as hex."""
     if len(files) == 1:
         return _one(files[0])
     return hashlib.sha256("".join(_one(file) for file in files).encode()).hexdigest()

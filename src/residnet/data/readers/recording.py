@@ -20,7 +20,10 @@ Remark = dict[str, Any]
 
 
 def remark(level: Level, code: str, text: str, **figures: float) -> Remark:
-    """Return one thing noticed on the way in, as `Log.meta["findings"]` holds it: level, code, text, figures (SI)."""
+    """Return a finding of the reader as `Log.meta["findings"]` holds it.
+
+    It has level, code, text and figures (SI).
+    """
     return {"level": level, "code": code, "text": text, "figures": figures}
 
 
@@ -161,5 +164,8 @@ def same_topic(topic: str, names: Iterable[str]) -> str | None:
 
 
 def key_of(path: str) -> str:
-    """Return a field's path with every separator as one underscore: exporters write `pose.position.x`, `pose/position/x` or `pose_position_x`."""
+    """Return a field's path with every separator as one underscore.
+
+    Exporters write `pose.position.x`, `pose/position/x` or `pose_position_x`.
+    """
     return re.sub(r"[./\[\]_]+", "_", path).strip("_").removeprefix("field_")

@@ -1,6 +1,4 @@
-"""Columns that grow piece by piece: in memory, or on disk where a file is larger than memory should
-be.
-"""
+"""Columns that grow piece by piece: in memory, or on disk where a file is large."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""Time as sources print it: numbers or dates, with zones, and with fractions of seconds whose zeros
-were lost.
+"""Times as sources print them: numbers or dates, with zones, and with damaged fractions.
+
+Fractions of seconds may have lost their leading zeros.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ _NS = 10**9
 
 @dataclass(frozen=True)
 class Stamps:
-    """Parsed times.
+    """The times of a column, parsed.
 
     Attributes:
         ns: [T] int64, whole ns; Unix time where `absolute`.
@@ -64,7 +65,7 @@ def parse_numbers(values: np.ndarray, factor: float | None = None) -> Stamps:
 
 
 def parse_texts(texts: np.ndarray, unpadded: bool | None = None) -> Stamps:
-    """Return the times from text [T]: dates with or without a zone, or plain numbers, one style throughout.
+    """Return the times of text [T]: dates with or without a zone, or numbers, in one style.
 
     A fraction of a second printed as an integer without its leading zeros (`09.70533347` for
     9.070533347 s) is recognised by the whole column: it makes time run backwards where the padded

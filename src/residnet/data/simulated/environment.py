@@ -1,6 +1,4 @@
-"""What the sea does to a simulated trial: random and constant forces, current, wind with gusts,
-waves.
-"""
+"""The disturbances of a simulated trial: forces, current, wind with gusts, waves."""
 
 from __future__ import annotations
 
@@ -43,15 +41,18 @@ class Disturbance(Config):
     """Random and constant forces, a constant current, wind and waves.
 
     Attributes:
-        force_x: standard deviation of an Ornstein-Uhlenbeck force along the hull; force_y and
-            force_n likewise.
-        correlation: correlation time of the three processes.
-        force_north: constant force towards north; force_east likewise.
-        current_north: current, towards north; current_east likewise.
-        current_speed, current_direction: the same current as its speed and where it sets TO,
-            clockwise from north, instead of the two.
-        current_each: slowest and fastest of a further current that each trial has of its own,
-            constant in speed and direction.
+        force_x: standard deviation of the random surge force, an Ornstein-Uhlenbeck process, in N.
+        force_y: the same of the sway force in N.
+        force_n: the same of the yaw moment in N m.
+        correlation: correlation time of the three processes in s.
+        force_north: constant force towards north in N.
+        force_east: constant force towards east in N.
+        current_north: current towards north in m/s.
+        current_east: current towards east in m/s.
+        current_speed: speed of the same current in m/s, given with its direction instead.
+        current_direction: where it sets to in rad, clockwise from north.
+        current_each: slowest and fastest speed in m/s of a further current that each trial has of
+            its own, constant in speed and direction.
         wind: mean wind and gusts, for vessels with wind coefficients.
         waves: first-order wave forces.
     """
@@ -118,7 +119,7 @@ class Disturbance(Config):
         return WIND_INPUTS if self.wind is not None else ()
 
     def needs(self) -> dict[str, str]:
-        """Return the inputs that a plant must have for this disturbance to reach it, each with the key that asks for it."""
+        """Return the inputs that a plant must have for this disturbance, each with its key."""
         north, east = self.current()
         asked = {
             "force_x": self.force_x != 0, "force_y": self.force_y != 0,
@@ -163,7 +164,9 @@ class Disturbance(Config):
         seed: int,
         random: np.random.Generator,
     ) -> np.ndarray:
-        """Return the inputs of the plant [B, T, m] with the commands zero, of all that does not depend on where the vessel is.
+        """Return the inputs of the plant [B, T, m], of all that does not depend on its place.
+
+        The commands are zero.
 
         The random forces are drawn from `random` (three values per step whatever their sizes, so
         that data of one seed stay the same), the gusts from generators of their own under `seed`.
@@ -193,7 +196,7 @@ class Disturbance(Config):
         return w
 
     def surround(self, source: Source, plant: Plant, rows: int, step: float, seed: int) -> Source:
-        """Return the source of inputs with the waves added to what it gives; itself in calm water."""
+        """Return a source with the waves added to its inputs; the same one in calm water."""
         if self.waves is None:
             return source
         return Seaway(source, self.waves.build(rows, np.random.default_rng([seed, 5])), plant, step)
@@ -201,8 +204,9 @@ class Disturbance(Config):
 
 @final
 class Seaway(Source):
-    """Adds the waves' forces, where the vessel is at the start of each step and held over it, to
-    the inputs of another source.
+    """A source that adds the waves' forces to the inputs of another source.
+
+    They are those at the vessel's place at the start of each step, held over it.
     """
 
     def __init__(self, source: Source, waves: Waves, plant: Plant, step: float) -> None:
@@ -240,7 +244,10 @@ class Seaway(Source):
 def ornstein_uhlenbeck(
     random: np.random.Generator, shape: tuple[int, int, int], step: float, correlation: float
 ) -> np.ndarray:
-    """Return the stationary first-order processes [B, T, k] of unit variance along T, discretised exactly."""
+    """Return stationary first-order processes [B, T, k] of unit variance.
+
+    They run along T and are discretised exactly.
+    """
     from scipy.signal import lfilter
 
     keep = np.exp(-step / correlation)
@@ -253,7 +260,10 @@ def ornstein_uhlenbeck(
 def gusty_wind(
     wind: WindField, rows: int, steps: int, step: float, random: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the speed [B, T] in m/s and direction [B, T] in rad (where it comes from) of the mean wind with its gusts."""
+    """Return the speed [B, T] in m/s and direction [B, T] in rad of the wind with gusts.
+
+    The direction is where it comes from.
+    """
     gust = wind.gust * ornstein_uhlenbeck(random, (rows, steps, 2), step, wind.correlation)
     along = wind.speed + gust[:, :, 0]
     return np.hypot(along, gust[:, :, 1]), wind.direction + np.arctan2(gust[:, :, 1], along)

@@ -1,6 +1,4 @@
-"""Flying manoeuvres with a plant or a learned model: the motion itself, and the logs that sensors
-would make of it.
-"""
+"""Flights of manoeuvres with a plant or a learned model, and the logs of sensors on them."""
 
 from __future__ import annotations
 
@@ -27,7 +25,7 @@ from residnet.physics.plant import Plant
 
 @dataclass(frozen=True)
 class Craft:
-    """What flies.
+    """A vessel that flies manoeuvres: a plant or a learned model.
 
     Attributes:
         name: in logs and tables.

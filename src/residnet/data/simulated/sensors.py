@@ -31,8 +31,13 @@ class Sensor(Config):
 
 
 class SensorNoise(Config):
-    """Standard deviations of white noise on the measured velocities; all else is measured exactly
-    unless `sensors` says otherwise.
+    """White noise on the measured velocities; all else is exact unless `sensors` says otherwise.
+
+    Attributes:
+        u: standard deviation in m/s.
+        v: standard deviation in m/s.
+        r: standard deviation in rad/s.
+        sensors: sensors of single channels, by the channel's name.
     """
 
     u: MetresPerSecond = Field(default=0.03, ge=0)
@@ -65,8 +70,7 @@ class SensorNoise(Config):
         return self
 
     def check(self, channels: tuple[str, ...], step: float, vessel: str) -> None:
-        """Stop where a sensor measures what the log does not have, or samples between the log's
-        samples.
+        """Stop where a sensor measures what the log does not have, or samples more often than it.
 
         Raises:
             ConfigError: naming the sensor.
@@ -120,7 +124,7 @@ class SensorNoise(Config):
 def _sampled(
     sensor: Sensor, values: np.ndarray, t: np.ndarray, seed: tuple[int, ...]
 ) -> np.ndarray:
-    """With bias and noise, NaN where the sensor takes no sample."""
+    """Return the values with bias and noise, NaN where the sensor takes no sample."""
     out: np.ndarray = (
         values
         + float(sensor.bias)

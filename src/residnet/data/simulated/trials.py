@@ -1,6 +1,4 @@
-"""Simulated sea trials: a plant, a programme of manoeuvres, disturbances and sensors, all in one
-batch.
-"""
+"""Simulated sea trials: plant, manoeuvres, disturbances and sensors, all in one batch."""
 
 from __future__ import annotations
 
@@ -23,8 +21,9 @@ from residnet.physics.vessel import VesselName, load_vessel
 
 
 class SimulatedTrials(Config):
-    """A programme of sea trials on a simulated vessel, from rest (a model that only holds near its
-    service speed starts there).
+    """A programme of sea trials on a simulated vessel, from rest.
+
+    A model that only holds near its service speed starts there.
 
     Attributes:
         vessel: name of a vessel of residnet, or path of a vessel file.
@@ -37,6 +36,8 @@ class SimulatedTrials(Config):
             set.
         validation: how many of those are kept back to choose between models.
         seed: of everything random in the data (the run's own seed moves only the training).
+        noise: of the sensors.
+        disturbance: of the sea.
     """
 
     kind: Literal["simulated"] = "simulated"
@@ -103,8 +104,7 @@ class SimulatedTrials(Config):
 
 
 def fly_trials(manoeuvres: Sequence[Manoeuvre], config: SimulatedTrials) -> list[Flight]:
-    """Fly the manoeuvres in one batch: the motion itself, and the logs of it as sensors would
-    measure it.
+    """Fly the manoeuvres in one batch and return the motion and the logs of sensors on it.
 
     Channels: the plant's state (for the WAM-V x, y, psi, u, v, r, n_port, n_stbd), the commands,
     and the true wind where there is any. Float64.

@@ -1,6 +1,4 @@
-"""Topics that a log does not use, against the log: do they lag, do they speak of another point of
-the vessel?
-"""
+"""Topics that a log does not use, compared with the log: lag, and another point of the vessel."""
 
 from __future__ import annotations
 
@@ -98,7 +96,10 @@ def _correlation(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def _lever(one: Series, t: np.ndarray, log: Log) -> list[Remark]:
-    """Return whether a topic's positions turn about the log's: both then belong to different points of the vessel."""
+    """Return whether a topic's positions turn about the log's.
+
+    Both then belong to different points of the vessel.
+    """
     pair = next(
         (
             p

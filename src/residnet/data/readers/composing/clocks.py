@@ -62,7 +62,7 @@ def settle(
 
 
 def _plausible(one: Series) -> Series:
-    """Without stamps that say nothing."""
+    """Return the series without stamps that carry no time."""
     if one.stamp is None or not len(one):
         return one
     if len(one) > 1 and np.ptp(one.stamp) == 0.0 and one.arrival is not None:
@@ -83,7 +83,7 @@ def _offset(one: Series) -> float:
 
 
 def _recorder(offsets: Mapping[str, float], zone: float | None) -> tuple[float, tuple[Remark, ...]]:
-    """Return the seconds that the recorder's clock is ahead of the senders', and what to say about it."""
+    """Return the seconds that the recorder's clock is ahead of the senders', and a remark."""
     if not offsets:
         return zone or 0.0, ()
     common = float(np.median(list(offsets.values())))
@@ -109,7 +109,10 @@ def _recorder(offsets: Mapping[str, float], zone: float | None) -> tuple[float, 
 
 
 def _latency(one: Series, offset: float) -> list[Remark]:
-    """Of a topic with stamps and arrivals, the latter on the senders' clock."""
+    """Return the latency of a topic with stamps and arrivals.
+
+    Arrivals are on the senders' clock.
+    """
     assert one.stamp is not None
     assert one.arrival is not None
     late = one.arrival - one.stamp

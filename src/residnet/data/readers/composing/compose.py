@@ -1,6 +1,4 @@
-"""From a recording to a log: every channel on one clock, in SI, NED and body axes, at the vessel's
-centre.
-"""
+"""From a recording to a log: one clock, SI, NED and body axes, the vessel's centre."""
 
 from __future__ import annotations
 

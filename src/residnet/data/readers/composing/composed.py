@@ -1,6 +1,4 @@
-"""What the readers of recordings share: the config that says what to take from a recording, and the
-reader that composes it.
-"""
+"""The config that says what to take from a recording, and the reader that composes it."""
 
 from __future__ import annotations
 
@@ -98,7 +96,7 @@ class RecordingConfig(Config, ABC):
         """
 
     def build(self) -> RecordingReader:
-        """Return the reader."""
+        """Build the reader of recordings with this config."""
         return RecordingReader(self)
 
 

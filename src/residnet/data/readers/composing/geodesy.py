@@ -10,7 +10,9 @@ from residnet.data.readers.files import missing_package
 def tangent_plane(
     latitude: np.ndarray, longitude: np.ndarray, latitude_0: float, longitude_0: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the north and east [T] in m of points of the WGS 84 ellipsoid, on the plane that touches it at the origin.
+    """Return north and east [T] in m of points of the WGS 84 ellipsoid.
+
+    They lie on the plane that touches the ellipsoid at the origin.
 
     Topocentric coordinates (EPSG method 9837); heights are taken as zero, which shifts a point at
     100 m height and 1 km distance by 16 mm.

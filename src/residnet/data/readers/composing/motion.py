@@ -1,4 +1,4 @@
-"""Motion at the vessel's centre: levers, earth-fixed to body velocities, velocities from positions."""
+"""The motion at the vessel's centre: levers, earth-fixed to body velocities, derivatives."""
 
 from __future__ import annotations
 
@@ -15,7 +15,10 @@ from residnet.data.readers.composing.quantities import Derived, Lever
 def at_centre(
     north: np.ndarray, east: np.ndarray, psi: np.ndarray, lever: Lever
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the position of the vessel's centre from that of an antenna at `lever` (body axes), all [T], m and rad."""
+    """Return the position of the vessel's centre from that of an antenna at `lever`, all [T].
+
+    The lever is in body axes; m and rad.
+    """
     c, s = np.cos(psi), np.sin(psi)
     return north - c * lever.x + s * lever.y, east - s * lever.x - c * lever.y
 
@@ -23,7 +26,10 @@ def at_centre(
 def body_velocity(
     north: np.ndarray, east: np.ndarray, psi: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the components along body x and y of an earth-fixed velocity (document 003 eq. (4), transposed), all [T]."""
+    """Return the components along body x and y of an earth-fixed velocity, all [T].
+
+    Source: document 003 eq. (4), transposed.
+    """
     c, s = np.cos(psi), np.sin(psi)
     return c * north + s * east, c * east - s * north
 
@@ -31,14 +37,19 @@ def body_velocity(
 def centre_velocity(
     u: np.ndarray, v: np.ndarray, r: np.ndarray, lever: Lever
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the velocity of the vessel's centre from that of a point at `lever`: a rigid body, u_P = u - r y, v_P = v + r x."""
+    """Return the velocity of the vessel's centre from that of a point at `lever`.
+
+    For a rigid body u_P = u - r y, v_P = v + r x.
+    """
     return u + r * lever.y, v - r * lever.x
 
 
 def derive_motion(
     pose: Sequence[Part], config: Derived, lever: Lever, times: np.ndarray, step: float
 ) -> dict[str, np.ndarray]:
-    """Return x, y, psi, u, v, r [T] on a uniform clock, smoothed and differentiated at the rate of the positions.
+    """Return x, y, psi, u, v, r [T] on a uniform clock, smoothed and differentiated.
+
+    This is done at the rate of the positions.
 
     The polynomials run on a grid that divides the log's step until it is as fine as the topics;
     nothing is smoothed across a gap.

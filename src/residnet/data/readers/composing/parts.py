@@ -1,6 +1,4 @@
-"""Parts of a log, each on its topic's own clock: converted to SI and residnet's frames, not yet
-aligned.
-"""
+"""Parts of a log, each on its topic's clock: SI and residnet's frames, not yet aligned."""
 
 from __future__ import annotations
 

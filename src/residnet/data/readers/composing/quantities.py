@@ -1,6 +1,4 @@
-"""Where a recording holds a channel, position, heading and velocity, and in which units and frames:
-what a config declares.
-"""
+"""Where a recording holds a channel, position, heading or velocity, and its unit and frame."""
 
 from __future__ import annotations
 
@@ -49,8 +47,11 @@ class FieldMap(Conversion):
 
 
 class Lever(Config):
-    """Where an antenna stands: metres forward (x) and to starboard (y) of the vessel's centre, in
-    body axes.
+    """The place of an antenna from the vessel's centre, in body axes.
+
+    Attributes:
+        x: forward of the centre in m.
+        y: to starboard of the centre in m.
     """
 
     x: Metres = 0.0
@@ -58,8 +59,13 @@ class Lever(Config):
 
 
 class Origin(Config):
-    """Origin of a local tangent plane on the WGS 84 ellipsoid; plain numbers are rad, so write
-    `63.44 deg`.
+    """The origin of a local tangent plane on the WGS 84 ellipsoid.
+
+    Plain numbers are rad, so write `63.44 deg`.
+
+    Attributes:
+        latitude: in rad, north positive.
+        longitude: in rad, east positive.
     """
 
     latitude: Radians = Field(ge=-1.5708, le=1.5708)
@@ -178,8 +184,9 @@ HeadingConfig = Annotated[Quaternion | Angle, Field(discriminator="kind")]
 
 @final
 class Derived(Config):
-    """u, v, r from position and heading, and these smoothed, by Savitzky-Golay polynomials at the
-    rate of the positions.
+    """u, v, r from position and heading, by Savitzky-Golay polynomials at the positions' rate.
+
+    Position and heading are smoothed by them too.
 
     Attributes:
         window: length of the polynomials for translation, s.
@@ -195,8 +202,9 @@ class Derived(Config):
 
 @final
 class EarthFixed(Config):
-    """u, v from northward and eastward velocity of the antenna, turned into body axes and moved to
-    the vessel's centre.
+    """u, v from northward and eastward velocity of the antenna.
+
+    They are turned into body axes and moved to the vessel's centre.
 
     Attributes:
         topic: of the velocity.
@@ -222,8 +230,9 @@ class EarthFixed(Config):
 
 @final
 class CourseSpeed(Config):
-    """u, v from course and speed over ground of the antenna, turned into body axes and moved to the
-    vessel's centre.
+    """u, v from course and speed over ground of the antenna.
+
+    They are turned into body axes and moved to the vessel's centre.
 
     Attributes:
         topic: of course and speed.

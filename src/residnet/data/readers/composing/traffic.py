@@ -1,6 +1,4 @@
-"""What the rows of one series give away: rate, gaps, empty columns, several publishers on one
-topic.
-"""
+"""The rate, gaps, empty columns and publishers of one series, as its rows tell them."""
 
 from __future__ import annotations
 
@@ -95,7 +93,10 @@ def publishers(one: Series, step: np.ndarray) -> list[Remark]:
 
 
 def _returns(values: np.ndarray) -> tuple[float, float, float]:
-    """Return the share of rows that change and change again, share that come back to the value before, and the leaps' width over the values' range."""
+    """Return the share of rows that change twice, that come back, and the leaps' width.
+
+    A row comes back to the value before; the width is a share of the values' range.
+    """
     known = values[np.isfinite(values)]
     if known.size < _ENOUGH:
         return 0.0, 0.0, 0.0

@@ -28,7 +28,7 @@ class Wanted:
         return self._named is None or any(self._same(name, topic) for name, _ in self._named)
 
     def field(self, topic: str, path: str) -> bool:
-        """Return whether a field is wanted, itself or as a part (`orientation.w` of `orientation`)."""
+        """Return whether a field or a part of it is wanted (`orientation.w` of `orientation`)."""
         key = key_of(path)
         fields = [key_of(field) for name, field in self._named or () if self._same(name, topic)]
         return self._named is None or any(

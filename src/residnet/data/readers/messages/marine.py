@@ -1,5 +1,6 @@
-"""Messages of PX4, ArduPilot and NMEA 0183 that map themselves; all three speak NED, and
-forward-right-down in the body.
+"""Messages of PX4, ArduPilot and NMEA 0183 that map themselves to channels.
+
+All three speak NED, and forward-right-down in the body.
 """
 
 from __future__ import annotations
@@ -30,32 +31,32 @@ class Px4LocalPosition(Message):
     said: ClassVar[str] = _SAID
 
     def plan(self, one: Series) -> Plan:
-        """See `Message.plan`."""
+        """Return the channels that a series of this message gives."""
         velocity = EarthFixed(topic=one.name, north="vx", east="vy") if one.has("vx") else None
         return Plan({}, Local(topic=one.name, north="x", east="y"), None, velocity)
 
 
 @final
 class Px4Attitude(Message):
-    """PX4 vehicle_attitude."""
+    """The message vehicle_attitude of PX4."""
 
     types = ("vehicle_attitude",)
     said: ClassVar[str] = _SAID
 
     def plan(self, one: Series) -> Plan:
-        """See `Message.plan`."""
+        """Return the channels that a series of this message gives."""
         return Plan({}, None, Quaternion(topic=one.name, field="q", frame="ned", roll=True))
 
 
 @final
 class Px4AngularVelocity(Message):
-    """PX4 vehicle_angular_velocity."""
+    """The message vehicle_angular_velocity of PX4."""
 
     types = ("vehicle_angular_velocity",)
     said: ClassVar[str] = _SAID
 
     def plan(self, one: Series) -> Plan:
-        """See `Message.plan`."""
+        """Return the channels that a series of this message gives."""
         return Plan(
             {
                 name: FieldMap(topic=one.name, field=f"xyz[{axis}]", unit="rad/s")
@@ -72,7 +73,7 @@ class Px4Gps(Message):
     said: ClassVar[str] = _SAID
 
     def plan(self, one: Series) -> Plan:
-        """See `Message.plan`."""
+        """Return the channels that a series of this message gives."""
         names = ("lat", "lon") if one.has("lat") else ("latitude_deg", "longitude_deg")
         velocity = (
             EarthFixed(topic=one.name, north="vel_n_m_s", east="vel_e_m_s")
@@ -92,7 +93,7 @@ class ArduPilotFilter(Message):
     said: ClassVar[str] = _SAID
 
     def plan(self, one: Series) -> Plan:
-        """See `Message.plan`."""
+        """Return the channels that a series of this message gives."""
         return Plan(
             {},
             Local(topic=one.name, north="PN", east="PE"),
@@ -103,13 +104,13 @@ class ArduPilotFilter(Message):
 
 @final
 class ArduPilotAttitude(Message):
-    """ArduPilot ATT."""
+    """The message ATT of ArduPilot."""
 
     types = ("ATT",)
     said: ClassVar[str] = _SAID
 
     def plan(self, one: Series) -> Plan:
-        """See `Message.plan`."""
+        """Return the channels that a series of this message gives."""
         return Plan(
             {"phi": FieldMap(topic=one.name, field="Roll", unit="deg")},
             None,
@@ -119,13 +120,13 @@ class ArduPilotAttitude(Message):
 
 @final
 class ArduPilotImu(Message):
-    """ArduPilot IMU."""
+    """The message IMU of ArduPilot."""
 
     types = ("IMU",)
     said: ClassVar[str] = _SAID
 
     def plan(self, one: Series) -> Plan:
-        """See `Message.plan`."""
+        """Return the channels that a series of this message gives."""
         return Plan(
             {
                 name: FieldMap(topic=one.name, field=field, unit="rad/s")
@@ -142,7 +143,7 @@ class ArduPilotGps(Message):
     said: ClassVar[str] = _SAID
 
     def plan(self, one: Series) -> Plan:
-        """See `Message.plan`."""
+        """Return the channels that a series of this message gives."""
         return Plan(
             {},
             Geodetic(topic=one.name, latitude="Lat", longitude="Lng"),
@@ -159,7 +160,7 @@ class NmeaFix(Message):
     said: ClassVar[str] = _SAID
 
     def plan(self, one: Series) -> Plan:
-        """See `Message.plan`."""
+        """Return the channels that a series of this message gives."""
         course = (
             CourseSpeed(
                 topic=one.name, course="true_course", speed="spd_over_grnd", speed_unit="kn"
@@ -178,7 +179,7 @@ class NmeaCourse(Message):
     said: ClassVar[str] = _SAID
 
     def plan(self, one: Series) -> Plan:
-        """See `Message.plan`."""
+        """Return the channels that a series of this message gives."""
         return Plan(
             {},
             None,
@@ -197,7 +198,7 @@ class NmeaHeading(Message):
     said: ClassVar[str] = _SAID
 
     def plan(self, one: Series) -> Plan:
-        """See `Message.plan`."""
+        """Return the channels that a series of this message gives."""
         return Plan({}, None, Angle(topic=one.name, field="heading", unit="deg"))
 
 
@@ -209,7 +210,7 @@ class NmeaRateOfTurn(Message):
     said: ClassVar[str] = _SAID
 
     def plan(self, one: Series) -> Plan:
-        """See `Message.plan`."""
+        """Return the channels that a series of this message gives."""
         return Plan({"r": FieldMap(topic=one.name, field="rate_of_turn", unit="deg/s")})
 
 
@@ -221,7 +222,7 @@ class NmeaRudder(Message):
     said: ClassVar[str] = _SAID
 
     def plan(self, one: Series) -> Plan:
-        """See `Message.plan`."""
+        """Return the channels that a series of this message gives."""
         return Plan({"delta": FieldMap(topic=one.name, field=next(iter(one.fields)), unit="deg")})
 
 

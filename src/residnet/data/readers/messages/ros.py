@@ -1,5 +1,4 @@
-"""Standard messages of ROS map themselves: which of their fields are which channels, by REP-103
-(world ENU, body forward-left-up).
+"""Standard messages of ROS map themselves to channels by REP-103 (ENU, forward-left-up).
 
 A topic's message type decides where the source has types; a table without one is recognised by its
 fields.
@@ -57,7 +56,7 @@ class Odometry(Message):
     signature = ("pose.pose.position.x", "twist.twist.linear.x")
 
     def plan(self, one: Series) -> Plan:
-        """See `Message.plan`."""
+        """Return the channels that a series of this message gives."""
         position = Local(topic=one.name, north="pose.pose.position.y", east="pose.pose.position.x")
         return Plan(_body(one, "twist.twist."), position, _heading(one, "pose.pose.orientation"))
 
@@ -70,7 +69,7 @@ class Pose(Message):
     signature = ("pose.position.x", "pose.orientation.w")
 
     def plan(self, one: Series) -> Plan:
-        """See `Message.plan`."""
+        """Return the channels that a series of this message gives."""
         prefix = next((p for p in ("pose.pose.", "pose.", "") if one.has(f"{p}position.x")), "")
         position = Local(topic=one.name, north=f"{prefix}position.y", east=f"{prefix}position.x")
         return Plan({}, position, _heading(one, f"{prefix}orientation"))
@@ -84,7 +83,7 @@ class Twist(Message):
     signature = ("twist.linear.x", "twist.angular.z")
 
     def plan(self, one: Series) -> Plan:
-        """See `Message.plan`; a twist that its frame places in the world is left to the config."""
+        """Return the channels of a series; a twist in the world frame is left to the config."""
         if (
             one.sender is not None
             and len(one.sender)
@@ -103,7 +102,7 @@ class Imu(Message):
     signature = ("angular_velocity.z", "linear_acceleration.x")
 
     def plan(self, one: Series) -> Plan:
-        """See `Message.plan`."""
+        """Return the channels that a series of this message gives."""
         rates = {"r": "angular_velocity.z", "p": "angular_velocity.x"}
         channels = {
             n: FieldMap(topic=one.name, field=path, unit="rad/s", frame="body_fpu")
@@ -124,13 +123,13 @@ class Imu(Message):
 
 @final
 class Fix(Message):
-    """sensor_msgs/NavSatFix."""
+    """The message sensor_msgs/NavSatFix of ROS."""
 
     types = ("NavSatFix",)
     signature = ("latitude", "longitude")
 
     def plan(self, one: Series) -> Plan:
-        """See `Message.plan`."""
+        """Return the channels that a series of this message gives."""
         return Plan({}, Geodetic(topic=one.name))
 
 
@@ -142,7 +141,7 @@ class Wrench(Message):
     signature = ("wrench.force.x", "wrench.torque.z")
 
     def plan(self, one: Series) -> Plan:
-        """See `Message.plan`."""
+        """Return the channels that a series of this message gives."""
         prefix = "wrench." if one.has("wrench.force.x") else ""
         parts = {"tau_x": ("force.x", "N"), "tau_y": ("force.y", "N"), "tau_n": ("torque.z", "N m")}
         channels = {
@@ -173,8 +172,9 @@ class Number(Message):
     signature = ("data",)
 
     def plan(self, one: Series) -> Plan:
-        """See `Message.plan`; a channel that residnet knows is taken to be in its SI unit, any
-        other has none.
+        """Return the channel of a series.
+
+        A channel that residnet knows is taken to be in its SI unit, any other has none.
         """
         if not one.has("data"):
             return Plan()
@@ -196,7 +196,7 @@ class Joints(Message):
     signature = ("position.0", "effort.0")
 
     def plan(self, one: Series) -> Plan:
-        """See `Message.plan`."""
+        """Return the channels that a series of this message gives."""
         channels = {}
         for path in one.fields:
             what, _, joint = path.partition(".")
@@ -212,8 +212,9 @@ class Joints(Message):
 
 @final
 class Named(Message):
-    """A table without a type whose fields bear the names of residnet's channels: they are taken to
-    be in SI, NED and body axes.
+    """A table without a type whose fields bear the names of residnet's channels.
+
+    They are taken to be in SI, NED and body axes.
     """
 
     types = ()
@@ -222,11 +223,11 @@ class Named(Message):
     _enough: ClassVar[int] = 3
 
     def fits(self, one: Series) -> bool:
-        """See `Message.fits`."""
+        """Return whether the fields of a series bear such names."""
         return not one.kind and len(self._names(one)) >= self._enough
 
     def plan(self, one: Series) -> Plan:
-        """See `Message.plan`."""
+        """Return the channels that a series of this message gives."""
         names = self._names(one)
         heading = Angle(topic=one.name, field="psi") if "psi" in names else None
         position = Local(topic=one.name, north="x", east="y") if {"x", "y"} <= set(names) else None
@@ -268,7 +269,10 @@ MESSAGES: tuple[Message, ...] = (
 
 
 def standard_plan(recording: Recording, declared: Plan) -> Plan:
-    """Return the declared plan with what standard messages add to it, the ones that say most first, then the busiest topic of each kind."""
+    """Return the declared plan with what standard messages add to it.
+
+    The messages that say most come first, then the busiest topic of each kind.
+    """
     plan, said, remarks = declared, [], []
     for message in MESSAGES:
         fitting = [one for one in recording.series.values() if len(one) > 1 and message.fits(one)]
@@ -329,7 +333,7 @@ def _joined(plan: Plan, offered: Plan) -> tuple[Plan, Sequence[str]]:
 
 
 def _channel_name(topic: str) -> str:
-    """Return a channel's name from a topic's: its last part where residnet knows that, else all parts."""
+    """Return a channel's name from a topic's: the last part if known, else all parts."""
     parts = [part for part in key_of(topic).split("_") if part]
     for k in range(len(parts)):
         name = "_".join(parts[k:])

@@ -26,14 +26,16 @@ _DATED = 100_000_000.0
 
 @final
 class ArduPilotConfig(RecordingConfig):
-    """ArduPilot dataflash log; a series is named by its message (`ATT`, `GPS`, the second instance
-    `GPS_1`), fields bear ArduPilot's names.
+    """An ArduPilot dataflash log.
+
+    A series is named by its message (`ATT`, `GPS`, the second instance `GPS_1`), fields bear
+    ArduPilot's names.
     """
 
     kind: Literal["ardupilot"] = "ardupilot"
 
     def load(self, path: Path, wanted: Wanted) -> Recording:
-        """See `RecordingConfig.load`."""
+        """Read the wanted messages of a dataflash log."""
         return load_ardupilot(path, wanted)
 
 
@@ -147,12 +149,12 @@ class _Columns:
         self.time, self._rows = array("q"), array("d")
 
     def add(self, message: Any) -> None:
-        """Return one more message."""
+        """Append one message to the columns."""
         self.time.append(int(message.TimeUS) * 1000)
         self._rows.extend([getattr(message, name) for name in self._names])
 
     def series(self, name: str, origin: int) -> Series:
-        """With times in s from `origin` (ns since boot)."""
+        """Return the columns as a series with times in s from `origin` (ns since boot)."""
         rows = np.frombuffer(self._rows, dtype=np.float64).reshape(len(self.time), len(self._names))
         t = (np.frombuffer(self.time, dtype=np.int64) - origin) * 1e-9
         return Series(

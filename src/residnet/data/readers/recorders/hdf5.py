@@ -37,7 +37,7 @@ class Hdf5Config(RecordingConfig):
     table: str | None = Field(default=None, min_length=1)
 
     def load(self, path: Path, wanted: Wanted) -> Recording:
-        """See `RecordingConfig.load`."""
+        """Read the wanted groups of an HDF5 file."""
         return load_hdf5(
             path, wanted if self.table is None else Wanted([(self.table, "")]), self.time
         )

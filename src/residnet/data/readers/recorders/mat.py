@@ -20,8 +20,9 @@ from residnet.data.readers.recording import Recording
 
 @final
 class MatConfig(RecordingConfig):
-    """MATLAB file, v5 or v7.3: vectors, matrices of one row per sample, structs, Simulink's
-    structures with time.
+    """A MATLAB file, v5 or v7.3: vectors, matrices, structs, Simulink's structures with time.
+
+    Matrices have one row per sample.
 
     Attributes:
         time: which variable of a struct (or of the workspace) holds time.
@@ -33,7 +34,7 @@ class MatConfig(RecordingConfig):
     table: str | None = Field(default=None, min_length=1)
 
     def load(self, path: Path, wanted: Wanted) -> Recording:
-        """See `RecordingConfig.load`."""
+        """Read the wanted variables of a MATLAB file."""
         return load_mat(
             path, wanted if self.table is None else Wanted([(self.table, "")]), self.time
         )

@@ -1,6 +1,4 @@
-"""Reader of NMEA 0183 sentences as a receiver or a logger writes them to text, through the package
-pynmea2.
-"""
+"""The reader of NMEA 0183 sentences in text files, through the package pynmea2."""
 
 from __future__ import annotations
 
@@ -28,8 +26,9 @@ _REPORT_EVERY = 5000
 
 @final
 class NmeaConfig(RecordingConfig):
-    """NMEA 0183 text, one sentence per line, with or without a time in front of it; a series is
-    named by its sentence (`RMC`, `HDT`).
+    """NMEA 0183 text, one sentence per line, with or without a time in front of it.
+
+    A series is named by its sentence (`RMC`, `HDT`).
 
     Fields bear the names of pynmea2; `latitude` and `longitude` are in signed degrees,
     `rate_of_turn` is in deg/s (the sentence has deg/min).
@@ -38,7 +37,7 @@ class NmeaConfig(RecordingConfig):
     kind: Literal["nmea"] = "nmea"
 
     def load(self, path: Path, wanted: Wanted) -> Recording:
-        """See `RecordingConfig.load`."""
+        """Read the wanted sentences of a text file."""
         return load_nmea(path, wanted)
 
 
@@ -86,8 +85,9 @@ def load_nmea(path: Path, wanted: Wanted = EVERYTHING) -> Recording:
 
 @final
 class _Sentence:
-    """Sentences of one kind: numbers row by row, their own time or -1, and how many timed sentences
-    went before.
+    """The sentences of one kind: numbers row by row, and their times.
+
+    A time is the sentence's own or -1; beside it stands how many timed sentences went before.
     """
 
     def __init__(self) -> None:
@@ -96,7 +96,7 @@ class _Sentence:
         self.before: list[str] = []
 
     def column(self, i: int) -> np.ndarray:
-        """Return one field [T]."""
+        """Return one field [T] by its number."""
         return np.frombuffer(self.rows, dtype=np.float64).reshape(-1, len(self.names))[:, i]
 
 
@@ -126,7 +126,7 @@ class _Lines:
         one.before.append(before)
 
     def _tick(self, message: Any) -> int | None:
-        """Return the time of a sentence in ns (Unix time once a date is known), None where it tells none."""
+        """Return the time of a sentence in ns (Unix time once a date is known), else None."""
         try:
             moment, date = message.timestamp, _date(message)
         except (AttributeError, ValueError, TypeError):
@@ -205,7 +205,10 @@ class _Lines:
 
 
 def _between(number: np.ndarray, ticks: np.ndarray) -> np.ndarray:
-    """Return the times [T] of sentences, of which `number` says after which tick each came: evenly over the time to the next tick."""
+    """Return the times [T] of sentences without a time, evenly between the timed ones.
+
+    `number` says after which timed sentence each came.
+    """
     number = np.clip(number, 0, ticks.size - 1)
     first = np.append(True, number[1:] != number[:-1])
     start = np.maximum.accumulate(np.where(first, np.arange(number.size), 0))

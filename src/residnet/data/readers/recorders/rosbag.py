@@ -1,5 +1,6 @@
-"""Reader of ROS 1 bags, ROS 2 bags (SQLite, MCAP) and plain MCAP files, through the package
-rosbags; no ROS is needed.
+"""The reader of ROS 1 bags, ROS 2 bags (SQLite, MCAP) and MCAP files, through rosbags.
+
+No ROS is needed.
 """
 
 from __future__ import annotations
@@ -31,14 +32,12 @@ _REPORT_EVERY = 5000
 
 @final
 class RosbagConfig(RecordingConfig):
-    """ROS 1 bag, ROS 2 bag (a folder with metadata.yaml, .db3 or .mcap), or plain MCAP file with
-    ROS 2 messages.
-    """
+    """A ROS 1 bag, a ROS 2 bag (a folder with metadata.yaml), or an .mcap or .db3 file."""
 
     kind: Literal["rosbag"] = "rosbag"
 
     def load(self, path: Path, wanted: Wanted) -> Recording:
-        """See `RecordingConfig.load`."""
+        """Read the wanted topics of a bag."""
         return load_bag(path, wanted)
 
 
@@ -184,9 +183,7 @@ class _Columns:
 
 @final
 class _Leaves:
-    """The numbers in a message: their paths, and the way to them; the first message of a topic
-    decides.
-    """
+    """The numbers in a message, by their paths; the first message of a topic decides."""
 
     def __init__(self, message: Any, wanted: Callable[[str], bool]) -> None:
         scalars: list[str] = []
@@ -212,7 +209,7 @@ class _Leaves:
         self._arrays = [(attrgetter(path), size) for path, size in arrays]
 
     def numbers(self, message: Any) -> list[float]:
-        """Return their values."""
+        """Return the numbers of a message, in the order of the paths."""
         out: list[float] = []
         if self._scalars is not None:
             out = [self._scalars(message)] if self._single else list(self._scalars(message))

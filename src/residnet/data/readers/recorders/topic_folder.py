@@ -27,8 +27,7 @@ _CHUNK = 200_000
 
 @final
 class TopicFolderConfig(RecordingConfig):
-    """A folder of csv files, one per topic, each with its own clock, or one csv file with dates,
-    latitudes, quaternions.
+    """A folder of csv files, one per topic, each with its own clock; or one such csv file.
 
     A topic is named by its path below the folder, without the ending.
 
@@ -42,8 +41,9 @@ class TopicFolderConfig(RecordingConfig):
     delimiter: str = Field(default=",", min_length=1, max_length=1)
 
     def load(self, path: Path, wanted: Wanted) -> Recording:
-        """See `RecordingConfig.load`; unwanted topics of a small folder are read too, so that what
-        is wrong with them is said.
+        """Read the wanted topics of a folder.
+
+        Unwanted topics of a small folder are read too, so that what is wrong with them is reported.
         """
         return load_folder(path, wanted, self.time, self.delimiter)
 
@@ -111,7 +111,10 @@ def load_folder(
 
 
 def is_topic_folder(path: Path) -> bool:
-    """Return whether a folder's csv files are topics of one recording, and not logs of their own: stamped headers, or headers that differ."""
+    """Return whether a folder's csv files are topics of one recording, and not logs.
+
+    Topics have stamped headers, or headers that differ.
+    """
     if not path.is_dir():
         return False
     heads = []
@@ -147,7 +150,7 @@ class _Table:
         )
 
     def series(self, name: str, epoch: int | None) -> Series:
-        """With times in s from the epoch."""
+        """Return the table as a series with times in s from the epoch."""
 
         def seconds(stamps: Stamps | None) -> np.ndarray | None:
             if stamps is None:

@@ -1,5 +1,6 @@
-"""Vectors in a tree of groups or structs, as MATLAB and HDF5 files hold them, to a recording: every
-group with a time is one series.
+"""Vectors in a tree of groups or structs, as MATLAB and HDF5 files hold them.
+
+Every group with a time is one series.
 """
 
 from __future__ import annotations
@@ -41,13 +42,19 @@ class Vector(Protocol):
     """An array that may still lie in its file; `numpy.asarray` reads it."""
 
     @property
-    def shape(self) -> tuple[int, ...]: ...
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the array."""
+        ...
 
     @property
-    def dtype(self) -> np.dtype: ...
+    def dtype(self) -> np.dtype:
+        """Type of its elements."""
+        ...
 
     @property
-    def size(self) -> int: ...
+    def size(self) -> int:
+        """Number of its elements."""
+        ...
 
 
 class TreeTime(Config):
@@ -89,7 +96,9 @@ class TreeTime(Config):
 def tree_recording(
     path: Path, leaves: Mapping[str, Vector], time: TreeTime, wanted: Wanted
 ) -> Recording:
-    """Return the recording of vectors by their path (`trial/u`): each belongs to the nearest group above it whose time has its length.
+    """Return the recording of vectors by their path (`trial/u`).
+
+    Each vector belongs to the nearest group above it whose time has its length.
 
     Args:
         path: the file.

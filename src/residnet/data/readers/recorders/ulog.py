@@ -19,7 +19,9 @@ from residnet.data.readers.recording import Recording, Remark, Series, remark
 
 @final
 class UlogConfig(RecordingConfig):
-    """PX4 ULog; a series is named by its message (`vehicle_local_position`, the second instance
+    """A PX4 ULog file.
+
+    A series is named by its message (`vehicle_local_position`, the second instance
     `vehicle_gps_position_1`).
 
     Fields bear PX4's names; the parts of a quaternion `q[0]` to `q[3]` are `q.w`, `q.x`, `q.y`,
@@ -29,7 +31,7 @@ class UlogConfig(RecordingConfig):
     kind: Literal["ulog"] = "ulog"
 
     def load(self, path: Path, wanted: Wanted) -> Recording:
-        """See `RecordingConfig.load`."""
+        """Read the wanted messages of a ULog."""
         return load_ulog(path, wanted)
 
 

@@ -22,12 +22,12 @@ from residnet.data.readers.base import (
 
 
 class CanonicalConfig(Config):
-    """Logs that residnet wrote: names, units and masks are inside, so there is nothing to declare."""
+    """Logs that residnet wrote: they hold names, units and masks, so nothing is declared."""
 
     kind: Literal["canonical"] = "canonical"
 
     def build(self) -> CanonicalReader:
-        """Return the reader."""
+        """Build the reader of canonical logs."""
         return CanonicalReader()
 
 

@@ -25,8 +25,9 @@ def names_sender(column: str) -> bool:
 
 @final
 class Cells:
-    """One column as its chunks come: times as whole ns, numbers as float64 (whole stamps int64), of
-    text only what is said of it.
+    """One column as its chunks come.
+
+    Times are whole ns, numbers float64 (whole stamps int64); of text only a summary is kept.
     """
 
     def __init__(self, name: str, *, is_time: bool) -> None:
@@ -44,7 +45,7 @@ class Cells:
         self._stamps: list[Stamps] = []
 
     def add(self, cells: pd.Series) -> None:
-        """Return one more chunk.
+        """Append one chunk of the column.
 
         Raises:
             DataError: where a cell of the time column is no time.
@@ -97,7 +98,7 @@ class Cells:
         return not self._is_time and (not self.spoilt or 2 * self.spoilt < self._filled)
 
     def numbers(self) -> np.ndarray:
-        """Return the column [T]."""
+        """Return the column [T] as numbers."""
         return np.concatenate(self._parts)
 
     def words(self) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""How one foreign channel becomes one of a log: unit, sign and frame, converted once, at the door."""
+"""How a foreign channel becomes one of a log: unit, sign and frame, converted once."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""The lines of a text table before anything parses them: as many cells in each as in the header, no
-zero bytes, a last line that is whole.
+"""Checks of a text table's lines before anything parses them.
+
+Each has as many cells as the header, no zero bytes, and the last line is whole.
 
 A parser fills short lines with nothing and reads on; cells that slipped by one column would be
 numbers like any other.
@@ -108,7 +109,7 @@ def _counted(block: bytes, delimiter: str, wide: int) -> tuple[np.ndarray, np.nd
 
 
 def _quoted(block: bytes, delimiter: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return the same where quotes may hold delimiters; line ends within quotes make no new line."""
+    """Return the same where quotes may hold delimiters, but no line ends."""
     try:
         rows = list(
             csv.reader(

@@ -1,5 +1,4 @@
-"""Reader of foreign tables (csv, Parquet): a channel map names each column, its unit, sign and
-frame.
+"""The reader of foreign tables (csv, Parquet), each column by its entry in a channel map.
 
 Everything foreign is converted here, once: units to SI, signs and frames to NED and body axes
 forward-starboard-down, psi unwrapped.
@@ -43,7 +42,12 @@ _PIECE = 20_000
 
 
 class TimeColumn(Config):
-    """The column that holds time, and its unit."""
+    """The column that holds time, and its unit.
+
+    Attributes:
+        column: name of the column.
+        unit: unit of its numbers, for example `ms`.
+    """
 
     column: str
     unit: str = "s"
@@ -56,11 +60,17 @@ class TimeColumn(Config):
 
 
 class _TableConfig(Config, ABC):
-    """What csv and Parquet have in common; `channels` maps canonical names (or names of your own)
-    to columns, all of which must exist.
+    """The part that csv and Parquet have in common.
 
     `manoeuvre` is the kind of manoeuvre of every file, `folder` takes the name of each file's
     folder, null says that nobody knows.
+
+    Attributes:
+        time: column of the time.
+        channels: canonical names (or names of your own) and the columns that they are taken from,
+            all of which must exist.
+        manoeuvre: kind of manoeuvre of every file; `folder` takes the name of each file's folder,
+            null says that it is not known.
     """
 
     time: TimeColumn
@@ -76,19 +86,24 @@ class _TableConfig(Config, ABC):
 
     @abstractmethod
     def build(self) -> LogReader:
-        """Return the reader."""
+        """Build the reader of such tables."""
 
 
 @final
 class CsvConfig(_TableConfig):
-    """Text tables with one header line."""
+    """Text tables with one header line.
+
+    Attributes:
+        delimiter: between cells.
+        decimal: sign of the decimals, `.` or `,`.
+    """
 
     kind: Literal["csv"] = "csv"
     delimiter: str = Field(default=",", min_length=1, max_length=1)
     decimal: Literal[".", ","] = "."
 
     def build(self) -> TableReader:
-        """Return the reader."""
+        """Build the reader of csv files."""
         return TableReader(
             self,
             lambda path, names: _read_csv(path, names, self.delimiter, self.decimal),
@@ -103,7 +118,7 @@ class ParquetConfig(_TableConfig):
     kind: Literal["parquet"] = "parquet"
 
     def build(self) -> TableReader:
-        """Return the reader."""
+        """Build the reader of Parquet files."""
         return TableReader(self, _read_parquet, lambda i: f"row {i + 1}")
 
 
@@ -199,8 +214,9 @@ class TableReader(LogReader):
 
 @final
 class _Rows:
-    """Rows as they come: measured ones are kept, in SI; what must hold over the whole table is
-    watched.
+    """The rows of a table as they come: measured ones are kept, in SI.
+
+    What must hold over the whole table is checked on the way.
     """
 
     def __init__(
