@@ -26,7 +26,11 @@ STILL = SensorNoise(u=0, v=0, r=0)
 def ship(vessel: str, disturbance: Disturbance) -> tuple[Craft, Sea]:
     plant = load_vessel(vessel).build()
     craft = Craft(
-        vessel, PlantDynamics(plant, STEP, 1), Helm.from_plant(plant), plant.commands, plant.approach(1)
+        vessel,
+        PlantDynamics(plant, STEP, 1),
+        Helm.from_plant(plant),
+        plant.commands,
+        plant.approach(1),
     )
     return craft, Sea(plant, disturbance, STILL, 0)
 

@@ -177,7 +177,11 @@ def flights() -> list[tuple[Flight, Flight]]:
     actuated = ActuatedDynamics(hybrid, signals.columns, "mean", gear)
     sea = Sea(plant, Disturbance(), SensorNoise(), 0)
     ship = Craft(
-        "ship", PlantDynamics(plant, step, 1), Helm.from_plant(plant), plant.commands, plant.approach(1)
+        "ship",
+        PlantDynamics(plant, step, 1),
+        Helm.from_plant(plant),
+        plant.commands,
+        plant.approach(1),
     )
     model = Craft(
         "model",

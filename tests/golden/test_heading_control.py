@@ -53,8 +53,7 @@ Heading = Callable[[np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class Case:
-    """What flies: the model and its step, and the source of its rudder for the times of the steps.
-    """
+    """What flies: the model and its step, and the source of its rudder for the steps' times."""
 
     plant: Plant
     model: Dynamics
@@ -113,7 +112,9 @@ def zigzag(angle: str, heading: str, rate: str | None) -> Case:
         heading=float(np.radians(float(heading))),
     )
     return Case(
-        plant, NomotoDynamics(plant, 0.01), lambda t: Zigzag.source([manoeuvre], Helm.from_plant(plant), t)
+        plant,
+        NomotoDynamics(plant, 0.01),
+        lambda t: Zigzag.source([manoeuvre], Helm.from_plant(plant), t),
     )
 
 

@@ -68,7 +68,8 @@ def test_every_vessel_in_a_batch_with_gradients(name: str) -> None:
             plant.rate(x[row : row + 1], w[row : row + 1])[0], rate[row], rtol=1e-9, atol=1e-12
         )
         torch.testing.assert_close(
-            plant.end_step(x[row : row + 1], w[row : row + 1], 0.01)[0], plant.end_step(x, w, 0.01)[row]
+            plant.end_step(x[row : row + 1], w[row : row + 1], 0.01)[0],
+            plant.end_step(x, w, 0.01)[row],
         )
 
 

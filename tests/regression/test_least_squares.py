@@ -57,7 +57,7 @@ def test_textbook_errors_with_one_manoeuvre() -> None:
 
 
 def test_cluster_errors_in_closed_form() -> None:
-    """(X'X)^-1 sum_g X_g'e_g e_g'X_g (X'X)^-1 G / (G - 1), written out in the columns' own units."""
+    """(X'X)^-1 sum_g X_g'e_g e_g'X_g (X'X)^-1 G / (G - 1), in the columns' own units."""
     rng = np.random.default_rng(3)
     x, group = problem(7, 30, rng)
     y = rng.normal(size=(210, 2))

@@ -1,4 +1,4 @@
-"""The surface analysis against the same surface from scikit-learn's PLSRegression, model by model."""
+"""The surface analysis against the same surface from scikit-learn's PLSRegression."""
 
 from __future__ import annotations
 

@@ -126,7 +126,7 @@ class BasisHead(ClosedFormHead):
         moments: FoldMoments,
         notes: dict[str, Any] | None = None,
     ) -> Solution:
-        """A solution y = mean_y + (x - mean_x) coefficients [J, 3], means as `moments` counts them."""
+        """A solution y = mean_y + (x - mean_x) coefficients [J, 3], means as in `moments`."""
         intercept = mean_y + moments.shift_y - (mean_x + moments.shift_x) @ coefficients
         return Solution(
             choice, {"coefficients": coefficients, "intercept": intercept}, notes=notes or {}

@@ -12,7 +12,7 @@ from residnet.core.errors import FitError
 
 
 class DelayProfile(NamedTuple):
-    """Residual sum of squares of each shift [S + 1], and the shift where it is least, in samples."""
+    """Residual sum of squares of each shift [S + 1], and the shift of the least, in samples."""
 
     rss: np.ndarray
     shift: int

@@ -1,4 +1,4 @@
-"""Partial least squares regression (document 002 section 3.2, ERRATA J14-J17), from moments alone."""
+"""Partial least squares (document 002 section 3.2, ERRATA J14-J17), from moments alone."""
 
 from __future__ import annotations
 

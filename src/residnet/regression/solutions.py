@@ -55,8 +55,8 @@ class Solution:
         state: numbers of the module that was fitted, by name, as in its state_dict.
         table: the same with names and standard errors, where the fit knows them.
         notes: what else there is to say about the fit.
-        neighbours: solutions near this one, made when free runs find it best, to be tried next; None
-            where there are none.
+        neighbours: solutions near this one, made when free runs find it best, to be tried next;
+            None where there are none.
     """
 
     choice: dict[str, Any]

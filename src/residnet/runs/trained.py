@@ -1,5 +1,4 @@
-"""Weights and notes of what a run has trained, so that an interrupted run need not train it again.
-"""
+"""Weights and notes of what a run has trained, so that an interrupted run can go on."""
 
 from __future__ import annotations
 
@@ -17,7 +16,10 @@ def store_weights(module: nn.Module, name: str, folder: RunFolder, notes: dict[s
 
     place = folder.models / name
     place.mkdir(parents=True, exist_ok=True)
-    save_file({key: value.contiguous() for key, value in module.state_dict().items()}, place / "weights.safetensors")
+    save_file(
+        {key: value.contiguous() for key, value in module.state_dict().items()},
+        place / "weights.safetensors",
+    )
     folder.write_json(place / "fit.json", notes)
 
 

@@ -155,7 +155,7 @@ class Algebra:
         return {self._function(function, turned): -1.0 if odd else 1.0}
 
     def _function(self, function: Function, a: Sum) -> Product:
-        """The product that a function of a sum is; of one atom alone a simpler one where there is."""
+        """The product that a function of a sum is; of one atom a simpler one if there is."""
         ((first, weight),) = list(a.items())[:1]
         if (
             len(a) == 1

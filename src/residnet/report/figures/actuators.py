@@ -21,7 +21,7 @@ def draw_actuators(
     step: StepAnswer | None,
     thrust: tuple[ThrustFit, ThrustFit] | None,
 ) -> None:
-    """Measurements as dots or thin lines, fits over them; one panel for each test that there was."""
+    """Measurements as dots or thin lines, fits over them; one panel for each test."""
     import matplotlib
 
     panels = [

@@ -244,7 +244,7 @@ def _fit(fit: StandardFit) -> dict[str, Any]:
 
 
 def draw_trial(study: PhaseStudy, file: Path) -> None:
-    """Velocities and commands of all logs one after another, phases shaded (Figures 7.1 and 7.2)."""
+    """Velocities and commands of all logs one after another, phases shaded (Figures 7.1, 7.2)."""
     from matplotlib import rc_context
 
     trial, z = study.trial, study.trial.samples.z.numpy()

@@ -270,7 +270,7 @@ def _errors(jacobian: np.ndarray, left: np.ndarray, free: np.ndarray) -> _Told:
 
 
 def _spread(told: _Told, along: np.ndarray) -> float:
-    """Standard error of a combination of scaled parameters; infinite where the data leave it open."""
+    """Standard error of a combination of scaled parameters; infinite where it is left open."""
     if told.open.size and np.linalg.norm(told.open.T @ along) > 1e-3 * np.linalg.norm(along):
         return float("inf")
     return float(np.sqrt(max(along @ told.covariance @ along, 0.0)))
