@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import residnet.runs.provenance as provenance_module
-from residnet import __version__
+from residnet.core.version import __version__
 from residnet.runs.folder import RunFolder
 from residnet.runs.provenance import Provenance, git_revision, sha256
 

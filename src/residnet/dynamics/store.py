@@ -11,11 +11,11 @@ from typing import Literal
 
 from pydantic import Field
 
-from residnet import __version__
 from residnet.baselines import BaselineConfig
 from residnet.core.config import Config, validate
 from residnet.core.errors import UsageError
 from residnet.core.names import VELOCITY, nearest
+from residnet.core.version import __version__
 from residnet.dynamics.base import Integrator
 from residnet.dynamics.ensemble import mean_of
 from residnet.dynamics.hybrid import HybridDynamics

@@ -15,9 +15,9 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from residnet import __version__
 from residnet.control.heading.policy import MEMORY, HeadingPolicy
 from residnet.core.errors import ExportError
+from residnet.core.version import __version__
 from residnet.export.scripting import write_scripted
 
 MEASURED = ("psi", "u", "r")

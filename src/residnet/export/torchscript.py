@@ -14,9 +14,9 @@ from typing import Any, ClassVar, final
 import torch
 from torch import Tensor, nn
 
-from residnet import __version__
 from residnet.core.errors import ExportError
 from residnet.core.names import STATE
+from residnet.core.version import __version__
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.store import ModelSpec

@@ -13,7 +13,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from residnet import __version__
+from residnet.core.version import __version__
 
 if TYPE_CHECKING:
     from residnet.runs.folder import RunFolder
