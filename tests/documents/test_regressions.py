@@ -14,9 +14,9 @@ from sklearn.cross_decomposition import PLSRegression
 from sklearn.linear_model import LinearRegression, Ridge
 
 from residnet.core.errors import FitError
-from residnet.documents.jervan2020.regressions import Fit, Regression, RegressionConfig, segments
+from residnet.documents.jervan2020.regressions import Fit, Regression, RegressionConfig
 from residnet.regression.nipals import nipals
-from residnet.regression.plsr import pls_path
+from residnet.regression.pls_path import pls_path
 
 TERMS = tuple("abcdef")
 
@@ -156,7 +156,3 @@ def test_clear_errors() -> None:
         with pytest.raises(FitError, match="one run or segment only"):
             fitted(single, kind=kind)
     assert fitted(single, kind="plsr", order=2).notes["order"] == 2
-
-
-def test_segments() -> None:
-    assert segments(torch.tensor([0.0, 5.0, 9.9, 10.0, 31.0]), 10.0).tolist() == [0, 0, 0, 1, 2]

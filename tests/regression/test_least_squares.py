@@ -10,9 +10,22 @@ import torch
 from sklearn.linear_model import Ridge
 
 from residnet.core.errors import FitError
-from residnet.regression.least_squares import solve
+from residnet.regression.least_squares import LeastSquares
+from residnet.regression.solutions import Solution
 
 NAMES = ("a", "b", "c")
+
+
+def solve(
+    x: torch.Tensor,
+    y: torch.Tensor,
+    group: torch.Tensor,
+    *,
+    names: tuple[str, ...],
+    ridge: float = 0.0,
+) -> Solution:
+    (found,) = LeastSquares((ridge,)).fit(x, y, group, names=names)
+    return found
 
 
 def problem(groups: int, per: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -27,7 +40,7 @@ def test_coefficients_are_the_least_squares_ones() -> None:
     fit = solve(torch.from_numpy(x), torch.from_numpy(y), torch.from_numpy(group), names=NAMES)
     np.testing.assert_allclose(fit.coefficients, np.linalg.lstsq(x, y, rcond=None)[0], rtol=1e-10)
     scaled = x / np.sqrt((x**2).mean(0))
-    assert fit.condition == pytest.approx(np.linalg.cond(scaled), rel=1e-9)
+    assert fit.notes["condition"] == pytest.approx(np.linalg.cond(scaled), rel=1e-9)
 
 
 def test_ridge_is_a_share_of_each_column_s_energy() -> None:

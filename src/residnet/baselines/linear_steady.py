@@ -15,7 +15,7 @@ from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.config import Seconds
 from residnet.core.errors import FitError
 from residnet.core.samples import Samples
-from residnet.regression.least_squares import LinearFit, solve
+from residnet.regression.least_squares import LeastSquares
 from residnet.regression.solutions import Coefficient, Solution
 
 
@@ -68,7 +68,7 @@ class LinearSteadyConfig(IdentifiedConfig):
                 table.append(Coefficient(f"{'uvr'[axis]}_dot", term, value, error))
         return [Solution({}, {"theta": theta}, tuple(table))]
 
-    def _steady_states(self, samples: Samples, states: tuple[str, ...], drive: str) -> LinearFit:
+    def _steady_states(self, samples: Samples, states: tuple[str, ...], drive: str) -> Solution:
         """Phi and Phi_bias [2, n] (rows: slope, bias) from the means of the settled part of every
         constant manoeuvre.
         """
@@ -90,7 +90,14 @@ class LinearSteadyConfig(IdentifiedConfig):
             / count
         )
         slope = torch.stack((means[:, -1], torch.ones_like(means[:, -1])), dim=1)
-        return solve(slope, means[:, :-1], torch.arange(int(present.numel())), names=(drive, "1"))
+        (steady,) = LeastSquares().fit(
+            slope,
+            means[:, :-1],
+            torch.arange(int(present.numel())),
+            names=(drive, "1"),
+            outputs=states,
+        )
+        return steady
 
     def _block(
         self, samples: Samples, states: tuple[str, ...], drive: str, kinds: tuple[str, ...]
@@ -110,7 +117,9 @@ class LinearSteadyConfig(IdentifiedConfig):
             x - dynamic.column(drive)[:, None] * steady.coefficients[0] - steady.coefficients[1]
         )
         axes = ["uvr".index(name) for name in states]
-        dynamic_fit = solve(deviation, dynamic.target[:, axes], dynamic.group, names=states)
+        (dynamic_fit,) = LeastSquares().fit(
+            deviation, dynamic.target[:, axes], dynamic.group, names=states
+        )
         a, a_error = dynamic_fit.coefficients.T, dynamic_fit.errors.T
         rows: list[list[tuple[str, float, float]]] = []
         for i in range(len(states)):

@@ -12,9 +12,9 @@ import torch
 from residnet.baselines.base import Baseline, IdentifiedConfig, of_manoeuvres, require
 from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.errors import FitError
-from residnet.core.names import VELOCITY
+from residnet.core.names import ACCELERATION, VELOCITY
 from residnet.core.samples import Samples
-from residnet.regression.least_squares import LinearFit, solve
+from residnet.regression.least_squares import LeastSquares, linear_solution
 from residnet.regression.solutions import Coefficient, Ratio, Solution
 
 
@@ -44,7 +44,7 @@ class _SteeringConfig(IdentifiedConfig):
         require(names, ("u", "v", "r", self.drive, self.steer), "a Nomoto baseline")
         return RegressorBaseline(self.rows(), names, self.held)
 
-    def lag(self, baseline: RegressorBaseline, samples: Samples, axis: int) -> LinearFit:
+    def lag(self, baseline: RegressorBaseline, samples: Samples, axis: int) -> Solution:
         """Least squares of one axis as a first-order lag.
 
         Raises:
@@ -54,7 +54,13 @@ class _SteeringConfig(IdentifiedConfig):
         columns = baseline.library(chosen.z)[
             :, [baseline.library.terms.index(term) for term in terms]
         ]
-        fit = solve(columns, chosen.target[:, axis : axis + 1], chosen.group, names=terms)
+        (fit,) = LeastSquares().fit(
+            columns,
+            chosen.target[:, [axis]],
+            chosen.group,
+            names=terms,
+            outputs=(ACCELERATION[axis],),
+        )
         slope, error, name = float(fit.coefficients[0, 0]), float(fit.errors[0, 0]), VELOCITY[axis]
         if slope >= 0:
             raise FitError(
@@ -66,10 +72,12 @@ class _SteeringConfig(IdentifiedConfig):
 
 
 def _parameters(
-    axis: int, terms: Sequence[str], fit: LinearFit, ratios: Mapping[str, Ratio]
+    axis: int, terms: Sequence[str], fit: Solution, ratios: Mapping[str, Ratio]
 ) -> list[Coefficient]:
     """Parameters that are ratios of the coefficients of an axis, with errors to first order."""
-    theta, covariance = fit.coefficients[:, 0], fit.covariance[0]
+    theta = fit.coefficients[:, 0]
+    assert fit.covariance is not None
+    covariance = fit.covariance[0]
     out = []
     for name, ratio in ratios.items():
         below = terms.index(ratio.denominator)
@@ -80,7 +88,7 @@ def _parameters(
             gradient[terms.index(ratio.numerator)] += ratio.sign / theta[below]
         out.append(
             Coefficient(
-                f"{VELOCITY[axis]}_dot",
+                ACCELERATION[axis],
                 name,
                 value,
                 float((gradient @ covariance @ gradient).clamp(min=0).sqrt()),
@@ -108,9 +116,11 @@ class NomotoConfig(_SteeringConfig):
         """
         assert isinstance(baseline, RegressorBaseline)
         surge, yaw = self.lag(baseline, samples, 0), self.lag(baseline, samples, 2)
-        decay = LinearFit(yaw.coefficients[:1], yaw.covariance[:, :1, :1], yaw.condition)
+        assert yaw.covariance is not None
+        slope, covariance = yaw.coefficients[:1], yaw.covariance[:, :1, :1]
+        decay = linear_solution({}, slope, covariance, self.sway, (ACCELERATION[1],), {})
         rows = self.rows()
-        found = baseline.solved(list(zip(rows, (surge, decay, yaw), strict=True)), {})
+        found = baseline.solution((surge, decay, yaw), {})
         more = _parameters(0, rows[0], surge, _lag_of("u", self.drive, "_u")) + _parameters(
             2, rows[2], yaw, _lag_of("r", self.steer, "")
         )
@@ -135,7 +145,7 @@ class NomotoSideslipConfig(_SteeringConfig):
         assert isinstance(baseline, RegressorBaseline)
         fits = [self.lag(baseline, samples, axis) for axis in range(3)]
         rows = self.rows()
-        found = baseline.solved(list(zip(rows, fits, strict=True)), {})
+        found = baseline.solution(fits, {})
         slip = {
             "T_beta": Ratio(-1.0, None, "v"),
             "K_beta": Ratio(1.0, "u r", "v"),

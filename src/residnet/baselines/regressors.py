@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Annotated, Literal, final
+from typing import Annotated, Any, Literal, final
 
 import torch
 from pydantic import Field, model_validator
@@ -12,11 +12,11 @@ from torch import Tensor
 
 from residnet.baselines.base import Baseline, IdentifiedConfig, ParametricBaseline, of_manoeuvres
 from residnet.baselines.sets import Roles, SetName, expand, merged
-from residnet.core.names import VELOCITY
+from residnet.core.names import ACCELERATION, VELOCITY
 from residnet.core.samples import Samples
 from residnet.physics.symmetry import wrong_parity
 from residnet.physics.terms import TermLibrary
-from residnet.regression.least_squares import LinearFit, solve_path
+from residnet.regression.least_squares import LeastSquares
 from residnet.regression.solutions import Coefficient, Solution
 
 RowTerms = dict[Literal["u", "v", "r"], tuple[str, ...]]
@@ -129,21 +129,13 @@ class RegressorBaseline(ParametricBaseline):
         left = samples.target - phi @ (self.theta * self.allowed).detach().T
         return phi, left.square().mean(0)
 
-    def solved(
-        self, fits: Sequence[tuple[Sequence[str], LinearFit]], choice: dict[str, float]
-    ) -> Solution:
-        """A solution from the fit of each axis: its terms, and coefficients [J, 1] with their
-        errors.
-        """
+    def solution(self, fits: Sequence[Solution], choice: dict[str, Any]) -> Solution:
+        """Return the solution of all axes from one of each, whose table names its terms."""
         theta = torch.zeros_like(self.theta)
-        table: list[Coefficient] = []
-        for axis, (terms, fit) in enumerate(fits):
-            for term, value, error in zip(
-                terms, fit.coefficients[:, 0].tolist(), fit.errors[:, 0].tolist(), strict=True
-            ):
-                theta[axis, self.library.terms.index(term)] = value
-                table.append(Coefficient(f"{VELOCITY[axis]}_dot", term, value, error))
-        return Solution(dict(choice), {"theta": theta}, tuple(table))
+        for axis, fit in enumerate(fits):
+            for entry in fit.table:
+                theta[axis, self.library.terms.index(entry.term)] = entry.value
+        return Solution(choice, {"theta": theta}, tuple(c for fit in fits for c in fit.table))
 
 
 class RegressorsConfig(IdentifiedConfig):
@@ -210,20 +202,18 @@ class RegressorsConfig(IdentifiedConfig):
         """
         assert isinstance(baseline, RegressorBaseline)
         chosen = of_manoeuvres(samples, self.manoeuvres)
-        ridges = self.ridge if isinstance(self.ridge, tuple) else (self.ridge,)
+        estimator = LeastSquares(self.ridge if isinstance(self.ridge, tuple) else (self.ridge,))
         phi = baseline.library(chosen.z)
-        terms, paths = [], []
-        for axis in range(3):
+        fits = []
+        for axis, output in enumerate(ACCELERATION):
             columns = baseline.columns(axis)
-            terms.append(tuple(baseline.library.terms[j] for j in columns))
-            target = chosen.target[:, axis : axis + 1]
-            paths.append(
-                solve_path(phi[:, columns], target, chosen.group, names=terms[-1], ridges=ridges)
+            fits.append(
+                estimator.fit(
+                    phi[:, columns],
+                    chosen.target[:, [axis]],
+                    chosen.group,
+                    names=[baseline.library.terms[j] for j in columns],
+                    outputs=(output,),
+                )
             )
-        return [
-            baseline.solved(
-                [(terms[axis], paths[axis][i]) for axis in range(3)],
-                {"ridge": ridge} if len(ridges) > 1 else {},
-            )
-            for i, ridge in enumerate(ridges)
-        ]
+        return [baseline.solution(axes, axes[0].choice) for axes in zip(*fits, strict=True)]

@@ -4,19 +4,19 @@ evaluation does not.
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Any, Literal, Self
+from typing import Literal, Self
 
 import torch
 from pydantic import Field, model_validator
 from torch import Tensor
 
-from residnet.core.errors import FitError
 from residnet.core.names import ACCELERATION
 from residnet.core.samples import Samples
 from residnet.heads.base import ClosedFormHead, FeatureConfig, Features
 from residnet.physics.terms import TermLibrary, polynomial_terms
-from residnet.regression.moments import FoldMoments
+from residnet.regression.estimator import Estimator, require_finite
 from residnet.regression.solutions import Solution
 
 
@@ -90,59 +90,20 @@ class BasisHead(ClosedFormHead):
         """Residual [..., 3] at channels z [..., nz]; the memory is empty."""
         return self.basis(z) @ self.coefficients.to(z.dtype) + self.intercept.to(z.dtype), s
 
-    def moments(self, samples: Samples) -> FoldMoments:
-        """Moments of basis functions and target by fold.
+    @abstractmethod
+    def estimator(self) -> Estimator:
+        """Return the estimator of the coefficients."""
 
-        Raises:
-            FitError: with fewer manoeuvres than folds, fewer samples than basis functions, or one
-                that is not finite.
-        """
-        groups = torch.unique(samples.group)
-        if groups.numel() < self.folds:
-            raise FitError(
-                f"{self.folds} folds need as many manoeuvres, the training data have"
-                f" {groups.numel()}; lower `folds`"
-            )
-        if len(samples) <= self.library.count:
-            raise FitError(
-                f"{len(samples)} samples do not determine {self.library.count} basis functions;"
-                " give more data or fewer terms"
-            )
-        fold = torch.searchsorted(groups, samples.group) % self.folds
-        chosen = [samples.names.index(name) for name in self.features.names]
-        _require_finite(samples.z[:, chosen], self.features.names, "channel")
-        x = self.basis(samples.z)
-        _require_finite(x, self.library.terms, "basis function")
-        # a column that varies by rounding alone gets no coefficient instead of a huge one
-        constant = x.std(0) <= 1e-9 * x.abs().amax(0)
-        return FoldMoments.gather(x.masked_fill(constant, 0.0), samples.target, fold, self.folds)
-
-    def solution(
-        self,
-        choice: dict[str, Any],
-        coefficients: Tensor,
-        mean_x: Tensor,
-        mean_y: Tensor,
-        moments: FoldMoments,
-        notes: dict[str, Any] | None = None,
-    ) -> Solution:
-        """A solution y = mean_y + (x - mean_x) coefficients [J, 3], means as in `moments`."""
-        intercept = mean_y + moments.shift_y - (mean_x + moments.shift_x) @ coefficients
-        return Solution(
-            choice, {"coefficients": coefficients, "intercept": intercept}, notes=notes or {}
-        )
-
-    def nothing(self, choice: dict[str, Any], notes: dict[str, Any]) -> Solution:
-        """The solution that leaves the baseline as it is: a residual that explains accelerations
-        may still spoil free runs.
-        """
-        return Solution(
-            choice,
-            {
-                "coefficients": torch.zeros_like(self.coefficients),
-                "intercept": torch.zeros_like(self.intercept),
-            },
-            notes=notes,
+    def solutions(self, samples: Samples) -> list[Solution]:
+        """Return the solutions of the estimator; see `ClosedFormHead.solutions`."""
+        chosen = samples.z[:, [samples.names.index(name) for name in self.features.names]]
+        require_finite(chosen, self.features.names, "channel")
+        return self.estimator().fit(
+            self.basis(samples.z),
+            samples.target,
+            samples.group,
+            names=self.library.terms,
+            outputs=ACCELERATION,
         )
 
     def coefficient_table(self) -> dict[str, list[float]]:
@@ -150,12 +111,3 @@ class BasisHead(ClosedFormHead):
         for the report.
         """
         return dict(zip(self.library.terms, self.coefficients.tolist(), strict=True))
-
-
-def _require_finite(values: Tensor, names: Sequence[str], what: str) -> None:
-    bad = ~torch.isfinite(values)
-    if bool(bad.any()):
-        row, column = (int(part[0]) for part in bad.nonzero(as_tuple=True))
-        raise FitError(
-            f"{what} '{names[column]}' is not finite at sample {row}; mask or repair the log"
-        )

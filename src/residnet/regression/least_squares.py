@@ -3,86 +3,174 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import final
 
 import torch
 from torch import Tensor
 
 from residnet.core.errors import FitError
+from residnet.regression.estimator import Estimator, column_names, require_data
+from residnet.regression.solutions import Coefficient, Solution
+
+_COLLINEAR = 1e-9
+"""Share of the largest singular value below which centred columns count as collinear."""
+_NAMED = 0.1
+"""Share of the largest load from which a column is named among collinear ones."""
+_ROUNDING = 10
+"""What rounding leaves of a zero eigenvalue, in units of columns times machine precision."""
+_TINY = 1e-300
+"""Least eigenvalue that a condition number is divided by."""
 
 
-class LinearFit(NamedTuple):
-    """Coefficients [J, K], their covariance for each column of y [K, J, J], and the condition
-    number of the scaled regressors.
-    """
-
-    coefficients: Tensor
-    covariance: Tensor
-    condition: float
-
-    @property
-    def errors(self) -> Tensor:
-        """Standard errors of the coefficients [J, K]."""
-        return self.covariance.diagonal(dim1=1, dim2=2).clamp(min=0).sqrt().T
-
-
-def solve(
-    x: Tensor, y: Tensor, group: Tensor, *, names: tuple[str, ...], ridge: float = 0.0
-) -> LinearFit:
-    """Fit y [N, K] by x [N, J] with one penalty; see `solve_path`."""
-    return solve_path(x, y, group, names=names, ridges=(ridge,))[0]
-
-
-def solve_path(
-    x: Tensor, y: Tensor, group: Tensor, *, names: tuple[str, ...], ridges: Sequence[float]
-) -> list[LinearFit]:
-    """Fit y [N, K] by x [N, J] with each of several relative ridge penalties (0 = ordinary least
-    squares), from one Gram matrix.
+@final
+class LeastSquares(Estimator):
+    """Ordinary least squares without intercept, or with relative ridge penalties.
 
     Columns are scaled to unit root mean square first, so a penalty is a share of each column's own
-    energy. Standard errors are cluster-robust over manoeuvres (`group` [N]): residuals at 10-20 Hz
-    are far from independent, and the textbook formula would claim several times the accuracy. With
-    fewer than two manoeuvres they are the textbook ones.
+    energy. Standard errors are cluster-robust over groups: residuals at 10-20 Hz are far from
+    independent, and the textbook formula would claim several times the accuracy. With fewer than
+    two groups they are the textbook ones.
+
+    Args:
+        penalties: relative ridge penalties, 0 for ordinary least squares; of several `fit` returns
+            one solution each, from one Gram matrix.
+    """
+
+    def __init__(self, penalties: Sequence[float] = (0.0,)) -> None:
+        self.penalties = tuple(penalties)
+
+    def fit(
+        self,
+        x: Tensor,
+        y: Tensor,
+        groups: Tensor | None = None,
+        *,
+        names: Sequence[str] = (),
+        outputs: Sequence[str] = (),
+    ) -> list[Solution]:
+        """Return one solution for each penalty, with standard errors.
+
+        See `Estimator.fit`.
+
+        Raises:
+            FitError: with fewer samples than regressors, a regressor that is zero throughout, or
+                regressors that the data cannot tell apart and no penalty decides between.
+        """
+        n, j = x.shape
+        names, outputs = column_names(x, names, "x"), column_names(y, outputs, "y")
+        require_data(x, y, names, outputs)
+        if n <= j:
+            raise FitError(
+                f"{n} samples do not determine {j} coefficients ({', '.join(names)}); give longer"
+                " or more logs"
+            )
+        scale = x.square().mean(0).sqrt()
+        if bool((scale <= 0).any()):
+            dead = [name for name, s in zip(names, scale.tolist(), strict=True) if s <= 0]
+            raise FitError(
+                f"regressor '{dead[0]}' is zero in all {n} samples; the data do not excite it:"
+                " leave it out or log it"
+            )
+        a = x / scale
+        gram, cross = a.T @ a / n, a.T @ y / n
+        condition = _condition(gram, min(self.penalties), names)
+        solutions = []
+        for penalty in self.penalties:
+            inverse = torch.linalg.inv(gram + penalty * torch.eye(j, dtype=x.dtype))
+            coefficients = inverse @ cross
+            residual = y - a @ coefficients
+            score = torch.stack(
+                [_score_spread(a, residual[:, [k]], gram, groups) for k in range(y.shape[1])]
+            )
+            covariance = inverse @ score @ inverse / n**2 / torch.outer(scale, scale)
+            solutions.append(
+                linear_solution(
+                    {"ridge": penalty} if len(self.penalties) > 1 else {},
+                    coefficients / scale[:, None],
+                    covariance,
+                    names,
+                    outputs,
+                    {"condition": condition},
+                )
+            )
+        return solutions
+
+
+@final
+class CentredLeastSquares(Estimator):
+    """Ordinary least squares with an intercept, from a QR factorisation of the centred columns.
+
+    A QR factor keeps the digits of nearly collinear columns that a Gram matrix loses.
+    """
+
+    def fit(
+        self,
+        x: Tensor,
+        y: Tensor,
+        groups: Tensor | None = None,
+        *,
+        names: Sequence[str] = (),
+        outputs: Sequence[str] = (),
+    ) -> list[Solution]:
+        """Return the one solution; groups do not matter.
+
+        See `Estimator.fit`.
+
+        Raises:
+            FitError: with no more samples than regressors, or where some are collinear, naming
+                them.
+        """
+        names, outputs = column_names(x, names, "x"), column_names(y, outputs, "y")
+        require_data(x, y, names, outputs)
+        if len(x) <= x.shape[1]:
+            raise FitError(
+                f"{len(x)} samples do not determine {x.shape[1]} basis functions; give more data or"
+                " fewer terms"
+            )
+        mean_x, mean_y = x.mean(0), y.mean(0)
+        e, f = x - mean_x, y - mean_y
+        _, singular, right = torch.linalg.svd(e, full_matrices=False)
+        if float(singular[-1]) <= _COLLINEAR * float(singular[0]):
+            loads = right[-1].abs()
+            which = (loads > _NAMED * loads.max()).nonzero()[:, 0].tolist()
+            raise FitError(
+                f"basis functions {', '.join(names[j] for j in which)} are collinear over these"
+                " samples; leave one out, or use ridge or plsr"
+            )
+        coefficients = torch.linalg.lstsq(e, f).solution
+        state = {"coefficients": coefficients, "intercept": mean_y - mean_x @ coefficients}
+        return [Solution({}, state, notes={"condition": float(singular[0] / singular[-1])})]
+
+
+def linear_solution(
+    choice: dict[str, float],
+    coefficients: Tensor,
+    covariance: Tensor,
+    names: Sequence[str],
+    outputs: Sequence[str],
+    notes: dict[str, float],
+) -> Solution:
+    """Return a solution with its table, from coefficients [J, n] and covariances [n, J, J]."""
+    found = Solution(choice, {"coefficients": coefficients}, (), notes, covariance=covariance)
+    errors = found.errors
+    table = tuple(
+        Coefficient(output, name, float(coefficients[j, k]), float(errors[j, k]))
+        for k, output in enumerate(outputs)
+        for j, name in enumerate(names)
+    )
+    return Solution(choice, found.state, table, notes, covariance=covariance)
+
+
+def _condition(gram: Tensor, ridge: float, names: Sequence[str]) -> float:
+    """Return the condition number of the scaled regressors.
 
     Raises:
-        FitError: with fewer samples than regressors, a regressor that is zero throughout, or
-            regressors that the data cannot tell apart and no penalty decides between.
+        FitError: where nothing tells two of them apart.
     """
-    n, j = x.shape
-    if n <= j:
-        raise FitError(
-            f"{n} samples do not determine {j} coefficients ({', '.join(names)}); give longer or"
-            " more logs"
-        )
-    scale = x.square().mean(0).sqrt()
-    if bool((scale <= 0).any()):
-        dead = [name for name, s in zip(names, scale.tolist(), strict=True) if s <= 0]
-        raise FitError(
-            f"regressor '{dead[0]}' is zero in all {n} samples; the data do not excite it: leave it"
-            " out or log it"
-        )
-    a = x / scale
-    gram, cross = a.T @ a / n, a.T @ y / n
-    condition = _condition(gram, min(ridges), names)
-    out = []
-    for ridge in ridges:
-        inverse = torch.linalg.inv(gram + ridge * torch.eye(j, dtype=x.dtype))
-        coefficients = inverse @ cross
-        residual = y - a @ coefficients
-        meat = torch.stack(
-            [_meat(a, residual[:, k : k + 1], gram, group) for k in range(y.shape[1])]
-        )
-        covariance = inverse @ meat @ inverse / n**2 / torch.outer(scale, scale)
-        out.append(LinearFit(coefficients / scale[:, None], covariance, condition))
-    return out
-
-
-def _condition(gram: Tensor, ridge: float, names: tuple[str, ...]) -> float:
-    """Condition number of the scaled regressors; an error where nothing tells two of them apart."""
     values, vectors = torch.linalg.eigh(gram)
-    condition = float(torch.sqrt(values[-1] / values[0].clamp(min=1e-300)))
-    # what rounding leaves of a zero eigenvalue
-    if float(values[0]) + ridge < 10 * len(names) * torch.finfo(gram.dtype).eps * float(values[-1]):
+    condition = float(torch.sqrt(values[-1] / values[0].clamp(min=_TINY)))
+    rounding = _ROUNDING * len(names) * torch.finfo(gram.dtype).eps * float(values[-1])
+    if float(values[0]) + ridge < rounding:
         worst = [names[i] for i in vectors[:, 0].abs().argsort(descending=True)[:2].tolist()]
         raise FitError(
             f"the data cannot tell apart regressors '{worst[0]}' and '{worst[1]}' (condition"
@@ -91,14 +179,16 @@ def _condition(gram: Tensor, ridge: float, names: tuple[str, ...]) -> float:
     return condition
 
 
-def _meat(a: Tensor, residual: Tensor, gram: Tensor, group: Tensor) -> Tensor:
-    """Spread of the score a'e [J, J]: over manoeuvres where there are at least two, else of
-    independent residuals [N, 1].
+def _score_spread(a: Tensor, residual: Tensor, gram: Tensor, groups: Tensor | None) -> Tensor:
+    """Return the spread of the score a'e [J, J], for residuals [N, 1].
+
+    It is taken over groups where there are at least two, else as of independent residuals.
     """
     n, j = a.shape
-    present, index = torch.unique(group, return_inverse=True)
-    count = int(present.numel())
-    if count < 2:
-        return gram * residual.square().sum() / (n - j) * n
-    total = torch.zeros(count, j, dtype=a.dtype).index_add_(0, index, a * residual)
-    return total.T @ total * count / (count - 1)
+    if groups is not None:
+        present, index = torch.unique(groups, return_inverse=True)
+        count = int(present.numel())
+        if count > 1:
+            total = torch.zeros(count, j, dtype=a.dtype).index_add_(0, index, a * residual)
+            return total.T @ total * count / (count - 1)
+    return gram * residual.square().sum() / (n - j) * n

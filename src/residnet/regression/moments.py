@@ -2,16 +2,61 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
+from residnet.core.errors import FitError
+from residnet.regression.estimator import column_names, fold_numbers, require_data
+
+CONSTANT = 1e-9
+"""Standard deviation below which, in units of its largest value, a column counts as constant."""
+
+
+class Centred(NamedTuple):
+    """Moments about the means of a part of the samples.
+
+    Attributes:
+        count: number of samples.
+        mean_x: mean of x [J], less the shift of the moments.
+        mean_y: mean of y [n], less the shift of the moments.
+        xx: X'X about the means [J, J].
+        xy: X'Y about the means [J, n].
+    """
+
+    count: float
+    mean_x: Tensor
+    mean_y: Tensor
+    xx: Tensor
+    xy: Tensor
+
+
+class Candidates(NamedTuple):
+    """Models y = mean_y + (x - mean_x) coefficients of C complexities.
+
+    Attributes:
+        coefficients: of each complexity [C, J, n].
+        mean_x: mean of x [J], less the shift of the moments.
+        mean_y: mean of y [n], less the shift of the moments.
+    """
+
+    coefficients: Tensor
+    mean_x: Tensor
+    mean_y: Tensor
+
 
 class FoldMoments:
-    """Sums over each fold of [1, X, Y]' [1, X, Y], float64: all that closed-form fits and their
-    cross-validation need.
+    """Sums over each fold of [1, X, Y]' [1, X, Y], float64.
 
     The data are passed once; a fold is left out by subtraction. X is shifted by its overall mean
     before, which keeps the differences well conditioned.
+
+    Args:
+        sums: sums of each fold [F, 1 + J + n, 1 + J + n].
+        shift_x: what was taken from x before [J].
+        shift_y: what was taken from y before [n].
     """
 
     def __init__(self, sums: Tensor, shift_x: Tensor, shift_y: Tensor) -> None:
@@ -23,45 +68,78 @@ class FoldMoments:
 
     @classmethod
     def gather(cls, x: Tensor, y: Tensor, fold: Tensor, folds: int) -> FoldMoments:
-        """From X [N, J], Y [N, K] and the fold of each sample [N]."""
+        """Return the moments of x [N, J] and y [N, n], with the fold of each sample [N]."""
         shift_x, shift_y = x.mean(0), y.mean(0)
         joined = torch.cat((torch.ones_like(y[:, :1]), x - shift_x, y - shift_y), dim=1)
         sums = torch.stack([joined[fold == f].T @ joined[fold == f] for f in range(folds)])
         return cls(sums, shift_x, shift_y)
 
-    def centred(self, total: Tensor) -> tuple[float, Tensor, Tensor, Tensor, Tensor]:
-        """(count, mean of X, mean of Y, X'X, X'Y) about the means, from summed moments."""
+    @classmethod
+    def checked(
+        cls,
+        x: Tensor,
+        y: Tensor,
+        groups: Tensor | None,
+        folds: int | None,
+        names: Sequence[str],
+        outputs: Sequence[str],
+    ) -> FoldMoments:
+        """Return the moments for an estimator, in one fold where `groups` is None.
+
+        A column that varies by rounding alone counts as zero, so that it gets no coefficient
+        instead of a huge one.
+
+        Raises:
+            FitError: with values that are not finite, too few groups, or no more samples than
+                columns.
+        """
+        require_data(x, y, column_names(x, names, "x"), column_names(y, outputs, "y"))
+        fold = fold_numbers(groups, folds) if groups is not None else x.new_zeros(len(x))
+        if len(x) <= x.shape[1]:
+            raise FitError(
+                f"{len(x)} samples do not determine {x.shape[1]} basis functions; give more data or"
+                " fewer terms"
+            )
+        constant = x.std(0) <= CONSTANT * x.abs().amax(0)
+        return cls.gather(x.masked_fill(constant, 0.0), y, fold, int(fold.max()) + 1)
+
+    def centred(self, total: Tensor) -> Centred:
+        """Return the moments about the means, from summed moments."""
         j = self.regressors
         n = float(total[0, 0])
         mean = total[0, 1:] / n
         cross = total[1:, 1:] - n * torch.outer(mean, mean)
-        return n, mean[:j], mean[j:], cross[:j, :j], cross[:j, j:]
+        return Centred(n, mean[:j], mean[j:], cross[:j, :j], cross[:j, j:])
 
-    def all(self) -> tuple[float, Tensor, Tensor, Tensor, Tensor]:
-        """`centred` of all folds."""
+    def all(self) -> Centred:
+        """Return the moments of all folds about their means."""
         return self.centred(self.sums.sum(0))
 
-    def without(self, fold: int) -> tuple[float, Tensor, Tensor, Tensor, Tensor]:
-        """`centred` of all folds but one."""
+    def without(self, fold: int) -> Centred:
+        """Return the moments of all folds but one about their means."""
         return self.centred(self.sums.sum(0) - self.sums[fold])
 
-    def squared_error(
-        self, fold: int, coefficients: Tensor, mean_x: Tensor, mean_y: Tensor
-    ) -> Tensor:
-        """Sum of squared errors on one fold [C, K] of candidates y = mean_y + (x - mean_x)
-        coefficients [C, J, K].
-        """
+    def intercept(self, coefficients: Tensor, model: Candidates) -> Tensor:
+        """Return the intercept [n] that goes with coefficients [J, n] and the means of a model."""
+        return model.mean_y + self.shift_y - (model.mean_x + self.shift_x) @ coefficients
+
+    def squared_error(self, fold: int, model: Candidates) -> Tensor:
+        """Return the sums of squared errors of candidates on one fold [C, n]."""
         j = self.regressors
         s = self.sums[fold]
-        intercept = mean_y - torch.einsum("j,cjk->ck", mean_x, coefficients)
+        coefficients = model.coefficients
+        intercept = model.mean_y - torch.einsum("j,cjk->ck", model.mean_x, coefficients)
         weights = torch.cat((intercept[:, None, :], coefficients), dim=1)
         xx, xy, yy = s[: j + 1, : j + 1], s[: j + 1, j + 1 :], s[j + 1 :, j + 1 :].diagonal()
         quadratic = torch.einsum("cik,ij,cjk->ck", weights, xx, weights)
         return yy - 2 * torch.einsum("cik,ik->ck", weights, xy) + quadratic
 
-    def cross_validate(self, path: list[tuple[Tensor, Tensor, Tensor]]) -> Tensor:
-        """Mean squared error [C, K] over left-out folds of candidate coefficients; path: per fold
-        (coefficients [C, J, K], mean of X, mean of Y).
-        """
-        errors = torch.stack([self.squared_error(f, *path[f]) for f in range(self.folds)])
+    def cross_validate(self, models: Sequence[Candidates]) -> Tensor:
+        """Return mean squared errors over left-out folds [C, n], from the models without each."""
+        errors = torch.stack([self.squared_error(f, models[f]) for f in range(self.folds)])
         return errors.sum(0) / self.sums[:, 0, 0].sum()
+
+    def variance(self) -> Tensor:
+        """Return the variance of each output over all samples [n]."""
+        j, total = self.regressors, self.sums.sum(0)
+        return total[j + 1 :, j + 1 :].diagonal() / total[0, 0]

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from residnet.core.errors import FitError
-from residnet.regression.plsr import LEAST_ENERGY
+from residnet.regression.pls_path import LEAST_ENERGY
 
 
 def nipals(

@@ -1,51 +1,145 @@
-"""Partial least squares (document 002 section 3.2, ERRATA J14-J17), from moments alone."""
+"""Partial least squares regression (document 002 section 3.2, ERRATA J14-J17)."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal, final
 
 import torch
 from torch import Tensor
 
-LEAST_ENERGY = 1e-13
-"""Least energy of a latent variable in units of a column's: below it are rounding and columns that
-are sums of others, without a meaning.
-"""
+from residnet.core.errors import FitError
+from residnet.regression.estimator import Estimator
+from residnet.regression.moments import CONSTANT, Candidates, Centred, FoldMoments
+from residnet.regression.nipals import nipals
+from residnet.regression.pls_path import pls_path
+from residnet.regression.solutions import Solution
+
+_EACH_ORDER = 8
+"""Order up to which every order is offered as an alternative; above, steps of a quarter."""
 
 
-def pls_path(xx: Tensor, xy: Tensor, orders: int) -> Tensor:
-    """Regression coefficients of PLS2 for every order up to `orders`, [A, J, K], by the kernel
-    algorithm of Dayal and MacGregor (1997).
+@final
+class PLSR(Estimator):
+    """Partial least squares of all outputs together, with an intercept.
 
     Args:
-        xx: X'X of centred, scaled columns [J, J].
-        xy: X'Y [J, K].
-        orders: number of latent variables; the path ends early where nothing is left to explain, or
-            to explain it with.
+        order: number of latent variables; None takes the least cross-validated error, summed over
+            the outputs in units of their variances.
+        max_order: highest order tried; None for the number of columns.
+        folds: folds of the cross-validation; None for one fold for each group.
+        scale: whether columns are scaled to unit variance; else they are only centred.
+        algorithm: `kernel`, from moments alone (Dayal and MacGregor 1997); or `nipals`, as document
+            002 prints it (section 3.3.1), whose order is chosen by the kernel algorithm.
+        alternatives: whether `fit` offers other orders, and none, beside its own choice.
     """
-    j, k = xy.shape
-    weights: list[Tensor] = []
-    loadings: list[Tensor] = []
-    rotations: list[Tensor] = []
-    coefficients = torch.zeros(j, k, dtype=xy.dtype)
-    path: list[Tensor] = []
-    rest = xy.clone()
-    start = float(torch.linalg.matrix_norm(xy))
-    for _ in range(orders):
-        left, singular, _right = torch.linalg.svd(rest, full_matrices=False)
-        if float(singular[0]) <= 1e-13 * start:
-            break
-        w = left[:, 0]
-        r = w.clone()
-        for p_old, r_old in zip(loadings, rotations, strict=True):
-            r = r - (p_old @ w) * r_old
-        energy = r @ xx @ r
-        if float(energy) <= LEAST_ENERGY * float(xx.diagonal().max()):
-            break
-        p = xx @ r / energy
-        q = rest.T @ r / energy
-        rest = rest - torch.outer(p, q) * energy
-        weights.append(w)
-        loadings.append(p)
-        rotations.append(r)
-        coefficients = coefficients + torch.outer(r, q)
-        path.append(coefficients)
-    return torch.stack(path) if path else torch.zeros(0, j, k, dtype=xy.dtype)
+
+    def __init__(
+        self,
+        order: int | None = None,
+        *,
+        max_order: int | None = 40,
+        folds: int | None = 5,
+        scale: bool = True,
+        algorithm: Literal["kernel", "nipals"] = "kernel",
+        alternatives: bool = False,
+    ) -> None:
+        self.order = order
+        self.max_order = max_order
+        self.folds = folds
+        self.scale = scale
+        self.algorithm = algorithm
+        self.alternatives = alternatives
+
+    def fit(
+        self,
+        x: Tensor,
+        y: Tensor,
+        groups: Tensor | None = None,
+        *,
+        names: Sequence[str] = (),
+        outputs: Sequence[str] = (),
+    ) -> list[Solution]:
+        """Return the solution of the order given or chosen, then the alternatives.
+
+        Without groups there is no cross-validation, and the order must be given. Outputs that
+        nothing explains get the solution of order 0, without coefficients. See `Estimator.fit`.
+        """
+        moments = FoldMoments.checked(x, y, groups, self.folds, names, outputs)
+        highest = min(self.order or self.max_order or x.shape[1], x.shape[1])
+        notes: dict[str, Any] = {"terms": x.shape[1]}
+        order = highest
+        if groups is not None:
+            folds = [self._path(moments.without(f), highest) for f in range(moments.folds)]
+            highest = min(len(fold.coefficients) for fold in folds)
+            if highest == 0:
+                return [_zero(x, y, notes)]
+            share = _relative_errors(moments, folds, highest)
+            notes = {"cross_validated_share": share.tolist()} | notes
+            order = self.order or int(share.argmin()) + 1
+        elif self.order is None:
+            raise FitError("the order is not given, and without groups nothing can choose it")
+        model = self._path(moments.all(), highest)
+        if self.algorithm == "nipals":
+            model = model._replace(coefficients=self._nipals(x, y, min(order, highest)))
+        found = model.coefficients
+        if len(found) == 0:
+            return [_zero(x, y, notes)]
+        orders = [min(order, len(found))]
+        orders += _ladder(len(found)) if self.alternatives else []
+        solutions = [
+            Solution(
+                {"order": k},
+                {
+                    "coefficients": found[k - 1],
+                    "intercept": moments.intercept(found[k - 1], model),
+                },
+                notes=notes,
+            )
+            for k in orders
+        ]
+        return [*solutions, _zero(x, y, notes)] if self.alternatives else solutions
+
+    def _path(self, centred: Centred, orders: int) -> Candidates:
+        """Return the models of all orders, from moments about the means."""
+        xx, xy = centred.xx, centred.xy
+        scale = torch.ones_like(centred.mean_x)
+        if self.scale:
+            scale = (xx.diagonal() / (centred.count - 1)).sqrt()
+            scale = torch.where(scale > 0, scale, torch.ones_like(scale))
+        path = pls_path(xx / torch.outer(scale, scale), xy / scale[:, None], orders)
+        return Candidates(path / scale[None, :, None], centred.mean_x, centred.mean_y)
+
+    def _nipals(self, x: Tensor, y: Tensor, orders: int) -> Tensor:
+        """Return the coefficients of all orders [A, J, n] by the printed algorithm."""
+        e, f = x - x.mean(0), y - y.mean(0)
+        scale = e.std(0) if self.scale else torch.ones_like(e[0])
+        scale = torch.where(scale > 0, scale, torch.ones_like(scale))
+        return nipals(e / scale, f, orders) / scale[None, :, None]
+
+
+def _relative_errors(moments: FoldMoments, folds: Sequence[Candidates], orders: int) -> Tensor:
+    """Return cross-validated errors by order, mean over outputs in units of their variances [A]."""
+    shortened = [fold._replace(coefficients=fold.coefficients[:orders]) for fold in folds]
+    error, variance = moments.cross_validate(shortened), moments.variance()
+    # an output that is constant but for rounding has no say
+    varies = variance > (CONSTANT * moments.shift_y).square()
+    return (error / torch.where(varies, variance, torch.inf)).mean(-1)
+
+
+def _ladder(highest: int) -> list[int]:
+    """Return orders worth trying: each of the first few, then steps of a quarter."""
+    orders = [1]
+    while orders[-1] < highest:
+        step = orders[-1] * 5 // 4 if orders[-1] >= _EACH_ORDER else orders[-1] + 1
+        orders.append(min(step, highest))
+    return orders
+
+
+def _zero(x: Tensor, y: Tensor, notes: dict[str, Any]) -> Solution:
+    """Return the solution that is zero everywhere: it leaves the known part as it is."""
+    state = {
+        "coefficients": y.new_zeros(x.shape[1], y.shape[1]),
+        "intercept": y.new_zeros(y.shape[1]),
+    }
+    return Solution({"order": 0}, state, notes=notes)

@@ -1,19 +1,21 @@
-"""What a closed-form fit hands back: its numbers, what they mean, and what sets them apart from
-other solutions of the same fit.
-"""
+"""What an estimator hands back: its numbers, what they mean, and what sets solutions apart."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 from torch import Tensor
 
 
 class Ratio(NamedTuple):
-    """A parameter that is a ratio of two coefficients of one axis: sign * numerator / denominator;
-    no numerator stands for 1.
+    """A parameter that is a ratio of two coefficients of one output.
+
+    Attributes:
+        sign: factor of the ratio, 1 or -1.
+        numerator: term of the coefficient above; None stands for 1.
+        denominator: term of the coefficient below.
     """
 
     sign: float
@@ -21,7 +23,7 @@ class Ratio(NamedTuple):
     denominator: str
 
     def of(self, coefficients: Mapping[str, float]) -> float:
-        """The parameter, from the coefficients of its axis by term."""
+        """Return the parameter, from the coefficients of its output by term."""
         above = 1.0 if self.numerator is None else coefficients[self.numerator]
         return self.sign * above / coefficients[self.denominator]
 
@@ -31,9 +33,9 @@ class Coefficient:
     """One identified number with its standard error.
 
     Attributes:
-        axis: u_dot, v_dot or r_dot.
-        term: regressor of that axis, or the name of a parameter that follows from coefficients.
-        value: of the coefficient of `term`, or of the parameter.
+        axis: name of the output, such as u_dot.
+        term: regressor of that output, or the name of a parameter that follows from coefficients.
+        value: value of the coefficient of `term`, or of the parameter.
         error: its standard error.
         ratio: how a parameter follows from coefficients; None for a coefficient.
     """
@@ -47,16 +49,19 @@ class Coefficient:
 
 @dataclass(frozen=True)
 class Solution:
-    """One solution of a closed-form fit; a fit with a complexity to choose has several.
+    """One solution of a fit; a fit with a complexity to choose has several.
 
     Attributes:
         choice: what sets it apart, for example {"ridge": 1e-4}; empty where there is nothing to
             choose.
-        state: numbers of the module that was fitted, by name, as in its state_dict.
-        table: the same with names and standard errors, where the fit knows them.
-        notes: what else there is to say about the fit.
-        neighbours: solutions near this one, made when free runs find it best, to be tried next;
-            None where there are none.
+        state: arrays by name. A linear solution y = x coefficients + intercept has `coefficients`
+            [J, n] and, where it has one, `intercept` [n]; other kinds say what they have. Fitted to
+            a module they are names of its state_dict.
+        table: the coefficients with names and standard errors, where the fit knows them.
+        notes: what else there is to say about the fit, in terms of JSON.
+        neighbours: makes the solutions next to this one, to be tried where free runs find this one
+            best; None where there are none.
+        covariance: covariance of the coefficients of each output [n, J, J], where the fit knows it.
     """
 
     choice: dict[str, Any]
@@ -64,3 +69,39 @@ class Solution:
     table: tuple[Coefficient, ...] = ()
     notes: dict[str, Any] = field(default_factory=dict)
     neighbours: Callable[[], Sequence[Solution]] | None = None
+    covariance: Tensor | None = None
+
+    @property
+    def coefficients(self) -> Tensor:
+        """Coefficients [J, n] of a linear solution."""
+        return self.state["coefficients"]
+
+    @property
+    def intercept(self) -> Tensor:
+        """Intercept [n] of a linear solution, zeros where it has none."""
+        zero = self.coefficients.new_zeros(self.coefficients.shape[1])
+        return self.state.get("intercept", zero)
+
+    @property
+    def errors(self) -> Tensor:
+        """Standard errors of the coefficients [J, n].
+
+        Raises:
+            ValueError: where the fit knows none.
+        """
+        if self.covariance is None:
+            raise ValueError("this solution has no standard errors")
+        return self.covariance.diagonal(dim1=1, dim2=2).clamp(min=0).sqrt().T
+
+    def predict(self, x: Tensor) -> Tensor:
+        """Return the outputs [N, n] of a linear solution at inputs [N, J]."""
+        return x @ self.coefficients + self.intercept
+
+    def prefixed(self, prefix: str) -> Solution:
+        """Return the solution for a module that holds the fitted one under the name `prefix`."""
+        make = self.neighbours
+        return replace(
+            self,
+            state={f"{prefix}.{name}": value for name, value in self.state.items()},
+            neighbours=None if make is None else lambda: [near.prefixed(prefix) for near in make()],
+        )

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from residnet.core.errors import FitError
 from residnet.regression.moments import FoldMoments
-from residnet.regression.plsr import LEAST_ENERGY
+from residnet.regression.pls_path import LEAST_ENERGY
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,100 @@
+"""The interface of estimators, from arrays to coefficients, in the habit of scikit-learn."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from residnet.core.errors import FitError
+from residnet.regression.solutions import Solution
+
+
+class Estimator(ABC):
+    """An estimator of y as a function of x: the constructor stores settings, `fit` takes the data."""
+
+    @abstractmethod
+    def fit(
+        self,
+        x: Tensor,
+        y: Tensor,
+        groups: Tensor | None = None,
+        *,
+        names: Sequence[str] = (),
+        outputs: Sequence[str] = (),
+    ) -> list[Solution]:
+        """Return the solutions, first the one that the estimator itself prefers.
+
+        Where the settings ask for alternatives, the solutions of other complexities follow, for a
+        criterion that the estimator does not know, such as the error of free runs.
+
+        Args:
+            x: inputs [N, J], float64.
+            y: outputs [N, n], float64.
+            groups: number of the group of each sample [N]. Samples of one group, such as a
+                manoeuvre, belong together: cross-validation never splits them. None where nothing
+                is known of groups.
+            names: names of the columns of x; `x0`, `x1` and so on where empty.
+            outputs: names of the columns of y; `y0`, `y1` and so on where empty.
+
+        Raises:
+            FitError: where the data do not determine the coefficients.
+        """
+
+
+def column_names(values: Tensor, names: Sequence[str], letter: str) -> tuple[str, ...]:
+    """Return the names of columns, numbered ones where none are given."""
+    return tuple(names) or tuple(f"{letter}{j}" for j in range(values.shape[1]))
+
+
+def require_finite(values: Tensor, names: Sequence[str], what: str) -> None:
+    """Check that all values [N, J] are finite.
+
+    Raises:
+        FitError: naming the column and the first sample that is not.
+    """
+    bad = ~torch.isfinite(values)
+    if bool(bad.any()):
+        row, column = (int(part[0]) for part in bad.nonzero(as_tuple=True))
+        raise FitError(
+            f"{what} '{names[column]}' is not finite at sample {row}; mask or repair the log"
+        )
+
+
+def require_data(x: Tensor, y: Tensor, names: Sequence[str], outputs: Sequence[str]) -> None:
+    """Check that inputs [N, J] and outputs [N, n] are finite and that there are any.
+
+    Raises:
+        FitError: where they are not, or where their numbers of samples differ.
+    """
+    if len(x) != len(y):
+        raise FitError(f"{len(x)} samples of the inputs, but {len(y)} of the outputs; give pairs")
+    if len(x) == 0 or x.shape[1] == 0:
+        raise FitError(
+            f"a regression needs samples and regressors, given {len(x)} samples of"
+            f" {x.shape[1]} regressors"
+        )
+    require_finite(x, names, "basis function")
+    require_finite(y, outputs, "output")
+
+
+def fold_numbers(groups: Tensor | None, folds: int | None) -> Tensor:
+    """Return the fold of each sample [N], groups dealt out in turn; every group is a fold for None.
+
+    Raises:
+        FitError: with fewer groups than folds, or fewer than two.
+    """
+    present = torch.unique(groups) if groups is not None else torch.zeros(0)
+    if groups is None or (folds is None and present.numel() < 2):
+        raise FitError(
+            "one run or segment only: nothing is left to cross-validate on; give more runs, or a"
+            " fixed order or penalty"
+        )
+    if folds is not None and present.numel() < folds:
+        raise FitError(
+            f"{folds} folds need as many manoeuvres, the training data have {present.numel()};"
+            " lower `folds`"
+        )
+    return torch.searchsorted(present, groups) % (folds or present.numel())
