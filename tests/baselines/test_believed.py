@@ -104,7 +104,7 @@ def test_export(tmp_path: Path) -> None:
 
 
 def test_forces_made_by_thrusters() -> None:
-    """With thrusters the revolutions are the inputs, and the forces are made from them."""
+    """With thrusters the revolutions are the inputs; the channels of force follow from them."""
     signals = SignalsConfig(inputs=("n_port", "n_stbd"), forces="wam_v_cal").build()
     baseline, plant = (
         BelievedConfig(vessel="wam_v_cal").build(signals.names),

@@ -1,4 +1,4 @@
-"""PLSR from moments against scikit-learn's converged NIPALS, and against explicit refits."""
+"""PLSR from moments against scikit-learn's NIPALS at convergence, and explicit refits."""
 
 from __future__ import annotations
 

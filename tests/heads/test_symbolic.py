@@ -93,7 +93,7 @@ def test_the_jets_equations_from_steps(file: Path) -> None:
 
 
 def test_two_levels_of_an_input_do_not_tell_its_square() -> None:
-    """What the data cannot identify is said: rpm^2 of two motor speeds is a line through both."""
+    """What the data cannot identify is said: of two motor speeds rpm^2 is a line through both."""
     log = jet_logs(1)[0]
     log["rpm"] = np.where(log["t"] % 20 < 10, 600.0, 1400.0)
     _, notes = fitted(JET, samples(log, JETS))

@@ -106,7 +106,7 @@ def test_forward_regression_is_orthogonal_matching_pursuit_on_orthogonal_columns
 
 
 def test_forward_regression_is_never_worse_than_matching_pursuit_at_its_first_two_terms() -> None:
-    """It takes the column that lessens the error most, pursuit the one most like the rest."""
+    """It takes the column that lessens the error most, pursuit the one most alike to the rest."""
     for seed in range(20):
         x, y, _ = planted(seed, columns=12, noise=0.3)
         unit = x / np.linalg.norm(x, axis=0)

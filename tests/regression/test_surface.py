@@ -1,4 +1,4 @@
-"""The surface analysis against the same surface from scikit-learn's PLSRegression."""
+"""The surface analysis against scikit-learn's PLSRegression, model by model."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Baselines linear in their coefficients: nu_dot = Theta phi(z), with regressors by name."""
+"""Baselines that are linear in their coefficients, nu_dot = Theta phi(z), regressors by name."""
 
 from __future__ import annotations
 

@@ -68,11 +68,11 @@ class ResidualHead(nn.Module, ABC):
         return baseline
 
     def warmup(self, z: Tensor) -> Tensor:
-        """Memory [B, n_state] of past channels [B, T, nz], oldest first; zeros where T = 0."""
+        """Return the memory [B, n_state] that past channels [B, T, nz], oldest first, leave."""
         return torch.zeros(z.shape[0], self.n_state, dtype=z.dtype, device=z.device)
 
     def calibrate(self, samples: Samples) -> None:
-        """Take scales and ranges from the training samples; called once, before any fit."""
+        """Take scales and ranges from the training samples; called once, before the fit."""
 
     def residual_std(self) -> Tensor:
         """Spread of the residual on the training samples, [3], float64: what a one-step loss is
@@ -122,7 +122,7 @@ class EquationHead(ClosedFormHead):
 
     @abstractmethod
     def contributions(self, z: Tensor, axis: int) -> dict[str, np.ndarray]:
-        """Every term of one axis times its coefficient along channels [T, nz], [T] each."""
+        """Return each term of an axis times its coefficient [T], along measured channels [T, nz]."""
 
 
 class FeatureConfig(Config):

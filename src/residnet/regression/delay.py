@@ -12,7 +12,7 @@ from residnet.core.errors import FitError
 
 
 class DelayProfile(NamedTuple):
-    """Residual sum of squares of each shift [S + 1], and the shift of the least, in samples."""
+    """Residual sums of squares by shift [S + 1], and the shift of the least one in samples."""
 
     rss: np.ndarray
     shift: int

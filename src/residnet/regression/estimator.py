@@ -13,7 +13,7 @@ from residnet.regression.solutions import Solution
 
 
 class Estimator(ABC):
-    """An estimator of y as a function of x: the constructor stores settings, `fit` takes the data."""
+    """An estimator of y from x: the constructor only stores settings, `fit` takes the data."""
 
     @abstractmethod
     def fit(

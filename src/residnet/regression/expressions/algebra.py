@@ -155,7 +155,7 @@ class Algebra:
         return {self._function(function, turned): -1.0 if odd else 1.0}
 
     def _function(self, function: Function, a: Sum) -> Product:
-        """The product that a function of a sum is; of one atom a simpler one if there is."""
+        """Return the product that a function of a sum is, a simpler one for a single atom."""
         ((first, weight),) = list(a.items())[:1]
         if (
             len(a) == 1

@@ -138,7 +138,7 @@ class EvolutionConfig(Config):
 
 @dataclass(frozen=True)
 class Generation:
-    """The best individual of one generation: relative mean square errors and number of terms."""
+    """The best individual of a generation: relative mean square errors and number of terms."""
 
     train: float
     validation: float

@@ -22,7 +22,7 @@ _FAR = 10.0
 
 
 class Recursion:
-    """Unbroken stretches of samples side by side, shorter ones padded by ignored samples."""
+    """Unbroken stretches of samples side by side, padded by samples that do not count."""
 
     def __init__(self, samples: Samples) -> None:
         """From samples with times; their target is what the fit explains.
