@@ -122,7 +122,7 @@ class EquationHead(ClosedFormHead):
 
     @abstractmethod
     def contributions(self, z: Tensor, axis: int) -> dict[str, np.ndarray]:
-        """Return each term of an axis times its coefficient [T], along measured channels [T, nz]."""
+        """Return each term of an axis times its coefficient [T], along channels z [T, nz]."""
 
 
 class FeatureConfig(Config):

@@ -157,7 +157,7 @@ class GeneticHead(EquationHead):
         return [float(count) for count in (self.weights.values != 0).sum(0)]
 
     def contributions(self, z: Tensor, axis: int) -> dict[str, np.ndarray]:
-        """Return each term of an axis times its coefficient [T], along measured channels [T, nz]."""
+        """Return each term of an axis times its coefficient [T], along channels z [T, nz]."""
         with torch.no_grad():
             values = (
                 self.library(self.features.guarded(z)) * self.weights.values[:, axis].to(z.dtype)

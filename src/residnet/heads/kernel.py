@@ -5,19 +5,24 @@ jointly in free run or by axis.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated, Any, Literal, NamedTuple, final
+from dataclasses import replace
+from functools import partial
+from typing import Annotated, Literal, final
 
 import torch
 from pydantic import Field
 from torch import Tensor, nn
 
 from residnet.core.errors import FitError
+from residnet.core.names import ACCELERATION, VELOCITY
 from residnet.core.samples import Samples
 from residnet.heads.base import ClosedFormHead, FeatureConfig, Features
 from residnet.physics.terms import TermLibrary
+from residnet.regression.equation_rows import step_of, stretches
 from residnet.regression.kernel.functions import Polynomial, Rbf
 from residnet.regression.kernel.path import Path
 from residnet.regression.kernel.recursion import Recursion
+from residnet.regression.kernel.ridge import KernelRidge
 from residnet.regression.solutions import Solution
 
 
@@ -51,13 +56,6 @@ class KernelConfig(FeatureConfig):
     def build(self, names: Sequence[str]) -> KernelHead:
         """The module for channels `names`."""
         return KernelHead(self, names)
-
-
-class _Pick(NamedTuple):
-    """Numbers of the kernel's setting and of the penalty, one of each for every axis."""
-
-    settings: tuple[int, ...]
-    penalties: tuple[int, ...]
 
 
 @final
@@ -138,91 +136,59 @@ class KernelHead(ClosedFormHead):
         return [float(count) for count in self.effective]
 
     def solutions(self, samples: Samples) -> list[Solution]:
-        """Of each axis the setting and penalty of the least error; where free runs choose, then all
-        joint ones, and no residual.
+        """Return the solution of the least error of each axis, then what free runs may prefer.
 
         Raises:
             FitError: with fewer manoeuvres than folds, or where a recursion finds no samples that
                 follow each other.
         """
-        groups = torch.unique(samples.group)
-        if groups.numel() < self.folds:
-            raise FitError(
-                f"{self.folds} folds need as many manoeuvres, the training data have"
-                f" {groups.numel()}; lower `folds`"
-            )
-        fold = torch.searchsorted(groups, samples.group) % self.folds
+        recursion = _recursion(samples) if self.by_recursion else None
+        estimator = KernelRidge(
+            self.kernel,
+            self.penalties,
+            folds=self.folds,
+            scoring=partial(self._recursion_errors, recursion) if recursion else None,
+            alternatives=self.by_free_run,
+        )
         with torch.no_grad():
             x = self.columns(samples.z)
-            paths = self.kernel.paths(
-                x,
-                samples.target,
-                fold,
-                self.folds,
-                [penalty * len(x) for penalty in self.penalties],
-            )
-        errors = torch.stack([path.errors for path in paths])
-        judged = self._recursion(paths, samples) if self.by_recursion else errors
-        best = judged.flatten(0, 1).argmin(0)
-        count = len(self.penalties)
-        picks = [_Pick(tuple((best // count).tolist()), tuple((best % count).tolist()))]
-        notes = {"cross_validated_error": errors.tolist(), "samples": len(x)} | (
-            {"recursion_error": judged.tolist()} if self.by_recursion else {}
-        )
-        if not self.by_free_run:
-            return [self._solution(paths, picks[0], notes)]
-        picks += [_Pick((i,) * 3, (j,) * 3) for i in range(len(paths)) for j in range(count)]
-        nothing = {f"kernel.{name}": value for name, value in self.kernel.nothing().items()}
-        none = Solution(
-            {"penalty": []},
-            nothing | {"effective": torch.zeros(3, dtype=torch.float64)},
-            notes=notes,
-        )
-        return [*(self._solution(paths, pick, notes) for pick in picks), none]
+        found = estimator.fit(x, samples.target, samples.group, outputs=ACCELERATION)
+        return [self._named(solution) for solution in found]
 
-    def _recursion(self, paths: Sequence[Path], samples: Samples) -> Tensor:
-        """Mean square errors of each velocity in free run of its own, [settings, penalties, 3]."""
-        recursion = Recursion(samples)
-        out = torch.zeros(len(paths), len(self.penalties), 3, dtype=torch.float64)
+    def _named(self, solution: Solution) -> Solution:
+        """Return the solution in the names of this head's state."""
+        out = solution.prefixed("kernel")
+        state = dict(out.state)
+        state["effective"] = state.pop("kernel.effective")
+        make = solution.neighbours
+        neighbours = None if make is None else lambda: [self._named(near) for near in make()]
+        return replace(out, state=state, neighbours=neighbours)
+
+    def _recursion_errors(self, recursion: Recursion, paths: Sequence[Path]) -> Tensor:
+        """Return mean square errors of velocities that run alone, [settings, penalties, 3]."""
+        count = len(self.penalties)
+        out = torch.zeros(len(paths), count, 3, dtype=torch.float64)
         for i, path in enumerate(paths):
             for axis in range(3):
                 weights = path.coefficients[:, :, axis]
 
                 def predicted(z: Tensor, path: Path = path, weights: Tensor = weights) -> Tensor:
-                    return torch.einsum(
-                        "cgp,cp->cg", self.kernel.along(path, self.columns(z)), weights
-                    )
+                    features = self.kernel.features(path, self.columns(z))
+                    return torch.einsum("cgp,cp->cg", features, weights)
 
                 with torch.no_grad():
-                    out[i, :, axis] = recursion.errors(axis, predicted, len(self.penalties))
+                    out[i, :, axis] = recursion.errors(axis, predicted, count)
         return out
 
-    def _solution(self, paths: Sequence[Path], pick: _Pick, notes: dict[str, Any]) -> Solution:
-        parts = list(enumerate(zip(pick.settings, pick.penalties, strict=True)))
-        coefficients = torch.stack(
-            [paths[i].coefficients[j, :, axis] for axis, (i, j) in parts], dim=1
-        )
-        effective = torch.stack([paths[i].effective[j] for _, (i, j) in parts])
-        said, state = self.kernel.chosen([paths[i] for i in pick.settings], coefficients)
-        choice = said | {"penalty": [self.penalties[j] for j in pick.penalties]}
-        told = notes | {"effective_parameters": effective.tolist()}
 
-        def neighbours() -> list[Solution]:
-            moved = [
-                (axis, j + step)
-                for axis, (_, j) in parts
-                for step in (-1, 1)
-                if 0 <= j + step < len(self.penalties)
-            ]
-            near = [
-                pick._replace(penalties=(*pick.penalties[:axis], j, *pick.penalties[axis + 1 :]))
-                for axis, j in moved
-            ]
-            return [self._solution(paths, other, notes) for other in near]
+def _recursion(samples: Samples) -> Recursion:
+    """Return the recursion of the velocities along samples with times.
 
-        return Solution(
-            choice,
-            {f"kernel.{name}": value for name, value in state.items()} | {"effective": effective},
-            notes=told,
-            neighbours=neighbours if self.by_free_run else None,
-        )
+    Raises:
+        FitError: where no manoeuvre has two samples at different times.
+    """
+    group, t = samples.group.numpy(), samples.t.numpy()
+    step = step_of(group, t)
+    stretch = torch.from_numpy(stretches(group, t, step))
+    columns = [samples.names.index(name) for name in VELOCITY]
+    return Recursion(samples.z, samples.target, stretch, step, columns)

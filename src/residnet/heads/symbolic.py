@@ -121,7 +121,7 @@ class SymbolicHead(EquationHead):
         return self.line.warmup(z.index_select(-1, self.features.index))
 
     def contributions(self, z: Tensor, axis: int) -> dict[str, np.ndarray]:
-        """Return each term of an axis times its coefficient [T], along measured channels [T, nz]."""
+        """Return each term of an axis times its coefficient [T], along channels z [T, nz]."""
         with torch.no_grad():
             values = (
                 self.basis(self.line.sequence(z.index_select(-1, self.features.index)))

@@ -1,6 +1,4 @@
-"""Kernels on standardised features, and how each is fitted and evaluated: radial basis functions
-and polynomials.
-"""
+"""Kernels on standardised inputs, and how each is fitted and evaluated."""
 
 from __future__ import annotations
 
@@ -23,74 +21,80 @@ _RANK = 1e-12
 
 
 class Kernel(nn.Module, ABC):
-    """f(x) [..., 3] from standardised features [..., F]: raw features of the kernel times
-    coefficients.
-    """
+    """A function f(x) [..., n] of inputs [..., F]: features of a kernel times coefficients."""
 
     @abstractmethod
     def forward(self, x: Tensor) -> Tensor:
-        """[..., 3] at features [..., F]."""
+        """Return f [..., n] at inputs x [..., F]."""
 
     @abstractmethod
     def paths(
         self, x: Tensor, y: Tensor, fold: Tensor, folds: int, penalties: Sequence[float]
     ) -> list[Path]:
-        """Fits of targets [N, 3] at features [N, F] with absolute penalties, one path for each
-        setting of the kernel.
+        """Return fits with absolute penalties, one path for each setting of the kernel.
+
+        Args:
+            x: inputs [N, F].
+            y: outputs [N, n].
+            fold: number of each sample's fold [N].
+            folds: how many there are.
+            penalties: lambda, absolute, positive.
         """
 
     @abstractmethod
-    def along(self, path: Path, x: Tensor) -> Tensor:
-        """Raw features [..., P] that the coefficients of a path belong to, at features [..., F]."""
+    def features(self, path: Path, x: Tensor) -> Tensor:
+        """Return the features [..., P] that the coefficients of a path belong to."""
 
     @abstractmethod
-    def chosen(
+    def selected(
         self, paths: Sequence[Path], coefficients: Tensor
     ) -> tuple[dict[str, Any], dict[str, Tensor]]:
-        """What there is to say of the path that each axis takes, and the state with coefficients
-        [P, 3].
-        """
+        """Return the settings of each output's path, and the state with coefficients [P, n]."""
 
     @abstractmethod
-    def nothing(self) -> dict[str, Tensor]:
-        """The state of the function that is zero."""
+    def zero_state(self) -> dict[str, Tensor]:
+        """Return the state of the function that is zero."""
 
 
 @final
 class RbfKernel(Kernel):
-    """f_k(x) = sum_i c_ik exp(-gamma_k |x - x_i|^2), gamma = 1 / (2 sigma) (document 001 section
-    3.2, ERRATA M5: sigma is a squared length).
+    """A sum of radial basis functions, f_k(x) = sum_i c_ik exp(-gamma_k |x - x_i|^2).
+
+    gamma = 1 / (2 sigma) (document 001 section 3.2, ERRATA M5: sigma is a squared length).
     """
 
-    def __init__(self, config: Rbf, count: int) -> None:
+    def __init__(self, config: Rbf, count: int, outputs: int = 3) -> None:
         super().__init__()
         self.sigmas = config.sigma
         self.exact = config.exact
         self.landmarks = config.landmarks
         self.seed = config.seed
+        self.outputs = outputs
         self.register_buffer("points", torch.zeros(0, count, dtype=torch.float64))
-        self.register_buffer("gamma", torch.ones(3, dtype=torch.float64))
-        self.register_buffer("coefficients", torch.zeros(0, 3, dtype=torch.float64))
+        self.register_buffer("gamma", torch.ones(outputs, dtype=torch.float64))
+        self.register_buffer("coefficients", torch.zeros(0, outputs, dtype=torch.float64))
         self.points: Tensor
         self.gamma: Tensor
         self.coefficients: Tensor
 
     def forward(self, x: Tensor) -> Tensor:
-        """[..., 3] at features [..., F]."""
+        """Return f [..., n] at inputs x [..., F]."""
         apart = squared_distances(x, self.points.to(x.dtype))
         out: list[Tensor] = []
-        for axis in range(3):
+        for output in range(self.outputs):
             out.append(
-                torch.exp(-self.gamma[axis].to(x.dtype) * apart)
-                @ self.coefficients[:, axis].to(x.dtype)
+                torch.exp(-self.gamma[output].to(x.dtype) * apart)
+                @ self.coefficients[:, output].to(x.dtype)
             )
         return torch.stack(out, dim=-1)
 
     def paths(
         self, x: Tensor, y: Tensor, fold: Tensor, folds: int, penalties: Sequence[float]
     ) -> list[Path]:
-        """One path for each sigma: exact where there are no more than `exact` samples, else by
-        Nystroem's method on landmarks.
+        """Return one path for each sigma; see `Kernel.paths`.
+
+        It is exact where there are no more than `exact` samples, else by Nystroem's method on
+        landmarks.
         """
         if len(x) <= self.exact:
             apart = squared_distances(x, x)
@@ -111,38 +115,30 @@ class RbfKernel(Kernel):
             def features(part: Tensor, sigma: float = sigma) -> Tensor:
                 return torch.exp(-squared_distances(part, points) / (2 * sigma))
 
-            out.append(
-                replace(
-                    primal_path(features, whiten, x, y, fold, folds, penalties),
-                    sigma=sigma,
-                    points=points,
-                )
-            )
+            path = primal_path(features, whiten, x, y, fold, folds, penalties)
+            out.append(replace(path, sigma=sigma, points=points))
         return out
 
-    def along(self, path: Path, x: Tensor) -> Tensor:
-        """The kernel between x and the points that carry the function."""
+    def features(self, path: Path, x: Tensor) -> Tensor:
+        """Return the kernel between x and the points that carry the function."""
         return torch.exp(-squared_distances(x, path.points) / (2 * path.sigma))
 
-    def chosen(
+    def selected(
         self, paths: Sequence[Path], coefficients: Tensor
     ) -> tuple[dict[str, Any], dict[str, Tensor]]:
-        """Sigma of each axis, and the points, gamma and coefficients."""
+        """Return sigma of each output, and the points, gamma and coefficients."""
         sigma = [path.sigma for path in paths]
         gamma = torch.tensor([0.5 / value for value in sigma], dtype=torch.float64)
-        return {"sigma": sigma}, {
-            "points": paths[0].points,
-            "gamma": gamma,
-            "coefficients": coefficients,
-        }
+        state = {"points": paths[0].points, "gamma": gamma, "coefficients": coefficients}
+        return {"sigma": sigma}, state
 
-    def nothing(self) -> dict[str, Tensor]:
-        """No landmarks."""
+    def zero_state(self) -> dict[str, Tensor]:
+        """Return a state without landmarks."""
         count = self.points.shape[1]
         return {
             "points": torch.zeros(0, count, dtype=torch.float64),
-            "gamma": torch.ones(3, dtype=torch.float64),
-            "coefficients": torch.zeros(0, 3, dtype=torch.float64),
+            "gamma": torch.ones(self.outputs, dtype=torch.float64),
+            "coefficients": torch.zeros(0, self.outputs, dtype=torch.float64),
         }
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
@@ -150,20 +146,21 @@ class RbfKernel(Kernel):
         for name in ("points", "coefficients"):
             stored = state_dict.get(prefix + name)
             if stored is not None:
-                own = getattr(self, name)
-                setattr(self, name, torch.zeros(stored.shape, dtype=own.dtype, device=own.device))
+                present = getattr(self, name)
+                empty = torch.zeros(stored.shape, dtype=present.dtype, device=present.device)
+                setattr(self, name, empty)
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
 
 @final
 class PolynomialKernel(Kernel):
-    """Kernel (slope x'x' + constant)^degree (document 001 section 3.2), as the ridge regression on
-    weighted products that it equals.
+    """The kernel (slope x'x' + constant)^degree (document 001 section 3.2).
 
-    The products are finitely many, so that any number of samples is fitted exactly.
+    It is fitted as the ridge regression on weighted products that it equals. The products are
+    finitely many, so that any number of samples is fitted exactly.
     """
 
-    def __init__(self, config: Polynomial, count: int) -> None:
+    def __init__(self, config: Polynomial, count: int, outputs: int = 3) -> None:
         super().__init__()
         self.degree = config.degree
         chosen = list(combinations_with_replacement(range(count + 1), config.degree))
@@ -175,14 +172,14 @@ class PolynomialKernel(Kernel):
             torch.tensor([_weight(c) for c in chosen], dtype=torch.float64).sqrt(),
             persistent=False,
         )
-        self.register_buffer("coefficients", torch.zeros(len(chosen), 3, dtype=torch.float64))
+        self.register_buffer("coefficients", torch.zeros(len(chosen), outputs, dtype=torch.float64))
         self.slope, self.constant = config.slope**0.5, config.constant**0.5
         self.index: Tensor
         self.weight: Tensor
         self.coefficients: Tensor
 
     def products(self, x: Tensor) -> Tensor:
-        """Weighted products [..., P] of features [..., F], whose inner product is the kernel."""
+        """Return the weighted products [..., P] of inputs [..., F], whose inner product it is."""
         joined = torch.cat((torch.full_like(x[..., :1], self.constant), x * self.slope), dim=-1)
         out = self.weight.to(x.dtype) * joined.index_select(-1, self.index[0])
         for i in range(1, self.degree):
@@ -190,50 +187,42 @@ class PolynomialKernel(Kernel):
         return out
 
     def forward(self, x: Tensor) -> Tensor:
-        """[..., 3] at features [..., F]."""
+        """Return f [..., n] at inputs x [..., F]."""
         return self.products(x) @ self.coefficients.to(x.dtype)
 
     def paths(
         self, x: Tensor, y: Tensor, fold: Tensor, folds: int, penalties: Sequence[float]
     ) -> list[Path]:
-        """A single path, exact for any number of samples."""
-        return [
-            primal_path(
-                self.products,
-                torch.eye(len(self.coefficients), dtype=torch.float64),
-                x,
-                y,
-                fold,
-                folds,
-                penalties,
-            )
-        ]
+        """Return a single path, exact for any number of samples; see `Kernel.paths`."""
+        identity = torch.eye(len(self.coefficients), dtype=torch.float64)
+        return [primal_path(self.products, identity, x, y, fold, folds, penalties)]
 
-    def along(self, path: Path, x: Tensor) -> Tensor:
-        """The products."""
+    def features(self, path: Path, x: Tensor) -> Tensor:
+        """Return the products."""
         return self.products(x)
 
-    def chosen(
+    def selected(
         self, paths: Sequence[Path], coefficients: Tensor
     ) -> tuple[dict[str, Any], dict[str, Tensor]]:
-        """Nothing to say; the coefficients."""
+        """Return no settings, and the coefficients."""
         return {}, {"coefficients": coefficients}
 
-    def nothing(self) -> dict[str, Tensor]:
-        """Coefficients of zero."""
+    def zero_state(self) -> dict[str, Tensor]:
+        """Return coefficients of zero."""
         return {"coefficients": torch.zeros_like(self.coefficients)}
 
 
 class Rbf(Config):
-    """Radial basis functions exp(-|x - x'|^2 / (2 sigma)) of standardised features.
+    """The radial basis functions exp(-|x - x'|^2 / (2 sigma)) of standardised features.
 
     Attributes:
-        sigma: candidates, in squared units of a feature's spread (ERRATA M5).
-        exact: with no more samples than these all of them carry the function, as in kernel ridge
+        kind: name of the kernel.
+        sigma: candidates, in squared standard deviations of a feature (ERRATA M5).
+        exact: number of samples up to which all of them carry the function, as in kernel ridge
             regression; with more, landmarks do.
-        landmarks: samples that carry the function where there are more than `exact` (Nystroem's
-            method), spread out by k-means++ seeding.
-        seed: of the choice of landmarks.
+        landmarks: number of samples that carry the function where there are more than `exact`
+            (Nystroem's method), spread out by k-means++ seeding.
+        seed: seed of the choice of landmarks.
     """
 
     kind: Literal["rbf"] = "rbf"
@@ -244,19 +233,21 @@ class Rbf(Config):
     landmarks: int = Field(default=300, ge=2, le=5000)
     seed: int = Field(default=0, ge=0)
 
-    def build(self, count: int) -> RbfKernel:
-        """The module for `count` features."""
-        return RbfKernel(self, count)
+    def build(self, count: int, outputs: int = 3) -> RbfKernel:
+        """Return the module for `count` features and a number of outputs."""
+        return RbfKernel(self, count, outputs)
 
 
 class Polynomial(Config):
-    """The polynomial kernel (slope x'x' + constant)^degree of standardised features; degree 1 is
-    ridge regression.
+    """The polynomial kernel (slope x'x' + constant)^degree of standardised features.
+
+    Degree 1 is ridge regression.
 
     Attributes:
-        degree: p.
-        slope: theta.
-        constant: c; with 0 only products of exactly `degree` features are left.
+        kind: name of the kernel.
+        degree: degree p of the polynomial.
+        slope: factor theta of the inner product.
+        constant: constant c; with 0 only products of exactly `degree` features are left.
     """
 
     kind: Literal["polynomial"] = "polynomial"
@@ -264,22 +255,22 @@ class Polynomial(Config):
     slope: float = Field(default=1.0, gt=0)
     constant: float = Field(default=1.0, ge=0)
 
-    def build(self, count: int) -> PolynomialKernel:
-        """The module for `count` features."""
-        return PolynomialKernel(self, count)
+    def build(self, count: int, outputs: int = 3) -> PolynomialKernel:
+        """Return the module for `count` features and a number of outputs."""
+        return PolynomialKernel(self, count, outputs)
 
 
 def squared_distances(x: Tensor, points: Tensor) -> Tensor:
-    """|x - x_i|^2 [..., M] between features [..., F] and points [M, F]."""
+    """Return |x - x_i|^2 [..., M] between inputs [..., F] and points [M, F]."""
     square = (x * x).sum(-1, keepdim=True) + (points * points).sum(-1)
     return (square - 2.0 * (x @ points.T)).clamp(min=0.0)
 
 
 def spread_out(x: Tensor, count: int, seed: int) -> Tensor:
-    """Indices [count] of samples that lie apart: each is drawn with a chance that grows with its
-    squared distance to those before (k-means++).
+    """Return the indices [count] of samples that lie apart (k-means++).
 
-    Fewer than `count` where the samples have no more different values.
+    Each is drawn with a chance that grows with its squared distance to those before. There are
+    fewer than `count` where the samples have no more different values.
     """
     random = torch.Generator().manual_seed(seed)
     first = int(torch.randint(len(x), (1,), generator=random))
@@ -295,7 +286,7 @@ def spread_out(x: Tensor, count: int, seed: int) -> Tensor:
 
 
 def _weight(chosen: tuple[int, ...]) -> float:
-    """Multinomial coefficient of a product of factors given by number."""
+    """Return the multinomial coefficient of a product of factors given by number."""
     out = factorial(len(chosen))
     for number in set(chosen):
         out //= factorial(chosen.count(number))
