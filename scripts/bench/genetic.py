@@ -34,11 +34,12 @@ import torch
 from made_odin import FORCE_TRUTH, JET_TRUTH, MSD_TRUTH, force_logs, jet_logs, msd_log
 from symbolic import FORCE, FORCES, JET, JETS, MSD, SPRING, regress, right
 
-from residnet.heads.genetic import Bred, GeneticConfig, breed
+from residnet.heads.genetic import GeneticConfig
 from residnet.physics.candidates import CandidatesConfig
 from residnet.regression.expressions.algebra import Algebra
 from residnet.regression.expressions.text import term
-from residnet.regression.genetic.evolution import limits_of
+from residnet.regression.genetic.config import limits_of
+from residnet.regression.genetic.equations import Bred, breed
 
 Log = dict[str, np.ndarray]
 Answer = tuple[dict[str, float], Bred, float]

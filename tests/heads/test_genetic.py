@@ -21,14 +21,15 @@ from residnet.core.names import ACCELERATION
 from residnet.core.samples import Samples
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec, load_model, save_model
-from residnet.heads.genetic import GeneticConfig, breed
+from residnet.heads.genetic import GeneticConfig
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.terms import TermLibrary
 from residnet.regression.expressions.algebra import Algebra, Limits, Sum
 from residnet.regression.expressions.library import ExpressionLibrary, tables
 from residnet.regression.expressions.notation import LATEX, SYMPY, C
 from residnet.regression.expressions.text import term, total
-from residnet.regression.genetic.evolution import limits_of
+from residnet.regression.genetic.config import limits_of
+from residnet.regression.genetic.equations import breed
 
 FORCES = ("u", "v", "r", "tau_x", "tau_y", "tau_n")
 

@@ -9,10 +9,10 @@ import pytest
 
 from residnet.core.errors import ConfigError, FitError
 from residnet.regression.equation_rows import (
-    Instruments,
-    LeastSquares,
+    InstrumentRows,
     Rows,
-    Weak,
+    SampleRows,
+    WeakRows,
     correlation_time,
     step_of,
     stretches,
@@ -32,7 +32,7 @@ def record(n: int = 200) -> Rows:
 
 def test_windows_are_weighted_sums_within_stretches() -> None:
     sampled = record()
-    rows = Weak(window=2.5, every=0.2).rows(sampled, 0.1, NONE_EXACT)
+    rows = WeakRows(window=2.5, every=0.2).rows(sampled, 0.1, NONE_EXACT)
     place = -1 + 2 * np.arange(1, 26) / 26
     weight = (1 - place**2) ** 2
     weight /= weight.sum()
@@ -55,7 +55,7 @@ def test_windows_over_central_differences_are_integrals_by_parts() -> None:
     step, size = 0.1, 30
     x = np.random.default_rng(1).normal(size=100)
     rate = (x[2:] - x[:-2]) / (2 * step)
-    rows = Weak(window=size * step, every=1 / size).rows(
+    rows = WeakRows(window=size * step, every=1 / size).rows(
         Rows(np.ones((98, 1)), rate[:, None], np.zeros(98, dtype=int)), step, NONE_EXACT[:1]
     )
     place = np.linspace(-1, 1, size + 2)
@@ -68,7 +68,7 @@ def test_windows_over_central_differences_are_integrals_by_parts() -> None:
 
 def test_instruments_are_two_stage_least_squares() -> None:
     sampled = record()
-    rows = Instruments(lag=0.3).rows(sampled, 0.1, np.array([False, True]))
+    rows = InstrumentRows(lag=0.3).rows(sampled, 0.1, np.array([False, True]))
     now = [i for i in range(6, 200) if sampled.stretch[i] == sampled.stretch[i - 6]]
     x, y = sampled.x[now], sampled.y[now, 0]
     z = np.column_stack(
@@ -93,7 +93,7 @@ def test_instruments_take_away_the_bias_of_noisy_regressors() -> None:
     )
     plain, lagged = (
         np.linalg.lstsq(rows.x, rows.y, rcond=None)[0].item()
-        for rows in (sampled, Instruments(lag=0.2).rows(sampled, 0.1, NONE_EXACT[:1]))
+        for rows in (sampled, InstrumentRows(lag=0.2).rows(sampled, 0.1, NONE_EXACT[:1]))
     )
     # a noise of half the deviation leaves 1 / (1 + 0.25) of the coefficient
     assert plain == pytest.approx(1.6, rel=0.02)
@@ -122,18 +122,18 @@ def test_stretches_end_at_gaps_and_manoeuvres() -> None:
 
 def test_least_squares_takes_samples_as_they_are() -> None:
     sampled = record()
-    assert LeastSquares().rows(sampled, 0.0, NONE_EXACT) is sampled
+    assert SampleRows().rows(sampled, 0.0, NONE_EXACT) is sampled
 
 
 def test_what_cannot_be_done_is_one_line() -> None:
     sampled = record(100)
     with pytest.raises(FitError, match="no unbroken stretch of samples is 9 s long"):
-        Weak(window=9.0).rows(sampled, 0.1, NONE_EXACT)
+        WeakRows(window=9.0).rows(sampled, 0.1, NONE_EXACT)
     with pytest.raises(ConfigError, match="holds 2 samples"):
-        Weak(window=0.2).rows(sampled, 0.1, NONE_EXACT)
+        WeakRows(window=0.2).rows(sampled, 0.1, NONE_EXACT)
     with pytest.raises(ConfigError, match="less than one step"):
-        Instruments(lag=0.04).rows(sampled, 0.1, NONE_EXACT)
+        InstrumentRows(lag=0.04).rows(sampled, 0.1, NONE_EXACT)
     with pytest.raises(FitError, match="0 samples have a past of 8 s"):
-        Instruments(lag=4.0).rows(sampled, 0.1, NONE_EXACT)
+        InstrumentRows(lag=4.0).rows(sampled, 0.1, NONE_EXACT)
     with pytest.raises(FitError, match="no manoeuvre has two samples"):
         step_of(np.array([0, 1, 2]), np.zeros(3))

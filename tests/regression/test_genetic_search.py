@@ -13,13 +13,8 @@ import pytest
 
 from residnet.core.errors import FitError, UsageError
 from residnet.regression.expressions.algebra import Algebra, Limits, Product
-from residnet.regression.genetic.evolution import (
-    EvolutionConfig,
-    Found,
-    evolve,
-    limits_of,
-    require_deap,
-)
+from residnet.regression.genetic.config import EvolutionConfig, limits_of
+from residnet.regression.genetic.evolution import Found, evolve, require_deap
 from residnet.regression.genetic.fitness import Fitness
 
 NAMES = ("a", "b", "c")

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, Literal, final
 
 import numpy as np
@@ -16,16 +17,10 @@ from residnet.core.names import ACCELERATION
 from residnet.core.samples import Samples
 from residnet.heads.base import EquationHead, FeatureConfig, Features
 from residnet.heads.delay_line import DelayConfig, DelayLine, Past, best_delay
-from residnet.physics.candidates import Candidate, CandidatesConfig, rated
+from residnet.physics.candidates import CandidatesConfig, rated
 from residnet.physics.symmetry import wrong_parity
 from residnet.physics.terms import TermLibrary, parse_term
-from residnet.regression.equation_rows import (
-    EstimatorConfig,
-    LeastSquares,
-    Rows,
-    step_of,
-    stretches,
-)
+from residnet.regression.equation_rows import Rows, RowsConfig, SampleRows, step_of, stretches
 from residnet.regression.expressions.equations import (
     Factor,
     Written,
@@ -35,10 +30,13 @@ from residnet.regression.expressions.equations import (
     sympy_text,
 )
 from residnet.regression.solutions import Coefficient, Solution
-from residnet.regression.sparse import NOTHING, Equation, Reduced, SearchConfig, find, reduce
+from residnet.regression.sparse import SearchConfig
+from residnet.regression.sparse_regression import SparseRegression
 
 _GAMMAS = (0.0, 0.5, 1.0)
+"""Weights of the number of candidates that are offered where free runs choose: from BIC up."""
 _MOST_DELAYS = 6
+"""Most rounds of the search for a delay."""
 
 
 class SymbolicConfig(FeatureConfig):
@@ -62,7 +60,7 @@ class SymbolicConfig(FeatureConfig):
     candidates: CandidatesConfig = Field(default_factory=CandidatesConfig)
     terms: tuple[str, ...] = ()
     search: SearchConfig = Field(default_factory=SearchConfig)
-    estimator: EstimatorConfig = Field(default_factory=LeastSquares)
+    estimator: RowsConfig = Field(default_factory=SampleRows)
     symmetric: bool = False
     delay: DelayConfig | None = None
     choose: Literal["one_step", "free_run"] = "one_step"
@@ -134,187 +132,118 @@ class SymbolicHead(EquationHead):
         }
 
     def solutions(self, samples: Samples) -> list[Solution]:
-        """The equations that the extended BIC chooses; where free runs choose, then those of weaker
-        and stronger penalties, and none.
+        """Return the equations of the extended BIC, then what free runs may prefer.
+
+        Those are the equations of weaker and stronger penalties, and none.
 
         Raises:
             FitError: where the samples do not tell the candidates apart, or hold no stretch as long
                 as the estimator or the delay needs.
         """
         past = self._past(samples)
-        steps, told = self._delay(past)
-        reduced = self._reduced(past.delayed(steps, self.line.index.numpy()))
-        found = [self._solution(reduced, self.config.search, steps, told)]
-        if self.config.choose == "free_run":
-            others = [
-                self.config.search.model_copy(update={"gamma": gamma})
-                for gamma in _GAMMAS
-                if gamma != self.config.search.gamma
-            ]
-            tried = [self._solution(reduced, search, steps, told) for search in others]
-            found += [
-                other
-                for other in tried
-                if not torch.equal(other.state["coefficients"], found[0].state["coefficients"])
-            ]
-            none = {
-                name: self._written(name, NOTHING, own, steps)
-                for name, own in zip(ACCELERATION, reduced, strict=True)
-            }
-            notes = found[0].notes | {"parameters": 0, "coefficients": [], "equations": none}
-            found.append(
-                Solution(
-                    {"kept": [0, 0, 0]},
-                    {"coefficients": torch.zeros_like(self.coefficients)},
-                    notes=notes,
-                )
-            )
-        return found
+        steps, delay = self._delay(past)
+        gammas = _GAMMAS if self.config.choose == "free_run" else ()
+        found = self._fit(past.delayed(steps, self.line.index.numpy()), gammas)
+        return [self._complete(solution, steps, delay) for solution in found]
 
     def _past(self, samples: Samples) -> Past:
-        """Features, targets and stretches of the samples; without times where nothing looks along
-        them.
+        """Return features, targets and stretches of the samples.
+
+        They are without times where nothing looks along them.
         """
-        chosen, target = (
-            samples.z.index_select(1, self.features.index).numpy(),
-            samples.target.numpy(),
-        )
+        chosen = samples.z.index_select(1, self.features.index).numpy()
+        target, group = samples.target.numpy(), samples.group.numpy()
         if not self.config.estimator.sequential and self.line.count == 0:
-            return Past(chosen, target, samples.group.numpy(), 0.0)
-        group, t = samples.group.numpy(), samples.t.numpy()
+            return Past(chosen, target, group, 0.0)
+        t = samples.t.numpy()
         step = step_of(group, t)
         return Past(chosen, target, stretches(group, t, step), step)
 
-    def _reduced(self, past: Past) -> list[Reduced]:
-        """The candidates' regression of each axis, reduced to its QR factor: one for all axes
-        unless symmetry gives them candidates of their own.
-        """
+    def _fit(self, past: Past, gammas: Sequence[float] = ()) -> list[Solution]:
+        """Return the solutions of a sparse regression of all axes."""
         with torch.no_grad():
             terms = self.basis(torch.from_numpy(past.chosen)).numpy()
-        motions = self.config.candidates.motions
+        motions, channels = self.config.candidates.motions, self.features.names
         exact = np.array(
             [
-                all(f.name not in motions for f in parse_term(c.term, self.features.names))
-                for c in self.candidates
+                all(factor.name not in motions for factor in parse_term(term, channels))
+                for term in self.library.terms
             ]
         )
         rows = self.config.estimator.rows(Rows(terms, past.target, past.stretch), past.step, exact)
-        if not self.config.symmetric:
-            return [reduce(rows.x, rows.y, *_columns(self.candidates))] * 3
-        out = []
-        for axis in range(3):
-            own = [
-                j
-                for j, candidate in enumerate(self.candidates)
-                if not wrong_parity(candidate.term, axis, self.features.names)
-            ]
-            out.append(reduce(rows.x[:, own], rows.y, *_columns([self.candidates[j] for j in own])))
-        return out
+        odd = [
+            [wrong_parity(term, axis, channels) for axis in range(3)] for term in self.library.terms
+        ]
+        estimator = SparseRegression(
+            self.config.search,
+            degrees=[candidate.degree for candidate in self.candidates],
+            efforts=[candidate.effort for candidate in self.candidates],
+            allowed=~torch.tensor(odd) if self.config.symmetric else None,
+            gammas=gammas,
+        )
+        x, y = torch.from_numpy(rows.x), torch.from_numpy(rows.y)
+        return estimator.fit(x, y, names=self.library.terms, outputs=ACCELERATION)
 
     def _delay(self, past: Past) -> tuple[int, dict[str, Any]]:
-        """The delay in steps: that which fits best with the terms of degree one, then with those
-        that are found at it, until it stays.
+        """Return the delay in steps, and the notes about it.
+
+        It is the one that fits best with the terms of degree one, then with those that are found at
+        it, until it stays.
         """
         if self.line.count == 0:
             return 0, {}
         simple = [c.term for c in self.candidates if c.degree <= 1]
         terms: list[list[str]] = [simple] * 3
-        seen: list[int] = []
+        tried: list[int] = []
         profile = np.zeros(0)
-        while len(seen) < 2 or (seen[-1] != seen[-2] and len(seen) < _MOST_DELAYS):
+        while len(tried) < 2 or (tried[-1] != tried[-2] and len(tried) < _MOST_DELAYS):
             steps, profile = best_delay(
                 past, terms, self.features.names, self.line.channels, self.line.longest
             )
-            seen.append(steps)
-            reduced = self._reduced(past.delayed(steps, self.line.index.numpy()))
-            terms = [
-                list(
-                    dict.fromkeys(
-                        (*find(reduced[axis], axis, self.config.search)[0].terms, *simple)
-                    )
-                )
-                for axis in range(3)
-            ]
-        return seen[-1], {
-            "delay": {
-                "steps": seen[-1],
-                "seconds": seen[-1] * past.step,
-                "profile": profile.tolist(),
-            }
-        }
-
-    def _solution(
-        self, reduced: list[Reduced], search: SearchConfig, steps: int, told: dict[str, Any]
-    ) -> Solution:
-        found = [find(own, axis, search) for axis, own in enumerate(reduced)]
-        equations = [equation for equation, _ in found]
-        coefficients = torch.zeros_like(self.coefficients)
-        for axis, equation in enumerate(equations):
-            for term, value in zip(equation.terms, equation.values.tolist(), strict=True):
-                coefficients[self.library.terms.index(term), axis] = value
-        table = tuple(
-            Coefficient(name, term, value, error)
-            for name, equation in zip(ACCELERATION, equations, strict=True)
-            for term, value, error in zip(
-                equation.terms, equation.values.tolist(), equation.errors.tolist(), strict=True
-            )
-        )
+            tried.append(steps)
+            table = self._fit(past.delayed(steps, self.line.index.numpy()))[0].table
+            found = [[c.term for c in table if c.axis == name] for name in ACCELERATION]
+            terms = [list(dict.fromkeys((*row, *simple))) for row in found]
         notes = {
-            "terms": self.library.count,
-            "parameters": len(table),
-            "coefficients": [
-                {"axis": c.axis, "term": c.term, "value": c.value, "standard_error": c.error}
-                for c in table
-            ],
-            "unexcited": list(dict.fromkeys(term for own in reduced for term in own.unexcited)),
-            "equations": {
-                name: self._written(name, *pair, steps)
-                for name, pair in zip(ACCELERATION, found, strict=True)
-            },
-            **told,
+            "steps": tried[-1],
+            "seconds": tried[-1] * past.step,
+            "profile": profile.tolist(),
         }
-        state = {
-            "coefficients": coefficients,
-            "line.steps": torch.full((1,), float(steps), dtype=torch.float64),
+        return tried[-1], {"delay": notes}
+
+    def _complete(self, solution: Solution, steps: int, delay: dict[str, Any]) -> Solution:
+        """Return the solution with its delay, and with its equations in writing."""
+        equations = {
+            name: self._written(name, [c for c in solution.table if c.axis == name], steps) | about
+            for name, about in solution.notes["equations"].items()
         }
-        return Solution(
-            {"kept": [len(equation.terms) for equation in equations], "gamma": search.gamma},
-            state,
-            table,
-            notes,
+        line = {"line.steps": torch.full((1,), float(steps), dtype=torch.float64)}
+        return replace(
+            solution,
+            state=solution.state | line,
+            notes=solution.notes | {"equations": equations} | delay,
         )
 
-    def _written(
-        self, name: str, equation: Equation, within: Reduced, steps: int
-    ) -> dict[str, Any]:
-        """One equation in writing, with what the data say about it."""
+    def _written(self, name: str, terms: Sequence[Coefficient], steps: int) -> dict[str, str]:
+        """Return one equation in writing."""
         channels = self.features.names
         factors = [
             [
                 Factor("abs" if factor.magnitude else factor.function, factor.name, factor.power)
-                for factor in parse_term(term, channels)
+                for factor in parse_term(entry.term, channels)
             ]
-            for term in equation.terms
+            for entry in terms
         ]
-        written = Written(name, equation.terms, factors, equation.values.tolist(), channels)
-        late = (
-            f"; {', '.join(self.line.channels)}: {steps} steps earlier" if self.line.count else ""
+        written = Written(
+            name, [c.term for c in terms], factors, [c.value for c in terms], channels
         )
+        late = ""
+        if self.line.count:
+            late = f"; {', '.join(self.line.channels)}: {steps} steps earlier"
+        comment = f"{name} in SI units, valid within the range of the training data{late}"
         return {
             "text": plain(written),
             "latex": latex(written),
             "sympy": sympy_text(written),
-            "c": c_function(
-                written, f"{name} in SI units, valid within the range of the training data{late}"
-            ),
-            **equation.summary(within),
+            "c": c_function(written, comment),
         }
-
-
-def _columns(candidates: Sequence[Candidate]) -> tuple[list[str], list[int], list[float]]:
-    """Terms, degrees and efforts."""
-    return (
-        [c.term for c in candidates],
-        [c.degree for c in candidates],
-        [c.effort for c in candidates],
-    )

@@ -6,7 +6,7 @@ and through the regressors on its right, which pull coefficients towards zero. I
 sides against a test function w that vanishes at the ends of a window, int w y dt = sum c_j int w
 f_j dt, takes the derivative off the noisy record (by parts, int w x_dot dt = -int w_dot x dt).
 Where accelerations are central differences (`savitzky_golay` over three samples) summing them is
-the same as summing by parts. Instruments, the terms themselves some time earlier, share what is
+the same as summing by parts. InstrumentRows, the terms themselves some time earlier, share what is
 true with the regressors and not the noise.
 """
 
@@ -32,7 +32,7 @@ class Rows(NamedTuple):
     stretch: np.ndarray
 
 
-class Estimator(Config, ABC):
+class RowBuilder(Config, ABC):
     """How sampled terms become rows of a regression.
 
     Attributes:
@@ -58,19 +58,19 @@ class Estimator(Config, ABC):
 
 
 @final
-class LeastSquares(Estimator):
+class SampleRows(RowBuilder):
     """Every sample is a row."""
 
     sequential: ClassVar[bool] = False
     kind: Literal["least_squares"] = "least_squares"
 
     def rows(self, sampled: Rows, step: float, exact: np.ndarray) -> Rows:
-        """The samples; see `Estimator.rows`."""
+        """The samples; see `RowBuilder.rows`."""
         return sampled
 
 
 @final
-class Weak(Estimator):
+class WeakRows(RowBuilder):
     """Both sides integrated over windows against (1 - s^2)^2, s from -1 to 1 (weak form; Bortz,
     Messenger and others, 2021).
 
@@ -84,12 +84,12 @@ class Weak(Estimator):
     every: float = Field(default=0.05, gt=0.0, le=1.0)
 
     def rows(self, sampled: Rows, step: float, exact: np.ndarray) -> Rows:
-        """One row for each window; see `Estimator.rows`."""
+        """One row for each window; see `RowBuilder.rows`."""
         return integrated(sampled, step, self.window, self.every)
 
 
 @final
-class Instruments(Estimator):
+class InstrumentRows(RowBuilder):
     """Regressors projected on instruments, the terms one and two lags earlier and the exact terms
     (two-stage least squares).
 
@@ -106,7 +106,7 @@ class Instruments(Estimator):
     every: float = Field(default=0.05, gt=0.0, le=1.0)
 
     def rows(self, sampled: Rows, step: float, exact: np.ndarray) -> Rows:
-        """Rows with projected terms; see `Estimator.rows`."""
+        """Rows with projected terms; see `RowBuilder.rows`."""
         if self.window > 0:
             apart = max(round(self.every * self.window / step), 1) * step
             sampled, step = integrated(sampled, step, self.window, self.every), apart
@@ -134,7 +134,7 @@ class Instruments(Estimator):
         return Rows(np.where(exact, x, q @ (q.T @ x)), sampled.y[now], sampled.stretch[now])
 
 
-EstimatorConfig = Annotated[LeastSquares | Weak | Instruments, Field(discriminator="kind")]
+RowsConfig = Annotated[SampleRows | WeakRows | InstrumentRows, Field(discriminator="kind")]
 """Any estimator; its `kind` says which."""
 
 

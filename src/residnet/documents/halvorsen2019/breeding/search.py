@@ -13,11 +13,12 @@ import numpy as np
 from pydantic import Field
 
 from residnet.core.config import Config, Seconds
-from residnet.heads.genetic import GeneticConfig, breed, validating
+from residnet.heads.genetic import GeneticConfig
 from residnet.physics.mass_spring_damper import MassSpringDamperConfig
 from residnet.regression.expressions.algebra import Algebra
 from residnet.regression.expressions.text import term
-from residnet.regression.genetic.evolution import limits_of
+from residnet.regression.genetic.config import limits_of
+from residnet.regression.genetic.equations import breed, validating
 
 CHANNELS = ("x", "u", "tau_x")
 Record = dict[str, np.ndarray]
