@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 from tiny import call
 
 from residnet.core.config import load_config
-from residnet.documents.halvorsen2019.breeding.search import NoiseConfig, RecordConfig
+from residnet.documents.halvorsen2019.breeding.config import NoiseConfig, RecordConfig
 from residnet.documents.halvorsen2019.breeding.task import BreedingTaskConfig
 
 STUDIES = Path(__file__).parents[2] / "configs" / "studies" / "halvorsen2019"
@@ -80,8 +80,11 @@ def test_a_grid_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert cells[300, 0.0]["error"] < 1e-20
     assert cells[10, 0.5]["found"] == 0
     assert len(cells[300, 0.0]["equations"]) == 3
-    text = (tmp_path / "run" / "study.md").read_text()
-    assert "| 300 | 3 (3); " in text
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary["finished"]
+    assert summary["figures"]["share of runs that find the equation"]["value"] >= 3 / 9
+    assert "of the 30 runs of the same table" in " ".join(summary["verdict"])
+    assert "published 3; " in (tmp_path / "run" / "report.html").read_text()
     assert (tmp_path / "run" / "figures" / "study.png").stat().st_size > 1000
 
 

@@ -18,7 +18,8 @@ from residnet.core.config import load_config
 from residnet.core.errors import ConfigError, DataError, FitError, UsageError
 from residnet.documents.jervan2020.measured.config import ForceSettings
 from residnet.documents.jervan2020.measured.data import compare_accelerations, read_measured
-from residnet.documents.jervan2020.measured.report import write
+from residnet.documents.jervan2020.measured.report import sections, verdict
+from residnet.documents.jervan2020.measured.results import write_results
 from residnet.documents.jervan2020.measured.study import better, force_study
 from residnet.documents.jervan2020.measured.task import ForceResidualConfig
 from residnet.physics.force_model import FERRY_TERMS
@@ -115,8 +116,11 @@ def test_what_the_hull_lacks_is_found_and_said(tmp_path: Path) -> None:
     )
     assert coefficients["u_dot"][0] == pytest.approx(500, rel=0.05)
     assert coefficients["r_dot"][2] == pytest.approx(400, rel=0.05)
-    text = write(settings, found, RunFolder.create(tmp_path / "run", "", resume=False))
-    assert "2 of 2 regressions beat a residual of zero" in text
+    results = write_results(settings, found, RunFolder.create(tmp_path / "run", "", resume=False))
+    assert "in the mean over the axes: plsr and ridge." in " ".join(verdict(results))
+    titles = [section.title for section in sections(settings, results, tmp_path / "run")]
+    assert titles[:2] == ["Data and cross-validation", "Commanded and actual force"]
+    assert "Residual of the actual force" in titles
     assert {path.name for path in (tmp_path / "run" / "figures").glob("*.png")} >= {
         "scores.png",
         "forces_one.png",
@@ -133,8 +137,8 @@ def test_a_residual_of_noise_is_said_to_be_none(tmp_path: Path) -> None:
     assert [row["model"] for row in found.rows] == ["zero", "believed", "ols", "surface"]
     assert not any(any(better(rows(found)[name], "believed")) for name in ("ols", "surface"))
     assert better(rows(found)["believed"], "zero")[3]
-    text = write(settings, found, RunFolder.create(tmp_path / "run", "", resume=False))
-    assert "NONE of the 2 regressions beats a residual of zero" in text
+    results = write_results(settings, found, RunFolder.create(tmp_path / "run", "", resume=False))
+    assert "None of the 2 regressions is better" in " ".join(verdict(results))
 
 
 def test_folds_are_stretches_of_one_log_with_a_gap_and_whole_logs_of_three(tmp_path: Path) -> None:
@@ -219,11 +223,12 @@ def test_a_model_that_is_not_determined_is_set_aside_and_said(tmp_path: Path) ->
     )
     found = force_study(settings)
     assert list(found.final) == ["ridge"]
-    text = write(settings, found, RunFolder.create(tmp_path / "run", "", resume=False))
-    assert (
-        "Not determined by these logs:\n\n- model earth: a force constant in earth axes does not"
-        " show" in text
+    results = write_results(settings, found, RunFolder.create(tmp_path / "run", "", resume=False))
+    assert results["failed"]["earth"].startswith(
+        "model earth: a force constant in earth axes does not show"
     )
+    titles = [section.title for section in sections(settings, results, tmp_path / "run")]
+    assert "Not determined by these logs" in titles
 
 
 def test_data_that_determine_nothing_are_clear_errors(tmp_path: Path) -> None:
@@ -238,7 +243,7 @@ def test_data_that_determine_nothing_are_clear_errors(tmp_path: Path) -> None:
         force_study(config(tmp_path, "validation.segment=1000"))
     log(tmp_path, "one", missing=1.0, seconds=12.0)
     with pytest.raises(
-        (FitError, DataError), match=r"samples do not determine|nothing left to learn"
+        (FitError, DataError), match=r"samples do not determine|nothing left to fit"
     ):
         force_study(config(tmp_path, "validation.segment=2"))
     log(tmp_path, "one", missing=1.0, seconds=300.0, tau_x_est=np.full(3000, np.nan))

@@ -17,11 +17,13 @@ from residnet.control.motion.anticipation import Derivatives, Lag, course, neede
 from residnet.core.config import load_config
 from residnet.core.errors import ConfigError, FitError
 from residnet.documents.jervan2020.ferry.flights import MotionNoise
-from residnet.documents.jervan2020.ferry.report import write
+from residnet.documents.jervan2020.ferry.identification import identify
+from residnet.documents.jervan2020.ferry.report import sections, verdict
+from residnet.documents.jervan2020.ferry.results import write_results
 from residnet.documents.jervan2020.ferry.study import Study, record_of, study
 from residnet.documents.jervan2020.ferry.task import FerryStudyConfig
 from residnet.documents.jervan2020.forward import forward_equations, missing_coefficients
-from residnet.documents.jervan2020.residual_model import constant_force, identify
+from residnet.documents.jervan2020.residual_model import constant_force
 from residnet.export.feed_forward import export_feed_forward
 from residnet.physics.force_model import FERRY_TERMS, ForceModel
 from residnet.physics.fossen import FossenVessel
@@ -96,9 +98,7 @@ def test_a_fitted_model_runs_forward_as_the_true_ferry(short: Study) -> None:
 
 
 def test_what_the_believed_hull_lacks_stands_beside_what_was_found() -> None:
-    """ERRATA J19: minus half of the believed model, which its own table misprints in the cross
-    terms.
-    """
+    """Minus half of the believed model (correction J19), which Table 4.11 misprints."""
     truth = missing_coefficients("milliampere_half", "milliampere")
     expected = {
         "u_dot": [-1194.83, 0, 0],
@@ -150,8 +150,15 @@ def test_feed_forward_alone_and_a_model_that_cannot_run_forward(tmp_path: Path) 
         "models.case={fit: {kind: plsr, order: 1}, fly: true}",
     )
     folder = RunFolder.create(tmp_path / "run", "", resume=False)
-    text = write(wanted, found, folder)
-    assert "Cannot run forward in time:\n\n- model case: its mass matrix" in text
+    results = write_results(wanted, found, folder)
+    assert results["models"]["case"]["not_forward"].startswith("model case: its mass matrix")
+    assert any(
+        sentence.startswith("With lag_ridge as feed-forward, the mean position error in the course")
+        for sentence in verdict(results)
+    )
+    titles = [section.title for section in sections(wanted, results, folder.path)]
+    assert "Models that cannot run forward in time" in titles
+    assert "Feed-forward without feedback" in titles
     assert {path.name for path in (tmp_path / "run" / "models").glob("*.yaml")} == {
         "lag_ridge_forward.yaml"
     }

@@ -15,6 +15,14 @@ from scipy.signal import butter, filtfilt
 
 from residnet.core.errors import FitError
 from residnet.core.log import Log
+from residnet.documents.halvorsen2019.sea_trial.config import (
+    CHANNELS,
+    EquationConfig,
+    PreparationConfig,
+    odin,
+)
+from residnet.documents.halvorsen2019.sea_trial.figures import SET_NAMES
+from residnet.documents.halvorsen2019.sea_trial.published import START_PARAMETERS
 from residnet.documents.halvorsen2019.sea_trial.standard_model import (
     NAMES,
     PARAMETERS,
@@ -23,13 +31,8 @@ from residnet.documents.halvorsen2019.sea_trial.standard_model import (
     fit,
     truth,
 )
-from residnet.documents.halvorsen2019.sea_trial.study import BlackConfig, PhasesSettings
-from residnet.documents.halvorsen2019.sea_trial.trial import (
-    CHANNELS,
-    PreparationConfig,
-    odin,
-    prepared,
-)
+from residnet.documents.halvorsen2019.sea_trial.task import SeaTrialTaskConfig
+from residnet.documents.halvorsen2019.sea_trial.trial import prepared
 from residnet.physics.odin import AccelerationHull
 from residnet.tasks import load_task
 
@@ -45,7 +48,7 @@ def states(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
 
 
 def matrices(p: dict[str, float], nu: np.ndarray, tau: np.ndarray) -> np.ndarray:
-    """(9.4)-(9.9) with ERRATA H1, H4, H18, H19, one sample at a time."""
+    """(9.4)-(9.9) with corrections H1, H4, H18, H19, one sample at a time."""
     out = []
     for (u, v, r), force in zip(nu, tau, strict=True):
         inertia = np.diag([MASS, MASS, p["I_z"]]) - np.array(
@@ -68,7 +71,7 @@ def matrices(p: dict[str, float], nu: np.ndarray, tau: np.ndarray) -> np.ndarray
 def some(seed: int = 1) -> dict[str, float]:
     random = np.random.default_rng(seed)
     values = {
-        name: entry.start + entry.scale * random.uniform(-0.5, 0.5)
+        name: START_PARAMETERS[name] + entry.scale * random.uniform(-0.5, 0.5)
         for name, entry in PARAMETERS.items()
     }
     limits = StandardFitConfig().limits()
@@ -193,20 +196,16 @@ def test_preparation_is_the_documents() -> None:
 
 def test_equations_see_forces_or_controls() -> None:
     with pytest.raises(ValidationError, match="give `inputs` instead"):
-        BlackConfig.model_validate(
+        EquationConfig.model_validate(
             {"inputs": "forces", "head": {"kind": "symbolic", "features": ["u"]}}
         )
     settings = yaml.safe_load(CONFIG.read_text())
     settings["equations"]["force"]["head"]["candidates"]["coupling"] = ["cmd_n"]
     with pytest.raises(ValidationError, match="'cmd_n' is not a channel"):
-        PhasesSettings.model_validate(
-            {key: value for key, value in settings.items() if key != "task"}
-        )
+        SeaTrialTaskConfig.model_validate(settings)
     settings["trials"]["calm"]["vessel"] = "odin_forces"
     with pytest.raises(ValidationError, match="needs a vessel of kind 'odin' with water jets"):
-        PhasesSettings.model_validate(
-            {key: value for key, value in settings.items() if key != "task"}
-        )
+        SeaTrialTaskConfig.model_validate(settings)
 
 
 def test_a_short_trial_runs(tmp_path: Path) -> None:
@@ -239,7 +238,10 @@ def test_a_short_trial_runs(tmp_path: Path) -> None:
         rows["standard", "displacement", "r_dot"]["rmse"]
         < 1.3 * rows["plant", "plant", "r_dot"]["rmse"]
     )
-    assert (tmp_path / "run" / "study.md").read_text().count("## Validation") == len(found["rows"])
+    page = (tmp_path / "run" / "report.html").read_text()
+    assert all(f"Validation, {SET_NAMES[where]}" in page for where in found["rows"])
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary["verdict"][0].startswith("Trial calm: on the validation stretches")
     assert {file.name for file in (tmp_path / "run" / "figures").iterdir()} >= {
         "trial_calm.png",
         "parameters_calm.png",

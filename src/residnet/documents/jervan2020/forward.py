@@ -1,4 +1,4 @@
-"""Force-space models that run forward in time (document 002 eq. (3.22))."""
+"""Equations of motion from a model in force space (document 002, (3.22))."""
 
 from __future__ import annotations
 
@@ -15,30 +15,32 @@ from residnet.physics.signals import FORCE_CHANNELS
 from residnet.physics.terms import parse_term
 
 
-def forward_equations(believed: str, model: ForceModel, who: str) -> HullEquations:
-    """nu_dot = (M + A)^-1 (tau - C nu - D nu - b) written out by terms, as the baseline `believed`
-    takes it.
+def forward_equations(believed: str, model: ForceModel, label: str) -> HullEquations:
+    """Return the accelerations of a force-space model as sums of terms.
+
+    They are nu_dot = (M + A)^-1 (tau - C nu - D nu - b), in the form that the baseline `believed`
+    takes.
 
     Args:
-        believed: vessel of the hull that the model stands on.
-        model: eps = A nu_dot + b(nu) on that hull.
-        who: name in errors.
+        believed: vessel of the known hull, by name or file.
+        model: the known hull and its residual eps = A nu_dot + b(nu).
+        label: name of the model in error messages.
 
     Raises:
         ConfigError: where a basis function is not affine in nu_dot.
         FitError: where the augmented mass cannot be inverted safely.
     """
-    given = BelievedConfig(vessel=believed).equations().rows()
-    known = list(dict.fromkeys(term for row in given for term in row))
+    hull_rows = BelievedConfig(vessel=believed).equations().rows()
+    known = list(dict.fromkeys(term for row in hull_rows for term in row))
     hull = torch.tensor(
-        [[row.get(term, 0.0) for term in known] for row in given], dtype=torch.float64
+        [[row.get(term, 0.0) for term in known] for row in hull_rows], dtype=torch.float64
     )
     mass, constant = model.hull.mass.clone(), torch.zeros(3, dtype=torch.float64)
     total, extra = mass, dict[str, Tensor]()
     for correction in model.corrections:
         assert isinstance(correction, Correction)
         terms, coefficients = correction.library.terms, correction.coefficients
-        total, rest = augmented(total, terms, coefficients, who)
+        total, rest = augmented(total, terms, coefficients, label)
         constant = constant + correction.intercept
         for j in rest:
             extra[terms[j]] = (
@@ -57,27 +59,27 @@ def forward_equations(believed: str, model: ForceModel, who: str) -> HullEquatio
 
 
 def missing_coefficients(true: str, believed: str) -> dict[str, list[float]]:
-    """What a believed hull lacks to the true one, by basis function: the residual's own
-    coefficients (surge, sway, yaw) (ERRATA J19).
+    """Return the true coefficients of a residual by basis function: surge, sway, yaw.
+
+    They are those of the true hull less those of the believed one, where document 002 misprints the
+    cross terms (correction J19).
     """
-    parts = [_force_coefficients(name) for name in (true, believed)]
-    nothing = torch.zeros(3, dtype=torch.float64)
+    of_true, of_believed = (_force_coefficients(name) for name in (true, believed))
+    zero = torch.zeros(3, dtype=torch.float64)
     out: dict[str, list[float]] = {}
-    for key in dict.fromkeys((*parts[1], *parts[0])):
-        apart = parts[0].get(key, nothing) - parts[1].get(key, nothing)
-        # what is equal in both differs by rounding
-        apart = torch.where(
-            apart.abs() > 1e-9 * (1 + parts[0].get(key, nothing).abs()), apart, nothing
+    for key in dict.fromkeys((*of_believed, *of_true)):
+        difference = of_true.get(key, zero) - of_believed.get(key, zero)
+        # equal coefficients differ by rounding alone
+        difference = torch.where(
+            difference.abs() > 1e-9 * (1 + of_true.get(key, zero).abs()), difference, zero
         )
-        if bool(apart.any()):
-            out[key] = apart.tolist()
+        if bool(difference.any()):
+            out[key] = difference.tolist()
     return out
 
 
 def _force_coefficients(vessel: str) -> dict[str, Tensor]:
-    """F(nu_dot, nu) of a vessel's hull by basis function, [3] each, those of document 002 under its
-    names.
-    """
+    """Return the coefficients [3] of F(nu_dot, nu) by basis function of document 002."""
     names = {_factors(term): term for term in FERRY_TERMS}
     rows = BelievedConfig(vessel=vessel).equations().rows()
     columns = {
@@ -97,12 +99,10 @@ def _factors(term: str) -> tuple[Any, ...]:
     return tuple(sorted(parse_term(term, MOTION)))
 
 
-def as_vessel_lines(equations: HullEquations, who: str) -> str:
-    """The model as lines for a fit's `baseline` or `baselines`, so that it runs forward beside
-    others.
-    """
+def as_baseline_yaml(equations: HullEquations, label: str) -> str:
+    """Return the model as YAML lines for the `baseline` or `baselines` of a fit."""
     lines = [
-        f"# {who}: accelerations from velocities and forces; needs the channels"
+        f"# {label}: accelerations from velocities and forces; needs the channels"
         f" {', '.join((*VELOCITY, *FORCE_CHANNELS))}"
     ]
     lines += ["kind: believed", "vessel:"]

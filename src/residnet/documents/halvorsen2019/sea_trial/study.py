@@ -1,161 +1,62 @@
-"""The standard model of Odin against equations found from the data, in the displacement phase and
-in all phases (document 000, section 7.5).
-"""
+"""Models of Odin by phase: the standard model against equations (document 000, section 7.5)."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
-from pydantic import Field, model_validator
 
-from residnet.core.config import Config
-from residnet.core.errors import ConfigError
-from residnet.core.names import VELOCITY, nearest
-from residnet.documents.halvorsen2019.sea_trial.standard_model import (
-    StandardFit,
-    StandardFitConfig,
-    fit,
-    truth,
-)
-from residnet.documents.halvorsen2019.sea_trial.trial import (
-    CHANNELS,
-    CONTROLS,
-    FORCES,
-    Trial,
-    TrialConfig,
+from residnet.documents.halvorsen2019.sea_trial.config import (
+    ALL,
+    PLANT,
+    SEPARATE,
+    STANDARD,
+    EquationConfig,
+    SeaTrialConfig,
+    SeaTrialSettings,
     odin,
-    sail,
 )
-from residnet.heads.base import ClosedFormHead
-from residnet.heads.genetic import GeneticConfig
-from residnet.heads.symbolic import SymbolicConfig
+from residnet.documents.halvorsen2019.sea_trial.standard_model import StandardFit, fit, truth
+from residnet.documents.halvorsen2019.sea_trial.trial import Trial, sail
 from residnet.judge.goodness import OneStep
 from residnet.judge.goodness import table as goodness_table
 from residnet.physics.froude import PHASES
 from residnet.physics.odin import AccelerationHull
 
-ALL = "all"
-STANDARD, SEPARATE, PLANT = "standard", "separate", "plant"
-SETS = (*PHASES, ALL)
-"""What a model is fitted on, and what it is judged on."""
-_FEWEST = 500
-"""Samples below which a phase is not fitted or judged."""
-Published = dict[str, tuple[float, float, float]]
-
-
-class BlackConfig(Config):
-    """An equation of the accelerations from the data alone.
-
-    Attributes:
-        inputs: `forces` of the jets by their known thrust, or `controls`, motor speed and nozzle
-            angle.
-        head: how the equation is found.
-    """
-
-    inputs: Literal["forces", "controls"]
-    head: Annotated[SymbolicConfig | GeneticConfig, Field(discriminator="kind")]
-
-    @model_validator(mode="after")
-    def _inputs_only(self) -> BlackConfig:
-        if self.head.features:
-            raise ValueError("head.features: give `inputs` instead")
-        return self
-
-    def build(self) -> ClosedFormHead:
-        """The head for the channels of a trial.
-
-        Raises:
-            ConfigError: where its terms name what it does not see.
-        """
-        seen = (*VELOCITY, *(FORCES if self.inputs == "forces" else CONTROLS))
-        return self.head.model_copy(update={"features": seen}).build(CHANNELS)
-
-
-class SeaTrialConfig(TrialConfig):
-    """A trial with a vessel.
-
-    Attributes:
-        vessel: of kind odin with water jets.
-    """
-
-    vessel: str
-
-    @model_validator(mode="after")
-    def _fits(self) -> SeaTrialConfig:
-        try:
-            self.disturbance.check(odin(self.vessel).build(), self.vessel)
-        except ConfigError as error:
-            raise ValueError(str(error)) from None
-        return self
-
-
-class PhasesSettings(Config):
-    """Models fitted and judged by phase, on one trial or several.
-
-    Attributes:
-        name: of the run.
-        trials: by name; the first is the one that published figures stand beside.
-        standard: fit of the standard model.
-        equations: by name.
-        separate: also put models together of one for each phase.
-        published: root mean square error, C_p and adjusted R^2 by set, model and acceleration.
-    """
-
-    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")
-    description: str = ""
-    trials: dict[str, SeaTrialConfig] = Field(min_length=1)
-    standard: StandardFitConfig = StandardFitConfig()
-    equations: dict[str, BlackConfig] = Field(default_factory=dict)
-    separate: bool = True
-    published: dict[str, dict[str, Published]] = Field(default_factory=dict)
-
-    @model_validator(mode="after")
-    def _names(self) -> PhasesSettings:
-        for name in self.equations:
-            if name in (STANDARD, SEPARATE, PLANT):
-                raise ValueError(f"equations: the name '{name}' is taken")
-        for where, models in self.published.items():
-            if where not in SETS:
-                raise ValueError(f"published: no set '{where}'{nearest(where, SETS)}")
-            for model in models:
-                if model not in (STANDARD, *self.equations):
-                    raise ValueError(
-                        f"published.{where}: no model"
-                        f" '{model}'{nearest(model, (STANDARD, *self.equations))}"
-                    )
-        for name, equation in self.equations.items():
-            try:
-                equation.build()
-            except ConfigError as error:
-                raise ValueError(f"equations.{name}: {error}") from None
-        return self
+_LEAST_SAMPLES = 500
+"""Number of samples below which a phase is neither fitted nor judged."""
+_STANDARD_PARAMETERS = (4.0, 8.0, 8.0)
+"""Number of parameters of the standard model in surge, sway and yaw."""
 
 
 @dataclass(frozen=True)
 class Fitted:
-    """A model fitted on one set: its prediction at all samples [N, 3], the number of parameters of
-    each axis, and what there is to say.
+    """A model that was fitted to one set of samples.
+
+    Attributes:
+        predicted: predicted accelerations at all samples [N, 3].
+        parameter_count: number of parameters in surge, sway and yaw.
+        equations: the equation of each axis as text; empty for other models.
     """
 
     predicted: np.ndarray
-    freedom: tuple[float, ...]
-    notes: dict[str, Any]
+    parameter_count: tuple[float, ...]
+    equations: Mapping[str, str]
 
 
 @dataclass(frozen=True)
 class PhaseStudy:
-    """One trial.
+    """What was found on one trial.
 
     Attributes:
-        trial: the data.
-        standard: fits of the standard model by set.
-        truth: its parameters on the vessel that sailed, as far as the model has them.
-        models: by name and set.
-        rows: goodness of fit on validation stretches by set.
+        trial: the samples.
+        standard: fits of the standard model by set of samples.
+        truth: true parameters of the vessel, as far as the standard model has them.
+        models: models by name and by the set that they were fitted to.
+        rows: goodness of fit on the validation stretches, by set.
     """
 
     trial: Trial
@@ -165,8 +66,8 @@ class PhaseStudy:
     rows: Mapping[str, list[dict[str, Any]]]
 
 
-def study(settings: PhasesSettings) -> dict[str, PhaseStudy]:
-    """Sail every trial, fit every model on every set, and judge.
+def study(settings: SeaTrialSettings) -> dict[str, PhaseStudy]:
+    """Simulate every trial, and fit and judge every model on every set of samples.
 
     Raises:
         ResidnetError: where a trial cannot be sailed or a model is not determined.
@@ -174,23 +75,23 @@ def study(settings: PhasesSettings) -> dict[str, PhaseStudy]:
     return {name: one_trial(settings, trial) for name, trial in settings.trials.items()}
 
 
-def one_trial(settings: PhasesSettings, config: SeaTrialConfig) -> PhaseStudy:
-    """Sail a trial, fit and judge; see `study`."""
-    trial = sail(config.vessel, config)
+def one_trial(settings: SeaTrialSettings, config: SeaTrialConfig) -> PhaseStudy:
+    """Simulate one trial, and fit and judge every model on every set of samples."""
+    trial = sail(config)
     sets = {
         name: keep
         for name, keep in _sets(trial).items()
-        if min((keep & ~trial.validates).sum(), (keep & trial.validates).sum()) >= _FEWEST
+        if min((keep & ~trial.validates).sum(), (keep & trial.validates).sum()) >= _LEAST_SAMPLES
     }
     z, a = trial.samples.z.numpy(), trial.samples.target.numpy()
     standard, models = {}, {}
     for name, keep in sets.items():
-        own = keep & ~trial.validates
-        standard[name] = found = fit(z[own, :3], z[own, 5:], a[own], settings.standard)
-        freedom = (4.0, 8.0, 8.0)
-        models[STANDARD, name] = Fitted(found.accelerations(z[:, :3], z[:, 5:]), freedom, {})
-        for equation, black in settings.equations.items():
-            models[equation, name] = _found(black, trial, own)
+        train = keep & ~trial.validates
+        standard[name] = found = fit(z[train, :3], z[train, 5:], a[train], settings.standard)
+        predicted = found.accelerations(z[:, :3], z[:, 5:])
+        models[STANDARD, name] = Fitted(predicted, _STANDARD_PARAMETERS, {})
+        for equation, equation_config in settings.equations.items():
+            models[equation, name] = _fit_equation(equation_config, trial, train)
     if settings.separate:
         models |= _separate(models, sets, trial)
     return PhaseStudy(
@@ -203,41 +104,43 @@ def one_trial(settings: PhasesSettings, config: SeaTrialConfig) -> PhaseStudy:
 
 
 def _sets(trial: Trial) -> dict[str, np.ndarray]:
+    """Return the samples [N] bool of each phase and of all phases."""
     return {phase: trial.phase == number for number, phase in enumerate(PHASES)} | {
         ALL: np.ones(len(trial.phase), dtype=bool)
     }
 
 
-def _found(config: BlackConfig, trial: Trial, own: np.ndarray) -> Fitted:
-    """The equation of the samples chosen, at all samples."""
-    head, seen = config.build(), trial.samples.where(torch.from_numpy(own))
-    head.calibrate(seen)
-    notes = head.solve(seen)
+def _fit_equation(config: EquationConfig, trial: Trial, train: np.ndarray) -> Fitted:
+    """Find an equation from the training samples [N] bool, and evaluate it at all samples."""
+    head, samples = config.build(), trial.samples.where(torch.from_numpy(train))
+    head.calibrate(samples)
+    notes = head.solve(samples)
     with torch.no_grad():
         predicted = head(trial.samples.z, trial.samples.z[:, :0])[0].numpy()
     return Fitted(
         predicted,
         tuple(head.parameter_count()),
-        {"equations": {axis: own["text"] for axis, own in notes["equations"].items()}},
+        {axis: equation["text"] for axis, equation in notes["equations"].items()},
     )
 
 
 def _separate(
     models: Mapping[tuple[str, str], Fitted], sets: Mapping[str, np.ndarray], trial: Trial
 ) -> dict[tuple[str, str], Fitted]:
-    """Of each kind of model one that takes, at each sample, the one fitted on its phase (where a
-    phase has none, the one of all phases).
+    """Return for each model one that consists of the models fitted to the single phases.
+
+    Where a phase has no model, the one of all phases takes its place.
     """
     out = {}
     for name in dict.fromkeys(model for model, _ in models):
-        predicted, freedom = models[name, ALL].predicted.copy(), np.zeros(3)
+        predicted, parameter_count = models[name, ALL].predicted.copy(), np.zeros(3)
         for number, phase in enumerate(PHASES):
             if phase in sets:
                 predicted[trial.phase == number] = models[name, phase].predicted[
                     trial.phase == number
                 ]
-                freedom += models[name, phase].freedom
-        out[name, SEPARATE] = Fitted(predicted, tuple(freedom), {})
+                parameter_count += models[name, phase].parameter_count
+        out[name, SEPARATE] = Fitted(predicted, tuple(parameter_count), {})
     return out
 
 
@@ -247,8 +150,10 @@ def _judged(
     sets: Mapping[str, np.ndarray],
     models: Mapping[tuple[str, str], Fitted],
 ) -> dict[str, list[dict[str, Any]]]:
-    """Goodness of fit on the validation stretches of each set; the plant's own equations show what
-    the sea and the preparation leave.
+    """Return the goodness of fit on the validation stretches of each set.
+
+    The plant's own equations stand beside the models: they show what the sea and the preparation
+    leave unexplained.
     """
     vessel = odin(config.vessel)
     z, a = trial.samples.z, trial.samples.target.numpy()
@@ -267,11 +172,11 @@ def _judged(
             OneStep(
                 f"{model} on {on}",
                 "head",
-                own.freedom,
-                [(a - own.predicted)[piece] for piece in pieces],
+                fitted.parameter_count,
+                [(a - fitted.predicted)[piece] for piece in pieces],
                 f"{STANDARD} on {name}",
             )
-            for (model, on), own in judged.items()
+            for (model, on), fitted in judged.items()
         ]
         keys = {f"{model} on {on}": (model, on) for model, on in judged}
         out[name] = [

@@ -1,54 +1,51 @@
-"""Task `sea_trial`: fit Odin's standard model and equations on a simulated sea trial, by phase
-(document 000 section 7.5).
-"""
+"""Task `sea_trial`: the standard model of Odin by phase (document 000, section 7.5)."""
 
 from __future__ import annotations
 
-import time
+import json
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Literal, final
 
-from residnet.core.config import dump_config
-from residnet.documents.halvorsen2019.sea_trial.study import PhasesSettings
+from residnet.core.config import load_config
+from residnet.documents.halvorsen2019.sea_trial.config import SeaTrialSettings
+from residnet.report.blocks import Section
 from residnet.runs.folder import RunFolder
+from residnet.runs.task import MainFigure, Outcome
 
 
 @final
-class SeaTrialTaskConfig(PhasesSettings):
-    """The standard model by bounded weighted least squares against equations from forces and from
-    controls, by phase.
+class SeaTrialTaskConfig(SeaTrialSettings):
+    """Models of Odin fitted and judged by phase, on one simulated trial or several.
+
+    Attributes:
+        task: `sea_trial`.
     """
 
     task: Literal["sea_trial"]
 
-    def check(self) -> None:
-        """Everything was checked when the config was read."""
+    def recorded_seed(self) -> int:
+        """Return the seed of the first trial."""
+        return next(iter(self.trials.values())).seed
 
-    def run(
-        self, *, source: Path, overrides: Sequence[str], out: Path | None, resume: bool
-    ) -> RunFolder:
-        """Sail, fit, judge; writes study.json, study.md and figures.
+    def carry_out(self, folder: RunFolder) -> Outcome:
+        """Simulate the trials, fit and judge the models, and write study.json and figures.
 
         Raises:
             ResidnetError: where a trial cannot be sailed or a model is not determined.
         """
-        import torch
-
-        from residnet.documents.halvorsen2019.sea_trial.report import write
+        from residnet.documents.halvorsen2019.sea_trial.report import main_figures, verdict
+        from residnet.documents.halvorsen2019.sea_trial.results import write_results
         from residnet.documents.halvorsen2019.sea_trial.study import study
 
-        started = time.time()
-        torch.set_num_threads(1)
-        folder = RunFolder.create(out or Path("runs") / self.name, dump_config(self), resume=resume)
-        text = write(self, study(self), folder)
-        folder.write_provenance(
-            config=source,
-            overrides=overrides,
-            seed=next(iter(self.trials.values())).seed,
-            files=[],
-            started=started,
-        )
-        print(text)
-        print(f"study: {folder.path / 'study.md'}")
-        return folder
+        results = write_results(self, study(self), folder)
+        figures = {name: MainFigure(*value) for name, value in main_figures(results).items()}
+        return Outcome(verdict(results), figures)
+
+    @classmethod
+    def report_sections(cls, run: RunFolder) -> Sequence[Section]:
+        """Return the sections of the report, from the run folder alone."""
+        from residnet.documents.halvorsen2019.sea_trial.report import sections
+        from residnet.documents.halvorsen2019.sea_trial.results import FILE
+
+        config = load_config(run.resolved, [], cls)
+        return sections(config, json.loads((run.path / FILE).read_text()), run.path)

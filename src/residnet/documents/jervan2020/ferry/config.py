@@ -1,4 +1,4 @@
-"""What a ferry study is made of (document 002 chapter 4)."""
+"""Config of a ferry study (document 002, chapter 4)."""
 
 from __future__ import annotations
 
@@ -8,40 +8,56 @@ from pydantic import Field, model_validator
 
 from residnet.control.guidance.crossing import CrossingConfig
 from residnet.control.motion.reference_filter import ReferenceFilterConfig
-from residnet.core.config import Config
 from residnet.core.errors import ConfigError
 from residnet.core.names import nearest
 from residnet.documents.jervan2020.ferry.flights import Disturbance, Ferry, LoopConfig, MotionNoise
-from residnet.documents.jervan2020.residual_model import FerryModelConfig, Published
+from residnet.documents.jervan2020.published import Published
+from residnet.documents.jervan2020.residual_model import ResidualModelConfig
 from residnet.judge.still_fits import StillFitsConfig
+from residnet.runs.task import ComputingTask
 
 _Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
 
 
-class FerrySettings(Config):
-    """A course flown with the believed model, models of what it lacks, and the course again with
-    them.
+class FerryModelConfig(ResidualModelConfig):
+    """One model of the ferry's residual force; with `lag`, its feed-forward is led by the lag.
 
     Attributes:
-        name: of the run.
-        believed: vessel of the controller, by name or file.
-        true: vessel that flies.
-        course: waypoints; its first half identifies, its second half tests.
-        loop: the controller.
-        crossing: an operational crossing that is flown too; null for none.
-        noise: on what is measured; null for none.
-        disturbance: constant in earth axes.
-        feed_forward_alone: fly the course without feedback too (Table 4.8).
-        models: by name, each after those that it stands on.
-        published: the document's figures for the believed model.
-        later: a vessel that the true one has become; models that fly are judged on its log and
-            identified again where they no longer fit.
-        check_fit: when a model no longer fits.
-        seed: of the noise.
+        smooth: estimate the motion from all noisy measurements together before the fit
+            (`residnet.data.motion_smoother`).
+        on: name of the model whose remaining residual this one explains (3.26); empty for the
+            believed hull.
+        fly: fly the course, and the crossing where there is one, with this model as feed-forward.
+        published: figures that the document prints for this model.
     """
 
-    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")
-    description: str = ""
+    smooth: bool = False
+    on: str = ""
+    fly: bool = False
+    published: Published = Published()
+
+
+class FerrySettings(ComputingTask):
+    """A course with the believed model, residual models identified from it, and the course again.
+
+    Attributes:
+        believed: vessel whose hull the controller believes in, by name or file.
+        true: vessel that is simulated, by name or file.
+        course: waypoints and reference filter; the first half of the course identifies, the second
+            half tests.
+        loop: controller and sampling.
+        crossing: an operational crossing that is flown too; null for none.
+        noise: noise on what is measured; null for none.
+        disturbance: force that is constant in earth axes.
+        feed_forward_alone: fly the course without feedback too (Table 4.8).
+        models: residual models by name; a model stands after the one that it builds on.
+        published: figures that the document prints for the believed model.
+        later: vessel that the true one has become later, by name or file; the models that fly are
+            judged on its log and identified again where they no longer fit. Null for none.
+        check_fit: when a model counts as no longer fitting.
+        seed: seed of the noise.
+    """
+
     believed: str = "milliampere"
     true: str = "milliampere_half"
     course: ReferenceFilterConfig
@@ -87,7 +103,11 @@ class FerrySettings(Config):
         return self
 
     def ferry(self, true: str | None = None) -> Ferry:
-        """The plant in its loop."""
+        """Return the ferry in its control loop.
+
+        Args:
+            true: vessel that is simulated instead of `true` of the config.
+        """
         return Ferry.of(
             true or self.true, self.believed, self.loop, self.disturbance, self.noise, self.seed
         )

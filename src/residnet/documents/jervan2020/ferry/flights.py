@@ -1,5 +1,6 @@
-"""The ferry of document 002 in closed loop: courses and crossings flown by a true plant under a
-controller that believes a model.
+"""Courses and crossings of the ferry in closed loop (document 002, chapter 4).
+
+A plant that stands for the true ferry is simulated under a controller that believes in a model.
 """
 
 from __future__ import annotations
@@ -37,14 +38,16 @@ from residnet.physics.vessel import load_vessel
 
 
 class LoopConfig(Config):
-    """The controller: Kp = m omega^2, Kd = 2 m omega, Ki = integral omega Kp with m the believed
-    mass of each axis.
+    """A PID controller with critically damped poles, and the sampling of its log.
+
+    The gains are Kp = m omega^2, Kd = 2 m omega and Ki = integral omega Kp, with m the believed
+    mass of each axis. The document does not print its gains (correction J10).
 
     Attributes:
-        frequency: omega of surge, sway and yaw.
-        integral: see above.
-        step: of the controller and the plant.
-        every: steps between samples of the log.
+        frequency: omega of surge, sway and yaw in rad/s.
+        integral: share of omega Kp that is the integral gain, without unit.
+        step: time step of controller and plant in s.
+        every: number of steps from one sample of the log to the next.
     """
 
     frequency: tuple[RadiansPerSecond, RadiansPerSecond, RadiansPerSecond]
@@ -53,7 +56,7 @@ class LoopConfig(Config):
     every: int = Field(default=5, ge=1)
 
     def pid(self, hull_mass: Tensor) -> MotionPID:
-        """The feedback."""
+        """Return the feedback for a hull's mass matrix [3, 3] in SI units."""
         mass, omega = hull_mass.diagonal(), torch.tensor(self.frequency, dtype=torch.float64)
         proportional = mass * omega**2
         gains = [
@@ -66,8 +69,15 @@ class LoopConfig(Config):
 
 
 class MotionNoise(Config):
-    """Standard deviations of white noise on what is measured, drawn anew at every step of the
-    controller (document 002 Table 4.14, ERRATA J25).
+    """White noise on what is measured, drawn anew at every step (Table 4.14, correction J25).
+
+    Attributes:
+        position: standard deviation of x and y in m.
+        heading: standard deviation of psi in rad.
+        velocity: standard deviation of u and v in m/s.
+        yaw_rate: standard deviation of r in rad/s.
+        acceleration: standard deviation of u_dot and v_dot in m/s^2.
+        yaw_acceleration: standard deviation of r_dot in rad/s^2.
     """
 
     position: Metres = Field(default=0.0, ge=0)
@@ -78,19 +88,13 @@ class MotionNoise(Config):
     yaw_acceleration: quantity("rad/s^2") = 0.0  # type: ignore[valid-type]
 
     def spread(self) -> tuple[float, ...]:
-        """Of pose, velocities and accelerations, nine."""
-        linear, angular = (
-            (self.position, self.velocity, self.acceleration),
-            (
-                self.heading,
-                self.yaw_rate,
-                self.yaw_acceleration,
-            ),
-        )
+        """Return the standard deviations of pose, velocities and accelerations, nine numbers."""
+        linear = (self.position, self.velocity, self.acceleration)
+        angular = (self.heading, self.yaw_rate, self.yaw_acceleration)
         return tuple(value for a, b in zip(linear, angular, strict=True) for value in (a, a, b))
 
     def draw(self, shape: Sequence[int], seed: int) -> Tensor:
-        """Noise [..., 9] on pose, velocities and accelerations, float64."""
+        """Return noise [..., 9] on pose, velocities and accelerations, float64."""
         generator = torch.Generator().manual_seed(seed)
         return torch.randn(*shape, 9, generator=generator, dtype=torch.float64) * torch.tensor(
             self.spread(), dtype=torch.float64
@@ -98,7 +102,12 @@ class MotionNoise(Config):
 
 
 class Disturbance(Config):
-    """Force constant in earth axes."""
+    """A force that is constant in earth axes.
+
+    Attributes:
+        north: force to the north in N.
+        east: force to the east in N.
+    """
 
     north: Newtons = 0.0
     east: Newtons = 0.0
@@ -106,18 +115,18 @@ class Disturbance(Config):
 
 @final
 class Sensed(Source):
-    """A closed loop that sees the state with given noise [B, T, 6] on pose and velocities."""
+    """A closed loop that measures the state with given noise [B, T, 6] on pose and velocities."""
 
     def __init__(self, loop: ClosedLoop, noise: Tensor) -> None:
         super().__init__()
         self.loop, self.noise = loop, noise
 
     def initial(self, x: Tensor) -> Tensor:
-        """Memory of the loop."""
+        """Return the memory that the loop starts with."""
         return self.loop.initial(x)
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Inputs [B, m] from the state as it is measured."""
+        """Return the inputs [B, m] that follow from the measured state."""
         inputs, memory = self.loop(
             torch.cat((x[:, :6] + self.noise[:, k], x[:, 6:]), dim=-1), w, k, memory
         )
@@ -126,18 +135,20 @@ class Sensed(Source):
 
 @dataclass(frozen=True)
 class Flight:
-    """One run, sampled as the log is; truth for judging, `seen` for identification.
+    """One simulated run, sampled as its log is; SI units, forces in N, N, N m.
 
     Attributes:
-        t: [N] s.
-        pose, nu, nu_dot: truth [N, 3].
-        seen: measured pose, nu, nu_dot [N, 9].
-        command: tau_c at the samples [N, 3].
-        averaged: tau_c averaged over the steps around each sample [N, 3]: without the noise between
-            samples that would fold down.
-        feedback: tau_FB [N, 3].
-        acting: the thrusters' force [N, 3].
-        desired: eta_d [N, 3].
+        t: time [N] in s.
+        pose: true x, y, psi [N, 3].
+        nu: true u, v, r [N, 3].
+        nu_dot: true accelerations [N, 3].
+        measured: pose, nu and nu_dot as measured [N, 9].
+        command: commanded force tau_c at the samples [N, 3].
+        averaged: tau_c averaged over the steps around each sample [N, 3], so that noise between the
+            samples does not alias.
+        feedback: force of the feedback tau_FB [N, 3].
+        acting: force of the thrusters [N, 3].
+        desired: desired pose eta_d [N, 3].
         tracking: metrics over every step.
     """
 
@@ -145,7 +156,7 @@ class Flight:
     pose: Tensor
     nu: Tensor
     nu_dot: Tensor
-    seen: Tensor
+    measured: Tensor
     command: Tensor
     averaged: Tensor
     feedback: Tensor
@@ -156,7 +167,16 @@ class Flight:
 
 @dataclass(frozen=True)
 class Ferry:
-    """The true plant, the believed hull and the loop between them."""
+    """The true plant, the believed hull and the control loop between them.
+
+    Attributes:
+        true: the plant that is simulated.
+        believed: the plant whose hull the controller believes in.
+        loop: controller and sampling.
+        disturbance: force that is constant in earth axes.
+        noise: noise on what is measured; None for none.
+        seed: seed of the noise.
+    """
 
     true: FossenVessel
     believed: FossenVessel
@@ -175,7 +195,7 @@ class Ferry:
         noise: MotionNoise | None,
         seed: int,
     ) -> Ferry:
-        """From vessels by name.
+        """Build both plants from vessels by name or file.
 
         Raises:
             ConfigError: where a vessel is no hull with forces as commands.
@@ -199,13 +219,13 @@ class Ferry:
         return cls(plants[0], plants[1], loop, disturbance, noise, seed)
 
     def without_feedback(self) -> Ferry:
-        """The same with the feed-forward alone."""
+        """Return the same ferry with the feed-forward alone."""
         return replace(self, loop=self.loop.model_copy(update={"frequency": (0.0, 0.0, 0.0)}))
 
     def fly_course(
         self, config: ReferenceFilterConfig, models: Sequence[tuple[ForceModel, Lag | None]]
     ) -> list[Flight]:
-        """The course with each model as feed-forward, all in one batch."""
+        """Fly the course with each model as feed-forward, all in one batch."""
         motion = course(config, self.loop.step)
         rows = [
             reference_row(motion, needed_force(model, motion, lag, self.loop.step))
@@ -218,7 +238,7 @@ class Ferry:
     def fly_crossing(
         self, config: CrossingConfig, models: Sequence[tuple[ForceModel, Lag | None]]
     ) -> list[Flight]:
-        """The crossing with each model as feed-forward, all in one batch."""
+        """Fly the crossing with each model as feed-forward, all in one batch."""
         return self._fly(
             Crossing(config, self.loop.step, models),
             round(config.duration / self.loop.step),
@@ -254,13 +274,13 @@ class Ferry:
 
     @staticmethod
     def _replay(guidance: Reference, states: Tensor, noise: Tensor) -> Tensor:
-        """The references [B, T, 18] that were followed."""
+        """Return the references [B, T, 18] that were followed."""
         if isinstance(guidance, GivenReference):
             return guidance.values
-        seen = torch.cat((states[..., :6] + noise, states[..., 6:]), dim=-1)
+        measured = torch.cat((states[..., :6] + noise, states[..., 6:]), dim=-1)
         memory, out = guidance.initial_state(states[:, 0]), []
         for k in range(states.shape[1]):
-            reference, memory = guidance(seen[:, k], k, memory)
+            reference, memory = guidance(measured[:, k], k, memory)
             out.append(reference)
         return torch.stack(out, dim=1)
 
@@ -268,9 +288,11 @@ class Ferry:
         self, x: Tensor, w: Tensor, reference: Tensor, noise: Tensor, pid: MotionPID
     ) -> Flight:
         command = w[:, :3]
-        seen_state = torch.cat((x[:, :6] + noise[:, :6], x[:, 6:]), dim=-1)
-        error = pid.error(seen_state, reference)
-        feedback, _ = pid(seen_state, reference[:, :9], (error.cumsum(0) - error) * self.loop.step)
+        measured_state = torch.cat((x[:, :6] + noise[:, :6], x[:, 6:]), dim=-1)
+        error = pid.error(measured_state, reference)
+        feedback, _ = pid(
+            measured_state, reference[:, :9], (error.cumsum(0) - error) * self.loop.step
+        )
         rate = self.true.rate(x, w)
         metrics = tracking(
             x[:, :3],
@@ -283,14 +305,14 @@ class Ferry:
         every, half = slice(None, None, self.loop.every), self.loop.every // 2
         ends = torch.cat((command[:1].expand(half, 3), command, command[-1:].expand(half, 3)))
         averaged = ends.unfold(0, 2 * half + 1, 1).mean(-1)
-        seen = torch.cat((x[:, :6], rate[:, 3:6]), dim=-1) + noise
+        measured = torch.cat((x[:, :6], rate[:, 3:6]), dim=-1) + noise
         t = torch.arange(len(x), dtype=torch.float64) * self.loop.step
         return Flight(
             t[every],
             x[every, :3],
             x[every, 3:6],
             rate[every, 3:6],
-            seen[every],
+            measured[every],
             command[every],
             averaged[every],
             feedback[every],

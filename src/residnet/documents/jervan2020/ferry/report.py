@@ -1,289 +1,215 @@
-"""Tables and pictures of the ferry study, the published figure beside each of its own (document 002
-chapter 4).
-"""
+"""The report page of a ferry study, from its results, with the document's figures beside ours."""
 
 from __future__ import annotations
 
-import math
-from dataclasses import asdict
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
-import torch
-
-from residnet.core.errors import ConfigError, FitError
-from residnet.core.frames import wrap
+from residnet.documents.cells import beside_published, joined, notes_text, pictures
 from residnet.documents.jervan2020.ferry.config import FerrySettings
-from residnet.documents.jervan2020.ferry.flights import Flight
-from residnet.documents.jervan2020.ferry.study import Study, Update
-from residnet.documents.jervan2020.forward import (
-    as_vessel_lines,
-    forward_equations,
-    missing_coefficients,
+from residnet.documents.jervan2020.published import Published
+from residnet.documents.jervan2020.residual_model import AXES
+from residnet.documents.jervan2020.residual_pages import coefficients_section
+from residnet.report.blocks import Block, Bullets, Cell, Section, Table
+from residnet.report.format import DEG, number
+
+Results = Mapping[str, Any]
+_BELIEVED = "believed"
+_TRACKING = (
+    "feed-forward",
+    "mean position error m",
+    "mean square m^2",
+    "mean heading error deg",
+    "mean abs force, surge N",
+    "sway N",
+    "yaw N m",
+    "of which feedback, surge N",
+    "sway N",
+    "yaw N m",
+    "power, position W",
+    "heading W",
+    "IAEW, position m s J",
+    "heading rad s J",
 )
-from residnet.documents.jervan2020.model_table import coefficients_text, notes_text
-from residnet.documents.jervan2020.regressions import SurfaceRegression
-from residnet.documents.jervan2020.residual_model import Published
-from residnet.export.feed_forward import export_feed_forward
-from residnet.report.figures.force import draw_surface, draw_weights
-from residnet.report.figures.loop import draw_errors, draw_force_parts
-from residnet.runs.folder import RunFolder
-
-_DEG = 180.0 / math.pi
 
 
-def later_text(later: dict[str, Update]) -> str:
-    """What became of the models on the changed vessel."""
-    lines = ["The vessel as it is later: position MAE m with the model, and after the update", ""]
-    for name, one in later.items():
-        lines.append(
-            f"- {name}: {one.verdict.text()}; {one.before.tracking.position_mae:.4g} m, then"
-            f" {one.after.tracking.position_mae:.4g} m"
-        )
-    return "\n".join(lines)
-
-
-def write(config: FerrySettings, found: Study, folder: RunFolder) -> str:
-    """Write ferry.json, ferry.md, the models' tables and figures; returns the text of ferry.md."""
-    folder.write_json(folder.path / "ferry.json", _content(config, found))
-    parts = [config.description or config.name, residuals_text(config, found)]
-    parts += [
-        tracking_text(config, flights, kind)
-        for kind, flights in (("course", found.courses), ("crossing", found.crossings))
-        if flights
+def verdict(results: Results) -> list[str]:
+    """Return the sentences that sum a ferry study up."""
+    models = results["models"]
+    best = _best_model(results)
+    left = joined([100 * share for share in models[best]["share_left"]])
+    sentences = [
+        f"Of {len(models)} residual models, {best} leaves the least of the residual force on the"
+        f" unseen half of the course: {left} % of its mean square in surge, sway and yaw."
     ]
-    parts += (
-        [
-            alone_text(config, found.alone),
-            tracking_text(config, found.alone, "course without feedback"),
-        ]
-        if found.alone
-        else []
-    )
-    parts += [later_text(found.later)] if found.later else []
-    standing = {
-        name: why for name in found.models if (why := keep_model(config, found, name, folder))
-    }
-    if standing:
-        parts.append(
-            "Cannot run forward in time:\n\n" + "\n".join(f"- {why}" for why in standing.values())
-        )
-    text = "\n\n".join(parts) + "\n"
-    folder.write(folder.path / "ferry.md", text)
-    truth = missing_coefficients(config.true, config.believed)
-    for name, model in found.models.items():
-        said = config.models[name]
-        about = f"Residual force of model {name}"
-        table = coefficients_text(
-            about,
-            said.terms,
-            model.fit,
-            model.notes,
-            truth if not said.on else {},
-            said.published.coefficients,
-        )
-        folder.write(folder.path / "models" / f"{name}.md", table)
-    for kind, flights in (
-        ("course", found.courses),
-        ("crossing", found.crossings),
-        ("feed_forward_alone", found.alone),
-    ):
-        if flights:
-            draw_flights(flights, kind, folder)
-    return text
-
-
-def draw_flights(flights: dict[str, Flight], kind: str, folder: RunFolder) -> None:
-    """Errors of all models over time, and the forces of the believed one and of the first two
-    models beside it.
-    """
-    t = next(iter(flights.values())).t
-    position = {
-        name: (flight.desired - flight.pose)[:, :2].norm(dim=-1) for name, flight in flights.items()
-    }
-    heading = {
-        name: wrap((flight.desired - flight.pose)[:, 2]).abs() for name, flight in flights.items()
-    }
-    draw_errors(t, position, heading, folder.figures / f"errors_{kind}.png")
-    if not any(bool(flight.feedback.any()) for flight in flights.values()):
-        return
-    shown = dict(list(flights.items())[:3])
-    parts = (
-        {name: flight.command for name, flight in shown.items()},
-        {name: flight.feedback for name, flight in shown.items()},
-    )
-    draw_force_parts(t, *parts, folder.figures / f"forces_{kind}.png")
-
-
-def keep_model(config: FerrySettings, found: Study, name: str, folder: RunFolder) -> str:
-    """Write a model's weights as a picture, its feed-forward as TorchScript, and its equations, or
-    return why it cannot run forward.
-    """
-    model = found.models[name]
-    draw_weights(
-        config.models[name].terms,
-        model.fit.pre,
-        f"Weights of the basis functions in {name}",
-        folder.figures / f"weights_{name}.png",
-    )
-    motion = torch.cat((found.first.nu_dot, found.first.nu), dim=-1)
-    ranges = list(zip(motion.amin(0).tolist(), motion.amax(0).tolist(), strict=True))
-    export_feed_forward(
-        model.model, model.notes.get("lag"), ranges, folder.exports / f"{name}_feed_forward.pt"
-    )
-    if isinstance(config.models[name].fit, SurfaceRegression) and model.fit.surface is not None:
-        picks = {
-            "chosen": list(zip(model.notes["order"], model.notes["terms"], strict=True)),
-            "least": [model.fit.surface.least(a) for a in range(3)],
-        }
-        draw_surface(
-            model.fit.surface.error, found.unmodelled, picks, folder.figures / f"surface_{name}.png"
-        )
-    try:
-        equations = forward_equations(config.believed, model.model, f"model {name}")
-    except (ConfigError, FitError) as error:
-        return str(error)
-    folder.write(
-        folder.path / "models" / f"{name}_forward.yaml",
-        as_vessel_lines(equations, f"run {config.name}, model {name}"),
-    )
-    return ""
-
-
-def _content(config: FerrySettings, found: Study) -> dict[str, Any]:
-    rows = {
-        name: {
-            "test_mse": model.test_mse,
-            "share_left": [a / b for a, b in zip(model.test_mse, found.unmodelled, strict=True)],
-            "notes": model.notes,
-            "terms": list(config.models[name].terms),
-            "coefficients": model.fit.coefficients.tolist(),
-            "intercept": model.fit.intercept.tolist(),
-        }
-        for name, model in found.models.items()
-    }
-    return {
-        "schema": "residnet.ferry/1",
-        "run": config.name,
-        "unmodelled_test_mse": found.unmodelled,
-        "models": rows,
-        "course": {name: flight.tracking.row() for name, flight in found.courses.items()},
-        "crossing": {name: flight.tracking.row() for name, flight in found.crossings.items()},
-        "feed_forward_alone": {name: flight.tracking.row() for name, flight in found.alone.items()},
-        "later": {
-            name: {
-                "verdict": asdict(one.verdict),
-                "before": one.before.tracking.row(),
-                "after": one.after.tracking.row(),
-            }
-            for name, one in found.later.items()
-        },
-    }
-
-
-def residuals_text(config: FerrySettings, found: Study) -> str:
-    """Table of the residual's MSE on the test half."""
-    lines = [
-        (
-            "Residual force on the unseen half: MSE and share of the un-modelled residual's,"
-            " published in brackets"
-        ),
-        "",
-    ]
-    lines += [
-        "| model | surge N^2 | sway N^2 | yaw (N m)^2 | left % | chosen |",
-        "|---|---|---|---|---|---|",
-    ]
-    base = config.published.mse
-    rows = [("believed", found.unmodelled, base, "")]
-    rows += [
-        (name, model.test_mse, config.models[name].published.mse, notes_text(model.notes))
-        for name, model in found.models.items()
-    ]
-    for name, own, printed, chosen in rows:
-        cells = [_beside(own[a], printed[a] if printed else None) for a in range(3)]
-        shares = [
-            _beside(
-                100 * own[a] / found.unmodelled[a],
-                100 * printed[a] / base[a] if printed and base else None,
+    for kind in ("course", "crossing"):
+        flights = results[kind]
+        flown = [name for name in flights if name != _BELIEVED]
+        if flown:
+            nearest = min(flown, key=lambda name: float(flights[name]["position_mae"]))
+            before, after = (flights[name]["position_mae"] for name in (_BELIEVED, nearest))
+            sentences.append(
+                f"With {nearest} as feed-forward, the mean position error in the {kind} falls from"
+                f" {number(before)} m to {number(after)} m."
             )
-            for a in range(3)
+    for name, update in results["later"].items():
+        sentences.append(f"On the vessel as it is later, {name} {update['text']}.")
+    return sentences
+
+
+def main_figures(results: Results) -> dict[str, tuple[float, str]]:
+    """Return the numbers that sum a ferry study up, with their units."""
+    best = _best_model(results)
+    figures = {
+        f"residual left by {best}, {axis}": (share, "-")
+        for axis, share in zip(AXES, results["models"][best]["share_left"], strict=True)
+    }
+    return figures | {
+        f"mean position error on the course with {name}": (flight["position_mae"], "m")
+        for name, flight in results["course"].items()
+    }
+
+
+def _best_model(results: Results) -> str:
+    """Return the model that leaves the least share of the residual, mean over the axes."""
+    models: Results = results["models"]
+    return min(models, key=lambda name: float(sum(models[name]["share_left"])))
+
+
+def sections(config: FerrySettings, results: Results, run: Path) -> list[Section]:
+    """Return the sections of the report.
+
+    Args:
+        config: the study.
+        results: contents of ferry.json.
+        run: run folder, which holds the figures.
+    """
+    models = results["models"]
+    blocks: list[Block]
+    out = [Section("Residual force on the unseen half", [_residuals(config, results)])]
+    for kind, title in (("course", "Course in closed loop"), ("crossing", "Operational crossing")):
+        if results[kind]:
+            blocks = [
+                _tracking(config, results[kind], kind),
+                *pictures(run, f"errors_{kind}", f"forces_{kind}"),
+            ]
+            out.append(Section(title, blocks))
+    if results["feed_forward_alone"]:
+        flights = results["feed_forward_alone"]
+        blocks = [
+            _alone(config, flights),
+            _tracking(config, flights, "alone"),
+            *pictures(run, "errors_feed_forward_alone"),
         ]
-        lines.append(f"| {name} | {' | '.join(cells)} | {' / '.join(shares)} | {chosen} |")
-    return "\n".join(lines)
+        out.append(Section("Feed-forward without feedback", blocks))
+    if results["later"]:
+        out.append(Section("The vessel as it is later", [_later(results["later"])]))
+    if causes := [model["not_forward"] for model in models.values() if model["not_forward"]]:
+        out.append(Section("Models that cannot run forward in time", [Bullets(causes)]))
+    for name, model in models.items():
+        model_config = config.models[name]
+        others = {
+            "true": {} if model_config.on else results["true_coefficients"],
+            "published": model_config.published.coefficients,
+        }
+        out.append(coefficients_section(name, model, model["notes"], others))
+    return [*out, Section("Weights and surfaces", pictures(run, "surface_", "weights_"), True)]
 
 
-def alone_text(config: FerrySettings, flights: dict[str, Flight]) -> str:
-    """Table 4.8: how far the feed-forward alone keeps velocities and accelerations."""
-    lines = [
-        (
-            "Feed-forward alone: MSE against the desired motion in (m/s)^2, (m/s)^2, (rad/s)^2 and"
-            " per second squared, published in brackets"
-        ),
-        "",
-    ]
-    lines += [
-        "| feed-forward | u | v | r | u_dot | v_dot | r_dot |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for name, flight in flights.items():
-        said = config.published if name == "believed" else config.models[name].published
-        own = flight.tracking.motion_mse
-        cells = (_beside(own[i], said.alone[i] if said.alone else None) for i in range(6))
-        lines.append(f"| {name} | {' | '.join(cells)} |")
-    return "\n".join(lines)
-
-
-def tracking_text(config: FerrySettings, flights: dict[str, Flight], kind: str) -> str:
-    """Table of a flight's metrics."""
-    lines = [f"Closed loop, {kind}: published in brackets", ""]
-    titles = [
-        "feed-forward",
-        "position MAE m",
-        "MSE m^2",
-        "heading MAE deg",
-        "mean |τ| N, N, N m",
-        "mean |τ_FB|",
-    ]
-    titles += ["energy J", "power W", "IAEW position, heading"]
-    lines += [f"| {' | '.join(titles)} |"]
-    lines += ["|---|---|---|---|---|---|---|---|---|"]
-    for name, flight in flights.items():
-        m = flight.tracking
-        said = config.published if name == "believed" else config.models[name].published
-        p = {
-            "course": said.model_copy(update={"crossing_power": None}),
-            "crossing": _crossing(said),
-        }.get(kind, Published())
-        tau = ", ".join(_beside(m.tau[a], p.tau[a] if p.tau else None) for a in range(3))
-        feedback = ", ".join(
-            _beside(m.feedback[a], p.feedback[a] if p.feedback else None) for a in range(3)
-        )
-        energy, iaew = (", ".join(f"{value:.4g}" for value in pair) for pair in (m.energy, m.iaew))
-        cells = [
-            _beside(m.position_mae, p.position_mae),
-            _beside(m.position_mse, p.position_mse),
-            _beside(m.heading_mae * _DEG, p.heading_mae),
-            tau,
-            feedback,
-            energy,
-            ", ".join(
-                _beside(m.power[i], p.crossing_power[i] if p.crossing_power else None)
-                for i in range(2)
-            ),
-            iaew,
-        ]
-        lines.append(f"| {name} | {' | '.join(cells)} |")
-    return "\n".join(lines).replace("|τ|", "abs τ").replace("|τ_FB|", "abs τ_FB")
-
-
-def _crossing(said: Published) -> Published:
-    return Published(
-        position_mae=said.crossing_position_mae,
-        position_mse=said.crossing_position_mse,
-        heading_mae=said.crossing_heading_mae,
-        crossing_power=said.crossing_power,
+def _residuals(config: FerrySettings, results: Results) -> Table:
+    """Return the table of the remaining residual (Tables 4.2, 4.5, 4.7 and 4.15)."""
+    unmodelled, base = results["unmodelled_test_mse"], config.published.mse
+    table = Table(
+        ["model", *("surge N^2", "sway N^2", "yaw (N m)^2"), *AXES, "chosen by the estimator"],
+        caption="Mean square of the residual, and what is left of the believed model's.",
+        groups=[("mean square", 3), ("left %", 3), ("", 1)],
     )
+    rows = [(_BELIEVED, unmodelled, base, "")]
+    rows += [
+        (name, model["test_mse"], config.models[name].published.mse, notes_text(model["notes"]))
+        for name, model in results["models"].items()
+    ]
+    for name, mse, published, chosen in rows:
+        cells = [beside_published(mse[a], published[a] if published else None) for a in range(3)]
+        for axis in range(3):
+            left = 100 * published[axis] / base[axis] if published and base else None
+            cells.append(beside_published(100 * mse[axis] / unmodelled[axis], left, 3))
+        table.add(name, [*cells, Cell(chosen, mark="text")])
+    return table
 
 
-def _beside(own: float, printed: float | None) -> str:
-    return f"{own:.4g}" if printed is None else f"{own:.4g} ({printed:.4g})"
+def _published(config: FerrySettings, name: str) -> Published:
+    return config.published if name == _BELIEVED else config.models[name].published
+
+
+def _tracking(config: FerrySettings, flights: Mapping[str, Results], kind: str) -> Table:
+    """Return the table of how well a course is followed (Tables 4.3, 4.4, 4.9, 4.10, 4.12, 4.13).
+
+    Args:
+        config: the study, with published figures.
+        flights: metrics by model.
+        kind: `course`, `crossing` or `alone`, for which the document prints different figures.
+    """
+    about = {
+        "course": "The whole course; IAEW is the integral of the error times the work (3.18).",
+        "crossing": "The whole crossing; IAEW is the integral of the error times the work (3.18).",
+        "alone": "The same course without feedback.",
+    }
+    table = Table(_TRACKING, caption=about[kind])
+    for name, metrics in flights.items():
+        printed = _of_kind(_published(config, name), kind)
+        cells = [
+            beside_published(metrics["position_mae"], printed.position_mae),
+            beside_published(metrics["position_mse"], printed.position_mse),
+            beside_published(metrics["heading_mae"] * DEG, printed.heading_mae),
+            *_each(metrics["tau"], printed.tau),
+            *_each(metrics["feedback"], printed.feedback),
+            *_each(metrics["power"], printed.crossing_power),
+            *_each(metrics["iaew"], None),
+        ]
+        table.add(name, cells)
+    return table
+
+
+def _each(values: Sequence[float], published: Sequence[float] | None) -> list[Cell]:
+    printed = [None] * len(values) if published is None else published
+    return [beside_published(a, b) for a, b in zip(values, printed, strict=True)]
+
+
+def _of_kind(published: Published, kind: str) -> Published:
+    """Return the published figures of one kind of flight under the names of a course."""
+    if kind == "course":
+        return published.model_copy(update={"crossing_power": None})
+    if kind == "crossing":
+        return Published(
+            position_mae=published.crossing_position_mae,
+            position_mse=published.crossing_position_mse,
+            heading_mae=published.crossing_heading_mae,
+            crossing_power=published.crossing_power,
+        )
+    return Published()
+
+
+def _alone(config: FerrySettings, flights: Mapping[str, Results]) -> Table:
+    """Return the table of velocities and accelerations without feedback (Table 4.8)."""
+    table = Table(
+        ["feed-forward", "u", "v", "r", "u_dot", "v_dot", "r_dot"],
+        caption="Mean square error against the desired motion without feedback, in (m/s)^2,"
+        " (m/s)^2, (rad/s)^2, and the same per second squared.",
+    )
+    for name, metrics in flights.items():
+        table.add(name, _each(metrics["motion_mse"], _published(config, name).alone))
+    return table
+
+
+def _later(later: Mapping[str, Results]) -> Table:
+    """Return the table of models on the changed vessel (section 3.7)."""
+    table = Table(
+        ["model", "mean position error m", "after the update m", "on the new log"],
+        caption="A model that no longer fits is identified again from the log of one course.",
+    )
+    for name, update in later.items():
+        errors = [number(update[when]["position_mae"], 4) for when in ("before", "after")]
+        table.add(name, [*errors, Cell(update["text"], mark="text")])
+    return table

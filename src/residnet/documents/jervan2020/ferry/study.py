@@ -1,6 +1,4 @@
-"""Document 002 chapter 4: the ferry flown with a believed model, identified, and flown again with
-what was found.
-"""
+"""The ferry study: fly, identify a residual, and fly again (document 002, chapter 4)."""
 
 from __future__ import annotations
 
@@ -11,7 +9,8 @@ import torch
 from residnet.control.motion.anticipation import Lag
 from residnet.documents.jervan2020.ferry.config import FerrySettings
 from residnet.documents.jervan2020.ferry.flights import Flight, MotionNoise
-from residnet.documents.jervan2020.residual_model import FerryModel, Record, identify, remaining
+from residnet.documents.jervan2020.ferry.identification import FerryModel, identify
+from residnet.documents.jervan2020.residual_model import Record, remaining
 from residnet.judge.still_fits import Verdict, still_fits
 from residnet.judge.tracking import mse
 from residnet.physics.force_model import ForceModel
@@ -19,12 +18,13 @@ from residnet.physics.force_model import ForceModel
 
 @dataclass(frozen=True)
 class Update:
-    """A model on a vessel that has changed.
+    """A model on a vessel that has changed since it was identified.
 
     Attributes:
-        verdict: whether it still fits there.
-        before, after: the course there with it, and with what was identified again from that log;
-            the same where it still fits.
+        verdict: whether the model still fits.
+        before: the course of the changed vessel with the model.
+        after: the course with the model that was identified again from that log; the same flight
+            where the model still fits.
     """
 
     verdict: Verdict
@@ -37,12 +37,14 @@ class Study:
     """Everything that was flown and fitted.
 
     Attributes:
-        first: the course with the believed model, which identifies.
-        unmodelled: MSE of its residual on the test half.
-        models: fitted, by name.
-        courses, crossings: flights by model, `believed` first.
-        alone: the course by model without feedback.
-        later: what became of each flown model on the vessel as it is later.
+        first: the course with the believed model, from which the models are identified.
+        unmodelled: mean square of the believed model's residual on the test half, by axis in N^2,
+            N^2, (N m)^2.
+        models: fitted models by name.
+        courses: the course by model, `believed` first.
+        crossings: the crossing by model, `believed` first.
+        alone: the course without feedback, by model.
+        later: each model that flies, on the vessel as it is later.
     """
 
     first: Flight
@@ -55,14 +57,20 @@ class Study:
 
 
 def record_of(flight: Flight, interval: float, noise: MotionNoise) -> Record:
-    """The log of a course: a fold for each segment, the first half identifies."""
+    """Return the log of a course with a fold for each segment; its first half identifies.
+
+    Args:
+        flight: the course as it was flown.
+        interval: time from one waypoint to the next in s.
+        noise: what is known of the sensors.
+    """
     fold = torch.div(flight.t + 1e-9, interval, rounding_mode="floor").long()
     train = torch.arange(len(flight.t)) < len(flight.t) // 2
     return Record(
         flight.t,
-        flight.seen[:, :3],
-        flight.seen[:, 3:6],
-        flight.seen[:, 6:],
+        flight.measured[:, :3],
+        flight.measured[:, 3:6],
+        flight.measured[:, 6:],
         flight.command,
         flight.averaged,
         fold,
@@ -72,36 +80,50 @@ def record_of(flight: Flight, interval: float, noise: MotionNoise) -> Record:
 
 
 def study(config: FerrySettings) -> Study:
-    """Fly with the believed model, identify, fly with what was found."""
+    """Fly with the believed model, identify residual models, and fly with these.
+
+    Raises:
+        ResidnetError: where a model cannot be identified or flown.
+    """
     ferry = config.ferry()
     believed = ForceModel(ferry.believed.hull)
     first = ferry.fly_course(config.course, [(believed, None)])[0]
     record = record_of(first, config.course.interval, config.noise or MotionNoise())
     residual = believed.residual(record.command, record.nu_dot, record.nu, record.pose[:, 2])
     models: dict[str, FerryModel] = {}
-    for name, wanted in config.models.items():
-        models[name] = identify(wanted, record, models[wanted.on].model if wanted.on else believed)
+    for name, model_config in config.models.items():
+        base = models[model_config.on].model if model_config.on else believed
+        models[name] = identify(model_config, record, base)
     flown: dict[str, tuple[ForceModel, Lag | None]] = {
-        n: (m.model, m.lag) for n, m in models.items() if config.models[n].fly
+        name: (fitted.model, fitted.lag)
+        for name, fitted in models.items()
+        if config.models[name].fly
     }
     courses, crossings = {"believed": first}, {}
     if flown:
         courses |= dict(
             zip(flown, ferry.fly_course(config.course, list(flown.values())), strict=True)
         )
-    everyone: dict[str, tuple[ForceModel, Lag | None]] = {"believed": (believed, None), **flown}
+    feed_forwards: dict[str, tuple[ForceModel, Lag | None]] = {
+        "believed": (believed, None),
+        **flown,
+    }
     alone = {}
     if config.feed_forward_alone:
         alone = dict(
             zip(
-                everyone,
-                ferry.without_feedback().fly_course(config.course, list(everyone.values())),
+                feed_forwards,
+                ferry.without_feedback().fly_course(config.course, list(feed_forwards.values())),
                 strict=True,
             )
         )
     if config.crossing is not None:
         crossings = dict(
-            zip(everyone, ferry.fly_crossing(config.crossing, list(everyone.values())), strict=True)
+            zip(
+                feed_forwards,
+                ferry.fly_crossing(config.crossing, list(feed_forwards.values())),
+                strict=True,
+            )
         )
     later = update(config, models, record, believed) if config.later is not None else {}
     return Study(first, mse(residual[~record.train]), models, courses, crossings, alone, later)
@@ -110,8 +132,13 @@ def study(config: FerrySettings) -> Study:
 def update(
     config: FerrySettings, models: dict[str, FerryModel], record: Record, believed: ForceModel
 ) -> dict[str, Update]:
-    """Fly the changed vessel with each model that flies, judge it on that log, and where it no
-    longer fits identify it again from it.
+    """Fly the changed vessel with each model, and identify again those that no longer fit.
+
+    Args:
+        config: the study, which names the changed vessel.
+        models: fitted models; those that fly are taken.
+        record: the log that they were identified from.
+        believed: the model of the controller.
     """
     ferry = config.ferry(config.later)
     known = {name: model for name, model in models.items() if config.models[name].fly}
@@ -121,11 +148,9 @@ def update(
     out: dict[str, Update] = {}
     for (name, model), flight in zip(known.items(), flights, strict=True):
         log = record_of(flight, config.course.interval, config.noise or MotionNoise())
-        then, now = (
-            remaining(model.model, model.lag, record)[~record.train],
-            remaining(model.model, model.lag, log),
-        )
-        verdict = still_fits(config.check_fit, then, now, log.command, log.fold)
+        before = remaining(model.model, model.lag, record)[~record.train]
+        now = remaining(model.model, model.lag, log)
+        verdict = still_fits(config.check_fit, before, now, log.command, log.fold)
         out[name] = Update(verdict, flight, flight)
         if not verdict.fits:
             again = identify(config.models[name], log, believed)

@@ -1,50 +1,51 @@
-"""Task `ferry_study`: identify the force residual of a believed ferry in closed loop, and fly again
-with it (document 002 chapter 4).
-"""
+"""Task `ferry_study`: residual models of a ferry in closed loop (document 002, chapter 4)."""
 
 from __future__ import annotations
 
-import time
+import json
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Literal, final
 
-from residnet.core.config import dump_config
+from residnet.core.config import load_config
 from residnet.documents.jervan2020.ferry.config import FerrySettings
+from residnet.report.blocks import Section
 from residnet.runs.folder import RunFolder
+from residnet.runs.task import MainFigure, Outcome
 
 
 @final
 class FerryStudyConfig(FerrySettings):
-    """A course flown with the believed model, models of what it lacks, and the course again with
-    them.
+    """A course with the believed model, residual models identified from it, and the course again.
+
+    Attributes:
+        task: `ferry_study`.
     """
 
     task: Literal["ferry_study"]
 
-    def check(self) -> None:
-        """Everything was checked when the config was read."""
+    def recorded_seed(self) -> int:
+        """Return the seed of the noise."""
+        return self.seed
 
-    def run(
-        self, *, source: Path, overrides: Sequence[str], out: Path | None, resume: bool
-    ) -> RunFolder:
-        """Fly, identify, fly again; writes ferry.json, ferry.md and figures.
+    def carry_out(self, folder: RunFolder) -> Outcome:
+        """Fly, identify, fly again, and write ferry.json, equations, feed-forwards and figures.
 
         Raises:
             ResidnetError: where a model cannot be identified or flown.
         """
-        import torch
-
-        from residnet.documents.jervan2020.ferry.report import write
+        from residnet.documents.jervan2020.ferry.report import main_figures, verdict
+        from residnet.documents.jervan2020.ferry.results import write_results
         from residnet.documents.jervan2020.ferry.study import study
 
-        started = time.time()
-        torch.set_num_threads(1)
-        folder = RunFolder.create(out or Path("runs") / self.name, dump_config(self), resume=resume)
-        text = write(self, study(self), folder)
-        folder.write_provenance(
-            config=source, overrides=overrides, seed=self.seed, files=[], started=started
-        )
-        print(text)
-        print(f"study: {folder.path / 'ferry.md'}")
-        return folder
+        results = write_results(self, study(self), folder)
+        figures = {name: MainFigure(*value) for name, value in main_figures(results).items()}
+        return Outcome(verdict(results), figures)
+
+    @classmethod
+    def report_sections(cls, run: RunFolder) -> Sequence[Section]:
+        """Return the sections of the report, from the run folder alone."""
+        from residnet.documents.jervan2020.ferry.report import sections
+        from residnet.documents.jervan2020.ferry.results import FILE
+
+        config = load_config(run.resolved, [], cls)
+        return sections(config, json.loads((run.path / FILE).read_text()), run.path)

@@ -1,4 +1,4 @@
-"""What an analysis of force residuals on measured logs is made of (document 002 chapter 5)."""
+"""Config of force residuals on measured logs (document 002, chapter 5)."""
 
 from __future__ import annotations
 
@@ -16,18 +16,19 @@ from residnet.documents.jervan2020.regressions import SurfaceRegression
 from residnet.documents.jervan2020.residual_model import ResidualModelConfig
 from residnet.physics.fossen import Fossen3, FossenVessel, HullConfig
 from residnet.physics.vessel import load_vessel
+from residnet.runs.task import ComputingTask
 
 _Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
 _Channels = tuple[str, str, str]
 
 
 class ForceLogs(Config):
-    """Measured logs; which part of them tests is said by `validation`.
+    """Measured logs; `validation` says which part of them tests.
 
     Attributes:
-        reader: format and channel map.
+        reader: format of the logs and their channel map.
         root: folder that the patterns start from.
-        logs: files or patterns such as `nlp*.csv`.
+        logs: file names or patterns such as `nlp*.csv`.
     """
 
     reader: ReaderConfig
@@ -35,7 +36,7 @@ class ForceLogs(Config):
     logs: tuple[str, ...] = Field(min_length=1)
 
     def files(self) -> list[Path]:
-        """All logs, each once.
+        """Return the paths of all logs, each once.
 
         Raises:
             ConfigError: where the folder is not there or a pattern matches nothing.
@@ -46,13 +47,14 @@ class ForceLogs(Config):
 
 
 class ForceChannels(Config):
-    """Channels of the logs beside x, y, psi, u, v and r.
+    """Names of the channels of force and acceleration, beside x, y, psi, u, v and r.
 
     Attributes:
-        actual: forces that acted, from measured revolutions and angles of the thrusters, in N, N, N
-            m.
-        commanded: forces that were asked for.
-        acceleration: measured accelerations of u, v and r; null where there are none.
+        actual: forces that acted, in N, N, N m, from measured revolutions and angles of the
+            thrusters.
+        commanded: forces that the controller commanded, in N, N, N m.
+        acceleration: measured accelerations of u, v, r in m/s^2, m/s^2, rad/s^2; null where there
+            are none.
     """
 
     actual: _Channels
@@ -60,19 +62,19 @@ class ForceChannels(Config):
     acceleration: _Channels | None = None
 
     def columns(self) -> tuple[str, ...]:
-        """All of them."""
+        """Return all channels: commanded, actual and measured acceleration."""
         return (*self.commanded, *self.actual, *(self.acceleration or ()))
 
 
 class FoldsConfig(Config):
-    """Cross-validation: every sample is predicted by a model that saw nothing near it.
+    """Cross-validation in which no model is fitted to data near what it predicts.
 
     Attributes:
-        folds: parts that are left out in turn; whole logs where there are at least three, else
-            equal stretches of time of each log.
-        gap: seconds before and after a left-out stretch that no model learns from either.
-        segment: seconds that belong together: a fold of the inner cross-validation that chooses
-            orders and penalties, and what intervals resample.
+        folds: number of parts that are left out in turn: whole logs where there are at least three,
+            else equal stretches of time of each log.
+        gap: time in s before and after a left-out stretch that is left out of the fit too.
+        segment: length in s of the segments that the inner cross-validation leaves out to choose
+            orders and penalties, and that the intervals resample.
     """
 
     folds: int = Field(default=5, ge=2)
@@ -81,12 +83,12 @@ class FoldsConfig(Config):
 
 
 class MeasuredModelConfig(ResidualModelConfig):
-    """One model of the residual of measured forces.
+    """One regression of the residual of measured forces.
 
     Attributes:
-        force: which force it explains.
-        published: MSE on the document's own test half without and with this model, in N^2, N^2, (N
-            m)^2; another run of another ferry.
+        force: force that the model explains: the actual or the commanded one.
+        published: mean square of the residual on the document's own test half, without and with
+            this model, in N^2, N^2, (N m)^2; from other trials, with the ferry as it was then.
     """
 
     force: Literal["actual", "commanded"] = "actual"
@@ -106,24 +108,21 @@ class MeasuredModelConfig(ResidualModelConfig):
         return self
 
 
-class ForceSettings(Config):
-    """The residual force of a believed hull on measured logs, explained by regressions and judged
-    where they saw nothing.
+class ForceSettings(ComputingTask):
+    """Regressions of the residual force of a believed hull on measured logs, cross-validated.
 
     Attributes:
-        name: of the run.
         believed: vessel whose hull is the known part, by name or file.
-        data: logs.
-        prepare: grid, masks, and how velocities are smoothed and differentiated.
-        channels: forces and accelerations.
-        acceleration: `velocity`: derivative of the measured velocities; `measured`: the log's own,
-            less its offset to that derivative.
-        validation: cross-validation.
-        models: by name.
+        data: the measured logs.
+        prepare: time grid, masks, and how velocities are smoothed and differentiated.
+        channels: names of the channels of force and acceleration.
+        acceleration: acceleration of the regressors: `velocity` for the derivative of the measured
+            velocities, `measured` for the log's own acceleration less its mean difference from that
+            derivative.
+        validation: how the models are cross-validated.
+        models: regressions by name.
     """
 
-    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")
-    description: str = ""
     believed: str
     data: ForceLogs
     prepare: PrepareConfig
@@ -154,7 +153,7 @@ class ForceSettings(Config):
         return self
 
     def hull(self) -> Fossen3:
-        """The known part.
+        """Return the known hull.
 
         Raises:
             ConfigError: where the vessel is no hull by matrices.

@@ -1,6 +1,4 @@
-"""Measured logs as one record of motion and forces, with the folds that judge models honestly
-(document 002 section 5.2).
-"""
+"""Measured logs as one record of motion and forces with folds (document 002, section 5.2)."""
 
 from __future__ import annotations
 
@@ -16,32 +14,34 @@ from residnet.core.errors import DataError, FitError
 from residnet.data.prepare import Prepared, prepare
 from residnet.data.split import check_leaks
 from residnet.documents.jervan2020.measured.config import FoldsConfig, ForceSettings
-from residnet.documents.jervan2020.residual_model import Record
+from residnet.documents.jervan2020.residual_model import AXES, Record
 from residnet.judge.bootstrap import Blocks, blocks, intervals
 from residnet.training.lag import fit_lag, followed
 
-AXES = ("surge", "sway", "yaw")
-_FEW_LOGS = 3
+_LOGS_FOR_FOLDS = 3
+"""Number of logs from which on whole logs are left out instead of stretches of time."""
+_LOGS_FOR_INTERVALS = 5
+"""Number of logs from which on intervals resample logs instead of segments."""
 _LEAST_SEGMENTS = 5
-_RUNS_OF_A_LOG = 5
+"""Least number of segments for intervals."""
 
 
 @dataclass(frozen=True)
 class Measured:
-    """All logs, one after another (N samples).
+    """All logs one after another, N samples; forces in N, N, N m.
 
     Attributes:
-        names: of the logs.
+        names: names of the logs.
         record: motion and commanded force, smoothed as `prepare` says; NaN where masked. Its folds
-            are segments.
+            are the segments.
         actual: forces that acted [N, 3].
-        good: samples that may be learned from and judged on [N].
+        good: samples that models may be fitted to and judged on [N] bool.
         part: number of the fold of the outer cross-validation [N].
-        parts: what a fold is: `logs` or `stretches`.
-        masked: share of samples that each mask excludes, by log.
-        derived: derivatives of velocity [N, 3].
-        sensed: measured accelerations as they are logged [N, 3]; None where there are none.
-        acceleration: how the two compare; empty where nothing was measured.
+        parts: what a fold consists of: `logs` or `stretches`.
+        masked: share of the samples that each mask excludes, by log and mask.
+        derived: derivatives of the velocities [N, 3].
+        sensed: measured accelerations as logged [N, 3]; None where there are none.
+        acceleration: comparison of the two by axis; empty where no acceleration was measured.
     """
 
     names: tuple[str, ...]
@@ -56,29 +56,32 @@ class Measured:
     acceleration: dict[str, Any]
 
     def force(self, which: str) -> Tensor:
-        """Force [N, 3], actual or commanded."""
+        """Return the force [N, 3], `actual` or `commanded`."""
         return self.actual if which == "actual" else self.record.command
 
     def split(self, part: int, gap: float) -> tuple[Record, Tensor]:
-        """The record that learns nothing from a part and `gap` seconds around it, and the samples
-        [N] of the part that judge.
+        """Return the record without a fold for training, and the samples [N] of the fold.
+
+        Args:
+            part: number of the fold.
+            gap: time in s around the fold that is left out of training too.
 
         Raises:
             DataError: where either has no samples.
         """
-        out = self.part == part
-        near = out.clone()
+        inside_fold = self.part == part
+        near = inside_fold.clone()
         reach = round(gap / self.record.dt)
         start = 0
         for length in self.record.runs:
-            inside = out[start : start + length].to(torch.float64)[None, None]
+            flags = inside_fold[start : start + length].to(torch.float64)[None, None]
             near[start : start + length] = (
-                torch.nn.functional.max_pool1d(inside, 2 * reach + 1, 1, reach)[0, 0] > 0
+                torch.nn.functional.max_pool1d(flags, 2 * reach + 1, 1, reach)[0, 0] > 0
             )
             start += length
-        train, test = self.good & ~near, self.good & out
+        train, test = self.good & ~near, self.good & inside_fold
         for name, samples in (
-            ("nothing left to learn from beside", train),
+            ("nothing left to fit to beside", train),
             ("no sample to judge on in", test),
         ):
             if not bool(samples.any()):
@@ -89,38 +92,43 @@ class Measured:
         return replace(self.record, train=train), test
 
     def segments(self) -> list[Tensor]:
-        """Indices of the good samples of each segment; one with less than half of the usual number
-        is left out.
+        """Return the indices of the good samples of each segment.
+
+        A segment with less than half of the largest number of good samples is left out.
         """
-        found = [
+        segments = [
             ((self.record.fold == number) & self.good).nonzero()[:, 0]
             for number in torch.unique(self.record.fold)
         ]
-        least = max(len(one) for one in found) / 2
-        return [one for one in found if len(one) >= least]
+        least = max(len(segment) for segment in segments) / 2
+        return [segment for segment in segments if len(segment) >= least]
 
     def blocks(self) -> Blocks | None:
-        """What intervals resample: logs from five on, segments for fewer; None with fewer than five
-        segments.
+        """Return what the intervals resample: logs from five on, segments for fewer.
+
+        None where there are fewer than five segments.
         """
         log = torch.repeat_interleave(torch.arange(len(self.names)), torch.tensor(self.record.runs))
-        of = [int(log[segment[0]]) for segment in self.segments()]
-        if len(self.names) >= _RUNS_OF_A_LOG:
-            return blocks(of)
-        return (
-            Blocks(np.arange(len(of)), "segments", len(of)) if len(of) >= _LEAST_SEGMENTS else None
-        )
+        log_of_segment = [int(log[segment[0]]) for segment in self.segments()]
+        if len(self.names) >= _LOGS_FOR_INTERVALS:
+            return blocks(log_of_segment)
+        return _segment_blocks(len(log_of_segment))
+
+
+def _segment_blocks(count: int) -> Blocks | None:
+    """Return segments as blocks of a bootstrap; None where there are too few."""
+    return Blocks(np.arange(count), "segments", count) if count >= _LEAST_SEGMENTS else None
 
 
 def read_measured(config: ForceSettings) -> Measured:
     """Read, mask, smooth and differentiate all logs.
 
     Raises:
-        ResidnetError: where a log cannot be read or holds nothing to learn from.
+        ResidnetError: where a log cannot be read or holds no usable samples.
     """
     reader = config.data.reader.build()
     recorded = [reader.read(path) for path in config.data.files()]
-    # a log that stands twice would be learned from where it is judged
+    # a model would be fitted to the very samples that judge it
     check_leaks({log.name: [log] for log in recorded})
     logs = [prepare(log, "all", config.channels.columns(), config.prepare) for log in recorded]
     for log in logs:
@@ -146,7 +154,7 @@ def read_measured(config: ForceSettings) -> Measured:
     part, parts = _parts(logs, config.validation)
     step, count = config.prepare.grid.step, len(fold)
     smooth = joined["smooth"]
-    command = torch.cat([_carried(log.recorded[:, :3]) for log in logs])
+    command = torch.cat([_held(log.recorded[:, :3]) for log in logs])
     record = Record(
         step * torch.arange(count, dtype=torch.float64),
         smooth[:, :3],
@@ -180,9 +188,7 @@ def read_measured(config: ForceSettings) -> Measured:
 
 
 def _calibrated(logs: Sequence[Prepared], derived: Tensor, sensed: Tensor) -> Tensor:
-    """Measured accelerations [N, 3] less what they lie above the derivative of velocity, log by
-    log.
-    """
+    """Return measured accelerations [N, 3] less their mean offset from `derived`, log by log."""
     out, start = sensed.clone(), 0
     for log in logs:
         inside, good = slice(start, start + len(log)), torch.from_numpy(log.good)
@@ -191,17 +197,15 @@ def _calibrated(logs: Sequence[Prepared], derived: Tensor, sensed: Tensor) -> Te
     return out
 
 
-def _carried(values: np.ndarray) -> Tensor:
-    """Commands [T, 3] with the last value before in place of NaN, zero before the first: what the
-    thrusters were told is not lost in a gap.
-    """
+def _held(values: np.ndarray) -> Tensor:
+    """Return commands [T, 3] with the last value held over gaps, and zero before the first."""
     import pandas as pd
 
     return torch.from_numpy(np.array(pd.DataFrame(values).ffill().fillna(0.0)))
 
 
 def _segments(logs: Sequence[Prepared], config: ForceSettings) -> Tensor:
-    """Number of each sample's segment [N]; no segment reaches across logs."""
+    """Return the number of each sample's segment [N]; no segment reaches across logs."""
     numbers, first = [], 0
     for log in logs:
         count = max(round(len(log) * config.prepare.grid.step / config.validation.segment), 1)
@@ -211,7 +215,8 @@ def _segments(logs: Sequence[Prepared], config: ForceSettings) -> Tensor:
 
 
 def _parts(logs: Sequence[Prepared], config: FoldsConfig) -> tuple[Tensor, str]:
-    if len(logs) >= _FEW_LOGS:
+    """Return the number of each sample's fold [N], and what a fold consists of."""
+    if len(logs) >= _LOGS_FOR_FOLDS:
         folds = min(config.folds, len(logs))
         return (
             torch.cat(
@@ -226,26 +231,28 @@ def _parts(logs: Sequence[Prepared], config: FoldsConfig) -> tuple[Tensor, str]:
 
 
 def compare_accelerations(derived: Tensor, measured: Tensor, segment: Tensor) -> dict[str, Any]:
-    """Measured accelerations [N, 3] against derivatives of velocity [N, 3]: by axis the offset with
-    its interval, and what remains without it.
+    """Compare measured accelerations with derivatives of velocity, axis by axis.
+
+    Args:
+        derived: derivatives of velocity [N, 3].
+        measured: measured accelerations [N, 3].
+        segment: number of each sample's segment [N].
+
+    Returns:
+        By axis the offset, its 95 % interval, and the spread and correlation without it.
     """
-    apart = measured - derived
-    means = np.stack([apart[segment == number].mean(0).numpy() for number in torch.unique(segment)])
-    within = intervals(
-        means,
-        (
-            Blocks(np.arange(len(means)), "segments", len(means))
-            if len(means) >= _LEAST_SEGMENTS
-            else None
-        ),
+    difference = measured - derived
+    means = np.stack(
+        [difference[segment == number].mean(0).numpy() for number in torch.unique(segment)]
     )
+    within = intervals(means, _segment_blocks(len(means)))
     out: dict[str, Any] = {}
     for axis, name in enumerate(AXES):
         both = torch.corrcoef(torch.stack((derived[:, axis], measured[:, axis])))
         out[name] = {
-            "offset": float(apart[:, axis].mean()),
+            "offset": float(difference[:, axis].mean()),
             "offset_ci95": within[axis],
-            "rms_without_offset": float(apart[:, axis].std()),
+            "rms_without_offset": float(difference[:, axis].std()),
             "rms": float(derived[:, axis].std()),
             "correlation": float(torch.nan_to_num(both[0, 1])),
         }
@@ -253,13 +260,16 @@ def compare_accelerations(derived: Tensor, measured: Tensor, segment: Tensor) ->
 
 
 def compare_forces(measured: Measured) -> dict[str, Any]:
-    """Commanded against actual force: the thrusters' lag, and by axis how much of the actual force
-    the command explains without and with it.
+    """Compare commanded and actual force: the thrusters' lag, and what the command explains.
+
+    Returns:
+        `lag` (its parameters, or why it is not determined), and by axis the share of the actual
+        force's variance that the command explains, without and with the lag.
     """
     record, good = measured.record, measured.good
     out: dict[str, Any] = {}
     try:
-        found = fit_lag(
+        lag = fit_lag(
             record.command,
             torch.nan_to_num(measured.actual),
             torch.zeros_like(record.command),
@@ -267,8 +277,8 @@ def compare_forces(measured: Measured) -> dict[str, Any]:
             good,
             record.runs,
         ).lag
-        out["lag"] = {"frequency": found.frequency, "damping": found.damping, "delay": found.delay}
-        after = followed(record.command, found, record.dt, record.runs)
+        out["lag"] = {"frequency": lag.frequency, "damping": lag.damping, "delay": lag.delay}
+        after = followed(record.command, lag, record.dt, record.runs)
     except FitError as error:
         out["lag"], after = str(error), record.command
     actual = measured.actual[good]

@@ -1,5 +1,6 @@
-"""Force residuals of measured logs: every sample predicted by a model that saw nothing near it,
-always beside no force and the believed model.
+"""Residual models of measured forces, cross-validated (document 002, chapter 5).
+
+Every model is judged beside two others: no force at all, and the believed hull alone.
 """
 
 from __future__ import annotations
@@ -24,11 +25,11 @@ from residnet.physics.force_model import ForceModel
 
 @dataclass(frozen=True)
 class Judged:
-    """One model's errors where it saw nothing.
+    """Errors of one model on the folds that were left out of its fit.
 
     Attributes:
-        error: remaining residual [N, 3]; NaN where there is none.
-        notes: what each fold chose.
+        error: remaining residual [N, 3] in N, N, N m; NaN where a sample is not used.
+        notes: what the estimator chose in each fold.
     """
 
     error: Tensor
@@ -37,17 +38,17 @@ class Judged:
 
 @dataclass(frozen=True)
 class Final:
-    """A model fitted on all good samples, for reading; nothing judges it.
+    """A model fitted to all good samples, to be read and not to be judged.
 
     Attributes:
         fit: coefficients.
-        notes: what was chosen.
-        forward: empty, or why it cannot run forward in time.
+        notes: what the estimator chose.
+        not_forward: why it cannot run forward in time; empty where it can.
     """
 
     fit: Fit
     notes: dict[str, Any]
-    forward: str
+    not_forward: str
 
 
 @dataclass(frozen=True)
@@ -56,11 +57,11 @@ class ForceStudy:
 
     Attributes:
         measured: the logs.
-        judged: by model.
-        final: by model.
-        failed: why a model is not among them: the logs do not determine it.
-        rows: of the tables, zero and the believed model first in each.
-        forces: commanded against actual.
+        judged: cross-validated errors by model.
+        final: models fitted to all samples, by name.
+        failed: models that the logs do not determine, with the reason.
+        rows: rows of the tables; `zero` and `believed` are the first of each force.
+        forces: comparison of commanded and actual force.
         blocks: what the intervals resample; None without intervals.
     """
 
@@ -74,8 +75,9 @@ class ForceStudy:
 
 
 def force_study(config: ForceSettings) -> ForceStudy:
-    """Read the logs, fit and judge every model; one that the logs do not determine is set aside
-    with the reason.
+    """Read the logs, and fit and judge every model.
+
+    A model that the logs do not determine is set aside with the reason.
 
     Raises:
         ResidnetError: where a log cannot be used or no model is determined.
@@ -83,17 +85,17 @@ def force_study(config: ForceSettings) -> ForceStudy:
     measured = read_measured(config)
     believed = ForceModel(config.hull())
     judged, final, failed = dict[str, Judged](), dict[str, Final](), dict[str, str]()
-    for name, wanted in config.models.items():
+    for name, model_config in config.models.items():
         try:
-            errors = cross_validate(wanted, measured, believed, config.validation.gap)
+            errors = cross_validate(model_config, measured, believed, config.validation.gap)
             model, _, fit, notes = fit_model(
-                wanted, _for(wanted, measured, measured.record), believed
+                model_config, _with_force(model_config, measured, measured.record), believed
             )
         except FitError as error:
             failed[name] = f"model {name}: {error}"
             continue
         judged[name] = errors
-        final[name] = Final(fit, notes, _forward(config, model, name))
+        final[name] = Final(fit, notes, _why_not_forward(config, model, name))
     if not final:
         raise FitError(next(iter(failed.values())))
     return ForceStudy(
@@ -107,12 +109,13 @@ def force_study(config: ForceSettings) -> ForceStudy:
     )
 
 
-def _for(wanted: MeasuredModelConfig, measured: Measured, record: Record) -> Record:
-    """The record with the force that a model explains as its command."""
-    return replace(record, command=measured.force(wanted.force))
+def _with_force(config: MeasuredModelConfig, measured: Measured, record: Record) -> Record:
+    """Return the record with the force that a model explains as its command."""
+    return replace(record, command=measured.force(config.force))
 
 
-def _forward(config: ForceSettings, model: ForceModel, name: str) -> str:
+def _why_not_forward(config: ForceSettings, model: ForceModel, name: str) -> str:
+    """Return why a model cannot run forward in time; empty where it can."""
     try:
         forward_equations(config.believed, model, f"model {name}")
     except (ConfigError, FitError) as error:
@@ -121,34 +124,42 @@ def _forward(config: ForceSettings, model: ForceModel, name: str) -> str:
 
 
 def cross_validate(
-    wanted: MeasuredModelConfig, measured: Measured, believed: ForceModel, gap: float
+    config: MeasuredModelConfig, measured: Measured, believed: ForceModel, gap: float
 ) -> Judged:
-    """Fit a model once for each fold, on what is not near it, and predict the fold.
+    """Fit a model for each fold on the samples outside and away from it, and predict the fold.
+
+    Args:
+        config: the model.
+        measured: the logs with their folds.
+        believed: the known hull.
+        gap: time in s around a fold that is left out of the fit.
 
     Raises:
         FitError: where a fold's training samples do not determine the model.
     """
-    target = measured.force(judge(wanted))
+    target = measured.force(judging_force(config))
     error, notes = torch.full_like(target, torch.nan), []
     for part in range(int(measured.part.max()) + 1):
         record, test = measured.split(part, gap)
-        model, _, _, said = fit_model(wanted, _for(wanted, measured, record), believed)
+        model, _, _, chosen = fit_model(config, _with_force(config, measured, record), believed)
         error[test] = model.residual(
             target[test], record.nu_dot[test], record.nu[test], record.pose[test, 2]
         )
-        notes.append(said)
+        notes.append(chosen)
     return Judged(error, notes)
 
 
-def judge(wanted: MeasuredModelConfig) -> str:
-    """The force that a model is judged on. What a lag makes of a command can be small by the lag
-    alone: such a model is held to the actual force.
+def judging_force(config: MeasuredModelConfig) -> str:
+    """Return the force that a model is judged on, `actual` or `commanded`.
+
+    A lag alone could make the residual of a command small: a model with lag is judged on the actual
+    force.
     """
-    return "actual" if wanted.lag else wanted.force
+    return "actual" if config.lag else config.force
 
 
 def unmodelled(measured: Measured, believed: ForceModel, force: str) -> Tensor:
-    """The believed model's residual [N, 3]."""
+    """Return the residual [N, 3] of the believed model for the `actual` or `commanded` force."""
     record = measured.record
     return believed.residual(measured.force(force), record.nu_dot, record.nu, record.pose[:, 2])
 
@@ -156,12 +167,13 @@ def unmodelled(measured: Measured, believed: ForceModel, force: str) -> Tensor:
 def table(
     config: ForceSettings, measured: Measured, judged: Mapping[str, Judged], believed: ForceModel
 ) -> list[dict[str, Any]]:
-    """Rows of all models by the force that judges them; every group begins with `zero` and
-    `believed` on the same samples.
+    """Return the rows of all models, grouped by the force that judges them.
+
+    Every group begins with `zero` (no force at all) and `believed` on the same samples.
     """
     groups: dict[str, list[str]] = {}
     for name in judged:
-        groups.setdefault(judge(config.models[name]), []).append(name)
+        groups.setdefault(judging_force(config.models[name]), []).append(name)
     segments, parts = measured.segments(), measured.blocks()
 
     def by_segment(error: Tensor) -> np.ndarray:
@@ -184,7 +196,7 @@ def table(
                     "of_zero": (error.mean(0) / level).tolist(),
                     "segments": len(segments),
                     **{
-                        f"minus_{other}": _apart((error - errors[other]) / level, parts)
+                        f"minus_{other}": _difference((error - errors[other]) / level, parts)
                         for other in ("zero", "believed")
                         if other != name
                     },
@@ -193,11 +205,9 @@ def table(
     return rows
 
 
-def _apart(apart: np.ndarray, parts: Blocks | None) -> dict[str, Any]:
-    """Difference of errors [W, 3] in units of zero's mean square error, by axis and their mean: 95
-    % intervals, share of segments below.
-    """
-    columns = np.concatenate((apart, apart.mean(1, keepdims=True)), axis=1)
+def _difference(difference: np.ndarray, parts: Blocks | None) -> dict[str, Any]:
+    """Return mean and 95 % intervals of differences [W, 3], by axis and for their mean."""
+    columns = np.concatenate((difference, difference.mean(1, keepdims=True)), axis=1)
     return {
         "mean": columns.mean(0).tolist(),
         "ci95": intervals(columns, parts),
@@ -206,7 +216,13 @@ def _apart(apart: np.ndarray, parts: Blocks | None) -> dict[str, Any]:
 
 
 def better(row: Mapping[str, Any], than: str) -> list[bool]:
-    """Whether a model's error is below another's with 95 % confidence: surge, sway, yaw, mean over
-    axes.
+    """Return whether a model's error lies below another's with 95 % confidence.
+
+    Args:
+        row: row of the model.
+        than: `zero` or `believed`.
+
+    Returns:
+        One flag each for surge, sway, yaw and the mean over the axes.
     """
     return [interval is not None and interval[1] < 0 for interval in row[f"minus_{than}"]["ci95"]]

@@ -1,57 +1,60 @@
-"""Task `force_residual`: what a believed hull leaves of measured forces, and whether any regression
-explains it (document 002 chapter 5).
-"""
+"""Task `force_residual`: residual models of measured forces (document 002, chapter 5)."""
 
 from __future__ import annotations
 
-import time
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, final
 
-from residnet.core.config import dump_config
+from residnet.core.config import load_config
 from residnet.documents.jervan2020.measured.config import ForceSettings
+from residnet.report.blocks import Section
 from residnet.runs.folder import RunFolder
+from residnet.runs.task import MainFigure, Outcome
 
 
 @final
 class ForceResidualConfig(ForceSettings):
-    """The residual force of a believed hull on measured logs, explained by regressions and judged
-    where they saw nothing.
+    """Regressions of the residual force of a believed hull on measured logs, cross-validated.
+
+    Attributes:
+        task: `force_residual`.
     """
 
     task: Literal["force_residual"]
 
     def check(self) -> None:
-        """That the logs' files are there.
+        """Check that the logs are there.
 
         Raises:
             ConfigError: where they are not.
         """
         self.data.files()
 
-    def run(
-        self, *, source: Path, overrides: Sequence[str], out: Path | None, resume: bool
-    ) -> RunFolder:
-        """Read, fit, judge; writes force_residual.json, force_residual.md, tables of the models and
-        figures.
+    def input_files(self) -> Sequence[Path]:
+        """Return the paths of the logs."""
+        return self.data.files()
+
+    def carry_out(self, folder: RunFolder) -> Outcome:
+        """Read the logs, fit and judge the models, and write force_residual.json and figures.
 
         Raises:
-            ResidnetError: where a log cannot be used or a model is not determined.
+            ResidnetError: where a log cannot be used or no model is determined.
         """
-        import torch
-
-        from residnet.documents.jervan2020.measured.report import write
+        from residnet.documents.jervan2020.measured.report import main_figures, verdict
+        from residnet.documents.jervan2020.measured.results import write_results
         from residnet.documents.jervan2020.measured.study import force_study
 
-        started = time.time()
-        torch.set_num_threads(1)
-        files = self.data.files()
-        folder = RunFolder.create(out or Path("runs") / self.name, dump_config(self), resume=resume)
-        text = write(self, force_study(self), folder)
-        folder.write_provenance(
-            config=source, overrides=overrides, seed=0, files=files, started=started
-        )
-        print(text)
-        print(f"study: {folder.path / 'force_residual.md'}")
-        return folder
+        results = write_results(self, force_study(self), folder)
+        figures = {name: MainFigure(*value) for name, value in main_figures(results).items()}
+        return Outcome(verdict(results), figures)
+
+    @classmethod
+    def report_sections(cls, run: RunFolder) -> Sequence[Section]:
+        """Return the sections of the report, from the run folder alone."""
+        from residnet.documents.jervan2020.measured.report import sections
+        from residnet.documents.jervan2020.measured.results import FILE
+
+        config = load_config(run.resolved, [], cls)
+        return sections(config, json.loads((run.path / FILE).read_text()), run.path)

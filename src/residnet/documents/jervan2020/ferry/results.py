@@ -1,0 +1,118 @@
+"""Results of a ferry study as they stand in its run folder: JSON, equations, exports, figures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
+
+import torch
+
+from residnet.core.errors import ConfigError, FitError
+from residnet.core.frames import wrap
+from residnet.documents.jervan2020.ferry.config import FerrySettings
+from residnet.documents.jervan2020.ferry.flights import Flight
+from residnet.documents.jervan2020.ferry.study import Study
+from residnet.documents.jervan2020.forward import (
+    as_baseline_yaml,
+    forward_equations,
+    missing_coefficients,
+)
+from residnet.documents.jervan2020.residual_pages import draw_model, fit_as_json
+from residnet.export.feed_forward import export_feed_forward
+from residnet.report.figures.loop import draw_errors, draw_force_parts
+from residnet.runs.folder import RunFolder
+
+FILE = "ferry.json"
+
+
+def write_results(config: FerrySettings, found: Study, folder: RunFolder) -> dict[str, Any]:
+    """Write ferry.json, the models' equations and feed-forwards, and figures.
+
+    Returns:
+        The contents of ferry.json.
+    """
+    folder.figures.mkdir(exist_ok=True)
+    not_forward = {name: _keep_model(config, found, name, folder) for name in found.models}
+    results = _content(config, found, not_forward)
+    folder.write_json(folder.path / FILE, results)
+    for kind, flights in (
+        ("course", found.courses),
+        ("crossing", found.crossings),
+        ("feed_forward_alone", found.alone),
+    ):
+        if flights:
+            _draw_flights(flights, kind, folder)
+    return results
+
+
+def _keep_model(config: FerrySettings, found: Study, name: str, folder: RunFolder) -> str:
+    """Write a model's pictures, feed-forward and equations; return why it cannot run forward."""
+    model, model_config = found.models[name], config.models[name]
+    draw_model(
+        name, model_config.fit, model_config.terms, model.fit, found.unmodelled, folder.figures
+    )
+    motion = torch.cat((found.first.nu_dot, found.first.nu), dim=-1)
+    ranges = list(zip(motion.amin(0).tolist(), motion.amax(0).tolist(), strict=True))
+    export_feed_forward(
+        model.model, model.notes.get("lag"), ranges, folder.exports / f"{name}_feed_forward.pt"
+    )
+    try:
+        equations = forward_equations(config.believed, model.model, f"model {name}")
+    except (ConfigError, FitError) as error:
+        return str(error)
+    folder.write(
+        folder.path / "models" / f"{name}_forward.yaml",
+        as_baseline_yaml(equations, f"run {config.name}, model {name}"),
+    )
+    return ""
+
+
+def _content(config: FerrySettings, found: Study, not_forward: Mapping[str, str]) -> dict[str, Any]:
+    models = {
+        name: {
+            "test_mse": model.test_mse,
+            "share_left": [a / b for a, b in zip(model.test_mse, found.unmodelled, strict=True)],
+            "notes": model.notes,
+            "not_forward": not_forward[name],
+            **fit_as_json(config.models[name].terms, model.fit),
+        }
+        for name, model in found.models.items()
+    }
+    return {
+        "schema": "residnet.ferry/1",
+        "run": config.name,
+        "unmodelled_test_mse": found.unmodelled,
+        "true_coefficients": missing_coefficients(config.true, config.believed),
+        "models": models,
+        "course": {name: flight.tracking.row() for name, flight in found.courses.items()},
+        "crossing": {name: flight.tracking.row() for name, flight in found.crossings.items()},
+        "feed_forward_alone": {name: flight.tracking.row() for name, flight in found.alone.items()},
+        "later": {
+            name: {
+                "verdict": asdict(update.verdict),
+                "text": update.verdict.text(),
+                "before": update.before.tracking.row(),
+                "after": update.after.tracking.row(),
+            }
+            for name, update in found.later.items()
+        },
+    }
+
+
+def _draw_flights(flights: Mapping[str, Flight], kind: str, folder: RunFolder) -> None:
+    """Draw the errors of all models over time, and the forces of the first three."""
+    t = next(iter(flights.values())).t
+    position = {
+        name: (flight.desired - flight.pose)[:, :2].norm(dim=-1) for name, flight in flights.items()
+    }
+    heading = {
+        name: wrap((flight.desired - flight.pose)[:, 2]).abs() for name, flight in flights.items()
+    }
+    draw_errors(t, position, heading, folder.figures / f"errors_{kind}.png")
+    if not any(bool(flight.feedback.any()) for flight in flights.values()):
+        return
+    shown = dict(list(flights.items())[:3])
+    command = {name: flight.command for name, flight in shown.items()}
+    feedback = {name: flight.feedback for name, flight in shown.items()}
+    draw_force_parts(t, command, feedback, folder.figures / f"forces_{kind}.png")
