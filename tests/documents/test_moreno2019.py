@@ -10,7 +10,8 @@ import pandas as pd
 import pytest
 
 from residnet.core.errors import UsageError
-from residnet.documents import draw_study
+from residnet.documents import study_sections
+from residnet.report.blocks import Cell, Figure, Table
 
 MODELS = (
     "zero",
@@ -80,8 +81,9 @@ def made(run: Path, models: tuple[str, ...] = MODELS) -> Path:
 
 
 def test_tables_hold_the_errors_of_the_records(tmp_path: Path) -> None:
-    table, text, figure = draw_study("moreno2019", made(tmp_path))
-    content = json.loads(table.read_text())
+    (section,) = study_sections("moreno2019", made(tmp_path))
+    errors, _, figure = section.blocks
+    content = json.loads((tmp_path / "study.json").read_text())
     assert {(row["model"], row["split"]) for row in content["rows"]} == {
         (m, s) for m in MODELS for s in ("train", "validation", "test")
     }
@@ -96,10 +98,17 @@ def test_tables_hold_the_errors_of_the_records(tmp_path: Path) -> None:
     )
     # of squares: (3 / 4)^2 - 1
     assert pair["v"] == pytest.approx(9 / 16 - 1)
-    assert "| polynomial p = 2, together | test | 0.0700 (0.0700 to 0.0700) |" in text.read_text()
-    assert figure.stat().st_size > 10_000
+    assert isinstance(errors, Table)
+    shown = next(
+        row.cells
+        for row in errors.rows
+        if row.label == "polynomial p = 2, together" and row.cells[0].text == "test"
+    )
+    assert shown[1] == Cell("0.0700", "0.0700 to 0.0700; published 0.2249")
+    assert isinstance(figure, Figure)
+    assert figure.path.stat().st_size > 10_000
 
 
 def test_a_run_without_a_model_of_the_study_says_which(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="'gptips' is absent"):
-        draw_study("moreno2019", made(tmp_path, MODELS[:-1]))
+        study_sections("moreno2019", made(tmp_path, MODELS[:-1]))

@@ -1,19 +1,41 @@
-"""The source documents' experiments: what a config under `configs/studies` draws beside the
-ordinary report.
+"""The experiments of the source documents: one package for each document.
+
+Where an experiment is a fit, `study` in its config adds the document's figures and tables to the
+report.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
+
+from residnet.report.blocks import Figure, Section
 
 StudyName = Literal["moreno2019", "woo2018"]
 
 
-def draw_study(name: StudyName, run: Path) -> list[Path]:
-    """Write a study's tables and figures into the folder of a finished run; returns their paths."""
+def study_sections(name: StudyName, run: Path) -> list[Section]:
+    """Draw a document's figures into a finished run and return its sections of the report.
+
+    Args:
+        name: name of the document's study.
+        run: folder of a finished fit.
+
+    Raises:
+        UsageError: where the run lacks a model or a manoeuvre of the study.
+    """
     from residnet.documents.moreno2019 import report as moreno2019
     from residnet.documents.woo2018 import report as woo2018
 
-    studies = {"moreno2019": moreno2019.draw, "woo2018": woo2018.draw}
+    studies: dict[StudyName, Callable[[Path], list[Section]]] = {
+        "moreno2019": moreno2019.sections,
+        "woo2018": woo2018.sections,
+    }
     return studies[name](run)
+
+
+def draw_study(name: StudyName, run: Path) -> list[Path]:
+    """Draw a document's figures into a finished run and return their paths."""
+    blocks = [block for section in study_sections(name, run) for block in section.blocks]
+    return [block.path for block in blocks if isinstance(block, Figure)]

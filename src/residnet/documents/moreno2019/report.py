@@ -1,9 +1,8 @@
-"""Tables 2 and 3 of Moreno-Salinas et al. 2019 (document 001) with our data, from a run of
-configs/studies/moreno2019/moreno2019.yaml.
+"""What the report of a run of configs/studies/moreno2019/moreno2019.yaml adds to that of a fit.
 
-The document prints root mean square errors of u, v, r in free runs over whole records on training,
-validation and test data. Here they have intervals by moving blocks, and outputs tuned together and
-each for itself are compared on the same records.
+Document 001 (Moreno-Salinas et al. 2019) prints root mean square errors of u, v, r in free runs
+over whole records on training, validation and test data (Tables 2 and 3). Here they have intervals
+by moving blocks, and outputs tuned together and each for itself are compared on the same records.
 """
 
 from __future__ import annotations
@@ -17,8 +16,11 @@ from typing import Any
 import numpy as np
 
 from residnet.core.errors import UsageError
+from residnet.documents.moreno2019.published import RMSE
 from residnet.judge.residual_series import block_interval
+from residnet.report.blocks import Cell, Figure, Section, Table
 from residnet.report.figures.style import MEASURED, RC, collect, legend_above, new_figure, save
+from residnet.report.format import DEG, fixed
 from residnet.report.run_reader import RunFiles, StoredWindow
 
 _PROTOCOL = "record"
@@ -37,11 +39,11 @@ _NAMES = {
     "zero": "velocities held",
 }
 _SHOWN = {"baseline": "#E69F00", "rbf_joint": "#0072B2", "p2_joint": "#D55E00"}
-_AXES = (("u", "m/s", 1.0), ("v", "m/s", 1.0), ("r", "deg/s", 180.0 / math.pi))
+_AXES = (("u", "m/s", 1.0), ("v", "m/s", 1.0), ("r", "deg/s", DEG))
 
 
-def draw(run: Path) -> list[Path]:
-    """Write study.json, study.md and figures/moreno2019_8.png; returns their paths.
+def sections(run: Path) -> list[Section]:
+    """Write study.json, draw Figure 8 and return the study's section of the report.
 
     Raises:
         UsageError: where the run lacks a model of the study or the free runs over whole records.
@@ -68,29 +70,26 @@ def draw(run: Path) -> list[Path]:
         for model, other in _PAIRS.items()
         for split in _SPLITS
     ]
-    out = [run / "study.json", run / "study.md", run / "figures" / "moreno2019_8.png"]
-    out[0].write_text(
-        json.dumps({"schema": "residnet.moreno2019/1", "rows": rows, "pairs": pairs}, indent=1)
-        + "\n"
-    )
-    out[1].write_text(as_text(rows, pairs))
-    _histories(records["test"], out[2])
-    return out
+    content = {"schema": "residnet.moreno2019/1", "rows": rows, "pairs": pairs}
+    (run / "study.json").write_text(json.dumps(content, indent=1) + "\n")
+    blocks = [_errors(rows), _joint(pairs), _draw(records["test"], run)]
+    return [Section("Document 001 (Moreno-Salinas et al. 2019)", blocks)]
 
 
 def _squares(model: str, records: Sequence[StoredWindow], axis: int) -> list[np.ndarray]:
-    """Squared errors of one velocity in each record, [T]: where u and v are usable, of r at all
-    samples.
+    """Return the squared errors [T] of one velocity in each record.
+
+    Errors of u and v are taken at usable samples, those of r at all samples.
     """
-    out = []
+    squares = []
     for record in records:
         error = record.predicted[model][:, axis] - record.measured[:, axis]
-        out.append(error[record.usable] ** 2 if axis < 2 else error**2)
-    return out
+        squares.append(error[record.usable] ** 2 if axis < 2 else error**2)
+    return squares
 
 
 def _row(model: str, split: str, records: Sequence[StoredWindow]) -> dict[str, Any]:
-    """Root mean square errors over all samples of a split, SI, with intervals."""
+    """Return root mean square errors over all samples of a split in SI units, with intervals."""
     row: dict[str, Any] = {
         "model": model,
         "split": split,
@@ -108,13 +107,15 @@ def _row(model: str, split: str, records: Sequence[StoredWindow]) -> dict[str, A
 
 
 def _pair(model: str, other: str, split: str, records: Sequence[StoredWindow]) -> dict[str, Any]:
-    """Difference of mean square errors of two models over the same samples, as a share of the
-    other's, with its interval; negative: better.
+    """Return the relative difference of the mean square errors of two models, with its interval.
+
+    Both are taken over the same samples; the difference is a share of the other model's error, and
+    negative where the first model is better.
     """
     row: dict[str, Any] = {"model": model, "to": other, "split": split}
     for axis, (name, _, _) in enumerate(_AXES):
-        own, reference = _squares(model, records, axis), _squares(other, records, axis)
-        found = block_interval([a - b for a, b in zip(own, reference, strict=True)])
+        squares, reference = _squares(model, records, axis), _squares(other, records, axis)
+        found = block_interval([a - b for a, b in zip(squares, reference, strict=True)])
         level = float(np.concatenate(reference).mean())
         row[name] = found.mean / level
         row[f"{name}_ci95"] = (
@@ -123,49 +124,73 @@ def _pair(model: str, other: str, split: str, records: Sequence[StoredWindow]) -
     return row
 
 
-def as_text(rows: Sequence[dict[str, Any]], pairs: Sequence[dict[str, Any]]) -> str:
-    """Both tables as Markdown."""
-    lines = ["# Free runs over whole records (document 001, Tables 2 and 3)", ""]
-    lines += [
-        "RMSE with 95 % intervals by moving blocks of the squared errors; u, v in m/s, r in deg/s.",
-        "",
-    ]
-    lines += ["| model | split | u | v | r | diverged |", "|---|---|---|---|---|---|"]
-    for row in rows:
-        cells = [
-            _number(row[name], row[f"{name}_ci95"], factor, 4 if factor == 1.0 else 3)
-            for name, _, factor in _AXES
-        ]
-        lines.append(
-            f"| {_NAMES[row['model']]} | {row['split']} | {' | '.join(cells)} | {row['diverged']}"
-            f" of {row['records']} |"
-        )
-    lines += ["", "# Tuned together against each for itself", ""]
-    lines += [
-        (
-            "Change of the mean square error in percent with its interval, paired sample by sample;"
-            " negative: together is better."
-        ),
-        "",
-    ]
-    lines += ["| model | split | u | v | r |", "|---|---|---|---|---|"]
-    for row in pairs:
-        cells = [_number(row[name], row[f"{name}_ci95"], 100.0, 0) for name, _, _ in _AXES]
-        lines.append(
-            f"| {_NAMES[row['model']].partition(',')[0]} | {row['split']} | {' | '.join(cells)} |"
-        )
-    return "\n".join(lines) + "\n"
-
-
-def _number(value: float, bounds: Sequence[float] | None, factor: float, digits: int) -> str:
-    interval = (
-        f" ({factor * bounds[0]:.{digits}f} to {factor * bounds[1]:.{digits}f})" if bounds else ""
+def _errors(rows: Sequence[dict[str, Any]]) -> Table:
+    """Return the errors of all models in free runs over whole records (Tables 2 and 3)."""
+    table = Table(
+        ["model", "split", *(f"{name} {unit}" for name, unit, _ in _AXES), "diverged"],
+        caption="Root mean square errors in free runs over whole records, with 95 % intervals by"
+        " moving blocks of the squared errors. Published figures are those of the document's own"
+        " ship and records.",
     )
-    return f"{factor * value:.{digits}f}{interval}"
+    for row in rows:
+        published = RMSE.get((row["model"], row["split"]))
+        cells = [
+            _cell(
+                row[name],
+                row[f"{name}_ci95"],
+                factor,
+                4 if factor == 1.0 else 3,
+                None if published is None else published[axis],
+            )
+            for axis, (name, _, factor) in enumerate(_AXES)
+        ]
+        diverged = f"{row['diverged']} of {row['records']}"
+        table.add(_NAMES[row["model"]], [Cell(row["split"], mark="text"), *cells, diverged])
+    return table
 
 
-def _histories(records: Sequence[StoredWindow], path: Path) -> None:
-    """The longest test record: measured and predicted velocities (Figure 8)."""
+def _joint(pairs: Sequence[dict[str, Any]]) -> Table:
+    """Return the comparison of outputs tuned together and each for itself."""
+    table = Table(
+        ["model", "split", *(f"{name} %" for name, _, _ in _AXES)],
+        caption="Change of the mean square error from outputs tuned each for itself to outputs"
+        " tuned together, paired sample by sample, with 95 % intervals. Negative: together is"
+        " better.",
+    )
+    for row in pairs:
+        cells = [_cell(row[name], row[f"{name}_ci95"], 100.0, 0, None) for name, _, _ in _AXES]
+        name = _NAMES[row["model"]].partition(",")[0]
+        table.add(name, [Cell(row["split"], mark="text"), *cells])
+    return table
+
+
+def _cell(
+    value: float,
+    bounds: Sequence[float] | None,
+    factor: float,
+    decimals: int,
+    published: float | None,
+) -> Cell:
+    """Return a cell with a value, and in small print its interval and the published value.
+
+    Args:
+        value: value in SI units.
+        bounds: its 95 % interval; None where there is none.
+        factor: from SI units to those of the column.
+        decimals: of the shown number.
+        published: published value in SI units; None where there is none.
+    """
+    notes = []
+    if bounds:
+        low, high = (fixed(factor * bound, decimals) for bound in bounds)
+        notes.append(f"{low} to {high}")
+    if published is not None:
+        notes.append(f"published {fixed(factor * published, decimals)}")
+    return Cell(fixed(factor * value, decimals), "; ".join(notes))
+
+
+def _draw(records: Sequence[StoredWindow], run: Path) -> Figure:
+    """Draw measured and predicted velocities of the longest test record (Figure 8)."""
     from matplotlib import rc_context
 
     record = max(records, key=lambda window: len(window.t))
@@ -187,9 +212,8 @@ def _histories(records: Sequence[StoredWindow], path: Path) -> None:
             collect(handles, panels[row])
         panels[-1].set_xlabel("time [s]")
         legend_above(figure, handles)
-        save(
-            figure,
-            path,
-            "Figure 8 of document 001: test record in free run",
-            "One free run over the whole record, without wind.",
-        )
+        path = run / "figures" / "moreno2019" / "8.png"
+        title = "Figure 8 of document 001: test record in free run"
+        caption = "One free run over the whole record, without the wind as an input."
+        save(figure, path, title, caption)
+    return Figure(path, title, caption)

@@ -29,8 +29,8 @@ def verdict(config: BreedingSettings, rows: Rows) -> list[str]:
     if printed:
         ours, theirs = (sum(row[key] for row in printed) for key in ("found", "published_found"))
         sentences.append(
-            f"Document 000 finds it in {theirs:g} of the {_PUBLISHED_RUNS * len(printed)} runs of the same"
-            f" table; here it is {ours} of {config.repeats * len(printed)}."
+            f"Document 000 finds it in {theirs:g} of the {_PUBLISHED_RUNS * len(printed)} runs of"
+            f" the same table; here it is {ours} of {config.repeats * len(printed)}."
         )
     right = sum(row["right"] for row in rows)
     return [*sentences, f"In {right} of {runs} runs the terms are exactly the true ones."]
