@@ -36,7 +36,7 @@ def test_rows_of_every_model_and_axis_agree_with_the_stored_residuals(tiny_run: 
             for row in content["splits"]["test"]
             if (row["model"], row["axis"]) == ("ridge", axis)
         )
-        # every so manieth sample is stored, with inputs held over the step
+        # only every so manieth sample is stored
         assert ((own.target - own.predicted) ** 2).mean() ** 0.5 == pytest.approx(
             row["rmse"], rel=0.1
         )

@@ -127,6 +127,25 @@ def _renumber(labels: np.ndarray) -> np.ndarray:
     return np.where(labels >= 0, np.cumsum(change) - 1, -1)
 
 
+def channels(log: Prepared, signals: Signals, rows: np.ndarray | None = None) -> torch.Tensor:
+    """Return what a model sees at the samples of a log, z [T, nz].
+
+    States are the smoothed ones, inputs those at the samples: a rate at an instant belongs to the
+    inputs of that instant, while a rollout is given what is held over each step (`Prepared.w`).
+    Everything that sets a model against measured accelerations takes this.
+
+    Args:
+        log: prepared log.
+        signals: of the model, float64.
+        rows: samples that are wanted [T] bool; None for all, where gaps are filled with 0.
+    """
+    x, w = log.smooth, log.recorded
+    x, w = (np.nan_to_num(x), np.nan_to_num(w)) if rows is None else (x[rows], w[rows])
+    with torch.no_grad():
+        z: torch.Tensor = signals(torch.from_numpy(x), signals.prepare(torch.from_numpy(w)))
+    return z
+
+
 def samples(logs: Sequence[Prepared], signals: Signals) -> Samples:
     """Return the samples of identification from prepared logs, float64.
 
@@ -142,11 +161,9 @@ def samples(logs: Sequence[Prepared], signals: Signals) -> Samples:
         )
     z, target, group, time = [], [], [], []
     for number, p in enumerate(logs):
-        x, w = torch.from_numpy(p.smooth[p.good]), torch.from_numpy(p.recorded[p.good])
-        with torch.no_grad():
-            z.append(signals(x, signals.prepare(w)))
+        z.append(channels(p, signals, p.good))
         target.append(torch.from_numpy(p.nu_dot[p.good]))
-        group.append(torch.full((len(x),), number))
+        group.append(torch.full((int(p.good.sum()),), number))
         time.append(torch.from_numpy(p.log.t[p.good] - p.log.t[0]))
     return Samples(
         torch.cat(z),

@@ -21,7 +21,8 @@ class WindowStore:
         y: measured states [N, 6].
         smooth: states with smoothed velocities [N, 6].
         nu_dot: accelerations [N, 3].
-        w: inputs [N, m].
+        w: inputs held over the step that follows each sample [N, m].
+        recorded: inputs at the samples themselves [N, m].
         usable: samples that may be scored [N].
         good: samples whose derivative may be learned from [N].
         reach: samples from here to the end of the stretch, itself included, [N]; 0 where there is
@@ -34,6 +35,7 @@ class WindowStore:
     smooth: Tensor
     nu_dot: Tensor
     w: Tensor
+    recorded: Tensor
     usable: Tensor
     good: Tensor
     reach: Tensor
@@ -67,6 +69,7 @@ class WindowStore:
             tensor(smooth),
             tensor(np.concatenate([p.nu_dot for p in logs])),
             tensor(np.concatenate([p.w for p in logs])),
+            tensor(np.concatenate([p.recorded for p in logs])),
             flags([p.usable for p in logs]),
             flags([p.good for p in logs]),
             torch.from_numpy(reach),

@@ -42,6 +42,16 @@ class HybridDynamics(Dynamics):
         nu_dot = self.head.accelerations(self.baseline(self.signals(x, p)), rho)
         return torch.cat((self.kinematics(x), nu_dot), dim=-1)
 
+    def channels(self, x: Tensor, w: Tensor) -> Tensor:
+        """Return what baseline and head see, z [..., nz].
+
+        Args:
+            x: states [..., 6].
+            w: inputs that belong to each state [..., m].
+        """
+        z: Tensor = self.signals(x, self.signals.prepare(w))
+        return z
+
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """State and memory one step of dt later."""
         p = self.signals.prepare(w)
@@ -60,7 +70,6 @@ class HybridDynamics(Dynamics):
 
         Args:
             y_history: measured states [B, T, 6], oldest first; T may be 0.
-            w_history: inputs [B, T, m] at the same samples.
+            w_history: inputs held over the step that follows each of them [B, T, m].
         """
-        z = self.signals(y_history, self.signals.prepare(w_history))
-        return self.head.warmup(z)
+        return self.head.warmup(self.channels(y_history, w_history))

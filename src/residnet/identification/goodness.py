@@ -6,12 +6,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import torch
 
 from residnet.data.prepare import Prepared
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.identification.models import FittedModel
 from residnet.identification.references import references
+from residnet.identification.teacher_forced import teacher_forced
 from residnet.judge.goodness import OneStep, table
 
 SPLITS = ("train", "test")
@@ -40,11 +40,7 @@ def goodness_rows(
                 name,
                 entry.spec.role,
                 _parameter_counts(entry.model),
-                [
-                    part
-                    for log in logs[split]
-                    for part in _residuals(entry.model.to(torch.float64), log)
-                ],
+                [part for log in logs[split] for part in _residuals(entry.model, log)],
                 compared_with.get(name),
             )
             for name, entry in models.items()
@@ -72,11 +68,7 @@ def _residuals(model: HybridDynamics, log: Prepared) -> list[np.ndarray]:
     """Measured minus predicted acceleration [T, 3] of each stretch; a head runs along the whole
     log, as its memory needs.
     """
-    with torch.no_grad():
-        x = torch.from_numpy(np.nan_to_num(log.smooth))[None]
-        w = torch.from_numpy(np.nan_to_num(log.recorded))[None]
-        z = model.signals(x, model.signals.prepare(w))
-        predicted = model.one_step(z)[0].numpy()
+    predicted = teacher_forced(model, log).predicted
     return [log.nu_dot[begin:end] - predicted[begin:end] for begin, end in _bounds(log)]
 
 

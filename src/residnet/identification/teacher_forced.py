@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,7 +11,7 @@ import torch
 from torch import Tensor
 
 from residnet.core.names import ACCELERATION
-from residnet.data.prepare import Prepared
+from residnet.data.prepare import Prepared, channels
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.heads.base import EquationHead
 from residnet.identification.models import FittedModel
@@ -19,13 +20,34 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-def channels_along(model: HybridDynamics, log: Prepared) -> Tensor:
-    """Return the channels [1, T, nz] that a float64 model sees along a log, gaps filled with 0."""
+@dataclass(frozen=True)
+class TeacherForced:
+    """What a model computes along the measured states of a log, its memory empty at first.
+
+    Attributes:
+        z: channels that baseline and head see [T, nz].
+        baseline: accelerations of the baseline [T, 3].
+        predicted: accelerations of baseline and head together [T, 3].
+    """
+
+    z: Tensor
+    baseline: np.ndarray
+    predicted: np.ndarray
+
+
+def teacher_forced(model: HybridDynamics, log: Prepared) -> TeacherForced:
+    """Run a model along a log without letting it move the vessel.
+
+    Args:
+        model: brought to float64.
+        log: gaps are filled with 0; what is predicted there means nothing.
+    """
+    model = model.to(torch.float64)
+    z = channels(log, model.signals)
     with torch.no_grad():
-        x = torch.from_numpy(np.nan_to_num(log.smooth))[None]
-        w = torch.from_numpy(np.nan_to_num(log.w))[None]
-        channels: Tensor = model.signals(x, model.signals.prepare(w))
-    return channels
+        baseline = model.baseline(z).numpy()
+        predicted = model.one_step(z[None])[0].numpy()
+    return TeacherForced(z, baseline, predicted)
 
 
 def residual_table(
@@ -49,14 +71,11 @@ def residual_table(
     for entry in fitted:
         if entry.spec.role != "head":
             continue
-        model = entry.model.to(torch.float64)
         pairs = []
         for log in logs:
-            z = channels_along(model, log)
-            with torch.no_grad():
-                baseline = model.baseline(z)[0].numpy()
-                predicted = model.one_step(z)[0].numpy() - baseline
-            pairs.append(np.stack((log.nu_dot - baseline, predicted), axis=-1)[log.good])
+            run = teacher_forced(entry.model, log)
+            residuals = (log.nu_dot - run.baseline, run.predicted - run.baseline)
+            pairs.append(np.stack(residuals, axis=-1)[log.good])
         joined = np.concatenate(pairs)
         joined = joined[:: max(len(joined) // most, 1)]
         for axis, name in enumerate(ACCELERATION):
@@ -87,15 +106,16 @@ def term_table(fitted: Iterable[FittedModel], logs: Sequence[Prepared]) -> pd.Da
     log = max(logs, key=len)
     parts = []
     for entry in fitted:
-        head = entry.model.to(torch.float64).head if entry.spec.role == "head" else None
+        head = entry.model.head if entry.spec.role == "head" else None
         if not isinstance(head, EquationHead):
             continue
-        z = channels_along(entry.model, log)[0]
-        with torch.no_grad():
-            left = log.nu_dot - entry.model.baseline(z).numpy()
-        left = np.where(log.good[:, None], left, np.nan)
+        run = teacher_forced(entry.model, log)
+        target = np.where(log.good[:, None], log.nu_dot - run.baseline, np.nan)
         for axis, name in enumerate(ACCELERATION):
-            for term, value in {"target": left[:, axis], **head.contributions(z, axis)}.items():
+            for term, value in {
+                "target": target[:, axis],
+                **head.contributions(run.z, axis),
+            }.items():
                 columns = {
                     "model": entry.name,
                     "log": log.log.name,

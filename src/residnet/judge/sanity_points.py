@@ -50,7 +50,7 @@ def acceleration(model: HybridDynamics, x: Tensor, w: Tensor) -> Tensor:
     """nu_dot [B, 3] of baseline and head together at states x [B, 6] and inputs w [B, m], the
     head's memory settled there.
     """
-    z = model.signals(x, model.signals.prepare(w))
+    z = model.channels(x, w)
     rho, _ = model.head(z, settled_memory(model, x, w))
     out: Tensor = model.head.accelerations(model.baseline(z), rho)
     return out

@@ -18,13 +18,12 @@ def one_step_loss(
     Args:
         model: the hybrid model.
         y: smoothed states [B, T, 6].
-        w: inputs [B, T, m].
+        w: inputs at the same samples [B, T, m].
         nu_dot: accelerations [B, T, 3].
         good: samples that count: acceleration known, memory filled [B, T].
         spread: of the residual, [3].
     """
-    z = model.signals(y, model.signals.prepare(w))
-    error = (nu_dot - model.one_step(z)) / spread
+    error = (nu_dot - model.one_step(model.channels(y, w))) / spread
     weight = good.to(error.dtype).unsqueeze(-1)
     return (error.square() * weight).sum() / (3.0 * weight.sum()).clamp(min=1.0)
 

@@ -116,7 +116,7 @@ class HeadTraining(EpochTraining):
         if self.settings.beginnings is not None:
             washout[self.store.depth[starts] == 0] = 0
         counted = take(self.store.good, starts, length) & (torch.arange(length) >= washout[:, None])
-        y, w = take(self.store.smooth, starts, length), take(self.store.w, starts, length)
+        y, w = take(self.store.smooth, starts, length), take(self.store.recorded, starts, length)
         spread = self.model.head.residual_std().to(y.dtype)
         return one_step_loss(
             self.model, y, w, take(self.store.nu_dot, starts, length), counted, spread
