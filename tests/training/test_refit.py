@@ -7,6 +7,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 from collections.abc import Sequence
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -30,13 +31,15 @@ from residnet.core.errors import DataError, FitError, ResidnetError
 from residnet.core.samples import Samples
 from residnet.data.prepare import Prepared, samples
 from residnet.data.windows import WindowStore
+from residnet.dynamics.base import Integrator
 from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.rollout import Rollout
 from residnet.heads import ZeroHead
 from residnet.physics.signals import SignalsConfig
 from residnet.training import refit as module
 from residnet.training.offsets import Offsets, OffsetsConfig
 from residnet.training.refit import RefitConfig, refit
-from residnet.training.sensitivities import ahead
+from residnet.training.sensitivities import step_sensitivities
 
 
 def fitted(
@@ -96,7 +99,7 @@ def test_windows_are_laid_every_so_often(smoothed: list[Prepared]) -> None:
     assert notes["horizon"] == 8.0
 
 
-def windy() -> tuple[HybridDynamics, module._Problem]:
+def windy(integrator: Integrator = "rk4") -> tuple[HybridDynamics, module._Problem]:
     """A model in true wind, whose heading matters to it, and windows with samples that do not
     count; everything moved off its start.
     """
@@ -114,7 +117,7 @@ def windy() -> tuple[HybridDynamics, module._Problem]:
     with torch.no_grad():
         for axis, name in enumerate("uvr"):
             baseline.theta[axis, baseline.library.terms.index(name)] = -0.7
-    model = HybridDynamics(signals, baseline, ZeroHead(), STEP, "rk4")
+    model = HybridDynamics(signals, baseline, ZeroHead(), STEP, integrator)
     active = torch.nonzero(baseline.allowed.flatten() > 0).squeeze(1)
     batch, steps, count = 5, 25, len(active)
     wind = torch.from_numpy(random.uniform([2, -3], [6, 3], size=(batch, 1, 2))).expand(
@@ -169,6 +172,33 @@ def with_step(
         module._level(other, problem, offsets)
         + module._prior_cost(problem, other.baseline, problem.share(LEVEL), offsets)
     )
+
+
+@pytest.mark.parametrize("integrator", get_args(Integrator))
+def test_sensitivities_are_those_of_the_rollout(integrator: Integrator) -> None:
+    """Central differences of the one time loop, heading included: the wind makes it matter."""
+    model, problem = windy(integrator)
+    assert isinstance(model.baseline, RegressorBaseline)
+    theta, count = model.baseline.theta.data.view(-1), len(problem.active)
+    steps = problem.w.shape[1]
+    memory = model.initial_state(len(problem.x0)).double()
+
+    def rolled(place: int, change: float) -> Tensor:
+        theta[problem.active[place]] += change
+        states, _, _ = Rollout(model)(problem.x0, problem.w, memory)
+        theta[problem.active[place]] -= change
+        return states
+
+    with torch.no_grad():
+        x, found = problem.x0, torch.zeros(len(problem.x0), 4, count, dtype=torch.float64)
+        for k in range(steps):
+            p = model.signals.prepare(problem.w[:, k])
+            found = step_sensitivities(model, model.baseline, x, p, found)
+            x, _ = model.step(x, problem.w[:, k], memory)
+        torch.testing.assert_close(x, rolled(0, 0.0)[:, -1], rtol=1e-12, atol=1e-12)
+        for place in range(count):
+            central = (rolled(place, 1e-5) - rolled(place, -1e-5))[:, -1, 2:6] / 2e-5
+            torch.testing.assert_close(found[:, :, place], central, rtol=1e-6, atol=1e-8)
 
 
 def test_normal_equations_hold_half_the_gradient_of_the_cost() -> None:
@@ -231,7 +261,7 @@ def test_hessian_is_half_that_of_the_cost_where_the_errors_vanish() -> None:
     x, exact = problem.x0, []
     with torch.no_grad():
         for k in range(problem.w.shape[1]):
-            x = ahead(model, x, model.signals.prepare(problem.w[:, k]))
+            x = module._ahead(model, x, model.signals.prepare(problem.w[:, k]))
             exact.append(x[:, 3:])
     fields = {
         **vars(problem),

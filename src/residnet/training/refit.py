@@ -23,7 +23,7 @@ from residnet.core.samples import Samples
 from residnet.data.windows import WindowStore
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.training.offsets import Arrow, Offsets, OffsetsConfig, with_spread
-from residnet.training.sensitivities import Shifted, ahead, carried
+from residnet.training.sensitivities import OffsetBaseline, step_sensitivities
 
 
 class RefitConfig(Config):
@@ -270,15 +270,20 @@ def _prior_cost(
 
 def _shifted(
     model: HybridDynamics, problem: _Problem, offsets: Offsets
-) -> tuple[HybridDynamics, ParametricBaseline | Shifted]:
+) -> tuple[HybridDynamics, ParametricBaseline | OffsetBaseline]:
     """The model with the offset of its log in every window, and its baseline."""
     assert isinstance(model.baseline, ParametricBaseline)
     if not offsets.axes:
         return model, model.baseline
-    baseline = Shifted(
+    baseline = OffsetBaseline(
         model.baseline, offsets.accelerations()[problem.log], offsets.axes, offsets.speed
     )
     return HybridDynamics(model.signals, baseline, model.head, model.dt, model.integrator), baseline
+
+
+def _ahead(model: HybridDynamics, x: Tensor, p: Tensor) -> Tensor:
+    """The step of the rollout, without a residual."""
+    return model.integrate(x, p, torch.zeros_like(x[:, :3]))
 
 
 @torch.no_grad()
@@ -287,7 +292,7 @@ def _level(model: HybridDynamics, problem: _Problem, offsets: Offsets) -> Tensor
     x, total = problem.x0, []
     shifted, _ = _shifted(model, problem, offsets)
     for k in range(problem.w.shape[1]):
-        x = ahead(shifted, x, model.signals.prepare(problem.w[:, k]))
+        x = _ahead(shifted, x, model.signals.prepare(problem.w[:, k]))
         total.append(x[:, 3:])
     error = (torch.stack(total, dim=1) - problem.nu) * problem.weight
     return torch.sqrt(_window_cost(error) + problem.robust**2).mean()
@@ -315,8 +320,8 @@ def _normal_equations(
     square = torch.zeros(batch, dtype=x.dtype)
     for k in range(steps):
         p = model.signals.prepare(problem.w[:, k])
-        sensitivity = carried(shifted, movable, x, p, sensitivity)
-        x = ahead(shifted, x, p)
+        sensitivity = step_sensitivities(shifted, movable, x, p, sensitivity)
+        x = _ahead(shifted, x, p)
         error = (x[:, 3:] - problem.nu[:, k]) * problem.weight[:, k]
         seen = sensitivity[:, 1:] * problem.weight[:, k].unsqueeze(-1)
         hessian += seen.transpose(1, 2) @ seen

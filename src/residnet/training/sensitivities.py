@@ -1,6 +1,4 @@
-"""One step of a free run, and the derivative of that step with respect to a baseline's parameters
-and the offsets beside it.
-"""
+"""Derivatives of a rollout's step with respect to a baseline's parameters and offsets."""
 
 from __future__ import annotations
 
@@ -15,9 +13,10 @@ from residnet.dynamics.hybrid import HybridDynamics
 
 
 @final
-class Shifted(Baseline):
-    """A baseline with an acceleration of its own beside it for every row of a batch, growing with
-    the square of the speed as hull forces do.
+class OffsetBaseline(Baseline):
+    """A baseline with an acceleration of its own for every row of a batch.
+
+    The accelerations grow with the square of the speed, as hull forces do.
 
     Args:
         baseline: as it is without.
@@ -36,64 +35,68 @@ class Shifted(Baseline):
         self.speed = speed
 
     def forward(self, z: Tensor) -> Tensor:
-        """nu_dot [B, 3] at channels z [B, nz], which begin with u and v."""
+        """Return nu_dot [B, 3] at channels z [B, nz], which begin with u and v."""
         return self.baseline(z) + self.growth(z) * self.value.repeat(
             z.shape[0] // self.value.shape[0], 1
         )
 
     def growth(self, z: Tensor) -> Tensor:
-        """Square of the speed over that at which the values hold, [B, 1]."""
+        """Return the square of the speed over that at which the values hold, [B, 1]."""
         return z[:, :2].square().sum(1, keepdim=True) / self.speed**2
 
     def parameter_count(self) -> list[float]:
-        """Parameters of each axis; the offsets are no part of the model."""
+        """Return the parameters of each axis; the offsets are no part of the model."""
         return self.baseline.parameter_count()
 
     def sensitivity(self, z: Tensor) -> Tensor:
-        """Derivative of nu_dot [B, 3, P + a] with respect to the baseline's free parameters and
-        to the row's own offsets.
+        """Return the derivative of nu_dot by free parameters and offsets, [B, 3, P + a].
+
+        The parameters are those that the baseline may move; the offsets are the row's own.
         """
         return torch.cat(
             (self.baseline.sensitivity(z), self.growth(z).unsqueeze(-1) * self.unit), dim=2
         )
 
 
-def ahead(model: HybridDynamics, x: Tensor, p: Tensor) -> Tensor:
-    """State one step later; of an Euler scheme with the mean yaw rate for the heading."""
-    if len(model.nodes) > 1:
-        return model.integrate(x, p, torch.zeros_like(x[:, :3]))
-    nu = x[:, 3:] + model.dt * model.baseline(model.signals(x, p))
-    psi = x[:, 2] + 0.5 * model.dt * (nu[:, 2] + x[:, 5])
-    return torch.cat((x[:, :2], psi[:, None], nu), dim=-1)
-
-
-def carried(
-    model: HybridDynamics, baseline: ParametricBaseline | Shifted, x: Tensor, p: Tensor, s: Tensor
+def step_sensitivities(
+    model: HybridDynamics,
+    baseline: ParametricBaseline | OffsetBaseline,
+    x: Tensor,
+    p: Tensor,
+    s: Tensor,
 ) -> Tensor:
-    """Sensitivities of (psi, u, v, r) to the parameters one step later, [B, 4, P], from s [B, 4, P]
-    at the states x: the scheme's own derivative.
+    """Return the sensitivities of (psi, u, v, r) one step later, [B, 4, P].
+
+    They are the exact derivative of `Dynamics.integrate` with the residual at zero, whatever the
+    integrator.
+
+    Args:
+        model: that steps.
+        baseline: its baseline.
+        x: states at the step's start [B, 6].
+        p: prepared inputs, held over the step [B, k].
+        s: sensitivities at the step's start [B, 4, P].
     """
-    change, total = torch.zeros_like(s), torch.zeros_like(s)
-    place = x
+    stage_rate, total = torch.zeros_like(s), torch.zeros_like(s)
+    stage_x = x
     for node, weight in zip(model.nodes, model.weights, strict=True):
-        here = s + node * model.dt * change
+        stage_s = s + node * model.dt * stage_rate
         if node > 0.0:
-            place = x + node * model.dt * model.rate(place, p, torch.zeros_like(x[:, :3]))
-        nu = _slopes(model, place, p) @ here + baseline.sensitivity(model.signals(place, p))
-        change = torch.cat((here[:, 3:], nu), dim=1)
-        total = total + weight * change
+            residual = torch.zeros_like(x[:, :3])
+            stage_x = x + node * model.dt * model.rate(stage_x, p, residual)
+        direct = baseline.sensitivity(model.signals(stage_x, p))
+        nu_dot = _slopes(model, stage_x, p) @ stage_s + direct
+        stage_rate = torch.cat((stage_s[:, 3:], nu_dot), dim=1)
+        total = total + weight * stage_rate
     after = s + model.dt * total
-    if len(model.nodes) == 1:
-        after = torch.cat(
-            (s[:, :1] + 0.5 * model.dt * (after[:, 3:] + s[:, 3:]), after[:, 1:]), dim=1
-        )
+    if model.semi_implicit:
+        # the heading moves with the new yaw rate
+        after = torch.cat((s[:, :1] + model.dt * after[:, 3:], after[:, 1:]), dim=1)
     return after
 
 
 def _slopes(model: HybridDynamics, x: Tensor, p: Tensor) -> Tensor:
-    """Derivative of nu_dot with respect to (psi, u, v, r), [B, 3, 4], by forward differentiation
-    along the four directions at once.
-    """
+    """Return the derivative of nu_dot by (psi, u, v, r), [B, 3, 4], in one forward pass."""
     batch = x.shape[0]
     tangent = torch.zeros(4, batch, x.shape[1], dtype=x.dtype)
     for direction in range(4):
