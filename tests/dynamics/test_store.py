@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -91,4 +92,66 @@ def test_a_card_that_was_tampered_with_is_refused(tmp_path: Path) -> None:
     content = json.loads(card.read_text())
     card.write_text(json.dumps(content | {"dt": -1.0}))
     with pytest.raises(ConfigError, match=r"model\.json.*dt"):
+        load_model(tmp_path / "m")
+
+
+def cut(file: Path) -> None:
+    file.write_bytes(file.read_bytes()[:-20])
+
+
+def flip(file: Path) -> None:
+    content = bytearray(file.read_bytes())
+    content[-3] ^= 1
+    file.write_bytes(bytes(content))
+
+
+def swap(file: Path) -> None:
+    other = spec(baseline=RegressorsConfig(terms=("u", "v", "r", "1")).model_dump())
+    save_model(file.parent.parent / "other", other, other.build())
+    file.write_bytes((file.parent.parent / "other" / file.name).read_bytes())
+
+
+def foreign(file: Path) -> None:
+    file.write_bytes(b"PK\x03\x04 not tensors at all")
+
+
+def remove(file: Path) -> None:
+    file.unlink()
+
+
+@pytest.mark.parametrize("damage", [cut, flip, swap, foreign, remove])
+def test_weights_that_are_not_as_written_are_refused_in_one_line(
+    tmp_path: Path, damage: Callable[[Path], None]
+) -> None:
+    save_model(tmp_path / "m", spec(), spec().build())
+    damage(tmp_path / "m" / "model.safetensors")
+    with pytest.raises(UsageError, match=r"model\.safetensors: .*run the fit again") as caught:
+        load_model(tmp_path / "m")
+    assert "\n" not in str(caught.value)
+
+
+def test_weights_of_another_module_are_refused_though_their_hash_is_right(tmp_path: Path) -> None:
+    save_model(tmp_path / "m", spec(), spec().build())
+    card = tmp_path / "m" / "model.json"
+    content = json.loads(card.read_text())
+    content["baseline"] = RegressorsConfig(terms=("u", "1")).model_dump()
+    card.write_text(json.dumps(content))
+    with pytest.raises(UsageError, match=r"does not belong to what model.json describes"):
+        load_model(tmp_path / "m")
+
+
+@pytest.mark.parametrize("text", ["{", "[1, 2]", "\x00"])
+def test_a_description_that_is_no_json_is_refused_in_one_line(tmp_path: Path, text: str) -> None:
+    save_model(tmp_path / "m", spec(), spec().build())
+    (tmp_path / "m" / "model.json").write_text(text)
+    with pytest.raises(UsageError, match=r"model\.json: is no") as caught:
+        load_model(tmp_path / "m")
+    assert "\n" not in str(caught.value)
+
+
+def test_another_kind_is_named(tmp_path: Path) -> None:
+    save_model(tmp_path / "m", spec(), spec().build())
+    card = tmp_path / "m" / "model.json"
+    card.write_text(card.read_text().replace("residnet.model/1", "residnet.heading_policy/1"))
+    with pytest.raises(UsageError, match=r"holds 'residnet.heading_policy/1', expected"):
         load_model(tmp_path / "m")

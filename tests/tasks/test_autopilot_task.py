@@ -82,7 +82,7 @@ def test_the_document_s_autopilot_says_how_well_it_predicts(run: Path) -> None:
     notes = json.loads((run / "controllers.json").read_text())["controllers"]["mlp"]
     assert 0 < notes["rms_heading"] < math.radians(2)
     assert notes["config"]["hidden"] == [8]
-    assert (run / "models" / "mlp" / "weights.safetensors").is_file()
+    assert (run / "models" / "mlp" / "model.safetensors").is_file()
 
 
 def test_a_pupil_is_chosen_by_how_like_its_teacher_it_is(

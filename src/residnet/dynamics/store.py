@@ -1,15 +1,20 @@
-"""Models on disk: `model.json` says how to build one, `model.safetensors` holds its numbers;
-nothing in them runs when loaded.
+"""Modules on disk: `model.json` says how to build one, `model.safetensors` holds its numbers.
+
+The description holds the SHA-256 of the numbers; nothing in the folder runs when it is loaded.
+Vessel models are described here, policies by the packages that build them.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, TypeVar
 
 from pydantic import Field
+from torch import nn
 
 from residnet.baselines import BaselineConfig
 from residnet.core.config import Config, validate
@@ -22,11 +27,29 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.heads import HeadConfig, ZeroHead
 from residnet.physics.signals import SignalsConfig
 
+_DESCRIPTION, _WEIGHTS = "model.json", "model.safetensors"
 
-class ModelSpec(Config):
-    """Everything that determines a hybrid model but its numbers.
+SpecT = TypeVar("SpecT", bound="Stored")
+
+
+class Stored(Config, ABC):
+    """A description that a stored module is built from; the kind's own package has it.
+
+    A subclass adds a `schema_name` of type `Literal["residnet.kind/1"]` with that default and the
+    alias `schema`, which tells the kinds apart on disk.
+    """
+
+    @abstractmethod
+    def build(self) -> nn.Module:
+        """Return the module with its numbers not yet filled in."""
+
+
+class ModelSpec(Stored):
+    """A description of a vessel model: everything that determines it but its numbers.
 
     Attributes:
+        schema_name: kind and version of the format.
+        version: of residnet that wrote it.
         name: of the model in its run.
         role: zero, baseline, head or ensemble.
         signals: what drives it.
@@ -57,7 +80,7 @@ class ModelSpec(Config):
     members: tuple[ModelSpec, ...] = ()
 
     def build(self) -> HybridDynamics:
-        """The model with its numbers not yet filled in."""
+        """Return the model with its numbers not yet filled in."""
         if self.members:
             return mean_of([member.build() for member in self.members])
         signals = self.signals.build()
@@ -68,7 +91,7 @@ class ModelSpec(Config):
 
     @property
     def ranges(self) -> dict[str, tuple[float, float]]:
-        """Training range of each velocity and input."""
+        """The training range of each velocity and input."""
         return {
             name: (low, high)
             for name, low, high in zip(
@@ -77,43 +100,118 @@ class ModelSpec(Config):
         }
 
 
-def save_model(folder: Path, spec: ModelSpec, model: HybridDynamics) -> None:
-    """Write a model; the folder is complete once `model.json` stands in it."""
-    from safetensors.torch import save_file
+def save_model(folder: Path, spec: Stored, module: nn.Module) -> None:
+    """Write a module of any kind; the folder is complete once `model.json` stands in it.
+
+    Args:
+        folder: of this one module; made where it is not there.
+        spec: what the module is built from.
+        module: whose numbers are kept.
+    """
+    from safetensors.torch import save
 
     folder.mkdir(parents=True, exist_ok=True)
-    save_file(
-        {name: value.contiguous() for name, value in model.state_dict().items()},
-        folder / "model.safetensors",
-    )
-    partial = folder / "model.json.partial"
-    partial.write_text(json.dumps(spec.model_dump(mode="json", by_alias=True), indent=1) + "\n")
-    partial.replace(folder / "model.json")
+    weights = save({name: value.contiguous() for name, value in module.state_dict().items()})
+    (folder / _WEIGHTS).write_bytes(weights)
+    content = spec.model_dump(mode="json", by_alias=True)
+    content["sha256"] = hashlib.sha256(weights).hexdigest()
+    partial = folder / f"{_DESCRIPTION}.partial"
+    partial.write_text(json.dumps(content, indent=1) + "\n")
+    partial.replace(folder / _DESCRIPTION)
 
 
 def load_model(folder: Path) -> tuple[ModelSpec, HybridDynamics]:
-    """Read a model that `save_model` wrote; in evaluation mode.
+    """Read a vessel model that `save_model` wrote; in evaluation mode.
 
     Raises:
-        UsageError: where the folder holds no model; the message names the models beside it.
+        UsageError: where the folder holds no vessel model, or one that is not as it was written;
+            the message names the models beside it.
     """
-    from safetensors.torch import load_file
+    spec = read_spec(folder, ModelSpec)
+    model = spec.build()
+    read_weights(folder, model)
+    return spec, model.eval()
 
-    card = folder / "model.json"
+
+def read_spec(folder: Path, kind: type[SpecT]) -> SpecT:
+    """Read the description of a stored module.
+
+    Args:
+        folder: of the module.
+        kind: what is expected there.
+
+    Raises:
+        UsageError: where there is none, or one of another kind.
+        ConfigError: where a key is wrong.
+    """
+    content = _description(folder)
+    content.pop("sha256", None)
+    wanted = kind.model_fields["schema_name"].default
+    if content.get("schema") != wanted:
+        raise UsageError(
+            f"{folder / _DESCRIPTION}: holds '{content.get('schema')}', expected '{wanted}'; name a"
+            " folder of that kind"
+        )
+    return validate(content, kind, str(folder / _DESCRIPTION))
+
+
+def read_weights(folder: Path, module: nn.Module) -> None:
+    """Fill a module with the numbers that stand in a folder, in the module's own precision.
+
+    Raises:
+        UsageError: where the numbers are missing, are not those that were written, or belong to
+            another module.
+    """
+    from safetensors import SafetensorError
+    from safetensors.torch import load
+
+    file = folder / _WEIGHTS
+    again = "restore the folder or run the fit again"
+    try:
+        weights = file.read_bytes()
+    except OSError as error:
+        raise UsageError(f"{file}: cannot be read ({error.strerror}); {again}") from None
+    if hashlib.sha256(weights).hexdigest() != _description(folder).get("sha256"):
+        raise UsageError(
+            f"{file}: its SHA-256 is not the one in {_DESCRIPTION}, so it is cut off, edited or"
+            f" from elsewhere; {again}"
+        )
+    try:
+        numbers = load(weights)
+    except SafetensorError as error:
+        raise UsageError(f"{file}: no safetensors file ({error}); {again}") from None
+    expected = module.state_dict()
+    wrong = sorted(
+        name
+        for name in expected.keys() | numbers.keys()
+        if name not in expected
+        or name not in numbers
+        or expected[name].shape != numbers[name].shape
+    )
+    if wrong:
+        raise UsageError(
+            f"{file}: '{wrong[0]}' does not belong to what {_DESCRIPTION} describes; {again}"
+        )
+    module.load_state_dict({name: numbers[name].to(expected[name].dtype) for name in expected})
+
+
+def _description(folder: Path) -> dict[str, Any]:
+    card = folder / _DESCRIPTION
     if not card.is_file():
         raise UsageError(
             f"{folder}: no model here{nearest(folder.name, model_names(folder.parent))}"
         )
-    spec = validate(json.loads(card.read_text()), ModelSpec, str(card))
-    model = spec.build()
-    numbers = load_file(folder / "model.safetensors")
-    for name, parameter in model.state_dict().items():
-        if name in numbers and parameter.dtype != numbers[name].dtype:
-            numbers[name] = numbers[name].to(parameter.dtype)
-    model.load_state_dict(numbers)
-    return spec, model.eval()
+    try:
+        content = json.loads(card.read_text())
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise UsageError(
+            f"{card}: is no JSON ({error}); restore the folder or run the fit again"
+        ) from None
+    if not isinstance(content, dict):
+        raise UsageError(f"{card}: is no description of a model; restore the folder")
+    return content
 
 
 def model_names(folder: Path) -> Sequence[str]:
-    """Names of the models in a run's `models` folder."""
-    return sorted(path.parent.name for path in folder.glob("*/model.json"))
+    """Return the names of the models in a run's `models` folder, whatever their kind."""
+    return sorted(path.parent.name for path in folder.glob(f"*/{_DESCRIPTION}"))

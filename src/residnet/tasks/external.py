@@ -19,8 +19,8 @@ from residnet.data.simulated.trials import SimulatedTrials
 from residnet.identification.evaluation import candidates, evaluate
 from residnet.identification.prepared import require_window, velocity_limit
 from residnet.judge.rollout_files import write_rollouts
-from residnet.runs.fit_store import FolderStore
 from residnet.runs.folder import RunFolder
+from residnet.runs.model_store import FolderStore
 from residnet.tasks.fit import FitConfig
 from residnet.tasks.inspection import log_files
 from residnet.tasks.reporting import report_run

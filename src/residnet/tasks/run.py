@@ -27,8 +27,8 @@ from residnet.judge.limits import SCHEMA as LIMITS
 from residnet.judge.repeats import repeatability
 from residnet.judge.rollout_files import write_rollouts
 from residnet.judge.tables import metrics_content
-from residnet.runs.fit_store import FolderStore
 from residnet.runs.folder import RunFolder
+from residnet.runs.model_store import FolderStore
 from residnet.tasks.booklet import write_booklet
 from residnet.tasks.exporting import export_model
 from residnet.tasks.fit import FitConfig

@@ -13,11 +13,12 @@ import torch
 from residnet.control.base import Policy
 from residnet.control.heading.controllers import DocumentConfig, Steering
 from residnet.control.heading.document_autopilot import NetworkPredictor
+from residnet.control.heading.stored import PredictorSpec
 from residnet.core.errors import UsageError
 from residnet.core.progress import say
 from residnet.documents.gouletas2020.config import PredictiveConfig
 from residnet.runs.folder import RunFolder
-from residnet.runs.trained import store_weights, stored_weights
+from residnet.runs.model_store import FolderStore
 from residnet.training.predictor import train_predictor
 
 
@@ -39,7 +40,8 @@ def predictive(
     torch.manual_seed(seed)
     law, network = _untrained(wanted, steering)
     exact, controller = law.predictor(steering), law.law(network, steering)
-    notes = stored_weights(network, name, folder)
+    store = FolderStore(folder)
+    notes = store.finished_module(name, network)
     if notes is None:
         started = time.time()
         say(f"  training {name}")
@@ -54,7 +56,7 @@ def predictive(
             folder.path,
         )
         notes["seconds"] = round(time.time() - started, 1)
-        store_weights(network, name, folder, notes)
+        store.keep_module(name, _spec(wanted, steering), network, notes)
     degrees = [math.degrees(notes[key]) for key in ("rms_heading", "rms_yaw_rate")]
     say(
         f"  {name}: predicts {wanted.horizon:g} s ahead within {degrees[0]:.2g} deg and"
@@ -74,8 +76,8 @@ def load_predictive(
         UsageError: where the run lacks it.
     """
     law, network = _untrained(wanted, steering)
-    if stored_weights(network, name, folder) is None:
-        raise UsageError(f"{folder.path}: no trained '{name}' (models/{name}/weights.safetensors)")
+    if FolderStore(folder).finished_module(name, network) is None:
+        raise UsageError(f"{folder.path}: no trained '{name}' (models/{name}/model.json)")
     return law.law(network, steering)
 
 
@@ -83,12 +85,13 @@ def _untrained(
     wanted: PredictiveConfig, steering: Steering
 ) -> tuple[DocumentConfig, NetworkPredictor]:
     law = DocumentConfig(horizon=wanted.horizon, candidates=wanted.candidates, weight=wanted.weight)
-    return (
-        law,
-        NetworkPredictor(
-            steering.vessel.state,
-            candidates=wanted.candidates,
-            hidden=wanted.hidden,
-            linear=wanted.linear,
-        ).double(),
+    return law, _spec(wanted, steering).build()
+
+
+def _spec(wanted: PredictiveConfig, steering: Steering) -> PredictorSpec:
+    return PredictorSpec(
+        state=tuple(steering.vessel.state),
+        candidates=wanted.candidates,
+        hidden=tuple(wanted.hidden),
+        linear=wanted.linear,
     )

@@ -15,6 +15,7 @@ from residnet.control.heading.imitation import SideBySide
 from residnet.control.heading.policy import HeadingPolicy
 from residnet.control.heading.steered_model import SteeredModel
 from residnet.control.heading.steering import SteeredPlant, fly
+from residnet.control.heading.stored import HeadingPolicySpec
 from residnet.control.heading.tuning import TuningTask, tune
 from residnet.core.errors import ConfigError
 from residnet.core.progress import say
@@ -28,8 +29,8 @@ from residnet.judge.metrics import SCHEMA
 from residnet.physics.vessel import load_vessel
 from residnet.report.autopilot import FLIGHTS, PLANTS
 from residnet.runs.folder import RunFolder
+from residnet.runs.model_store import FolderStore
 from residnet.runs.task import MainFigure, Outcome
-from residnet.runs.trained import store_weights, stored_weights
 from residnet.tasks.autopilot.comparison import compare
 from residnet.tasks.autopilot.config import AutopilotSettings, PolicyConfig
 from residnet.training.autopilot import train_autopilot
@@ -228,17 +229,20 @@ def _policy(
     teacher: AnyController | None,
 ) -> tuple[HeadingPolicy, dict[str, Any]]:
     torch.manual_seed(config.seed)
-    policy = HeadingPolicy(
-        steering.vessel.state,
-        turning=steering.turning,
+    spec = HeadingPolicySpec(
+        state=tuple(steering.vessel.state),
+        gain=steering.turning.gain,
+        time=steering.turning.time,
+        speed=steering.turning.speed,
         limit=steering.limit,
-        dt=wanted.training.dt,
         rate=steering.vessel.rate,
-        hidden=wanted.hidden,
+        dt=wanted.training.dt,
+        hidden=tuple(wanted.hidden),
         observer=wanted.observer,
     )
+    policy, store = spec.build(), FolderStore(folder)
     started = time.time()
-    notes = stored_weights(policy, name, folder)
+    notes = store.finished_module(name, policy)
     if notes is None:
         say(f"  training {name}")
         # a controller with a memory knows its step: one teaches at the step of training, its like
@@ -261,7 +265,7 @@ def _policy(
             shown,
         )
         notes |= {"seconds": round(time.time() - started, 1), "imitates": wanted.imitate}
-        store_weights(policy, name, folder, notes)
+        store.keep_module(name, spec, policy, notes)
     policy.dt = steering.dt
     say(f"  {name}: score {notes['best_validation']:.3f} after {notes['seconds']:.0f} s")
     return policy.double(), {key: value for key, value in notes.items() if key != "curve"}

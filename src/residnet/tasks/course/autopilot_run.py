@@ -6,7 +6,6 @@ import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import torch
 from pydantic import TypeAdapter
 
 from residnet.control.base import Policy
@@ -15,9 +14,10 @@ from residnet.control.courses.turns import SteadyTurn
 from residnet.control.heading.controllers import AnyController, Steering
 from residnet.control.heading.policy import HeadingPolicy
 from residnet.control.heading.steering import SteeredPlant
+from residnet.control.heading.stored import load_heading_policy
 from residnet.control.heading.turning import Turning
 from residnet.core.config import load_config
-from residnet.core.errors import ConfigError, UsageError
+from residnet.core.errors import ConfigError
 from residnet.core.names import nearest
 from residnet.documents.gouletas2020.autopilot import load_predictive
 from residnet.physics.vessel import load_vessel
@@ -100,30 +100,12 @@ def load_policy(run: Path, name: str, steering: Steering) -> HeadingPolicy:
     """A trained policy from the run folder of an autopilot, at the step of `steering`.
 
     Raises:
-        UsageError: where the run lacks it.
+        UsageError: where the run lacks it, or it is not as it was written.
     """
-    from safetensors.torch import load_file
-
-    file, weights = run / "exports" / f"{name}.pt", run / "models" / name / "weights.safetensors"
-    if not file.is_file() or not weights.is_file():
-        raise UsageError(
-            f"{run}: no policy '{name}' (models/{name}/weights.safetensors and exports/{name}.pt)"
-        )
-    extra = {"card.json": ""}
-    torch.jit.load(str(file), _extra_files=extra)
-    card = json.loads(extra["card.json"])
-    turning, command = card["turning"], card["command"][0]
-    policy = HeadingPolicy(
-        steering.vessel.state,
-        turning=Turning(turning["K"], turning["T"], turning["speed"]),
-        limit=command["limit"],
-        dt=steering.dt,
-        rate=command["rate"],
-        hidden=card["hidden"],
-        observer=card["observer"],
-    )
-    policy.load_state_dict(load_file(weights))
-    return policy.eval().requires_grad_(False).double()
+    policy = load_heading_policy(run / "models" / name)
+    policy.dt = steering.dt
+    policy.read_from(steering.vessel.state)
+    return policy
 
 
 def load_peers(config: CourseSettings, known: AutopilotRun) -> dict[str, Policy]:

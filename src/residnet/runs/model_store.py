@@ -1,0 +1,71 @@
+"""Trained models in their run folder, each kept as it is done, so that a broken run can go on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from torch import nn
+
+from residnet.dynamics.store import Stored, load_model, model_names, read_weights, save_model
+from residnet.identification.models import FittedModel
+from residnet.runs.folder import RunFolder
+
+
+class FolderStore:
+    """Vessel models and policies in `models/<name>` of a run folder.
+
+    Attributes:
+        training_folder: the run folder, where checkpoints and the TensorBoard log stand.
+    """
+
+    def __init__(self, folder: RunFolder) -> None:
+        self.folder = folder
+        self.training_folder: Path | None = folder.path
+
+    def names(self) -> list[str]:
+        """Return the names of the models that are there."""
+        return list(model_names(self.folder.models))
+
+    def finished(self, name: str) -> FittedModel | None:
+        """Return a model that is there whole; None where it is not."""
+        return self.load(name) if (self.folder.models / name / "model.json").is_file() else None
+
+    def load(self, name: str) -> FittedModel:
+        """Return a model with its notes.
+
+        Raises:
+            UsageError: where there is none of that name.
+        """
+        return FittedModel(
+            *load_model(self.folder.models / name), notes=self.folder.fit_notes(name)
+        )
+
+    def keep_module(
+        self, name: str, spec: Stored, module: nn.Module, notes: Mapping[str, Any]
+    ) -> None:
+        """Write a trained module of any kind, such as a policy, with its notes."""
+        folder = self.folder.models / name
+        self.folder.write_json(folder / "fit.json", dict(notes))
+        save_model(folder, spec, module)
+
+    def finished_module(self, name: str, module: nn.Module) -> dict[str, Any] | None:
+        """Fill a module with the weights that an interrupted run had trained, and freeze it.
+
+        Returns:
+            The notes of its training; None where it had not ended.
+
+        Raises:
+            UsageError: where the weights are not as they were written.
+        """
+        folder = self.folder.models / name
+        if not (folder / "model.json").is_file():
+            return None
+        read_weights(folder, module)
+        module.eval().requires_grad_(False)
+        return self.folder.fit_notes(name)
+
+    def keep(self, fitted: FittedModel) -> None:
+        """Write a model and its notes; the model's description comes last and marks it whole."""
+        self.keep_module(fitted.name, fitted.spec, fitted.model, fitted.notes)
