@@ -67,7 +67,7 @@ def test_training_sees_the_channels_of_the_closed_forms(logs: PreparedSplits) ->
 def test_least_squares_leaves_nothing_along_its_regressors_by_the_same_rule(
     logs: PreparedSplits, identified: Identified
 ) -> None:
-    """Where fit and residuals saw other inputs, the residual would correlate with the regressors."""
+    """Where the fit saw other inputs, its residual would correlate with the regressors."""
     baseline = identified["baseline"].model
     rows, left = [], []
     for log in logs["train"]:
