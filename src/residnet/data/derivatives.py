@@ -6,7 +6,6 @@ the smoothing that goes with it is stated.
 
 from __future__ import annotations
 
-import itertools
 from abc import ABC, abstractmethod
 from typing import Annotated, Literal, final
 
@@ -15,6 +14,7 @@ from pydantic import Field
 
 from residnet.core.config import Config, Hertz, Seconds
 from residnet.core.errors import ConfigError
+from residnet.core.stretches import stretches
 
 
 class Derivative(Config, ABC):
@@ -198,6 +198,5 @@ def _forward(values: np.ndarray, step: float) -> np.ndarray:
 def _runs(values: np.ndarray, pieces: np.ndarray) -> list[tuple[int, int]]:
     """Return the first index and the index past the last of every contiguous, finite run."""
     number = np.where(np.isfinite(values).all(axis=1), pieces, -1)
-    edges = np.flatnonzero(np.diff(number)) + 1
-    bounds = np.concatenate(([0], edges, [number.size]))
-    return [(a, b) for a, b in itertools.pairwise(bounds.tolist()) if b > a and number[a] >= 0]
+    starts, stops = stretches(number)
+    return list(zip(starts.tolist(), stops.tolist(), strict=True))

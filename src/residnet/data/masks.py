@@ -19,6 +19,7 @@ from pydantic import Field
 
 from residnet.core.config import Config, Seconds
 from residnet.core.log import Log
+from residnet.core.stretches import stretch_numbers, stretches
 from residnet.data.readers.base import unwrap
 
 # standard deviations of a Gaussian in its median absolute deviation
@@ -71,7 +72,7 @@ class Frozen(Mask):
 
     def apply(self, log: Log) -> np.ndarray:
         """Return [T] bool; see `Mask.apply`."""
-        starts, stops = true_runs((np.diff(log.stack(self.channels), axis=0) == 0.0).all(axis=1))
+        starts, stops = stretches((np.diff(log.stack(self.channels), axis=0) == 0.0).all(axis=1))
         long = stops - starts >= self.samples
         starts, last = starts[long], stops[long]
         # half a step of margin keeps `after` a whole number of samples in spite of rounding in t
@@ -298,9 +299,7 @@ def scored(log: Log) -> np.ndarray:
 
 def segments(log: Log) -> np.ndarray:
     """Return the number of the contiguous piece of each sample, [T] int from 0; -1 if masked."""
-    hard = hard_mask(log)
-    starts = ~hard & np.append(True, hard[:-1])
-    return np.where(hard, -1, np.cumsum(starts) - 1)
+    return stretch_numbers(~hard_mask(log))
 
 
 def steps_above(log: Log, channel: str, limit: float) -> np.ndarray:
@@ -344,12 +343,6 @@ def far_from_median(values: np.ndarray, sigmas: float, samples: int) -> np.ndarr
     # what a smooth channel bends by anyhow is no outlier where it stops bending
     out[at] = distance > sigmas * np.maximum(np.maximum(floor, spread), np.abs(median))
     return out
-
-
-def true_runs(flags: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first index and index past the last of every run of True in flags [T]."""
-    edges = np.diff(np.concatenate(([0], flags.astype(np.int8), [0])))
-    return np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
 
 
 def _any(log: Log, names: Sequence[str]) -> np.ndarray:

@@ -15,6 +15,7 @@ from residnet.core.errors import DataError
 from residnet.core.log import Log
 from residnet.core.names import STATE
 from residnet.core.samples import Samples
+from residnet.core.stretches import stretch_numbers
 from residnet.data.align import GridConfig, align
 from residnet.data.derivatives import DerivativeConfig, SavitzkyGolay
 from residnet.data.masks import MaskConfig, apply_masks, scored, segments
@@ -105,7 +106,7 @@ def prepare(log: Log, split: str, columns: Sequence[str], config: PrepareConfig)
             f" {', '.join((*STATE, *columns))}"
         )
     # derivatives must not see masked samples, so a piece ends at each of them
-    clean = _renumber(np.where(log.usable & usable, piece, -1))
+    clean = stretch_numbers(np.where(log.usable & usable, piece, -1))
     smooth_nu, nu_dot, valid = config.derivative.derive(y[:, 3:], config.grid.step, clean)
     smooth = np.concatenate((y[:, :3], np.where(valid[:, None], smooth_nu, y[:, 3:])), axis=1)
     trimmed = (log.t >= log.t[0] + config.trim - 1e-9) & (log.t <= log.t[-1] - config.trim + 1e-9)
@@ -119,12 +120,6 @@ def _means(w: np.ndarray, piece: np.ndarray) -> np.ndarray:
     on = (piece[:-1] >= 0) & (piece[1:] == piece[:-1])
     out[:-1][on] = 0.5 * (w[:-1] + w[1:])[on]
     return out
-
-
-def _renumber(labels: np.ndarray) -> np.ndarray:
-    """Return the contiguous runs of equal labels numbered from 0; -1 stays."""
-    change = np.concatenate(([True], labels[1:] != labels[:-1]))
-    return np.where(labels >= 0, np.cumsum(change) - 1, -1)
 
 
 def channels(log: Prepared, signals: Signals, rows: np.ndarray | None = None) -> torch.Tensor:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from residnet.core.errors import DataError
+from residnet.core.stretches import stretch_bounds
 from residnet.data.prepare import Prepared
 
 
@@ -53,10 +54,8 @@ class WindowStore:
         labels = np.concatenate(
             [np.where(p.piece >= 0, p.piece + 1_000_000 * i, -1) for i, p in enumerate(logs)]
         )
-        starts = np.flatnonzero(np.concatenate(([True], labels[1:] != labels[:-1])))
-        lengths = np.diff(np.append(starts, labels.size))
-        depth = np.arange(labels.size) - np.repeat(starts, lengths)
-        reach = np.where(labels >= 0, np.repeat(lengths, lengths) - depth, 0)
+        begins, ends = stretch_bounds(labels)
+        depth, reach = np.arange(labels.size) - begins, ends - np.arange(labels.size)
 
         def tensor(array: np.ndarray) -> Tensor:
             return torch.from_numpy(np.nan_to_num(array)).to(dtype)

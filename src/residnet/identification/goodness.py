@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from residnet.core.stretches import stretches
 from residnet.data.prepare import Prepared
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.identification.models import FittedModel
@@ -34,7 +35,7 @@ def goodness_rows(
     )
     splits = {}
     for split in SPLITS:
-        measured = [piece for log in logs[split] for piece in stretches(log)]
+        measured = [piece for log in logs[split] for piece in measured_stretches(log)]
         predictions = [
             OneStep(
                 name,
@@ -49,9 +50,9 @@ def goodness_rows(
     return splits
 
 
-def stretches(log: Prepared) -> list[np.ndarray]:
+def measured_stretches(log: Prepared) -> list[np.ndarray]:
     """Return the measured accelerations [T, 3] of each stretch that may be learned from."""
-    return [log.nu_dot[begin:end] for begin, end in _bounds(log)]
+    return [log.nu_dot[begin:end] for begin, end in zip(*stretches(log.good), strict=True)]
 
 
 def _parameter_counts(model: HybridDynamics) -> list[float]:
@@ -69,9 +70,7 @@ def _residuals(model: HybridDynamics, log: Prepared) -> list[np.ndarray]:
     log, as its memory needs.
     """
     predicted = teacher_forced(model, log).predicted
-    return [log.nu_dot[begin:end] - predicted[begin:end] for begin, end in _bounds(log)]
-
-
-def _bounds(log: Prepared) -> list[tuple[int, int]]:
-    edges = np.flatnonzero(np.diff(log.good, prepend=False, append=False)).tolist()
-    return list(zip(edges[::2], edges[1::2], strict=True))
+    return [
+        log.nu_dot[begin:end] - predicted[begin:end]
+        for begin, end in zip(*stretches(log.good), strict=True)
+    ]

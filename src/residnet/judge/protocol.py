@@ -11,6 +11,7 @@ from pydantic import Field
 
 from residnet.core.config import Config, Seconds
 from residnet.core.errors import DataError
+from residnet.core.stretches import stretch_bounds
 from residnet.data.prepare import Prepared
 
 
@@ -49,7 +50,7 @@ class Windows(Config):
     def windows(self, log: Prepared, number: int, step: float) -> list[Window]:
         """The windows of one log; none where it is too short."""
         steps, start, out = round(self.length / step), round(self.first / step), []
-        end = _ends(log.piece)
+        _, end = stretch_bounds(log.piece)
         while start + steps < len(log):
             while start < len(log) and not log.usable[start]:
                 start += 1
@@ -81,7 +82,7 @@ class WholeManoeuvre(Config):
     def windows(self, log: Prepared, number: int, step: float) -> list[Window]:
         """One window per stretch."""
         lead, out = max(round(self.initial / step), 1), []
-        end = _ends(log.piece)
+        _, end = stretch_bounds(log.piece)
         begin = 0
         while begin < len(log):
             if log.piece[begin] < 0:
@@ -102,15 +103,6 @@ class WholeManoeuvre(Config):
 
 
 ProtocolConfig = Annotated[Windows | WholeManoeuvre, Field(discriminator="kind")]
-
-
-def _ends(piece: np.ndarray) -> np.ndarray:
-    """One past the last sample of each sample's stretch, [T]; the sample itself where there is
-    none.
-    """
-    change = np.flatnonzero(np.append(piece[1:] != piece[:-1], True)) + 1
-    ends = change[np.searchsorted(change, np.arange(piece.size), side="right")]
-    return np.where(piece >= 0, ends, np.arange(piece.size))
 
 
 def all_windows(

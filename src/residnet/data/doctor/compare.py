@@ -9,9 +9,9 @@ import numpy as np
 
 from residnet.core.log import Log
 from residnet.core.names import VELOCITY
+from residnet.core.stretches import stretches
 from residnet.data.doctor.findings import Finding, Level, share_of, show
 from residnet.data.doctor.signals import MEASURED, noise_of
-from residnet.data.masks import true_runs
 from residnet.data.split import row_hashes
 
 # so many rows in a row that two logs share are no chance
@@ -67,7 +67,7 @@ def _copies(logs: Sequence[Log], splits: Mapping[str, str]) -> Iterator[Finding]
             continue
         flags = np.zeros(len(logs[i]) + 1, dtype=bool)
         flags[rows] = True
-        starts, stops = true_runs(flags)
+        starts, stops = stretches(flags)
         longest = int((stops - starts).max(initial=0))
         if longest >= _COPIED:
             yield _copy(

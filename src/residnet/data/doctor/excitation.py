@@ -8,9 +8,9 @@ import numpy as np
 
 from residnet.core.log import Log
 from residnet.core.names import VELOCITY
+from residnet.core.stretches import stretches
 from residnet.data.doctor.findings import Finding, share_of, show
 from residnet.data.doctor.signals import MEASURED, averaged, noise_of
-from residnet.data.masks import true_runs
 
 # a vessel at rest for this share of a log makes it one about noise
 _MOST_REST = 0.1
@@ -75,7 +75,7 @@ def _rest(log: Log) -> Iterator[Finding]:
     at_rest = still(log)
     if at_rest is not None:
         share = float(at_rest.mean())
-        starts, stops = true_runs(at_rest)
+        starts, stops = stretches(at_rest)
         longest = int(np.argmax(stops - starts)) if starts.size else 0
         seconds = float(log.t[stops[longest] - 1] - log.t[starts[longest]]) if starts.size else 0.0
         if share > 0.02 and seconds > 3.0:

@@ -12,10 +12,10 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from residnet.core.log import Log
+from residnet.core.stretches import stretches
 from residnet.data.doctor.findings import Finding, Level, share_of, show
 from residnet.data.doctor.response import response_findings
 from residnet.data.doctor.signals import noise_of
-from residnet.data.masks import true_runs
 
 # words that tell a demand from what the actuator does
 _DEMAND = re.compile(
@@ -162,7 +162,7 @@ def _excursions(log: Log, name: str) -> Iterator[Finding]:
         & (away > 8.0 * noise_of(known))
     )
     far = _abrupt(known, away, far)
-    starts, _ = true_runs(far)
+    starts, _ = stretches(far)
     if starts.size:
         furthest = show(float(known[far][np.argmax(away[far])]), log.units[name])
         text = (
@@ -187,7 +187,7 @@ def _abrupt(values: np.ndarray, away: np.ndarray, far: np.ndarray) -> np.ndarray
     """
     change = np.abs(np.diff(values, prepend=values[0], append=values[-1]))
     out = far.copy()
-    for start, stop in zip(*true_runs(far), strict=True):
+    for start, stop in zip(*stretches(far), strict=True):
         edges = change[max(start - 1, 0) : start + 1].max(), change[stop : stop + 2].max()
         out[start:stop] = min(edges) > 0.5 * away[start:stop].max()
     return out
@@ -204,7 +204,7 @@ def _stuck(log: Log, inputs: Sequence[str]) -> Iterator[Finding]:
         if span <= 0.0:
             continue
         still = np.abs(np.nan_to_num(np.diff(done))) <= max(6.0 * noise_of(done), 1e-4 * span)
-        starts, stops = true_runs(still)
+        starts, stops = stretches(still)
         worst: tuple[float, int, int] = (0.0, 0, 0)
         for start, stop in zip(starts, stops, strict=True):
             run = slice(start, stop + 1)
@@ -261,7 +261,7 @@ def _idle(log: Log, inputs: Sequence[str]) -> Iterator[Finding]:
             for name in driving
         ]
     )
-    for start, stop in zip(*true_runs(still), strict=True):
+    for start, stop in zip(*stretches(still), strict=True):
         turns = _swings(psi[start : stop + 1])
         if turns >= 2:
             text = (

@@ -9,9 +9,9 @@ import numpy as np
 
 from residnet.core.log import Log
 from residnet.core.names import STATE, VELOCITY
+from residnet.core.stretches import stretches
 from residnet.data.doctor.findings import Finding, Level, share_of, show
 from residnet.data.doctor.signals import MEASURED, noise_of, spikes, without
-from residnet.data.masks import true_runs
 
 # shortest run of equal values that counts as frozen, in steps
 _FROZEN = 5
@@ -90,7 +90,7 @@ def _missing(log: Log) -> Iterator[Finding]:
                 "give it a log of its own, or interpolate it",
             )
             continue
-        starts, stops = true_runs(absent)
+        starts, stops = stretches(absent)
         longest = int(np.argmax(stops - starts))
         seconds = float(log.t[min(stops[longest], len(log) - 1)] - log.t[starts[longest]])
         text = (
@@ -168,7 +168,7 @@ def _sample_and_hold(log: Log, name: str) -> Iterator[Finding]:
 
 
 def _frozen(log: Log, name: str, held: np.ndarray) -> Finding:
-    starts, stops = true_runs(held)
+    starts, stops = stretches(held)
     seconds = log.t[stops - 1] - log.t[starts]
     at = held.copy()
     if name in ("position", "x", "y"):
@@ -203,7 +203,7 @@ def _held(log: Log, names: Sequence[str]) -> np.ndarray:
     """Return [T] bool: runs of equal values that neither chance nor rest explains."""
     out = np.zeros(len(log), dtype=bool)
     same = (np.diff(log.stack(tuple(names)), axis=0) == 0.0).all(axis=1)
-    starts, stops = true_runs(same)
+    starts, stops = stretches(same)
     long = stops - starts >= _FROZEN
     outside = same.size - int((stops - starts)[long].sum())
     if outside < 0.02 * same.size:

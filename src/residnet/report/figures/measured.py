@@ -8,9 +8,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from torch import Tensor
 
+from residnet.core.stretches import stretches
 from residnet.report.figures.style import DASHED, MASKED, RC, SOLID, legend_above, new_figure, save
 
 FORCE_UNITS = ("surge [N]", "sway [N]", "yaw [N m]")
@@ -51,20 +51,13 @@ def draw_pair(
             handles[labels[1]] = axes.plot(
                 t, second[:, axis], **{**SOLID, "linewidth": 1.1, "zorder": 4}
             )[0]
-            for a, b in _stretches(~good.numpy()):
+            for a, b in zip(*stretches(~good.numpy()), strict=True):
                 handles["masked"] = axes.axvspan(float(t[a]), float(t[b - 1]), **MASKED)
             axes.set_ylabel(names[axis])
         panels[-1].set_xlabel("time [s]")
         panels[-1].set_xlim(float(t[0]), float(t[-1]))
         legend_above(figure, handles)
         save(figure, path, title, f"{title}; {labels[0]} (dashed) and {labels[1]} (solid).")
-
-
-def _stretches(flags: np.ndarray) -> list[tuple[int, int]]:
-    edges = np.diff(np.concatenate(([0], flags.astype(np.int8), [0])))
-    return list(
-        zip(np.flatnonzero(edges == 1).tolist(), np.flatnonzero(edges == -1).tolist(), strict=True)
-    )
 
 
 def draw_scores(rows: Sequence[Mapping[str, Any]], path: Path) -> None:

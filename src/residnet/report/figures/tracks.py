@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from residnet.core.stretches import stretches
 from residnet.report.figures.style import (
     MASKED,
     MEASURED,
@@ -153,8 +154,7 @@ def history(run: RunFiles, window: StoredWindow) -> Any:
 
 def shade(axes: Any, time: np.ndarray, usable: np.ndarray) -> None:
     """Grey ground where samples are masked."""
-    edges = np.flatnonzero(np.diff(np.concatenate(([True], usable, [True])).astype(int)))
-    for i, (begin, end) in enumerate(zip(edges[::2], edges[1::2], strict=True)):
+    for i, (begin, end) in enumerate(zip(*stretches(~usable), strict=True)):
         extra = {"label": MASKED_LABEL} if i == 0 else {}
         axes.axvspan(time[begin], time[min(end, time.size - 1)], **MASKED, **extra)
 

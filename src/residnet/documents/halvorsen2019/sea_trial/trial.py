@@ -15,6 +15,7 @@ import torch
 from residnet.core.log import Log
 from residnet.core.names import VELOCITY
 from residnet.core.samples import Samples
+from residnet.core.stretches import stretches
 from residnet.data.simulated.environment import Disturbance
 from residnet.data.simulated.flying import Craft, Sea, fly
 from residnet.documents.halvorsen2019.sea_trial.config import (
@@ -54,10 +55,12 @@ class Trial:
         Args:
             keep: samples to keep [N] bool.
         """
-        kept = np.flatnonzero(keep)
-        group = self.samples.group.numpy()[kept]
-        gaps = np.flatnonzero((np.diff(kept) > 1) | (np.diff(group) != 0)) + 1
-        return [piece for piece in np.split(kept, gaps) if len(piece) > 1]
+        starts, stops = stretches(np.where(keep, self.samples.group.numpy(), -1))
+        return [
+            np.arange(start, stop)
+            for start, stop in zip(starts, stops, strict=True)
+            if stop - start > 1
+        ]
 
 
 def sail(config: SeaTrialConfig) -> Trial:
