@@ -71,7 +71,8 @@ class BelievedBaseline(Baseline):
 
     def forward(self, z: Tensor) -> Tensor:
         """nu_dot [..., 3] at channels z [..., nz]."""
-        return self.library(z) @ self.theta.to(z.dtype).T
+        phi: Tensor = self.library(z)
+        return phi @ self.theta.to(z.dtype).T
 
     def parameter_count(self) -> list[float]:
         """None: nothing was fitted."""

@@ -37,7 +37,8 @@ class EquationsBaseline(Baseline):
 
     def forward(self, z: Tensor) -> Tensor:
         """nu_dot [..., 3] at channels z [..., nz]."""
-        return self.library(z) @ self.theta.to(z.dtype).T
+        phi: Tensor = self.library(z)
+        return phi @ self.theta.to(z.dtype).T
 
     def parameter_count(self) -> list[float]:
         """Number of terms of each axis: they were fitted, if to other data (ERRATA E9 of document

@@ -51,7 +51,8 @@ class MMGBaseline(ParametricBaseline):
 
     def forward(self, z: Tensor) -> Tensor:
         """nu_dot [..., 3] at channels z [..., nz]."""
-        return self.forces(z, self.theta.to(z.dtype))
+        nu_dot: Tensor = self.forces(z, self.theta.to(z.dtype))
+        return nu_dot
 
     def parameter_count(self) -> list[float]:
         """Parameters that are not fixed, by the axis that they are listed under; those of propeller
@@ -76,7 +77,8 @@ class MMGBaseline(ParametricBaseline):
         moves[torch.arange(free.numel()), free] = steps
         theta = self.theta.detach().to(z.dtype)
         ahead, behind = self.forces(z, (theta + torch.stack((moves, -moves)))[:, :, None])
-        return ((ahead - behind) / (2.0 * steps[:, None, None])).permute(1, 2, 0)
+        slopes: Tensor = (ahead - behind) / (2.0 * steps[:, None, None])
+        return slopes.permute(1, 2, 0)
 
     def information(self, samples: Samples) -> Tensor:
         """Mean information of a sample [P, P], by the variance that the present parameters leave of

@@ -51,7 +51,8 @@ class RegressorBaseline(ParametricBaseline):
     def forward(self, z: Tensor) -> Tensor:
         """nu_dot [..., 3] at channels z [..., nz]."""
         weights = self.theta * self.allowed
-        return self.library(z) @ weights.to(z.dtype).T
+        phi: Tensor = self.library(z)
+        return phi @ weights.to(z.dtype).T
 
     def parameter_count(self) -> list[float]:
         """Coefficients of each axis that are not zero."""
@@ -83,7 +84,9 @@ class RegressorBaseline(ParametricBaseline):
         phi, variance = self._residual(samples)
         gram = phi.T @ phi / len(samples)
         free = self.free_indices()
-        return torch.block_diag(*[gram / variance[axis] for axis in range(3)])[free][:, free]
+        blocks = [gram / variance[axis] for axis in range(3)]
+        whole: Tensor = torch.block_diag(*blocks)
+        return whole[free][:, free]
 
     def prior(self) -> tuple[Tensor, Tensor]:
         """Nothing is thought before."""

@@ -84,7 +84,8 @@ class BasisHead(ClosedFormHead):
         """Basis functions [..., J] at channels z [..., nz]; features are scaled but not centred, so
         that names keep their meaning.
         """
-        return self.library(self.features.guarded(z) / self.features.std.to(z.dtype))
+        values: Tensor = self.library(self.features.guarded(z) / self.features.std.to(z.dtype))
+        return values
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Residual [..., 3] at channels z [..., nz]; the memory is empty."""

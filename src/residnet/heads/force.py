@@ -192,4 +192,5 @@ class AugmentedMassBaseline(nn.Module):
 
     def parameter_count(self) -> list[float]:
         """The baseline's."""
-        return self.baseline.parameter_count()  # type: ignore[operator]
+        counts: list[float] = self.baseline.parameter_count()  # type: ignore[operator]
+        return counts

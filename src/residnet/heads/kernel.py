@@ -92,7 +92,8 @@ class TermFeatures(nn.Module):
 
     def forward(self, channels: Tensor) -> Tensor:
         """Standardised terms [..., J]."""
-        return (self.library(channels) - self.mean.to(channels.dtype)) / self.std.to(channels.dtype)
+        values: Tensor = self.library(channels)
+        return (values - self.mean.to(values.dtype)) / self.std.to(values.dtype)
 
 
 @final

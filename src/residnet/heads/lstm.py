@@ -172,7 +172,8 @@ class LstmNetwork(nn.Module):
     def read(self, h: Tensor, f: Tensor) -> Tensor:
         """Scaled residual [..., outputs] from LSTM outputs [..., H] and features [..., F]."""
         h = self.dropout(h)
-        return self.readout(torch.cat((h, f), dim=-1) if self.skip else h)
+        out: Tensor = self.readout(torch.cat((h, f), dim=-1) if self.skip else h)
+        return out
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """One step: channels [B, nz], memory [B, 2H] -> [B, outputs], new memory."""
@@ -225,7 +226,9 @@ class LstmHead(ResidualHead):
 
     def sequence(self, z: Tensor) -> Tensor:
         """Residuals [B, T, 3] along measured channels [B, T, nz], from an empty memory."""
-        return self.scale(torch.cat([network.sequence(z)[0] for network in self.networks], dim=-1))
+        scaled = torch.cat([network.sequence(z)[0] for network in self.networks], dim=-1)
+        rho: Tensor = self.scale(scaled)
+        return rho
 
     def warmup(self, z: Tensor) -> Tensor:
         """Memory [B, n_state] that past channels [B, T, nz] leave."""

@@ -102,7 +102,8 @@ class SymbolicHead(EquationHead):
         """All candidate terms [..., J] of chosen features [..., F], held at the edge of the
         training range.
         """
-        return self.library(self.features.held(chosen))
+        values: Tensor = self.library(self.features.held(chosen))
+        return values
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Residual [B, 3] at channels z [B, nz], and the past of late inputs one step on."""

@@ -214,4 +214,4 @@ def correlation_time(residual: np.ndarray) -> np.ndarray:
     rho = covariance / np.maximum(covariance[0], 1e-300)
     # noise of an estimate of zero: what is less than two of its deviations ends the sum
     positive = np.cumprod(rho > 2.0 / np.sqrt(n), axis=0).astype(bool)
-    return np.maximum(2.0 * np.where(positive, rho, 0.0).sum(axis=0) - 1.0, 1.0)
+    return np.asarray(np.maximum(2.0 * np.where(positive, rho, 0.0).sum(axis=0) - 1.0, 1.0))

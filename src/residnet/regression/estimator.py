@@ -69,6 +69,17 @@ def require_data(x: Tensor, y: Tensor, names: Sequence[str], outputs: Sequence[s
     Raises:
         FitError: where they are not, or where their numbers of samples differ.
     """
+    require_pairs(x, y)
+    require_finite(x, names, "basis function")
+    require_finite(y, outputs, "output")
+
+
+def require_pairs(x: Tensor, y: Tensor) -> None:
+    """Check that there are inputs [N, J], and as many outputs [N, n].
+
+    Raises:
+        FitError: where there are not.
+    """
     if len(x) != len(y):
         raise FitError(f"{len(x)} samples of the inputs, but {len(y)} of the outputs; give pairs")
     if len(x) == 0 or x.shape[1] == 0:
@@ -76,8 +87,6 @@ def require_data(x: Tensor, y: Tensor, names: Sequence[str], outputs: Sequence[s
             f"a regression needs samples and regressors, given {len(x)} samples of"
             f" {x.shape[1]} regressors"
         )
-    require_finite(x, names, "basis function")
-    require_finite(y, outputs, "output")
 
 
 def fold_numbers(groups: Tensor | None, folds: int | None) -> Tensor:

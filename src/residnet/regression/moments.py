@@ -19,14 +19,14 @@ class Centred(NamedTuple):
     """Moments about the means of a part of the samples.
 
     Attributes:
-        count: number of samples.
+        samples: number of samples.
         mean_x: mean of x [J], less the shift of the moments.
         mean_y: mean of y [n], less the shift of the moments.
         xx: X'X about the means [J, J].
         xy: X'Y about the means [J, n].
     """
 
-    count: float
+    samples: float
     mean_x: Tensor
     mean_y: Tensor
     xx: Tensor

@@ -105,7 +105,7 @@ class PLSR(Estimator):
         xx, xy = centred.xx, centred.xy
         scale = torch.ones_like(centred.mean_x)
         if self.scale:
-            scale = (xx.diagonal() / (centred.count - 1)).sqrt()
+            scale = (xx.diagonal() / (centred.samples - 1)).sqrt()
             scale = torch.where(scale > 0, scale, torch.ones_like(scale))
         path = pls_path(xx / torch.outer(scale, scale), xy / scale[:, None], orders)
         return Candidates(path / scale[None, :, None], centred.mean_x, centred.mean_y)

@@ -89,7 +89,7 @@ class Ridge(Estimator):
 
     def _path(self, centred: Centred) -> Candidates:
         """Return the models of all penalties, from one eigendecomposition."""
-        n, xx, xy = centred.count, centred.xx, centred.xy
+        n, xx, xy = centred.samples, centred.xx, centred.xy
         scale = torch.ones_like(centred.mean_x)
         if self.scale:
             scale = (xx.diagonal() / n).sqrt()

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from residnet.regression.estimator import Estimator, column_names
+from residnet.regression.estimator import Estimator, column_names, require_pairs
 from residnet.regression.solutions import Coefficient, Solution
 from residnet.regression.sparse import NOTHING, Equation, Reduced, SearchConfig, find, reduce
 
@@ -62,6 +62,7 @@ class SparseRegression(Estimator):
             FitError: where the samples do not tell the candidates apart.
         """
         names, outputs = column_names(x, names, "x"), column_names(y, outputs, "y")
+        require_pairs(x, y)
         reduced = self._reduced(x.numpy(), y.numpy(), names)
         own = self._solution(reduced, self.search, names, outputs)
         if not self.gammas:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from residnet.regression.estimator import Estimator, fold_numbers
-from residnet.regression.moments import FoldMoments
+from residnet.regression.moments import CONSTANT, FoldMoments
 from residnet.regression.pls_path import pls_path
 from residnet.regression.solutions import Solution
 from residnet.regression.surface import Surface, surface
@@ -71,10 +71,14 @@ class SurfacePLSR(Estimator):
             x, y = x[train], y[train]
         outputs = range(y.shape[1])
         pick = found.simplest if self.choose == "simplest" else found.least
-        picks = [pick(output) for output in outputs]
         std_x, std_y = x.std(0), y.std(0)
+        varies = (std_y > CONSTANT * y.abs().amax(0)).tolist()
+        # an output that is constant but for rounding needs no basis function
+        picks = [pick(output) if varies[output] else (0, 0) for output in outputs]
         coefficients = y.new_zeros(x.shape[1], y.shape[1])
         for output, (order, count) in zip(outputs, picks, strict=True):
+            if order == 0:
+                continue
             kept = found.kept(output, order, count)
             e = (x[:, kept] - x[:, kept].mean(0)) / std_x[kept]
             f = (y[:, [output]] - y[:, output].mean()) / std_y[output]

@@ -117,7 +117,8 @@ class ExpressionLibrary(nn.Module):
         columns = torch.cat((torch.ones_like(z[..., :1]), z), dim=-1)
         for level in self.levels:
             columns = level(columns)
-        return self.terms(columns)
+        values: Tensor = self.terms(columns)
+        return values
 
 
 class Weights(Table):

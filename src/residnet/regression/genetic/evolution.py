@@ -159,9 +159,8 @@ def evolve(
 
 
 def _thinned(indices: np.ndarray, most: int) -> np.ndarray:
-    return indices[
-        np.unique(np.linspace(0, len(indices) - 1, min(most, len(indices))).round().astype(int))
-    ]
+    kept = np.linspace(0, len(indices) - 1, min(most, len(indices))).round().astype(int)
+    return np.asarray(indices[np.unique(kept)])
 
 
 @contextmanager

@@ -118,7 +118,8 @@ def _factor(features: Callable[[Tensor], Tensor], whiten: Tensor, x: Tensor, y: 
 
 
 def _triangle(rows: Tensor) -> Tensor:
-    return torch.linalg.qr(rows, mode="r")[1]
+    factor: Tensor = torch.linalg.qr(rows, mode="r")[1]
+    return factor
 
 
 def _weights(factor: Tensor, outputs: int, penalties: Sequence[float]) -> tuple[Tensor, Tensor]:

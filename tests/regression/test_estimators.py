@@ -1,0 +1,235 @@
+"""Every estimator on data that determine little, and on random draws beside scikit-learn.
+
+What an estimator is given it either answers rightly or refuses in one line.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from sklearn.cross_decomposition import PLSRegression
+from sklearn.kernel_ridge import KernelRidge as ReferenceKernelRidge
+from sklearn.linear_model import ElasticNet as ReferenceElasticNet
+from sklearn.linear_model import LinearRegression
+from sklearn.linear_model import Ridge as ReferenceRidge
+
+from residnet.core.errors import FitError
+from residnet.regression.elastic_net import ElasticNet
+from residnet.regression.estimator import Estimator
+from residnet.regression.genetic.config import EquationSearchConfig, EvolutionConfig
+from residnet.regression.genetic.equations import GeneticEquations
+from residnet.regression.kernel.functions import Polynomial, Rbf
+from residnet.regression.kernel.ridge import KernelRidge
+from residnet.regression.least_squares import CentredLeastSquares, LeastSquares
+from residnet.regression.plsr import PLSR
+from residnet.regression.ridge import Ridge
+from residnet.regression.solutions import Solution
+from residnet.regression.sparse_regression import SparseRegression
+from residnet.regression.surface_plsr import SurfacePLSR
+
+Make = Callable[[int, int], Estimator]
+LINEAR: dict[str, Make] = {
+    "least squares": lambda j, n: LeastSquares(),
+    "ridge penalties": lambda j, n: LeastSquares((1e-8, 1e-2)),
+    "centred": lambda j, n: CentredLeastSquares(),
+    "plsr": lambda j, n: PLSR(folds=2),
+    "nipals": lambda j, n: PLSR(min(2, j), folds=2, algorithm="nipals"),
+    "ridge": lambda j, n: Ridge((1e-10, 1e-3), folds=2, alternatives=True),
+    "elastic net": lambda j, n: ElasticNet(0.5, folds=2),
+    "surface": lambda j, n: SurfacePLSR("least"),
+    "sparse": lambda j, n: SparseRegression(gammas=(0.0, 1.0)),
+}
+OTHERS: dict[str, Make] = {
+    "rbf": lambda j, n: KernelRidge(Rbf(sigma=(3.0,)).build(j, n), (1e-6, 1e-2), folds=2),
+    "polynomial": lambda j, n: KernelRidge(Polynomial().build(j, n), (1e-6, 1e-2), folds=2),
+    "genetic": lambda j, n: GeneticEquations(
+        EquationSearchConfig(evolution=EvolutionConfig(population=10, generations=1))
+    ),
+}
+ALL = LINEAR | OTHERS
+
+
+def drawn(samples: int, j: int, n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Inputs and outputs that are linear in them, but for noise."""
+    random = np.random.default_rng(seed)
+    x = random.normal(size=(samples, j)) * 10.0 ** random.uniform(-2, 2, j)
+    return x, x / (x.std(0) + 1e-3) @ random.normal(size=(j, n)) + 0.1 * random.normal(
+        size=(samples, n)
+    )
+
+
+def case(name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Data that ask for trouble."""
+    x, y = drawn(60, 4, 2)
+    if name == "rank deficient":
+        x[:, 3] = 2.0 * x[:, 0] - x[:, 1]
+    elif name == "one sample":
+        x, y = x[:1], y[:1]
+    elif name == "no sample":
+        x, y = x[:0], y[:0]
+    elif name == "no column":
+        x = x[:, :0]
+    elif name == "constant column":
+        x[:, 2] = 7.3
+    elif name == "zero column":
+        x[:, 2] = 0.0
+    elif name == "fewer samples than columns":
+        x, y = drawn(8, 12, 2)
+    elif name == "one output":
+        y = y[:, :1]
+    elif name == "one column":
+        x = x[:, :1]
+    elif name == "constant output":
+        y[:, 1] = 5.1
+    elif name == "zero output":
+        y[:, 1] = 0.0
+    elif name == "not finite":
+        x[7, 2] = np.nan
+    elif name == "not finite output":
+        y[7, 1] = np.inf
+    elif name == "repeated sample":
+        x, y = np.repeat(x[:1], 60, axis=0), np.repeat(y[:1], 60, axis=0)
+    elif name == "far from zero":
+        x += 1e6 * x.std(0)
+    elif name == "huge":
+        x, y = 1e150 * x, 1e150 * y
+    return x, y
+
+
+CASES = [
+    "plain",
+    "rank deficient",
+    "one sample",
+    "no sample",
+    "no column",
+    "constant column",
+    "zero column",
+    "fewer samples than columns",
+    "one output",
+    "one column",
+    "constant output",
+    "zero output",
+    "not finite",
+    "not finite output",
+    "repeated sample",
+    "far from zero",
+    "huge",
+]
+ANSWERED_BY_ALL = {"plain", "one output"}
+REFUSED_BY_ALL = {"no sample", "no column", "not finite", "not finite output"}
+
+
+@pytest.mark.parametrize("trouble", CASES)
+@pytest.mark.parametrize("kind", ALL)
+def test_the_answer_is_right_or_refused_in_one_line(kind: str, trouble: str) -> None:
+    """Right: coefficients are finite, and no prediction is far beyond the outputs."""
+    x, y = (torch.from_numpy(part) for part in case(trouble))
+    groups = torch.arange(len(x)) * 4 // max(len(x), 1)
+    refused = ""
+    solutions: list[Solution] = []
+    try:
+        solutions = ALL[kind](x.shape[1], y.shape[1]).fit(x, y, groups)
+    except FitError as error:
+        refused = str(error)
+    assert "\n" not in refused
+    assert bool(refused) != bool(solutions)
+    assert trouble not in ANSWERED_BY_ALL or not refused, refused
+    assert trouble not in REFUSED_BY_ALL or refused
+    for solution in solutions:
+        assert all(bool(torch.isfinite(value).all()) for value in solution.state.values())
+        if kind in LINEAR and bool(solution.coefficients.any()):
+            assert solution.coefficients.shape == (x.shape[1], y.shape[1])
+            reach = y - y.mean(0) if "intercept" in solution.state else y
+            left = y - solution.predict(x)
+            limit = 1.01 * reach.square().sum(0) + 1e-9 * y.square().sum(0)
+            assert bool((left.square().sum(0) <= limit).all())
+
+
+def reference(kind: str, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Predictions of scikit-learn with the same settings."""
+    std = x.std(0)
+    if kind == "least squares":
+        model, seen = LinearRegression(fit_intercept=False), x
+    elif kind == "centred":
+        model, seen = LinearRegression(), x
+    elif kind == "plsr":
+        model, seen = (
+            PLSRegression(2, scale=False, tol=1e-28, max_iter=20_000),
+            x / x.std(0, ddof=1),
+        )
+    elif kind == "ridge":
+        model, seen = ReferenceRidge(alpha=1e-2 * len(x), solver="svd"), x / std
+    else:
+        model, seen = ReferenceElasticNet(alpha=0.01, l1_ratio=0.5, tol=1e-12, max_iter=10**6), x
+    return np.asarray(model.fit(seen, y).predict(seen)).reshape(len(x), -1)
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("kind", ["least squares", "centred", "plsr", "ridge"])
+def test_random_draws_are_as_scikit_learn_has_them(kind: str, seed: int) -> None:
+    random = np.random.default_rng(seed)
+    j, n = int(random.integers(2, 9)), int(random.integers(1, 5))
+    x, y = drawn(int(random.integers(j + 5, 80)), j, n, seed)
+    estimators: dict[str, Estimator] = {
+        "least squares": LeastSquares(),
+        "centred": CentredLeastSquares(),
+        "plsr": PLSR(2),
+        "ridge": Ridge((1e-2,)),
+    }
+    found = estimators[kind].fit(torch.from_numpy(x), torch.from_numpy(y))[0]
+    mine = found.predict(torch.from_numpy(x)).numpy()
+    np.testing.assert_allclose(mine, reference(kind, x, y), atol=1e-7 * y.std())
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_chosen_elastic_net_is_scikit_learns_at_its_penalty(seed: int) -> None:
+    x, y = drawn(80, 5, 2, seed)
+    x = (x - x.mean(0)) / x.std(0)
+    groups = torch.arange(80) // 20
+    found = ElasticNet(0.5).fit(torch.from_numpy(x), torch.from_numpy(y), groups)[0]
+    for output, alpha in enumerate(found.choice["alpha"]):
+        model = ReferenceElasticNet(alpha=alpha, l1_ratio=0.5, tol=1e-4, max_iter=3000)
+        model.fit(x, y[:, output])
+        np.testing.assert_allclose(found.coefficients[:, output], model.coef_, atol=1e-3)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_kernel_ridge_is_scikit_learns_for_any_number_of_outputs(seed: int) -> None:
+    n = 1 + seed
+    x, y = drawn(60, 3, n, seed)
+    x = (x - x.mean(0)) / x.std(0)
+    kernel = Rbf(sigma=(5.0,)).build(3, n)
+    inputs = torch.from_numpy(x)
+    estimator = KernelRidge(kernel, (1e-3,), folds=3)
+    found = estimator.fit(inputs, torch.from_numpy(y), torch.arange(60) // 20)[0]
+    kernel.load_state_dict(found.state, strict=False)
+    model = ReferenceKernelRidge(alpha=1e-3 * 60, kernel="rbf", gamma=0.1).fit(x, y)
+    np.testing.assert_allclose(kernel(inputs), model.predict(x).reshape(60, n), atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["plsr", "ridge", "elastic net", "surface", "rbf"])
+def test_without_groups_nothing_is_chosen(kind: str) -> None:
+    x, y = (torch.from_numpy(part) for part in drawn(60, 4, 2))
+    with pytest.raises(FitError, match=r"groups|one run or segment only"):
+        ALL[kind](4, 2).fit(x, y)
+
+
+def test_the_numbers_of_samples_must_agree() -> None:
+    x, y = (torch.from_numpy(part) for part in drawn(60, 4, 2))
+    for make in ALL.values():
+        with pytest.raises(FitError, match="60 samples of the inputs, but 59 of the outputs"):
+            make(4, 2).fit(x, y[:59], torch.arange(60) // 15)
+
+
+def test_settings_stay_as_they_were() -> None:
+    """`fit` learns nothing into the estimator: a second fit of other data is as a first one."""
+    x, y = (torch.from_numpy(part) for part in drawn(60, 4, 2))
+    groups = torch.arange(60) // 15
+    for make in LINEAR.values():
+        estimator = make(4, 2)
+        estimator.fit(x.flip(0) ** 2, y.exp(), groups)
+        again, fresh = estimator.fit(x, y, groups)[0], make(4, 2).fit(x, y, groups)[0]
+        torch.testing.assert_close(again.coefficients, fresh.coefficients, rtol=1e-9, atol=1e-12)
