@@ -8,7 +8,7 @@ from typing import Any
 
 from residnet.report.blocks import Cell, Figure
 from residnet.report.figures.files import read_figures
-from residnet.report.format import number
+from residnet.report.format import minus, number
 
 
 def beside_published(value: float | None, published: float | None, digits: int = 4) -> Cell:
@@ -19,9 +19,9 @@ def beside_published(value: float | None, published: float | None, digits: int =
         published: number that the document prints; None where it prints none.
         digits: significant digits.
     """
-    return Cell(
-        number(value, digits), "" if published is None else f"published {number(published, digits)}"
-    )
+    # the document's number keeps the digits that it is printed with
+    note = "" if published is None else f"published {minus(f'{published:.{digits}g}')}"
+    return Cell(number(value, digits), note)
 
 
 def joined(values: Sequence[float], digits: int = 3) -> str:

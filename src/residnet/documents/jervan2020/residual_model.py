@@ -199,7 +199,8 @@ def constant_force(x: Tensor, y: Tensor, unit_forces: Tensor) -> Tensor:
     left = left[:, singular > _RANK_TOLERANCE * singular[0]]
 
     def unexplained(part: Tensor) -> Tensor:
-        return part - left @ (left.T @ part)
+        rest: Tensor = part - left @ (left.T @ part)
+        return rest
 
     weight = unexplained(y).std(0).clamp(min=1e-9)
     design = torch.cat(
@@ -215,4 +216,5 @@ def constant_force(x: Tensor, y: Tensor, unit_forces: Tensor) -> Tensor:
             "a force constant in earth axes does not show: the vessel kept its heading; give a run"
             " that turns, or leave earth out"
         )
-    return torch.linalg.lstsq(design, target[:, None]).solution[:, 0]
+    solution: Tensor = torch.linalg.lstsq(design, target[:, None]).solution
+    return solution[:, 0]

@@ -13,6 +13,12 @@ from residnet.report.blocks import Section, Table, Text
 from residnet.report.figures.force import draw_surface, draw_weights
 from residnet.report.format import number
 
+ABOUT_COEFFICIENTS = (
+    "The force of a model is that of the believed hull plus the sum of coefficient times basis"
+    " function, in SI units. A weight is the magnitude of the coefficient of scaled variables: it"
+    " says how much a basis function matters."
+)
+
 
 def fit_as_json(terms: Sequence[str], fit: Fit) -> dict[str, Any]:
     """Return a fitted model as it stands in the results: terms, coefficients and weights."""
@@ -56,15 +62,10 @@ def coefficients_section(
         for values in others.values():
             cells += [number(value, 4) for value in values.get(term, absent)]
         table.add(term, cells)
-    about = (
-        "The force of the model is that of the believed hull plus the sum of coefficient times"
-        " basis function, in SI units. A weight is the magnitude of the coefficient of scaled"
-        " variables: it says how much a basis function matters."
-    )
     chosen = notes_text(notes)
     return Section(
-        f"Coefficients of {name}",
-        [Text([about, f"Chosen by the estimator: {chosen}." if chosen else ""]), table],
+        name,
+        [Text(f"Chosen by the estimator: {chosen}." if chosen else ""), table],
         folded=True,
     )
 

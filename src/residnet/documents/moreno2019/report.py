@@ -18,7 +18,7 @@ import numpy as np
 from residnet.core.errors import UsageError
 from residnet.documents.moreno2019.published import RMSE
 from residnet.judge.residual_series import block_interval
-from residnet.report.blocks import Cell, Figure, Section, Table
+from residnet.report.blocks import Block, Cell, Figure, Section, Table
 from residnet.report.figures.style import MEASURED, RC, collect, legend_above, new_figure, save
 from residnet.report.format import DEG, fixed
 from residnet.report.run_reader import RunFiles, StoredWindow
@@ -72,7 +72,7 @@ def sections(run: Path) -> list[Section]:
     ]
     content = {"schema": "residnet.moreno2019/1", "rows": rows, "pairs": pairs}
     (run / "study.json").write_text(json.dumps(content, indent=1) + "\n")
-    blocks = [_errors(rows), _joint(pairs), _draw(records["test"], run)]
+    blocks: list[Block] = [_errors(rows), _joint(pairs), _draw(records["test"], run)]
     return [Section("Document 001 (Moreno-Salinas et al. 2019)", blocks)]
 
 

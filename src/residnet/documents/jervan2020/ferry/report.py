@@ -10,28 +10,12 @@ from residnet.documents.cells import beside_published, joined, notes_text, pictu
 from residnet.documents.jervan2020.ferry.config import FerrySettings
 from residnet.documents.jervan2020.published import Published
 from residnet.documents.jervan2020.residual_model import AXES
-from residnet.documents.jervan2020.residual_pages import coefficients_section
-from residnet.report.blocks import Block, Bullets, Cell, Section, Table
+from residnet.documents.jervan2020.residual_pages import ABOUT_COEFFICIENTS, coefficients_section
+from residnet.report.blocks import Block, Bullets, Cell, Section, Table, Text
 from residnet.report.format import DEG, number
 
 Results = Mapping[str, Any]
 _BELIEVED = "believed"
-_TRACKING = (
-    "feed-forward",
-    "mean position error m",
-    "mean square m^2",
-    "mean heading error deg",
-    "mean abs force, surge N",
-    "sway N",
-    "yaw N m",
-    "of which feedback, surge N",
-    "sway N",
-    "yaw N m",
-    "power, position W",
-    "heading W",
-    "IAEW, position m s J",
-    "heading rad s J",
-)
 
 
 def verdict(results: Results) -> list[str]:
@@ -91,7 +75,7 @@ def sections(config: FerrySettings, results: Results, run: Path) -> list[Section
     for kind, title in (("course", "Course in closed loop"), ("crossing", "Operational crossing")):
         if results[kind]:
             blocks = [
-                _tracking(config, results[kind], kind),
+                *_tracking(config, results[kind], kind),
                 *pictures(run, f"errors_{kind}", f"forces_{kind}"),
             ]
             out.append(Section(title, blocks))
@@ -99,7 +83,7 @@ def sections(config: FerrySettings, results: Results, run: Path) -> list[Section
         flights = results["feed_forward_alone"]
         blocks = [
             _alone(config, flights),
-            _tracking(config, flights, "alone"),
+            *_tracking(config, flights, "alone"),
             *pictures(run, "errors_feed_forward_alone"),
         ]
         out.append(Section("Feed-forward without feedback", blocks))
@@ -107,14 +91,21 @@ def sections(config: FerrySettings, results: Results, run: Path) -> list[Section
         out.append(Section("The vessel as it is later", [_later(results["later"])]))
     if causes := [model["not_forward"] for model in models.values() if model["not_forward"]]:
         out.append(Section("Models that cannot run forward in time", [Bullets(causes)]))
-    for name, model in models.items():
+    out.append(Section("Coefficients", [Text(ABOUT_COEFFICIENTS), *_coefficients(config, results)]))
+    return [*out, Section("Weights and surfaces", pictures(run, "surface_", "weights_"), True)]
+
+
+def _coefficients(config: FerrySettings, results: Results) -> list[Section]:
+    """Return a folded section for each model (Table 4.11)."""
+    out = []
+    for name, model in results["models"].items():
         model_config = config.models[name]
         others = {
             "true": {} if model_config.on else results["true_coefficients"],
             "published": model_config.published.coefficients,
         }
         out.append(coefficients_section(name, model, model["notes"], others))
-    return [*out, Section("Weights and surfaces", pictures(run, "surface_", "weights_"), True)]
+    return out
 
 
 def _residuals(config: FerrySettings, results: Results) -> Table:
@@ -143,33 +134,44 @@ def _published(config: FerrySettings, name: str) -> Published:
     return config.published if name == _BELIEVED else config.models[name].published
 
 
-def _tracking(config: FerrySettings, flights: Mapping[str, Results], kind: str) -> Table:
-    """Return the table of how well a course is followed (Tables 4.3, 4.4, 4.9, 4.10, 4.12, 4.13).
+def _tracking(config: FerrySettings, flights: Mapping[str, Results], kind: str) -> list[Table]:
+    """Return how well a course is followed and with which forces.
+
+    Tables 4.4, 4.10, 4.12 and 4.13 of the document; Tables 4.3 and 4.9.
 
     Args:
         config: the study, with published figures.
         flights: metrics by model.
         kind: `course`, `crossing` or `alone`, for which the document prints different figures.
     """
-    about = {
-        "course": "The whole course; IAEW is the integral of the error times the work (3.18).",
-        "crossing": "The whole crossing; IAEW is the integral of the error times the work (3.18).",
-        "alone": "The same course without feedback.",
-    }
-    table = Table(_TRACKING, caption=about[kind])
+    errors = Table(
+        [
+            "feed-forward",
+            *("mean position error m", "mean square m^2", "mean heading error deg"),
+            *("power, position W", "power, heading W"),
+            *("IAEW, position m s J", "IAEW, heading rad s J"),
+        ],
+        caption="IAEW is the integral of the error times the work (3.18).",
+    )
+    forces = Table(
+        ["feed-forward", *("surge N", "sway N", "yaw N m") * 2],
+        groups=[("mean absolute force", 3), ("mean absolute feedback", 3)],
+    )
     for name, metrics in flights.items():
         printed = _of_kind(_published(config, name), kind)
-        cells = [
-            beside_published(metrics["position_mae"], printed.position_mae),
-            beside_published(metrics["position_mse"], printed.position_mse),
-            beside_published(metrics["heading_mae"] * DEG, printed.heading_mae),
-            *_each(metrics["tau"], printed.tau),
-            *_each(metrics["feedback"], printed.feedback),
-            *_each(metrics["power"], printed.crossing_power),
-            *_each(metrics["iaew"], None),
-        ]
-        table.add(name, cells)
-    return table
+        errors.add(
+            name,
+            [
+                beside_published(metrics["position_mae"], printed.position_mae),
+                beside_published(metrics["position_mse"], printed.position_mse),
+                beside_published(metrics["heading_mae"] * DEG, printed.heading_mae),
+                *_each(metrics["power"], printed.crossing_power),
+                *_each(metrics["iaew"], None),
+            ],
+        )
+        tau = _each(metrics["tau"], printed.tau)
+        forces.add(name, [*tau, *_each(metrics["feedback"], printed.feedback)])
+    return [errors, forces]
 
 
 def _each(values: Sequence[float], published: Sequence[float] | None) -> list[Cell]:

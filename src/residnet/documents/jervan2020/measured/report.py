@@ -10,12 +10,13 @@ from residnet.documents.cells import beside_published, listed, notes_text, pictu
 from residnet.documents.jervan2020.measured.config import ForceSettings
 from residnet.documents.jervan2020.measured.study import better
 from residnet.documents.jervan2020.residual_model import AXES
-from residnet.documents.jervan2020.residual_pages import coefficients_section
+from residnet.documents.jervan2020.residual_pages import ABOUT_COEFFICIENTS, coefficients_section
 from residnet.report.blocks import Bullets, Cell, Section, Table, Text
 from residnet.report.format import fixed, interval, number, plural, signed
 
 Results = Mapping[str, Any]
 _BASE = ("zero", "believed")
+_ABOUT = Text(ABOUT_COEFFICIENTS)
 
 
 def verdict(results: Results) -> list[str]:
@@ -135,8 +136,11 @@ def sections(config: ForceSettings, results: Results, run: Path) -> list[Section
     causes = [model["not_forward"] for model in results["models"].values() if model["not_forward"]]
     if causes:
         out.append(Section("Models that cannot run forward in time", [Bullets(causes)]))
-    for name, model in results["models"].items():
-        out.append(coefficients_section(name, model, model["all"], {}))
+    coefficients = [
+        coefficients_section(name, model, model["all"], {})
+        for name, model in results["models"].items()
+    ]
+    out.append(Section("Coefficients of models fitted to all samples", [_ABOUT, *coefficients]))
     return [*out, Section("Weights and surfaces", pictures(run, "surface_", "weights_"), True)]
 
 
