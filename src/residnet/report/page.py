@@ -122,8 +122,8 @@ def _anchor(title: str) -> str:
 
 
 def _breakable(text: str) -> Markup:
-    """Return escaped text that may break after underscores and slashes, never inside words."""
-    return Markup(re.sub(r"([_/])", r"\1<wbr>", str(escape(text))))
+    """Return escaped text that may break after underscores, never inside words."""
+    return Markup(str(escape(text)).replace("_", "_<wbr>"))
 
 
 def _embedded(path: Path) -> str:

@@ -9,7 +9,15 @@ from typing import Any
 import numpy as np
 
 from residnet.report.figures.files import Drawing
-from residnet.report.figures.style import MEASURED, SOLID, WIDTH, collect, legend_above, new_figure
+from residnet.report.figures.style import (
+    MEASURED,
+    SOLID,
+    WIDTH,
+    collect,
+    legend_above,
+    new_figure,
+    styled,
+)
 from residnet.report.run_reader import RunFiles
 
 _DRAWN: dict[str, Any] = {"color": SOLID["color"], "alpha": 0.12, "linewidth": 0.7, "zorder": 1}
@@ -60,6 +68,7 @@ def of_booklet(run: RunFiles) -> Iterator[Drawing]:
         )
 
 
+@styled
 def _circles(frame: Any, pages: Sequence[Mapping[str, Any]], length: float) -> Any:
     figure = new_figure(0.66 * WIDTH)
     axes = figure.subplots()
@@ -103,6 +112,7 @@ def _circles(frame: Any, pages: Sequence[Mapping[str, Any]], length: float) -> A
     return figure
 
 
+@styled
 def _zigzags(frame: Any, pages: Sequence[Mapping[str, Any]], level: float) -> Any:
     columns = 2 if len(pages) > 1 else 1
     lines = math.ceil(len(pages) / columns)

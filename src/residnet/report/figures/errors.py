@@ -10,7 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from residnet.report.figures.style import collect, legend_above, new_figure, short_label, styles
+from residnet.report.figures.style import (
+    collect,
+    legend_above,
+    new_figure,
+    short_label,
+    styled,
+    styles,
+)
 from residnet.report.run_reader import Content, RunFiles, StoredWindow
 
 _DEG = 180.0 / math.pi
@@ -61,6 +68,7 @@ def growth(windows: Sequence[StoredWindow], model: str) -> tuple[np.ndarray, np.
     return ((np.arange(count) + 0.5) * longest / count)[keep], error[keep]
 
 
+@styled
 def horizon(run: RunFiles, windows: Sequence[StoredWindow]) -> Any:
     """Error against horizon of every model, logarithmic; the windows are those of one protocol."""
     figure = new_figure(5.4)
@@ -110,6 +118,7 @@ def _plain_log(axes: Any) -> None:
     axes.yaxis.set_minor_formatter(NullFormatter())
 
 
+@styled
 def bars(run: RunFiles, protocol: str) -> Any:
     """RMSE by model, train beside test, with 95 % intervals; as figures 16 and 17 of document 003.
     `zero` is left out: it would flatten the rest.
@@ -172,6 +181,7 @@ def _alpha(run: RunFiles, split: str) -> float:
     return 0.85 if split == run.focus else 0.3
 
 
+@styled
 def residuals(run: RunFiles, table: Mapping[str, np.ndarray], models: Sequence[str]) -> Any:
     """Residual target against prediction, one line of panels for each head; table: columns model,
     axis, target, predicted (SI).
@@ -225,6 +235,7 @@ def r_squared(target: np.ndarray, predicted: np.ndarray) -> float:
     return 1.0 - float(np.sum((target - predicted) ** 2)) / spread if spread > 0 else math.nan
 
 
+@styled
 def learning_curves(run: RunFiles, models: Sequence[str]) -> Any:
     """Loss and free-run error on validation data by epoch, one column for each trained head; stages
     are parted by lines.

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from residnet.report.blocks import Figure, Section
+from residnet.report.figures.style import save
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -30,31 +31,26 @@ class Drawing:
     figure: Canvas
 
 
-def write_drawings(folder: Path, draw: Callable[[], Iterable[Drawing]]) -> list[Figure]:
-    """Draw in the style of the reports and write one PNG for each drawing.
+def write_drawings(folder: Path, drawings: Iterable[Drawing]) -> list[Figure]:
+    """Write one PNG for each drawing.
 
     Figures that an earlier call left in the folder are replaced; other pictures stay.
 
     Args:
         folder: for the pictures.
-        draw: gives the drawings, in the order in which a page shows them.
+        drawings: in the order in which a page shows them.
 
     Returns:
         The written figures.
     """
-    from matplotlib import rc_context
-
-    from residnet.report.figures.style import RC, save
-
     for figure in read_figures(folder):
         figure.path.unlink()
     out: list[Figure] = []
-    with rc_context(RC):
-        for drawing in draw():
-            # the number keeps the order for whoever lists the folder
-            path = folder / f"{len(out) + 1:02d}_{drawing.name}.png"
-            save(drawing.figure, path, drawing.title, drawing.caption)
-            out.append(Figure(path, drawing.title, drawing.caption))
+    for drawing in drawings:
+        # the number keeps the order for whoever lists the folder
+        path = folder / f"{len(out) + 1:02d}_{drawing.name}.png"
+        save(drawing.figure, path, drawing.title, drawing.caption)
+        out.append(Figure(path, drawing.title, drawing.caption))
     return out
 
 

@@ -30,7 +30,7 @@ def write_figures(run: RunFiles) -> list[Figure]:
     Raises:
         UsageError: where the folder holds no metrics.json.
     """
-    return write_drawings(run.path / "figures", lambda: drawings(run))
+    return write_drawings(run.path / "figures", drawings(run))
 
 
 def drawings(run: RunFiles) -> Iterator[Drawing]:

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import wraps
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
 from residnet.report.run_reader import RunFiles
+
+_Arguments = ParamSpec("_Arguments")
+_Result = TypeVar("_Result")
 
 DPI = 140
 WIDTH = 7.0
@@ -76,8 +81,21 @@ RC: Any = {
 }
 
 
+def styled(draw: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+    """Return a drawing function that draws in the style of the reports wherever it is called."""
+
+    @wraps(draw)
+    def drawn(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
+        from matplotlib import rc_context
+
+        with rc_context(RC):
+            return draw(*args, **kwargs)
+
+    return drawn
+
+
 def new_figure(height: float) -> Any:
-    """A figure `WIDTH` wide and `height` inches high, without pyplot."""
+    """Return a figure `WIDTH` wide and `height` inches high, made without pyplot."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -111,8 +129,9 @@ def save(figure: Any, path: Path, title: str, caption: str) -> None:
 
 
 def styles(run: RunFiles) -> dict[str, dict[str, Any]]:
-    """Line properties of each model: zero, baseline and truth have their own; the selected head is
-    always the solid blue one.
+    """Return the line properties of each model.
+
+    Zero, baseline and truth have their own; the selected head is always the solid blue one.
     """
     fixed: dict[str, tuple[str, Any]] = {
         "zero": (_GREY, ":"),
@@ -140,13 +159,13 @@ def styles(run: RunFiles) -> dict[str, dict[str, Any]]:
 
 
 def short_label(run: RunFiles, model: str) -> str:
-    """Name of a model in figures, where a long one would run over its neighbours."""
+    """Return the name of a model in figures, where a long one would run over its neighbours."""
     full = run.label(model)
     return full if len(model) <= 20 else full.replace(model, model[:19] + "…")
 
 
 def legend_above(figure: Any, handles: dict[str, Any]) -> None:
-    """One legend for the whole figure, above its panels, in as many columns as its width holds."""
+    """Put one legend above the panels of a figure, in as many columns as its width holds."""
     # in points: the sample and its spaces, then the text at 9 pt
     widths = [46.0 + 4.9 * len(text) for text in handles]
     columns = max(len(widths), 1)

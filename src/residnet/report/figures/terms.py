@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from residnet.report.figures.files import Drawing
-from residnet.report.figures.style import new_figure
+from residnet.report.figures.style import new_figure, styled
 from residnet.report.run_reader import RunFiles
 
 _AXES = (
@@ -43,6 +43,7 @@ def of_terms(run: RunFiles) -> Iterator[Drawing]:
         )
 
 
+@styled
 def parts(frame: Any) -> Any:
     """A panel for each axis: its terms, their sum, and the target.
 

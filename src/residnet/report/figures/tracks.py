@@ -16,6 +16,7 @@ from residnet.report.figures.style import (
     collect,
     legend_above,
     new_figure,
+    styled,
     styles,
 )
 from residnet.report.run_reader import RunFiles, StoredWindow
@@ -75,6 +76,7 @@ def shown(run: RunFiles) -> list[str]:
     return list(dict.fromkeys(name for name in (run.baseline, run.truth, head) if name is not None))
 
 
+@styled
 def tracks(run: RunFiles, windows: Sequence[StoredWindow]) -> Any:
     """Measured and predicted tracks, one panel for each window; north up, equal scales, the start
     at the origin.
@@ -120,6 +122,7 @@ def tracks(run: RunFiles, windows: Sequence[StoredWindow]) -> Any:
     return figure
 
 
+@styled
 def history(run: RunFiles, window: StoredWindow) -> Any:
     """Velocities and heading against time, measured and predicted; masked samples are gaps on a
     grey ground.

@@ -33,8 +33,9 @@ def section(run: RunFiles) -> Section | None:
         if not page["split"]:
             parts: list[Block] = [_table(booklet, page)]
             if page["faults"]:
-                left_out = f"{plural(page['faults'], 'draw')} did not end the manoeuvre"
-                parts.append(Bullets([f"{left_out} and do not count."], warning=True))
+                draws = plural(page["faults"], "draw")
+                text = f"The intervals leave out {draws} that did not end the manoeuvre."
+                parts.append(Bullets([text], warning=True))
             blocks.append(Section(page_title(page), parts))
     repeated = [page for page in booklet["pages"] if page["split"]]
     if repeated:

@@ -156,7 +156,7 @@ def _worst(run: RunFiles, lead: str, known: Content) -> Table | None:
     table = Table(
         [
             "worst windows",
-            "starts at, log's clock [s]",
+            "log time at start [s]",
             "NRMSE",
             *(f"{title_of(name)} [{run.unit(name)[0]}]" for name in channels),
             "position, end [m]",
