@@ -7,10 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from made_run import made_run
+from PIL import Image
 
 from residnet.core.errors import DataError
 from residnet.judge.bootstrap import blocks, intervals
-from residnet.report.comparison import Variant, as_text, draw, table, window_nrmse
+from residnet.report.comparison import Variant, table, window_nrmse
+from residnet.report.figures.files import write_drawings
+from residnet.report.figures.study import differences
+from residnet.report.sections.study import variants_table
 
 KEYS = {"T30": tuple((f"log{i // 3}", i % 3) for i in range(18))}
 
@@ -58,21 +62,25 @@ def test_pairing_sees_what_the_spread_of_windows_hides() -> None:
 def test_one_seed_has_no_spread() -> None:
     rows = table(variants(0.05, seeds=1), KEYS, "recipe")
     assert rows[1]["nrmse_sd"] is None
-    assert "(" not in as_text(rows, "recipe").splitlines()[2]
+    lines = variants_table(rows, "recipe").text().splitlines()
+    assert lines[2].split()[:3] == ["recipe", f"{rows[0]['nrmse_mean']:.4f}", "–"]
 
 
-def test_text_and_picture(tmp_path: Path) -> None:
+def test_table_and_picture(tmp_path: Path) -> None:
     rows = table(variants(0.05), KEYS, "recipe")
-    lines = as_text(rows, "recipe").splitlines()
-    assert [line.split("|")[1].strip() for line in lines[2:]] == ["recipe", "other"]
-    assert "`a=1`" in lines[3]
-    assert {line.count("|") for line in lines} == {6}
-    draw(rows, "recipe", tmp_path / "study.png")
-    from PIL import Image
-
-    image = Image.open(tmp_path / "study.png")
-    assert image.width > 600
-    assert image.info["Title"]
+    shown = variants_table(rows, "recipe")
+    recipe, other = shown.rows
+    assert (recipe.label, other.label) == ("recipe", "other")
+    assert [cell.text for cell in recipe.cells[2:4]] == ["", ""]
+    low, high = rows[1]["difference_ci95"]
+    assert other.cells[3].text == f"+{low:.4f} to +{high:.4f}"
+    assert other.cells[3].mark == "best"
+    assert other.cells[-1].text == "a=1"
+    drawing = differences(rows, "recipe")
+    (figure,) = write_drawings(tmp_path, [drawing])
+    with Image.open(figure.path) as picture:
+        assert picture.width > 600
+        assert picture.info["Title"] == figure.title
 
 
 def test_a_run_without_the_model(tmp_path: Path) -> None:

@@ -51,6 +51,8 @@ def test_findings_above_a_note_stand_in_a_table_and_notes_below(tmp_path: Path) 
         )
     ]
     assert '<a href="#data-doctor">Data doctor</a>' in text
-    assert all(f'<th class="label"><div>{code.replace("_", " ")}</div></th>' in page for code in loud)
+    assert all(
+        f'<th class="label"><div>{code.replace("_", " ")}</div></th>' in page for code in loud
+    )
     assert "split the log there (mask kind: gap)" in page
     assert "10 Hz over" in page

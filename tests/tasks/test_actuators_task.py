@@ -92,7 +92,7 @@ def test_logs_become_lines_of_a_vessel_file(
         < vessel.actuators.forward[2]
         < numbers["forward"]["c2"]["high"]
     )
-    assert (tmp_path / "run" / "figures" / "actuators.png").stat().st_size > 5000
+    assert (tmp_path / "run" / "figures" / "01_actuators.png").stat().st_size > 5000
     inputs = json.loads((tmp_path / "run" / "provenance.json").read_text())["inputs"]
     assert len(inputs) == 3
 

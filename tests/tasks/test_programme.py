@@ -104,7 +104,7 @@ def test_a_vessel_leaves_logs_indices_and_figures(ship: Path) -> None:
         circle["indices"]["advance"] / 4.88
     )
     assert not any(row["timed_out"] for row in content["rows"])
-    figures = {path.stem for path in (ship / "figures").glob("*.png")}
+    figures = {path.stem[3:] for path in (ship / "figures").glob("*.png")}
     assert figures == {"tracks_1", *(f"history_{name}" for name in logs)}
     for path in (ship / "figures").glob("*.png"):
         with Image.open(path) as picture:

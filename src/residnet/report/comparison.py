@@ -1,4 +1,4 @@
-"""Variants of one recipe against each other: the same windows, several seeds, paired intervals."""
+"""Variants of one recipe compared over the same windows: several seeds, paired intervals."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from residnet.report.run_reader import RunFiles
 
 @dataclass(frozen=True)
 class WindowErrors:
-    """NRMSE (mean over u, v, r) of one model by window.
+    """The NRMSE of one model by window, mean over u, v, r.
 
     Attributes:
         keys: (log, number of the window), [W].
@@ -29,7 +29,7 @@ class WindowErrors:
 
 
 def window_nrmse(run: Path, model: str, split: str) -> dict[str, WindowErrors]:
-    """Errors of one model of a finished run by protocol, from its stored rollouts.
+    """Return the errors of one model of a finished run by protocol, from its stored rollouts.
 
     Args:
         run: run folder.
@@ -61,8 +61,13 @@ def window_nrmse(run: Path, model: str, split: str) -> dict[str, WindowErrors]:
 
 @dataclass(frozen=True)
 class Variant:
-    """One way to do it: errors [S, W] by protocol over the windows `keys` for S seeds; `seconds` of
-    the runs, [S].
+    """A variant of a recipe with its errors.
+
+    Attributes:
+        name: of the variant.
+        overrides: of the recipe's config.
+        errors: [S, W] by protocol, NRMSE for S seeds over W windows.
+        seconds: that the runs took, [S].
     """
 
     name: str
@@ -74,7 +79,7 @@ class Variant:
 def table(
     variants: Sequence[Variant], keys: Mapping[str, Sequence[tuple[str, int]]], reference: str
 ) -> list[dict[str, Any]]:
-    """One row per variant and protocol.
+    """Return one row per variant and protocol.
 
     A row has the mean error over windows and seeds, its standard deviation over seeds (None for one
     seed), the smallest and largest of the seeds, and the difference to the reference variant over
@@ -121,71 +126,16 @@ def _row(
 
 
 def as_text(rows: Sequence[Mapping[str, Any]], reference: str) -> str:
-    """The table in Markdown."""
-    protocols = list(dict.fromkeys(row["protocol"] for row in rows))
-    head = [
-        "variant",
-        *(f"{p} NRMSE (sd of seeds) | difference to {reference} [95 %]" for p in protocols),
-        "s per run",
-        "what changes",
-    ]
-    lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * (3 + 2 * len(protocols))]
-    for name in dict.fromkeys(row["variant"] for row in rows):
-        parts = {row["protocol"]: row for row in rows if row["variant"] == name}
-        cells = [name]
-        for protocol in protocols:
-            row = parts[protocol]
-            spread = "" if row["nrmse_sd"] is None else f" ({row['nrmse_sd']:.4f})"
-            interval = row["difference_ci95"]
-            cells.append(f"{row['nrmse_mean']:.4f}{spread}")
-            cells.append(
-                ""
-                if interval is None
-                else f"{row['difference']:+.4f} [{interval[0]:+.4f}, {interval[1]:+.4f}]"
-            )
-        first = parts[protocols[0]]
-        cells += [f"{first['seconds']:.0f}", ", ".join(f"`{text}`" for text in first["overrides"])]
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
+    """Return the table of a study for the terminal."""
+    from residnet.report.sections.study import variants_table
+
+    return variants_table(rows, reference).text()
 
 
 def draw(rows: Sequence[Mapping[str, Any]], reference: str, path: Path) -> None:
-    """Differences to the reference with their intervals, one row per variant, one panel per
-    protocol.
-    """
-    from matplotlib import rc_context
+    """Write the figure of a study."""
+    from residnet.report.figures.study import differences
+    from residnet.report.figures.style import save
 
-    from residnet.report.figures.style import RC, new_figure, save
-
-    protocols = list(dict.fromkeys(row["protocol"] for row in rows))
-    names = [name for name in dict.fromkeys(row["variant"] for row in rows) if name != reference]
-    with rc_context(RC):
-        figure = new_figure(0.9 + 0.28 * len(names))
-        axes = figure.subplots(1, len(protocols), sharey=True, squeeze=False)[0]
-        for axis, protocol in zip(axes, protocols, strict=True):
-            for height, name in enumerate(reversed(names)):
-                row = next(
-                    row for row in rows if row["variant"] == name and row["protocol"] == protocol
-                )
-                if row["difference_ci95"] is not None:
-                    axis.plot(
-                        row["difference_ci95"], [height, height], color="black", linewidth=1.2
-                    )
-                axis.plot(
-                    row["difference"],
-                    height,
-                    marker="o",
-                    markersize=4.5,
-                    color="#0072B2",
-                    linestyle="none",
-                )
-            axis.axvline(0.0, color="0.4", linewidth=0.8)
-            axis.set_xlabel(f"{protocol}: NRMSE minus that of {reference} [-]")
-        axes[0].set_yticks(range(len(names)), list(reversed(names)))
-        save(
-            figure,
-            path,
-            "Variants of the recipe",
-            f"Free-run error of each variant minus that of {reference}, mean over windows and"
-            " seeds; bars: 95 % interval over logs.",
-        )
+    drawing = differences(rows, reference)
+    save(drawing.figure, path, drawing.title, drawing.caption)

@@ -23,8 +23,10 @@ from residnet.physics.actuators.identify import (
     fit_throttle,
     fit_thrust,
 )
-from residnet.report.blocks import Code, Section
-from residnet.report.figures.files import figures_section
+from residnet.report.blocks import Section
+from residnet.report.figures.files import write_drawings
+from residnet.report.run_reader import RunFiles
+from residnet.report.sections.actuators import sections
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import MainFigure, Outcome, Task
 
@@ -146,20 +148,26 @@ class ActuatorsTaskConfig(Task):
         Raises:
             ResidnetError: where the logs cannot be used or do not determine the actuators.
         """
-        from residnet.report.figures.actuators import draw_actuators
+        from residnet.report.figures.actuators import actuator_tests
 
         logs = _Logs(self)
         throttle = fit_throttle(logs.throttle[0], logs.throttle[1]) if logs.throttle else None
         step = fit_step(logs.steps) if logs.steps else None
-        thrust = (
-            fit_thrust(logs.bollard[0], logs.bollard[1], self.bollard.thrusters)
-            if self.bollard is not None and logs.bollard
-            else None
-        )
+        thrust = pull_of_one = None
+        if self.bollard is not None and logs.bollard:
+            n, pull = logs.bollard
+            thrust = fit_thrust(n, pull, self.bollard.thrusters)
+            pull_of_one = (n, pull / self.bollard.thrusters, thrust)
         text = vessel_lines(self, throttle, step, thrust)
         folder.write(folder.path / "actuators.yaml", text)
         folder.write_json(folder.path / "actuators.json", _numbers(throttle, step, thrust))
-        draw_actuators(folder.figures / "actuators.png", self, logs, throttle, step, thrust)
+        drawing = actuator_tests(
+            self.name,
+            (logs.throttle[0], logs.throttle[1], throttle) if logs.throttle and throttle else None,
+            (logs.steps, step) if step else None,
+            pull_of_one,
+        )
+        write_drawings(folder.figures, [drawing])
         figures = {}
         if throttle is not None:
             figures["n_max"] = MainFigure(throttle.n_max.value, "1/s")
@@ -183,10 +191,8 @@ class ActuatorsTaskConfig(Task):
 
     @classmethod
     def report_sections(cls, run: RunFolder) -> Sequence[Section]:
-        """Return the lines for a vessel file; the figure is that of the run."""
-        text = (run.path / "actuators.yaml").read_text()
-        figures = figures_section(run.figures)
-        return [Section("Lines of a vessel file", [Code(text)]), *([figures] if figures else [])]
+        """Return parameters and lines for a vessel file; the figure is that of the run."""
+        return sections(RunFiles(run.path))
 
 
 class _Logs:

@@ -15,7 +15,9 @@ from residnet.core.names import nearest
 from residnet.core.progress import report
 from residnet.data.readers import ReaderConfig
 from residnet.data.readers.files import files_of
-from residnet.report.blocks import Code, Section
+from residnet.report.blocks import Section
+from residnet.report.run_reader import RunFiles
+from residnet.report.sections.import_logs import sections
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import MainFigure, Outcome, Task
 
@@ -81,7 +83,7 @@ class ImportConfig(Task):
     @classmethod
     def report_sections(cls, run: RunFolder) -> Sequence[Section]:
         """Return what was read, and what was noticed on the way in."""
-        return [Section("Recordings", [Code((run.path / "import.txt").read_text())])]
+        return sections(RunFiles(run.path))
 
     def _paths(self) -> list[Path]:
         root = self.root or Path.cwd()

@@ -15,8 +15,10 @@ from residnet.data.simulated.flying import Craft, Flight
 from residnet.data.simulated.trials import SimulatedTrials, fly_trials, trials_craft
 from residnet.manoeuvres import Replay
 from residnet.physics.vessel import load_vessel
-from residnet.report.blocks import Code, Section
-from residnet.report.figures.files import figures_section
+from residnet.report.blocks import Section
+from residnet.report.figures.files import write_drawings
+from residnet.report.run_reader import RunFiles
+from residnet.report.sections.simulate import sections
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import ComputingTask, MainFigure, Outcome
 from residnet.tasks.programme import Programme
@@ -84,7 +86,7 @@ class SimulateConfig(ComputingTask):
             UsageError: where something cannot fly the manoeuvres.
         """
         from residnet.judge.index_table import contents, index_rows, table
-        from residnet.report.figures.flights import draw_flights
+        from residnet.report.figures.flights import flight_drawings
 
         flown, places, length = (
             self._drawn() if self.programme is None else self._listed(self.programme)
@@ -99,7 +101,8 @@ class SimulateConfig(ComputingTask):
         folder.write_json(folder.path / "indices.json", contents(self.name, length, rows))
         text = table(rows)
         folder.write(folder.path / "indices.txt", text + "\n")
-        draw_flights(folder.figures, {craft.name: flights for craft, flights in flown})
+        drawings = flight_drawings({craft.name: flights for craft, flights in flown})
+        write_drawings(folder.figures, drawings)
         faults = [row for row in rows if row["fault"]]
         verdict = [
             f"{count} manoeuvres were flown by {' and '.join(craft.name for craft, _ in flown)};"
@@ -115,10 +118,8 @@ class SimulateConfig(ComputingTask):
 
     @classmethod
     def report_sections(cls, run: RunFolder) -> Sequence[Section]:
-        """Return the table of manoeuvring indices; the figures are those of the run."""
-        text = (run.path / "indices.txt").read_text()
-        figures = figures_section(run.figures)
-        return [Section("Manoeuvring indices", [Code(text)]), *([figures] if figures else [])]
+        """Return the tables of manoeuvring indices; the figures are those of the run."""
+        return sections(RunFiles(run.path))
 
     def _drawn(
         self,

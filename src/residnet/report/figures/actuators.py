@@ -1,46 +1,46 @@
-"""The figure of an actuator identification: throttle map, step responses, bollard pull (document
-003, Figs. 4, 6, 7).
-"""
+"""The figure of an actuator identification (document 003, Figs. 4, 6, 7)."""
 
 from __future__ import annotations
 
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from residnet.physics.actuators.identify import StepAnswer, ThrottleMap, ThrustFit, follow_command
-from residnet.report.figures.style import RC, new_figure, save
+from residnet.report.figures.files import Drawing
+from residnet.report.figures.style import new_figure, styled
+
+Step = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Time in s, command and measured revolutions in 1/s of one step response, each [N]."""
 
 
-def draw_actuators(
-    path: Path,
-    config: Any,
-    logs: Any,
-    throttle: ThrottleMap | None,
-    step: StepAnswer | None,
-    thrust: tuple[ThrustFit, ThrustFit] | None,
-) -> None:
-    """Measurements as dots or thin lines, fits over them; one panel for each test."""
-    import matplotlib
+@styled
+def actuator_tests(
+    name: str,
+    throttle: tuple[np.ndarray, np.ndarray, ThrottleMap] | None = None,
+    steps: tuple[Sequence[Step], StepAnswer] | None = None,
+    bollard: tuple[np.ndarray, np.ndarray, tuple[ThrustFit, ThrustFit]] | None = None,
+) -> Drawing:
+    """Draw measurements as dots or thin lines and the fits over them, a panel for each test.
 
-    panels = [
-        kind
-        for kind, fit in (("throttle", throttle), ("step", step), ("thrust", thrust))
-        if fit is not None
-    ]
-    with matplotlib.rc_context(RC):
-        figure = new_figure(2.6)
-        axes = dict(zip(panels, np.atleast_1d(figure.subplots(1, len(panels))), strict=True))
-        if throttle is not None:
-            _throttle(axes["throttle"], logs.throttle[0], logs.throttle[1], throttle)
-        if step is not None:
-            _steps(axes["step"], logs.steps, step)
-        if thrust is not None:
-            n, pull = logs.bollard
-            _thrust(axes["thrust"], n, pull / config.bollard.thrusters, thrust)
-        caption = f"Actuator tests of {config.name}: measured (dots, grey lines) and fitted."
-        save(figure, path, f"Actuators of {config.name}", caption)
+    Args:
+        name: of the run.
+        throttle: throttle [N], revolutions [N] in 1/s, and the fitted map.
+        steps: measured step responses, and the fitted one.
+        bollard: revolutions [N] in 1/s, thrust [N] of one thruster in N, and the fitted curves.
+    """
+    drawn = [test is not None for test in (throttle, steps, bollard)]
+    figure = new_figure(2.6)
+    panels = iter(np.atleast_1d(figure.subplots(1, sum(drawn))))
+    if throttle is not None:
+        _throttle(next(panels), *throttle)
+    if steps is not None:
+        _steps(next(panels), *steps)
+    if bollard is not None:
+        _thrust(next(panels), *bollard)
+    caption = f"Actuator tests of {name}: measurements as dots and grey lines, fits in colour."
+    return Drawing("actuators", f"Actuators of {name}", caption, figure)
 
 
 def _throttle(axis: Any, throttle: np.ndarray, n: np.ndarray, fit: ThrottleMap) -> None:
@@ -50,9 +50,7 @@ def _throttle(axis: Any, throttle: np.ndarray, n: np.ndarray, fit: ThrottleMap) 
     axis.set(xlabel="throttle [%]", ylabel="revolutions [rpm]", title="throttle map")
 
 
-def _steps(
-    axis: Any, runs: list[tuple[np.ndarray, np.ndarray, np.ndarray]], fit: StepAnswer
-) -> None:
+def _steps(axis: Any, runs: Sequence[Step], fit: StepAnswer) -> None:
     for t, command, n in runs:
         axis.plot(t - t[0], 60 * command, color="#009E73", linestyle=(0, (4, 2)), linewidth=0.8)
         axis.plot(t - t[0], 60 * n, color="0.5", linewidth=0.8)

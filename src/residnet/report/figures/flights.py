@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,15 +11,15 @@ import numpy as np
 from residnet.core.log import Log
 from residnet.data.simulated.flying import Flight
 from residnet.manoeuvres import Replay, Spiral, Waypoints, Zigzag
+from residnet.report.figures.files import Drawing
 from residnet.report.figures.style import (
     DASHED,
-    RC,
     SOLID,
     WIDTH,
     collect,
     legend_above,
     new_figure,
-    save,
+    styled,
 )
 
 MOST = 12
@@ -39,55 +38,46 @@ _NAMES = {
 }  # fmt: skip
 
 
-def draw_flights(folder: Path, flown: Mapping[str, Sequence[Flight]]) -> list[Path]:
-    """Write `tracks_<n>.png`, `history_<log>.png` and, for spirals, `spiral_<log>.png`; returns the
-    files.
+def flight_drawings(flown: Mapping[str, Sequence[Flight]]) -> Iterator[Drawing]:
+    """Draw tracks, time histories and, of spirals, yaw rate over helm.
+
+    Of many flights, only the first of each kind of manoeuvre is drawn.
 
     Args:
-        folder: for the figures.
         flown: flights of the same manoeuvres by what flew them; of two, the first is the solid line
             and the second the dashed one.
-    """
-    from matplotlib import rc_context
 
-    logs = [
-        [flights[i] for flights in flown.values()] for i in range(len(next(iter(flown.values()))))
-    ]
-    kinds: dict[str, list[Flight]] = {}
-    for group in logs:
+    Yields:
+        Each figure with its title and caption.
+    """
+    crafts = list(flown)
+    groups: list[Sequence[Flight]] = list(zip(*flown.values(), strict=True))
+    kinds: dict[str, Sequence[Flight]] = {}
+    for group in groups:
         kinds.setdefault(group[0].manoeuvre.kind, group)
-    chosen = logs if len(logs) <= MOST else list(kinds.values())
-    out: list[Path] = []
-    with rc_context(RC):
-        for place in range(0, len(chosen), _PER_FIGURE):
-            path = folder / f"tracks_{place // _PER_FIGURE + 1}.png"
-            save(
-                _tracks(list(flown), chosen[place : place + _PER_FIGURE]),
-                path,
-                "Tracks",
-                "North up, equal scales, each from its start.",
+    chosen = groups if len(groups) <= MOST else list(kinds.values())
+    for place in range(0, len(chosen), _PER_FIGURE):
+        yield Drawing(
+            f"tracks_{place // _PER_FIGURE + 1}",
+            "Tracks",
+            "North is up, scales are equal, and each track begins at its start.",
+            _tracks(crafts, chosen[place : place + _PER_FIGURE]),
+        )
+    for group in chosen:
+        name = group[0].motion.name
+        yield Drawing(
+            f"history_{name}",
+            f"Time history: {name}",
+            "The motion itself, without the noise of sensors, and the commands.",
+            _history(crafts, group),
+        )
+        if group[0].manoeuvre.kind == "spiral":
+            yield Drawing(
+                f"spiral_{name}",
+                f"Spiral: {name}",
+                "Steady yaw rate over helm; a loop about zero shows an unstable vessel.",
+                _spiral(crafts, group),
             )
-            out.append(path)
-        for group in chosen:
-            name = group[0].motion.name
-            path = folder / f"history_{name}.png"
-            save(
-                _history(list(flown), group),
-                path,
-                f"Time history: {name}",
-                "The motion itself, without the noise of sensors, and the commands.",
-            )
-            out.append(path)
-            if group[0].manoeuvre.kind == "spiral":
-                path = folder / f"spiral_{name}.png"
-                save(
-                    _spiral(list(flown), group),
-                    path,
-                    f"Spiral: {name}",
-                    "Steady yaw rate over helm; a loop about zero shows an unstable vessel.",
-                )
-                out.append(path)
-    return out
 
 
 def _look(place: int, name: str) -> dict[str, Any]:
@@ -95,7 +85,7 @@ def _look(place: int, name: str) -> dict[str, Any]:
 
 
 def _recorded(flight: Flight) -> Log | None:
-    """What a replay was recorded as, as far as it was flown; None for other manoeuvres."""
+    """Return the recording of a replay, as far as it was flown; None for other manoeuvres."""
     if not isinstance(flight.manoeuvre, Replay):
         return None
     log = flight.manoeuvre.recorded
@@ -108,6 +98,7 @@ def _recorded(flight: Flight) -> Log | None:
     )
 
 
+@styled
 def _tracks(crafts: Sequence[str], groups: Sequence[Sequence[Flight]]) -> Any:
     columns = min(2, len(groups))
     lines = math.ceil(len(groups) / columns)
@@ -158,6 +149,7 @@ def _tracks(crafts: Sequence[str], groups: Sequence[Sequence[Flight]]) -> Any:
     return figure
 
 
+@styled
 def _history(crafts: Sequence[str], group: Sequence[Flight]) -> Any:
     first = group[0].motion
     names: list[str] = [
@@ -202,6 +194,7 @@ def _history(crafts: Sequence[str], group: Sequence[Flight]) -> Any:
     return figure
 
 
+@styled
 def _spiral(crafts: Sequence[str], group: Sequence[Flight]) -> Any:
     figure = new_figure(3.6)
     axes = figure.subplots()

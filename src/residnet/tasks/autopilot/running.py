@@ -27,7 +27,7 @@ from residnet.export.autopilot import export_autopilot
 from residnet.judge.autopilots import QUANTITIES, effort_table, step_flights, table
 from residnet.judge.metrics import SCHEMA
 from residnet.physics.vessel import load_vessel
-from residnet.report.autopilot import FLIGHTS, PLANTS
+from residnet.report.sections.autopilot import FLIGHTS, PLANTS
 from residnet.runs.folder import RunFolder
 from residnet.runs.model_store import FolderStore
 from residnet.runs.task import MainFigure, Outcome

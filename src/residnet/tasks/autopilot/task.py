@@ -10,6 +10,7 @@ from typing import ClassVar, Literal, final
 from residnet.core.errors import UsageError
 from residnet.core.names import nearest
 from residnet.report.blocks import Section
+from residnet.report.run_reader import RunFiles
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import Outcome
 from residnet.tasks.autopilot.config import AutopilotSettings
@@ -35,15 +36,12 @@ class AutopilotConfig(AutopilotSettings):
 
     @classmethod
     def report_sections(cls, run: RunFolder) -> Sequence[Section]:
-        """Return the comparison of the controllers."""
-        return []
+        """Draw the figures and return the comparison of the controllers."""
+        from residnet.report.sections.autopilot import draw, sections
 
-    @classmethod
-    def write_report(cls, run: RunFolder) -> Path:
-        """Write figures and report from the run folder alone; returns the page's path."""
-        from residnet.report.autopilot import write_autopilot_report
-
-        return write_autopilot_report(run.path)
+        files = RunFiles(run.path)
+        draw(files)
+        return sections(files)
 
     def export_model(self, run: RunFolder, model: str, out: Path | None, file_format: str) -> Path:
         """Return the file of a policy, which was exported and checked when the run ended.

@@ -26,7 +26,7 @@ from residnet.control.heading.policy import HeadingPolicy
 from residnet.core.progress import say
 from residnet.judge.courses import CourseFlight, row, spread_row, table
 from residnet.judge.metrics import SCHEMA
-from residnet.report.course import COURSES, SPREAD, TRACKS
+from residnet.report.sections.course import COURSES, SPREAD, TRACKS
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import MainFigure, Outcome
 from residnet.tasks.autopilot.config import AutopilotSettings

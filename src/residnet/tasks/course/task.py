@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Literal, final
 
 from residnet.report.blocks import Section
+from residnet.report.run_reader import RunFiles
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import Outcome
 from residnet.tasks.course.autopilot_run import autopilot_of
@@ -41,12 +41,9 @@ class CourseTaskConfig(CourseSettings):
 
     @classmethod
     def report_sections(cls, run: RunFolder) -> Sequence[Section]:
-        """Return the comparison of the flights."""
-        return []
+        """Draw the figures and return the comparison of the flights."""
+        from residnet.report.sections.course import draw, sections
 
-    @classmethod
-    def write_report(cls, run: RunFolder) -> Path:
-        """Write figures and report from the run folder alone; returns the page's path."""
-        from residnet.report.course import write_course_report
-
-        return write_course_report(run.path)
+        files = RunFiles(run.path)
+        draw(files)
+        return sections(files)
