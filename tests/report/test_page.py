@@ -30,7 +30,7 @@ def table() -> Table:
         ["controller", "settling [s]", "remark"],
         [
             [
-                "pd_with_filter",
+                "proportional_and_derivative",
                 Cell("12.5", "best of 5"),
                 Cell("tuned at the corners", mark="text"),
             ],
@@ -72,7 +72,7 @@ def test_every_block_is_drawn_and_nothing_is_loaded_or_run(tmp_path: Path) -> No
     assert page.tables == [
         [
             ["controller", "settling [s]", "remark"],
-            ["pd_with_filter", "12.5|best of 5", "tuned at the corners"],
+            ["proportional_and_derivative", "12.5|best of 5", "tuned at the corners"],
             ["net", "10.1", "learned"],
         ]
     ]
@@ -85,7 +85,7 @@ def test_every_block_is_drawn_and_nothing_is_loaded_or_run(tmp_path: Path) -> No
     assert sum(source.startswith("data:image/png;base64,") for source in page.sources) == 1
     assert all(source.startswith(("data:image/png;base64,", "#")) for source in page.sources)
     assert not re.search(r"<script|url\(|@import|https?://", text)
-    assert "pd_<wbr>with_<wbr>filter" in text
+    assert "proportional_<wbr>and_<wbr>derivative" in text
     assert text.count("<details>") == 2
     assert "a: 1\nb: 2" in html.unescape(text)
     assert not list(tmp_path.glob("*.partial"))
@@ -107,9 +107,9 @@ def test_provenance_and_configuration_come_last_and_folded(tmp_path: Path) -> No
 def test_a_table_for_the_terminal_has_its_columns_below_each_other() -> None:
     assert table().text().splitlines() == [
         "Changes of 10 deg.",
-        "controller          settling [s]  remark",
-        "pd_with_filter  12.5 (best of 5)  tuned at the corners",
-        "net                         10.1  learned",
+        "controller                       settling [s]  remark",
+        "proportional_and_derivative  12.5 (best of 5)  tuned at the corners",
+        "net                                      10.1  learned",
     ]
     grouped = Table(
         ["model", "train", "test"],

@@ -18,6 +18,10 @@ _FACT_TITLES = {"git": "git revision", "python": "Python", "started": "started (
 _FACTS = ("residnet", "git", "seed", "python", "machine", "started")
 
 
+_LONG = 20
+"""Least number of characters of a name that may break in the middle."""
+
+
 def write_page(
     run: Path, title: str, description: str, verdict: Sequence[str], sections: Sequence[Section]
 ) -> Path:
@@ -122,8 +126,12 @@ def _anchor(title: str) -> str:
 
 
 def _breakable(text: str) -> Markup:
-    """Return escaped text that may break after underscores, never inside words."""
-    return Markup(str(escape(text)).replace("_", "_<wbr>"))
+    """Return escaped text whose long names and paths may break after underscores and slashes."""
+
+    def broken(found: re.Match[str]) -> str:
+        return re.sub(r"([_/])", r"\1<wbr>", found[0])
+
+    return Markup(re.sub(rf"\S{{{_LONG},}}", broken, str(escape(text))))
 
 
 def _embedded(path: Path) -> str:

@@ -37,11 +37,18 @@ def _indices(content: Content) -> Section:
 def _about(content: Content) -> str:
     length = content.get("length")
     if length is None:
-        return "The length of the hull is not known, so there are no values in hull lengths."
-    return (
-        f"L: hull lengths of {number(length)} m. The limits are those of IMO resolution"
-        " MSC.137(76), where they apply to a manoeuvre."
+        text = "The length of the hull is not known, so there are no values in hull lengths."
+    else:
+        text = (
+            f"L: hull lengths of {number(length)} m. The limits are those of IMO resolution"
+            " MSC.137(76), where they apply to a manoeuvre."
+        )
+    without = dict.fromkeys(
+        str(row["manoeuvre"]).replace("_", " ") for row in content["rows"] if not row["indices"]
     )
+    if without:
+        text += f" Flights without indices: {', '.join(without)}."
+    return text
 
 
 def index_tables(content: Content) -> list[tuple[str, Table]]:
@@ -61,7 +68,7 @@ def index_tables(content: Content) -> list[tuple[str, Table]]:
     else:
         kinds = dict.fromkeys(str(row["manoeuvre"]) for row in content["rows"])
         tables = [(kind.replace("_", " "), _of_kind(content, kind)) for kind in kinds]
-    return [(title, table) for title, table in tables if table.rows]
+    return [(title, table) for title, table in tables if table.rows and len(table.columns) > 1]
 
 
 def _of_log(content: Content, rows: Sequence[Content]) -> Table:
@@ -88,7 +95,7 @@ def _of_log(content: Content, rows: Sequence[Content]) -> Table:
             apart = None if None in values else factor * (values[1] - values[0])
             cells.append(Cell(number(apart)))
         if lengths:
-            cells += [Cell(fixed(row["indices"].get(f"{name}_lengths"), 2)) for row in rows]
+            cells += [_in_lengths(row["indices"].get(f"{name}_lengths")) for row in rows]
         if limited:
             cells.append(_limit(rows, name, factor))
         table.add(index_title(name), cells)
@@ -126,6 +133,10 @@ def _single_values(rows: Sequence[Content]) -> list[str]:
 
 def _value(value: float | None, factor: float) -> Cell:
     return Cell(DASH) if value is None else Cell(number(factor * value, 4))
+
+
+def _in_lengths(value: float | None) -> Cell:
+    return Cell("") if value is None else Cell(fixed(value, 2))
 
 
 def _limit(rows: Sequence[Mapping[str, Any]], name: str, factor: float) -> Cell:

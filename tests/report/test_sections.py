@@ -1,0 +1,179 @@
+"""Every task's page: its sections render from a made-up folder and show the numbers in it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from browser import browser, layout
+from made_run import made_run
+from made_task_runs import (
+    made_actuators,
+    made_autopilot,
+    made_course,
+    made_import,
+    made_simulate,
+    made_study,
+)
+from read_page import Page
+
+from residnet.report.blocks import Section
+from residnet.report.fit import fit_sections
+from residnet.report.page import write_page
+from residnet.report.run_reader import RunFiles
+from residnet.report.sections import actuators, autopilot, course, import_logs, simulate, study
+
+
+@dataclass(frozen=True)
+class Reported:
+    """A task's made-up folder, its sections, and what draws its figures, if something does."""
+
+    make: Callable[[Path], Path]
+    sections: Callable[[RunFiles], Sequence[Section]]
+    draw: Callable[[RunFiles], object] | None = None
+
+
+TASKS = {
+    "actuators": Reported(made_actuators, actuators.sections),
+    "autopilot": Reported(made_autopilot, autopilot.sections, autopilot.draw),
+    "course": Reported(made_course, course.sections, course.draw),
+    "fit": Reported(made_run, fit_sections),
+    "import": Reported(made_import, import_logs.sections),
+    "simulate": Reported(made_simulate, simulate.sections),
+    "study": Reported(made_study, study.sections, study.draw),
+}
+
+
+def page_of(task: str, folder: Path) -> Path:
+    """Write the page of a made-up run of that task."""
+    reported = TASKS[task]
+    run = RunFiles(reported.make(folder))
+    if reported.draw is not None:
+        reported.draw(run)
+    return write_page(run.path, run.title, "Made by hand.", ["Done."], reported.sections(run))
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_every_task_has_a_page_whose_sections_hold_something(task: str, tmp_path: Path) -> None:
+    path = page_of(task, tmp_path / "run")
+    text = path.read_text()
+    page = Page(text)
+    assert len(page.sections) == len(set(page.sections)) >= 3
+    assert page.tables
+    for table in page.tables:
+        assert len(table) > 1, table
+    assert sum(source.startswith("data:image") for source in page.sources) == len(
+        list((tmp_path / "run" / "figures").glob("*.png"))
+    )
+    shown = re.sub(r"data:image/png;base64,[^\"]+", "", text).partition('id="provenance"')[0]
+    assert re.findall(r"\b(?:None|nan|inf|Undefined)\b|[{}]{2}", shown.partition("<body>")[2]) == []
+    # the page of a finished run can be written again, and is the same
+    reported = TASKS[task]
+    run = RunFiles(path.parent)
+    write_page(path.parent, run.title, "Made by hand.", ["Done."], reported.sections(run))
+    assert path.read_text() == text
+
+
+@pytest.mark.skipif(browser() is None, reason="no browser (chromium or chrome) is installed")
+@pytest.mark.parametrize("width", [360, 820])
+@pytest.mark.parametrize("task", TASKS)
+def test_nothing_is_wider_than_the_window_and_no_word_is_broken(
+    task: str, width: int, tmp_path: Path
+) -> None:
+    found = layout(page_of(task, tmp_path / "run"), width, tmp_path)
+    assert found.overflow == 0
+    assert found.broken == []
+
+
+@pytest.mark.skipif(browser() is None, reason="no browser (chromium or chrome) is installed")
+def test_the_browser_sees_what_is_too_wide_and_what_is_broken(tmp_path: Path) -> None:
+    page = tmp_path / "bad.html"
+    page.write_text(
+        "<!DOCTYPE html><html><body><div style='width:900px'>wide</div>"
+        "<p style='width:3em;overflow-wrap:anywhere'>tacticaldiameter</p></body></html>"
+    )
+    found = layout(page, 360, tmp_path)
+    assert found.overflow > 400
+    assert found.broken == ["tacticaldiameter"]
+
+
+def test_controllers_are_compared_by_settling_time_and_effort(tmp_path: Path) -> None:
+    page = Page(page_of("autopilot", tmp_path / "run").read_text())
+    cells = page.table("controller", "net")
+    assert cells["pd"] == [
+        "16.50",
+        "1.100",
+        "16.50",
+        "11.00",
+        "13.20",
+        "0.300",
+        "0.2500",
+        "0.2500",
+        "4",
+    ]
+    effort = next(table for table in page.tables if "sea, root mean square [deg]" in table[0])
+    assert (
+        effort[2] == ["net", "57.30", "68.75", "28.65", "34.38", "328.28", "393.94"] + ["2.000"] * 3
+    )
+
+
+def test_a_course_shows_what_was_missed(tmp_path: Path) -> None:
+    text = page_of("course", tmp_path / "run").read_text()
+    page = Page(text)
+    entered, spread, sides, _ = page.tables
+    assert entered[1][:6] == ["net", "course", "61.50", "1.0250", "0.9500", "2 of 2"]
+    assert sides[1][5:7] == ["2 of 2", "1 of 2"]
+    assert spread[1][2:5] == ["75.0", "100.0", "1.0400"]
+    assert 'class="bad">1 of 2' in text
+    assert "The circles of buoy 1 (20.00 m) are tighter than that" in text
+    assert "The shortest possible time is 60.00 s." in text
+
+
+def test_indices_stand_flight_by_flight_or_by_kind(tmp_path: Path) -> None:
+    few = Page(page_of("simulate", tmp_path / "few").read_text())
+    assert few.tables[0] == [
+        ["index", "unit", "ship", "model", "difference", "ship [L]", "model [L]", "IMO limit"],
+        ["first overshoot", "deg", "9.000", "11.00", "2.00", "", "", "10.00|exceeded"],
+        ["initial turning distance", "m", "8.000", "8.000", "0", "2.00", "2.00", ""],
+    ]
+    run = RunFiles(made_simulate(tmp_path / "many", logs=13))
+    text = write_page(run.path, "many", "", [], simulate.sections(run)).read_text()
+    (table,) = Page(text).tables
+    assert table[0] == ["log", "first overshoot [deg]", "initial turning distance [m]"]
+    assert len(table) == 1 + 2 * 13
+    assert table[2] == ["zigzag_01 (model)", "11.00|beyond the IMO limit", "8.000"]
+    assert "Flights without indices: constant." in text
+    assert "ship, constant_01: timed out after 60 s" in text
+
+
+def test_an_import_shows_gaps_channels_and_findings(tmp_path: Path) -> None:
+    text = page_of("import", tmp_path / "run").read_text()
+    page = Page(text)
+    cells = page.table("log", "first")
+    assert cells["first"] == ["100", "0.1000", "9.900", "2", "9", "1", "1"]
+    assert cells["second"][-2:] == ["0", "1"]
+    channels = page.table("channel", "u")
+    assert channels["u"] == ["m/s", "1.00", "1.00", "1.00", "50"]
+    assert channels["psi"][0] == "deg"
+    assert "first: will mislead: a gap of −5 s" in text
+
+
+def test_actuator_parameters_come_with_intervals(tmp_path: Path) -> None:
+    cells = Page(page_of("actuators", tmp_path / "run").read_text()).table(
+        "parameter", "largest revolutions"
+    )
+    assert cells["largest revolutions"] == ["2400", "2160 to 2640", "rpm"]
+    assert cells["dead time"] == ["0.2500", "0.2250 to 0.2750", "s"]
+    assert cells["forward thrust, c0"][2] == "N s^2"
+    assert cells["reverse thrust, rms residual"] == ["1.50", "–", "N"]
+
+
+def test_variants_are_compared_with_the_reference(tmp_path: Path) -> None:
+    page = Page(page_of("study", tmp_path / "run").read_text())
+    cells = page.table("variant", "no_head")
+    assert cells["no_head"][:4] == ["0.2500", "0.0100", "+0.0500", "+0.0250 to +0.0750"]
+    assert cells["recipe"][2:4] == ["", ""]
+    assert cells["no_head"][-1] == "~heads"
