@@ -8,11 +8,7 @@ _VOID = {"meta", "img", "br", "hr", "link", "wbr"}
 
 
 class Page(HTMLParser):
-<<<<<<< HEAD
-    """Tables as lists of lines of cell texts, and whether every tag closes where it should."""
-=======
     """A page as tables of cell texts; every tag must be closed where it should be."""
->>>>>>> 9601f0a (Simulated trials, imports, actuator tests and studies report by tables and figures of their own)
 
     def __init__(self, text: str) -> None:
         super().__init__()
