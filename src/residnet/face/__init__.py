@@ -1,0 +1,1 @@
+"""What `import residnet` offers, in plain Python values; a name is loaded when it is first used."""

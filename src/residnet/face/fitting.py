@@ -1,0 +1,232 @@
+"""The fit in Python: baselines, heads and ensembles by name, judged in free run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, final
+
+import torch
+
+from residnet.core.config import validate
+from residnet.core.errors import UsageError
+from residnet.core.names import nearest
+from residnet.core.progress import ProgressCallback
+from residnet.face.data import Data
+from residnet.face.models import Model
+from residnet.face.runs import FreeRuns, free_run
+from residnet.face.values import PartGiven, described, hearing, named_parts, part, plain
+from residnet.identification.currents import through_currents
+from residnet.identification.fit import Identified
+from residnet.identification.fit import fit as identify
+from residnet.identification.prepared import require_window
+from residnet.identification.settings import FitSettings
+from residnet.judge.tables import metrics_table
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@final
+class Models(Mapping[str, Model]):
+    """Fitted models by name: zero, the baselines, heads and ensembles, in this order.
+
+    Attributes:
+        data: what they were fitted on and are judged on.
+        settings: of the fit, as YAML would have them.
+
+    Example:
+        models["lstm"].step(x, w)
+    """
+
+    def __init__(self, identified: Identified, data: Data) -> None:
+        self.identified = identified
+        self.data = data
+        self.settings: FitSettings = identified.settings
+        self._models = {name: Model(fitted) for name, fitted in identified.items()}
+
+    @cached_property
+    def runs(self) -> dict[str, FreeRuns]:
+        """Free runs of all models by split."""
+        splits = self.settings.evaluation.splits
+        return {split: free_run(self, self.data, split) for split in splits}
+
+    @cached_property
+    def selected(self) -> str:
+        """Name of the model with the least free-run error on the validation logs."""
+        return self.identified.select(self.runs["validation"].rows)
+
+    @property
+    def metrics(self) -> pd.DataFrame:
+        """Free-run errors of all models over all splits, see `residnet.metrics`."""
+        rows = [
+            {**row, "selected": row["model"] == self.selected}
+            for runs in self.runs.values()
+            for row in runs.rows
+        ]
+        return metrics_table(rows)
+
+    def __getitem__(self, name: str) -> Model:
+        if name not in self._models:
+            raise UsageError(f"no model '{name}'{nearest(str(name), self._models)}")
+        return self._models[name]
+
+    def get(self, name: str, default: Any = None) -> Any:
+        """Return the model of that name, or the default."""
+        return self._models.get(name, default)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._models
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._models)
+
+    def __len__(self) -> int:
+        return len(self._models)
+
+    def __repr__(self) -> str:
+        return f"Models({', '.join(self._models)})"
+
+
+def fit(
+    data: Data,
+    baseline: PartGiven = "regressors",
+    heads: PartGiven | Sequence[str] | Mapping[str, PartGiven] = (),
+    *,
+    baselines: Mapping[str, PartGiven] | None = None,
+    base_of: Mapping[str, str] | None = None,
+    ensembles: Mapping[str, Sequence[str]] | None = None,
+    training: Mapping[str, Any] | None = None,
+    refit: Mapping[str, Any] | None = None,
+    current: Mapping[str, Any] | None = None,
+    integrator: str = "rk4",
+    seed: int = 0,
+    threads: int = 1,
+    progress: ProgressCallback | None = None,
+) -> Models:
+    """Fit baselines, then heads on what each leaves, then ensembles.
+
+    The arguments are the keys of a config of the task `fit`, and give the same numbers.
+
+    Args:
+        data: from `prepare`.
+        baseline: the known part: its kind, a mapping or a config object. `regressors` alone is a
+            line in every channel.
+        heads: what is learned on top: kinds such as `["plsr", "lstm"]`, or a mapping from names to
+            kinds, mappings or config objects.
+        baselines: further baselines by name.
+        base_of: the baseline that a head stands on, by the head's name.
+        ensembles: models whose mean acceleration makes another model, by its name.
+        training: of network heads by the name of the head; `epochs` and so on, as YAML has them.
+        refit: baselines whose coefficients are moved through rollouts.
+        current: the logs ran in constant currents that are estimated first.
+        integrator: of the models: rk4, heun, euler or semi_implicit_euler.
+        seed: of weights and batches.
+        threads: of PyTorch; one is fastest for these small products, and part of what makes a fit
+            repeatable.
+        progress: is told what is being fitted, and how far it is.
+
+    Raises:
+        ConfigError: where a setting is wrong.
+        FitError: where the data do not determine a part.
+        DataError: where a split holds no sample or no window.
+
+    Example:
+        models = residnet.fit(data, heads=["plsr", "lstm"]); models.metrics
+    """
+    if not isinstance(data, Data):
+        raise UsageError(f"fit: expected data from residnet.prepare, given {described(data)}")
+    settings: FitSettings = validate(
+        plain(
+            {
+                "seed": seed,
+                "prepare": data.prepare,
+                "signals": data.signals,
+                "integrator": integrator,
+                "baseline": part(baseline, "baseline"),
+                "baselines": {} if not baselines else named_parts(baselines, "baseline"),
+                "current": current,
+                "refit": refit or {},
+                "heads": {} if _empty(heads) else named_parts(heads, "head"),
+                "base_of": base_of or {},
+                "ensembles": ensembles or {},
+                "training": training or {},
+                "evaluation": data.evaluation,
+            }
+        ),
+        FitSettings,
+        "fit",
+    )
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        with hearing(progress):
+            for split in ("validation", "test"):
+                for log in data.logs(split):
+                    require_window(log, settings)
+            logs, _ = through_currents(data.splits, settings)
+            moved = Data(logs, data.signals, data.prepare, data.evaluation, data.source)
+            return Models(identify(logs, settings), moved)
+    finally:
+        torch.set_num_threads(before)
+
+
+def _empty(heads: Any) -> bool:
+    return isinstance(heads, list | tuple | Mapping) and not heads
+
+
+def metrics(
+    models: Models,
+    data: Data | None = None,
+    *,
+    split: str | None = None,
+    manoeuvre: str | None = "all",
+    progress: ProgressCallback | None = None,
+) -> pd.DataFrame:
+    """Return the free-run errors of models, one row for each model, split and protocol.
+
+    Args:
+        models: from `fit`.
+        data: other logs, from `prepare(logs, like=data)`; those of the fit where None.
+        split: train, validation, test or external; all where None.
+        manoeuvre: a kind of manoeuvre or a group; `all` for all together, None for a row of each.
+        progress: is told how far the free runs are.
+
+    Returns:
+        Columns model, kind, split, protocol, manoeuvre, selected, windows, diverged, n, rmse_u,
+        rmse_v (m/s), rmse_r (rad/s), the same for mae and nrmse, nrmse_mean, position_error_end
+        (m), heading_error_end (rad).
+
+    Raises:
+        UsageError: where there is no such split or manoeuvre.
+
+    Example:
+        residnet.metrics(models, split="test")
+    """
+    if not isinstance(models, Models):
+        raise UsageError(f"metrics: expected models from residnet.fit, given {described(models)}")
+    with hearing(progress):
+        if data is None:
+            table = models.metrics
+        else:
+            runs = free_run(models, data, split).rows
+            marked = [{**row, "selected": row["model"] == models.selected} for row in runs]
+            table = metrics_table(marked)
+    for column, wanted in (("split", split), ("manoeuvre", manoeuvre)):
+        if wanted is not None:
+            if wanted not in set(table[column]):
+                known = nearest(str(wanted), map(str, table[column].unique()))
+                raise UsageError(f"metrics: no {column} '{wanted}'{known}")
+            table = table[table[column] == wanted]
+    return table.reset_index(drop=True)
+
+
+def select(models: Models) -> Model:
+    """Return the model with the least free-run error on the validation logs.
+
+    Example:
+        residnet.select(models).name
+    """
+    if not isinstance(models, Models):
+        raise UsageError(f"select: expected models from residnet.fit, given {described(models)}")
+    return models[models.selected]
