@@ -82,7 +82,9 @@ POSITION_LIMITS = {
 }
 
 
-def told(causes: dict[str, Cause], limits: dict[str, Limit], log: Log) -> Iterator[Finding]:
+def cause_findings(
+    causes: dict[str, Cause], limits: dict[str, Limit], log: Log
+) -> Iterator[Finding]:
     """Return the findings for the causes that are certain and large enough to matter."""
     step = float(np.median(np.diff(log.t)))
     speed = (

@@ -227,11 +227,13 @@ def _channel(column: str, taken: dict[str, Any]) -> str:
         for name, pattern in _NAMES.items():
             if name not in taken and re.fullmatch(pattern, bare):
                 return name
-    own = re.sub(r"[^a-z0-9]+", "_", _IN_BRACKETS.sub("", column).lower()).strip("_") or "column"
-    own = own if own not in CHANNEL_UNITS else f"{own}_"
-    while own in taken:
-        own += "_"
-    return own
+    made_name = (
+        re.sub(r"[^a-z0-9]+", "_", _IN_BRACKETS.sub("", column).lower()).strip("_") or "column"
+    )
+    made_name = made_name if made_name not in CHANNEL_UNITS else f"{made_name}_"
+    while made_name in taken:
+        made_name += "_"
+    return made_name
 
 
 def _unit(name: str, column: str, values: np.ndarray) -> str:

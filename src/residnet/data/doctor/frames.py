@@ -7,19 +7,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
 from residnet.core.log import Log
 from residnet.core.names import VELOCITY
-from residnet.data.doctor.causes import LEAST_LAG, POSITION_LIMITS, YAW_LIMITS, told
-from residnet.data.doctor.findings import Finding, Level, unit_slip
+from residnet.data.doctor.causes import POSITION_LIMITS, YAW_LIMITS, cause_findings
+from residnet.data.doctor.findings import Finding, Level
+from residnet.data.doctor.following import FEWEST_SAMPLES, follow_findings, slip_in_words
 from residnet.data.doctor.kinematics import Cause, position_causes, yaw_causes
+from residnet.data.doctor.rates import Rates, average_rates
 from residnet.data.doctor.signals import noise_of
 
-_FEWEST = 50
-_LONGEST_LAG = 3.0
 # a reference must vary by this share of the speed (or this yaw rate, rad/s) before a correlation
 # says anything
 _SHARE_OF_SPEED = 0.05
@@ -40,29 +39,6 @@ _CONVENTIONS = {
 }
 
 
-@dataclass(frozen=True)
-class _Motion:
-    """The rates of a log on a uniform grid, all averaged over the same few seconds.
-
-    Pose and velocities are thus filtered alike.
-
-    Attributes:
-        step: time between samples, s.
-        ground: rate of the position, north + i east, [T] in m/s.
-        sailed: what psi, u, v say of it [T] for each convention.
-        yaw: rate of psi [T] in rad/s.
-        measured: u, v, r as far as the log has them, [T].
-        noise: standard deviation of the noise in `yaw` and in the averaged r.
-    """
-
-    step: float
-    ground: np.ndarray
-    sailed: dict[str, np.ndarray]
-    yaw: np.ndarray
-    measured: dict[str, np.ndarray]
-    noise: tuple[float, float]
-
-
 def frame_findings(log: Log) -> list[Finding]:
     """Return whether position, heading and velocities of a log describe one motion.
 
@@ -78,7 +54,7 @@ def frame_findings(log: Log) -> list[Finding]:
                 f"frames not checked: the log has no {', '.join(absent or VELOCITY)}",
             )
         ]
-    motion = _motion(log, moving)
+    motion = average_rates(log, moving)
     findings: list[Finding] = []
     if "u" in moving and "v" in moving:
         convention = _velocity(motion)
@@ -90,100 +66,38 @@ def frame_findings(log: Log) -> list[Finding]:
             for finding in convention
         ):
             causes = position_causes(log)
-            findings += [*_follows_ground(log, motion, causes), *told(causes, POSITION_LIMITS, log)]
+            findings += [
+                *_follows_ground(log, motion, causes),
+                *cause_findings(causes, POSITION_LIMITS, log),
+            ]
     if "r" in moving:
         findings += _yaw(log, motion)
     return findings
 
 
-def _motion(log: Log, moving: list[str]) -> _Motion:
-    """Return the rates over windows in which the pose moves by several times its noise."""
-    step, span = float(np.median(np.diff(log.t))), float(log.t[-1] - log.t[0])
-    speed = (
-        float(np.sqrt(np.nanmean(log["u"] ** 2 + log["v"] ** 2)))
-        if "u" in moving and "v" in moving
-        else 0.0
-    )
-    turning = float(np.nanstd(log["r"])) if "r" in moving else 0.0
-
-    def half(noise: float, rate: float) -> int:
-        seconds = min(max(1.5, 10.0 * noise / max(rate, 1e-9)), span / 15.0)
-        return max(round(0.5 * seconds / step), 3)
-
-    place, turn = (
-        half(max(noise_of(log["x"]), noise_of(log["y"])), speed),
-        half(noise_of(log["psi"]), turning),
-    )
-    position = log["x"] + 1j * log["y"]
-    u, v = (log[name] if name in moving else np.full(len(log), np.nan) for name in ("u", "v"))
-    angles = {
-        "as declared": (log["psi"], u + 1j * v),
-        "psi reversed": (-log["psi"], u + 1j * v),
-        "v reversed": (log["psi"], u - 1j * v),
-    }
-    sailed = {
-        name: _mean(np.exp(1j * angle) * body, place) for name, (angle, body) in angles.items()
-    }
-    measured = {name: _mean(log[name], turn if name == "r" else place) for name in moving}
-    noise = (
-        np.sqrt(0.5) * noise_of(log["psi"]) / (turn * step),
-        noise_of(log["r"]) / np.sqrt(2.0 * turn) if "r" in moving else 0.0,
-    )
-    return _Motion(
-        step, _rate(position, place, step), sailed, _rate(log["psi"], turn, step), measured, noise
-    )
-
-
-def _rate(values: np.ndarray, half: int, step: float) -> np.ndarray:
-    """Return the central differences [T] over 2 half steps, NaN at the ends."""
-    out = np.full(values.shape, np.nan, dtype=values.dtype)
-    if values.size > 2 * half:
-        out[half:-half] = (values[2 * half :] - values[: -2 * half]) / (2 * half * step)
-    return out
-
-
-def _mean(values: np.ndarray, half: int) -> np.ndarray:
-    """Return the trapezoidal means [T] over 2 half steps.
-
-    They are NaN at the ends and where a sample is missing.
-    """
-    out = np.full(values.shape, np.nan, dtype=values.dtype)
-    if values.size > 2 * half:
-        weights = np.ones(2 * half + 1)
-        weights[[0, -1]] = 0.5
-        missing = np.convolve(~np.isfinite(values), np.ones(2 * half + 1), mode="valid") > 0.5
-        out[half:-half] = np.where(
-            missing,
-            np.nan,
-            np.convolve(
-                np.where(np.isfinite(values), values, 0.0), weights / (2 * half), mode="valid"
-            ),
-        )
-    return out
-
-
-def _velocity(motion: _Motion) -> list[Finding]:
+def _velocity(motion: Rates) -> list[Finding]:
     good = (
         np.isfinite(motion.ground)
-        & np.isfinite(motion.sailed["as declared"])
-        & np.isfinite(motion.sailed["psi reversed"])
+        & np.isfinite(motion.through_water["as declared"])
+        & np.isfinite(motion.through_water["psi reversed"])
     )
-    ground, sailed = (
+    ground, through_water = (
         motion.ground[good],
-        {name: values[good] for name, values in motion.sailed.items()},
+        {name: values[good] for name, values in motion.through_water.items()},
     )
-    if good.sum() < _FEWEST or not ground.any() or not sailed["as declared"].any():
+    if good.sum() < FEWEST_SAMPLES or not ground.any() or not through_water["as declared"].any():
         return [
             Finding(
                 "note",
                 "frames_unchecked",
-                f"u, v not checked against position: fewer than {_FEWEST} samples with motion",
+                f"u, v not checked against position: fewer than {FEWEST_SAMPLES} samples with"
+                " motion",
             )
         ]
-    return [_convention(ground, sailed)]
+    return [_convention(ground, through_water)]
 
 
-def _convention(ground: np.ndarray, sailed: dict[str, np.ndarray]) -> Finding:
+def _convention(ground: np.ndarray, through_water: dict[str, np.ndarray]) -> Finding:
     """Return how the velocity over ground [N] agrees with R(psi) [u, v] under each convention.
 
     Vectors are complex numbers.
@@ -191,15 +105,15 @@ def _convention(ground: np.ndarray, sailed: dict[str, np.ndarray]) -> Finding:
     The coherence is 1 where both agree, and the angle of the complex overlap is what would have to
     be added to psi.
     """
-    candidates = {name: (ground, values) for name, values in sailed.items()} | {
-        "y reversed": (ground.conj(), sailed["as declared"])
+    candidates = {name: (ground, values) for name, values in through_water.items()} | {
+        "y reversed": (ground.conj(), through_water["as declared"])
     }
     overlap = {
         name: complex(np.vdot(b, g)) / float(np.linalg.norm(g) * np.linalg.norm(b))
         for name, (g, b) in candidates.items()
     }
     declared, offset = overlap["as declared"].real, math.degrees(np.angle(overlap["as declared"]))
-    ratio = float(np.linalg.norm(sailed["as declared"]) / np.linalg.norm(ground))
+    ratio = float(np.linalg.norm(through_water["as declared"]) / np.linalg.norm(ground))
     # on a straight course all conventions do equally well: the declared one wins
     best = max(
         overlap, key=lambda name: abs(overlap[name]) + (1e-3 if name == "as declared" else 0.0)
@@ -224,7 +138,7 @@ def _convention(ground: np.ndarray, sailed: dict[str, np.ndarray]) -> Finding:
         level, action = "fatal", "are the columns of one run, one clock and one vessel?"
         text += "; no change of sign or angle makes them fit"
     elif not 0.8 < ratio < 1.25:
-        text += f"; check the units of u, v and x, y{_named(ratio)}"
+        text += f"; check the units of u, v and x, y{slip_in_words(ratio)}"
     elif abs(offset) > 5.0:
         text, action = (
             text + "; a compass offset, or velocities through the water in a current",
@@ -242,20 +156,15 @@ def _convention(ground: np.ndarray, sailed: dict[str, np.ndarray]) -> Finding:
     )
 
 
-def _named(factor: float) -> str:
-    slip = unit_slip(factor)
-    return f" ({slip})" if slip else ""
-
-
-def _follows_ground(log: Log, motion: _Motion, causes: dict[str, Cause]) -> Iterator[Finding]:
-    turned = motion.ground * np.exp(-1j * log["psi"])
-    known = np.isfinite(turned)
+def _follows_ground(log: Log, motion: Rates, causes: dict[str, Cause]) -> Iterator[Finding]:
+    in_body_axes = motion.ground * np.exp(-1j * log["psi"])
+    known = np.isfinite(in_body_axes)
     if not known.any():
         return
-    speed = float(np.sqrt(np.mean(np.abs(turned[known]) ** 2)))
-    for name, reference in (("u", turned.real), ("v", turned.imag)):
+    speed = float(np.sqrt(np.mean(np.abs(in_body_axes[known]) ** 2)))
+    for name, reference in (("u", in_body_axes.real), ("v", in_body_axes.imag)):
         certain = any(cause.sure for cause in causes.values())
-        yield from _follows(
+        yield from follow_findings(
             name,
             reference,
             motion,
@@ -263,95 +172,6 @@ def _follows_ground(log: Log, motion: _Motion, causes: dict[str, Cause]) -> Iter
             f"the position's rate along {'xy'[name == 'v']}",
             certain,
         )
-
-
-def _follows(
-    name: str, reference: np.ndarray, motion: _Motion, least: float, what: str, certain: bool
-) -> Iterator[Finding]:
-    """Return the sign, gain and lag of a channel against a reference [T].
-
-    Nothing is returned where the reference varies by less than `least`.
-
-    A lag alone misleads where the finer look is `certain` that pose and velocities differ at all:
-    slow channels correlate at any lag.
-    """
-    match = _agreement(reference, motion.measured[name], np.isfinite(reference), motion.step)
-    if match is None or match[3] < least:
-        return
-    correlation, gain, lag, spread = match
-    text = (
-        f"{name} against {what}: correlation {correlation:.3f}, gain {gain:.3f}, lag {lag:+.2f} s"
-    )
-    level: Level = "will mislead"
-    action = ""
-    clear = name != "r" or spread > 5.0 * max(motion.noise)
-    if correlation < -0.8 or (correlation < -0.5 and clear):
-        text, action = f"{text}; it has the opposite sign", "turn it in the channel map (sign: -1)"
-    elif correlation < 0.5 and name == "r" and clear:
-        level, text, action = (
-            "fatal",
-            f"{text}; they do not describe one motion",
-            "are both columns of this vessel and this clock?",
-        )
-    elif correlation > 0.9 and not 0.6 < gain < 1.6:
-        text, action = (
-            f"{text}; check its unit{_named(gain)}",
-            "correct the unit in the channel map",
-        )
-    elif correlation > 0.9 and abs(lag) > max(LEAST_LAG, motion.step) and clear and certain:
-        text = f"{text}; it {'trails' if lag > 0.0 else 'leads'}, a filter or another clock"
-        action = "shift it, or estimate the lag where the reader can"
-    else:
-        level = "note"
-    yield Finding(
-        level,
-        f"follows_{name}",
-        text,
-        {"correlation": correlation, "gain": gain, "lag": lag},
-        action,
-    )
-
-
-def _agreement(
-    reference: np.ndarray, measured: np.ndarray, good: np.ndarray, step: float
-) -> tuple[float, float, float, float] | None:
-    """Return how `measured` [T] follows `reference` [T] where `good` [T].
-
-    Returns:
-        Correlation (means removed) and gain (least squares through the origin) at the lag with the
-        largest correlation, that lag in s (positive where `measured` trails; within 3 s, refined by
-        a parabola), and the standard deviation of the reference; None where fewer than 50 samples
-        can be compared at all lags, or either does not vary.
-    """
-    reach = max(round(_LONGEST_LAG / step), 10)
-    if good.size < 2 * reach + _FEWEST:
-        return None
-    # the same samples for every lag, or the comparison of lags would be one of samples
-    around = np.lib.stride_tricks.sliding_window_view(np.isfinite(measured), 2 * reach + 1).all(
-        axis=1
-    )
-    at = np.flatnonzero(good[reach:-reach] & around) + reach
-    if at.size < _FEWEST:
-        return None
-    a, spread = reference[at], float(reference[at].std())
-    lags = np.arange(-reach, reach + 1)
-    cov = np.array([(a - a.mean()) @ measured[at + k] for k in lags]) / at.size
-    std = np.array([measured[at + k].std() for k in lags])
-    if spread == 0.0 or std.min() <= 1e-12 * np.nanmax(np.abs(measured)):
-        return None
-    values = cov / (spread * std)
-    best = int(np.argmax(np.abs(values)))
-    shift = 0.0
-    if 0 < best < lags.size - 1:
-        before, peak, after = np.abs(values[best - 1 : best + 2])
-        curvature = before - 2.0 * peak + after
-        shift = 0.5 * (before - after) / curvature if curvature < 0.0 else 0.0
-    return (
-        float(values[best]),
-        float(a @ measured[at + lags[best]] / (a @ a)),
-        float((lags[best] + shift) * step),
-        spread,
-    )
 
 
 def _position_jumps(log: Log, step: float) -> Iterator[Finding]:
@@ -386,10 +206,10 @@ def _position_jumps(log: Log, step: float) -> Iterator[Finding]:
         )
 
 
-def _yaw(log: Log, motion: _Motion) -> Iterator[Finding]:
+def _yaw(log: Log, motion: Rates) -> Iterator[Finding]:
     causes = yaw_causes(log)
     certain = any(cause.sure for cause in causes.values())
-    follows = list(_follows("r", motion.yaw, motion, _LEAST_YAW, "the rate of psi", certain))
+    follows = list(follow_findings("r", motion.yaw, motion, _LEAST_YAW, "the rate of psi", certain))
     yield from follows
     psi, r = log["psi"], log["r"]
     change = np.diff(psi) - 0.5 * motion.step * (r[1:] + r[:-1])
@@ -442,4 +262,4 @@ def _drift(log: Log, causes: dict[str, Cause]) -> Iterator[Finding]:
     level: Level = "will mislead" if strong else "note"
     action = "take the bias off r, or use the rate of psi in its place" if strong else ""
     yield Finding(level, "yaw_drift", text, {"end": end, "most": most, "bias": bias}, action)
-    yield from told(causes, YAW_LIMITS, log)
+    yield from cause_findings(causes, YAW_LIMITS, log)

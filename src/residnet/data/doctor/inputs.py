@@ -13,7 +13,8 @@ import numpy as np
 
 from residnet.core.log import Log
 from residnet.core.stretches import stretches
-from residnet.data.doctor.findings import Finding, Level, share_of, show
+from residnet.data.doctor.findings import Finding, share_of, show
+from residnet.data.doctor.relative_wind import relative_wind_findings
 from residnet.data.doctor.response import response_findings
 from residnet.data.doctor.signals import noise_of
 
@@ -23,7 +24,7 @@ _DEMAND = re.compile(
 )
 # an actuator that rests so long, s, so far from its demand (share of the demand's range) is stuck
 _STUCK = 5.0
-_APART = 0.2
+_FAR_APART = 0.2
 # a heading that goes so far one way and the other was steered
 _SWING = math.radians(10.0)
 _STEERING = ("delta", "cmd_delta", "nozzle", "cmd_nozzle")
@@ -39,7 +40,7 @@ def input_findings(log: Log, inputs: Sequence[str]) -> Iterator[Finding]:
         yield from _size(log, name)
         yield from _excursions(log, name)
     yield from _stuck(log, inputs)
-    yield from _relative_wind(log, inputs)
+    yield from relative_wind_findings(log, inputs)
     yield from response_findings(log, inputs)
 
 
@@ -153,18 +154,18 @@ def _excursions(log: Log, name: str) -> Iterator[Finding]:
     windows = np.lib.stride_tricks.sliding_window_view(
         np.pad(known, half, mode="edge"), 2 * half + 1
     )
-    away = np.abs(known - np.median(windows, axis=1))
+    distance = np.abs(known - np.median(windows, axis=1))
     low, high = (float(value) for value in np.quantile(known, (0.01, 0.99)))
     beyond = np.maximum(low - known, known - high)
     far = (
-        (away > 0.25 * max(high - low, 1e-12))
+        (distance > 0.25 * max(high - low, 1e-12))
         & (beyond > 0.25 * max(high - low, 1e-12))
-        & (away > 8.0 * noise_of(known))
+        & (distance > 8.0 * noise_of(known))
     )
-    far = _abrupt(known, away, far)
+    far = _abrupt(known, distance, far)
     starts, _ = stretches(far)
     if starts.size:
-        furthest = show(float(known[far][np.argmax(away[far])]), log.units[name])
+        furthest = show(float(known[far][np.argmax(distance[far])]), log.units[name])
         text = (
             f"{name} leaves its range for a moment {starts.size} times ({int(far.sum())} samples),"
             f" to {furthest}"
@@ -180,7 +181,7 @@ def _excursions(log: Log, name: str) -> Iterator[Finding]:
         )
 
 
-def _abrupt(values: np.ndarray, away: np.ndarray, far: np.ndarray) -> np.ndarray:
+def _abrupt(values: np.ndarray, distance: np.ndarray, far: np.ndarray) -> np.ndarray:
     """Return the excursions among far [T] that go and come within a step or two.
 
     An actuator takes its time.
@@ -189,7 +190,7 @@ def _abrupt(values: np.ndarray, away: np.ndarray, far: np.ndarray) -> np.ndarray
     out = far.copy()
     for start, stop in zip(*stretches(far), strict=True):
         edges = change[max(start - 1, 0) : start + 1].max(), change[stop : stop + 2].max()
-        out[start:stop] = min(edges) > 0.5 * away[start:stop].max()
+        out[start:stop] = min(edges) > 0.5 * distance[start:stop].max()
     return out
 
 
@@ -199,21 +200,23 @@ def _stuck(log: Log, inputs: Sequence[str]) -> Iterator[Finding]:
         actual = _actual_of(demand, log)
         if actual is None or log.units[actual] != log.units[demand]:
             continue
-        wanted, done = log[demand], log[actual]
-        span = float(np.nanmax(wanted) - np.nanmin(wanted))
+        demanded, measured = log[demand], log[actual]
+        span = float(np.nanmax(demanded) - np.nanmin(demanded))
         if span <= 0.0:
             continue
-        still = np.abs(np.nan_to_num(np.diff(done))) <= max(6.0 * noise_of(done), 1e-4 * span)
+        still = np.abs(np.nan_to_num(np.diff(measured))) <= max(
+            6.0 * noise_of(measured), 1e-4 * span
+        )
         starts, stops = stretches(still)
         worst: tuple[float, int, int] = (0.0, 0, 0)
         for start, stop in zip(starts, stops, strict=True):
             run = slice(start, stop + 1)
             seconds = float(log.t[stop] - log.t[start])
-            apart = np.abs(wanted[run] - done[run]) > _APART * span
+            far_apart = np.abs(demanded[run] - measured[run]) > _FAR_APART * span
             if (
                 seconds >= _STUCK
-                and float(np.ptp(wanted[run])) > _APART * span
-                and float(apart.mean()) > 0.1
+                and float(np.ptp(demanded[run])) > _FAR_APART * span
+                and float(far_apart.mean()) > 0.1
                 and seconds > worst[0]
             ):
                 worst = (seconds, int(start), int(stop))
@@ -287,71 +290,11 @@ def _idle(log: Log, inputs: Sequence[str]) -> Iterator[Finding]:
 
 def _swings(angle: np.ndarray) -> int:
     """Return how often an angle [T] turns round after going more than `_SWING` one way."""
-    count, low, high, way = 0, float(angle[0]), float(angle[0]), 0
+    count, low, high, direction = 0, float(angle[0]), float(angle[0]), 0
     for value in angle.tolist():
         low, high = min(low, value), max(high, value)
-        if way <= 0 and value - low > _SWING:
-            count, way, high = count + (way < 0), 1, value
-        elif way >= 0 and high - value > _SWING:
-            count, way, low = count + (way > 0), -1, value
+        if direction <= 0 and value - low > _SWING:
+            count, direction, high = count + (direction < 0), 1, value
+        elif direction >= 0 and high - value > _SWING:
+            count, direction, low = count + (direction > 0), -1, value
     return count
-
-
-def _relative_wind(log: Log, inputs: Sequence[str]) -> Iterator[Finding]:
-    """Return the wind directions that turn against the heading: relative wind, not true wind."""
-    if "psi" not in log.channels:
-        return
-    directions = [name for name in log.channels if "wind" in name and log.units[name] == "rad"]
-    for name in directions:
-        slope, error = _slope_against_heading(log, name)
-        twin = next(
-            (other for other in directions if other != name and _same_direction(log, name, other)),
-            None,
-        )
-        turns = error > 0.0 and slope < -5.0 * error and abs(slope + 1.0) < max(3.0 * error, 0.2)
-        if not (turns or twin or "relative" in name or name.startswith("rel_")):
-            continue
-        text = f"{name} turns by {slope:+.2f} +- {2.0 * error:.2f} of every change of heading" + (
-            f", and plus psi it is {twin}" if twin else ""
-        )
-        action = (
-            "a free run must not be given it: use the true wind"
-            if name in inputs
-            else "do not make it an input: use the true wind"
-        )
-        level: Level = "will mislead" if name in inputs else "note"
-        yield Finding(
-            level,
-            "relative_wind",
-            f"{text}: a relative wind contains psi, u and v",
-            {"slope": slope, "error": error},
-            action,
-        )
-
-
-def _same_direction(log: Log, relative: str, true: str) -> bool:
-    """Return whether one direction plus the heading is the other, where the heading tells."""
-    both, alone = (np.exp(1j * (log[relative] + turn - log[true])) for turn in (log["psi"], 0.0))
-    return bool(
-        abs(np.nanmean(both)) > 0.9 and abs(np.nanmean(alone)) < abs(np.nanmean(both)) - 0.02
-    )
-
-
-def _slope_against_heading(log: Log, name: str) -> tuple[float, float]:
-    """Return the change of a direction over ten seconds per rad of heading, and its error.
-
-    The error is a standard error; both are 0 where nothing can be said.
-    """
-    hop = max(round(10.0 / float(np.median(np.diff(log.t)))), 1)
-    if len(log) < 5 * hop:
-        return 0.0, 0.0
-    change = np.angle(np.exp(1j * (log[name][hop:] - log[name][:-hop])))
-    turned = log["psi"][hop:] - log["psi"][:-hop]
-    # beyond half a circle a change of direction cannot be told from its complement
-    good = np.isfinite(change) & np.isfinite(turned) & (np.abs(turned) < 1.5)
-    if good.sum() < 100 or float(np.std(turned[good])) < math.radians(1.0):
-        return 0.0, 0.0
-    y, x = change[good] - change[good].mean(), turned[good] - turned[good].mean()
-    slope = float(x @ y) / float(x @ x)
-    scores = np.array([part.sum() for part in np.array_split(x * (y - slope * x), 20)])
-    return slope, float(np.sqrt((scores**2).sum()) / float(x @ x))

@@ -221,16 +221,17 @@ class _Rows:
         return _pursuit(y * weight, x * weight[:, None], names, section)
 
     def _factorise(self, keep: np.ndarray) -> None:
-        each = (self._dt * self._rate) ** 2
-        total, one = self._between(each)[keep], each[np.minimum(self._at[keep], each.size - 1)]
-        one = np.where(np.isfinite(one), np.minimum(one, total), total)
+        variance = (self._dt * self._rate) ** 2
+        total = self._between(variance)[keep]
+        shared = variance[np.minimum(self._at[keep], variance.size - 1)]
+        shared = np.where(np.isfinite(shared), np.minimum(shared, total), total)
         floor = 1e-3 * float(np.median(np.abs(self._excess[keep]))) + 1e-12
         # the trapezoid shares half a sample with its neighbour, which noise of the pose hides at
         # least in part: increments are never taken as more alike than independent ones, or the
         # whitening would look at the highest frequencies alone
-        ends = np.maximum(self._noise**2 - 0.25 * one, 0.0)
-        beside = np.append(keep[1:] == keep[:-1] + 1, False)
-        diagonal, off = total + 2.0 * ends + floor**2, np.where(beside, -ends, 0.0)
+        ends = np.maximum(self._noise**2 - 0.25 * shared, 0.0)
+        adjacent = np.append(keep[1:] == keep[:-1] + 1, False)
+        diagonal, off = total + 2.0 * ends + floor**2, np.where(adjacent, -ends, 0.0)
         # noise of the pose alone is singular in the limit: a little of the diagonal keeps the
         # factor
         self._factor = cholesky_banded(np.stack((1.0001 * diagonal, off)), lower=True)
@@ -244,10 +245,10 @@ class _Rows:
         """Return [K] 1 or 0: 0 for rows that stand far out and that no cause explains (jumps)."""
         scale = np.maximum(np.abs(x).max(axis=0), 1e-300)
         coefficients = np.linalg.lstsq(x / scale, y, rcond=1e-9)[0]
-        rest = np.abs(y - (x / scale) @ coefficients)
-        kept: np.ndarray = (rest <= 8.0 * 1.4826 * max(float(np.median(rest)), 1e-300)).astype(
-            float
-        )
+        residual = np.abs(y - (x / scale) @ coefficients)
+        kept: np.ndarray = (
+            residual <= 8.0 * 1.4826 * max(float(np.median(residual)), 1e-300)
+        ).astype(float)
         return kept
 
 
@@ -260,7 +261,7 @@ def _pursuit(
     x, names, scale = x[:, alive] / scale[alive], names[alive], scale[alive]
     gram, product, energy = x.T @ x, x.T @ y, float(y @ y)
 
-    def left(chosen: list[str]) -> float:
+    def residual_energy(chosen: list[str]) -> float:
         part = np.isin(names, chosen)
         return (
             energy
@@ -273,12 +274,12 @@ def _pursuit(
         )
 
     every = list(dict.fromkeys(names.tolist()))
-    variance = max(left(every) / y.size, 1e-12 * energy / y.size)
+    variance = max(residual_energy(every) / y.size, 1e-12 * energy / y.size)
     price = {name: _WORTH * variance * (1.0 + 0.2 * float((names == name).sum())) for name in every}
     chosen: list[str] = []
     while len(chosen) < _MOST_CAUSES:
         gain = {
-            name: left(chosen) - left([*chosen, name]) - price[name]
+            name: residual_energy(chosen) - residual_energy([*chosen, name]) - price[name]
             for name in every
             if name not in chosen
         }
@@ -287,9 +288,9 @@ def _pursuit(
             break
         chosen.append(best)
     for name in list(chosen[:-1]):
-        rest = [other for other in chosen if other != name]
-        if left(rest) - left(chosen) < price[name]:
-            chosen = rest
+        fewer = [cause for cause in chosen if cause != name]
+        if residual_energy(fewer) - residual_energy(chosen) < price[name]:
+            chosen = fewer
     columns = np.isin(names, chosen)
     return (
         _causes(y, x[:, columns], names[columns], scale[columns], section, chosen) if chosen else {}
@@ -305,11 +306,11 @@ def _causes(
     order: list[str],
 ) -> dict[str, Cause]:
     values = np.linalg.lstsq(x, y, rcond=1e-9)[0]
-    rest = y - x @ values
+    residual = y - x @ values
     inverse = np.linalg.pinv(x.T @ x)
-    scores = np.stack([x[section == i].T @ rest[section == i] for i in range(_SECTIONS)])
+    scores = np.stack([x[section == i].T @ residual[section == i] for i in range(_SECTIONS)])
     spread = inverse @ (scores.T @ scores) @ inverse * _SECTIONS / (_SECTIONS - 1)
-    plain = inverse * float(rest @ rest) / max(y.size - x.shape[1], 1)
+    plain = inverse * float(residual @ residual) / max(y.size - x.shape[1], 1)
     errors = np.sqrt(np.maximum(np.diag(spread), np.diag(plain)))
     return {
         name: Cause(name, (values / scale)[names == name], (errors / scale)[names == name])

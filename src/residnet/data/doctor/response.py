@@ -112,13 +112,13 @@ class _Answer:
 def _opposite(log: Log, steer: np.ndarray) -> bool:
     """Return whether steering and yaw rate both stay on one side, and not on the same."""
     good = np.isfinite(log["r"]) & np.isfinite(steer)
-    r, given = _smoothed(log["r"])[good], steer[good]
+    r, steering = _smoothed(log["r"])[good], steer[good]
     if r.size < _FEWEST or float(np.abs(r).mean()) < 6.0 * noise_of(log["r"]):
         return False
     one_sided = all(
-        abs(float(values.sum())) > 0.95 * float(np.abs(values).sum()) for values in (r, given)
+        abs(float(values.sum())) > 0.95 * float(np.abs(values).sum()) for values in (r, steering)
     )
-    return one_sided and float(r.sum()) * float(given.sum()) < 0.0
+    return one_sided and float(r.sum()) * float(steering.sum()) < 0.0
 
 
 def _steering(log: Log, inputs: Sequence[str]) -> tuple[str, np.ndarray] | None:
@@ -179,18 +179,19 @@ def _answer(log: Log, steer: np.ndarray) -> _Answer | None:
         area(v * np.abs(v)),
     ]
     known, y = np.stack([change(column) for column in columns], axis=-1), change(smooth)
-    given = area(steer)
+    steering = area(steer)
     shifts = np.unique(np.round(np.linspace(-reach, reach, 61)).astype(int))
-    left = {
-        int(shift): _fit(np.column_stack((known, change(given, int(shift)))), y) for shift in shifts
+    fits = {
+        int(shift): _fit(np.column_stack((known, change(steering, int(shift)))), y)
+        for shift in shifts
     }
-    zero, best = left[0], min(left, key=lambda shift: left[shift][0])
+    zero, best = fits[0], min(fits, key=lambda shift: fits[shift][0])
     return _Answer(
         zero[1],
         zero[2],
         best * step,
-        zero[0] / max(left[best][0], 1e-300),
-        left[best][2],
+        zero[0] / max(fits[best][0], 1e-300),
+        fits[best][2],
         _fit(known, y)[0] / max(zero[0], 1e-300),
     )
 

@@ -1,0 +1,162 @@
+"""Tables read piece by piece: the wanted columns of csv and Parquet files."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from residnet.core.errors import DataError, UsageError
+from residnet.core.names import nearest, shown
+from residnet.data.readers.tables.lines import check_lines
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+# pieces of this many rows stay in the cache while they are parsed
+_PIECE = 20_000
+Pieces = Iterator["tuple[pd.DataFrame, float]"]
+
+
+def _positions(
+    path: Path, header: Sequence[str], columns: Sequence[str], hint: str = ""
+) -> list[int]:
+    """Return where the wanted columns stand in the header."""
+    for column in columns:
+        count = list(header).count(column)
+        if count == 0:
+            raise UsageError(f"{path}: no column '{column}'{nearest(column, header)}{hint}")
+        if count > 1:
+            raise DataError(
+                f"{path}: column '{column}' stands {count} times in the header; rename the copies"
+                " so that one is meant"
+            )
+    return [list(header).index(column) for column in columns]
+
+
+def read_csv(path: Path, columns: Sequence[str], delimiter: str, decimal: str) -> Pieces:
+    """Yield the wanted columns of a text table piece by piece, with the share of the file read.
+
+    Args:
+        path: the file.
+        columns: names of the wanted columns, in order.
+        delimiter: between cells.
+        decimal: sign of the decimals.
+
+    Raises:
+        UsageError: where a column is missing.
+        DataError: where the file is empty, not UTF-8 or not a regular table.
+    """
+    import pandas as pd
+
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as stream:
+            header = [cell.strip() for cell in next(csv.reader(stream, delimiter=delimiter), [])]
+        if not any(header):
+            raise DataError(
+                f"{path}: the file is empty or its first line is blank; a header line with column"
+                " names was expected"
+            )
+        hint = (
+            f" (only one column found; is the delimiter really '{delimiter}'?)"
+            if len(header) == 1
+            else ""
+        )
+        where = _positions(path, header, columns, hint)
+        # one column more than the header: cells beyond it would shift or vanish silently (a decimal
+        # comma in a comma table does that)
+        wide, size = len(header), max(1, path.stat().st_size)
+        cut = check_lines(path, delimiter, wide)
+        with path.open("rb") as stream_of_bytes:
+            pieces = pd.read_csv(
+                stream_of_bytes,
+                sep=delimiter,
+                decimal=decimal,
+                header=None,
+                skiprows=1,
+                names=list(range(wide + 1)),
+                index_col=False,
+                skip_blank_lines=False,
+                skipinitialspace=True,
+                low_memory=False,
+                encoding="utf-8-sig",
+                chunksize=_PIECE,
+            )
+            for table, last in _with_last(pieces):
+                beyond = np.flatnonzero(table[wide].notna().to_numpy())
+                if beyond.size:
+                    raise DataError(
+                        f"{path}: line {int(table.index[beyond[0]]) + 2} has more cells than the"
+                        f" {wide} columns of the header ({beyond.size} such lines); check"
+                        " `delimiter` and `decimal`"
+                    )
+                wanted = table[where]
+                if last and cut:
+                    wanted = wanted.iloc[:-1]
+                    wanted.attrs["cut"] = True
+                yield wanted, min(1.0, stream_of_bytes.tell() / size)
+    except UnicodeDecodeError as error:
+        raise DataError(
+            f"{path}: not UTF-8 text (byte {error.start}); save the file as UTF-8"
+        ) from error
+    except pd.errors.EmptyDataError:
+        return
+    except pd.errors.ParserError as error:
+        reason = shown(" ".join(str(error).split()), 200)
+        raise DataError(
+            f"{path}: not a regular table, its header has {len(header)} columns ({reason}); check"
+            " `delimiter` and `decimal`"
+        ) from error
+
+
+def _with_last(pieces: Iterable[pd.DataFrame]) -> Iterator[tuple[pd.DataFrame, bool]]:
+    """Return each piece, and whether it is the last."""
+    waiting: pd.DataFrame | None = None
+    for piece in pieces:
+        if waiting is not None:
+            yield waiting, False
+        waiting = piece
+    if waiting is not None:
+        yield waiting, True
+
+
+def read_parquet(path: Path, columns: Sequence[str]) -> Pieces:
+    """Yield the wanted columns of a Parquet file piece by piece, with the share of the rows read.
+
+    Args:
+        path: the file.
+        columns: names of the wanted columns, in order.
+
+    Raises:
+        UsageError: where a column is missing.
+        DataError: where the file cannot be read.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        _positions(path, pq.read_schema(path).names, columns)
+        with pq.ParquetFile(path, page_checksum_verification=True) as file:
+            rows, read = max(1, file.metadata.num_rows), 0
+            for batch in file.iter_batches(batch_size=_PIECE, columns=sorted(set(columns))):
+                read += batch.num_rows
+                table = pa.Table.from_batches([batch]).to_pandas(ignore_metadata=True)
+                yield table[list(columns)], read / rows
+    except (
+        pa.ArrowException,
+        OSError,
+        ValueError,
+        TypeError,
+        LookupError,
+        ArithmeticError,
+        MemoryError,
+    ) as error:
+        # damaged metadata reaches every layer of the library
+        raise DataError(
+            f"{path}: not a readable Parquet file"
+            f" ({shown(str(error) or type(error).__name__, 200)})"
+        ) from error
