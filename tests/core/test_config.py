@@ -28,7 +28,6 @@ from residnet.core.config import (
     Seconds,
     dump_config,
     load_config,
-    load_mapping,
     quantity,
 )
 from residnet.core.errors import ConfigError, UsageError
@@ -125,92 +124,6 @@ def test_defaults_are_checked() -> None:
 
     with pytest.raises(ValidationError, match="greater than 0"):
         Wrong()
-
-
-# YAML
-
-
-def test_scalars_follow_yaml_1_2(tmp_path: Path) -> None:
-    path = tmp_path / "a.yaml"
-    path.write_text(
-        "a: 1e-3\nb: 1E6\nc: 010\nd: 0x10\ne: off\nf: yes\ng: 12:30\nh: 2024-01-01\ni: ~\nj:\nk:"
-        " true\nl: .5\nm: '1e-3'\non: 0o17\n7: x\n"
-    )
-    mapping = load_mapping(path)
-    assert mapping == {
-        **{
-            "a": 1e-3,
-            "b": 1e6,
-            "c": 10,
-            "d": 16,
-            "e": "off",
-            "f": "yes",
-            "g": "12:30",
-            "h": "2024-01-01",
-            "i": None,
-            "j": None,
-        },
-        **{"k": True, "l": 0.5, "m": "1e-3", "on": 15, "7": "x"},
-    }
-    assert type(mapping["b"]) is float
-    assert type(mapping["c"]) is int
-
-
-def test_merge_keys_are_not_duplicates_and_are_not_shared(load: Callable[..., Fit]) -> None:
-    text = "heads:\n  a: &a {kind: lstm, hidden_size: 3}\n  b: *a\n  c: {<<: *a, hidden_size: 5}\n"
-    heads = load(text, "heads.a.hidden_size=4").heads
-    assert {name: head.model_dump()["hidden_size"] for name, head in heads.items()} == {
-        "a": 4,
-        "b": 3,
-        "c": 5,
-    }
-
-
-@pytest.mark.parametrize(
-    ("content", "expected"),
-    [
-        (b"", ": empty; expected a mapping"),
-        (b"# nothing\n", ": empty; expected a mapping"),
-        (b"- 1\n- 2\n", ": expected a mapping of keys to values, found a list"),
-        (b"hello\n", ": expected a mapping of keys to values, found the value 'hello'"),
-        (b"a: 1\nb: [1, 2\n", ":3:1: not YAML: "),
-        (b"a: 1\n\tb: 2\n", ":2:1: not YAML: "),
-        (b"a: b: c\n", ":1:5: not YAML: mapping values are not allowed here"),
-        (b"a: 1\n---\nb: 2\n", ":2:1: not YAML: "),
-        (b"a: !!python/object:os.system {}\n", ":1:4: not YAML: could not determine a constructor"),
-        (b"a: !!timestamp 2024-01-01\n", ":1:4: not YAML: could not determine a constructor"),
-        (b"? [a]\n: 1\n", ":1:3: not YAML: a key must be plain text"),
-        (b"a: *nowhere\n", ":1:4: not YAML: found undefined alias"),
-        (b"a: &a [*a]\n", ": nested too deeply, or refers to itself"),
-        (b"[" * 5000, ": nested too deeply"),
-        (b"a: \x01\n", ": not YAML: "),
-        (b"a: \xff\n", ": not UTF-8 text (byte 3)"),
-        (b"a: 1\nb:\n  c: 1\n  d: 2\n  c: 3\n", ":5: duplicate key 'c', first on line 3"),
-        (b"a: 1\na: 1\n", ":2: duplicate key 'a', first on line 1"),
-        (b"l:\n- {k: 1, k: 2}\n", ":2: duplicate key 'k', first on line 2"),
-    ],
-)
-def test_unreadable_files(tmp_path: Path, content: bytes, expected: str) -> None:
-    path = tmp_path / "a.yaml"
-    path.write_bytes(content)
-    for read in (lambda: load_mapping(path), lambda: load_config(path, [], Fit)):
-        with pytest.raises(ConfigError) as caught:
-            read()
-        assert str(caught.value).startswith(f"{path}{expected}")
-        assert "\n" not in str(caught.value)
-
-
-def test_missing_file_and_folder(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"nope\.yaml: no such file$"):
-        load_config(tmp_path / "nope.yaml", [], Fit)
-    with pytest.raises(ConfigError, match="is a folder; give a YAML file"):
-        load_mapping(tmp_path)
-
-
-def test_byte_order_mark_is_skipped(tmp_path: Path) -> None:
-    path = tmp_path / "a.yaml"
-    path.write_bytes(b"\xef\xbb\xbfa: 1\n")
-    assert load_mapping(path) == {"a": 1}
 
 
 # paths
