@@ -9,7 +9,7 @@ import pytest
 from printed_times import EPOCH, printed
 
 from residnet.core.errors import DataError, UsageError
-from residnet.data.readers.composing.clocks import settle
+from residnet.data.readers.composing.clocks import align_clocks
 from residnet.data.readers.composing.traffic import traffic
 from residnet.data.readers.recording import Recording, Series
 from residnet.data.readers.stamps import parse_numbers, parse_texts
@@ -89,7 +89,7 @@ def test_zones_unix_times_and_plain_seconds() -> None:
 def test_the_recorders_clock_is_brought_to_the_stamps(offset: float, expected: set[str]) -> None:
     t = 0.1 * np.arange(500)
     late = RNG.exponential(2e-3, t.size)
-    settled = settle(
+    settled = align_clocks(
         recording(topic("gps", t, t, t + offset + late), topic("rpm", t, None, t + offset)), {}
     )
     assert {entry["code"] for entry in settled.remarks} == expected
@@ -106,7 +106,7 @@ def test_one_sender_with_another_clock_is_named_and_delays_correct_it() -> None:
             for name, ahead in [("a", 0.0), ("b", 0.0), ("c", -0.6)]
         )
     )
-    settled = settle(made, {"/c": -0.6})
+    settled = align_clocks(made, {"/c": -0.6})
     assert "clock_offset" in codes(settled["c"])
     assert "clock_offset" not in codes(settled["a"])
     np.testing.assert_allclose(settled["c"].clock, t, atol=1e-12)
@@ -116,7 +116,7 @@ def test_one_sender_with_another_clock_is_named_and_delays_correct_it() -> None:
 def test_estimated_delay_of_a_topic_without_stamps() -> None:
     t = 0.1 * np.arange(500)
     late = 0.05 + RNG.exponential(1e-3, t.size)
-    settled = settle(
+    settled = align_clocks(
         recording(topic("gps", t, t, t + late), topic("rpm", t, None, t + 0.05)), {"rpm": None}
     )
     np.testing.assert_allclose(settled["rpm"].clock, t, atol=3e-3)
@@ -137,7 +137,7 @@ def test_order_of_rows() -> None:
         topic("shared", t, doubled, None, a=shared),
         topic("empty_stamps", t, np.zeros(300), t),
     )
-    settled = settle(made, {}, 0.0).series
+    settled = align_clocks(made, {}, 0.0).series
     assert all((np.diff(one.clock) > 0).all() for name, one in settled.items() if name != "restart")
     assert codes(settled["late"]) == ["out_of_order"]
     assert (settled["restart"].remarks[0]["level"], codes(settled["restart"])[0]) == (

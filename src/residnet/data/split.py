@@ -38,13 +38,13 @@ class SplitConfig(Config):
 
     @model_validator(mode="after")
     def _one_source(self) -> SplitConfig:
-        given = [name for name in SPLITS if getattr(self, name)]
-        if self.file is not None and given:
+        named = [name for name in SPLITS if getattr(self, name)]
+        if self.file is not None and named:
             raise ValueError(
-                f"give either `file` or patterns, not both (given: file and {', '.join(given)})"
+                f"give either `file` or patterns, not both (given: file and {', '.join(named)})"
             )
-        if self.file is None and len(given) < len(SPLITS):
-            empty = [name for name in SPLITS if name not in given]
+        if self.file is None and len(named) < len(SPLITS):
+            empty = [name for name in SPLITS if name not in named]
             raise ValueError(
                 f"no files for {', '.join(empty)}; give patterns for train, validation and test, or"
                 " one `file` that names them"

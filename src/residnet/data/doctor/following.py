@@ -11,7 +11,7 @@ from residnet.data.doctor.findings import Finding, Level, unit_slip
 from residnet.data.doctor.rates import Rates
 
 FEWEST_SAMPLES = 50
-"""Fewest samples that anything is said of."""
+"""Fewest samples that a comparison needs."""
 
 
 _LONGEST_LAG = 3.0

@@ -11,7 +11,7 @@ from typing import Literal, final
 from residnet.core.errors import UsageError
 from residnet.core.log import Log
 from residnet.data.readers.base import LogReader, require_file
-from residnet.data.readers.composing.clocks import settle
+from residnet.data.readers.composing.clocks import align_clocks
 from residnet.data.readers.composing.composed import RecordingConfig
 from residnet.data.readers.composing.wanted import EVERYTHING, Wanted
 from residnet.data.readers.recorders.ardupilot import ArduPilotConfig
@@ -97,7 +97,10 @@ def format_of(path: Path) -> Format | None:
         require_file(path)
         with path.open("rb") as stream:
             head = stream.read(1024)
-    return next((one for one in FORMATS if one.fits(path, head)), None)
+    return next(
+        (recording_format for recording_format in FORMATS if recording_format.fits(path, head)),
+        None,
+    )
 
 
 def reader_for(path: Path) -> LogReader:
@@ -118,15 +121,15 @@ def recording_for(path: Path) -> Recording:
         UsageError: where there is nothing at `path`, or its format describes no channels.
         DataError: where it cannot be read.
     """
-    return settle(_config_for(path).load(path, EVERYTHING), {}, None)
+    return align_clocks(_config_for(path).load(path, EVERYTHING), {}, None)
 
 
 def _config_for(path: Path) -> RecordingConfig:
-    one = format_of(path)
-    if one is None:
-        known = ", ".join(dict.fromkeys(entry.name for entry in FORMATS))
+    recording_format = format_of(path)
+    if recording_format is None:
+        names = ", ".join(dict.fromkeys(entry.name for entry in FORMATS))
         raise UsageError(
             f"{path}: does not say what its columns are; give a channel map with --config (formats"
-            f" that need none: {known}, canonical Parquet)"
+            f" that need none: {names}, canonical Parquet)"
         )
-    return one.config()
+    return recording_format.config()

@@ -17,11 +17,11 @@ _LARGE = 50_000_000
 def digest(files: Sequence[Path]) -> str:
     """Return the SHA-256 of one file's bytes, or of the digests of several in order, as hex."""
     if len(files) == 1:
-        return _one(files[0])
-    return hashlib.sha256("".join(_one(file) for file in files).encode()).hexdigest()
+        return _file_digest(files[0])
+    return hashlib.sha256("".join(_file_digest(file) for file in files).encode()).hexdigest()
 
 
-def _one(file: Path) -> str:
+def _file_digest(file: Path) -> str:
     with file.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
@@ -43,7 +43,7 @@ class Advance(Protocol):
 
 
 @contextmanager
-def progress(what: str, size: int, total: float) -> Iterator[Advance]:
+def progress(name: str, size: int, total: float) -> Iterator[Advance]:
     """Return a bar on standard error while a recording of `size` bytes is read.
 
     None where it is small or nobody watches.
@@ -74,13 +74,13 @@ def progress(what: str, size: int, total: float) -> Iterator[Advance]:
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(what, total=total)
+        task = bar.add_task(name, total=total)
         yield lambda done: bar.update(task, completed=done)
 
 
-def missing_package(extra: str, package: str, what: str) -> UsageError:
+def missing_package(extra: str, package: str, name: str) -> UsageError:
     """Return the error for a format whose package is not installed."""
     return UsageError(
-        f"{what} needs the package {package}, which is not installed; install it with: pip install"
+        f"{name} needs the package {package}, which is not installed; install it with: pip install"
         f' "residnet[{extra}]"'
     )

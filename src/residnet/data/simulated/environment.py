@@ -121,14 +121,14 @@ class Disturbance(Config):
     def needs(self) -> dict[str, str]:
         """Return the inputs that a plant must have for this disturbance, each with its key."""
         north, east = self.current()
-        asked = {
+        requested = {
             "force_x": self.force_x != 0, "force_y": self.force_y != 0,
             "force_n": self.force_n != 0,
             "force_north": self.force_north != 0, "force_east": self.force_east != 0,
             "current_north": north != 0 or self.current_each is not None,
             "current_east": east != 0 or self.current_each is not None,
         }  # fmt: skip
-        needs = {name: name for name, wanted in asked.items() if wanted}
+        needs = {name: name for name, is_needed in requested.items() if is_needed}
         needs |= dict.fromkeys(WIND_INPUTS, "wind") if self.wind is not None else {}
         return needs | (
             dict.fromkeys(("force_x", "force_y", "force_n"), "waves")

@@ -53,7 +53,7 @@ class SimulatedTrials(Config):
     seed: int = Field(default=0, ge=0)
 
     @model_validator(mode="after")
-    def _felt(self) -> SimulatedTrials:
+    def _check_plant(self) -> SimulatedTrials:
         try:
             plant = load_vessel(self.vessel).build()
             # actuators with dead time move by a step of their own
@@ -89,14 +89,14 @@ class SimulatedTrials(Config):
         out = ["train"] * len(manoeuvres)
         for kind, count in self.identification.items():
             members = [i for i, manoeuvre in enumerate(manoeuvres) if manoeuvre.kind == kind]
-            kept = self.validation.get(kind, 0)
-            if not 0 < count < len(members) or not 0 <= kept < count:
+            held_back = self.validation.get(kind, 0)
+            if not 0 < count < len(members) or not 0 <= held_back < count:
                 raise ValueError(
-                    f"{count} of {len(members)} '{kind}' manoeuvres for identification, {kept} of"
-                    " them for validation: leaves a split empty"
+                    f"{count} of {len(members)} '{kind}' manoeuvres for identification, {held_back}"
+                    " of them for validation: leaves a split empty"
                 )
             order = random.permutation(members)
-            for i in order[:kept]:
+            for i in order[:held_back]:
                 out[i] = "validation"
             for i in order[count:]:
                 out[i] = "test"

@@ -25,14 +25,14 @@ def agreement(recording: Recording, log: Log, start: float, idle: Iterable[str])
     out: list[Remark] = []
     rates = _rates(log)
     for name in idle:
-        one = recording.series.get(name)
-        if one is None or len(one) < _ENOUGH:
+        series = recording.series.get(name)
+        if series is None or len(series) < _ENOUGH:
             continue
-        t = one.clock - start + log.t[0]
-        for path in one.fields:
+        t = series.clock - start + log.t[0]
+        for path in series.fields:
             if key_of(path).endswith(("linear_x", "linear_y", "angular_z")):
-                out += _lag(one, path, t, log.t, rates)
-        out += _lever(one, t, log)
+                out += _lag(series, path, t, log.t, rates)
+        out += _lever(series, t, log)
     return out
 
 
@@ -51,10 +51,10 @@ def _rates(log: Log) -> dict[str, np.ndarray]:
 
 
 def _lag(
-    one: Series, path: str, t: np.ndarray, clock: np.ndarray, rates: dict[str, np.ndarray]
+    series: Series, path: str, t: np.ndarray, clock: np.ndarray, rates: dict[str, np.ndarray]
 ) -> list[Remark]:
-    every = max(1, len(one) // _MOST_ROWS)
-    at, values = t[::every], one[path][::every]
+    every = max(1, len(series) // _MOST_ROWS)
+    at, values = t[::every], series[path][::every]
     best = (0.0, 0.0, "", 0.0)
     for name, rate in rates.items():
         known = np.isfinite(rate)
@@ -82,7 +82,7 @@ def _lag(
         else f"leads {name} of the log by {-lag:.2f} s"
     )
     text = (
-        f"topic {one.name}: {path} {verb} (correlation {size:.3f}, {still:.3f} without the lag);"
+        f"topic {series.name}: {path} {verb} (correlation {size:.3f}, {still:.3f} without the lag);"
         " give the topic's `delays` before it is used"
     )
     return [remark("note", "topic_lag", text, lag=lag, correlation=size, correlation_without=still)]
@@ -95,7 +95,7 @@ def _correlation(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.corrcoef(a[known], b[known])[0, 1])
 
 
-def _lever(one: Series, t: np.ndarray, log: Log) -> list[Remark]:
+def _lever(series: Series, t: np.ndarray, log: Log) -> list[Remark]:
     """Return whether a topic's positions turn about the log's.
 
     Both then belong to different points of the vessel.
@@ -104,13 +104,13 @@ def _lever(one: Series, t: np.ndarray, log: Log) -> list[Remark]:
         (
             p
             for p in ("pose.position", "pose.pose.position", "position")
-            if one.has(f"{p}.x") and one.has(f"{p}.y")
+            if series.has(f"{p}.x") and series.has(f"{p}.y")
         ),
         None,
     )
     if pair is None or not {"x", "y", "psi"} <= set(log.channels):
         return []
-    first, second = one[f"{pair}.x"], one[f"{pair}.y"]
+    first, second = series[f"{pair}.x"], series[f"{pair}.y"]
     known = np.isfinite(log["psi"]) & np.isfinite(log["x"]) & np.isfinite(log["y"])
     if known.sum() < _ENOUGH:
         return []
@@ -118,37 +118,37 @@ def _lever(one: Series, t: np.ndarray, log: Log) -> list[Remark]:
         np.interp(t, log.t[known], log[name][known], left=np.nan, right=np.nan)
         for name in ("x", "y", "psi")
     )
-    found = []
+    fits = []
     for north, east in ((first, second), (second, first)):
         good = np.isfinite(north) & np.isfinite(east) & np.isfinite(x)
         if good.sum() < _ENOUGH or np.ptp(psi[good]) < np.pi / 3:
             return []
-        c, s, one_, none = (
+        c, s, ones, zeros = (
             np.cos(psi[good]),
             np.sin(psi[good]),
             np.ones(good.sum()),
             np.zeros(good.sum()),
         )
         columns = np.concatenate(
-            (np.stack((c, -s, one_, none), axis=1), np.stack((s, c, none, one_), axis=1))
+            (np.stack((c, -s, ones, zeros), axis=1), np.stack((s, c, zeros, ones), axis=1))
         )
-        apart = np.concatenate((x[good] - north[good], y[good] - east[good]))
-        lever, *_ = np.linalg.lstsq(columns, apart, rcond=None)
-        found.append(
+        offset = np.concatenate((x[good] - north[good], y[good] - east[good]))
+        lever, *_ = np.linalg.lstsq(columns, offset, rcond=None)
+        fits.append(
             (
-                float(np.sqrt(np.mean((columns @ lever - apart) ** 2))),
+                float(np.sqrt(np.mean((columns @ lever - offset) ** 2))),
                 lever,
-                float(np.std(apart[: good.sum()]) + np.std(apart[good.sum() :])),
+                float(np.std(offset[: good.sum()]) + np.std(offset[good.sum() :])),
             )
         )
-    rest, lever, spread = min(found, key=lambda one: one[0])
+    residual, lever, spread = min(fits, key=lambda series: series[0])
     length = float(np.hypot(lever[0], lever[1]))
-    if length < _LEVER or rest > 0.5 * spread or rest > length:
+    if length < _LEVER or residual > 0.5 * spread or residual > length:
         return []
     text = (
-        f"topic {one.name}: its positions and the log's belong to points {length:.2f} m apart: the"
-        f" log's lies at ({lever[0]:.2f}, {lever[1]:.2f}) m (forward, starboard) of it, rest"
-        f" {rest:.3f} m; give `position.antenna` where the log's is an antenna"
+        f"topic {series.name}: its positions and the log's belong to points {length:.2f} m apart:"
+        f" the log's lies at ({lever[0]:.2f}, {lever[1]:.2f}) m (forward, starboard) of it, rest"
+        f" {residual:.3f} m; give `position.antenna` where the log's is an antenna"
     )
     return [
         remark(
@@ -157,6 +157,6 @@ def _lever(one: Series, t: np.ndarray, log: Log) -> list[Remark]:
             text,
             forward=float(lever[0]),
             starboard=float(lever[1]),
-            rest=rest,
+            residual=residual,
         )
     ]

@@ -54,7 +54,7 @@ class Plan:
         position: source of x and y.
         heading: source of psi.
         velocity: source of u, v (and r) where no channels are.
-        said: what was decided without being asked, for the log's meta.
+        conversions: what was converted without a setting for it, for the log's meta.
         remarks: what was noticed while deciding.
     """
 
@@ -62,7 +62,7 @@ class Plan:
     position: PositionConfig | None = None
     heading: HeadingConfig | None = None
     velocity: VelocityConfig | None = None
-    said: tuple[str, ...] = ()
+    conversions: tuple[str, ...] = ()
     remarks: tuple[Remark, ...] = ()
 
 
@@ -92,8 +92,8 @@ def compose(recording: Recording, plan: Plan, clock: ClockConfig, longest_gap: f
         raise DataError(
             f"{recording.path}: {len(t)} samples on the log's clock, at least 2 are needed"
         )
-    for name, one in values.items():
-        if not np.isfinite(one).any():
+    for name, channel in values.items():
+        if not np.isfinite(channel).any():
             raise DataError(
                 f"{recording.path}: channel {name} holds no number on the log's clock; take it out"
                 " of the map, or give its topic's delay"
@@ -109,8 +109,8 @@ def compose(recording: Recording, plan: Plan, clock: ClockConfig, longest_gap: f
         masks=masks,
         meta=_meta(recording, plan, parts, times),
     )
-    seen = agreement(recording, log, float(times[0]), log.meta["topics_not_used"])
-    return log.replace(meta={**log.meta, "findings": [*log.meta["findings"], *seen]})
+    disagreements = agreement(recording, log, float(times[0]), log.meta["topics_not_used"])
+    return log.replace(meta={**log.meta, "findings": [*log.meta["findings"], *disagreements]})
 
 
 def _parts(recording: Recording, plan: Plan, longest_gap: float) -> list[Part]:
@@ -122,7 +122,7 @@ def _parts(recording: Recording, plan: Plan, longest_gap: float) -> list[Part]:
     if plan.velocity is not None and not isinstance(plan.velocity, Derived):
         parts.append(velocity_part(recording, plan.velocity, longest_gap))
     for part in parts:
-        fatal = next((one for one in part.remarks if one["level"] == "fatal"), None)
+        fatal = next((entry for entry in part.remarks if entry["level"] == "fatal"), None)
         if fatal is not None:
             raise DataError(f"{recording.path}: {fatal['text']}")
     return parts
@@ -221,33 +221,33 @@ def _meta(
 ) -> dict[str, Any]:
     remarks: list[Remark] = [*recording.remarks, *plan.remarks]
     topics: dict[str, Any] = {}
-    for one in recording.series.values():
-        seen = traffic(one)
-        remarks += [*one.remarks, *seen]
-        topics[one.name] = {
-            "kind": one.kind,
-            "rows": len(one),
-            **next((r["figures"] for r in seen if r["code"] == "topic_rate"), {}),
+    for series in recording.series.values():
+        found = traffic(series)
+        remarks += [*series.remarks, *found]
+        topics[series.name] = {
+            "kind": series.kind,
+            "rows": len(series),
+            **next((r["figures"] for r in found if r["code"] == "topic_rate"), {}),
         }
-    gone = [name for name in plan.channels if name not in present(recording, plan.channels)]
-    if gone:
+    absent = [name for name in plan.channels if name not in present(recording, plan.channels)]
+    if absent:
         text = (
-            f"channels {', '.join(gone)} are not in the recording or hold no number; the log lacks"
-            " them (they are not required)"
+            f"channels {', '.join(absent)} are not in the recording or hold no number; the log"
+            " lacks them (they are not required)"
         )
-        remarks.append(remark("note", "missing_channels", text, channels=len(gone)))
+        remarks.append(remark("note", "missing_channels", text, channels=len(absent)))
     used = {part.topic for part in parts}
-    remarks += [one for part in parts for one in part.remarks if one not in remarks]
+    remarks += [entry for part in parts for entry in part.remarks if entry not in remarks]
     idle = [name for name in (*recording.series, *recording.listed) if name not in used]
     meta: dict[str, Any] = {
         "findings": remarks,
         "topics": topics,
         "topics_not_used": idle,
-        "frames": [*plan.said, *(s for p in parts for s in p.said)],
+        "frames": [*plan.conversions, *(text for part in parts for text in part.conversion)],
     }
     rows = {part.topic: len(part.log) for part in parts}
     meta |= {
-        "rows_read": sum(len(one) for one in recording.series.values()),
+        "rows_read": sum(len(series) for series in recording.series.values()),
         "rows_dropped": 0,
         "rows_used": sum(rows.values()),
     }

@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 from residnet.core.config import Config, Seconds
 from residnet.core.log import Log
 from residnet.data.readers.base import LogReader, require_samples
-from residnet.data.readers.composing.clocks import settle
+from residnet.data.readers.composing.clocks import align_clocks
 from residnet.data.readers.composing.compose import Plan, compose
 from residnet.data.readers.composing.quantities import (
     ClockConfig,
@@ -121,7 +121,7 @@ class RecordingReader(LogReader):
         delays = {
             topic: None if delay == "estimated" else delay for topic, delay in config.delays.items()
         }
-        recording = settle(config.load(path, self._wanted()), delays, config.zone)
+        recording = align_clocks(config.load(path, self._wanted()), delays, config.zone)
         plan = Plan(config.channels, config.position, config.heading, config.velocity)
         if config.standard_messages:
             plan = standard_plan(recording, plan)

@@ -39,7 +39,7 @@ class Part:
         held: those whose last value holds until the next.
         longest_gap: longest step that is bridged, s.
         remarks: what was noticed on the way.
-        said: which frames were converted.
+        conversion: which frames were converted, in words.
     """
 
     topic: str
@@ -47,7 +47,7 @@ class Part:
     held: tuple[str, ...]
     longest_gap: float
     remarks: tuple[Remark, ...] = ()
-    said: tuple[str, ...] = field(default=())
+    conversion: tuple[str, ...] = field(default=())
 
     @property
     def pose(self) -> bool:
@@ -83,10 +83,10 @@ class Part:
         out: dict[str, np.ndarray] = {}
         # one by one: aligning needs several copies of what it aligns
         for name, values in self.log.channels.items():
-            alone = self.log.replace(channels={name: values})
+            own_rows = self.log.replace(channels={name: values})
             held = (name,) if name in self.held else ()
             out.update(
-                onto(alone, GridConfig(step=step, held=held, longest_gap=gap), times).channels
+                onto(own_rows, GridConfig(step=step, held=held, longest_gap=gap), times).channels
             )
         return out
 
@@ -104,29 +104,29 @@ def channel_parts(
     """
     groups: dict[tuple[str, str | None, float, str], dict[str, FieldMap]] = {}
     for name, entry in present(recording, channels).items():
-        one = recording[entry.topic]
-        sparse = np.isnan(one[entry.field]).mean() > 0.5
-        key = (one.name, entry.sender, entry.longest_gap or longest_gap, name if sparse else "")
+        series = recording[entry.topic]
+        sparse = np.isnan(series[entry.field]).mean() > 0.5
+        key = (series.name, entry.sender, entry.longest_gap or longest_gap, name if sparse else "")
         groups.setdefault(key, {})[name] = entry
     parts = []
-    for (topic, sender, gap, alone), entries in groups.items():
-        one = (
+    for (topic, sender, gap, own_rows), entries in groups.items():
+        series = (
             recording.series[topic] if sender is None else recording.series[topic].of_sender(sender)
         )
-        if alone:
-            one = one.where(np.isfinite(one[entries[alone].field]))
+        if own_rows:
+            series = series.where(np.isfinite(series[entries[own_rows].field]))
         values = {
-            name: entry.convert(name, _numbers(recording, one, entry.field))
+            name: entry.convert(name, _numbers(recording, series, entry.field))
             for name, entry in entries.items()
         }
         units = {name: si_unit(entry.unit) for name, entry in entries.items()}
         held = tuple(name for name, entry in entries.items() if entry.hold)
-        said = tuple(
+        conversion = tuple(
             f"{name}: {entry.frame} of {topic}.{entry.field}"
             for name, entry in entries.items()
             if entry.frame != "as_measured"
         )
-        parts.append(_part(recording, one, values, units, gap, held, said=said))
+        parts.append(_part(recording, series, values, units, gap, held, conversion=conversion))
     return parts
 
 
@@ -140,12 +140,12 @@ def present(recording: Recording, channels: Mapping[str, FieldMap]) -> dict[str,
                 if entry.topic is not None
                 else next(iter(recording.series), None)
             )
-            one = recording.series.get(topic or "")
+            series = recording.series.get(topic or "")
             if (
-                one is None
-                or not one.has(entry.field)
-                or len(one) < 2
-                or not np.isfinite(one[entry.field]).any()
+                series is None
+                or not series.has(entry.field)
+                or len(series) < 2
+                or not np.isfinite(series[entry.field]).any()
             ):
                 continue
         out[name] = entry
@@ -159,17 +159,18 @@ def position_part(recording: Recording, config: PositionConfig, longest_gap: flo
         UsageError: where topic or field is missing, or PROJ is not installed.
         DataError: where there is no position, or a latitude is none.
     """
-    one = recording[config.topic]
+    series = recording[config.topic]
     if not isinstance(config, Geodetic):
         scale = to_si(config.unit)
         values = {
-            "x": scale * _numbers(recording, one, config.north),
-            "y": scale * _numbers(recording, one, config.east),
+            "x": scale * _numbers(recording, series, config.north),
+            "y": scale * _numbers(recording, series, config.east),
         }
-        return _part(recording, one, values, {}, longest_gap, said=_moved(config.antenna))
+        return _part(recording, series, values, {}, longest_gap, conversion=_moved(config.antenna))
     to_radians = to_si(config.unit)
     latitude, longitude = (
-        to_radians * _numbers(recording, one, name) for name in (config.latitude, config.longitude)
+        to_radians * _numbers(recording, series, name)
+        for name in (config.latitude, config.longitude)
     )
     known = np.isfinite(latitude) & np.isfinite(longitude)
     none = known & (latitude == 0.0) & (longitude == 0.0)
@@ -177,7 +178,7 @@ def position_part(recording: Recording, config: PositionConfig, longest_gap: flo
     if none.any():
         # receivers without a fix report the origin
         text = (
-            f"topic {one.name}: {int(none.sum())} fixes at latitude 0, longitude 0 are no fixes;"
+            f"topic {series.name}: {int(none.sum())} fixes at latitude 0, longitude 0 are no fixes;"
             " left out"
         )
         remarks = (remark("note", "no_fix", text, rows=int(none.sum())),)
@@ -185,7 +186,7 @@ def position_part(recording: Recording, config: PositionConfig, longest_gap: flo
         known &= ~none
     if not known.any() or float(np.abs(latitude[known]).max()) > np.pi / 2:
         raise DataError(
-            f"{recording.path}: topic {one.name}: '{config.latitude}' holds no latitude in"
+            f"{recording.path}: topic {series.name}: '{config.latitude}' holds no latitude in"
             f" {config.unit}; check field and unit"
         )
     first = int(np.argmax(known))
@@ -196,12 +197,18 @@ def position_part(recording: Recording, config: PositionConfig, longest_gap: flo
     )
     north, east = tangent_plane(latitude, longitude, *origin)
     degrees = np.degrees(origin)
-    said = (
+    conversion = (
         f"x, y: tangent plane of WGS 84 at {degrees[0]:.7f} deg N, {degrees[1]:.7f} deg E",
         *_moved(config.antenna),
     )
     return _part(
-        recording, one, {"x": north, "y": east}, {}, longest_gap, remarks=remarks, said=said
+        recording,
+        series,
+        {"x": north, "y": east},
+        {},
+        longest_gap,
+        remarks=remarks,
+        conversion=conversion,
     )
 
 
@@ -212,23 +219,23 @@ def heading_part(recording: Recording, config: HeadingConfig, longest_gap: float
         UsageError: where topic or field is missing.
         DataError: where there is no heading.
     """
-    one = recording[config.topic]
+    series = recording[config.topic]
     values: dict[str, np.ndarray] = {}
     remarks: tuple[Remark, ...] = ()
     if isinstance(config, Angle):
-        yaw = to_si(config.unit) * _numbers(recording, one, config.field)
+        yaw = to_si(config.unit) * _numbers(recording, series, config.field)
         offset = config.offset
     else:
-        yaw, values, remarks = _quaternion(recording, one, config)
+        yaw, values, remarks = _quaternion(recording, series, config)
         offset = 0.0
     psi = (np.pi / 2 - yaw if config.frame == "enu" else yaw) + offset
     values["psi"] = _from_first_circle(unwrap(psi))
-    said = (
+    conversion = (
         ("psi: counter-clockwise from east (REP-103) to clockwise from north",)
         if config.frame == "enu"
         else ()
     )
-    return _part(recording, one, values, {}, longest_gap, remarks=remarks, said=said)
+    return _part(recording, series, values, {}, longest_gap, remarks=remarks, conversion=conversion)
 
 
 def velocity_part(
@@ -240,66 +247,79 @@ def velocity_part(
         UsageError: where topic or field is missing.
         DataError: where there is no velocity.
     """
-    one = recording[config.topic]
+    series = recording[config.topic]
     if isinstance(config, CourseSpeed):
-        course = to_si(config.course_unit, "rad") * _numbers(recording, one, config.course)
-        speed = to_si(config.speed_unit, "m/s") * _numbers(recording, one, config.speed)
+        course = to_si(config.course_unit, "rad") * _numbers(recording, series, config.course)
+        speed = to_si(config.speed_unit, "m/s") * _numbers(recording, series, config.speed)
         # receivers give no course at rest
         north, east = speed * np.cos(np.nan_to_num(course)), speed * np.sin(np.nan_to_num(course))
         undirected = np.isnan(course) & (speed > 0.3)
         north, east = np.where(undirected, np.nan, north), np.where(undirected, np.nan, east)
     else:
         north, east = (
-            to_si(config.unit) * _numbers(recording, one, name)
+            to_si(config.unit) * _numbers(recording, series, name)
             for name in (config.north, config.east)
         )
-    said = ("u, v: earth-fixed velocity turned into body axes", *_moved(config.antenna, "u, v"))
+    conversion = (
+        "u, v: earth-fixed velocity turned into body axes",
+        *_moved(config.antenna, "u, v"),
+    )
     return _part(
-        recording, one, {"north_rate": north, "east_rate": east}, {}, longest_gap, said=said
+        recording,
+        series,
+        {"north_rate": north, "east_rate": east},
+        {},
+        longest_gap,
+        conversion=conversion,
     )
 
 
 def _part(
     recording: Recording,
-    one: Series,
+    series: Series,
     values: dict[str, np.ndarray],
     units: dict[str, str],
     gap: float,
     held: tuple[str, ...] = (),
     remarks: tuple[Remark, ...] = (),
-    said: tuple[str, ...] = (),
+    conversion: tuple[str, ...] = (),
 ) -> Part:
-    if len(one) < 2:
+    if len(series) < 2:
         raise DataError(
-            f"{recording.path}: topic {one.name} has {len(one)} rows, at least 2 are needed; take"
-            " it out of the map"
+            f"{recording.path}: topic {series.name} has {len(series)} rows, at least 2 are needed;"
+            " take it out of the map"
         )
     units = {name: units.get(name) or CHANNEL_UNITS.get(name, "m/s") for name in values}
     return Part(
-        one.name, Log(one.name, one.clock, values, units), held, gap, (*one.remarks, *remarks), said
+        series.name,
+        Log(series.name, series.clock, values, units),
+        held,
+        gap,
+        (*series.remarks, *remarks),
+        conversion,
     )
 
 
-def _numbers(recording: Recording, one: Series, path: str) -> np.ndarray:
-    values = one[path]
+def _numbers(recording: Recording, series: Series, path: str) -> np.ndarray:
+    values = series[path]
     if not np.isfinite(values).any():
         raise DataError(
-            f"{recording.path}: topic {one.name}: field '{path}' holds no number in any of"
+            f"{recording.path}: topic {series.name}: field '{path}' holds no number in any of"
             f" {values.size} rows; take it out of the map"
         )
     return values
 
 
 def _quaternion(
-    recording: Recording, one: Series, config: Quaternion
+    recording: Recording, series: Series, config: Quaternion
 ) -> tuple[np.ndarray, dict[str, np.ndarray], tuple[Remark, ...]]:
     """Return the yaw in the source's frame [T], roll where asked for, and what was noticed."""
-    x, y, z, w = (_numbers(recording, one, f"{config.field}.{axis}") for axis in "xyzw")
+    x, y, z, w = (_numbers(recording, series, f"{config.field}.{axis}") for axis in "xyzw")
     norm = np.sqrt(x * x + y * y + z * z + w * w)
     known = np.isfinite(norm) & (norm > 0.5)
     if not known.any():
         raise DataError(
-            f"{recording.path}: topic {one.name}: '{config.field}' holds no orientation, all"
+            f"{recording.path}: topic {series.name}: '{config.field}' holds no orientation, all"
             " quaternions are empty"
         )
     x, y, z, w = (
@@ -310,12 +330,12 @@ def _quaternion(
     flips = int(((x[1:] * x[:-1] + y[1:] * y[:-1] + z[1:] * z[:-1] + w[1:] * w[:-1]) < 0.0).sum())
     if flips:
         text = (
-            f"topic {one.name}: the quaternion changes sign {flips} times (both signs are one"
+            f"topic {series.name}: the quaternion changes sign {flips} times (both signs are one"
             " attitude); the heading is taken through"
         )
         remarks.append(remark("note", "quaternion_flips", text, flips=flips))
     if not known.all():
-        text = f"topic {one.name}: {int((~known).sum())} quaternions are empty; no heading there"
+        text = f"topic {series.name}: {int((~known).sum())} quaternions are empty; no heading there"
         remarks.append(remark("note", "empty_quaternions", text, rows=int((~known).sum())))
     # roll about the forward axis has one sign in both frames
     roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))

@@ -12,75 +12,75 @@ _GAP_STEPS, _GAP_SECONDS = 5.0, 0.5
 _ENOUGH = 100
 
 
-def traffic(one: Series) -> list[Remark]:
+def traffic(series: Series) -> list[Remark]:
     """Return the remarks on a series whose rows are in order."""
-    if not len(one):
-        return [remark("note", "empty_topic", f"topic {one.name}: holds no rows")]
+    if not len(series):
+        return [remark("note", "empty_topic", f"topic {series.name}: holds no rows")]
     out = []
-    empty = [path for path, values in one.fields.items() if np.isnan(values).all()]
+    empty = [path for path, values in series.fields.items() if np.isnan(values).all()]
     if empty:
         shown = ", ".join(empty[:6]) + (", ..." if len(empty) > 6 else "")
         out.append(
             remark(
                 "note",
                 "empty_columns",
-                f"topic {one.name}: {len(empty)} fields hold no number ({shown})",
+                f"topic {series.name}: {len(empty)} fields hold no number ({shown})",
                 fields=len(empty),
             )
         )
-    if len(one) < 3:
+    if len(series) < 3:
         return out
-    step = np.diff(one.clock)
+    step = np.diff(series.clock)
     usual, longest = float(np.median(step)), float(step.max())
-    rate = (len(one) - 1) / float(one.clock[-1] - one.clock[0])
+    rate = (len(series) - 1) / float(series.clock[-1] - series.clock[0])
     text = (
-        f"topic {one.name}: {len(one)} rows, {rate:.3g} Hz, step {usual:.3g} s (median), spread"
-        f" {float(np.std(step)):.2g} s, longest {longest:.3g} s"
+        f"topic {series.name}: {len(series)} rows, {rate:.3g} Hz, step {usual:.3g} s (median),"
+        f" spread {float(np.std(step)):.2g} s, longest {longest:.3g} s"
     )
     out.append(
-        remark("note", "topic_rate", text, rows=len(one), rate=rate, step=usual, longest=longest)
+        remark("note", "topic_rate", text, rows=len(series), rate=rate, step=usual, longest=longest)
     )
     gaps = step > max(_GAP_STEPS * usual, _GAP_SECONDS)
     if gaps.any():
-        at = float(one.clock[int(np.argmax(step))])
+        at = float(series.clock[int(np.argmax(step))])
         text = (
-            f"topic {one.name}: {int(gaps.sum())} gaps, the longest {longest:.3g} s at {at:.1f} s;"
-            " nothing is interpolated across"
+            f"topic {series.name}: {int(gaps.sum())} gaps, the longest {longest:.3g} s at"
+            f" {at:.1f} s; nothing is interpolated across"
         )
         out.append(remark("note", "topic_gaps", text, gaps=int(gaps.sum()), longest=longest, at=at))
-    return out + publishers(one, step)
+    return out + publishers(series, step)
 
 
-def publishers(one: Series, step: np.ndarray) -> list[Remark]:
+def publishers(series: Series, step: np.ndarray) -> list[Remark]:
     """Return whether several publishers share the topic; step [T - 1] in s.
 
     Told by what the source says of the sender, else by values that leap away and come straight back
     (A, B, A) while rows follow each other at irregular short steps, as two trains of messages on
     one track do, or by such leaps alone where nearly every row is one and they are wide.
     """
-    if one.sender is not None and len(one) >= 2:
-        names = [str(name) for name in dict.fromkeys(one.sender.tolist())]
-        turns = int((one.sender[1:] != one.sender[:-1]).sum())
+    if series.sender is not None and len(series) >= 2:
+        names = [str(name) for name in dict.fromkeys(series.sender.tolist())]
+        turns = int((series.sender[1:] != series.sender[:-1]).sum())
         if len(names) > 1 and turns >= len(names):
             text = (
-                f"topic {one.name}: rows of {len(names)} senders alternate"
+                f"topic {series.name}: rows of {len(names)} senders alternate"
                 f" ({', '.join(names[:6])}); name one with `sender`"
             )
             return [
                 remark("will mislead", "several_publishers", text, senders=len(names), turns=turns)
             ]
-    if len(one) < _ENOUGH:
+    if len(series) < _ENOUGH:
         return []
     short = float((step < 0.2 * step.mean()).mean())
-    for path, values in one.fields.items():
+    for path, values in series.fields.items():
         leaps, returns, width = _returns(values)
         bursts = short > 0.15 and returns > 0.05 and returns > 0.3 * leaps
         mixed = short > 0.05 and returns > 0.2 and returns > 0.35 * leaps and width > 0.05
         in_turns = returns > 0.3 and returns > 0.8 * leaps and width > 0.05
         if bursts or mixed or in_turns:
             text = (
-                f"topic {one.name}: several publishers seem to write to it: field {path} leaps away"
-                f" and straight back in {returns:.0%} of the rows, {short:.0%} of the steps are"
+                f"topic {series.name}: several publishers seem to write to it: field {path} leaps"
+                f" away and straight back in {returns:.0%} of the rows, {short:.0%} of the steps are"
                 " shorter than a fifth of the mean; do not use it unless the source tells its"
                 " senders apart"
             )

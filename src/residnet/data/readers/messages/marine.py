@@ -20,7 +20,7 @@ from residnet.data.readers.composing.quantities import (
 from residnet.data.readers.messages.message import Message
 from residnet.data.readers.recording import Series
 
-_SAID = "already in NED and forward-starboard-down"
+_CONVERSION = "already in NED and forward-starboard-down"
 
 
 @final
@@ -28,12 +28,14 @@ class Px4LocalPosition(Message):
     """PX4 vehicle_local_position: the navigation filter's position and velocity."""
 
     types = ("vehicle_local_position",)
-    said: ClassVar[str] = _SAID
+    conversion: ClassVar[str] = _CONVERSION
 
-    def plan(self, one: Series) -> Plan:
+    def plan(self, series: Series) -> Plan:
         """Return the channels that a series of this message gives."""
-        velocity = EarthFixed(topic=one.name, north="vx", east="vy") if one.has("vx") else None
-        return Plan({}, Local(topic=one.name, north="x", east="y"), None, velocity)
+        velocity = (
+            EarthFixed(topic=series.name, north="vx", east="vy") if series.has("vx") else None
+        )
+        return Plan({}, Local(topic=series.name, north="x", east="y"), None, velocity)
 
 
 @final
@@ -41,11 +43,11 @@ class Px4Attitude(Message):
     """The message vehicle_attitude of PX4."""
 
     types = ("vehicle_attitude",)
-    said: ClassVar[str] = _SAID
+    conversion: ClassVar[str] = _CONVERSION
 
-    def plan(self, one: Series) -> Plan:
+    def plan(self, series: Series) -> Plan:
         """Return the channels that a series of this message gives."""
-        return Plan({}, None, Quaternion(topic=one.name, field="q", frame="ned", roll=True))
+        return Plan({}, None, Quaternion(topic=series.name, field="q", frame="ned", roll=True))
 
 
 @final
@@ -53,13 +55,13 @@ class Px4AngularVelocity(Message):
     """The message vehicle_angular_velocity of PX4."""
 
     types = ("vehicle_angular_velocity",)
-    said: ClassVar[str] = _SAID
+    conversion: ClassVar[str] = _CONVERSION
 
-    def plan(self, one: Series) -> Plan:
+    def plan(self, series: Series) -> Plan:
         """Return the channels that a series of this message gives."""
         return Plan(
             {
-                name: FieldMap(topic=one.name, field=f"xyz[{axis}]", unit="rad/s")
+                name: FieldMap(topic=series.name, field=f"xyz[{axis}]", unit="rad/s")
                 for name, axis in (("r", 2), ("p", 0))
             }
         )
@@ -70,18 +72,18 @@ class Px4Gps(Message):
     """PX4 vehicle_gps_position and sensor_gps: the receiver's fix."""
 
     types = ("vehicle_gps_position", "sensor_gps")
-    said: ClassVar[str] = _SAID
+    conversion: ClassVar[str] = _CONVERSION
 
-    def plan(self, one: Series) -> Plan:
+    def plan(self, series: Series) -> Plan:
         """Return the channels that a series of this message gives."""
-        names = ("lat", "lon") if one.has("lat") else ("latitude_deg", "longitude_deg")
+        names = ("lat", "lon") if series.has("lat") else ("latitude_deg", "longitude_deg")
         velocity = (
-            EarthFixed(topic=one.name, north="vel_n_m_s", east="vel_e_m_s")
-            if one.has("vel_n_m_s")
+            EarthFixed(topic=series.name, north="vel_n_m_s", east="vel_e_m_s")
+            if series.has("vel_n_m_s")
             else None
         )
         return Plan(
-            {}, Geodetic(topic=one.name, latitude=names[0], longitude=names[1]), None, velocity
+            {}, Geodetic(topic=series.name, latitude=names[0], longitude=names[1]), None, velocity
         )
 
 
@@ -90,15 +92,15 @@ class ArduPilotFilter(Message):
     """ArduPilot XKF1, NKF1: the navigation filter's position and velocity."""
 
     types = ("XKF1", "NKF1")
-    said: ClassVar[str] = _SAID
+    conversion: ClassVar[str] = _CONVERSION
 
-    def plan(self, one: Series) -> Plan:
+    def plan(self, series: Series) -> Plan:
         """Return the channels that a series of this message gives."""
         return Plan(
             {},
-            Local(topic=one.name, north="PN", east="PE"),
+            Local(topic=series.name, north="PN", east="PE"),
             None,
-            EarthFixed(topic=one.name, north="VN", east="VE"),
+            EarthFixed(topic=series.name, north="VN", east="VE"),
         )
 
 
@@ -107,14 +109,14 @@ class ArduPilotAttitude(Message):
     """The message ATT of ArduPilot."""
 
     types = ("ATT",)
-    said: ClassVar[str] = _SAID
+    conversion: ClassVar[str] = _CONVERSION
 
-    def plan(self, one: Series) -> Plan:
+    def plan(self, series: Series) -> Plan:
         """Return the channels that a series of this message gives."""
         return Plan(
-            {"phi": FieldMap(topic=one.name, field="Roll", unit="deg")},
+            {"phi": FieldMap(topic=series.name, field="Roll", unit="deg")},
             None,
-            Angle(topic=one.name, field="Yaw", unit="deg"),
+            Angle(topic=series.name, field="Yaw", unit="deg"),
         )
 
 
@@ -123,13 +125,13 @@ class ArduPilotImu(Message):
     """The message IMU of ArduPilot."""
 
     types = ("IMU",)
-    said: ClassVar[str] = _SAID
+    conversion: ClassVar[str] = _CONVERSION
 
-    def plan(self, one: Series) -> Plan:
+    def plan(self, series: Series) -> Plan:
         """Return the channels that a series of this message gives."""
         return Plan(
             {
-                name: FieldMap(topic=one.name, field=field, unit="rad/s")
+                name: FieldMap(topic=series.name, field=field, unit="rad/s")
                 for name, field in (("r", "GyrZ"), ("p", "GyrX"))
             }
         )
@@ -140,15 +142,15 @@ class ArduPilotGps(Message):
     """ArduPilot GPS: the receiver's fix, course and speed."""
 
     types = ("GPS",)
-    said: ClassVar[str] = _SAID
+    conversion: ClassVar[str] = _CONVERSION
 
-    def plan(self, one: Series) -> Plan:
+    def plan(self, series: Series) -> Plan:
         """Return the channels that a series of this message gives."""
         return Plan(
             {},
-            Geodetic(topic=one.name, latitude="Lat", longitude="Lng"),
+            Geodetic(topic=series.name, latitude="Lat", longitude="Lng"),
             None,
-            CourseSpeed(topic=one.name, course="GCrs", speed="Spd"),
+            CourseSpeed(topic=series.name, course="GCrs", speed="Spd"),
         )
 
 
@@ -157,18 +159,18 @@ class NmeaFix(Message):
     """NMEA GGA, GNS, RMC, GLL: latitude and longitude; RMC has course and speed too."""
 
     types = ("GGA", "GNS", "RMC", "GLL")
-    said: ClassVar[str] = _SAID
+    conversion: ClassVar[str] = _CONVERSION
 
-    def plan(self, one: Series) -> Plan:
+    def plan(self, series: Series) -> Plan:
         """Return the channels that a series of this message gives."""
         course = (
             CourseSpeed(
-                topic=one.name, course="true_course", speed="spd_over_grnd", speed_unit="kn"
+                topic=series.name, course="true_course", speed="spd_over_grnd", speed_unit="kn"
             )
-            if one.has("spd_over_grnd")
+            if series.has("spd_over_grnd")
             else None
         )
-        return Plan({}, Geodetic(topic=one.name), None, course)
+        return Plan({}, Geodetic(topic=series.name), None, course)
 
 
 @final
@@ -176,16 +178,16 @@ class NmeaCourse(Message):
     """NMEA VTG: course and speed over ground."""
 
     types = ("VTG",)
-    said: ClassVar[str] = _SAID
+    conversion: ClassVar[str] = _CONVERSION
 
-    def plan(self, one: Series) -> Plan:
+    def plan(self, series: Series) -> Plan:
         """Return the channels that a series of this message gives."""
         return Plan(
             {},
             None,
             None,
             CourseSpeed(
-                topic=one.name, course="true_track", speed="spd_over_grnd_kts", speed_unit="kn"
+                topic=series.name, course="true_track", speed="spd_over_grnd_kts", speed_unit="kn"
             ),
         )
 
@@ -195,11 +197,11 @@ class NmeaHeading(Message):
     """NMEA HDT: true heading."""
 
     types = ("HDT",)
-    said: ClassVar[str] = _SAID
+    conversion: ClassVar[str] = _CONVERSION
 
-    def plan(self, one: Series) -> Plan:
+    def plan(self, series: Series) -> Plan:
         """Return the channels that a series of this message gives."""
-        return Plan({}, None, Angle(topic=one.name, field="heading", unit="deg"))
+        return Plan({}, None, Angle(topic=series.name, field="heading", unit="deg"))
 
 
 @final
@@ -207,11 +209,11 @@ class NmeaRateOfTurn(Message):
     """NMEA ROT: rate of turn, positive to starboard."""
 
     types = ("ROT",)
-    said: ClassVar[str] = _SAID
+    conversion: ClassVar[str] = _CONVERSION
 
-    def plan(self, one: Series) -> Plan:
+    def plan(self, series: Series) -> Plan:
         """Return the channels that a series of this message gives."""
-        return Plan({"r": FieldMap(topic=one.name, field="rate_of_turn", unit="deg/s")})
+        return Plan({"r": FieldMap(topic=series.name, field="rate_of_turn", unit="deg/s")})
 
 
 @final
@@ -219,11 +221,13 @@ class NmeaRudder(Message):
     """NMEA RSA: rudder angle, negative where the bow turns to port."""
 
     types = ("RSA",)
-    said: ClassVar[str] = _SAID
+    conversion: ClassVar[str] = _CONVERSION
 
-    def plan(self, one: Series) -> Plan:
+    def plan(self, series: Series) -> Plan:
         """Return the channels that a series of this message gives."""
-        return Plan({"delta": FieldMap(topic=one.name, field=next(iter(one.fields)), unit="deg")})
+        return Plan(
+            {"delta": FieldMap(topic=series.name, field=next(iter(series.fields)), unit="deg")}
+        )
 
 
 MARINE: tuple[Message, ...] = (

@@ -16,19 +16,19 @@ class Message(ABC):
         types: names of the message's type, without its package.
         signature: fields that tell it where the source has no types; none where it is known by its
             type only.
-        said: how its frames become residnet's, for the log's meta.
+        conversion: how its frames become residnet's, for the log's meta.
     """
 
     types: ClassVar[tuple[str, ...]]
     signature: ClassVar[tuple[str, ...]] = ()
-    said: ClassVar[str] = "REP-103 (ENU, forward-left-up) to NED, forward-starboard-down"
+    conversion: ClassVar[str] = "REP-103 (ENU, forward-left-up) to NED, forward-starboard-down"
 
-    def fits(self, one: Series) -> bool:
+    def fits(self, series: Series) -> bool:
         """Return whether a series holds messages of this kind."""
-        if one.kind:
-            return one.kind.rsplit("/", 1)[-1] in self.types
-        return bool(self.signature) and all(one.has(field) for field in self.signature)
+        if series.kind:
+            return series.kind.rsplit("/", 1)[-1] in self.types
+        return bool(self.signature) and all(series.has(field) for field in self.signature)
 
     @abstractmethod
-    def plan(self, one: Series) -> Plan:
+    def plan(self, series: Series) -> Plan:
         """Return what a series of this kind says of the vessel."""

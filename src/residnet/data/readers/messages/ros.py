@@ -29,23 +29,25 @@ from residnet.data.readers.recording import Recording, Series, key_of, remark
 _WORLD = ("map", "odom", "earth", "world", "enu", "ned")
 
 
-def _body(one: Series, prefix: str) -> dict[str, FieldMap]:
+def _body(series: Series, prefix: str) -> dict[str, FieldMap]:
     """Return the velocities in forward-left-up axes."""
     paths = {"u": "linear.x", "v": "linear.y", "r": "angular.z", "p": "angular.x"}
     si = {"u": "m/s", "v": "m/s", "r": "rad/s", "p": "rad/s"}
     fields = {name: f"{prefix}{path}" for name, path in paths.items()}
-    told = {name: path for name, path in fields.items() if one.has(path) and one[path].any()}
+    measured = {
+        name: path for name, path in fields.items() if series.has(path) and series[path].any()
+    }
     return {
-        name: FieldMap(topic=one.name, field=path, unit=si[name], frame="body_fpu")
-        for name, path in told.items()
+        name: FieldMap(topic=series.name, field=path, unit=si[name], frame="body_fpu")
+        for name, path in measured.items()
     }
 
 
-def _heading(one: Series, path: str) -> Quaternion | None:
-    if not all(one.has(f"{path}.{axis}") for axis in "xyzw"):
+def _heading(series: Series, path: str) -> Quaternion | None:
+    if not all(series.has(f"{path}.{axis}") for axis in "xyzw"):
         return None
-    tilted = bool(one[f"{path}.x"].any() or one[f"{path}.y"].any())
-    return Quaternion(topic=one.name, field=path, frame="enu", roll=tilted)
+    tilted = bool(series[f"{path}.x"].any() or series[f"{path}.y"].any())
+    return Quaternion(topic=series.name, field=path, frame="enu", roll=tilted)
 
 
 @final
@@ -55,10 +57,14 @@ class Odometry(Message):
     types = ("Odometry",)
     signature = ("pose.pose.position.x", "twist.twist.linear.x")
 
-    def plan(self, one: Series) -> Plan:
+    def plan(self, series: Series) -> Plan:
         """Return the channels that a series of this message gives."""
-        position = Local(topic=one.name, north="pose.pose.position.y", east="pose.pose.position.x")
-        return Plan(_body(one, "twist.twist."), position, _heading(one, "pose.pose.orientation"))
+        position = Local(
+            topic=series.name, north="pose.pose.position.y", east="pose.pose.position.x"
+        )
+        return Plan(
+            _body(series, "twist.twist."), position, _heading(series, "pose.pose.orientation")
+        )
 
 
 @final
@@ -68,11 +74,11 @@ class Pose(Message):
     types = ("PoseStamped", "Pose", "PoseWithCovarianceStamped")
     signature = ("pose.position.x", "pose.orientation.w")
 
-    def plan(self, one: Series) -> Plan:
+    def plan(self, series: Series) -> Plan:
         """Return the channels that a series of this message gives."""
-        prefix = next((p for p in ("pose.pose.", "pose.", "") if one.has(f"{p}position.x")), "")
-        position = Local(topic=one.name, north=f"{prefix}position.y", east=f"{prefix}position.x")
-        return Plan({}, position, _heading(one, f"{prefix}orientation"))
+        prefix = next((p for p in ("pose.pose.", "pose.", "") if series.has(f"{p}position.x")), "")
+        position = Local(topic=series.name, north=f"{prefix}position.y", east=f"{prefix}position.x")
+        return Plan({}, position, _heading(series, f"{prefix}orientation"))
 
 
 @final
@@ -82,16 +88,16 @@ class Twist(Message):
     types = ("TwistStamped", "Twist", "TwistWithCovarianceStamped")
     signature = ("twist.linear.x", "twist.angular.z")
 
-    def plan(self, one: Series) -> Plan:
+    def plan(self, series: Series) -> Plan:
         """Return the channels of a series; a twist in the world frame is left to the config."""
         if (
-            one.sender is not None
-            and len(one.sender)
-            and str(one.sender[0]).strip("/").lower() in _WORLD
+            series.sender is not None
+            and len(series.sender)
+            and str(series.sender[0]).strip("/").lower() in _WORLD
         ):
             return Plan()
-        prefix = next((p for p in ("twist.twist.", "twist.", "") if one.has(f"{p}linear.x")), "")
-        return Plan(_body(one, prefix))
+        prefix = next((p for p in ("twist.twist.", "twist.", "") if series.has(f"{p}linear.x")), "")
+        return Plan(_body(series, prefix))
 
 
 @final
@@ -101,22 +107,22 @@ class Imu(Message):
     types = ("Imu",)
     signature = ("angular_velocity.z", "linear_acceleration.x")
 
-    def plan(self, one: Series) -> Plan:
+    def plan(self, series: Series) -> Plan:
         """Return the channels that a series of this message gives."""
         rates = {"r": "angular_velocity.z", "p": "angular_velocity.x"}
         channels = {
-            n: FieldMap(topic=one.name, field=path, unit="rad/s", frame="body_fpu")
+            n: FieldMap(topic=series.name, field=path, unit="rad/s", frame="body_fpu")
             for n, path in rates.items()
-            if one.has(path)
+            if series.has(path)
         }
         # the message's own sign that there is no orientation
-        none = one.has("orientation_covariance.0") and bool(
-            (one["orientation_covariance.0"] == -1.0).all()
+        zeros = series.has("orientation_covariance.0") and bool(
+            (series["orientation_covariance.0"] == -1.0).all()
         )
         heading = (
             None
-            if none or not one.has("orientation.w") or not one["orientation.w"].any()
-            else _heading(one, "orientation")
+            if zeros or not series.has("orientation.w") or not series["orientation.w"].any()
+            else _heading(series, "orientation")
         )
         return Plan(channels, None, heading)
 
@@ -128,9 +134,9 @@ class Fix(Message):
     types = ("NavSatFix",)
     signature = ("latitude", "longitude")
 
-    def plan(self, one: Series) -> Plan:
+    def plan(self, series: Series) -> Plan:
         """Return the channels that a series of this message gives."""
-        return Plan({}, Geodetic(topic=one.name))
+        return Plan({}, Geodetic(topic=series.name))
 
 
 @final
@@ -140,12 +146,14 @@ class Wrench(Message):
     types = ("WrenchStamped", "Wrench")
     signature = ("wrench.force.x", "wrench.torque.z")
 
-    def plan(self, one: Series) -> Plan:
+    def plan(self, series: Series) -> Plan:
         """Return the channels that a series of this message gives."""
-        prefix = "wrench." if one.has("wrench.force.x") else ""
+        prefix = "wrench." if series.has("wrench.force.x") else ""
         parts = {"tau_x": ("force.x", "N"), "tau_y": ("force.y", "N"), "tau_n": ("torque.z", "N m")}
         channels = {
-            n: FieldMap(topic=one.name, field=prefix + path, unit=unit, frame="body_fpu", hold=True)
+            n: FieldMap(
+                topic=series.name, field=prefix + path, unit=unit, frame="body_fpu", hold=True
+            )
             for n, (path, unit) in parts.items()
         }
         return Plan(channels)
@@ -171,18 +179,18 @@ class Number(Message):
     )
     signature = ("data",)
 
-    def plan(self, one: Series) -> Plan:
+    def plan(self, series: Series) -> Plan:
         """Return the channel of a series.
 
         A channel that residnet knows is taken to be in its SI unit, any other has none.
         """
-        if not one.has("data"):
+        if not series.has("data"):
             return Plan()
-        name = _channel_name(one.name)
+        name = _channel_name(series.name)
         return Plan(
             {
                 name: FieldMap(
-                    topic=one.name, field="data", unit=CHANNEL_UNITS.get(name, "-"), hold=True
+                    topic=series.name, field="data", unit=CHANNEL_UNITS.get(name, "-"), hold=True
                 )
             }
         )
@@ -195,10 +203,10 @@ class Joints(Message):
     types = ("JointState",)
     signature = ("position.0", "effort.0")
 
-    def plan(self, one: Series) -> Plan:
+    def plan(self, series: Series) -> Plan:
         """Return the channels that a series of this message gives."""
         channels = {}
-        for path in one.fields:
+        for path in series.fields:
             what, _, joint = path.partition(".")
             unit = {"position": "rad", "velocity": "rad/s", "effort": "N m"}.get(what)
             if unit is None or not joint:
@@ -206,7 +214,7 @@ class Joints(Message):
             name = joint if what == "position" else f"{joint}_{what}"
             # a joint of a known name in another unit is another quantity
             name = name if CHANNEL_UNITS.get(name, unit) == unit else f"{name}_{what}"
-            channels[name] = FieldMap(topic=one.name, field=path, unit=unit)
+            channels[name] = FieldMap(topic=series.name, field=path, unit=unit)
         return Plan(channels)
 
 
@@ -219,37 +227,42 @@ class Named(Message):
 
     types = ()
     signature = ()
-    said = "by its names, taken to be in SI, NED and body axes"
+    conversions = "by its names, taken to be in SI, NED and body axes"
     _enough: ClassVar[int] = 3
 
-    def fits(self, one: Series) -> bool:
+    def fits(self, series: Series) -> bool:
         """Return whether the fields of a series bear such names."""
-        return not one.kind and len(self._names(one)) >= self._enough
+        return not series.kind and len(self._names(series)) >= self._enough
 
-    def plan(self, one: Series) -> Plan:
+    def plan(self, series: Series) -> Plan:
         """Return the channels that a series of this message gives."""
-        names = self._names(one)
-        heading = Angle(topic=one.name, field="psi") if "psi" in names else None
-        position = Local(topic=one.name, north="x", east="y") if {"x", "y"} <= set(names) else None
+        names = self._names(series)
+        heading = Angle(topic=series.name, field="psi") if "psi" in names else None
+        position = (
+            Local(topic=series.name, north="x", east="y") if {"x", "y"} <= set(names) else None
+        )
         taken = {"psi", *(("x", "y") if position else ())}
         plain = [name for name in names if name not in taken]
         channels = {
             name: FieldMap(
-                topic=one.name, field=name, unit=CHANNEL_UNITS[name], hold=name.startswith("cmd_")
+                topic=series.name,
+                field=name,
+                unit=CHANNEL_UNITS[name],
+                hold=name.startswith("cmd_"),
             )
             for name in plain
         }
         return Plan(channels, position, heading)
 
     @staticmethod
-    def _names(one: Series) -> list[str]:
+    def _names(series: Series) -> list[str]:
         return [
             name
-            for name in one.fields
+            for name in series.fields
             if name in CHANNEL_UNITS
             and name != "t"
-            and one[name].size
-            and not np.isnan(one[name]).all()
+            and series[name].size
+            and not np.isnan(series[name]).all()
         ]
 
 
@@ -273,13 +286,17 @@ def standard_plan(recording: Recording, declared: Plan) -> Plan:
 
     The messages that say most come first, then the busiest topic of each kind.
     """
-    plan, said, remarks = declared, [], []
+    plan, conversions, remarks = declared, [], []
     for message in MESSAGES:
-        fitting = [one for one in recording.series.values() if len(one) > 1 and message.fits(one)]
+        fitting = [
+            series
+            for series in recording.series.values()
+            if len(series) > 1 and message.fits(series)
+        ]
         alike = [
-            one.name
-            for one in fitting
-            if isinstance(message, Named) and {"x", "y", "psi"} <= set(one.fields)
+            series.name
+            for series in fitting
+            if isinstance(message, Named) and {"x", "y", "psi"} <= set(series.fields)
         ]
         if len(alike) > 1:
             text = (
@@ -287,35 +304,37 @@ def standard_plan(recording: Recording, declared: Plan) -> Plan:
                 " experiments? name one with `table`, or map fields"
             )
             remarks.append(remark("will mislead", "several_tables", text, tables=len(alike)))
-        for one in sorted(fitting, key=lambda one: (-len(one), one.name)):
-            offered = message.plan(one)
+        for series in sorted(fitting, key=lambda series: (-len(series), series.name)):
+            offered = message.plan(series)
             plan, taken = _joined(plan, offered)
             if taken:
-                said.append(
-                    f"{', '.join(taken)}: {type(message).__name__} of {one.name}, REP-103 (ENU,"
+                conversions.append(
+                    f"{', '.join(taken)}: {type(message).__name__} of {series.name}, REP-103 (ENU,"
                     " forward-left-up) to NED, forward-starboard-down"
                 )
     if plan.heading is None and "psi" not in plan.channels and declared.velocity is None:
         # without a heading an earth-fixed velocity has no components in the body
         plan = dataclasses.replace(plan, velocity=None)
     return dataclasses.replace(
-        plan, said=(*declared.said, *said), remarks=(*declared.remarks, *remarks)
+        plan,
+        conversions=(*declared.conversions, *conversions),
+        remarks=(*declared.remarks, *remarks),
     )
 
 
 def _joined(plan: Plan, offered: Plan) -> tuple[Plan, Sequence[str]]:
     """Return a plan with what it lacks of another, and the names of that."""
-    given = (
+    present = (
         set(plan.channels)
         | ({"x", "y"} if plan.position else set())
         | ({"psi"} if plan.heading else set())
     )
-    given |= {"u", "v"} if plan.velocity else set()
-    given |= {"r"} if isinstance(plan.velocity, Derived) else set()
-    new = {name: entry for name, entry in offered.channels.items() if name not in given}
-    position = offered.position if not {"x", "y"} & given else None
-    heading = offered.heading if "psi" not in given else None
-    velocity = offered.velocity if not {"u", "v"} & (given | set(new)) else None
+    present |= {"u", "v"} if plan.velocity else set()
+    present |= {"r"} if isinstance(plan.velocity, Derived) else set()
+    new = {name: entry for name, entry in offered.channels.items() if name not in present}
+    position = offered.position if not {"x", "y"} & present else None
+    heading = offered.heading if "psi" not in present else None
+    velocity = offered.velocity if not {"u", "v"} & (present | set(new)) else None
     taken = [
         *(["x", "y"] if position else []),
         *(["psi"] if heading else []),

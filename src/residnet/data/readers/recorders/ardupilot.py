@@ -75,11 +75,14 @@ def load_ardupilot(path: Path, wanted: Wanted = EVERYTHING) -> Recording:
                 f"{path}: none of its messages is wanted (it holds {', '.join(sorted(listed))})"
             )
         raise DataError(f"{path}: holds no message with a time; is it an ArduPilot .bin log?")
-    start = min(one.time[0] for one in columns.values())
+    start = min(message_columns.time[0] for message_columns in columns.values())
     boot = round(base * 1e6) * 1000 if base > _DATED else None
     epoch = None if boot is None else (boot + start) // 10**9 * 10**9
     origin = 0 if boot is None or epoch is None else epoch - boot
-    series = {name: one.series(name, origin) for name, one in sorted(columns.items())}
+    series = {
+        name: message_columns.series(name, origin)
+        for name, message_columns in sorted(columns.items())
+    }
     return Recording(path, series, epoch, (path,), (), tuple(sorted(listed - set(series))))
 
 
@@ -118,9 +121,9 @@ def _silence() -> Iterator[None]:
     """Keeps the indexer of pymavlink, which is compiled, from printing every byte that it skips."""
     sys.stdout.flush()
     sys.stderr.flush()
-    kept = [(number, os.dup(number)) for number in (1, 2)]
+    saved = [(number, os.dup(number)) for number in (1, 2)]
     with Path(os.devnull).open("wb") as nowhere:
-        for number, _ in kept:
+        for number, _ in saved:
             os.dup2(nowhere.fileno(), number)
         try:
             with (
@@ -129,7 +132,7 @@ def _silence() -> Iterator[None]:
             ):
                 yield
         finally:
-            for number, copy in kept:
+            for number, copy in saved:
                 os.dup2(copy, number)
                 os.close(copy)
 

@@ -117,13 +117,13 @@ class _Lines:
         values = _numbers(message)
         if not wanted(name) or not values:
             return
-        one = self.series.setdefault(name, _Sentence())
-        if not one.names:
-            one.names = list(values)
-        one.rows.extend([values.get(field, np.nan) for field in one.names])
-        one.own.append(-1 if at is None else at)
-        one.epoch_number.append(len(self._ticks) - 1)
-        one.before.append(before)
+        sentences = self.series.setdefault(name, _Sentence())
+        if not sentences.names:
+            sentences.names = list(values)
+        sentences.rows.extend([values.get(field, np.nan) for field in sentences.names])
+        sentences.own.append(-1 if at is None else at)
+        sentences.epoch_number.append(len(self._ticks) - 1)
+        sentences.before.append(before)
 
     def _tick(self, message: Any) -> int | None:
         """Return the time of a sentence in ns (Unix time once a date is known), else None."""
@@ -153,7 +153,7 @@ class _Lines:
             DataError: where nothing tells the time.
         """
         ticks = np.frombuffer(self._ticks, dtype=np.int64)
-        stamped = all(all(one.before) for one in self.series.values())
+        stamped = all(all(sentences.before) for sentences in self.series.values())
         if not ticks.size and not stamped:
             raise DataError(
                 f"{path}: no sentence tells the time (RMC, GGA, ZDA, ...), and the lines do not"
@@ -165,8 +165,8 @@ class _Lines:
             remarks.append(remark("note", "bad_lines", text, lines=bad))
         arrivals = (
             {
-                name: parse_texts(np.array(one.before, dtype=object))
-                for name, one in self.series.items()
+                name: parse_texts(np.array(sentences.before, dtype=object))
+                for name, sentences in self.series.items()
             }
             if stamped
             else {}
@@ -181,12 +181,12 @@ class _Lines:
                 remark("note", "undated", "no sentence tells the date; time counts from midnight")
             )
         series = {}
-        for name, one in sorted(self.series.items()):
-            own = np.frombuffer(one.own, dtype=np.int64)
+        for name, sentences in sorted(self.series.items()):
+            own = np.frombuffer(sentences.own, dtype=np.int64)
             said: tuple[Remark, ...] = ()
             timed = bool((own >= 0).all())
             if not timed and not stamped:
-                own = _between(np.frombuffer(one.epoch_number, dtype=np.int64), ticks)
+                own = _between(np.frombuffer(sentences.epoch_number, dtype=np.int64), ticks)
                 text = (
                     f"topic {name}: its sentences tell no time; they are spread between the timed"
                     " ones before and after"
@@ -199,7 +199,7 @@ class _Lines:
                 if stamped
                 else None
             )
-            fields = {field: one.column(i) for i, field in enumerate(one.names)}
+            fields = {field: sentences.column(i) for i, field in enumerate(sentences.names)}
             series[name] = Series(name, f"nmea/{name}", fields, stamp, arrival, None, said)
         return Recording(path, series, epoch, (path,), tuple(remarks))
 

@@ -80,10 +80,12 @@ def load_bag(path: Path, wanted: Wanted = EVERYTHING) -> Recording:
 
 def _read(path: Path, reader: AnyReader, wanted: Wanted) -> Recording:
     chosen = [one for one in reader.connections if wanted(one.topic)]
-    left = tuple(sorted({one.topic for one in reader.connections} - {one.topic for one in chosen}))
+    not_wanted = tuple(
+        sorted({one.topic for one in reader.connections} - {one.topic for one in chosen})
+    )
     if not chosen:
         raise UsageError(
-            f"{path}: none of its topics is wanted (it holds {', '.join(left) or 'none'})"
+            f"{path}: none of its topics is wanted (it holds {', '.join(not_wanted) or 'none'})"
         )
     columns: dict[str, _Columns] = {}
     failed: dict[str, str] = {}
@@ -107,9 +109,11 @@ def _read(path: Path, reader: AnyReader, wanted: Wanted) -> Recording:
                 failed[name] = f"{type(error).__name__}: {' '.join(str(error).split())[:120]}"
     remarks: list[Remark] = []
     for name, why in failed.items():
-        kept = len(columns.pop(name).arrival)
-        text = f"topic {name}: message {kept + 1} cannot be read ({why}); the topic is left out"
-        remarks.append(remark("will mislead", "unreadable", text, rows=kept))
+        count_read = len(columns.pop(name).arrival)
+        text = (
+            f"topic {name}: message {count_read + 1} cannot be read ({why}); the topic is left out"
+        )
+        remarks.append(remark("will mislead", "unreadable", text, rows=count_read))
     silent = sorted({one.topic for one in chosen} - set(columns) - set(failed))
     remarks += [
         remark("note", "empty_topic", f"topic {name}: holds no messages") for name in silent
@@ -121,7 +125,7 @@ def _read(path: Path, reader: AnyReader, wanted: Wanted) -> Recording:
         epoch,
         files,
         tuple(remarks),
-        left,
+        not_wanted,
     )
 
 
@@ -213,8 +217,8 @@ class _Leaves:
         out: list[float] = []
         if self._scalars is not None:
             out = [self._scalars(message)] if self._single else list(self._scalars(message))
-        for way, size in self._arrays:
-            values = way(message)
+        for getter, size in self._arrays:
+            values = getter(message)
             out += (
                 values.tolist()
                 if values.size == size

@@ -67,7 +67,7 @@ def load_ulog(path: Path, wanted: Wanted = EVERYTHING) -> Recording:
             )
         )
     if log.dropouts:
-        lost = sum(one.duration for one in log.dropouts) * 1e-3
+        lost = sum(dropout.duration for dropout in log.dropouts) * 1e-3
         text = (
             f"the logger dropped data {len(log.dropouts)} times, {lost:.3g} s in all; gaps stay"
             " gaps"

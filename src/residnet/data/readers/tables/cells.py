@@ -113,18 +113,19 @@ class Cells:
     def times(self) -> Stamps:
         """Return the column as times."""
         first = self._stamps[0]
-        said = tuple(one for stamps in self._stamps for one in stamps.remarks)
+        remarks = tuple(noted for stamps in self._stamps for noted in stamps.remarks)
         # one remark for all chunks
         merged = (
             [
                 {
-                    **said[0],
+                    **remarks[0],
                     "figures": {
-                        key: sum(one["figures"][key] for one in said) for key in said[0]["figures"]
+                        key: sum(noted["figures"][key] for noted in remarks)
+                        for key in remarks[0]["figures"]
                     },
                 }
             ]
-            if said
+            if remarks
             else []
         )
         return dataclasses.replace(
