@@ -87,7 +87,7 @@ def test_random_forces_are_drawn_as_they_always_were() -> None:
 
 
 def test_new_disturbances_leave_old_draws_alone(windy: str) -> None:
-    """Wind and waves have generators of their own: noise and random forces of a seed do not move."""
+    """Wind and waves have generators of their own: noise and random forces stay the same."""
     plant = load_vessel(windy).build()
     forces = {"force_x": 20.0, "force_n": 15.0}
     plain, full = (

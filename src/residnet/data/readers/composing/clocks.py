@@ -192,7 +192,8 @@ def _sorted(topic: Series, behind: int, farthest: float) -> Series:
         usual = float(np.median(topic.arrival - topic.stamp))
         text = (
             f"topic {topic.name}: header stamps run backwards {behind} times, by up to"
-            f" {farthest:.3g} s; arrival times less the median latency of {usual:.3g} s are used instead"
+            f" {farthest:.3g} s; arrival times less the median latency of {usual:.3g} s are"
+            " used instead"
         )
         figures["latency"] = usual
         topic = dataclasses.replace(topic, stamp=topic.arrival - usual)

@@ -80,8 +80,8 @@ def publishers(series: Series, step: np.ndarray) -> list[Remark]:
         if bursts or mixed or in_turns:
             text = (
                 f"topic {series.name}: several publishers seem to write to it: field {path} leaps"
-                f" away and straight back in {returns:.0%} of the rows, {short:.0%} of the steps are"
-                " shorter than a fifth of the mean; do not use it unless the source tells its"
+                f" away and straight back in {returns:.0%} of the rows, {short:.0%} of the steps"
+                " are shorter than a fifth of the mean; do not use it unless the source tells its"
                 " senders apart"
             )
             return [
