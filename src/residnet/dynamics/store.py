@@ -180,19 +180,18 @@ def read_weights(folder: Path, module: nn.Module) -> None:
         numbers = load(weights)
     except SafetensorError as error:
         raise UsageError(f"{file}: no safetensors file ({error}); {again}") from None
-    expected = module.state_dict()
-    wrong = sorted(
-        name
-        for name in expected.keys() | numbers.keys()
-        if name not in expected
-        or name not in numbers
-        or expected[name].shape != numbers[name].shape
-    )
-    if wrong:
+    own = module.state_dict()
+    numbers = {
+        name: value.to(own[name].dtype) if name in own else value for name, value in numbers.items()
+    }
+    try:
+        # a module may take tensors of other sizes than it was built with, such as support vectors
+        module.load_state_dict(numbers)
+    except RuntimeError as error:
+        first = str(error).splitlines()[-1].strip()
         raise UsageError(
-            f"{file}: '{wrong[0]}' does not belong to what {_DESCRIPTION} describes; {again}"
-        )
-    module.load_state_dict({name: numbers[name].to(expected[name].dtype) for name in expected})
+            f"{file}: does not belong to what {_DESCRIPTION} describes ({first}); {again}"
+        ) from None
 
 
 def _description(folder: Path) -> dict[str, Any]:

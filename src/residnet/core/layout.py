@@ -1,0 +1,105 @@
+"""Which states and degrees of freedom a model has, and where they stand in its tensors.
+
+The columns below are those of the planar model, three degrees of freedom; no other module counts
+them. Functions serve code that TorchScript compiles, which takes no global slices.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from residnet.core import names
+
+
+@dataclass(frozen=True)
+class StateLayout:
+    """The states of a model in the order of its tensors: pose, velocities, then its actuators'.
+
+    Attributes:
+        pose: names of the pose.
+        velocities: names of the velocities, one for each degree of freedom.
+    """
+
+    pose: tuple[str, ...]
+    velocities: tuple[str, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of pose and velocities."""
+        return (*self.pose, *self.velocities)
+
+    @property
+    def dof(self) -> int:
+        """Number of degrees of freedom."""
+        return len(self.velocities)
+
+    @property
+    def pose_columns(self) -> slice:
+        """Columns of the pose."""
+        return slice(0, len(self.pose))
+
+    @property
+    def velocity_columns(self) -> slice:
+        """Columns of the velocities."""
+        return slice(len(self.pose), len(self.names))
+
+    @property
+    def motion_columns(self) -> slice:
+        """Columns of pose and velocities."""
+        return slice(0, len(self.names))
+
+    @property
+    def actuator_columns(self) -> slice:
+        """Columns of what follows: states of actuators and the like."""
+        return slice(len(self.names), None)
+
+
+PLANAR = StateLayout(names.POSE, names.VELOCITY)
+"""Three degrees of freedom: x, y, psi, u, v, r."""
+
+POSE = PLANAR.pose_columns
+VELOCITIES = PLANAR.velocity_columns
+MOTION = PLANAR.motion_columns
+ACTUATORS = PLANAR.actuator_columns
+POSITION = slice(0, PLANAR.pose.index("psi"))
+HEADING = PLANAR.names.index("psi")
+SURGE = PLANAR.names.index("u")
+SWAY = PLANAR.names.index("v")
+YAW_RATE = PLANAR.names.index("r")
+LATERAL = slice(SWAY, YAW_RATE + 1)
+"""Columns of sway and yaw, whose motion is that of steering."""
+HEADING_AND_VELOCITIES = slice(HEADING, len(PLANAR.names))
+"""Columns of all that forces may depend on."""
+
+RANGE_VELOCITIES = slice(0, PLANAR.dof)
+"""Of ranges, channels and accelerations: velocities stand first."""
+RANGE_INPUTS = slice(PLANAR.dof, None)
+"""Of training ranges: inputs follow the velocities."""
+
+
+def pose(x: Tensor) -> Tensor:
+    """Return the pose (x, y, psi) [..., 3] of states [..., nx]."""
+    return x[..., :3]
+
+
+def velocities(x: Tensor) -> Tensor:
+    """Return the velocities (u, v, r) [..., 3] of states [..., nx]."""
+    return x[..., 3:6]
+
+
+def motion(x: Tensor) -> Tensor:
+    """Return pose and velocities [..., 6] of states [..., nx]."""
+    return x[..., :6]
+
+
+def actuators(x: Tensor) -> Tensor:
+    """Return the states of actuators [..., nx - 6] of states [..., nx]."""
+    return x[..., 6:]
+
+
+def zero_acceleration(z: Tensor) -> Tensor:
+    """Return accelerations of zero [..., 3], alike in type to channels [..., nz]."""
+    return torch.zeros_like(z[..., :3])
