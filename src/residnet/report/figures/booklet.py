@@ -74,8 +74,8 @@ def _circles(frame: Any, pages: Sequence[Mapping[str, Any]], length: float) -> A
     axes = figure.subplots()
     handles: dict[str, Any] = {}
     for page in pages:
-        own = frame[frame["page"] == page["name"]]
-        for draw, part in own[own["draw"] >= 0].groupby("draw"):
+        of_page = frame[frame["page"] == page["name"]]
+        for draw, part in of_page[of_page["draw"] >= 0].groupby("draw"):
             axes.plot(
                 part["y"] / length,
                 part["x"] / length,
@@ -83,7 +83,7 @@ def _circles(frame: Any, pages: Sequence[Mapping[str, Any]], length: float) -> A
             )
         found = page["indices"]
         if "tactical_diameter" in found:
-            fitted = own[own["draw"] == 0]
+            fitted = of_page[of_page["draw"] == 0]
             side = 1.0 if fitted["psi"].iloc[-1] > 0 else -1.0
             advance, transfer = found["advance"]["lengths"], side * found["transfer"]["lengths"]
             diameter = side * found["tactical_diameter"]["lengths"]
@@ -120,11 +120,11 @@ def _zigzags(frame: Any, pages: Sequence[Mapping[str, Any]], level: float) -> An
     handles: dict[str, Any] = {}
     for place, page in enumerate(pages):
         axes = figure.add_subplot(lines, columns, place + 1)
-        own = frame[frame["page"] == page["name"]]
-        fitted = own[own["draw"] == 0]
+        of_page = frame[frame["page"] == page["name"]]
+        fitted = of_page[of_page["draw"] == 0]
         drawn = [
             _DEG * (part["psi"] - part["psi"].iloc[0]).to_numpy()
-            for draw, part in own[own["draw"] > 0].groupby("draw")
+            for draw, part in of_page[of_page["draw"] > 0].groupby("draw")
         ]
         if drawn:
             # flights that end at their stop condition are of different length: the band ends with
@@ -136,8 +136,8 @@ def _zigzags(frame: Any, pages: Sequence[Mapping[str, Any]], level: float) -> An
                 axis=0,
             )
             t = (
-                own[own["draw"] == 1]["t"].to_numpy()[:shortest]
-                if (own["draw"] == 1).any()
+                of_page[of_page["draw"] == 1]["t"].to_numpy()[:shortest]
+                if (of_page["draw"] == 1).any()
                 else np.zeros(0)
             )
             if t.size == shortest:
@@ -146,7 +146,7 @@ def _zigzags(frame: Any, pages: Sequence[Mapping[str, Any]], level: float) -> An
             fitted["t"], _DEG * (fitted["psi"] - fitted["psi"].iloc[0]), **SOLID, label="model"
         )
         axes.plot(fitted["t"], _DEG * fitted["rudder"], **_RUDDER)
-        measured = own[own["draw"] == -1]
+        measured = of_page[of_page["draw"] == -1]
         if len(measured):
             axes.plot(
                 measured["t"],

@@ -1,6 +1,4 @@
-"""Figures of errors: against horizon, by model and split, over training, and of the residual
-itself.
-"""
+"""Figures of errors: against the horizon, by model and split, over training, of residuals."""
 
 from __future__ import annotations
 
@@ -36,18 +34,22 @@ _HORIZON = ("u [m/s]", "v [m/s]", "r [deg/s]", "position [m]", "heading [deg]")
 
 
 def growth(windows: Sequence[StoredWindow], model: str) -> tuple[np.ndarray, np.ndarray]:
-    """RMS errors over windows against the time since the start.
+    """Return the root mean square errors over windows against the time since the start.
+
+    Args:
+        windows: free runs of one protocol.
+        model: whose errors are taken.
 
     Returns:
-        middles of time bins [K] in s, and errors [K, 5] of u, v (m/s), r (deg/s), position (m),
-        heading (deg); bins that fewer than half of the windows reach are left out. u, v and
+        Middles of time bins [K] in s, and errors [K, 5] of u, v (m/s), r (deg/s), position (m),
+        heading (deg). Bins that fewer than half of the windows reach are left out. u, v and
         position count where usable.
     """
-    own = [window for window in windows if model in window.predicted]
-    longest = max(float(window.t[-1] - window.t[0]) for window in own)
-    count = max(min(_BINS, max(window.t.size for window in own) // 2), 1)
+    of_model = [window for window in windows if model in window.predicted]
+    longest = max(float(window.t[-1] - window.t[0]) for window in of_model)
+    count = max(min(_BINS, max(window.t.size for window in of_model) // 2), 1)
     squares, samples, reached = np.zeros((count, 5)), np.zeros((count, 5)), np.zeros(count)
-    for window in own:
+    for window in of_model:
         error = window.predicted[model] - window.measured
         columns = (
             error[:, 0],
@@ -62,7 +64,7 @@ def growth(windows: Sequence[StoredWindow], model: str) -> tuple[np.ndarray, np.
             weight = window.usable if k in (0, 1, 3) else np.ones_like(window.usable)
             squares[:, k] += np.bincount(index, np.where(weight, column, 0.0) ** 2, count)
             samples[:, k] += np.bincount(index, weight, count)
-    keep = reached >= 0.5 * len(own)
+    keep = reached >= 0.5 * len(of_model)
     with np.errstate(invalid="ignore", divide="ignore"):
         error = np.sqrt(squares / samples)
     return ((np.arange(count) + 0.5) * longest / count)[keep], error[keep]
@@ -70,7 +72,12 @@ def growth(windows: Sequence[StoredWindow], model: str) -> tuple[np.ndarray, np.
 
 @styled
 def horizon(run: RunFiles, windows: Sequence[StoredWindow]) -> Any:
-    """Error against horizon of every model, logarithmic; the windows are those of one protocol."""
+    """Draw the error of every model against the horizon, on a logarithmic scale.
+
+    Args:
+        run: folder of the fit.
+        windows: free runs of one protocol.
+    """
     figure = new_figure(5.4)
     grid = figure.subplots(3, 2, sharex=True)
     panels = [grid[0, 0], grid[1, 0], grid[2, 0], grid[1, 1], grid[2, 1]]
@@ -120,8 +127,9 @@ def _plain_log(axes: Any) -> None:
 
 @styled
 def bars(run: RunFiles, protocol: str) -> Any:
-    """RMSE by model, train beside test, with 95 % intervals; as figures 16 and 17 of document 003.
-    `zero` is left out: it would flatten the rest.
+    """Draw the error of every model, train beside test, with 95 % intervals.
+
+    Figures 16 and 17 of document 003 look like this. `zero` is left out: it would flatten the rest.
     """
     from matplotlib.patches import Patch
 
@@ -170,8 +178,9 @@ def bars(run: RunFiles, protocol: str) -> Any:
 
 
 def bar_group(run: RunFiles, protocol: str, channel: str) -> str:
-    """Manoeuvres that a channel is judged on: surge on the group `speed`, the others on `steering`,
-    where a run has these groups.
+    """Return the group of manoeuvres that a channel is judged on.
+
+    Surge is judged on `speed` and the others on `steering`, where a run has both groups.
     """
     groups = set(run.manoeuvres(run.focus, protocol))
     return ("speed" if channel == "u" else "steering") if {"speed", "steering"} <= groups else "all"
@@ -183,8 +192,12 @@ def _alpha(run: RunFiles, split: str) -> float:
 
 @styled
 def residuals(run: RunFiles, table: Mapping[str, np.ndarray], models: Sequence[str]) -> Any:
-    """Residual target against prediction, one line of panels for each head; table: columns model,
-    axis, target, predicted (SI).
+    """Draw residual targets against predictions, a row of panels for each head.
+
+    Args:
+        run: folder of the fit.
+        table: columns model, axis, target and predicted, each [N], in SI.
+        models: whose rows are drawn.
     """
     from matplotlib.ticker import MaxNLocator
 
@@ -230,15 +243,16 @@ def residuals(run: RunFiles, table: Mapping[str, np.ndarray], models: Sequence[s
 
 
 def r_squared(target: np.ndarray, predicted: np.ndarray) -> float:
-    """Share of the variance of the target [N] that the prediction [N] explains."""
+    """Return the share of the variance of the target [N] that the prediction [N] explains."""
     spread = float(np.sum((target - target.mean()) ** 2))
     return 1.0 - float(np.sum((target - predicted) ** 2)) / spread if spread > 0 else math.nan
 
 
 @styled
 def learning_curves(run: RunFiles, models: Sequence[str]) -> Any:
-    """Loss and free-run error on validation data by epoch, one column for each trained head; stages
-    are parted by lines.
+    """Draw loss and free-run error on validation data by epoch, a column for each trained head.
+
+    Lines separate the stages.
     """
     from matplotlib.ticker import MaxNLocator
 

@@ -1,6 +1,4 @@
-"""Pictures of force-space models: the surface of errors, and how much each basis function weighs
-(document 002 Figures 4.6, 4.20, 4.25).
-"""
+"""Figures of force-space models (document 002 Figures 4.6, 4.20, 4.25)."""
 
 from __future__ import annotations
 
@@ -21,12 +19,12 @@ def draw_surface(
     chosen: Mapping[str, Sequence[tuple[int, int]]],
     path: Path,
 ) -> None:
-    """Share of the un-modelled MSE over model order and number of basis functions.
+    """Write a figure of the error that is left, over model order and number of basis functions.
 
     Args:
-        error: [3, A, J + 1], NaN where there is no model.
-        unmodelled: MSE of the residual by axis.
-        chosen: name of a choice -> its (order, count) of each axis.
+        error: mean square error by axis, order and number of basis functions.
+        unmodelled: mean square of the residual of each axis.
+        chosen: (order, number of basis functions) of each axis, by what chose them.
         path: PNG file.
     """
     from matplotlib import rc_context
@@ -65,8 +63,8 @@ def draw_surface(
             figure,
             path,
             "Surface analysis",
-            "Share of the un-modelled residual's mean square that is left, by model order and"
-            " number of basis functions.",
+            "Share of the unmodelled residual's mean square that is left, by model order and"
+            " number of basis functions. Marks show what each rule chose.",
         )
 
 
@@ -75,12 +73,12 @@ def _extent(share: np.ndarray) -> tuple[float, float, float, float]:
 
 
 def draw_weights(terms: Sequence[str], pre: Tensor, title: str, path: Path) -> None:
-    """|Theta_pre|: coefficients of basis functions and outputs in units of their spread.
+    """Write a figure of the coefficients of basis functions, scaled by the spread of each.
 
     Args:
         terms: names of the basis functions.
-        pre: [J, 3].
-        title: of the picture.
+        pre: scaled coefficients, [J, 3].
+        title: of the figure.
         path: PNG file.
     """
     from matplotlib import rc_context
@@ -98,6 +96,6 @@ def draw_weights(terms: Sequence[str], pre: Tensor, title: str, path: Path) -> N
             figure,
             path,
             title,
-            "Magnitude of the coefficients of scaled basis functions: how much each weighs in the"
-            " model.",
+            "Magnitude of the coefficients of scaled basis functions. It shows how much each one"
+            " weighs in the model.",
         )

@@ -1,6 +1,4 @@
-"""Pictures of closed loops: errors and forces over time, by the model of the feed-forward (document
-002 Figures 4.31-4.39).
-"""
+"""Figures of closed loops by model of the feed-forward (document 002 Figures 4.31-4.39)."""
 
 from __future__ import annotations
 
@@ -20,13 +18,14 @@ _FORCES = ("surge [N]", "sway [N]", "yaw [N m]")
 def draw_errors(
     t: Tensor, position: Mapping[str, Tensor], heading: Mapping[str, Tensor], path: Path
 ) -> None:
-    """Distance to the desired position and heading error over time, one line for each model;
-    logarithmic, for models differ by orders of magnitude.
+    """Write a figure of position and heading errors over time, a line for each model.
+
+    The scales are logarithmic, since models differ by orders of magnitude.
 
     Args:
-        t: [N] s.
-        position: by model [N] m, at least zero.
-        heading: by model [N] rad, at least zero.
+        t: [N] in s.
+        position: by model, [N] in m, at least zero.
+        heading: by model, [N] in rad, at least zero.
         path: PNG file.
     """
     from matplotlib import rc_context
@@ -60,12 +59,12 @@ def draw_errors(
 def draw_force_parts(
     t: Tensor, total: Mapping[str, Tensor], feedback: Mapping[str, Tensor], path: Path
 ) -> None:
-    """Commanded force and the part of it that is feedback, a column for each model.
+    """Write a figure of the commanded force and its feedback part, a column for each model.
 
     Args:
-        t: [N] s.
-        total: tau by model [N, 3].
-        feedback: tau_FB by model [N, 3].
+        t: [N] in s.
+        total: tau by model, [N, 3] in N and N m.
+        feedback: tau_FB by model, [N, 3] in N and N m.
         path: PNG file.
     """
     from matplotlib import rc_context

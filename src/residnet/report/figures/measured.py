@@ -1,6 +1,4 @@
-"""Pictures of measured forces: over time, against each other, and what models leave of them
-(document 002 chapter 5).
-"""
+"""Figures of measured forces and of what models leave of them (document 002 chapter 5)."""
 
 from __future__ import annotations
 
@@ -27,16 +25,16 @@ def draw_pair(
     path: Path,
     labels: tuple[str, str],
 ) -> None:
-    """Two signals of three axes over time, masked samples shaded.
+    """Write a figure of two signals of three axes over time, with masked samples shaded.
 
     Args:
-        t: [T] s.
+        t: [T] in s.
         first, second: [T, 3].
-        good: [T] bool.
+        good: [T], whether a sample is used.
         names: of the three axes, with units.
-        title: of the picture.
+        title: of the figure.
         path: PNG file.
-        labels: of the two.
+        labels: of the two signals.
     """
     from matplotlib import rc_context
 
@@ -61,11 +59,12 @@ def draw_pair(
 
 
 def draw_scores(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Error of every model less that of the believed one, in units of the force's mean square, with
-    intervals; one panel for each force.
+    """Write a figure of every model's error less that of the believed model, with intervals.
+
+    There is a panel for each force; errors are in units of its mean square.
 
     Args:
-        rows: of the tables, as in force_residual.json.
+        rows: as in force_residual.json.
         path: PNG file.
     """
     from matplotlib import rc_context

@@ -28,8 +28,8 @@ def of_terms(run: RunFiles) -> Iterator[Drawing]:
     frame = run.frame("terms.parquet")
     if frame is None:
         return
-    for model, own in frame.groupby("model", sort=False):
-        log = str(own["log"].iloc[0])
+    for model, rows in frame.groupby("model", sort=False):
+        log = str(rows["log"].iloc[0])
         yield Drawing(
             f"terms_{model}",
             f"Equation of {model}, term by term",
@@ -39,13 +39,13 @@ def of_terms(run: RunFiles) -> Iterator[Drawing]:
                 " that mirror each other mean that the data can hardly tell them apart. A flat term"
                 " could be left out."
             ),
-            parts(own),
+            parts(rows),
         )
 
 
 @styled
 def parts(frame: Any) -> Any:
-    """A panel for each axis: its terms, their sum, and the target.
+    """Draw the terms of each axis along a log, their sum, and the target.
 
     Args:
         frame: rows of one model with columns axis, term, t, value.
@@ -53,12 +53,12 @@ def parts(frame: Any) -> Any:
     figure = new_figure(6.6)
     panels = figure.subplots(3, 1, sharex=True)
     for axes, (axis, text, factor) in zip(panels, _AXES, strict=True):
-        own = frame[frame["axis"] == axis]
+        of_axis = frame[frame["axis"] == axis]
         curves = {
             str(term): factor * np.asarray(rows["value"])
-            for term, rows in own.groupby("term", sort=False)
+            for term, rows in of_axis.groupby("term", sort=False)
         }
-        time = np.asarray(own["t"])[: len(curves["target"])]
+        time = np.asarray(of_axis["t"])[: len(curves["target"])]
         axes.plot(time, curves.pop("target"), color="0.75", linewidth=2.2, label="target")
         ordered = sorted(curves, key=lambda term: -float(np.square(curves[term]).mean()))
         for term, colour in zip(ordered[:_SHOWN], _COLOURS, strict=False):

@@ -35,8 +35,9 @@ _PANELS = (
 def representative(
     run: RunFiles, windows: Sequence[StoredWindow], protocol: str
 ) -> list[StoredWindow]:
-    """For each kind of manoeuvre the window in which the leading model has its median error, by
-    kind; neither the best nor the worst case.
+    """Return for each kind of manoeuvre the window in which the leading model has its median error.
+
+    It is neither the best nor the worst case.
     """
     judge = leading(run)
     scales = run.metrics.get("scales") or {}
@@ -59,17 +60,16 @@ def representative(
 
 
 def leading(run: RunFiles) -> str:
-    """The model that figures of single runs show: the selected one, else the first head, else the
-    baseline.
+    """Return the model that figures of single runs show.
+
+    It is the selected one, else the first head, else the baseline.
     """
     names = [run.selected, *run.heads, run.baseline, *run.kinds]
     return next(name for name in names if name is not None and name in run.kinds)
 
 
 def shown(run: RunFiles) -> list[str]:
-    """Models in figures of single runs: baseline, plant where there is one, the leading head on
-    top.
-    """
+    """Return the models in figures of single runs: baseline, plant, the leading head on top."""
     head = leading(run)
     if head == run.baseline and run.heads:
         head = run.heads[0]
@@ -78,8 +78,9 @@ def shown(run: RunFiles) -> list[str]:
 
 @styled
 def tracks(run: RunFiles, windows: Sequence[StoredWindow]) -> Any:
-    """Measured and predicted tracks, one panel for each window; north up, equal scales, the start
-    at the origin.
+    """Draw measured and predicted tracks, a panel for each window.
+
+    North is up, scales are equal, and the start is at the origin.
     """
     columns = min(2, len(windows))
     lines = math.ceil(len(windows) / columns)
@@ -124,8 +125,9 @@ def tracks(run: RunFiles, windows: Sequence[StoredWindow]) -> Any:
 
 @styled
 def history(run: RunFiles, window: StoredWindow) -> Any:
-    """Velocities and heading against time, measured and predicted; masked samples are gaps on a
-    grey ground.
+    """Draw velocities and heading against time, measured and predicted.
+
+    Masked samples are gaps on a grey ground.
     """
     figure = new_figure(6.6)
     panels = figure.subplots(4, 1, sharex=True)
@@ -156,7 +158,7 @@ def history(run: RunFiles, window: StoredWindow) -> Any:
 
 
 def shade(axes: Any, time: np.ndarray, usable: np.ndarray) -> None:
-    """Grey ground where samples are masked."""
+    """Draw a grey ground where samples are masked."""
     for i, (begin, end) in enumerate(zip(*stretches(~usable), strict=True)):
         extra = {"label": MASKED_LABEL} if i == 0 else {}
         axes.axvspan(time[begin], time[min(end, time.size - 1)], **MASKED, **extra)
