@@ -15,28 +15,31 @@ from residnet.regression.solutions import Coefficient, Solution
 
 
 class Baseline(nn.Module, ABC):
-    """Acceleration from channels: z [..., nz] -> nu_dot [..., 3] (m/s^2, m/s^2, rad/s^2);
-    memoryless.
+    """A baseline: accelerations [..., 3] from channels z [..., nz], without memory.
+
+    They are in m/s^2, m/s^2 and rad/s^2.
     """
 
     @abstractmethod
     def forward(self, z: Tensor) -> Tensor:
-        """nu_dot [..., 3] at channels z [..., nz] (see `residnet.physics.signals`)."""
+        """Return nu_dot [..., 3] at channels z [..., nz] (see `residnet.physics.signals`)."""
 
     @abstractmethod
     def parameter_count(self) -> list[float]:
-        """Number of fitted parameters of each axis."""
+        """Return the number of fitted parameters of each axis."""
 
     def mass(self) -> Tensor | None:
-        """Inertia [3, 3] between forces and accelerations, float64; None where a baseline knows no
-        forces.
+        """Return the inertia [3, 3] between forces and accelerations, float64.
+
+        None where a baseline knows no forces.
         """
         return None
 
 
 class ParametricBaseline(Baseline, ABC):
-    """A baseline of which all that was fitted stands in `theta`, so that its parameters can be
-    moved through free runs and drawn at random.
+    """A baseline of which all that was fitted stands in `theta`.
+
+    Its parameters can be moved through free runs and drawn at random.
 
     Args:
         theta: numbers of any shape, kept as the parameter `theta`; the P of them that may move are
@@ -49,36 +52,41 @@ class ParametricBaseline(Baseline, ABC):
 
     @abstractmethod
     def free_indices(self) -> Tensor:
-        """Numbers of the parameters, in theta flattened, that may move, [P]."""
+        """Return the places [P] in theta, flattened, of the parameters that may move."""
 
     @abstractmethod
     def sensitivity(self, z: Tensor) -> Tensor:
-        """Derivative of nu_dot with respect to the free parameters at channels z [B, nz], [B, 3,
-        P].
+        """Return the derivatives [B, 3, P] of nu_dot with respect to the free parameters.
+
+        They are taken at channels z [B, nz].
         """
 
     @abstractmethod
     def information(self, samples: Samples) -> Tensor:
-        """Information that a sample's accelerations hold about the free parameters, mean over
-        the samples, [P, P].
+        """Return the information [P, P] that a sample's accelerations hold, mean over samples.
+
+        It is about the free parameters.
         """
 
     @abstractmethod
     def prior(self) -> tuple[Tensor, Tensor]:
-        """Mean [P] and precision [P] of what is thought of the free parameters before any trial;
-        zero precision where nothing is.
+        """Return the prior mean [P] and precision [P] of the free parameters, before any trial.
+
+        The precision is zero where nothing is known before.
         """
 
     @abstractmethod
     def asymmetry(self, samples: Samples) -> Tensor:
-        """Information [P] about those free parameters that a mirror-symmetric vessel cannot
-        have; zero for all others.
+        """Return the information [P] about parameters that a mirror-symmetric vessel cannot have.
+
+        It is zero for all other free parameters.
         """
 
     @abstractmethod
     def updated_table(self, table: Sequence[Coefficient], errors: Tensor) -> list[Coefficient]:
-        """The table of coefficients as theta is now, with standard errors [P] of the free
-        parameters; errors of ratios stay as they were.
+        """Return the table of coefficients as theta is now.
+
+        Standard errors [P] are those of the free parameters; errors of ratios stay as they were.
         """
 
 
@@ -86,12 +94,12 @@ class IdentifiedConfig(Config, ABC):
     """A kind of baseline and how it is identified."""
 
     def resolved(self) -> Self:
-        """The same without references to files, as it is kept with a model."""
+        """Return the config without references to files, as it is kept with a model."""
         return self
 
     @abstractmethod
     def build(self, names: Sequence[str]) -> Baseline:
-        """The module, its numbers not yet found, for channels `names`.
+        """Return the module, its numbers not yet found, for channels `names`.
 
         Raises:
             ConfigError: where a channel that it needs is missing.
@@ -99,8 +107,9 @@ class IdentifiedConfig(Config, ABC):
 
     @abstractmethod
     def solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
-        """Identify from samples whose target is the measured acceleration; several solutions where
-        free runs are to choose between them.
+        """Identify from samples whose target is the measured acceleration.
+
+        There are several solutions where free runs are to choose between them.
 
         Raises:
             FitError: where the data do not determine a coefficient.
@@ -108,7 +117,7 @@ class IdentifiedConfig(Config, ABC):
 
     @final
     def fit(self, baseline: Baseline, samples: Samples) -> list[Coefficient]:
-        """Fill the baseline with the first (or only) of `solutions`; returns its coefficients."""
+        """Fill the baseline with the first of `solutions` and return its coefficients."""
         first = self.solutions(baseline, samples)[0]
         baseline.load_state_dict(first.state, strict=False)
         return list(first.table)
@@ -129,7 +138,7 @@ def require(names: Sequence[str], wanted: Sequence[str], who: str) -> None:
 
 
 def of_manoeuvres(samples: Samples, kinds: Sequence[str]) -> Samples:
-    """The samples of some kinds of manoeuvre; all where `kinds` is empty.
+    """Return the samples of some kinds of manoeuvre, all where `kinds` is empty.
 
     Raises:
         FitError: where there are none.

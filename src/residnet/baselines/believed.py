@@ -1,5 +1,6 @@
-"""The known part as given: the hull of a vessel file, with a factor on its mass, Coriolis and
-damping matrices (document 002 section 4.1.1).
+"""The known part as given: the hull of a vessel file (document 002 section 4.1.1).
+
+A factor on its mass, Coriolis and damping matrices makes it wrong on purpose.
 """
 
 from __future__ import annotations
@@ -27,8 +28,14 @@ Row = dict[str, float]
 
 
 class HullEquations(Config):
-    """Accelerations written out: coefficients of u_dot, v_dot and r_dot by term of u, v, r, tau_x,
-    tau_y, tau_n, in SI.
+    """The accelerations of a hull written out, in SI.
+
+    The terms are products of u, v, r, tau_x, tau_y and tau_n.
+
+    Attributes:
+        u: coefficients of u_dot by term.
+        v: coefficients of v_dot by term.
+        r: coefficients of r_dot by term.
     """
 
     u: Row
@@ -48,13 +55,13 @@ class HullEquations(Config):
         return self
 
     def rows(self) -> tuple[Row, Row, Row]:
-        """Of u_dot, v_dot, r_dot."""
+        """Return the coefficients of u_dot, v_dot and r_dot."""
         return self.u, self.v, self.r
 
 
 @final
 class BelievedBaseline(Baseline):
-    """nu_dot [..., 3] = theta [3, J] phi(z) [..., J], with numbers that stay as they were given."""
+    """A baseline nu_dot = theta [3, J] phi(z) [..., J] whose numbers stay as they were given."""
 
     def __init__(self, equations: HullEquations, names: Sequence[str]) -> None:
         super().__init__()
@@ -70,17 +77,18 @@ class BelievedBaseline(Baseline):
         self.theta: Tensor
 
     def forward(self, z: Tensor) -> Tensor:
-        """nu_dot [..., 3] at channels z [..., nz]."""
+        """Return nu_dot [..., 3] at channels z [..., nz]."""
         phi: Tensor = self.library(z)
         return phi @ self.theta.to(z.dtype).T
 
     def parameter_count(self) -> list[float]:
-        """None: nothing was fitted."""
+        """Return zeros: nothing was fitted."""
         return [0.0, 0.0, 0.0]
 
     def mass(self) -> Tensor | None:
-        """Inertia [3, 3]: the inverse of what the forces do to the accelerations; None where that
-        has none.
+        """Return the inertia [3, 3], the inverse of what forces do to accelerations.
+
+        None where that has no inverse.
         """
         columns = [
             self.library.terms.index(name) for name in FORCE_CHANNELS if name in self.library.terms
@@ -102,7 +110,7 @@ class BelievedConfig(IdentifiedConfig):
         vessel: name or file of a vessel whose hull is given by matrices or accelerations (kinds
             fossen, mass_matrix, odin); a saved model has the hull's equations in its place, without
             the factor.
-        scale: what mass, Coriolis and damping matrices are multiplied by.
+        scale: factor on the mass, Coriolis and damping matrices.
     """
 
     kind: Literal["believed"] = "believed"
@@ -115,7 +123,7 @@ class BelievedConfig(IdentifiedConfig):
         return self
 
     def equations(self) -> HullEquations:
-        """Of the vessel, without the factor.
+        """Return the equations of the vessel, without the factor.
 
         Raises:
             ValueError: where there is no such vessel, or its hull has no equations of this form.
@@ -141,11 +149,11 @@ class BelievedConfig(IdentifiedConfig):
         return HullEquations(u=rows[0], v=rows[1], r=rows[2])
 
     def resolved(self) -> Self:
-        """With the equations in place of the vessel's name."""
+        """Return the config with the equations in place of the vessel's name."""
         return self.model_copy(update={"vessel": self.equations()})
 
     def build(self, names: Sequence[str]) -> BelievedBaseline:
-        """The module with its numbers, for channels `names`."""
+        """Return the module with its numbers, for channels `names`."""
         require(names, (*VELOCITY, *FORCE_CHANNELS), "baseline 'believed'")
         # M, C and D times one factor: only the forces act differently
         rows = [
@@ -158,5 +166,5 @@ class BelievedConfig(IdentifiedConfig):
         return BelievedBaseline(HullEquations(u=rows[0], v=rows[1], r=rows[2]), names)
 
     def solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
-        """Nothing to fit: one solution without numbers."""
+        """Return one solution without numbers: there is nothing to fit."""
         return [Solution({}, {})]

@@ -1,5 +1,6 @@
-"""Equations that somebody published: accelerations as terms with given coefficients, scored beside
-what is identified here.
+"""Equations that somebody published, scored beside what is identified here.
+
+They are accelerations as terms with given coefficients.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ Row = dict[str, float]
 
 @final
 class EquationsBaseline(Baseline):
-    """nu_dot [..., 3] = theta [3, J] phi(z) [..., J], theta as given."""
+    """A baseline nu_dot = theta [3, J] phi(z) [..., J] with published coefficients theta."""
 
     def __init__(self, rows: Sequence[Row], names: Sequence[str]) -> None:
         super().__init__()
@@ -36,26 +37,30 @@ class EquationsBaseline(Baseline):
         self.theta: Tensor
 
     def forward(self, z: Tensor) -> Tensor:
-        """nu_dot [..., 3] at channels z [..., nz]."""
+        """Return nu_dot [..., 3] at channels z [..., nz]."""
         phi: Tensor = self.library(z)
         return phi @ self.theta.to(z.dtype).T
 
     def parameter_count(self) -> list[float]:
-        """Number of terms of each axis: they were fitted, if to other data (ERRATA E9 of document
-        000).
+        """Return the number of terms of each axis.
+
+        They were fitted, if to other data (ERRATA E9 of document 000).
         """
         return [float(count) for count in (self.theta != 0).sum(1)]
 
 
 class EquationsConfig(IdentifiedConfig):
-    """Published equations of the accelerations, for example document 000 eqs. (6.24)-(6.32) and
-    (7.2)-(7.7); nothing is identified.
+    """Published equations of the accelerations; nothing is identified.
+
+    Examples are eqs. (6.24)-(6.32) and (7.2)-(7.7) of document 000.
 
     Attributes:
-        u, v, r: coefficients of u_dot, v_dot, r_dot by term; a term that is left out is zero.
+        u: coefficients of u_dot by term; a term that is left out is zero.
+        v: coefficients of v_dot by term.
+        r: coefficients of r_dot by term.
         units: units in which the coefficients take channels, where not SI (document 000 has
             revolutions in rpm).
-        source: where they stand.
+        source: where the equations stand.
     """
 
     kind: Literal["equations"] = "equations"
@@ -77,7 +82,7 @@ class EquationsConfig(IdentifiedConfig):
         return self
 
     def rows(self, names: Sequence[str]) -> list[Row]:
-        """Coefficients of each axis in SI, for channels `names`.
+        """Return the coefficients of each axis in SI, for channels `names`.
 
         Raises:
             ConfigError: where a term names a channel that the model lacks, or a function of one
@@ -101,9 +106,9 @@ class EquationsConfig(IdentifiedConfig):
         return out
 
     def build(self, names: Sequence[str]) -> EquationsBaseline:
-        """The module with its numbers, for channels `names`."""
+        """Return the module with its numbers, for channels `names`."""
         return EquationsBaseline(self.rows(names), names)
 
     def solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
-        """Nothing to fit: one solution without numbers."""
+        """Return one solution without numbers: there is nothing to fit."""
         return [Solution({}, {})]

@@ -1,5 +1,6 @@
-"""The linear speed and steering models of document 003, identified through steady-state constraints
-(sections 4.2.1, 4.2.2).
+"""The linear speed and steering models of document 003 (sections 4.2.1, 4.2.2).
+
+They are identified through steady-state constraints.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from residnet.regression.solutions import Coefficient, Solution
 
 
 class LinearSteadyConfig(IdentifiedConfig):
-    """u_dot = a u + b tau + c and (v, r)_dot = A (v, r) + B tau + C (eqs. (12), (16)).
+    """Linear models u_dot = a u + k tau + c and (v, r)_dot = A (v, r) + B tau + C (eqs. (12), (16)).
 
     First the steady states of constant-input manoeuvres give x_ss = Phi tau + Phi_bias by least
     squares (eqs. (24), (32)); then x_dot = A (x - Phi tau - Phi_bias) gives A by least squares on
@@ -30,8 +31,8 @@ class LinearSteadyConfig(IdentifiedConfig):
         drive: channel that drives surge.
         steer: channel that turns the vessel.
         steady: kinds of manoeuvre with constant input.
-        settled: only samples later than this after a constant manoeuvre's start are taken as
-            steady.
+        settled: time after the start of a constant manoeuvre from which its samples count as
+            steady, s.
         speed: kinds of manoeuvre that identify a.
         steering: kinds of manoeuvre that identify A.
     """
@@ -45,13 +46,13 @@ class LinearSteadyConfig(IdentifiedConfig):
     steering: tuple[str, ...] = ("zigzag", "three_two_one_one")
 
     def build(self, names: Sequence[str]) -> RegressorBaseline:
-        """The module, coefficients zero, for channels `names`."""
+        """Return the module, coefficients zero, for channels `names`."""
         require(names, ("u", "v", "r", self.drive, self.steer), "baseline 'linear_steady'")
         steering = ("v", "r", self.steer, "1")
         return RegressorBaseline([("u", self.drive, "1"), steering, steering], names)
 
     def solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
-        """The one solution.
+        """Return the one solution.
 
         Raises:
             FitError: where a kind of manoeuvre that a step needs is absent.
@@ -69,8 +70,9 @@ class LinearSteadyConfig(IdentifiedConfig):
         return [Solution({}, {"theta": theta}, tuple(table))]
 
     def _steady_states(self, samples: Samples, states: tuple[str, ...], drive: str) -> Solution:
-        """Phi and Phi_bias [2, n] (rows: slope, bias) from the means of the settled part of every
-        constant manoeuvre.
+        """Return Phi and Phi_bias [2, n] as the rows of a fit.
+
+        It is made of the means of the settled part of every constant manoeuvre.
         """
         settled = samples.of_kinds(self.steady)
         settled = settled.where(settled.t >= self.settled)
@@ -102,8 +104,9 @@ class LinearSteadyConfig(IdentifiedConfig):
     def _block(
         self, samples: Samples, states: tuple[str, ...], drive: str, kinds: tuple[str, ...]
     ) -> list[list[tuple[str, float, float]]]:
-        """Rows of (term, value, standard error) for each state: A, then B = -A Phi and -A Phi_bias
-        with propagated errors.
+        """Return rows of (term, value, standard error) for each state.
+
+        First stands A, then B = -A Phi and -A Phi_bias with propagated errors.
         """
         steady = self._steady_states(samples, states, drive)
         dynamic = samples.of_kinds(kinds)
@@ -136,5 +139,5 @@ class LinearSteadyConfig(IdentifiedConfig):
 
 
 def _product_error(a: Tensor, a_error: Tensor, b: Tensor, b_error: Tensor) -> float:
-    """Standard error of a.b to first order, errors of a and b taken as independent."""
+    """Return the standard error of a.b to first order, errors of a and b being independent."""
     return float(((a * b_error).square() + (b * a_error).square()).sum().sqrt())

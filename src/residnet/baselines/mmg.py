@@ -1,6 +1,4 @@
-"""The MMG standard model with parameters identified from trials, starting from what is thought of
-such a ship.
-"""
+"""The MMG standard model with parameters identified from trials, starting from a prior."""
 
 from __future__ import annotations
 
@@ -41,7 +39,7 @@ _AXIS = {"X": "u_dot", "R": "u_dot", "t": "u_dot", "Y": "v_dot", "N": "r_dot"}
 
 @final
 class MMGBaseline(ParametricBaseline):
-    """nu_dot [..., 3] of the MMG model; theta [34] as `PARAMETERS` names them."""
+    """The MMG model, nu_dot [..., 3], with parameters theta [34] as `PARAMETERS` names them."""
 
     def __init__(self, forces: MMGForces, beliefs: Sequence[Prior]) -> None:
         super().__init__(torch.tensor([belief.mean for belief in beliefs], dtype=torch.float64))
@@ -50,13 +48,14 @@ class MMGBaseline(ParametricBaseline):
         self.spread = [belief.sd for belief in beliefs]
 
     def forward(self, z: Tensor) -> Tensor:
-        """nu_dot [..., 3] at channels z [..., nz]."""
+        """Return nu_dot [..., 3] at channels z [..., nz]."""
         nu_dot: Tensor = self.forces(z, self.theta.to(z.dtype))
         return nu_dot
 
     def parameter_count(self) -> list[float]:
-        """Parameters that are not fixed, by the axis that they are listed under; those of propeller
-        and rudder count in every axis.
+        """Return the number of parameters that are not fixed, by the axis they are listed under.
+
+        Those of propeller and rudder count in every axis.
         """
         free = [PARAMETERS[i] for i in self.free_indices().tolist()]
         return [
@@ -64,12 +63,13 @@ class MMGBaseline(ParametricBaseline):
         ]
 
     def free_indices(self) -> Tensor:
-        """Numbers of the parameters whose spread is not zero, [P]."""
+        """Return the places [P] of the parameters whose prior is not fixed."""
         return torch.nonzero(torch.tensor(self.spread) > 0).squeeze(1)
 
     def sensitivity(self, z: Tensor) -> Tensor:
-        """d nu_dot / d theta [B, 3, P], by central differences of all parameters at once: as exact
-        as needed and 20 times as fast as torch.func.
+        """Return d nu_dot / d theta [B, 3, P], by central differences of all parameters at once.
+
+        This is as exact as needed and 20 times as fast as torch.func.
         """
         free = self.free_indices()
         steps = _STEP * torch.tensor(self.spread, dtype=z.dtype)[free]
@@ -81,8 +81,9 @@ class MMGBaseline(ParametricBaseline):
         return slopes.permute(1, 2, 0)
 
     def information(self, samples: Samples) -> Tensor:
-        """Mean information of a sample [P, P], by the variance that the present parameters leave of
-        each axis.
+        """Return the mean information of a sample [P, P].
+
+        Each axis weighs by the variance that the present parameters leave of it.
         """
         part = _thinned(samples)
         with torch.no_grad():
@@ -93,7 +94,7 @@ class MMGBaseline(ParametricBaseline):
         return torch.einsum("bip,biq,i->pq", slopes, slopes, 1.0 / variance) / len(part)
 
     def prior(self) -> tuple[Tensor, Tensor]:
-        """Mean and precision [P] as the config gives them."""
+        """Return the mean and precision [P] that the config gives."""
         free = self.free_indices()
         return (
             torch.tensor(self.mean, dtype=torch.float64)[free],
@@ -101,11 +102,11 @@ class MMGBaseline(ParametricBaseline):
         )
 
     def asymmetry(self, samples: Samples) -> Tensor:
-        """None: what is asymmetric here has a belief of its own."""
+        """Return zeros [P]: what is asymmetric here has a prior of its own."""
         return torch.zeros(self.free_indices().numel(), dtype=torch.float64)
 
     def updated_table(self, table: Sequence[Coefficient], errors: Tensor) -> list[Coefficient]:
-        """Every parameter as it is now."""
+        """Return every parameter as it is now."""
         known = dict(zip(self.free_indices().tolist(), errors.tolist(), strict=True))
         return [
             Coefficient(axis_of(name), name, float(self.theta[i]), known.get(i, 0.0))
@@ -114,7 +115,7 @@ class MMGBaseline(ParametricBaseline):
 
 
 def axis_of(name: str) -> str:
-    """Acceleration that a parameter is listed under; empty where it acts on several."""
+    """Return the acceleration that a parameter is listed under, empty where it acts on several."""
     return _AXIS.get(name.split("_")[0], "") if name != "t_R" else "u_dot"
 
 
@@ -125,20 +126,21 @@ def _thinned(samples: Samples) -> Samples:
 
 
 class MMGConfig(IdentifiedConfig):
-    """Hull, propeller and rudder of the MMG standard model (Yasukawa and Yoshimura 2015), for a
-    ship with one of each.
+    """The MMG standard model of a ship with one propeller and one rudder.
 
-    Every parameter has a belief, a mean and a standard deviation; usual values stand in for those
-    that are not given. The trials move the parameters as far as they tell, first through
-    accelerations, then, with a `refit` of this baseline, through free runs, which also gives the
-    standard errors that intervals of predictions come from.
+    It is that of Yasukawa and Yoshimura (2015). Every parameter has a prior, a mean and a standard
+    deviation; usual values stand in for those that are not given. The trials move the parameters as
+    far as they tell, first through accelerations, then, with a `refit` of this baseline, through
+    free runs, which also gives the standard errors that intervals of predictions come from.
 
     Attributes:
-        hull, propeller, rudder: particulars.
-        beliefs: mean and standard deviation by parameter, where not the usual ones; a standard
-            deviation of 0 fixes it.
-        revolutions: channel of the propeller's.
-        angle: channel of the rudder's angle, positive to starboard.
+        hull: particulars of the hull.
+        propeller: particulars of the propeller.
+        rudder: particulars of the rudder.
+        beliefs: prior mean and standard deviation by parameter (non-dimensional, as the model has
+            them), where not the usual ones; a standard deviation of 0 fixes it.
+        revolutions: channel of the propeller's revolutions, rad/s.
+        angle: channel of the rudder's angle, rad, positive to starboard.
         correlation: number of successive samples of accelerations that tell as much as one alone.
         manoeuvres: kinds of manoeuvre to fit on; empty for all.
     """
@@ -161,7 +163,7 @@ class MMGConfig(IdentifiedConfig):
         return self
 
     def build(self, names: Sequence[str]) -> MMGBaseline:
-        """The module with every parameter as believed, for channels `names`."""
+        """Return the module with every parameter at its prior mean, for channels `names`."""
         wanted = (*VELOCITY, self.revolutions, self.angle)
         require(names, wanted, "the baseline 'mmg'")
         u, v, r, n, delta = (list(names).index(name) for name in wanted)
@@ -179,7 +181,7 @@ class MMGConfig(IdentifiedConfig):
         )
 
     def solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
-        """The parameters that accelerations and beliefs together make most likely, by Gauss-Newton.
+        """Return the most likely parameters given accelerations and priors, by Gauss-Newton.
 
         Raises:
             FitError: where the accelerations of the beliefs are not finite.

@@ -1,5 +1,6 @@
-"""Nomoto's steering models (document 003 eqs. (12)-(15), document 004 section 5.1.2), identified by
-least squares on derivatives.
+"""Nomoto's steering models (document 003 eqs. (12)-(15), document 004 section 5.1.2).
+
+They are identified by least squares on derivatives.
 """
 
 from __future__ import annotations
@@ -19,8 +20,9 @@ from residnet.regression.solutions import Coefficient, Ratio, Solution
 
 
 class _SteeringConfig(IdentifiedConfig):
-    """What both models have: T_u u_dot + u = K_u drive + b_u (eq. (12)) and T r_dot + r = K steer +
-    b (eq. (13)).
+    """The part that both Nomoto models share.
+
+    T_u u_dot + u = K_u drive + b_u (eq. (12)) and T r_dot + r = K steer + b (eq. (13)).
 
     Attributes:
         drive: channel that drives surge.
@@ -36,16 +38,16 @@ class _SteeringConfig(IdentifiedConfig):
     manoeuvres: tuple[str, ...] = ()
 
     def rows(self) -> tuple[tuple[str, ...], ...]:
-        """Terms of each axis; the first is the rate that settles."""
+        """Return the terms of each axis; the first is the rate that settles."""
         return ("u", self.drive, "1"), self.sway, ("r", self.steer, "1")
 
     def build(self, names: Sequence[str]) -> RegressorBaseline:
-        """The module, coefficients zero, for channels `names`."""
+        """Return the module, coefficients zero, for channels `names`."""
         require(names, ("u", "v", "r", self.drive, self.steer), "a Nomoto baseline")
         return RegressorBaseline(self.rows(), names, self.held)
 
     def lag(self, baseline: RegressorBaseline, samples: Samples, axis: int) -> Solution:
-        """Least squares of one axis as a first-order lag.
+        """Fit one axis as a first-order lag by least squares.
 
         Raises:
             FitError: where the data do not determine it, or it does not settle.
@@ -74,7 +76,7 @@ class _SteeringConfig(IdentifiedConfig):
 def _parameters(
     axis: int, terms: Sequence[str], fit: Solution, ratios: Mapping[str, Ratio]
 ) -> list[Coefficient]:
-    """Parameters that are ratios of the coefficients of an axis, with errors to first order."""
+    """Return parameters that are ratios of the coefficients of an axis, errors to first order."""
     theta = fit.coefficients[:, 0]
     assert fit.covariance is not None
     covariance = fit.covariance[0]
@@ -99,8 +101,10 @@ def _parameters(
 
 
 class NomotoConfig(_SteeringConfig):
-    """First-order Nomoto: T r_dot + r = K steer + b, surge a first-order lag of the drive; sway, of
-    which it knows nothing, dies out with T.
+    """Nomoto's model of first order, T r_dot + r = K steer + b.
+
+    Surge is a first-order lag of the drive; sway, of which the model knows nothing, dies out with
+    T.
     """
 
     sway = ("v",)
@@ -109,7 +113,9 @@ class NomotoConfig(_SteeringConfig):
     kind: Literal["nomoto"] = "nomoto"
 
     def solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
-        """The one solution; its table holds the coefficients, then T, K and b of each lag.
+        """Return the one solution.
+
+        Its table holds the coefficients, then T, K and b of each lag.
 
         Raises:
             FitError: where the data do not determine a coefficient, or a lag does not settle.
@@ -128,8 +134,9 @@ class NomotoConfig(_SteeringConfig):
 
 
 class NomotoSideslipConfig(_SteeringConfig):
-    """Nomoto with side slip (document 003 eqs. (14), (15)): T_beta beta_dot + beta = -K_beta r +
-    b_beta, written for v = u beta.
+    """Nomoto's model with side slip (document 003 eqs. (14), (15)).
+
+    T_beta beta_dot + beta = -K_beta r + b_beta, written for v = u beta.
     """
 
     sway = ("v", "u r", "u")
@@ -137,7 +144,9 @@ class NomotoSideslipConfig(_SteeringConfig):
     kind: Literal["nomoto_sideslip"] = "nomoto_sideslip"
 
     def solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
-        """The one solution; its table holds the coefficients, then T, K and b of each lag.
+        """Return the one solution.
+
+        Its table holds the coefficients, then T, K and b of each lag.
 
         Raises:
             FitError: where the data do not determine a coefficient, or a lag does not settle.
@@ -159,7 +168,7 @@ class NomotoSideslipConfig(_SteeringConfig):
 
 
 def _lag_of(state: str, drive: str, suffix: str) -> dict[str, Ratio]:
-    """T x_dot + x = K drive + b from x_dot = a x + k drive + c."""
+    """Return T, K and b of T x_dot + x = K drive + b, from x_dot = a x + k drive + c."""
     return {
         f"T{suffix}": Ratio(-1.0, None, state),
         f"K{suffix}": Ratio(-1.0, drive, state),

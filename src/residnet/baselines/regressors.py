@@ -25,8 +25,9 @@ Penalty = Annotated[float, Field(ge=0)]
 
 @final
 class RegressorBaseline(ParametricBaseline):
-    """nu_dot [..., 3] = theta [3, J] phi(z) [..., J]; a term that an axis does not have keeps a
-    zero.
+    """A baseline that is linear in its coefficients, nu_dot [..., 3] = theta [3, J] phi(z).
+
+    A term that an axis does not have keeps a zero.
     """
 
     def __init__(
@@ -49,28 +50,28 @@ class RegressorBaseline(ParametricBaseline):
         self.held = tuple((axis, terms.index(term)) for axis, term in held)
 
     def forward(self, z: Tensor) -> Tensor:
-        """nu_dot [..., 3] at channels z [..., nz]."""
+        """Return nu_dot [..., 3] at channels z [..., nz]."""
         weights = self.theta * self.allowed
         phi: Tensor = self.library(z)
         return phi @ weights.to(z.dtype).T
 
     def parameter_count(self) -> list[float]:
-        """Coefficients of each axis that are not zero."""
+        """Return the number of coefficients of each axis that are not zero."""
         return [float(count) for count in ((self.theta * self.allowed) != 0).sum(1)]
 
     def columns(self, axis: int) -> list[int]:
-        """Numbers of the terms that an axis has."""
+        """Return the places of the terms that an axis has."""
         return [j for j in range(self.library.count) if bool(self.allowed[axis, j] > 0)]
 
     def free_indices(self) -> Tensor:
-        """Numbers of the coefficients, in theta flattened, that a refit may move, [P]."""
+        """Return the places [P] in theta, flattened, of coefficients that a refit may move."""
         free = self.allowed > 0
         for axis, column in self.held:
             free[axis, column] = False
         return torch.nonzero(free.flatten()).squeeze(1)
 
     def sensitivity(self, z: Tensor) -> Tensor:
-        """d nu_dot / d theta [B, 3, P]: each coefficient moves its own axis by its term."""
+        """Return d nu_dot / d theta [B, 3, P]: a coefficient moves its own axis by its term."""
         free = self.free_indices()
         axis, column = free // self.library.count, free % self.library.count
         out = torch.zeros(z.shape[0], 3, free.numel(), dtype=z.dtype)
@@ -78,8 +79,9 @@ class RegressorBaseline(ParametricBaseline):
         return out
 
     def information(self, samples: Samples) -> Tensor:
-        """Mean information of a sample [P, P], by the variance that least squares leaves of each
-        axis.
+        """Return the mean information of a sample [P, P].
+
+        Each axis weighs by the variance that least squares leaves of it.
         """
         phi, variance = self._residual(samples)
         gram = phi.T @ phi / len(samples)
@@ -89,12 +91,12 @@ class RegressorBaseline(ParametricBaseline):
         return whole[free][:, free]
 
     def prior(self) -> tuple[Tensor, Tensor]:
-        """Nothing is thought before."""
+        """Return zeros: nothing is known before."""
         none = torch.zeros(self.free_indices().numel(), dtype=torch.float64)
         return none, none
 
     def asymmetry(self, samples: Samples) -> Tensor:
-        """Mean information of a sample [P] about terms of the wrong parity."""
+        """Return the mean information of a sample [P] about terms of the wrong parity."""
         phi, variance = self._residual(samples)
         odd = [
             [float(wrong_parity(term, axis, samples.names)) for term in self.library.terms]
@@ -104,7 +106,7 @@ class RegressorBaseline(ParametricBaseline):
         return pull.flatten()[self.free_indices()]
 
     def updated_table(self, table: Sequence[Coefficient], errors: Tensor) -> list[Coefficient]:
-        """Coefficients and ratios as theta is now; a ratio keeps its error."""
+        """Return coefficients and ratios as theta is now; a ratio keeps its error."""
         terms = self.library.terms
         rows = {
             f"{name}_dot": dict(zip(terms, self.theta[axis].tolist(), strict=True))
@@ -127,7 +129,7 @@ class RegressorBaseline(ParametricBaseline):
         ]
 
     def _residual(self, samples: Samples) -> tuple[Tensor, Tensor]:
-        """Terms [N, J], and the variance [3] of what they leave."""
+        """Return the terms [N, J], and the variance [3] of what they leave."""
         phi = self.library(samples.z)
         left = samples.target - phi @ (self.theta * self.allowed).detach().T
         return phi, left.square().mean(0)
@@ -147,9 +149,9 @@ class RegressorsConfig(IdentifiedConfig):
     Attributes:
         sets: regressors of every axis by the name of a set, written out for the model's channels:
             `linear`; `fossen` (linear and quadratic damping, Coriolis products, propeller and
-            rudder); `abkowitz` (third-order Taylor series about straight ahead); `wind`;
-            `polynomial_1`, `polynomial_2` (all products of velocities and inputs, the ridge models
-            of document 001 section 2.2).
+            rudder); `abkowitz` (third-order Taylor series about straight ahead); `astern` (what
+            tells a propeller that turns astern); `wind`; `polynomial_1`, `polynomial_2` (all
+            products of velocities and inputs, the ridge models of document 001 section 2.2).
         terms: further regressors of every axis, or of each axis `u`, `v`, `r`; with neither sets
             nor terms: the constant and every channel.
         drive: channels that the sets take as thrust; empty: n, or tau_x where the model makes
@@ -180,8 +182,9 @@ class RegressorsConfig(IdentifiedConfig):
         return self
 
     def rows(self, names: Sequence[str]) -> list[tuple[str, ...]]:
-        """Regressors of each axis for channels `names`; one that sets and terms both name stands
-        once, as it was named first.
+        """Return the regressors of each axis for channels `names`.
+
+        One that sets and terms both name stands once, as it was named first.
         """
         own = (
             [tuple(self.terms[axis]) for axis in ("u", "v", "r")]
@@ -194,11 +197,11 @@ class RegressorsConfig(IdentifiedConfig):
         return [row or ("1", *names) for row in own] if self.terms == () else own
 
     def build(self, names: Sequence[str]) -> RegressorBaseline:
-        """The module, coefficients zero, for channels `names`."""
+        """Return the module, coefficients zero, for channels `names`."""
         return RegressorBaseline(self.rows(names), names)
 
     def solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
-        """One solution for each penalty.
+        """Return one solution for each penalty.
 
         Raises:
             FitError: where the data do not determine a coefficient.

@@ -19,7 +19,7 @@ _STEERS = ("delta", "tau_n")
 
 
 class Roles(NamedTuple):
-    """What the channels of a model do.
+    """The roles of a model's channels.
 
     Attributes:
         names: all channels.
@@ -39,7 +39,7 @@ class Roles(NamedTuple):
     def of(
         cls, names: Sequence[str], drive: Sequence[str] = (), steer: Sequence[str] = ()
     ) -> Roles:
-        """Roles by name, or as given.
+        """Return the roles by name, or as given.
 
         Raises:
             ConfigError: where a given channel does not exist.
@@ -59,7 +59,7 @@ class Roles(NamedTuple):
         return cls(tuple(names), drives, steers, others, "wind_u" in names)
 
     def known(self, who: str) -> Roles:
-        """The same, where every input has a role.
+        """Return the same, where every input has a role.
 
         Raises:
             ConfigError: where one has none.
@@ -82,13 +82,14 @@ def _linear(roles: Roles) -> list[str]:
 
 
 def _thrust(drive: str) -> list[str]:
-    """A force as it is; of a propeller thrust that falls with the inflow."""
+    """Return a force as it is, or the thrust of a propeller, which falls with the inflow."""
     return [drive] if drive in FORCE_CHANNELS else [drive, f"{drive}|{drive}|", f"|{drive}| u"]
 
 
 def _turning(steer: str, drives: Sequence[str]) -> list[str]:
-    """A moment as it is; of a rudder lift that grows with the square of the inflow from speed and
-    propellers.
+    """Return a moment as it is, or the lift of a rudder.
+
+    It grows with the square of the inflow from speed and propellers.
     """
     if steer in FORCE_CHANNELS:
         return [steer]
@@ -107,16 +108,19 @@ def _controls(roles: Roles) -> list[str]:
 
 
 def _fossen(roles: Roles) -> list[str]:
-    """Coriolis products, linear and quadratic damping of Fossen's manoeuvring model (document 002
-    eq. (2.4), document 003 eqs. (7)-(9)).
+    """Return the terms of Fossen's manoeuvring model.
+
+    Coriolis products, linear and quadratic damping (document 002 eq. (2.4), document 003 eqs.
+    (7)-(9)).
     """
     hull = ["u v", "u r", "v r", "u|u|", "v|v|", "r|r|", "v|r|", "r|v|"]
     return ["1", *VELOCITY, *hull, *_controls(roles.known("fossen"))]
 
 
 def _abkowitz(roles: Roles) -> list[str]:
-    """Taylor series to third order about straight ahead: even products in surge, odd ones in sway
-    and yaw (an asymmetric hull has both).
+    """Return a Taylor series to third order about straight ahead.
+
+    Even products act in surge, odd ones in sway and yaw (an asymmetric hull has both).
     """
     sideways = ["v", "r", *roles.known("abkowitz").steers]
     even = [" ".join(c) for c in combinations_with_replacement(sideways, 2)]
@@ -133,8 +137,10 @@ def _abkowitz(roles: Roles) -> list[str]:
 
 
 def _wind(roles: Roles) -> list[str]:
-    """Loads of the relative wind: quadratic in it, with coefficients that turn with its direction
-    (first three harmonics).
+    """Return the loads of the relative wind.
+
+    They are quadratic in it, with coefficients that turn with its direction (first three
+    harmonics).
     """
     if not roles.wind:
         raise ConfigError(
@@ -145,8 +151,9 @@ def _wind(roles: Roles) -> list[str]:
 
 
 def _astern(roles: Roles) -> list[str]:
-    """What tells a propeller that turns astern from one that turns ahead; the other sets alone take
-    them as mirrored.
+    """Return what tells a propeller that turns astern from one that turns ahead.
+
+    The other sets alone take them as mirrored.
     """
     propellers = [name for name in roles.drives if name not in FORCE_CHANNELS]
     if not propellers:
@@ -180,7 +187,7 @@ _SETS: dict[str, Callable[[Roles], list[str]]] = {
 
 
 def expand(sets: Sequence[SetName], roles: Roles) -> tuple[str, ...]:
-    """Terms of all sets, one after another.
+    """Return the terms of all sets, one after another.
 
     Raises:
         ConfigError: where the model lacks a channel that a set needs.
@@ -189,8 +196,9 @@ def expand(sets: Sequence[SetName], roles: Roles) -> tuple[str, ...]:
 
 
 def merged(terms: Sequence[str], names: Sequence[str]) -> tuple[str, ...]:
-    """The terms without those that say the same as one before them, such as `v u` after `u v` or
-    `n^2` after `n n`.
+    """Return the terms without those that repeat one before them.
+
+    Such are `v u` after `u v` or `n^2` after `n n`.
     """
     seen: dict[frozenset[tuple[Factor, int, bool]], str] = {}
     for term in terms:
@@ -199,8 +207,10 @@ def merged(terms: Sequence[str], names: Sequence[str]) -> tuple[str, ...]:
 
 
 def _meaning(term: str, names: Sequence[str]) -> frozenset[tuple[Factor, int, bool]]:
-    """What a term multiplies: each thing without its power or magnitude, its whole power, and
-    whether the product changes sign with it.
+    """Return what a term multiplies.
+
+    Each thing stands without its power or magnitude, with its whole power, and with whether the
+    product changes sign with it.
     """
     power: dict[Factor, int] = {}
     odd: dict[Factor, bool] = {}

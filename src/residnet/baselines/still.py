@@ -1,5 +1,6 @@
-"""The baseline that knows nothing: velocities held. It makes the model `zero`, and a black box
-where a head is set on it.
+"""The baseline that knows nothing: velocities held.
+
+It makes the model `zero`, and a black box where a head is set on it.
 """
 
 from __future__ import annotations
@@ -17,14 +18,14 @@ from residnet.regression.solutions import Solution
 
 @final
 class StillBaseline(Baseline):
-    """nu_dot = 0."""
+    """A baseline without any acceleration, nu_dot = 0."""
 
     def forward(self, z: Tensor) -> Tensor:
-        """Zeros [..., 3] for channels z [..., nz]."""
+        """Return zeros [..., 3] for channels z [..., nz]."""
         return torch.zeros_like(z[..., :3])
 
     def parameter_count(self) -> list[float]:
-        """None."""
+        """Return zeros."""
         return [0.0, 0.0, 0.0]
 
 
@@ -34,9 +35,9 @@ class StillConfig(IdentifiedConfig):
     kind: Literal["still"] = "still"
 
     def build(self, names: Sequence[str]) -> StillBaseline:
-        """The module; it has no parameters."""
+        """Return the module; it has no parameters."""
         return StillBaseline()
 
     def solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
-        """Nothing to fit: one solution without numbers."""
+        """Return one solution without numbers: there is nothing to fit."""
         return [Solution({}, {})]

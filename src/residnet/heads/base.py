@@ -19,8 +19,9 @@ from residnet.regression.solutions import Solution
 
 
 class ResidualHead(nn.Module, ABC):
-    """What is learned on top of the baseline: rho [B, 3] in m/s^2, m/s^2, rad/s^2 from channels z
-    [B, nz] and memory s [B, n_state].
+    """A head: the residual rho [B, 3] from channels z [B, nz] and memory s [B, n_state].
+
+    It is in m/s^2, m/s^2 and rad/s^2, on top of the baseline.
 
     A memoryless head has n_state = 0. Every head is scriptable, however its parameters were found.
     """
@@ -31,39 +32,42 @@ class ResidualHead(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Residual [B, 3] at channels z [B, nz], and the memory for the next step [B, n_state];
-        called once per step.
+        """Return the residual [B, 3] at channels z [B, nz], and the memory for the next step.
+
+        Called once per step; the memory is [B, n_state].
         """
 
     def sequence(self, z: Tensor) -> Tensor:
-        """Residuals [B, T, 3] along measured channels [B, T, nz], from an empty memory (teacher
-        forcing).
+        """Return residuals [B, T, 3] along measured channels [B, T, nz], from an empty memory.
+
+        In other words, teacher forcing.
         """
         return self.forward(z, z[..., :0])[0]
 
     def accelerations(self, known: Tensor, rho: Tensor) -> Tensor:
-        """nu_dot [..., 3] from what the baseline says of it and this head's residual, [..., 3]
-        each.
-        """
+        """Return nu_dot [..., 3] from the baseline's `known` and this head's residual, [..., 3]."""
         return known + rho
 
     def residual_target(self, samples: Samples, known: Tensor) -> Samples:
-        """Samples whose target is what the baseline's accelerations `known` [N, 3] leave, in the
-        space that this head lives in.
+        """Return the samples with what the baseline leaves as target, in this head's space.
+
+        The baseline's accelerations are `known` [N, 3].
         """
         return samples.with_target(samples.target - known)
 
     def set_mass(self, mass: Tensor | None) -> None:
-        """Take the inertia [3, 3] of the baseline, None where it knows no forces; most heads need
-        none.
+        """Take the inertia [3, 3] of the baseline, None where it knows no forces.
+
+        Most heads need none.
 
         Raises:
             ConfigError: where a head needs one and there is none.
         """
 
     def effective_baseline(self, baseline: nn.Module) -> nn.Module:
-        """The baseline as this head leaves it, so that nu_dot is its acceleration plus the
-        residual.
+        """Return the baseline as this head changes it.
+
+        Its acceleration plus the residual is nu_dot.
         """
         return baseline
 
@@ -75,13 +79,14 @@ class ResidualHead(nn.Module, ABC):
         """Take scales and ranges from the training samples; called once, before the fit."""
 
     def residual_std(self) -> Tensor:
-        """Spread of the residual on the training samples, [3], float64: what a one-step loss is
-        measured in; ones where a head keeps none.
+        """Return the standard deviation of the residual on the training samples, [3], float64.
+
+        A one-step loss is measured in it; ones where a head keeps none.
         """
         return torch.ones(3, dtype=torch.float64)
 
     def parameter_count(self) -> list[float]:
-        """Number of fitted parameters of each axis: all trained ones, which the axes share."""
+        """Return the number of fitted parameters of each axis, all trained ones for each."""
         return [float(sum(parameter.numel() for parameter in self.parameters()))] * 3
 
 
@@ -90,24 +95,25 @@ class ClosedFormHead(ResidualHead):
 
     @abstractmethod
     def solutions(self, samples: Samples) -> list[Solution]:
-        """Fit samples whose target is the residual [N, 3]: the solution that one-step errors
-        choose, then those that free runs may prefer.
+        """Fit samples whose target is the residual [N, 3].
+
+        The solution that one-step errors choose stands first, then those that free runs may prefer.
 
         Raises:
             FitError: where the data do not determine the parameters.
         """
 
     def solve(self, samples: Samples) -> dict[str, Any]:
-        """Fill the buffers with the first of `solutions`; returns what there is to say about the
-        fit.
-        """
+        """Fill the buffers with the first of `solutions` and return the notes of the fit."""
         first = self.solutions(samples)[0]
         self.load_state_dict(first.state, strict=False)
         return first.choice | first.notes
 
     def parameter_count(self) -> list[float]:
-        """Number of fitted parameters of each axis: coefficients [J, 3] and intercepts [3] that are
-        not zero, where a head says nothing else.
+        """Return the number of fitted parameters of each axis.
+
+        Coefficients [J, 3] and intercepts [3] that are not zero, where a head does not count
+        otherwise.
         """
         fitted = [
             numbers.reshape(-1, 3)
@@ -126,19 +132,20 @@ class EquationHead(ClosedFormHead):
 
 
 class FeatureConfig(Config):
-    """Which channels a head sees, and how far beyond the training range it follows them.
+    """The channels that a head sees, and how far beyond the training range it follows them.
 
     Attributes:
         features: names of channels; empty for all.
-        margin: features are held at the training range widened by this share of it; outside, the
-            residual stays what it was at the edge instead of running away.
+        margin: share of the training range that it is widened by. Features are held at the edges of
+            the wider range; outside, the residual stays what it was at the edge instead of running
+            away.
     """
 
     features: tuple[str, ...] = ()
     margin: float = Field(default=0.1, ge=0)
 
     def chosen(self, names: Sequence[str]) -> tuple[str, ...]:
-        """Names of the features among the channels `names`.
+        """Return the names of the features among the channels `names`.
 
         Raises:
             ConfigError: where a feature is no channel.
@@ -175,8 +182,9 @@ class HeadKind(FeatureConfig, ABC):
 
 
 class Features(nn.Module):
-    """Selected, guarded and standardised channels: z [..., nz] -> [..., F], near zero mean and unit
-    variance on the training data.
+    """The selected, guarded and standardised channels: z [..., nz] -> [..., F].
+
+    They are near zero mean and unit variance on the training data.
     """
 
     def __init__(self, chosen: Sequence[str], names: Sequence[str], margin: float) -> None:
@@ -200,8 +208,9 @@ class Features(nn.Module):
         self.high: Tensor
 
     def calibrate(self, samples: Samples) -> None:
-        """Take mean, spread and range of each feature from the samples; a constant feature is left
-        unscaled.
+        """Take mean, standard deviation and range of each feature from the samples.
+
+        A constant feature is left unscaled.
         """
         z = samples.z.index_select(1, self.index)
         low, high = z.amin(0), z.amax(0)
@@ -213,23 +222,24 @@ class Features(nn.Module):
         self.high.copy_(high + reach)
 
     def guarded(self, z: Tensor) -> Tensor:
-        """Selected channels [..., F], held at the edge of the training range."""
+        """Return the selected channels [..., F], held at the edge of the training range."""
         return self.held(z.index_select(-1, self.index))
 
     def held(self, chosen: Tensor) -> Tensor:
-        """Channels that are selected already [..., F], held at the edge of the training range."""
+        """Return channels that are selected already [..., F], held at the edge of the range."""
         return torch.minimum(
             torch.maximum(chosen, self.low.to(chosen.dtype)), self.high.to(chosen.dtype)
         )
 
     def forward(self, z: Tensor) -> Tensor:
-        """Standardised features [..., F]."""
+        """Return the standardised features [..., F]."""
         return (self.guarded(z) - self.mean.to(z.dtype)) / self.std.to(z.dtype)
 
 
 class ResidualScale(nn.Module):
-    """Turns a network's output near one into accelerations: the spread of the residual on the
-    training samples.
+    """The scale between a network's output near one and accelerations.
+
+    It is the standard deviation of the residual on the training samples.
     """
 
     def __init__(self) -> None:
@@ -238,9 +248,9 @@ class ResidualScale(nn.Module):
         self.spread: Tensor
 
     def calibrate(self, samples: Samples) -> None:
-        """Take the spread of each axis from the samples' target."""
+        """Take the standard deviation of each axis from the samples' target."""
         self.spread.copy_(samples.target.std(0, correction=0).clamp(min=1e-9))
 
     def forward(self, out: Tensor) -> Tensor:
-        """[..., 3] -> residual accelerations [..., 3]."""
+        """Return residual accelerations [..., 3] for outputs [..., 3] near one."""
         return out * self.spread.to(out.dtype)

@@ -1,5 +1,6 @@
-"""Heads that are linear in basis functions of the channels; their solutions differ, their
-evaluation does not.
+"""Heads that are linear in basis functions of the channels.
+
+Their solutions differ, their evaluation does not.
 """
 
 from __future__ import annotations
@@ -21,20 +22,20 @@ from residnet.regression.solutions import Solution
 
 
 class BasisConfig(FeatureConfig):
-    """Which basis functions.
+    """The basis functions of a head.
 
     Attributes:
         space: what the residual is: `acceleration`, what the baseline leaves of nu_dot; or `force`,
             tau - F(nu_dot, nu) of a baseline of kind believed, whose features are accelerations and
             velocities and whose terms are affine in the accelerations.
         terms: basis functions by name (see `residnet.physics.terms`), in units of each feature's
-            spread; empty: all products of the features up to `degree` and x|x| of the velocities,
-            or in force space the thirty of document 002 (4.12).
+            standard deviation; empty: all products of the features up to `degree` and x|x| of the
+            velocities, or in force space the thirty of document 002 (4.12).
         degree: highest degree of the products where `terms` is empty.
         choose: what the complexity is chosen by: `free_run`, error of free runs on validation data,
             which may find that no residual at all is best; or `one_step`, cross-validated error of
             accelerations.
-        folds: folds of the cross-validation; a manoeuvre is never split between folds.
+        folds: number of folds of the cross-validation; a manoeuvre is never split between folds.
     """
 
     space: Literal["acceleration", "force"] = "acceleration"
@@ -55,8 +56,9 @@ class BasisConfig(FeatureConfig):
 
 
 class BasisHead(ClosedFormHead):
-    """rho [..., 3] = intercept + phi(features / spread) coefficients; buffers found by the
-    subclass.
+    """A head that is linear in basis functions: intercept + phi(features / std) coefficients.
+
+    The buffers are found by the estimator of the subclass.
     """
 
     def __init__(self, config: BasisConfig, names: Sequence[str]) -> None:
@@ -81,14 +83,15 @@ class BasisHead(ClosedFormHead):
         self.features.calibrate(samples)
 
     def basis(self, z: Tensor) -> Tensor:
-        """Basis functions [..., J] at channels z [..., nz]; features are scaled but not centred, so
-        that names keep their meaning.
+        """Return the basis functions [..., J] at channels z [..., nz].
+
+        Features are scaled but not centred, so that names keep their meaning.
         """
         values: Tensor = self.library(self.features.guarded(z) / self.features.std.to(z.dtype))
         return values
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Residual [..., 3] at channels z [..., nz]; the memory is empty."""
+        """Return the residual [..., 3] at channels z [..., nz]; the memory is empty."""
         return self.basis(z) @ self.coefficients.to(z.dtype) + self.intercept.to(z.dtype), s
 
     @abstractmethod
@@ -108,7 +111,8 @@ class BasisHead(ClosedFormHead):
         )
 
     def coefficient_table(self) -> dict[str, list[float]]:
-        """Basis function -> its coefficients (u, v, r axis), for features in units of their spread;
-        for the report.
+        """Return the coefficients (u, v, r axis) by basis function, for the report.
+
+        Features are in units of their standard deviation.
         """
         return dict(zip(self.library.terms, self.coefficients.tolist(), strict=True))

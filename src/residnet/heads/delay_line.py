@@ -30,8 +30,9 @@ class DelayConfig(Config):
 
 
 class DelayLine(nn.Module):
-    """Channels with some of them as they were `steps` ago; the memory holds the last `longest`
-    values of these, oldest first.
+    """The channels with some of them as they were `steps` ago.
+
+    The memory holds the last `longest` values of these, oldest first.
     """
 
     def __init__(self, config: DelayConfig | None, names: Sequence[str]) -> None:
@@ -57,7 +58,7 @@ class DelayLine(nn.Module):
         self.steps: Tensor
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Channels [B, nz] with the late ones delayed, and the memory [B, n_state] one step on."""
+        """Return channels [B, nz] with the late ones delayed, and the next memory [B, n_state]."""
         if self.count == 0:
             return z, s
         line = torch.cat((s, z.index_select(-1, self.index)), dim=-1)
@@ -66,7 +67,7 @@ class DelayLine(nn.Module):
         return z.index_copy(-1, self.index, late), line[..., self.count :]
 
     def sequence(self, z: Tensor) -> Tensor:
-        """Channels [..., T, nz] with the late ones delayed, from an empty memory."""
+        """Return channels [..., T, nz] with the late ones delayed, from an empty memory."""
         if self.count == 0:
             return z
         late = z.index_select(-1, self.index)
@@ -87,15 +88,20 @@ class DelayLine(nn.Module):
         )
 
     def warmup(self, z: Tensor) -> Tensor:
-        """Memory [B, n_state] after channels [B, T, nz]; zero before their first."""
+        """Return the memory [B, n_state] after channels [B, T, nz], zero before their first."""
         late = z.index_select(-1, self.index)
         line = torch.cat((late.new_zeros((z.shape[0], self.longest, self.count)), late), dim=1)
         return line[:, line.shape[1] - self.longest :].reshape(z.shape[0], self.n_state)
 
 
 class Past(NamedTuple):
-    """Features [N, F] and targets [N, K] of samples, the unbroken stretch of each, ascending [N],
-    and the step between neighbours in s.
+    """The samples of a fit with what lies before them.
+
+    Attributes:
+        chosen: features [N, F].
+        target: outputs [N, n].
+        stretch: number of the unbroken stretch of each sample, ascending [N].
+        step: time between neighbouring samples, s.
     """
 
     chosen: np.ndarray
@@ -104,7 +110,7 @@ class Past(NamedTuple):
     step: float
 
     def delayed(self, steps: int, index: np.ndarray) -> Past:
-        """The samples that have a past of `steps`, with the features `index` from then."""
+        """Return the samples that have a past of `steps`, with the features `index` from then."""
         if steps == 0:
             return self
         now = np.arange(steps, len(self.stretch))
@@ -121,8 +127,10 @@ def best_delay(
     late: Sequence[str],
     longest: int,
 ) -> tuple[int, np.ndarray]:
-    """Delay in steps at which terms explain their targets best, and the mean over targets of
-    ln(RSS) for each delay [longest + 1].
+    """Return the delay at which terms explain their targets best, and the profile of errors.
+
+    The delay is in steps; the profile is the mean over targets of ln(RSS) for each delay [longest +
+    1].
 
     Args:
         past: samples.
@@ -148,7 +156,7 @@ def best_delay(
 
 
 def _part(term: str, names: Sequence[str], late: Sequence[str], take: bool) -> str:
-    """The factors of a term that are delayed, or those that are not."""
+    """Return the factors of a term that are delayed, or those that are not."""
     factors = [factor for factor in parse_term(term, names) if (factor.name in late) == take]
     return (
         " ".join(f"{f'|{f.name}|' if f.magnitude else f.symbol}^{f.power}" for f in factors) or "1"

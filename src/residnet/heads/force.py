@@ -1,5 +1,6 @@
-"""Residuals in force space: eps = tau - F(nu_dot, nu) of a believed hull (document 002
-(3.19)-(3.24)), affine in nu_dot to run forward.
+"""Residuals in force space of a believed hull, eps = tau - F(nu_dot, nu).
+
+They are affine in nu_dot to run forward (document 002 (3.19)-(3.24)).
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ def in_space(
     names: Sequence[str],
     make: Callable[[BasisConfig, Sequence[str]], BasisHead],
 ) -> ClosedFormHead:
-    """A head of basis functions in the space that its config names.
+    """Return a head of basis functions in the space that its config names.
 
     Raises:
         ConfigError: where a term is not understood, or in force space not affine in the
@@ -41,7 +42,7 @@ def in_space(
 
 @final
 class ForceHead(ClosedFormHead):
-    """eps = A nu_dot + b(z), a force, by a head of basis functions over accelerations and channels.
+    """A force eps = A nu_dot + b(z) by a head of basis functions over accelerations and channels.
 
     Every stage of the integrator solves (M + A) nu_dot = tau - C nu - D nu - b: with the believed
     baseline's acceleration nu_dot_0 this is nu_dot = (M + A)^-1 M nu_dot_0 - (M + A)^-1 b, of which
@@ -80,8 +81,9 @@ class ForceHead(ClosedFormHead):
         self.inverse.copy_(torch.linalg.inv(mass))
 
     def residual_target(self, samples: Samples, known: Tensor) -> Samples:
-        """Samples over accelerations and channels whose target is the lack-of-fit tau - F(nu_dot,
-        nu) = M (nu_dot_0 - nu_dot) (3.20).
+        """Return samples over accelerations and channels with the lack-of-fit as target.
+
+        It is tau - F(nu_dot, nu) = M (nu_dot_0 - nu_dot) (3.20).
         """
         force = (known - samples.target) @ self.mass.T
         return Samples(
@@ -94,8 +96,9 @@ class ForceHead(ClosedFormHead):
         )
 
     def calibrate(self, samples: Samples) -> None:
-        """Take scales and ranges of the features from the samples; accelerations are solved for and
-        never held.
+        """Take scales and ranges of the features from the samples.
+
+        Accelerations are solved for and never held.
         """
         self.inner.calibrate(samples)
         varying = dict(zip(samples.names, samples.z.std(0).tolist(), strict=True))
@@ -111,7 +114,7 @@ class ForceHead(ClosedFormHead):
                 )
 
     def solutions(self, samples: Samples) -> list[Solution]:
-        """Those of the basis functions that can run forward.
+        """Return those solutions of the basis functions that can run forward.
 
         Raises:
             FitError: where none can, or the data do not determine any.
@@ -129,7 +132,7 @@ class ForceHead(ClosedFormHead):
         return found
 
     def _with_mass(self, solution: Solution) -> Solution:
-        """A solution with the mass that it makes, in the names of this head's numbers."""
+        """Return a solution with the mass that it makes, in the names of this head's state."""
         coefficients = solution.state["coefficients"].clone()
         for j, axis in self.moving.items():
             coefficients[j] /= self.inner.features.std[self.seen.index(ACCELERATION[axis])]
@@ -149,29 +152,28 @@ class ForceHead(ClosedFormHead):
         return Solution(solution.choice, state, notes=notes)
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """What the residual's part without accelerations does to nu_dot, -(M + A)^-1 b [..., 3], at
-        channels z [..., nz]; the memory is empty.
+        """Return -(M + A)^-1 b [..., 3], what the part without accelerations does to nu_dot.
+
+        It is taken at channels z [..., nz]; the memory is empty.
         """
         b, s = self.inner(torch.cat((torch.zeros_like(z[..., :3]), z), dim=-1), s)
         return -(b @ self.inverse.to(z.dtype).T), s
 
     def accelerations(self, known: Tensor, rho: Tensor) -> Tensor:
-        """nu_dot [..., 3] from the believed one and the residual's part without accelerations [...,
-        3].
-        """
+        """Return nu_dot [..., 3] from the believed one and the part without accelerations."""
         return known @ self.gain.to(known.dtype).T + rho
 
     def force(self, nu_dot: Tensor, z: Tensor) -> Tensor:
-        """eps [..., 3] in N, N, N m at accelerations [..., 3] and channels z [..., nz]."""
+        """Return eps [..., 3] in N, N, N m at accelerations [..., 3] and channels z [..., nz]."""
         out: Tensor = self.inner(torch.cat((nu_dot, z), dim=-1), z[..., :0])[0]
         return out
 
     def effective_baseline(self, baseline: nn.Module) -> nn.Module:
-        """The baseline with the mass that this head gives it."""
+        """Return the baseline with the mass that this head gives it."""
         return AugmentedMassBaseline(baseline, self.gain)
 
     def parameter_count(self) -> list[float]:
-        """Number of fitted parameters of each axis."""
+        """Return the number of fitted parameters of each axis."""
         return self.inner.parameter_count()
 
 
@@ -186,11 +188,11 @@ class AugmentedMassBaseline(nn.Module):
         self.gain: Tensor
 
     def forward(self, z: Tensor) -> Tensor:
-        """nu_dot [..., 3] at channels z [..., nz]."""
+        """Return nu_dot [..., 3] at channels z [..., nz]."""
         known: Tensor = self.baseline(z)
         return known @ self.gain.to(z.dtype).T
 
     def parameter_count(self) -> list[float]:
-        """The baseline's."""
+        """Return the number of parameters of the baseline."""
         counts: list[float] = self.baseline.parameter_count()  # type: ignore[operator]
         return counts

@@ -1,6 +1,4 @@
-"""The genetic head: the residual, or the whole acceleration, as an equation bred by genetic
-programming (document 000).
-"""
+"""The genetic head: an equation bred by genetic programming (document 000)."""
 
 from __future__ import annotations
 
@@ -33,14 +31,15 @@ class GeneticConfig(FeatureConfig, EquationSearchConfig):
     kind: Literal["genetic"] = "genetic"
 
     def build(self, names: Sequence[str]) -> GeneticHead:
-        """The module for channels `names`."""
+        """Return the module for channels `names`."""
         return GeneticHead(self, names)
 
 
 @final
 class GeneticHead(EquationHead):
-    """rho [..., 3] = terms(features) coefficients; over the baseline `still` it is the equation of
-    the acceleration itself.
+    """A head whose residual is terms(features) coefficients.
+
+    Over the baseline `still` it is the equation of the acceleration itself.
     """
 
     def __init__(self, config: GeneticConfig, names: Sequence[str]) -> None:
@@ -55,11 +54,11 @@ class GeneticHead(EquationHead):
         self.features.calibrate(samples)
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Residual [..., 3] at channels z [..., nz]; the memory is empty."""
+        """Return the residual [..., 3] at channels z [..., nz]; the memory is empty."""
         return self.library(self.features.guarded(z)) @ self.weights.values.to(z.dtype), s
 
     def parameter_count(self) -> list[float]:
-        """Coefficients of each axis that are not zero."""
+        """Return the number of coefficients of each axis that are not zero."""
         return [float(count) for count in (self.weights.values != 0).sum(0)]
 
     def contributions(self, z: Tensor, axis: int) -> dict[str, np.ndarray]:
@@ -76,7 +75,7 @@ class GeneticHead(EquationHead):
 
     @torch.jit.unused
     def names(self) -> list[str]:
-        """The terms in writing."""
+        """Return the terms in writing."""
         algebra, products = self.library.read(self.features.names)
         return [term(algebra, product) for product in products]
 

@@ -1,6 +1,4 @@
-"""Kernel ridge regression (document 001 section 3.2, ERRATA M4, M5), kernel and penalty chosen
-jointly in free run or by axis.
-"""
+"""Kernel ridge regression of the residual (document 001 section 3.2, ERRATA M4, M5)."""
 
 from __future__ import annotations
 
@@ -27,21 +25,22 @@ from residnet.regression.solutions import Solution
 
 
 class KernelConfig(FeatureConfig):
-    """Kernel ridge regression of each residual on standardised features, without intercept.
+    """A kernel ridge regression of each residual on standardised features, without intercept.
 
     Attributes:
-        kernel: `rbf` or `polynomial`.
+        kernel: radial basis functions (`rbf`) or a polynomial (`polynomial`).
         terms: further features, made of the others, such as `n|n|`: the kernel of degree p has
             products of these too. A polynomial of low degree in the revolutions is a poor thrust.
         penalties: candidates, for each sample: the document's lambda (scikit-learn's alpha) is
             penalty * samples.
-        choose: `free_run`, jointly: the setting of the kernel and one penalty for all axes by the
-            error of free runs on validation data, then the penalty of each axis in turn for as long
-            as free runs gain, or no residual at all (document 001 section 4, second approach);
-            `one_step`: setting and penalty of each axis for itself by cross-validated errors of
-            accelerations; `recursion`: of each axis for itself by the error of its own velocity in
-            free run along the training records, the other velocities as measured (first approach).
-        folds: folds of the cross-validation; a manoeuvre is never split between folds.
+        choose: what chooses. `free_run`, jointly: the setting of the kernel and one penalty for all
+            axes by the error of free runs on validation data, then the penalty of each axis in turn
+            for as long as free runs gain, or no residual at all (document 001 section 4, second
+            approach); `one_step`: setting and penalty of each axis for itself by cross-validated
+            errors of accelerations; `recursion`: of each axis for itself by the error of its own
+            velocity in free run along the training records, the other velocities as measured (first
+            approach).
+        folds: number of folds of the cross-validation; a manoeuvre is never split between folds.
     """
 
     kind: Literal["kernel"] = "kernel"
@@ -54,13 +53,13 @@ class KernelConfig(FeatureConfig):
     folds: int = Field(default=5, ge=2)
 
     def build(self, names: Sequence[str]) -> KernelHead:
-        """The module for channels `names`."""
+        """Return the module for channels `names`."""
         return KernelHead(self, names)
 
 
 @final
 class TermFeatures(nn.Module):
-    """Terms of guarded channels [..., F], standardised on the training data: [..., J]."""
+    """The standardised terms [..., J] of guarded channels [..., F]."""
 
     def __init__(self, terms: Sequence[str], channels: Sequence[str]) -> None:
         super().__init__()
@@ -72,7 +71,7 @@ class TermFeatures(nn.Module):
         self.std: Tensor
 
     def calibrate(self, channels: Tensor) -> None:
-        """Take mean and spread from the training samples of the channels [N, F].
+        """Take mean and standard deviation from the training samples of the channels [N, F].
 
         Raises:
             FitError: where a term is constant.
@@ -91,14 +90,14 @@ class TermFeatures(nn.Module):
         self.std.copy_(std)
 
     def forward(self, channels: Tensor) -> Tensor:
-        """Standardised terms [..., J]."""
+        """Return the standardised terms [..., J]."""
         values: Tensor = self.library(channels)
         return (values - self.mean.to(values.dtype)) / self.std.to(values.dtype)
 
 
 @final
 class KernelHead(ClosedFormHead):
-    """rho [..., 3] = f(standardised features), f in the space of a kernel."""
+    """A head rho [..., 3] = f(standardised features), f in the space of a kernel."""
 
     def __init__(self, config: KernelConfig, names: Sequence[str]) -> None:
         super().__init__()
@@ -120,11 +119,11 @@ class KernelHead(ClosedFormHead):
             self.terms.calibrate(self.features.guarded(samples.z))
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Residual [..., 3] at channels z [..., nz]; the memory is empty."""
+        """Return the residual [..., 3] at channels z [..., nz]; the memory is empty."""
         return self.kernel(self.columns(z)), s
 
     def columns(self, z: Tensor) -> Tensor:
-        """Standardised features and terms [..., F + J]."""
+        """Return the standardised features and terms [..., F + J]."""
         x = self.features(z)
         return (
             x
@@ -133,7 +132,7 @@ class KernelHead(ClosedFormHead):
         )
 
     def parameter_count(self) -> list[float]:
-        """Effective number of parameters of each axis, the trace of the smoother."""
+        """Return the effective number of parameters of each axis, the trace of the smoother."""
         return [float(count) for count in self.effective]
 
     def solutions(self, samples: Samples) -> list[Solution]:

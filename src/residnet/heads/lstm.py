@@ -16,19 +16,19 @@ from residnet.heads.mirror import MirroredHead
 
 
 class LstmConfig(FeatureConfig):
-    """One LSTM for all axes, or one for each.
+    """An LSTM for all axes, or one for each.
 
     Attributes:
-        hidden_size: units.
-        readout: units of one tanh layer between (memory, features) and the residual; 0 reads the
-            memory alone by a linear map, as document 003 does.
+        hidden_size: number of hidden units.
+        readout: number of units of a tanh layer between (memory, features) and the residual; 0
+            reads the memory alone by a linear map, as document 003 does.
         memory: features that the memory sees; empty for all. A memory of the commands alone is the
             same in free run as along measurements: it can hold the state of an actuator, but no
             measured acceleration. Needs `readout`, which sees all features.
-        activation: of block input and output; the document uses softsign in place of the usual
-            tanh.
+        activation: function of block input and output; document 003 uses softsign in place of the
+            usual tanh.
         dropout: share of hidden outputs dropped before the readout while training.
-        per_axis: one network for each of surge, sway, yaw, as the document has it.
+        per_axis: one network for each of surge, sway, yaw, as document 003 has it.
         axis_features: channels of each axis' network, where they differ; needs `per_axis`.
         mirror: make the residual mirror-symmetric between port and starboard by construction.
     """
@@ -59,12 +59,12 @@ class LstmConfig(FeatureConfig):
         return self
 
     def build(self, names: Sequence[str]) -> ResidualHead:
-        """The module for channels `names`."""
+        """Return the module for channels `names`."""
         head = LstmHead(self, names)
         return MirroredHead(head, names) if self.mirror else head
 
     def networks(self, names: Sequence[str]) -> list[tuple[tuple[str, ...], int]]:
-        """(features, number of outputs) of each network."""
+        """Return (features, number of outputs) of each network."""
         if not self.per_axis:
             return [(self.chosen(names), 3)]
         if self.axis_features is None:
@@ -76,8 +76,9 @@ class LstmConfig(FeatureConfig):
 
 
 class LstmCore(nn.Module):
-    """One LSTM layer with a single bias per gate, stepped by a cell and run over sequences with the
-    same weights.
+    """An LSTM layer with a single bias per gate.
+
+    It is stepped by a cell and run over sequences with the same weights.
 
     Memory s [B, 2H] holds h and c side by side. 4 H (F + H + 1) parameters.
     """
@@ -97,7 +98,7 @@ class LstmCore(nn.Module):
         self.no_bias: Tensor
 
     def forward(self, f: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """One step: features [B, F], memory [B, 2H] -> output h [B, H], new memory [B, 2H]."""
+        """Return output h [B, H] and memory [B, 2H] after one step of features [B, F]."""
         gates = f @ self.w_input.T + s[:, : self.hidden] @ self.w_hidden.T + self.bias
         i, forget, g, o = gates.chunk(4, dim=-1)
         if self.softsign:
@@ -112,8 +113,9 @@ class LstmCore(nn.Module):
         return h, torch.cat((h, c), dim=-1)
 
     def sequence(self, f: Tensor) -> tuple[Tensor, Tensor]:
-        """Features [B, T, F] -> outputs [B, T, H] from an empty memory, and the memory after them
-        [B, 2H].
+        """Return outputs [B, T, H] for features [B, T, F], and the memory [B, 2H] after them.
+
+        It starts from an empty memory.
         """
         zeros = torch.zeros(f.shape[0], self.hidden, dtype=f.dtype, device=f.device)
         if f.shape[1] == 0:
@@ -134,7 +136,7 @@ class LstmCore(nn.Module):
 
 
 class LstmNetwork(nn.Module):
-    """Features, LSTM and readout of one or all axes; `outputs` numbers per sample."""
+    """The features, LSTM and readout of one or all axes; `outputs` numbers per sample."""
 
     def __init__(
         self, config: LstmConfig, chosen: Sequence[str], outputs: int, names: Sequence[str]
@@ -166,23 +168,23 @@ class LstmNetwork(nn.Module):
         self.readout = nn.Sequential(*mixer, out)
 
     def remembered(self, f: Tensor) -> Tensor:
-        """The features that the memory sees."""
+        """Return the features that the memory sees."""
         return f.index_select(-1, self.seen) if self.partial else f
 
     def read(self, h: Tensor, f: Tensor) -> Tensor:
-        """Scaled residual [..., outputs] from LSTM outputs [..., H] and features [..., F]."""
+        """Return scaled residuals [..., outputs] from outputs [..., H] and features [..., F]."""
         h = self.dropout(h)
         out: Tensor = self.readout(torch.cat((h, f), dim=-1) if self.skip else h)
         return out
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """One step: channels [B, nz], memory [B, 2H] -> [B, outputs], new memory."""
+        """Return [B, outputs] and the new memory after one step of channels [B, nz]."""
         f = self.features(z)
         h, s = self.core(self.remembered(f), s)
         return self.read(h, f), s
 
     def sequence(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Channels [B, T, nz] -> [B, T, outputs] and the memory after them."""
+        """Return [B, T, outputs] for channels [B, T, nz], and the memory after them."""
         f = self.features(z)
         h, s = self.core.sequence(self.remembered(f))
         return self.read(h, f), s
@@ -190,7 +192,7 @@ class LstmNetwork(nn.Module):
 
 @final
 class LstmHead(ResidualHead):
-    """Residual with memory; s packs (h, c) of each network."""
+    """A head with memory; s packs (h, c) of each network."""
 
     def __init__(self, config: LstmConfig, names: Sequence[str]) -> None:
         super().__init__()
@@ -211,11 +213,11 @@ class LstmHead(ResidualHead):
         self.scale.calibrate(samples)
 
     def residual_std(self) -> Tensor:
-        """Spread of the residual on the training samples, [3]."""
+        """Return the standard deviation of the residual on the training samples, [3]."""
         return self.scale.spread
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Residual [B, 3] at channels z [B, nz] and the memory for the next step."""
+        """Return the residual [B, 3] at channels z [B, nz], and the memory for the next step."""
         out: list[Tensor] = []
         memory: list[Tensor] = []
         for i, network in enumerate(self.networks):
@@ -225,11 +227,11 @@ class LstmHead(ResidualHead):
         return self.scale(torch.cat(out, dim=-1)), torch.cat(memory, dim=-1)
 
     def sequence(self, z: Tensor) -> Tensor:
-        """Residuals [B, T, 3] along measured channels [B, T, nz], from an empty memory."""
+        """Return residuals [B, T, 3] along measured channels [B, T, nz], from an empty memory."""
         scaled = torch.cat([network.sequence(z)[0] for network in self.networks], dim=-1)
         rho: Tensor = self.scale(scaled)
         return rho
 
     def warmup(self, z: Tensor) -> Tensor:
-        """Memory [B, n_state] that past channels [B, T, nz] leave."""
+        """Return the memory [B, n_state] that past channels [B, T, nz] leave."""
         return torch.cat([network.sequence(z)[1] for network in self.networks], dim=-1)

@@ -1,5 +1,6 @@
-"""Heads that are mirror-symmetric by construction: what happens to starboard happens, mirrored, to
-port.
+"""Heads that are mirror-symmetric by construction.
+
+What happens to starboard happens, mirrored, to port.
 
 A hull is symmetric to better than the data can tell, and knowing it halves what a network has to
 learn.
@@ -21,8 +22,9 @@ from residnet.physics.symmetry import mirrored_channels
 
 @final
 class MirroredHead(ResidualHead):
-    """rho = (g(z) + M g(M z)) / 2 of an inner head g, in one batch of twice the size; M mirrors
-    port and starboard.
+    """A head rho = (g(z) + M g(M z)) / 2 of an inner head g; M mirrors port and starboard.
+
+    Both halves go through in one batch of twice the size.
 
     The memory holds that of both halves side by side.
     """
@@ -48,8 +50,9 @@ class MirroredHead(ResidualHead):
         self.turned: Tensor
 
     def calibrate(self, samples: Samples) -> None:
-        """Take scales from the samples and their mirror images, so that the mirror of a known state
-        is known too.
+        """Take scales from the samples and their mirror images.
+
+        So the mirror of a known state is known too.
         """
         other = samples.z.index_select(1, self.index) * self.sign
         both = Samples(
@@ -63,20 +66,20 @@ class MirroredHead(ResidualHead):
         self.inner.calibrate(both)
 
     def residual_std(self) -> Tensor:
-        """Spread of the residual on the training samples, [3]."""
+        """Return the standard deviation of the residual on the training samples, [3]."""
         return self.inner.residual_std()
 
     def both(self, z: Tensor) -> Tensor:
-        """Channels and their mirror images, [2 B, ...]."""
+        """Return channels and their mirror images, [2 B, ...]."""
         return torch.cat((z, z.index_select(-1, self.index) * self.sign.to(z.dtype)), dim=0)
 
     def mean(self, rho: Tensor) -> Tensor:
-        """Mean of residuals [2 B, ..., 3] and their mirror images, [B, ..., 3]."""
+        """Return the mean of residuals [2 B, ..., 3] and their mirror images, [B, ..., 3]."""
         half = rho.shape[0] // 2
         return 0.5 * (rho[:half] + rho[half:] * self.turned.to(rho.dtype))
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Residual [B, 3] at channels z [B, nz] and the memory for the next step."""
+        """Return the residual [B, 3] at channels z [B, nz], and the memory for the next step."""
         rho, after = self.inner(
             self.both(z), torch.cat((s[:, : self.width], s[:, self.width :]), dim=0)
         )
@@ -84,11 +87,11 @@ class MirroredHead(ResidualHead):
         return self.mean(rho), torch.cat((after[:half], after[half:]), dim=-1)
 
     def sequence(self, z: Tensor) -> Tensor:
-        """Residuals [B, T, 3] along measured channels [B, T, nz], from an empty memory."""
+        """Return residuals [B, T, 3] along measured channels [B, T, nz], from an empty memory."""
         return self.mean(self.inner.sequence(self.both(z)))
 
     def warmup(self, z: Tensor) -> Tensor:
-        """Memory [B, n_state] that past channels [B, T, nz] leave."""
+        """Return the memory [B, n_state] that past channels [B, T, nz] leave."""
         s = self.inner.warmup(self.both(z))
         half = z.shape[0]
         return torch.cat((s[:half], s[half:]), dim=-1)

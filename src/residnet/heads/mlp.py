@@ -22,12 +22,13 @@ ACTIVATIONS: dict[str, type[nn.Module]] = {
 
 
 class MlpConfig(FeatureConfig):
-    """Layers of `hidden` units with one activation; the output layer starts near zero, so that
-    training starts from the baseline.
+    """A network of layers with one activation.
+
+    The output layer starts near zero, so that training starts from the baseline.
 
     Attributes:
-        hidden: units of each layer.
-        activation: after each layer.
+        hidden: number of units of each hidden layer.
+        activation: function after each hidden layer.
         dropout: share of units dropped while training.
         mirror: make the residual mirror-symmetric between port and starboard by construction.
     """
@@ -39,14 +40,14 @@ class MlpConfig(FeatureConfig):
     mirror: bool = False
 
     def build(self, names: Sequence[str]) -> ResidualHead:
-        """The module for channels `names`."""
+        """Return the module for channels `names`."""
         head = MlpHead(self, names)
         return MirroredHead(head, names) if self.mirror else head
 
 
 @final
 class MlpHead(ResidualHead):
-    """rho = spread * net(features)."""
+    """A head rho = std * net(features)."""
 
     def __init__(self, config: MlpConfig, names: Sequence[str]) -> None:
         super().__init__()
@@ -71,9 +72,9 @@ class MlpHead(ResidualHead):
         self.scale.calibrate(samples)
 
     def residual_std(self) -> Tensor:
-        """Spread of the residual on the training samples, [3]."""
+        """Return the standard deviation of the residual on the training samples, [3]."""
         return self.scale.spread
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Residual [..., 3] at channels z [..., nz]; the memory is empty."""
+        """Return the residual [..., 3] at channels z [..., nz]; the memory is empty."""
         return self.scale(self.net(self.features(z))), s

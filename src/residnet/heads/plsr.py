@@ -1,6 +1,4 @@
-"""Partial least squares regression over basis functions (document 002 section 3.2, ERRATA J14-J17),
-from moments alone.
-"""
+"""Partial least squares over basis functions (document 002 section 3.2, ERRATA J14-J17)."""
 
 from __future__ import annotations
 
@@ -17,12 +15,12 @@ from residnet.regression.plsr import PLSR
 
 
 class PlsrConfig(BasisConfig):
-    """PLSR of the three residuals together.
+    """A PLSR of the three residuals together.
 
     Attributes:
-        order: number of latent variables; None chooses it as `choose` says (by one-step errors: the
-            sum over axes, each in units of its variance).
-        max_order: highest order tried.
+        order: number of latent variables; None chooses it as `choose` says. One-step errors are
+            summed over the axes, each in units of its variance.
+        max_order: highest number of latent variables that is tried.
     """
 
     kind: Literal["plsr"] = "plsr"
@@ -30,7 +28,7 @@ class PlsrConfig(BasisConfig):
     max_order: int = Field(default=40, ge=1)
 
     def build(self, names: Sequence[str]) -> ClosedFormHead:
-        """The module for channels `names`."""
+        """Return the module for channels `names`."""
         return in_space(
             self, names, lambda own, channels: PlsrHead(self.model_validate(own), channels)
         )
@@ -38,7 +36,7 @@ class PlsrConfig(BasisConfig):
 
 @final
 class PlsrHead(BasisHead):
-    """Basis functions with coefficients by PLSR."""
+    """A head of basis functions with coefficients by PLSR."""
 
     def __init__(self, config: PlsrConfig, names: Sequence[str]) -> None:
         super().__init__(config, names)

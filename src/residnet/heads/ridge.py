@@ -1,6 +1,4 @@
-"""Ridge regression over basis functions (document 001 section 2.2, ERRATA M4), the penalty by
-cross-validation from moments.
-"""
+"""Ridge regression over basis functions (document 001 section 2.2, ERRATA M4)."""
 
 from __future__ import annotations
 
@@ -17,12 +15,12 @@ from residnet.regression.ridge import Ridge
 
 
 class RidgeConfig(BasisConfig):
-    """Ridge of each residual; penalties are in units of a standardised column's energy (alpha =
-    penalty * samples in scikit-learn's terms).
+    """A ridge regression of each residual.
 
     Attributes:
-        penalties: candidates. By one-step errors each axis takes its own; free runs choose between
-            those, one penalty for all axes, and no residual (an empty list in fit.json).
+        penalties: candidates, in units of a standardised column's energy: alpha = penalty * samples
+            in scikit-learn's terms. By one-step errors each axis takes its own; free runs choose
+            between those, one penalty for all axes, and no residual (an empty list in fit.json).
     """
 
     kind: Literal["ridge"] = "ridge"
@@ -31,7 +29,7 @@ class RidgeConfig(BasisConfig):
     )
 
     def build(self, names: Sequence[str]) -> ClosedFormHead:
-        """The module for channels `names`."""
+        """Return the module for channels `names`."""
         return in_space(
             self, names, lambda own, channels: RidgeHead(self.model_validate(own), channels)
         )
@@ -39,7 +37,7 @@ class RidgeConfig(BasisConfig):
 
 @final
 class RidgeHead(BasisHead):
-    """Basis functions with coefficients by ridge regression."""
+    """A head of basis functions with coefficients by ridge regression."""
 
     def __init__(self, config: RidgeConfig, names: Sequence[str]) -> None:
         super().__init__(config, names)

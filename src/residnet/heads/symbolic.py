@@ -1,5 +1,6 @@
-"""The symbolic head: the residual, or the whole acceleration, as an equation of few terms
-(documents 000 and 001).
+"""The symbolic head: an equation of few terms (documents 000 and 001).
+
+It is that of the residual, or of the whole acceleration.
 """
 
 from __future__ import annotations
@@ -44,13 +45,13 @@ class SymbolicConfig(FeatureConfig):
 
     Attributes:
         candidates: which terms the equations may have, by type.
-        terms: the candidates by name instead.
+        terms: names of the candidates, instead of types.
         search: how far the search goes.
         estimator: what a row of the regression is: a sample, a window of the weak form, or either
             behind instruments; terms that name no motion count as free of measuring noise.
         symmetric: leave out of each axis the terms that a vessel with port/starboard symmetry
             cannot have there, as far as the mirror images of its channels are known.
-        delay: inputs that act late.
+        delay: inputs that act late; none where left out.
         choose: what the length of the equations is chosen by: `one_step`, extended BIC of the
             accelerations; or `free_run`, error of free runs on validation data, between shorter and
             longer equations and none.
@@ -66,14 +67,15 @@ class SymbolicConfig(FeatureConfig):
     choose: Literal["one_step", "free_run"] = "one_step"
 
     def build(self, names: Sequence[str]) -> SymbolicHead:
-        """The module for channels `names`."""
+        """Return the module for channels `names`."""
         return SymbolicHead(self, names)
 
 
 @final
 class SymbolicHead(EquationHead):
-    """rho [..., 3] = phi(features) coefficients, most of them zero; over the baseline `still` it is
-    the equation of the acceleration itself.
+    """A head rho [..., 3] = phi(features) coefficients, most of them zero.
+
+    Over the baseline `still` it is the equation of the acceleration itself.
     """
 
     def __init__(self, config: SymbolicConfig, names: Sequence[str]) -> None:
@@ -99,24 +101,25 @@ class SymbolicHead(EquationHead):
         self.features.calibrate(samples)
 
     def basis(self, chosen: Tensor) -> Tensor:
-        """All candidate terms [..., J] of chosen features [..., F], held at the edge of the
-        training range.
+        """Return all candidate terms [..., J] of chosen features [..., F].
+
+        The features are held at the edge of the training range.
         """
         values: Tensor = self.library(self.features.held(chosen))
         return values
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Residual [B, 3] at channels z [B, nz], and the past of late inputs one step on."""
+        """Return the residual [B, 3] at channels z [B, nz], and the past of late inputs after it."""
         chosen, s = self.line(z.index_select(-1, self.features.index), s)
         return self.basis(chosen) @ self.coefficients.to(z.dtype), s
 
     def sequence(self, z: Tensor) -> Tensor:
-        """Residuals [..., T, 3] along measured channels [..., T, nz], from an empty memory."""
+        """Return residuals [..., T, 3] along channels [..., T, nz], from an empty memory."""
         chosen = self.line.sequence(z.index_select(-1, self.features.index))
         return self.basis(chosen) @ self.coefficients.to(z.dtype)
 
     def warmup(self, z: Tensor) -> Tensor:
-        """Memory [B, n_state] that past channels [B, T, nz] leave, oldest first."""
+        """Return the memory [B, n_state] that past channels [B, T, nz], oldest first, leave."""
         return self.line.warmup(z.index_select(-1, self.features.index))
 
     def contributions(self, z: Tensor, axis: int) -> dict[str, np.ndarray]:

@@ -12,8 +12,8 @@ from residnet.heads.base import ResidualHead
 
 @final
 class ZeroHead(ResidualHead):
-    """rho = 0: the baseline alone."""
+    """A head without a residual, rho = 0: the baseline alone."""
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Zeros [..., 3]."""
+        """Return zeros [..., 3]."""
         return torch.zeros_like(z[..., :3]), s

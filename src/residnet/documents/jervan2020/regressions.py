@@ -243,6 +243,7 @@ class ShrinkRegression(_ScaledRegression):
     """LASSO or elastic net, cross-validated over the folds; each axis by itself.
 
     Attributes:
+        kind: `lasso`, or `elastic_net`, whose penalty is partly quadratic.
         l1_ratio: share of the absolute penalty in that of the elastic net.
     """
 
