@@ -21,7 +21,7 @@ from residnet.regression.solutions import Coefficient, Solution
 
 
 class LinearSteadyConfig(IdentifiedConfig):
-    """Linear models u_dot = a u + k tau + c and (v, r)_dot = A (v, r) + B tau + C (eqs. (12), (16)).
+    """The models u_dot = a u + k tau + c and (v, r)_dot = A (v, r) + B tau + C (eqs. (12), (16)).
 
     First the steady states of constant-input manoeuvres give x_ss = Phi tau + Phi_bias by least
     squares (eqs. (24), (32)); then x_dot = A (x - Phi tau - Phi_bias) gives A by least squares on

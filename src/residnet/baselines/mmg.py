@@ -139,7 +139,7 @@ class MMGConfig(IdentifiedConfig):
         rudder: particulars of the rudder.
         beliefs: prior mean and standard deviation by parameter (non-dimensional, as the model has
             them), where not the usual ones; a standard deviation of 0 fixes it.
-        revolutions: channel of the propeller's revolutions, rad/s.
+        revolutions: channel of the propeller's revolutions, 1/s.
         angle: channel of the rudder's angle, rad, positive to starboard.
         correlation: number of successive samples of accelerations that tell as much as one alone.
         manoeuvres: kinds of manoeuvre to fit on; empty for all.

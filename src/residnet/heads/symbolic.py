@@ -109,7 +109,7 @@ class SymbolicHead(EquationHead):
         return values
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the residual [B, 3] at channels z [B, nz], and the past of late inputs after it."""
+        """Return the residual [B, 3] at channels z [B, nz], and the late inputs as memory."""
         chosen, s = self.line(z.index_select(-1, self.features.index), s)
         return self.basis(chosen) @ self.coefficients.to(z.dtype), s
 
