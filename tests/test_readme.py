@@ -14,7 +14,7 @@ import yaml
 
 from residnet.core.config import load_config, load_mapping, validate
 from residnet.physics.vessel import VesselConfig
-from residnet.tasks import load_task
+from residnet.tasks.loading import load_task
 from residnet.tasks.union import TaskConfig
 
 ROOT = Path(__file__).parent.parent

@@ -50,17 +50,24 @@ def run(
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue an interrupted run in its folder.")
     ] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace an earlier run in its folder.")
+    ] = False,
 ) -> None:
     """Carry out a run: fit, evaluate, report and export, or any other task."""
-    from residnet.runs.task import Finished
-    from residnet.tasks import load_task
+    from residnet.tasks.loading import load_task
 
     _limit_threads()
     task = load_task(config, overrides or [])
     with drawn_progress():
-        finished = task.run(source=config, overrides=overrides or [], out=out, resume=resume)
-    if isinstance(finished, Finished):
-        _show(finished)
+        finished = task.run(
+            source=config,
+            overrides=overrides or [],
+            out=out,
+            resume=resume,
+            overwrite=overwrite,
+        )
+    _show(finished)
 
 
 @app.command()
@@ -69,7 +76,7 @@ def check(
     overrides: Overrides = None,
 ) -> None:
     """Validate a config and everything that it names, without running it."""
-    from residnet.tasks import load_task
+    from residnet.tasks.loading import load_task
 
     task = load_task(config, overrides or [])
     task.check()
@@ -101,7 +108,13 @@ def inspect(
     """
     from residnet.tasks.inspection import inspect_logs
 
-    if inspect_logs(logs, config, file):
+    _limit_threads()
+    with drawn_progress():
+        found = inspect_logs(logs, config)
+    print(found.text)
+    if file is not None:
+        found.write(file)
+    if found.misled:
         raise typer.Exit(1)
 
 
@@ -125,10 +138,12 @@ def evaluate(
     ] = None,
 ) -> None:
     """Free-run a finished run's models on other logs."""
-    from residnet.tasks.external import evaluate_external
+    from residnet.tasks.verbs import evaluate_run
 
     _limit_threads()
-    evaluate_external(folder, [*logs, *(more or [])], out)
+    with drawn_progress():
+        finished = evaluate_run(folder, [*logs, *(more or [])], out)
+    _show(finished)
 
 
 @app.command()
@@ -154,16 +169,16 @@ def export(
     ] = None,
 ) -> None:
     """Export a model for controllers, after a parity check."""
-    from residnet.tasks.exporting import export_model
+    from residnet.tasks.verbs import export_run
 
     _limit_threads()
-    print(export_model(folder, model, out, file_format))
+    print(export_run(folder, model, out, file_format))
 
 
 @app.command()
 def report(folder: RunPath) -> None:
     """Write figures and report of a finished run anew."""
-    from residnet.tasks.reporting import report_run
+    from residnet.tasks.verbs import report_run
 
     _limit_threads()
     print(report_run(folder))

@@ -13,7 +13,7 @@ import pytest
 
 from residnet.core.log import Log
 from residnet.core.resources import config_folder
-from residnet.tasks import load_task
+from residnet.tasks.loading import load_task
 from residnet.tasks.import_logs import ImportConfig
 
 FERRY = Path(os.environ.get("RESIDNET_DATA", "")) / "milliampere"

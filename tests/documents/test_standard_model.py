@@ -34,7 +34,7 @@ from residnet.documents.halvorsen2019.sea_trial.standard_model import (
 from residnet.documents.halvorsen2019.sea_trial.task import SeaTrialTaskConfig
 from residnet.documents.halvorsen2019.sea_trial.trial import prepared
 from residnet.physics.odin import AccelerationHull
-from residnet.tasks import load_task
+from residnet.tasks.loading import load_task
 
 CONFIG = Path(__file__).parents[2] / "configs" / "studies" / "halvorsen2019" / "standard_model.yaml"
 MASS = 4935.14

@@ -32,7 +32,7 @@ def one_line(capsys: pytest.CaptureFixture[str]) -> str:
     ids=lambda p: p.name,
 )
 def test_every_config_is_valid(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from residnet.tasks import load_task
+    from residnet.tasks.loading import load_task
 
     monkeypatch.setenv("RESIDNET_DATA", str(tmp_path))
     task = load_task(path, [])
@@ -111,7 +111,7 @@ def test_help_does_not_import_torch() -> None:
 
 
 def test_check_does_not_import_lightning(tiny_config: Path) -> None:
-    load = f"from residnet.tasks import load_task; load_task(Path({str(tiny_config)!r}), [])"
+    load = f"from residnet.tasks.loading import load_task; load_task(Path({str(tiny_config)!r}), [])"
     code = f"import sys; from pathlib import Path; {load}; sys.exit('lightning' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 

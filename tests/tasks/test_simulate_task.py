@@ -15,7 +15,7 @@ from tiny import TINY, call
 from residnet.core.log import Log
 from residnet.data.readers import CanonicalConfig
 from residnet.data.simulated.trials import SimulatedTrials, simulate
-from residnet.tasks import load_task
+from residnet.tasks.loading import load_task
 
 DATA: dict[str, Any] = copy.deepcopy(TINY["data"])  # type: ignore[assignment]
 CONFIG = {"task": "simulate", "name": "trials", "data": DATA}

@@ -64,7 +64,7 @@ def test_all_variants_and_seeds_in_one_table(
     assert (out / "figures" / "study.png").stat().st_size > 1000
     stamps = {path: path.stat().st_mtime_ns for path in out.glob("variants/*/metrics.json")}
     assert len(stamps) == 4
-    (out / "variants" / "short.1" / "metrics.json").unlink()
+    (out / "variants" / "short.1" / "summary.json").unlink()
     assert call(monkeypatch, "run", study, "--out", out, "--resume") == 0
     again = {path: path.stat().st_mtime_ns for path in out.glob("variants/*/metrics.json")}
     changed = {path.parent.name for path in again if again[path] != stamps[path]}

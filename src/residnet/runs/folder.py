@@ -104,7 +104,7 @@ class RunFolder:
         folder = cls(path)
         if not folder.resolved.is_file():
             raise UsageError(f"{path}: not a run folder (no resolved.yaml)")
-        if not (folder.finished or folder.metrics.is_file()):
+        if not folder.finished:
             raise UsageError(
                 f"{path}: the run is not finished (summary.json does not say so); continue it with"
                 f" residnet run CONFIG --out {path} --resume"

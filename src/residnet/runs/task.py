@@ -13,7 +13,7 @@ from typing import Any, ClassVar, NamedTuple, final
 
 from pydantic import Field
 
-from residnet.core.config import Config, dump_config
+from residnet.core.config import Config, dump_config, load_mapping
 from residnet.core.errors import DataError, UsageError
 from residnet.report.blocks import Section
 from residnet.report.page import title_and_description, write_page
@@ -132,7 +132,7 @@ class Task(Config):
             UsageError: where runs of this task have no such models.
             ResidnetError: where a log cannot be used.
         """
-        raise self._no_such_verb(run)
+        raise self.lacks_verb(run)
 
     def export_model(self, run: RunFolder, model: str, out: Path | None, file_format: str) -> Path:
         """Export one model of a finished run for controllers; returns the file.
@@ -141,7 +141,7 @@ class Task(Config):
             UsageError: where runs of this task have nothing to export, or there is no such model.
             ExportError: where the exported model does not agree with the one that it came from.
         """
-        raise self._no_such_verb(run)
+        raise self.lacks_verb(run)
 
     @final
     def run(
@@ -220,9 +220,12 @@ class Task(Config):
         """Hold what the work needs of the machine while it is carried out."""
         yield
 
-    def _no_such_verb(self, run: RunFolder) -> UsageError:
+    @classmethod
+    def lacks_verb(cls, run: RunFolder) -> UsageError:
+        """Return the error that names the verbs that a run has."""
+        task = load_mapping(run.resolved).get("task")
         return UsageError(
-            f"{run.path}: the run is of task '{self.task}'; it has: {', '.join(self.verbs)}"
+            f"{run.path}: the run is of task '{task}'; it has: {', '.join(cls.verbs)}"
         )
 
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from residnet.core import progress
 from residnet.core.errors import ConfigError, DataError, UsageError
 from residnet.core.log import Log
 from residnet.data.doctor import Finding, Level, Report, inspect, inspect_together, inspection
@@ -20,13 +20,14 @@ from residnet.data.masks import Mask
 from residnet.data.readers.base import LogReader
 from residnet.data.readers.composing.composed import RecordingConfig
 from residnet.data.readers.detect import format_of, reader_for
-from residnet.runs.folder import RunFolder
+from residnet.data.sources import MeasuredLogs
+from residnet.tasks.fit.task import FitConfig
+from residnet.tasks.import_logs import ImportConfig
+from residnet.tasks.loading import load_task
+from residnet.tasks.log_files import log_files
 
-if TYPE_CHECKING:
-    from residnet.tasks.fit import FitConfig
-
-# regressors that move together so closely leave their coefficients to the noise
-_ILL = 1e6
+_ILL_CONDITIONED = 1e6
+"""Condition number from which regressors leave their coefficients to the noise."""
 
 
 @dataclass(frozen=True)
@@ -43,14 +44,42 @@ class _Setup:
     task: Any = None
 
 
-def inspect_logs(paths: Sequence[Path], config: Path | None, file: Path | None = None) -> bool:
-    """Print what the doctor finds in each log and between them; True where a fit would be misled.
+@dataclass(frozen=True)
+class Inspection:
+    """What the doctor found.
+
+    Attributes:
+        text: for the terminal.
+        content: the same for JSON (schema residnet.inspection/1).
+    """
+
+    text: str
+    content: Mapping[str, Any]
+
+    @property
+    def misled(self) -> bool:
+        """Whether a fit to these logs would be misled."""
+        return bool(self.content["misled"])
+
+    def write(self, file: Path) -> None:
+        """Write the findings as JSON.
+
+        Raises:
+            UsageError: where the file cannot be written.
+        """
+        try:
+            file.write_text(json.dumps(self.content, indent=1) + "\n")
+        except OSError as error:
+            raise UsageError(f"--json {file}: cannot be written ({error.strerror})") from error
+
+
+def inspect_logs(paths: Sequence[Path], config: Path | None) -> Inspection:
+    """Return what the doctor finds in each log and between them.
 
     Args:
         paths: files and folders.
         config: a run or import whose channel map reads them; None where they describe themselves,
             or to have a map drafted.
-        file: where the same goes as JSON (schema residnet.inspection/1).
 
     Raises:
         ResidnetError: where a path does not exist, the config cannot be used, or the only log
@@ -61,7 +90,9 @@ def inspect_logs(paths: Sequence[Path], config: Path | None, file: Path | None =
     logs: list[Log] = []
     reports: list[Report] = []
     drafts: dict[str, list[str]] = {}
-    for path in files:
+    lines: list[str] = []
+    for number, path in enumerate(files):
+        progress.report("inspecting logs", number, len(files))
         try:
             log, draft = _read(path, setup)
             report = inspect(log, setup.inputs, setup.masks)
@@ -75,58 +106,20 @@ def inspect_logs(paths: Sequence[Path], config: Path | None, file: Path | None =
             logs.append(log)
             reports.append(report)
             drafts |= {"\n".join(draft): draft} if draft else {}
-        print("\n".join(reports[-1].lines()), flush=True)
+        lines += reports[-1].lines()
     together = (
         inspect_together(logs, setup.inputs, setup.splits) if logs else Report("together", ())
     )
     if setup.task is not None and logs:
         together = Report("together", (*together.findings, *_regressors(logs, setup.task)))
-    print("\n".join(together.lines()), flush=True)
+    progress.report("inspecting logs", len(files), len(files))
+    lines += together.lines()
     for draft in drafts.values():
-        print(
-            "\n".join(
-                ("channel map as guessed, to check and paste under `data:` of a config:", *draft)
-            )
-        )
-    content = inspection(reports, together)
-    if file is not None:
-        _write(file, content)
-    return bool(content["misled"])
-
-
-def write_inspection(
-    folder: RunFolder, splits: Mapping[str, Sequence[Log]], config: FitConfig
-) -> None:
-    """doctor.json of a fit: what the doctor finds in the logs of all splits as the run's masks
-    leave them.
-    """
-    logs = [log for members in splits.values() for log in members]
-    reports = [inspect(log, config.signals.columns, config.prepare.masks) for log in logs]
-    names = {log.name: split for split, members in splits.items() for log in members}
-    content = inspection(reports, inspect_together(logs, config.signals.columns, names))
-    folder.write_json(folder.path / "doctor.json", content)
-    loud = sum(report.misled for report in reports)
-    if loud:
-        print(
-            f"  the data doctor says of {loud} of {len(logs)} logs that they would mislead a fit:"
-            " see the report",
-            file=sys.stderr,
-        )
-
-
-def _write(file: Path, content: dict[str, Any]) -> None:
-    try:
-        file.write_text(json.dumps(content, indent=1) + "\n")
-    except OSError as error:
-        raise UsageError(f"--json {file}: cannot be written ({error.strerror})") from error
+        lines += ["channel map as guessed, to check and paste under `data:` of a config:", *draft]
+    return Inspection("\n".join(lines), inspection(reports, together))
 
 
 def _setup(config: Path) -> _Setup:
-    from residnet.data.sources import MeasuredLogs
-    from residnet.tasks import load_task
-    from residnet.tasks.fit import FitConfig
-    from residnet.tasks.import_logs import ImportConfig
-
     task = load_task(config, [])
     if isinstance(task, ImportConfig):
         return _Setup(task.reader.build(), isinstance(task.reader, RecordingConfig))
@@ -202,7 +195,7 @@ def _regressors(logs: Sequence[Log], task: Any) -> list[Finding]:
                 f" {condition:.3g} (centred, scaled)"
             )
             text += f"; constant: {', '.join(still)}" if still else ""
-            ill = condition > _ILL
+            ill = condition > _ILL_CONDITIONED
             text += f"; {', '.join(worst)} move together" if condition > 30.0 else ""
             action = (
                 "leave regressors out, give the baseline a ridge, or add manoeuvres" if ill else ""
@@ -218,27 +211,4 @@ def _regressors(logs: Sequence[Log], task: Any) -> list[Finding]:
                     action,
                 )
             )
-    return out
-
-
-def log_files(paths: Sequence[Path], folders: bool = False) -> list[Path]:
-    """Files, and the csv and Parquet files below folders, in order; a folder that is itself a
-    recording stays one where `folders`.
-
-    Raises:
-        UsageError: where a path does not exist or a folder holds no log.
-    """
-    out: list[Path] = []
-    for path in paths:
-        if path.is_dir() and folders and format_of(path) is not None:
-            out.append(path)
-        elif path.is_dir():
-            found = sorted(p for p in path.rglob("*") if p.suffix in {".csv", ".parquet"})
-            if not found:
-                raise UsageError(f"{path}: holds no csv or Parquet file")
-            out += found
-        elif path.is_file():
-            out.append(path)
-        else:
-            raise UsageError(f"{path}: no such file or folder")
     return out

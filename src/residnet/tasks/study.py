@@ -5,28 +5,33 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import Field, model_validator
 
-from residnet.core.config import Config, ExistingPath, dump_config, load_config
+from residnet.core.config import ExistingPath, load_config
+from residnet.core.errors import UsageError
 from residnet.core.names import nearest
+from residnet.core.progress import report
+from residnet.report.blocks import Code, Section
+from residnet.report.comparison import Variant, as_text, draw, table, window_nrmse
+from residnet.report.figures.files import figures_section
 from residnet.runs.folder import RunFolder
+from residnet.runs.task import MainFigure, Outcome, Task
 from residnet.tasks.fit import FitConfig
 
 _Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
 
 
-class StudyConfig(Config):
-    """What each part of a recipe brings.
+class StudyConfig(Task):
+    """Variants of one fit, each over several seeds, compared window by window.
 
     Attributes:
-        name: of the run.
         base: config of a fit; paths in it are taken from its own folder.
         common: overrides of the base for all variants.
         variants: overrides by the variant's name; the files differ in nothing else.
@@ -39,8 +44,6 @@ class StudyConfig(Config):
     """
 
     task: Literal["study"]
-    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")
-    description: str = ""
     base: ExistingPath
     common: tuple[str, ...] = ()
     variants: dict[_Name, tuple[str, ...]] = Field(min_length=2)
@@ -71,14 +74,12 @@ class StudyConfig(Config):
         ]
 
     def check(self) -> None:
-        """That every variant is a valid fit, holds the model and finds its files.
+        """Check that every variant is a valid fit, holds the model and finds its files.
 
         Raises:
             ConfigError: where one does not.
             UsageError: where one has no such model.
         """
-        from residnet.core.errors import UsageError
-
         for variant in self.variants:
             fit = load_config(self.base, self.overrides(variant, self.seeds[0]), FitConfig)
             fit.check()
@@ -89,46 +90,38 @@ class StudyConfig(Config):
                     f" '{self.model}'{nearest(self.model, models)}"
                 )
 
-    def run(
-        self, *, source: Path, overrides: Sequence[str], out: Path | None, resume: bool
-    ) -> RunFolder:
-        """Fit all variants and write study.json, study.md and figures/study.png; runs that are
-        there already are kept.
+    def input_files(self) -> list[Path]:
+        """Return the config of the fit."""
+        return [self.base]
+
+    def recorded_seed(self) -> int:
+        """Return the first seed."""
+        return self.seeds[0]
+
+    def carry_out(self, folder: RunFolder) -> Outcome:
+        """Fit all variants and write the comparison; runs that are there already are kept.
 
         Raises:
             ResidnetError: where a variant cannot be run.
         """
-        self.check()
-        started = time.time()
-        folder = RunFolder.create(out or Path("runs") / self.name, dump_config(self), resume=resume)
         jobs = [
             (self, variant, seed, folder.path / "variants" / f"{variant}.{seed}")
             for variant in self.variants
             for seed in self.seeds
         ]
         if self.workers == 1:
-            seconds = [_fit(*job) for job in jobs]
+            seconds = []
+            for number, job in enumerate(jobs):
+                report("fits of the study", number, len(jobs))
+                seconds.append(_fit(*job))
+            report("fits of the study", len(jobs), len(jobs))
         else:
             with ProcessPoolExecutor(self.workers, mp_context=get_context("spawn")) as pool:
                 seconds = list(pool.map(_fit, *zip(*jobs, strict=True)))
-        self._write(
-            folder,
-            dict(zip([(variant, seed) for _, variant, seed, _ in jobs], seconds, strict=True)),
-        )
-        folder.write_provenance(
-            config=source,
-            overrides=overrides,
-            seed=self.seeds[0],
-            files=[self.base],
-            started=started,
-        )
-        return folder
+        names = [(variant, seed) for _, variant, seed, _ in jobs]
+        return self._write(folder, dict(zip(names, seconds, strict=True)))
 
-    def _write(self, folder: RunFolder, seconds: dict[tuple[str, int], float]) -> None:
-        import numpy as np
-
-        from residnet.report.comparison import Variant, as_text, draw, table, window_nrmse
-
+    def _write(self, folder: RunFolder, seconds: dict[tuple[str, int], float]) -> Outcome:
         found = {
             (variant, seed): window_nrmse(
                 folder.path / "variants" / f"{variant}.{seed}", self.model, self.split
@@ -165,22 +158,45 @@ class StudyConfig(Config):
         folder.write(folder.path / "study.md", f"{self.description or self.name}\n\n{text}")
         folder.figures.mkdir(exist_ok=True)
         draw(rows, self.reference, folder.figures / "study.png")
-        print(text)
-        print(f"study: {folder.path / 'study.md'}")
+        return Outcome(_verdict(rows, self.reference), _main_figures(rows), text)
+
+    @classmethod
+    def report_sections(cls, run: RunFolder) -> Sequence[Section]:
+        """Return the table of the variants with their differences, and the figure."""
+        content = json.loads((run.path / "study.json").read_text())
+        text = as_text(content["rows"], content["reference"])
+        figures = figures_section(run.figures)
+        return [Section("Variants", [Code(text)]), *([figures] if figures else [])]
+
+
+def _verdict(rows: Sequence[dict[str, Any]], reference: str) -> list[str]:
+    """Return for each protocol which variant has the least error, and by how much."""
+    sentences = []
+    for protocol in dict.fromkeys(row["protocol"] for row in rows):
+        found = [row for row in rows if row["protocol"] == protocol]
+        best = min(found, key=lambda row: float(row["nrmse_mean"]))
+        sentence = f"{protocol}: '{best['variant']}' has the least error, {best['nrmse_mean']:.4f}"
+        interval = best["difference_ci95"]
+        if best["variant"] != reference and interval is not None:
+            sentence += (
+                f"; that is {best['difference']:+.4f} [{interval[0]:+.4f}, {interval[1]:+.4f}]"
+                f" from '{reference}'"
+            )
+        sentences.append(f"{sentence}.")
+    return sentences
+
+
+def _main_figures(rows: Sequence[dict[str, Any]]) -> dict[str, MainFigure]:
+    return {
+        f"nrmse_{row['variant']}_{row['protocol']}": MainFigure(row["nrmse_mean"]) for row in rows
+    }
 
 
 def _fit(study: StudyConfig, variant: str, seed: int, out: Path) -> float:
     """Run one variant with one seed unless it is finished; returns the seconds that it took."""
-    from residnet.tasks.run import run_fit
-
-    if not (out / "metrics.json").is_file():
+    if not RunFolder(out).finished:
         overrides = study.overrides(variant, seed)
-        run_fit(
-            load_config(study.base, overrides, FitConfig),
-            source=study.base,
-            overrides=overrides,
-            out=out,
-            resume=True,
-            report=False,
+        load_config(study.base, overrides, FitConfig).run(
+            source=study.base, overrides=overrides, out=out, resume=True, report=False
         )
-    return float(json.loads((out / "provenance.json").read_text())["seconds"])
+    return float(json.loads(RunFolder(out).provenance.read_text())["seconds"])

@@ -1,54 +1,48 @@
-"""Task `fit`: logs to baseline, heads, free-run comparison, report and export."""
+"""What a run of the task `fit` is told: settings of the fit, logs, and what is made of them."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
 
-from pydantic import Field, model_validator
+from pydantic import model_validator
 
 from residnet.core.config import Config
 from residnet.data.simulated.trials import SimulatedTrials
-from residnet.data.sources import DataConfig, MeasuredLogs
+from residnet.data.sources import DataConfig, MeasuredLogs, input_files
 from residnet.documents import StudyName
 from residnet.identification.settings import FitSettings, require_known
 from residnet.judge.booklet import BookletConfig
+from residnet.runs.task import ComputingTask
 
 
 class ExportConfig(Config):
-    """Which models are exported as TorchScript; `selected` is the one chosen on validation data."""
+    """Models that are exported as TorchScript when the run ends.
+
+    Attributes:
+        models: their names; `selected` is the one chosen on validation data.
+    """
 
     models: tuple[str, ...] = ("selected",)
 
 
-class FitConfig(FitSettings):
-    """A complete fit: what is identified, from which logs, and what is made of it.
+class FitTaskSettings(FitSettings, ComputingTask):
+    """Everything that a complete fit is told.
 
     Attributes:
-        task: the kind of run.
-        name: of the run; its folder is runs/<name> unless --out says otherwise.
-        description: a sentence about the run.
-        study: a published experiment whose figures are drawn too.
-        threads: of PyTorch; part of what makes a run repeatable. One is fastest for these small
-            products.
+        study: a published experiment whose figures are drawn too; null for none.
         data: logs and splits.
         booklet: standard manoeuvres by one of the refitted baselines, with intervals; null for
             none.
-        export: TorchScript.
+        export: models that are exported when the run ends.
     """
 
-    task: Literal["fit"]
-    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")
-    description: str = ""
     study: StudyName | None = None
-    threads: int = Field(default=1, ge=1)
     data: DataConfig
     booklet: BookletConfig | None = None
     export: ExportConfig = ExportConfig()
 
     @model_validator(mode="after")
-    def _outputs(self) -> FitConfig:
+    def _outputs(self) -> FitTaskSettings:
         if self.booklet is not None:
             require_known("booklet.model", (self.booklet.model,), self.refit, "refitted baseline")
             self.booklet.rudder()
@@ -63,8 +57,7 @@ class FitConfig(FitSettings):
         return self
 
     def check(self) -> None:
-        """What reading the config does not show: that the logs' files are there and no split is
-        empty.
+        """Check that the logs' files are there and no split is empty.
 
         Raises:
             ConfigError: where they are not.
@@ -72,10 +65,10 @@ class FitConfig(FitSettings):
         if isinstance(self.data, MeasuredLogs):
             self.data.split.resolve()
 
-    def run(
-        self, *, source: Path, overrides: Sequence[str], out: Path | None, resume: bool
-    ) -> None:
-        """Carry out the fit; see `residnet.tasks.run.run_fit`."""
-        from residnet.tasks.run import run_fit
+    def input_files(self) -> list[Path]:
+        """Return the files of the measured logs."""
+        return input_files(self.data)
 
-        run_fit(self, source=source, overrides=overrides, out=out, resume=resume)
+    def recorded_seed(self) -> int:
+        """Return the seed of weights and batches."""
+        return self.seed

@@ -1,0 +1,110 @@
+"""The models of a finished fit on logs that they have never seen."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from residnet.core.config import dump_config
+from residnet.core.errors import DataError
+from residnet.core.log import Log
+from residnet.core.progress import say
+from residnet.data.prepare import prepare
+from residnet.data.readers import CanonicalConfig
+from residnet.data.simulated.trials import SimulatedTrials
+from residnet.identification.evaluation import candidates, evaluate
+from residnet.identification.prepared import require_window, velocity_limit
+from residnet.judge.rollout_files import write_rollouts
+from residnet.runs.folder import RunFolder
+from residnet.runs.model_store import FolderStore
+from residnet.runs.provenance import Provenance
+from residnet.runs.task import Outcome
+from residnet.tasks.fit.config import FitTaskSettings
+from residnet.tasks.fit.files import (
+    fit_outcome,
+    write_data_quality,
+    write_limits,
+    write_metrics,
+)
+from residnet.tasks.log_files import log_files
+
+SPLIT = "external"
+"""Name of the split of these logs."""
+
+
+class ExternalLogs:
+    """Logs that are judged with a fit's reader, masks, protocols and scales.
+
+    Attributes:
+        provenance: what the evaluation is made from.
+    """
+
+    def __init__(self, config: FitTaskSettings, run: RunFolder, paths: Sequence[Path]) -> None:
+        """Read and prepare the logs.
+
+        Args:
+            config: of the finished fit.
+            run: its folder.
+            paths: files and folders.
+
+        Raises:
+            DataError: where a log cannot be used or is too short, or two have one name.
+            UsageError: where a path or a channel is missing.
+        """
+        self.config, self.run = config, run
+        files = log_files(paths)
+        self.provenance = Provenance(run.resolved, (), config.seed, files, time.time())
+        self.logs = [
+            prepare(read_external(path, config), SPLIT, config.signals.columns, config.prepare)
+            for path in files
+        ]
+        names = [log.log.name for log in self.logs]
+        for name in names:
+            if names.count(name) > 1:
+                raise DataError(f"two logs are named '{name}'; rename one file")
+        for log in self.logs:
+            require_window(log, config)
+
+    def create_folder(self, out: Path | None) -> RunFolder:
+        """Make the folder for the results; RUN/external-<time> where none is given.
+
+        Raises:
+            UsageError: where the folder exists and may not be used.
+        """
+        place = out or self.run.path / time.strftime("external-%Y%m%dT%H%M%S")
+        return RunFolder.create(place, dump_config(self.config))
+
+    def judge(self, folder: RunFolder) -> Outcome:
+        """Free-run every model of the fit, and write what was found."""
+        config, logs = self.config, self.logs
+        store = FolderStore(self.run)
+        fitted = [store.load(name) for name in store.names()]
+        order = ["zero", *config.model_names]
+        fitted.sort(key=lambda model: (*order, model.name).index(model.name))
+        low, high = np.array(fitted[0].spec.low), np.array(fitted[0].spec.high)
+        limit = velocity_limit(low, high, config.evaluation.divergence)
+        say(f"{config.name}: {len(logs)} logs, {len(fitted)} models")
+        simulated = isinstance(config.data, SimulatedTrials) and all(
+            "vessel" in log.log.meta for log in logs
+        )
+        models = [c for c in candidates(fitted, config.data) if c.kind != "truth" or simulated]
+        judged = evaluate(models, logs, config.evaluation, config.prepare.grid.step, limit)
+        write_rollouts(folder.rollouts / SPLIT, judged.runs, logs)
+        write_data_quality(folder, {SPLIT: logs})
+        write_metrics(folder, config, judged.rows, str(self.run.read_metrics()["selected"]))
+        write_limits(folder, config, {SPLIT: judged.limits}, logs)
+        return fit_outcome(folder, SPLIT)
+
+
+def read_external(path: Path, config: FitTaskSettings) -> Log:
+    """Read a log as the run read its own; canonical files are recognised by their own mark.
+
+    Raises:
+        ResidnetError: where the file cannot be read.
+    """
+    if isinstance(config.data, SimulatedTrials) or Log.recognises(path):
+        return CanonicalConfig().build().read(path)
+    return config.data.reader.build().read(path)

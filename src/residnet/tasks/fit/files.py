@@ -1,0 +1,126 @@
+"""What a fit and its evaluation on other logs write beside their models: tables of numbers."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from residnet.core.names import STATE, si_unit
+from residnet.data.prepare import Prepared
+from residnet.judge.limits import SCHEMA as LIMITS
+from residnet.judge.repeats import repeatability
+from residnet.judge.tables import metrics_content
+from residnet.report.run_reader import RunFiles
+from residnet.report.sections.fit.verdict import verdict
+from residnet.runs.folder import RunFolder
+from residnet.runs.task import MainFigure, Outcome
+from residnet.tasks.fit.config import FitTaskSettings
+
+
+def write_metrics(
+    folder: RunFolder, config: FitTaskSettings, table: Sequence[dict[str, Any]], selected: str
+) -> None:
+    """Write metrics.json with schema, units, scales and rows."""
+    units = {name: si_unit(unit) for name, unit in config.signals.units().items() if name in STATE}
+    scales = config.evaluation.scales.named()
+    folder.write_json(folder.metrics, metrics_content(config.name, units, scales, selected, table))
+
+
+def write_limits(
+    folder: RunFolder,
+    config: FitTaskSettings,
+    limiting: Mapping[str, Any],
+    logs: Sequence[Prepared],
+) -> None:
+    """Write limits.json: where models fail and what limits them, by split and protocol.
+
+    How well the vessel repeats itself over all logs stands there too.
+    """
+    scales = config.evaluation.scales.named()
+    commands, step = len(config.signals.inputs), config.prepare.grid.step
+    repeats = {
+        name: repeatability(protocol, logs, commands, scales, step)
+        for name, protocol in config.evaluation.protocols.items()
+    }
+    folder.write_json(
+        folder.limits,
+        {"schema": LIMITS, "run": config.name, "splits": limiting, "repeatability": repeats},
+    )
+
+
+def write_data_quality(folder: RunFolder, logs: Mapping[str, Sequence[Prepared]]) -> None:
+    """Write data_quality.json: what each log contributes, for the report."""
+    entries = [_quality(prepared, split) for split, members in logs.items() for prepared in members]
+    folder.write_json(folder.data_quality, entries)
+
+
+def _quality(prepared: Prepared, split: str) -> dict[str, Any]:
+    log = prepared.log
+    return {
+        "log": log.name,
+        "split": split,
+        "manoeuvre": log.manoeuvre,
+        "seconds": float(log.t[-1] - log.t[0]),
+        "samples": len(prepared),
+        "usable": float(prepared.usable.mean()),
+        "learned_from": float(prepared.good.mean()),
+        "masked": {
+            reason: float(np.mean(mask)) for reason, mask in log.masks.items() if mask.any()
+        },
+        "largest": {
+            name: float(np.abs(prepared.y[prepared.usable, 3 + i]).max())
+            for i, name in enumerate(("u", "v", "r"))
+        },
+    }
+
+
+def fit_outcome(
+    folder: RunFolder, split: str, export: Callable[[], Sequence[Path]] | None = None
+) -> Outcome:
+    """Return the verdict of a fit or an evaluation, and the errors of its selected model.
+
+    Args:
+        folder: where the results stand.
+        split: that is shown.
+        export: writes the exports when the run ends.
+    """
+    metrics = folder.read_metrics()
+    evaluation = RunFiles(folder.path)
+    protocol = evaluation.protocols[0]
+    row = evaluation.row(metrics["selected"], split, protocol)
+    figures: dict[str, MainFigure] = {}
+    if row is not None:
+        figures = {
+            "nrmse": MainFigure(row["nrmse"]["mean"]),
+            "rmse_u": MainFigure(row["rmse"]["u"], "m/s"),
+            "rmse_v": MainFigure(row["rmse"]["v"], "m/s"),
+            "rmse_r": MainFigure(row["rmse"]["r"], "rad/s"),
+            "position_error_end": MainFigure(row["position_error_end"], "m"),
+            "heading_error_end": MainFigure(row["heading_error_end"], "rad"),
+        }
+    sentences = [sentence for sentence in verdict(evaluation) if sentence]
+    return Outcome(sentences, figures, free_run_table(metrics["rows"], split), export=export)
+
+
+def free_run_table(rows: Sequence[Mapping[str, Any]], split: str) -> str:
+    """Return the free-run errors of one split as text; `*` marks the selected model."""
+    titles = (
+        f"{'protocol':12s} {'model':14s} {'u m/s':>8s} {'v m/s':>8s} {'r deg/s':>8s} {'nrmse':>7s}"
+    )
+    lines = [f"{titles} {'position m':>11s} {'heading deg':>12s} {'diverged':>9s}"]
+    for row in rows:
+        if row["split"] != split or row["manoeuvre"] != "all":
+            continue
+        rmse, mark = row["rmse"], " *" if row["selected"] else ""
+        lines.append(
+            f"{row['protocol']:12s} {row['model'] + mark:14s} {rmse['u']:8.4f} {rmse['v']:8.4f}"
+            f" {math.degrees(rmse['r']):8.3f} {row['nrmse']['mean']:7.4f}"
+            f" {row['position_error_end']:11.2f} {math.degrees(row['heading_error_end']):12.2f}"
+            f" {row['diverged']:5d}/{row['windows']}"
+        )
+    lines.append("free-run errors, mean over windows; * = selected on validation data")
+    return "\n".join(lines)

@@ -1,0 +1,97 @@
+"""Carrying out a fit, into a run folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from residnet.core.progress import say
+from residnet.data.sources import read_logs
+from residnet.identification.currents import through_currents
+from residnet.identification.fit import Identified, fit
+from residnet.identification.goodness import goodness_rows
+from residnet.identification.prepared import PreparedSplits, prepare_logs
+from residnet.identification.teacher_forced import residual_table, term_table
+from residnet.judge.goodness import content
+from residnet.judge.rollout_files import write_rollouts
+from residnet.runs.folder import RunFolder
+from residnet.runs.model_store import FolderStore
+from residnet.runs.task import Outcome
+from residnet.tasks.fit.booklet import write_booklet
+from residnet.tasks.fit.config import FitTaskSettings
+from residnet.tasks.fit.doctor import write_inspection
+from residnet.tasks.fit.exporting import export_model
+from residnet.tasks.fit.files import (
+    fit_outcome,
+    write_data_quality,
+    write_limits,
+    write_metrics,
+)
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+def run_fit(config: FitTaskSettings, folder: RunFolder) -> Outcome:
+    """Fit all models, judge them in free run, and write what was found.
+
+    Raises:
+        ResidnetError: where the logs cannot be used, or do not determine a model.
+    """
+    logs = _prepared(config, folder)
+    identified = fit(logs, config, store=FolderStore(folder))
+    _judged(config, folder, identified, logs)
+    return fit_outcome(
+        folder,
+        "test",
+        lambda: [export_model(folder, name, None, "torchscript") for name in config.export.models],
+    )
+
+
+def _prepared(config: FitTaskSettings, folder: RunFolder) -> PreparedSplits:
+    """Read the logs, have the doctor look at them, and prepare them.
+
+    Where they ran in currents, they are taken through the water.
+    """
+    say(f"{config.name}: reading logs")
+    read = read_logs(config.data)
+    write_inspection(folder, read, config)
+    logs = prepare_logs(read, config)
+    say("  " + ", ".join(f"{split} {len(members)} logs" for split, members in logs.items()))
+    logs, currents = through_currents(logs, config)
+    if config.current is not None:
+        folder.write_json(folder.path / "currents.json", currents)
+    write_data_quality(folder, logs)
+    return logs
+
+
+def _judged(
+    config: FitTaskSettings, folder: RunFolder, identified: Identified, logs: PreparedSplits
+) -> None:
+    """Run all models freely, and write everything that is found of them."""
+    say("  free runs")
+    fitted, step = list(identified.values()), config.prepare.grid.step
+    table: list[dict[str, Any]] = []
+    limiting: dict[str, Any] = {}
+    for split in config.evaluation.splits:
+        judged = identified.evaluate(logs[split], config.data)
+        write_rollouts(folder.rollouts / split, judged.runs, judged.logs)
+        limiting[split] = judged.limits
+        table += judged.rows
+    write_metrics(folder, config, table, identified.select(table))
+    write_limits(
+        folder, config, limiting, [log for split in config.evaluation.splits for log in logs[split]]
+    )
+    _write_table(folder.residuals, residual_table(fitted, logs["test"]))
+    _write_table(folder.path / "terms.parquet", term_table(fitted, logs["test"]))
+    splits = goodness_rows(fitted, logs, step)
+    folder.write_json(folder.goodness, content(config.name, splits, step))
+    if config.booklet is not None:
+        refitted = identified[config.booklet.model]
+        say("  " + write_booklet(folder, config.booklet, refitted, logs, identified.limit))
+
+
+def _write_table(file: Path, table: pd.DataFrame) -> None:
+    """Write a table that has rows as Parquet."""
+    if len(table):
+        table.to_parquet(file, index=False)

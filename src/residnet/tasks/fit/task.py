@@ -1,0 +1,71 @@
+"""Task `fit`: from logs to baselines, heads, a comparison in free run, report and export."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import ClassVar, Literal, final
+
+from residnet.report.blocks import Section
+from residnet.runs.folder import RunFolder
+from residnet.runs.task import Finished, Outcome
+from residnet.tasks.fit.config import FitTaskSettings
+
+
+@final
+class FitConfig(FitTaskSettings):
+    """A complete fit: what is identified, from which logs, and what is made of it."""
+
+    task: Literal["fit"]
+
+    verbs: ClassVar[tuple[str, ...]] = ("report", "evaluate", "export")
+
+    def carry_out(self, folder: RunFolder) -> Outcome:
+        """Fit all models and judge them in free run.
+
+        Raises:
+            ResidnetError: where the logs cannot be used, or do not determine a model.
+        """
+        from residnet.tasks.fit.running import run_fit
+
+        return run_fit(self, folder)
+
+    @classmethod
+    def report_sections(cls, run: RunFolder) -> Sequence[Section]:
+        """Draw the figures, those of a published study too, and return the sections."""
+        from residnet.core.config import load_mapping
+        from residnet.documents import draw_study
+        from residnet.report.figures.fit import write_figures
+        from residnet.report.fit import fit_sections
+        from residnet.report.run_reader import RunFiles
+
+        files = RunFiles(run.path)
+        write_figures(files)
+        study = load_mapping(run.resolved).get("study")
+        if study is not None and "test" in files.splits:
+            draw_study(study, run.path)
+        return fit_sections(files)
+
+    def evaluate_on(self, run: RunFolder, logs: Sequence[Path], out: Path | None) -> Finished:
+        """Free-run every model of a finished run on other logs.
+
+        Raises:
+            ResidnetError: where a log cannot be used, lacks a channel or is too short.
+        """
+        from residnet.tasks.fit.external import ExternalLogs
+
+        external = ExternalLogs(self, run, logs)
+        folder = external.create_folder(out)
+        return self.conduct(folder, external.provenance, external.judge)
+
+    def export_model(self, run: RunFolder, model: str, out: Path | None, file_format: str) -> Path:
+        """Export one model, `selected` for the one chosen on validation data; returns the file.
+
+        Raises:
+            ConfigError: where there is no such format.
+            UsageError: where there is no such model.
+            ExportError: where the exported model does not agree with the one that it came from.
+        """
+        from residnet.tasks.fit.exporting import export_model
+
+        return export_model(run, model, out, file_format)

@@ -1,0 +1,70 @@
+"""What `residnet report`, `evaluate` and `export` do with a finished run of any task."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from residnet.core.config import load_config, load_mapping
+from residnet.core.errors import UsageError
+from residnet.core.names import nearest
+from residnet.core.registry import kinds
+from residnet.runs.folder import RunFolder
+from residnet.runs.task import Finished, Task
+from residnet.tasks.union import TaskConfig
+
+
+def report_run(path: Path) -> Path:
+    """Write figures and report of a finished run from its folder alone; returns the page's path.
+
+    Raises:
+        UsageError: where there is no finished run, or its task is not known.
+    """
+    run = RunFolder.open(path)
+    return task_class(run).write_report(run)
+
+
+def evaluate_run(path: Path, logs: Sequence[Path], out: Path | None) -> Finished:
+    """Judge the models of a finished run on other logs.
+
+    Raises:
+        UsageError: where runs of this task have no such models.
+        ResidnetError: where a log cannot be used.
+    """
+    run = RunFolder.open(path)
+    return _task(run, "evaluate").evaluate_on(run, logs, out)
+
+
+def export_run(path: Path, model: str, out: Path | None, file_format: str) -> Path:
+    """Export one model of a finished run; returns the file.
+
+    Raises:
+        UsageError: where runs of this task have nothing to export, or there is no such model.
+        ExportError: where the exported model does not agree with the one that it came from.
+    """
+    run = RunFolder.open(path)
+    return _task(run, "export").export_model(run, model, out, file_format)
+
+
+def task_class(run: RunFolder) -> type[Task]:
+    """Return the class of a run's task, by the name in its resolved.yaml.
+
+    The class alone can write the report, so that a run can be reported whose inputs have gone.
+
+    Raises:
+        UsageError: where there is no such task.
+    """
+    known = kinds(TaskConfig)
+    name = str(load_mapping(run.resolved).get("task"))
+    if name not in known:
+        raise UsageError(f"{run.resolved}: no task '{name}'{nearest(name, known)}")
+    found: type[Task] = known[name]
+    return found
+
+
+def _task(run: RunFolder, verb: str) -> Task:
+    found = task_class(run)
+    if verb not in found.verbs:
+        # said before the config is read: its inputs may have gone
+        raise found.lacks_verb(run)
+    return load_config(run.resolved, [], found)
