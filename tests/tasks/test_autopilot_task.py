@@ -194,7 +194,7 @@ def test_a_policy_is_exported_by_its_name(
     assert call(monkeypatch, "export", run, "--model", "polcy") == 2
     assert "did you mean 'policy'" in capsys.readouterr().err
     assert call(monkeypatch, "evaluate", run, "--logs", tmp_path) == 2
-    assert "task 'autopilot' has no models to free-run" in capsys.readouterr().err
+    assert "of task 'autopilot'; it has: report, export" in capsys.readouterr().err
 
 
 def check(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, config: dict[str, Any]) -> int:

@@ -6,12 +6,9 @@ import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pydantic import TypeAdapter
-
-from residnet.control.base import Policy
 from residnet.control.courses.config import smallest_turn
 from residnet.control.courses.turns import SteadyTurn
-from residnet.control.heading.controllers import AnyController, Steering
+from residnet.control.heading.controllers import Steering
 from residnet.control.heading.policy import HeadingPolicy
 from residnet.control.heading.steering import SteeredPlant
 from residnet.control.heading.stored import load_heading_policy
@@ -19,7 +16,6 @@ from residnet.control.heading.turning import Turning
 from residnet.core.config import load_config
 from residnet.core.errors import ConfigError
 from residnet.core.names import nearest
-from residnet.documents.gouletas2020.autopilot import load_predictive
 from residnet.physics.vessel import load_vessel
 from residnet.runs.folder import RunFolder
 from residnet.tasks.autopilot.task import AutopilotConfig
@@ -106,20 +102,3 @@ def load_policy(run: Path, name: str, steering: Steering) -> HeadingPolicy:
     policy.dt = steering.dt
     policy.read_from(steering.vessel.state)
     return policy
-
-
-def load_peers(config: CourseSettings, known: AutopilotRun) -> dict[str, Policy]:
-    """Peers as the autopilot run tuned or trained them, then the others."""
-    reader: TypeAdapter[AnyController] = TypeAdapter(AnyController)
-    built: dict[str, Policy] = {}
-    for name in config.peers:
-        if name in known.autopilot.predictive:
-            built[name] = load_predictive(
-                name, known.autopilot.predictive[name], known.steering, known.run
-            )
-        else:
-            built[name] = reader.validate_python(known.controllers[name]["config"]).build(
-                known.steering
-            )
-    built |= {name: law.build(known.steering) for name, law in config.others.items()}
-    return {name: law.double() for name, law in built.items()}

@@ -33,12 +33,12 @@ from residnet.tasks.autopilot.config import AutopilotSettings
 from residnet.tasks.course.autopilot_run import (
     AutopilotRun,
     autopilot_of,
-    load_peers,
     load_policy,
     ready,
 )
 from residnet.tasks.course.config import CourseSettings
 from residnet.tasks.course.flights import NOMINAL, Vessels, fly
+from residnet.tasks.course.peers import load_peers
 from residnet.tasks.course.tables import plan_table, spread_table, track_table
 
 _UNITS = {
