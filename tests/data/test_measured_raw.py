@@ -13,8 +13,8 @@ import pytest
 
 from residnet.core.log import Log
 from residnet.core.resources import config_folder
-from residnet.tasks.loading import load_task
 from residnet.tasks.import_logs import ImportConfig
+from residnet.tasks.loading import load_task
 
 FERRY = Path(os.environ.get("RESIDNET_DATA", "")) / "milliampere"
 pytestmark = pytest.mark.skipif(not (FERRY / "raw_nlp1").is_dir(), reason=f"no raw_nlp1 in {FERRY}")

@@ -111,7 +111,7 @@ def test_help_does_not_import_torch() -> None:
 
 
 def test_check_does_not_import_lightning(tiny_config: Path) -> None:
-    load = f"from residnet.tasks.loading import load_task; load_task(Path({str(tiny_config)!r}), [])"
+    load = f"import residnet.tasks.loading as l; l.load_task(Path({str(tiny_config)!r}), [])"
     code = f"import sys; from pathlib import Path; {load}; sys.exit('lightning' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
