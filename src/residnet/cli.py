@@ -36,12 +36,13 @@ Overrides = Annotated[
         help="Override a key of the config, or take one away with ~KEY; may be repeated.",
     ),
 ]
+_CONFIG = "YAML file of one run, or the name of a config that comes with residnet."
 RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a finished run.")]
 
 
 @app.command()
 def run(
-    config: Annotated[Path, typer.Argument(metavar="CONFIG", help="YAML file of one run.")],
+    config: Annotated[Path, typer.Argument(metavar="CONFIG", help=_CONFIG)],
     overrides: Overrides = None,
     out: Annotated[
         Path | None,
@@ -55,13 +56,13 @@ def run(
     ] = False,
 ) -> None:
     """Carry out a run: fit, evaluate, report and export, or any other task."""
-    from residnet.tasks.loading import load_task
+    from residnet.tasks.loading import config_file, load_task
 
     _limit_threads()
     task = load_task(config, overrides or [])
     with drawn_progress():
         finished = task.run(
-            source=config,
+            source=config_file(config),
             overrides=overrides or [],
             out=out,
             resume=resume,
@@ -72,7 +73,7 @@ def run(
 
 @app.command()
 def check(
-    config: Annotated[Path, typer.Argument(metavar="CONFIG", help="YAML file of one run.")],
+    config: Annotated[Path, typer.Argument(metavar="CONFIG", help=_CONFIG)],
     overrides: Overrides = None,
 ) -> None:
     """Validate a config and everything that it names, without running it."""
@@ -187,7 +188,16 @@ def report(folder: RunPath) -> None:
 @app.command(name="list")
 def list_names(
     what: Annotated[
-        Literal["vessels", "heads", "manoeuvres", "readers", "tasks", "baselines", "formats"],
+        Literal[
+            "vessels",
+            "heads",
+            "manoeuvres",
+            "readers",
+            "tasks",
+            "baselines",
+            "formats",
+            "configs",
+        ],
         typer.Argument(help="What to list."),
     ],
 ) -> None:

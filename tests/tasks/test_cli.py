@@ -93,13 +93,26 @@ def test_existing_folder_is_left_alone(
 
 
 @pytest.mark.parametrize(
-    "what", ["vessels", "heads", "manoeuvres", "readers", "tasks", "baselines"]
+    "what",
+    ["vessels", "heads", "manoeuvres", "readers", "tasks", "baselines", "formats", "configs"],
 )
 def test_list(
     what: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert call(monkeypatch, "list", what) == 0
     assert len(capsys.readouterr().out.splitlines()) >= 2
+
+
+def test_a_shipped_config_is_found_by_its_name(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    # a folder of the same name does not hide it
+    (tmp_path / "quickstart").mkdir()
+    assert call(monkeypatch, "check", "quickstart") == 0
+    assert "quickstart: fine (task fit, run quickstart)" in capsys.readouterr().out
+    assert call(monkeypatch, "run", "quikstart") == 2
+    assert "did you mean 'quickstart'" in one_line(capsys)
 
 
 def test_help_does_not_import_torch() -> None:

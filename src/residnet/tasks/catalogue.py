@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from residnet.baselines import BaselineConfig
+from residnet.core.config import load_mapping
 from residnet.core.errors import ResidnetError
 from residnet.core.registry import ThirdParty, broken_kinds, kinds
 from residnet.data.readers import ReaderConfig
@@ -12,6 +13,7 @@ from residnet.export import exporters
 from residnet.heads import HeadConfig
 from residnet.manoeuvres import ManoeuvreConfig
 from residnet.physics.vessel import broken_vessels, load_vessel, vessel_files
+from residnet.tasks.loading import shipped_configs
 from residnet.tasks.union import TaskConfig
 
 
@@ -19,11 +21,18 @@ def catalogue(what: str) -> list[tuple[str, str]]:
     """Return names and one-line descriptions of what there is, third-party parts included.
 
     Args:
-        what: `vessels`, `heads`, `manoeuvres`, `readers`, `tasks`, `baselines` or `formats`.
+        what: `vessels`, `heads`, `manoeuvres`, `readers`, `tasks`, `baselines`, `formats` or
+            `configs`.
     """
     if what == "vessels":
         found = [(name, _description(name)) for name in vessel_files()]
         return found + [_broken(part) for part in broken_vessels()]
+    if what == "configs":
+        files = {file: name for name, file in reversed(shipped_configs().items())}
+        return [
+            (name, str(load_mapping(file).get("description") or ""))
+            for file, name in sorted(files.items())
+        ]
     if what == "formats":
         return [
             _broken(part) if isinstance(part, ThirdParty) else (name, part.about)

@@ -6,15 +6,50 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from residnet.core.config import load_config
+from residnet.core.errors import ConfigError
+from residnet.core.names import nearest
+from residnet.core.resources import config_folder
 from residnet.runs.task import Task
 from residnet.tasks.union import TaskConfig
 
 
-def load_task(path: Path, overrides: Sequence[str]) -> Task:
+def load_task(path: Path, overrides: Sequence[str] = ()) -> Task:
     """Return the task of a config file with overrides.
+
+    Args:
+        path: YAML file, or the name of a config that comes with residnet, such as `quickstart`.
+        overrides: `dotted.key=value`, in order; `~dotted.key` takes a key away.
 
     Raises:
         ConfigError: one line with file or override, key, fault and the nearest valid name.
     """
-    task: Task = load_config(path, overrides, TaskConfig)
+    task: Task = load_config(config_file(path), overrides, TaskConfig)
     return task
+
+
+def config_file(path: Path) -> Path:
+    """Return the file of a config: the path itself, or that of a shipped config of this name.
+
+    Raises:
+        ConfigError: where there is neither; the message names the nearest shipped config.
+    """
+    if path.is_file() or path.suffix or path.is_absolute():
+        return path
+    shipped = shipped_configs()
+    name = path.as_posix()
+    if name not in shipped:
+        raise ConfigError(
+            f"{path}: no such file, and no config of this name comes with residnet"
+            f"{nearest(name, shipped)}; residnet list configs shows them"
+        )
+    return shipped[name]
+
+
+def shipped_configs() -> dict[str, Path]:
+    """Return the configs that come with residnet by name; studies are named by their path too."""
+    folder = config_folder()
+    files = [file for file in sorted(folder.rglob("*.yaml")) if file.parent.name != "vessels"]
+    by_path = {file.relative_to(folder).with_suffix("").as_posix(): file for file in files}
+    stems = [file.stem for file in files]
+    # a stem that two studies share names neither
+    return {file.stem: file for file in files if stems.count(file.stem) == 1} | by_path
