@@ -1,0 +1,6 @@
+#!/usr/bin/env bash
+# Lint and types.
+source "$(dirname "${BASH_SOURCE[0]}")/../_venv.sh"
+install_residnet "[dev]"
+.venv/bin/ruff check src tests scripts
+.venv/bin/mypy

@@ -1,0 +1,295 @@
+"""Run every shipped config in a shortened form, to its report.
+
+Each config under configs/ has a row in `SHORT`: overrides that keep every part of the run but
+lessen the work. A config without a row fails. Configs whose data are absent are skipped visibly.
+
+    python scripts/ci/short_configs.py [NAME...] [--jobs 2] [--out FOLDER]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+CONFIGS = ROOT / "configs"
+LIMIT = 400
+"""Seconds after which a run has failed."""
+
+
+@dataclass(frozen=True)
+class Short:
+    """How a config is shortened.
+
+    Attributes:
+        overrides: of its keys; `{runs}` stands for the folder of all short runs.
+        data: folder below RESIDNET_DATA that it needs; empty for none.
+        after: config whose short run it uses.
+    """
+
+    overrides: tuple[str, ...] = ()
+    data: str = ""
+    after: str = ""
+
+
+# fewer simulated sea trials
+_TRIALS = (
+    "data.trials=[{kind: constant, drive: [0.4, 0.9], steer: [-0.4, 0.0, 0.4]},"
+    " {kind: zigzag, count: 5, heading: [20 deg]}, {kind: acceleration_deceleration, count: 3},"
+    " {kind: three_two_one_one, count: 3}]",
+    "data.identification={zigzag: 4, acceleration_deceleration: 2, three_two_one_one: 2}",
+    "data.validation={zigzag: 1, acceleration_deceleration: 1, three_two_one_one: 1}",
+)
+_ONE_STEP = "{epochs: 1, window: 2 s, batch: 32}"
+_MULTI_STEP = "[{horizon: 2 s, epochs: 1, batch: 32}]"
+
+
+def _trained(*heads: str) -> tuple[str, ...]:
+    """Return overrides for one short epoch of each stage."""
+    return tuple(
+        override
+        for head in heads
+        for override in (
+            f"training.{head}.steps=2",
+            f"training.{head}.one_step={_ONE_STEP}",
+            f"training.{head}.multi_step={_MULTI_STEP}",
+        )
+    )
+
+
+def _policy(name: str) -> tuple[str, ...]:
+    return tuple(f"policies.{name}.training.{key}" for key in ("epochs=1", "steps=1", "batch=16"))
+
+
+def _predictor(name: str) -> tuple[str, ...]:
+    return (f"predictive.{name}.training={{states: 300, epochs: 5, batch: 50}}",)
+
+
+# eight logs of the Esso Osaka model tanker are enough
+_TANKER = (
+    "refit={}",
+    "baselines.physics={kind: regressors, terms: [u, v, r, n]}",
+    "evaluation.splits=[validation, test]",
+    *_trained("mlp", "lstm"),
+)
+_FERRY = ("course.interval=20 s",)
+_STEP_TEST = ("test.plants=2", "tuning_points=16")
+_PEERS = ("test.dt=0.1 s",)
+
+SHORT: dict[str, Short] = {
+    "quickstart": Short((*_TRIALS, *_trained("mlp", "lstm"))),
+    "wam_v_s1": Short((*_TRIALS, *_trained("mlp", "lstm"))),
+    "wam_v_s2": Short((*_TRIALS, *_trained("mlp", "lstm"))),
+    "wam_v_s3": Short((*_TRIALS, *_trained("mlp", "lstm"))),
+    "wam_v_equations": Short(_TRIALS),
+    "wam_v_trials": Short(_TRIALS),
+    "simulate_wam_v": Short(),
+    "rudder_boat_trials": Short(_TRIALS),
+    "patrol_identified": Short(_trained("mlp")),
+    "kvlcc2": Short(
+        ("refit.mmg.iterations=2", "booklet.draws=3", "booklet.duration=120 s"), data="kvlcc2"
+    ),
+    "esso_osaka": Short(_TANKER, data="esso_osaka"),
+    "esso_osaka_no_wind": Short(_TANKER, data="esso_osaka"),
+    "milliampere_raw": Short(data="milliampere"),
+    "autopilot_nomoto": Short((*_policy("policy"), *_predictor("document"), *_STEP_TEST, *_PEERS)),
+    "autopilot_nomoto_rate": Short((*_policy("policy"), *_STEP_TEST, *_PEERS)),
+    "autopilot_patrol": Short((*_policy("policy"), *_STEP_TEST)),
+    "autopilot_patrol_learned": Short(
+        (
+            *_policy("on_vessel"),
+            *_policy("on_model"),
+            "policies.on_model.learned.run={runs}/patrol_identified",
+            *_STEP_TEST,
+        ),
+        after="patrol_identified",
+    ),
+    "studies/esso_osaka/ablation": Short(
+        (
+            "variants={recipe: [], no_mirror: ['heads.mlp.mirror=false']}",
+            "common=['baselines.physics={kind: regressors, terms: [u, v, r, n]}', 'refit={}',"
+            " 'heads={mlp: {kind: mlp, hidden: [8]}}', 'base_of={mlp: hull}', 'ensembles={}',"
+            " '~training.lstm', 'training.mlp.steps=1', 'training.mlp.multi_step=[{horizon: 2 s,"
+            " epochs: 1, batch: 32}]']",
+            "seeds=[0]",
+            "workers=1",
+        ),
+        data="esso_osaka",
+    ),
+    "studies/gouletas2020/heading_nomoto": Short(
+        (
+            *_policy("like_pd"),
+            "predictive={mlp_printed: {horizon: 0.01 s, training: {states: 300, epochs: 5}},"
+            " mlp_3s_linear: {horizon: 3 s, linear: true, training: {states: 300, epochs: 5}}}",
+            *_STEP_TEST,
+            *_PEERS,
+        )
+    ),
+    "studies/gouletas2020/heading_patrol": Short(
+        (
+            *_policy("like_pd"),
+            "predictive={mlp_10s: {horizon: 10 s, hidden: [30],"
+            " training: {states: 300, epochs: 5}}}",
+            "test.plants=2",
+            "tuning_points=16",
+        )
+    ),
+    "studies/gouletas2020/table_6_3": Short(
+        ("autopilot={runs}/autopilot_nomoto", "spread.flights=2", "protocols=[enter]"),
+        after="autopilot_nomoto",
+    ),
+    "studies/gouletas2020/table_6_8": Short(
+        ("autopilot={runs}/autopilot_patrol", "protocols=[enter]", "duration=300 s"),
+        after="autopilot_patrol",
+    ),
+    "studies/halvorsen2019/force_equations": Short(
+        ("heads.genetic.evolution={population: 30, generations: 2}",)
+    ),
+    "studies/halvorsen2019/jet_equations": Short(
+        ("heads.genetic.evolution={population: 30, generations: 2}",)
+    ),
+    "studies/halvorsen2019/noise": Short(("repeats=1",)),
+    "studies/halvorsen2019/table_5_2": Short(
+        ("repeats=1", "rows.values=[2]", "columns.values=[5]", "~published", "~published_error")
+    ),
+    "studies/halvorsen2019/table_5_3": Short(
+        ("repeats=1", "rows.values=[0.2]", "columns.values=[0.2]", "~published")
+    ),
+    "studies/halvorsen2019/standard_model": Short(),
+    "studies/jervan2020/case": Short(_FERRY),
+    "studies/jervan2020/disturbance": Short(_FERRY),
+    "studies/jervan2020/force_residual": Short(_FERRY),
+    "studies/jervan2020/measured": Short(("validation.folds=2",), data="milliampere"),
+    "studies/jervan2020/noise": Short(_FERRY),
+    "studies/jervan2020/operation": Short(_FERRY),
+    "studies/jervan2020/update": Short(_FERRY),
+    "studies/jervan2020/zigzag": Short(),
+    "studies/moreno2019/moreno2019": Short(
+        ("heads.gptips.evolution.population=30", "heads.gptips.evolution.generations=2"),
+        data="esso_osaka",
+    ),
+    "studies/moreno2019/polynomial_wind": Short(("refit={}",), data="esso_osaka"),
+    "studies/woo2018/woo2018": Short((*_TRIALS, *_trained("lstm_printed", "lstm_rate", "lstm"))),
+}
+
+
+def shipped() -> list[str]:
+    """Return the names of all configs of runs: their paths below configs/, without suffix."""
+    files = (path for path in CONFIGS.rglob("*.yaml") if path.parent.name != "vessels")
+    return sorted(path.relative_to(CONFIGS).with_suffix("").as_posix() for path in files)
+
+
+@dataclass(frozen=True)
+class Result:
+    """How the short run of a config ended.
+
+    Attributes:
+        name: of the config.
+        state: `ok`, `skipped` or `FAILED`.
+        seconds: that it took.
+        words: why.
+    """
+
+    name: str
+    state: str
+    seconds: float
+    words: str = ""
+
+    def line(self) -> str:
+        """Return a line for the log."""
+        return f"{self.state:8s} {self.seconds:6.1f} s  {self.name}  {self.words}".rstrip()
+
+
+def carry_out(name: str, runs: Path) -> Result:
+    """Run one config in its short form, and look for its report and finished mark."""
+    short = SHORT[name]
+    if short.data and not (Path(os.environ.get("RESIDNET_DATA", "")) / short.data).is_dir():
+        return Result(name, "skipped", 0.0, f"no RESIDNET_DATA/{short.data}")
+    folder = runs / name.rsplit("/", maxsplit=1)[-1]
+    command = [sys.executable, "-m", "residnet.cli", "run", str(CONFIGS / f"{name}.yaml")]
+    command += ["--out", str(folder)]
+    for override in short.overrides:
+        command += ["-s", override.replace("{runs}", str(runs))]
+    started = time.monotonic()
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT, check=False)
+    except subprocess.TimeoutExpired:
+        return Result(name, "FAILED", time.monotonic() - started, f"not done after {LIMIT} s")
+    seconds = time.monotonic() - started
+    last = (done.stderr.strip().splitlines() or [""])[-1]
+    if done.returncode != 0:
+        return Result(name, "FAILED", seconds, f"exit {done.returncode}: {last}")
+    summary = json.loads((folder / "summary.json").read_text())
+    for wrong, words in (
+        (not summary["finished"], "summary.json does not say finished"),
+        (not summary["verdict"], "summary.json has no verdict"),
+        (not (folder / "report.html").is_file(), "no report.html"),
+    ):
+        if wrong:
+            return Result(name, "FAILED", seconds, words)
+    return Result(name, "ok", seconds)
+
+
+def carry_out_all(names: list[str], runs: Path, jobs: int) -> list[Result]:
+    """Run configs side by side; one that uses another's run waits for it."""
+    results: dict[str, Future[Result]] = {}
+    lock = threading.Lock()
+
+    def run(name: str) -> Result:
+        before = SHORT[name].after
+        result = (
+            Result(name, "FAILED", 0.0, f"{before} failed")
+            if before and results[before].result().state == "FAILED"
+            else carry_out(name, runs)
+        )
+        with lock:
+            print(result.line(), flush=True)
+        return result
+
+    # what others wait for comes first, so that waiting never blocks all jobs
+    wanted = {*names, *(SHORT[name].after for name in names if SHORT[name].after)}
+    order = sorted(wanted, key=lambda name: (bool(SHORT[name].after), name))
+    with ThreadPoolExecutor(jobs) as pool:
+        for name in order:
+            results[name] = pool.submit(run, name)
+    return [result.result() for result in results.values()]
+
+
+def main() -> int:
+    """Run the named configs, or all; return how many failed."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("names", nargs="*", help="configs below configs/, without suffix")
+    parser.add_argument("--jobs", type=int, default=2, help="runs side by side")
+    parser.add_argument("--out", type=Path, help="folder for the runs; a temporary one otherwise")
+    given = parser.parse_args()
+    rowless = sorted(set(shipped()) - set(SHORT))
+    stale = sorted(set(SHORT) - set(shipped()))
+    for name in rowless:
+        print(f"FAILED   configs/{name}.yaml has no row in {Path(__file__).name}")
+    for name in stale:
+        print(f"FAILED   the row '{name}' names no config")
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    started = time.monotonic()
+    with tempfile.TemporaryDirectory() as temporary:
+        runs = given.out or Path(temporary)
+        results = carry_out_all(given.names or sorted(set(SHORT) - set(stale)), runs, given.jobs)
+    failed = len(rowless) + len(stale) + sum(result.state == "FAILED" for result in results)
+    skipped = sum(result.state == "skipped" for result in results)
+    print(
+        f"{len(results)} configs: {failed} failed, {skipped} skipped for want of data,"
+        f" {time.monotonic() - started:.0f} s"
+    )
+    return min(failed, 1)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
