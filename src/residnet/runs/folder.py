@@ -145,20 +145,6 @@ class RunFolder:
         }
         self.write_json(self.summary, content)
 
-    def write_provenance(
-        self,
-        *,
-        config: Path,
-        overrides: Sequence[str],
-        seed: int,
-        files: Sequence[Path],
-        started: float,
-    ) -> None:
-        """Write who made this run, with what, from which files."""
-        from residnet.runs.provenance import Provenance
-
-        Provenance(config, overrides, seed, files, started).write(self)
-
     def read_summary(self) -> Mapping[str, Any]:
         """Return the contents of summary.json.
 
