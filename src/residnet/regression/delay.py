@@ -1,5 +1,6 @@
-"""Time delay of inputs by a least-squares profile over shifts, all of them from the same
-correlations (document 000 section 5.3.4).
+"""Time delay of inputs by a least-squares profile over shifts (document 000 section 5.3.4).
+
+All shifts come from the same correlations.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from residnet.core.errors import FitError
 
 
 class DelayProfile(NamedTuple):
-    """Residual sums of squares by shift [S + 1], and the shift of the least one in samples."""
+    """The residual sums of squares by shift [S + 1], and the shift of the least one in samples."""
 
     rss: np.ndarray
     shift: int
@@ -21,8 +22,7 @@ class DelayProfile(NamedTuple):
 def delay_profile(
     held: np.ndarray, delayed: np.ndarray, y: np.ndarray, stretch: np.ndarray, longest: int
 ) -> DelayProfile:
-    """Least-squares error of y(t) = sum_j c_j held_j(t) delayed_j(t - s) for every shift s = 0 ...
-    longest.
+    """Return the errors of y(t) = sum_j c_j held_j(t) delayed_j(t - s) for shifts 0 ... longest.
 
     All shifts are judged on the same samples, those with a past of `longest`. The moments of all
     shifts are correlations of held_i held_j with delayed_i delayed_j, taken by FFT: no shift costs
@@ -72,7 +72,7 @@ def delay_profile(
 
 
 def _correlations(now: np.ndarray, past: np.ndarray, longest: int) -> np.ndarray:
-    """sum_t now(t) past(t - s) for s = 0 ... longest, [longest + 1, P]."""
+    """Return sum_t now(t) past(t - s) for s = 0 ... longest, [longest + 1, P]."""
     size = 1 << (len(now) + longest).bit_length()
     return np.fft.irfft(
         np.fft.rfft(now, size, axis=0) * np.conj(np.fft.rfft(past, size, axis=0)), size, axis=0

@@ -1,5 +1,4 @@
-"""Rows of a regression from sampled terms: as they are, integrated over short windows, or behind
-lagged instruments.
+"""Rows of a regression: samples, integrals over short windows, or rows behind instruments.
 
 Noise enters an equation twice: through the derivative on its left, which differentiation amplifies,
 and through the regressors on its right, which pull coefficients towards zero. Integrating both
@@ -23,8 +22,9 @@ from residnet.core.errors import ConfigError, FitError
 
 
 class Rows(NamedTuple):
-    """Terms [N, J] and targets [N, K], and the number of the stretch of unbroken samples that each
-    belongs to, ascending [N].
+    """The terms [N, J], targets [N, K] and stretches [N] of a regression.
+
+    A stretch of unbroken samples has a number, ascending.
     """
 
     x: np.ndarray
@@ -33,7 +33,7 @@ class Rows(NamedTuple):
 
 
 class RowBuilder(Config, ABC):
-    """How sampled terms become rows of a regression.
+    """A way to make rows of a regression from sampled terms.
 
     Attributes:
         sequential: whether rows are made of neighbouring samples, so that times must be known.
@@ -43,7 +43,7 @@ class RowBuilder(Config, ABC):
 
     @abstractmethod
     def rows(self, sampled: Rows, step: float, exact: np.ndarray) -> Rows:
-        """Rows of the regression.
+        """Return the rows of the regression.
 
         Args:
             sampled: terms and targets at samples `step` seconds apart within each stretch.
@@ -59,20 +59,21 @@ class RowBuilder(Config, ABC):
 
 @final
 class SampleRows(RowBuilder):
-    """Every sample is a row."""
+    """The samples themselves as rows."""
 
     sequential: ClassVar[bool] = False
     kind: Literal["least_squares"] = "least_squares"
 
     def rows(self, sampled: Rows, step: float, exact: np.ndarray) -> Rows:
-        """The samples; see `RowBuilder.rows`."""
+        """Return the samples; see `RowBuilder.rows`."""
         return sampled
 
 
 @final
 class WeakRows(RowBuilder):
-    """Both sides integrated over windows against (1 - s^2)^2, s from -1 to 1 (weak form; Bortz,
-    Messenger and others, 2021).
+    """The weak form: both sides integrated over windows (Bortz, Messenger and others, 2021).
+
+    The weight is (1 - s^2)^2, s from -1 to 1.
 
     Attributes:
         window: length of a window.
@@ -84,14 +85,15 @@ class WeakRows(RowBuilder):
     every: float = Field(default=0.05, gt=0.0, le=1.0)
 
     def rows(self, sampled: Rows, step: float, exact: np.ndarray) -> Rows:
-        """One row for each window; see `RowBuilder.rows`."""
+        """Return one row for each window; see `RowBuilder.rows`."""
         return integrated(sampled, step, self.window, self.every)
 
 
 @final
 class InstrumentRows(RowBuilder):
-    """Regressors projected on instruments, the terms one and two lags earlier and the exact terms
-    (two-stage least squares).
+    """The regressors projected on instruments (two-stage least squares).
+
+    Instruments are the terms one and two lags earlier and the exact terms.
 
     Attributes:
         lag: longer than noise stays correlated, shorter than the motion takes to change.
@@ -106,7 +108,7 @@ class InstrumentRows(RowBuilder):
     every: float = Field(default=0.05, gt=0.0, le=1.0)
 
     def rows(self, sampled: Rows, step: float, exact: np.ndarray) -> Rows:
-        """Rows with projected terms; see `RowBuilder.rows`."""
+        """Return rows with projected terms; see `RowBuilder.rows`."""
         if self.window > 0:
             apart = max(round(self.every * self.window / step), 1) * step
             sampled, step = integrated(sampled, step, self.window, self.every), apart
@@ -139,8 +141,9 @@ RowsConfig = Annotated[SampleRows | WeakRows | InstrumentRows, Field(discriminat
 
 
 def integrated(sampled: Rows, step: float, window: float, every: float) -> Rows:
-    """Weighted sums over windows of `window` seconds within each stretch, scaled so that a constant
-    keeps its value.
+    """Return weighted sums over windows of `window` seconds within each stretch.
+
+    They are scaled so that a constant keeps its value.
 
     Raises:
         ConfigError: where a window holds fewer than three samples.
@@ -176,7 +179,7 @@ def integrated(sampled: Rows, step: float, window: float, every: float) -> Rows:
 
 
 def stretches(group: np.ndarray, t: np.ndarray, step: float) -> np.ndarray:
-    """Number of the unbroken stretch of each sample [N], ascending from 0.
+    """Return the number of the unbroken stretch of each sample [N], ascending from 0.
 
     Args:
         group: manoeuvre of each sample [N], ascending.
@@ -188,7 +191,7 @@ def stretches(group: np.ndarray, t: np.ndarray, step: float) -> np.ndarray:
 
 
 def step_of(group: np.ndarray, t: np.ndarray) -> float:
-    """Time between samples: the median distance of neighbours in one manoeuvre, s.
+    """Return the time between samples: the median distance of neighbours in one manoeuvre, s.
 
     Raises:
         FitError: where no manoeuvre has two samples.
@@ -202,8 +205,7 @@ def step_of(group: np.ndarray, t: np.ndarray) -> float:
 
 
 def correlation_time(residual: np.ndarray) -> np.ndarray:
-    """How many neighbouring rows say together what one independent row would, [K], at least 1, from
-    residuals [N, K].
+    """Return how many neighbouring rows tell as much as one independent row, [K], at least 1.
 
     1 + 2 sum rho over the first lags until rho is negative (initial positive sequence).
     """

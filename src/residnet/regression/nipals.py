@@ -1,6 +1,4 @@
-"""NIPALS as document 002 prints it (section 3.3.1) with ERRATA J14-J17, for comparison with the
-kernel algorithm.
-"""
+"""NIPALS as document 002 prints it (section 3.3.1) with ERRATA J14-J17."""
 
 from __future__ import annotations
 
@@ -14,7 +12,7 @@ from residnet.regression.pls_path import LEAST_ENERGY
 def nipals(
     e: Tensor, f: Tensor, orders: int, tolerance: float = 1e-12, iterations: int = 50_000
 ) -> Tensor:
-    """Theta_pre [A, J, K] for every order up to `orders`.
+    """Return Theta_pre [A, J, K] for every order up to `orders`.
 
     Args:
         e: centred, scaled inputs [N, J].

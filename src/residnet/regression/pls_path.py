@@ -12,8 +12,9 @@ are sums of others, without a meaning.
 
 
 def pls_path(xx: Tensor, xy: Tensor, orders: int) -> Tensor:
-    """Regression coefficients of PLS2 for every order up to `orders`, [A, J, K], by the kernel
-    algorithm of Dayal and MacGregor (1997).
+    """Return coefficients of PLS2 for every order up to `orders`, [A, J, K].
+
+    The kernel algorithm is that of Dayal and MacGregor (1997).
 
     Args:
         xx: X'X of centred, scaled columns [J, J].

@@ -73,18 +73,18 @@ class Solution:
 
     @property
     def coefficients(self) -> Tensor:
-        """Coefficients [J, n] of a linear solution."""
+        """Return the coefficients [J, n] of a linear solution."""
         return self.state["coefficients"]
 
     @property
     def intercept(self) -> Tensor:
-        """Intercept [n] of a linear solution, zeros where it has none."""
+        """Return the intercept [n] of a linear solution, zeros where it has none."""
         zero = self.coefficients.new_zeros(self.coefficients.shape[1])
         return self.state.get("intercept", zero)
 
     @property
     def errors(self) -> Tensor:
-        """Standard errors of the coefficients [J, n].
+        """Return the standard errors of the coefficients [J, n].
 
         Raises:
             ValueError: where the fit knows none.

@@ -1,5 +1,6 @@
-"""Sparse regression: the few candidate columns, out of many, that make up a target exactly or as
-well as the data can tell.
+"""Sparse regression: the few candidate columns, out of many, that make up a target.
+
+They do so exactly, or as well as the data can tell.
 
 Everything works on one QR factorisation of [candidates | targets]: columns that the data cannot
 tell from simpler ones are set aside, then orthogonal forward regression, backward elimination and
@@ -34,7 +35,7 @@ Raftery 1995).
 
 
 class SearchConfig(Config):
-    """How far the search goes.
+    """The extent of a sparse search.
 
     Attributes:
         max_terms: most terms of an equation on the way of the search; the result usually has fewer.
@@ -56,7 +57,7 @@ class SearchConfig(Config):
 
 @dataclass(frozen=True)
 class Reduced:
-    """Candidates and targets in the coordinates of one QR factorisation.
+    """The candidates and targets in the coordinates of one QR factorisation.
 
     Attributes:
         names: the J candidates that the data tell apart, simplest first.
@@ -86,7 +87,7 @@ class Reduced:
 
 @dataclass(frozen=True)
 class Equation:
-    """One target as a sum of few terms.
+    """A target as a sum of few terms.
 
     Attributes:
         terms: names, simplest first.
@@ -113,7 +114,10 @@ class Equation:
     undecided: dict[str, float]
 
     def summary(self, within: Reduced) -> dict[str, Any]:
-        """What the data say about it, among the candidates that were searched: for fit.json."""
+        """Return what the data say about the equation, for fit.json.
+
+        It holds among the candidates that were searched.
+        """
         return {
             "error_share": self.share,
             "exact": self.exact,
@@ -136,8 +140,9 @@ def reduce(
     degree: Sequence[int],
     effort: Sequence[float] = (),
 ) -> Reduced:
-    """One QR factorisation of candidates and targets, with columns that simpler ones make up set
-    aside.
+    """Return candidates and targets by one QR factorisation.
+
+    Columns that simpler ones make up are set aside.
 
     Args:
         x: candidate columns [N, J].
@@ -195,8 +200,9 @@ def reduce(
 
 
 def coarser(reduced: Reduced, resolution: float) -> Reduced:
-    """The same without the candidates that differ from simpler ones by no more than a share of
-    their length.
+    """Return the same without the candidates that hardly differ from simpler ones.
+
+    They differ by no more than a share of their length.
     """
     kept, dependent = _independent(reduced.r, reduced.names, reduced.scale, resolution)
     rows = triangle(np.concatenate((reduced.r[:, kept], reduced.y), axis=1))
@@ -215,14 +221,14 @@ def coarser(reduced: Reduced, resolution: float) -> Reduced:
 
 
 def triangle(x: np.ndarray) -> np.ndarray:
-    """R of the QR factorisation of columns [N, J]: [J, J]."""
+    """Return R of the QR factorisation of columns [N, J]: [J, J]."""
     return np.asarray(np.linalg.qr(x, mode="r"))
 
 
 def _independent(
     r: np.ndarray, names: Sequence[str], scale: np.ndarray, least: float
 ) -> tuple[list[int], dict[str, dict[str, float]]]:
-    """Columns of the triangle that simpler ones do not make up, and what makes up the others."""
+    """Return the columns that simpler ones do not make up, and what makes up the others."""
     kept = list(range(len(names)))
     while True:
         beside = np.abs(np.diagonal(triangle(r[:, kept])))
@@ -245,8 +251,9 @@ def _independent(
 
 
 def find(reduced: Reduced, target: int, config: SearchConfig) -> tuple[Equation, Reduced]:
-    """The equation of one target, and the candidates that it was searched in: fewer where noise
-    hides what sets some apart.
+    """Return the equation of one target, and the candidates that it was searched in.
+
+    These are fewer where noise hides what sets some apart.
 
     Args:
         reduced: candidates and targets.
@@ -266,7 +273,7 @@ def find(reduced: Reduced, target: int, config: SearchConfig) -> tuple[Equation,
 
 
 def _search(reduced: Reduced, target: int, config: SearchConfig) -> Equation:
-    """The best equation.
+    """Return the best equation.
 
     Degrees are searched in turn, simplest first, until one explains the target exactly; otherwise
     the criterion, which knows how many candidates each had to choose from, decides between them.
@@ -293,7 +300,7 @@ def _search(reduced: Reduced, target: int, config: SearchConfig) -> Equation:
 
 
 def _told(reduced: Reduced, target: int, search: Search, chosen: list[int], stage: int) -> Equation:
-    """The equation of the chosen columns, with what stands beside it."""
+    """Return the equation of the chosen columns, with what stands beside it."""
     chosen = sorted(chosen)
     y, rule = reduced.y[:, target], search.rule
     rss = search.rss(chosen)
@@ -316,7 +323,7 @@ def _told(reduced: Reduced, target: int, search: Search, chosen: list[int], stag
 
 
 def _alternatives(search: Search, chosen: list[int], names: np.ndarray) -> dict[str, list[str]]:
-    """Term -> candidates in whose favour or against which the data do not decide."""
+    """Return by term the candidates between which and it the data do not decide."""
     limit = search.rule.value(search.rss(chosen), len(chosen)) + _EVIDENCE
     table = search.rule.value(swap_table(search.r, search.y, chosen), len(chosen))
     out: dict[str, list[str]] = {}
@@ -332,8 +339,9 @@ def _alternatives(search: Search, chosen: list[int], names: np.ndarray) -> dict[
 def _undecided(
     search: Search, chosen: list[int], names: np.ndarray, spread: float
 ) -> dict[str, float]:
-    """Candidates whose coefficient the data leave so open that they could matter: the share of the
-    target within two standard errors.
+    """Return the candidates whose coefficient the data leave so open that they could matter.
+
+    Each has the share of the target within two standard errors.
     """
     left = search.left_over(chosen)
     length = np.linalg.norm(left.columns, axis=0)

@@ -1,6 +1,4 @@
-"""The search for a sparse solution on the factor of one QR: forward, backward, and swaps that leave
-the model shorter.
-"""
+"""The search for a sparse solution on one QR factor: forward, backward, and swaps."""
 
 from __future__ import annotations
 
@@ -22,8 +20,9 @@ _PAIR_CANDIDATES = 40
 
 
 class Criterion(NamedTuple):
-    """Extended BIC of k terms out of `candidates`; an error below `precision` of the target is no
-    better than none.
+    """The extended BIC of k terms out of `candidates`.
+
+    An error below `precision` of the target is no better than none.
     """
 
     samples: float
@@ -33,7 +32,7 @@ class Criterion(NamedTuple):
     precision: float
 
     def value(self, rss: np.ndarray | float, terms: int) -> np.ndarray:
-        """Criterion of models with `terms` terms and residual sums of squares `rss`."""
+        """Return the criterion of models with `terms` terms and residual sums of squares `rss`."""
         share = np.maximum(np.asarray(rss), 0.0) / self.energy + self.precision**2
         room = max(self.candidates, terms)
         ways = gammaln(room + 1) - gammaln(terms + 1) - gammaln(room - terms + 1)
@@ -42,20 +41,21 @@ class Criterion(NamedTuple):
         )
 
     def exact(self, rss: float) -> bool:
-        """Whether a fit is as good as arithmetic allows."""
+        """Return whether a fit is as good as arithmetic allows."""
         return rss <= (2.0 * self.precision) ** 2 * self.energy
 
 
 class LeftOver(NamedTuple):
-    """What chosen columns leave of all columns [R, J] and of the target [R]."""
+    """The remainder of all columns [R, J] and of the target [R] beside chosen columns."""
 
     columns: np.ndarray
     target: np.ndarray
 
 
 def coefficients(r: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Least-squares coefficients [p] of columns [R, p], and the inverse of their triangle [p, p],
-    whose rows give standard errors.
+    """Return least-squares coefficients [p] of columns [R, p], and their triangle's inverse.
+
+    The rows of the inverse [p, p] give standard errors.
     """
     q, triangle = np.linalg.qr(r)
     inverse = np.linalg.inv(triangle) if triangle.size else triangle
@@ -64,7 +64,7 @@ def coefficients(r: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @final
 class Search:
-    """Search of one target [R] in columns of unit length [R, J]."""
+    """A search of one target [R] in columns of unit length [R, J]."""
 
     def __init__(self, r: np.ndarray, y: np.ndarray, rule: Criterion, max_terms: int) -> None:
         self.r = r
@@ -73,7 +73,7 @@ class Search:
         self.max_terms = min(max_terms, r.shape[1])
 
     def rss(self, chosen: Sequence[int]) -> float:
-        """Residual sum of squares of the chosen columns."""
+        """Return the residual sum of squares of the chosen columns."""
         q = np.linalg.qr(self.r[:, list(chosen)])[0]
         left = self.y - q @ (q.T @ self.y)
         # once more: what the first projection rounded away
@@ -81,11 +81,11 @@ class Search:
         return float(left @ left)
 
     def value(self, chosen: Sequence[int]) -> float:
-        """Criterion of the chosen columns."""
+        """Return the criterion of the chosen columns."""
         return float(self.rule.value(self.rss(chosen), len(chosen)))
 
     def left_over(self, chosen: Sequence[int]) -> LeftOver:
-        """What the chosen columns leave."""
+        """Return what the chosen columns leave."""
         q = np.linalg.qr(self.r[:, list(chosen)])[0]
         columns, target = self.r, self.y
         for _ in range(2):
@@ -93,8 +93,9 @@ class Search:
         return LeftOver(columns, target)
 
     def start(self) -> tuple[float, list[int]]:
-        """Criterion and columns of the better of two ways: forward and back again, and back from
-        all columns where there are enough samples.
+        """Return criterion and columns of the better of two ways.
+
+        Forward and back again, and back from all columns where there are enough samples.
         """
         ways = [self.backward(self.forward())]
         if self.rule.samples > 4 * self.r.shape[1]:
@@ -102,8 +103,9 @@ class Search:
         return min(ways)
 
     def forward(self) -> list[int]:
-        """Columns in the order of orthogonal forward regression, until the fit is exact or
-        `max_terms` are chosen.
+        """Return columns in the order of orthogonal forward regression.
+
+        It ends when the fit is exact or `max_terms` are chosen.
 
         Each step takes the column that lessens the error most beside those chosen, and takes its
         direction out of all others, twice, so that nearly collinear columns keep their digits.
@@ -131,8 +133,9 @@ class Search:
         return chosen
 
     def backward(self, chosen: list[int]) -> tuple[float, list[int]]:
-        """Best criterion on the way from the chosen columns to none, dropping the least useful one
-        at a time (a tenth at a time while many).
+        """Return the best criterion on the way from the chosen columns to none, and its columns.
+
+        The least useful one is dropped at a time (a tenth at a time while many).
         """
         chosen = list(chosen)
         best: tuple[float, list[int]] = (float(self.rule.value(float(self.y @ self.y), 0)), [])
@@ -151,8 +154,10 @@ class Search:
         return best
 
     def refine(self, chosen: list[int], swaps: int) -> list[int]:
-        """Swaps until none betters the criterion, each k chosen columns for k others, k - 1 or (k =
-        0) one more; every gain is trimmed backward.
+        """Return the columns after swaps, until none betters the criterion.
+
+        Each swaps k chosen columns for k others, k - 1 or (k = 0) one more; every gain is trimmed
+        backward.
         """
         value = self.value(chosen)
         again = True
@@ -172,7 +177,7 @@ class Search:
         return chosen
 
     def _swapped(self, chosen: list[int], out: int, into: int) -> tuple[float, list[int]] | None:
-        """The best of all swaps of `out` chosen columns for `into` others, judged exactly."""
+        """Return the best swap of `out` chosen columns for `into` others, judged exactly."""
         gone = list(combinations(chosen, out))
         kept = np.array([[c for c in chosen if c not in away] for away in gone], dtype=int).reshape(
             len(gone), len(chosen) - out
@@ -199,8 +204,9 @@ class Search:
 
 
 def swap_table(r: np.ndarray, y: np.ndarray, chosen: list[int]) -> np.ndarray:
-    """Residual sums of squares [p, J] with each chosen column replaced by each other one; infinite
-    where it adds nothing.
+    """Return sums of squares [p, J] with each chosen column replaced by each other one.
+
+    They are infinite where it adds nothing.
     """
     if not chosen:
         return np.zeros((0, r.shape[1]))
@@ -213,7 +219,7 @@ def swap_table(r: np.ndarray, y: np.ndarray, chosen: list[int]) -> np.ndarray:
 
 
 def _projected(r: np.ndarray, y: np.ndarray, kept: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """All columns [M, R, J] and the target [M, R] beside each of M sets of columns [M, p]."""
+    """Return all columns [M, R, J] and the target [M, R] beside each of M sets of columns."""
     if kept.shape[1] == 0:
         return np.repeat(r[None], len(kept), axis=0), np.repeat(y[None], len(kept), axis=0)
     q = np.linalg.qr(r.T[kept].transpose(0, 2, 1))[0]
@@ -223,7 +229,7 @@ def _projected(r: np.ndarray, y: np.ndarray, kept: np.ndarray) -> tuple[np.ndarr
 
 
 def _single_gains(columns: np.ndarray, target: np.ndarray, kept: np.ndarray) -> np.ndarray:
-    """What each column [M, J] takes from the error; -1 where it is chosen or adds nothing."""
+    """Return what each column [M, J] takes from the error; -1 where it adds nothing."""
     square = np.square(columns).sum(axis=1)
     usable = square > _ALIKE**2
     np.put_along_axis(usable, kept, False, axis=1)
@@ -239,7 +245,7 @@ def _best_single(gains: np.ndarray) -> tuple[float, tuple[int, ...]]:
 def _best_pair(
     columns: np.ndarray, target: np.ndarray, gains: np.ndarray
 ) -> tuple[float, tuple[int, ...]]:
-    """The pair of columns that takes most from the error, among the best single ones."""
+    """Return the pair of columns that takes most from the error, among the best single ones."""
     tried = np.argsort(gains)[::-1][:_PAIR_CANDIDATES]
     tried = tried[gains[tried] >= 0]
     if tried.size < 2:

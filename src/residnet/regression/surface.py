@@ -1,5 +1,6 @@
-"""Surface analysis (document 002 section 4.5): how good PLSR is by model order and number of basis
-functions, the weakest removed one by one.
+"""Surface analysis: PLSR by model order and number of basis functions.
+
+The weakest basis functions are removed one by one (document 002 section 4.5).
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from residnet.regression.pls_path import LEAST_ENERGY
 
 @dataclass(frozen=True)
 class Surface:
-    """Errors over orders and numbers of basis functions, for each output by itself.
+    """The errors over orders and numbers of basis functions, for each output by itself.
 
     Attributes:
         error: mean squared error [K, A, J + 1] of output k with a + 1 latent variables and j basis
@@ -33,23 +34,23 @@ class Surface:
     removal: Tensor
 
     def kept(self, output: int, order: int, count: int) -> list[int]:
-        """Numbers of the `count` basis functions left at model order `order` (from 1) for one
-        output.
-        """
+        """Return the `count` basis functions left for an output at model order `order` (from 1)."""
         gone = self.removal[output, order - 1, : self.removal.shape[2] - count].tolist()
         return [j for j in range(self.removal.shape[2]) if j not in gone]
 
     def least(self, output: int) -> tuple[int, int]:
-        """(order, count) of the least error of one output: the document's choice; optimistic where
-        its folds also judge the result.
+        """Return (order, count) of the least error of one output: the document's choice.
+
+        It is optimistic where its folds also judge the result.
         """
         flat = torch.nan_to_num(self.error[output], nan=torch.inf).flatten()
         a, j = divmod(int(flat.argmin()), self.error.shape[2])
         return a + 1, j
 
     def simplest(self, output: int) -> tuple[int, int]:
-        """(order, count) of the lowest order, then the most basis functions, whose error is within
-        one standard error of the least.
+        """Return the lowest (order, count) within one standard error of the least.
+
+        Of the lowest order it has the most basis functions.
 
         The least cross-validated error of some 450 models is partly luck, and high orders on few
         near-collinear columns explode elsewhere (Breiman's one-standard-error rule; a low order
@@ -65,7 +66,7 @@ class Surface:
 
 
 def surface(moments: FoldMoments, test: Sequence[int] = (), orders: int | None = None) -> Surface:
-    """All models of the surface from moments alone, in one batch over outputs and orders.
+    """Return all models of the surface from moments alone, in one batch.
 
     At every model order the basis function with the least |coefficient| on standardised columns is
     removed, until the order or two are left.
@@ -104,8 +105,9 @@ def surface(moments: FoldMoments, test: Sequence[int] = (), orders: int | None =
 
 @dataclass(frozen=True)
 class _Problems:
-    """Standardised normal equations: the first is fitted on all that may be used, the others on
-    that less one fold each.
+    """The standardised normal equations.
+
+    The first is fitted on all that may be used, the others on that less one fold each.
 
     gram [P, J, J], covariance [P, J, K], scale and mean of the columns [P, J], mean of the outputs
     [P, K]; `judged` are the sums [P', 1 + J + K, 1 + J + K] that the last P' problems are judged
@@ -121,6 +123,7 @@ class _Problems:
 
     @classmethod
     def gather(cls, moments: FoldMoments, test: Sequence[int]) -> _Problems:
+        """Return the problems of moments by fold, judged on the folds `test` or on each in turn."""
         total = moments.sums.sum(0)
         apart = moments.sums[list(test)].sum(0) if test else total * 0.0
         used = [total - apart] + (
@@ -155,8 +158,9 @@ class _Problems:
         )
 
     def coefficients(self, mask: Tensor, axis: Tensor, order: Tensor) -> Tensor:
-        """PLS1 coefficients on standardised columns [P, J, C] of C models: their basis functions
-        [J, C], outputs [C] and orders [C], ascending.
+        """Return PLS1 coefficients on standardised columns [P, J, C] of C models.
+
+        Their basis functions are [J, C], outputs [C] and orders [C], ascending.
 
         Kernel algorithm of Dayal and MacGregor (1997) with one output, all models at once; a model
         is left alone once its order is reached.
@@ -196,9 +200,7 @@ class _Problems:
         return b
 
     def errors(self, coefficients: Tensor, axis: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean squared error [C] over the samples judged on, and its standard error over the folds
-        [C].
-        """
+        """Return the mean squared error [C] where judged, and its standard error over folds [C]."""
         count, j = len(self.judged), self.gram.shape[1]
         slope = coefficients[-count:] / self.scale[-count:, :, None]
         intercept = self.mean_y[-count:][:, axis] - (self.mean_x[-count:, :, None] * slope).sum(1)

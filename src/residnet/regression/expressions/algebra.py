@@ -1,5 +1,6 @@
-"""Expressions in normal form: sums of products of channels and of functions of such sums, equal
-expressions being equal objects.
+"""Expressions in normal form: sums of products of channels and of functions of such sums.
+
+Equal expressions are equal objects.
 
 Genetic programming breeds trees; what a tree means is the sum of products that it comes to, whose
 terms get a coefficient each (document 000 sections 5.1.1 and 5.1.3). Here every product is a tuple
@@ -27,8 +28,10 @@ ONE: Product = ()
 
 
 class Limits(NamedTuple):
-    """What an expression may be: terms of a sum, factors of a product, functions inside functions,
-    whether sums are multiplied out.
+    """The limits of an expression.
+
+    Terms of a sum, factors of a product, functions inside functions, and whether sums are
+    multiplied out.
     """
 
     terms: int = 50
@@ -51,8 +54,9 @@ class Atom(NamedTuple):
 
 
 class Algebra:
-    """Sums of products over named channels, kept in normal form: |a|^2 = a^2, |a b| = |a| |b|,
-    cos(-a) = cos a, sin(-a) = -sin a.
+    """The sums of products over named channels, kept in normal form.
+
+    |a|^2 = a^2, |a b| = |a| |b|, cos(-a) = cos a, sin(-a) = -sin a.
     """
 
     def __init__(self, channels: Sequence[str], limits: Limits = Limits()) -> None:  # noqa: B008 (immutable)
@@ -63,11 +67,11 @@ class Algebra:
         self._products: dict[tuple[Product, Product], Product] = {}
 
     def channel(self, name: str) -> Sum:
-        """A channel alone."""
+        """Return a channel alone."""
         return {(self.channels.index(name),): 1.0}
 
     def add(self, a: Sum, b: Sum, sign: float = 1.0) -> Sum:
-        """a + sign b.
+        """Return a + sign b.
 
         Raises:
             TooLargeError: beyond the limits.
@@ -82,7 +86,7 @@ class Algebra:
         return self._bounded(out)
 
     def multiply(self, a: Sum, b: Sum) -> Sum:
-        """a b, multiplied out or as a product of brackets.
+        """Return a b, multiplied out or as a product of brackets.
 
         Raises:
             TooLargeError: beyond the limits.
@@ -99,7 +103,7 @@ class Algebra:
         return self._bounded({product: weight for product, weight in out.items() if weight != 0.0})
 
     def apply(self, function: Function, a: Sum) -> Sum:
-        """A function of a sum.
+        """Return a function of a sum.
 
         Raises:
             TooLargeError: beyond the limits.
@@ -115,7 +119,7 @@ class Algebra:
         return self._signed(function, a)
 
     def bracket(self, a: Sum) -> Sum:
-        """A sum of several terms as one factor."""
+        """Return a sum of several terms as one factor."""
         if len(a) <= 1:
             return a
         lead = a[min(a)]
@@ -124,7 +128,7 @@ class Algebra:
         }
 
     def atom(self, function: Function, a: Sum) -> int:
-        """The number of a function of a sum in normal form."""
+        """Return the number of a function of a sum in normal form."""
         nesting = 1 + max([self.atoms[i].nesting for product in a for i in product], default=0)
         atom = Atom("", function, tuple(sorted(a.items())), nesting)
         if atom not in self._number:
@@ -133,7 +137,7 @@ class Algebra:
         return self._number[atom]
 
     def degree(self, product: Product) -> int:
-        """Factors of a product, with those inside its functions."""
+        """Return the number of factors of a product, with those inside its functions."""
         return sum(
             max([self.degree(p) for p, _ in self.atoms[i].inner], default=1)
             + bool(self.atoms[i].nesting)
@@ -141,13 +145,13 @@ class Algebra:
         )
 
     def effort(self, product: Product) -> float:
-        """How complicated a product is among those of its degree."""
+        """Return how complicated a product is among those of its degree."""
         return len(set(product)) + sum(
             0.5 + 0.1 * len(self.atoms[i].inner) for i in product if self.atoms[i].inner
         )
 
     def _signed(self, function: Function, a: Sum) -> Sum:
-        """With the first weight of the inner sum positive, where the function is even or odd."""
+        """Return the sum with a positive first weight, where the function is even or odd."""
         if a[min(a)] > 0:
             return {self._function(function, a): 1.0}
         turned = {product: -weight for product, weight in a.items()}
@@ -185,7 +189,7 @@ class Algebra:
         return self._products[key]
 
     def _normal(self, factors: list[int]) -> Product:
-        """Ascending, with squares of magnitudes as squares."""
+        """Return the product in ascending order, with squares of magnitudes as squares."""
         out = sorted(factors)
         for i in {i for i in out if self.atoms[i].function == "abs" and out.count(i) > 1}:
             inner = self.atoms[i].inner
@@ -206,8 +210,9 @@ class Algebra:
         return a
 
     def values(self, products: Sequence[Product], data: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Values [P, N] of products at channels [N] each; infinite or not a number where they
-        overflow.
+        """Return the values [P, N] of products at channels [N] each.
+
+        They are infinite or not a number where they cannot be had.
         """
         columns = Columns(self, data)
         return columns.of(products)
@@ -223,7 +228,7 @@ class Columns:
         self._row = {i: i + 1 for i in range(len(rows))}
 
     def of(self, products: Sequence[Product]) -> np.ndarray:
-        """Values [P, N] of products."""
+        """Return the values [P, N] of products."""
         self._prepare({i for product in products for i in product})
         depth = max([len(product) for product in products], default=0)
         index = np.array(
@@ -257,7 +262,7 @@ class Columns:
 
 
 def values_of(function: Function, x: np.ndarray) -> np.ndarray:
-    """A function of values."""
+    """Return a function of values."""
     return np.asarray(_VALUES[function](x))
 
 

@@ -44,7 +44,7 @@ class Written(NamedTuple):
 
 
 def plain(equation: Written) -> str:
-    """`u_dot = 0.0002026 tau_x - 0.0101 u`, six digits; terms as in the term language."""
+    """Return `u_dot = 0.0002026 tau_x - 0.0101 u`, six digits; terms as in the term language."""
     parts = [
         PLAIN.number(abs(v)) + ("" if t == "1" else f" {t}")
         for t, v in zip(equation.terms, equation.values, strict=True)
@@ -53,20 +53,22 @@ def plain(equation: Written) -> str:
 
 
 def latex(equation: Written) -> str:
-    """LaTeX with six digits, names with more than one letter upright."""
+    """Return LaTeX with six digits, names with more than one letter upright."""
     return f"{latex_left(equation.name)} = " + signed_sum(_parts(equation, LATEX), equation.values)
 
 
 def sympy_text(equation: Written) -> str:
-    """The right side as text that `sympy.sympify` reads, all digits; SymPy itself is not needed to
-    write it.
+    """Return the right side as text that `sympy.sympify` reads, all digits.
+
+    SymPy itself is not needed to write it.
     """
     return signed_sum(_parts(equation, SYMPY), equation.values)
 
 
 def c_function(equation: Written, comment: str = "") -> str:
-    """A C99 function `double <name>(double <channel>, ...)` with all channels as arguments, all
-    digits; needs <math.h>.
+    """Return a C99 function `double <name>(double <channel>, ...)`, all digits.
+
+    It has all channels as arguments and needs <math.h>.
     """
     used = {factor.channel for factors in equation.factors for factor in factors}
     value = signed_sum(_parts(equation, C), equation.values) if equation.terms else "0.0"
@@ -74,7 +76,7 @@ def c_function(equation: Written, comment: str = "") -> str:
 
 
 def _parts(equation: Written, style: Style) -> list[str]:
-    """Magnitudes of the coefficients times factors."""
+    """Return magnitudes of the coefficients times factors."""
     return [
         style.times.join(
             [

@@ -1,5 +1,6 @@
-"""Values of found expressions: products of channels and of functions of sums, as tables that a
-saved model carries and TorchScript runs.
+"""Values of found expressions, as tables that a saved model carries and TorchScript runs.
+
+Expressions are products of channels and of functions of sums.
 """
 
 from __future__ import annotations
@@ -16,8 +17,9 @@ _ROOT_FLOOR = 1e-24
 
 
 class Table(nn.Module):
-    """A module whose buffers take the shapes of what is loaded: how many terms an equation has is
-    known only from the data.
+    """A module whose buffers take the shapes of what is loaded.
+
+    How many terms an equation has is known only from the data.
     """
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
@@ -29,7 +31,7 @@ class Table(nn.Module):
 
 
 class Products(Table):
-    """Products of columns: [..., C] -> [..., P], gathered by index [D, P]; column 0 is one."""
+    """The products of columns: [..., C] -> [..., P], gathered by index [D, P]; column 0 is one."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -38,11 +40,11 @@ class Products(Table):
 
     @torch.jit.unused
     def products(self, place: Mapping[int, int]) -> list[Product]:
-        """Numbers of atoms of each product, from those of the columns."""
+        """Return the atoms of each product, from those of the columns."""
         return [tuple(sorted(place[i] for i in column if i)) for column in self.index.T.tolist()]
 
     def forward(self, columns: Tensor) -> Tensor:
-        """Products [..., P]."""
+        """Return the products [..., P]."""
         out = columns.index_select(-1, self.index[0])
         for d in range(1, self.index.shape[0]):
             out = out * columns.index_select(-1, self.index[d])
@@ -50,7 +52,7 @@ class Products(Table):
 
 
 class Functions(Table):
-    """Columns with K functions of sums beside them: f_k(sum_m weight_km product_km)."""
+    """The columns with K functions of sums beside them: f_k(sum_m weight_km product_km)."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -62,7 +64,7 @@ class Functions(Table):
         self.root_floor = _ROOT_FLOOR
 
     def forward(self, columns: Tensor) -> Tensor:
-        """[..., C] -> [..., C + K]."""
+        """Return [..., C + K] for columns [..., C]."""
         if self.weight.shape[0] == 0:
             return columns
         s = (
@@ -81,8 +83,9 @@ class Functions(Table):
 
 
 class ExpressionLibrary(nn.Module):
-    """Values of J terms from channels: [..., F] -> [..., J]; functions of functions one level after
-    the other.
+    """The values of J terms from channels: [..., F] -> [..., J].
+
+    Functions of functions follow one level after the other.
     """
 
     def __init__(self, nesting: int) -> None:
@@ -92,7 +95,7 @@ class ExpressionLibrary(nn.Module):
 
     @torch.jit.unused
     def read(self, channels: Sequence[str]) -> tuple[Algebra, list[Product]]:
-        """The terms again, for channels by name: `tables` backwards."""
+        """Return the terms again, for channels by name: `tables` backwards."""
         algebra = Algebra(channels, Limits(nesting=len(self.levels)))
         place: dict[int, int] = {i + 1: i for i in range(len(channels))}
         for level in self.levels:
@@ -113,7 +116,7 @@ class ExpressionLibrary(nn.Module):
         return algebra, self.terms.products(place)
 
     def forward(self, z: Tensor) -> Tensor:
-        """Channels [..., F] -> terms [..., J]."""
+        """Return the terms [..., J] at channels [..., F]."""
         columns = torch.cat((torch.ones_like(z[..., :1]), z), dim=-1)
         for level in self.levels:
             columns = level(columns)
@@ -122,7 +125,7 @@ class ExpressionLibrary(nn.Module):
 
 
 class Weights(Table):
-    """Coefficients [J, 3] of the terms on each axis."""
+    """The coefficients [J, 3] of the terms on each axis."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -131,8 +134,9 @@ class Weights(Table):
 
 
 def tables(algebra: Algebra, terms: Sequence[Product], nesting: int) -> dict[str, Tensor]:
-    """State of an `ExpressionLibrary` of these terms: all functions that they need, innermost
-    first.
+    """Return the state of an `ExpressionLibrary` of these terms.
+
+    It has all functions that they need, innermost first.
     """
     used = _used(algebra, terms)
     place = {i: i + 1 for i in range(len(algebra.channels))}
@@ -159,7 +163,7 @@ def tables(algebra: Algebra, terms: Sequence[Product], nesting: int) -> dict[str
 
 
 def _used(algebra: Algebra, products: Sequence[Product]) -> list[int]:
-    """Functions that products need, at any level."""
+    """Return the functions that products need, at any level."""
     found: set[int] = set()
     left = {i for product in products for i in product}
     while left:

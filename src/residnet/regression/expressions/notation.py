@@ -1,5 +1,6 @@
-"""How formulas are written: plain text, LaTeX, SymPy and C, one table of functions for equations of
-terms and for bred expressions.
+"""How formulas are written: plain text, LaTeX, SymPy and C.
+
+One table of functions serves equations of terms and bred expressions.
 """
 
 from __future__ import annotations
@@ -10,8 +11,10 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Style:
-    """How to write: numbers, channels, powers (positive, or negative for a divisor), what stands
-    between factors, and functions of what is within.
+    """A way to write formulas.
+
+    Numbers, channels, powers (positive, or negative for a divisor), what stands between factors,
+    and functions of what is within.
     """
 
     number: Callable[[float], str]
@@ -22,9 +25,7 @@ class Style:
 
 
 def signed_sum(parts: Sequence[str], values: Sequence[float]) -> str:
-    """Parts that are written without sign, joined by the signs of their values; `0` where there are
-    none.
-    """
+    """Return parts written without sign, joined by the signs of their values; `0` for none."""
     out = "".join(
         (" - " if value < 0 else " + ") + part for part, value in zip(parts, values, strict=True)
     )
@@ -34,8 +35,9 @@ def signed_sum(parts: Sequence[str], values: Sequence[float]) -> str:
 def c_body(
     name: str, channels: Sequence[str], used: Sequence[str], value: str, comment: str = ""
 ) -> str:
-    """A C99 function `double <name>(double <channel>, ...)` that returns `value`, with all channels
-    as arguments; needs <math.h>.
+    """Return a C99 function `double <name>(double <channel>, ...)` that returns `value`.
+
+    It has all channels as arguments and needs <math.h>.
     """
     unused = "".join(f"    (void){channel};\n" for channel in channels if channel not in used)
     note = f"/* {comment} */\n" if comment else ""
@@ -47,7 +49,7 @@ def c_body(
 
 
 def latex_name(name: str) -> str:
-    """A channel in LaTeX, names with more than one letter upright."""
+    """Return a channel in LaTeX, names with more than one letter upright."""
     head, _, foot = name.partition("_")
     greek = head in ("tau", "delta", "psi", "phi", "eta", "nu")
     symbol = f"\\{head}" if greek else head if len(head) == 1 else rf"\mathrm{{{head}}}"
@@ -55,7 +57,7 @@ def latex_name(name: str) -> str:
 
 
 def latex_left(name: str) -> str:
-    """The left side of an equation; `u_dot` gets its dot."""
+    """Return the left side of an equation; `u_dot` gets its dot."""
     base, dot, _ = name.rpartition("_dot")
     return rf"\dot{{{latex_name(base)}}}" if dot else latex_name(name)
 

@@ -1,5 +1,6 @@
-"""Found expressions in writing: plain text, LaTeX, SymPy and C, for terms with functions of sums as
-well.
+"""Found expressions in writing: plain text, LaTeX, SymPy and C.
+
+Terms may have functions of sums.
 """
 
 from __future__ import annotations
@@ -11,8 +12,9 @@ from residnet.regression.expressions.notation import PLAIN, C, Style, c_body, si
 
 
 def term(algebra: Algebra, product: Product, style: Style = PLAIN) -> str:
-    """A product, channels before functions; `1` where it is empty. What it says does not depend on
-    the order in which atoms were found.
+    """Return a product in writing, channels before functions; `1` where it is empty.
+
+    It does not depend on the order in which atoms were found.
     """
     numbers = sorted(
         set(product),
@@ -34,7 +36,7 @@ def term(algebra: Algebra, product: Product, style: Style = PLAIN) -> str:
 def total(
     algebra: Algebra, products: Sequence[Product], weights: Sequence[float], style: Style
 ) -> str:
-    """A sum of products; weights of 1 are not written."""
+    """Return a sum of products; weights of 1 are not written."""
     parts = []
     for product, weight in zip(products, weights, strict=True):
         number, factors = style.number(abs(weight)), term(algebra, product, style)
@@ -51,8 +53,9 @@ def total(
 def c_function(
     algebra: Algebra, name: str, products: Sequence[Product], weights: Sequence[float]
 ) -> str:
-    """A C99 function `double <name>(double <channel>, ...)` with all channels as arguments; needs
-    <math.h>.
+    """Return a C99 function `double <name>(double <channel>, ...)`.
+
+    It has all channels as arguments and needs <math.h>.
     """
     return c_body(name, algebra.channels, (), total(algebra, products, weights, C))
 

@@ -104,7 +104,7 @@ class EvolutionConfig(Config):
 
 
 def limits_of(config: EvolutionConfig) -> Limits:
-    """What the terms of a search may be."""
+    """Return the limits of the terms of a search."""
     return Limits(config.max_terms, config.max_degree, config.nesting, config.split == "expand")
 
 

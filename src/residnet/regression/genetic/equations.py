@@ -97,8 +97,14 @@ class GeneticEquations(Estimator):
 
 
 class Bred(NamedTuple):
-    """The equation of one axis: what the search found; products with coefficients and standard
-    errors; and what the data say about them.
+    """The equation of one output.
+
+    Attributes:
+        found: what the search found.
+        products: terms of the equation.
+        values: coefficients of the terms.
+        errors: standard errors of the coefficients.
+        summary: what the data say about the equation.
     """
 
     found: Found
@@ -154,7 +160,7 @@ def breed(
 
 
 def _whole(reduced: Reduced) -> Equation:
-    """All terms that the data tell apart, by least squares."""
+    """Return all terms that the data tell apart, by least squares."""
     y = reduced.y[:, 0]
     best, inverse = coefficients(reduced.r, y)
     left = y - reduced.r @ best
@@ -175,8 +181,9 @@ def _whole(reduced: Reduced) -> Equation:
 
 
 def validating(group: np.ndarray, every: int) -> np.ndarray:
-    """Which samples [N] validate, from the numbers of their manoeuvres: every so manieth where
-    there are enough, else blocks of the record.
+    """Return which samples [N] validate, from the numbers of their groups.
+
+    Every so manieth group does where there are enough, else blocks of the record.
     """
     numbers = np.unique(group, return_inverse=True)[1]
     if numbers.max(initial=0) + 1 < every:
@@ -185,7 +192,7 @@ def validating(group: np.ndarray, every: int) -> np.ndarray:
 
 
 def _written(algebra: Algebra, name: str, bred: Bred) -> dict[str, Any]:
-    """One equation in writing, with the course of its search."""
+    """Return one equation in writing, with the course of its search."""
     return {
         "text": f"{name} = {total(algebra, bred.products, bred.values, PLAIN)}",
         "latex": f"{latex_left(name)} = {total(algebra, bred.products, bred.values, LATEX)}",

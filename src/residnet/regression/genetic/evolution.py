@@ -88,12 +88,12 @@ class Individual:
         self.terms: Terms = ()
 
     def copy(self) -> Individual:
-        """The same trees in lists of their own."""
+        """Return the same trees in lists of their own."""
         return Individual([tree.__class__(tree) for tree in self.trees])
 
 
 def require_deap() -> ModuleType:
-    """DEAP's genetic programming.
+    """Return DEAP's genetic programming.
 
     Raises:
         UsageError: where it is not installed.
@@ -165,7 +165,7 @@ def _thinned(indices: np.ndarray, most: int) -> np.ndarray:
 
 @contextmanager
 def _seeded(seed: int) -> Iterator[None]:
-    """DEAP draws from Python's own generator; what stood in it is put back."""
+    """Seed Python's own generator, from which DEAP draws, and put back what stood in it."""
     state = random.getstate()
     random.seed(seed)
     try:
@@ -191,7 +191,7 @@ class _Breeding:
         )
 
     def run(self) -> Found:
-        """Generation after generation until the goal, the patience's end or the last one."""
+        """Breed generations until the goal, the patience's end or the last one."""
         low, high = self.config.first_depth
         tree = partial(self.gp.genHalfAndHalf, self.set, low, high)
         first = [
@@ -247,7 +247,7 @@ class _Breeding:
         return made
 
     def _offspring(self, population: Sequence[Individual]) -> list[Individual]:
-        """From parents by tournament: crossover, mutation or a copy."""
+        """Return children of parents by tournament: crossover, mutation or a copy."""
         from deap import tools
 
         wanted = self.config.population - self.config.elite
@@ -265,8 +265,9 @@ class _Breeding:
         return out
 
     def _cross(self, child: Individual, other: Individual) -> None:
-        """One-point crossover of a tree of each; with several genes every other time an exchange of
-        whole ones.
+        """Cross a tree of each at one point.
+
+        With several genes every other time whole ones are exchanged.
         """
         here, there = random.randrange(len(child.trees)), random.randrange(len(other.trees))
         if len(child.trees) > 1 and random.random() < 0.5:
@@ -275,14 +276,14 @@ class _Breeding:
             child.trees[here], _ = self.mate(child.trees[here], other.trees[there])
 
     def _rated(self, individuals: list[Individual]) -> list[Individual]:
-        """With fitness, best first; of equals the one of fewer terms."""
+        """Return the individuals with fitness, best first; of equals the one of fewer terms."""
         results = self.fitness.of([self._terms(individual) for individual in individuals])
         for individual, (train, validation, terms) in zip(individuals, results, strict=True):
             individual.fitness, individual.validation, individual.terms = -train, validation, terms
         return sorted(individuals, key=lambda i: (-i.fitness, len(i.terms)))
 
     def _terms(self, individual: Individual) -> Terms | None:
-        """Its terms; None beyond the limits or without any."""
+        """Return the terms of an individual; None beyond the limits or without any."""
         products: set[Product] = {ONE} if self.config.intercept else set()
         try:
             for tree in individual.trees:
@@ -297,7 +298,7 @@ class _Breeding:
         return tuple(sorted(products)) if 0 < len(products) <= self.config.max_terms else None
 
     def _repeats(self, tree: Any) -> bool:
-        """Whether a term stands twice among the branches at + and - from the root down."""
+        """Return whether a term stands twice among the branches at + and - from the root down."""
         seen: set[Product] = set()
         starts = [0]
         while starts:
@@ -313,7 +314,7 @@ class _Breeding:
         return False
 
     def _sum(self, tree: Sequence[Any]) -> Sum:
-        """What a tree in prefix order comes to."""
+        """Return the sum that a tree in prefix order comes to."""
         stack: list[Sum] = []
         for node in reversed(tree):
             if node.arity == 2:

@@ -1,6 +1,4 @@
-"""Fitness of a generation: the coefficients of every individual's terms by least squares, and its
-errors on training and validation samples.
-"""
+"""Fitness of a generation: coefficients by least squares, and errors on both kinds of samples."""
 
 from __future__ import annotations
 
@@ -24,8 +22,9 @@ _CHUNK = 3_000_000
 
 
 class Fitness:
-    """Errors of individuals: mean square errors on training and validation samples, over the
-    target's mean square on each.
+    """The errors of individuals on training and validation samples.
+
+    They are mean square errors over the target's mean square on each.
 
     Each distinct set of terms is fitted once in the whole search. A generation's new sets go
     through together: columns of the terms that they share are computed once, then Gram matrices,
@@ -60,8 +59,9 @@ class Fitness:
         self._empty()
 
     def of(self, individuals: Sequence[Terms | None]) -> list[tuple[float, float, Terms]]:
-        """(training error, validation error, terms that are left) of each; infinite where there are
-        no terms, or they are not independent.
+        """Return (training error, validation error, terms that are left) of each.
+
+        Errors are infinite where there are no terms, or they are not independent.
         """
         new = [
             terms
@@ -93,7 +93,7 @@ class Fitness:
         self.fitted += len(sets)
 
     def _cache(self, wanted: set[Product]) -> None:
-        """Columns of unit mean square over the training samples."""
+        """Keep columns of unit mean square over the training samples."""
         if (len(self._rows) + len(wanted)) * self._values.shape[1] > _ROWS:
             self._empty()
         new = sorted(wanted - self._rows.keys())
@@ -109,7 +109,7 @@ class Fitness:
         self._usable = torch.cat((self._usable, torch.from_numpy(good)))
 
     def _batch(self, group: Sequence[Terms]) -> None:
-        """Sets of as many terms each."""
+        """Fit sets of as many terms each."""
         columns = self._values[torch.tensor([[self._rows[p] for p in terms] for terms in group])]
         x, x_validation = columns[..., : self.count], columns[..., self.count :]
         gram = x @ x.transpose(1, 2) / self.count
@@ -137,8 +137,9 @@ class Fitness:
                 self._known[terms] = (a, b, terms)
 
     def _pruned(self, group: Sequence[Terms], good: Tensor, parts: Tensor) -> None:
-        """Orthogonal least squares: terms that explain less than a share of the target beside those
-        before them go, and the rest is fitted anew.
+        """Drop the terms that explain too little beside those before them, and fit the rest.
+
+        This is orthogonal least squares.
         """
         keep = parts.square() / self.energy[0] >= self.prune
         rest = {}

@@ -1,5 +1,6 @@
-"""Ridge regression on the features of a kernel: every penalty, and its cross-validation, from one
-decomposition.
+"""Ridge regression on the features of a kernel, with every penalty from one decomposition.
+
+Its cross-validation comes from the same one.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ _ROWS = 8192
 
 @dataclass(frozen=True)
 class Path:
-    """Fits with each of C penalties.
+    """The fits with each of C penalties.
 
     Attributes:
         coefficients: of the raw features, [C, P, 3].
@@ -36,8 +37,9 @@ class Path:
 def dual_path(
     kernel: Tensor, y: Tensor, fold: Tensor, folds: int, penalties: Sequence[float]
 ) -> Path:
-    """Kernel ridge regression alpha = (K + lambda I)^-1 Y (document 001 section 3.2, ERRATA M4) for
-    every penalty lambda.
+    """Return kernel ridge regressions alpha = (K + lambda I)^-1 Y for every penalty lambda.
+
+    See document 001 section 3.2, ERRATA M4.
 
     A left-out fold needs no refit: with the smoother H = K (K + lambda I)^-1 its errors are (I -
     H_ff)^-1 (Y - H Y)_f.
@@ -77,8 +79,9 @@ def primal_path(
     folds: int,
     penalties: Sequence[float],
 ) -> Path:
-    """Ridge regression min |Y - Phi W w|^2 + lambda |w|^2 for every penalty lambda, from R factors
-    of the folds.
+    """Return ridge regressions min |Y - Phi W w|^2 + lambda |w|^2 for every penalty lambda.
+
+    They come from R factors of the folds.
 
     Args:
         features: raw features [n, P] of inputs [n, F].
@@ -109,7 +112,7 @@ def primal_path(
 
 
 def _factor(features: Callable[[Tensor], Tensor], whiten: Tensor, x: Tensor, y: Tensor) -> Tensor:
-    """R factor of [Phi W, Y], gathered in chunks."""
+    """Return the R factor of [Phi W, Y], gathered in chunks."""
     kept = torch.zeros(0, whiten.shape[1] + y.shape[1], dtype=y.dtype)
     for begin in range(0, len(x), _ROWS):
         rows = slice(begin, begin + _ROWS)
@@ -123,8 +126,9 @@ def _triangle(rows: Tensor) -> Tensor:
 
 
 def _weights(factor: Tensor, outputs: int, penalties: Sequence[float]) -> tuple[Tensor, Tensor]:
-    """Coefficients [C, Q, outputs] and effective numbers of parameters [C] from the R factor of
-    [Phi W, Y].
+    """Return coefficients [C, Q, outputs] and effective numbers of parameters [C].
+
+    They come from the R factor of [Phi W, Y].
     """
     count = factor.shape[1] - outputs
     left, values, right = torch.linalg.svd(factor[:, :count], full_matrices=False)
