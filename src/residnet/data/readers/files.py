@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Protocol
 
 from residnet.core.errors import UsageError
+from residnet.core.progress import report
 
-# recordings below this size are read before a bar would be seen, bytes
+# recordings below this size are read before anybody waits, bytes
 _LARGE = 50_000_000
 
 
@@ -36,46 +36,25 @@ def total_size(files: Iterable[Path]) -> int:
     return sum(file.stat().st_size for file in files)
 
 
-class Advance(Protocol):
-    """Tells the bar how far a reader is, in the unit of its total."""
-
-    def __call__(self, done: float) -> None: ...
+Advance = Callable[[float], None]
+"""Reports how far a reader is, in the unit of its total."""
 
 
 @contextmanager
 def progress(name: str, size: int, total: float) -> Iterator[Advance]:
-    """Return a bar on standard error while a recording of `size` bytes is read.
-
-    None where it is small or nobody watches.
+    """Report the reading of a large recording to whoever listens to progress.
 
     Args:
-        what: name of the file.
-        size: its bytes.
-        total: what `done` counts to.
+        name: of the file.
+        size: its bytes; nothing is reported of a small recording.
+        total: what the reader counts to.
     """
-    import sys
-
-    if size < _LARGE or not sys.stderr.isatty():
+    if size < _LARGE:
         yield lambda done: None
         return
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        Progress,
-        TaskProgressColumn,
-        TextColumn,
-        TimeRemainingColumn,
-    )
-
-    columns = (
-        TextColumn("reading {task.description}"),
-        BarColumn(),
-        TaskProgressColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(name, total=total)
-        yield lambda done: bar.update(task, completed=done)
+    stage = f"reading {name}, per cent"
+    yield lambda done: report(stage, 100.0 * done / total, 100.0)
+    report(stage, 100.0, 100.0)
 
 
 def missing_package(extra: str, package: str, name: str) -> UsageError:
