@@ -43,6 +43,9 @@ def test_sentences_of_a_receiver_and_a_compass(tmp_path: Path) -> None:
     for name in ("psi", "u", "v", "r"):
         np.testing.assert_allclose(got[name], log[name], atol=1e-5, err_msg=name)
     assert "estimated_times" in codes(got)
+    # NMEA 0183 is north-east-down; only messages of ROS are turned from ENU
+    assert got.meta["frames"]
+    assert not any("REP-103" in text for text in got.meta["frames"])
 
 
 def test_sentences_that_fail_their_checksum_or_have_no_fix(tmp_path: Path) -> None:

@@ -309,8 +309,8 @@ def standard_plan(recording: Recording, declared: Plan) -> Plan:
             plan, taken = _joined(plan, offered)
             if taken:
                 conversions.append(
-                    f"{', '.join(taken)}: {type(message).__name__} of {series.name}, REP-103 (ENU,"
-                    " forward-left-up) to NED, forward-starboard-down"
+                    f"{', '.join(taken)}: {type(message).__name__} of {series.name},"
+                    f" {message.conversion}"
                 )
     if plan.heading is None and "psi" not in plan.channels and declared.velocity is None:
         # without a heading an earth-fixed velocity has no components in the body
