@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from typing import Literal, final
 
 import torch
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 from torch import Tensor, nn
 
 from residnet.core.config import Config
@@ -18,54 +18,15 @@ from residnet.core.names import VELOCITY
 from residnet.physics.actuators import ActuatorsConfig
 from residnet.physics.environment.wind import WindLoadsConfig
 from residnet.physics.kinematics import Planar
-from residnet.physics.mass import inverse_mass
+from residnet.physics.mass import AddedMass, MassEntries, RigidBody, inverse_mass
 from residnet.physics.parameters import (
-    Inertia,
-    Length,
-    Mass,
-    MassArm,
     Parameter,
-    above_zero,
     dimension,
     unit_text,
 )
 from residnet.physics.plant import HullPlant
 from residnet.physics.terms import TermLibrary, parse_term
 from residnet.physics.vessel_file import VesselFile
-
-
-class RigidBody(Config):
-    """The rigid body: mass, yaw inertia and centre of gravity.
-
-    Attributes:
-        m: mass in kg.
-        I_z: moment of inertia in yaw about the body origin in kg m^2.
-        x_G: centre of gravity ahead of the body origin in m.
-    """
-
-    m: Mass
-    I_z: Inertia
-    x_G: Length
-
-    _positive = field_validator("m", "I_z")(above_zero)
-
-
-class AddedMass(Config):
-    """The hydrodynamic derivatives of the accelerations (SNAME: negative for a normal hull).
-
-    Attributes:
-        X_udot: surge force by surge acceleration in kg.
-        Y_vdot: sway force by sway acceleration in kg.
-        Y_rdot: sway force by yaw acceleration in kg m.
-        N_vdot: yaw moment by sway acceleration in kg m.
-        N_rdot: yaw moment by yaw acceleration in kg m^2.
-    """
-
-    X_udot: Mass
-    Y_vdot: Mass
-    Y_rdot: MassArm
-    N_vdot: MassArm
-    N_rdot: Inertia
 
 
 class Damping(Config):
@@ -181,24 +142,6 @@ class FossenConfig(HullConfig):
         """
         mass = self.mass_matrix()
         return 0.5 * (mass[1][2] + mass[2][1])
-
-
-class MassEntries(Config):
-    """The mass matrix with added mass; the entries that are not here are zero.
-
-    Attributes:
-        m11: surge in kg.
-        m22: sway in kg.
-        m23: sway force by yaw acceleration in kg m.
-        m32: yaw moment by sway acceleration in kg m.
-        m33: yaw in kg m^2.
-    """
-
-    m11: Mass
-    m22: Mass
-    m23: MassArm
-    m32: MassArm
-    m33: Inertia
 
 
 class MassMatrixConfig(HullConfig):

@@ -193,16 +193,40 @@ class MMGForces(nn.Module):
 
         The order of the parameters is that of `PARAMETERS`.
         """
-        (
-            m_x, m_y, J_z, R_0, X_vv, X_vr, X_rr, X_vvvv, Y_0, Y_v, Y_r, Y_vvv, Y_vvr, Y_vrr, Y_rrr,
-            N_0, N_v, N_r, N_vvv, N_vvr, N_vrr, N_rrr,
-            t_P, w_P0, C_2p, C_2n, t_R, a_H, x_H, gamma_p, gamma_n, l_R, epsilon, kappa,
-        ) = theta.unbind(-1)  # fmt: skip
+        m_x, m_y, J_z = theta[..., 0], theta[..., 1], theta[..., 2]
         chosen = [z[..., c] for c in self.columns]
         u, v, r, n, delta = chosen[0], chosen[1], chosen[2], chosen[3], chosen[4]
         speed = torch.sqrt(u * u + v * v + self.still)
         a, b = v / speed, r * self.length / speed
-        # hull
+        x_hull, y_hull, n_hull = self._hull(theta, u, speed, a, b)
+        inflow, loading, x_propeller = self._propeller(theta, u, n, a, b)
+        x_rudder, y_rudder, n_rudder = self._rudder(theta, speed, a, b, delta, inflow, loading)
+        # rigid body and added mass
+        scale = self.pressed * self.length
+        mass_x, mass_y = self.mass + m_x * scale, self.mass + m_y * scale
+        inertia = self.inertia + J_z * scale * self.length**2
+        arm = self.x_G * self.mass
+        surge = x_hull + x_propeller + x_rudder + mass_y * v * r + arm * r * r
+        sway = y_hull + y_rudder - mass_x * u * r
+        yaw = n_hull + n_rudder - arm * u * r
+        determinant = mass_y * inertia - arm * arm
+        return torch.stack(
+            (
+                surge / mass_x,
+                (inertia * sway - arm * yaw) / determinant,
+                (mass_y * yaw - arm * sway) / determinant,
+            ),
+            dim=-1,
+        )
+
+    def _hull(
+        self, theta: Tensor, u: Tensor, speed: Tensor, a: Tensor, b: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return X, Y [N] and N [N m] of the hull at v' = a and r' = b, each [...]."""
+        (
+            R_0, X_vv, X_vr, X_rr, X_vvvv, Y_0, Y_v, Y_r, Y_vvv, Y_vvr, Y_vrr, Y_rrr,
+            N_0, N_v, N_r, N_vvv, N_vvr, N_vrr, N_rrr,
+        ) = theta[..., 3:22].unbind(-1)  # fmt: skip
         pressure = self.pressed * speed * speed
         x_hull = pressure * (
             -R_0 * (u / speed) ** 2 + X_vv * a * a + X_vr * a * b + X_rr * b * b + X_vvvv * a**4
@@ -225,15 +249,34 @@ class MMGForces(nn.Module):
             + N_vrr * a * b * b
             + N_rrr * b**3
         )
-        n_hull = pressure * self.length * n_hull
-        # propeller: inflow changes with its drift angle, to both sides differently
+        return x_hull, y_hull, pressure * self.length * n_hull
+
+    def _propeller(
+        self, theta: Tensor, u: Tensor, n: Tensor, a: Tensor, b: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return inflow [m/s], loading n^2 D^2 K_T [m^2/s^2] and X [N] of the propeller."""
+        t_P, w_P0, C_2p, C_2n = theta[..., 22:26].unbind(-1)
+        # the inflow changes with the propeller's drift angle, to both sides differently
         aside = -a - self.x_P * b
         side = torch.where(aside > 0, C_2p, C_2n)
         inflow = u * (1 - w_P0) * (1 + (1 - torch.exp(-self.wake_slope * aside.abs())) * (side - 1))
         nd = n * self.diameter
         loading = self.k0 * nd * nd + self.k1 * nd * inflow + self.k2 * inflow * inflow
         thrust = self.density * self.diameter**2 * loading
-        # rudder: partly in the race
+        return inflow, loading, (1 - t_P) * thrust
+
+    def _rudder(
+        self,
+        theta: Tensor,
+        speed: Tensor,
+        a: Tensor,
+        b: Tensor,
+        delta: Tensor,
+        inflow: Tensor,
+        loading: Tensor,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return X, Y [N] and N [N m] of the rudder, partly in the propeller's race."""
+        t_R, a_H, x_H, gamma_p, gamma_n, l_R, epsilon, kappa = theta[..., 26:34].unbind(-1)
         raced = torch.sqrt(torch.clamp(inflow * inflow + 8.0 / math.pi * loading, min=self.still))
         squared = (
             self.race * (inflow + kappa * (raced - inflow)) ** 2 + (1 - self.race) * inflow * inflow
@@ -250,23 +293,8 @@ class MMGForces(nn.Module):
             * self.lift
             * torch.sin(angle)
         )
-        x_rudder = -(1 - t_R) * normal * torch.sin(delta)
-        y_rudder = -(1 + a_H) * normal * torch.cos(delta)
-        n_rudder = -(self.x_R + a_H * x_H) * self.length * normal * torch.cos(delta)
-        # rigid body and added mass
-        scale = self.pressed * self.length
-        mass_x, mass_y = self.mass + m_x * scale, self.mass + m_y * scale
-        inertia = self.inertia + J_z * scale * self.length**2
-        arm = self.x_G * self.mass
-        surge = x_hull + (1 - t_P) * thrust + x_rudder + mass_y * v * r + arm * r * r
-        sway = y_hull + y_rudder - mass_x * u * r
-        yaw = n_hull + n_rudder - arm * u * r
-        determinant = mass_y * inertia - arm * arm
-        return torch.stack(
-            (
-                surge / mass_x,
-                (inertia * sway - arm * yaw) / determinant,
-                (mass_y * yaw - arm * sway) / determinant,
-            ),
-            dim=-1,
+        return (
+            -(1 - t_R) * normal * torch.sin(delta),
+            -(1 + a_H) * normal * torch.cos(delta),
+            -(self.x_R + a_H * x_H) * self.length * normal * torch.cos(delta),
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from residnet.data.masks import far_from_median
+from residnet.data.outliers import far_from_median
 
 MEASURED = ("x", "y", "psi", "u", "v", "r", "phi", "p", "u_dot", "v_dot", "r_dot")
 """Channels that a sensor or filter measures; all others drive the vessel."""

@@ -149,9 +149,8 @@ def fly(
             start, w, craft.dynamics.initial_state(rows).to(w.dtype)
         )
     noise = random.standard_normal((rows, steps, 3)) * [sea.noise.u, sea.noise.v, sea.noise.r]
-    names = log_names(manoeuvres)
-    out = []
-    for i, manoeuvre in enumerate(manoeuvres):
+    flights = []
+    for i, (manoeuvre, name) in enumerate(zip(manoeuvres, log_names(manoeuvres), strict=True)):
         stopped = int(watched.stopped[i])
         reached = 0 <= stopped < lengths[i]
         length = stopped + 1 if reached else lengths[i]
@@ -167,23 +166,28 @@ def fly(
             meta["timed_out"] = True
         if length < 2:
             raise DataError(
-                f"{craft.name}, {names[i]}: the motion is not finite from its first step on"
+                f"{craft.name}, {name}: the motion is not finite from its first step on"
             )
-        clean = {
-            n: states[i, :length, j].numpy().copy()
-            for j, n in enumerate(craft.helm.state)
-            if not n.startswith("_")
-        }
-        known = [*craft.helm.inputs[: craft.commands], *sea.disturbance.logged]
-        clean |= {
-            name: inputs[i, :length, craft.helm.inputs.index(name)].numpy().copy() for name in known
-        }
+        clean = _channels(craft, sea, states[i, :length], inputs[i, :length])
         time = t[:length].numpy().copy()
         measured = sea.noise.measured(clean, time, noise[i, :length], (sea.seed, 6, i))
-        units = {name: CHANNEL_UNITS.get(name, "-") for name in clean}
-        motion = Log(names[i], time, clean, units, manoeuvre.kind, meta=meta)
-        out.append(Flight(manoeuvre, motion, motion.replace(channels=measured)))
-    return out
+        units = {channel: CHANNEL_UNITS.get(channel, "-") for channel in clean}
+        motion = Log(name, time, clean, units, manoeuvre.kind, meta=meta)
+        flights.append(Flight(manoeuvre, motion, motion.replace(channels=measured)))
+    return flights
+
+
+def _channels(craft: Craft, sea: Sea, states: Tensor, inputs: Tensor) -> dict[str, np.ndarray]:
+    """Return the channels [T] of a flight's log from states [T, nx] and inputs [T, m]."""
+    channels = {
+        name: states[:, column].numpy().copy()
+        for column, name in enumerate(craft.helm.state)
+        if not name.startswith("_")
+    }
+    logged = [*craft.helm.inputs[: craft.commands], *sea.disturbance.logged]
+    return channels | {
+        name: inputs[:, craft.helm.inputs.index(name)].numpy().copy() for name in logged
+    }
 
 
 def _surroundings(

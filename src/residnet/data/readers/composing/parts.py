@@ -12,6 +12,11 @@ from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS, si_unit, to_si
 from residnet.data.readers.base import unwrap
 from residnet.data.readers.composing.geodesy import tangent_plane
+from residnet.data.readers.composing.orientation import (
+    field_values,
+    from_first_circle,
+    from_quaternion,
+)
 from residnet.data.readers.composing.quantities import (
     Angle,
     CourseSpeed,
@@ -21,7 +26,6 @@ from residnet.data.readers.composing.quantities import (
     HeadingConfig,
     Lever,
     PositionConfig,
-    Quaternion,
 )
 from residnet.data.readers.recording import Recording, Remark, Series, remark, same_topic
 
@@ -116,7 +120,7 @@ def channel_parts(
         if own_rows:
             series = series.where(np.isfinite(series[entries[own_rows].field]))
         values = {
-            name: entry.convert(name, _numbers(recording, series, entry.field))
+            name: entry.convert(name, field_values(recording, series, entry.field))
             for name, entry in entries.items()
         }
         units = {name: si_unit(entry.unit) for name, entry in entries.items()}
@@ -163,13 +167,13 @@ def position_part(recording: Recording, config: PositionConfig, longest_gap: flo
     if not isinstance(config, Geodetic):
         scale = to_si(config.unit)
         values = {
-            "x": scale * _numbers(recording, series, config.north),
-            "y": scale * _numbers(recording, series, config.east),
+            "x": scale * field_values(recording, series, config.north),
+            "y": scale * field_values(recording, series, config.east),
         }
         return _part(recording, series, values, {}, longest_gap, conversion=_moved(config.antenna))
     to_radians = to_si(config.unit)
     latitude, longitude = (
-        to_radians * _numbers(recording, series, name)
+        to_radians * field_values(recording, series, name)
         for name in (config.latitude, config.longitude)
     )
     known = np.isfinite(latitude) & np.isfinite(longitude)
@@ -223,13 +227,13 @@ def heading_part(recording: Recording, config: HeadingConfig, longest_gap: float
     values: dict[str, np.ndarray] = {}
     remarks: tuple[Remark, ...] = ()
     if isinstance(config, Angle):
-        yaw = to_si(config.unit) * _numbers(recording, series, config.field)
+        yaw = to_si(config.unit) * field_values(recording, series, config.field)
         offset = config.offset
     else:
-        yaw, values, remarks = _quaternion(recording, series, config)
+        yaw, values, remarks = from_quaternion(recording, series, config)
         offset = 0.0
     psi = (np.pi / 2 - yaw if config.frame == "enu" else yaw) + offset
-    values["psi"] = _from_first_circle(unwrap(psi))
+    values["psi"] = from_first_circle(unwrap(psi))
     conversion = (
         ("psi: counter-clockwise from east (REP-103) to clockwise from north",)
         if config.frame == "enu"
@@ -249,15 +253,15 @@ def velocity_part(
     """
     series = recording[config.topic]
     if isinstance(config, CourseSpeed):
-        course = to_si(config.course_unit, "rad") * _numbers(recording, series, config.course)
-        speed = to_si(config.speed_unit, "m/s") * _numbers(recording, series, config.speed)
+        course = to_si(config.course_unit, "rad") * field_values(recording, series, config.course)
+        speed = to_si(config.speed_unit, "m/s") * field_values(recording, series, config.speed)
         # receivers give no course at rest
         north, east = speed * np.cos(np.nan_to_num(course)), speed * np.sin(np.nan_to_num(course))
         undirected = np.isnan(course) & (speed > 0.3)
         north, east = np.where(undirected, np.nan, north), np.where(undirected, np.nan, east)
     else:
         north, east = (
-            to_si(config.unit) * _numbers(recording, series, name)
+            to_si(config.unit) * field_values(recording, series, name)
             for name in (config.north, config.east)
         )
     conversion = (
@@ -298,58 +302,6 @@ def _part(
         (*series.remarks, *remarks),
         conversion,
     )
-
-
-def _numbers(recording: Recording, series: Series, path: str) -> np.ndarray:
-    values = series[path]
-    if not np.isfinite(values).any():
-        raise DataError(
-            f"{recording.path}: topic {series.name}: field '{path}' holds no number in any of"
-            f" {values.size} rows; take it out of the map"
-        )
-    return values
-
-
-def _quaternion(
-    recording: Recording, series: Series, config: Quaternion
-) -> tuple[np.ndarray, dict[str, np.ndarray], tuple[Remark, ...]]:
-    """Return the yaw in the source's frame [T], roll where asked for, and what was noticed."""
-    x, y, z, w = (_numbers(recording, series, f"{config.field}.{axis}") for axis in "xyzw")
-    norm = np.sqrt(x * x + y * y + z * z + w * w)
-    known = np.isfinite(norm) & (norm > 0.5)
-    if not known.any():
-        raise DataError(
-            f"{recording.path}: topic {series.name}: '{config.field}' holds no orientation, all"
-            " quaternions are empty"
-        )
-    x, y, z, w = (
-        np.where(known, part / np.where(known, norm, 1.0), np.nan) for part in (x, y, z, w)
-    )
-    yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-    remarks = []
-    flips = int(((x[1:] * x[:-1] + y[1:] * y[:-1] + z[1:] * z[:-1] + w[1:] * w[:-1]) < 0.0).sum())
-    if flips:
-        text = (
-            f"topic {series.name}: the quaternion changes sign {flips} times (both signs are one"
-            " attitude); the heading is taken through"
-        )
-        remarks.append(remark("note", "quaternion_flips", text, flips=flips))
-    if not known.all():
-        text = f"topic {series.name}: {int((~known).sum())} quaternions are empty; no heading there"
-        remarks.append(remark("note", "empty_quaternions", text, rows=int((~known).sum())))
-    # roll about the forward axis has one sign in both frames
-    roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
-    return yaw, {"phi": roll} if config.roll else {}, tuple(remarks)
-
-
-def _from_first_circle(psi: np.ndarray) -> np.ndarray:
-    known = np.flatnonzero(np.isfinite(psi))
-    if not known.size:
-        return psi
-    # a heading of zero with rounding stays zero
-    turns = np.floor((psi[known[0]] + 1e-6) / (2.0 * np.pi))
-    unwound: np.ndarray = psi - 2.0 * np.pi * turns
-    return unwound
 
 
 def _moved(lever: Lever, what: str = "x, y") -> tuple[str, ...]:
