@@ -8,10 +8,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Literal, final
 
-import torch
 from torch import Tensor
 
 from residnet.baselines.base import Baseline, IdentifiedConfig
+from residnet.core.layout import zero_acceleration
 from residnet.core.samples import Samples
 from residnet.regression.solutions import Solution
 
@@ -22,7 +22,7 @@ class StillBaseline(Baseline):
 
     def forward(self, z: Tensor) -> Tensor:
         """Return zeros [..., 3] for channels z [..., nz]."""
-        return torch.zeros_like(z[..., :3])
+        return zero_acceleration(z)
 
     def parameter_count(self) -> list[float]:
         """Return zeros."""

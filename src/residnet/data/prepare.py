@@ -12,6 +12,7 @@ from pydantic import Field
 
 from residnet.core.config import Config, Seconds
 from residnet.core.errors import DataError
+from residnet.core.layout import POSE, VELOCITIES
 from residnet.core.log import Log
 from residnet.core.names import STATE
 from residnet.core.samples import Samples
@@ -107,8 +108,10 @@ def prepare(log: Log, split: str, columns: Sequence[str], config: PrepareConfig)
         )
     # derivatives must not see masked samples, so a piece ends at each of them
     clean = stretch_numbers(np.where(log.usable & usable, piece, -1))
-    smooth_nu, nu_dot, valid = config.derivative.derive(y[:, 3:], config.grid.step, clean)
-    smooth = np.concatenate((y[:, :3], np.where(valid[:, None], smooth_nu, y[:, 3:])), axis=1)
+    smooth_nu, nu_dot, valid = config.derivative.derive(y[:, VELOCITIES], config.grid.step, clean)
+    smooth = np.concatenate(
+        (y[:, POSE], np.where(valid[:, None], smooth_nu, y[:, VELOCITIES])), axis=1
+    )
     trimmed = (log.t >= log.t[0] + config.trim - 1e-9) & (log.t <= log.t[-1] - config.trim + 1e-9)
     held = _means(w, piece) if config.hold == "mean" else w
     return Prepared(log, split, y, smooth, nu_dot, held, w, piece, usable, usable & valid & trimmed)
@@ -176,6 +179,6 @@ def envelope(logs: Sequence[Prepared]) -> tuple[np.ndarray, np.ndarray]:
     Only usable samples count.
     """
     joined = np.concatenate(
-        [np.concatenate((p.y[p.usable, 3:], p.w[p.usable]), axis=1) for p in logs]
+        [np.concatenate((p.y[p.usable, VELOCITIES], p.w[p.usable]), axis=1) for p in logs]
     )
     return joined.min(0), joined.max(0)

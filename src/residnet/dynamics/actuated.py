@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from residnet.core.errors import ConfigError
+from residnet.core.layout import actuators, motion
 from residnet.core.names import STATE, nearest
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.gear import Gear, commanded
@@ -66,14 +67,16 @@ class ActuatedDynamics(Dynamics):
 
     def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
         """x_dot [B, 6 + k] of the model at a stage; the gear moves once per step."""
-        return torch.cat((self.model.rate(x[:, :6], p, rho), torch.zeros_like(x[:, 6:])), dim=-1)
+        return torch.cat(
+            (self.model.rate(motion(x), p, rho), torch.zeros_like(actuators(x))), dim=-1
+        )
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """State and memory one step later."""
-        a = x[:, 6:]
+        a = actuators(x)
         moved = self.gear.move(a, w)
         given = torch.cat((a, w), dim=-1)[:, self.take]
         if self.mean:
             given = 0.5 * (given + torch.cat((moved, w), dim=-1)[:, self.take])
-        y, s = self.model.step(x[:, :6], given, s)
+        y, s = self.model.step(motion(x), given, s)
         return torch.cat((y, moved), dim=-1), s

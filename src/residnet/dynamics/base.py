@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from residnet.core.frames import to_earth
+from residnet.core.layout import pose
 
 Integrator = Literal["rk4", "heun", "euler", "semi_implicit_euler"]
 
@@ -66,12 +67,13 @@ class Dynamics(nn.Module, ABC):
             total = total + self.weights[i] * k
         after = x + self.dt * total
         if self.semi_implicit:
-            # the pose moves with the new velocities, which keeps an undamped oscillation bounded
+            # the pose moves with the new velocities, which keeps an undamped oscillation bounded;
+            # what stands behind the velocities goes along
+            moved = after[:, 3:]
             return torch.cat(
                 (
-                    x[:, :3]
-                    + self.dt * self.kinematics(torch.cat((x[:, :3], after[:, 3:]), dim=-1)),
-                    after[:, 3:],
+                    pose(x) + self.dt * self.kinematics(torch.cat((pose(x), moved), dim=-1)),
+                    moved,
                 ),
                 dim=-1,
             )

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from residnet.baselines.base import Baseline
+from residnet.core.layout import zero_acceleration
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.heads.base import ResidualHead
 
@@ -25,7 +26,7 @@ class MeanBaseline(Baseline):
 
     def forward(self, z: Tensor) -> Tensor:
         """nu_dot [..., 3] at channels z [..., nz]."""
-        total = torch.zeros_like(z[..., :3])
+        total = zero_acceleration(z)
         for member in self.members:
             total = total + member(z)
         return total / len(self.members)
@@ -47,7 +48,7 @@ class MeanHead(ResidualHead):
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Residual [B, 3] at channels z [B, nz] and the memory for the next step."""
-        total = torch.zeros_like(z[..., :3])
+        total = zero_acceleration(z)
         memory: list[Tensor] = []
         begin = 0
         for i, member in enumerate(self.members):
@@ -59,7 +60,7 @@ class MeanHead(ResidualHead):
 
     def sequence(self, z: Tensor) -> Tensor:
         """Residuals [B, T, 3] along measured channels [B, T, nz], from an empty memory."""
-        total = torch.zeros_like(z[..., :3])
+        total = zero_acceleration(z)
         for member in self.members:
             total = total + member.sequence(z)  # type: ignore[operator]
         return total / len(self.members)

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from residnet.core.errors import ConfigError
+from residnet.core.layout import LATERAL, SWAY, actuators, motion
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.physics.plant import Plant
@@ -131,21 +132,22 @@ class VariedModel(Dynamics):
 
     def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
         """x_dot [B, 6] of the model at a stage, as if it were not varied; steps do not need it."""
-        return self._of(x).rate(x[:, :6], p, rho)
+        return self._of(x).rate(motion(x), p, rho)
 
     def _of(self, x: Tensor) -> HybridDynamics:
         return self.models[1 if x.dtype == torch.float64 else 0]
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """State and memory one step later under the commands w [B, m]."""
-        command, angle = w[:, :1], x[:, 6:]
+        command, angle = w[:, :1], actuators(x)
         if self.travel is None:
             stands = after = command
         else:
             stands, after = angle, angle + (command - angle).clamp(-self.travel, self.travel)
         felt = (0.5 * (stands + after) if self.mean else stands) * s[:, :1] + s[:, 2:3]
         given = torch.cat((felt, w[:, 1:]), dim=1)[:, self.take]
-        moved, memory = self._of(x).step(x[:, :6], given, s[:, 3:])
-        slowed = x[:, 4:6] + (moved[:, 4:] - x[:, 4:6]) / s[:, 1:2]
-        parts = (moved[:, :4], slowed) if self.travel is None else (moved[:, :4], slowed, after)
-        return torch.cat(parts, dim=1), torch.cat((s[:, :3], memory), dim=1)
+        moved, memory = self._of(x).step(motion(x), given, s[:, len(VARIATION) :])
+        slowed = x[:, LATERAL] + (moved[:, LATERAL] - x[:, LATERAL]) / s[:, 1:2]
+        straight = moved[:, :SWAY]
+        parts = (straight, slowed) if self.travel is None else (straight, slowed, after)
+        return torch.cat(parts, dim=1), torch.cat((s[:, : len(VARIATION)], memory), dim=1)

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from residnet.core.errors import ExportError, UsageError
+from residnet.core.layout import RANGE_VELOCITIES
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
 from residnet.export.base import Exporter
@@ -65,8 +66,8 @@ def required_force(
     model = model.to(torch.float64)
     ranges = list(
         zip(
-            (*head.lowest.tolist(), *spec.low[:3]),
-            (*head.highest.tolist(), *spec.high[:3]),
+            (*head.lowest.tolist(), *spec.low[RANGE_VELOCITIES]),
+            (*head.highest.tolist(), *spec.high[RANGE_VELOCITIES]),
             strict=True,
         )
     )

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from residnet.core.errors import ExportError
+from residnet.core.layout import RANGE_INPUTS, velocities
 from residnet.core.names import STATE
 from residnet.core.version import __version__
 from residnet.dynamics.hybrid import HybridDynamics
@@ -62,7 +63,7 @@ class ExportedModel(nn.Module):
 
         `outside` [B] is True beyond the training range.
         """
-        seen = torch.cat((x[:, 3:6], w), dim=-1)
+        seen = torch.cat((velocities(x), w), dim=-1)
         outside = ((seen < self.low) | (seen > self.high)).any(dim=-1)
         x, s = self.simulate.model.step(x, w, s)
         return x, s, outside
@@ -123,7 +124,7 @@ def check_parity(spec: ModelSpec, model: HybridDynamics, exported: Any) -> dict[
     steps = torch.arange(PARITY_STEPS + past, dtype=torch.float32)
     phase = torch.arange(low.numel() - 3, dtype=torch.float32)
     sweep = 0.5 + 0.4 * torch.sin(0.02 * (1 + 0.37 * phase)[None] * steps[:, None] + phase[None])
-    w = (low[3:] + sweep * (high - low)[3:]).unsqueeze(0)
+    w = (low[RANGE_INPUTS] + sweep * (high - low)[RANGE_INPUTS]).unsqueeze(0)
     y = torch.zeros(1, past, len(STATE))
     y[:, :, 3] = 0.5 * (low[0] + high[0])
     x = y[:, -1].clone()

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from residnet.core.errors import ConfigError, FitError
+from residnet.core.layout import RANGE_VELOCITIES, zero_acceleration
 from residnet.core.names import ACCELERATION
 from residnet.core.samples import Samples
 from residnet.heads.base import ClosedFormHead
@@ -103,7 +104,7 @@ class ForceHead(ClosedFormHead):
         self.inner.calibrate(samples)
         varying = dict(zip(samples.names, samples.z.std(0).tolist(), strict=True))
         self.still = [name for name in FORCE_CHANNELS if varying.get(name, 0.0) <= 1e-9]
-        moved = samples.z[:, :3]
+        moved = samples.z[:, RANGE_VELOCITIES]
         self.lowest.copy_(moved.amin(0))
         self.highest.copy_(moved.amax(0))
         for place, name in enumerate(self.seen):
@@ -156,7 +157,7 @@ class ForceHead(ClosedFormHead):
 
         It is taken at channels z [..., nz]; the memory is empty.
         """
-        b, s = self.inner(torch.cat((torch.zeros_like(z[..., :3]), z), dim=-1), s)
+        b, s = self.inner(torch.cat((zero_acceleration(z), z), dim=-1), s)
         return -(b @ self.inverse.to(z.dtype).T), s
 
     def accelerations(self, known: Tensor, rho: Tensor) -> Tensor:

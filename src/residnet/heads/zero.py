@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import final
 
-import torch
 from torch import Tensor
 
+from residnet.core.layout import zero_acceleration
 from residnet.heads.base import ResidualHead
 
 
@@ -16,4 +16,4 @@ class ZeroHead(ResidualHead):
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return zeros [..., 3]."""
-        return torch.zeros_like(z[..., :3]), s
+        return zero_acceleration(z), s

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from residnet.core.errors import DataError
+from residnet.core.layout import RANGE_VELOCITIES
 from residnet.core.log import Log
 from residnet.data.prepare import Prepared, prepare
 from residnet.identification.settings import FitSettings
@@ -72,4 +73,6 @@ def velocity_limit(low: np.ndarray, high: np.ndarray, divergence: float) -> np.n
         high: largest ones, [3 + m].
         divergence: the multiple of the largest training value.
     """
-    return np.asarray(divergence * np.maximum(np.abs(low[:3]), np.abs(high[:3])))
+    return np.asarray(
+        divergence * np.maximum(np.abs(low[RANGE_VELOCITIES]), np.abs(high[RANGE_VELOCITIES]))
+    )

@@ -13,8 +13,14 @@ from residnet.judge.protocol import ProtocolConfig
 
 
 class Scales(Config):
-    """What nrmse divides by: typical spreads of the measured velocities; `evaluate` reuses them
-    unchanged.
+    """Scales that nrmse divides by: typical spreads of the measured velocities.
+
+    Other logs that a run is evaluated on are judged by the same scales.
+
+    Attributes:
+        u: of the surge velocity in m/s.
+        v: of the sway velocity in m/s.
+        r: of the yaw rate in rad/s.
     """
 
     u: Annotated[MetresPerSecond, Field(gt=0)]

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
+from residnet.core.layout import POSE
 from residnet.core.names import STATE, VELOCITY
 from residnet.data.prepare import Prepared
 from residnet.dynamics.base import Dynamics
@@ -112,12 +113,12 @@ def _run(
     out = []
     for i, window in enumerate(windows):
         length = window.stop - window.start
-        velocities = nu[i, :length]
-        bad = not np.isfinite(velocities).all() or bool((np.abs(velocities) > limit).any())
+        nu_hat = nu[i, :length]
+        bad = not np.isfinite(nu_hat).all() or bool((np.abs(nu_hat) > limit).any())
         if bad:
-            velocities = np.tile(window.nu, (length, 1))
-        pose = integrate(logs[window.log].y[window.start, :3], velocities, step)
-        out.append(Prediction(np.concatenate((pose, velocities), axis=1), bad))
+            nu_hat = np.tile(window.nu, (length, 1))
+        pose = integrate(logs[window.log].y[window.start, POSE], nu_hat, step)
+        out.append(Prediction(np.concatenate((pose, nu_hat), axis=1), bad))
     return out
 
 
@@ -153,7 +154,7 @@ def _inputs(candidate: Candidate, log: Prepared) -> np.ndarray:
 
 
 def _initial(candidate: Candidate, window: Window, log: Prepared) -> np.ndarray:
-    known = dict(zip(STATE, (*log.y[window.start, :3], *window.nu), strict=True))
+    known = dict(zip(STATE, (*log.y[window.start, POSE], *window.nu), strict=True))
     return np.array(
         [known[name] if name in known else log.log[name][window.start] for name in candidate.state]
     )

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from residnet.core.layout import POSE, VELOCITIES
 from residnet.data.prepare import Prepared
 from residnet.judge.bootstrap import blocks
 from residnet.judge.freerun import Candidate, FreeRun, integrate
@@ -51,7 +52,7 @@ def kinematics(run: FreeRun, logs: Sequence[Prepared], step: float) -> dict[str,
     apart = []
     for window in run.windows:
         y = logs[window.log].y[window.start : window.stop]
-        apart.append(integrate(y[0, :3], y[:, 3:], step)[-1] - y[-1, :3])
+        apart.append(integrate(y[0, POSE], y[:, VELOCITIES], step)[-1] - y[-1, POSE])
     error = np.array(apart)
     position, heading = np.hypot(error[:, 0], error[:, 1]), np.abs(error[:, 2])
     return {

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from residnet.core.layout import HEADING, SURGE, SWAY, YAW_RATE
 from residnet.core.names import VELOCITY
 from residnet.data.prepare import Prepared
 from residnet.judge.bootstrap import Blocks, blocks, difference, intervals
@@ -27,11 +28,11 @@ def window_errors(run: FreeRun, model: str, logs: Sequence[Prepared]) -> dict[st
         measured = log.y[window.start : window.stop]
         good = log.usable[window.start : window.stop]
         error = prediction.states - measured
-        parts = (error[good, 3], error[good, 4], error[:, 5])
+        parts = (error[good, SURGE], error[good, SWAY], error[:, YAW_RATE])
         rmse.append([float(np.sqrt(np.mean(e**2))) for e in parts])
         mae.append([float(np.mean(np.abs(e))) for e in parts])
         position.append(float(np.hypot(error[-1, 0], error[-1, 1])))
-        heading.append(float(abs(error[-1, 2])))
+        heading.append(float(abs(error[-1, HEADING])))
         count.append(int(good.sum()))
     return {
         "rmse": np.array(rmse),

@@ -11,6 +11,7 @@ from pydantic import Field
 
 from residnet.core.config import Config, Seconds
 from residnet.core.errors import DataError
+from residnet.core.layout import VELOCITIES
 from residnet.core.stretches import stretch_bounds
 from residnet.data.prepare import Prepared
 
@@ -37,9 +38,14 @@ class Window:
 class Windows(Config):
     """Back-to-back windows of one length (the free-run protocol of the measured tanker).
 
-    The first starts `first` after the log's start; a start on a sample that is not usable moves on
-    to the first that is; an incomplete tail is dropped. The initial state is measured. `history`
-    seconds before the window may warm up a memory.
+    A start on a sample that is not usable moves on to the first that is; an incomplete tail is
+    dropped. The initial state is measured.
+
+    Attributes:
+        kind: `windows`.
+        length: of a window in s.
+        first: start of the first window after the log's start, in s.
+        history: time before a window that may warm up a memory, in s.
     """
 
     kind: Literal["windows"] = "windows"
@@ -62,7 +68,9 @@ class Windows(Config):
                 continue
             # a break ends the past that may warm up a memory
             past = max(start - round(self.history / step), int(np.searchsorted(end, end[start])))
-            out.append(Window(number, start, start + steps + 1, past, log.y[start, 3:].copy()))
+            out.append(
+                Window(number, start, start + steps + 1, past, log.y[start, VELOCITIES].copy())
+            )
             start += steps
         return out
 
@@ -70,9 +78,13 @@ class Windows(Config):
 class WholeManoeuvre(Config):
     """Every uninterrupted stretch of a log as one free run.
 
-    The initial velocities are the mean of the first `initial` seconds, which also warm up a memory;
-    scoring starts after them. Stretches shorter than `shortest`, or without a sample to score, are
-    left out.
+    The initial velocities are the mean of the first seconds, which also warm up a memory; scoring
+    starts after them. Stretches without a sample to score are left out.
+
+    Attributes:
+        kind: `manoeuvre`.
+        initial: how long the initial velocities are averaged, in s.
+        shortest: shorter stretches are left out, in s.
     """
 
     kind: Literal["manoeuvre"] = "manoeuvre"
@@ -95,7 +107,11 @@ class WholeManoeuvre(Config):
             ):
                 out.append(
                     Window(
-                        number, begin + lead, stop, begin, log.y[begin : begin + lead, 3:].mean(0)
+                        number,
+                        begin + lead,
+                        stop,
+                        begin,
+                        log.y[begin : begin + lead, VELOCITIES].mean(0),
                     )
                 )
             begin = stop

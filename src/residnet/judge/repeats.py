@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.signal import correlate
 
+from residnet.core.layout import POSE, VELOCITIES
 from residnet.core.names import VELOCITY
 from residnet.data.prepare import Prepared
 from residnet.judge.protocol import ProtocolConfig, Window
@@ -144,7 +145,7 @@ def _same_start(
         & (log.piece[starts] == log.piece[starts + length - 1])
         & log.usable[starts]
     )
-    near = (np.abs(log.smooth[starts, 3:] - window.nu) < _START * scales).all(1)
+    near = (np.abs(log.smooth[starts, VELOCITIES] - window.nu) < _START * scales).all(1)
     return np.asarray(whole & near)
 
 
@@ -155,7 +156,7 @@ def _apart(pair: Pair, logs: Sequence[Prepared]) -> list[float]:
     one, other = logs[pair.first.log], logs[pair.log]
     a = slice(pair.first.start, pair.first.stop)
     b = slice(pair.start, pair.start + a.stop - a.start)
-    nu = one.y[a, 3:] - other.y[b, 3:]
+    nu = one.y[a, VELOCITIES] - other.y[b, VELOCITIES]
     good = one.usable[a] & other.usable[b]
     end_a, end_b = _end(one.y[a]), _end(other.y[b])
     rms = [float(np.sqrt(np.mean(part**2))) for part in (nu[good, 0], nu[good, 1], nu[:, 2])]
@@ -163,9 +164,8 @@ def _apart(pair: Pair, logs: Sequence[Prepared]) -> list[float]:
 
 
 def _end(y: np.ndarray) -> np.ndarray:
-    """Pose at the end of a run [T, 6] in the axes of its start: ahead, to starboard, turned; [3].
-    """
-    north, east, turned = y[-1, :3] - y[0, :3]
+    """The pose [3] at the end of a run [T, 6] in the axes of its start."""
+    north, east, turned = y[-1, POSE] - y[0, POSE]
     c, s = np.cos(y[0, 2]), np.sin(y[0, 2])
     return np.array([c * north + s * east, c * east - s * north, turned])
 

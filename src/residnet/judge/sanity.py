@@ -12,6 +12,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from residnet.core.layout import LATERAL, RANGE_INPUTS, RANGE_VELOCITIES, SURGE, SWAY, VELOCITIES
 from residnet.core.names import STATE, VELOCITY
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec, load_model, model_names
@@ -101,10 +102,12 @@ def check_damping(
     chosen = [point for point in points if point.label in ("rest", "cruise")]
     x = torch.stack([point.x for point in chosen]).requires_grad_()
     # a model may depend on no velocity at all
-    nu_dot = acceleration(model, x, torch.stack([point.w for point in chosen])) + 0.0 * x[:, 3:6]
+    nu_dot = (
+        acceleration(model, x, torch.stack([point.w for point in chosen])) + 0.0 * x[:, VELOCITIES]
+    )
     slopes = torch.stack(
         [
-            torch.autograd.grad(nu_dot[:, i].sum(), x, retain_graph=True)[0][:, 3 + i]
+            torch.autograd.grad(nu_dot[:, i].sum(), x, retain_graph=True)[0][:, SURGE + i]
             for i in range(3)
         ],
         dim=1,
@@ -182,13 +185,13 @@ def growth_rate(model: HybridDynamics, point: OperatingPoint) -> float:
     step map's spectral radius over dt.
     """
     s = settled_memory(model, point.x[None], point.w[None])
-    start = torch.cat((point.x[4:6], s[0])).detach()
+    start = torch.cat((point.x[LATERAL], s[0])).detach()
     count = start.numel()
     z = start.expand(count, count).clone().requires_grad_()
-    x = torch.cat((point.x[:4].expand(count, 4), z[:, :2]), dim=1)
+    x = torch.cat((point.x[:SWAY].expand(count, SWAY), z[:, :2]), dim=1)
     after, memory = model.step(x, point.w.expand(count, -1), z[:, 2:])
     # one row of the batch for each output: one backward pass gives the whole Jacobian
-    out = torch.cat((after[:, 4:6], memory), dim=1)
+    out = torch.cat((after[:, LATERAL], memory), dim=1)
     jacobian = torch.autograd.grad(out.diagonal().sum(), z)[0]
     radius = float(torch.linalg.eigvals(jacobian).abs().max())
     return math.log(max(radius, 1e-12)) / model.dt
@@ -244,29 +247,32 @@ def check_bounded(spec: ModelSpec, model: HybridDynamics, divergence: float) -> 
     corners = _corners(spec)
     x = torch.zeros(len(corners), len(STATE), dtype=torch.float64)
     limit = (
-        torch.maximum(torch.tensor(spec.low[:3]).abs(), torch.tensor(spec.high[:3]).abs())
+        torch.maximum(
+            torch.tensor(spec.low[RANGE_VELOCITIES]).abs(),
+            torch.tensor(spec.high[RANGE_VELOCITIES]).abs(),
+        )
         .double()
         .clamp(min=1e-9)
     )
     largest, seconds = torch.zeros(len(corners), 3, dtype=torch.float64), 0.0
     s = model.initial_state(len(corners)).double()
     steps, pause = round(_LONG_RUN / model.dt), max(round(10.0 / model.dt), 1)
-    before = x[:, 3:6]
+    before = x[:, VELOCITIES]
     with torch.no_grad():
         for k in range(1, steps + 1):
             x, s = model.step(x, corners, s)
             seconds = k * model.dt
             if k % 20 == 0 or k == steps:
-                largest = torch.maximum(largest, x[:, 3:6].abs() / limit)
+                largest = torch.maximum(largest, x[:, VELOCITIES].abs() / limit)
                 if not bool(torch.isfinite(x).all()) or float(largest.max()) > divergence:
                     break
             if k % pause == 0:
                 if (
                     not spec.signals.exogenous
-                    and float(((x[:, 3:6] - before).abs() / limit).max()) < 1e-6
+                    and float(((x[:, VELOCITIES] - before).abs() / limit).max()) < 1e-6
                 ):
                     break  # settled: nothing more will come
-                before = x[:, 3:6]
+                before = x[:, VELOCITIES]
     ratio = torch.nan_to_num(largest, nan=math.inf).amax(1)
     row = int(ratio.argmax())
     inputs = ", ".join(
@@ -292,8 +298,8 @@ def check_bounded(spec: ModelSpec, model: HybridDynamics, divergence: float) -> 
 def _corners(spec: ModelSpec, most: int = 64) -> Tensor:
     """Inputs [K, m] at the edges of their ranges, every combination or `most` drawn ones."""
     low, high = (
-        torch.tensor(spec.low[3:], dtype=torch.float64),
-        torch.tensor(spec.high[3:], dtype=torch.float64),
+        torch.tensor(spec.low[RANGE_INPUTS], dtype=torch.float64),
+        torch.tensor(spec.high[RANGE_INPUTS], dtype=torch.float64),
     )
     pick = (
         torch.cartesian_prod(

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from residnet.core.layout import PLANAR, RANGE_INPUTS, RANGE_VELOCITIES, SURGE
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
-from residnet.physics.signals import WIND_INPUTS
+from residnet.physics.environment.wind import WIND_INPUTS
 
 _SETTLE = 10.0
 _FRACTIONS = (0.0, 0.25, 0.5, 0.67, 1.0, 1.5)
@@ -82,8 +83,8 @@ def operating_points(spec: ModelSpec, model: HybridDynamics) -> list[OperatingPo
     out = []
     for fraction in _FRACTIONS:
         speed = fraction * top
-        x = torch.zeros(len(drives), 6, dtype=torch.float64)
-        x[:, 3] = speed
+        x = torch.zeros(len(drives), len(PLANAR.names), dtype=torch.float64)
+        x[:, SURGE] = speed
         with torch.no_grad():
             surge = acceleration(model, x, drives)[:, 0]
         best = int(surge.abs().argmin())
@@ -100,8 +101,8 @@ def _drives(spec: ModelSpec, count: int = 41) -> Tensor:
     """Inputs [count, m] of straight running, from the least to the most drive."""
     columns = spec.signals.columns
     low, high = (
-        torch.tensor(spec.low[3:], dtype=torch.float64),
-        torch.tensor(spec.high[3:], dtype=torch.float64),
+        torch.tensor(spec.low[RANGE_INPUTS], dtype=torch.float64),
+        torch.tensor(spec.high[RANGE_INPUTS], dtype=torch.float64),
     )
     rudders, pairs = steering(columns)
     for port, stbd in pairs:
@@ -162,12 +163,13 @@ class Mirror:
         that lies inside it mirrored too.
         """
         low, high = list(spec.low), list(spec.high)
-        for i in (1, 2, *(3 + k for k in self.rudders)):
+        for i in (1, 2, *(PLANAR.dof + k for k in self.rudders)):
             high[i] = max(min(-low[i], high[i]), 0.0)
             low[i] = -high[i]
         for port, stbd in self.pairs:
-            ends = max(low[3 + port], low[3 + stbd]), min(high[3 + port], high[3 + stbd])
-            for i in (3 + port, 3 + stbd):
+            port, stbd = PLANAR.dof + port, PLANAR.dof + stbd
+            ends = max(low[port], low[stbd]), min(high[port], high[stbd])
+            for i in (port, stbd):
                 low[i], high[i] = ends
         low_t, high_t = (
             torch.tensor(low, dtype=torch.float64),
@@ -177,5 +179,11 @@ class Mirror:
             count, len(low), generator=torch.Generator().manual_seed(0), dtype=torch.float64
         )
         values = low_t + share * (high_t - low_t)
-        x = torch.cat((torch.zeros(count, 3, dtype=torch.float64), values[:, :3]), dim=1)
-        return x, values[:, 3:]
+        x = torch.cat(
+            (
+                torch.zeros(count, len(PLANAR.pose), dtype=torch.float64),
+                values[:, RANGE_VELOCITIES],
+            ),
+            dim=1,
+        )
+        return x, values[:, RANGE_INPUTS]

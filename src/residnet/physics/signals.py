@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from residnet.core.config import Config
 from residnet.core.errors import ConfigError
 from residnet.core.frames import to_body
+from residnet.core.layout import velocities
 from residnet.core.names import CHANNEL_UNITS, STATE, VELOCITY, nearest
 from residnet.physics.actuators import DifferentialThrustConfig
 from residnet.physics.environment.wind import WIND_INPUTS
@@ -156,12 +157,12 @@ class Signals(nn.Module):
             p: what `prepare` returned for the step's inputs.
         """
         if not self.wind:
-            return torch.cat((x[..., 3:6], p), dim=-1)
+            return torch.cat((velocities(x), p), dim=-1)
         known = p.shape[-1] - 2
         along, across = to_body(p[..., known], p[..., known + 1], x[..., 2])
         along, across = along - x[..., 3], across - x[..., 4]
         # the offset keeps the gradient finite in a calm
         magnitude = torch.sqrt(along * along + across * across + 1e-8)
         return torch.cat(
-            (x[..., 3:6], p[..., :known], torch.stack((along, across, magnitude), dim=-1)), dim=-1
+            (velocities(x), p[..., :known], torch.stack((along, across, magnitude), dim=-1)), dim=-1
         )

@@ -92,7 +92,7 @@ class AutopilotFit(EpochTraining):
         if self.teacher is not None:
             difference = SideBySide(self.seen, self.teacher, reference)
             Rollout(self.model, difference)(x, w, self.vessel.memory(variation))
-            loss = difference.total / (steps * self.policy.limit**2)
+            loss: Tensor = difference.total / (steps * self.policy.limit**2)
         else:
             states, inputs, _ = Rollout(self.model, ClosedLoop(self.seen, reference))(
                 x, w, self.vessel.memory(variation)
@@ -156,7 +156,9 @@ class AutopilotFit(EpochTraining):
         over = torch.where(calm, most + 5.0 * over.mean(1) + 5.0 * most.square(), 0.05 * most)
         slow = (variation[:, 1] / variation[:, 0]) ** own.slowest * torch.where(calm, 1.0, 0.25)
         weight = slow / slow.mean()
-        return (weight * (outside + 0.5 * relative).mean(1)).mean() + own.overshoot * over.mean()
+        missed = (weight * (outside + 0.5 * relative).mean(1)).mean()
+        cost: Tensor = missed + own.overshoot * over.mean()
+        return cost
 
     def validated(self) -> tuple[nn.Module, float]:
         """The policy and its score."""

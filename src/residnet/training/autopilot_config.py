@@ -92,9 +92,9 @@ class SpreadConfig(Config):
         """
         low, high = torch.tensor([self.effect, self.time]).T
         share = torch.rand(rows, 2)
-        return low + (high - low) * torch.where(
-            torch.arange(rows)[:, None] % 2 == 0, share, share.round()
-        )
+        at_corner = torch.arange(rows)[:, None] % 2 == 1
+        drawn: Tensor = low + (high - low) * torch.where(at_corner, share.round(), share)
+        return drawn
 
     def corners(self) -> Tensor:
         """Effect, time and zero bias [9, 3]: nominal first, then the ends and the middles between

@@ -21,6 +21,7 @@ from torch import Tensor
 from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.config import Config, MetresPerSecond
 from residnet.core.errors import FitError
+from residnet.core.layout import HEADING, POSITION, VELOCITIES, YAW_RATE
 from residnet.data.prepare import Prepared, samples
 from residnet.physics.signals import Signals
 
@@ -114,15 +115,19 @@ def through_water(log: Prepared, current: np.ndarray, signals: Signals) -> Prepa
     """A log as seen from a frame that drifts with the current [2]: positions, velocities,
     accelerations and the wind.
     """
-    psi, drifted = log.y[:, 2], (log.log.t - log.log.t[0])[:, None] * current
+    psi, drifted = log.y[:, HEADING], (log.log.t - log.log.t[0])[:, None] * current
     along = np.cos(psi) * current[0] + np.sin(psi) * current[1]
     across = np.cos(psi) * current[1] - np.sin(psi) * current[0]
     drift = np.stack((along, across, np.zeros_like(along)), axis=1)
     # the current is constant in earth axes, so it turns in body axes
-    turning = log.smooth[:, 5:6] * np.stack((across, -along, np.zeros_like(along)), axis=1)
+    turning = log.smooth[:, YAW_RATE, None] * np.stack(
+        (across, -along, np.zeros_like(along)), axis=1
+    )
 
     def less(x: np.ndarray) -> np.ndarray:
-        return np.concatenate((x[:, :2] - drifted, x[:, 2:3], x[:, 3:] - drift), axis=1)
+        return np.concatenate(
+            (x[:, POSITION] - drifted, x[:, HEADING, None], x[:, VELOCITIES] - drift), axis=1
+        )
 
     return replace(
         log,

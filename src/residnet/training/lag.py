@@ -98,7 +98,8 @@ def fit_lag(
 
     def unexplained(y: Tensor) -> Tensor:
         y = y - y.mean(0)
-        return y - q @ (q.T @ y)
+        left: Tensor = y - q @ (q.T @ y)
+        return left
 
     def miss(p: np.ndarray) -> np.ndarray:
         lag = Lag(frequency=float(p[0]), damping=float(p[1]), delay=float(p[2]))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from residnet.core.layout import velocities
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 
@@ -53,7 +54,7 @@ def rollout_loss(
             metrics do, so that few bad ones do not rule.
     """
     states, _, _ = rollout(x0, w, s)
-    error = (states[:, 1:, 3:6] - y[:, :, 3:6]) / scales
+    error = (velocities(states[:, 1:]) - velocities(y)) / scales
     weight = usable.to(error.dtype).unsqueeze(-1)
     if robust > 0:
         square = (error.square() * weight).sum((1, 2)) / (3.0 * weight.sum((1, 2))).clamp(min=1.0)

@@ -10,6 +10,7 @@ from typing import Any, final
 import torch
 from torch import Tensor, nn
 
+from residnet.core.layout import POSE, VELOCITIES
 from residnet.data.windows import WindowBatches, WindowStore
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
@@ -133,7 +134,7 @@ class HeadTraining(EpochTraining):
         if own is not None:
             past, w_past = self.store.history(parts[1], max(round(own.initial / dt), 1))
             memories.append(self.model.warmup(past, w_past))
-            begun = torch.cat((x0[len(parts[0]) :, :3], past[:, :, 3:].mean(1)), dim=1)
+            begun = torch.cat((x0[len(parts[0]) :, POSE], past[..., VELOCITIES].mean(1)), dim=1)
             x0 = torch.cat((x0[: len(parts[0])], begun))
         if self.settings.start_noise > 0:
             noise = (
@@ -141,7 +142,7 @@ class HeadTraining(EpochTraining):
                 * self.scales
                 * torch.randn(len(starts), 3, dtype=x0.dtype)
             )
-            x0 = torch.cat((x0[:, :3], x0[:, 3:] + noise), dim=1)
+            x0 = torch.cat((x0[:, POSE], x0[:, VELOCITIES] + noise), dim=1)
         w, y = take(self.store.w, starts, length - 1), take(self.store.y, starts + 1, length - 1)
         usable = take(self.store.usable, starts + 1, length - 1)
         return rollout_loss(
@@ -170,7 +171,7 @@ class EpochBatches:
         self.module = module
 
     def __len__(self) -> int:
-        return self.module.settings.steps
+        return int(self.module.settings.steps)
 
     def __iter__(self) -> Iterator[Tensor]:
         epoch = self.module.epoch

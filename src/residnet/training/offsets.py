@@ -196,9 +196,9 @@ class Arrow:
         P].
         """
         taken = torch.linalg.solve(self.own, self.mixed.transpose(1, 2))
-        return (torch.linalg.inv(self.own) + taken @ shared @ taken.transpose(1, 2)).diagonal(
-            dim1=1, dim2=2
-        )
+        inverse = torch.linalg.inv(self.own) + taken @ shared @ taken.transpose(1, 2)
+        diagonal: Tensor = inverse.diagonal(dim1=1, dim2=2)
+        return diagonal
 
 
 def with_spread(offsets: Offsets, arrow: Arrow, share: Tensor) -> Offsets:

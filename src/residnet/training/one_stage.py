@@ -1,5 +1,4 @@
-"""What trainings of one stage have in common. No Lightning here: `residnet check` must stay quick.
-"""
+"""Trainings of one stage, without Lightning: `residnet check` must stay quick."""
 
 from __future__ import annotations
 

@@ -19,6 +19,7 @@ from torch import Tensor
 from residnet.baselines import ParametricBaseline
 from residnet.core.config import Config, Seconds
 from residnet.core.errors import FitError
+from residnet.core.layout import VELOCITIES, zero_acceleration
 from residnet.core.samples import Samples
 from residnet.data.windows import WindowStore
 from residnet.dynamics.hybrid import HybridDynamics
@@ -227,7 +228,7 @@ def _problem(
             " `horizon`"
         )
     take = store.take
-    nu = take(store.y, starts + 1, steps)[:, :, 3:]
+    nu = take(store.y, starts + 1, steps)[..., VELOCITIES]
     usable = take(store.usable, starts + 1, steps).to(scales.dtype).unsqueeze(-1)
     # r comes from a gyro, which a frozen position does not disturb
     weight = torch.cat((usable, usable, torch.ones_like(usable)), dim=-1) / scales
@@ -283,7 +284,7 @@ def _shifted(
 
 def _ahead(model: HybridDynamics, x: Tensor, p: Tensor) -> Tensor:
     """The step of the rollout, without a residual."""
-    return model.integrate(x, p, torch.zeros_like(x[:, :3]))
+    return model.integrate(x, p, zero_acceleration(x))
 
 
 @torch.no_grad()
@@ -293,7 +294,7 @@ def _level(model: HybridDynamics, problem: _Problem, offsets: Offsets) -> Tensor
     shifted, _ = _shifted(model, problem, offsets)
     for k in range(problem.w.shape[1]):
         x = _ahead(shifted, x, model.signals.prepare(problem.w[:, k]))
-        total.append(x[:, 3:])
+        total.append(x[:, VELOCITIES])
     error = (torch.stack(total, dim=1) - problem.nu) * problem.weight
     return torch.sqrt(_window_cost(error) + problem.robust**2).mean()
 
@@ -322,7 +323,7 @@ def _normal_equations(
         p = model.signals.prepare(problem.w[:, k])
         sensitivity = step_sensitivities(shifted, movable, x, p, sensitivity)
         x = _ahead(shifted, x, p)
-        error = (x[:, 3:] - problem.nu[:, k]) * problem.weight[:, k]
+        error = (x[:, VELOCITIES] - problem.nu[:, k]) * problem.weight[:, k]
         seen = sensitivity[:, 1:] * problem.weight[:, k].unsqueeze(-1)
         hessian += seen.transpose(1, 2) @ seen
         gradient += (seen * error.unsqueeze(-1)).sum(1)

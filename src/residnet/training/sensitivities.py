@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from residnet.baselines import Baseline, ParametricBaseline
+from residnet.core.layout import zero_acceleration
 from residnet.dynamics.hybrid import HybridDynamics
 
 
@@ -36,9 +37,9 @@ class OffsetBaseline(Baseline):
 
     def forward(self, z: Tensor) -> Tensor:
         """Return nu_dot [B, 3] at channels z [B, nz], which begin with u and v."""
-        return self.baseline(z) + self.growth(z) * self.value.repeat(
-            z.shape[0] // self.value.shape[0], 1
-        )
+        offsets = self.value.repeat(z.shape[0] // self.value.shape[0], 1)
+        nu_dot: Tensor = self.baseline(z) + self.growth(z) * offsets
+        return nu_dot
 
     def growth(self, z: Tensor) -> Tensor:
         """Return the square of the speed over that at which the values hold, [B, 1]."""
@@ -82,7 +83,7 @@ def step_sensitivities(
     for node, weight in zip(model.nodes, model.weights, strict=True):
         stage_s = s + node * model.dt * stage_rate
         if node > 0.0:
-            residual = torch.zeros_like(x[:, :3])
+            residual = zero_acceleration(x)
             stage_x = x + node * model.dt * model.rate(stage_x, p, residual)
         direct = baseline.sensitivity(model.signals(stage_x, p))
         nu_dot = _slopes(model, stage_x, p) @ stage_s + direct
@@ -102,7 +103,7 @@ def _slopes(model: HybridDynamics, x: Tensor, p: Tensor) -> Tensor:
     for direction in range(4):
         tangent[direction, :, 2 + direction] = 1.0
     repeated, inputs = x.repeat(4, 1), p.repeat(4, 1)
-    slopes = torch.func.jvp(
+    slopes: Tensor = torch.func.jvp(
         lambda state: model.baseline(model.signals(state, inputs)),
         (repeated,),
         (tangent.reshape(-1, x.shape[1]),),

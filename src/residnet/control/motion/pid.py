@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from residnet.control.base import Policy
 from residnet.core.config import Config
 from residnet.core.frames import to_body, wrap
+from residnet.core.layout import pose, velocities
 from residnet.physics.actuators import AzimuthThrusters
 from residnet.physics.fossen import Fossen3
 
@@ -100,16 +101,16 @@ class MotionPID(Policy):
 
     def error(self, x: Tensor, reference: Tensor) -> Tensor:
         """Return e [B, 3] in body axes: m, m, rad."""
-        difference = reference[:, :3] - x[:, :3]
+        difference = pose(reference) - pose(x)
         along, across = to_body(difference[:, 0], difference[:, 1], x[:, 2])
         return torch.stack((along, across, wrap(difference[:, 2])), dim=-1)
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return the command tau [B, 3] in N, N, N m, and the integral with this step's error."""
         error = self.error(x, reference)
-        nu_d = reference[:, 3:6]
+        nu_d = velocities(reference)
         gains = self.gains.to(x.dtype)
-        feedback = gains[0] * error + gains[1] * s + gains[2] * (nu_d - x[:, 3:6])
+        feedback = gains[0] * error + gains[1] * s + gains[2] * (nu_d - velocities(x))
         return self.feed_forward(reference[:, 6:9], nu_d) + feedback, s + self.dt * error
 
 

@@ -16,6 +16,7 @@ from residnet.control.base import Reference
 from residnet.core.config import Config, Metres, Radians, RadiansPerSecond, Seconds
 from residnet.core.errors import ConfigError
 from residnet.core.frames import to_body
+from residnet.core.layout import pose
 
 Waypoint = tuple[Metres, Metres, Radians]
 """North, east and heading; headings are followed as they are written: from 0 to 180 deg clockwise,
@@ -117,7 +118,7 @@ class ReferenceFilter(Reference):
 
     def initial_state(self, x: Tensor) -> Tensor:
         """Return the memory [B, 9]: at rest at the vessel's pose."""
-        return torch.cat((x[:, :3], torch.zeros_like(x[:, :1]).expand(-1, 6)), dim=-1)
+        return torch.cat((pose(x), torch.zeros_like(x[:, :1]).expand(-1, 6)), dim=-1)
 
     def waypoint(self, k: int) -> Tensor:
         """Return the waypoint [B or 1, 3] that is given at step k."""
