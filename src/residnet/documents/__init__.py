@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
-from residnet.report.blocks import Figure, Section
+from residnet.report.blocks import Section
 
 StudyName = Literal["moreno2019", "woo2018"]
 
@@ -33,9 +33,3 @@ def study_sections(name: StudyName, run: Path) -> list[Section]:
         "woo2018": woo2018.sections,
     }
     return studies[name](run)
-
-
-def draw_study(name: StudyName, run: Path) -> list[Path]:
-    """Draw a document's figures into a finished run and return their paths."""
-    blocks = [block for section in study_sections(name, run) for block in section.blocks]
-    return [block.path for block in blocks if isinstance(block, Figure)]

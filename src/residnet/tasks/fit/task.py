@@ -34,17 +34,18 @@ class FitConfig(FitTaskSettings):
     def report_sections(cls, run: RunFolder) -> Sequence[Section]:
         """Draw the figures, those of a published study too, and return the sections."""
         from residnet.core.config import load_mapping
-        from residnet.documents import draw_study
+        from residnet.documents import study_sections
         from residnet.report.figures.fit import write_figures
         from residnet.report.fit import fit_sections
         from residnet.report.run_reader import RunFiles
 
         files = RunFiles(run.path)
         write_figures(files)
+        sections = fit_sections(files)
         study = load_mapping(run.resolved).get("study")
         if study is not None and "test" in files.splits:
-            draw_study(study, run.path)
-        return fit_sections(files)
+            sections += study_sections(study, run.path)
+        return sections
 
     def evaluate_on(self, run: RunFolder, logs: Sequence[Path], out: Path | None) -> Finished:
         """Free-run every model of a finished run on other logs.
