@@ -71,6 +71,6 @@ def test_channels_in_other_units() -> None:
     ],
 )
 def test_terms_of_the_published_models(file: str, model: str, counts: list[int]) -> None:
-    """ERRATA E9: (7.2) 14, (7.3) 8, (7.4) 14, (7.5) 14, (7.6) 10, (7.7) 11 terms."""
+    """Correction E9: (7.2) 14, (7.3) 8, (7.4) 14, (7.5) 14, (7.6) 10, (7.7) 11 terms."""
     config = load_config(STUDIES / f"{file}.yaml", [], FitConfig)
     assert config.baselines[model].build(config.signals.build().names).parameter_count() == counts

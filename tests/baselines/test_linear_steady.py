@@ -13,7 +13,7 @@ from residnet.core.errors import ConfigError, FitError
 from residnet.core.samples import Samples
 
 NAMES = ("u", "v", "r", "tau_x", "tau_n")
-# (33), (34) in SI (ERRATA W11), the steering row with B = -A Phi
+# (33), (34) in SI (correction W11), the steering row with B = -A Phi
 A = np.array([[-1.3191, 0, 0], [0, 0.0161, -0.2979], [0, 0.14462, -0.9860]])
 PHI = np.array([[0.0028 / 1.3191, 0], [0, 2.23e-4], [0, 5.76e-4]])
 BIAS = np.array([0.6836 / 1.3191, 0.002, 0.0225])

@@ -41,7 +41,7 @@ def asked(guidance: ReferenceFilter, steps: int, start: torch.Tensor) -> torch.T
 
 
 def test_filter_against_its_transfer_function() -> None:
-    """(2.15) is (s + W)(s^2 + 2 D W s + W^2) (ERRATA J9)."""
+    """(2.15) is (s + W)(s^2 + 2 D W s + W^2) (correction J9)."""
     w, d = 0.4, 0.7
     config = ReferenceFilterConfig(
         waypoints=((10.0, 0.0, 0.0),), interval=40.0, frequency=(w, w, w), damping=(d, d, d)
@@ -55,7 +55,7 @@ def test_filter_against_its_transfer_function() -> None:
 
 
 def test_body_velocity_and_acceleration_belong_to_the_pose() -> None:
-    """nu_d and its derivative are those of eta_d seen from the turning vessel (ERRATA J7), by
+    """nu_d and its derivative are those of eta_d seen from the turning vessel (correction J7), by
     differences.
     """
     config = ReferenceFilterConfig(waypoints=WAYPOINTS, interval=10.0, frequency=(0.4, 0.5, 0.6))
@@ -79,8 +79,7 @@ def test_body_velocity_and_acceleration_belong_to_the_pose() -> None:
 
 
 def test_headings_are_followed_as_written() -> None:
-    """From 0 to 180 deg clockwise and from 135 to -45 deg the other way (ERRATA J13): no wrapping.
-    """
+    """0 to 180 deg is clockwise, 135 to -45 deg is not: no wrapping (correction J13)."""
     points = ((0.0, 0.0, np.pi), (0.0, 0.0, 0.75 * np.pi), (0.0, 0.0, -0.25 * np.pi))
     config = ReferenceFilterConfig(waypoints=points, interval=60.0)
     psi = asked(config.build(0.1), 1800, torch.zeros(1, 6, dtype=torch.float64))[0, :, 2].numpy()

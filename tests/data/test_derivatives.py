@@ -68,7 +68,7 @@ def test_differences() -> None:
 
 
 def test_butterworth_is_document_000s() -> None:
-    # "0.1" of document 000 is a share of the Nyquist frequency (ERRATA H27): 0.5 Hz at 10 Hz
+    # "0.1" of document 000 is a share of the Nyquist frequency (correction H27): 0.5 Hz at 10 Hz
     smooth, rate, valid = Butterworth(cutoff=0.5).derive(NOISE, STEP, ONE)
     expected = filtfilt(*butter(2, 0.1), NOISE, axis=0)
     np.testing.assert_allclose(smooth[:-1], expected[:-1], atol=1e-10)

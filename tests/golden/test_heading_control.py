@@ -1,7 +1,8 @@
 """Nomoto's model and heading autopilots against golden runs of another implementation
 (golden/README.md, g5_nomoto).
 
-Neither the README nor ERRATA print the gains of `pd_*` and `timeopt_*` and the steps of `patrol_*`.
+Neither the README nor the corrections print the gains of `pd_*` and `timeopt_*` and the steps of
+`patrol_*`.
 They were read from the files: a linear fit of the unsaturated rows gives the gains to rounding
 (poles of 2 rad/s and damping 0.9 for `pd_tuned`; 6 and 6 s for the patrol vessel; layer and linear
 law of the time-optimal one), and only steps of 0.05 s (PD) and of 0.25 s (document's controller)

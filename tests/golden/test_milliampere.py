@@ -1,7 +1,7 @@
 """The ferry milliAmpere, its controller and its reference filter against golden runs of another
 implementation (golden/README.md, g3_milliampere).
 
-The gains that the README prints are rounded; the files were made with the formulas of ERRATA J10.
+The gains that the README prints are rounded; the files were made by those of correction J10.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from residnet.physics.vessel import vessel_files
 GROUP = "g3_milliampere"
 DT, OPEN_DT = 0.02, 0.01
 EVERY = {"closed": 5, "open": 10}
-# Table 4.1, row 4 as ERRATA J12 has it; rows 13 to 24 repeat these
+# Table 4.1, row 4 as correction J12 has it; rows 13 to 24 repeat these
 TABLE = (
     (0, -15, -90), (15, -15, 0), (15, 0, 0), (30, 0, 0), (30, -15, 0), (30, -15, 180),
     (15, -15, 180), (15, 0, 135), (0, 0, 135), (0, 0, -45), (0, -15, -45), (0, 0, 0),
@@ -45,13 +45,13 @@ TABLE = (
 LAP = tuple((float(x), float(y), float(np.radians(psi))) for x, y, psi in TABLE)
 FREQUENCY = {"cal": (0.2, 0.2, 0.4), "lit": (0.5, 0.5, 0.5)}
 SCALE = {"half": 0.5, "matched": 1.0}
-# limits beyond what any trajectory asks for: the golden runs do not saturate (ERRATA J26)
+# limits beyond what any trajectory asks for: the golden runs do not saturate (correction J26)
 UNLIMITED = ("actuators.x_max=1e6", "actuators.y_max=1e6", "actuators.n_max=1e6")
 STATE = ("x", "y", "psi", "u", "v", "r", "tau_u", "tau_v", "tau_r")
 
 
 def pid(feedback: bool) -> MotionPIDConfig:
-    """Gains by ERRATA J10, or none."""
+    """Gains by correction J10, or none."""
     mass, w = np.array([2389.657, 2533.911, 5068.910]), np.array([0.4, 0.4, 0.6])
     p = 0.5 * mass * w**2
     return MotionPIDConfig(

@@ -2,7 +2,7 @@
 (golden/README.md, g2_odin).
 
 The author's own jet inputs are sets 1 and 2 of the simulations in the repository that the document
-cites as [15] (ERRATA).
+cites as [15] (corrections of document 000).
 """
 
 from __future__ import annotations

@@ -177,8 +177,8 @@ def test_trajectory(golden_file: Path) -> None:
 
 @on_linear
 def test_linear_model_by_exact_discretisation(golden_file: Path) -> None:
-    """(33), (34) as printed, or with B = -A Phi from Table 1 (ERRATA W11-W14): the file's own
-    matrices, by the matrix exponential.
+    """(33), (34) as printed, or with B = -A Phi from Table 1 (corrections W11 to W14): the file's
+    own matrices, by the matrix exponential.
     """
     frame = table(golden_file)
     a, b, c = linear_model(golden_file)

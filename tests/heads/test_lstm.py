@@ -112,7 +112,7 @@ def test_softsign_cell_equals_numpy() -> None:
 
 
 def test_parameters_of_the_document_s_network() -> None:
-    """4 * 100 * (4 + 100 + 1) + 101 = 42,101 for each of surge, sway, yaw (ERRATA W4)."""
+    """4 * 100 * (4 + 100 + 1) + 101 = 42,101 for each of surge, sway, yaw (correction W4)."""
     head = LstmConfig(hidden_size=100, per_axis=True, features=("u", "v", "r", "tau_n")).build(
         NAMES
     )

@@ -261,7 +261,7 @@ def test_a_delayed_head_is_scriptable_with_the_same_answers() -> None:
 
 
 def test_a_symmetric_vessel_has_no_terms_that_a_mirror_forbids() -> None:
-    """Document 001's published equations have such terms (ERRATA M8): fitted, not physical. Here
+    """Document 001's published equations have such terms (correction M8), not physical ones. Here
     noise and a bias would put them in.
     """
     log = force_logs(1)[0]

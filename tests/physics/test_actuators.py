@@ -45,8 +45,7 @@ def test_full_thrust_of_two_is_what_errata_states(thrusters: DifferentialThrust)
 
 
 def test_dead_band_and_sign(thrusters: DifferentialThrust) -> None:
-    """Clipped, the curve is zero from -60.6 to 44.4 rpm (ERRATA W5) and never opposes the rotation.
-    """
+    """Clipped, the curve is zero from -60.6 to 44.4 rpm and never opposes n (correction W5)."""
     n = torch.linspace(-2380, 2380, 20_001, dtype=torch.float64) / 60.0
     thrust = thrusters.thrust(n)
     assert bool((thrust * n >= 0).all())
@@ -80,7 +79,7 @@ def test_shapes(thrusters: DifferentialThrust) -> None:
 
 
 def test_rate_limit(thrusters: DifferentialThrust) -> None:
-    """From rest to full in 2380 / 1500 = 1.59 s, a reversal in 3.17 s (ERRATA W7)."""
+    """From rest to full in 2380 / 1500 = 1.59 s, a reversal in 3.17 s (correction W7)."""
     dt, n, command = (
         0.01,
         torch.zeros(1, 2, dtype=torch.float64),

@@ -1,5 +1,5 @@
 """The ferry milliAmpere and the mass-spring-damper: their matrices written out, the figures of
-ERRATA 002, the thrusters.
+the corrections of document 002, the thrusters.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def test_matrices_written_out(name: str, delta: float) -> None:
     ("speed", "pole"), [(0.2, 0.0064), (0.5, 0.0545), (1.0, 0.135), (2.0, 0.296)]
 )
 def test_yaw_is_unstable_above_walking_pace(speed: float, pole: float) -> None:
-    """ERRATA J6; at rest the poles are -0.019 and -0.026."""
+    """Correction J6; at rest the poles are -0.019 and -0.026."""
     hull = ferry().hull
 
     def poles(u: float) -> Tensor:
@@ -77,13 +77,13 @@ def test_yaw_is_unstable_above_walking_pace(speed: float, pole: float) -> None:
 
 
 def test_damping_takes_energy() -> None:
-    """ERRATA J6: nu^T D nu >= 0 for |v| < 1.5, |r| < 0.5."""
+    """Correction J6: nu^T D nu >= 0 for |v| < 1.5, |r| < 0.5."""
     nu = motions(5000)
     assert float((nu * ferry().hull.drag(nu)).sum(-1).min()) >= 0
 
 
 def test_coriolis_is_skew_as_printed() -> None:
-    """C does no work although M is not symmetric (ERRATA J4)."""
+    """C does no work although M is not symmetric (correction J4)."""
     nu = motions()
     force = ferry().hull.coriolis(nu)
     assert float((nu * force).sum(-1).abs().max()) < 1e-12 * float((nu * force).abs().max())

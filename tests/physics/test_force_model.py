@@ -34,7 +34,7 @@ def motion(n: int = 50) -> tuple[torch.Tensor, torch.Tensor]:
 
 def truth() -> tuple[torch.Tensor, torch.Tensor]:
     """What half of the believed ferry lacks, by basis function (document 002 Table 4.11 with the
-    signs of ERRATA J19).
+    signs of correction J19).
     """
     axes: list[dict[str, float]] = [
         {

@@ -49,8 +49,8 @@ def motions(count: int = 200, seed: int = 0) -> torch.Tensor:
 
 
 def test_right_hand_side_written_out(vessel: FossenConfig) -> None:
-    """M nu_dot + C nu + D nu = tau with every matrix as document 003 eqs. (5)-(9) and ERRATA have
-    it, vessel by vessel.
+    """M nu_dot + C nu + D nu = tau with every matrix as document 003 eqs. (5)-(9) and W1, W2
+    have it, vessel by vessel.
     """
     body, added, damping = vessel.rigid_body, vessel.added_mass, vessel.damping
     m, arm = body.m.value, body.m.value * body.x_G.value
@@ -230,7 +230,7 @@ def test_a_current_is_a_moving_frame(vessel: FossenConfig) -> None:
 
 
 def test_top_speed_and_pivot_of_the_calibrated_set() -> None:
-    """ERRATA: 2.19 m/s at full thrust; turning on the spot 25.9 deg/s with v = -0.19 m/s."""
+    """Corrections of document 003: 2.19 m/s at most; a pivot at 25.9 deg/s with v = -0.19 m/s."""
     plant = load_vessel("wam_v_cal").build()
     w = torch.zeros(2, 1200, len(plant.inputs), dtype=torch.float64)
     w[0, :, :2] = plant.demand(

@@ -1,5 +1,5 @@
 """Odin: the document's equations written out, what physics demands of them, and the figures of
-ERRATA 000.
+the corrections of document 000.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def test_jet_model_against_the_printed_polynomials() -> None:
         - 1.65e-7 * u * rpm**2
     )
     g += 2.55e-5 * u**2 - 5.31e-7 * u**2 * rpm + 1.58e-9 * u**2 * rpm**2
-    # 0.054 m/s^2 is what ERRATA H11 measured between (6.20) and (6.16)
+    # 0.054 m/s^2 is what correction H11 measured between (6.20) and (6.16)
     assert np.abs(rate[:, 3] - (g * np.cos(nozzle) - 0.0101 * u - 0.0492 * u**2)).max() < 0.06
     yaw = (
         -0.04321
@@ -91,8 +91,7 @@ def test_jet_model_against_the_printed_polynomials() -> None:
 
 
 def test_thrust_curve_figures() -> None:
-    """ERRATA H15: its value at rest, its roots, where it turns, and the speed at which it vanishes.
-    """
+    """Correction H15: value at rest, roots, where it turns, and the speed at which it is zero."""
     actuators, zero = jets(), torch.zeros(1, dtype=torch.float64)
 
     def thrust(rpm: float, u: float = 0.0) -> float:
@@ -141,7 +140,7 @@ def test_slew_rates_where_they_are_switched_on() -> None:
 
 @pytest.mark.parametrize(("rpm", "top"), [(2000, 9.96)])
 def test_top_speed(rpm: float, top: float) -> None:
-    """ERRATA H16, where surge balances (6.21)."""
+    """Correction H16, where surge balances (6.21)."""
     plant = plant_of("odin_jets").in_calm_water()
     w = torch.tensor([[rpm / 60, 0.0]], dtype=torch.float64)
     x = torch.zeros(1, 6, dtype=torch.float64)
@@ -157,7 +156,7 @@ def test_top_speed(rpm: float, top: float) -> None:
     ("speed", "pole"), [(0.044, -0.0), (1.0, 0.194), (5.0, 0.50), (10.0, 0.73)]
 )
 def test_sway_and_yaw_are_unstable_as_printed(speed: float, pole: float) -> None:
-    """ERRATA H5."""
+    """Correction H5."""
     hull = plant_of("odin_forces").hull
     nu = torch.tensor([speed, 0.0, 0.0], dtype=torch.float64)
     slope = torch.autograd.functional.jacobian(lambda x: hull(x, torch.zeros_like(x)), nu)
@@ -192,8 +191,8 @@ def test_mirror_symmetry() -> None:
 
 
 def test_motion_dies_out_where_the_printed_coupling_does_no_work() -> None:
-    """Without force, u^2 + v^2 falls at every step; N_v of (6.8) may feed yaw (ERRATA H5), so r is
-    left out of the sum.
+    """Without force, u^2 + v^2 falls at every step; N_v of (6.8) may feed yaw (correction H5), so r
+    is left out of the sum.
     """
     plant = plant_of("odin_forces").in_calm_water()
     x = torch.cat((torch.zeros(300, 3, dtype=torch.float64), motions()), dim=1)
@@ -222,8 +221,7 @@ def test_a_wrong_coefficient_is_found_when_the_file_is_read(override: str, messa
 
 
 def test_froude_phases() -> None:
-    """Appendix D with the length of ERRATA H17: 0.4 at 4.06 m/s, 1.0 at 10.1 m/s; side slip counts.
-    """
+    """Appendix D with the length of correction H17: 0.4 at 4.06 m/s, 1.0 at 10.1 m/s."""
     vessel = load_vessel("odin_forces")
     u = torch.tensor([0.0, 4.0, 4.1, 10.1, 10.2, 3.0], dtype=torch.float64)
     v = torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, -4.0], dtype=torch.float64)

@@ -1,5 +1,5 @@
 """The patrol vessel: MSS navalvessel.m and document 004 written out, what physics demands, and the
-figures of ERRATA 004.
+figures of the corrections of document 004.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ MIRROR = torch.tensor([1.0, -1.0, -1.0, -1.0, 1.0, -1.0, -1.0, -1.0, -1.0], dtyp
 
 @dataclass(frozen=True)
 class Numbers:
-    """What differs between the sets, as ERRATA 004 lists it."""
+    """What differs between the sets, as the corrections of document 004 list it."""
 
     rho: float
     volume: float
@@ -54,7 +54,7 @@ SETS = {
 
 
 def navalvessel(c: Numbers, nu: np.ndarray, b: float, tau: np.ndarray) -> np.ndarray:
-    """Accelerations as MSS navalvessel.m forms them, abs(u*b) read as abs(u*v) (ERRATA 004); tau
+    """Accelerations as MSS navalvessel.m forms them, abs(u*b) read as abs(u*v); tau
     acts beside the hull's own forces.
     """
     u, v, p, r = nu

@@ -106,7 +106,7 @@ def test_the_exact_step_against_rk4_and_scipy(name: str) -> None:
 
 
 def test_a_steady_turn_is_a_circle_of_document_numbers() -> None:
-    """ERRATA G18, G20: 5 deg turn at 17.3 deg/s on a radius of 10.57 m."""
+    """Corrections G18, G20: 5 deg turn at 17.3 deg/s on a radius of 10.57 m."""
     plant = load_vessel("nomoto_oceanos").build()
     states = flown(NomotoDynamics(plant, 0.01), np.full(6000, np.radians(5.0)))
     assert np.degrees(states[-1, 5]) == pytest.approx(17.35, abs=0.01)

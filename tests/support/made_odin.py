@@ -1,5 +1,6 @@
-"""Truth for equations: Odin (document 000 eqs. (6.6)-(6.8), (6.12)-(6.23) with ERRATA H1-H11) and
-the mass-spring-damper (5.13), in plain NumPy.
+"""Truth for equations in plain NumPy: Odin and the mass-spring-damper (5.13) of document 000.
+
+Odin has (6.6)-(6.8) and (6.12)-(6.23) with corrections H1 to H11.
 """
 
 from __future__ import annotations

@@ -55,8 +55,8 @@ def test_answers_are_nomotos_closed_form() -> None:
 
 
 def test_a_linear_network_finds_nomotos_affine_map(tmp_path: Path) -> None:
-    """ERRATA G21: layers without activation are exact here; the network's slope with the yaw rate
-    is that of the closed form.
+    """Correction G21: layers without activation are exact here; the network's slope with the yaw
+    rate is that of the closed form.
     """
     network, notes = trained(tmp_path, 2.0, linear=True)
     assert notes["rms_heading"] < 0.01 * DEG

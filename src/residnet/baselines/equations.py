@@ -44,7 +44,7 @@ class EquationsBaseline(Baseline):
     def parameter_count(self) -> list[float]:
         """Return the number of terms of each axis.
 
-        They were fitted, if to other data (ERRATA E9 of document 000).
+        They were fitted, if to other data (correction E9 of document 000).
         """
         return [float(count) for count in (self.theta != 0).sum(1)]
 

@@ -149,7 +149,7 @@ class Butterworth(Derivative):
         order: of the filter, for one of the two passes.
         cutoff: frequency of half gain in Hz.
 
-    Source: document 000, section 7.3; ERRATA H27.
+    Source: document 000, section 7.3; correction H27.
 
     The two passes square the magnitude: the gain at `cutoff` is 1/2, not 1/sqrt(2). The document's
     normalised cut-off is a share of the Nyquist frequency: its 0.1 at 20 Hz is 1 Hz here. The last

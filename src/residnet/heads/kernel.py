@@ -1,4 +1,4 @@
-"""Kernel ridge regression of the residual (document 001 section 3.2, ERRATA M4, M5)."""
+"""Kernel ridge regression of the residual (document 001 section 3.2, corrections M4, M5)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Long short-term memory: a residual with a hidden state (document 003 eq. (17), ERRATA W4)."""
+"""Long short-term memory: a residual with a hidden state (document 003 eq. (17), correction W4)."""
 
 from __future__ import annotations
 

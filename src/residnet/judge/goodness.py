@@ -1,5 +1,5 @@
 """Goodness of fit of one-step predictions, by model and axis (document 000 appendix E, as corrected
-in ERRATA E1-E9).
+in corrections E1 to E9).
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def measures(
 
 
 def noise_variance(residual: np.ndarray, freedom: float) -> float:
-    """sigma^2 = RSS / (m - d - 1) (9.17 with ERRATA E1); infinite where there are no more samples
+    """sigma^2 = RSS / (m - d - 1) (9.17, correction E1); infinite where there are no more samples
     than that.
     """
     left = len(residual) - freedom - 1

@@ -151,8 +151,8 @@ def independent_interval(values: np.ndarray) -> tuple[float, float]:
     """95 % interval of the mean as document 000 Listing 9.1 prints it: Student's t times the
     standard error of independent samples.
 
-    The resampling of the listing moves only the centre, by noise (ERRATA E8); here it is the mean
-    itself. Far too narrow for correlated values.
+    The resampling of the listing moves only the centre, by noise (correction E8); here it is the
+    mean itself. Far too narrow for correlated values.
     """
     n = len(values)
     half = (

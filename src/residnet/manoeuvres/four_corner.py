@@ -23,7 +23,7 @@ from residnet.dynamics.rollout import Source
 from residnet.manoeuvres.base import Helm, Manoeuvre, StackedSource
 
 _H, _D = math.pi / 2, math.pi / 4
-# Table 4.1 prints the twelve twice (ERRATA J12); headings are followed as they are written (J13)
+# Table 4.1 prints the twelve twice (correction J12); headings are followed as written (J13)
 SEGMENTS: tuple[Waypoint, ...] = (
     (0.0, -15.0, -_H), (15.0, -15.0, 0.0), (15.0, 0.0, 0.0), (30.0, 0.0, 0.0), (30.0, -15.0, 0.0),
     (30.0, -15.0, 2 * _H), (15.0, -15.0, 2 * _H), (15.0, 0.0, 3 * _D), (0.0, 0.0, 3 * _D),

@@ -62,7 +62,7 @@ def order_of(term: str) -> int:
 def column_scale(terms: Sequence[str], x: Tensor) -> Tensor:
     """Return what the columns x [N, J] of basis functions are divided by: beta std(x) [J].
 
-    Higher orders weigh less by it; (4.8), (4.9), ERRATA J15.
+    Higher orders weigh less by it; (4.8), (4.9), correction J15.
 
     Raises:
         FitError: where a column is constant.

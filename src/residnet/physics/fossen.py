@@ -1,6 +1,6 @@
 """The 3-DOF Fossen model M nu_dot + C(nu) nu + D(nu) nu = tau, from a vessel file alone.
 
-Source: document 003 eqs. (5)-(9), ERRATA W1, W2.
+Source: document 003 eqs. (5)-(9), corrections W1, W2.
 """
 
 from __future__ import annotations
@@ -166,7 +166,7 @@ class MassMatrixConfig(HullConfig):
         ]
 
     def coupling(self) -> float:
-        """Return m23 alone, as (2.5) has it (ERRATA J4)."""
+        """Return m23 alone, as (2.5) has it (correction J4)."""
         return self.mass.m23.value
 
 

@@ -83,7 +83,7 @@ class Planar(Kinematics):
 
 @final
 class Rolling(Kinematics):
-    """Surge, sway, roll and yaw, without heave and pitch (document 004, ERRATA 004).
+    """Surge, sway, roll and yaw, without heave and pitch (document 004 and its corrections).
 
     The pose is x, y, phi, psi; the velocities are u, v, p, r.
     """

@@ -18,7 +18,7 @@ class MassSpringDamperConfig(Config):
 
     Attributes:
         m, d, k: mass, damping, stiffness; by default those of section 5.3. (4.3) is another system:
-            m = 20 kg, d = 10 kg/s, k = 12 N/m (ERRATA H24).
+            m = 20 kg, d = 10 kg/s, k = 12 N/m (correction H24).
         tau_max: force that the full drive of a manoeuvre stands for.
     """
 

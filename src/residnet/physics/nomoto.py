@@ -123,8 +123,8 @@ class SecondOrderConfig(SteeringConfig, ABC):
 class SecondOrderNomotoConfig(SecondOrderConfig):
     """The second-order model of the yaw rate; no sideslip.
 
-    T1 T2 r_ddot + (T1 + T2) r_dot + r = K (delta + T3 delta_dot) (document 004 eq. (5.5), ERRATA
-    G12).
+    T1 T2 r_ddot + (T1 + T2) r_dot + r = K (delta + T3 delta_dot): document 004 eq. (5.5) by
+    correction G12.
 
     The internal state is q = r_dot - K T3 / (T1 T2) delta, which needs no derivative of the rudder
     angle.
@@ -148,7 +148,7 @@ class SideslipNomotoConfig(SecondOrderConfig):
     """The second-order model in yaw and sway, given by its transfer functions.
 
     M nu_dot + N(u) nu = b delta with nu = (v, r) (document 004 eq. (5.1)) has the transfer
-    functions (5.3) and v/delta = K_v (1 + T_v s) / ((1 + T1 s)(1 + T2 s)), (5.4) as in ERRATA G12.
+    functions (5.3) and v/delta = K_v (1 + T_v s) / ((1 + T1 s)(1 + T2 s)), (5.4) by correction G12.
 
     K_v and T_v belong to v, in m/s per rad and s.
 

@@ -1,6 +1,6 @@
 """The USV Odin: accelerations as terms of the velocities, and forces by their gains.
 
-Source: document 000 eqs. (6.6)-(6.8), ERRATA H1-H5.
+Source: document 000 eqs. (6.6)-(6.8), corrections H1 to H5.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The 4-DOF patrol vessel: surge, sway, roll and yaw with roll restoring.
 
-Source: document 004, section 5.2, as corrected in ERRATA 004.
+Source: document 004, section 5.2, with the corrections of document 004.
 """
 
 from __future__ import annotations

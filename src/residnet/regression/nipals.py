@@ -1,4 +1,4 @@
-"""NIPALS as document 002 prints it (section 3.3.1) with ERRATA J14-J17."""
+"""NIPALS as document 002 prints it (section 3.3.1) with corrections J14 to J17."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Partial least squares regression (document 002 section 3.2, ERRATA J14-J17)."""
+"""Partial least squares regression (document 002 section 3.2, corrections J14 to J17)."""
 
 from __future__ import annotations
 

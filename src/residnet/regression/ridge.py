@@ -1,4 +1,4 @@
-"""Ridge regression (document 001 section 2.2, ERRATA M4)."""
+"""Ridge regression (document 001 section 2.2, correction M4)."""
 
 from __future__ import annotations
 

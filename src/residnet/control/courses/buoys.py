@@ -68,7 +68,7 @@ class Feasibility(NamedTuple):
 def feasibility(buoys: Sequence[BuoyConfig], smallest: float) -> list[Feasibility]:
     """Return each buoy's radius beside the vessel's smallest turning radius in m.
 
-    Both printed courses ask for less than the vessel can do (ERRATA 004 G18).
+    Both printed courses ask for less than the vessel can do (correction G18).
     """
     return [Feasibility(number + 1, buoy.radius, smallest) for number, buoy in enumerate(buoys)]
 

@@ -231,7 +231,7 @@ class DocumentConfig(ControllerConfig):
     """The predictive law of document 004 with an exact predictor of the nominal vessel.
 
     Attributes:
-        horizon: of the prediction; the source's 0.01 s cannot settle (ERRATA 004).
+        horizon: of the prediction; the source's 0.01 s cannot settle (corrections of document 004).
         candidates: rudder angles.
         weight: of the choice for the heading error.
     """

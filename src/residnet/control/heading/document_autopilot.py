@@ -1,6 +1,6 @@
 """The predictive heading autopilot of document 004.
 
-Source: section 6.1.3, eqs. (6.3), (6.4), ERRATA 004.
+Source: section 6.1.3, eqs. (6.3), (6.4), corrections of document 004.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Predictor(nn.Module, ABC):
         Args:
             x: states [B, nx].
             heading: reference [B] of now, which the error is measured from (the source's own
-                listing does so, ERRATA G22).
+                listing does so, correction G22).
             rudder: candidates [C] in rad.
         """
 
@@ -84,7 +84,7 @@ class NetworkPredictor(Predictor):
     What moves the vessel goes in: velocities, heel, and the rudder's angle where it takes time to
     move. Where the vessel is and heads changes nothing in calm water, so that the heading error
     itself passes through. With linear layers, as in the source's listing, the map is affine: exact
-    for Nomoto's model, and no more than a tangent to the 4-DOF vessel (ERRATA G21).
+    for Nomoto's model, and no more than a tangent to the 4-DOF vessel (correction G21).
 
     Args:
         state: names of the columns of x.
@@ -150,7 +150,7 @@ class DocumentAutopilot(Policy):
 
     The source takes 41 candidates between -5 and 5 deg, weight 0.2 and a horizon of one step of
     0.01 s. There the first choice saturates and the second stops the yaw, so that it turns at 0.011
-    deg/s (ERRATA 004); a horizon of seconds repairs it.
+    deg/s (corrections of document 004); a horizon of seconds repairs it.
 
     Args:
         predictor: of heading error and yaw rate.

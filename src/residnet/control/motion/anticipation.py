@@ -67,7 +67,7 @@ class Derivatives(NamedTuple):
         psi, r = pose[..., 2], rate[..., 2]
         u, v = to_body(rate[..., 0], rate[..., 1], psi)
         along, across = to_body(change[..., 0], change[..., 1], psi)
-        # a vector fixed in the earth turns by -r in the body (ERRATA J7)
+        # a vector fixed in the earth turns by -r in the body (correction J7)
         return (
             psi,
             torch.stack((u, v, r), dim=-1),

@@ -1,6 +1,6 @@
 """Way-points through a third-order reference filter.
 
-Source: document 002 section 2.2.1, eq. (2.15), ERRATA J7, J9, J13.
+Source: document 002 section 2.2.1, eq. (2.15), corrections J7, J9, J13.
 """
 
 from __future__ import annotations

@@ -89,7 +89,7 @@ class Fit:
     def from_pre(cls, data: Regression, pre: Tensor, notes: dict[str, Any]) -> Fit:
         """Return the fit with coefficients of scaled variables.
 
-        Theta_post = diag(scale)^-1 Theta_pre diag(std y) (3.12), ERRATA J15.
+        Theta_post = diag(scale)^-1 Theta_pre diag(std y) (3.12), correction J15.
         """
         _, _, mean_x, mean_y, std_y = data.standardised
         post = pre / data.scale[:, None] * std_y

@@ -22,7 +22,7 @@ class DifferentialThrustConfig(ActuatorConfig):
     """Two fixed thrusters side by side (document 003 section 4.1; revolutions in 1/s).
 
     The thrust curve is clipped so that thrust never opposes the sense of rotation, which closes the
-    jump that the printed polynomials have at zero (ERRATA W5).
+    jump that the printed polynomials have at zero (correction W5).
 
     Attributes:
         spacing: distance between the thrusters in m.
@@ -74,7 +74,7 @@ class DifferentialThrust(Actuators):
     def thrust(self, n: Tensor) -> Tensor:
         """Return the thrust of one propeller [N] at revolutions n [1/s], any shape.
 
-        Source: document 003 eqs. (21), (22), clipped as in ERRATA W5.
+        Source: document 003 eqs. (21), (22), clipped as in correction W5.
         """
         thrust: Tensor = self.curve(n)
         return thrust

@@ -44,7 +44,7 @@ class SternRudders(Actuators, ABC):
     rate.
 
     delta > 0 turns to starboard: Y = -L, K = z L, N = -x L, X = T - D (document 004 eqs.
-    (5.26)-(5.29), signs as in ERRATA G9, G10).
+    (5.26)-(5.29), signs as in corrections G9, G10).
     """
 
     commands = ("cmd_delta", "cmd_thrust")
@@ -100,7 +100,7 @@ class SternRudders(Actuators, ABC):
 
 
 class FoilRuddersConfig(SternRuddersConfig):
-    """Rudders as foils (document 004 eqs. (5.20)-(5.25), ERRATA G8, G11).
+    """Rudders as foils (document 004 eqs. (5.20)-(5.25), corrections G8, G11).
 
     Attributes:
         rudders, propellers: how many; they share lift and thrust evenly.

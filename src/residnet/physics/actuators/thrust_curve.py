@@ -49,7 +49,7 @@ def require_range(config: Curved) -> None:
 class ThrustCurve(nn.Module):
     """The curve T = c0 + c1 n + c2 n^2 [N], with coefficients of its own for n < 0 [1/s].
 
-    It is clipped at zero (ERRATA W5).
+    It is clipped at zero (correction W5).
     """
 
     def __init__(self, forward: Coefficients, reverse: Coefficients) -> None:

@@ -1,6 +1,6 @@
 """Water jets with a common nozzle angle and a common motor speed.
 
-Source: document 000 eqs. (6.12)-(6.16), ERRATA H10-H16.
+Source: document 000 eqs. (6.12)-(6.16), corrections H10 to H16.
 """
 
 from __future__ import annotations

@@ -60,7 +60,7 @@ class Kernel(nn.Module, ABC):
 class RbfKernel(Kernel):
     """A sum of radial basis functions, f_k(x) = sum_i c_ik exp(-gamma_k |x - x_i|^2).
 
-    gamma = 1 / (2 sigma) (document 001 section 3.2, ERRATA M5: sigma is a squared length).
+    gamma = 1 / (2 sigma) (document 001 section 3.2, correction M5: sigma is a squared length).
     """
 
     def __init__(self, config: Rbf, count: int, outputs: int = 3) -> None:
@@ -217,7 +217,7 @@ class Rbf(Config):
 
     Attributes:
         kind: name of the kernel.
-        sigma: candidates, in squared standard deviations of a feature (ERRATA M5).
+        sigma: candidates, in squared standard deviations of a feature (correction M5).
         exact: number of samples up to which all of them carry the function, as in kernel ridge
             regression; with more, landmarks do.
         landmarks: number of samples that carry the function where there are more than `exact`

@@ -39,7 +39,7 @@ def dual_path(
 ) -> Path:
     """Return kernel ridge regressions alpha = (K + lambda I)^-1 Y for every penalty lambda.
 
-    See document 001 section 3.2, ERRATA M4.
+    See document 001 section 3.2, correction M4.
 
     A left-out fold needs no refit: with the smoother H = K (K + lambda I)^-1 its errors are (I -
     H_ff)^-1 (Y - H Y)_f.
