@@ -103,12 +103,27 @@ SHORT: dict[str, Short] = {
     "milliampere_raw": Short(data="milliampere"),
     "autopilot_nomoto": Short((*_policy("policy"), *_predictor("document"), *_STEP_TEST, *_PEERS)),
     "autopilot_nomoto_rate": Short((*_policy("policy"), *_STEP_TEST, *_PEERS)),
-    "autopilot_patrol": Short((*_policy("policy"), *_STEP_TEST)),
+    "autopilot_patrol": Short(
+        (
+            *_policy("policy"),
+            *_predictor("document"),
+            *_STEP_TEST,
+            "policies.policy.training.horizon=8 s",
+            "test.dt=0.2 s",
+            "test.duration=20 s",
+            "test.bias_time=20 s",
+            "test.sea_time=10 s",
+        )
+    ),
     "autopilot_patrol_learned": Short(
         (
             *_policy("on_vessel"),
             *_policy("on_model"),
+            "policies.on_vessel.training.horizon=8 s",
+            "policies.on_model.training.horizon=8 s",
             "policies.on_model.learned.run={runs}/patrol_identified",
+            "test.dt=0.2 s",
+            "test.duration=20 s",
             *_STEP_TEST,
         ),
         after="patrol_identified",
@@ -139,7 +154,10 @@ SHORT: dict[str, Short] = {
             *_policy("like_pd"),
             "predictive={mlp_10s: {horizon: 10 s, hidden: [30],"
             " training: {states: 300, epochs: 5}}}",
+            "policies.like_pd.training.horizon=8 s",
             "test.plants=2",
+            "test.dt=0.25 s",
+            "test.duration=30 s",
             "tuning_points=16",
         )
     ),
