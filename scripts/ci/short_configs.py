@@ -96,7 +96,7 @@ SHORT: dict[str, Short] = {
     "rudder_boat_trials": Short(_TRIALS),
     "patrol_identified": Short(_trained("mlp")),
     "kvlcc2": Short(
-        ("refit.mmg.iterations=2", "booklet.draws=20", "booklet.duration=120 s"), data="kvlcc2"
+        ("refit.mmg.iterations=2", "booklet.draws=20"), data="kvlcc2"
     ),
     "esso_osaka": Short(_TANKER, data="esso_osaka"),
     "esso_osaka_no_wind": Short(_TANKER, data="esso_osaka"),

@@ -1,0 +1,67 @@
+"""Every shipped config has a row of overrides for continuous integration, and the row is valid."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from residnet.core.resources import config_folder
+from residnet.tasks.loading import load_task
+
+FILE = Path(__file__).parents[2] / "scripts" / "ci" / "short_configs.py"
+
+
+def loaded() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("short_configs", FILE)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["short_configs"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+short_configs = loaded()
+CONFIGS = sorted(
+    path.relative_to(config_folder()).with_suffix("").as_posix()
+    for path in config_folder().rglob("*.yaml")
+    if path.parent.name != "vessels"
+)
+
+
+def test_every_config_has_a_row_and_every_row_a_config() -> None:
+    assert sorted(short_configs.SHORT) == CONFIGS
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_the_overrides_of_a_row_are_valid(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RESIDNET_DATA", str(tmp_path))
+    row = short_configs.SHORT[name]
+    if row.after:
+        (tmp_path / row.after).mkdir()
+    given = [override.replace("{runs}", str(tmp_path)) for override in row.overrides]
+    assert load_task(config_folder() / f"{name}.yaml", given).name
+
+
+def test_a_config_whose_data_are_absent_is_skipped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RESIDNET_DATA", str(tmp_path))
+    result = short_configs.carry_out("kvlcc2", tmp_path)
+    assert (result.state, result.words) == ("skipped", "no RESIDNET_DATA/kvlcc2")
+
+
+def test_a_run_that_fails_is_said_to_have_failed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wrong = short_configs.Short(("trials=3",))
+    monkeypatch.setitem(short_configs.SHORT, "wam_v_trials", wrong)
+    result = short_configs.carry_out("wam_v_trials", tmp_path)
+    assert result.state == "FAILED"
+    assert "unknown key" in result.words
