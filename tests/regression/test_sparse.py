@@ -12,7 +12,8 @@ import pytest
 from sklearn.linear_model import OrthogonalMatchingPursuit
 
 from residnet.core.errors import FitError
-from residnet.regression.sparse import Equation, SearchConfig, coarser, find, reduce
+from residnet.regression.sparse import Equation, SearchConfig, find
+from residnet.regression.sparse_reduction import coarser, reduce
 from residnet.regression.sparse_search import Criterion, Search, swap_table
 
 

@@ -90,7 +90,7 @@ class EquationsConfig(IdentifiedConfig):
         """
         out: list[Row] = []
         for axis, row in zip(VELOCITY, (self.u, self.v, self.r), strict=True):
-            own: Row = {}
+            converted: Row = {}
             for term, value in row.items():
                 for factor in parse_term(term, names):
                     if factor.name not in self.units:
@@ -101,8 +101,8 @@ class EquationsConfig(IdentifiedConfig):
                             f" {factor.name} in SI; leave its unit out"
                         )
                     value /= to_si(self.units[factor.name]) ** factor.power
-                own[term] = value
-            out.append(own)
+                converted[term] = value
+            out.append(converted)
         return out
 
     def build(self, names: Sequence[str]) -> EquationsBaseline:

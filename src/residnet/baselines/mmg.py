@@ -31,8 +31,13 @@ from residnet.physics.mmg import (
 from residnet.regression.solutions import Coefficient, Solution
 
 _MOST_SAMPLES = 4000
-# of a difference quotient, in standard deviations
+"""Samples that accelerations are fitted to; more are thinned evenly."""
 _STEP = 1e-4
+"""Step of a difference quotient, in prior standard deviations."""
+_MOST_STEPS = 20
+"""Most steps of Gauss-Newton."""
+_CONVERGED = 1e-6
+"""Largest squared step, in prior standard deviations, at which Gauss-Newton ends."""
 # what can only be seen in the accelerations of one axis is listed under it
 _AXIS = {"X": "u_dot", "R": "u_dot", "t": "u_dot", "Y": "v_dot", "N": "r_dot"}
 
@@ -41,11 +46,11 @@ _AXIS = {"X": "u_dot", "R": "u_dot", "t": "u_dot", "Y": "v_dot", "N": "r_dot"}
 class MMGBaseline(ParametricBaseline):
     """The MMG model, nu_dot [..., 3], with parameters theta [34] as `PARAMETERS` names them."""
 
-    def __init__(self, forces: MMGForces, beliefs: Sequence[Prior]) -> None:
-        super().__init__(torch.tensor([belief.mean for belief in beliefs], dtype=torch.float64))
+    def __init__(self, forces: MMGForces, priors: Sequence[Prior]) -> None:
+        super().__init__(torch.tensor([prior.mean for prior in priors], dtype=torch.float64))
         self.forces = forces
-        self.mean = [belief.mean for belief in beliefs]
-        self.spread = [belief.sd for belief in beliefs]
+        self.mean = [prior.mean for prior in priors]
+        self.sd = [prior.sd for prior in priors]
 
     def forward(self, z: Tensor) -> Tensor:
         """Return nu_dot [..., 3] at channels z [..., nz]."""
@@ -64,7 +69,7 @@ class MMGBaseline(ParametricBaseline):
 
     def free_indices(self) -> Tensor:
         """Return the places [P] of the parameters whose prior is not fixed."""
-        return torch.nonzero(torch.tensor(self.spread) > 0).squeeze(1)
+        return torch.nonzero(torch.tensor(self.sd) > 0).squeeze(1)
 
     def sensitivity(self, z: Tensor) -> Tensor:
         """Return d nu_dot / d theta [B, 3, P], by central differences of all parameters at once.
@@ -72,7 +77,7 @@ class MMGBaseline(ParametricBaseline):
         This is as exact as needed and 20 times as fast as torch.func.
         """
         free = self.free_indices()
-        steps = _STEP * torch.tensor(self.spread, dtype=z.dtype)[free]
+        steps = _STEP * torch.tensor(self.sd, dtype=z.dtype)[free]
         moves = torch.zeros(free.numel(), self.theta.numel(), dtype=z.dtype)
         moves[torch.arange(free.numel()), free] = steps
         theta = self.theta.detach().to(z.dtype)
@@ -98,7 +103,7 @@ class MMGBaseline(ParametricBaseline):
         free = self.free_indices()
         return (
             torch.tensor(self.mean, dtype=torch.float64)[free],
-            torch.tensor(self.spread, dtype=torch.float64)[free] ** -2,
+            torch.tensor(self.sd, dtype=torch.float64)[free] ** -2,
         )
 
     def asymmetry(self, samples: Samples) -> Tensor:
@@ -168,7 +173,7 @@ class MMGConfig(IdentifiedConfig):
         require(names, wanted, "the baseline 'mmg'")
         u, v, r, n, delta = (list(names).index(name) for name in wanted)
         usual = usual_priors(self.hull)
-        beliefs = [
+        priors = [
             (
                 Prior(*self.beliefs[name], usual[name].meaning)
                 if name in self.beliefs
@@ -177,21 +182,21 @@ class MMGConfig(IdentifiedConfig):
             for name in PARAMETERS
         ]
         return MMGBaseline(
-            MMGForces(self.hull, self.propeller, self.rudder, (u, v, r, n, delta)), beliefs
+            MMGForces(self.hull, self.propeller, self.rudder, (u, v, r, n, delta)), priors
         )
 
     def solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
         """Return the most likely parameters given accelerations and priors, by Gauss-Newton.
 
         Raises:
-            FitError: where the accelerations of the beliefs are not finite.
+            FitError: where the accelerations at the prior means are not finite.
         """
         assert isinstance(baseline, MMGBaseline)
         chosen = _thinned(of_manoeuvres(samples, self.manoeuvres))
         free, (mean, precision) = baseline.free_indices(), baseline.prior()
         count = len(of_manoeuvres(samples, self.manoeuvres)) / self.correlation
         baseline.theta[free] = mean
-        for _ in range(20):
+        for _ in range(_MOST_STEPS):
             left = chosen.target - baseline(chosen.z)
             if not torch.isfinite(left).all():
                 raise FitError(
@@ -208,7 +213,7 @@ class MMGConfig(IdentifiedConfig):
             ) + precision * (mean - baseline.theta[free])
             step = torch.linalg.solve(hessian, gradient)
             baseline.theta[free] += step
-            if float((step.square() * precision).max()) < 1e-6:
+            if float((step.square() * precision).max()) < _CONVERGED:
                 break
         errors = torch.linalg.inv(hessian).diagonal().sqrt()
         return [

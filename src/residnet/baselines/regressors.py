@@ -186,15 +186,15 @@ class RegressorsConfig(IdentifiedConfig):
 
         One that sets and terms both name stands once, as it was named first.
         """
-        own = (
+        given = (
             [tuple(self.terms[axis]) for axis in ("u", "v", "r")]
             if isinstance(self.terms, dict)
             else [tuple(self.terms)] * 3
         )
         if self.sets:
             shared = expand(self.sets, Roles.of(names, self.drive, self.steer))
-            return [merged((*shared, *row), names) for row in own]
-        return [row or ("1", *names) for row in own] if self.terms == () else own
+            return [merged((*shared, *row), names) for row in given]
+        return [row or ("1", *names) for row in given] if self.terms == () else given
 
     def build(self, names: Sequence[str]) -> RegressorBaseline:
         """Return the module, coefficients zero, for channels `names`."""

@@ -15,7 +15,11 @@ from residnet.core.config import Config
 from residnet.core.errors import ConfigError
 from residnet.core.names import ACCELERATION, nearest
 from residnet.core.samples import Samples
+from residnet.regression.moments import CONSTANT
 from residnet.regression.solutions import Solution
+
+_LEAST_STD = 1e-9
+"""Least standard deviation of a residual that a network's output is scaled by, SI."""
 
 
 class ResidualHead(nn.Module, ABC):
@@ -217,7 +221,9 @@ class Features(nn.Module):
         reach = self.margin * (high - low)
         std = z.std(0, correction=0)
         self.mean.copy_(z.mean(0))
-        self.std.copy_(torch.where(std > 1e-9 * (1 + self.mean.abs()), std, torch.ones_like(std)))
+        self.std.copy_(
+            torch.where(std > CONSTANT * (1 + self.mean.abs()), std, torch.ones_like(std))
+        )
         self.low.copy_(low - reach)
         self.high.copy_(high + reach)
 
@@ -249,7 +255,7 @@ class ResidualScale(nn.Module):
 
     def calibrate(self, samples: Samples) -> None:
         """Take the standard deviation of each axis from the samples' target."""
-        self.spread.copy_(samples.target.std(0, correction=0).clamp(min=1e-9))
+        self.spread.copy_(samples.target.std(0, correction=0).clamp(min=_LEAST_STD))
 
     def forward(self, out: Tensor) -> Tensor:
         """Return residual accelerations [..., 3] for outputs [..., 3] near one."""

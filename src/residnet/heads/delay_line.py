@@ -16,6 +16,11 @@ from residnet.core.names import nearest
 from residnet.physics.terms import TermLibrary, parse_term
 from residnet.regression.delay import delay_profile
 
+_PRECISION = 1e-14
+"""Share of the energy of a target that rounding leaves."""
+_TINY = 1e-300
+"""Keeps the logarithm of the error of a target of zeros finite."""
+
 
 class DelayConfig(Config):
     """A delay that the fit finds, one for all of its channels.
@@ -144,14 +149,16 @@ def best_delay(
     """
     z = torch.from_numpy(past.chosen)
     total = np.zeros(longest + 1)
-    for own, y in zip(terms, past.target.T, strict=True):
+    for names_of_terms, y in zip(terms, past.target.T, strict=True):
         held, moved = (
-            TermLibrary([_part(term, names, late, take) for term in own], names)(z).numpy()
+            TermLibrary([_part(term, names, late, take) for term in names_of_terms], names)(
+                z
+            ).numpy()
             for take in (False, True)
         )
         rss = delay_profile(held, moved, y, past.stretch, longest).rss
         # what rounding leaves of a perfect fit is no evidence
-        total += np.log(rss + 1e-14 * float(y @ y) + 1e-300) / len(terms)
+        total += np.log(rss + _PRECISION * float(y @ y) + _TINY) / len(terms)
     return int(total.argmin()), total
 
 

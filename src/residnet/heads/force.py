@@ -21,6 +21,9 @@ from residnet.physics.force_model import FERRY_TERMS, MOTION, accelerating, augm
 from residnet.physics.signals import FORCE_CHANNELS
 from residnet.regression.solutions import Solution
 
+_STEADY = 1e-9
+"""Standard deviation of a force in N or N m up to which it never varies."""
+
 
 def in_space(
     config: BasisConfig,
@@ -35,10 +38,10 @@ def in_space(
     """
     if config.space == "acceleration":
         return make(config, names)
-    own = config.model_copy(
+    settings = config.model_copy(
         update={"features": config.features or MOTION, "terms": config.terms or FERRY_TERMS}
     )
-    return ForceHead(make(own, (*ACCELERATION, *names)))
+    return ForceHead(make(settings, (*ACCELERATION, *names)))
 
 
 @final
@@ -103,7 +106,7 @@ class ForceHead(ClosedFormHead):
         """
         self.inner.calibrate(samples)
         varying = dict(zip(samples.names, samples.z.std(0).tolist(), strict=True))
-        self.still = [name for name in FORCE_CHANNELS if varying.get(name, 0.0) <= 1e-9]
+        self.still = [name for name in FORCE_CHANNELS if varying.get(name, 0.0) <= _STEADY]
         moved = samples.z[:, RANGE_VELOCITIES]
         self.lowest.copy_(moved.amin(0))
         self.highest.copy_(moved.amax(0))

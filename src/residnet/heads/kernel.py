@@ -21,6 +21,7 @@ from residnet.regression.kernel.functions import Polynomial, Rbf
 from residnet.regression.kernel.path import Path
 from residnet.regression.kernel.recursion import Recursion
 from residnet.regression.kernel.ridge import KernelRidge
+from residnet.regression.moments import CONSTANT
 from residnet.regression.solutions import Solution
 
 
@@ -79,7 +80,7 @@ class TermFeatures(nn.Module):
         values = self.library(channels)
         std = values.std(0, correction=0)
         for term, still in zip(
-            self.library.terms, (std <= 1e-9 * (1 + values.mean(0).abs())).tolist(), strict=True
+            self.library.terms, (std <= CONSTANT * (1 + values.mean(0).abs())).tolist(), strict=True
         ):
             if still:
                 raise FitError(

@@ -30,7 +30,9 @@ class PlsrConfig(BasisConfig):
     def build(self, names: Sequence[str]) -> ClosedFormHead:
         """Return the module for channels `names`."""
         return in_space(
-            self, names, lambda own, channels: PlsrHead(self.model_validate(own), channels)
+            self,
+            names,
+            lambda settings, channels: PlsrHead(self.model_validate(settings), channels),
         )
 
 

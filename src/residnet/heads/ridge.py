@@ -31,7 +31,9 @@ class RidgeConfig(BasisConfig):
     def build(self, names: Sequence[str]) -> ClosedFormHead:
         """Return the module for channels `names`."""
         return in_space(
-            self, names, lambda own, channels: RidgeHead(self.model_validate(own), channels)
+            self,
+            names,
+            lambda settings, channels: RidgeHead(self.model_validate(settings), channels),
         )
 
 

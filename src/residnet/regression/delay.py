@@ -11,6 +11,11 @@ import numpy as np
 
 from residnet.core.errors import FitError
 
+_DEPENDENT = 1e-10
+"""Share of the largest eigenvalue up to which one is what rounding leaves."""
+_TINY = 1e-300
+"""Least size that a column is divided by."""
+
 
 class DelayProfile(NamedTuple):
     """The residual sums of squares by shift [S + 1], and the shift of the least one in samples."""
@@ -48,7 +53,7 @@ def delay_profile(
             f"delay: {count} samples have a past of {longest} samples, {j} terms need more; give"
             " longer logs or a shorter delay"
         )
-    scale = np.maximum(np.abs(held).max(axis=0) * np.abs(delayed).max(axis=0), 1e-300)
+    scale = np.maximum(np.abs(held).max(axis=0) * np.abs(delayed).max(axis=0), _TINY)
     held = held / scale * has_past[:, None]
     first, second = np.triu_indices(j)
     # pairs of terms, then each term with the target
@@ -58,13 +63,13 @@ def delay_profile(
     gram = np.zeros((longest + 1, j, j))
     gram[:, first, second] = gram[:, second, first] = moments[:, : first.size]
     cross = moments[:, first.size :]
-    size = np.sqrt(np.maximum(gram.diagonal(axis1=1, axis2=2), 1e-300))
+    size = np.sqrt(np.maximum(gram.diagonal(axis1=1, axis2=2), _TINY))
     gram = gram / size[:, :, None] / size[:, None, :]
     cross = cross / size
     # candidates may be collinear: what rounding cannot tell apart shares its part
     values, vectors = np.linalg.eigh(gram)
     along = np.einsum("sij,si->sj", vectors, cross)
-    kept = values > 1e-10 * values[:, -1:]
+    kept = values > _DEPENDENT * values[:, -1:]
     explained = np.where(kept, np.square(along) / np.where(kept, values, 1.0), 0.0).sum(axis=1)
     energy = float(np.square(y[has_past]).sum())
     rss = np.maximum(energy - explained, 0.0)

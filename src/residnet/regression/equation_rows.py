@@ -20,6 +20,13 @@ from pydantic import Field
 from residnet.core.config import Config, Seconds
 from residnet.core.errors import ConfigError, FitError
 
+_DEPENDENT = 1e-10
+"""Length of a unit instrument beside those before it up to which it adds nothing."""
+_BLOCK = 8_000_000
+"""Numbers of windows held at a time."""
+_TINY = 1e-300
+"""Least variance that a covariance is divided by."""
+
 
 class Rows(NamedTuple):
     """The terms [N, J], targets [N, K] and stretches [N] of a regression.
@@ -132,7 +139,7 @@ class InstrumentRows(RowBuilder):
             )
         length = np.linalg.norm(behind, axis=0)
         q, r = np.linalg.qr(behind / np.where(length > 0, length, 1.0))
-        q = q[:, np.abs(np.diagonal(r)) > 1e-10]
+        q = q[:, np.abs(np.diagonal(r)) > _DEPENDENT]
         return Rows(np.where(exact, x, q @ (q.T @ x)), sampled.y[now], sampled.stretch[now])
 
 
@@ -169,7 +176,7 @@ def integrated(sampled: Rows, step: float, window: float, every: float) -> Rows:
     begins = np.searchsorted(sampled.stretch, sampled.stretch[first])
     first = first[(first - begins) % max(round(every * size), 1) == 0]
     joined = np.concatenate((sampled.x, sampled.y), axis=1)
-    size_of_block = max(8_000_000 // (size * joined.shape[1]), 1)
+    size_of_block = max(_BLOCK // (size * joined.shape[1]), 1)
     parts = []
     view = np.lib.stride_tricks.sliding_window_view(joined, size, axis=0)
     for begin in range(0, first.size, size_of_block):
@@ -213,7 +220,7 @@ def correlation_time(residual: np.ndarray) -> np.ndarray:
     centred = residual - residual.mean(axis=0)
     spectrum = np.abs(np.fft.rfft(centred, 2 * n, axis=0)) ** 2
     covariance = np.fft.irfft(spectrum, axis=0)[:n]
-    rho = covariance / np.maximum(covariance[0], 1e-300)
+    rho = covariance / np.maximum(covariance[0], _TINY)
     # noise of an estimate of zero: what is less than two of its deviations ends the sum
     positive = np.cumprod(rho > 2.0 / np.sqrt(n), axis=0).astype(bool)
     return np.asarray(np.maximum(2.0 * np.where(positive, rho, 0.0).sum(axis=0) - 1.0, 1.0))

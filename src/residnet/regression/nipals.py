@@ -8,6 +8,9 @@ from torch import Tensor
 from residnet.core.errors import FitError
 from residnet.regression.pls_path import LEAST_ENERGY
 
+_EXPLAINED = 1e-24
+"""Share of the energy up to which nothing is left to explain, or to explain it with."""
+
 
 def nipals(
     e: Tensor, f: Tensor, orders: int, tolerance: float = 1e-12, iterations: int = 50_000
@@ -32,8 +35,8 @@ def nipals(
     path: list[Tensor] = []
     for _ in range(orders):
         if (
-            float(f.square().sum()) <= 1e-24 * energy
-            or float(e.square().sum()) <= 1e-24 * e.numel()
+            float(f.square().sum()) <= _EXPLAINED * energy
+            or float(e.square().sum()) <= _EXPLAINED * e.numel()
         ):
             break
         u = f[:, int(f.square().sum(0).argmax())]

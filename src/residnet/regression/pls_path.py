@@ -10,6 +10,9 @@ LEAST_ENERGY = 1e-13
 are sums of others, without a meaning.
 """
 
+_EXPLAINED = 1e-13
+"""Share of the covariance up to which nothing is left to explain."""
+
 
 def pls_path(xx: Tensor, xy: Tensor, orders: int) -> Tensor:
     """Return coefficients of PLS2 for every order up to `orders`, [A, J, K].
@@ -32,7 +35,7 @@ def pls_path(xx: Tensor, xy: Tensor, orders: int) -> Tensor:
     start = float(torch.linalg.matrix_norm(xy))
     for _ in range(orders):
         left, singular, _right = torch.linalg.svd(rest, full_matrices=False)
-        if float(singular[0]) <= 1e-13 * start:
+        if float(singular[0]) <= _EXPLAINED * start:
             break
         w = left[:, 0]
         r = w.clone()

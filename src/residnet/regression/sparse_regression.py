@@ -11,7 +11,8 @@ from torch import Tensor
 
 from residnet.regression.estimator import Estimator, column_names, require_pairs
 from residnet.regression.solutions import Coefficient, Solution
-from residnet.regression.sparse import NOTHING, Equation, Reduced, SearchConfig, find, reduce
+from residnet.regression.sparse import NOTHING, Equation, SearchConfig, find
+from residnet.regression.sparse_reduction import Reduced, reduce
 
 
 @final
@@ -64,21 +65,21 @@ class SparseRegression(Estimator):
         names, outputs = column_names(x, names, "x"), column_names(y, outputs, "y")
         require_pairs(x, y)
         reduced = self._reduced(x.numpy(), y.numpy(), names)
-        own = self._solution(reduced, self.search, names, outputs)
+        preferred = self._solution(reduced, self.search, names, outputs)
         if not self.gammas:
-            return [own]
-        solutions = [own]
+            return [preferred]
+        solutions = [preferred]
         for gamma in self.gammas:
             if gamma != self.search.gamma:
                 search = self.search.model_copy(update={"gamma": gamma})
                 other = self._solution(reduced, search, names, outputs)
-                if not torch.equal(other.coefficients, own.coefficients):
+                if not torch.equal(other.coefficients, preferred.coefficients):
                     solutions.append(other)
         nothing = {
             output: NOTHING.summary(part) for output, part in zip(outputs, reduced, strict=True)
         }
-        notes = own.notes | {"parameters": 0, "coefficients": [], "equations": nothing}
-        state = {"coefficients": torch.zeros_like(own.coefficients)}
+        notes = preferred.notes | {"parameters": 0, "coefficients": [], "equations": nothing}
+        state = {"coefficients": torch.zeros_like(preferred.coefficients)}
         return [*solutions, Solution({"kept": [0] * len(outputs)}, state, notes=notes)]
 
     def _reduced(self, x: np.ndarray, y: np.ndarray, names: Sequence[str]) -> list[Reduced]:

@@ -13,6 +13,10 @@ _ALIKE = 1e-11
 """Length of a unit column beside the chosen ones below which it adds nothing that rounding does
 not.
 """
+_PARALLEL = 1e-12
+"""One less the squared cosine of two columns up to which they count as one."""
+_GAIN = 1e-6
+"""Least gain of the criterion for which columns are swapped."""
 _BLOCK = 4_000_000
 """Numbers held at once by the batched swaps."""
 _PAIR_CANDIDATES = 40
@@ -170,7 +174,7 @@ class Search:
                 ):
                     continue
                 found = self._swapped(chosen, out, into)
-                if found is not None and found[0] < value - 1e-6:
+                if found is not None and found[0] < value - _GAIN:
                     value, chosen = min(found, self.backward(found[1]))
                     again = True
                     break
@@ -188,8 +192,8 @@ class Search:
             block = kept[first : first + step]
             columns, target = _projected(self.r, self.y, block)
             rss = np.square(target).sum(axis=1)
-            one = _single_gains(columns, target, block)
-            for m, gains in enumerate(one):
+            gains_of_sets = _single_gains(columns, target, block)
+            for m, gains in enumerate(gains_of_sets):
                 best, added = (
                     _best_single(gains) if into == 1 else _best_pair(columns[m], target[m], gains)
                 )
@@ -255,7 +259,7 @@ def _best_pair(
     angle = unit.T @ unit
     room = 1.0 - np.square(angle)
     np.fill_diagonal(room, 0.0)
-    usable = room > 1e-12
+    usable = room > _PARALLEL
     both = (
         np.square(along)[:, None] + np.square(along)[None, :] - 2.0 * angle * np.outer(along, along)
     )

@@ -12,8 +12,13 @@ import torch
 from torch import Tensor
 
 from residnet.core.errors import FitError
-from residnet.regression.moments import FoldMoments
+from residnet.regression.moments import CONSTANT, FoldMoments
 from residnet.regression.pls_path import LEAST_ENERGY
+
+_EXPLAINED = 1e-26
+"""Share of a covariance's energy up to which nothing is left to explain."""
+_TINY = 1e-300
+"""Least length that a vector is divided by."""
 
 
 @dataclass(frozen=True)
@@ -142,7 +147,7 @@ class _Problems:
         size = (
             total[1 : 1 + moments.regressors, 1 : 1 + moments.regressors].diagonal() / total[0, 0]
         ).sqrt() + moments.shift_x.abs()
-        if bool((constant := scale <= 1e-9 * size).any()):
+        if bool((constant := scale <= CONSTANT * size).any()):
             raise FitError(
                 f"basis function number {int(constant.any(0).nonzero()[0, 0])} is constant; leave"
                 " it out (the intercept is there)"
@@ -167,7 +172,7 @@ class _Problems:
         """
         covariance = self.covariance[:, :, axis] * mask
         rest, b = covariance.clone(), torch.zeros_like(covariance)
-        least = 1e-26 * covariance.square().sum(1)
+        least = _EXPLAINED * covariance.square().sum(1)
         steps = int(order.max())
         least_energy = LEAST_ENERGY * float(self.gram.diagonal(dim1=1, dim2=2).max())
         loadings, rotations = (
@@ -177,7 +182,7 @@ class _Problems:
         for step in range(steps):
             first = int((order <= step).sum())
             c = rest[:, :, first:]
-            w = c / c.square().sum(1, keepdim=True).sqrt().clamp(min=1e-300)
+            w = c / c.square().sum(1, keepdim=True).sqrt().clamp(min=_TINY)
             r = w
             if step:
                 known = (loadings[:step, :, :, first:] * w).sum(2, keepdim=True)

@@ -142,8 +142,8 @@ def tables(algebra: Algebra, terms: Sequence[Product], nesting: int) -> dict[str
     place = {i: i + 1 for i in range(len(algebra.channels))}
     state: dict[str, Tensor] = {}
     for level in range(nesting):
-        own = [i for i in used if algebra.atoms[i].nesting == level + 1]
-        atoms = [algebra.atoms[i] for i in own]
+        level_atoms = [i for i in used if algebra.atoms[i].nesting == level + 1]
+        atoms = [algebra.atoms[i] for i in level_atoms]
         width = max([len(atom.inner) for atom in atoms], default=1)
         inner = [
             product
@@ -158,7 +158,7 @@ def tables(algebra: Algebra, terms: Sequence[Product], nesting: int) -> dict[str
         state[f"levels.{level}.pick"] = torch.tensor(pick, dtype=torch.float64).reshape(
             len(atoms), len(FUNCTIONS)
         )
-        place |= {i: len(place) + 1 + k for k, i in enumerate(own)}
+        place |= {i: len(place) + 1 + k for k, i in enumerate(level_atoms)}
     return state | {"terms.index": _index(terms, place)}
 
 

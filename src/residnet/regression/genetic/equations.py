@@ -18,10 +18,13 @@ from residnet.regression.expressions.text import c_function, term, total
 from residnet.regression.genetic.config import BLOCKS, EquationSearchConfig, limits_of
 from residnet.regression.genetic.evolution import Found, evolve
 from residnet.regression.solutions import Coefficient, Solution
-from residnet.regression.sparse import Equation, Reduced, find, reduce
+from residnet.regression.sparse import Equation, find
+from residnet.regression.sparse_reduction import Reduced, reduce
 from residnet.regression.sparse_regression import coefficient_row
 from residnet.regression.sparse_search import coefficients
 
+_TINY = 1e-300
+"""Least energy of a target that an error is divided by."""
 _EXACT = 1e-13
 """Unexplained share of the target below which a fit is as good as arithmetic allows."""
 
@@ -165,7 +168,7 @@ def _whole(reduced: Reduced) -> Equation:
     best, inverse = coefficients(reduced.r, y)
     left = y - reduced.r @ best
     spread = np.sqrt(left @ left / max(float(reduced.samples[0]) - len(best), 1.0))
-    share = float(np.sqrt(left @ left / max(y @ y, 1e-300)))
+    share = float(np.sqrt(left @ left / max(y @ y, _TINY)))
     errors = spread * np.sqrt(np.square(inverse).sum(axis=1))
     return Equation(
         reduced.names,

@@ -199,7 +199,7 @@ class _Breeding:
             for _ in range(self.config.population)
         ]
         population = self._rated(first)
-        best, when, history, reached = population[0], 0, [self._told(population[0])], False
+        best, when, history, reached = population[0], 0, [self._described(population[0])], False
         for generation in range(self.config.generations + 1):
             reached = max(-best.fitness, best.validation) <= self.config.goal
             if (
@@ -211,7 +211,7 @@ class _Breeding:
             population = self._rated(
                 [*population[: self.config.elite], *self._offspring(population)]
             )
-            history.append(self._told(population[0]))
+            history.append(self._described(population[0]))
             if population[0].validation < best.validation:
                 best, when = population[0], generation + 1
         if not best.terms:
@@ -229,7 +229,7 @@ class _Breeding:
             self.fitness.fitted,
         )
 
-    def _told(self, best: Individual) -> Generation:
+    def _described(self, best: Individual) -> Generation:
         return Generation(-best.fitness, best.validation, len(best.terms))
 
     def _primitives(self) -> Any:
@@ -253,11 +253,11 @@ class _Breeding:
         wanted = self.config.population - self.config.elite
         parents = tools.selTournament(population, 2 * wanted, self.config.tournament)
         out = []
-        for one, two in zip(parents[::2], parents[1::2], strict=True):
+        for first, second in zip(parents[::2], parents[1::2], strict=True):
             draw = random.random()
-            child = one.copy()
+            child = first.copy()
             if draw < self.config.crossover:
-                self._cross(child, two.copy())
+                self._cross(child, second.copy())
             elif draw < self.config.crossover + self.config.mutation:
                 place = random.randrange(len(child.trees))
                 (child.trees[place],) = self.mutate(child.trees[place])

@@ -15,6 +15,10 @@ _SINGULAR = 1e-13
 """Share of a term's energy that must be left beside the terms before it; below it the Gram matrix
 counts as singular (section 5.1.2).
 """
+_TINY = 1e-300
+"""Least mean square of a target that errors are divided by."""
+_LEAST_SCALE = 1e-100
+"""Root mean square of a term below which it is not used."""
 _ROWS = 40_000_000
 """Numbers in the cache of columns before it is emptied."""
 _CHUNK = 3_000_000
@@ -51,7 +55,7 @@ class Fitness:
         y = torch.from_numpy(np.asarray(target, dtype=np.float64)[order])
         self.y, self.y_validation = y[: self.count], y[self.count :]
         self.energy = [
-            max(float(part.square().mean()), 1e-300) for part in (self.y, self.y_validation)
+            max(float(part.square().mean()), _TINY) for part in (self.y, self.y_validation)
         ]
         self.prune = prune
         self.fitted = 0
@@ -102,7 +106,7 @@ class Fitness:
         values = self.columns.of(new)
         with np.errstate(over="ignore", invalid="ignore"):
             scale = np.sqrt(np.square(values[:, : self.count]).mean(axis=1))
-        good = np.isfinite(scale) & (scale > 1e-100) & np.isfinite(values).all(axis=1)
+        good = np.isfinite(scale) & (scale > _LEAST_SCALE) & np.isfinite(values).all(axis=1)
         values = np.where(good[:, None], values, 0.0) / np.where(good, scale, 1.0)[:, None]
         self._rows |= {product: len(self._rows) + i for i, product in enumerate(new)}
         self._values = torch.cat((self._values, torch.from_numpy(values)))

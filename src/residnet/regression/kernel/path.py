@@ -60,9 +60,11 @@ def dual_path(
         alpha = vectors @ (projected / (values + penalty)[:, None])
         total = torch.zeros(y.shape[1], dtype=y.dtype)
         for rows in members:
-            own = vectors[rows]
+            rows_of_fold = vectors[rows]
             # I - H = lambda (K + lambda I)^-1, so the penalty cancels
-            left = torch.linalg.solve((own / (values + penalty)) @ own.T, alpha[rows])
+            left = torch.linalg.solve(
+                (rows_of_fold / (values + penalty)) @ rows_of_fold.T, alpha[rows]
+            )
             total += left.square().sum(0)
         coefficients.append(alpha)
         errors.append(total / len(y))
@@ -97,7 +99,7 @@ def primal_path(
     """
     factors = [_factor(features, whiten, x[fold == f], y[fold == f]) for f in range(folds)]
     errors = torch.zeros(len(penalties), y.shape[1], dtype=y.dtype)
-    for f, own in enumerate(factors):
+    for f, factor in enumerate(factors):
         weights, _ = _weights(
             _triangle(torch.cat([other for g, other in enumerate(factors) if g != f])),
             y.shape[1],
@@ -106,7 +108,7 @@ def primal_path(
         joined = torch.cat(
             (weights, -torch.eye(y.shape[1], dtype=y.dtype).expand(len(penalties), -1, -1)), dim=1
         )
-        errors += (own @ joined).square().sum(1)
+        errors += (factor @ joined).square().sum(1)
     weights, effective = _weights(_triangle(torch.cat(factors)), y.shape[1], penalties)
     return Path(whiten @ weights, errors / len(y), effective)
 

@@ -91,11 +91,11 @@ class KernelRidge(Estimator):
             raise FitError(
                 "kernel ridge regression: no setting has finite errors; give larger `penalties`"
             )
-        own = _Pick(tuple((best // count).tolist()), tuple((best % count).tolist()))
+        preferred = _Pick(tuple((best // count).tolist()), tuple((best % count).tolist()))
         if not self.alternatives:
-            return [self._solution(paths, own, notes)]
+            return [self._solution(paths, preferred, notes)]
         n = y.shape[1]
-        picks = [own]
+        picks = [preferred]
         picks += [_Pick((i,) * n, (j,) * n) for i in range(len(paths)) for j in range(count)]
         zero = self.kernel.zero_state() | {"effective": y.new_zeros(n)}
         nothing = Solution({"penalty": []}, zero, notes=notes)
