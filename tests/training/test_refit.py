@@ -38,7 +38,8 @@ from residnet.heads import ZeroHead
 from residnet.physics.signals import SignalsConfig
 from residnet.training import refit as module
 from residnet.training.offsets import Offsets, OffsetsConfig
-from residnet.training.refit import RefitConfig, refit
+from residnet.training.refit import refit
+from residnet.training.refit_config import RefitConfig
 from residnet.training.sensitivities import step_sensitivities
 
 

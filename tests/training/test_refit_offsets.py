@@ -16,7 +16,8 @@ from residnet.data.prepare import Prepared, samples
 from residnet.data.windows import WindowStore
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.heads import ZeroHead
-from residnet.training.refit import RefitConfig, Refitted, refit
+from residnet.training.refit import Refitted, refit
+from residnet.training.refit_config import RefitConfig
 
 ROWS = {
     "u": ("u", "u|u|", "tau_x"),

@@ -1,3 +1,1 @@
-"""Models that move: hybrid (baseline + head), simulated plants, and the one time loop that runs
-them all.
-"""
+"""Models in discrete time, and the one time loop that runs them all."""

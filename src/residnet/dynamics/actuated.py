@@ -1,6 +1,4 @@
-"""A learned model with actuators in front: commands go in, so that it flies manoeuvres by itself
-like the vessel.
-"""
+"""A learned model with actuators in front, flown by commands like the vessel itself."""
 
 from __future__ import annotations
 
@@ -19,8 +17,9 @@ from residnet.dynamics.hybrid import HybridDynamics
 
 @final
 class ActuatedDynamics(Dynamics):
-    """State x [B, 6 + k]: x, y, psi, u, v, r, then the states of the gear; inputs w [B, m] as the
-    gear's.
+    """A learned model behind actuators, with states x [B, 6 + k] and the gear's inputs w [B, m].
+
+    The state is x, y, psi, u, v, r, then the states of the gear.
 
     Each input of the model is a state of the gear where it has one of that name, else an input of
     the gear, else the command of that name (`cmd_delta` for `delta`: a rudder that stands at its
@@ -62,17 +61,17 @@ class ActuatedDynamics(Dynamics):
             self.take.append(names.index(found))
 
     def initial_state(self, batch: int) -> Tensor:
-        """Memory [batch, n_state] without a past."""
+        """Return the memory [batch, n_state] without a past."""
         return self.model.initial_state(batch)
 
     def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
-        """x_dot [B, 6 + k] of the model at a stage; the gear moves once per step."""
+        """Return x_dot [B, 6 + k] of the model at a stage; the gear moves once per step."""
         return torch.cat(
             (self.model.rate(motion(x), p, rho), torch.zeros_like(actuators(x))), dim=-1
         )
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """State and memory one step later."""
+        """Return the state and the memory one step later."""
         a = actuators(x)
         moved = self.gear.move(a, w)
         given = torch.cat((a, w), dim=-1)[:, self.take]

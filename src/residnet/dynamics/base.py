@@ -1,6 +1,4 @@
-"""What the time loop steps: abstract `Dynamics`, with the explicit Runge-Kutta step that all models
-share.
-"""
+"""The interface of all models, with the explicit Runge-Kutta step that they share."""
 
 from __future__ import annotations
 
@@ -26,8 +24,9 @@ _TABLEAUX: dict[str, tuple[list[float], list[float]]] = {
 
 
 class Dynamics(nn.Module, ABC):
-    """A vessel model in discrete time: `step(x, w, s) -> (x', s')` at a fixed dt, inputs held over
-    the step.
+    """A vessel model in discrete time: `step(x, w, s) -> (x', s')` at a fixed dt.
+
+    Inputs are held over the step.
 
     Subclasses give `rate(x, p, rho)`, the derivative of the state at a stage, and `step`. All is
     pure tensor code that TorchScript compiles.
@@ -43,23 +42,26 @@ class Dynamics(nn.Module, ABC):
 
     @abstractmethod
     def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
-        """Derivative of the state [B, nx] with what a step holds fixed, p [B, k] and rho [B, n]."""
+        """Return the derivative of the state [B, nx] at a stage.
+
+        A step holds p [B, k] and rho [B, n] fixed.
+        """
 
     @abstractmethod
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """State [B, nx] and memory [B, n_state] one step later under inputs w [B, m]."""
+        """Return the state [B, nx] and the memory [B, n_state] one step later, inputs w [B, m]."""
 
     def initial_state(self, batch: int) -> Tensor:
-        """Memory [batch, n_state] without a past: zeros."""
+        """Return the memory [batch, n_state] without a past: zeros."""
         return torch.zeros(batch, self.n_state)
 
     def kinematics(self, x: Tensor) -> Tensor:
-        """Derivative [B, 3] of the pose (x, y, psi) of states [B, nx] (document 003 eq. (1))."""
+        """Return the derivative of the pose [B, 3] of states [B, nx] (document 003 eq. (1))."""
         north, east = to_earth(x[:, 3], x[:, 4], x[:, 2])
         return torch.stack((north, east, x[:, 5]), dim=-1)
 
     def integrate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
-        """State one step later, [B, nx]."""
+        """Return the state one step later, [B, nx]."""
         k = self.rate(x, p, rho)
         total = self.weights[0] * k
         for i in range(1, len(self.nodes)):

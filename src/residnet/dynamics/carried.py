@@ -13,8 +13,9 @@ from residnet.dynamics.base import Dynamics
 
 @final
 class Carried(Dynamics):
-    """A model in water that moves over ground, each row in its own steady current; u and v are
-    velocities through the water.
+    """A model in an ambient current that is steady and each row's own.
+
+    u and v are velocities through the water, x and y the place over ground.
 
     In a current that is the same everywhere and always, a vessel moves through the water as it does
     in water at rest (T. I. Fossen, Handbook of Marine Craft Hydrodynamics and Motion Control,
@@ -36,11 +37,11 @@ class Carried(Dynamics):
         self.places: Tensor
 
     def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
-        """Of the model, through the water."""
+        """Return x_dot of the model, through the water."""
         return self.model.rate(x, p, rho)
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """State and memory one step later."""
+        """Return the state and the memory one step later."""
         moved, memory = self.model.step(x, w, s[:, 2:])
         return moved + self.dt * s[:, :2] @ self.places.to(x.dtype), torch.cat(
             (s[:, :2], memory), dim=-1

@@ -12,8 +12,10 @@ from residnet.dynamics.base import Dynamics
 
 @final
 class DrawnDynamics(Dynamics):
-    """Rows [M * D] of a batch, M manoeuvres with D draws each (draws vary fastest); draw d runs
-    with theta[d] in place of a parameter.
+    """A model that runs with many samples of one parameter side by side.
+
+    Rows [M * D] of a batch are M manoeuvres with D samples each (samples vary fastest); sample d
+    runs with theta[d] in place of the parameter.
 
     Args:
         dynamics: the model, memoryless or not.
@@ -29,11 +31,11 @@ class DrawnDynamics(Dynamics):
         self.n_state = dynamics.n_state
 
     def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
-        """x_dot [M * D, nx] at a stage."""
+        """Return x_dot [M * D, nx] at a stage."""
         return self._each("rate", x, p, rho)[0]
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """State and memory one step later."""
+        """Return the state and the memory one step later."""
         after, memory = self._each("step", x, w, s)
         return after, memory
 
@@ -62,5 +64,5 @@ class _Method(torch.nn.Module):
         self.method = method
 
     def forward(self, *given: Tensor) -> object:
-        """What the method returns."""
+        """Return what the method returns."""
         return getattr(self.dynamics, self.method)(*given)

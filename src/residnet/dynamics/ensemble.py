@@ -1,5 +1,7 @@
-"""The mean of several models as one: accelerations are averaged inside one free run, so it steps,
-warms up and exports like any model.
+"""The mean of several models as one model.
+
+Accelerations are averaged inside one free run, so that it steps, warms up and exports like any
+other.
 """
 
 from __future__ import annotations
@@ -18,27 +20,27 @@ from residnet.heads.base import ResidualHead
 
 @final
 class MeanBaseline(Baseline):
-    """Mean acceleration of several baselines."""
+    """A baseline that is the mean acceleration of several baselines."""
 
     def __init__(self, members: Sequence[nn.Module]) -> None:
         super().__init__()
         self.members = nn.ModuleList(members)
 
     def forward(self, z: Tensor) -> Tensor:
-        """nu_dot [..., 3] at channels z [..., nz]."""
+        """Return nu_dot [..., 3] at channels z [..., nz]."""
         total = zero_acceleration(z)
         for member in self.members:
             total = total + member(z)
         return total / len(self.members)
 
     def parameter_count(self) -> list[float]:
-        """Those of all members."""
+        """Return the parameters of each axis, those of all members together."""
         return _summed([member.parameter_count() for member in self.members])  # type: ignore[operator]
 
 
 @final
 class MeanHead(ResidualHead):
-    """Mean residual of several heads; the memory holds theirs side by side."""
+    """A head that is the mean residual of several; the memory holds theirs side by side."""
 
     def __init__(self, members: Sequence[ResidualHead]) -> None:
         super().__init__()
@@ -47,7 +49,7 @@ class MeanHead(ResidualHead):
         self.n_state = sum(self.widths)
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Residual [B, 3] at channels z [B, nz] and the memory for the next step."""
+        """Return the residual [B, 3] at channels z [B, nz] and the memory for the next step."""
         total = zero_acceleration(z)
         memory: list[Tensor] = []
         begin = 0
@@ -59,21 +61,21 @@ class MeanHead(ResidualHead):
         return total / len(self.members), torch.cat(memory, dim=-1)
 
     def sequence(self, z: Tensor) -> Tensor:
-        """Residuals [B, T, 3] along measured channels [B, T, nz], from an empty memory."""
+        """Return residuals [B, T, 3] along channels [B, T, nz], from an empty memory."""
         total = zero_acceleration(z)
         for member in self.members:
             total = total + member.sequence(z)  # type: ignore[operator]
         return total / len(self.members)
 
     def warmup(self, z: Tensor) -> Tensor:
-        """Memory [B, n_state] that past channels [B, T, nz] leave."""
+        """Return the memory [B, n_state] that past channels [B, T, nz] leave."""
         memory: list[Tensor] = []
         for member in self.members:
             memory.append(member.warmup(z))  # type: ignore[operator]
         return torch.cat(memory, dim=-1)
 
     def parameter_count(self) -> list[float]:
-        """Those of all members."""
+        """Return the parameters of each axis, those of all members together."""
         return _summed([member.parameter_count() for member in self.members])  # type: ignore[operator]
 
 
@@ -82,7 +84,7 @@ def _summed(counts: Sequence[Sequence[float]]) -> list[float]:
 
 
 def mean_of(members: Sequence[HybridDynamics]) -> HybridDynamics:
-    """The mean of models with the same signals, step and integrator."""
+    """Return the mean of models with the same signals, step and integrator."""
     first = members[0]
     baseline, head = (
         MeanBaseline([member.head.effective_baseline(member.baseline) for member in members]),

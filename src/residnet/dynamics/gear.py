@@ -1,6 +1,4 @@
-"""Steering and propulsion gear in front of a learned model: what turns commands into the inputs
-that the model was fitted on.
-"""
+"""Steering and propulsion gear in front of a learned model, from commands to its inputs."""
 
 from __future__ import annotations
 
@@ -22,7 +20,7 @@ _RATES = {"rad": "rad/s", "1/s": "1/s^2", "m": "m/s", "-": "1/s"}
 
 
 class Gear(nn.Module, ABC):
-    """Commands move states that do not depend on the motion of the hull.
+    """A set of actuators whose states do not depend on the motion of the hull.
 
     Attributes:
         state: names of the states a [B, k].
@@ -36,21 +34,22 @@ class Gear(nn.Module, ABC):
 
     @abstractmethod
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Commands [..., c] from the normalised drive and steer [...] of a manoeuvre."""
+        """Return commands [..., c] from the normalised drive and steer [...] of a manoeuvre."""
 
     @abstractmethod
     def move(self, a: Tensor, w: Tensor) -> Tensor:
-        """States [B, k] one step later under inputs w [B, m]."""
+        """Return the states [B, k] one step later under inputs w [B, m]."""
 
     @abstractmethod
     def approach(self, rows: int) -> Tensor:
-        """State [rows, 6 + k] of hull and gear that trials start from, float64."""
+        """Return the state [rows, 6 + k] of hull and gear that trials start from, float64."""
 
 
 @final
 class PlantGear(Gear):
-    """The actuators of a plant, whatever its kind: the plant itself moves them, and what its hull
-    would do is thrown away.
+    """A gear made of a plant's actuators, whatever their kind.
+
+    The plant itself moves them, and what its hull would do is thrown away.
     """
 
     def __init__(self, plant: Plant, dt: float, substeps: int = 1) -> None:
@@ -62,12 +61,13 @@ class PlantGear(Gear):
         self.dynamics = TracedPlantDynamics(plant, dt, substeps) if self.columns else None
 
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Commands [..., c] of the plant."""
+        """Return the commands [..., c] of the plant."""
         return self.plant.demand(drive, steer)
 
     def move(self, a: Tensor, w: Tensor) -> Tensor:
-        """States [B, k] one step later; the hull is where trials start, whose motion the actuators
-        do not feel.
+        """Return the states [B, k] one step later.
+
+        The hull is where trials start; the actuators do not feel its motion.
         """
         if self.dynamics is None:
             return a
@@ -76,14 +76,15 @@ class PlantGear(Gear):
         return self.dynamics.step(x, w, x[:, :0])[0][:, self.columns]
 
     def approach(self, rows: int) -> Tensor:
-        """As the plant's."""
+        """Return the state that the plant's trials start from."""
         x = self.plant.approach(rows)
         return x[:, [*map(self.plant.state.index, STATE), *self.columns]]
 
 
 class InputShare(Config):
-    """How one input of a learned model follows the demands of a manoeuvre; all in the input's SI
-    unit or as text with a unit.
+    """A rule by which one input of a learned model follows the demands of a manoeuvre.
+
+    All values are in the input's SI unit, or text with a unit.
 
     Attributes:
         drive: value at full drive.
@@ -102,7 +103,7 @@ class InputShare(Config):
 
 @final
 class GivenGear(Gear):
-    """Inputs that follow the demands within limits and rates.
+    """A gear whose inputs follow the demands within limits and rates.
 
     Args:
         shares: by the name of the model's input; its command is that name after `cmd_`.
@@ -128,7 +129,7 @@ class GivenGear(Gear):
         self.dt = dt
 
     def demand(self, drive: Tensor, steer: Tensor) -> Tensor:
-        """Commands [..., c], within their limits."""
+        """Return the commands [..., c], within their limits."""
         both = drive.unsqueeze(-1) * self.drive.to(drive.dtype) + steer.unsqueeze(
             -1
         ) * self.steer.to(drive.dtype)
@@ -136,18 +137,18 @@ class GivenGear(Gear):
         return self.centre.to(drive.dtype) + torch.minimum(torch.maximum(both, -limit), limit)
 
     def move(self, a: Tensor, w: Tensor) -> Tensor:
-        """States [B, k] one step later: towards their commands by at most the rate."""
+        """Return the states [B, k] one step later, towards their commands by at most the rate."""
         step = self.rate[self.limited].to(a.dtype) * self.dt
         return a + torch.minimum(torch.maximum(w[:, self.limited] - a, -step), step)
 
     def approach(self, rows: int) -> Tensor:
-        """At rest, the inputs without demand."""
+        """Return the state at rest, the inputs without demand."""
         hull = torch.zeros(rows, len(STATE), dtype=torch.float64)
         return torch.cat((hull, self.centre[self.limited].expand(rows, -1)), dim=-1)
 
 
 def commanded(name: str) -> str:
-    """Name of the command that an input follows."""
+    """Return the name of the command that an input follows."""
     return name if name.startswith("cmd_") else f"cmd_{name}"
 
 

@@ -1,5 +1,6 @@
-"""The hybrid model: nu_dot = baseline + residual in acceleration space (document 003 eq. (19)), or
-through the head's mass in force space.
+"""The hybrid model, nu_dot = baseline + residual (document 003 eq. (19)).
+
+A residual in force space acts through the head's mass.
 """
 
 from __future__ import annotations
@@ -17,8 +18,9 @@ from residnet.physics.signals import Signals
 
 @final
 class HybridDynamics(Dynamics):
-    """State x [B, 6] = (x, y, psi, u, v, r); the head is evaluated once per step and held over the
-    integrator's stages.
+    """A hybrid model with the state x [B, 6] = (x, y, psi, u, v, r).
+
+    The head is evaluated once per step and held over the integrator's stages.
     """
 
     def __init__(
@@ -36,8 +38,9 @@ class HybridDynamics(Dynamics):
         self.n_state = head.n_state
 
     def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
-        """x_dot [B, 6] from what the step holds fixed: p = signals.prepare(w) and the residual rho
-        [B, 3].
+        """Return x_dot [B, 6] from what the step holds fixed.
+
+        That is p = signals.prepare(w) and the residual rho [B, 3].
         """
         nu_dot = self.head.accelerations(self.baseline(self.signals(x, p)), rho)
         return torch.cat((self.kinematics(x), nu_dot), dim=-1)
@@ -53,20 +56,21 @@ class HybridDynamics(Dynamics):
         return z
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """State and memory one step of dt later."""
+        """Return the state and the memory one step of dt later."""
         p = self.signals.prepare(w)
         rho, s = self.head(self.signals(x, p), s)
         return self.integrate(x, p, rho), s
 
     def one_step(self, z: Tensor) -> Tensor:
-        """nu_dot [B, T, 3] along measured channels [B, T, nz], the head's memory empty at first
-        (teacher forcing).
+        """Return nu_dot [B, T, 3] along measured channels [B, T, nz] (teacher forcing).
+
+        The head's memory is empty at first.
         """
         known, rho = self.baseline(z), self.head.sequence(z)
         return self.head.accelerations(known, rho)
 
     def warmup(self, y_history: Tensor, w_history: Tensor) -> Tensor:
-        """Memory [B, n_state] that a measured past leaves.
+        """Return the memory [B, n_state] that a measured past leaves.
 
         Args:
             y_history: measured states [B, T, 6], oldest first; T may be 0.

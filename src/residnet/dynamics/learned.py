@@ -11,7 +11,7 @@ from residnet.dynamics.store import model_names
 
 
 def chosen_model(run: Path, name: str) -> str:
-    """Name of a model in its run; `selected` is the one chosen on validation data.
+    """Return the name of a model in its run; `selected` is the one that validation chose.
 
     Raises:
         UsageError: where there is no such folder or no such model in it.

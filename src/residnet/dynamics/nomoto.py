@@ -16,8 +16,9 @@ from residnet.physics.nomoto import SteeringVessel
 
 @final
 class NomotoDynamics(Dynamics):
-    """Steps heading, sway and yaw of a `SteeringVessel` by the matrix exponential, then moves the
-    rudder.
+    """An exact step of heading, sway and yaw of a `SteeringVessel`, then of its rudder.
+
+    The motion is stepped by the matrix exponential.
 
     The position is the integral of the exact velocities by Simpson's rule over the step: its error
     is O(dt^4), that of heading and velocities is rounding at any dt.
@@ -58,11 +59,11 @@ class NomotoDynamics(Dynamics):
         self.simpson: Tensor
 
     def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
-        """x_dot [B, nx] of the plant; steps do not need it."""
+        """Return x_dot [B, nx] of the plant; steps do not need it."""
         return self.plant.rate(x, p)
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """State after a step; the memory passes through."""
+        """Return the state after a step; the memory passes through."""
         plant = self.plant
         speed, rudder = x[:, 3], x[:, 4 + plant.free :]
         start = torch.cat(

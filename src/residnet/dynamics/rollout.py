@@ -23,31 +23,32 @@ class Source(nn.Module, ABC):
         self.may_stop = False
 
     def initial(self, x: Tensor) -> Tensor:
-        """Memory of the source [B, k] at the start, from the initial state x [B, nx]."""
+        """Return the source's memory [B, k] at the start, from the initial state x [B, nx]."""
         return x[:, :0]
 
     @abstractmethod
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Inputs [B, m] for step k and the new memory, from the state x [B, nx] and the inputs
-        given for that step, w [B, m].
+        """Return the inputs [B, m] for step k and the new memory.
+
+        They follow from the state x [B, nx] and the inputs given for that step, w [B, m].
         """
 
     def finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
-        """[B] bool: rows that stop at this state; asked only where `may_stop`."""
+        """Return which rows stop at this state, [B] bool; asked only where `may_stop`."""
         return torch.zeros(x.shape[0], dtype=torch.bool, device=x.device)
 
 
 @final
 class Playback(Source):
-    """Gives back the inputs as they are."""
+    """A source that gives the inputs back as they are."""
 
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Inputs w [B, m], unchanged."""
+        """Return the inputs w [B, m], unchanged."""
         return w, memory
 
 
 class Rollout(nn.Module):
-    """Free run of a model from an initial state under a source of inputs."""
+    """A free run of a model from an initial state under a source of inputs."""
 
     def __init__(self, model: Dynamics, source: Source | None = None) -> None:
         super().__init__()
@@ -55,7 +56,7 @@ class Rollout(nn.Module):
         self.source = Playback() if source is None else source
 
     def forward(self, x0: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Simulate T steps.
+        """Run the model freely over T steps.
 
         Args:
             x0: initial states [B, nx].

@@ -13,8 +13,9 @@ from residnet.physics.plant import Plant
 
 @final
 class PlantDynamics(Dynamics):
-    """Steps a plant's hull with held actuators by RK4, then moves the actuators (the order of the
-    golden runs).
+    """A plant stepped by RK4 with held actuators, which move afterwards.
+
+    This is the order of the golden runs.
 
     A step of the log may hold several sub-steps of the plant: inputs are held over all of them.
     """
@@ -25,13 +26,14 @@ class PlantDynamics(Dynamics):
         self.substeps = substeps
 
     def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
-        """x_dot [B, nx] of the plant with what a step holds, p = prepare(x, w); a plant has no
-        residual.
+        """Return x_dot [B, nx] of the plant; a plant has no residual.
+
+        A step holds p = prepare(x, w).
         """
         return self.plant.held_rate(x, p)
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """State after a step of the log; the memory passes through."""
+        """Return the state after a step of the log; the memory passes through."""
         for _ in range(self.substeps):
             x = self.plant.end_step(self.integrate(x, self.plant.prepare(x, w), s), w, self.dt)
         return x, s
@@ -39,8 +41,7 @@ class PlantDynamics(Dynamics):
 
 @final
 class StagedPlantDynamics(Dynamics):
-    """Steps a plant under inputs that move during a step: RK4 with the inputs of each stage's own
-    time.
+    """A plant stepped by RK4 under inputs that move during a step, taken at each stage's time.
 
     Inputs w [B, 3 m] hold those at the start, the middle and the end of the step side by side.
     """
@@ -50,11 +51,11 @@ class StagedPlantDynamics(Dynamics):
         self.plant = plant
 
     def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
-        """x_dot [B, nx] of the plant under the inputs p [B, m] of one stage."""
+        """Return x_dot [B, nx] of the plant under the inputs p [B, m] of one stage."""
         return self.plant.rate(x, p)
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """State after a step; the memory passes through."""
+        """Return the state after a step; the memory passes through."""
         start, middle, end = torch.chunk(w, 3, dim=-1)
         k1 = self.rate(x, start, s)
         k2 = self.rate(x + 0.5 * self.dt * k1, middle, s)
@@ -68,8 +69,9 @@ class StagedPlantDynamics(Dynamics):
 
 @final
 class TracedPlantDynamics(Dynamics):
-    """`PlantDynamics` with its step recorded once as TorchScript: the same numbers, two to three
-    times faster for small batches.
+    """A `PlantDynamics` whose step is recorded once as TorchScript.
+
+    The numbers are the same, two to three times faster for small batches.
 
     For simulation only: it runs without gradients, in float64, at any batch size.
     """
@@ -85,10 +87,10 @@ class TracedPlantDynamics(Dynamics):
         self.plant = plant
 
     def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
-        """x_dot [B, nx] of the plant with what a step holds."""
+        """Return x_dot [B, nx] of the plant with what a step holds."""
         return self.plant.held_rate(x, p)
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """State after a step of the log; the memory passes through."""
+        """Return the state after a step of the log; the memory passes through."""
         after: tuple[Tensor, Tensor] = self.recorded.step(x, w, s)
         return after

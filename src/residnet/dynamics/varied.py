@@ -1,6 +1,4 @@
-"""A plant whose every row steers a little differently: what controllers are trained and compared
-on.
-"""
+"""Vessels whose every row steers a little differently, to train and compare controllers on."""
 
 from __future__ import annotations
 
@@ -26,8 +24,9 @@ angle [rad] that is added to the rudder's.
 
 @final
 class VariedPlant(Dynamics):
-    """Steps a plant by RK4 with held actuators, each row with its own rudder effect, time constants
-    and rudder bias.
+    """A plant of which each row has its own rudder effect, time constants and rudder bias.
+
+    It is stepped by RK4 with held actuators.
 
     Its memory s [B, 3] is the variation, constant over a rollout: rows of ones and a zero bias are
     the plant itself. With Nomoto's model of first order, T r_dot + r = K delta, `effect` multiplies
@@ -62,11 +61,14 @@ class VariedPlant(Dynamics):
             )
 
     def initial_state(self, batch: int) -> Tensor:
-        """The plant itself, [batch, 3]."""
+        """Return the plant itself, [batch, 3]."""
         return torch.tensor([1.0, 1.0, 0.0]).expand(batch, 3)
 
     def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
-        """x_dot [B, nx] from the rudder angle that the water feels and 1/time - 1, rho [B, 2]."""
+        """Return x_dot [B, nx] from the rudder angle that the water feels.
+
+        rho [B, 2] holds that angle and 1/time - 1.
+        """
         x_dot = self.plant.held_rate(self._felt(x, rho[:, :1]), p)
         return x_dot * (1.0 + self.slowed.to(x.dtype) * rho[:, 1:])
 
@@ -76,7 +78,7 @@ class VariedPlant(Dynamics):
         return torch.cat((x[:, : self.rudder], angle, x[:, self.rudder + 1 :]), dim=-1)
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """State after a step; the variation passes through."""
+        """Return the state after a step; the variation passes through."""
         angle = (x[:, self.rudder : self.rudder + 1] if self.rudder >= 0 else w[:, :1]) * s[
             :, :1
         ] + s[:, 2:]
@@ -88,8 +90,7 @@ class VariedPlant(Dynamics):
 
 @final
 class VariedModel(Dynamics):
-    """A learned model of a hull behind a rudder that follows its command at a rate, each row with
-    its own variation.
+    """A learned hull behind a rudder with a rate, each row with its own variation.
 
     State x [B, 6 or 7]: x, y, psi, u, v, r, and the rudder angle where it has a rate. Memory s [B,
     3 + k]: the variation, then the head's. `effect` multiplies the rudder angle that the model is
@@ -127,18 +128,18 @@ class VariedModel(Dynamics):
         self.travel = None if rate is None else rate * dt
 
     def initial_state(self, batch: int) -> Tensor:
-        """The model itself, without a past, [batch, 3 + k]."""
+        """Return the model itself, without a past, [batch, 3 + k]."""
         return torch.tensor([1.0, 1.0] + [0.0] * (self.n_state - 2)).expand(batch, -1)
 
     def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
-        """x_dot [B, 6] of the model at a stage, as if it were not varied; steps do not need it."""
+        """Return x_dot [B, 6] of the model at a stage, not varied; steps do not need it."""
         return self._of(x).rate(motion(x), p, rho)
 
     def _of(self, x: Tensor) -> HybridDynamics:
         return self.models[1 if x.dtype == torch.float64 else 0]
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """State and memory one step later under the commands w [B, m]."""
+        """Return the state and the memory one step later under the commands w [B, m]."""
         command, angle = w[:, :1], actuators(x)
         if self.travel is None:
             stands = after = command

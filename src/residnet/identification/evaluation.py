@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Free runs of models over the logs of one split.
+    """The free runs of models over the logs of one split.
 
     Attributes:
         split: train, validation, test or external.

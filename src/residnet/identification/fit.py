@@ -35,7 +35,7 @@ from residnet.training.refit import refit
 
 @dataclass(frozen=True)
 class Identified(Mapping[str, FittedModel]):
-    """Fitted models by name: zero, baselines, heads and ensembles, in this order.
+    """The fitted models by name: zero, baselines, heads and ensembles, in this order.
 
     Attributes:
         settings: of the fit.

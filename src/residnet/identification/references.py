@@ -10,7 +10,7 @@ _FIRST = "baseline"
 
 
 def references(roles: Mapping[str, str], notes: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
-    """Name of each model's reference.
+    """Return the name of each model's reference.
 
     A head is compared with the baseline that it was fitted on; an ensemble, which stands on none,
     with the baseline of the run that does best on the validation data; any other model with the

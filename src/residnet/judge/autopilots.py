@@ -1,6 +1,4 @@
-"""What flights say about heading controllers: one definition for all, distributions over random
-vessels.
-"""
+"""Measures of heading controllers: one definition for all, with spreads over random vessels."""
 
 from __future__ import annotations
 
@@ -31,7 +29,7 @@ of the rudder command, integral of its square.
 
 
 def measure(flights: Flights, band: float) -> dict[str, Tensor]:
-    """Each of `QUANTITIES` by flight, [B]."""
+    """Return each of `QUANTITIES` by flight, [B]."""
     values = (
         flights.settled(band),
         flights.overshoot(),
@@ -43,7 +41,7 @@ def measure(flights: Flights, band: float) -> dict[str, Tensor]:
 
 
 def distribution(values: Tensor) -> dict[str, float]:
-    """Mean, median, 95th percentile and largest of values [B]."""
+    """Return mean, median, 95th percentile and largest of values [B]."""
     array = values.double().numpy()
     return {
         "mean": float(array.mean()),
@@ -54,9 +52,7 @@ def distribution(values: Tensor) -> dict[str, float]:
 
 
 def row(controller: str, kind: str, protocol: str, flights: Flights, band: float) -> dict[str, Any]:
-    """A row of metrics.json: the distributions, how many flights had not settled at the end, and
-    how many there were.
-    """
+    """Return a row of metrics.json: distributions, flights not settled at the end, flights."""
     found = measure(flights, band)
     finite = torch.isfinite(flights.states).all(dim=2).all(dim=1)
     unsettled = (flights.error[:, -1].abs() > band) | ~finite
@@ -77,7 +73,7 @@ def row(controller: str, kind: str, protocol: str, flights: Flights, band: float
 def random_variations(
     effect: tuple[float, float], time: tuple[float, float], count: int, seed: int
 ) -> Tensor:
-    """Effect and time drawn evenly from their ranges, no bias: [count, 3]."""
+    """Return effect and time drawn evenly from their ranges, no bias: [count, 3]."""
     drawn = torch.rand(count, 2, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
     low, high = torch.tensor([effect, time], dtype=torch.float64).T
     return torch.cat(
@@ -94,8 +90,9 @@ def step_flights(
     duration: float,
     speed: Tensor | None = None,
 ) -> Flights:
-    """Steps of the reference, to starboard and to port in turn; `speed`: multiples [B] of the
-    service speed.
+    """Run steps of the reference, to starboard and to port in turn.
+
+    `speed` holds multiples [B] of the service speed.
     """
     side = torch.where(torch.arange(len(variations)) % 2 == 0, 1.0, -1.0)
     return fly(vessel, policy, heading * side, variations, dt=dt, duration=duration, speed=speed)
@@ -104,7 +101,7 @@ def step_flights(
 def wind_flights(
     vessel: SteeredVessel, policy: Policy, speed: float, heading: float, dt: float, duration: float
 ) -> Flights:
-    """Steps of the reference of the nominal vessel in a steady wind, from eight directions."""
+    """Run steps of the reference with the nominal vessel in wind from eight directions."""
     direction = torch.arange(8) * (torch.pi / 4.0)
     weather: dict[str, float | Tensor] = {"wind_speed": speed, "wind_dir": direction}
     return fly(
@@ -128,7 +125,7 @@ def sea_flights(
     seed: int,
     rows: int = 8,
 ) -> Flights:
-    """Steps of the reference of the nominal vessel in several realisations of a seaway."""
+    """Run steps of the reference with the nominal vessel in several seaways."""
     disturbance = Disturbance(waves=waves)
     return fly(
         SteeredPlant(plant, calm=False),
@@ -142,8 +139,9 @@ def sea_flights(
 
 
 def sea_row(controller: str, kind: str, flights: Flights, start: float) -> dict[str, Any]:
-    """A row of metrics.json: roots of mean squares of heading error, rudder and, where the vessel
-    rolls, heel, from a time [s] on.
+    """Return a row of metrics.json: roots of mean squares from a time [s] on.
+
+    They are of heading error, rudder and, where the vessel rolls, heel.
     """
     settled = flights.error[:, round(start / flights.dt) :]
     found = {
@@ -168,8 +166,10 @@ def _nominal(rows: int) -> Tensor:
 
 
 def table(rows: Sequence[Mapping[str, Any]], floor: str | None) -> str:
-    """The comparison as text: settling at the nominal vessel, over the corners and over random
-    vessels, overshoot, steady errors.
+    """Return the comparison as text.
+
+    Settling at the nominal vessel, over the corners and over random vessels, overshoot, steady
+    errors.
     """
     find = {(row["model"], row["protocol"]): row for row in rows}
     names = list(dict.fromkeys(row["model"] for row in rows))
@@ -202,9 +202,7 @@ def table(rows: Sequence[Mapping[str, Any]], floor: str | None) -> str:
 
 
 def effort_table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Means over random vessels of what a change costs, and what the course costs in the sea, as
-    text.
-    """
+    """Return means over random vessels of what a change and what the course costs, as text."""
     find = {(row["model"], row["protocol"]): row for row in rows}
     names = list(dict.fromkeys(row["model"] for row in rows))
     degree = 180.0 / math.pi

@@ -1,6 +1,4 @@
-"""booklet.json: indices of standard manoeuvres with intervals, limits of IMO, and measured zigzags
-beside their repetition by the model.
-"""
+"""The manoeuvring booklet: indices with intervals, limits of IMO, measured zigzags repeated."""
 
 from __future__ import annotations
 
@@ -68,7 +66,7 @@ class BookletConfig(Config):
         }
 
     def rudder(self) -> str:
-        """The input that steers.
+        """Return the input that steers.
 
         Raises:
             ConfigError: where none or several do.
@@ -83,7 +81,7 @@ class BookletConfig(Config):
 
 @dataclass(frozen=True)
 class Page:
-    """One manoeuvre.
+    """A page of the booklet, for one manoeuvre.
 
     Attributes:
         name: of it.
@@ -109,8 +107,9 @@ class Page:
 def contents(
     model: str, length: float, scale: float, draws: int, level: float, pages: Sequence[Page]
 ) -> dict[str, Any]:
-    """What stands in booklet.json, SI and rad, in the scale of the logs; `ship` beside an index is
-    its value for the ship.
+    """Return the contents of booklet.json, SI and rad, in the scale of the logs.
+
+    `ship` beside an index is its value for the ship.
 
     Args:
         model: its name.

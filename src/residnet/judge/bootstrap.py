@@ -1,5 +1,6 @@
-"""Intervals of mean errors by a block bootstrap: windows of one log resemble each other, so whole
-blocks of them are drawn.
+"""Intervals of mean errors by a block bootstrap.
+
+Windows of one log resemble each other, so that whole blocks of them are drawn.
 """
 
 from __future__ import annotations
@@ -37,13 +38,14 @@ class Blocks:
     count: int
 
     def row(self) -> dict[str, Any]:
-        """As it stands in metrics.json."""
+        """Return the blocks as they stand in metrics.json."""
         return {"of": self.of, "count": self.count}
 
 
 def blocks(logs: Sequence[int]) -> Blocks | None:
-    """Blocks of windows from the number of the log that each comes from, in time order within a
-    log.
+    """Return blocks of windows from the number of the log that each comes from.
+
+    Windows of a log are in time order.
 
     From five logs on a block is a log: the interval then speaks for other logs, whatever the
     windows of one have in common. Of three or four logs the mean cannot be resampled so; each is
@@ -69,8 +71,9 @@ def blocks(logs: Sequence[int]) -> Blocks | None:
 
 
 def intervals(values: np.ndarray, blocks: Blocks | None) -> list[list[float] | None]:
-    """95 % intervals of the means of columns [W, C] over windows, [low, high] of each; None where
-    there are no blocks.
+    """Return 95 % intervals of the means of columns [W, C] over windows, [low, high] of each.
+
+    None where there are no blocks.
 
     Percentile bootstrap over blocks drawn with replacement, with a fixed seed, at levels widened
     for few blocks as Student's t is against the normal distribution (Hesterberg 2015, The American
@@ -91,8 +94,9 @@ def intervals(values: np.ndarray, blocks: Blocks | None) -> list[list[float] | N
 
 
 def tail(count: int) -> float:
-    """Share of resampled means left out at either end, for a number of blocks of at least 2: 0.025
-    for many, less for few.
+    """Return the share of resampled means left out at either end, for at least 2 blocks.
+
+    It is 0.025 for many blocks and less for few.
     """
     wide = math.sqrt(count / (count - 1)) * stats.t.ppf(0.5 + _LEVEL / 2, count - 1)
     return float(stats.norm.cdf(-wide))
@@ -111,8 +115,9 @@ def _draws(count: int) -> np.ndarray:
 def difference(
     model: np.ndarray, reference: np.ndarray, to: str, blocks: Blocks | None
 ) -> dict[str, Any]:
-    """Paired difference of two models' mean errors over the same windows, as it stands in
-    metrics.json.
+    """Return the paired difference of two models' mean errors, as in metrics.json.
+
+    Both are over the same windows.
 
     Args:
         model: error of each window, [W].

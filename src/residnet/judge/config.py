@@ -37,7 +37,7 @@ class Scales(Config):
 
 
 class EvaluationConfig(Config):
-    """Protocols and scales.
+    """Settings of the evaluation: protocols and scales.
 
     Attributes:
         protocols: by name; the name stands in metrics.json.

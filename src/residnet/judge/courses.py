@@ -1,5 +1,6 @@
-"""What flights along courses say: time against the shortest possible, cross-track error, and how
-every buoy was passed.
+"""Measures of flights along courses: time, cross-track error, and how buoys were passed.
+
+Times are compared with the shortest possible.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class CourseFlight:
-    """One vessel along one course, until it ended.
+    """A flight of one vessel along one course, until it ended.
 
     Attributes:
         track: north, east [N, 2] in m.
@@ -42,7 +43,7 @@ class CourseFlight:
 
 @dataclass(frozen=True)
 class Pass:
-    """How a buoy was passed.
+    """A passage of a buoy.
 
     Attributes:
         distance: smallest distance on the whole course after the start has been left, in m.
@@ -58,7 +59,7 @@ class Pass:
 def passes(
     flight: CourseFlight, places: Sequence[tuple[float, float]], within: Sequence[float]
 ) -> list[Pass]:
-    """How each buoy at (north, east) was passed, one after the other.
+    """Return how each buoy at (north, east) was passed, one after the other.
 
     Args:
         places: of the buoys.
@@ -119,7 +120,7 @@ def row(
     acceptance: float,
     speed: float,
 ) -> dict[str, Any]:
-    """A row of metrics.json.
+    """Return a row of metrics.json.
 
     `ratio` is course time over the floor's length at the service speed; `ratio_turning` takes the
     speed that the vessel keeps in its smallest turn, for vessels that slow down. `margin` is how
@@ -179,8 +180,7 @@ def _tightest(flight: CourseFlight) -> float:
 
 
 def spread_row(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """A row of metrics.json for many flights of one controller under one guidance, from their own
-    rows.
+    """Return a row of metrics.json for many flights of one controller, from their own rows.
 
     `passed` and `finished` are shares of the flights; flights that were given up count with the
     time until then.
@@ -207,7 +207,7 @@ _TITLES: Mapping[Protocol, str] = {
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """The comparison as text: the nominal flights, then those of the spread."""
+    """Return the comparison as text: the nominal flights, then those of the spread."""
     lines = []
     for protocol, title in _TITLES.items():
         own = [row for row in rows if row["protocol"] == protocol]

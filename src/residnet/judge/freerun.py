@@ -46,8 +46,10 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Prediction:
-    """What one model predicts for one window: states [L, 6] (velocities from the model, pose
-    integrated from them) and whether it diverged.
+    """A prediction of one model for one window.
+
+    States [L, 6] hold the model's velocities and the pose integrated from them; `diverged` says
+    whether the free run ran away.
     """
 
     states: np.ndarray
@@ -56,8 +58,9 @@ class Prediction:
 
 @dataclass(frozen=True)
 class FreeRun:
-    """All models over all windows of one protocol and split; predictions[model][i] belongs to
-    windows[i].
+    """The free runs of all models over all windows of one protocol and split.
+
+    predictions[model][i] belongs to windows[i].
     """
 
     protocol: str
@@ -161,8 +164,9 @@ def _initial(candidate: Candidate, window: Window, log: Prepared) -> np.ndarray:
 
 
 def integrate(pose: np.ndarray, nu: np.ndarray, step: float) -> np.ndarray:
-    """Pose [L, 3] from its first value [3] and velocities [L, 3] by the trapezoidal rule, heading
-    first, then position.
+    """Return the pose [L, 3] from its first value [3] and velocities [L, 3].
+
+    By the trapezoidal rule, heading first, then position.
     """
 
     def trapezoid(start: float, rate: np.ndarray) -> np.ndarray:

@@ -1,5 +1,6 @@
-"""Goodness of fit of one-step predictions, by model and axis (document 000 appendix E, as corrected
-in corrections E1 to E9).
+"""Goodness of fit of one-step predictions, by model and axis (document 000 appendix E).
+
+As corrected in corrections E1 to E9.
 """
 
 from __future__ import annotations
@@ -47,8 +48,9 @@ class OneStep:
 def measures(
     residual: np.ndarray, target: np.ndarray, freedom: float, variance: float
 ) -> dict[str, float | None]:
-    """RMSE (9.11), R^2 (9.15), adjusted R^2 (9.16), Mallows' C_p (9.12), AIC (9.13) and BIC (9.14),
-    sums of squares in the place of means.
+    """Return RMSE (9.11), R^2 (9.15), adjusted R^2 (9.16), C_p (9.12), AIC (9.13), BIC (9.14).
+
+    Sums of squares stand in the place of means.
 
     Args:
         residual: measured minus predicted, [m].
@@ -80,8 +82,9 @@ def measures(
 
 
 def noise_variance(residual: np.ndarray, freedom: float) -> float:
-    """sigma^2 = RSS / (m - d - 1) (9.17, correction E1); infinite where there are no more samples
-    than that.
+    """Return sigma^2 = RSS / (m - d - 1) (9.17, correction E1).
+
+    Infinite where there are no more samples than that.
     """
     left = len(residual) - freedom - 1
     return float(residual @ residual) / left if left > 0 else math.inf
@@ -90,7 +93,7 @@ def noise_variance(residual: np.ndarray, freedom: float) -> float:
 def table(
     models: Sequence[OneStep], targets: Sequence[np.ndarray], step: float
 ) -> list[dict[str, Any]]:
-    """A row for each model and axis.
+    """Return a row for each model and axis.
 
     Args:
         models: one-step residuals over the same pieces.
@@ -154,8 +157,9 @@ def _series(pieces: Sequence[np.ndarray], step: float) -> dict[str, Any]:
 def paired(
     pieces: Sequence[np.ndarray], reference: Sequence[np.ndarray], to: str
 ) -> dict[str, Any]:
-    """Difference of two models' mean absolute residuals over the same samples, with its interval by
-    blocks; negative where the model is better.
+    """Return the difference of two models' mean absolute residuals, with its interval.
+
+    Over the same samples, by blocks; negative where the model is better.
 
     Args:
         pieces: residuals of the model, piece by piece.
@@ -179,5 +183,5 @@ def _bounds(low: float, high: float) -> list[float] | None:
 
 
 def content(run: str, splits: Mapping[str, list[dict[str, Any]]], step: float) -> dict[str, Any]:
-    """Contents of goodness.json."""
+    """Return the contents of goodness.json."""
     return {"schema": SCHEMA, "run": run, "lags": LAGS, "step": step, "splits": dict(splits)}

@@ -1,6 +1,4 @@
-"""Manoeuvring indices of flights as a table: vessel beside model, with the limits of IMO where they
-apply.
-"""
+"""Manoeuvring indices of flights as a table, vessel beside model, with limits of IMO."""
 
 from __future__ import annotations
 
@@ -18,8 +16,9 @@ _SHOWN = {"rad": ("deg", math.degrees(1.0)), "rad/s": ("deg/s", math.degrees(1.0
 def index_rows(
     craft: Craft, flights: Sequence[Flight], length: float | None
 ) -> list[dict[str, Any]]:
-    """For each flight its log, manoeuvre, craft, faults, indices (SI, rad) and limits, each with
-    whether it is kept.
+    """Return log, manoeuvre, craft, faults, indices and limits of each flight.
+
+    Indices in SI and rad; each limit with whether it is kept.
 
     Args:
         craft: what flew.
@@ -58,15 +57,16 @@ def index_rows(
 
 
 def contents(run: str, length: float | None, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """indices.json."""
+    """Return the contents of indices.json."""
     used = {name for row in rows for name in row["indices"]}
     units = {name: UNITS.get(name, "-") for name in sorted(used)}
     return {"schema": SCHEMA, "run": run, "length": length, "units": units, "rows": list(rows)}
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Indices as text, flight by flight, one column for each craft; with two crafts how far the
-    second is off.
+    """Return the indices as text, flight by flight, one column for each craft.
+
+    With two crafts also how far the second is off.
     """
     crafts = list(dict.fromkeys(row["craft"] for row in rows))
     lines: list[str] = []

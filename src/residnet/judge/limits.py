@@ -1,6 +1,4 @@
-"""Where a model fails and what limits it: errors by band of speed and wind, worst windows,
-consistency of the measured channels.
-"""
+"""Limits of a model: errors by speed and wind, worst windows, consistency of the channels."""
 
 from __future__ import annotations
 
@@ -29,7 +27,10 @@ def limits(
     scales: Mapping[str, float],
     step: float,
 ) -> dict[str, Any]:
-    """What stands in limits.json for one protocol and split: `kinematics`, `bands` and `worst`."""
+    """Return the part of limits.json for one protocol and split.
+
+    It holds `kinematics`, `bands` and `worst`.
+    """
     errors = {candidate.name: window_errors(run, candidate.name, logs) for candidate in candidates}
     return {
         "kinematics": kinematics(run, logs, step),
@@ -42,8 +43,9 @@ def limits(
 
 
 def kinematics(run: FreeRun, logs: Sequence[Prepared], step: float) -> dict[str, float]:
-    """How far measured velocities, integrated over each window from its measured pose as
-    predictions are, end from the measured pose.
+    """Return how far integrated measured velocities end from the measured pose.
+
+    They are integrated over each window from its measured pose, as predictions are.
 
     Returns:
         windows; position_mean, position_rms in m and heading_mean, heading_rms in rad at the ends
@@ -71,8 +73,9 @@ def bands(
     scales: Mapping[str, float],
     errors: Mapping[str, Mapping[str, np.ndarray]],
 ) -> list[dict[str, Any]]:
-    """Errors by thirds of the windows in mean speed and, where every log has it, in mean true wind
-    speed.
+    """Return errors by thirds of the windows in mean speed and in mean true wind speed.
+
+    The wind only where every log has it.
 
     A band of fewer than three windows is left out, and so is a quantity of which one band remains.
     Each entry: `by` (speed or wind), `low` and `high` in m/s (extremes of the windows' means),
@@ -125,8 +128,9 @@ def _bands(values: np.ndarray) -> list[np.ndarray]:
 def worst(
     run: FreeRun, logs: Sequence[Prepared], nrmse: np.ndarray, errors: Mapping[str, np.ndarray]
 ) -> list[dict[str, Any]]:
-    """The three windows with the largest nrmse [W]: log, manoeuvre, t (start, the log's clock, s),
-    nrmse, rmse and position_error_end.
+    """Return the three windows with the largest nrmse [W].
+
+    Each with log, manoeuvre, t (start, the log's clock, s), nrmse, rmse and position_error_end.
     """
     out = []
     for i in np.argsort(-nrmse, kind="stable")[:_WORST].tolist():

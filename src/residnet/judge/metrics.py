@@ -17,8 +17,9 @@ SCHEMA = "residnet.metrics/1"
 
 
 def window_errors(run: FreeRun, model: str, logs: Sequence[Prepared]) -> dict[str, np.ndarray]:
-    """Errors of one model by window: rmse and mae [W, 3] of (u, v, r), position_error_end and
-    heading_error_end [W], samples [W].
+    """Return the errors of one model by window.
+
+    rmse and mae [W, 3] of (u, v, r), position_error_end and heading_error_end [W], samples [W].
 
     u and v are scored over usable samples; r, which no position sensor disturbs, over all.
     """
@@ -50,8 +51,9 @@ def rows(
     scales: Mapping[str, float],
     groups: Mapping[str, Sequence[str]],
 ) -> list[dict[str, Any]]:
-    """Rows of metrics.json for one protocol and split: every model, over all windows, every kind of
-    manoeuvre and every named group of kinds.
+    """Return the rows of metrics.json for one protocol and split.
+
+    Every model, over all windows, every kind of manoeuvre and every named group of kinds.
 
     `difference` compares a model with its reference (`Candidate.reference`) over the same windows;
     None where it has none.
@@ -86,7 +88,7 @@ def rows(
 
 
 def nrmse_of_windows(errors: Mapping[str, np.ndarray], scales: Mapping[str, float]) -> np.ndarray:
-    """Mean over u, v, r of rmse / scale for each window, [W]."""
+    """Return the mean over u, v, r of rmse / scale for each window, [W]."""
     return np.asarray((errors["rmse"] / np.array([scales[name] for name in VELOCITY])).mean(1))
 
 
@@ -97,8 +99,9 @@ def against(
     chosen: np.ndarray,
     drawn: Blocks | None,
 ) -> dict[str, Any] | None:
-    """Paired difference of a model to its reference over chosen windows [W] bool; None where it has
-    none among the models.
+    """Return the paired difference of a model to its reference over chosen windows [W] bool.
+
+    None where it has none among the models.
     """
     if candidate.reference is None or candidate.reference not in errors:
         return None
@@ -141,7 +144,7 @@ def _summary(
 
 
 def find(table: Sequence[Mapping[str, Any]], **wanted: str) -> Mapping[str, Any]:
-    """The one row with the given model, split, protocol (and manoeuvre, `all` where not said)."""
+    """Return the one row of a model, split, protocol and manoeuvre (`all` where not given)."""
     keys = {"manoeuvre": "all"} | wanted
     found = [row for row in table if all(row[key] == value for key, value in keys.items())]
     if len(found) != 1:

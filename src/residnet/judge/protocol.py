@@ -18,7 +18,7 @@ from residnet.data.prepare import Prepared
 
 @dataclass(frozen=True)
 class Window:
-    """One free run: samples start .. stop-1 of a log, the first of them the initial state.
+    """A free run over samples start .. stop-1 of a log, the first of them the initial state.
 
     Attributes:
         log: number of the log.
@@ -36,7 +36,7 @@ class Window:
 
 
 class Windows(Config):
-    """Back-to-back windows of one length (the free-run protocol of the measured tanker).
+    """A protocol of back-to-back windows of one length, as for the measured tanker.
 
     A start on a sample that is not usable moves on to the first that is; an incomplete tail is
     dropped. The initial state is measured.
@@ -54,7 +54,7 @@ class Windows(Config):
     history: Seconds = Field(default=5.0, ge=0)
 
     def windows(self, log: Prepared, number: int, step: float) -> list[Window]:
-        """The windows of one log; none where it is too short."""
+        """Return the windows of one log; none where it is too short."""
         steps, start, out = round(self.length / step), round(self.first / step), []
         _, end = stretch_bounds(log.piece)
         while start + steps < len(log):
@@ -76,7 +76,7 @@ class Windows(Config):
 
 
 class WholeManoeuvre(Config):
-    """Every uninterrupted stretch of a log as one free run.
+    """A protocol that takes every uninterrupted stretch of a log as one free run.
 
     The initial velocities are the mean of the first seconds, which also warm up a memory; scoring
     starts after them. Stretches without a sample to score are left out.
@@ -92,7 +92,7 @@ class WholeManoeuvre(Config):
     shortest: Seconds = Field(default=5.0, gt=0)
 
     def windows(self, log: Prepared, number: int, step: float) -> list[Window]:
-        """One window per stretch."""
+        """Return one window per stretch."""
         lead, out = max(round(self.initial / step), 1), []
         _, end = stretch_bounds(log.piece)
         begin = 0
@@ -124,7 +124,7 @@ ProtocolConfig = Annotated[Windows | WholeManoeuvre, Field(discriminator="kind")
 def all_windows(
     protocol: Windows | WholeManoeuvre, logs: Sequence[Prepared], step: float, name: str
 ) -> list[Window]:
-    """The windows of a protocol over several logs.
+    """Return the windows of a protocol over several logs.
 
     Raises:
         DataError: where no log is long enough for a single one.

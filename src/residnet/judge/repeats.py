@@ -1,6 +1,4 @@
-"""Repeatability: stretches of logs with the same commands and the same start, and how far the
-vessel's motions in them differ.
-"""
+"""Repeatability: how far a vessel's motions differ under the same commands and start."""
 
 from __future__ import annotations
 
@@ -23,8 +21,9 @@ _SEARCH = 0.5
 
 @dataclass(frozen=True)
 class Pair:
-    """Window `first` and the stretch of log number `log` from sample `start` on that repeats it;
-    `mismatch` of the commands, share of their range.
+    """A pair of repeated runs: a window, and the stretch of a log that repeats it.
+
+    `mismatch` is that of the commands, as a share of their range.
     """
 
     first: Window
@@ -40,7 +39,7 @@ def repeatability(
     scales: Mapping[str, float],
     step: float,
 ) -> dict[str, Any]:
-    """What stands in limits.json about repeated manoeuvres.
+    """Return the part of limits.json about repeated manoeuvres.
 
     Every window of the protocol is compared with every stretch of equal length of the logs after
     its own, and of its own after the window, at starts every 0.5 s. A stretch repeats a window
@@ -90,8 +89,9 @@ def find_pairs(
     scales: np.ndarray,
     step: float,
 ) -> Iterator[Pair]:
-    """Pairs of repeated runs: each window of the protocol with at most one stretch of each log from
-    its own on; scales [3] of u, v, r.
+    """Return pairs of repeated runs; scales [3] are of u, v, r.
+
+    Each window of the protocol with at most one stretch of each log from its own on.
     """
     every = max(round(_SEARCH / step), 1)
     known = [log.recorded[log.piece >= 0, :commands] for log in logs]
@@ -118,8 +118,9 @@ def find_pairs(
 
 
 def mismatch(given: np.ndarray, series: np.ndarray) -> np.ndarray:
-    """Root mean square difference of a stretch [L, m] to every stretch of a series [T, m], the
-    largest over columns, [T - L + 1].
+    """Return the difference of a stretch [L, m] to every stretch of a series, [T - L + 1].
+
+    It is the root mean square, the largest over the columns of the series [T, m].
     """
     if len(series) < len(given):
         return np.zeros(0)

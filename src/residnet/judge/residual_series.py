@@ -1,5 +1,4 @@
-"""Statistics of serially correlated residuals: autocorrelation, whiteness, effective sample size,
-intervals by moving-block bootstrap.
+"""Statistics of serially correlated residuals, with moving-block bootstrap intervals.
 
 A series may consist of pieces (logs, stretches between masked samples): nothing is correlated
 across their ends and no block crosses them.
@@ -31,7 +30,7 @@ Pieces = Sequence[np.ndarray]
 
 @dataclass(frozen=True)
 class Memory:
-    """How far a series remembers.
+    """The memory of a series: how far it remembers.
 
     Attributes:
         block: length of blocks for a bootstrap of its mean, in samples.
@@ -46,9 +45,7 @@ class Memory:
 
 @dataclass(frozen=True)
 class Interval:
-    """A mean with a 95 % interval, the length of the blocks in samples, and the number of blocks
-    that the series holds.
-    """
+    """A mean with a 95 % interval, the blocks' length in samples, and their number."""
 
     mean: float
     low: float
@@ -58,8 +55,9 @@ class Interval:
 
 
 def autocovariance(pieces: Pieces, lags: int) -> np.ndarray:
-    """Autocovariances at lags 0 .. `lags`, [lags + 1], about the mean of all pieces, products
-    within pieces over the number n of all samples.
+    """Return autocovariances at lags 0 .. `lags`, [lags + 1], about the mean of all pieces.
+
+    Products are within pieces, over the number n of all samples.
     """
     joined = np.concatenate(list(pieces))
     mean, out = joined.mean(), np.zeros(lags + 1)
@@ -72,9 +70,10 @@ def autocovariance(pieces: Pieces, lags: int) -> np.ndarray:
 
 
 def memory(pieces: Pieces) -> Memory:
-    """Block length and long-run variance chosen from the data (Politis and White 2004, Econometric
-    Reviews 23, 53-70; corrected by Patton, Politis and White 2009, 28, 372-375), for blocks of
-    fixed length.
+    """Return block length and long-run variance chosen from the data, for fixed blocks.
+
+    Politis and White 2004, Econometric Reviews 23, 53-70; corrected by Patton, Politis and White
+    2009, 28, 372-375.
 
     The flat-top window of the autocovariances R(k) reaches to twice the lag m from which on
     correlations are no more than noise; with g = sum R(k) and G = sum |k| R(k) under it, the block
@@ -102,8 +101,9 @@ def memory(pieces: Pieces) -> Memory:
 
 
 def block_interval(pieces: Pieces, seed: int = 0) -> Interval:
-    """Mean of all samples with its 95 % interval by a moving-block bootstrap, block length by
-    `memory`.
+    """Return the mean of all samples with its 95 % interval by a moving-block bootstrap.
+
+    The block length is that of `memory`.
 
     Percentiles about the mean, at levels widened for few blocks as Student's t is (see
     `residnet.judge.bootstrap`), and by what blocks of finite length miss: the ratio of the standard
@@ -148,8 +148,9 @@ def _blocks(pieces: Pieces, length: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def independent_interval(values: np.ndarray) -> tuple[float, float]:
-    """95 % interval of the mean as document 000 Listing 9.1 prints it: Student's t times the
-    standard error of independent samples.
+    """Return the 95 % interval of the mean as document 000 Listing 9.1 prints it.
+
+    Student's t times the standard error of independent samples.
 
     The resampling of the listing moves only the centre, by noise (correction E8); here it is the
     mean itself. Far too narrow for correlated values.
@@ -164,8 +165,10 @@ def independent_interval(values: np.ndarray) -> tuple[float, float]:
 
 
 def ljung_box(pieces: Pieces, lags: int) -> tuple[float, float]:
-    """Ljung and Box's (1978) statistic n (n + 2) sum rho_k^2 / (n - k), lags 1 .. `lags`, and the
-    chance of a larger one in white noise.
+    """Return the statistic of Ljung and Box (1978) and its chance in white noise.
+
+    The statistic is n (n + 2) sum rho_k^2 / (n - k) over lags 1 .. `lags`; the chance is that of a
+    larger one.
     """
     n = sum(len(piece) for piece in pieces)
     covariance = autocovariance(pieces, lags)

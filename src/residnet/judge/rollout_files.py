@@ -1,6 +1,4 @@
-"""The stored rollouts: `rollouts/<split>/<log>.parquet`, from which anyone can recompute the
-metrics.
-"""
+"""The stored rollouts, from which anyone can recompute the metrics."""
 
 from __future__ import annotations
 
@@ -17,7 +15,7 @@ _ORDER = ("u", "v", "r", "psi", "x", "y")
 
 
 def write_rollouts(folder: Path, runs: Sequence[FreeRun], logs: Sequence[Prepared]) -> None:
-    """One file per log of a split; `runs` are the protocols of that split.
+    """Write one file per log of a split; `runs` are the protocols of that split.
 
     Columns: protocol, model, window, t (s, the log's clock), usable, diverged, then u, v, r, psi,
     x, y as measured and with `_hat` as predicted (SI, rad).

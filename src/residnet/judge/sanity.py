@@ -1,6 +1,4 @@
-"""Physical sanity of a model: does what was identified behave like a vessel, inside its training
-data and outside?
-"""
+"""Physical sanity of a model: does it behave like a vessel, within its data and beyond?"""
 
 from __future__ import annotations
 
@@ -40,8 +38,9 @@ _LONG_RUN = 300.0
 
 @dataclass(frozen=True)
 class Finding:
-    """Outcome of one check of one model; `ok` is None where the check does not apply or could not
-    be made.
+    """A finding of one check of one model.
+
+    `ok` is None where the check does not apply or could not be made.
     """
 
     model: str
@@ -73,7 +72,7 @@ def check_run(run: Path, *, divergence: float = 3.0) -> list[Finding]:
 def check_model(
     spec: ModelSpec, model: HybridDynamics, *, divergence: float = 3.0
 ) -> list[Finding]:
-    """All checks of one model, in the order of `CHECKS`.
+    """Return all checks of one model, in the order of `CHECKS`.
 
     Args:
         spec: its description; the training ranges are taken from it.
@@ -96,8 +95,9 @@ def check_model(
 def check_damping(
     spec: ModelSpec, model: HybridDynamics, points: Sequence[OperatingPoint]
 ) -> Finding:
-    """Does each velocity decay by itself? Slopes d u_dot/du, d v_dot/dv, d r_dot/dr with the memory
-    settled, by autograd.
+    """Check that each velocity decays by itself.
+
+    Slopes d u_dot/du, d v_dot/dv, d r_dot/dr with the memory settled, by autograd.
     """
     chosen = [point for point in points if point.label in ("rest", "cruise")]
     x = torch.stack([point.x for point in chosen]).requires_grad_()
@@ -143,8 +143,9 @@ def check_damping(
 def check_stability(
     spec: ModelSpec, model: HybridDynamics, points: Sequence[OperatingPoint]
 ) -> Finding:
-    """Straight running at several speeds: growth of small sway-yaw disturbances, memory included,
-    from the Jacobian of a step.
+    """Check how small sway-yaw disturbances grow in straight running at several speeds.
+
+    Memory included, from the Jacobian of a step.
     """
     unstable: list[tuple[OperatingPoint, float]] = []
     parts = []
@@ -181,8 +182,10 @@ def check_stability(
 
 
 def growth_rate(model: HybridDynamics, point: OperatingPoint) -> float:
-    """Largest growth rate [1/s] of a small disturbance of (v, r, memory) about a point: log of the
-    step map's spectral radius over dt.
+    """Return the largest growth rate [1/s] of a small disturbance about a point.
+
+    The disturbance is of (v, r, memory); the rate is the log of the step map's spectral radius over
+    dt.
     """
     s = settled_memory(model, point.x[None], point.w[None])
     start = torch.cat((point.x[LATERAL], s[0])).detach()
@@ -198,8 +201,9 @@ def growth_rate(model: HybridDynamics, point: OperatingPoint) -> float:
 
 
 def check_symmetry(spec: ModelSpec, model: HybridDynamics, *, samples: int = 500) -> Finding:
-    """A mirrored state with mirrored inputs must give the mirrored acceleration; sampled over the
-    symmetric part of the training ranges.
+    """Check that mirrored states and inputs give the mirrored acceleration.
+
+    Sampled over the symmetric part of the training ranges.
     """
     mirror = Mirror.of(spec.signals.columns)
     if mirror is None:
@@ -241,9 +245,7 @@ def check_symmetry(spec: ModelSpec, model: HybridDynamics, *, samples: int = 500
 
 
 def check_bounded(spec: ModelSpec, model: HybridDynamics, divergence: float) -> Finding:
-    """From rest with every input held at the edges of its training range: does the motion stay
-    bounded?
-    """
+    """Check that the motion stays bounded from rest with inputs at the edges of their ranges."""
     corners = _corners(spec)
     x = torch.zeros(len(corners), len(STATE), dtype=torch.float64)
     limit = (

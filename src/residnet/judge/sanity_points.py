@@ -20,8 +20,9 @@ _CRUISE = 0.67
 
 @dataclass(frozen=True)
 class OperatingPoint:
-    """Straight running at a speed: state x [6], inputs w [m], and whether both lie inside the
-    training ranges.
+    """A point of straight running at a speed: state x [6], inputs w [m].
+
+    `inside` says whether both lie within the training ranges.
     """
 
     label: str
@@ -40,16 +41,18 @@ class OperatingPoint:
 
 
 def settled_memory(model: HybridDynamics, x: Tensor, w: Tensor) -> Tensor:
-    """Memory [B, n_state] after ten seconds in the same state x [B, 6] under the same inputs w [B,
-    m].
+    """Return the memory [B, n_state] after ten seconds in the same state and inputs.
+
+    States x [B, 6], inputs w [B, m].
     """
     steps = max(round(_SETTLE / model.dt), 1) if model.n_state else 0
     return model.warmup(x[:, None].expand(-1, steps, -1), w[:, None].expand(-1, steps, -1))
 
 
 def acceleration(model: HybridDynamics, x: Tensor, w: Tensor) -> Tensor:
-    """nu_dot [B, 3] of baseline and head together at states x [B, 6] and inputs w [B, m], the
-    head's memory settled there.
+    """Return nu_dot [B, 3] of baseline and head together, the head's memory settled.
+
+    States x [B, 6], inputs w [B, m].
     """
     z = model.channels(x, w)
     rho, _ = model.head(z, settled_memory(model, x, w))
@@ -58,8 +61,9 @@ def acceleration(model: HybridDynamics, x: Tensor, w: Tensor) -> Tensor:
 
 
 def steering(columns: Sequence[str]) -> tuple[list[int], list[tuple[int, int]]]:
-    """Columns of rudders (they change sign in a mirror) and pairs (port, starboard) of columns
-    (they change places).
+    """Return columns of rudders, and pairs (port, starboard) of columns.
+
+    In a mirror the former change sign and the latter change places.
     """
     names = list(columns)
     rudders = [i for i, name in enumerate(names) if name == "delta"]
@@ -72,8 +76,9 @@ def steering(columns: Sequence[str]) -> tuple[list[int], list[tuple[int, int]]]:
 
 
 def operating_points(spec: ModelSpec, model: HybridDynamics) -> list[OperatingPoint]:
-    """Straight running from rest to half as fast again as the training data, each under the drive
-    that nearly holds the speed.
+    """Return points of straight running from rest to beyond the training data's speeds.
+
+    The fastest is half as fast again; each is under the drive that nearly holds the speed.
 
     Drives are all inputs that do not steer, moved together from the low to the high end of their
     ranges; rudders are amidships and the air is calm, as far as the ranges allow.
@@ -118,8 +123,9 @@ def _drives(spec: ModelSpec, count: int = 41) -> Tensor:
 
 @dataclass(frozen=True)
 class Mirror:
-    """Reflection in the vessel's plane of symmetry: rudders change sign, port and starboard change
-    places, wind comes from the other side.
+    """A reflection in the vessel's plane of symmetry.
+
+    Rudders change sign, port and starboard change places, wind comes from the other side.
     """
 
     columns: tuple[str, ...]
@@ -128,8 +134,10 @@ class Mirror:
 
     @classmethod
     def of(cls, columns: Sequence[str]) -> Mirror | None:
-        """The reflection of inputs `columns`; None where none of them is known to steer, or a lone
-        port or starboard input has no partner.
+        """Return the reflection of inputs `columns`; None where it is not known.
+
+        That is where none of them is known to steer, or a lone port or starboard input has no
+        partner.
         """
         rudders, pairs = steering(columns)
         paired = {i for pair in pairs for i in pair}
@@ -143,11 +151,11 @@ class Mirror:
         return cls(tuple(columns), tuple(rudders), tuple(pairs))
 
     def state(self, x: Tensor) -> Tensor:
-        """Mirrored states [B, 6]."""
+        """Return mirrored states [B, 6]."""
         return x * torch.tensor([1.0, -1.0, -1.0, 1.0, -1.0, -1.0], dtype=x.dtype)
 
     def inputs(self, w: Tensor) -> Tensor:
-        """Mirrored inputs [B, m]."""
+        """Return mirrored inputs [B, m]."""
         out = w.clone()
         for i in self.rudders:
             out[:, i] = -w[:, i]
@@ -159,8 +167,9 @@ class Mirror:
         return out
 
     def draw(self, spec: ModelSpec, count: int) -> tuple[Tensor, Tensor]:
-        """States [count, 6] and inputs [count, m], uniform over the part of the training ranges
-        that lies inside it mirrored too.
+        """Draw states [count, 6] and inputs [count, m] whose mirror images are in the ranges too.
+
+        They are uniform over that part of the training ranges.
         """
         low, high = list(spec.low), list(spec.high)
         for i in (1, 2, *(PLANAR.dof + k for k in self.rudders)):

@@ -1,6 +1,4 @@
-"""Whether a force model still fits what is logged now: the trigger of an update (document 002
-section 3.7).
-"""
+"""A check that a force model still fits new logs, which triggers an update (document 002 3.7)."""
 
 from __future__ import annotations
 
@@ -15,8 +13,7 @@ from residnet.core.errors import DataError
 
 
 class StillFitsConfig(Config):
-    """When a model no longer fits: on some axis the residual has grown by `factor` beyond what it
-    was, and it is no trifle.
+    """Settings of the check: on some axis the residual has grown by `factor` and is no trifle.
 
     Attributes:
         factor: of the mean square residual of the stretch it is compared with.
@@ -47,7 +44,7 @@ class Verdict:
     segments: list[float]
 
     def text(self) -> str:
-        """One line."""
+        """Return one line about it."""
         growth, share = (
             "/".join(f"{value:.3g}" for value in part)
             for part in (self.growth, [100 * value for value in self.share])
@@ -62,7 +59,7 @@ class Verdict:
 def still_fits(
     config: StillFitsConfig, then: Tensor, now: Tensor, force: Tensor, fold: Tensor
 ) -> Verdict:
-    """Compare residuals.
+    """Return whether a model still fits, by comparing residuals.
 
     Args:
         config: limits.

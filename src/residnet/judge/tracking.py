@@ -12,7 +12,7 @@ from residnet.core.frames import wrap
 
 @dataclass(frozen=True)
 class Tracking:
-    """Metrics of one run in closed loop; SI, angles in rad.
+    """The metrics of one run in closed loop; SI, angles in rad.
 
     Attributes:
         position_mae, position_mse: of the distance to the desired position in m, m^2 (4.6).
@@ -39,7 +39,7 @@ class Tracking:
     iaew: tuple[float, float]
 
     def row(self) -> dict[str, float | list[float]]:
-        """For JSON."""
+        """Return the metrics for JSON."""
         return {
             key: list(value) if isinstance(value, tuple) else value
             for key, value in asdict(self).items()
@@ -49,7 +49,7 @@ class Tracking:
 def tracking(
     pose: Tensor, motion: Tensor, desired: Tensor, command: Tensor, feedback: Tensor, dt: float
 ) -> Tracking:
-    """Metrics of a run.
+    """Return the metrics of a run in closed loop.
 
     Args:
         pose: x, y, psi [T, 3].
@@ -82,5 +82,5 @@ def tracking(
 
 
 def mse(residual: Tensor) -> list[float]:
-    """Mean square of a residual [N, 3] by axis."""
+    """Return the mean square of a residual [N, 3] by axis."""
     return [float(value) for value in torch.mean(residual.square(), dim=0)]

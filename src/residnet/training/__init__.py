@@ -1,3 +1,1 @@
-"""Fitting heads: closed form, and by gradient through one-step and free-run losses (Lightning,
-imported only when training).
-"""
+"""Training by gradient and refits through rollouts; Lightning is imported when it is used."""

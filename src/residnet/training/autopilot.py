@@ -1,5 +1,6 @@
-"""Training a heading policy through the closed loop: the one time loop carries gradients through
-vessel and policy.
+"""Training of a heading policy through the closed loop.
+
+The one time loop carries gradients through vessel and policy.
 """
 
 from __future__ import annotations
@@ -56,17 +57,18 @@ class AutopilotFit(EpochTraining):
         self.columns = vessel.column("psi"), vessel.column("r")
 
     def train_dataloader(self) -> range:
-        """Numbers of batches: what is in them is drawn when they are used. (A loader of PyTorch
-        would draw random numbers of its own.)
+        """Return the numbers of batches; what is in them is drawn when they are used.
+
+        A loader of PyTorch would draw random numbers of its own.
         """
         return range(self.settings.steps)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
-        """Adam."""
+        """Return Adam."""
         return torch.optim.Adam(self.policy.parameters(), lr=self.settings.learning_rate)
 
     def on_fit_start(self) -> None:
-        """Score the start too: training is kept where it brings something."""
+        """Validate the start too: training is kept where it brings something."""
         super().on_fit_start()
         if not self.history:
             model, score = self.validated()
@@ -84,7 +86,7 @@ class AutopilotFit(EpochTraining):
             group["lr"] = self.settings.rate(self.epoch)
 
     def training_step(self, number: int, batch_index: int) -> Tensor:
-        """Loss of one batch of heading changes."""
+        """Return the loss of one batch of heading changes."""
         rows, steps = self.settings.batch, round(self.settings.horizon / self.settings.dt)
         x, w, heading, variation, calm = self._draw(rows)
         reference = GivenReference(heading[:, None, None])
@@ -107,8 +109,9 @@ class AutopilotFit(EpochTraining):
         return loss
 
     def on_after_backward(self) -> None:
-        """Leave out a batch whose gradient is no number: through hundreds of steps of a saturated
-        loop a single flight's can overflow.
+        """Reset the gradient of a batch where it is no number.
+
+        Through hundreds of steps of a saturated loop a single flight's can overflow.
         """
         given = [p.grad for p in self.policy.parameters() if p.grad is not None]
         if not all(bool(torch.isfinite(grad).all()) for grad in given):
@@ -139,8 +142,9 @@ class AutopilotFit(EpochTraining):
         )
 
     def cost(self, error: Tensor, heading: Tensor, variation: Tensor, calm: Tensor) -> Tensor:
-        """Time outside the band, absolute error and overshoot of errors [B, T] after changes of
-        heading [B].
+        """Return the cost of errors [B, T] after changes of heading [B].
+
+        Time outside the band, absolute error and overshoot count.
 
         The share |e| / (|e| + band) counts time, so that small changes weigh as much as large ones.
         Where the start already turns or something pushes, the vessel cannot be known in time and an
@@ -161,7 +165,7 @@ class AutopilotFit(EpochTraining):
         return cost
 
     def validated(self) -> tuple[nn.Module, float]:
-        """The policy and its score."""
+        """Return the policy and its score."""
         score = self.score(self.policy)
         self.policy.float()
         return self.policy, score
@@ -178,8 +182,9 @@ def train_autopilot(
     folder: Path,
     teacher: Policy | None = None,
 ) -> dict[str, Any]:
-    """Train a policy and leave the weights that scored best in it; `checkpoints/<name>/last.ckpt`
-    in the folder is resumed where it exists.
+    """Train a policy and leave the weights that scored best in it.
+
+    `checkpoints/<name>/last.ckpt` in the folder is resumed where it exists.
 
     Returns:
         What there is to say: the curve by epoch, the best score, the number of parameters.

@@ -15,8 +15,7 @@ Range = Annotated[tuple[float, float], Field(description="low and high multiple"
 
 
 class SpreadConfig(Config):
-    """The range of vessels, starts and disturbances that a policy is trained for and controllers
-    are compared over.
+    """Settings of the range of vessels, starts and disturbances of training and comparison.
 
     Attributes:
         effect: of the rudder, as a multiple (K of Nomoto's model).
@@ -64,14 +63,14 @@ class SpreadConfig(Config):
         return self.wind is not None or self.current > 0
 
     def needs(self) -> tuple[str, ...]:
-        """Inputs that a vessel must have for it."""
+        """Return the inputs that a vessel must have for it."""
         return (
             *(("wind_speed", "wind_dir") if self.wind is not None else ()),
             *(("current_north", "current_east") if self.current > 0 else ()),
         )
 
     def draw_weather(self, rows: int) -> dict[str, Tensor]:
-        """Inputs of a vessel by name, each [rows]."""
+        """Return inputs of a vessel by name, each [rows]."""
         drawn, around = torch.rand(2, rows), 2.0 * torch.pi * torch.rand(2, rows)
         out: dict[str, Tensor] = {}
         if self.wind is not None:
@@ -87,8 +86,9 @@ class SpreadConfig(Config):
         return out
 
     def draw(self, rows: int) -> Tensor:
-        """Effect and time [rows, 2], every second row at a corner of their ranges, where
-        controllers fail first.
+        """Draw effect and time [rows, 2], every second row at a corner of their ranges.
+
+        Controllers fail there first.
         """
         low, high = torch.tensor([self.effect, self.time]).T
         share = torch.rand(rows, 2)
@@ -97,9 +97,7 @@ class SpreadConfig(Config):
         return drawn
 
     def corners(self) -> Tensor:
-        """Effect, time and zero bias [9, 3]: nominal first, then the ends and the middles between
-        them.
-        """
+        """Return effect, time and zero bias [9, 3]: nominal first, then ends and middles."""
         effects = (1.0, *self.effect)
         times = (1.0, *self.time)
         return torch.tensor(
@@ -108,7 +106,7 @@ class SpreadConfig(Config):
 
 
 class AutopilotTraining(OneStage):
-    """Back-propagation through vessel and policy.
+    """Settings of a training by back-propagation through vessel and policy.
 
     Attributes:
         steps: batches of an epoch.

@@ -8,7 +8,7 @@ from residnet.core.config import Config, Seconds
 
 
 class OneStep(Config):
-    """Teacher-forced start: residual accelerations along measured windows (document 003 eq. (20)).
+    """Settings of the teacher-forced start on residual accelerations (document 003 eq. (20)).
 
     Attributes:
         epochs: of `steps` batches each.
@@ -37,8 +37,7 @@ class OneStep(Config):
 
 
 class MultiStep(Config):
-    """A stage of free-run training: the model is rolled out over `horizon` and its velocities are
-    compared with the measured ones.
+    """A stage of free-run training, which compares velocities over a horizon.
 
     Attributes:
         horizon: length of the rollouts.
@@ -57,8 +56,9 @@ class MultiStep(Config):
 
 
 class Beginnings(Config):
-    """Windows at the beginning of a stretch, where there is hardly a past: whole manoeuvres are run
-    from there.
+    """Settings of windows at the beginning of a stretch, where there is hardly a past.
+
+    Whole manoeuvres are run from there.
 
     One-step windows start with the stretch and are scored from their first sample on; rollouts
     start after `initial`, from the mean velocities of that time, which alone warms up the memory.
@@ -73,7 +73,7 @@ class Beginnings(Config):
 
 
 class TrainingConfig(Config):
-    """Stages in order: one-step, then each of `multi_step` (a curriculum of horizons).
+    """Settings of a training: one-step, then each of `multi_step` (a curriculum of horizons).
 
     Attributes:
         one_step: the teacher-forced start.
@@ -135,7 +135,7 @@ class TrainingConfig(Config):
         return len(self.multi_step)
 
     def stage(self, epoch: int) -> tuple[int, int]:
-        """(stage, epoch within it); stage 0 is one-step, stage i the i-th free-run stage."""
+        """Return (stage, epoch within it); stage 0 is one-step, stage i the i-th free-run stage."""
         begin = 0
         for number, length in enumerate(
             (self.one_step.epochs, *(stage.epochs for stage in self.multi_step))

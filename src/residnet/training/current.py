@@ -1,5 +1,4 @@
-"""The unknown current of each log, estimated together with a baseline's coefficients, and logs as
-motion through the water.
+"""Ambient currents of logs, estimated together with a baseline, and motion through water.
 
 A log measures velocities over ground, a hull feels those through the water: nu_r = nu - R(psi)'
 [c_north, c_east, 0]. Without the current, least squares takes what it does for properties of the
@@ -32,7 +31,7 @@ _THIN = 10
 
 
 class CurrentConfig(Config):
-    """Each training and validation log ran in a constant current of its own that nobody measured.
+    """Settings for logs that each ran in a constant current which nobody measured.
 
     The currents are estimated first; what follows fits and chooses models on these logs as motion
     through the water, without current. Test logs stay as they were measured: there the current is
@@ -54,8 +53,7 @@ class CurrentConfig(Config):
 def estimate_currents(
     baseline: RegressorBaseline, signals: Signals, logs: Sequence[Prepared], config: CurrentConfig
 ) -> tuple[np.ndarray, list[dict[str, Any]]]:
-    """Currents towards north and east [L, 2] in m/s of logs over ground, and a table of them for
-    the record.
+    """Return currents to north and east [L, 2] in m/s of logs over ground, and their table.
 
     The baseline gives the regressors and keeps its own coefficients. The table's standard errors
     hold where the regressors are the true ones and the errors of neighbouring samples independent.
@@ -112,8 +110,9 @@ def _descend(
 
 
 def through_water(log: Prepared, current: np.ndarray, signals: Signals) -> Prepared:
-    """A log as seen from a frame that drifts with the current [2]: positions, velocities,
-    accelerations and the wind.
+    """Return a log as seen from a frame that drifts with the current [2].
+
+    Positions, velocities, accelerations and the wind change.
     """
     psi, drifted = log.y[:, HEADING], (log.log.t - log.log.t[0])[:, None] * current
     along = np.cos(psi) * current[0] + np.sin(psi) * current[1]
@@ -172,7 +171,10 @@ class _Problem:
     precision: float
 
     def regression(self, current: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Regressors [N, J], accelerations [N, 3] and log [N] of all samples through the water."""
+        """Return regressors [N, J], accelerations [N, 3] and log [N] of all samples.
+
+        They are of the motion through the water.
+        """
         moved = samples(
             [
                 through_water(p, c, self.signals)
@@ -183,8 +185,9 @@ class _Problem:
         return self.baseline.library(moved.z), moved.target, moved.group
 
     def solve(self, current: Tensor) -> tuple[float, _State]:
-        """Least-squares coefficients at given currents [L, 2], and the negative log-likelihood with
-        the prior of the currents.
+        """Return the negative log-likelihood and least-squares fit at currents [L, 2].
+
+        The likelihood holds the prior of the currents.
         """
         phi, target, group = self.regression(current)
         theta = torch.zeros_like(self.baseline.theta)
@@ -201,7 +204,7 @@ class _Problem:
         return cost, _State(theta, error, variance, phi, group)
 
     def step(self, current: Tensor, state: _State) -> tuple[Tensor, Tensor]:
-        """Gauss-Newton step [L, 2] and covariance [2L, 2L] of the currents."""
+        """Return the Gauss-Newton step [L, 2] and covariance [2L, 2L] of the currents."""
         count = len(self.logs)
         slopes = torch.stack(
             [self._slope(current, direction, state) for direction in range(2)], dim=2
@@ -228,8 +231,9 @@ class _Problem:
         return -(covariance @ gradient.flatten()).reshape(-1, 2), covariance
 
     def search(self, current: Tensor, state: _State, spread: float) -> Tensor:
-        """Currents [L, 2] with a lower cost than `current` at the same coefficients, log by log, on
-        a grid over what is likely; else as they are.
+        """Return currents [L, 2] with a lower cost than `current` at the same coefficients.
+
+        Searched log by log on a grid over what is likely; else as they are.
         """
         thin = replace(
             self,

@@ -1,6 +1,4 @@
-"""One trainer for all networks: epochs that repeat themselves when resumed, the best state so far,
-early stopping, TensorBoard, progress.
-"""
+"""The one trainer for all networks: resumable epochs, the best state, early stopping."""
 
 from __future__ import annotations
 
@@ -40,7 +38,7 @@ class Epochs(Protocol):
         """Epochs between validations."""
 
     def stage(self, epoch: int) -> tuple[int, int]:
-        """(stage, epoch within it)."""
+        """Return (stage, epoch within it)."""
 
     @property
     def last_stage(self) -> int:
@@ -66,7 +64,7 @@ class EpochTraining(L.LightningModule, ABC):
 
     @abstractmethod
     def validated(self) -> tuple[nn.Module, float]:
-        """The module that is kept if it is the best so far, and its score: less is better."""
+        """Return the module that is kept if it is the best so far, and its score, which falls."""
 
     @property
     def epoch(self) -> int:
@@ -79,12 +77,13 @@ class EpochTraining(L.LightningModule, ABC):
         return self.stopped or self.epoch >= self.settings.epochs
 
     def seed_epoch(self) -> None:
-        """Random numbers of the present epoch."""
+        """Seed the random numbers of the present epoch."""
         torch.manual_seed((self.seed * 7_919 + self.epoch) % (2**63))
 
     def finish_epoch(self) -> None:
-        """Validate; keep the best weights; stop early in the last stage. Called by the first
-        callback of an epoch's end.
+        """Validate, keep the best weights, and stop early in the last stage.
+
+        The first callback of an epoch's end calls it.
         """
         stage, _ = self.settings.stage(self.epoch)
         last = self.epoch + 1 == self.settings.epochs
@@ -114,7 +113,7 @@ class EpochTraining(L.LightningModule, ABC):
         self.trainer.should_stop = self.stopped
 
     def on_fit_start(self) -> None:
-        """Losses of the running epoch."""
+        """Reset the losses of the running epoch."""
         self._losses: list[float] = []
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
@@ -147,12 +146,13 @@ class EpochTraining(L.LightningModule, ABC):
 
 
 class FinishEpoch(L.Callback):
-    """Lets the module finish its epoch before the checkpoint is written: Lightning runs callbacks
-    before the module's own hook.
+    """A callback that lets the module finish its epoch before the checkpoint is written.
+
+    Lightning runs callbacks before the module's own hook.
     """
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Validate."""
+        """Run the module's own end of the epoch."""
         assert isinstance(pl_module, EpochTraining)
         pl_module.finish_epoch()
 
@@ -171,7 +171,7 @@ class KeepCheckpoint(L.Callback):
 
 
 class ReportProgress(L.Callback):
-    """Reports every epoch; every tenth of the epochs with a line about loss and validation."""
+    """A callback that reports every epoch, and every tenth of the epochs with a line."""
 
     def __init__(self, name: str, epochs: int) -> None:
         self.name = name

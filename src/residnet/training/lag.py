@@ -1,5 +1,6 @@
-"""Lag of actuators fitted together with a force residual: for each candidate lag the regression is
-linear (variable projection).
+"""Lag of actuators fitted with a force residual, by variable projection.
+
+For each candidate lag the regression is linear.
 """
 
 from __future__ import annotations
@@ -21,8 +22,9 @@ _LEAST, _MOST = np.array([0.1, 0.1, 0.0]), np.array([30.0, 3.0, 2.0])
 
 
 def followed(command: Tensor, lag: Lag, dt: float, runs: Sequence[int] = ()) -> Tensor:
-    """Force [N, c] that follows a command [N, c] sampled every dt seconds, taken as straight
-    between samples; at rest before.
+    """Return the force [N, c] that follows a command [N, c] sampled every dt seconds.
+
+    The command is straight between samples and at rest before.
 
     `runs` are the lengths of several runs that stand one after another, each at rest before; empty
     for one.
@@ -73,7 +75,7 @@ def fit_lag(
     use: Tensor | None = None,
     runs: Sequence[int] = (),
 ) -> LagFit:
-    """The lag under which F_believed + basis explains the followed command best.
+    """Return the lag under which F_believed + basis explains the followed command best.
 
     Args:
         command: tau_c [N, 3], uniform in time, from rest on.

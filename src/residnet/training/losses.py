@@ -13,8 +13,9 @@ from residnet.dynamics.rollout import Rollout
 def one_step_loss(
     model: HybridDynamics, y: Tensor, w: Tensor, nu_dot: Tensor, good: Tensor, spread: Tensor
 ) -> Tensor:
-    """Mean squared error of accelerations along measured windows, in units of the residual's spread
-    (document 003 eq. (20)).
+    """Return the mean squared error of accelerations along windows (document 003 eq. (20)).
+
+    In units of the residual's spread.
 
     Args:
         model: the hybrid model.
@@ -39,8 +40,9 @@ def rollout_loss(
     scales: Tensor,
     robust: float,
 ) -> Tensor:
-    """Error of free-run velocities, in units of the metrics' scales: their mean square, or the mean
-    over windows of their root mean square.
+    """Return the error of free-run velocities, in units of the metrics' scales.
+
+    The mean square, or the mean over windows of their root mean square.
 
     Args:
         rollout: the free run of the model.

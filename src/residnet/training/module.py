@@ -23,8 +23,9 @@ Validate = Callable[[HybridDynamics], float]
 
 @final
 class HeadTraining(EpochTraining):
-    """Trains `model.head` (and the baseline, where the config says so) and keeps the weights that
-    validate best in free run.
+    """A training of `model.head` that keeps the weights which validate best in free run.
+
+    The baseline moves too, where the config says so.
     """
 
     def __init__(
@@ -73,11 +74,11 @@ class HeadTraining(EpochTraining):
         ]
 
     def train_dataloader(self) -> EpochBatches:
-        """Window starts [batch], `steps` times an epoch."""
+        """Return window starts [batch], `steps` times an epoch."""
         return EpochBatches(self)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
-        """AdamW; weight decay on matrices of the head only."""
+        """Return AdamW, with weight decay on matrices of the head only."""
         head = list(self.model.head.parameters())
         groups = [
             {"params": [p for p in head if p.ndim > 1], "weight_decay": self.settings.weight_decay},
@@ -100,7 +101,7 @@ class HeadTraining(EpochTraining):
             group["lr"] = rate
 
     def training_step(self, starts: Tensor, batch_index: int) -> Tensor:
-        """Loss of one batch of windows."""
+        """Return the loss of one batch of windows."""
         stage, _ = self.settings.stage(self.epoch)
         length, _ = self._stages()[stage]
         loss = (
@@ -159,7 +160,7 @@ class HeadTraining(EpochTraining):
             kept.lerp_(new.detach(), 1.0 - decay)
 
     def validated(self) -> tuple[nn.Module, float]:
-        """The averaged model, where there is one, and its free-run error."""
+        """Return the averaged model, where there is one, and its free-run error."""
         model = self.model if self.average is None else self.average
         return model, self.validate(model)
 

@@ -1,5 +1,4 @@
-"""Accelerations that every log has for itself, beside parameters that all logs share: beliefs,
-normal equations, spread.
+"""Accelerations that every log has for itself, beside parameters that all logs share.
 
 A model test is never quite the same vessel twice: trim, rudder zero, carriage and tank leave a
 small yaw moment and sway force that differ from log to log. Taken for nothing, they are taken for
@@ -31,8 +30,9 @@ Estimated = Literal["estimated"]
 
 
 class OffsetsConfig(Config):
-    """Standard deviations from log to log of an acceleration, at the root mean square speed of the
-    free runs, by axis; no offset where null.
+    """Settings of offsets: standard deviations of an acceleration from log to log, by axis.
+
+    They hold at the root mean square speed of the free runs; there is no offset where null.
 
     `estimated` takes the standard deviation under which the training logs are most likely,
     parameters and offsets integrated out (type-II maximum likelihood); it needs about five logs or
@@ -63,14 +63,14 @@ class OffsetsConfig(Config):
         return tuple(axis for axis, name in enumerate(VELOCITY) if getattr(self, name) is not None)
 
     def given(self) -> tuple[float | None, ...]:
-        """Standard deviation by axis that has an offset; None where it is estimated."""
+        """Return the standard deviation by axis that has an offset; None where it is estimated."""
         found = [getattr(self, VELOCITY[axis]) for axis in self.axes]
         return tuple(None if value == "estimated" else float(value) for value in found)
 
 
 @dataclass(frozen=True)
 class Offsets:
-    """Offsets of L logs in `axes` (a of surge 0, sway 1, yaw 2).
+    """The offsets of L logs in `axes` (a of surge 0, sway 1, yaw 2).
 
     Attributes:
         axes: that have one.
@@ -90,8 +90,10 @@ class Offsets:
 
     @classmethod
     def begin(cls, config: OffsetsConfig | None, logs: int, usual: Tensor, speed: float) -> Offsets:
-        """All zero; `usual` [3] is where spreads that are to be estimated start from, `speed` that
-        at which offsets are what they are said to be.
+        """Return offsets that are all zero.
+
+        `usual` [3] is where spreads that are to be estimated start from, `speed` that at which
+        offsets are what they are said to be.
         """
         axes, given = (config.axes, config.given()) if config is not None else ((), ())
         spread = torch.tensor(
@@ -109,21 +111,24 @@ class Offsets:
         )
 
     def moved(self, step: Tensor) -> Offsets:
-        """With a step [L, a] subtracted."""
+        """Return the offsets with a step [L, a] subtracted."""
         return replace(self, value=self.value - step)
 
     def accelerations(self) -> Tensor:
-        """By log, [L, 3]."""
+        """Return the accelerations by log, [L, 3]."""
         out = torch.zeros(len(self.value), 3, dtype=torch.float64)
         out[:, list(self.axes)] = self.value
         return out
 
     def unlikely(self) -> Tensor:
-        """Twice minus the logarithm of their probability density, without its constant."""
+        """Return twice minus the logarithm of their probability density, without its constant."""
         return (self.value / self.spread).square().sum()
 
     def table(self, logs: Sequence[str]) -> list[dict[str, Any]]:
-        """A row for each log and axis: log, axis, value, standard_error, spread, speed."""
+        """Return a row for each log and axis.
+
+        Columns log, axis, value, standard_error, spread, speed.
+        """
         spread = self.spread.tolist()
         return [
             {
@@ -141,7 +146,7 @@ class Offsets:
 
 @dataclass(frozen=True)
 class Arrow:
-    """Normal equations of P shared parameters and of a offsets for each of L logs.
+    """The normal equations of P shared parameters and of a offsets for each of L logs.
 
     Attributes:
         shared: [P, P].
@@ -158,8 +163,9 @@ class Arrow:
     slope: Tensor
 
     def believing(self, offsets: Offsets, share: Tensor) -> Arrow:
-        """With what is believed of the offsets, `share` being what one unit of minus the logarithm
-        of a probability costs, halved.
+        """Return the equations with what is believed of the offsets.
+
+        `share` is what one unit of minus the logarithm of a probability costs, halved.
         """
         precision = share / offsets.spread.square()
         return replace(
@@ -167,14 +173,14 @@ class Arrow:
         )
 
     def damped(self, damping: float) -> Arrow:
-        """With a share of the diagonal added to itself (Levenberg and Marquardt)."""
+        """Return the equations with a share of the diagonal added (Levenberg and Marquardt)."""
         own = self.own + damping * torch.diag_embed(self.own.diagonal(dim1=1, dim2=2))
         return replace(
             self, shared=self.shared + damping * torch.diag(self.shared.diagonal()), own=own
         )
 
     def solve(self) -> tuple[Tensor, Tensor]:
-        """Gauss-Newton step of the shared parameters [P] and of the offsets [L, a]."""
+        """Return the Gauss-Newton step of the shared parameters [P] and of the offsets [L, a]."""
         matrix, gradient = self.reduced()
         step = torch.linalg.solve(matrix, gradient)
         return step, torch.linalg.solve(
@@ -182,8 +188,9 @@ class Arrow:
         ).squeeze(-1)
 
     def reduced(self) -> tuple[Tensor, Tensor]:
-        """Matrix [P, P] and right side [P] of the shared parameters alone, every log eliminated
-        (Schur complement).
+        """Return matrix [P, P] and right side [P] of the shared parameters alone.
+
+        Every log is eliminated (Schur complement).
         """
         taken = torch.linalg.solve(
             self.own, torch.cat((self.mixed.transpose(1, 2), self.slope.unsqueeze(-1)), dim=2)
@@ -192,8 +199,9 @@ class Arrow:
         return self.shared - less[:, :-1], self.gradient - less[:, -1]
 
     def variances(self, shared: Tensor) -> Tensor:
-        """Diagonal [L, a] of the offsets' blocks of the inverse, from that of the shared block [P,
-        P].
+        """Return the diagonal [L, a] of the offsets' blocks of the inverse.
+
+        From that of the shared block [P, P].
         """
         taken = torch.linalg.solve(self.own, self.mixed.transpose(1, 2))
         inverse = torch.linalg.inv(self.own) + taken @ shared @ taken.transpose(1, 2)
@@ -202,8 +210,9 @@ class Arrow:
 
 
 def with_spread(offsets: Offsets, arrow: Arrow, share: Tensor) -> Offsets:
-    """Offsets with those spreads that are to be estimated at their most likely, the free runs taken
-    for linear around where they are.
+    """Return offsets with those spreads at their most likely that are to be estimated.
+
+    The free runs are taken for linear around where they are.
 
     Expectation maximisation: a spread's square is the mean over the logs of the squares of the
     offsets and of their standard errors.

@@ -10,7 +10,7 @@ from residnet.core.config import Config
 
 
 class OneStage(Config):
-    """Epochs with a learning rate that falls along a cosine.
+    """Settings of a training in one stage, with a learning rate that falls along a cosine.
 
     Attributes:
         epochs: at most.
@@ -34,10 +34,10 @@ class OneStage(Config):
         return 0
 
     def stage(self, epoch: int) -> tuple[int, int]:
-        """One stage only."""
+        """Return stage 0, the only one, and the epoch."""
         return 0, epoch
 
     def rate(self, epoch: int) -> float:
-        """Learning rate of an epoch."""
+        """Return the learning rate of an epoch."""
         progress = 0.5 * (1 - math.cos(math.pi * epoch / max(self.epochs - 1, 1)))
         return self.learning_rate * (1 - progress * (1 - self.final))

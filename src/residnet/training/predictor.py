@@ -1,5 +1,6 @@
-"""Training the predictor of document 004's autopilot on simulated answers to its rudder angles
-(sections 6.1.1, 6.1.2, 6.2.1, 6.2.2).
+"""Training of the predictor of document 004's autopilot on simulated answers.
+
+Sections 6.1.1, 6.1.2, 6.2.1, 6.2.2.
 """
 
 from __future__ import annotations
@@ -19,8 +20,9 @@ from residnet.training.predictor_config import PredictorTraining
 
 
 class Answers(NamedTuple):
-    """States [S, nx] and the changes of heading [rad] and yaw rate [rad/s] that each of C rudder
-    angles brings, [S, 2, C].
+    """The simulated changes [S, 2, C] that each of C rudder angles brings to states [S, nx].
+
+    Changes are of heading [rad] and yaw rate [rad/s].
     """
 
     x: Tensor
@@ -35,7 +37,7 @@ def simulate_answers(
     states: int,
     seed: int,
 ) -> Answers:
-    """Data of section 6.1.1: random states, each simulated under all rudder angles.
+    """Return the data of section 6.1.1: random states, simulated under all rudder angles.
 
     The states are those that the vessel comes through under random angles, since few combinations
     of its velocities can occur, scattered a little beyond.
@@ -73,7 +75,9 @@ def simulate_answers(
 
 @final
 class PredictorFit(EpochTraining):
-    """Least squares on the changes of heading and yaw rate, each over its own spread.
+    """A training by least squares on the changes of heading and yaw rate.
+
+    Each is taken over its own spread.
 
     Args:
         predictor: what is trained, float64.
@@ -96,11 +100,11 @@ class PredictorFit(EpochTraining):
         self.train_answers, self.kept = train, kept
 
     def train_dataloader(self) -> range:
-        """Numbers of batches; their states are drawn when the epoch begins."""
+        """Return the numbers of batches; their states are drawn when the epoch begins."""
         return range(math.ceil(len(self.train_answers.x) / self.settings.batch))
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
-        """Adam, as in the source."""
+        """Return Adam, as in the source."""
         return torch.optim.Adam(self.predictor.parameters(), lr=self.settings.learning_rate)
 
     def on_train_epoch_start(self) -> None:
@@ -111,7 +115,7 @@ class PredictorFit(EpochTraining):
             group["lr"] = self.settings.rate(self.epoch)
 
     def training_step(self, number: int, batch_index: int) -> Tensor:
-        """Mean squared error of one batch of states."""
+        """Return the mean squared error of one batch of states."""
         rows = self.order[number]
         loss = (
             self._misses(Answers(self.train_answers.x[rows], self.train_answers.change[rows]))
@@ -125,8 +129,9 @@ class PredictorFit(EpochTraining):
         return (self.predictor.changes(answers.x) - answers.change) / self.predictor.scale
 
     def validated(self) -> tuple[nn.Module, float]:
-        """The predictor, and the root of its mean squared error on states that it was not trained
-        on, as a share of the spread.
+        """Return the predictor and its error on fresh states, as a share of the spread.
+
+        The error is the root of the mean square.
         """
         with torch.no_grad():
             return self.predictor, float(self._misses(self.kept).square().mean().sqrt())
@@ -142,7 +147,8 @@ def train_predictor(
     seed: int,
     folder: Path,
 ) -> dict[str, Any]:
-    """Simulate, train, and leave the weights that validated best in the predictor;
+    """Train the predictor and leave the weights that validated best in it.
+
     `checkpoints/<name>/last.ckpt` is resumed where it exists.
 
     Args:

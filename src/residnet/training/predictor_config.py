@@ -1,5 +1,6 @@
-"""How the predictor of document 004's autopilot is trained. No Lightning here: `residnet check`
-must stay quick.
+"""Settings of the predictor of document 004's autopilot, without Lightning.
+
+`residnet check` must stay quick.
 """
 
 from __future__ import annotations
@@ -11,8 +12,9 @@ from residnet.training.one_stage import OneStage
 
 
 class PredictorTraining(OneStage):
-    """Supervised: from states that the vessel comes through under random rudder angles to what each
-    angle leads to (document 004, 6.1.1, 6.2.1).
+    """Settings of a supervised training, from random states to what each rudder angle brings.
+
+    Document 004, 6.1.1 and 6.2.1.
 
     Attributes:
         states: to train on; a fifth as many are kept back to validate on.

@@ -1,5 +1,6 @@
-"""Refitting a baseline's parameters through rollouts: Gauss-Newton on free-run errors with forward
-sensitivities.
+"""Refit of a baseline's parameters through rollouts: Gauss-Newton on free-run errors.
+
+Sensitivities are carried forward with the rollout.
 
 Least squares on derivatives weighs every instant alike and ignores how errors add up; this
 minimises what a free run is judged by. The least-squares solution and its information matrix stand
@@ -13,48 +14,17 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
-from pydantic import Field
 from torch import Tensor
 
 from residnet.baselines import ParametricBaseline
-from residnet.core.config import Config, Seconds
 from residnet.core.errors import FitError
 from residnet.core.layout import VELOCITIES, zero_acceleration
 from residnet.core.samples import Samples
 from residnet.data.windows import WindowStore
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.training.offsets import Arrow, Offsets, OffsetsConfig, with_spread
+from residnet.training.offsets import Arrow, Offsets, with_spread
+from residnet.training.refit_config import RefitConfig
 from residnet.training.sensitivities import OffsetBaseline, step_sensitivities
-
-
-class RefitConfig(Config):
-    """Gauss-Newton refit of a baseline's parameters.
-
-    Attributes:
-        horizon: length of the free runs.
-        every: time between their starts.
-        prior: weight of the least-squares solution, as a share of its own information.
-        asymmetric: shrinks terms that a mirror-symmetric vessel cannot have towards zero; 0 for no
-            such knowledge.
-        robust: windows whose error (in units of the scales) is far above this count by their error
-            and not by its square.
-        correlation: time over which errors of a free run hang together; the logs hold so many
-            independent errors, which says how much beliefs weigh beside them, and how large the
-            standard errors are.
-        offsets: accelerations that each log has for itself (trim, rudder zero, carriage), estimated
-            with the parameters and left out of the model; null where all logs are of exactly the
-            same vessel. The least-squares prior does not know them: give it little weight.
-        iterations: at most.
-    """
-
-    horizon: Seconds = Field(default=20.0, gt=0)
-    every: Seconds = Field(default=10.0, gt=0)
-    prior: float = Field(default=1e-2, ge=0)
-    asymmetric: float = Field(default=0.0, ge=0)
-    robust: float = Field(default=0.05, gt=0)
-    correlation: Seconds = Field(default=10.0, gt=0)
-    offsets: OffsetsConfig | None = None
-    iterations: int = Field(default=10, ge=1)
 
 
 @dataclass(frozen=True)
@@ -101,8 +71,9 @@ class _Problem:
     speed: float
 
     def share(self, level: Tensor) -> Tensor:
-        """Half of what one unit of minus the logarithm of a probability costs, where the cost is
-        `level`.
+        """Return half of what one unit of minus the logarithm of a probability costs.
+
+        The cost is `level`.
 
         With c the mean square error of three channels of so many independent errors each, that
         logarithm grows by 3 N / 2c for each unit of c, and the cost sqrt(c + robust^2) by 1 / (2
