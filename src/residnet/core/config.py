@@ -133,15 +133,17 @@ def load_mapping(path: Path) -> dict[str, Any]:
 
 
 @overload
-def load_config(path: Path, overrides: Sequence[str], model: type[T]) -> T: ...
+def load_config(path: Path, overrides: Sequence[str], model: type[T]) -> T:
+    """Build a config of one class from a YAML file and overrides."""
 
 
 @overload
-def load_config(path: Path, overrides: Sequence[str], model: Any) -> Any: ...
+def load_config(path: Path, overrides: Sequence[str], model: Any) -> Any:
+    """Build a config of a union of classes from a YAML file and overrides."""
 
 
 def load_config(path: Path, overrides: Sequence[str], model: Any) -> Any:
-    """Return the config of type `model` from a YAML file and overrides.
+    """Build a config of type `model` from a YAML file and overrides.
 
     Args:
         path: YAML file.
@@ -160,11 +162,13 @@ def load_config(path: Path, overrides: Sequence[str], model: Any) -> Any:
 
 
 @overload
-def validate(data: Any, model: type[T], where: str, folder: Path | None = None) -> T: ...
+def validate(data: Any, model: type[T], where: str, folder: Path | None = None) -> T:
+    """Build a config of one class from plain values."""
 
 
 @overload
-def validate(data: Any, model: Any, where: str, folder: Path | None = None) -> Any: ...
+def validate(data: Any, model: Any, where: str, folder: Path | None = None) -> Any:
+    """Build a config of a union of classes from plain values."""
 
 
 def validate(data: Any, model: Any, where: str, folder: Path | None = None) -> Any:

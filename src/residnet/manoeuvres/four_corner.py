@@ -39,7 +39,8 @@ class FourCorner(Manoeuvre):
     Attributes:
         poses: (north, east, heading); the twelve of the document where absent.
         interval: between poses; the course lasts so long for each.
-        frequency, damping: of the reference filter in x, y and psi.
+        frequency: of the reference filter in x, y and psi, in rad/s.
+        damping: relative damping of the reference filter in x, y and psi.
         control: gains of the PID.
     """
 

@@ -134,8 +134,10 @@ class AbkowitzConfig(VesselFile):
             -C_RB(nu) nu is added.
         delta_sign: -1 where the coefficients' rudder angle is positive to port (Y_delta > 0), +1
             where it is positive to starboard; commands and states here are positive to starboard.
-        mass, coefficients: with the source of all of them.
-        rudder, shaft: how these follow their commands; `shaft` only where there are terms in dn.
+        mass: rigid body and added mass, in the units of the series.
+        coefficients: hydrodynamic derivatives of the forces.
+        rudder: limits and lag of the steering gear.
+        shaft: limits and lag of the propeller shaft; only where there are terms in dn.
         wind: coefficients of the hull above water.
         source: where all coefficients come from.
     """

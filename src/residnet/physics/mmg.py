@@ -30,7 +30,8 @@ class MMGHull(Config):
 
     Attributes:
         length: between perpendiculars.
-        beam, draught: of the hull.
+        beam: of the hull in m.
+        draught: of the hull in m.
         mass: of the displaced water.
         gyration: radius of gyration about the centre of gravity, as a share of the length.
         x_G: centre of gravity ahead of midship.

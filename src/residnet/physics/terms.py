@@ -28,7 +28,8 @@ EVEN_FUNCTIONS = ("cos", "sqrt")
 """
 
 _FACTOR = re.compile(
-    r"\s*(?:\|(?P<magnitude>\w+)\||(?P<function>[a-z]+)\((?P<inner>\w+)\)|(?P<name>[A-Za-z_]\w*)|(?P<one>1))(?:\^(?P<power>-?[1-9]))?\s*\*?"
+    r"\s*(?:\|(?P<magnitude>\w+)\||(?P<function>[a-z]+)\((?P<inner>\w+)\)"
+    r"|(?P<name>[A-Za-z_]\w*)|(?P<one>1))(?:\^(?P<power>-?[1-9]))?\s*\*?"
 )
 
 

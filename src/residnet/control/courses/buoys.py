@@ -19,7 +19,8 @@ class BuoyConfig(Config):
     """A buoy with the side to pass it on and the circle to keep out of.
 
     Attributes:
-        north, east: where it is.
+        north: place in m.
+        east: place in m.
         leave_to: the side of the vessel that it passes on; rounded to starboard, it is left to
             starboard. Document 004 plots x to the right and y upwards: its "counter-clockwise" is a
             turn from x towards y, to starboard with x north and y east.

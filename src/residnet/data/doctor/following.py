@@ -113,5 +113,6 @@ def _agreement(
 
 
 def slip_in_words(factor: float) -> str:
+    """Return which slip of a unit a factor looks like, in brackets; empty where it is none."""
     slip = unit_slip(factor)
     return f" ({slip})" if slip else ""

@@ -25,7 +25,8 @@ class SternRuddersConfig(ServoConfig, ActuatorConfig, ABC):
     Attributes:
         limit: largest rudder angle of either side.
         rate: of the steering gear; None where the rudder stands at its command at once.
-        x, z: of the centre of pressure of the rudders from the body origin; z down.
+        x: place of the rudders' centre of pressure ahead of the body origin in m; negative aft.
+        z: the same below the body origin in m.
         thrust: of all propellers together at full drive; the source knows no astern thrust, so
             commands hold between zero and this.
     """
@@ -103,7 +104,8 @@ class FoilRuddersConfig(SternRuddersConfig):
     """Rudders as foils (document 004 eqs. (5.20)-(5.25), corrections G8, G11).
 
     Attributes:
-        rudders, propellers: how many; they share lift and thrust evenly.
+        rudders: how many rudders share the lift evenly.
+        propellers: how many propellers share the thrust evenly.
         area: of one rudder.
         aspect_ratio: effective, of the induced drag C_L^2 / (0.9 pi a).
         lift_slope: dC_L/d alpha per rad.

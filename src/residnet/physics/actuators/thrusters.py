@@ -24,10 +24,16 @@ class ThrusterConfig(ServoConfig):
 
     Attributes:
         name: ends its channels, n_<name> and cmd_<name>, for example `port`.
-        x, y: place from the body origin, forward and to starboard.
+        x: place ahead of the body origin in m.
+        y: place to starboard of the body origin in m.
         angle: of its thrust from the bow, clockwise; 90 deg for a bow thruster that pushes to
             starboard.
-        n_max, n_rate, forward, reverse, curve_range: as those of a propeller.
+        n_max: largest revolutions of either direction in 1/s; commands beyond it saturate.
+        n_rate: rate limit of the shaft in 1/s^2; None for no limit.
+        forward: coefficients c0 [N], c1 [N s], c2 [N s^2] of the thrust for n > 0.
+        reverse: coefficients for n < 0.
+        curve_range: revolutions (astern, ahead) in 1/s that the curves were measured between; they must
+            include +-n_max.
     """
 
     name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")

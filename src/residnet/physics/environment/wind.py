@@ -33,7 +33,8 @@ class WindLoadConfig(Config, ABC):
     """The part of a vessel file that describes the hull above water.
 
     Attributes:
-        frontal_area, lateral_area: projected areas.
+        frontal_area: projected frontal area in m^2.
+        lateral_area: projected lateral area in m^2.
         length: overall, which the yaw coefficient refers to.
         centre_height: of the lateral area's centre above the body origin, for the heeling moment of
             vessels that roll.

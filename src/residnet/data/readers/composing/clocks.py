@@ -44,7 +44,10 @@ def align_clocks(
         if topic.stamp is not None and topic.arrival is not None and len(topic)
     }
     shift, remarks = _recorder(offsets, zone)
-    late = [float(np.median(series[name].arrival - series[name].stamp)) - shift for name in offsets]  # type: ignore[operator]
+    late = [
+        float(np.median(series[name].arrival - series[name].stamp)) - shift  # type: ignore[operator]
+        for name in offsets
+    ]
     usual = max(0.0, float(np.median(late))) if late else 0.0
     out = {}
     for name, topic in series.items():

@@ -10,6 +10,11 @@ from residnet.data.readers.recording import Recording, Remark, Series, remark
 
 
 def field_values(recording: Recording, series: Series, path: str) -> np.ndarray:
+    """Return the numbers [T] of a field.
+
+    Raises:
+        DataError: where the field holds no number.
+    """
     values = series[path]
     if not np.isfinite(values).any():
         raise DataError(
@@ -22,7 +27,7 @@ def field_values(recording: Recording, series: Series, path: str) -> np.ndarray:
 def from_quaternion(
     recording: Recording, series: Series, config: Quaternion
 ) -> tuple[np.ndarray, dict[str, np.ndarray], tuple[Remark, ...]]:
-    """Return the yaw in the source's frame [T], roll where asked for, and what was noticed."""
+    """Return heading, roll where it is wanted, and remarks from the quaternions of a topic."""
     x, y, z, w = (field_values(recording, series, f"{config.field}.{axis}") for axis in "xyzw")
     norm = np.sqrt(x * x + y * y + z * z + w * w)
     known = np.isfinite(norm) & (norm > 0.5)
@@ -52,6 +57,7 @@ def from_quaternion(
 
 
 def from_first_circle(psi: np.ndarray) -> np.ndarray:
+    """Return a heading [T] whose first value lies in [0, 2 pi)."""
     known = np.flatnonzero(np.isfinite(psi))
     if not known.size:
         return psi
