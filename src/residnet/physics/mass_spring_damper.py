@@ -17,8 +17,8 @@ class MassSpringDamperConfig(Config):
     """The mass-spring-damper m x_ddot + d x_dot + k x = tau.
 
     Attributes:
-        m: mass in kg; by default that of section 5.3. (4.3) is another system: m = 20 kg, d = 10 kg/s,
-            k = 12 N/m (correction H24).
+        m: mass in kg; by default that of section 5.3. (4.3) is another system: m = 20 kg,
+            d = 10 kg/s, k = 12 N/m (correction H24).
         d: damping in kg/s.
         k: stiffness in N/m.
         tau_max: force that the full drive of a manoeuvre stands for.

@@ -50,8 +50,8 @@ class PropellerConfig(ServoConfig):
 
     Attributes:
         diameter: of the disc.
-        forward: coefficients c0 [N], c1 [N s], c2 [N s^2] of the thrust c0 + c1 n + c2 n^2 at standstill
-            for n > 0 [1/s]; it never opposes the rotation.
+        forward: coefficients c0 [N], c1 [N s], c2 [N s^2] of the thrust c0 + c1 n + c2 n^2 at
+            standstill for n > 0 [1/s]; it never opposes the rotation.
         reverse: coefficients for n < 0.
         curve_range: revolutions (astern, ahead) that these were measured between; they must include
             +-n_max.

@@ -32,8 +32,8 @@ class ThrusterConfig(ServoConfig):
         n_rate: rate limit of the shaft in 1/s^2; None for no limit.
         forward: coefficients c0 [N], c1 [N s], c2 [N s^2] of the thrust for n > 0.
         reverse: coefficients for n < 0.
-        curve_range: revolutions (astern, ahead) in 1/s that the curves were measured between; they must
-            include +-n_max.
+        curve_range: revolutions (astern, ahead) in 1/s that the curves were measured between; they
+            must include +-n_max.
     """
 
     name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")

@@ -88,8 +88,8 @@ class WaterJetsConfig(ActuatorConfig):
     Attributes:
         jets: how many there are.
         x: place of the nozzles ahead of the body origin; negative astern.
-        speed: parabola of the thrust of one jet over the speed; its product with `revolutions` is the
-            thrust (6.16), which may be negative below some revolutions (H15).
+        speed: parabola of the thrust of one jet over the speed; its product with `revolutions` is
+            the thrust (6.16), which may be negative below some revolutions (H15).
         revolutions: parabola of the thrust over the revolutions.
         motor: limits of the revolutions.
         nozzle: limits of the nozzle angle.
