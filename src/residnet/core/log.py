@@ -40,7 +40,7 @@ class Log:
         channels: name -> values [T], float64, SI and radians; psi unwrapped; NaN where nothing was
             measured.
         units: name -> SI unit.
-        manoeuvre: kind of manoeuvre, for example `zigzag`; `unknown` where nobody said.
+        manoeuvre: kind of manoeuvre, for example `zigzag`; `unknown` where it is not known.
         masks: reason -> [T] bool, True where samples must not be scored or learned from.
         meta: anything else worth keeping (source file, SHA-256, set-up); JSON values only.
     """

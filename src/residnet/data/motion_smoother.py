@@ -23,7 +23,7 @@ def smooth_motion(seen: np.ndarray, noise: Sequence[float], dt: float) -> np.nda
     sample count alike, so nothing lags.
 
     Args:
-        seen: measured, the heading unwrapped; a quantity that nobody measures has an infinite
+        seen: measured, the heading unwrapped; a quantity without a measurement has an infinite
             noise.
         noise: standard deviations of the nine.
         dt: sampling interval in s.

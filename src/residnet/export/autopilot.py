@@ -28,7 +28,7 @@ _METHODS = ["initial_state", "step"]
 
 
 class Limits(NamedTuple):
-    """Ranges [low, high] in which measurements are taken for good."""
+    """Ranges [low, high] in which measurements are accepted."""
 
     psi: tuple[float, float]
     u: tuple[float, float]
@@ -42,7 +42,7 @@ def memory_limits(policy: HeadingPolicy, turn: float) -> list[tuple[float, float
 
     Args:
         policy: see there.
-        turn: fastest yaw rate [rad/s] that is taken for good.
+        turn: fastest yaw rate [rad/s] that is accepted.
     """
     angle, variance = 1.001 * policy.limit, 2.0 * policy.prior
     # at a third of the speed the rudder that a turn stands for is three times as large

@@ -30,7 +30,7 @@ PARITY_STEPS = 1000
 PARITY_TOLERANCE = 1e-4
 _METHODS = ["initial_state", "step"]
 _FAR = 1e3
-"""How many look-ahead distances outside the course's own extent a position is taken for good."""
+"""How many look-ahead distances outside the course's own extent a position is accepted."""
 
 
 class ExportedCourse(nn.Module):

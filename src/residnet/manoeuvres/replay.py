@@ -44,7 +44,7 @@ class Replay(Manoeuvre):
         """The log that is replayed.
 
         Raises:
-            UsageError: where the file is not canonical and nobody has read it.
+            UsageError: where the file is not canonical and was not read before.
         """
         if self._recorded is None:
             self._recorded = Log.load(self.log)
@@ -103,7 +103,7 @@ class Replay(Manoeuvre):
     def inputs(self, helm: Helm, t: Tensor) -> Tensor:
         """Return the inputs [T, m] at times t [T].
 
-        NaN in the columns that nobody commands and that the log does not have.
+        Exogenous columns that the log does not have are NaN.
 
         Raises:
             UsageError: where the log lacks a command.

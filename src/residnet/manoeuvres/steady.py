@@ -1,4 +1,4 @@
-"""Whether a vessel turns steadily, told from the yaw rate as it comes."""
+"""Recognition of a steady turn from the yaw rate, sample by sample."""
 
 from __future__ import annotations
 

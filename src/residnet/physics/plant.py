@@ -18,7 +18,7 @@ class Plant(nn.Module, ABC):
 
     Attributes:
         state: names of the columns of x [B, nx]: pose, velocities, then states of the actuators.
-        inputs: names of the columns of w [B, m]: commands, then what nobody commands.
+        inputs: names of the columns of w [B, m]: commands, then exogenous inputs.
         commands: how many of the inputs are commands.
     """
 

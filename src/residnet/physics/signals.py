@@ -30,7 +30,7 @@ class SignalsConfig(Config):
 
     Attributes:
         inputs: command channels of the log, in order; held over a step.
-        exogenous: channels that nobody commands; `wind_speed` and `wind_dir` (where the true wind
+        exogenous: channels that are not commanded; `wind_speed` and `wind_dir` (where the true wind
             comes FROM, earth-fixed) become the channels wind_u, wind_v, wind_mag: velocity of the
             air relative to the vessel in body axes.
         forces: a vessel (by name or file) whose thrusters turn the two inputs into tau_x, tau_y,

@@ -1,1 +1,1 @@
-"""Courses past buoys: what is asked for, what a vessel can follow, and the plan."""
+"""Courses past buoys: the request, what a vessel can follow, and the plan."""

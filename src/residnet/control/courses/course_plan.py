@@ -2,7 +2,7 @@
 
 They are timed so that they keep out of circles or reach into them.
 
-A course of arcs and tangents asks for a yaw rate that jumps. A vessel with a yaw time constant T
+A course of arcs and tangents needs a yaw rate that jumps. A vessel with a yaw time constant T
 runs U T past the point where such an arc begins; here every turn is one that the vessel makes
 (`turns.TurnMaker`) from the motion that the turn before it left, and how long the rudder is held
 and legs last is left to find.
@@ -104,8 +104,8 @@ def plan(
     if float(missed.max()) > _TOLERANCE:
         worst = (*marks, goal)[min(int(missed.argmax()), len(marks))].number
         raise ConfigError(
-            f"no course found that passes mark {worst} as asked for with this vessel's turns; move"
-            " it, or allow more rudder"
+            f"no course found that passes mark {worst} at its clearance with this vessel's turns;"
+            " move it, or allow more rudder"
         )
     return _joined(request, z, turns, make.turning.speed, step, beyond)
 
@@ -314,7 +314,7 @@ def _joined(
 def _sampled(parts: Sequence[tuple[Array, Array, Array]], beyond: float, step: float) -> Course:
     track, heading, rudder = (np.concatenate([part[i] for part in parts]) for i in range(3))
     moved = np.hypot(*np.diff(track, axis=0).T)
-    # where parts meet, what the next one asks for holds
+    # where parts meet, the rudder of the next one holds
     distinct = np.concatenate((moved > 1e-9, [True]))
     track, heading, rudder = track[distinct], heading[distinct], rudder[distinct]
     along = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(track, axis=0).T))))

@@ -32,7 +32,7 @@ class CourseGuidance(Reference):
     each time, never back.
 
     With an estimate of the drift D, heading_d = heading of the course - atan(e / look-ahead + D
-    across), and the yaw rate counts what D says of the speed over ground; D turns with respect to
+    across), and the yaw rate takes the speed over ground from D; D turns with respect to
     the course in its bends. Memory [B, 1 or 3]: place along the course in m, and D.
 
     Args:

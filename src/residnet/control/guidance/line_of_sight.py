@@ -73,7 +73,7 @@ class Enclosure(LineOfSight):
 
 @final
 class IntegralLookAhead(LineOfSight):
-    """Look-ahead steering with the crab angle that a steady current asks for.
+    """Look-ahead steering with the crab angle that a steady current needs.
 
     The angle is -atan(error / distance + D).
 

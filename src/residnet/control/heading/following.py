@@ -12,7 +12,7 @@ from residnet.control.base import Policy
 from residnet.control.heading.policy import HeadingPolicy
 
 FOLLOWED = ("heading", "yaw_rate", "rudder")
-"""What a course asks for at every step, in rad, rad/s, rad."""
+"""Reference of a course at every step: heading, yaw rate and rudder in rad, rad/s, rad."""
 
 
 @final
@@ -23,7 +23,7 @@ class Following(Policy):
 
     T r_dot + r = K delta has the same form for the differences from a motion that fulfils it, so
     that a law for steps of the heading corrects them and lags behind nothing. A law with an
-    observer is told the rudder that it got, less delta_d.
+    observer gets the rudder angle less delta_d.
 
     Reference [B, 3]: `FOLLOWED`. Memory [B, 1 + n_state of the law]: the rudder angle [rad] as the
     steering gear follows, then the law's.

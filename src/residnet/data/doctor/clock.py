@@ -9,7 +9,7 @@ import numpy as np
 from residnet.core.log import Log
 from residnet.data.doctor.findings import Finding, Level, share_of
 
-# stamps scatter by this share of a step before interpolation between them is felt
+# stamps scatter by this share of a step before interpolation between them suffers
 _MOST_JITTER = 0.05
 # longest time step, in usual ones, that the grid interpolates across
 _BRIDGED = 3.0

@@ -1,4 +1,4 @@
-"""How much of the vessel's envelope logs cover, and whether effects can be told apart."""
+"""How much of the vessel's envelope logs cover, and whether effects can be separated."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ def _collinearity(log: Log, names: Sequence[str]) -> Iterator[Finding]:
     text = f"condition number of {_list(names)} (centred, scaled): {condition:.3g}"
     if condition > _COLLINEAR:
         text += (
-            f"; {', '.join(worst)} move together in this log: their effects are told apart by other"
+            f"; {', '.join(worst)} move together in this log: their effects are separated by other"
             " manoeuvres only"
         )
     yield Finding("note", "condition", text, {"condition": condition})
@@ -202,7 +202,7 @@ def set_findings(logs: Sequence[Log], inputs: Sequence[str] | None) -> Iterator[
         yield Finding(
             "note",
             "constant_inputs",
-            f"{', '.join(held)} never varies: its effect cannot be told from a constant",
+            f"{', '.join(held)} never varies: its effect cannot be separated from a constant",
             {"count": len(held)},
         )
     moving = [name for name in (*awake, *driving) if name not in held]

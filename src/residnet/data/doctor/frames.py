@@ -59,7 +59,7 @@ def frame_findings(log: Log) -> list[Finding]:
     if "u" in moving and "v" in moving:
         convention = _velocity(motion)
         findings += [*convention, *_position_jumps(log, motion.step)]
-        # an offset or a current is told apart by the finer look, wrong axes are not
+        # an offset or a current is found by the comparison of increments, wrong axes are not
         if any(
             finding.figures.get("coherence", 0.0) > 0.8
             and 0.8 < finding.figures["speed_ratio"] < 1.25

@@ -94,8 +94,7 @@ def _held(log: Log, names: Sequence[str]) -> np.ndarray:
     outside = same.size - int((stops - starts)[long].sum())
     if outside < 0.02 * same.size:
         return out
-    # share of equal neighbours where the channel runs: a coarse one stands still for some samples
-    # by nature
+    # share of equal neighbours where the channel moves: a coarse one repeats values anyhow
     chance = min(float((stops - starts)[~long].sum()) / outside, 0.99)
     # two channels that hold together are never chance
     least = (

@@ -132,7 +132,7 @@ def position_causes(log: Log) -> dict[str, Cause]:
     )
 
 
-# channel -> causes that cannot be told where it holds noise only: the noise would explain itself
+# channel -> causes that cannot be found where it holds noise only: the noise would explain itself
 _NEEDS = {
     "u": ("gain_u", "lag_u", "gain", "lag", "lag_xy", "heading"),
     "v": ("gain_v", "lag_v"),
@@ -164,7 +164,7 @@ class _Rows:
 
     Args:
         pose: [T] real or complex, NaN where it was not measured.
-        known: what the velocities say of its increments [T - 1], NaN where they do not.
+        known: its increments [T - 1] by the velocities, NaN where these are missing.
         dt: time steps [T - 1], s.
         noise: of the pose at each sample.
         rate: noise [T - 1] of the velocity.

@@ -19,7 +19,7 @@ class Rates:
     Attributes:
         step: time between samples, s.
         ground: rate of the position, north + i east, [T] in m/s.
-        sailed: what psi, u, v say of it [T] for each convention.
+        through_water: the same from psi, u, v [T], for each convention.
         yaw: rate of psi [T] in rad/s.
         measured: u, v, r as far as the log has them, [T].
         noise: standard deviation of the noise in `yaw` and in the averaged r.

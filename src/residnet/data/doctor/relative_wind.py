@@ -64,7 +64,7 @@ def _slope_against_heading(log: Log, name: str) -> tuple[float, float]:
         return 0.0, 0.0
     change = np.angle(np.exp(1j * (log[name][hop:] - log[name][:-hop])))
     turn = log["psi"][hop:] - log["psi"][:-hop]
-    # beyond half a circle a change of direction cannot be told from its complement
+    # beyond half a circle a change of direction is ambiguous
     good = np.isfinite(change) & np.isfinite(turn) & (np.abs(turn) < 1.5)
     if good.sum() < 100 or float(np.std(turn[good])) < math.radians(1.0):
         return 0.0, 0.0

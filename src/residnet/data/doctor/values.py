@@ -13,7 +13,7 @@ from residnet.data.doctor.findings import Finding, Level, share_of, show
 from residnet.data.doctor.frozen import frozen_findings, sample_and_hold
 from residnet.data.doctor.signals import MEASURED, noise_of, spikes, without
 
-# levels between the 5th and the 95th percentile below which a resolution is felt
+# levels between the 5th and the 95th percentile below which a resolution is too coarse
 _FEWEST_LEVELS = 50
 
 

@@ -84,7 +84,7 @@ def provenance(path: Path, rows_read: int, rows_dropped: int) -> dict[str, Any]:
 def unwrap(angle: np.ndarray) -> np.ndarray:
     """Return the angle [T] in rad made continuous over its finite samples; NaN stay where they are.
 
-    A turn of more than half a circle between two finite samples cannot be told from its complement.
+    A turn of more than half a circle between two finite samples is ambiguous.
     """
     known = np.isfinite(angle)
     out = np.asarray(angle, dtype=np.float64).copy()

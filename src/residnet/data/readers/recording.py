@@ -120,11 +120,11 @@ class Recording:
     Attributes:
         path: where it lies.
         series: by name.
-        epoch: Unix time in whole ns that all times count from; None where times count from a start
-            that nobody knows.
+        epoch: Unix time in whole ns that all times count from; None where the start of
+            their count is not known.
         files: files that were read.
         remarks: what was noticed about the recording as a whole.
-        listed: names of series that the source holds and that were not asked for.
+        listed: names of series that the source holds and that were not wanted.
     """
 
     path: Path

@@ -9,7 +9,7 @@ import numpy as np
 from residnet.core.log import Log
 from residnet.data.readers.recording import Recording, Remark, Series, key_of, remark
 
-# lags that are looked for, s, and the least that is told
+# lags that are looked for, s, and the least that is reported
 _LONGEST, _STEP, _TELLING = 2.0, 0.05, 0.1
 # correlation that calls two signals the same quantity, and rows that a verdict needs
 _SAME, _ENOUGH = 0.9, 100
@@ -73,7 +73,7 @@ def _lag(
                 )
                 best = (size, float(lag), name, still)
     size, lag, name, still = best
-    # a lag is told only where it explains a good part of what the two differ by
+    # a lag is reported only where it explains a good part of what the two differ by
     if size < _SAME or abs(lag) < _TELLING or 1.0 - size > 0.7 * (1.0 - still):
         return []
     verb = (

@@ -47,7 +47,7 @@ class RecordingConfig(Config, ABC):
         longest_gap: longest step that is interpolated across, s; slow topics may always step over
             three of their usual steps.
         manoeuvre: kind of manoeuvre of every recording, `folder` takes the name of the folder it
-            lies in, null says that nobody knows.
+            lies in, null says that it is not known.
     """
 
     channels: dict[str, FieldMap] = Field(default_factory=dict)

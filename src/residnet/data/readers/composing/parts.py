@@ -217,7 +217,7 @@ def position_part(recording: Recording, config: PositionConfig, longest_gap: flo
 
 
 def heading_part(recording: Recording, config: HeadingConfig, longest_gap: float) -> Part:
-    """Return psi, unwrapped from its first value in [0, 2 pi); phi where asked for.
+    """Return psi, unwrapped from its first value in [0, 2 pi); phi where wanted.
 
     Raises:
         UsageError: where topic or field is missing.

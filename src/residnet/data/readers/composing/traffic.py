@@ -52,11 +52,16 @@ def traffic(series: Series) -> list[Remark]:
 
 
 def publishers(series: Series, step: np.ndarray) -> list[Remark]:
-    """Return whether several publishers share the topic; step [T - 1] in s.
+    """Return a remark where several publishers share the topic.
 
-    Told by what the source says of the sender, else by values that leap away and come straight back
-    (A, B, A) while rows follow each other at irregular short steps, as two trains of messages on
-    one track do, or by such leaps alone where nearly every row is one and they are wide.
+    They are recognised by the sender that the source names, else by values that leap away and come
+    straight back (A, B, A) while rows follow each other at irregular short steps, as two trains of
+    messages on one track do, or by such leaps alone where nearly every row is one and they are
+    wide.
+
+    Args:
+        series: with its rows in order.
+        step: between them [T - 1] in s.
     """
     if series.sender is not None and len(series) >= 2:
         names = [str(name) for name in dict.fromkeys(series.sender.tolist())]

@@ -1,4 +1,4 @@
-"""What a kind of message must say to map itself."""
+"""The interface of messages that map themselves to channels."""
 
 from __future__ import annotations
 
@@ -31,4 +31,4 @@ class Message(ABC):
 
     @abstractmethod
     def plan(self, series: Series) -> Plan:
-        """Return what a series of this kind says of the vessel."""
+        """Return the channels that a series of this kind gives."""

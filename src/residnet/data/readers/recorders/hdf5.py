@@ -112,7 +112,7 @@ def _vectors(dataset: h5py.Dataset) -> dict[str, Vector]:
 
 @final
 class _Column:
-    """One column of a table, read when it is asked for."""
+    """One column of a table, read when it is used."""
 
     def __init__(self, dataset: h5py.Dataset, name: str) -> None:
         self._dataset, self._name = dataset, name

@@ -133,7 +133,7 @@ class Cells:
         )
 
     def remark(self, topic: str) -> Remark:
-        """Return what is said of a column of text."""
+        """Return the remark about a column of text."""
         kind = "structures" if self._sample.startswith(("{", "[", "(")) else "text"
         shown = self._sample if len(self._sample) <= 40 else self._sample[:37] + "..."
         text = (
