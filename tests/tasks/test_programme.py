@@ -110,7 +110,7 @@ def test_a_vessel_leaves_logs_indices_and_figures(ship: Path) -> None:
         with Image.open(path) as picture:
             assert min(picture.size) > 600
             assert picture.info["Title"]
-    assert "first_overshoot" in (ship / "indices.txt").read_text()
+    assert "first overshoot" in (ship / "report.html").read_text()
 
 
 def test_a_model_flies_beside_its_vessel_and_alone(

@@ -60,8 +60,8 @@ def test_all_variants_and_seeds_in_one_table(
             ]
             found.append(own["nrmse"]["mean"])
         assert row["nrmse_mean"] == pytest.approx(sum(found) / 2, rel=1e-6)
-    assert "short" in (out / "study.md").read_text()
-    assert (out / "figures" / "study.png").stat().st_size > 1000
+    assert "short" in (out / "report.html").read_text()
+    assert (out / "figures" / "01_study.png").stat().st_size > 1000
     stamps = {path: path.stat().st_mtime_ns for path in out.glob("variants/*/metrics.json")}
     assert len(stamps) == 4
     (out / "variants" / "short.1" / "summary.json").unlink()

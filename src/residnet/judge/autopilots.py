@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -163,72 +161,3 @@ def sea_row(controller: str, kind: str, flights: Flights, start: float) -> dict[
 
 def _nominal(rows: int) -> Tensor:
     return torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64).expand(rows, -1)
-
-
-def table(rows: Sequence[Mapping[str, Any]], floor: str | None) -> str:
-    """Return the comparison as text.
-
-    Settling at the nominal vessel, over the corners and over random vessels, overshoot, steady
-    errors.
-    """
-    find = {(row["model"], row["protocol"]): row for row in rows}
-    names = list(dict.fromkeys(row["model"] for row in rows))
-    base = find[(floor, "nominal")]["settling"]["max"] if floor else None
-    windy = any(row["protocol"] == "wind" for row in rows)
-    lines = [
-        f"{'controller':14s} {'nominal s':>9s} {'x floor':>8s} {'worst s':>8s} {'random s':>9s}"
-        f" {'p95 s':>7s} {'overshoot deg':>14s} {'bias deg':>9s}"
-        + (f" {'wind deg':>9s}" if windy else "")
-    ]
-    for name in names:
-        nominal, corners, random, bias = (
-            find[(name, protocol)] for protocol in ("nominal", "corners", "random", "bias")
-        )
-        share = f"{nominal['settling']['max'] / base:8.3f}" if base else f"{'':8s}"
-        over = math.degrees(max(corners["overshoot"]["max"], random["overshoot"]["max"]))
-        late = (
-            "  (not settled in all flights)"
-            if corners["unsettled"] + random["unsettled"] + nominal["unsettled"]
-            else ""
-        )
-        wind = f" {math.degrees(find[(name, 'wind')]['error_end']):9.4f}" if windy else ""
-        lines.append(
-            f"{name:14s} {nominal['settling']['max']:9.2f} {share}"
-            f" {corners['settling']['max']:8.2f} {random['settling']['mean']:9.2f}"
-            f" {random['settling']['p95']:7.2f} {over:14.3f}"
-            f" {math.degrees(bias['error_end']):9.4f}{wind}{late}"
-        )
-    return "\n".join(lines)
-
-
-def effort_table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return means over random vessels of what a change and what the course costs, as text."""
-    find = {(row["model"], row["protocol"]): row for row in rows}
-    names = list(dict.fromkeys(row["model"] for row in rows))
-    degree = 180.0 / math.pi
-    sea = {name: find[(name, "sea")] for name in names if (name, "sea") in find}
-    rolls = any("heel_rms" in row for row in sea.values())
-    head = (
-        f"{'controller':14s} {'IAE deg s':>10s} {'p95':>8s} {'travel deg':>11s} {'p95':>8s}"
-        f" {'energy deg2 s':>14s} {'p95':>8s}"
-    )
-    head += f" {'sea: heading deg':>17s} {'rudder deg':>11s}" if sea else ""
-    lines = [head + (f" {'heel deg':>9s}" if rolls else "")]
-    for name in names:
-        random = find[(name, "random")]
-        parts = [
-            (random["iae"], degree, 10),
-            (random["travel"], degree, 11),
-            (random["energy"], degree**2, 14),
-        ]
-        line = f"{name:14s} " + " ".join(
-            f"{scale * own['mean']:{width}.2f} {scale * own['p95']:8.2f}"
-            for own, scale, width in parts
-        )
-        if sea:
-            line += (
-                f" {degree * sea[name]['heading_rms']['mean']:17.3f}"
-                f" {degree * sea[name]['rudder_rms']['mean']:11.3f}"
-            )
-        lines.append(line + (f" {degree * sea[name]['heel_rms']['mean']:9.3f}" if rolls else ""))
-    return "\n".join(lines)

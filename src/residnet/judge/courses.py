@@ -5,7 +5,6 @@ Times are compared with the shortest possible.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -13,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from residnet.control.courses.config import PlannedCourse, Protocol
+from residnet.control.courses.config import PlannedCourse
 
 Array = NDArray[np.float64]
 
@@ -198,64 +197,3 @@ def spread_row(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "margin_worst": float(margin.min()),
         "cross_track_rms": float(np.median([row["cross_track_rms"] for row in rows])),
     }
-
-
-_TITLES: Mapping[Protocol, str] = {
-    "enter": "Every buoy's circle of acceptance to be entered",
-    "sides": "Every buoy to be passed on its side, outside its circle",
-}
-
-
-def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return the comparison as text: the nominal flights, then those of the spread."""
-    lines = []
-    for protocol, title in _TITLES.items():
-        own = [row for row in rows if row["protocol"] == protocol]
-        if not own:
-            continue
-        lines.append(f"{title}; shortest possible {own[0]['floor_time']:.2f} s")
-        lines += _nominal_lines(
-            [row for row in own if row["split"] == "simulated"],
-            "entered" if protocol == "enter" else "side/clear",
-        )
-        lines += _spread_lines([row for row in own if row["split"] == "spread"])
-    return "\n".join(lines)
-
-
-def _nominal_lines(rows: Sequence[Mapping[str, Any]], passed: str) -> list[str]:
-    heads = (passed, "margin m", "tightest m", "xte rms m", "max m", "rudder deg")
-    lines = [
-        f"{'controller':12s} {'guidance':14s} {'time s':>8s} {'ratio':>7s} {'turning':>8s} "
-        + " ".join(f"{head:>11s}" for head in heads)
-    ]
-    for one in rows:
-        buoys = (
-            f"{one['entered']}/{one['n']}"
-            if one["protocol"] == "enter"
-            else f"{one['right_side']}/{one['clear']}/{one['n']}"
-        )
-        late = "" if one["finished"] else "  (did not finish)"
-        lines.append(
-            f"{one['model']:12s} {one['guidance']:14s} {one['course_time']:8.2f}"
-            f" {one['ratio']:7.4f} {one['ratio_turning']:8.4f} {buoys:>11s} {one['margin']:11.3f}"
-            f" {one['tightest_turn']:11.2f} {one['cross_track_rms']:11.3f}"
-            f" {one['cross_track_max']:11.3f} {math.degrees(one['travel']):11.1f}{late}"
-        )
-    return lines
-
-
-def _spread_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    if not rows:
-        return []
-    heads = ("passed %", "finished %", "ratio", "worst", "margin m", "worst m", "xte rms m")
-    lines = [
-        f"{rows[0]['n']} vessels and currents; medians",
-        f"{'controller':12s} {'guidance':14s} " + " ".join(f"{head:>10s}" for head in heads),
-    ]
-    for one in rows:
-        lines.append(
-            f"{one['model']:12s} {one['guidance']:14s} {100 * one['passed']:10.1f}"
-            f" {100 * one['finished']:10.1f} {one['ratio']:10.4f} {one['ratio_worst']:10.4f}"
-            f" {one['margin']:10.3f} {one['margin_worst']:10.3f} {one['cross_track_rms']:10.3f}"
-        )
-    return lines

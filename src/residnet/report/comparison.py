@@ -123,19 +123,3 @@ def _row(
         "difference_ci95": None if variant is reference else interval,
         "seconds": float(np.mean(variant.seconds)),
     }
-
-
-def as_text(rows: Sequence[Mapping[str, Any]], reference: str) -> str:
-    """Return the table of a study for the terminal."""
-    from residnet.report.sections.study import variants_table
-
-    return variants_table(rows, reference).text()
-
-
-def draw(rows: Sequence[Mapping[str, Any]], reference: str, path: Path) -> None:
-    """Write the figure of a study."""
-    from residnet.report.figures.study import differences
-    from residnet.report.figures.style import save
-
-    drawing = differences(rows, reference)
-    save(drawing.figure, path, drawing.title, drawing.caption)

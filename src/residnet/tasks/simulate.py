@@ -18,7 +18,7 @@ from residnet.physics.vessel import load_vessel
 from residnet.report.blocks import Section
 from residnet.report.figures.files import write_drawings
 from residnet.report.run_reader import RunFiles
-from residnet.report.sections.simulate import sections
+from residnet.report.sections.simulate import indices_text, sections
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import ComputingTask, MainFigure, Outcome
 from residnet.tasks.programme import Programme
@@ -85,7 +85,7 @@ class SimulateConfig(ComputingTask):
         Raises:
             UsageError: where something cannot fly the manoeuvres.
         """
-        from residnet.judge.index_table import contents, index_rows, table
+        from residnet.judge.index_table import contents, index_rows
         from residnet.report.figures.flights import flight_drawings
 
         flown, places, length = (
@@ -98,9 +98,8 @@ class SimulateConfig(ComputingTask):
                 flight.log.save(folder.path / place / f"{flight.log.name}.parquet")
                 count += 1
         rows = [row for craft, flights in flown for row in index_rows(craft, flights, length)]
-        folder.write_json(folder.path / "indices.json", contents(self.name, length, rows))
-        text = table(rows)
-        folder.write(folder.path / "indices.txt", text + "\n")
+        content = contents(self.name, length, rows)
+        folder.write_json(folder.path / "indices.json", content)
         drawings = flight_drawings({craft.name: flights for craft, flights in flown})
         write_drawings(folder.figures, drawings)
         faults = [row for row in rows if row["fault"]]
@@ -112,7 +111,7 @@ class SimulateConfig(ComputingTask):
         return Outcome(
             verdict,
             {"logs": MainFigure(count), "flights_with_a_fault": MainFigure(len(faults))},
-            text if len(rows) <= _SHOWN else f"indices of {len(rows)} manoeuvres: indices.txt",
+            indices_text(content) if len(rows) <= _SHOWN else "",
             self._failure(flown),
         )
 
@@ -155,11 +154,15 @@ class SimulateConfig(ComputingTask):
                 if not flight.fault:
                     continue
                 line = f"{craft.name}, {flight.log.name}: {flight.fault}"
-                say(line)
                 if number < listed:
                     failures.append(line)
+                else:
+                    say(line)
         if not failures:
             return ""
+        # the last one is the error itself
+        for line in failures[:-1]:
+            say(line)
         count = sum(len(flights) for _, flights in flown)
         return (
             f"{failures[-1]} ({len(failures)} of {count} flights did not end as they should; give"

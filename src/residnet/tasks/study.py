@@ -18,9 +18,10 @@ from residnet.core.config import ExistingPath, load_config
 from residnet.core.errors import UsageError
 from residnet.core.names import nearest
 from residnet.core.progress import report
-from residnet.report.blocks import Code, Section
-from residnet.report.comparison import Variant, as_text, draw, table, window_nrmse
-from residnet.report.figures.files import figures_section
+from residnet.report.blocks import Section
+from residnet.report.comparison import Variant, table, window_nrmse
+from residnet.report.run_reader import RunFiles
+from residnet.report.sections.study import draw, sections, variants_table
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import MainFigure, Outcome, Task
 from residnet.tasks.fit import FitConfig
@@ -154,19 +155,15 @@ class StudyConfig(Task):
             "reference": self.reference,
         }
         folder.write_json(folder.path / "study.json", head | {"rows": rows})
-        text = as_text(rows, self.reference)
-        folder.write(folder.path / "study.md", f"{self.description or self.name}\n\n{text}")
-        folder.figures.mkdir(exist_ok=True)
-        draw(rows, self.reference, folder.figures / "study.png")
+        text = variants_table(rows, self.reference).text()
         return Outcome(_verdict(rows, self.reference), _main_figures(rows), text)
 
     @classmethod
     def report_sections(cls, run: RunFolder) -> Sequence[Section]:
-        """Return the table of the variants with their differences, and the figure."""
-        content = json.loads((run.path / "study.json").read_text())
-        text = as_text(content["rows"], content["reference"])
-        figures = figures_section(run.figures)
-        return [Section("Variants", [Code(text)]), *([figures] if figures else [])]
+        """Draw the figure and return the table of the variants with their differences."""
+        files = RunFiles(run.path)
+        draw(files)
+        return sections(files)
 
 
 def _verdict(rows: Sequence[dict[str, Any]], reference: str) -> list[str]:

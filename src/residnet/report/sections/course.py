@@ -71,6 +71,23 @@ def _protocol(run: RunFiles, protocol: str) -> Section:
     return Section(f"Protocol {protocol}", blocks)
 
 
+def text_of(rows: Sequence[Content]) -> str:
+    """Return the tables of a course run for the terminal.
+
+    Args:
+        rows: of metrics.json.
+    """
+    parts = []
+    for protocol in dict.fromkeys(row["protocol"] for row in rows):
+        found = [row for row in rows if row["protocol"] == protocol]
+        nominal = [row for row in found if row["split"] == "simulated"]
+        drawn = [row for row in found if row["split"] == "spread"]
+        shortest = f"Shortest possible: {nominal[0]['floor_time']:.2f} s."
+        parts += [f"{RULES[protocol]} {shortest}", nominal_table(nominal).text()]
+        parts += [spread_table(drawn).text()] if drawn else []
+    return "\n".join(parts)
+
+
 def nominal_table(rows: Sequence[Content]) -> Table:
     """Return time, margin and cross-track error of the nominal flights of one protocol."""
     enters = rows[0]["protocol"] == "enter"

@@ -51,6 +51,15 @@ def _about(content: Content) -> str:
     return text
 
 
+def indices_text(content: Content) -> str:
+    """Return the indices for the terminal.
+
+    Args:
+        content: of indices.json.
+    """
+    return "\n\n".join(f"{title}\n{table.text()}" for title, table in index_tables(content))
+
+
 def index_tables(content: Content) -> list[tuple[str, Table]]:
     """Return titles and tables of manoeuvring indices.
 

@@ -24,10 +24,15 @@ from residnet.dynamics.learned import chosen_model
 from residnet.dynamics.rollout import Source
 from residnet.dynamics.store import load_model
 from residnet.export.autopilot import export_autopilot
-from residnet.judge.autopilots import QUANTITIES, effort_table, step_flights, table
+from residnet.judge.autopilots import QUANTITIES, step_flights
 from residnet.judge.metrics import SCHEMA
 from residnet.physics.vessel import load_vessel
-from residnet.report.sections.autopilot import FLIGHTS, PLANTS
+from residnet.report.sections.autopilot import (
+    FLIGHTS,
+    PLANTS,
+    effort_table,
+    settling_table,
+)
 from residnet.runs.folder import RunFolder
 from residnet.runs.model_store import FolderStore
 from residnet.runs.task import MainFigure, Outcome
@@ -90,7 +95,7 @@ def run_autopilot(config: AutopilotSettings, folder: RunFolder) -> Outcome:
     return Outcome(
         _verdict(config, rows),
         _main_figures(config, rows),
-        f"{table(rows, config.floor)}\n{effort_table(rows)}",
+        f"{settling_table(rows, config.floor).text()}\n\n{effort_table(rows).text()}",
         export=lambda: [_export(config, folder, name, policies[name], rows) for name in policies],
     )
 

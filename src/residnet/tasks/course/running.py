@@ -24,9 +24,9 @@ from residnet.control.heading.controllers import Steering
 from residnet.control.heading.following import Following
 from residnet.control.heading.policy import HeadingPolicy
 from residnet.core.progress import say
-from residnet.judge.courses import CourseFlight, row, spread_row, table
+from residnet.judge.courses import CourseFlight, row, spread_row
 from residnet.judge.metrics import SCHEMA
-from residnet.report.sections.course import COURSES, SPREAD, TRACKS
+from residnet.report.sections.course import COURSES, SPREAD, TRACKS, text_of
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import MainFigure, Outcome
 from residnet.tasks.autopilot.config import AutopilotSettings
@@ -116,7 +116,7 @@ def run_course(config: CourseSettings, folder: RunFolder) -> Outcome:
     return Outcome(
         _verdict(config, done.rows),
         _main_figures(config, done.rows),
-        table(done.rows),
+        text_of(done.rows),
         export=lambda: [export.write(done.rows) for export in exports],
     )
 

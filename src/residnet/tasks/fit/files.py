@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from residnet.judge.limits import SCHEMA as LIMITS
 from residnet.judge.repeats import repeatability
 from residnet.judge.tables import metrics_content
 from residnet.report.run_reader import RunFiles
+from residnet.report.sections.fit.free_runs import errors_table
 from residnet.report.sections.fit.verdict import verdict
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import MainFigure, Outcome
@@ -103,24 +103,4 @@ def fit_outcome(
             "heading_error_end": MainFigure(row["heading_error_end"], "rad"),
         }
     sentences = [sentence for sentence in verdict(evaluation) if sentence]
-    return Outcome(sentences, figures, free_run_table(metrics["rows"], split), export=export)
-
-
-def free_run_table(rows: Sequence[Mapping[str, Any]], split: str) -> str:
-    """Return the free-run errors of one split as text; `*` marks the selected model."""
-    titles = (
-        f"{'protocol':12s} {'model':14s} {'u m/s':>8s} {'v m/s':>8s} {'r deg/s':>8s} {'nrmse':>7s}"
-    )
-    lines = [f"{titles} {'position m':>11s} {'heading deg':>12s} {'diverged':>9s}"]
-    for row in rows:
-        if row["split"] != split or row["manoeuvre"] != "all":
-            continue
-        rmse, mark = row["rmse"], " *" if row["selected"] else ""
-        lines.append(
-            f"{row['protocol']:12s} {row['model'] + mark:14s} {rmse['u']:8.4f} {rmse['v']:8.4f}"
-            f" {math.degrees(rmse['r']):8.3f} {row['nrmse']['mean']:7.4f}"
-            f" {row['position_error_end']:11.2f} {math.degrees(row['heading_error_end']):12.2f}"
-            f" {row['diverged']:5d}/{row['windows']}"
-        )
-    lines.append("free-run errors, mean over windows; * = selected on validation data")
-    return "\n".join(lines)
+    return Outcome(sentences, figures, errors_table(evaluation, split).text(), export=export)

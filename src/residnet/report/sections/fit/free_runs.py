@@ -84,6 +84,34 @@ def free_runs(run: RunFiles, protocol: str) -> Table | None:
     return table
 
 
+def errors_table(run: RunFiles, split: str) -> Table:
+    """Return the errors of all models on one split under all protocols, for the terminal."""
+    units = [f"{title_of(channel)} [{run.unit(channel)[0]}]" for channel in run.channels]
+    ends = ["NRMSE [-]", "position, end [m]", "heading, end [deg]", "diverged"]
+    table = Table(
+        ["model", "protocol", *units, *ends],
+        caption=f"Free-run errors on {split} data, mean over windows.",
+    )
+    for protocol in run.protocols:
+        for model in run.kinds:
+            row = run.row(model, split, protocol)
+            if row is None:
+                continue
+            table.add(
+                run.label(model),
+                [
+                    Cell(protocol, mark="text"),
+                    *(number(run.unit(name)[1] * row["rmse"][name]) for name in run.channels),
+                    number(row["nrmse"]["mean"]),
+                    *(
+                        _quantity(run, key, row, None)
+                        for key in ("position", "heading", "diverged")
+                    ),
+                ],
+            )
+    return table
+
+
 def by_manoeuvre(run: RunFiles, protocol: str, split: str) -> Table | None:
     """Return the errors of one split by kind of manoeuvre, None where there is a single kind."""
     kinds = distinct(run, run.manoeuvres(split, protocol), split, protocol)
