@@ -8,9 +8,9 @@ import torch
 from scipy.linalg import expm
 
 from residnet.baselines import LinearSteadyConfig
-from residnet.baselines.regressors import Coefficient
 from residnet.core.errors import ConfigError, FitError
 from residnet.core.samples import Samples
+from residnet.regression.solutions import Coefficient
 
 NAMES = ("u", "v", "r", "tau_x", "tau_n")
 # (33), (34) in SI (correction W11), the steering row with B = -A Phi
@@ -54,8 +54,9 @@ def trials(settled: float = 400.0, noise: float = 0.0) -> Samples:
         target.append(nu @ A.T + tau @ B.T + C + noise * rng.normal(size=nu.shape))
         group.append(np.full(steps, number))
         t.append(time)
-    arrays = [torch.from_numpy(np.concatenate(part)) for part in (z, target, group, t)]
-    return Samples(*arrays, tuple(kind for kind, _ in parts), NAMES)
+    joined = (torch.from_numpy(np.concatenate(part)) for part in (z, target, group, t))
+    x, y, groups, times = joined
+    return Samples(x, y, groups, times, tuple(kind for kind, _ in parts), NAMES)
 
 
 def by_name(table: list[Coefficient]) -> dict[tuple[str, str], float]:

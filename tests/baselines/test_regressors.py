@@ -90,9 +90,10 @@ def test_only_the_chosen_manoeuvres() -> None:
     samples = made()
     spoiled = samples.target.clone()
     spoiled[(samples.group % 2) == 0] = 99.0
-    config = RegressorsConfig(
-        terms={axis: tuple(row) for axis, row in TRUTH.items()}, manoeuvres=("zigzag",)
-    )  # type: ignore[misc]
+    terms = {axis: tuple(row) for axis, row in TRUTH.items()}
+    config = RegressorsConfig.model_validate(
+        {"kind": "regressors", "terms": terms, "manoeuvres": ("zigzag",)}
+    )
     for entry in config.fit(config.build(NAMES), samples.with_target(spoiled)):
         assert entry.value == pytest.approx(TRUTH[entry.axis[0]][entry.term], rel=1e-9)
     other = RegressorsConfig(manoeuvres=("turning",))

@@ -94,6 +94,7 @@ def fitted(head: Any, of: Samples) -> HybridDynamics:
     model = spec(head).build()
     with torch.no_grad():
         residual = model.head.residual_target(of, model.baseline(of.z))
+    assert isinstance(model.head, ForceHead)
     model.head.calibrate(residual)
     model.head.solve(residual)
     return model.eval()
@@ -119,6 +120,7 @@ def test_the_mass_and_the_accelerations_are_the_true_ferrys(model: HybridDynamic
 )
 def test_the_thirty_basis_functions_hold_it_too(config: Any) -> None:
     model = fitted(config, samples())
+    assert isinstance(model.head, ForceHead)
     assert model.head.inner.library.count == 30
     of = samples()
     with torch.no_grad():
@@ -145,6 +147,7 @@ def test_a_free_run_is_the_true_ferrys(model: HybridDynamics) -> None:
 
 def test_the_feed_forward_undoes_the_motion(model: HybridDynamics) -> None:
     of = samples(count=50)
+    assert isinstance(model.head, ForceHead)
     force = RequiredForce(model.baseline, model.head).eval()
     with torch.no_grad():
         torch.testing.assert_close(force(of.target, of.z[:, :3]), of.z[:, 3:], rtol=0, atol=1e-2)
@@ -193,6 +196,7 @@ def test_only_the_solutions_that_run_forward_are_offered() -> None:
     of = samples(mass_sign=-1.0)
     with torch.no_grad():
         residual = head.head.residual_target(of, head.baseline(of.z))
+    assert isinstance(head.head, ForceHead)
     head.head.calibrate(residual)
     offered = [solution.choice["penalty"] for solution in head.head.solutions(residual)]
     assert offered == [[100.0] * 3, []]

@@ -193,7 +193,7 @@ def test_terms_are_written_as_the_term_language_reads_them() -> None:
     algebra = Algebra(("u", "rpm", "nozzle"))
     u, rpm, nozzle = (algebra.channel(name) for name in algebra.channels)
     multiply, apply = algebra.multiply, algebra.apply
-    made = [
+    made: list[Sum] = [
         multiply(u, apply("abs", u)),
         multiply(multiply(rpm, rpm), apply("cos", nozzle)),
         apply("sqrt", u),

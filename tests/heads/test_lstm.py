@@ -19,6 +19,7 @@ from residnet.heads.lstm import LstmCore, LstmHead
 def built(**config: object) -> LstmHead:
     torch.manual_seed(0)
     head = LstmConfig.model_validate({"kind": "lstm", "hidden_size": 12, **config}).build(NAMES)
+    assert isinstance(head, LstmHead)
     head.calibrate(made())
     return head.double().eval()
 
@@ -73,10 +74,11 @@ def test_core_equals_torch_lstm() -> None:
     other = nn.LSTM(4, 10, batch_first=True).double()
     with torch.no_grad():
         core.bias.uniform_(-0.5, 0.5)
-        other.weight_ih_l0.copy_(core.w_input)
-        other.weight_hh_l0.copy_(core.w_hidden)
-        other.bias_ih_l0.copy_(core.bias)
-        other.bias_hh_l0.zero_()
+        weights = dict(other.named_parameters())
+        weights["weight_ih_l0"].copy_(core.w_input)
+        weights["weight_hh_l0"].copy_(core.w_hidden)
+        weights["bias_ih_l0"].copy_(core.bias)
+        weights["bias_hh_l0"].zero_()
         out, (h, c) = other(z)
         mine, s = core.sequence(z)
     torch.testing.assert_close(mine, out, rtol=0, atol=1e-12)
@@ -116,6 +118,7 @@ def test_parameters_of_the_document_s_network() -> None:
     head = LstmConfig(hidden_size=100, per_axis=True, features=("u", "v", "r", "tau_n")).build(
         NAMES
     )
+    assert isinstance(head, LstmHead)
     counts = [sum(p.numel() for p in network.parameters()) for network in head.networks]
     assert counts == [42_101] * 3
     assert head.n_state == 600

@@ -12,6 +12,7 @@ from torch import Tensor
 from residnet.core.errors import ConfigError
 from residnet.core.samples import Samples
 from residnet.heads import LstmConfig, MlpConfig, ResidualHead
+from residnet.heads.mlp import MlpHead
 
 CHANNELS = {
     "rudder": (("u", "v", "r", "n", "delta"), [0, 1, 2, 3, 4], [1, -1, -1, 1, -1]),
@@ -150,7 +151,9 @@ def test_scripted(kind: str, dtype: torch.dtype) -> None:
 def test_scales_are_those_of_both_sides() -> None:
     names, index, sign = CHANNELS["rudder"]
     head, known = built("mlp", names), samples(names)
-    inner = head.inner.features  # type: ignore[union-attr]
+    mlp = head.inner
+    assert isinstance(mlp, MlpHead)
+    inner = mlp.features
     both = torch.cat((known.z, mirror(known.z, index, sign)))
     torch.testing.assert_close(inner.mean, both.mean(0))
     torch.testing.assert_close(inner.std, both.std(0, correction=0))

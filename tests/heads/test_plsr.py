@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -23,9 +25,10 @@ def basis(head: BasisHead, z: torch.Tensor) -> np.ndarray:
     return head.basis(z).numpy()
 
 
-def fitted(**config: object) -> tuple[PlsrHead, dict[str, object]]:
+def fitted(**config: object) -> tuple[PlsrHead, dict[str, Any]]:
     samples = made()
     head = PlsrConfig.model_validate({"kind": "plsr", **config}).build(NAMES)
+    assert isinstance(head, PlsrHead)
     head.calibrate(samples)
     return head, head.solve(samples)
 
@@ -86,7 +89,7 @@ def test_cross_validation_equals_explicit_refits() -> None:
             predicted = sklearn_fit(x[rest] / scale, y[rest], order).predict(x[own] / scale)
             error[order - 1] += ((predicted - y[own]) ** 2).sum(0)
     share = (error / len(x) / y.var(0)).mean(1)
-    np.testing.assert_allclose(notes["cross_validated_share"], share, rtol=1e-7)  # type: ignore[arg-type]
+    np.testing.assert_allclose(notes["cross_validated_share"], share, rtol=1e-7)
     assert notes["order"] == int(np.argmin(share)) + 1
 
 
@@ -104,6 +107,7 @@ def test_too_little_data_is_refused() -> None:
 
 def test_named_terms_and_features() -> None:
     head = PlsrConfig(features=("u", "r"), terms=("u|u|", "u r", "r|r|"), order=3).build(NAMES)
+    assert isinstance(head, PlsrHead)
     samples = made()
     head.calibrate(samples)
     head.solve(samples)
@@ -123,6 +127,7 @@ def test_free_runs_are_offered_every_order_and_none() -> None:
     """
     samples = made()
     head = PlsrConfig().build(NAMES)
+    assert isinstance(head, PlsrHead)
     head.calibrate(samples)
     found = head.solutions(samples)
     orders = [solution.choice["order"] for solution in found]

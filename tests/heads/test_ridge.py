@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -12,8 +14,9 @@ from residnet.heads import RidgeConfig
 from residnet.heads.ridge import RidgeHead
 
 
-def fitted(penalties: tuple[float, ...], folds: int = 5) -> tuple[RidgeHead, dict[str, object]]:
+def fitted(penalties: tuple[float, ...], folds: int = 5) -> tuple[RidgeHead, dict[str, Any]]:
     head = RidgeConfig(penalties=penalties, folds=folds).build(NAMES)
+    assert isinstance(head, RidgeHead)
     head.calibrate(made())
     return head, head.solve(made())
 
@@ -56,7 +59,7 @@ def test_cross_validation_equals_explicit_refits() -> None:
                 .predict(x[own] / scale)
             )
             error[i] += ((predicted - y[own]) ** 2).sum(0)
-    np.testing.assert_allclose(notes["cross_validated_error"], error / len(x), rtol=1e-9)  # type: ignore[arg-type]
+    np.testing.assert_allclose(notes["cross_validated_error"], error / len(x), rtol=1e-9)
     assert notes["penalty"] == [penalties[i] for i in error.argmin(0)]
 
 
@@ -73,6 +76,7 @@ def test_each_axis_takes_its_own_penalty() -> None:
 
 def test_a_constant_basis_function_does_no_harm() -> None:
     head = RidgeConfig(terms=("u", "1", "v"), penalties=(1e-8,)).build(NAMES)
+    assert isinstance(head, RidgeHead)
     samples = made()
     head.calibrate(samples)
     head.solve(samples)

@@ -82,7 +82,7 @@ def test_all_six_equations_of_random_multisines(number: int) -> None:
 def test_the_jets_equations_from_steps(file: Path) -> None:
     """Document 000 section 6.4: genetic programming did not find these from such inputs."""
     frame = pd.read_csv(file)
-    log = {name: np.array(frame[name]) for name in frame} | {
+    log = {str(name): np.array(frame[name]) for name in frame} | {
         f"{name}_dot": np.array(frame[f"d{name}"]) for name in "uvr"
     }
     _, notes = fitted(JET, samples(log, JETS))

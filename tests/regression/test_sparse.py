@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from itertools import combinations
 from math import comb, log
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ def named(count: int) -> list[str]:
     return [f"c{i}" for i in range(count)]
 
 
-def solve(x: np.ndarray, y: np.ndarray, **config: float) -> Equation:
+def solve(x: np.ndarray, y: np.ndarray, **config: Any) -> Equation:
     return find(
         reduce(x, y[:, None], named(x.shape[1]), [1] * x.shape[1]), 0, SearchConfig(**config)
     )[0]
