@@ -6,7 +6,6 @@ One config class per kind says which estimator of `residnet.regression` finds th
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, final
 
@@ -267,13 +266,3 @@ RegressionConfig = Annotated[
     | ShrinkRegression,
     Field(discriminator="kind"),
 ]
-
-
-def table(terms: Sequence[str], fit: Fit) -> list[tuple[str, list[float]]]:
-    """Rows of the model for reading: the constant, then each basis function that is kept, with its
-    coefficients (surge, sway, yaw).
-    """
-    rows = [("1", fit.intercept.tolist())]
-    return rows + [
-        (term, row) for term, row in zip(terms, fit.coefficients.tolist(), strict=True) if any(row)
-    ]

@@ -1,3 +1,1 @@
-"""Document 001 (Moreno et al. 2019): ridge, kernel ridge and symbolic regression on random
-manoeuvres.
-"""
+"""Document 001 (Moreno-Salinas et al. 2019): regressions on random manoeuvres."""

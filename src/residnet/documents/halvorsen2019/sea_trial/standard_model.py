@@ -231,23 +231,13 @@ def fit(
     free = ~near
     # a bound fixes what the data leave open: what the data determine is judged without bounds
     information = _information(np.asarray(best.jac), best.fun.reshape(-1, 3), free)
-    sums = {}
-    for name, (first, sign, second) in SUMS.items():
-        along = np.zeros(len(NAMES))
-        along[NAMES.index(first)] = sign * scale[NAMES.index(first)]
-        if second:
-            along[NAMES.index(second)] = -scale[NAMES.index(second)]
-        sums[name] = (
-            float(along @ best.x) + (0.0 if second else config.mass),
-            _standard_error(information, along),
-        )
     errors = np.array(
         [_standard_error(information, scale[i] * np.eye(len(NAMES))[i]) for i in range(len(NAMES))]
     )
     return StandardFit(
         values=values,
         errors=errors,
-        sums=sums,
+        sums=_inertias(best.x, scale, config.mass, information),
         undetermined=tuple(
             NAMES[i]
             for i in np.flatnonzero(np.abs(information.open).max(axis=1, initial=0.0) > _OPEN_SHARE)
@@ -293,6 +283,28 @@ def _information(jacobian: np.ndarray, errors: np.ndarray, free: np.ndarray) -> 
     covariance = np.zeros((count, count))
     covariance[np.ix_(free, free)] = inverse @ middle @ inverse
     return _Information(covariance, directions[~kept].T, float(values[0] / values[kept][-1]))
+
+
+def _inertias(
+    scaled: np.ndarray, scale: np.ndarray, mass: float, information: _Information
+) -> dict[str, tuple[float, float]]:
+    """Return estimate and standard error of the inertias as the equations contain them.
+
+    Args:
+        scaled: estimated parameters [14] in units of `scale`.
+        scale: typical sizes of the parameters [14].
+        mass: known mass in kg.
+        information: what the data say of the scaled parameters.
+    """
+    out = {}
+    for name, (first, sign, second) in SUMS.items():
+        along = np.zeros(len(NAMES))
+        along[NAMES.index(first)] = sign * scale[NAMES.index(first)]
+        if second:
+            along[NAMES.index(second)] = -scale[NAMES.index(second)]
+        estimate = float(along @ scaled) + (0.0 if second else mass)
+        out[name] = (estimate, _standard_error(information, along))
+    return out
 
 
 def _standard_error(information: _Information, along: np.ndarray) -> float:

@@ -126,17 +126,7 @@ def read_measured(config: ForceSettings) -> Measured:
     Raises:
         ResidnetError: where a log cannot be read or holds no usable samples.
     """
-    reader = config.data.reader.build()
-    recorded = [reader.read(path) for path in config.data.files()]
-    # a model would be fitted to the very samples that judge it
-    check_leaks({log.name: [log] for log in recorded})
-    logs = [prepare(log, "all", config.channels.columns(), config.prepare) for log in recorded]
-    for log in logs:
-        if not log.good.any():
-            raise DataError(
-                f"log {log.log.name}: no stretch is as long as the derivative's window; leave it"
-                " out or shorten prepare.derivative"
-            )
+    logs = _read(config)
     joined = {
         name: torch.from_numpy(np.concatenate([getattr(log, name) for log in logs]))
         for name in ("smooth", "nu_dot", "recorded", "good")
@@ -167,12 +157,6 @@ def read_measured(config: ForceSettings) -> Measured:
         (0.0,) * 9,
         tuple(len(log) for log in logs),
     )
-    masked = {
-        log.log.name: {
-            reason: float(mask.mean()) for reason, mask in log.log.masks.items() if mask.any()
-        }
-        for log in logs
-    }
     return Measured(
         tuple(log.log.name for log in logs),
         record,
@@ -180,11 +164,41 @@ def read_measured(config: ForceSettings) -> Measured:
         good,
         part,
         parts,
-        masked,
+        _masked(logs),
         derived,
         sensed,
         acceleration,
     )
+
+
+def _read(config: ForceSettings) -> list[Prepared]:
+    """Read and prepare all logs.
+
+    Raises:
+        DataError: where two logs have rows in common, or a log holds no usable samples.
+    """
+    reader = config.data.reader.build()
+    recorded = [reader.read(path) for path in config.data.files()]
+    # a model would be fitted to the very samples that judge it
+    check_leaks({log.name: [log] for log in recorded})
+    logs = [prepare(log, "all", config.channels.columns(), config.prepare) for log in recorded]
+    for log in logs:
+        if not log.good.any():
+            raise DataError(
+                f"log {log.log.name}: no stretch is as long as the derivative's window; leave it"
+                " out or shorten prepare.derivative"
+            )
+    return logs
+
+
+def _masked(logs: Sequence[Prepared]) -> dict[str, dict[str, float]]:
+    """Return the share of the samples that each mask excludes, by log and mask."""
+    return {
+        log.log.name: {
+            reason: float(mask.mean()) for reason, mask in log.log.masks.items() if mask.any()
+        }
+        for log in logs
+    }
 
 
 def _calibrated(logs: Sequence[Prepared], derived: Tensor, sensed: Tensor) -> Tensor:
