@@ -14,17 +14,21 @@ if [ -z "$python" ]; then
   exit 2
 fi
 
-install_residnet() {  # $1: extras, for example [dev], or nothing
+install_residnet() {  # $1: extras, for example [dev,docs], or nothing
   if [ ! -x .venv/bin/python ]; then
     "$python" -m venv .venv
   fi
-  local stamp
-  stamp="$(cat pyproject.toml scripts/constraints.txt | cksum)$1"
-  if [ "$(cat .venv/installed 2>/dev/null)" != "$stamp" ] && [ "$(cat .venv/installed 2>/dev/null)" != "${stamp}[dev]" ]; then
+  local sum have wanted="${1//[\[\],]/ }" extra missing=""
+  sum="$(cat pyproject.toml scripts/constraints.txt | cksum | tr ' ' -)"
+  have=" $(cat .venv/installed 2>/dev/null) "
+  for extra in "$sum" $wanted; do
+    [[ "$have" == *" $extra "* ]] || missing="$missing $extra"
+  done
+  if [ -n "$missing" ]; then
     echo "installing into .venv (some minutes the first time)"
     # torch first and alone: pip takes the CPU build that the constraint names, and nothing after it asks for another
     .venv/bin/python -m pip install --quiet --disable-pip-version-check --constraint scripts/constraints.txt torch
     .venv/bin/python -m pip install --quiet --disable-pip-version-check --constraint scripts/constraints.txt --editable ".$1"
-    echo "$stamp" > .venv/installed
+    if [[ "$have" == *" $sum "* ]]; then echo "$have $wanted" >.venv/installed; else echo "$sum $wanted" >.venv/installed; fi
   fi
 }

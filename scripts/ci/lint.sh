@@ -2,5 +2,5 @@
 # Lint and types.
 source "$(dirname "${BASH_SOURCE[0]}")/../_venv.sh"
 install_residnet "[dev]"
-.venv/bin/ruff check src tests scripts
+.venv/bin/ruff check src tests scripts docs examples
 .venv/bin/mypy

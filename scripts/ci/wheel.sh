@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
 # Builds wheel and sdist, installs the wheel into an environment that holds no residnet, and runs it
 # far from the checkout: shipped configs and vessels must be found by name.
-set -euo pipefail
-root="$(cd "$(dirname "${BASH_SOURCE[0]}")/../.." && pwd)"
+source "$(dirname "${BASH_SOURCE[0]}")/../_venv.sh"
+install_residnet "[dev]"
+root="$PWD"
 work="$(mktemp -d)"
 trap 'rm -rf "$work"' EXIT
-cd "$root"
 
 echo "building wheel and sdist"
 .venv/bin/python -m build --no-isolation --outdir "$work/dist" . >"$work/build.log" 2>&1 || { cat "$work/build.log" >&2; exit 1; }

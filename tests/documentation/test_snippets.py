@@ -1,0 +1,190 @@
+"""What README and documentation show is valid: YAML is read, commands and files exist, links lead.
+
+Python and shell blocks that a comment `not run: <reason>` precedes or begins are not carried out;
+their commands and options are checked all the same.
+"""
+
+from __future__ import annotations
+
+import ast
+import os
+import re
+import shlex
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from typer.main import get_command
+
+import residnet
+from residnet.cli import app
+from residnet.core.config import load_config, load_mapping, validate
+from residnet.physics.vessel import VesselConfig
+from residnet.tasks.loading import load_task
+from residnet.tasks.union import TaskConfig
+
+ROOT = Path(__file__).parents[2]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+FENCE = re.compile(
+    r"(?:<!-- not run: (?P<why>[^>]*) -->\n)?```(?P<kind>\w+)\n(?P<text>.*?)```", re.S
+)
+TEXT = "\n".join(page.read_text() for page in PAGES)
+NAMED = sorted(set(re.findall(r"residnet run ((?!configs\b)[a-z_0-9]+)\b(?!\.)", TEXT)))
+FILES = sorted(set(re.findall(r"residnet (?:run|check) (configs/[\w./-]+\.yaml)", TEXT)))
+
+
+@dataclass(frozen=True)
+class Block:
+    """A fenced block of a page."""
+
+    page: str
+    number: int
+    kind: str
+    text: str
+    why_not_run: str | None
+
+    def __str__(self) -> str:
+        return f"{self.page}:{self.number}"
+
+
+def blocks() -> list[Block]:
+    found = []
+    for page in PAGES:
+        for number, match in enumerate(FENCE.finditer(page.read_text())):
+            first = re.match(r"# not run: (.*)", match["text"])
+            why = match["why"] or (first[1] if first else None)
+            name = page.relative_to(ROOT).as_posix()
+            found.append(Block(name, number, match["kind"], match["text"], why))
+    return found
+
+
+BLOCKS = blocks()
+
+
+def of_kind(kind: str) -> list[Any]:
+    return [pytest.param(block, id=str(block)) for block in BLOCKS if block.kind == kind]
+
+
+def test_pages_show_what_they_should() -> None:
+    assert {"sh", "yaml", "python"} <= {block.kind for block in BLOCKS}
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 130
+
+
+@pytest.mark.parametrize("block", of_kind("yaml"))
+def test_yaml_is_read(block: Block, tmp_path: Path) -> None:
+    path = tmp_path / "shown.yaml"
+    path.write_text(block.text)
+    content = load_mapping(path)
+    if "task" in content:
+        if content["data"]["kind"] == "measured":
+            content["data"]["split"]["root"] = str(tmp_path)  # the logs are the reader's own
+        assert validate(content, TaskConfig, str(block)).task == content["task"]
+    elif block.text.startswith("# fragment: "):
+        assert isinstance(fragment(block.text), object)
+    else:
+        assert load_config(path, [], VesselConfig).build().commands > 0
+
+
+def fragment(text: str) -> object:
+    """Validate part of a fit's config inside a complete one."""
+    place = re.match(r"# fragment: (.*)", text)
+    assert place is not None
+    whole = yaml.safe_load(
+        next(b.text for b in BLOCKS if b.kind == "yaml" and "kind: measured" in b.text)
+    )
+    part = yaml.safe_load(text)
+    if place[1] == "data.reader":
+        whole["data"]["reader"]["channels"] |= part["channels"]
+        whole["data"]["reader"]["time"] = part["time"]
+    elif place[1] == "prepare":
+        whole["prepare"] |= part
+    else:
+        whole |= part
+        whole["signals"]["exogenous"] = ["wind_speed", "wind_dir"]
+    return validate(whole, TaskConfig, text)
+
+
+@pytest.mark.parametrize("block", of_kind("sh"))
+def test_commands_exist(block: Block) -> None:
+    group = get_command(app)
+    for line in re.sub(r"\\\n", " ", block.text).splitlines():
+        words = shlex.split(line, comments=True)
+        for word in words:
+            if re.fullmatch(r"(scripts|configs|examples|docs)/[\w./-]+", word) and "*" not in word:
+                assert (ROOT / word).exists(), f"{block}: {word} does not exist"
+        if words[:1] != ["residnet"]:
+            continue
+        command = group.commands.get(words[1])  # type: ignore[attr-defined]
+        assert command is not None, f"{block}: residnet has no command {words[1]}"
+        options = {name for parameter in command.params for name in parameter.opts}
+        for word in words[2:]:
+            if re.match(r"-{1,2}[a-z]", word):
+                assert word in options, f"{block}: {words[1]} has no option {word}"
+
+
+@pytest.mark.parametrize("name", NAMED)
+def test_named_configs_come_with_residnet(name: str) -> None:
+    assert any(path.stem == name for path in (ROOT / "configs").rglob("*.yaml"))
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_config_files_that_are_named_are_read(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    split = "train: [a.csv]\nvalidation: [b.csv]\ntest: [c.csv]\n"
+    (tmp_path / "esso_osaka").mkdir()
+    (tmp_path / "esso_osaka" / "split.yaml").write_text(split)
+    monkeypatch.setenv("RESIDNET_DATA", str(tmp_path))
+    load_task(ROOT / name, [])
+
+
+@pytest.mark.parametrize("block", of_kind("python"))
+def test_python_is_right(block: Block) -> None:
+    tree = ast.parse(block.text)
+    used = {
+        node.attr
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Attribute)
+        and isinstance(node.value, ast.Name)
+        and node.value.id == "residnet"
+    }
+    assert used <= set(dir(residnet)), f"{block}: residnet has no {used - set(dir(residnet))}"
+
+
+def test_the_head_of_contributing_keeps_the_contract(tmp_path: Path) -> None:
+    block = next(b for b in BLOCKS if b.page == "CONTRIBUTING.md" and "BrakeConfig" in b.text)
+    (tmp_path / "brake.py").write_text(block.text)
+    about = tmp_path / "brake-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: brake\nVersion: 1.0\n")
+    points = "[residnet.heads]\nbrake = brake:BrakeConfig\n"
+    (about / "entry_points.txt").write_text(points)
+    source = Path(residnet.__file__).parents[1]
+    lines = [
+        "from brake import BrakeConfig",
+        "from residnet.testing import check_head",
+        "check_head(BrakeConfig())",
+    ]
+    run = subprocess.run(
+        [sys.executable, "-c", "\n".join(lines)],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join((str(source), str(tmp_path)))},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert run.returncode == 0, run.stderr
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_files_and_links_exist(page: Path) -> None:
+    text = page.read_text()
+    for name in re.findall(r"`((?:configs|scripts|src|examples)/[\w./-]+)`", text):
+        assert (ROOT / name).exists(), f"{page.name} names {name}"
+    if page.name in ("README.md", "CONTRIBUTING.md"):
+        for link in re.findall(r"\]\((?!http)([^)#]+)", text):
+            assert (page.parent / link).exists(), f"{page.name} links to {link}"
