@@ -1,6 +1,4 @@
-"""Task `actuators`: throttle, step and bollard-pull tests to the actuators of a vessel file
-(document 003 section 4.1).
-"""
+"""Task `actuators`: identify the actuators of a vessel file from tests (document 003, 4.1)."""
 
 from __future__ import annotations
 
@@ -32,7 +30,12 @@ from residnet.runs.task import MainFigure, Outcome, Task
 
 
 class Column(Config):
-    """A column of a csv file and its unit."""
+    """A column of a csv file and its unit.
+
+    Attributes:
+        column: its title in the first line of the file.
+        unit: of its numbers, for example `rpm`.
+    """
 
     column: str
     unit: str
@@ -47,7 +50,7 @@ class Column(Config):
         return unit
 
     def measures(self, si: str, key: str) -> None:
-        """Stop where the unit does not measure `si`.
+        """Check that the unit measures what the SI unit `si` does.
 
         Raises:
             ValueError: naming the key.
@@ -59,11 +62,23 @@ class Column(Config):
 
 
 class _Test(Config):
+    """A test of the actuators.
+
+    Attributes:
+        files: csv files of the test.
+    """
+
     files: Annotated[tuple[ExistingPath, ...], Field(min_length=1)]
 
 
 class ThrottleTest(_Test):
-    """Steady revolutions `n` over `throttle`, one row per point."""
+    """Steady revolutions over throttle, one row for each point.
+
+    Attributes:
+        files: csv files of the test.
+        throttle: column of the throttle, from -1 to 1 (`-`) or in `%`.
+        n: column of the revolutions, for example in `rpm`.
+    """
 
     throttle: Column
     n: Column
@@ -76,7 +91,14 @@ class ThrottleTest(_Test):
 
 
 class StepTest(_Test):
-    """Revolutions `n` over time after steps of `command`, one file per step response."""
+    """Revolutions over time after steps of the command, one file for each step response.
+
+    Attributes:
+        files: csv files of the test.
+        t: column of the time, for example in `s`.
+        command: column of the commanded revolutions, for example in `rpm`.
+        n: column of the measured revolutions, for example in `rpm`.
+    """
 
     t: Column
     command: Column
@@ -91,8 +113,13 @@ class StepTest(_Test):
 
 
 class BollardTest(_Test):
-    """Steady pull on the tether over revolutions `n`, positive ahead, of all `thrusters` running
-    together.
+    """Steady pull on a tether over revolutions, of all thrusters together.
+
+    Attributes:
+        files: csv files of the test.
+        n: column of the revolutions, for example in `rpm`.
+        pull: column of the pull, positive ahead, for example in `N`.
+        thrusters: how many pull together.
     """
 
     n: Column
@@ -111,7 +138,9 @@ class ActuatorsTaskConfig(Task):
     file.
 
     Attributes:
-        throttle, step, bollard: the tests; at least one.
+        throttle: test of the throttle map; null for none. At least one test is needed.
+        step: test of the rate limit and the dead time; null for none.
+        bollard: test of the thrust curves; null for none.
     """
 
     task: Literal["actuators"]
@@ -126,12 +155,12 @@ class ActuatorsTaskConfig(Task):
         return self
 
     def files(self) -> list[Path]:
-        """All logs."""
+        """Return the files of all tests."""
         tests: tuple[_Test | None, ...] = (self.throttle, self.step, self.bollard)
         return [path for test in tests if test is not None for path in test.files]
 
     def check(self) -> None:
-        """Read the logs.
+        """Check that the logs can be read.
 
         Raises:
             ResidnetError: where a column is missing or holds what is no number.
@@ -196,7 +225,7 @@ class ActuatorsTaskConfig(Task):
 
 
 class _Logs:
-    """Contents of the tests in SI: throttle and n; (t, command, n) of each step; n and pull."""
+    """The contents of the tests in SI: throttle and n; (t, command, n) of each step; n and pull."""
 
     def __init__(self, config: ActuatorsTaskConfig) -> None:
         self.throttle = (
@@ -227,7 +256,7 @@ def _together(paths: Sequence[Path], *columns: Column) -> tuple[np.ndarray, ...]
 
 
 def _read(path: Path, *columns: Column) -> tuple[np.ndarray, ...]:
-    """Columns [N] of a csv file in SI; rows with an empty cell are left out.
+    """Return columns [N] of a csv file in SI; rows with an empty cell are left out.
 
     Raises:
         UsageError: where a column is missing.
@@ -270,7 +299,7 @@ def vessel_lines(
     step: StepAnswer | None,
     thrust: tuple[ThrustFit, ThrustFit] | None,
 ) -> str:
-    """Lines for the section `actuators` of a vessel file, with 95 % intervals as comments."""
+    """Return lines for the section `actuators` of a vessel file, 95 % intervals as comments."""
     lines = [f"# from {', '.join(path.name for path in config.files())}; intervals are 95 %"]
     if throttle is not None:
         k, o, m = throttle.slope, throttle.offset, throttle.n_max

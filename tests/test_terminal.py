@@ -1,0 +1,57 @@
+"""Progress on the command line: lines where there is no terminal, bars where there is one."""
+
+from __future__ import annotations
+
+import io
+import sys
+
+import pytest
+
+from residnet.core.progress import report, say
+from residnet.terminal import drawn_progress
+
+
+def test_lines_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    with drawn_progress():
+        say("reading logs")
+        for done in range(4):
+            report("training lstm", done, 3)
+        report("training lstm", 3, 3)
+        report("searching")
+    assert capsys.readouterr() == ("", "reading logs\n  training lstm: 3\n")
+
+
+def test_a_stage_that_begins_again_is_told_again(capsys: pytest.CaptureFixture[str]) -> None:
+    with drawn_progress():
+        for _ in range(2):
+            report("free runs", 1, 2)
+            report("free runs", 2, 2)
+    assert capsys.readouterr().err == "  free runs: 2\n" * 2
+
+
+class Terminal(io.StringIO):
+    """A terminal that keeps what is drawn."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+def test_bars_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setenv("TERM", "xterm")
+    with drawn_progress():
+        say("reading [logs]")
+        report("training lstm", 1, 4)
+        report("searching", 3)
+        report("training lstm", 4, 4)
+    text = terminal.getvalue()
+    assert "reading [logs]" in text
+    assert "searching" in text
+
+
+def test_nothing_is_drawn_outside(capsys: pytest.CaptureFixture[str]) -> None:
+    with drawn_progress():
+        pass
+    say("nobody listens")
+    assert capsys.readouterr() == ("", "")
