@@ -23,8 +23,7 @@ from residnet.runs.task import MainFigure, Outcome, Task
 
 
 class ImportConfig(Task):
-    """Recordings read once and kept as logs/<name>.parquet; findings.json says what was noticed and
-    mended.
+    """Recordings of any format that become canonical logs, with what was noticed on the way in.
 
     Attributes:
         reader: how the recordings are read.
@@ -38,7 +37,7 @@ class ImportConfig(Task):
     logs: tuple[str, ...] = Field(min_length=1)
 
     def check(self) -> None:
-        """What reading the config does not show: that every pattern matches.
+        """Check that every pattern matches.
 
         Raises:
             ConfigError: where one does not, or two recordings would have one name.
@@ -126,7 +125,7 @@ def _write(log: Log, folder: RunFolder) -> None:
 
 
 def _lines(log: Log) -> list[str]:
-    """What is printed of one log."""
+    """Return what the terminal shows of one log."""
     findings = log.meta.get("findings", [])
     usual = (log.t[-1] - log.t[0]) / (len(log) - 1)
     lost = sum(int(mask.sum()) for reason, mask in log.masks.items() if reason.startswith("hard:"))
@@ -134,8 +133,10 @@ def _lines(log: Log) -> list[str]:
         f"{log.name}: {len(log)} samples, step {usual:.4g} s, {log.t[-1] - log.t[0]:.1f} s,"
         f" {len(log.channels)} channels ({', '.join(log.channels)})"
     )
-    notes = sum(one["level"] == "note" for one in findings)
+    notes = sum(finding["level"] == "note" for finding in findings)
     loud = [
-        f"{log.name}: {one['level']}: {one['text']}" for one in findings if one["level"] != "note"
+        f"{log.name}: {finding['level']}: {finding['text']}"
+        for finding in findings
+        if finding["level"] != "note"
     ]
     return [f"{head}, {lost} samples in gaps, {notes} notes", *loud]

@@ -32,9 +32,7 @@ _ILL_CONDITIONED = 1e6
 
 @dataclass(frozen=True)
 class _Setup:
-    """What a config says about logs: how they are read, what drives the vessel, what is masked, and
-    which split a file is in.
-    """
+    """What a config says about logs: reader, inputs, masks, and the split of each file."""
 
     reader: LogReader | None = None
     folders: bool = False
@@ -150,7 +148,7 @@ def _setup(config: Path) -> _Setup:
 
 
 def _read(path: Path, setup: _Setup) -> tuple[Log, list[str]]:
-    """The log in a file, and the lines of the channel map that was guessed for it, if any."""
+    """Return the log in a file, and the lines of the channel map that was guessed for it."""
     if setup.reader is not None:
         return setup.reader.read(path), []
     if Log.recognises(path) or format_of(path) is not None:
@@ -162,7 +160,7 @@ def _read(path: Path, setup: _Setup) -> tuple[Log, list[str]]:
 
 
 def _regressors(logs: Sequence[Log], task: Any) -> list[Finding]:
-    """Condition number of the baselines' regressors over all logs, as the config prepares them."""
+    """Return how well the prepared logs condition the regressors of each baseline."""
     from residnet.baselines import RegressorBaseline
     from residnet.data.prepare import prepare, samples
 

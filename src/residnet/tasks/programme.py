@@ -1,6 +1,4 @@
-"""What the task `simulate` flies: manoeuvres on a vessel, on a learned model, or on both side by
-side.
-"""
+"""Manoeuvres of the task `simulate`, flown by a vessel, a learned model, or both."""
 
 from __future__ import annotations
 
@@ -55,7 +53,7 @@ class ModelChoice(Config):
 
     @property
     def chosen(self) -> str:
-        """Name of the model in its run.
+        """Return the name of the model in its run.
 
         Raises:
             UsageError: where the folder holds no such model.
@@ -122,7 +120,7 @@ class Programme(Config):
         return self
 
     def draw(self) -> list[Manoeuvre]:
-        """The manoeuvres: those given, then those drawn."""
+        """Return the manoeuvres: those given, then those drawn."""
         random = np.random.default_rng([self.seed, 1])
         return [
             *self.manoeuvres,
@@ -135,7 +133,7 @@ class Programme(Config):
 
     @cached_property
     def flown(self) -> list[Manoeuvre]:
-        """The manoeuvres, with the logs of replays read.
+        """Return the manoeuvres, with the logs of replays read.
 
         Raises:
             ResidnetError: where a log cannot be read.
@@ -149,7 +147,7 @@ class Programme(Config):
 
     @property
     def hull_length(self) -> float | None:
-        """Length of the hull in m; None where nobody says."""
+        """Return the length of the hull in m; None where nobody says."""
         vessel = self.vessel or (self.model.actuators if self.model is not None else None)
         return (
             self.length
@@ -158,7 +156,7 @@ class Programme(Config):
         )
 
     def crafts(self) -> list[tuple[Craft, Sea]]:
-        """What flies, each with what surrounds it: the vessel, then the model.
+        """Return what flies, each with what surrounds it: the vessel, then the model.
 
         Raises:
             UsageError: where one of them cannot fly the manoeuvres.
@@ -169,7 +167,7 @@ class Programme(Config):
         return out if model is None else [*out, model]
 
     def fly(self, craft: Craft, sea: Sea) -> list[Flight]:
-        """All manoeuvres in one batch."""
+        """Fly all manoeuvres in one batch."""
         step = self.step or (craft.dynamics.dt if self.model is not None else STEP)
         return fly(
             craft,
@@ -282,5 +280,5 @@ class Programme(Config):
 
 
 def plant_name(vessel: str) -> str:
-    """Name of a vessel in tables: that in its file."""
+    """Return the name of a vessel in tables: that in its file."""
     return load_vessel(vessel).name

@@ -1,6 +1,4 @@
-"""Task `simulate`: sea trials of a vessel, a learned model or both: canonical logs, manoeuvring
-indices and figures.
-"""
+"""Task `simulate`: sea trials as canonical logs, with manoeuvring indices and figures."""
 
 from __future__ import annotations
 
@@ -50,8 +48,7 @@ class SimulateConfig(ComputingTask):
         return self
 
     def check(self) -> None:
-        """What reading the config does not show: that models and logs are there and fit the
-        manoeuvres.
+        """Check that models and logs are there and fit the manoeuvres.
 
         Raises:
             ResidnetError: where they do not.

@@ -26,8 +26,7 @@ from residnet.tasks.autopilot.config import AutopilotSettings
 def compare(
     controllers: dict[str, tuple[str, Policy]], vessel: SteeredPlant, config: AutopilotSettings
 ) -> tuple[list[dict[str, Any]], pd.DataFrame, pd.DataFrame]:
-    """Rows of metrics.json, the flights over the corners of the spread as a table, and what each
-    random vessel gave as another.
+    """Return the rows of metrics.json, and two tables: flights of the corners, random vessels.
 
     Args:
         controllers: kind (policy, classical, floor) and controller by name.
@@ -59,7 +58,7 @@ def compare(
 
 
 def _random(config: AutopilotSettings) -> tuple[Tensor, Tensor]:
-    """Variations [B, 3] and speeds [B]: the same for all controllers."""
+    """Return variations [B, 3] and speeds [B] in m/s, the same for all controllers."""
     low, high = config.spread.speed
     count, seed = config.test.plants, config.seed + 1
     share = torch.rand(
@@ -74,7 +73,7 @@ def _random(config: AutopilotSettings) -> tuple[Tensor, Tensor]:
 def _disturbed(
     name: str, kind: str, policy: Policy, vessel: SteeredPlant, config: AutopilotSettings
 ) -> list[dict[str, Any]]:
-    """Rows under a constant rudder bias, in wind and in waves."""
+    """Return the rows under a constant rudder bias, in wind and in waves."""
     test = config.test
     pushed = torch.tensor(
         [[1.0, 1.0, side * test.bias] for side in (1.0, -1.0)], dtype=torch.float64
@@ -115,7 +114,7 @@ def _disturbed(
 
 
 def _series(name: str, flights: Flights, corners: Tensor) -> pd.DataFrame:
-    """Heading, yaw rate and rudder every 0.05 s, all turned to starboard."""
+    """Return heading, yaw rate and rudder every 0.05 s, all turned to starboard."""
     every = max(round(0.05 / flights.dt), 1)
     parts = []
     for i, variation in enumerate(corners):

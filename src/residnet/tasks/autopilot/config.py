@@ -56,23 +56,22 @@ class PolicyConfig(Config):
 
 
 class StepTestConfig(Config):
-    """The one test of all controllers: a step of the reference without prefilter, from straight
-    ahead.
+    """The one test of all controllers: a step of the heading reference, from straight ahead.
 
     Attributes:
-        heading: the step.
-        band: the change has settled at the last entry into it, either side.
-        overshoot: limit that peers are tuned under, and that policies are chosen by.
-        dt: step of simulation and controllers.
-        duration: of a flight.
-        plants: random vessels of the spread, beside its corners.
-        bias: constant rudder angle of the steady-error test.
-        bias_error: largest heading error there after `bias_time`.
-        bias_time: see above.
-        wind: mean wind speed of the same test in wind, from eight directions and without bias; null
-            for none.
+        heading: change of the reference in rad; no prefilter smooths it.
+        band: heading error in rad; the change has settled at the last entry into this band.
+        overshoot: limit in rad that peers are tuned under, and that policies are chosen by.
+        dt: step of simulation and controllers in s.
+        duration: of a flight in s.
+        plants: number of random vessels of the spread, beside its corners.
+        bias: constant rudder angle of the steady-error test in rad.
+        bias_error: largest heading error in rad that is left after `bias_time`.
+        bias_time: duration of the steady-error test in s.
+        wind: mean wind speed in m/s of the same test in wind, from eight directions and without
+            bias; null for none.
         sea: waves in which the course is kept after the step; null for none.
-        sea_time: how long, counted from the end of the step's flight.
+        sea_time: how long in s, counted from the end of the step's flight.
     """
 
     heading: Radians = Field(default=0.5235987755982988, gt=0, lt=3.1)
@@ -89,7 +88,7 @@ class StepTestConfig(Config):
     sea_time: Seconds = Field(default=120.0, gt=0)
 
     def weather(self) -> Disturbance:
-        """What the vessel must be able to feel."""
+        """Return the wind and waves that the vessel must be able to feel."""
         return Disturbance(
             wind=None if self.wind is None else WindField(speed=self.wind, direction=0.0),
             waves=self.sea,
@@ -101,12 +100,12 @@ class AutopilotSettings(ComputingTask):
 
     Attributes:
         seed: of weights, batches and random vessels.
-        vessel: name or file.
-        rudder: largest rudder angle that controllers may use.
-        turning_time: until the turn at that angle is steady.
+        vessel: name or file of the vessel.
+        rudder: largest rudder angle in rad that controllers may use.
+        turning_time: time in s until the turn at that angle is steady.
         spread: of vessels and disturbances, for training, tuning and comparison alike.
-        test: see there.
-        policies: by name.
+        test: the step of the heading reference that all controllers fly.
+        policies: neural policies by name.
         predictive: the document's own autopilots, by name.
         peers: by name; gains that are left out are tuned.
         floor: peer that knows the vessel exactly: the others are measured in multiples of its
@@ -164,7 +163,7 @@ class AutopilotSettings(ComputingTask):
         return self
 
     def check(self) -> None:
-        """Whether the runs of learned models are there.
+        """Check that the runs of learned models are there.
 
         Raises:
             UsageError: where one is not.

@@ -160,7 +160,7 @@ def _export(
 def _peer(
     name: str, peer: AnyController, steering: Steering, config: AutopilotSettings
 ) -> tuple[AnyController, dict[str, Any]]:
-    """A peer with all its gains, and what there is to say about it."""
+    """Return a peer with all its gains, and notes on its tuning."""
     if not isinstance(peer, TunedConfig):
         return peer, {"config": peer.model_dump(mode="json")}
     test = config.test
@@ -195,8 +195,9 @@ def _peer(
 def _school(
     name: str, wanted: PolicyConfig, steering: Steering, config: AutopilotSettings
 ) -> Steering:
-    """What a policy is trained on: the vessel, in wind and current where the spread has them, or a
-    learned model of it.
+    """Return what a policy is trained on: the vessel, or a learned model of it.
+
+    The vessel is in wind and current where the spread has them.
 
     Raises:
         FitError: where the learned model does not turn steadily.
@@ -277,8 +278,9 @@ def _policy(
 
 
 class _Score:
-    """Mean and worst settling time over the corners of the spread, and what overshoot beyond the
-    limit costs; seconds.
+    """The score of a policy: mean and worst settling time in s, and a penalty on overshoot.
+
+    Both are taken over the corners of the spread.
     """
 
     def __init__(self, steering: Steering, config: AutopilotSettings) -> None:
@@ -296,8 +298,9 @@ class _Score:
 
 
 class _CommandDifference:
-    """Root mean square of the difference between the commands of a policy and of its teacher, which
-    sees what the policy flies; radians.
+    """The root mean square in rad of how the commands of a policy differ from its teacher's.
+
+    The teacher sees what the policy flies.
     """
 
     def __init__(self, steering: Steering, config: AutopilotSettings, teacher: Policy) -> None:

@@ -23,7 +23,7 @@ from residnet.tasks.course.config import CourseSettings
 
 
 def autopilot_of(config: CourseSettings) -> AutopilotConfig:
-    """The autopilot's config, from its run folder or its file.
+    """Return the config of the autopilot, from its run folder or its file.
 
     Raises:
         UsageError: where the folder is not that of a finished autopilot run.
@@ -48,7 +48,7 @@ def autopilot_of(config: CourseSettings) -> AutopilotConfig:
 
 
 class AutopilotRun(NamedTuple):
-    """What courses are planned and flown with.
+    """The finished autopilot run that courses are planned and flown with.
 
     Attributes:
         autopilot: config of the autopilot run.
@@ -66,8 +66,7 @@ class AutopilotRun(NamedTuple):
 
 
 def ready(config: CourseSettings, folder: RunFolder) -> AutopilotRun:
-    """From the finished run of the autopilot: the one that is given, or the one in the course's own
-    folder.
+    """Read the finished autopilot run: the given one, or the one in the folder of the course.
 
     Raises:
         UsageError: where it is not finished.
@@ -93,7 +92,7 @@ def ready(config: CourseSettings, folder: RunFolder) -> AutopilotRun:
 
 
 def load_policy(run: Path, name: str, steering: Steering) -> HeadingPolicy:
-    """A trained policy from the run folder of an autopilot, at the step of `steering`.
+    """Return a trained policy from the run folder of an autopilot, at the step of `steering`.
 
     Raises:
         UsageError: where the run lacks it, or it is not as it was written.

@@ -17,8 +17,7 @@ _Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
 
 
 class CourseSettings(ComputingTask):
-    """A course past buoys, flown by a policy, by peers of its autopilot run, and by line of sight
-    from way-point to way-point.
+    """A course past buoys, the controllers that fly it, and the guidance laws beside the plan.
 
     Attributes:
         autopilot: folder of a finished autopilot run, or the config of one, which is then carried
@@ -27,18 +26,19 @@ class CourseSettings(ComputingTask):
         policy: its name there.
         peers: names of tuned peers and of the document's own autopilots there.
         others: further controllers, for example the document's law with another horizon.
-        course: see there.
-        protocols: that are flown.
-        integral: gain of integral action against a steady current in the guidance along the plan;
-            null for none.
+        course: start, buoys and how the course is planned.
+        protocols: what passing a buoy means: `enter` its circle of acceptance, or leave it on its
+            side and outside its circle (`sides`).
+        integral: gain in m/s of integral action against a steady current in the guidance along the
+            plan; null for none.
         line_of_sight: laws that are also flown without a plan, on straight legs from way-point to
             way-point, as the source did it; for the protocol `enter`.
         legs_change: where they do: in the circle of acceptance, as in the source, or at the
             wheel-over before it.
         spread: of vessels and currents that all fly the course too, beside the nominal vessel in
             water at rest; null for none.
-        dt: step of simulation and controllers.
-        duration: after which a flight that has not ended is given up.
+        dt: step of simulation and controllers in s.
+        duration: time in s after which a flight that has not ended is given up.
         safe: what the exported policy commands while its inputs are wrong: the last good command,
             or rudder amidships.
     """

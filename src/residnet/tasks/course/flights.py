@@ -1,6 +1,4 @@
-"""Flights of a course run: many vessels at once, each in its own current, under one controller and
-one guidance.
-"""
+"""Flights of a course run: many vessels at once, each in a current of its own."""
 
 from __future__ import annotations
 
@@ -38,16 +36,19 @@ NOMINAL = Vessels(
 
 
 class CourseSpreadConfig(Config):
-    """Random vessels, each in a steady current from a random direction; the same ones for every
-    controller and guidance.
+    """Random vessels, each in a steady current from a random direction.
+
+    Every controller and guidance flies the same ones.
 
     Attributes:
-        flights: how many.
-        seed: of them.
-        effect: of the rudder, as a multiple (K of Nomoto's model).
-        time: constants of sway and yaw, as a multiple (T of Nomoto's model).
-        bias: largest constant angle that is added to the rudder's.
-        current: its speed.
+        flights: number of vessels.
+        seed: of the random numbers.
+        effect: least and largest effect of the rudder, as a multiple of the nominal one (K of
+            Nomoto's model).
+        time: least and largest time constants of sway and yaw, as a multiple of the nominal ones (T
+            of Nomoto's model).
+        bias: largest constant angle that is added to the rudder's, in rad.
+        current: speed of the current in m/s.
     """
 
     flights: int = Field(default=50, ge=2)
@@ -67,7 +68,7 @@ class CourseSpreadConfig(Config):
         return self
 
     def draw(self) -> Vessels:
-        """Evenly spread over their ranges."""
+        """Draw the vessels, evenly spread over their ranges."""
         generator = np.random.default_rng(self.seed)
         effect, time, bias = (
             generator.uniform(*limits, self.flights)
@@ -90,7 +91,7 @@ def fly(
     duration: float,
     vessels: Vessels,
 ) -> list[CourseFlight]:
-    """One flight of each vessel from the plan's first point and heading.
+    """Fly each vessel once, from the plan's first point and heading.
 
     Args:
         steering: vessel and step.
@@ -132,7 +133,7 @@ def fly(
 
 
 def _aside(plan: CourseGuidance, states: Tensor) -> Tensor:
-    """Cross-track errors [B, T] in m of states [B, T, nx]."""
+    """Return the cross-track errors [B, T] in m of states [B, T, nx]."""
     place, errors = plan.initial_state(states[:, 0]), []
     for k in range(states.shape[1]):
         _, place = plan(states[:, k], k, place)

@@ -12,7 +12,7 @@ from residnet.tasks.course.config import CourseSettings
 
 
 def load_peers(config: CourseSettings, known: AutopilotRun) -> dict[str, Policy]:
-    """Peers as the autopilot run tuned or trained them, then the others."""
+    """Return the peers as the autopilot run tuned or trained them, then the others."""
     reader: TypeAdapter[AnyController] = TypeAdapter(AnyController)
     built: dict[str, Policy] = {}
     for name in config.peers:

@@ -57,7 +57,7 @@ _UNITS = {
 def plan_for(
     config: CourseSettings, known: AutopilotRun, protocol: Protocol
 ) -> tuple[PlannedCourse, CourseGuidance]:
-    """The plan of a protocol, and the guidance along it.
+    """Return the plan of a protocol, and the guidance along it.
 
     Raises:
         ConfigError: where no course fits the vessel's turns.
@@ -193,7 +193,7 @@ class _Export(NamedTuple):
 
 
 class _Flown(NamedTuple):
-    """Rows of metrics.json, tracks of nominal flights, and flights of the spread."""
+    """The rows of metrics.json, tracks of nominal flights, and flights of the spread."""
 
     rows: list[dict[str, Any]]
     tracks: list[pd.DataFrame]
@@ -209,7 +209,7 @@ def _fly(
     sight: AnyLineOfSight | None,
     done: _Flown,
 ) -> None:
-    """The nominal flight, then those of the spread, of one controller under one guidance."""
+    """Fly the nominal vessel, then those of the spread, with one controller and guidance."""
     kind = "policy" if name == config.policy else "classical"
     guidance = "course" if sight is None else sight.kind
     steered = _steered(config, planned, steering, law, sight)
@@ -236,7 +236,7 @@ def _fly(
 
 
 def _guidance(config: CourseSettings, planned: PlannedCourse, steering: Steering) -> CourseGuidance:
-    """Along the plan."""
+    """Return the guidance along the plan."""
     lookahead = config.course.lookahead
     drift = (
         None if config.integral is None else DriftEstimate(lookahead, config.integral, steering.dt)
@@ -251,9 +251,7 @@ def _steered(
     law: Policy,
     sight: AnyLineOfSight | None,
 ) -> tuple[Policy, Reference]:
-    """Controller and guidance along the plan, or under a line of sight on the legs from buoy to
-    buoy instead.
-    """
+    """Return controller and guidance along the plan, or by line of sight from buoy to buoy."""
     vessel = steering.vessel
     if sight is None:
         return Following(

@@ -16,7 +16,7 @@ _KEPT = 0.1
 
 
 def spread_table(rows: list[dict[str, Any]], vessels: Vessels) -> pd.DataFrame:
-    """One line for each flight."""
+    """Return one line for each flight of the spread."""
     kept = (
         "model",
         "guidance",

@@ -1,6 +1,4 @@
-"""The manoeuvring booklet of a fit: what the identified model does in standard manoeuvres, with
-intervals, beside what was measured.
-"""
+"""The manoeuvring booklet of a fit: standard manoeuvres of the identified model, with intervals."""
 
 from __future__ import annotations
 
@@ -38,7 +36,7 @@ def write_booklet(
     logs: Mapping[str, Sequence[Prepared]],
     limit: np.ndarray,
 ) -> str:
-    """Fly, and write booklet.json and booklet.parquet; returns a line for the console.
+    """Fly, and write booklet.json and booklet.parquet; returns a line for the log.
 
     Args:
         folder: of the run.
@@ -96,7 +94,7 @@ def write_booklet(
 
 
 def _craft(config: BookletConfig, fitted: FittedModel, inputs: Mapping[str, InputShare]) -> Craft:
-    """The model in front of which the inputs' gear stands; its rows are draws."""
+    """Return the model behind the gear of its inputs; its rows are draws."""
     spec, model = fitted.spec, fitted.model.double()
     gear = GivenGear(inputs, spec.signals.exogenous, spec.dt)
     actuated = ActuatedDynamics(model, spec.signals.columns, spec.hold, gear)
@@ -176,7 +174,7 @@ def _measured(
 
 
 def _shares(config: BookletConfig, logs: Sequence[Log]) -> dict[str, InputShare]:
-    """The inputs' shares, full drive and steer being the most that the logs have."""
+    """Return the shares of the inputs; full drive and steer are the most that the logs have."""
     rudder = config.rudder()
     steer = max(steered_zigzag(log, rudder).angle for log in logs)
     out = {}
@@ -191,7 +189,7 @@ def _shares(config: BookletConfig, logs: Sequence[Log]) -> dict[str, InputShare]
 
 
 def _like(config: BookletConfig, shares: Mapping[str, InputShare], log: Log) -> Zigzag:
-    """The zigzag of a log as a manoeuvre."""
+    """Return the zigzag of a log as a manoeuvre."""
     steered, rudder = steered_zigzag(log, config.rudder()), config.rudder()
     drives = [
         float(log[name].mean()) / float(share.drive)
