@@ -95,6 +95,26 @@ def _correlation(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.corrcoef(a[known], b[known])[0, 1])
 
 
+def _lever_fit(
+    north: np.ndarray, east: np.ndarray, psi: np.ndarray
+) -> tuple[float, np.ndarray, float]:
+    """Return the rms residual, the lever with its offset [4], and the spread of a distance.
+
+    Args:
+        north: distance [N] of the log's positions from the topic's in m.
+        east: the same in m.
+        psi: heading [N] in rad.
+    """
+    c, s, ones, zeros = np.cos(psi), np.sin(psi), np.ones(psi.size), np.zeros(psi.size)
+    columns = np.concatenate(
+        (np.stack((c, -s, ones, zeros), axis=1), np.stack((s, c, zeros, ones), axis=1))
+    )
+    offset = np.concatenate((north, east))
+    lever, *_ = np.linalg.lstsq(columns, offset, rcond=None)
+    residual = float(np.sqrt(np.mean((columns @ lever - offset) ** 2)))
+    return residual, lever, float(np.std(north) + np.std(east))
+
+
 def _lever(series: Series, t: np.ndarray, log: Log) -> list[Remark]:
     """Return whether a topic's positions turn about the log's.
 
@@ -123,24 +143,7 @@ def _lever(series: Series, t: np.ndarray, log: Log) -> list[Remark]:
         good = np.isfinite(north) & np.isfinite(east) & np.isfinite(x)
         if good.sum() < _ENOUGH or np.ptp(psi[good]) < np.pi / 3:
             return []
-        c, s, ones, zeros = (
-            np.cos(psi[good]),
-            np.sin(psi[good]),
-            np.ones(good.sum()),
-            np.zeros(good.sum()),
-        )
-        columns = np.concatenate(
-            (np.stack((c, -s, ones, zeros), axis=1), np.stack((s, c, zeros, ones), axis=1))
-        )
-        offset = np.concatenate((x[good] - north[good], y[good] - east[good]))
-        lever, *_ = np.linalg.lstsq(columns, offset, rcond=None)
-        fits.append(
-            (
-                float(np.sqrt(np.mean((columns @ lever - offset) ** 2))),
-                lever,
-                float(np.std(offset[: good.sum()]) + np.std(offset[good.sum() :])),
-            )
-        )
+        fits.append(_lever_fit(x[good] - north[good], y[good] - east[good], psi[good]))
     residual, lever, spread = min(fits, key=lambda series: series[0])
     length = float(np.hypot(lever[0], lever[1]))
     if length < _LEVER or residual > 0.5 * spread or residual > length:

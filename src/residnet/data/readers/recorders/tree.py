@@ -111,16 +111,7 @@ def tree_recording(
         UsageError: where no wanted group has a time.
         DataError: where a time cannot be read.
     """
-    clocks = dict(_clocks(leaves, time))
-    if not clocks:
-        what = (
-            f"'{time.column}'" if time.column is not None else "of time (t, time, timestamp, ...)"
-        )
-        near = ", ".join(list(leaves)[:12]) or "nothing"
-        raise UsageError(
-            f"{path}: no vector {what} in it; name it with time: {{column: ...}} (the file holds"
-            f" {near})"
-        )
+    clocks = _required_clocks(path, leaves, time)
     fields: dict[str, dict[str, np.ndarray]] = {group: {} for group in clocks}
     remarks: list[Remark] = []
     left = []
@@ -140,14 +131,10 @@ def tree_recording(
             f" ({', '.join(left[:6])}{', ...' if len(left) > 6 else ''}); left out"
         )
         remarks.append(remark("note", "no_time", text, arrays=len(left)))
-    parsed = {}
-    for group, (name, values) in clocks.items():
-        if not wanted(group or "/") or not fields[group]:
-            continue
-        try:
-            parsed[group] = time.parse(values)
-        except DataError as error:
-            raise DataError(f"{path}: {name}: {error}") from error
+    chosen = {
+        group: clock for group, clock in clocks.items() if wanted(group or "/") and fields[group]
+    }
+    parsed = _parsed(path, chosen, time)
     dated = [
         int(stamps.ns.min()) for stamps in parsed.values() if stamps.absolute and stamps.ns.size
     ]
@@ -169,6 +156,36 @@ def tree_recording(
     if not series:
         raise UsageError(f"{path}: none of its groups is wanted (it holds {', '.join(listed)})")
     return Recording(path, series, epoch, (path,), tuple(remarks), listed)
+
+
+def _required_clocks(
+    path: Path, leaves: Mapping[str, Vector], time: TreeTime
+) -> dict[str, tuple[str, np.ndarray]]:
+    """Return the time of every group that has one, and stop where none has."""
+    clocks = dict(_clocks(leaves, time))
+    if not clocks:
+        vector = (
+            f"'{time.column}'" if time.column is not None else "of time (t, time, timestamp, ...)"
+        )
+        near = ", ".join(list(leaves)[:12]) or "nothing"
+        raise UsageError(
+            f"{path}: no vector {vector} in it; name it with time: {{column: ...}} (the file holds"
+            f" {near})"
+        )
+    return clocks
+
+
+def _parsed(
+    path: Path, clocks: Mapping[str, tuple[str, np.ndarray]], time: TreeTime
+) -> dict[str, Stamps]:
+    """Return the times of groups, parsed."""
+    parsed = {}
+    for group, (name, values) in clocks.items():
+        try:
+            parsed[group] = time.parse(values)
+        except DataError as error:
+            raise DataError(f"{path}: {name}: {error}") from error
+    return parsed
 
 
 def _clocks(

@@ -44,35 +44,7 @@ def load_ulog(path: Path, wanted: Wanted = EVERYTHING) -> Recording:
         UsageError: where the file is missing, nothing in it is wanted, or pyulog is not installed.
         DataError: where it cannot be read.
     """
-    require_file(path)
-    try:
-        from pyulog import ULog
-    except ImportError as error:
-        raise missing_package("px4", "pyulog", "a PX4 flight log") from error
-    try:
-        # pyulog prints what it finds damaged, which the remarks say below
-        with contextlib.redirect_stdout(io.StringIO()):
-            log = ULog(str(path), None, disable_str_exceptions=True)
-    # pyulog fails in its own ways on damaged bytes
-    except Exception as error:
-        raise DataError(
-            f"{path}: damaged or not a ULog file ({type(error).__name__}:"
-            f" {' '.join(str(error).split())[:200]})"
-        ) from error
-    remarks: list[Remark] = []
-    if log.file_corruption:
-        remarks.append(
-            remark(
-                "will mislead", "damaged", "the file is damaged in places; messages there are lost"
-            )
-        )
-    if log.dropouts:
-        lost = sum(dropout.duration for dropout in log.dropouts) * 1e-3
-        text = (
-            f"the logger dropped data {len(log.dropouts)} times, {lost:.3g} s in all; gaps stay"
-            " gaps"
-        )
-        remarks.append(remark("note", "dropouts", text, dropouts=len(log.dropouts), seconds=lost))
+    log = _opened(path)
     names = {
         id(data): data.name + (f"_{data.multi_id}" if data.multi_id else "")
         for data in log.data_list
@@ -100,7 +72,45 @@ def load_ulog(path: Path, wanted: Wanted = EVERYTHING) -> Recording:
         }
         series[name] = Series(name, f"px4/{data.name}", fields, ns * 1e-9)
     listed = tuple(sorted(set(names.values()) - set(series)))
-    return Recording(path, series, epoch, (path,), tuple(remarks), listed)
+    return Recording(path, series, epoch, (path,), _damages(log), listed)
+
+
+def _opened(path: Path) -> Any:
+    """Return the file as pyulog reads it."""
+    require_file(path)
+    try:
+        from pyulog import ULog
+    except ImportError as error:
+        raise missing_package("px4", "pyulog", "a PX4 flight log") from error
+    try:
+        # pyulog prints what it finds damaged, which the remarks say below
+        with contextlib.redirect_stdout(io.StringIO()):
+            return ULog(str(path), None, disable_str_exceptions=True)
+    # pyulog fails in its own ways on damaged bytes
+    except Exception as error:
+        raise DataError(
+            f"{path}: damaged or not a ULog file ({type(error).__name__}:"
+            f" {' '.join(str(error).split())[:200]})"
+        ) from error
+
+
+def _damages(log: Any) -> tuple[Remark, ...]:
+    """Return the remarks about what is lost in a file."""
+    remarks: list[Remark] = []
+    if log.file_corruption:
+        remarks.append(
+            remark(
+                "will mislead", "damaged", "the file is damaged in places; messages there are lost"
+            )
+        )
+    if log.dropouts:
+        lost = sum(dropout.duration for dropout in log.dropouts) * 1e-3
+        text = (
+            f"the logger dropped data {len(log.dropouts)} times, {lost:.3g} s in all; gaps stay"
+            " gaps"
+        )
+        remarks.append(remark("note", "dropouts", text, dropouts=len(log.dropouts), seconds=lost))
+    return tuple(remarks)
 
 
 def _boot_time(messages: list[Any]) -> int | None:

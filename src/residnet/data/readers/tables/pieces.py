@@ -38,6 +38,23 @@ def _positions(
     return [list(header).index(column) for column in columns]
 
 
+def _header(path: Path, delimiter: str) -> tuple[list[str], str]:
+    """Return the cells of a csv file's header, and a hint for errors about missing columns."""
+    with path.open(newline="", encoding="utf-8-sig") as stream:
+        header = [cell.strip() for cell in next(csv.reader(stream, delimiter=delimiter), [])]
+    if not any(header):
+        raise DataError(
+            f"{path}: the file is empty or its first line is blank; a header line with column"
+            " names was expected"
+        )
+    hint = (
+        f" (only one column found; is the delimiter really '{delimiter}'?)"
+        if len(header) == 1
+        else ""
+    )
+    return header, hint
+
+
 def read_csv(path: Path, columns: Sequence[str], delimiter: str, decimal: str) -> Pieces:
     """Yield the wanted columns of a text table piece by piece, with the share of the file read.
 
@@ -54,18 +71,7 @@ def read_csv(path: Path, columns: Sequence[str], delimiter: str, decimal: str) -
     import pandas as pd
 
     try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            header = [cell.strip() for cell in next(csv.reader(stream, delimiter=delimiter), [])]
-        if not any(header):
-            raise DataError(
-                f"{path}: the file is empty or its first line is blank; a header line with column"
-                " names was expected"
-            )
-        hint = (
-            f" (only one column found; is the delimiter really '{delimiter}'?)"
-            if len(header) == 1
-            else ""
-        )
+        header, hint = _header(path, delimiter)
         where = _positions(path, header, columns, hint)
         # one column more than the header: cells beyond it would shift or vanish silently (a decimal
         # comma in a comma table does that)
