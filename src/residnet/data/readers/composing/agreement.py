@@ -144,7 +144,7 @@ def _lever(series: Series, t: np.ndarray, log: Log) -> list[Remark]:
         if good.sum() < _ENOUGH or np.ptp(psi[good]) < np.pi / 3:
             return []
         fits.append(_lever_fit(x[good] - north[good], y[good] - east[good], psi[good]))
-    residual, lever, spread = min(fits, key=lambda series: series[0])
+    residual, lever, spread = min(fits, key=lambda fit: fit[0])
     length = float(np.hypot(lever[0], lever[1]))
     if length < _LEVER or residual > 0.5 * spread or residual > length:
         return []
