@@ -115,7 +115,10 @@ def test_simplest_is_no_worse_than_one_standard_error_and_no_more_complex() -> N
     for k in range(3):
         (a, j), (low, many) = found.least(k), found.simplest(k)
         assert low <= a
-        assert found.error[k, low - 1, many] <= found.error[k, a - 1, j] + found.spread[k, a - 1, j]
+        assert (
+            found.error[k, low - 1, many]
+            <= found.error[k, a - 1, j] + found.standard_error[k, a - 1, j]
+        )
 
 
 def test_constant_and_single_columns_are_refused() -> None:

@@ -1,4 +1,4 @@
-"""Equations that somebody published, scored beside what is identified here.
+"""Published equations, scored beside what is identified here.
 
 They are accelerations as terms with given coefficients.
 """

@@ -34,7 +34,7 @@ class MirroredHead(ResidualHead):
         mirror = mirrored_channels(names)
         if mirror is None:
             raise ConfigError(
-                f"mirror: nobody said how all of the channels {', '.join(names)} change in the"
+                f"mirror: it is not known how all of the channels {', '.join(names)} change in the"
                 " mirror; leave `mirror` out"
             )
         self.inner = inner

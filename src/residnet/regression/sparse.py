@@ -160,8 +160,8 @@ def _equation(
     rss = search.rss(chosen)
     exact = rule.exact(rss)
     value, inverse = coefficients(reduced.r[:, chosen], y)
-    spread = np.sqrt(rss / max(rule.samples - len(chosen), 1.0))
-    errors = spread * np.sqrt(np.square(inverse).sum(axis=1))
+    std = np.sqrt(rss / max(rule.samples - len(chosen), 1.0))
+    errors = std * np.sqrt(np.square(inverse).sum(axis=1))
     names = np.array(reduced.names, dtype=object)
     return Equation(
         terms=tuple(names[chosen]),
@@ -172,7 +172,7 @@ def _equation(
         criterion=float(rule.value(rss, len(chosen))),
         searched=int(stage),
         alternatives=_alternatives(search, chosen, names),
-        undecided={} if exact else _undecided(search, chosen, names, spread),
+        undecided={} if exact else _undecided(search, chosen, names, std),
     )
 
 
@@ -191,7 +191,7 @@ def _alternatives(search: Search, chosen: list[int], names: np.ndarray) -> dict[
 
 
 def _undecided(
-    search: Search, chosen: list[int], names: np.ndarray, spread: float
+    search: Search, chosen: list[int], names: np.ndarray, std: float
 ) -> dict[str, float]:
     """Return the candidates whose coefficient the data leave so open that they could matter.
 
@@ -202,7 +202,7 @@ def _undecided(
     free = np.flatnonzero(length > _ALIKE)
     free = free[~np.isin(free, chosen)]
     reach = (
-        (np.abs(left.columns[:, free].T @ left.target) / length[free] + 2.0 * spread)
+        (np.abs(left.columns[:, free].T @ left.target) / length[free] + 2.0 * std)
         / length[free]
         / np.sqrt(search.rule.energy)
     )

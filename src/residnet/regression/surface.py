@@ -29,13 +29,13 @@ class Surface:
         error: mean squared error [K, A, J + 1] of output k with a + 1 latent variables and j basis
             functions; NaN where there is no such model (fewer basis functions than latent
             variables, or fewer than two).
-        spread: standard error of that mean over the folds, [K, A, J + 1]; NaN with one fold.
+        standard_error: of that mean over the folds, [K, A, J + 1]; NaN with one fold.
         removal: basis functions in the order of their removal, [K, A, J], -1 after the last one
             that was removed.
     """
 
     error: Tensor
-    spread: Tensor
+    standard_error: Tensor
     removal: Tensor
 
     def kept(self, output: int, order: int, count: int) -> list[int]:
@@ -63,7 +63,7 @@ class Surface:
         """
         order, count = self.least(output)
         limit = self.error[output, order - 1, count] + torch.nan_to_num(
-            self.spread[output, order - 1, count]
+            self.standard_error[output, order - 1, count]
         )
         fine = torch.nan_to_num(self.error[output], nan=torch.inf) <= limit
         lowest = int(fine.any(1).nonzero()[0, 0])
@@ -91,20 +91,27 @@ def surface(moments: FoldMoments, test: Sequence[int] = (), orders: int | None =
     axis = torch.arange(k).repeat(a)
     order = torch.arange(1, a + 1).repeat_interleave(k)
     mask = torch.ones(j, a * k, dtype=torch.float64)
-    error, spread = (torch.full((j + 1, a * k), torch.nan, dtype=torch.float64) for _ in range(2))
+    error, standard_error = (
+        torch.full((j + 1, a * k), torch.nan, dtype=torch.float64) for _ in range(2)
+    )
     removal = torch.full((j, a * k), -1, dtype=torch.long)
     for count in range(j, 1, -1):
         # columns are sorted by order: those that may still have `count` basis functions come first
         active = int((order <= count).sum())
         coefficients = problems.coefficients(mask[:, :active], axis[:active], order[:active])
-        error[count, :active], spread[count, :active] = problems.errors(coefficients, axis[:active])
+        error[count, :active], standard_error[count, :active] = problems.errors(
+            coefficients, axis[:active]
+        )
         size = coefficients[0].abs().masked_fill(mask[:, :active] == 0, torch.inf)
         weakest = size.argmin(0)
         further = torch.arange(active)[order[:active].clamp(min=2) < count]
         removal[j - count, further] = weakest[further]
         mask[weakest[further], further] = 0.0
     return Surface(
-        *(part.reshape(-1, a, k).permute(2, 1, 0).contiguous() for part in (error, spread, removal))
+        *(
+            part.reshape(-1, a, k).permute(2, 1, 0).contiguous()
+            for part in (error, standard_error, removal)
+        )
     )
 
 
@@ -222,7 +229,7 @@ class _Problems:
         )
         n = self.judged[:, 0, 0]
         by_fold = squares / n[:, None]
-        spread = (
+        standard_error = (
             by_fold.std(0) / count**0.5 if count > 1 else torch.full_like(by_fold[0], torch.nan)
         )
-        return squares.sum(0) / n.sum(), spread
+        return squares.sum(0) / n.sum(), standard_error

@@ -120,8 +120,8 @@ class EquationSearchConfig(Config):
         final: how the terms of the individual that wins are chosen from once more, by the extended
             BIC on all samples; terms that genetic programming carries along without need go. None
             keeps all.
-        validate_every: every so manieth manoeuvre validates during the search; with fewer
-            manoeuvres every so manieth eighth of the samples.
+        validate_every: number n of which every n-th manoeuvre validates during the search; with
+            fewer manoeuvres every n-th eighth of the samples.
         seed: seed of the random choices; each axis has its own.
     """
 

@@ -167,9 +167,9 @@ def _whole(reduced: Reduced) -> Equation:
     y = reduced.y[:, 0]
     best, inverse = coefficients(reduced.r, y)
     left = y - reduced.r @ best
-    spread = np.sqrt(left @ left / max(float(reduced.samples[0]) - len(best), 1.0))
+    std = np.sqrt(left @ left / max(float(reduced.samples[0]) - len(best), 1.0))
     share = float(np.sqrt(left @ left / max(y @ y, _TINY)))
-    errors = spread * np.sqrt(np.square(inverse).sum(axis=1))
+    errors = std * np.sqrt(np.square(inverse).sum(axis=1))
     return Equation(
         reduced.names,
         best / reduced.scale,
@@ -186,7 +186,7 @@ def _whole(reduced: Reduced) -> Equation:
 def validating(group: np.ndarray, every: int) -> np.ndarray:
     """Return which samples [N] validate, from the numbers of their groups.
 
-    Every so manieth group does where there are enough, else blocks of the record.
+    Every n-th group does where there are enough, else blocks of the record.
     """
     numbers = np.unique(group, return_inverse=True)[1]
     if numbers.max(initial=0) + 1 < every:
