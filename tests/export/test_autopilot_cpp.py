@@ -1,4 +1,4 @@
-"""The C++ program of `scripts/autopilot_cpp`: built as the README says, it steers as Python does.
+"""The C++ program of `examples/autopilot_cpp`: built as the README says, it steers as Python does.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from residnet.control.heading.steering import SteeredPlant
 from residnet.export.autopilot import export_autopilot
 from residnet.physics.vessel import load_vessel
 
-SOURCE = Path(__file__).parents[2] / "scripts" / "autopilot_cpp"
+SOURCE = Path(__file__).parents[2] / "examples" / "autopilot_cpp"
 GAIN, TIME, SPEED, DT, HEADING = 3.47, 3.94, 3.2, 0.02, math.radians(30)
 
 pytestmark = [

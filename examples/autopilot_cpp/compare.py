@@ -1,7 +1,7 @@
 """Fly an exported policy on Nomoto's model in C++ and in Python: the same track, and how long a
 step takes.
 
-python scripts/autopilot_cpp/compare.py RUN/exports/policy.pt BUILD/autopilot [--seconds 40]
+python examples/autopilot_cpp/compare.py RUN/exports/policy.pt BUILD/autopilot [--seconds 40]
 """
 
 from __future__ import annotations

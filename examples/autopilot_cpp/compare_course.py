@@ -1,7 +1,7 @@
 """Fly an exported course (policy and guidance in one module) on Nomoto's model in C++ and in
 Python: the same track, and how long a step takes.
 
-python scripts/autopilot_cpp/compare_course.py RUN/exports/policy_enter.pt BUILD/course [--seconds
+python examples/autopilot_cpp/compare_course.py RUN/exports/policy_enter.pt BUILD/course [--seconds
 250]
 """
 
