@@ -21,7 +21,7 @@ from residnet.control.heading.following import Following
 from residnet.control.heading.heading_pid import HeadingPID
 from residnet.control.heading.steering import SteeredPlant
 from residnet.core.errors import ConfigError
-from residnet.dynamics.carried import Carried
+from residnet.dynamics.ambient_current import InAmbientCurrent
 from residnet.dynamics.rollout import Rollout
 from residnet.physics.vessel import load_vessel
 
@@ -58,7 +58,8 @@ def sailed(
     )
     nominal = torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64).expand(len(across), -1)
     with torch.no_grad():
-        loop = Rollout(Carried(VESSEL.model(DT), VESSEL.state), ClosedLoop(policy, reference))
+        model = InAmbientCurrent(VESSEL.model(DT), VESSEL.state)
+        loop = Rollout(model, ClosedLoop(policy, reference))
         states, _, _ = loop(
             x,
             w.unsqueeze(1).expand(-1, round(seconds / DT), -1),

@@ -146,10 +146,10 @@ def row(
         "cross_track_max": float(np.abs(flight.cross_track).max()),
         "travel": float(abs(flight.rudder[0]) + np.abs(np.diff(flight.rudder)).sum()),
         "tightest_turn": _tightest(flight),
-        "distances": [one.distance for one in seen],
+        "distances": [passage.distance for passage in seen],
     }
     if planned.protocol == "enter":
-        inside = [radius - one.distance for one, radius in zip(seen, radii, strict=True)]
+        inside = [radius - passage.distance for passage, radius in zip(seen, radii, strict=True)]
         entered = sum(margin >= 0 for margin in inside)
         return out | {
             "entered": entered,
@@ -157,8 +157,9 @@ def row(
             "margin": min(inside),
             "n": len(seen),
         }
-    right = sum(one.side == buoy.leave_to for one, buoy in zip(seen, planned.buoys, strict=True))
-    outside = [one.distance - radius for one, radius in zip(seen, radii, strict=True)]
+    buoys = zip(seen, planned.buoys, strict=True)
+    right = sum(passage.side == buoy.leave_to for passage, buoy in buoys)
+    outside = [passage.distance - radius for passage, radius in zip(seen, radii, strict=True)]
     clear = sum(margin >= 0 for margin in outside)
     passed = {"right_side": right, "clear": clear, "clearance": min(outside)}
     return (

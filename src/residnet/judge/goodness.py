@@ -33,20 +33,20 @@ class OneStep:
     Attributes:
         model: its name.
         kind: zero, baseline, head or ensemble.
-        freedom: number of fitted parameters of each axis.
+        parameters: number of fitted parameters of each axis.
         residuals: measured minus predicted acceleration, [T, 3] of each piece.
         reference: name of the model that it is compared with; None for none.
     """
 
     model: str
     kind: str
-    freedom: Sequence[float]
+    parameters: Sequence[float]
     residuals: Sequence[np.ndarray]
     reference: str | None = None
 
 
 def measures(
-    residual: np.ndarray, target: np.ndarray, freedom: float, variance: float
+    residual: np.ndarray, target: np.ndarray, parameters: float, variance: float
 ) -> dict[str, float | None]:
     """Return RMSE (9.11), R^2 (9.15), adjusted R^2 (9.16), C_p (9.12), AIC (9.13), BIC (9.14).
 
@@ -55,7 +55,7 @@ def measures(
     Args:
         residual: measured minus predicted, [m].
         target: measured, [m].
-        freedom: number of parameters d.
+        parameters: number of parameters d.
         variance: of the noise, sigma^2, by `noise_variance` of the richest model that is compared:
             from each model's own the criteria tell nothing apart.
 
@@ -71,22 +71,22 @@ def measures(
         "rmse": math.sqrt(rss / m),
         "r2": r2,
         "r2_adjusted": (
-            1 - (1 - r2) * (m - 1) / (m - freedom - 1)
-            if r2 is not None and m > freedom + 1
+            1 - (1 - r2) * (m - 1) / (m - parameters - 1)
+            if r2 is not None and m > parameters + 1
             else None
         ),
-        "cp": (rss + 2 * freedom * variance) / m,
-        "aic": (rss + 2 * freedom * variance) / (m * variance) if noisy else None,
-        "bic": (rss + math.log(m) * freedom * variance) / (m * variance) if noisy else None,
+        "cp": (rss + 2 * parameters * variance) / m,
+        "aic": (rss + 2 * parameters * variance) / (m * variance) if noisy else None,
+        "bic": (rss + math.log(m) * parameters * variance) / (m * variance) if noisy else None,
     }
 
 
-def noise_variance(residual: np.ndarray, freedom: float) -> float:
+def noise_variance(residual: np.ndarray, parameters: float) -> float:
     """Return sigma^2 = RSS / (m - d - 1) (9.17, correction E1).
 
     Infinite where there are no more samples than that.
     """
-    left = len(residual) - freedom - 1
+    left = len(residual) - parameters - 1
     return float(residual @ residual) / left if left > 0 else math.inf
 
 
@@ -106,19 +106,21 @@ def table(
         target = np.concatenate([piece[:, axis] for piece in targets])
         series = {model.model: [piece[:, axis] for piece in model.residuals] for model in models}
         joined = {key: np.concatenate(pieces) for key, pieces in series.items()}
-        variance = min(noise_variance(joined[model.model], model.freedom[axis]) for model in models)
+        variance = min(
+            noise_variance(joined[model.model], model.parameters[axis]) for model in models
+        )
         for model in models:
             row = {
                 "model": model.model,
                 "kind": model.kind,
                 "axis": name,
                 "samples": len(target),
-                "parameters": float(model.freedom[axis]),
+                "parameters": float(model.parameters[axis]),
             }
             row |= measures(
                 joined[model.model],
                 target,
-                model.freedom[axis],
+                model.parameters[axis],
                 variance if math.isfinite(variance) else 0.0,
             )
             row |= _series(series[model.model], step)

@@ -82,13 +82,13 @@ def bands(
     `windows`, and by model `nrmse_mean` and `difference` as in metrics.json.
     """
     parts = [(logs[window.log], slice(window.start, window.stop)) for window in run.windows]
-    of = {
+    quantities = {
         "speed": np.array([np.hypot(log.y[rows, 3], log.y[rows, 4]).mean() for log, rows in parts])
     }
     if all(_WIND in log.log.channels for log, _ in parts):
-        of["wind"] = np.array([log.log[_WIND][rows].mean() for log, rows in parts])
+        quantities["wind"] = np.array([log.log[_WIND][rows].mean() for log, rows in parts])
     out = []
-    for name, values in of.items():
+    for name, values in quantities.items():
         if not np.isfinite(values).all():
             continue
         thirds = [chosen for chosen in _bands(values) if chosen.sum() >= _LEAST_WINDOWS]

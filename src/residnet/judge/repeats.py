@@ -154,12 +154,12 @@ def _apart(pair: Pair, logs: Sequence[Prepared]) -> list[float]:
     """Differences of two runs: root mean square of u, v (samples usable in both) and r, then
     position and heading at the end.
     """
-    one, other = logs[pair.first.log], logs[pair.log]
+    first, second = logs[pair.first.log], logs[pair.log]
     a = slice(pair.first.start, pair.first.stop)
     b = slice(pair.start, pair.start + a.stop - a.start)
-    nu = one.y[a, VELOCITIES] - other.y[b, VELOCITIES]
-    good = one.usable[a] & other.usable[b]
-    end_a, end_b = _end(one.y[a]), _end(other.y[b])
+    nu = first.y[a, VELOCITIES] - second.y[b, VELOCITIES]
+    good = first.usable[a] & second.usable[b]
+    end_a, end_b = _end(first.y[a]), _end(second.y[b])
     rms = [float(np.sqrt(np.mean(part**2))) for part in (nu[good, 0], nu[good, 1], nu[:, 2])]
     return [*rms, float(np.hypot(*(end_a - end_b)[:2])), float(abs(end_a[2] - end_b[2]))]
 

@@ -214,13 +214,13 @@ def check_symmetry(spec: ModelSpec, model: HybridDynamics, *, samples: int = 500
         return Finding(spec.name, SYMMETRY, None, text)
     x, w = mirror.draw(spec, samples)
     with torch.no_grad():
-        one, other = (
+        plain, mirrored = (
             acceleration(model, x, w),
             acceleration(model, mirror.state(x), mirror.inputs(w)),
         )
-    sign = torch.tensor([1.0, -1.0, -1.0], dtype=one.dtype)
-    uneven = 0.5 * (one - sign * other).abs()
-    spread = torch.cat((one, sign * other)).std(0).clamp(min=1e-12)
+    sign = torch.tensor([1.0, -1.0, -1.0], dtype=plain.dtype)
+    uneven = 0.5 * (plain - sign * mirrored).abs()
+    spread = torch.cat((plain, sign * mirrored)).std(0).clamp(min=1e-12)
     typical, largest = uneven.square().mean(0).sqrt() / spread, uneven.amax(0) / spread
     parts = [
         f"{name}′ {100 * float(t):.1f} % (largest {100 * float(m):.1f} %)"

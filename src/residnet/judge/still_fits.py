@@ -49,9 +49,9 @@ class Verdict:
             "/".join(f"{value:.3g}" for value in part)
             for part in (self.growth, [100 * value for value in self.share])
         )
-        said = "still fits" if self.fits else "no longer fits: identify it again from this log"
+        sentence = "still fits" if self.fits else "no longer fits: identify it again from this log"
         return (
-            f"{said} (residual {growth} times what it was, {share} % of the force's variance;"
+            f"{sentence} (residual {growth} times what it was, {share} % of the force's variance;"
             " surge/sway/yaw)"
         )
 
@@ -79,7 +79,7 @@ def still_fits(
     variance, before = force.var(0), then.square().mean(0)
     if bool((variance <= 0).any()):
         raise DataError(
-            "the force of the new log does not vary on some axis: nothing can be said about the"
+            "the force of the new log does not vary on some axis: nothing can be sentence about the"
             " model; give a log with manoeuvres"
         )
     by_segment = torch.stack([now[fold == f].square().mean(0) for f in torch.unique(fold)])

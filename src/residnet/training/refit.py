@@ -284,7 +284,7 @@ def _normal_equations(
     batch, steps = problem.w.shape[:2]
     shared, logs = int(problem.active.numel()), len(offsets.value)
     count = shared + len(offsets.axes)
-    shifted, movable = _shifted(model, problem, offsets)
+    shifted, baseline_with_offsets = _shifted(model, problem, offsets)
     x = problem.x0
     sensitivity = torch.zeros(batch, 4, count, dtype=x.dtype)
     hessian = torch.zeros(batch, count, count, dtype=x.dtype)
@@ -292,7 +292,7 @@ def _normal_equations(
     square = torch.zeros(batch, dtype=x.dtype)
     for k in range(steps):
         p = model.signals.prepare(problem.w[:, k])
-        sensitivity = step_sensitivities(shifted, movable, x, p, sensitivity)
+        sensitivity = step_sensitivities(shifted, baseline_with_offsets, x, p, sensitivity)
         x = _ahead(shifted, x, p)
         error = (x[:, VELOCITIES] - problem.nu[:, k]) * problem.weight[:, k]
         seen = sensitivity[:, 1:] * problem.weight[:, k].unsqueeze(-1)

@@ -13,7 +13,7 @@ from residnet.core.names import STATE, nearest
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.gear import commanded
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.varied import VariedModel
+from residnet.dynamics.steering_variation import VariedModel
 
 
 @final

@@ -15,7 +15,7 @@ from residnet.control.heading.turning import Turning, measure_turning
 from residnet.core.frames import wrap
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.rollout import Rollout, Source
-from residnet.dynamics.varied import VariedPlant
+from residnet.dynamics.steering_variation import VariedPlant
 from residnet.physics.plant import HullPlant, Plant
 
 
@@ -36,7 +36,8 @@ class SteeredVessel(ABC):
     def model(self, dt: float, integrator: str = "rk4") -> Dynamics:
         """Return the steps of dt seconds.
 
-        The first columns of its memory are the variation of each row (`dynamics.varied.VARIATION`).
+        The first columns of its memory are the variation of each row
+        (`dynamics.steering_variation.VARIATION`).
         """
 
     def memory(self, variation: Tensor) -> Tensor:

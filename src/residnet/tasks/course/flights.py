@@ -15,14 +15,17 @@ from residnet.control.courses.config import PlannedCourse
 from residnet.control.guidance.course_guidance import CourseGuidance
 from residnet.control.heading.controllers import Steering
 from residnet.core.config import Config, MetresPerSecond, Radians
-from residnet.dynamics.carried import Carried
+from residnet.dynamics.ambient_current import InAmbientCurrent
 from residnet.dynamics.rollout import Rollout
 from residnet.judge.courses import CourseFlight
 
 
 class Vessels(NamedTuple):
-    """B vessels: variation [B, 3] (`dynamics.varied.VARIATION`) and current to the north and to the
-    east [B, 2] in m/s.
+    """The variation of B vessels and the current that each runs in.
+
+    Attributes:
+        variation: of the steering, [B, 3] (`dynamics.steering_variation.VARIATION`).
+        current: to the north and to the east, [B, 2] in m/s.
     """
 
     variation: Tensor
@@ -107,7 +110,8 @@ def fly(
     x, w = vessel.start(torch.ones(count, dtype=torch.float64))
     x[:, place] = torch.from_numpy(planned.course.track[0])
     x[:, vessel.column("psi")] = float(planned.course.heading[0])
-    loop = Rollout(Carried(vessel.model(steering.dt), vessel.state), ClosedLoop(policy, reference))
+    model = InAmbientCurrent(vessel.model(steering.dt), vessel.state)
+    loop = Rollout(model, ClosedLoop(policy, reference))
     memory = torch.cat((vessels.current, vessel.memory(vessels.variation)), dim=-1)
     with torch.no_grad():
         states, inputs, _ = loop(x, w.unsqueeze(1).expand(-1, steps, -1), memory)

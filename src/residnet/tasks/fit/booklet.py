@@ -18,8 +18,8 @@ from residnet.data.simulated.environment import Disturbance
 from residnet.data.simulated.flying import Craft, Flight, Sea, fly
 from residnet.data.simulated.sensors import SensorNoise
 from residnet.dynamics.actuated import ActuatedDynamics
-from residnet.dynamics.drawn import DrawnDynamics
 from residnet.dynamics.gear import GivenGear, InputShare
+from residnet.dynamics.parameter_samples import SampledDynamics
 from residnet.identification.models import FittedModel
 from residnet.judge.booklet import BookletConfig, Page, contents
 from residnet.manoeuvres import Helm, Manoeuvre, Zigzag
@@ -118,7 +118,7 @@ def _flown(
     theta = drawn(fitted, config.draws, config.seed)
     rows = [manoeuvre for manoeuvre in manoeuvres for _ in range(len(theta))]
     start = craft.start.repeat_interleave(len(theta), 0) if len(craft.start) > 1 else craft.start
-    many = replace(craft, dynamics=DrawnDynamics(craft.dynamics, _PARAMETER, theta), start=start)
+    many = replace(craft, dynamics=SampledDynamics(craft.dynamics, _PARAMETER, theta), start=start)
     flights = fly(
         many,
         rows,

@@ -11,7 +11,7 @@ from residnet.dynamics.base import Dynamics
 
 
 @final
-class DrawnDynamics(Dynamics):
+class SampledDynamics(Dynamics):
     """A model that runs with many samples of one parameter side by side.
 
     Rows [M * D] of a batch are M manoeuvres with D samples each (samples vary fastest); sample d

@@ -3,8 +3,8 @@ import copy
 import torch
 
 from residnet.baselines import RegressorBaseline
-from residnet.dynamics.drawn import DrawnDynamics
 from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.parameter_samples import SampledDynamics
 from residnet.heads import ZeroHead
 from residnet.physics.signals import SignalsConfig
 
@@ -19,7 +19,7 @@ def test_each_draw_steps_as_the_model_with_its_parameters() -> None:
     ).double()
     theta = 0.3 * torch.randn(4, 3, len(TERMS), dtype=torch.float64)
     x, w = torch.randn(12, 6, dtype=torch.float64), torch.randn(12, 2, dtype=torch.float64)
-    many = DrawnDynamics(model, "baseline.theta", theta)
+    many = SampledDynamics(model, "baseline.theta", theta)
     with torch.no_grad():
         after, memory = many.step(x, w, x[:, :0])
         rates = many.rate(x, signals.prepare(w), torch.zeros(12, 3, dtype=torch.float64))

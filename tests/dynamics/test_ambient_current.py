@@ -9,7 +9,7 @@ import torch
 
 from residnet.control.heading.steering import SteeredPlant
 from residnet.core.frames import to_body
-from residnet.dynamics.carried import Carried
+from residnet.dynamics.ambient_current import InAmbientCurrent
 from residnet.dynamics.rollout import Rollout
 from residnet.physics.vessel import load_vessel
 
@@ -27,7 +27,7 @@ def test_it_moves_over_ground_as_a_hull_in_the_current() -> None:
     steps, rudder = 600, 0.01
     x, w = calm.start(torch.ones(2, dtype=torch.float64))
     w[:, 0] = rudder
-    water, _, _ = Rollout(Carried(calm.model(0.1), calm.state))(
+    water, _, _ = Rollout(InAmbientCurrent(calm.model(0.1), calm.state))(
         x, w.unsqueeze(1).expand(-1, steps, -1), torch.cat((current, nominal), dim=1)
     )
     y, w = felt.start(torch.ones(2, dtype=torch.float64))

@@ -12,7 +12,7 @@ from residnet.dynamics.base import Dynamics
 
 
 @final
-class Carried(Dynamics):
+class InAmbientCurrent(Dynamics):
     """A model in an ambient current that is steady and each row's own.
 
     u and v are velocities through the water, x and y the place over ground.

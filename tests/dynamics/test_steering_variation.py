@@ -10,7 +10,7 @@ import torch
 from residnet.core.errors import ConfigError
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import PlantDynamics
-from residnet.dynamics.varied import VariedPlant
+from residnet.dynamics.steering_variation import VariedPlant
 from residnet.physics.vessel import load_vessel
 
 
