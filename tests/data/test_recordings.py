@@ -13,6 +13,7 @@ from printed_times import EPOCH, printed
 from residnet.core.config import validate
 from residnet.core.errors import ConfigError, DataError, UsageError
 from residnet.core.log import Log
+from residnet.core.progress import Progress, listen
 from residnet.data.readers import ReaderConfig
 from residnet.data.readers.composing.geodesy import tangent_plane
 
@@ -327,3 +328,22 @@ def test_one_table_with_dates_latitudes_and_a_compass(tmp_path: Path) -> None:
     assert log.meta["epoch"] == pytest.approx(EPOCH - 3600)
     np.testing.assert_allclose(log["u"], 2.0, atol=2e-4)
     np.testing.assert_allclose(log["r"], 0.1, atol=1e-5)
+
+
+def test_reading_a_large_recording_reports_its_progress(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    t = 0.1 * np.arange(200)
+    place = folder(tmp_path, gyro={"time": t, "data": t}, log={"time": t, "data": t})
+    reports: list[Progress] = []
+    channels = {"r": field("gyro", "rad/s"), "u": field("log", "m/s")}
+    with listen(reports.append):
+        read(place, channels=channels)
+    assert not reports
+    monkeypatch.setattr("residnet.data.readers.files._LARGE", 1)
+    with listen(reports.append):
+        read(place, channels=channels)
+    assert {report.stage for report in reports} == {"reading run, per cent"}
+    done = [report.done or 0.0 for report in reports]
+    assert done == sorted(done)
+    assert done[-1] == reports[-1].total == 100.0
