@@ -58,7 +58,7 @@ def test_the_import_is_quick_and_loads_nothing() -> None:
 
 def test_every_name_is_there_and_documented() -> None:
     for name in residnet.__all__:
-        assert getattr(residnet, name).__doc__ if name != "__version__" else residnet.__version__
+        assert getattr(residnet, name).__doc__
     with pytest.raises(AttributeError, match="no attribute 'fitt'"):
         _ = residnet.fitt  # type: ignore[attr-defined]
 

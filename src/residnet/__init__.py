@@ -15,12 +15,11 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
-
 if TYPE_CHECKING:
     from residnet.core.errors import ResidnetError
     from residnet.core.log import Log
     from residnet.core.progress import Progress
+    from residnet.core.version import __version__
     from residnet.face.data import Data, prepare
     from residnet.face.fitting import Models, fit, metrics, select
     from residnet.face.logs import inspect, read_logs
@@ -31,6 +30,7 @@ if TYPE_CHECKING:
     from residnet.face.tasks import Result, autopilot, run
 
 _HOME = {
+    "__version__": "core.version",
     "Data": "face.data",
     "FreeRuns": "face.runs",
     "Log": "core.log",
