@@ -57,10 +57,9 @@ class Result:
         """
         import pandas as pd
 
-        content = RunFolder(self.folder).read_metrics()
-        if content.get("schema") == "residnet.metrics/1":
-            return metrics_table(content["rows"])
-        return pd.json_normalize(list(content["rows"]))
+        rows = list(RunFolder(self.folder).read_metrics()["rows"])
+        # a fit counts errors of velocities; other tasks have columns of their own
+        return metrics_table(rows) if "rmse" in rows[0] else pd.json_normalize(rows)
 
     @property
     def files(self) -> list[str]:
