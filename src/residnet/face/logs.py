@@ -14,7 +14,7 @@ from residnet.core.progress import ProgressCallback, report, say
 from residnet.data.readers import LogReader, ReaderConfig
 from residnet.data.readers.detect import format_of, reader_for
 from residnet.face.values import PartGiven, PathGiven, described, hearing, part, path, plain
-from residnet.tasks.inspection import log_files
+from residnet.tasks.log_files import log_files
 
 if TYPE_CHECKING:
     import pandas as pd

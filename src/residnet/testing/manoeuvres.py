@@ -60,7 +60,7 @@ def check_manoeuvre(
         short.units,
     )
     _check_indices(manoeuvre.indices(short, None), who)
-    helm = Helm.of(plant)
+    helm = Helm.from_plant(plant)
     limits = manoeuvre.limits(helm, length, 1.0)
     require(all(math.isfinite(limit) for limit in limits.values()), f"{who}: a limit is not finite")
     return flight
@@ -74,7 +74,7 @@ def _beginning(log: Log) -> Log:
 
 def _flown(manoeuvres: list[Manoeuvre], plant: Plant, seconds: float) -> tuple[Tensor, Tensor]:
     """Return states [B, T+1, nx] and inputs [B, T, m] of manoeuvres of one kind side by side."""
-    helm = Helm.of(plant)
+    helm = Helm.from_plant(plant)
     t = torch.arange(max(round(seconds / _STEP), 2), dtype=torch.float64) * _STEP
     start = torch.stack([m.begin(plant.approach(1)[0], helm.state) for m in manoeuvres])
     w = torch.zeros(len(manoeuvres), len(t), len(plant.inputs), dtype=torch.float64)
@@ -102,7 +102,7 @@ def _check_batch(manoeuvre: Manoeuvre, plant: Plant, seconds: float, who: str) -
 
 
 def _flight(manoeuvre: Manoeuvre, vessel: str, plant: Plant, duration: float) -> Flight:
-    helm = Helm.of(plant)
+    helm = Helm.from_plant(plant)
     craft = Craft(vessel, PlantDynamics(plant, _STEP), helm, plant.commands, plant.approach(1))
     return fly(craft, [manoeuvre], Sea(plant, Disturbance(), SensorNoise(), 0), duration, _STEP)[0]
 
