@@ -140,8 +140,9 @@ def test_feed_forward_alone_and_a_model_that_cannot_run_forward(tmp_path: Path) 
         alone["believed"].tracking.position_mae
         > 10 * found.courses["believed"].tracking.position_mae
     )
-    upside_down = found.models["case"].model.corrections[0]
-    upside_down.coefficients[:3] -= 5000.0 * torch.eye(3)
+    upside_down = found.models["case"].model.corrections[0].coefficients
+    assert isinstance(upside_down, torch.Tensor)
+    upside_down[:3] -= 5000.0 * torch.eye(3)
     wanted = config(
         "operation",
         *SHORT,
