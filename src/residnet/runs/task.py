@@ -198,11 +198,11 @@ class Task(Config):
             outcome = work(folder)
             figures = {name: figure.as_json() for name, figure in outcome.figures.items()}
             folder.write_summary(self.task, outcome.verdict, figures, finished=False)
+            # the last time, since the report shows it and must come out the same again
             made_from.write(folder)
             if report:
                 self.write_report(folder)
             files = outcome.export() if report and outcome.export is not None else ()
-        made_from.write(folder)
         folder.write_summary(self.task, outcome.verdict, figures, finished=True)
         if outcome.failure:
             raise DataError(outcome.failure)
