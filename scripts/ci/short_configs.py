@@ -81,7 +81,7 @@ _TANKER = (
     "evaluation.splits=[validation, test]",
     *_trained("mlp", "lstm"),
 )
-_FERRY = ("course.interval=20 s",)
+_FERRY = ("course.interval=10 s",)
 _STEP_TEST = ("test.plants=2", "tuning_points=16")
 _PEERS = ("test.dt=0.1 s",)
 
@@ -92,12 +92,10 @@ SHORT: dict[str, Short] = {
     "wam_v_s3": Short((*_TRIALS, *_trained("mlp", "lstm"))),
     "wam_v_equations": Short(_TRIALS),
     "wam_v_trials": Short(_TRIALS),
-    "simulate_wam_v": Short(),
+    "simulate_wam_v": Short(("~programme.families", "programme.step=0.1 s")),
     "rudder_boat_trials": Short(_TRIALS),
     "patrol_identified": Short(_trained("mlp")),
-    "kvlcc2": Short(
-        ("refit.mmg.iterations=2", "booklet.draws=20"), data="kvlcc2"
-    ),
+    "kvlcc2": Short(("refit.mmg.iterations=2", "booklet.draws=20"), data="kvlcc2"),
     "esso_osaka": Short(_TANKER, data="esso_osaka"),
     "esso_osaka_no_wind": Short(_TANKER, data="esso_osaka"),
     "milliampere_raw": Short(data="milliampere"),
@@ -182,7 +180,16 @@ SHORT: dict[str, Short] = {
     "studies/halvorsen2019/table_5_3": Short(
         ("repeats=1", "rows.values=[0.2]", "columns.values=[0.2]", "~published")
     ),
-    "studies/halvorsen2019/standard_model": Short(),
+    "studies/halvorsen2019/standard_model": Short(
+        (
+            "~trials.planing",
+            *(
+                f"trials.{name}.programme={{drives: [0.35, 0.55, 0.7, 1.0], steers: [0.3],"
+                " zigzag: 40 s, hold: 10 s, courses: [0.0]}"
+                for name in ("standard", "calm")
+            ),
+        )
+    ),
     "studies/jervan2020/case": Short(_FERRY),
     "studies/jervan2020/disturbance": Short(_FERRY),
     "studies/jervan2020/force_residual": Short(_FERRY),
