@@ -28,7 +28,8 @@ class SpreadConfig(Config):
             coefficients; null for none.
         current: fastest current in training, in any direction.
         heading: largest change of heading.
-        noise_psi, noise_r: standard deviation of white sensor noise.
+        noise_psi: standard deviation of white noise on the measured heading in rad.
+        noise_r: standard deviation of white noise on the measured yaw rate in rad/s.
     """
 
     effect: Range = (0.8, 1.2)
