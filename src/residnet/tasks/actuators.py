@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
@@ -14,9 +13,6 @@ from residnet.core.config import Config, ExistingPath
 from residnet.core.errors import DataError, UsageError
 from residnet.core.names import nearest, to_si
 from residnet.physics.actuators.identify import (
-    StepAnswer,
-    ThrottleMap,
-    ThrustFit,
     fit_step,
     fit_throttle,
     fit_thrust,
@@ -27,6 +23,7 @@ from residnet.report.run_reader import RunFiles
 from residnet.report.sections.actuators import sections
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import MainFigure, Outcome, Task
+from residnet.tasks.actuator_lines import numbers, vessel_lines
 
 
 class Column(Config):
@@ -187,9 +184,9 @@ class ActuatorsTaskConfig(Task):
             n, pull = logs.bollard
             thrust = fit_thrust(n, pull, self.bollard.thrusters)
             pull_of_one = (n, pull / self.bollard.thrusters, thrust)
-        text = vessel_lines(self, throttle, step, thrust)
+        text = vessel_lines(self.name, self.files(), throttle, step, thrust)
         folder.write(folder.path / "actuators.yaml", text)
-        folder.write_json(folder.path / "actuators.json", _numbers(throttle, step, thrust))
+        folder.write_json(folder.path / "actuators.json", numbers(throttle, step, thrust))
         drawing = actuator_tests(
             self.name,
             (logs.throttle[0], logs.throttle[1], throttle) if logs.throttle and throttle else None,
@@ -291,66 +288,3 @@ def _read(path: Path, *columns: Column) -> tuple[np.ndarray, ...]:
             f"{path}: no row has a number in all of {', '.join(entry.column for entry in columns)}"
         )
     return tuple(values[whole] for values in out)
-
-
-def vessel_lines(
-    config: ActuatorsTaskConfig,
-    throttle: ThrottleMap | None,
-    step: StepAnswer | None,
-    thrust: tuple[ThrustFit, ThrustFit] | None,
-) -> str:
-    """Return lines for the section `actuators` of a vessel file, 95 % intervals as comments."""
-    lines = [f"# from {', '.join(path.name for path in config.files())}; intervals are 95 %"]
-    if throttle is not None:
-        k, o, m = throttle.slope, throttle.offset, throttle.n_max
-        lines.append(
-            f"# n = {k.value * 60:.6g} rpm * throttle {o.value * 60:+.4g} rpm (slope"
-            f" {k.low * 60:.6g} .. {k.high * 60:.6g})"
-        )
-        about = (
-            f"{m.low * 60:.5g} .. {m.high * 60:.5g}"
-            if throttle.saturated
-            else "largest measured: nothing saturated"
-        )
-        lines.append(f"n_max: {m.value * 60:.5g} rpm  # {about}")
-    if step is not None:
-        lines.append(
-            f"n_rate: {step.rate.value * 60:.5g} rpm/s  # {step.rate.low * 60:.5g} .."
-            f" {step.rate.high * 60:.5g}"
-        )
-        lines.append(
-            f"# dead_time: {step.dead_time.value:.3g} s  ({step.dead_time.low:.3g} .."
-            f" {step.dead_time.high:.3g})"
-        )
-    for name, fit in zip(("forward", "reverse"), thrust or (), strict=False):
-        lines.append(
-            f"{name}: [{', '.join(f'{c.value:.6g}' for c in fit.coefficients)}]  # rms residual"
-            f" {fit.rms:.3g} N per thruster"
-        )
-        lines += [
-            f"#   c{i}: {c.low:.6g} .. {c.high:.6g} {c.unit}"
-            for i, c in enumerate(fit.coefficients)
-        ]
-    if thrust is not None:
-        lines.append(f"curve_range: [{thrust[1].low * 60:.5g} rpm, {thrust[0].high * 60:.5g} rpm]")
-    lines.append(f"source: {json.dumps(f'identified by residnet, run {config.name}')}")
-    return "\n".join(lines) + "\n"
-
-
-def _numbers(
-    throttle: ThrottleMap | None,
-    step: StepAnswer | None,
-    thrust: tuple[ThrustFit, ThrustFit] | None,
-) -> dict[str, Any]:
-    out: dict[str, Any] = {"schema": "residnet.actuators/1"}
-    if throttle is not None:
-        parts = {"slope": throttle.slope, "offset": throttle.offset, "n_max": throttle.n_max}
-        out["throttle"] = {name: estimate._asdict() for name, estimate in parts.items()} | {
-            "saturated": throttle.saturated
-        }
-    if step is not None:
-        out["step"] = {name: estimate._asdict() for name, estimate in step._asdict().items()}
-    for name, fit in zip(("forward", "reverse"), thrust or (), strict=False):
-        entries = {f"c{i}": c._asdict() for i, c in enumerate(fit.coefficients)}
-        out[name] = entries | {"low": fit.low, "high": fit.high, "rms": fit.rms}
-    return out
