@@ -351,5 +351,5 @@ def test_wind_and_sea_are_flown_by_vessels_that_feel_them(
         assert 0 < found[(name, "sea")]["heel_rms"]["mean"] < math.radians(20)
         assert 0 < found[(name, "sea")]["rudder_rms"]["max"] <= math.radians(5)
     text = (tmp_path / "run" / "report.html").read_text()
-    assert "165 deg (jonswap)" in text
+    assert "(jonswap) and travel towards 165 deg" in text
     assert "10 m/s from eight directions" in text
