@@ -15,7 +15,7 @@ from residnet.core.config import validate
 from residnet.core.errors import DataError
 from residnet.core.log import Log
 from residnet.data.readers import LogReader, ReaderConfig
-from residnet.data.readers.tables import lines, table
+from residnet.data.readers.tables import lines, pieces, table
 
 
 def reader(kind: str = "csv") -> LogReader:
@@ -28,7 +28,7 @@ def reader(kind: str = "csv") -> LogReader:
 def in_pieces(
     path: Path, monkeypatch: pytest.MonkeyPatch, *, rows: int, large: int = 10**9, kind: str = "csv"
 ) -> Log:
-    monkeypatch.setattr(table, "_PIECE", rows)
+    monkeypatch.setattr(pieces, "_PIECE", rows)
     monkeypatch.setattr(table, "LARGE", large)
     return reader(kind).read(path)
 
