@@ -20,7 +20,7 @@ install_residnet() {  # $1: extras, for example [dev,docs], or nothing
   fi
   local sum have wanted="${1//[\[\],]/ }" extra missing=""
   sum="$(cat pyproject.toml scripts/constraints.txt | cksum | tr ' ' -)"
-  have=" $(cat .venv/installed 2>/dev/null) "
+  have=" $(cat .venv/installed 2>/dev/null || true) "
   for extra in "$sum" $wanted; do
     [[ "$have" == *" $extra "* ]] || missing="$missing $extra"
   done
