@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 app = typer.Typer(
     name="residnet",
     help=(
-        "Models of real vessels: an identified baseline, learned residuals, free-run validation,"
-        " export for controllers."
+        "Identify models of real vessels from logs: a baseline from physics, a learned residual,"
+        " validation in free run, and export for controllers."
     ),
     no_args_is_help=True,
     add_completion=False,
@@ -81,7 +81,7 @@ def check(
 
     task = load_task(config, overrides or [])
     task.check()
-    print(f"{config}: fine (task {task.task}, run {task.name})")
+    print(f"{config}: the config is valid (task {task.task}, run {task.name})")
 
 
 @app.command()
@@ -104,18 +104,20 @@ def inspect(
         typer.Option("--json", metavar="FILE", help="Write the findings to a file as JSON, too."),
     ] = None,
 ) -> None:
-    """Look at logs as a doctor would: clocks, gaps, jumps, frames, lags, copies, excitation. Exit 1
-    where a fit would be misled.
+    """Check logs for faults that would mislead a fit.
+
+    Clocks, gaps, jumps, frozen channels, reference frames, lags, copied channels and excitation
+    are checked. The exit code is 1 where a fit would be misled.
     """
     from residnet.tasks.inspection import inspect_logs
 
     _limit_threads()
     with drawn_progress():
-        found = inspect_logs(logs, config)
-    print(found.text)
+        findings = inspect_logs(logs, config)
+    print(findings.text)
     if file is not None:
-        found.write(file)
-    if found.misled:
+        findings.write(file)
+    if findings.misled:
         raise typer.Exit(1)
 
 
@@ -138,7 +140,7 @@ def evaluate(
         list[Path] | None, typer.Argument(metavar="[PATH]...", help="Further logs.")
     ] = None,
 ) -> None:
-    """Free-run a finished run's models on other logs."""
+    """Evaluate the models of a finished run in free run on other logs."""
     from residnet.tasks.verbs import evaluate_run
 
     _limit_threads()
@@ -169,7 +171,7 @@ def export(
         ),
     ] = None,
 ) -> None:
-    """Export a model for controllers, after a parity check."""
+    """Export a model of a finished run for controllers, after a parity check."""
     from residnet.tasks.verbs import export_run
 
     _limit_threads()
@@ -178,7 +180,7 @@ def export(
 
 @app.command()
 def report(folder: RunPath) -> None:
-    """Write figures and report of a finished run anew."""
+    """Write the figures and the report of a finished run again."""
     from residnet.tasks.verbs import report_run
 
     _limit_threads()
@@ -198,10 +200,10 @@ def list_names(
             "formats",
             "configs",
         ],
-        typer.Argument(help="What to list."),
+        typer.Argument(help="Kind of part to list."),
     ],
 ) -> None:
-    """List what there is to choose from."""
+    """List the parts that a config may name, with a line about each."""
     from residnet.tasks.catalogue import catalogue
 
     for name, about in catalogue(what):
@@ -209,7 +211,7 @@ def list_names(
 
 
 def _show(finished: Finished) -> None:
-    """Print what a run found, and where it stands."""
+    """Print the table and verdict of a run, its exported files and its report."""
     if finished.outcome.table:
         print(finished.outcome.table)
     for sentence in finished.outcome.verdict:
@@ -227,9 +229,7 @@ def _limit_threads() -> None:
 
 
 def main() -> None:
-    """Entry point: one line on standard error and an exit code for every error that a user can
-    cause.
-    """
+    """Run the command line; an error that a user can cause is one line and an exit code."""
     try:
         app(standalone_mode=True)
     except ResidnetError as error:

@@ -15,7 +15,7 @@ from residnet.regression.equation_rows import (
     WeakRows,
     correlation_time,
     step_of,
-    stretches,
+    unbroken_stretches,
 )
 
 NONE_EXACT = np.zeros(2, dtype=bool)
@@ -117,7 +117,7 @@ def test_stretches_end_at_gaps_and_manoeuvres() -> None:
     t = np.array([0.0, 0.1, 0.2, 0.5, 0.6, 0.0, 0.1])
     group = np.array([0, 0, 0, 0, 0, 1, 1])
     assert step_of(group, t) == pytest.approx(0.1)
-    assert stretches(group, t, 0.1).tolist() == [0, 0, 0, 1, 1, 2, 2]
+    assert unbroken_stretches(group, t, 0.1).tolist() == [0, 0, 0, 1, 1, 2, 2]
 
 
 def test_least_squares_takes_samples_as_they_are() -> None:

@@ -70,7 +70,7 @@ def test_check_passes(
     tiny_config: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert call(monkeypatch, "check", tiny_config) == 0
-    assert "fine" in capsys.readouterr().out
+    assert "valid" in capsys.readouterr().out
 
 
 def test_missing_config(
@@ -110,7 +110,7 @@ def test_a_shipped_config_is_found_by_its_name(
     # a folder of the same name does not hide it
     (tmp_path / "quickstart").mkdir()
     assert call(monkeypatch, "check", "quickstart") == 0
-    assert "quickstart: fine (task fit, run quickstart)" in capsys.readouterr().out
+    assert "quickstart: the config is valid (task fit, run quickstart)" in capsys.readouterr().out
     assert call(monkeypatch, "run", "quikstart") == 2
     assert "did you mean 'quickstart'" in one_line(capsys)
 

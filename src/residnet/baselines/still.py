@@ -25,7 +25,7 @@ class StillBaseline(Baseline):
         return zero_acceleration(z)
 
     def parameter_count(self) -> list[float]:
-        """Return zeros."""
+        """Return zero parameters for each axis."""
         return [0.0, 0.0, 0.0]
 
 

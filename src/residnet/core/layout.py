@@ -63,6 +63,8 @@ PLANAR = StateLayout(names.POSE, names.VELOCITY)
 POSE = PLANAR.pose_columns
 VELOCITIES = PLANAR.velocity_columns
 MOTION = PLANAR.motion_columns
+ACCELERATIONS = slice(MOTION.stop, MOTION.stop + PLANAR.dof)
+"""Of a motion with accelerations, which stand behind pose and velocities."""
 ACTUATORS = PLANAR.actuator_columns
 POSITION = slice(0, PLANAR.pose.index("psi"))
 HEADING = PLANAR.names.index("psi")
@@ -98,6 +100,41 @@ def motion(x: Tensor) -> Tensor:
 def actuators(x: Tensor) -> Tensor:
     """Return the states of actuators [..., nx - 6] of states [..., nx]."""
     return x[..., 6:]
+
+
+def accelerations(x: Tensor) -> Tensor:
+    """Return the accelerations [..., 3] behind pose and velocities of a motion [..., 9]."""
+    return x[..., 6:9]
+
+
+def velocities_on(x: Tensor) -> Tensor:
+    """Return all but the pose [..., nx - 3] of states [..., nx]: velocities and what follows."""
+    return x[..., 3:]
+
+
+def position(x: Tensor) -> Tensor:
+    """Return the position (x, y) [..., 2] of states [..., nx]."""
+    return x[..., :2]
+
+
+def heading(x: Tensor) -> Tensor:
+    """Return the heading [...] in rad of states [..., nx]."""
+    return x[..., 2]
+
+
+def surge(x: Tensor) -> Tensor:
+    """Return the surge velocity [...] in m/s of states [..., nx]."""
+    return x[..., 3]
+
+
+def sway(x: Tensor) -> Tensor:
+    """Return the sway velocity [...] in m/s of states [..., nx]."""
+    return x[..., 4]
+
+
+def yaw_rate(x: Tensor) -> Tensor:
+    """Return the yaw rate [...] in rad/s of states [..., nx]."""
+    return x[..., 5]
 
 
 def zero_acceleration(z: Tensor) -> Tensor:

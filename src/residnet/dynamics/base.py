@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from residnet.core.frames import to_earth
-from residnet.core.layout import pose
+from residnet.core.layout import heading, pose, surge, sway, velocities_on, yaw_rate
 
 Integrator = Literal["rk4", "heun", "euler", "semi_implicit_euler"]
 
@@ -57,8 +57,8 @@ class Dynamics(nn.Module, ABC):
 
     def kinematics(self, x: Tensor) -> Tensor:
         """Return the derivative of the pose [B, 3] of states [B, nx] (document 003 eq. (1))."""
-        north, east = to_earth(x[:, 3], x[:, 4], x[:, 2])
-        return torch.stack((north, east, x[:, 5]), dim=-1)
+        north, east = to_earth(surge(x), sway(x), heading(x))
+        return torch.stack((north, east, yaw_rate(x)), dim=-1)
 
     def integrate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
         """Return the state one step later, [B, nx]."""
@@ -71,7 +71,7 @@ class Dynamics(nn.Module, ABC):
         if self.semi_implicit:
             # the pose moves with the new velocities, which keeps an undamped oscillation bounded;
             # what stands behind the velocities goes along
-            moved = after[:, 3:]
+            moved = velocities_on(after)
             return torch.cat(
                 (
                     pose(x) + self.dt * self.kinematics(torch.cat((pose(x), moved), dim=-1)),

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from residnet.core.errors import ConfigError
 from residnet.core.frames import to_earth
+from residnet.core.layout import heading, surge
 from residnet.dynamics.base import Dynamics
 from residnet.physics.actuators.servo import Immediate, RateLimited
 from residnet.physics.nomoto import SteeringVessel
@@ -65,12 +66,18 @@ class NomotoDynamics(Dynamics):
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return the state after a step; the memory passes through."""
         plant = self.plant
-        speed, rudder = x[:, 3], x[:, 4 + plant.free :]
+        speed, rudder = surge(x), x[:, plant.rudder_columns]
         start = torch.cat(
-            (x[:, 2:3], x[:, 4 : 4 + plant.free], plant.delta(x, w).unsqueeze(-1)), dim=-1
+            (
+                heading(x).unsqueeze(-1),
+                x[:, plant.turning_columns],
+                plant.delta(x, w).unsqueeze(-1),
+            ),
+            dim=-1,
         )
         middle, end = start @ self.to_middle.to(x.dtype), start @ self.to_end.to(x.dtype)
-        psi, v, _ = torch.stack((start[:, :3], middle[:, :3], end[:, :3]), dim=1).unbind(-1)
+        # psi and v stand first in the linear system
+        psi, v = torch.stack((start, middle, end), dim=1)[..., :2].unbind(-1)
         north, east = to_earth(speed.unsqueeze(-1), v, psi)
         simpson = self.simpson.to(x.dtype)
         north, east = x[:, 0] + north @ simpson, x[:, 1] + east @ simpson

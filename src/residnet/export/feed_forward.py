@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from residnet.core.errors import ExportError, UsageError
-from residnet.core.layout import RANGE_VELOCITIES
+from residnet.core.layout import PLANAR, RANGE_VELOCITIES
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
 from residnet.export.base import Exporter
@@ -107,8 +107,8 @@ def export_feed_forward(
         ) * (high - low)
         with torch.no_grad():
             eager, scripted = (
-                model(motion[:, :3], motion[:, 3:]),
-                exported(motion[:, :3], motion[:, 3:]),
+                model(motion[:, : PLANAR.dof], motion[:, PLANAR.dof :]),
+                exported(motion[:, : PLANAR.dof], motion[:, PLANAR.dof :]),
             )
         share = float(((eager - scripted).abs().amax(0) / (eager.amax(0) - eager.amin(0))).max())
         if not share < 1e-9:
@@ -143,7 +143,9 @@ class FeedForwardExporter(Exporter):
 
     name: ClassVar[str] = "feed_forward"
     suffix: ClassVar[str] = "_feed_forward.pt"
-    about: ClassVar[str] = "tau = F(nu_dot, nu) of a model in force space, as TorchScript"
+    about: ClassVar[str] = (
+        "The force tau = F(nu_dot, nu) that a motion needs, from a model in force space."
+    )
 
     def export(
         self,

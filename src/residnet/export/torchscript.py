@@ -205,7 +205,7 @@ class TorchScriptExporter(Exporter):
 
     name: ClassVar[str] = "torchscript"
     suffix: ClassVar[str] = ".pt"
-    about: ClassVar[str] = "the model as TorchScript, for Python and C++ with torch alone"
+    about: ClassVar[str] = "The model as TorchScript, which Python and C++ run with torch alone."
 
     def export(
         self,

@@ -10,6 +10,7 @@ import numpy as np
 
 from residnet.core.config import validate
 from residnet.core.errors import DataError, UsageError
+from residnet.core.layout import VELOCITIES
 from residnet.core.log import Log
 from residnet.core.names import VELOCITY, nearest
 from residnet.core.progress import ProgressCallback, report
@@ -288,7 +289,7 @@ def _protocols(logs: Sequence[Prepared]) -> dict[str, Any]:
 
 
 def _scales(logs: Sequence[Prepared]) -> dict[str, float]:
-    measured = np.concatenate([log.y[log.usable, 3:6] for log in logs])
+    measured = np.concatenate([log.y[log.usable, VELOCITIES] for log in logs])
     spread = measured.std(axis=0)
     out = {name: float(value) for name, value in zip(VELOCITY, spread, strict=True)}
     if still := [name for name, value in out.items() if not value > 0]:

@@ -76,7 +76,7 @@ class Model:
 
     @property
     def dt(self) -> float:
-        """Step in s."""
+        """Time step of the model in s."""
         return self.spec.dt
 
     @property

@@ -73,7 +73,7 @@ def named_parts(given: Any, what: str) -> dict[str, Any]:
 
 
 def path(given: Any, what: str) -> Path:
-    """Return a path.
+    """Return the given value as a path, ~ expanded.
 
     Raises:
         UsageError: where it is none.

@@ -16,7 +16,7 @@ from residnet.core.names import ACCELERATION, VELOCITY
 from residnet.core.samples import Samples
 from residnet.heads.base import ClosedFormHead, FeatureConfig, Features
 from residnet.physics.terms import TermLibrary
-from residnet.regression.equation_rows import step_of, stretches
+from residnet.regression.equation_rows import step_of, unbroken_stretches
 from residnet.regression.kernel.functions import Polynomial, Rbf
 from residnet.regression.kernel.path import Path
 from residnet.regression.kernel.recursion import Recursion
@@ -190,6 +190,6 @@ def _recursion(samples: Samples) -> Recursion:
     """
     group, t = samples.group.numpy(), samples.t.numpy()
     step = step_of(group, t)
-    stretch = torch.from_numpy(stretches(group, t, step))
+    stretch = torch.from_numpy(unbroken_stretches(group, t, step))
     columns = [samples.names.index(name) for name in VELOCITY]
     return Recursion(samples.z, samples.target, stretch, step, columns)

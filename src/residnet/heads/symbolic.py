@@ -21,7 +21,13 @@ from residnet.heads.delay_line import DelayConfig, DelayLine, Past, best_delay
 from residnet.physics.candidates import CandidatesConfig, rated
 from residnet.physics.symmetry import wrong_parity
 from residnet.physics.terms import TermLibrary, parse_term
-from residnet.regression.equation_rows import Rows, RowsConfig, SampleRows, step_of, stretches
+from residnet.regression.equation_rows import (
+    Rows,
+    RowsConfig,
+    SampleRows,
+    step_of,
+    unbroken_stretches,
+)
 from residnet.regression.expressions.equations import (
     Factor,
     Written,
@@ -161,7 +167,7 @@ class SymbolicHead(EquationHead):
             return Past(chosen, target, group, 0.0)
         t = samples.t.numpy()
         step = step_of(group, t)
-        return Past(chosen, target, stretches(group, t, step), step)
+        return Past(chosen, target, unbroken_stretches(group, t, step), step)
 
     def _fit(self, past: Past, gammas: Sequence[float] = ()) -> list[Solution]:
         """Return the solutions of a sparse regression of all axes."""

@@ -59,4 +59,4 @@ class NoStore:
         return None
 
     def keep(self, fitted: FittedModel) -> None:
-        """Keep nothing."""
+        """Leave the disk as it is: nothing is kept."""

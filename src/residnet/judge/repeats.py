@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.signal import correlate
 
-from residnet.core.layout import POSE, VELOCITIES
+from residnet.core.layout import HEADING, POSE, POSITION, RANGE_VELOCITIES, VELOCITIES
 from residnet.core.names import VELOCITY
 from residnet.data.prepare import Prepared
 from residnet.judge.protocol import ProtocolConfig, Window
@@ -161,16 +161,16 @@ def _apart(pair: Pair, logs: Sequence[Prepared]) -> list[float]:
     good = first.usable[a] & second.usable[b]
     end_a, end_b = _end(first.y[a]), _end(second.y[b])
     rms = [float(np.sqrt(np.mean(part**2))) for part in (nu[good, 0], nu[good, 1], nu[:, 2])]
-    return [*rms, float(np.hypot(*(end_a - end_b)[:2])), float(abs(end_a[2] - end_b[2]))]
+    return [*rms, float(np.hypot(*(end_a - end_b)[POSITION])), float(abs((end_a - end_b)[HEADING]))]
 
 
 def _end(y: np.ndarray) -> np.ndarray:
     """The pose [3] at the end of a run [T, 6] in the axes of its start."""
     north, east, turned = y[-1, POSE] - y[0, POSE]
-    c, s = np.cos(y[0, 2]), np.sin(y[0, 2])
+    c, s = np.cos(y[0, HEADING]), np.sin(y[0, HEADING])
     return np.array([c * north + s * east, c * east - s * north, turned])
 
 
 def _mean(apart: np.ndarray, scales: np.ndarray) -> dict[str, float]:
     mean = dict(zip((*VELOCITY, "position", "heading"), apart.mean(0).tolist(), strict=True))
-    return mean | {"nrmse": float((apart[:, :3].mean(0) / scales).mean())}
+    return mean | {"nrmse": float((apart[:, RANGE_VELOCITIES].mean(0) / scales).mean())}

@@ -33,7 +33,7 @@ class OperatingPoint:
 
     @property
     def text(self) -> str:
-        """For a sentence."""
+        """The point as words of a sentence: drive, surge velocity and whether it was trained on."""
         name = f"{self.label}, " if self.label else ""
         return f"{name}u = {self.speed:.3g} m/s" + (
             "" if self.inside else " (outside the training data)"

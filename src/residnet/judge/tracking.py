@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from residnet.core.frames import wrap
+from residnet.core.layout import HEADING, POSITION, RANGE_VELOCITIES, velocities_on
 
 
 @dataclass(frozen=True)
@@ -59,13 +60,13 @@ def tracking(
         feedback: its part tau_FB [T, 3].
         dt: step in s.
     """
-    position = (desired[:, :2] - pose[:, :2]).norm(dim=-1)
-    heading = wrap(desired[:, 2] - pose[:, 2]).abs()
-    work = command * motion[:, :3]
+    position = (desired[:, POSITION] - pose[:, POSITION]).norm(dim=-1)
+    heading = wrap(desired[:, HEADING] - pose[:, HEADING]).abs()
+    work = command * motion[:, RANGE_VELOCITIES]
     # the power of keeping the position and of keeping the heading are told apart (Table 4.13)
     energy = [float(work[:, :2].sum(-1).abs().sum() * dt), float(work[:, 2].abs().sum() * dt)]
     errors = [float(position.sum() * dt), float(heading.sum() * dt)]
-    seconds, missed = dt * len(pose), (desired[:, 3:] - motion).square().mean(0).tolist()
+    seconds, missed = dt * len(pose), (velocities_on(desired) - motion).square().mean(0).tolist()
     tau, fed = command.abs().mean(0).tolist(), feedback.abs().mean(0).tolist()
     return Tracking(
         float(position.mean()),

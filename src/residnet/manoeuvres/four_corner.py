@@ -18,6 +18,7 @@ from residnet.control.motion.pid import MotionPIDConfig
 from residnet.control.motion.reference_filter import ReferenceFilterConfig, Waypoint
 from residnet.core.config import RadiansPerSecond, Seconds
 from residnet.core.errors import UsageError
+from residnet.core.layout import HEADING, MOTION, PLANAR, POSE
 from residnet.core.log import Log
 from residnet.dynamics.rollout import Source
 from residnet.manoeuvres.base import Helm, Manoeuvre, StackedSource
@@ -86,9 +87,9 @@ class FourCorner(Manoeuvre):
         desired = []
         for k in range(len(log)):
             pose, s = reference(x[k : k + 1], k, s)
-            desired.append(pose[0, :3].numpy())
+            desired.append(pose[0, POSE].numpy())
         error = x.numpy() - np.stack(desired)
-        heading = np.abs((error[:, 2] + math.pi) % (2 * math.pi) - math.pi)
+        heading = np.abs((error[:, HEADING] + math.pi) % (2 * math.pi) - math.pi)
         return {
             "mean_position_error": float(np.hypot(error[:, 0], error[:, 1]).mean()),
             "mean_heading_error": float(heading.mean()),
@@ -101,7 +102,7 @@ class FourCornerSource(Source):
 
     def __init__(self, manoeuvre: FourCorner, helm: Helm, step: float) -> None:
         super().__init__()
-        if helm.forces is None or helm.state[:6] != ("x", "y", "psi", "u", "v", "r"):
+        if helm.forces is None or helm.state[MOTION] != PLANAR.names:
             raise UsageError(
                 "a four-corner course needs a vessel in surge, sway and yaw that is commanded in"
                 " all three, by forces or azimuth thrusters"

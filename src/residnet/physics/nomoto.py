@@ -15,6 +15,7 @@ from torch import Tensor
 
 from residnet.core.config import MetresPerSecond
 from residnet.core.frames import to_earth
+from residnet.core.layout import SURGE, SWAY, heading, surge, sway, yaw_rate
 from residnet.physics.abkowitz import SteeringGearConfig
 from residnet.physics.parameters import Parameter, measured_in
 from residnet.physics.plant import Plant
@@ -195,6 +196,8 @@ class SteeringVessel(Plant):
         self.speed, self.delta_max = config.speed, config.rudder.limit
         self.servo = config.rudder.follow("delta", config.rudder.limit, config.rudder.rate)
         self.free = 2 + len(extra)
+        self.turning_columns = slice(SWAY, SWAY + self.free)
+        self.rudder_columns = slice(SWAY + self.free, None)
         self.state = ("x", "y", "psi", "u", "v", "r", *extra, *self.servo.state)
         self.inputs = ("cmd_delta",)
         self.commands = 1
@@ -207,30 +210,28 @@ class SteeringVessel(Plant):
         """Return the rudder angle [..., 1] for a steer [...] as a share of the limit.
 
         The speed is constant whatever the drive.
-
-        The speed is constant whatever the drive.
         """
         return (steer.clamp(-1.0, 1.0) * self.delta_max).unsqueeze(-1)
 
     def delta(self, x: Tensor, w: Tensor) -> Tensor:
         """Return the rudder angle [B] in rad."""
-        return self.servo.value(x[:, 4 + self.free :], w[:, 0])
+        return self.servo.value(x[:, self.rudder_columns], w[:, 0])
 
     def rate(self, x: Tensor, w: Tensor) -> Tensor:
         """Return x_dot [B, nx] under inputs w [B, 1]."""
-        z, rudder = x[:, 4 : 4 + self.free], x[:, 4 + self.free :]
+        z, rudder = x[:, self.turning_columns], x[:, self.rudder_columns]
         turning = z @ self.a.to(x.dtype).T + self.delta(x, w).unsqueeze(-1) * self.b.to(x.dtype)
-        north, east = to_earth(x[:, 3], x[:, 4], x[:, 2])
-        pose = torch.stack((north, east, x[:, 5], torch.zeros_like(north)), dim=-1)
+        north, east = to_earth(surge(x), sway(x), heading(x))
+        pose = torch.stack((north, east, yaw_rate(x), torch.zeros_like(north)), dim=-1)
         return torch.cat((pose, turning, self.servo.rate(rudder, w[:, 0])), dim=-1)
 
     def end_step(self, x: Tensor, w: Tensor, dt: float) -> Tensor:
         """Return the state [B, nx] with the rudder moved on by a step of dt seconds."""
-        split = 4 + self.free
-        return torch.cat((x[:, :split], self.servo.advance(x[:, split:], w[:, 0], dt)), dim=-1)
+        rudder = self.servo.advance(x[:, self.rudder_columns], w[:, 0], dt)
+        return torch.cat((x[:, : self.rudder_columns.start], rudder), dim=-1)
 
     def approach(self, rows: int) -> Tensor:
         """Return the state straight ahead at the model's speed, [rows, nx]."""
         x = super().approach(rows)
-        x[:, 3] = self.speed
+        x[:, SURGE] = self.speed
         return x

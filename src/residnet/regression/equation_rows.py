@@ -19,6 +19,7 @@ from pydantic import Field
 
 from residnet.core.config import Config, Seconds
 from residnet.core.errors import ConfigError, FitError
+from residnet.core.stretches import stretch_bounds
 
 _DEPENDENT = 1e-10
 """Length of a unit instrument beside those before it up to which it adds nothing."""
@@ -125,8 +126,8 @@ class InstrumentRows(RowBuilder):
                 f"instruments: a lag of {self.lag:g} s is less than one step of {step:g} s;"
                 " lengthen it"
             )
-        now = np.arange(2 * lag, len(sampled.stretch))
-        now = now[sampled.stretch[now] == sampled.stretch[now - 2 * lag]]
+        begins, _ = stretch_bounds(sampled.stretch)
+        now = np.flatnonzero(np.arange(len(begins)) - 2 * lag >= begins)
         x = sampled.x[now]
         behind = np.concatenate(
             (sampled.x[now - lag], sampled.x[now - 2 * lag][:, ~exact], x[:, exact]), axis=1
@@ -144,7 +145,7 @@ class InstrumentRows(RowBuilder):
 
 
 RowsConfig = Annotated[SampleRows | WeakRows | InstrumentRows, Field(discriminator="kind")]
-"""Any estimator; its `kind` says which."""
+"""Any way to make rows; its `kind` says which."""
 
 
 def integrated(sampled: Rows, step: float, window: float, every: float) -> Rows:
@@ -165,16 +166,15 @@ def integrated(sampled: Rows, step: float, window: float, every: float) -> Rows:
     place = np.linspace(-1.0, 1.0, size + 2)[1:-1]
     weight = np.square(1.0 - np.square(place))
     weight /= weight.sum()
-    first = np.arange(0, len(sampled.stretch) - size + 1)
-    first = first[sampled.stretch[first] == sampled.stretch[first + size - 1]]
+    begins, ends = stretch_bounds(sampled.stretch)
+    first = np.flatnonzero(np.arange(size, len(ends) + size) <= ends)
     if not first.size:
         raise FitError(
             f"weak form: no unbroken stretch of samples is {window:g} s long; shorten the window or"
             " give logs with fewer gaps"
         )
     # windows every so many samples, counted from the start of each stretch
-    begins = np.searchsorted(sampled.stretch, sampled.stretch[first])
-    first = first[(first - begins) % max(round(every * size), 1) == 0]
+    first = first[(first - begins[first]) % max(round(every * size), 1) == 0]
     joined = np.concatenate((sampled.x, sampled.y), axis=1)
     size_of_block = max(_BLOCK // (size * joined.shape[1]), 1)
     parts = []
@@ -185,7 +185,7 @@ def integrated(sampled: Rows, step: float, window: float, every: float) -> Rows:
     return Rows(out[:, : sampled.x.shape[1]], out[:, sampled.x.shape[1] :], sampled.stretch[first])
 
 
-def stretches(group: np.ndarray, t: np.ndarray, step: float) -> np.ndarray:
+def unbroken_stretches(group: np.ndarray, t: np.ndarray, step: float) -> np.ndarray:
     """Return the number of the unbroken stretch of each sample [N], ascending from 0.
 
     Args:

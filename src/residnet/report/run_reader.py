@@ -14,6 +14,7 @@ import numpy as np
 import yaml
 
 from residnet.core.errors import DataError, UsageError
+from residnet.core.layout import RANGE_VELOCITIES
 from residnet.core.names import CHANNEL_UNITS
 from residnet.report.format import shown_unit
 
@@ -52,7 +53,7 @@ class StoredWindow:
 
     def rmse(self, model: str) -> np.ndarray:
         """Return the root mean square errors [3] of u, v (usable samples) and r (all samples)."""
-        error = self.predicted[model][:, :3] - self.measured[:, :3]
+        error = self.predicted[model][:, RANGE_VELOCITIES] - self.measured[:, RANGE_VELOCITIES]
         good = self.usable if self.usable.any() else np.ones_like(self.usable)
         return np.sqrt(
             [np.mean(error[good, 0] ** 2), np.mean(error[good, 1] ** 2), np.mean(error[:, 2] ** 2)]

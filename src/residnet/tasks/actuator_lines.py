@@ -60,6 +60,13 @@ def numbers(
     step: StepAnswer | None,
     thrust: tuple[ThrustFit, ThrustFit] | None,
 ) -> dict[str, Any]:
+    """Return the identified actuators as the content of actuators.json.
+
+    Args:
+        throttle: map from throttle to revolutions, where identified.
+        step: rate limit and dead time, where identified.
+        thrust: thrust curves ahead and astern, where identified.
+    """
     out: dict[str, Any] = {"schema": "residnet.actuators/1"}
     if throttle is not None:
         parts = {"slope": throttle.slope, "offset": throttle.offset, "n_max": throttle.n_max}

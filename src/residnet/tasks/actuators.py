@@ -131,8 +131,7 @@ class BollardTest(_Test):
 
 
 class ActuatorsTaskConfig(Task):
-    """Throttle map, rate limit and thrust curves from tests of the actuators, as lines for a vessel
-    file.
+    """Throttle map, rate limit and thrust curves of a vessel file, from tests of its actuators.
 
     Attributes:
         throttle: test of the throttle map; null for none. At least one test is needed.
@@ -165,7 +164,7 @@ class ActuatorsTaskConfig(Task):
         _Logs(self)
 
     def input_files(self) -> list[Path]:
-        """Return all logs."""
+        """Return the files of all logs that the task reads."""
         return self.files()
 
     def carry_out(self, folder: RunFolder) -> Outcome:

@@ -25,8 +25,8 @@ def catalogue(what: str) -> list[tuple[str, str]]:
             `configs`.
     """
     if what == "vessels":
-        found = [(name, _description(name)) for name in vessel_files()]
-        return found + [_broken(part) for part in broken_vessels()]
+        known = [(name, _description(name)) for name in vessel_files()]
+        return known + [_broken(part) for part in broken_vessels()]
     if what == "configs":
         files = {file: name for name, file in reversed(shipped_configs().items())}
         return [

@@ -7,6 +7,7 @@ import functools
 import torch
 
 from residnet.baselines import RegressorsConfig
+from residnet.core.layout import RANGE_INPUTS, RANGE_VELOCITIES
 from residnet.core.samples import Samples
 from residnet.data.prepare import PrepareConfig, prepare, samples
 from residnet.data.simulated.trials import SimulatedTrials, fly_trials
@@ -77,7 +78,7 @@ def example_spec(head: FeatureConfig | None) -> ModelSpec:
         head: config of any head.
     """
     z = example_samples().z
-    seen = torch.cat((z[:, :3], z[:, 3:5]), dim=1)
+    seen = torch.cat((z[:, RANGE_VELOCITIES], z[:, RANGE_INPUTS][:, :2]), dim=1)
     return ModelSpec.model_validate(
         {
             "schema": "residnet.model/1",

@@ -64,7 +64,7 @@ class AutopilotFit(EpochTraining):
         return range(self.settings.steps)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
-        """Return Adam."""
+        """Return Adam over the policy's parameters."""
         return torch.optim.Adam(self.policy.parameters(), lr=self.settings.learning_rate)
 
     def on_fit_start(self) -> None:

@@ -35,7 +35,7 @@ class Epochs(Protocol):
 
     @property
     def validate_every(self) -> int:
-        """Epochs between validations."""
+        """Number of epochs between validations."""
 
     def stage(self, epoch: int) -> tuple[int, int]:
         """Return (stage, epoch within it)."""

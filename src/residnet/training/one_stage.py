@@ -30,7 +30,7 @@ class OneStage(Config):
 
     @property
     def last_stage(self) -> int:
-        """The only one."""
+        """Number of the only stage, 0."""
         return 0
 
     def stage(self, epoch: int) -> tuple[int, int]:

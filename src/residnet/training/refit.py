@@ -43,7 +43,7 @@ class Refitted:
 
     @property
     def errors(self) -> Tensor:
-        """Standard errors [P]."""
+        """Standard errors [P] of the free parameters."""
         return self.covariance.diagonal().clamp(min=0.0).sqrt()
 
 

@@ -9,8 +9,13 @@ import torch
 from torch import Tensor
 
 from residnet.baselines import Baseline, ParametricBaseline
-from residnet.core.layout import zero_acceleration
+from residnet.core.layout import HEADING, PLANAR, YAW_RATE, zero_acceleration
 from residnet.dynamics.hybrid import HybridDynamics
+
+_ROWS = len(PLANAR.names) - HEADING
+"""Sensitivities have a row for the heading and one for each velocity."""
+_HEADING_ROW = slice(0, 1)
+_YAW_RATE_ROW = slice(YAW_RATE - HEADING, _ROWS)
 
 
 @final
@@ -87,25 +92,26 @@ def step_sensitivities(
             stage_x = x + node * model.dt * model.rate(stage_x, p, residual)
         direct = baseline.sensitivity(model.signals(stage_x, p))
         nu_dot = _slopes(model, stage_x, p) @ stage_s + direct
-        stage_rate = torch.cat((stage_s[:, 3:], nu_dot), dim=1)
+        stage_rate = torch.cat((stage_s[:, _YAW_RATE_ROW], nu_dot), dim=1)
         total = total + weight * stage_rate
     after = s + model.dt * total
     if model.semi_implicit:
         # the heading moves with the new yaw rate
-        after = torch.cat((s[:, :1] + model.dt * after[:, 3:], after[:, 1:]), dim=1)
+        turned = s[:, _HEADING_ROW] + model.dt * after[:, _YAW_RATE_ROW]
+        after = torch.cat((turned, after[:, _HEADING_ROW.stop :]), dim=1)
     return after
 
 
 def _slopes(model: HybridDynamics, x: Tensor, p: Tensor) -> Tensor:
     """Return the derivative of nu_dot by (psi, u, v, r), [B, 3, 4], in one forward pass."""
     batch = x.shape[0]
-    tangent = torch.zeros(4, batch, x.shape[1], dtype=x.dtype)
-    for direction in range(4):
-        tangent[direction, :, 2 + direction] = 1.0
-    repeated, inputs = x.repeat(4, 1), p.repeat(4, 1)
+    tangent = torch.zeros(_ROWS, batch, x.shape[1], dtype=x.dtype)
+    for direction in range(_ROWS):
+        tangent[direction, :, HEADING + direction] = 1.0
+    repeated, inputs = x.repeat(_ROWS, 1), p.repeat(_ROWS, 1)
     slopes: Tensor = torch.func.jvp(
         lambda state: model.baseline(model.signals(state, inputs)),
         (repeated,),
         (tangent.reshape(-1, x.shape[1]),),
     )[1]
-    return slopes.reshape(4, batch, 3).permute(1, 2, 0)
+    return slopes.reshape(_ROWS, batch, PLANAR.dof).permute(1, 2, 0)

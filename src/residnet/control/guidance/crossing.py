@@ -23,6 +23,7 @@ from residnet.control.motion.anticipation import (
 from residnet.control.motion.reference_filter import ReferenceFilterConfig
 from residnet.core.config import Config, Metres, RadiansPerSecond, Seconds
 from residnet.core.frames import wrap
+from residnet.core.layout import accelerations, heading, pose, position, velocities
 from residnet.physics.force_model import ForceModel
 
 
@@ -81,17 +82,15 @@ class Crossing(Reference):
     def initial_state(self, x: Tensor) -> Tensor:
         """Return the memory at rest where the ferry is, on the first leg; NaN for no point yet."""
         rest = torch.zeros_like(x[:, :1])
-        return torch.cat(
-            (x[:, :3], rest.expand(-1, 7), torch.full_like(x[:, :3], torch.nan)), dim=-1
-        )
+        return torch.cat((pose(x), rest.expand(-1, 7), torch.full_like(pose(x), torch.nan)), dim=-1)
 
-    def target(self, x: Tensor, heading: Tensor, leg: Tensor) -> tuple[Tensor, Tensor]:
+    def target(self, x: Tensor, desired: Tensor, leg: Tensor) -> tuple[Tensor, Tensor]:
         """Return the point and heading [B, 3] to steer for, and the leg [B] after a change.
 
-        `heading` [B] is the desired heading in rad, x [B, nx] the state.
+        `desired` [B] is the desired heading in rad, x [B, nx] the state.
         """
         last = len(self.points) - 2
-        place = x[:, :2]
+        place = position(x)
         near = (self.points[leg + 1] - place).norm(dim=-1) < self.config.circle
         arrived = near & (leg == last)
         leg = torch.where(near & (leg < last), leg + 1, leg)
@@ -104,22 +103,22 @@ class Crossing(Reference):
         point = torch.where(arrived[:, None], end, start + (travelled + reach)[:, None] * along)
         aim = torch.where(arrived[:, None], along, point - place)
         direction = torch.atan2(aim[:, 1], aim[:, 0])
-        return torch.cat((point, (heading + wrap(direction - heading))[:, None]), dim=-1), leg
+        return torch.cat((point, (desired + wrap(direction - desired))[:, None]), dim=-1), leg
 
     def forward(self, x: Tensor, k: int, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return the reference [B, 18] of step k and the memory one step later."""
         old = s[:, 9].long()
-        target, leg = self.target(x, s[:, 2], old)
+        target, leg = self.target(x, heading(s), old)
         # where the point jumps (first step, change of leg, the stop) it has no rate
         rate = (target - s[:, 10:]) / self.dt
-        steady = (rate[:, :2].norm(dim=-1) < self.config.circle) & (leg == old)
+        steady = (position(rate).norm(dim=-1) < self.config.circle) & (leg == old)
         rate = torch.where(steady[:, None], rate, torch.zeros_like(rate))
         motion = derivatives(self.filter_config, s[:, :9], target, rate)
         forces = [
             needed_force(model, Derivatives(*(part[i : i + 1] for part in motion)), lag, self.dt)
             for i, (model, lag) in enumerate(self.models)
         ]
-        error = torch.stack((s[:, :3] - target, s[:, 3:6], s[:, 6:9]), dim=-1)
+        error = torch.stack((pose(s) - target, velocities(s), accelerations(s)), dim=-1)
         after = torch.einsum("aij,baj->bia", self.advance, error)
         memory = torch.cat(
             (after[:, 0] + target, after[:, 1], after[:, 2], leg[:, None].to(s.dtype), target),

@@ -15,6 +15,7 @@ from torch import Tensor
 from residnet.control.base import Policy
 from residnet.control.motion.pid import MotionPID
 from residnet.control.motion.reference_filter import ReferenceFilterConfig
+from residnet.core import layout
 from residnet.core.config import Config, RadiansPerSecond, Seconds
 from residnet.core.frames import to_body
 from residnet.physics.force_model import ForceModel
@@ -85,7 +86,11 @@ def derivatives(
     """
     w = torch.tensor(config.frequency, dtype=memory.dtype)
     d = 2.0 * torch.tensor(config.damping, dtype=memory.dtype) + 1.0
-    pose, rate, change = memory[..., :3], memory[..., 3:6], memory[..., 6:]
+    pose, rate, change = (
+        layout.pose(memory),
+        layout.velocities(memory),
+        layout.accelerations(memory),
+    )
     jerk = w**3 * (target - pose) - d * w**2 * rate - d * w * change
     snap = w**3 * (target_rate - rate) - d * w**2 * change - d * w * jerk
     return Derivatives(pose, rate, change, jerk, snap)
@@ -211,7 +216,14 @@ def course(config: ReferenceFilterConfig, dt: float) -> Derivatives:
         step = step @ step
     memory, parts, targets = torch.zeros(9, dtype=torch.float64), [], []
     for target in filtered.waypoints[0]:
-        error = torch.stack((memory[:3] - target, memory[3:6], memory[6:]), dim=-1)
+        error = torch.stack(
+            (
+                layout.pose(memory) - target,
+                layout.velocities(memory),
+                layout.accelerations(memory),
+            ),
+            dim=-1,
+        )
         path = torch.einsum("taij,aj->tia", powers[: every + 1], error)
         path[:, 0] += target
         states = path.reshape(every + 1, 9)

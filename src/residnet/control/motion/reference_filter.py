@@ -16,7 +16,7 @@ from residnet.control.base import Reference
 from residnet.core.config import Config, Metres, Radians, RadiansPerSecond, Seconds
 from residnet.core.errors import ConfigError
 from residnet.core.frames import to_body
-from residnet.core.layout import pose
+from residnet.core.layout import accelerations, pose, velocities
 
 Waypoint = tuple[Metres, Metres, Radians]
 """North, east and heading; headings are followed as they are written: from 0 to 180 deg clockwise,
@@ -126,7 +126,7 @@ class ReferenceFilter(Reference):
 
     def forward(self, x: Tensor, k: int, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return the reference [B, 9] of step k and the memory one step later."""
-        place, rate, change = s[:, :3], s[:, 3:6], s[:, 6:]
+        place, rate, change = pose(s), velocities(s), accelerations(s)
         u, v = to_body(rate[:, 0], rate[:, 1], place[:, 2])
         along, across = to_body(change[:, 0], change[:, 1], place[:, 2])
         r = rate[:, 2]

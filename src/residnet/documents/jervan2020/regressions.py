@@ -104,7 +104,7 @@ class RegressionKind(Config, ABC):
 
     @abstractmethod
     def fit(self, data: Regression) -> Fit:
-        """Return the coefficients.
+        """Return the coefficients that fit the regression's samples.
 
         Raises:
             FitError: where the data do not determine them.
@@ -157,7 +157,7 @@ class PlsrRegression(_ScaledRegression):
         return self.order is not None
 
     def chosen(self, choice: dict[str, Any], notes: dict[str, Any]) -> dict[str, Any]:
-        """Return the order.
+        """Return the order, the number of latent variables.
 
         Raises:
             FitError: where it is 0.
@@ -198,7 +198,7 @@ class SurfaceRegression(RegressionKind):
 
 @final
 class LeastSquaresRegression(_ScaledRegression):
-    """Ordinary least squares."""
+    """Ordinary least squares of the residual force on the basis functions."""
 
     kind: Literal["ols"]
 
@@ -213,7 +213,7 @@ class LeastSquaresRegression(_ScaledRegression):
 
 @final
 class RidgeRegression(_ScaledRegression):
-    """Ridge regression.
+    """Ridge regression of the residual force on the basis functions.
 
     Attributes:
         penalty: in units of a scaled column's energy: alpha = penalty * samples in scikit-learn's

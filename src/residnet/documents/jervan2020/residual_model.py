@@ -15,6 +15,7 @@ from residnet.control.motion.anticipation import Lag
 from residnet.core.config import Config
 from residnet.core.errors import FitError
 from residnet.core.frames import to_body
+from residnet.core.layout import ACCELERATIONS, HEADING, POSE, VELOCITIES
 from residnet.documents.jervan2020.regressions import Fit, Regression, RegressionConfig
 from residnet.judge.tracking import mse
 from residnet.physics.force_model import FERRY_TERMS, MOTION, Correction, ForceModel, column_scale
@@ -90,7 +91,12 @@ class Record:
 
         measured = torch.cat((self.pose, self.nu, self.nu_dot), dim=-1)
         motion = torch.from_numpy(smooth_motion(measured.numpy(), self.noise, self.dt))
-        return replace(self, pose=motion[:, :3], nu=motion[:, 3:6], nu_dot=motion[:, 6:])
+        return replace(
+            self,
+            pose=motion[:, POSE],
+            nu=motion[:, VELOCITIES],
+            nu_dot=motion[:, ACCELERATIONS],
+        )
 
 
 def fit_model(
@@ -112,8 +118,8 @@ def fit_model(
     """
     train = record.train
     x = TermLibrary(config.terms, MOTION)(torch.cat((record.nu_dot, record.nu), dim=-1))
-    needed = base.at_heading(record.nu_dot, record.nu, record.pose[:, 2])
-    earth_axes = _earth_axes(record.pose[:, 2])
+    needed = base.at_heading(record.nu_dot, record.nu, record.pose[:, HEADING])
+    earth_axes = _earth_axes(record.pose[:, HEADING])
     lag_fit: LagFit | None = None
     force = record.command
     if config.lag:
@@ -175,7 +181,7 @@ def remaining(model: ForceModel, lag: Lag | None, record: Record) -> Tensor:
     force = (
         record.command if lag is None else followed(record.averaged, lag, record.dt, record.runs)
     )
-    residual: Tensor = model.residual(force, record.nu_dot, record.nu, record.pose[:, 2])
+    residual: Tensor = model.residual(force, record.nu_dot, record.nu, record.pose[:, HEADING])
     return residual
 
 

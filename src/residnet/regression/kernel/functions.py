@@ -198,7 +198,7 @@ class PolynomialKernel(Kernel):
         return [primal_path(self.products, identity, x, y, fold, folds, penalties)]
 
     def features(self, path: Path, x: Tensor) -> Tensor:
-        """Return the products."""
+        """Return the products [N, J] of inputs x [N, F]; they are the same for every path."""
         return self.products(x)
 
     def selected(

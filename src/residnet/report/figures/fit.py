@@ -12,6 +12,7 @@ from residnet.report.figures import errors as figures_errors
 from residnet.report.figures import terms as figures_terms
 from residnet.report.figures import tracks as figures_tracks
 from residnet.report.figures.files import Drawing, write_drawings
+from residnet.report.figures.learning import learning_curves
 from residnet.report.format import plural
 from residnet.report.run_reader import RunFiles
 
@@ -142,5 +143,5 @@ def _of_training(run: RunFiles) -> Iterator[Drawing]:
                 " so only the slopes count. The lower panels decide: the weights of the circled"
                 " epoch are kept. A curve that still falls at its end asks for more epochs."
             ),
-            figures_errors.learning_curves(run, models[place : place + _PER_FIGURE]),
+            learning_curves(run, models[place : place + _PER_FIGURE]),
         )

@@ -17,7 +17,7 @@ _KEPT = 0.1
 
 def spread_table(rows: list[dict[str, Any]], vessels: Vessels) -> pd.DataFrame:
     """Return one line for each flight of the spread."""
-    kept = (
+    columns = (
         "model",
         "guidance",
         "protocol",
@@ -28,19 +28,20 @@ def spread_table(rows: list[dict[str, Any]], vessels: Vessels) -> pd.DataFrame:
         "margin",
         "cross_track_rms",
     )
-    columns = {
+    drawn = {
         "effect": vessels.variation[:, 0],
         "time": vessels.variation[:, 1],
         "bias": vessels.variation[:, 2],
     }
-    columns |= {"current_north": vessels.current[:, 0], "current_east": vessels.current[:, 1]}
+    drawn |= {"current_north": vessels.current[:, 0], "current_east": vessels.current[:, 1]}
     return pd.DataFrame(
-        {name: [one[name] for one in rows] for name in kept}
-        | {name: values.numpy() for name, values in columns.items()}
+        {name: [row[name] for row in rows] for name in columns}
+        | {name: values.numpy() for name, values in drawn.items()}
     )
 
 
 def track_table(name: str, guidance: str, protocol: str, flight: CourseFlight) -> pd.DataFrame:
+    """Return the track of one flight, a sample every 0.1 s: positions in m, angles in rad."""
     every = max(round(_KEPT / flight.dt), 1)
     count = len(flight.track)
     columns = {
@@ -59,6 +60,7 @@ def track_table(name: str, guidance: str, protocol: str, flight: CourseFlight) -
 
 
 def plan_table(planned: PlannedCourse) -> pd.DataFrame:
+    """Return the planned course up to its end: positions in m, heading and rudder in rad."""
     course = planned.course
     within = course.step * np.arange(len(course.track)) <= course.length
     columns = {

@@ -11,6 +11,7 @@ from typing import Any, Literal, final
 import numpy as np
 
 from residnet.core.errors import DataError
+from residnet.core.stretches import stretch_bounds
 from residnet.data.readers.base import require_file
 from residnet.data.readers.composing.composed import RecordingConfig
 from residnet.data.readers.composing.wanted import EVERYTHING, Wanted
@@ -210,9 +211,7 @@ def _between(number: np.ndarray, ticks: np.ndarray) -> np.ndarray:
     `number` says after which timed sentence each came.
     """
     number = np.clip(number, 0, ticks.size - 1)
-    first = np.append(True, number[1:] != number[:-1])
-    start = np.maximum.accumulate(np.where(first, np.arange(number.size), 0))
-    order = np.arange(number.size) - start
+    order = np.arange(number.size) - stretch_bounds(number)[0]
     _, group, count = np.unique(number, return_inverse=True, return_counts=True)
     usual = np.median(np.diff(ticks)) if ticks.size > 1 else 10**9
     length = np.append(np.diff(ticks), usual)[number]

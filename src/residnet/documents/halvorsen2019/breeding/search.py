@@ -24,7 +24,7 @@ from residnet.regression.genetic.equations import breed, validating
 
 @dataclass(frozen=True)
 class Trial:
-    """One search.
+    """The outcome of one search for the equation.
 
     Attributes:
         error: mean square error on the test record without noise, in (m/s^2)^2.

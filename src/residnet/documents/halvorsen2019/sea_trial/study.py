@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from residnet.core.layout import RANGE_VELOCITIES
 from residnet.documents.halvorsen2019.sea_trial.config import (
     ALL,
     PLANT,
@@ -87,8 +88,10 @@ def one_trial(settings: SeaTrialSettings, config: SeaTrialConfig) -> PhaseStudy:
     standard, models = {}, {}
     for name, keep in sets.items():
         train = keep & ~trial.validates
-        standard[name] = found = fit(z[train, :3], z[train, 5:], a[train], settings.standard)
-        predicted = found.accelerations(z[:, :3], z[:, 5:])
+        standard[name] = found = fit(
+            z[train, RANGE_VELOCITIES], z[train, 5:], a[train], settings.standard
+        )
+        predicted = found.accelerations(z[:, RANGE_VELOCITIES], z[:, 5:])
         models[STANDARD, name] = Fitted(predicted, _STANDARD_PARAMETERS, {})
         for equation, equation_config in settings.equations.items():
             models[equation, name] = _fit_equation(equation_config, trial, train)
@@ -158,7 +161,7 @@ def _judged(
     vessel = odin(config.vessel)
     z, a = trial.samples.z, trial.samples.target.numpy()
     known = Fitted(
-        AccelerationHull(vessel.gains, vessel.terms)(z[:, :3], z[:, 5:]).numpy(),
+        AccelerationHull(vessel.gains, vessel.terms)(z[:, RANGE_VELOCITIES], z[:, 5:]).numpy(),
         (0.0, 0.0, 0.0),
         {},
     )

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from residnet.core.layout import RANGE_INPUTS, RANGE_VELOCITIES
 from residnet.core.log import Log
 from residnet.core.names import VELOCITY
 from residnet.core.samples import Samples
@@ -120,10 +121,10 @@ def prepared(
     rows, rates, times, log_numbers, stretches = [], [], [], [], []
     for number, given in enumerate(logs):
         t, z = _even(given, config, random)
-        nu, command = torch.from_numpy(z[:, :3]), torch.from_numpy(z[:, 3:])
+        nu, command = torch.from_numpy(z[:, RANGE_VELOCITIES]), torch.from_numpy(z[:, RANGE_INPUTS])
         force = actuators.force(torch.zeros(len(t), 0, dtype=torch.float64), command, nu).numpy()
-        inputs = np.concatenate((z[:, 3:], force), axis=1)
-        velocity = _filtered(z[:, :3], config)
+        inputs = np.concatenate((z[:, RANGE_INPUTS], force), axis=1)
+        velocity = _filtered(z[:, RANGE_VELOCITIES], config)
         cut = round(config.margin / config.step)
         kept = slice(cut, len(t) - 1 - cut)
         rows.append(

@@ -29,6 +29,7 @@ from residnet.core.config import (
     quantity,
 )
 from residnet.core.errors import ConfigError, DataError
+from residnet.core.layout import ACTUATORS, MOTION, PLANAR, POSE, VELOCITIES
 from residnet.dynamics.rollout import Rollout, Source
 from residnet.dynamics.simulated import TracedPlantDynamics
 from residnet.judge.tracking import Tracking, tracking
@@ -128,7 +129,7 @@ class Sensed(Source):
     def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Return the inputs [B, m] that follow from the measured state."""
         inputs, memory = self.loop(
-            torch.cat((x[:, :6] + self.noise[:, k], x[:, 6:]), dim=-1), w, k, memory
+            torch.cat((x[:, MOTION] + self.noise[:, k], x[:, ACTUATORS]), dim=-1), w, k, memory
         )
         return inputs, memory
 
@@ -254,7 +255,7 @@ class Ferry:
             w[:, :, self.true.inputs.index("force_east")] = self.disturbance.east
         noise = (self.noise or MotionNoise()).draw((rows, steps), self.seed)
         loop = ClosedLoop(Assisted(pid, lags, step), guidance)
-        source: Source = Sensed(loop, noise[..., :6]) if self.noise is not None else loop
+        source: Source = Sensed(loop, noise[..., MOTION]) if self.noise is not None else loop
         x0 = torch.zeros(rows, len(self.true.state), dtype=torch.float64)
         with torch.no_grad():
             states, inputs, _ = Rollout(TracedPlantDynamics(self.true, step), source)(
@@ -266,7 +267,7 @@ class Ferry:
                     "the ferry left all bounds in closed loop: with these gains and models the loop"
                     " is unstable"
                 )
-            references = self._replay(guidance, states, noise[..., :6])
+            references = self._replay(guidance, states, noise[..., MOTION])
             return [
                 self._flight(states[i], inputs[i], references[i], noise[i], pid)
                 for i in range(rows)
@@ -277,7 +278,7 @@ class Ferry:
         """Return the references [B, T, 18] that were followed."""
         if isinstance(guidance, GivenReference):
             return guidance.values
-        measured = torch.cat((states[..., :6] + noise, states[..., 6:]), dim=-1)
+        measured = torch.cat((states[..., MOTION] + noise, states[..., ACTUATORS]), dim=-1)
         memory, out = guidance.initial_state(states[:, 0]), []
         for k in range(states.shape[1]):
             reference, memory = guidance(measured[:, k], k, memory)
@@ -287,16 +288,16 @@ class Ferry:
     def _flight(
         self, x: Tensor, w: Tensor, reference: Tensor, noise: Tensor, pid: MotionPID
     ) -> Flight:
-        command = w[:, :3]
-        measured_state = torch.cat((x[:, :6] + noise[:, :6], x[:, 6:]), dim=-1)
+        command = w[:, : PLANAR.dof]
+        measured_state = torch.cat((x[:, MOTION] + noise[:, MOTION], x[:, ACTUATORS]), dim=-1)
         error = pid.error(measured_state, reference)
         feedback, _ = pid(
             measured_state, reference[:, :9], (error.cumsum(0) - error) * self.loop.step
         )
         rate = self.true.rate(x, w)
         metrics = tracking(
-            x[:, :3],
-            torch.cat((x[:, 3:6], rate[:, 3:6]), dim=-1),
+            x[:, POSE],
+            torch.cat((x[:, VELOCITIES], rate[:, VELOCITIES]), dim=-1),
             reference[:, :9],
             command,
             feedback,
@@ -305,18 +306,18 @@ class Ferry:
         every, half = slice(None, None, self.loop.every), self.loop.every // 2
         ends = torch.cat((command[:1].expand(half, 3), command, command[-1:].expand(half, 3)))
         averaged = ends.unfold(0, 2 * half + 1, 1).mean(-1)
-        measured = torch.cat((x[:, :6], rate[:, 3:6]), dim=-1) + noise
+        measured = torch.cat((x[:, MOTION], rate[:, VELOCITIES]), dim=-1) + noise
         t = torch.arange(len(x), dtype=torch.float64) * self.loop.step
         return Flight(
             t[every],
-            x[every, :3],
-            x[every, 3:6],
-            rate[every, 3:6],
+            x[every, POSE],
+            x[every, VELOCITIES],
+            rate[every, VELOCITIES],
             measured[every],
             command[every],
             averaged[every],
             feedback[every],
-            x[every, 6:9],
-            reference[every, :3],
+            x[every, ACTUATORS][:, : PLANAR.dof],
+            reference[every, POSE],
             metrics,
         )

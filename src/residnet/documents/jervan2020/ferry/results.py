@@ -10,6 +10,7 @@ import torch
 
 from residnet.core.errors import ConfigError, FitError
 from residnet.core.frames import wrap
+from residnet.core.layout import HEADING, POSITION
 from residnet.documents.jervan2020.ferry.config import FerrySettings
 from residnet.documents.jervan2020.ferry.flights import Flight
 from residnet.documents.jervan2020.ferry.study import Study
@@ -104,10 +105,12 @@ def _draw_flights(flights: Mapping[str, Flight], kind: str, folder: RunFolder) -
     """Draw the errors of all models over time, and the forces of the first three."""
     t = next(iter(flights.values())).t
     position = {
-        name: (flight.desired - flight.pose)[:, :2].norm(dim=-1) for name, flight in flights.items()
+        name: (flight.desired - flight.pose)[:, POSITION].norm(dim=-1)
+        for name, flight in flights.items()
     }
     heading = {
-        name: wrap((flight.desired - flight.pose)[:, 2]).abs() for name, flight in flights.items()
+        name: wrap((flight.desired - flight.pose)[:, HEADING]).abs()
+        for name, flight in flights.items()
     }
     draw_errors(t, position, heading, folder.figures / f"errors_{kind}.png")
     if not any(bool(flight.feedback.any()) for flight in flights.values()):

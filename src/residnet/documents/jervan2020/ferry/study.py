@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 
 from residnet.control.motion.anticipation import Lag
+from residnet.core.layout import ACCELERATIONS, HEADING, POSE, VELOCITIES
 from residnet.documents.jervan2020.ferry.config import FerrySettings
 from residnet.documents.jervan2020.ferry.flights import Flight, MotionNoise
 from residnet.documents.jervan2020.ferry.identification import FerryModel, identify
@@ -68,9 +69,9 @@ def record_of(flight: Flight, interval: float, noise: MotionNoise) -> Record:
     train = torch.arange(len(flight.t)) < len(flight.t) // 2
     return Record(
         flight.t,
-        flight.measured[:, :3],
-        flight.measured[:, 3:6],
-        flight.measured[:, 6:],
+        flight.measured[:, POSE],
+        flight.measured[:, VELOCITIES],
+        flight.measured[:, ACCELERATIONS],
         flight.command,
         flight.averaged,
         fold,
@@ -89,7 +90,7 @@ def study(config: FerrySettings) -> Study:
     believed = ForceModel(ferry.believed.hull)
     first = ferry.fly_course(config.course, [(believed, None)])[0]
     record = record_of(first, config.course.interval, config.noise or MotionNoise())
-    residual = believed.residual(record.command, record.nu_dot, record.nu, record.pose[:, 2])
+    residual = believed.residual(record.command, record.nu_dot, record.nu, record.pose[:, HEADING])
     models: dict[str, FerryModel] = {}
     for name, model_config in config.models.items():
         base = models[model_config.on].model if model_config.on else believed

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from residnet.core.errors import DataError, FitError
+from residnet.core.layout import ACCELERATIONS, PLANAR, POSE, VELOCITIES
 from residnet.data.prepare import Prepared, prepare
 from residnet.data.split import check_leaks
 from residnet.documents.jervan2020.measured.config import FoldsConfig, ForceSettings
@@ -133,7 +134,7 @@ def read_measured(config: ForceSettings) -> Measured:
     }
     good, columns = joined["good"], joined["recorded"]
     derived, fold = joined["nu_dot"], _segments(logs, config)
-    sensed = columns[:, 6:9] if config.channels.acceleration is not None else None
+    sensed = columns[:, ACCELERATIONS] if config.channels.acceleration is not None else None
     acceleration: dict[str, Any] = {}
     nu_dot = derived
     if sensed is not None:
@@ -144,11 +145,11 @@ def read_measured(config: ForceSettings) -> Measured:
     part, parts = _parts(logs, config.validation)
     step, count = config.prepare.grid.step, len(fold)
     smooth = joined["smooth"]
-    command = torch.cat([_held(log.recorded[:, :3]) for log in logs])
+    command = torch.cat([_held(log.recorded[:, : PLANAR.dof]) for log in logs])
     record = Record(
         step * torch.arange(count, dtype=torch.float64),
-        smooth[:, :3],
-        smooth[:, 3:6],
+        smooth[:, POSE],
+        smooth[:, VELOCITIES],
         nu_dot,
         command,
         command,
@@ -160,7 +161,7 @@ def read_measured(config: ForceSettings) -> Measured:
     return Measured(
         tuple(log.log.name for log in logs),
         record,
-        columns[:, 3:6],
+        columns[:, VELOCITIES],
         good,
         part,
         parts,

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from residnet.core.errors import ConfigError, FitError
+from residnet.core.layout import HEADING
 from residnet.documents.jervan2020.forward import forward_equations
 from residnet.documents.jervan2020.measured.config import ForceSettings, MeasuredModelConfig
 from residnet.documents.jervan2020.measured.data import Measured, compare_forces, read_measured
@@ -161,7 +162,9 @@ def judging_force(config: MeasuredModelConfig) -> str:
 def unmodelled(measured: Measured, believed: ForceModel, force: str) -> Tensor:
     """Return the residual [N, 3] of the believed model for the `actual` or `commanded` force."""
     record = measured.record
-    return believed.residual(measured.force(force), record.nu_dot, record.nu, record.pose[:, 2])
+    return believed.residual(
+        measured.force(force), record.nu_dot, record.nu, record.pose[:, HEADING]
+    )
 
 
 def table(
