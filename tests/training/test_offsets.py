@@ -34,10 +34,10 @@ def arrow_and_dense(seed: int) -> tuple[Arrow, np.ndarray, np.ndarray]:
         rows = random.normal(size=(9, P + 2))
         matrix[np.ix_(here, here)] += rows.T @ rows
     mixed = matrix[:P, P:].reshape(P, LOGS, 2).transpose(1, 0, 2)
-    own = np.stack(
+    blocks = np.stack(
         [matrix[P + 2 * i : P + 2 * i + 2, P + 2 * i : P + 2 * i + 2] for i in range(LOGS)]
     )
-    parts = (matrix[:P, :P], mixed, own, right[:P], right[P:].reshape(LOGS, 2))
+    parts = (matrix[:P, :P], mixed, blocks, right[:P], right[P:].reshape(LOGS, 2))
     return Arrow(*(torch.from_numpy(np.array(part)) for part in parts)), matrix, right
 
 
@@ -45,9 +45,9 @@ def arrow_and_dense(seed: int) -> tuple[Arrow, np.ndarray, np.ndarray]:
 def test_an_arrow_is_solved_as_the_whole_matrix(damping: float) -> None:
     arrow, matrix, right = arrow_and_dense(1)
     expected = np.linalg.solve(matrix + damping * np.diag(np.diag(matrix)), right)
-    shared, own = arrow.damped(damping).solve()
+    shared, blocks = arrow.damped(damping).solve()
     np.testing.assert_allclose(shared.numpy(), expected[:P], rtol=1e-9)
-    np.testing.assert_allclose(own.flatten().numpy(), expected[P:], rtol=1e-9)
+    np.testing.assert_allclose(blocks.flatten().numpy(), expected[P:], rtol=1e-9)
 
 
 def test_its_inverse_is_that_of_the_whole_matrix() -> None:
@@ -69,8 +69,8 @@ def test_beliefs_add_their_precision_and_pull_to_zero() -> None:
         matrix + np.diag(np.r_[np.zeros(P), precision]),
         right + np.r_[np.zeros(P), precision * value.flatten().numpy()],
     )
-    shared, own = arrow.believing(offsets, torch.tensor(0.7, dtype=torch.float64)).solve()
-    np.testing.assert_allclose(np.r_[shared.numpy(), own.flatten().numpy()], expected, rtol=1e-9)
+    shared, blocks = arrow.believing(offsets, torch.tensor(0.7, dtype=torch.float64)).solve()
+    np.testing.assert_allclose(np.r_[shared.numpy(), blocks.flatten().numpy()], expected, rtol=1e-9)
     assert float(offsets.unlikely()) == pytest.approx(
         float((value / torch.tensor([0.5, 0.2])).square().sum())
     )
@@ -82,13 +82,13 @@ def test_without_offsets_the_shared_part_is_left_alone() -> None:
     bare = Arrow(
         arrow.shared,
         arrow.mixed[:, :, :0],
-        arrow.own[:, :0, :0],
+        arrow.blocks[:, :0, :0],
         arrow.gradient,
         arrow.slope[:, :0],
     )
-    step, own = with_and_believing(bare, none).solve()
+    step, blocks = with_and_believing(bare, none).solve()
     assert torch.equal(step, torch.linalg.solve(arrow.shared, arrow.gradient))
-    assert own.shape == (LOGS, 0)
+    assert blocks.shape == (LOGS, 0)
     assert torch.equal(none.accelerations(), torch.zeros(LOGS, 3, dtype=torch.float64))
     assert none.table(["log"] * LOGS) == []
 

@@ -229,7 +229,7 @@ def test_normal_equations_hold_the_gradient_and_the_curvature_of_offsets() -> No
     offsets = offsets_of(0.03)
     share = problem.share(LEVEL)
     arrow = module._normal_equations(model, problem, model.baseline, LEVEL, offsets)
-    assert float(arrow.own[2].abs().max()) == 0.0, "a log without a window says nothing"
+    assert float(arrow.blocks[2].abs().max()) == 0.0, "a log without a window says nothing"
     believing, step = arrow.believing(offsets, share), 1e-5
     for log in range(4):
         for axis in range(2):

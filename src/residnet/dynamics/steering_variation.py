@@ -121,8 +121,8 @@ class VariedModel(Dynamics):
             copy.deepcopy(model).to(dtype).eval().requires_grad_(False)
             for dtype in (torch.float32, torch.float64)
         )
-        for own in self.models:
-            own.dt = dt
+        for model_at_precision in self.models:
+            model_at_precision.dt = dt
         self.n_state = len(VARIATION) + model.n_state
         self.take, self.mean = list(take), mean
         self.travel = None if rate is None else rate * dt
@@ -142,13 +142,16 @@ class VariedModel(Dynamics):
         """Return the state and the memory one step later under the commands w [B, m]."""
         command, angle = w[:, :1], actuators(x)
         if self.travel is None:
-            stands = after = command
+            angle_before = angle_after = command
         else:
-            stands, after = angle, angle + (command - angle).clamp(-self.travel, self.travel)
-        felt = (0.5 * (stands + after) if self.mean else stands) * s[:, :1] + s[:, 2:3]
-        given = torch.cat((felt, w[:, 1:]), dim=1)[:, self.take]
+            moved_by = (command - angle).clamp(-self.travel, self.travel)
+            angle_before, angle_after = angle, angle + moved_by
+        held = 0.5 * (angle_before + angle_after) if self.mean else angle_before
+        effect, time_share, bias = s[:, : len(VARIATION)].split(1, dim=1)
+        effective = effect * held + bias
+        given = torch.cat((effective, w[:, 1:]), dim=1)[:, self.take]
         moved, memory = self._of(x).step(motion(x), given, s[:, len(VARIATION) :])
-        slowed = x[:, LATERAL] + (moved[:, LATERAL] - x[:, LATERAL]) / s[:, 1:2]
+        slowed = x[:, LATERAL] + (moved[:, LATERAL] - x[:, LATERAL]) / time_share
         straight = moved[:, :SWAY]
-        parts = (straight, slowed) if self.travel is None else (straight, slowed, after)
+        parts = (straight, slowed) if self.travel is None else (straight, slowed, angle_after)
         return torch.cat(parts, dim=1), torch.cat((s[:, : len(VARIATION)], memory), dim=1)

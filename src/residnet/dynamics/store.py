@@ -180,9 +180,10 @@ def read_weights(folder: Path, module: nn.Module) -> None:
         numbers = load(weights)
     except SafetensorError as error:
         raise UsageError(f"{file}: no safetensors file ({error}); {again}") from None
-    own = module.state_dict()
+    tensors = module.state_dict()
     numbers = {
-        name: value.to(own[name].dtype) if name in own else value for name, value in numbers.items()
+        name: value.to(tensors[name].dtype) if name in tensors else value
+        for name, value in numbers.items()
     }
     try:
         # a module may take tensors of other sizes than it was built with, such as support vectors

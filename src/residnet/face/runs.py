@@ -71,9 +71,9 @@ class FreeRuns:
         parts = []
         for run in self.evaluation.runs:
             for number, log in enumerate(self.evaluation.logs):
-                own = [i for i, window in enumerate(run.windows) if window.log == number]
+                of_log = [i for i, window in enumerate(run.windows) if window.log == number]
                 for model, predictions in run.predictions.items():
-                    for place, i in enumerate(own):
+                    for place, i in enumerate(of_log):
                         window = run.windows[i]
                         labels = {
                             "log": log.log.name,
@@ -142,17 +142,18 @@ class FreeRuns:
         run = self.evaluation.runs[self.protocols.index(kind)]
         name = _named(log or self.logs[run.windows[0].log], self.logs, "log")
         prepared = self.evaluation.logs[self.logs.index(name)]
-        own = [i for i, w in enumerate(run.windows) if w.log == self.logs.index(name)]
-        if not own:
+        of_log = [i for i, w in enumerate(run.windows) if w.log == self.logs.index(name)]
+        if not of_log:
             raise UsageError(f"log {name} has no window of the protocol {kind}")
         longest = max(
-            range(len(own)), key=lambda i: run.windows[own[i]].stop - run.windows[own[i]].start
+            range(len(of_log)),
+            key=lambda i: run.windows[of_log[i]].stop - run.windows[of_log[i]].start,
         )
         place = longest if window is None else window
-        if not 0 <= place < len(own):
-            raise UsageError(f"log {name} has {len(own)} windows of {kind}, no number {place}")
-        found = run.windows[own[place]]
-        rows = slice(found.start, found.stop)
+        if not 0 <= place < len(of_log):
+            raise UsageError(f"log {name} has {len(of_log)} windows of {kind}, no number {place}")
+        drawn = run.windows[of_log[place]]
+        rows = slice(drawn.start, drawn.stop)
         given = [models] if isinstance(models, str) else models
         shown = [_named(model, run.predictions, "model") for model in given]
         return DrawnRun(
@@ -161,7 +162,7 @@ class FreeRuns:
             prepared.usable[rows],
             prepared.y[rows],
             {
-                model: run.predictions[model][own[place]].states
+                model: run.predictions[model][of_log[place]].states
                 for model in shown or [m for m in run.predictions if m != "zero"]
             },
         )
@@ -225,12 +226,12 @@ def free_run(
 def _models(models: Any) -> list[Model]:
     if isinstance(models, Model):
         return [models]
-    found = list(models.values()) if isinstance(models, Mapping) else models
-    if not isinstance(found, list | tuple) or not found:
+    fitted = list(models.values()) if isinstance(models, Mapping) else models
+    if not isinstance(fitted, list | tuple) or not fitted:
         raise UsageError(f"free_run: expected one or several models, given {described(models)}")
-    for model in found:
+    for model in fitted:
         require_model(model, "free_run")
-    return list(found)
+    return list(fitted)
 
 
 def _require_fit(model: Model, data: Data) -> None:

@@ -62,10 +62,10 @@ def autocovariance(pieces: Pieces, lags: int) -> np.ndarray:
     joined = np.concatenate(list(pieces))
     mean, out = joined.mean(), np.zeros(lags + 1)
     for piece in pieces:
-        own = piece - mean
-        spectrum = np.abs(np.fft.rfft(own, 2 * len(own))) ** 2
-        reach = min(lags + 1, len(own))
-        out[:reach] += np.fft.irfft(spectrum, 2 * len(own))[:reach]
+        centred = piece - mean
+        spectrum = np.abs(np.fft.rfft(centred, 2 * len(centred))) ** 2
+        reach = min(lags + 1, len(centred))
+        out[:reach] += np.fft.irfft(spectrum, 2 * len(centred))[:reach]
     return out / len(joined)
 
 

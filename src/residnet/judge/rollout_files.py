@@ -31,9 +31,9 @@ def write_rollouts(folder: Path, runs: Sequence[FreeRun], logs: Sequence[Prepare
         measured: list[np.ndarray] = []
         predicted: list[np.ndarray] = []
         for run in runs:
-            own = [i for i, window in enumerate(run.windows) if window.log == number]
+            of_log = [i for i, window in enumerate(run.windows) if window.log == number]
             for model, predictions in run.predictions.items():
-                for place, i in enumerate(own):
+                for place, i in enumerate(of_log):
                     rows = slice(run.windows[i].start, run.windows[i].stop)
                     length = rows.stop - rows.start
                     labels: dict[str, object] = {

@@ -166,7 +166,7 @@ def _regressors(logs: Sequence[Log], task: Any) -> list[Finding]:
 
     try:
         prepared = [prepare(log, "train", task.signals.columns, task.prepare) for log in logs]
-        data = samples([one for one in prepared if one.good.any()], task.signals.build())
+        data = samples([log for log in prepared if log.good.any()], task.signals.build())
     except (DataError, UsageError) as error:
         return [
             Finding(

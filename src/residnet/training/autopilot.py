@@ -150,18 +150,20 @@ class AutopilotFit(EpochTraining):
         Where the start already turns or something pushes, the vessel cannot be known in time and an
         overshoot may be unavoidable: these count little.
         """
-        own, size = self.settings, error.abs()
-        outside = size / (size + own.band) + own.sharp * torch.sigmoid(
-            (size - own.band) * (5.0 / own.band)
+        settings, size = self.settings, error.abs()
+        outside = size / (size + settings.band) + settings.sharp * torch.sigmoid(
+            (size - settings.band) * (5.0 / settings.band)
         )
-        relative = size / (heading.abs()[:, None] + 5.0 * own.band)
-        over = torch.relu(-error * heading.sign()[:, None] - own.margin) / own.band
+        relative = size / (heading.abs()[:, None] + 5.0 * settings.band)
+        over = torch.relu(-error * heading.sign()[:, None] - settings.margin) / settings.band
         most = over.amax(1)
         over = torch.where(calm, most + 5.0 * over.mean(1) + 5.0 * most.square(), 0.05 * most)
-        slow = (variation[:, 1] / variation[:, 0]) ** own.slowest * torch.where(calm, 1.0, 0.25)
+        slow = (variation[:, 1] / variation[:, 0]) ** settings.slowest * torch.where(
+            calm, 1.0, 0.25
+        )
         weight = slow / slow.mean()
         missed = (weight * (outside + 0.5 * relative).mean(1)).mean()
-        cost: Tensor = missed + own.overshoot * over.mean()
+        cost: Tensor = missed + settings.overshoot * over.mean()
         return cost
 
     def validated(self) -> tuple[nn.Module, float]:

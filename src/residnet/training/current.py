@@ -214,7 +214,7 @@ class _Problem:
         for axis in range(3):
             slope, columns = slopes[:, axis], self.baseline.columns(axis)
             phi, weight = state.phi[:, columns], 1.0 / state.variance[axis]
-            own = torch.zeros(count, 2, 2, dtype=torch.float64).index_add_(
+            blocks = torch.zeros(count, 2, 2, dtype=torch.float64).index_add_(
                 0, state.group, slope[:, :, None] * slope[:, None, :]
             )
             mixed = torch.zeros(count, len(columns), 2, dtype=torch.float64).index_add_(
@@ -222,7 +222,7 @@ class _Problem:
             )
             mixed = mixed.permute(1, 0, 2).reshape(len(columns), 2 * count)
             hessian += weight * (
-                torch.block_diag(*own) - mixed.T @ torch.linalg.solve(_gram(phi), mixed)
+                torch.block_diag(*blocks) - mixed.T @ torch.linalg.solve(_gram(phi), mixed)
             )
             gradient = gradient + weight * torch.zeros_like(current).index_add_(
                 0, state.group, slope * state.error[:, axis : axis + 1]
@@ -251,9 +251,9 @@ class _Problem:
         best, found = cost(current), current.clone()
         for point in _grid(1.25 * spread, spread / 6):
             trial = point.expand(count, 2)
-            own = cost(trial)
-            found = torch.where((own < best)[:, None], trial, found)
-            best = torch.minimum(best, own)
+            trial_cost = cost(trial)
+            found = torch.where((trial_cost < best)[:, None], trial, found)
+            best = torch.minimum(best, trial_cost)
         return found
 
     def _slope(self, current: Tensor, direction: int, state: _State) -> Tensor:

@@ -133,16 +133,16 @@ class EpochTraining(L.LightningModule, ABC):
         """Put back what `on_save_checkpoint` kept."""
         self.restore(checkpoint["residnet"])
 
-    def restore(self, own: dict[str, Any]) -> None:
+    def restore(self, kept: dict[str, Any]) -> None:
         """Put back what a checkpoint kept of this module."""
         self.best_score, self.best_state, self.without_gain = (
-            own["best_score"],
-            own["best_state"],
-            own["without_gain"],
+            kept["best_score"],
+            kept["best_state"],
+            kept["without_gain"],
         )
-        self.history, self.stopped = own["history"], own["stopped"]
-        torch.set_rng_state(own["random"])
-        torch.set_num_threads(own["threads"])
+        self.history, self.stopped = kept["history"], kept["stopped"]
+        torch.set_rng_state(kept["random"])
+        torch.set_num_threads(kept["threads"])
 
 
 class FinishEpoch(L.Callback):

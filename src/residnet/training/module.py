@@ -59,14 +59,14 @@ class HeadTraining(EpochTraining):
         """Where the windows of a stage's batches come from: anywhere, then the beginnings of
         stretches.
         """
-        own, steps = self.settings.beginnings, self.settings.steps
+        beginnings, steps = self.settings.beginnings, self.settings.steps
         if stage == 0 and self.settings.one_step.epochs == 0:
             return []
-        if own is None:
+        if beginnings is None:
             return [WindowBatches(self.store.starts(length), batch, steps)]
-        few = min(max(round(own.share * batch), 1), batch - 1)
+        few = min(max(round(beginnings.share * batch), 1), batch - 1)
         begins = self.store.beginnings(
-            length, 0 if stage == 0 else max(round(own.initial / self.model.dt), 1)
+            length, 0 if stage == 0 else max(round(beginnings.initial / self.model.dt), 1)
         )
         return [
             WindowBatches(self.store.starts(length), batch - few, steps),
@@ -92,9 +92,9 @@ class HeadTraining(EpochTraining):
         """Seed the epoch and set the stage's learning rate."""
         self.seed_epoch()
         stage, epoch = self.settings.stage(self.epoch)
-        own = self.settings.one_step if stage == 0 else self.settings.multi_step[stage - 1]
-        progress = 0.5 * (1 - math.cos(math.pi * epoch / max(own.epochs - 1, 1)))
-        rate = own.learning_rate * (1 - progress * (1 - own.final))
+        schedule = self.settings.one_step if stage == 0 else self.settings.multi_step[stage - 1]
+        progress = 0.5 * (1 - math.cos(math.pi * epoch / max(schedule.epochs - 1, 1)))
+        rate = schedule.learning_rate * (1 - progress * (1 - schedule.final))
         for parameter in self.model.baseline.parameters():
             parameter.requires_grad_(self.settings.refit_baseline and stage > 0)
         for group in self.trainer.optimizers[0].param_groups:
@@ -127,13 +127,13 @@ class HeadTraining(EpochTraining):
     def _multi_step(self, starts: Tensor, length: int, sources: list[WindowBatches]) -> Tensor:
         take, dt = self.store.take, self.model.dt
         x0 = self.store.smooth[starts]
-        own = self.settings.beginnings
+        beginnings = self.settings.beginnings
         parts = starts.split([source.batch for source in sources])
         memories = [
             self.model.warmup(*self.store.history(parts[0], round(self.settings.history / dt)))
         ]
-        if own is not None:
-            past, w_past = self.store.history(parts[1], max(round(own.initial / dt), 1))
+        if beginnings is not None:
+            past, w_past = self.store.history(parts[1], max(round(beginnings.initial / dt), 1))
             memories.append(self.model.warmup(past, w_past))
             begun = torch.cat((x0[len(parts[0]) :, POSE], past[..., VELOCITIES].mean(1)), dim=1)
             x0 = torch.cat((x0[: len(parts[0])], begun))

@@ -151,14 +151,14 @@ class Arrow:
     Attributes:
         shared: [P, P].
         mixed: [L, P, a].
-        own: [L, a, a].
+        blocks: of the offsets of each log, [L, a, a].
         gradient: half the cost's, of the shared, [P].
         slope: the same of the offsets, [L, a].
     """
 
     shared: Tensor
     mixed: Tensor
-    own: Tensor
+    blocks: Tensor
     gradient: Tensor
     slope: Tensor
 
@@ -169,14 +169,16 @@ class Arrow:
         """
         precision = share / offsets.spread.square()
         return replace(
-            self, own=self.own + torch.diag(precision), slope=self.slope + precision * offsets.value
+            self,
+            blocks=self.blocks + torch.diag(precision),
+            slope=self.slope + precision * offsets.value,
         )
 
     def damped(self, damping: float) -> Arrow:
         """Return the equations with a share of the diagonal added (Levenberg and Marquardt)."""
-        own = self.own + damping * torch.diag_embed(self.own.diagonal(dim1=1, dim2=2))
+        blocks = self.blocks + damping * torch.diag_embed(self.blocks.diagonal(dim1=1, dim2=2))
         return replace(
-            self, shared=self.shared + damping * torch.diag(self.shared.diagonal()), own=own
+            self, shared=self.shared + damping * torch.diag(self.shared.diagonal()), blocks=blocks
         )
 
     def solve(self) -> tuple[Tensor, Tensor]:
@@ -184,7 +186,7 @@ class Arrow:
         matrix, gradient = self.reduced()
         step = torch.linalg.solve(matrix, gradient)
         return step, torch.linalg.solve(
-            self.own, (self.slope - step @ self.mixed).unsqueeze(-1)
+            self.blocks, (self.slope - step @ self.mixed).unsqueeze(-1)
         ).squeeze(-1)
 
     def reduced(self) -> tuple[Tensor, Tensor]:
@@ -193,7 +195,7 @@ class Arrow:
         Every log is eliminated (Schur complement).
         """
         taken = torch.linalg.solve(
-            self.own, torch.cat((self.mixed.transpose(1, 2), self.slope.unsqueeze(-1)), dim=2)
+            self.blocks, torch.cat((self.mixed.transpose(1, 2), self.slope.unsqueeze(-1)), dim=2)
         )
         less = (self.mixed @ taken).sum(0)
         return self.shared - less[:, :-1], self.gradient - less[:, -1]
@@ -203,8 +205,8 @@ class Arrow:
 
         From that of the shared block [P, P].
         """
-        taken = torch.linalg.solve(self.own, self.mixed.transpose(1, 2))
-        inverse = torch.linalg.inv(self.own) + taken @ shared @ taken.transpose(1, 2)
+        taken = torch.linalg.solve(self.blocks, self.mixed.transpose(1, 2))
+        inverse = torch.linalg.inv(self.blocks) + taken @ shared @ taken.transpose(1, 2)
         diagonal: Tensor = inverse.diagonal(dim1=1, dim2=2)
         return diagonal
 

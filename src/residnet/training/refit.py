@@ -162,9 +162,9 @@ def _descend(
     cost = level + _prior_cost(problem, baseline, share, offsets)
     kept = baseline.theta.detach().flatten()[problem.active].clone()
     for _attempt in range(8):
-        step, own = believing.damped(damping).solve()
+        step, offset_step = believing.damped(damping).solve()
         _place(baseline, kept - step, problem.active)
-        moved = offsets.moved(own)
+        moved = offsets.moved(offset_step)
         reached = _level(model, problem, moved)
         trial = reached + _prior_cost(problem, baseline, share, moved)
         if torch.isfinite(trial) and trial < cost:
@@ -316,10 +316,14 @@ def _normal_equations(
         weight[:, None, None] * hessian[:, :, shared:],
         weight[:, None] * gradient[:, shared:],
     )
-    own = torch.zeros(logs, count, len(offsets.axes), dtype=x.dtype).index_add_(
+    offset_columns = torch.zeros(logs, count, len(offsets.axes), dtype=x.dtype).index_add_(
         0, problem.log, weighted
     )
     slopes = torch.zeros_like(offsets.value).index_add_(0, problem.log, slope)
     return Arrow(
-        total, own[:, :shared], own[:, shared:], weight @ gradient[:, :shared] + prior, slopes
+        total,
+        offset_columns[:, :shared],
+        offset_columns[:, shared:],
+        weight @ gradient[:, :shared] + prior,
+        slopes,
     )

@@ -59,8 +59,8 @@ def run_autopilot(config: AutopilotSettings, folder: RunFolder) -> Outcome:
             "floor" if name == config.floor else "classical",
             complete[name].build(steering),
         )
-    for name, own in config.predictive.items():
-        built, notes[name] = predictive(name, own, steering, config.seed, folder)
+    for name, settings in config.predictive.items():
+        built, notes[name] = predictive(name, settings, steering, config.seed, folder)
         controllers[name] = ("predictive", built)
     for name, wanted in config.policies.items():
         school = _school(name, wanted, steering, config)

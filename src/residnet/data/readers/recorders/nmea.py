@@ -183,25 +183,27 @@ class _Lines:
             )
         series = {}
         for name, sentences in sorted(self.series.items()):
-            own = np.frombuffer(sentences.own, dtype=np.int64)
-            said: tuple[Remark, ...] = ()
-            timed = bool((own >= 0).all())
+            times = np.frombuffer(sentences.own, dtype=np.int64)
+            remarks_of_topic: tuple[Remark, ...] = ()
+            timed = bool((times >= 0).all())
             if not timed and not stamped:
-                own = _between(np.frombuffer(sentences.epoch_number, dtype=np.int64), ticks)
+                times = _between(np.frombuffer(sentences.epoch_number, dtype=np.int64), ticks)
                 text = (
                     f"topic {name}: its sentences tell no time; they are spread between the timed"
                     " ones before and after"
                 )
-                said = (remark("note", "estimated_times", text, rows=own.size),)
+                remarks_of_topic = (remark("note", "estimated_times", text, rows=times.size),)
             zero = epoch or 0
-            stamp = (own - zero) * 1e-9 if timed or not stamped else None
+            stamp = (times - zero) * 1e-9 if timed or not stamped else None
             arrival = (
                 (arrivals[name].ns - (zero if arrivals[name].absolute else 0)) * 1e-9
                 if stamped
                 else None
             )
             fields = {field: sentences.column(i) for i, field in enumerate(sentences.names)}
-            series[name] = Series(name, f"nmea/{name}", fields, stamp, arrival, None, said)
+            series[name] = Series(
+                name, f"nmea/{name}", fields, stamp, arrival, None, remarks_of_topic
+            )
         return Recording(path, series, epoch, (path,), tuple(remarks))
 
 

@@ -139,14 +139,14 @@ class _Table:
         stamp: Stamps | None,
         fields: dict[str, np.ndarray],
         sender: np.ndarray | None,
-        said: list[Remark],
+        remarks: list[Remark],
     ) -> None:
-        self.arrival, self.stamp, self.fields, self.sender, self.said = (
+        self.arrival, self.stamp, self.fields, self.sender, self.remarks = (
             arrival,
             stamp,
             fields,
             sender,
-            said,
+            remarks,
         )
 
     def series(self, name: str, epoch: int | None) -> Series:
@@ -157,11 +157,11 @@ class _Table:
                 return None
             return (stamps.ns - (epoch if stamps.absolute and epoch is not None else 0)) * 1e-9
 
-        remarks = [*self.said]
+        remarks = [*self.remarks]
         for stamps in (self.arrival, self.stamp):
             remarks += [
-                {**one, "text": f"topic {name}: {one['text']}"}
-                for one in (stamps.remarks if stamps is not None else ())
+                {**noted, "text": f"topic {name}: {noted['text']}"}
+                for noted in (stamps.remarks if stamps is not None else ())
             ]
         return Series(
             name,
@@ -262,41 +262,41 @@ def _table(
     """Return the times and fields from the columns of a file."""
     arrival = None if clock is None else columns[clock].times()
     rows = None if arrival is None else len(arrival.ns)
-    numbers = {column: one.numbers()[:rows] for column, one in columns.items() if one.numeric}
+    numbers = {column: cells.numbers()[:rows] for column, cells in columns.items() if cells.numeric}
     stamped = None if stamp is None else _stamps(numbers, stamp)
     sender = next(
         (
-            one.words()[:rows]
-            for column, one in columns.items()
-            if not one.numeric and names_sender(column)
+            cells.words()[:rows]
+            for column, cells in columns.items()
+            if not cells.numeric and names_sender(column)
         ),
         None,
     )
-    said = [
-        one.remark(name)
-        for column, one in columns.items()
-        if not one.numeric and not names_sender(column) and column != clock
+    remarks = [
+        cells.remark(name)
+        for column, cells in columns.items()
+        if not cells.numeric and not names_sender(column) and column != clock
     ]
     if clock is not None and columns[clock].cut:
-        said.append(
+        remarks.append(
             remark(
                 "note", "cut_short", f"topic {name}: the last row is cut short; left out", rows=1.0
             )
         )
-    for column, one in columns.items():
-        if one.numeric and one.spoilt:
+    for column, cells in columns.items():
+        if cells.numeric and cells.spoilt:
             text = (
-                f"topic {name}: column '{column}' holds {one.spoilt} cells that are not numbers;"
+                f"topic {name}: column '{column}' holds {cells.spoilt} cells that are not numbers;"
                 " they count as missing"
             )
-            said.append(remark("will mislead", "not_numbers", text, cells=one.spoilt))
+            remarks.append(remark("will mislead", "not_numbers", text, cells=cells.spoilt))
     taken = {*(stamp or ()), clock}
     return _Table(
         arrival,
         stamped,
         {column: values for column, values in numbers.items() if column not in taken},
         sender,
-        said,
+        remarks,
     )
 
 
