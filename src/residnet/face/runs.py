@@ -193,7 +193,7 @@ def free_run(
     *,
     progress: ProgressCallback | None = None,
 ) -> FreeRuns:
-    """Run models freely along logs: from a measured state on, they are told the inputs alone.
+    """Run models freely along logs: from a measured state on, with the inputs alone.
 
     A window whose prediction is not finite, or leaves the training envelope by far, has diverged
     and counts with the prediction that holds the initial velocities.

@@ -28,7 +28,7 @@ LAGS = 20
 
 @dataclass(frozen=True)
 class OneStep:
-    """What a model says along measured states against what was measured, piece by piece.
+    """Predicted beside measured accelerations along measured states, stretch by stretch.
 
     Attributes:
         model: its name.

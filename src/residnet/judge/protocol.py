@@ -1,4 +1,4 @@
-"""Protocols: which stretches of a log a model is asked to predict, from which initial state."""
+"""Protocols: which stretches of a log a model predicts, and from which initial state."""
 
 from __future__ import annotations
 

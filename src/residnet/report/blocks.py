@@ -56,7 +56,7 @@ class Bullets:
 
 @dataclass(frozen=True)
 class Facts:
-    """Names with what is to be said of each.
+    """Names with a description of each.
 
     Attributes:
         pairs: (name, text); the text of a check may be marked as failed by `failed`.

@@ -25,7 +25,7 @@ from residnet.report.sections.fit import (
 from residnet.report.sections.fit.verdict import caution_section, verdict
 
 _DIVERGENCE = 3.0
-"""Times the training envelope beyond which a run has diverged, where the config says nothing."""
+"""Times the training envelope beyond which a run has diverged, where the config gives none."""
 
 
 def write_fit_report(path: Path) -> Path:

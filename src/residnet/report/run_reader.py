@@ -68,7 +68,7 @@ class RunFiles:
     """
 
     def __init__(self, path: Path) -> None:
-        """Look at a folder; files are read when they are first asked for.
+        """Look at a folder; files are read when they are first needed.
 
         Raises:
             UsageError: where there is no such folder.

@@ -147,7 +147,7 @@ class Programme(Config):
 
     @property
     def hull_length(self) -> float | None:
-        """Return the length of the hull in m; None where nobody says."""
+        """Return the length of the hull in m; None where it is not known."""
         vessel = self.vessel or (self.model.actuators if self.model is not None else None)
         return (
             self.length

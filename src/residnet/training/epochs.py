@@ -221,19 +221,7 @@ def run_epochs(
         logger = TensorBoardLogger(folder / "tensorboard", name=name, version="")
     # a checkpoint that is there is taken up
     checkpoint = last if last is not None and last.is_file() else None
-    trainer = L.Trainer(
-        accelerator="cpu",
-        devices=1,
-        max_epochs=settings.epochs,
-        gradient_clip_val=settings.gradient_clip,
-        logger=logger if logger is not None else False,
-        callbacks=callbacks,
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        num_sanity_val_steps=0,
-        log_every_n_steps=10**9,
-    )
+    trainer = _trainer(settings, callbacks, logger)
     if checkpoint is not None:
         module.restore(torch.load(checkpoint, weights_only=True)["residnet"])
     # killed between the last epoch and the model's file: there is nothing left to train
@@ -260,3 +248,22 @@ def run_epochs(
         "epochs": len(module.history),
         "curve": module.history,
     }
+
+
+def _trainer(
+    settings: Epochs, callbacks: list[L.Callback], logger: TensorBoardLogger | None
+) -> L.Trainer:
+    """Return a trainer on the CPU that prints nothing and keeps no checkpoints of its own."""
+    return L.Trainer(
+        accelerator="cpu",
+        devices=1,
+        max_epochs=settings.epochs,
+        gradient_clip_val=settings.gradient_clip,
+        logger=logger if logger is not None else False,
+        callbacks=callbacks,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        num_sanity_val_steps=0,
+        log_every_n_steps=10**9,
+    )

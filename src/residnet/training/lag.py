@@ -123,22 +123,7 @@ def fit_lag(
         diff_step=[1e-4] * 3,
         max_nfev=60,
     )
-    p = found.x
-    inside = [
-        low * 1.02 < value < high * 0.98 or (low == 0.0 and value < 0.98 * high)
-        for value, low, high in zip(p, _LEAST, _MOST, strict=True)
-    ]
-    at = [
-        name
-        for name, fine in zip(("frequency", "damping", "delay"), inside, strict=True)
-        if not fine
-    ]
-    if at:
-        raise FitError(
-            f"the lag's {at[0]} ends at the bound of its search ({p[0]:.3g} rad/s, {p[1]:.3g},"
-            f" {p[2]:.3g} s); the data do not show one"
-        )
-    lag = Lag(frequency=float(p[0]), damping=float(p[1]), delay=float(p[2]))
+    lag = _lag_within_bounds(found.x)
     rests = [
         unexplained((force - needed)[keep]) for force in (followed(command, lag, dt, runs), command)
     ]
@@ -146,3 +131,20 @@ def fit_lag(
     return LagFit(
         lag, (shares[0][0], shares[0][1], shares[0][2]), (shares[1][0], shares[1][1], shares[1][2])
     )
+
+
+def _lag_within_bounds(p: np.ndarray) -> Lag:
+    """Return the lag of frequency, damping and delay [3]; FitError where one ends at a bound."""
+    inside = [
+        low * 1.02 < value < high * 0.98 or (low == 0.0 and value < 0.98 * high)
+        for value, low, high in zip(p, _LEAST, _MOST, strict=True)
+    ]
+    names = ("frequency", "damping", "delay")
+    at_bound = [name for name, fine in zip(names, inside, strict=True) if not fine]
+    if at_bound:
+        raise FitError(
+            f"the lag's {at_bound[0]} ends at the bound of its search ({p[0]:.3g} rad/s,"
+            f" {p[1]:.3g}, {p[2]:.3g} s): the data show no lag; give a run in which the command"
+            " changes faster"
+        )
+    return Lag(frequency=float(p[0]), damping=float(p[1]), delay=float(p[2]))

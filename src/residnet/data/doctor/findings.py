@@ -1,4 +1,4 @@
-"""What the data doctor says: findings, and the report that holds them."""
+"""The outcome of the data doctor: findings, and the report that holds them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a run of the task `autopilot` is told: vessel, test, policies and their peers."""
+"""The config of the task `autopilot`: vessel, test, policies and their peers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a run of the task `course` is told: an autopilot, a course past buoys, and guidance laws."""
+"""The config of the task `course`: an autopilot, a course past buoys, and guidance laws."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a run of the task `fit` is told: settings of the fit, logs, and what is made of them."""
+"""The config of the task `fit`: settings of the fit, logs, and what is made of them."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class ExportConfig(Config):
 
 
 class FitTaskSettings(FitSettings, ComputingTask):
-    """Everything that a complete fit is told.
+    """The config of a complete fit.
 
     Attributes:
         study: a published experiment whose figures are drawn too; null for none.
