@@ -3,21 +3,18 @@
     python scripts/bench/symbolic.py [--parts exact,steps,spring,noise,velocities,delay] [--designs
     10]
 
-    exact        all six equations of Odin (document 000 eqs. (6.6)-(6.8), (6.21)-(6.23)) from
-    random multi-sine designs, 300 s at 10 Hz,
-                 accelerations given; a coefficient counts within 1 %
-    steps        the three water-jet equations from the golden runs jetA* (two-level steps and a
-    ramp); needs RESIDNET_GOLDEN spring       the mass-spring-damper (5.13), 50 s at 10 Hz, without
-    and with noise of amplitude 0.1 on the acceleration noise        the force model with noise of
-    0.3 standard deviations on the accelerations, on records of several lengths and rates; t is what
-                 the smallest true term, linear drag in surge, is worth in standard errors when the
-                 structure is known (Cramer-Rao bound); "possible" is how often an efficient
-                 estimate of that term alone would pass plain BIC, the structure beside it given
-    velocities   the force model from velocities alone with 1 % noise, forces in steps: estimators
-    side by side delay        a delay of 0.5 s, 10 % noise on all channels: one profile from
-    moments, and a regression for every shift as the document does
+    exact       all six equations of Odin (document 000, (6.6)-(6.8), (6.21)-(6.23)) from random
+                multi-sine designs with accelerations given; a coefficient counts within 1 %
+    steps       the three water-jet equations from the golden runs jetA*; needs RESIDNET_GOLDEN
+    spring      the mass-spring-damper (5.13), 50 s at 10 Hz, without and with noise
+    noise       the force model with noise of 0.3 standard deviations on the accelerations; "t" is
+                the smallest true term in standard errors (Cramer-Rao bound), "possible" how often
+                an efficient estimate of that term alone would pass plain BIC
+    velocities  the force model from velocities alone with 1 % noise, estimators side by side
+    delay       a delay of 0.5 s, 10 % noise on all channels: one profile, and a regression for
+                every shift as the document does
 
-Truth and designs stand in tests/heads/made_odin.py. Times are of the wall, of the terms' values,
+Truth and designs stand in tests/support/made_odin.py. Times are of the wall, of the terms' values,
 factorisation and search together.
 """
 
@@ -33,7 +30,7 @@ from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "heads"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "support"))
 
 import numpy as np
 import pandas as pd
