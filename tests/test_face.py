@@ -208,7 +208,7 @@ def test_a_fit_by_function_mapping_and_command_line_is_one(
 def test_a_simulation_by_function_mapping_and_command_line_is_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    programme = {
+    programme: dict[str, Any] = {
         "vessel": "wam_v_cal",
         "manoeuvres": [
             {"kind": "zigzag", "drive": 0.6, "steer": 0.4, "heading": "20 deg", "start": 3},

@@ -31,11 +31,19 @@ def made(folder: Path) -> dict[str, Any]:
     return {"logs": logs, "data": data, "models": models, "folder": folder}
 
 
+def wrong(value: object) -> Any:
+    """An argument that no type checker would let pass."""
+    return value
+
+
 X, W = np.zeros(6), np.zeros(2)
 CALLS: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
     "no logs": (lambda m: residnet.read_logs([]), "no log is given"),
-    "a table": (lambda m: residnet.read_logs(pd.DataFrame()), "expected a path, given a DataFrame"),
-    "nothing": (lambda m: residnet.read_logs(None), "expected a path, given None"),
+    "a table": (
+        lambda m: residnet.read_logs(wrong(pd.DataFrame())),
+        "expected a path, given a DataFrame",
+    ),
+    "nothing": (lambda m: residnet.read_logs(wrong(None)), "expected a path, given None"),
     "no such file": (lambda m: residnet.read_logs("nowhere.csv"), "no such file"),
     "no match": (lambda m: residnet.read_logs("no*where.csv"), "matches no file"),
     "an empty folder": (lambda m: residnet.read_logs(m["folder"] / "empty"), "holds no csv"),
@@ -125,14 +133,17 @@ CALLS: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
         "unknown value 'zigzagg'; did you mean 'zigzag'",
     ),
     "nothing flown": (lambda m: residnet.simulate("wam_v_cal"), "nothing is flown"),
-    "an unknown list": (lambda m: residnet.available("head"), "did you mean 'heads'"),
+    "an unknown list": (lambda m: residnet.available(wrong("head")), "did you mean 'heads'"),
     "an unknown task": (lambda m: residnet.run({"task": "fitt"}), "did you mean 'fit'"),
-    "no config": (lambda m: residnet.run(3), "expected the path of a YAML file"),
+    "no config": (lambda m: residnet.run(wrong(3)), "expected the path of a YAML file"),
     "overrides of a mapping": (
         lambda m: residnet.run({"task": "fit"}, overrides=["seed=1"]),
         "overrides are for a file",
     ),
-    "no callback": (lambda m: residnet.fit(m["data"], progress=3), "progress: expected a function"),
+    "no callback": (
+        lambda m: residnet.fit(m["data"], progress=wrong(3)),
+        "progress: expected a function",
+    ),
 }
 
 

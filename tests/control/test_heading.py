@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 import torch
+from kinds import of_kind
 from torch import Tensor
 
 from residnet.control import (
@@ -21,6 +24,8 @@ from residnet.core.errors import ConfigError
 from residnet.dynamics.nomoto import NomotoDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import PlantDynamics
+from residnet.physics.nomoto import SteeringVessel
+from residnet.physics.patrol import PatrolVessel
 from residnet.physics.vessel import load_vessel
 
 GAIN, TIME, LIMIT = 3.47, 3.94, float(np.radians(5.0))
@@ -37,7 +42,7 @@ def heading(*psi: float) -> Tensor:
 
 def flown(policy: Policy, target: float, seconds: float) -> tuple[np.ndarray, np.ndarray]:
     """Headings and rudder angles of a step of heading, 0.01 s apart."""
-    plant = load_vessel("nomoto_oceanos").build()
+    plant = of_kind(load_vessel("nomoto_oceanos").build(), SteeringVessel)
     steps = round(100 * seconds)
     x0 = plant.approach(1)
     source = ClosedLoop(policy, GivenReference(torch.full((1, 1, 1), target, dtype=torch.float64)))
@@ -159,7 +164,7 @@ def test_document_law_takes_the_shorter_way_round() -> None:
 
 def test_document_autopilot_creeps_as_errata_says() -> None:
     """With the source's horizon of one step it turns at 0.011 deg/s; with 2 s it arrives."""
-    plant = load_vessel("nomoto_oceanos").build()
+    plant = of_kind(load_vessel("nomoto_oceanos").build(), SteeringVessel)
     target = float(np.radians(30.0))
     near = DocumentAutopilot(
         SimulatedPredictor(NomotoDynamics(plant, 0.01), plant.state, 1), limit=LIMIT
@@ -174,7 +179,7 @@ def test_document_autopilot_creeps_as_errata_says() -> None:
 
 
 def test_a_simulated_predictor_is_the_simulation_of_each_candidate() -> None:
-    plant = load_vessel("patrol_p06").build().in_calm_water()
+    plant = of_kind(load_vessel("patrol_p06").build(), PatrolVessel).in_calm_water()
     model = PlantDynamics(plant, 0.25)
     x = plant.approach(2)
     x[1, 3], x[1, 7] = 0.3, 0.02
@@ -208,6 +213,6 @@ def test_a_simulated_predictor_is_the_simulation_of_each_candidate() -> None:
         ),
     ],
 )
-def test_wrong_numbers_stop(make: object, message: str) -> None:
+def test_wrong_numbers_stop(make: Callable[[], object], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         make()

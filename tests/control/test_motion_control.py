@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.integrate import solve_ivp
-from scipy.signal import lti, step
+from scipy.signal import step
 
 from residnet.control import (
     Allocated,
@@ -48,7 +48,7 @@ def test_filter_against_its_transfer_function() -> None:
     )
     x = torch.zeros(1, 6, dtype=torch.float64)
     found = asked(config.build(0.05), 800, x)[0]
-    _, y = step(lti([w**3], np.polymul([1, w], [1, 2 * d * w, w**2])), T=0.05 * np.arange(800))
+    _, y = step(([w**3], np.polymul([1, w], [1, 2 * d * w, w**2])), T=0.05 * np.arange(800))
     np.testing.assert_allclose(found[:, 0], 10 * y, atol=1e-6)
     # straight north: body axes are earth axes
     np.testing.assert_allclose(found[1:-1, 3], (found[2:, 0] - found[:-2, 0]) / 0.1, atol=2e-3)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -19,7 +20,7 @@ VESSEL = SteeredPlant(load_vessel("nomoto_oceanos").build())
 TURNING = VESSEL.turning(LIMIT, 60.0)
 
 
-def untrained(seed: int = 0, **settings: float) -> HeadingPolicy:
+def untrained(seed: int = 0, **settings: Any) -> HeadingPolicy:
     torch.manual_seed(seed)
     policy = HeadingPolicy(VESSEL.state, turning=TURNING, limit=LIMIT, dt=0.05, **settings)
     with torch.no_grad():

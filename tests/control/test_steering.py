@@ -11,6 +11,7 @@ import torch
 from scipy.integrate import solve_ivp
 from scipy.optimize import linprog
 
+from residnet.control import Policy
 from residnet.control.heading.bang_bang_rate import RatedBangBangHeading
 from residnet.control.heading.controllers import BangBangConfig, Steering
 from residnet.control.heading.steering import Flights, SteeredPlant, fly
@@ -111,12 +112,7 @@ def test_a_flight_is_what_an_ode_solver_says() -> None:
     equation.
     """
 
-    class HardOver(torch.nn.Module):
-        n_state = 0
-
-        def initial_state(self, x: torch.Tensor) -> torch.Tensor:
-            return x[:, :0]
-
+    class HardOver(Policy):
         def forward(
             self, x: torch.Tensor, reference: torch.Tensor, s: torch.Tensor
         ) -> tuple[torch.Tensor, torch.Tensor]:
@@ -129,7 +125,7 @@ def test_a_flight_is_what_an_ode_solver_says() -> None:
         torch.tensor([[0.9, 1.1, 0.0]]),
         dt=0.005,
         duration=3.0,
-    )  # type: ignore[arg-type]
+    )
     slope = 10 * DEG
 
     def rates(t: float, y: np.ndarray) -> list[float]:

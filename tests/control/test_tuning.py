@@ -59,7 +59,7 @@ def test_a_row_flies_as_the_controller_itself() -> None:
 
 def test_tuned_gains_keep_the_limit_and_are_the_fastest_of_a_grid() -> None:
     tuned = tune(PdConfig(), STEERING, task(), points=64, rounds=3)
-    built = PdConfig(**tuned.parameters).build(STEERING)
+    built = PdConfig.model_validate(tuned.parameters).build(STEERING)
     flights = fly(VESSEL, built, torch.full((3,), 30 * DEG), SPREAD, dt=0.05, duration=10.0)
     assert float(flights.overshoot().max()) <= 0.1 * DEG
     assert float(flights.settled(DEG).max()) == pytest.approx(tuned.settling)
@@ -81,7 +81,7 @@ def test_tuned_gains_keep_the_limit_and_are_the_fastest_of_a_grid() -> None:
 
 def test_integral_action_is_tuned_to_take_a_bias_away() -> None:
     tuned = tune(PidConfig(kp=4.0), STEERING, task(), points=64, rounds=2)
-    built = PidConfig(**tuned.parameters).build(STEERING)
+    built = PidConfig.model_validate(tuned.parameters).build(STEERING)
     flights = fly(
         VESSEL,
         built,

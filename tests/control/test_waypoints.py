@@ -114,4 +114,4 @@ def test_nonsense_is_refused() -> None:
         (IntegralLookAheadConfig, "gain"),
     ):
         with pytest.raises(ValidationError, match="greater than 0"):
-            config(**{"distance": 1.0, "gain": 1.0, key: 0.0})
+            config.model_validate({"distance": 1.0, "gain": 1.0, key: 0.0})

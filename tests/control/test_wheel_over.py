@@ -33,7 +33,7 @@ def turned(change: float) -> np.ndarray:
             (TURNING.gain * rudder - z[3]) / TURNING.time,
         ]
 
-    def stopped(_: float, z: np.ndarray, __: float) -> float:
+    def stopped(_: float, z: np.ndarray, *rudder: float) -> float:
         return float(z[3])
 
     stopped.terminal = True  # type: ignore[attr-defined]

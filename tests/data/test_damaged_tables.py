@@ -8,6 +8,7 @@ import io
 import random
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -73,7 +74,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("damaged")
 
 
-ONCE = {
+ONCE: dict[str, Any] = {
     "deadline": None,
     "derandomize": True,
     "database": None,
@@ -184,6 +185,7 @@ def test_undamaged_tables_come_out_whole(folder: Path) -> None:
         assert log is not None
         assert len(log) == ROWS
         assert foreign(log) == []
+    assert log is not None
     assert foreign(log.replace(channels={**log.channels, "u": np.roll(log["u"], 1)})) != []
 
 

@@ -91,7 +91,7 @@ def test_new_disturbances_leave_old_draws_alone(windy: str) -> None:
     plant = load_vessel(windy).build()
     forces = {"force_x": 20.0, "force_n": 15.0}
     plain, full = (
-        Disturbance(**forces),
+        Disturbance.model_validate(forces),
         validate(
             forces | {"wind": {"speed": 5, "direction": 1.0, "gust": 1.0}, "waves": WAVES},
             Disturbance,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from kinds import of_kind
 from scipy.integrate import solve_ivp
 from torch import Tensor
 
@@ -165,7 +166,7 @@ def test_semi_implicit_euler_keeps_an_undamped_oscillation_bounded() -> None:
 
 @pytest.mark.parametrize("integrator", ["rk4", "heun", "euler", "semi_implicit_euler"])
 def test_every_integrator_is_scriptable(integrator: Integrator) -> None:
-    from residnet.baselines import RegressorsConfig
+    from residnet.baselines import RegressorBaseline, RegressorsConfig
     from residnet.dynamics.hybrid import HybridDynamics
     from residnet.heads import ZeroHead
     from residnet.physics.signals import SignalsConfig
@@ -178,8 +179,9 @@ def test_every_integrator_is_scriptable(integrator: Integrator) -> None:
         0.1,
         integrator,
     )
+    theta = of_kind(model.baseline, RegressorBaseline).theta
     with torch.no_grad():
-        model.baseline.theta.copy_(torch.tensor([[-0.5, 0.1], [0.0, 0.2], [0.0, 0.3]]))
+        theta.copy_(torch.tensor([[-0.5, 0.1], [0.0, 0.2], [0.0, 0.3]]))
     x, w, s = torch.ones(2, 6), torch.ones(2, 5, 1), torch.zeros(2, 0)
     torch.testing.assert_close(
         torch.jit.script(Rollout(model))(x, w, s)[0], Rollout(model)(x, w, s)[0], rtol=0, atol=0

@@ -1,6 +1,7 @@
 import copy
 
 import torch
+from kinds import of_kind
 
 from residnet.baselines import RegressorBaseline
 from residnet.dynamics.hybrid import HybridDynamics
@@ -25,7 +26,7 @@ def test_each_draw_steps_as_the_model_with_its_parameters() -> None:
         rates = many.rate(x, signals.prepare(w), torch.zeros(12, 3, dtype=torch.float64))
         for row in range(12):
             alone = copy.deepcopy(model)
-            alone.baseline.theta.copy_(theta[row % 4])
+            of_kind(alone.baseline, RegressorBaseline).theta.copy_(theta[row % 4])
             torch.testing.assert_close(
                 after[row], alone.step(x[row : row + 1], w[row : row + 1], x[:1, :0])[0][0]
             )

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from residnet.baselines.regressors import RegressorBaseline
 from residnet.dynamics.base import Integrator
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.rollout import Playback, Rollout
+from residnet.dynamics.rollout import Rollout, Source
 from residnet.heads import LstmConfig, ResidualHead, ZeroHead
 from residnet.physics.signals import SignalsConfig
 
@@ -127,13 +127,16 @@ def test_the_head_is_asked_once_per_step_and_held() -> None:
     np.testing.assert_allclose(states[0, :, 3], 0.07 * np.arange(11), atol=1e-12)
 
 
-class StopAt(Playback):
-    """Rows stop once they are `distance` [B] north of the origin."""
+class StopAt(Source):
+    """Inputs as they are given; rows stop once they are `distance` [B] north of the origin."""
 
     def __init__(self, distance: Tensor) -> None:
         super().__init__()
         self.may_stop = True
         self.distance = distance
+
+    def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
+        return w, memory
 
     def finished(self, x: Tensor, k: int, memory: Tensor) -> Tensor:
         return x[:, 0] >= self.distance

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from kinds import of_kind
 from scipy.integrate import solve_ivp
 
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import PlantDynamics, StagedPlantDynamics
+from residnet.physics.actuators import DifferentialThrust
 from residnet.physics.vessel import load_vessel
 
 
@@ -29,7 +31,7 @@ def test_inputs_that_move_within_a_step() -> None:
         None
     ]
     x0 = torch.tensor([[0.0, 0.0, 0.1, 1.0, 0.1, 0.05, 20.0, 18.0]], dtype=torch.float64)
-    held = plant.actuators.n_max
+    held = of_kind(plant.actuators, DifferentialThrust).n_max
     assert float(x0[0, 6:].max()) < held
     w[..., 0::9], w[..., 1::9] = 20.0, 18.0
     with torch.no_grad():

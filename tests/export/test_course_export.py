@@ -7,6 +7,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -65,7 +66,7 @@ def made(
 
 
 def test_it_commands_what_guidance_and_policy_command(
-    made: tuple[torch.jit.ScriptModule, Following, CourseGuidance, dict[str, object]],
+    made: tuple[torch.jit.ScriptModule, Following, CourseGuidance, dict[str, Any]],
 ) -> None:
     loaded, follower, guidance, card = made
     y = torch.tensor([[0.1, 0.3, 0.05, 3.2, 0.01, 0.02]])

@@ -62,7 +62,7 @@ ROW = {
 
 def spec_of(head: dict[str, Any] | None, **changes: Any) -> ModelSpec:
     baseline = RegressorsConfig(terms=("1", "u", "v", "r", "tau_x", "tau_n", "wind_v wind_mag"))
-    content = {
+    content: dict[str, Any] = {
         "schema": "residnet.model/1",
         "name": "mine",
         "role": "head",

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -30,7 +31,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     wanted = getattr(metafunc.function, "only", lambda path: True)
     files = [path for path in golden_files(group) if wanted(path)]
     reason = f"no golden files: set RESIDNET_GOLDEN to the folder that holds {group}/{NAMES}"
-    values = files or [pytest.param(None, marks=pytest.mark.skip(reason=reason))]
+    values: list[Any] = [*files] or [pytest.param(None, marks=pytest.mark.skip(reason=reason))]
     metafunc.parametrize(
         "golden_file",
         values,

@@ -45,7 +45,7 @@ def wave(t: np.ndarray, period: float, phase: float = 0.0) -> np.ndarray:
     return np.sin(2 * np.pi * t / period + phase)
 
 
-def between(t: np.ndarray, *parts: tuple[float, float, object]) -> np.ndarray:
+def between(t: np.ndarray, *parts: tuple[float, float, float | np.ndarray]) -> np.ndarray:
     """Zero but for parts (from, to, value)."""
     out = np.zeros_like(t)
     for start, end, value in parts:

@@ -14,11 +14,13 @@ import numpy as np
 import pytest
 import torch
 from golden_tables import table
+from kinds import of_kind
 
 from residnet.dynamics.rollout import Rollout, Source
 from residnet.dynamics.simulated import PlantDynamics, TracedPlantDynamics
 from residnet.manoeuvres import Helm, StackedSource, Zigzag
 from residnet.manoeuvres.base import ScheduleSource
+from residnet.physics.actuators.stern_rudders import SternRudders
 from residnet.physics.patrol import PatrolVessel
 from residnet.physics.vessel import load_vessel
 
@@ -82,7 +84,7 @@ def plant_of(case: Case) -> PatrolVessel:
     vessel = load_vessel(SETS[case.parameters])
     if case.rudder == "lin":
         vessel = vessel.model_copy(update={"actuators": load_vessel(RUDDERS["lin"]).actuators})
-    return vessel.build()
+    return of_kind(vessel.build(), PatrolVessel)
 
 
 def source_of(runs: list[Run], plant: PatrolVessel, t: torch.Tensor) -> Source:
@@ -169,7 +171,9 @@ def test_from_each_row_to_the_next(golden_file: Path) -> None:
     command = frame["delta_cmd"].to_numpy().copy()
     w = torch.zeros(len(frame), EVERY, len(plant.inputs), dtype=torch.float64)
     w[:, :, 0] = torch.from_numpy(command)[:, None]
-    w[:, :, 1] = case.run.drive * plant.actuators.thrust_max
+    rudders = plant.actuators
+    assert isinstance(rudders, SternRudders)
+    w[:, :, 1] = case.run.drive * rudders.thrust_max
     with torch.no_grad():
         states, _, _ = Rollout(PlantDynamics(plant, DT))(x, w, x[:, :0])
     # a zigzag may turn its rudder between two rows

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 from golden_tables import table, tensor
+from kinds import of_kind
 from scipy.linalg import expm
 
 from residnet.baselines.regressors import RegressorBaseline
@@ -31,6 +32,8 @@ from residnet.manoeuvres import (
     ThreeTwoOneOne,
     Zigzag,
 )
+from residnet.physics.actuators import DifferentialThrust
+from residnet.physics.fossen import FossenVessel
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.vessel import load_vessel
 
@@ -118,7 +121,8 @@ def trajectories(vessel: str, folder: Path) -> dict[str, tuple[np.ndarray, np.nd
 @on_plant
 def test_thrust_columns(golden_file: Path) -> None:
     frame = table(golden_file)
-    thrusters = load_vessel(case_of(golden_file).vessel).actuators.build()
+    vessel = load_vessel(case_of(golden_file).vessel)
+    thrusters = of_kind(vessel.actuators.build(), DifferentialThrust)
     thrust = thrusters.thrust(tensor(frame, "n_port", "n_stbd") / 60.0).numpy()
     truth = frame[["T_port", "T_stbd"]].to_numpy()
     # the printed polynomial cancels near zero thrust, where only its largest term bounds the
@@ -129,7 +133,7 @@ def test_thrust_columns(golden_file: Path) -> None:
 @on_plant
 def test_right_hand_side_row_by_row(golden_file: Path) -> None:
     frame = table(golden_file)
-    plant = load_vessel(case_of(golden_file).vessel).build()
+    plant = of_kind(load_vessel(case_of(golden_file).vessel).build(), FossenVessel)
     x = torch.cat(
         (tensor(frame, "x", "y", "psi", "u", "v", "r"), tensor(frame, "n_port", "n_stbd") / 60.0),
         dim=1,
@@ -242,7 +246,8 @@ def test_names_of_further_files_are_understood() -> None:
     )
     assert case_of(Path("CAL_turn08_02.csv.gz")).manoeuvre == ConstantInput(drive=0.8, steer=0.2)
     times = torch.arange(0.0, 60.0, 1.0, dtype=torch.float64)
-    drive, steer = case_of(Path("CAL_t3211.csv.gz")).manoeuvre.demands(times)
+    excitation = of_kind(case_of(Path("CAL_t3211.csv.gz")).manoeuvre, ThreeTwoOneOne)
+    drive, steer = excitation.demands(times)
     assert drive.tolist() == [0.5] * 60
     assert (
         steer.tolist() == [0.0] * 10 + [0.5] * 9 + [-0.5] * 6 + [0.5] * 3 + [-0.5] * 3 + [0.0] * 29

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from residnet.identification.references import references
 
 ROLES = {
@@ -13,7 +15,7 @@ ROLES = {
     "ridge": "head",
     "mean": "ensemble",
 }
-NOTES = {
+NOTES: dict[str, dict[str, Any]] = {
     "zero": {},
     "baseline": {"validation": 0.5},
     "physics": {"validation": 0.16},

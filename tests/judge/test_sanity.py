@@ -7,9 +7,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from kinds import of_kind
 
+from residnet.baselines.regressors import RegressorBaseline
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec, save_model
+from residnet.heads.lstm import LstmHead
 from residnet.judge.sanity import (
     BOUNDED,
     CHECKS,
@@ -68,7 +71,8 @@ def made(
     )
     torch.manual_seed(0)
     model = spec.build()
-    model.baseline.theta.data.copy_(torch.tensor(list(terms.values()), dtype=torch.float64).T)
+    theta = of_kind(model.baseline, RegressorBaseline).theta
+    theta.data.copy_(torch.tensor(list(terms.values()), dtype=torch.float64).T)
     return spec, model
 
 
@@ -156,7 +160,7 @@ def test_growth_rate_is_the_eigenvalue_of_the_linearisation() -> None:
 def test_growth_rate_with_a_memory_is_that_of_the_whole_step() -> None:
     spec, model = made(RUDDER, head={"kind": "lstm", "hidden_size": 3})
     model = model.double().eval()
-    model.head.scale.spread.fill_(0.3)
+    of_kind(model.head, LstmHead).scale.spread.fill_(0.3)
     point = operating_points(spec, model)[2]
     s = model.warmup(point.x.expand(1, 100, 6), point.w.expand(1, 100, 2))[0]
 
@@ -224,7 +228,7 @@ def test_wind_from_the_other_side_is_the_mirror_of_wind() -> None:
 
 def test_a_network_on_top_is_checked_with_its_memory_settled() -> None:
     spec, model = made(RUDDER, head={"kind": "lstm", "hidden_size": 4})
-    model.head.scale.spread.fill_(1e-6)
+    of_kind(model.head, LstmHead).scale.spread.fill_(1e-6)
     found = findings(spec, model)
     assert {check: finding.ok for check, finding in found.items()} == {
         DAMPING: True,
@@ -233,7 +237,7 @@ def test_a_network_on_top_is_checked_with_its_memory_settled() -> None:
         MASS: None,
         BOUNDED: True,
     }
-    model.head.scale.spread.fill_(0.5)
+    of_kind(model.head, LstmHead).scale.spread.fill_(0.5)
     assert findings(spec, model)[SYMMETRY].ok is False
 
 

@@ -26,7 +26,7 @@ def motion(
     """A log whose track is the fine quadrature of its velocities."""
     v = np.broadcast_to(v, t.shape).copy()
     north, east = u * np.cos(psi) - v * np.sin(psi), u * np.sin(psi) + v * np.cos(psi)
-    x, y = (cumulative_trapezoid(rate, t, initial=0.0) for rate in (north, east))
+    x, y = (cumulative_trapezoid(rate, t, initial=0) for rate in (north, east))
     return Log("made", t, {"x": x, "y": y, "psi": psi, "u": u, "v": v, "r": r})
 
 

@@ -62,8 +62,9 @@ def test_the_mariner_written_out() -> None:
         x = torch.tensor([[0.0, 0.0, 0.0, *nu, delta]], dtype=torch.float64)
         w = torch.zeros(1, len(plant.inputs), dtype=torch.float64)
         w[0, 0] = delta
+        u, v, r = nu
         np.testing.assert_allclose(
-            plant.rate(x, w)[0, 3:6], mariner(*nu, -delta), rtol=1e-10, atol=1e-14
+            plant.rate(x, w)[0, 3:6], mariner(u, v, r, -delta), rtol=1e-10, atol=1e-14
         )
 
 
@@ -83,9 +84,8 @@ def test_a_turn_of_the_mariner() -> None:
     def rate(_: float, s: np.ndarray) -> np.ndarray:
         c, i = np.cos(s[2]), np.sin(s[2])
         gear = np.clip(np.radians(35) - s[6], -np.radians(5), np.radians(5))
-        return np.array(
-            [c * s[3] - i * s[4], i * s[3] + c * s[4], s[5], *mariner(*s[3:6], -s[6]), gear]
-        )
+        u, v, r, delta = s[3:7]
+        return np.array([c * u - i * v, i * u + c * v, r, *mariner(u, v, r, -delta), gear])
 
     truth = solve_ivp(rate, (0, steps * dt), x0[0].numpy(), rtol=1e-9, atol=1e-10, max_step=1.0).y[
         :, -1

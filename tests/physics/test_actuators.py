@@ -7,6 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from kinds import of_kind
 
 from residnet.core.config import validate
 from residnet.core.errors import ConfigError
@@ -18,7 +19,7 @@ N_MAX = 2380.0 / 60.0
 
 @pytest.fixture(scope="module")
 def thrusters() -> DifferentialThrust:
-    return load_vessel("wam_v_cal").actuators.build()
+    return of_kind(load_vessel("wam_v_cal").actuators.build(), DifferentialThrust)
 
 
 def rpm(*values: float) -> torch.Tensor:

@@ -170,8 +170,10 @@ def test_a_moving_vessel_meets_waves_at_the_encounter_frequency() -> None:
     waves = sea(direction=float(np.radians(40)))
     speed, course = 6.0, np.radians(-100)
     t = 12.0
-    place = (torch.tensor([speed * t * f(course)], dtype=torch.float64) for f in (np.cos, np.sin))
-    phase = waves.phases(*place, t)
+    north, east = (
+        torch.tensor([speed * t * f(course)], dtype=torch.float64) for f in (np.cos, np.sin)
+    )
+    phase = waves.phases(north, east, t)
     chi = np.radians(40) - course
     encounter = waves.omega - waves.omega**2 * speed / GRAVITY * np.cos(chi)
     torch.testing.assert_close(phase, encounter * t + waves.phase)

@@ -224,14 +224,19 @@ def test_mass_spring_damper() -> None:
     x0 = torch.zeros(1, 2, dtype=torch.float64)
     with torch.no_grad():
         states, _, _ = Rollout(PlantDynamics(plant, 0.1, substeps=5))(x0, w, x0[:, :0])
+
+    def rate(_: float, y: np.ndarray, force: float) -> list[float]:
+        return [y[1], -1.3 * y[1] + 0.1 * force - 0.5 * y[0]]
+
     x = np.zeros(2)
     for k in range(500):
         force = float(w[0, k, 0])
         np.testing.assert_allclose(states[0, k], x, atol=1e-7)
         x = solve_ivp(
-            lambda _, y, f=force: [y[1], -1.3 * y[1] + 0.1 * f - 0.5 * y[0]],
+            rate,
             (0, 0.1),
             x,
+            args=(force,),
             rtol=1e-10,
             atol=1e-12,
         ).y[:, -1]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 import torch
@@ -118,6 +120,22 @@ def bollard_test(
     return n, pull + np.random.default_rng(seed).normal(size=n.size) * noise
 
 
+def changed_pull(
+    unit: DifferentialThrust, change: Callable[[np.ndarray], np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Revolutions and pull of a bollard test, both changed in the same way."""
+    n, pull = bollard_test(unit, 0)
+    return change(n), change(pull)
+
+
+def first_samples(
+    unit: DifferentialThrust, count: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The first samples of a step response: times, commands and revolutions."""
+    t, command, n = step_test(unit, 0)[0]
+    return t[:count], command[:count], n[:count]
+
+
 def test_thrust_curves_of_both_directions(
     config: DifferentialThrustConfig, unit: DifferentialThrust
 ) -> None:
@@ -146,25 +164,23 @@ def test_thrust_curves_of_both_directions(
     ("call", "message"),
     [
         (
-            lambda u: fit_thrust(*(part[part > 0] for part in bollard_test(u, 0)), 2),
+            lambda u: fit_thrust(*changed_pull(u, lambda part: part[part > 0]), 2),
             "bollard pull astern: 0 points",
         ),
         (
-            lambda u: fit_thrust(*(part[::8] for part in bollard_test(u, 0)), 2),
+            lambda u: fit_thrust(*changed_pull(u, lambda part: part[::8]), 2),
             "needs 5 at 4 revolutions",
         ),
         (
-            lambda u: fit_thrust(
-                *(sign * part for sign, part in zip((1, -1), bollard_test(u, 0), strict=True)), 2
-            ),
+            lambda u: fit_thrust(bollard_test(u, 0)[0], -bollard_test(u, 0)[1], 2),
             "wrong sign",
         ),
         (lambda u: fit_throttle(*(part[20:] for part in throttle_test(0))), "only one direction"),
         (lambda u: fit_throttle(*(part[:3] for part in throttle_test(0))), "3 points"),
         (lambda u: fit_throttle(throttle_test(0)[0], -throttle_test(0)[1]), "do not rise"),
-        (lambda u: fit_step([tuple(part[:10] for part in step_test(u, 0)[0])]), "10 samples"),
-        (lambda u: fit_step([tuple(part[:60] for part in step_test(u, 0)[0])]), "never changes"),
-        (lambda u: fit_step([tuple(part[:75] for part in step_test(u, 0)[0])]), "hardly follow"),
+        (lambda u: fit_step([first_samples(u, 10)]), "10 samples"),
+        (lambda u: fit_step([first_samples(u, 60)]), "never changes"),
+        (lambda u: fit_step([first_samples(u, 75)]), "hardly follow"),
     ],
     ids=[
         "one direction",

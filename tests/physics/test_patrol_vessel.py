@@ -9,10 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import torch
+from kinds import of_kind
 
 from residnet.core.config import load_config
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import PlantDynamics, TracedPlantDynamics
+from residnet.physics.actuators.stern_rudders import SternRudders
 from residnet.physics.patrol import PatrolVessel
 from residnet.physics.vessel import VesselConfig, load_vessel, vessel_files
 
@@ -107,7 +109,7 @@ def motions(count: int = 100, seed: int = 0) -> np.ndarray:
 
 @pytest.fixture(params=NAMES)
 def plant(request: pytest.FixtureRequest) -> PatrolVessel:
-    return load_vessel(request.param).build()
+    return of_kind(load_vessel(request.param).build(), PatrolVessel)
 
 
 def inputs(
@@ -129,7 +131,7 @@ def flown(
 
 @pytest.mark.parametrize("name", NAMES)
 def test_right_hand_side_written_out(name: str) -> None:
-    plant, c = load_vessel(name).build(), SETS[name]
+    plant, c = of_kind(load_vessel(name).build(), PatrolVessel), SETS[name]
     states = motions()
     thrusts = np.random.default_rng(1).uniform(0, THRUST, len(states))
     x, w = torch.from_numpy(states), inputs(plant, len(states))
@@ -156,6 +158,7 @@ def test_right_hand_side_written_out(name: str) -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_a_foil_beyond_stall_lifts_no_more(name: str) -> None:
     rudders = load_vessel(name).actuators.build()
+    assert isinstance(rudders, SternRudders)
     delta = torch.linspace(-0.6, 0.6, 241, dtype=torch.float64)
     u, v, thrust = (
         torch.full_like(delta, 7.0),
@@ -303,7 +306,7 @@ def test_heel_and_steady_turns_are_those_of_errata() -> None:
 
 def test_roll_decays_with_the_period_of_errata() -> None:
     """From 10 deg: 6.63 s at 7.71 m/s, 6.69 s at rest; document 004, Table 5.2 prints 6.76 s."""
-    plant = load_vessel("patrol_p06").build()
+    plant = of_kind(load_vessel("patrol_p06").build(), PatrolVessel)
     x0 = plant.approach(2)
     x0[1, 4] = 0.0
     x0[:, 2] = np.radians(10.0)

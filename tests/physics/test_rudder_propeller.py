@@ -9,12 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from kinds import of_kind
 
 from residnet.core.config import load_config, validate
 from residnet.core.errors import ConfigError
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import PlantDynamics
 from residnet.physics.actuators import (
+    DifferentialThrust,
     RudderPropeller,
     RudderPropellerConfig,
     Thrusters,
@@ -145,7 +147,7 @@ def test_fixed_thrusters_push_where_they_stand() -> None:
 def test_two_of_them_are_the_differential_thrusters() -> None:
     known = load_vessel("wam_v_cal")
     assert isinstance(known, FossenConfig)
-    twin = known.actuators.build()
+    twin = of_kind(known.actuators.build(), DifferentialThrust)
     shared = {
         "forward": twin.curve.ahead.tolist(),
         "reverse": twin.curve.astern.tolist(),

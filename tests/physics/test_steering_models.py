@@ -7,6 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from kinds import of_kind
 from scipy.integrate import solve_ivp
 from scipy.signal import TransferFunction, lsim
 
@@ -23,7 +24,7 @@ NAMES = ("nomoto_oceanos", "nomoto_mariner_yaw", "nomoto_mariner")
 
 @pytest.fixture(params=NAMES)
 def plant(request: pytest.FixtureRequest) -> SteeringVessel:
-    return load_vessel(request.param).build()
+    return of_kind(load_vessel(request.param).build(), SteeringVessel)
 
 
 def immediate(name: str) -> SteeringVessel:
@@ -66,7 +67,7 @@ def test_steps_of_the_rudder_as_the_transfer_functions_say(name: str, dt: float)
     known = transfer_functions(name)
     for channel, function in known.items():
         # lsim holds inputs over a step and is exact in it
-        _, truth, _ = lsim(function, rudder, np.arange(400) * dt, interp=False)
+        _, truth, _ = lsim((function.num, function.den), rudder, np.arange(400) * dt, interp=False)
         np.testing.assert_allclose(
             states[:-1, plant.state.index(channel)], truth, rtol=0, atol=1e-11 * np.ptp(truth)
         )
@@ -88,15 +89,18 @@ def test_the_exact_step_against_rk4_and_scipy(name: str) -> None:
     spread = np.ptp(exact, axis=0)
     np.testing.assert_array_equal(exact[:, -1], stepped[:, -1])
     assert (np.abs(exact - stepped).max(0) <= 1e-7 * spread).all()
+
+    def rate(_: float, y: np.ndarray, w: torch.Tensor, delta: float) -> np.ndarray:
+        return plant.rate(torch.tensor([[*y, delta]]), w)[0, :-1].numpy()
+
     x = exact[0, :-1]
     for k in range(200):
         w, delta = torch.tensor([[rudder[k]]]), exact[k, -1]
         x = solve_ivp(
-            lambda _, y, w=w, delta=delta: plant.rate(torch.tensor([[*y, delta]]), w)[
-                0, :-1
-            ].numpy(),
+            rate,
             (0, dt),
             x,
+            args=(w, delta),
             method="DOP853",
             rtol=1e-12,
             atol=1e-14,
@@ -107,7 +111,7 @@ def test_the_exact_step_against_rk4_and_scipy(name: str) -> None:
 
 def test_a_steady_turn_is_a_circle_of_document_numbers() -> None:
     """Corrections G18, G20: 5 deg turn at 17.3 deg/s on a radius of 10.57 m."""
-    plant = load_vessel("nomoto_oceanos").build()
+    plant = of_kind(load_vessel("nomoto_oceanos").build(), SteeringVessel)
     states = flown(NomotoDynamics(plant, 0.01), np.full(6000, np.radians(5.0)))
     assert np.degrees(states[-1, 5]) == pytest.approx(17.35, abs=0.01)
     # where the yaw rate has settled: half a circle apart

@@ -9,9 +9,10 @@ from itertools import combinations_with_replacement
 import numpy as np
 import pytest
 import torch
+from kinds import of_kind
 from torch import Tensor
 
-from residnet.physics.fossen import Fossen3
+from residnet.physics.fossen import Fossen3, FossenConfig
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.symmetry import channel_parity, mirrored_channels, term_parity, wrong_parity
 from residnet.physics.terms import TermLibrary
@@ -87,7 +88,7 @@ def test_a_term_is_wrong_where_it_breaks_the_symmetry_of_its_axis(axis: int) -> 
 
 
 def test_a_symmetric_hull_has_no_wrong_term() -> None:
-    vessel = load_vessel("wam_v_cal")
+    vessel = of_kind(load_vessel("wam_v_cal"), FossenConfig)
     for axis, row in enumerate((vessel.damping.X, vessel.damping.Y, vessel.damping.N)):
         assert row
         assert not any(wrong_parity(term, axis, ("u", "v", "r")) for term in row)

@@ -186,6 +186,7 @@ def test_equal_units_of_damping_are_taken(override: str) -> None:
         override.split(".")[1],
         override.removeprefix("damping.").split(".")[1].split("=")[0],
     )
+    assert isinstance(known, FossenConfig)
     row = getattr(vessel.damping, axis)
     assert row[term].value == (
         1.0 if term == "|u|v|v|" else getattr(known.damping, axis)[term].value

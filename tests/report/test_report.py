@@ -11,9 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from kinds import of_kind
 from made_run import DEG, LEVEL, made_run, metrics, residuals, row, write_json
 from read_page import Page
 
+from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.errors import DataError, UsageError
 from residnet.dynamics.store import ModelSpec, save_model
 from residnet.report.fit import write_fit_page, write_fit_report
@@ -341,7 +343,7 @@ def test_physical_sanity_is_shown_where_models_can_be_loaded(run: Path) -> None:
     )
     model = spec.build()
     # surge that feeds itself
-    model.baseline.theta.data[0, 0] = 0.3
+    of_kind(model.baseline, RegressorBaseline).theta.data[0, 0] = 0.3
     save_model(run / "models" / "plsr", spec, model)
     page = html.unescape(write_fit_page(RunFiles(run)).read_text())
     assert "Physical sanity" in page

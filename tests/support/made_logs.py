@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
-
 import numpy as np
 
 from residnet.core.log import Log
@@ -34,18 +32,18 @@ def prepared(
     log: Log, y: np.ndarray, w: np.ndarray, usable: np.ndarray, piece: np.ndarray
 ) -> Prepared:
     """Without smoothing; the accelerations are no part of an evaluation."""
-    parts = {
-        "log": log,
-        "split": "test",
-        "y": y,
-        "smooth": y.copy(),
-        "nu_dot": np.zeros((len(y), 3)),
-        "w": w,
-        "recorded": w,
-    }
-    parts |= {"piece": piece, "usable": usable, "good": usable}
-    known = {field.name for field in fields(Prepared)}
-    return Prepared(**{name: value for name, value in parts.items() if name in known})
+    return Prepared(
+        log=log,
+        split="test",
+        y=y,
+        smooth=y.copy(),
+        nu_dot=np.zeros((len(y), 3)),
+        w=w,
+        recorded=w,
+        piece=piece,
+        usable=usable,
+        good=usable,
+    )
 
 
 def random_states(count: int, rng: np.random.Generator) -> np.ndarray:

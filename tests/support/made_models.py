@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import torch
+from kinds import of_kind
 
-from residnet.baselines import RegressorsConfig
+from residnet.baselines import RegressorBaseline, RegressorsConfig
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
 from residnet.physics.signals import SignalsConfig
@@ -30,5 +31,6 @@ def nomoto_model(gain: float, time: float, dt: float) -> tuple[ModelSpec, Hybrid
     )
     model = spec.build()
     with torch.no_grad():
-        model.baseline.theta[2] = torch.tensor([-1.0 / time, gain / time])  # type: ignore[union-attr, index]
+        theta = of_kind(model.baseline, RegressorBaseline).theta
+        theta[2] = torch.tensor([-1.0 / time, gain / time])
     return spec, model

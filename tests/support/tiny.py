@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
 from residnet.cli import main
 
-TINY = {
+TINY: dict[str, Any] = {
     "task": "fit",
     "name": "tiny",
     "data": {

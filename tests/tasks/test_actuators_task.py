@@ -11,10 +11,11 @@ import pandas as pd
 import pytest
 import torch
 import yaml
+from kinds import of_kind
 from tiny import call
 
 from residnet.core.config import validate
-from residnet.physics.actuators import DifferentialThrustConfig
+from residnet.physics.actuators import DifferentialThrust, DifferentialThrustConfig
 from residnet.physics.fossen import FossenConfig
 from residnet.physics.vessel import load_vessel
 
@@ -24,7 +25,7 @@ def config(tmp_path: Path) -> dict[str, Any]:
     """Made logs of the WAM-V's thrusters and the config that names them."""
     vessel, random = load_vessel("wam_v_cal"), np.random.default_rng(0)
     assert isinstance(vessel, FossenConfig)
-    unit = vessel.actuators.build()
+    unit = of_kind(vessel.actuators.build(), DifferentialThrust)
     throttle = np.arange(-100, 101, 5)
     rpm = np.clip(28 * throttle, -2380, 2380) + random.normal(size=throttle.size) * 5
     pd.DataFrame({"throttle": throttle, "rpm": rpm}).to_csv(tmp_path / "throttle.csv", index=False)
@@ -82,7 +83,7 @@ def test_logs_become_lines_of_a_vessel_file(
     vessel = load_vessel("wam_v_cal")
     assert isinstance(vessel, FossenConfig)
     n = torch.linspace(-2300, 2300, 50, dtype=torch.float64) / 60
-    known = vessel.actuators.build().thrust(n)
+    known = of_kind(vessel.actuators.build(), DifferentialThrust).thrust(n)
     assert float((found.build().thrust(n) - known).abs().max()) < 0.01 * float(known.max())
     assert found.n_rate * 60 == pytest.approx(1500, rel=0.01)
     numbers = json.loads((tmp_path / "run" / "actuators.json").read_text())

@@ -30,13 +30,13 @@ def test_rows_of_every_model_and_axis_agree_with_the_stored_residuals(tiny_run: 
             assert by["ridge", axis]["difference"]["to"] == "baseline"
             low, high = by["ridge", axis]["mae_ci95"]
             assert low < by["ridge", axis]["mae"] < high
-    for axis, own in stored[stored.model == "ridge"].groupby("axis"):
+    for name, part in stored[stored.model == "ridge"].groupby("axis"):
         row = next(
             row
             for row in content["splits"]["test"]
-            if (row["model"], row["axis"]) == ("ridge", axis)
+            if (row["model"], row["axis"]) == ("ridge", name)
         )
         # only every so manieth sample is stored
-        assert ((own.target - own.predicted) ** 2).mean() ** 0.5 == pytest.approx(
+        assert ((part.target - part.predicted) ** 2).mean() ** 0.5 == pytest.approx(
             row["rmse"], rel=0.1
         )

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -63,11 +64,12 @@ def test_what_does_not_match_stops_before_any_work(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     recorded(tmp_path, "rec_a", 2.0)
-    for keys, words in [
+    cases: list[tuple[dict[str, Any], str]] = [
         ({"logs": ["raw_*"]}, "'raw_*' matches nothing"),
         ({"logs": ["/rec_*"]}, "set `root` instead"),
         ({"logs": []}, "logs"),
-    ]:
+    ]
+    for keys, words in cases:
         assert call(monkeypatch, "run", config(tmp_path, **keys), "--out", tmp_path / "run") == 2
         said = capsys.readouterr().err
         assert words in said

@@ -17,7 +17,7 @@ from residnet.data.readers import CanonicalConfig
 from residnet.data.simulated.trials import SimulatedTrials, simulate
 from residnet.tasks.loading import load_task
 
-DATA: dict[str, Any] = copy.deepcopy(TINY["data"])  # type: ignore[assignment]
+DATA: dict[str, Any] = copy.deepcopy(TINY["data"])
 CONFIG = {"task": "simulate", "name": "trials", "data": DATA}
 
 
@@ -107,7 +107,9 @@ def test_a_fit_of_the_files_equals_a_fit_of_the_simulation(
     found = []
     for run in (tiny_run, tmp_path / "files"):
         fit = json.loads((run / "models" / "baseline" / "fit.json").read_text())
-        values = {(entry["axis"], entry["term"]): entry["value"] for entry in fit["coefficients"]}
+        values: dict[tuple[str, ...], float] = {
+            (entry["axis"], entry["term"]): entry["value"] for entry in fit["coefficients"]
+        }
         for row in json.loads((run / "metrics.json").read_text())["rows"]:
             if row["model"] in ("zero", "baseline", "ridge"):
                 values[row["model"], row["split"], row["protocol"], row["manoeuvre"]] = row[

@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from kinds import of_kind
 from made_system import LINEAR, STEP, inputs, model_of
-from torch import Tensor
+from torch import Tensor, nn
 
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.heads import MlpConfig
+from residnet.heads.mlp import MlpHead
 from residnet.training.losses import one_step_loss, rollout_loss
 
 A = np.array([[-0.4, 0.1, 0.0], [0.0, -0.9, -0.2], [0.05, 0.1, -0.8]])
@@ -35,6 +37,12 @@ def with_mlp() -> HybridDynamics:
     ).double()
 
 
+def layers(model: HybridDynamics) -> tuple[nn.Linear, nn.Linear]:
+    """The hidden and the last layer of the head."""
+    net = of_kind(model.head, MlpHead).net
+    return of_kind(net[0], nn.Linear), of_kind(net[2], nn.Linear)
+
+
 def by_euler() -> np.ndarray:
     """Velocities [B, T, 3] after each step of the linear model, by the explicit Euler rule."""
     nu, out = X0[:, 3:].numpy(), []
@@ -51,14 +59,14 @@ def euler() -> Rollout:
 
 def test_one_step_loss_is_the_mean_square_over_what_counts() -> None:
     model = with_mlp()
-    net = model.head.net  # type: ignore[union-attr]
+    first, last = layers(model)
     total, count = 0.0, 0
     for b in range(BATCH):
         for k in range(STEPS):
             if COUNTED[b, k]:
                 z = np.concatenate((Y[b, k, 3:].numpy(), W[b, k].numpy()))
-                hidden = np.tanh(net[0].weight.detach().numpy() @ z + net[0].bias.detach().numpy())
-                rho = net[2].weight.detach().numpy() @ hidden + net[2].bias.detach().numpy()
+                hidden = np.tanh(first.weight.detach().numpy() @ z + first.bias.detach().numpy())
+                rho = last.weight.detach().numpy() @ hidden + last.bias.detach().numpy()
                 error = NU_DOT[b, k].numpy() - A @ z[:3] - B @ z[3:] - C - rho
                 total, count = total + float(np.sum((error / SCALES.numpy()) ** 2)), count + 3
     assert 0 < count < 3 * BATCH * STEPS
@@ -146,7 +154,7 @@ def test_gradients_reach_through_the_rollout() -> None:
         return rollout_loss(Rollout(model), X0, W, S, Y, COUNTED, SCALES, 0.1)
 
     loss().backward()
-    bias = model.head.net[2].bias  # type: ignore[union-attr]
+    bias = layers(model)[1].bias
     assert bias.grad is not None
     for i in range(3):
         values = []

@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 import torch
+from kinds import of_kind
 from made_system import LINEAR, SCALES, STEP, free_run_error, model_of, trials
 from torch import Tensor
 
@@ -24,6 +25,7 @@ from residnet.data.prepare import Prepared, samples
 from residnet.data.windows import WindowStore
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.heads import LstmConfig, MlpConfig
+from residnet.heads.mlp import MlpHead
 from residnet.training.config import TrainingConfig
 from residnet.training.module import HeadTraining
 from residnet.training.trainer import train
@@ -188,23 +190,33 @@ def test_averaged_weights_are_validated_and_kept(logs: list[Prepared], tmp_path:
     assert not same({name: raw[name] for name in state_of(model)}, state_of(model))
 
 
+def first_weight(model: HybridDynamics) -> Tensor:
+    """The weights of the first layer of an MLP head."""
+    return of_kind(of_kind(model.head, MlpHead).net[0], torch.nn.Linear).weight
+
+
+def at_step(step: int) -> property:
+    """A count of the training steps that stands at this one."""
+    return property(lambda module: step)
+
+
 def test_the_average_is_the_recursion_written_out(
     logs: list[Prepared], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     module = untrained(logs, average=0.6)
     assert module.average is not None
-    weight = module.model.head.net[0].weight  # type: ignore[union-attr]
+    weight = first_weight(module.model)
     expected = weight.detach().double().clone()
     for step in range(1, 12):
         with torch.no_grad():
             weight.add_(torch.randn_like(weight))
-        monkeypatch.setattr(HeadTraining, "global_step", property(lambda self, step=step: step))
+        monkeypatch.setattr(HeadTraining, "global_step", at_step(step))
         module.on_train_batch_end(None, None, 0)
         keep = min(0.6, (1 + step) / (10 + step))
         expected = keep * expected + (1 - keep) * weight.detach().double()
     torch.testing.assert_close(
-        module.average.head.net[0].weight.double(), expected, rtol=1e-5, atol=1e-6
-    )  # type: ignore[union-attr]
+        first_weight(module.average).double(), expected, rtol=1e-5, atol=1e-6
+    )
 
 
 @pytest.mark.parametrize(("moves", "refit"), [(False, False), (True, True)])

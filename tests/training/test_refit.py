@@ -242,14 +242,14 @@ def test_normal_equations_hold_the_gradient_and_the_curvature_of_offsets() -> No
             assert 2.0 * float(believing.slope[log, axis]) == pytest.approx(
                 central, rel=1e-6, abs=1e-8
             )
-    central = [
+    gradient = [
         (with_step(model, problem, i, step, offsets) - with_step(model, problem, i, -step, offsets))
         / (2 * step)
         for i in range(3)
     ]
     torch.testing.assert_close(
         2.0 * believing.gradient[:3],
-        torch.tensor(central, dtype=torch.float64),
+        torch.tensor(gradient, dtype=torch.float64),
         rtol=1e-6,
         atol=1e-8,
     )

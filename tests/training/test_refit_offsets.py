@@ -4,6 +4,8 @@ vessel, and costs nothing where there are none.
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 import pytest
 import torch
@@ -19,7 +21,7 @@ from residnet.heads import ZeroHead
 from residnet.training.refit import Refitted, refit
 from residnet.training.refit_config import RefitConfig
 
-ROWS = {
+ROWS: dict[Literal["u", "v", "r"], tuple[str, ...]] = {
     "u": ("u", "u|u|", "tau_x"),
     "v": ("v", "r", "tau_n", "v|v|", "u r"),
     "r": ("v", "r", "tau_n", "r|r|"),

@@ -42,7 +42,7 @@ class Blocks:
         return {"of": self.of, "count": self.count}
 
 
-def blocks(logs: Sequence[int]) -> Blocks | None:
+def blocks(logs: Sequence[int] | np.ndarray) -> Blocks | None:
     """Return blocks of windows from the number of the log that each comes from.
 
     Windows of a log are in time order.

@@ -6,7 +6,7 @@ Source: document 003 eqs. (5)-(9), corrections W1, W2.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Literal, final
+from typing import Literal, Self, final
 
 import torch
 from pydantic import Field, model_validator
@@ -291,7 +291,7 @@ class FossenVessel(HullPlant):
         )
         self.hull = Fossen3(vessel)
 
-    def in_calm_water(self) -> HullPlant:
+    def in_calm_water(self) -> Self:
         """Return this plant without its exogenous inputs, and the hull's forces in one product."""
         self.hull.compact()
         return super().in_calm_water()

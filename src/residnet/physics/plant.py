@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import final
+from typing import Self, final
 
 import torch
 from torch import Tensor, nn
@@ -123,7 +123,7 @@ class HullPlant(Plant, ABC):
         """Return the commands [..., c] from the normalised drive and steer [...] of a manoeuvre."""
         return self.actuators.demand(drive, steer)
 
-    def in_calm_water(self) -> HullPlant:
+    def in_calm_water(self) -> Self:
         """Return this plant without its exogenous inputs, which is faster.
 
         There are no body or earth-fixed forces, current, wind or air resistance.
