@@ -81,7 +81,7 @@ def config_classes() -> list[type[BaseModel]]:
 
 
 def documented(config: type[BaseModel]) -> dict[str, str]:
-    """Return the text of each key under `Attributes:` in the docstrings of a class and its bases."""
+    """Return the text of each key under `Attributes:` of a class and its bases."""
     texts: dict[str, str] = {}
     for base in reversed(config.__mro__):
         for section in griffe.Docstring(inspect.cleandoc(base.__doc__ or "")).parse("google"):
@@ -100,7 +100,7 @@ def summary(config: type[BaseModel]) -> str:
 
 
 def selector(config: type[BaseModel]) -> str | None:
-    """Return the key that selects this class, for example `kind: lstm`; None where there is none."""
+    """Return the key that selects this class, such as `kind: lstm`; None where there is none."""
     for name in DISCRIMINATORS:
         field = config.model_fields.get(name)
         if field is not None and typing.get_origin(field.annotation) is Literal:
