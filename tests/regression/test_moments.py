@@ -34,7 +34,7 @@ def test_a_fold_is_left_out_by_subtraction() -> None:
     left = moments.without(1)
     kept_x, kept_y = x[fold != 1], y[fold != 1]
     e, f = kept_x - kept_x.mean(0), kept_y - kept_y.mean(0)
-    assert left.count == 40
+    assert left.samples == 40
     torch.testing.assert_close(left.mean_x + moments.shift_x, kept_x.mean(0))
     torch.testing.assert_close(left.xx, e.T @ e)
     torch.testing.assert_close(left.xy, e.T @ f)

@@ -66,6 +66,7 @@ def course(folder: Path) -> dict[str, Any]:
             "lookahead": 10.0,
             "planning_dt": "0.2 s",
         },
+        "peers": [],
         "line_of_sight": [{"kind": "lookahead", "distance": 10.0}],
         "spread": {"flights": 2, "effect": [1.0, 1.0], "time": [1.0, 1.0]},
         "dt": "0.2 s",
