@@ -82,6 +82,7 @@ def test_defaults_come_from_the_logs(data: residnet.Data) -> None:
     assert data.evaluation.selection == "T30"
 
 
+@pytest.mark.whole_runs
 def test_fifteen_lines(trials: Path) -> None:
     """The example fits, runs freely and draws, as a stranger would start it."""
     lines = EXAMPLE.read_text().split('"""')[2].strip().splitlines()
@@ -174,6 +175,7 @@ def cli_rows(config: dict[str, Any], folder: Path, patch: pytest.MonkeyPatch) ->
     return RunFolder(folder / "run")
 
 
+@pytest.mark.whole_runs
 def test_a_fit_by_function_mapping_and_command_line_is_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
