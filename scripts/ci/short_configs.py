@@ -239,7 +239,7 @@ def carry_out(name: str, runs: Path) -> Result:
     short = SHORT[name]
     if short.data and not (Path(os.environ.get("RESIDNET_DATA", "")) / short.data).is_dir():
         return Result(name, "skipped", 0.0, f"no RESIDNET_DATA/{short.data}")
-    folder = runs / name.rsplit("/", maxsplit=1)[-1]
+    folder = runs / name.replace("/", "_")
     command = [sys.executable, "-m", "residnet.cli", "run", str(CONFIGS / f"{name}.yaml")]
     command += ["--out", str(folder)]
     for override in short.overrides:
