@@ -160,11 +160,22 @@ SHORT: dict[str, Short] = {
         )
     ),
     "studies/gouletas2020/table_6_3": Short(
-        ("autopilot={runs}/autopilot_nomoto", "spread.flights=2", "protocols=[enter]"),
+        (
+            "autopilot={runs}/autopilot_nomoto",
+            "spread.flights=2",
+            "protocols=[enter]",
+            "dt=0.1 s",
+            "line_of_sight=[{kind: lookahead, distance: 17 m}]",
+        ),
         after="autopilot_nomoto",
     ),
     "studies/gouletas2020/table_6_8": Short(
-        ("autopilot={runs}/autopilot_patrol", "protocols=[enter]", "duration=300 s"),
+        (
+            "autopilot={runs}/autopilot_patrol",
+            "protocols=[enter]",
+            "duration=300 s",
+            "line_of_sight=[{kind: lookahead, distance: 123 m}]",
+        ),
         after="autopilot_patrol",
     ),
     "studies/halvorsen2019/force_equations": Short(

@@ -77,7 +77,7 @@ class NomotoDynamics(Dynamics):
         )
         middle, end = start @ self.to_middle.to(x.dtype), start @ self.to_end.to(x.dtype)
         # psi and v stand first in the linear system
-        psi, v = torch.stack((start, middle, end), dim=1)[..., :2].unbind(-1)
+        psi, v = torch.stack((start[:, :2], middle[:, :2], end[:, :2]), dim=1).unbind(-1)
         north, east = to_earth(speed.unsqueeze(-1), v, psi)
         simpson = self.simpson.to(x.dtype)
         north, east = x[:, 0] + north @ simpson, x[:, 1] + east @ simpson
