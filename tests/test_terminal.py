@@ -18,7 +18,13 @@ def test_lines_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
             report("training lstm", done, 3)
         report("training lstm", 3, 3)
         report("searching")
-    assert capsys.readouterr() == ("", "reading logs\n  training lstm: 3\n")
+    assert capsys.readouterr() == ("", "reading logs\n  training lstm: all 3 done\n")
+
+
+def test_a_message_stands_for_the_end_of_its_stage(capsys: pytest.CaptureFixture[str]) -> None:
+    with drawn_progress():
+        report("training mlp", 2, 2, "mlp: epoch 2/2")
+    assert capsys.readouterr().err == "mlp: epoch 2/2\n"
 
 
 def test_a_stage_that_begins_again_is_told_again(capsys: pytest.CaptureFixture[str]) -> None:
@@ -26,7 +32,7 @@ def test_a_stage_that_begins_again_is_told_again(capsys: pytest.CaptureFixture[s
         for _ in range(2):
             report("free runs", 1, 2)
             report("free runs", 2, 2)
-    assert capsys.readouterr().err == "  free runs: 2\n" * 2
+    assert capsys.readouterr().err == "  free runs: all 2 done\n" * 2
 
 
 class Terminal(io.StringIO):

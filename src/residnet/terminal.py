@@ -37,7 +37,7 @@ def drawn_progress() -> Iterator[None]:
 
 
 class _Lines:
-    """One line for each message, and one for each counted stage when it is complete."""
+    """One line for each message, and one for each counted stage that ends without a message."""
 
     def __init__(self) -> None:
         self._complete: set[str] = set()
@@ -51,7 +51,9 @@ class _Lines:
             self._complete.discard(progress.stage)
         elif progress.stage not in self._complete:
             self._complete.add(progress.stage)
-            print(f"  {progress.stage}: {progress.total:g}", file=sys.stderr, flush=True)
+            if not progress.message:
+                line = f"  {progress.stage}: all {progress.total:g} done"
+                print(line, file=sys.stderr, flush=True)
 
 
 class _Bars:

@@ -271,5 +271,5 @@ def test_columns_that_say_nothing_get_nothing(kind: Any) -> None:
         answer(("v", "u"), Samples(spoiled, target, group, of.t, of.kinds, SURGE_YAW))
     with pytest.raises(FitError, match="samples do not determine"):
         answer((), of.where(torch.arange(400) % 40 == 0))
-    with pytest.raises(FitError, match="folds need as many manoeuvres"):
+    with pytest.raises(FitError, match="one run or segment only"):
         answer(("u",), Samples(z, target, torch.zeros_like(group), of.t, ("a",), SURGE_YAW))

@@ -11,7 +11,7 @@ from made_samples import NAMES, made
 from sklearn.cross_decomposition import PLSRegression
 
 from residnet.core.errors import FitError
-from residnet.heads import PlsrConfig
+from residnet.heads import ClosedFormHead, KernelConfig, PlsrConfig, RidgeConfig
 from residnet.heads.basis import BasisHead
 from residnet.heads.plsr import PlsrHead
 from residnet.regression.pls_path import pls_path
@@ -103,6 +103,21 @@ def test_too_little_data_is_refused() -> None:
     short = samples.where(torch.arange(len(samples)) % 40 == 0)
     with pytest.raises(FitError, match="15 samples do not determine 23 basis functions"):
         head.solve(short)
+
+
+@pytest.mark.parametrize("kind", [PlsrConfig, RidgeConfig, KernelConfig])
+def test_few_manoeuvres_make_fewer_folds(
+    kind: type[PlsrConfig] | type[RidgeConfig] | type[KernelConfig],
+) -> None:
+    samples = made()
+    few = samples.where(samples.group < 3)
+    usual, three = kind().build(NAMES), kind(folds=3).build(NAMES)
+    for head in (usual, three):
+        assert isinstance(head, ClosedFormHead)
+        head.calibrate(few)
+        head.solve(few)
+    for name, value in three.state_dict().items():
+        torch.testing.assert_close(usual.state_dict()[name], value, rtol=0, atol=0)
 
 
 def test_named_terms_and_features() -> None:

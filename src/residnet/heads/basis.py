@@ -17,7 +17,7 @@ from residnet.core.names import ACCELERATION
 from residnet.core.samples import Samples
 from residnet.heads.base import ClosedFormHead, FeatureConfig, Features
 from residnet.physics.terms import TermLibrary, polynomial_terms
-from residnet.regression.estimator import Estimator, require_finite
+from residnet.regression.estimator import Estimator, require_finite, usual_folds
 from residnet.regression.solutions import Solution
 
 
@@ -36,13 +36,14 @@ class BasisConfig(FeatureConfig):
             which may find that no residual at all is best; or `one_step`, cross-validated error of
             accelerations.
         folds: number of folds of the cross-validation; a manoeuvre is never split between folds.
+            null for five, or one for each manoeuvre where there are fewer.
     """
 
     space: Literal["acceleration", "force"] = "acceleration"
     terms: tuple[str, ...] = ()
     degree: int = Field(default=2, ge=1, le=4)
     choose: Literal["one_step", "free_run"] = "free_run"
-    folds: int = Field(default=5, ge=2)
+    folds: int | None = Field(default=None, ge=2)
 
     @model_validator(mode="after")
     def _space(self) -> Self:
@@ -95,14 +96,15 @@ class BasisHead(ClosedFormHead):
         return self.basis(z) @ self.coefficients.to(z.dtype) + self.intercept.to(z.dtype), s
 
     @abstractmethod
-    def estimator(self) -> Estimator:
-        """Return the estimator of the coefficients."""
+    def estimator(self, folds: int | None) -> Estimator:
+        """Return the estimator of the coefficients, cross-validated over so many folds."""
 
     def solutions(self, samples: Samples) -> list[Solution]:
         """Return the solutions of the estimator; see `ClosedFormHead.solutions`."""
         chosen = samples.z[:, [samples.names.index(name) for name in self.features.names]]
         require_finite(chosen, self.features.names, "channel")
-        return self.estimator().fit(
+        folds = self.folds or usual_folds(samples.group)
+        return self.estimator(folds).fit(
             self.basis(samples.z),
             samples.target,
             samples.group,

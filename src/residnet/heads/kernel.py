@@ -17,6 +17,7 @@ from residnet.core.samples import Samples
 from residnet.heads.base import ClosedFormHead, FeatureConfig, Features
 from residnet.physics.terms import TermLibrary
 from residnet.regression.equation_rows import step_of, unbroken_stretches
+from residnet.regression.estimator import usual_folds
 from residnet.regression.kernel.functions import Polynomial, Rbf
 from residnet.regression.kernel.path import Path
 from residnet.regression.kernel.recursion import Recursion
@@ -42,6 +43,7 @@ class KernelConfig(FeatureConfig):
             velocity in free run along the training records, the other velocities as measured (first
             approach).
         folds: number of folds of the cross-validation; a manoeuvre is never split between folds.
+            null for five, or one for each manoeuvre where there are fewer.
     """
 
     kind: Literal["kernel"] = "kernel"
@@ -51,7 +53,7 @@ class KernelConfig(FeatureConfig):
         default=(1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1), min_length=1
     )
     choose: Literal["one_step", "recursion", "free_run"] = "free_run"
-    folds: int = Field(default=5, ge=2)
+    folds: int | None = Field(default=None, ge=2)
 
     def build(self, names: Sequence[str]) -> KernelHead:
         """Return the module for channels `names`."""
@@ -147,7 +149,7 @@ class KernelHead(ClosedFormHead):
         estimator = KernelRidge(
             self.kernel,
             self.penalties,
-            folds=self.folds,
+            folds=self.folds or usual_folds(samples.group),
             scoring=partial(self._recursion_errors, recursion) if recursion else None,
             alternatives=self.by_free_run,
         )

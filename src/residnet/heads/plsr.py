@@ -45,11 +45,11 @@ class PlsrHead(BasisHead):
         self.order = config.order
         self.max_order = config.max_order
 
-    def estimator(self) -> Estimator:
+    def estimator(self, folds: int | None) -> Estimator:
         """Return PLSR of all axes, other orders on offer where free runs choose."""
         return PLSR(
             self.order,
             max_order=self.max_order,
-            folds=self.folds,
+            folds=folds,
             alternatives=self.by_free_run and self.order is None,
         )

@@ -45,6 +45,6 @@ class RidgeHead(BasisHead):
         super().__init__(config, names)
         self.penalties = config.penalties
 
-    def estimator(self) -> Estimator:
+    def estimator(self, folds: int | None) -> Estimator:
         """Return ridge regression, every penalty on offer where free runs choose."""
-        return Ridge(self.penalties, folds=self.folds, alternatives=self.by_free_run)
+        return Ridge(self.penalties, folds=folds, alternatives=self.by_free_run)

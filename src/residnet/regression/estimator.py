@@ -89,6 +89,16 @@ def require_pairs(x: Tensor, y: Tensor) -> None:
         )
 
 
+USUAL_FOLDS = 5
+"""Folds of a cross-validation where nobody asks for another number."""
+
+
+def usual_folds(groups: Tensor) -> int | None:
+    """Return five, or the number of groups [N] where there are fewer; None for a single group."""
+    count = torch.unique(groups).numel()
+    return min(USUAL_FOLDS, count) if count > 1 else None
+
+
 def fold_numbers(groups: Tensor | None, folds: int | None) -> Tensor:
     """Return the fold of each sample [N], groups dealt out in turn; every group is a fold for None.
 
