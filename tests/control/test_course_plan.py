@@ -58,7 +58,7 @@ def test_the_steady_turn_is_that_of_the_model(vessel: SteeredPlant) -> None:
 
 
 def test_turns_take_the_time_of_full_rudder_and_counter_rudder(vessel: SteeredPlant) -> None:
-    """T r_dot + r = K delta from rest to rest: K d (t1 - t2) turned, t2 = T ln(2 - exp(-t1 / T))."""
+    """T r_dot + r = K delta, rest to rest: turned K d (t1 - t2), t2 = T ln(2 - exp(-t1 / T))."""
     make = TurnMaker(vessel, TURNING, 0.05)
     holds = np.array([[3.0, 9.0], [5.03, 12.0]])
     for side, row in zip(

@@ -1,4 +1,4 @@
-"""Shortest paths and courses round buoys, against geometry and paths that are flown piece by piece."""
+"""Shortest paths and courses round buoys, against geometry and paths flown piece by piece."""
 
 from __future__ import annotations
 

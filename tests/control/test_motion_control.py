@@ -131,7 +131,7 @@ GAINS = MotionPIDConfig(
 
 
 def test_pid_by_hand() -> None:
-    """Two steps: error in the body frame, heading wrapped, the integral used before it is updated."""
+    """Two steps: error in the body frame, heading wrapped, the integral used before its update."""
     x = torch.tensor([[1.0, 2.0, 3.0, 0.5, -0.1, 0.02, 7.0]], dtype=torch.float64)
     reference = torch.tensor([[4.0, 1.0, -3.1, 0.6, 0.1, 0.0, 0.3, 0.2, 0.1]], dtype=torch.float64)
     controller, dt = GAINS.build(0.1), 0.1
@@ -159,7 +159,7 @@ def ferry(name: str) -> FossenVessel:
 
 
 def test_the_exact_model_follows_without_feedback() -> None:
-    """Forces of the true hull's inverse, at once: the only error is that they are held over a step."""
+    """Forces of the true hull's inverse, at once: the only error is their hold over a step."""
     plant = ferry("milliampere")
     dt = 0.05
     config = ReferenceFilterConfig(waypoints=((5.0, -3.0, 0.8),), interval=30.0)

@@ -1,4 +1,4 @@
-"""Flights and what is read from them; the time-optimal floor of a rudder that takes time to move."""
+"""Flights and what is read from them; the time-optimal floor of a rudder of finite rate."""
 
 from __future__ import annotations
 

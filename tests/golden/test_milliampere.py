@@ -163,7 +163,7 @@ NAMES = (
 
 
 class Watched(Reference):
-    """Guidance that remembers what it asked for, and the waypoint of then, at every so manyth step."""
+    """Guidance that remembers what it asked for, and the waypoint of that time, every few steps."""
 
     def __init__(self, guidance: ReferenceFilter, every: int) -> None:
         super().__init__()

@@ -180,7 +180,7 @@ def test_forces_of_the_commands(golden_file: Path) -> None:
 
 
 def test_right_hand_side_row_by_row(golden_file: Path) -> None:
-    """From the state and the forces of each row; sums of terms are as exact as the largest of them."""
+    """From the state and the forces of each row; sums are as exact as their largest term."""
     frame, plant = table(golden_file), plant_of(golden_file)
     nu, tau = tensor(frame, "u", "v", "r"), tensor(frame, "tau_x", "tau_y", "tau_z")
     hull = plant.hull

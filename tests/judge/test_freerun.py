@@ -211,7 +211,7 @@ def test_single_precision_is_close() -> None:
 
 
 def test_the_plant_itself_predicts_its_own_noise_free_trial() -> None:
-    """The candidate `truth`: actuator states from the log, commands as inputs, nothing else known."""
+    """The candidate `truth`: actuator states from the log, commands as inputs, no more known."""
     plant = load_vessel("wam_v_cal").build()
     model = PlantDynamics(plant, STEP, 2)
     count = 80

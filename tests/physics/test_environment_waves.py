@@ -155,7 +155,7 @@ def test_symmetry_of_the_force() -> None:
 
 
 def test_long_waves_push_down_their_slope() -> None:
-    """Buoyancy on a tilted surface: minus displacement times slope, and no moment about midships."""
+    """Buoyancy on a tilted surface: minus displacement times slope, no moment about midships."""
     waves = sea(peak_period=60.0, frequencies=10, direction=0.0)
     quadrature, _ = waves.response(torch.zeros(1, dtype=torch.float64))
     slope = waves.number[0]
@@ -164,7 +164,7 @@ def test_long_waves_push_down_their_slope() -> None:
 
 
 def test_a_moving_vessel_meets_waves_at_the_encounter_frequency() -> None:
-    """(5.31): omega_e = omega - omega^2 U cos(chi) / g along a straight course at constant speed."""
+    """(5.31): omega_e = omega - omega^2 U cos(chi) / g along a straight course at steady speed."""
     waves = sea(direction=float(np.radians(40)))
     speed, course = 6.0, np.radians(-100)
     t = 12.0

@@ -111,7 +111,7 @@ def windy(*extra: str) -> FossenConfig:
 
 
 def test_a_plant_feels_the_wind_relative_to_itself() -> None:
-    """Running before the wind at its own speed it feels none; heading and direction turn together."""
+    """Running before the wind at its own speed it feels none; heading and wind turn together."""
     plant = windy().build()
     assert plant.inputs[-2:] == ("wind_speed", "wind_dir")
     still = load_vessel("wam_v_cal").build()

@@ -215,7 +215,7 @@ def test_a_base_of_another_kind_of_actuators() -> None:
 
 
 def test_mass_spring_damper() -> None:
-    """(5.13) under the square wave of section 5.3.1, against SciPy; without force its energy falls."""
+    """(5.13) under section 5.3.1's square wave, against SciPy; without force its energy falls."""
     config = MassSpringDamperConfig()
     plant = config.build()
     t = 0.1 * np.arange(500)

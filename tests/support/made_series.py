@@ -1,4 +1,4 @@
-"""Autoregressive residuals of unit variance, and how often an interval holds what is true of them."""
+"""Autoregressive residuals of unit variance, and how often an interval holds the truth."""
 
 from __future__ import annotations
 

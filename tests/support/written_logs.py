@@ -1,4 +1,4 @@
-"""One simulated trial, written in the formats that boats record, by the libraries of those formats."""
+"""One simulated trial, written in the formats that boats record, by those formats' libraries."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def hdf5_table(log: Log, folder: Path) -> Path:
 
 
 def topics(log: Log, folder: Path) -> Path:
-    """One csv per topic, by REP-103, arrivals in local time two hours ahead of the header stamps."""
+    """One csv per topic, by REP-103, arrivals in local time two hours ahead of the stamps."""
     path = folder / "trial"
     path.mkdir()
     ns = _stamps(log)

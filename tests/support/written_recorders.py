@@ -99,7 +99,7 @@ def ulog(log: Log, folder: Path) -> Path:
 
 
 def ardupilot(log: Log, folder: Path) -> Path:
-    """ArduPilot: filter (XKF1), attitude (ATT), gyro (IMU), and GPS with its week and milliseconds."""
+    """ArduPilot: filter (XKF1), attitude (ATT), gyro (IMU), and GPS in weeks and milliseconds."""
     formats = [
         (128, "FMT", "BBnNZ", "Type,Length,Name,Format,Columns", 89),
         (

@@ -265,6 +265,7 @@ IDENTIFIED: dict[str, Any] = {
 }
 
 
+@pytest.mark.whole_runs
 def test_a_policy_that_learned_on_an_identified_model_steers_the_vessel(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

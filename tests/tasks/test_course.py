@@ -16,6 +16,8 @@ import torch
 import yaml
 from tiny import call
 
+pytestmark = pytest.mark.whole_runs
+
 AUTOPILOT: dict[str, Any] = {
     "task": "autopilot",
     "name": "small",
