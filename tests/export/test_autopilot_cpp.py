@@ -1,4 +1,4 @@
-"""The C++ program of `examples/autopilot_cpp`: built as its README says, it steers as Python does."""
+"""`examples/autopilot_cpp`, built as its README says, steers as Python does."""
 
 from __future__ import annotations
 
