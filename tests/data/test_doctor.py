@@ -10,7 +10,7 @@ from known_logs import wavy
 
 from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
-from residnet.data.doctor import Finding, Report, inspect, inspect_together, inspection
+from residnet.data.doctor import Finding, Report, inspect, inspect_together, inspection, summary
 from residnet.data.masks import Frozen
 
 
@@ -338,3 +338,19 @@ def test_the_report_as_json_has_every_finding() -> None:
             "will mislead",
             "fatal",
         }
+
+
+def test_the_tally_counts_logs_and_names_what_to_fix_first() -> None:
+    log = wavy()
+    sick = changed(log, psi=-log["psi"]).replace(name="sick")
+    clean, ill = (
+        inspection([inspect(one) for one in logs], Report("together", ()))
+        for logs in ([log], [log, sick])
+    )
+    assert summary(clean).misled == 0
+    assert summary(clean).lines == ["Data doctor: nothing in the log would mislead a fit."]
+    counted = summary(ill)
+    assert (counted.logs, counted.misled) == (2, 1)
+    assert counted.tally.startswith("Data doctor: 1 of 2 logs hold something")
+    assert counted.first.startswith("First fix this: sick: ")
+    assert [ill["tally"], ill["first"]] == counted.lines

@@ -13,7 +13,15 @@ import numpy as np
 from residnet.core import progress
 from residnet.core.errors import ConfigError, DataError, UsageError
 from residnet.core.log import Log
-from residnet.data.doctor import Finding, Level, Report, inspect, inspect_together, inspection
+from residnet.data.doctor import (
+    Finding,
+    Level,
+    Report,
+    inspect,
+    inspect_together,
+    inspection,
+    summary,
+)
 from residnet.data.doctor.draft import draft_map
 from residnet.data.doctor.excitation import conditioning
 from residnet.data.masks import Mask
@@ -114,7 +122,8 @@ def inspect_logs(paths: Sequence[Path], config: Path | None) -> Inspection:
     lines += together.lines()
     for draft in drafts.values():
         lines += ["channel map as guessed, to check and paste under `data:` of a config:", *draft]
-    return Inspection("\n".join(lines), inspection(reports, together))
+    content = inspection(reports, together)
+    return Inspection("\n".join((*summary(content).lines, *lines)), content)
 
 
 def _setup(config: Path) -> _Setup:

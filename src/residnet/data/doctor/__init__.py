@@ -16,11 +16,21 @@ from residnet.data.doctor.findings import Finding, Level, Report, imported, insp
 from residnet.data.doctor.frames import frame_findings
 from residnet.data.doctor.inputs import input_findings
 from residnet.data.doctor.signals import MEASURED, without
+from residnet.data.doctor.summary import Summary, summary
 from residnet.data.doctor.values import channel_findings, value_findings
 from residnet.data.doctor.wraps import unwrapped, wrap_findings
 from residnet.data.masks import Mask, apply_masks
 
-__all__ = ["Finding", "Level", "Report", "inspect", "inspect_together", "inspection"]
+__all__ = [
+    "Finding",
+    "Level",
+    "Report",
+    "Summary",
+    "inspect",
+    "inspect_together",
+    "inspection",
+    "summary",
+]
 
 
 def inspect(log: Log, inputs: Sequence[str] | None = None, masks: Sequence[Mask] = ()) -> Report:

@@ -10,8 +10,9 @@ from typing import Any, Literal
 
 import numpy as np
 
+from residnet.data.doctor.summary import LEVELS, summary
+
 Level = Literal["note", "will mislead", "fatal"]
-LEVELS: tuple[Level, ...] = ("note", "will mislead", "fatal")
 SCHEMA = "residnet.inspection/1"
 
 
@@ -27,6 +28,8 @@ class Finding:
         figures: the numbers, SI.
         action: what to do about it; empty where there is nothing to do.
         at: [T] bool, the samples concerned, where it concerns single samples.
+        effect: what it does to a fit, measured: the share by which what a cheap one-step fit
+            predicts changes without it; None where that was not measured.
     """
 
     level: Level
@@ -35,6 +38,7 @@ class Finding:
     figures: dict[str, float] = field(default_factory=dict)
     action: str = ""
     at: np.ndarray | None = field(default=None, repr=False, compare=False)
+    effect: float | None = None
 
     @property
     def line(self) -> str:
@@ -63,6 +67,7 @@ class Finding:
             "code": self.code,
             "text": self.text,
             "action": self.action,
+            "effect": self.effect,
             "figures": figures,
         }
 
@@ -92,7 +97,10 @@ class Report:
 
     def lines(self) -> list[str]:
         """Return the report as text, one line per finding, the worst first."""
-        order = sorted(self.findings, key=lambda finding: -LEVELS.index(finding.level))
+        order = sorted(
+            self.findings,
+            key=lambda finding: (-LEVELS.index(finding.level), -(finding.effect or 0.0)),
+        )
         return [f"{self.name}: {finding.line}" for finding in order]
 
     def content(self) -> dict[str, Any]:
@@ -106,14 +114,16 @@ class Report:
 
 
 def inspection(reports: Sequence[Report], together: Report) -> dict[str, Any]:
-    """Return all reports for JSON, schema residnet.inspection/1."""
+    """Return all reports for JSON, schema residnet.inspection/1, with their tally."""
     misled = any(report.misled for report in (*reports, together))
-    return {
+    content = {
         "schema": SCHEMA,
         "misled": misled,
         "logs": [report.content() for report in reports],
         "together": together.content()["findings"],
     }
+    counted = summary(content)
+    return {**content, "tally": counted.tally, "first": counted.first}
 
 
 def imported(remarks: Iterable[dict[str, Any]]) -> list[Finding]:

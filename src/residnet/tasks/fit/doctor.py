@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from residnet.core.log import Log
 from residnet.core.progress import say
-from residnet.data.doctor import inspect, inspect_together, inspection
+from residnet.data.doctor import inspect, inspect_together, inspection, summary
 from residnet.runs.folder import RunFolder
 from residnet.tasks.fit.config import FitTaskSettings
 
@@ -19,10 +19,8 @@ def write_inspection(
     reports = [inspect(log, config.signals.columns, config.prepare.masks) for log in logs]
     split_of = {log.name: split for split, members in splits.items() for log in members}
     together = inspect_together(logs, config.signals.columns, split_of)
-    folder.write_json(folder.path / "doctor.json", inspection(reports, together))
-    misleading = sum(report.misled for report in reports)
-    if misleading:
-        say(
-            f"  the data doctor says of {misleading} of {len(logs)} logs that they would mislead a"
-            " fit: see the report"
-        )
+    content = inspection(reports, together)
+    folder.write_json(folder.path / "doctor.json", content)
+    if content["misled"]:
+        for line in summary(content).lines:
+            say(f"  {line}")
