@@ -55,6 +55,13 @@ def parquet(log: Log, folder: Path) -> Path:
     return path
 
 
+def excel(log: Log, folder: Path) -> Path:
+    """The first sheet of an Excel file."""
+    path = folder / "trial.xlsx"
+    pd.DataFrame({"t": log.t, **log.channels}).to_excel(path, index=False)
+    return path
+
+
 def mat5(log: Log, folder: Path) -> Path:
     """A struct in a file of MATLAB 5 to 7."""
     path = folder / "trial.mat"

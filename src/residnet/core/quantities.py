@@ -12,7 +12,7 @@ from pydantic_core import CoreSchema, core_schema
 
 from residnet.core.config_errors import given
 from residnet.core.errors import UsageError
-from residnet.core.names import nearest, si_unit, to_si, units
+from residnet.core.units import si_unit, to_si, units
 
 
 @dataclass(frozen=True)
@@ -65,10 +65,6 @@ class Quantity:
                 f"expected a number in {self.si} or text such as '1.5 {example}' {given(value)}"
             )
         number, unit = match.groups()
-        if unit and unit not in units():
-            raise ValueError(
-                f"unknown unit '{unit}'{nearest(unit, self._fitting())} {given(value)}"
-            )
         try:
             return float(number) * to_si(unit or self.si, self.si)
         except UsageError as error:

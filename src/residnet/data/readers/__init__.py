@@ -16,11 +16,18 @@ from residnet.data.readers.recorders.topic_folder import TopicFolderConfig
 from residnet.data.readers.recorders.ulog import UlogConfig
 from residnet.data.readers.tables.canonical import CanonicalConfig, CanonicalReader
 from residnet.data.readers.tables.channel_map import ChannelMap
-from residnet.data.readers.tables.table import CsvConfig, ParquetConfig, TableReader, TimeColumn
+from residnet.data.readers.tables.table import (
+    CsvConfig,
+    ExcelConfig,
+    ParquetConfig,
+    TableReader,
+    TimeColumn,
+)
 
 ReaderConfig = Annotated[
     CsvConfig
     | ParquetConfig
+    | ExcelConfig
     | CanonicalConfig
     | TopicFolderConfig
     | RosbagConfig
@@ -41,6 +48,7 @@ __all__ = [
     "CanonicalReader",
     "ChannelMap",
     "CsvConfig",
+    "ExcelConfig",
     "Hdf5Config",
     "LogReader",
     "MatConfig",

@@ -9,7 +9,7 @@ import numpy as np
 
 from residnet.core.errors import DataError
 from residnet.core.log import Log
-from residnet.core.names import CHANNEL_UNITS, si_unit, to_si
+from residnet.core.names import CHANNEL_UNITS, to_si
 from residnet.data.readers.base import unwrap
 from residnet.data.readers.composing.geodesy import tangent_plane
 from residnet.data.readers.composing.orientation import (
@@ -123,7 +123,7 @@ def channel_parts(
             name: entry.convert(name, field_values(recording, series, entry.field))
             for name, entry in entries.items()
         }
-        units = {name: si_unit(entry.unit) for name, entry in entries.items()}
+        units = {name: entry.si(name) for name, entry in entries.items()}
         held = tuple(name for name, entry in entries.items() if entry.hold)
         conversion = tuple(
             f"{name}: {entry.frame} of {topic}.{entry.field}"

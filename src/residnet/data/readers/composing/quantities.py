@@ -7,13 +7,14 @@ from typing import Annotated, Literal, final
 from pydantic import AfterValidator, Field
 
 from residnet.core.config import Config, Metres, Radians, Seconds
+from residnet.core.units import known_unit
 from residnet.data.readers.tables.channel_map import Conversion, factor
 
 
 def _converts(si: str) -> AfterValidator:
     def known(unit: str) -> str:
         factor(unit, si)
-        return unit
+        return known_unit(unit, si)
 
     return AfterValidator(known)
 

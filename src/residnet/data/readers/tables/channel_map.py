@@ -9,7 +9,8 @@ import numpy as np
 
 from residnet.core.config import Config
 from residnet.core.errors import UsageError
-from residnet.core.names import CHANNEL_UNITS, to_si
+from residnet.core.names import CHANNEL_UNITS
+from residnet.core.units import known_unit, si_unit, to_si
 from residnet.data.readers.base import unwrap
 
 Frame = Literal["as_measured", "ned", "enu", "body_fsd", "body_fpu"]
@@ -36,12 +37,18 @@ class Conversion(Config):
 
     Attributes:
         unit: its unit, for example `deg/s`.
-        sign: -1 turns it around before anything else.
+        offset: taken from the column's number first, in the column's own unit: the neutral of a
+            servo, for example 1500.
+        scale: what the rest is multiplied by to be in `unit`, for example 0.07 where 1000 us more
+            are 70 deg more.
+        sign: -1 turns it around.
         frame: `as_measured` (nothing to convert), `ned`, `body_fsd` (forward, starboard, down),
             `enu` (angles counter-clockwise from east) or `body_fpu` (forward, port, up).
     """
 
     unit: str
+    offset: float = 0.0
+    scale: float = 1.0
     sign: Literal[1, -1] = 1
     frame: Frame = "as_measured"
 
@@ -54,6 +61,8 @@ class Conversion(Config):
         """
         if name == "t" or name.startswith("mask:"):
             raise ValueError(f"'{name}' cannot name a channel; time has its own key")
+        if self.scale == 0.0:
+            raise ValueError(f"channel {name}: scale must not be zero, all would be the same")
         try:
             factor(self.unit, CHANNEL_UNITS.get(name))
         except ValueError as error:
@@ -68,13 +77,18 @@ class Conversion(Config):
                 " it points the other way"
             )
 
+    def si(self, name: str) -> str:
+        """Return the SI unit of channel `name`."""
+        return si_unit(known_unit(self.unit, CHANNEL_UNITS.get(name)))
+
     def convert(self, name: str, raw: np.ndarray) -> np.ndarray:
         """Return the values [T] of channel `name` in residnet's unit, sign and frame.
 
         psi unwrapped.
         """
-        scale, offset = _FRAMES[self.frame][name] if self.frame != "as_measured" else _SAME
-        values = scale * self.sign * to_si(self.unit) * raw + offset
+        turn, ahead = _FRAMES[self.frame][name] if self.frame != "as_measured" else _SAME
+        gain = turn * self.sign * to_si(self.unit, CHANNEL_UNITS.get(name)) * self.scale
+        values = gain * (raw - self.offset) + ahead
         return unwrap(values) if name == "psi" else values
 
 

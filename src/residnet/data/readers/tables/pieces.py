@@ -11,6 +11,7 @@ import numpy as np
 
 from residnet.core.errors import DataError, UsageError
 from residnet.core.names import nearest, shown
+from residnet.data.readers.files import missing_package
 from residnet.data.readers.tables.lines import check_lines
 
 if TYPE_CHECKING:
@@ -38,9 +39,9 @@ def _positions(
     return [list(header).index(column) for column in columns]
 
 
-def _header(path: Path, delimiter: str) -> tuple[list[str], str]:
+def _header(path: Path, delimiter: str, encoding: str) -> tuple[list[str], str]:
     """Return the cells of a csv file's header, and a hint for errors about missing columns."""
-    with path.open(newline="", encoding="utf-8-sig") as stream:
+    with path.open(newline="", encoding=encoding) as stream:
         header = [cell.strip() for cell in next(csv.reader(stream, delimiter=delimiter), [])]
     if not any(header):
         raise DataError(
@@ -55,7 +56,9 @@ def _header(path: Path, delimiter: str) -> tuple[list[str], str]:
     return header, hint
 
 
-def read_csv(path: Path, columns: Sequence[str], delimiter: str, decimal: str) -> Pieces:
+def read_csv(
+    path: Path, columns: Sequence[str], delimiter: str, decimal: str, encoding: str = "utf-8"
+) -> Pieces:
     """Yield the wanted columns of a text table piece by piece, with the share of the file read.
 
     Args:
@@ -63,15 +66,18 @@ def read_csv(path: Path, columns: Sequence[str], delimiter: str, decimal: str) -
         columns: names of the wanted columns, in order.
         delimiter: between cells.
         decimal: sign of the decimals.
+        encoding: of the text.
 
     Raises:
         UsageError: where a column is missing.
-        DataError: where the file is empty, not UTF-8 or not a regular table.
+        DataError: where the file is empty, not text of this encoding or not a regular table.
     """
     import pandas as pd
 
+    # a byte order mark is no part of the first name
+    coded = "utf-8-sig" if encoding == "utf-8" else encoding
     try:
-        header, hint = _header(path, delimiter)
+        header, hint = _header(path, delimiter, coded)
         where = _positions(path, header, columns, hint)
         # one column more than the header: cells beyond it would shift or vanish silently (a decimal
         # comma in a comma table does that)
@@ -89,7 +95,7 @@ def read_csv(path: Path, columns: Sequence[str], delimiter: str, decimal: str) -
                 skip_blank_lines=False,
                 skipinitialspace=True,
                 low_memory=False,
-                encoding="utf-8-sig",
+                encoding=coded,
                 chunksize=_PIECE,
             )
             for table, last in _with_last(pieces):
@@ -107,7 +113,8 @@ def read_csv(path: Path, columns: Sequence[str], delimiter: str, decimal: str) -
                 yield wanted, min(1.0, stream_of_bytes.tell() / size)
     except UnicodeDecodeError as error:
         raise DataError(
-            f"{path}: not UTF-8 text (byte {error.start}); save the file as UTF-8"
+            f"{path}: not {encoding.upper()} text (byte {error.start}); save the file as UTF-8, or"
+            " give its `encoding`"
         ) from error
     except pd.errors.EmptyDataError:
         return
@@ -166,3 +173,55 @@ def read_parquet(path: Path, columns: Sequence[str]) -> Pieces:
             f"{path}: not a readable Parquet file"
             f" ({shown(str(error) or type(error).__name__, 200)})"
         ) from error
+
+
+def read_excel(path: Path, columns: Sequence[str], sheet: str | None) -> Pieces:
+    """Yield the wanted columns of a sheet in one piece.
+
+    Args:
+        path: the file.
+        columns: names of the wanted columns, in order.
+        sheet: its name; None takes the first.
+
+    Raises:
+        UsageError: where a column or the sheet is missing, or openpyxl is not installed.
+        DataError: where the file cannot be read.
+    """
+    table = excel_sheet(path, sheet)
+    where = _positions(path, [str(name) for name in table.columns], columns)
+    yield table.iloc[:, where], 1.0
+
+
+def excel_sheet(path: Path, sheet: str | None, rows: int | None = None) -> pd.DataFrame:
+    """Return a sheet as its cells are, with the first line as names.
+
+    Args:
+        path: the file.
+        sheet: its name; None takes the first.
+        rows: how many are read; None for all.
+
+    Raises:
+        UsageError: where there is no such sheet, or openpyxl is not installed.
+        DataError: where the file cannot be read.
+    """
+    import pandas as pd
+
+    try:
+        import openpyxl
+    except ImportError as error:
+        raise missing_package("excel", "openpyxl", "an Excel sheet") from error
+    try:
+        names = openpyxl.load_workbook(path, read_only=True).sheetnames
+        if sheet is not None and sheet not in names:
+            raise UsageError(f"{path}: no sheet '{sheet}'{nearest(sheet, names)}")
+        table = pd.read_excel(path, sheet_name=sheet or 0, nrows=rows, engine="openpyxl")
+    except UsageError:
+        raise
+    # a damaged archive fails in every layer of the library
+    except Exception as error:
+        raise DataError(
+            f"{path}: damaged or not an Excel file ({type(error).__name__}:"
+            f" {shown(' '.join(str(error).split()), 200)})"
+        ) from error
+    table.columns = [str(name).strip() for name in table.columns]
+    return table.dropna(how="all")

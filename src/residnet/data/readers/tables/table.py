@@ -6,18 +6,20 @@ forward-starboard-down, psi unwrapped.
 
 from __future__ import annotations
 
+import codecs
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, final
 
 import numpy as np
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from residnet.core.config import Config
 from residnet.core.errors import DataError
 from residnet.core.log import Log
-from residnet.core.names import shown, si_unit
+from residnet.core.names import shown
+from residnet.core.units import known_unit
 from residnet.data.readers.base import (
     LogReader,
     provenance,
@@ -27,11 +29,15 @@ from residnet.data.readers.files import progress
 from residnet.data.readers.recording import remark
 from residnet.data.readers.spool import LARGE
 from residnet.data.readers.tables.channel_map import ChannelMap, factor
-from residnet.data.readers.tables.pieces import Pieces, read_csv, read_parquet
+from residnet.data.readers.tables.dates import DateClock, Order, zone_of
+from residnet.data.readers.tables.pieces import Pieces, read_csv, read_excel, read_parquet
 from residnet.data.readers.tables.rows import Rows
 
 if TYPE_CHECKING:
     import pandas as pd
+
+DATE = "date"
+"""Stands for a unit where a column holds dates."""
 
 
 class TimeColumn(Config):
@@ -39,17 +45,44 @@ class TimeColumn(Config):
 
     Attributes:
         column: name of the column.
-        unit: unit of its numbers, for example `ms`.
+        unit: unit of its numbers, for example `ms`; `date` for dates and times of day, as
+            `2024-05-03T12:00:00.5+02:00`, `03.05.2024 12:00:00,5` or `12:00:00.5`.
+        date: column with the dates, where `column` holds times of day; null for none.
+        zone: time zone of dates that name none, for example `Europe/Berlin`; null leaves them
+            without one.
+        order: of day, month and year in dates: `dmy`, `mdy` or `ymd`; null takes it from the cells.
     """
 
     column: str
     unit: str = "s"
+    date: str | None = None
+    zone: str | None = None
+    order: Order | None = None
 
     @field_validator("unit")
     @classmethod
     def _measures_time(cls, unit: str) -> str:
+        if unit == DATE:
+            return unit
         factor(unit, "s")
-        return unit
+        return known_unit(unit, "s")
+
+    @field_validator("zone")
+    @classmethod
+    def _known_zone(cls, zone: str | None) -> str | None:
+        return zone if zone is None else zone_of(zone).key
+
+    @model_validator(mode="after")
+    def _dates(self) -> TimeColumn:
+        given = [name for name in ("date", "zone", "order") if getattr(self, name) is not None]
+        if given and self.unit != DATE:
+            raise ValueError(f"{given[0]} is for dates; set unit: {DATE}")
+        return self
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of the columns that hold time."""
+        return (self.column,) if self.date is None else (self.column, self.date)
 
 
 class _TableConfig(Config, ABC):
@@ -86,18 +119,50 @@ class CsvConfig(_TableConfig):
     Attributes:
         delimiter: between cells.
         decimal: sign of the decimals, `.` or `,`.
+        encoding: of the text, for example `cp1252` for a file that an older Windows wrote.
     """
 
     kind: Literal["csv"] = "csv"
     delimiter: str = Field(default=",", min_length=1, max_length=1)
     decimal: Literal[".", ","] = "."
+    encoding: str = "utf-8"
+
+    @field_validator("encoding")
+    @classmethod
+    def _known_encoding(cls, encoding: str) -> str:
+        try:
+            return codecs.lookup(encoding).name
+        except LookupError as error:
+            raise ValueError(
+                f"no encoding is called '{encoding}'; usual are utf-8, cp1252 and cp932"
+            ) from error
 
     def build(self) -> TableReader:
         """Build the reader of csv files."""
         return TableReader(
             self,
-            lambda path, names: read_csv(path, names, self.delimiter, self.decimal),
+            lambda path, names: read_csv(path, names, self.delimiter, self.decimal, self.encoding),
             lambda i: f"line {i + 2}",
+        )
+
+
+@final
+class ExcelConfig(_TableConfig):
+    """Sheets of Excel files (.xlsx) with one line of column names.
+
+    Attributes:
+        sheet: name of the sheet; null takes the first.
+    """
+
+    kind: Literal["excel"] = "excel"
+    sheet: str | None = None
+
+    def build(self) -> TableReader:
+        """Build the reader of Excel sheets."""
+        return TableReader(
+            self,
+            lambda path, names: read_excel(path, names, self.sheet),
+            lambda i: f"row {i + 2}",
         )
 
 
@@ -125,7 +190,7 @@ class TableReader(LogReader):
 
     def __init__(
         self,
-        config: CsvConfig | ParquetConfig,
+        config: _TableConfig,
         load: Callable[[Path, Sequence[str]], Pieces],
         row: Callable[[int], str],
     ) -> None:
@@ -146,11 +211,14 @@ class TableReader(LogReader):
         """
         require_file(path)
         maps = self._config.channels
-        columns = [self._config.time.column, *(entry.column for entry in maps.values())]
+        time, dates = self._config.time, None
+        if time.unit == DATE:
+            dates = DateClock(time.zone, time.order)
+        columns = [*time.columns, *(entry.column for entry in maps.values())]
         size = path.stat().st_size
         rows = Rows(
             path,
-            (self._config.time.column, self._config.time.unit),
+            (time.column, "s" if dates else time.unit),
             maps,
             self._row,
             on_disk=size > LARGE,
@@ -159,13 +227,17 @@ class TableReader(LogReader):
         with progress(path.name, size, 1.0) as advance:
             for piece, share in self._load(path, columns):
                 cut |= bool(piece.attrs.get("cut"))
-                rows.add(
-                    [
-                        self._numbers(path, piece.iloc[:, i], column, read)
-                        for i, column in enumerate(columns)
-                    ],
-                    read,
+                first = len(time.columns)
+                clock = (
+                    self._dated(path, piece.iloc[:, :first], dates)
+                    if dates
+                    else self._numbers(path, piece.iloc[:, 0], time.column, read)
                 )
+                measured = [
+                    self._numbers(path, piece.iloc[:, i], columns[i], read)
+                    for i in range(first, len(columns))
+                ]
+                rows.add([clock, *measured], read)
                 read += len(piece)
                 advance(share)
         t, channels = rows.finish()
@@ -174,13 +246,26 @@ class TableReader(LogReader):
             if self._config.manoeuvre == "folder"
             else self._config.manoeuvre
         )
-        units = {name: si_unit(entry.unit) for name, entry in maps.items()}
+        units = {name: entry.si(name) for name, entry in maps.items()}
         meta = provenance(path, read + cut, read + cut - t.size)
+        findings = list(dates.remarks) if dates else []
         if cut:
-            meta["findings"] = [
+            findings.append(
                 remark("note", "cut_line", "the file ends within its last line, which is left out")
-            ]
+            )
+        if findings:
+            meta["findings"] = findings
+        if dates and dates.epoch_ns is not None:
+            meta |= {"epoch": dates.epoch_ns * 1e-9, "epoch_ns": dates.epoch_ns}
         return Log(path.stem, t, channels, units, manoeuvre or "unknown", meta=meta)
+
+    @staticmethod
+    def _dated(path: Path, cells: pd.DataFrame, dates: DateClock) -> np.ndarray:
+        """Return the times of one piece in s, from its column of times and that of its dates."""
+        try:
+            return dates.seconds(cells.iloc[:, 0], cells.iloc[:, 1] if cells.shape[1] > 1 else None)
+        except DataError as error:
+            raise DataError(f"{path}: column '{cells.columns[0]}': {error}") from None
 
     def _numbers(self, path: Path, column: pd.Series, name: str, first: int) -> np.ndarray:
         """Return the cells of one column as float64 [T], NaN where empty.

@@ -1,0 +1,148 @@
+"""Tables as people write them: local dates, decimal commas, encodings, servos, Excel, any case."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from residnet.core.config import validate
+from residnet.core.errors import ConfigError, DataError, UsageError
+from residnet.core.log import Log
+from residnet.core.units import known_unit, to_si
+from residnet.data.readers import ReaderConfig
+from residnet.data.readers.tables.dates import DateClock, date_order, looks_dated
+
+
+@pytest.mark.parametrize(
+    ("written", "unit"),
+    [
+        ("deg/min", "deg/min"),
+        ("° / MIN", "deg/min"),
+        ("Degrees per second", "deg/s"),
+        ("KT", "kn"),
+        ("Knots", "kn"),
+        ("RPM", "rpm"),
+        ("U/min", "1/min"),
+        ("rev/min", "1/min"),
+        ("min-1", "1/min"),
+        ("m s-1", "m/s"),
+        ("rad s^-1", "rad/s"),
+        ("m/s²", "m/s^2"),
+        ("%", "%"),
+        ("µs", "us"),
+        ("US", "us"),
+        ("Nm", "N m"),
+        ("度/分", "deg/min"),
+        ("kN", "kN"),
+    ],
+)
+def test_spelling_of_a_unit(written: str, unit: str) -> None:
+    assert known_unit(written) == unit
+
+
+def test_case_alone_is_settled_by_the_dimension() -> None:
+    assert to_si("KN", "m/s") == pytest.approx(1852 / 3600)
+    assert to_si("KN", "N") == 1000.0
+    with pytest.raises(UsageError, match="may be kn or kN"):
+        known_unit("KN")
+
+
+@pytest.mark.parametrize("written", ["deg/m", "deg/h", "gon", "kn/s", "mrad", "rad/mm", "deg/ms"])
+def test_no_suggestion_differs_by_a_factor(written: str) -> None:
+    with pytest.raises(UsageError) as caught:
+        known_unit(written)
+    assert "did you mean" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("cells", "order", "seconds"),
+    [
+        (["03.05.2024 23:59:59,5", "04.05.2024 00:00:01"], "dmy", 1.5),
+        (["03/05/2024 11:59:59 PM", "03/06/2024 12:00:01 AM"], "mdy", 2.0),
+        (["31/05/2024 10:00", "31/05/2024 10:01"], "dmy", 60.0),
+        (["12-Nov-2020 11:14:47", "12-Nov-2020 11:14:48"], "dmy", 1.0),
+        (["7. Mär. 2024 11:14:47", "7. Mär. 2024 11:14:48"], "dmy", 1.0),
+        (["2024年5月3日 12時00分01秒", "2024年5月3日 12時00分02秒"], "ymd", 1.0),
+        (["2024-05-03T12:00:00.5+02:00", "2024-05-03T10:00:01Z"], "ymd", 0.5),
+        (["23:59:59.9", "00:00:00.1"], None, 0.2),
+    ],
+)
+def test_forms_of_dates(cells: list[str], order: str | None, seconds: float) -> None:
+    column = pd.Series(cells)
+    assert looks_dated(column)
+    assert date_order(column) == order
+    assert DateClock(None, None).seconds(column, None)[-1] == pytest.approx(seconds, abs=1e-9)
+
+
+def test_the_hour_that_comes_twice() -> None:
+    clock = DateClock("Europe/Berlin", None)
+    local = ["27.10.2024 02:59:59", "27.10.2024 02:00:01", "27.10.2024 02:00:02"]
+    assert clock.seconds(pd.Series(local), None).tolist() == [0.0, 2.0, 3.0]
+    assert clock.epoch_ns == pd.Timestamp("2024-10-27 00:59:59").value
+
+
+def test_cells_that_are_no_dates() -> None:
+    assert not looks_dated(pd.Series(["1.5", "2.5"]))
+    with pytest.raises(DataError, match="'soon' is no date"):
+        DateClock(None, None).seconds(pd.Series(["03.05.2024 10:00:00", "soon"]), None)
+    with pytest.raises(DataError, match=r"'31\.31\.2024 10:00' is no date with dmy"):
+        DateClock(None, None).seconds(pd.Series(["31.31.2024 10:00"]), None)
+
+
+def _read(path: Path, settings: dict[str, Any]) -> Log:
+    return validate(settings, ReaderConfig, "here").build().read(path)
+
+
+CHANNELS = {
+    "u": {"column": "Fahrt [kn]", "unit": "KN"},
+    "delta": {"column": "Servo [µs]", "unit": "deg", "offset": 1500, "scale": 0.07},
+}
+
+
+def test_a_german_table(tmp_path: Path) -> None:
+    path = tmp_path / "fahrt.csv"
+    lines = ["Datum;Uhrzeit;Fahrt [kn];Servo [µs]"]
+    lines += [f"03.05.2024;12:00:0{i},5;{i},25;{1400 + 100 * i}" for i in range(4)]
+    path.write_bytes("\r\n".join([*lines, ""]).encode("cp1252"))
+    time = {"column": "Uhrzeit", "date": "Datum", "unit": "date", "zone": "Europe/Berlin"}
+    table = {"kind": "csv", "delimiter": ";", "decimal": ",", "encoding": "cp1252"}
+    log = _read(path, {**table, "time": time, "channels": CHANNELS})
+    np.testing.assert_allclose(log.t, [0.0, 1.0, 2.0, 3.0])
+    np.testing.assert_allclose(log["u"], (np.arange(4) + 0.25) * 1852 / 3600)
+    np.testing.assert_allclose(log["delta"], np.radians([-7.0, 0.0, 7.0, 14.0]), atol=1e-12)
+    assert log.meta["epoch_ns"] == pd.Timestamp("2024-05-03 10:00:00.5").value
+
+
+def test_an_excel_sheet(tmp_path: Path) -> None:
+    pytest.importorskip("openpyxl")
+    path = tmp_path / "fahrt.xlsx"
+    moments = pd.date_range("2024-05-03 12:00:00", periods=4, freq="500ms")
+    table = pd.DataFrame({"Zeit": moments, "Fahrt [kn]": [1.0, 2, 3, 4], "Servo [µs]": 1500})
+    with pd.ExcelWriter(path) as writer:
+        pd.DataFrame({"note": ["x"]}).to_excel(writer, sheet_name="about", index=False)
+        table.to_excel(writer, sheet_name="run", index=False)
+    settings = {"kind": "excel", "sheet": "run", "time": {"column": "Zeit", "unit": "date"}}
+    log = _read(path, {**settings, "channels": CHANNELS})
+    np.testing.assert_allclose(log.t, [0.0, 0.5, 1.0, 1.5])
+    np.testing.assert_allclose(log["u"], np.arange(1, 5) * 1852 / 3600)
+    with pytest.raises(UsageError, match="no sheet 'runs'; did you mean 'run'"):
+        _read(path, {**settings, "sheet": "runs", "channels": CHANNELS})
+    path.write_bytes(b"PK nothing")
+    with pytest.raises(DataError, match="damaged or not an Excel file"):
+        _read(path, {**settings, "channels": CHANNELS})
+
+
+@pytest.mark.parametrize(
+    ("time", "message"),
+    [
+        ({"column": "t", "unit": "date", "zone": "Europe/Berlim"}, "no time zone is called"),
+        ({"column": "t", "zone": "UTC"}, "zone is for dates; set unit: date"),
+    ],
+)
+def test_times_that_cannot_be(time: dict[str, str], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        validate({"kind": "csv", "time": time, "channels": CHANNELS}, ReaderConfig, "here")
