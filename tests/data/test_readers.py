@@ -155,7 +155,7 @@ def test_text_that_is_not_utf8(tmp_path: Path) -> None:
     ("channels", "words"),
     [
         ({"psi": {"column": "a", "unit": "deg/s"}}, "unit 'deg/s' does not measure [rad]"),
-        ({"u": {"column": "a", "unit": "knot"}}, "unknown unit 'knot'"),
+        ({"u": {"column": "a", "unit": "fathom"}}, "unknown unit 'fathom'"),
         (
             {"x": {"column": "a", "unit": "m", "frame": "enu"}},
             "frame 'enu' says nothing about it (frames that do: ned)",
