@@ -75,10 +75,13 @@ def test_python_and_command_line_give_the_same_metrics(
     path.write_text(yaml.safe_dump({**TINY, "export": {"models": []}}, sort_keys=False))
     assert call(monkeypatch, "run", path, "--out", tmp_path / "run") == 0
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
-    rows: list[dict[str, Any]] = []
-    for split in settings.evaluation.splits:
-        rows += identified.evaluate(logs[split], DATA).rows
-    assert identified.select(rows) == metrics["selected"]
+    splits = settings.evaluation.splits
+    judged = {split: identified.evaluate(logs[split], DATA) for split in splits}
+    rows: list[dict[str, Any]] = [row for part in judged.values() for row in part.rows]
+    chosen = identified.select(judged)
+    assert chosen.selected == metrics["selected"]
+    assert chosen.selected_ensemble == metrics["selected_ensemble"] == "mean"
+    assert chosen.content() == json.loads((tmp_path / "run" / "selection.json").read_text())
     for row in metrics["rows"]:
         row.pop("selected")
     # JSON holds every float exactly

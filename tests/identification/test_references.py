@@ -52,3 +52,8 @@ def test_what_is_not_there_is_no_reference() -> None:
         )["mean"]
         == "baseline"
     )
+
+
+def test_a_baseline_that_diverged_is_no_reference_while_a_steady_one_is_there() -> None:
+    lost = {**NOTES, "physics": {"validation": 0.16, "validation_diverged": 2}}
+    assert references(ROLES, lost)["mean"] == "hull"

@@ -7,7 +7,7 @@ from __future__ import annotations
 import copy
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -27,7 +27,7 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.heads import LstmConfig, MlpConfig
 from residnet.heads.mlp import MlpHead
 from residnet.training.config import TrainingConfig
-from residnet.training.module import HeadTraining
+from residnet.training.module import HeadTraining, Score, Validate
 from residnet.training.trainer import train
 
 ONE_STEP = {"epochs": 2, "window": 1.0, "batch": 8}
@@ -61,21 +61,22 @@ def state_of(model: HybridDynamics) -> dict[str, Tensor]:
 class Scripted:
     """A validation that says what it is told, and remembers which model and weights it saw."""
 
-    def __init__(self, scores: Sequence[float]) -> None:
+    def __init__(self, scores: Sequence[float], diverged: Sequence[int] = (0,)) -> None:
         self.scores = itertools.chain(scores, itertools.repeat(scores[-1]))
+        self.diverged = itertools.chain(diverged, itertools.repeat(diverged[-1]))
         self.seen: list[dict[str, Tensor]] = []
         self.models: list[HybridDynamics] = []
 
-    def __call__(self, model: HybridDynamics) -> float:
+    def __call__(self, model: HybridDynamics) -> Score:
         self.seen.append(state_of(model))
         self.models.append(model)
-        return next(self.scores)
+        return Score(next(self.diverged), next(self.scores))
 
 
 def trained(
     logs: Sequence[Prepared],
     folder: Path,
-    validate: Callable[[HybridDynamics], float],
+    validate: Validate,
     **config: Any,
 ) -> tuple[HybridDynamics, dict[str, Any]]:
     model, residual, store = prepared(logs)
@@ -100,8 +101,8 @@ def test_training_lowers_the_free_run_error(tmp_path: Path) -> None:
     logs = trials(noise=0.002, window=0.5)
     baseline = free_run_error(prepared(logs)[0])
 
-    def validate(model: HybridDynamics) -> float:
-        return free_run_error(copy.deepcopy(model), seed=55)
+    def validate(model: HybridDynamics) -> Score:
+        return Score(0, free_run_error(copy.deepcopy(model), seed=55))
 
     stages = {
         "one_step": {"epochs": 6, "window": 1.0, "batch": 32, "learning_rate": 2e-2},
@@ -117,7 +118,7 @@ def test_training_lowers_the_free_run_error(tmp_path: Path) -> None:
     assert (
         notes["best_validation"]
         == min(entry["validation"] for entry in curve)
-        == pytest.approx(validate(model), rel=1e-5)
+        == pytest.approx(validate(model).error, rel=1e-5)
     )
     assert notes["parameters"] == 12 * (5 + 1) + 3 * (12 + 1)
     assert free_run_error(model) < 0.7 * baseline
@@ -132,6 +133,14 @@ def test_the_weights_that_validated_best_are_kept(logs: list[Prepared], tmp_path
     assert same(state_of(model), validate.seen[1])
     assert not same(validate.seen[1], validate.seen[3])
     assert (notes["best_validation"], notes["epochs"]) == (1.0, 4)
+
+
+def test_weights_that_diverge_never_beat_steady_ones(logs: list[Prepared], tmp_path: Path) -> None:
+    validate = Scripted([1.0, 3.0, 2.0, 2.5], diverged=[1, 0, 2, 0])
+    model, notes = trained(logs, tmp_path, validate, multi_step=[HALF_SECOND])
+    assert same(state_of(model), validate.seen[3])
+    assert notes["best_validation"] == 2.5
+    assert [entry["diverged"] for entry in notes["curve"]] == [1.0, 0.0, 2.0, 0.0]
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,7 @@ from residnet.identification.fit import Identified
 from residnet.identification.fit import fit as identify
 from residnet.identification.prepared import require_window
 from residnet.identification.settings import FitSettings
+from residnet.judge.selection import Selection
 from residnet.judge.tables import metrics_table
 
 if TYPE_CHECKING:
@@ -52,9 +53,14 @@ class Models(Mapping[str, Model]):
         return {split: free_run(self, self.data, split) for split in splits}
 
     @cached_property
+    def selection(self) -> Selection:
+        """Which single model and which ensemble the validation logs choose, and why."""
+        return self.identified.select({name: runs.evaluation for name, runs in self.runs.items()})
+
+    @property
     def selected(self) -> str:
-        """Name of the model with the least free-run error on the validation logs."""
-        return self.identified.select(self.runs["validation"].rows)
+        """Name of the simplest sound model within one standard error of the best."""
+        return self.selection.selected
 
     @property
     def metrics(self) -> pd.DataFrame:
@@ -222,7 +228,9 @@ def metrics(
 
 
 def select(models: Models) -> Model:
-    """Return the model with the least free-run error on the validation logs.
+    """Return the simplest sound model that is within one standard error of the best.
+
+    Free runs over the validation logs decide; `models.selection.reason` says why.
 
     Example:
         residnet.select(models).name

@@ -1,4 +1,4 @@
-"""Fitted models judged: free runs over all protocols of a split, their metrics, the selection."""
+"""Fitted models judged: free runs over all protocols of a split, and their metrics."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from residnet.identification.references import references
 from residnet.judge.config import EvaluationConfig
 from residnet.judge.freerun import Candidate, FreeRun, free_run
 from residnet.judge.limits import limits
-from residnet.judge.metrics import find, rows
+from residnet.judge.metrics import rows
 from residnet.judge.tables import metrics_table
 from residnet.physics.vessel import load_vessel
 
@@ -114,19 +114,3 @@ def _truth(data: SimulatedTrials) -> Candidate | None:
     model = PlantDynamics(plant, data.step, data.substeps)
     unknown = len(plant.inputs) - len(commands)
     return Candidate("truth", "truth", model, plant.state, commands, unknown, "baseline")
-
-
-def select(rows: Sequence[dict[str, Any]], fitted: Iterable[FittedModel], protocol: str) -> str:
-    """Return the name of the model with the least mean nrmse on validation, `zero` left out.
-
-    Args:
-        rows: of metrics.json, those of the validation split among them.
-        fitted: models to choose from.
-        protocol: whose rows decide.
-    """
-
-    def error(name: str) -> float:
-        row = find(rows, model=name, split="validation", protocol=protocol)
-        return float(row["nrmse"]["mean"])
-
-    return min((entry.name for entry in fitted if entry.spec.role != "zero"), key=error)

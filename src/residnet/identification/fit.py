@@ -6,6 +6,7 @@ import copy
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -23,12 +24,15 @@ from residnet.dynamics.ensemble import mean_of
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
 from residnet.heads import ClosedFormHead
-from residnet.identification.evaluation import Evaluation, candidates, evaluate, select
+from residnet.identification.evaluation import Evaluation, candidates, evaluate
 from residnet.identification.models import FitStore, FittedModel, NoStore
 from residnet.identification.prepared import velocity_limit
+from residnet.identification.selecting import examine, select
 from residnet.identification.settings import FitSettings
 from residnet.identification.solution_choice import choose_solution
 from residnet.identification.validation import ValidationScore
+from residnet.judge.sanity import Finding
+from residnet.judge.selection import Selection
 from residnet.training.config import TrainingConfig
 from residnet.training.refit import refit
 
@@ -41,11 +45,13 @@ class Identified(Mapping[str, FittedModel]):
         settings: of the fit.
         models: by name.
         limit: of |u, v, r| [3] beyond which a free run has diverged.
+        train: the logs that fitted them.
     """
 
     settings: FitSettings
     models: dict[str, FittedModel]
     limit: np.ndarray
+    train: Sequence[Prepared]
 
     def evaluate(
         self, logs: Sequence[Prepared], data: MeasuredLogs | SimulatedTrials | None = None
@@ -60,9 +66,24 @@ class Identified(Mapping[str, FittedModel]):
         models = candidates(self.values(), data)
         return evaluate(models, logs, settings.evaluation, settings.prepare.grid.step, self.limit)
 
-    def select(self, rows: Sequence[dict[str, Any]]) -> str:
-        """Return the name of the model that does best on the validation rows."""
-        return select(rows, self.values(), self.settings.evaluation.selection)
+    @cached_property
+    def findings(self) -> dict[str, list[Finding]]:
+        """What the checks for physical sanity find, by model; `zero` is left out."""
+        settings = self.settings
+        step = settings.prepare.grid.step
+        return examine(self.values(), self.train, settings.evaluation, step)
+
+    def select(self, judged: Mapping[str, Evaluation]) -> Selection:
+        """Choose a single model and an ensemble by their free runs.
+
+        Args:
+            judged: what `evaluate` returned, by split; `validation` is needed, and divergences on
+                `train` count where it is there.
+
+        Raises:
+            UsageError: where the validation logs have not been judged.
+        """
+        return select(self.values(), judged, self.findings, self.settings.evaluation)
 
     def __getitem__(self, name: str) -> FittedModel:
         return self.models[name]
@@ -92,19 +113,16 @@ def fit(
     baselines = {name: fitter.baseline(name) for name in settings.all_baselines}
     models = {"zero": fitter.zero(), **baselines}
     for name, baseline in baselines.items():
-        say(f"  {name}: validation free-run error {baseline.notes['validation']:.4f}")
+        say(f"  {name}: {_said(baseline)}")
     for name in settings.heads:
         say(f"  fitting {name}")
         head = fitter.head(name, baselines[settings.baseline_name_of(name)].model)
-        say(
-            f"  {name}: validation free-run error {head.notes['validation']:.4f} after"
-            f" {head.notes['seconds']:.1f} s"
-        )
+        say(f"  {name}: {_said(head)} after {head.notes['seconds']:.1f} s")
         models[name] = head
     for name, members in settings.ensembles.items():
         models[name] = fitter.ensemble(name, [models[member] for member in members])
-        say(f"  {name}: validation free-run error {models[name].notes['validation']:.4f}")
-    return Identified(settings, models, fitter.limit)
+        say(f"  {name}: {_said(models[name])}")
+    return Identified(settings, models, fitter.limit, fitter.train)
 
 
 class Fitter:
@@ -173,12 +191,12 @@ class Fitter:
             "samples": len(self.samples),
             **solution.choice,
             **tried,
-            "least_squares": self.validate(model),
+            "least_squares": self.validate(model).error,
         }
         if name in self.settings.refit:
             table, covariance = self._refit(name, model, table, notes)
         notes["coefficients"] = [_coefficient_row(entry) for entry in table]
-        notes["validation"] = self.validate(model)
+        notes |= self._validated(model)
         notes["seconds"] = round(time.perf_counter() - started, 1)
         return self._kept(FittedModel(spec, model, notes, covariance))
 
@@ -235,7 +253,7 @@ class Fitter:
         notes |= {
             "baseline": self.settings.baseline_name_of(name),
             "seconds": round(time.perf_counter() - started, 1),
-            "validation": self.validate(model),
+            **self._validated(model),
         }
         return self._kept(FittedModel(spec, model, notes))
 
@@ -247,7 +265,7 @@ class Fitter:
         model = mean_of([copy.deepcopy(member.model).to(torch.float64) for member in members])
         notes: dict[str, Any] = {
             "members": [member.name for member in members],
-            "validation": self.validate(model),
+            **self._validated(model),
         }
         return self._kept(FittedModel(spec, model, notes))
 
@@ -261,6 +279,11 @@ class Fitter:
         return train(
             name, model, residual, windows, settings, self.scales, self.validate, seed, folder
         )
+
+    def _validated(self, model: HybridDynamics) -> dict[str, Any]:
+        """Notes on a model's free runs over the validation logs."""
+        diverged, error = self.validate(model)
+        return {"validation": error, "validation_diverged": diverged}
 
     def _kept(self, fitted: FittedModel) -> FittedModel:
         self.store.keep(fitted)
@@ -279,6 +302,13 @@ def residual_samples(model: HybridDynamics, known: Samples) -> Samples:
     """
     with torch.no_grad():
         return model.head.residual_target(known, model.baseline(known.z))
+
+
+def _said(fitted: FittedModel) -> str:
+    """The validation error of a model in words, its divergences beside it."""
+    diverged = fitted.notes.get("validation_diverged", 0)
+    lost = f" ({diverged} windows DIVERGED)" if diverged else ""
+    return f"validation free-run error {fitted.notes['validation']:.4f}{lost}"
 
 
 def _coefficient_row(entry: Coefficient) -> dict[str, Any]:

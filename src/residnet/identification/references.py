@@ -19,10 +19,14 @@ def references(roles: Mapping[str, str], notes: Mapping[str, Mapping[str, Any]])
     Args:
         roles: zero, baseline, head, ensemble or truth by model.
         notes: contents of models/<model>/fit.json by model; a head's `baseline` and the baselines'
-            `validation` are read.
+            `validation` and `validation_diverged` are read.
     """
+    # a baseline that diverged is the worse one, whatever its error
     validated = {
-        name: float(notes[name].get("validation", math.inf))
+        name: (
+            int(notes[name].get("validation_diverged", 0)),
+            float(notes[name].get("validation", math.inf)),
+        )
         for name, role in roles.items()
         if role == "baseline"
     }

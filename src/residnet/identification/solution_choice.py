@@ -9,13 +9,14 @@ from torch import nn
 
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.regression.solutions import Solution
+from residnet.training.module import Score
 
 
 def choose_solution(
     model: HybridDynamics,
     part: nn.Module,
     solutions: Sequence[Solution],
-    score: Callable[[HybridDynamics], float],
+    score: Callable[[HybridDynamics], Score],
 ) -> tuple[Solution, dict[str, Any]]:
     """Fill a part of the model with the solution whose free run is best.
 
@@ -25,13 +26,13 @@ def choose_solution(
         model: the model that runs.
         part: its baseline or head, which the solutions belong to.
         solutions: at least one; a single one is taken as it is.
-        score: error of a model's free runs on validation data.
+        score: of a model's free runs on validation data; fewer divergences come before less error.
 
     Returns:
         The solution, and for fit.json the free-run error of each; empty where there was nothing to
         choose.
     """
-    tried: list[tuple[Solution, float]] = []
+    tried: list[tuple[Solution, Score]] = []
 
     def attempt(batch: Sequence[Solution]) -> None:
         for solution in batch:
@@ -47,20 +48,23 @@ def choose_solution(
         if better is centre:
             break
         centre = better
-    best = min(tried, key=_error, default=(solutions[0], 0.0))
-    part.load_state_dict(best[0].state, strict=False)
-    scores = [{**solution.choice, "validation": error} for solution, error in tried]
-    return best[0], {"free_run_choice": scores} if scores else {}
+    best = min(tried, key=_score)[0] if tried else solutions[0]
+    part.load_state_dict(best.state, strict=False)
+    scores = [
+        {**solution.choice, "validation": found.error, "diverged": found.diverged}
+        for solution, found in tried
+    ]
+    return best, {"free_run_choice": scores} if scores else {}
 
 
-def _error(tried: tuple[Solution, float]) -> float:
+def _score(tried: tuple[Solution, Score]) -> Score:
     return tried[1]
 
 
 def _best_with_neighbours(
-    tried: Sequence[tuple[Solution, float]],
-) -> tuple[Solution, float] | None:
+    tried: Sequence[tuple[Solution, Score]],
+) -> tuple[Solution, Score] | None:
     """The best of those that have neighbours; one that has none, such as no residual at all, does
     not end the search.
     """
-    return min((pair for pair in tried if pair[0].neighbours is not None), key=_error, default=None)
+    return min((pair for pair in tried if pair[0].neighbours is not None), key=_score, default=None)

@@ -13,10 +13,11 @@ from residnet.judge.config import EvaluationConfig
 from residnet.judge.freerun import Candidate, FreeRun, free_run
 from residnet.judge.metrics import window_errors
 from residnet.judge.protocol import all_windows
+from residnet.training.module import Score
 
 
 class ValidationScore:
-    """The free-run error of a model on the validation logs; the windows are laid out once.
+    """The free-run score of a model on the validation logs; the windows are laid out once.
 
     Args:
         logs: of the validation split.
@@ -37,14 +38,12 @@ class ValidationScore:
         self.scales = config.scales.array()
         self.windows = all_windows(config.protocols[config.selection], logs, step, config.selection)
 
-    def __call__(self, model: HybridDynamics) -> float:
-        """Return the mean nrmse over u, v, r of the validation windows, run in float32.
-
-        A diverged window counts with the error of `zero`.
-        """
+    def __call__(self, model: HybridDynamics) -> Score:
+        """Return the divergences and the mean nrmse of the validation windows, run in float32."""
         candidate = Candidate("validated", "head", model)
         predictions = free_run(
             [candidate], self.windows, self.logs, self.step, self.limit, dtype=torch.float32
         )
         errors = window_errors(FreeRun("", "", self.windows, predictions), "validated", self.logs)
-        return float((errors["rmse"].mean(0) / self.scales).mean())
+        diverged = sum(prediction.diverged for prediction in predictions["validated"])
+        return Score(diverged, float((errors["rmse"].mean(0) / self.scales).mean()))

@@ -40,13 +40,16 @@ _LONG_RUN = 300.0
 class Finding:
     """A finding of one check of one model.
 
-    `ok` is None where the check does not apply or could not be made.
+    `ok` is None where the check does not apply or could not be made. `fault` says in a few words
+    what makes the model unsound, so that it is not selected; it is empty where the finding is only
+    reported.
     """
 
     model: str
     check: str
     ok: bool | None
     text: str
+    fault: str = ""
 
 
 def check_run(run: Path, *, divergence: float = 3.0) -> list[Finding]:
@@ -132,11 +135,19 @@ def check_damping(
         for i in range(3)
         if bool(wrong[row, i])
     ]
+    # no damping at all is no wrong sign, and outside the training data no fit can know better
+    grown = [
+        f"d{VELOCITY[i]}′/d{VELOCITY[i]} {float(slopes[row, i]):+.2g} 1/s at {point.text}"
+        for row, point in enumerate(chosen)
+        for i in range(3)
+        if point.inside and float(slopes[row, i]) > 0.05 * float(largest[i])
+    ]
     return Finding(
         spec.name,
         DAMPING,
         False,
         f"not damped (wrong sign or none): {', '.join(which)}. " + "; ".join(parts),
+        f"its damping has the wrong sign ({', '.join(grown)})" if grown else "",
     )
 
 
@@ -289,7 +300,8 @@ def check_bounded(spec: ModelSpec, model: HybridDynamics, divergence: float) -> 
             f"runs away within {seconds:.0f} s with {inputs} held from rest (more than"
             f" {divergence:g} times the largest training velocity)"
         )
-        return Finding(spec.name, BOUNDED, False, text)
+        fault = f"it runs away within {seconds:.0f} s with inputs inside their training ranges"
+        return Finding(spec.name, BOUNDED, False, text, f"{fault} ({inputs})")
     text = (
         f"{len(corners)} runs of {_LONG_RUN:.0f} s from rest with inputs held at their extremes"
         f" stay bounded; the farthest ({inputs}) reaches {reached} of the largest training values"

@@ -21,6 +21,7 @@ def metrics_content(
     units: Mapping[str, str],
     scales: Mapping[str, float],
     selected: str,
+    selected_ensemble: str | None,
     rows: Sequence[Mapping[str, Any]],
 ) -> dict[str, Any]:
     """Return the contents of metrics.json.
@@ -29,7 +30,8 @@ def metrics_content(
         run: name of the run.
         units: unit of each state.
         scales: what nrmse divides by.
-        selected: name of the model that the validation data chose.
+        selected: name of the single model that the validation data chose.
+        selected_ensemble: name of the best ensemble; None where there is none.
         rows: of all splits, without `selected`.
     """
     marked = [{**row, "selected": row["model"] == selected} for row in rows]
@@ -39,6 +41,7 @@ def metrics_content(
         "channels": dict(units),
         "scales": dict(scales),
         "selected": selected,
+        "selected_ensemble": selected_ensemble,
         "rows": marked,
     }
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from residnet.judge.sanity import check_run
+from residnet.judge.sanity_file import read_findings
 from residnet.report.blocks import Section
 from residnet.report.figures.files import figures_section
 from residnet.report.figures.fit import write_figures
@@ -67,7 +67,7 @@ def fit_sections(run: RunFiles) -> list[Section]:
         DataError: where a file in it cannot be read.
     """
     divergence = float(run.evaluation.get("divergence") or _DIVERGENCE)
-    findings = check_run(run.path, divergence=divergence)
+    findings = read_findings(run.path, divergence=divergence)
     found = [
         caution_section(run, findings),
         limits.section(run),

@@ -37,6 +37,8 @@ class RunFolder:
         limits: where models fail, and what limits them.
         goodness: goodness of fit of the regressions.
         booklet: standard manoeuvres of the identified model.
+        selection: which model was selected, and why.
+        sanity: whether each model behaves like a vessel.
     """
 
     def __init__(self, path: Path) -> None:
@@ -55,6 +57,8 @@ class RunFolder:
         self.limits = path / "limits.json"
         self.goodness = path / "goodness.json"
         self.booklet = path / "booklet.json"
+        self.selection = path / "selection.json"
+        self.sanity = path / "sanity.json"
 
     @classmethod
     def create(

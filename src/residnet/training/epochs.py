@@ -50,13 +50,19 @@ class EpochTraining(L.LightningModule, ABC):
 
     Every epoch is seeded by (seed, epoch) alone, so that a run resumed at an epoch's end repeats
     the undisturbed one.
+
+    Attributes:
+        diverged: number of free runs that diverged in the last validation; weights with fewer of
+            them are better, whatever the scores.
     """
 
     def __init__(self, settings: Epochs, seed: int) -> None:
         super().__init__()
         self.settings: Any = settings
         self.seed = seed
+        self.diverged = 0
         self.best_score = math.inf
+        self.best_diverged = 0
         self.best_state: dict[str, Tensor] = {}
         self.without_gain = 0
         self.stopped = False
@@ -96,8 +102,9 @@ class EpochTraining(L.LightningModule, ABC):
         if last or (self.epoch + 1) % self.settings.validate_every == 0:
             model, score = self.validated()
             entry["validation"] = score
-            if score < self.best_score:
-                self.best_score, self.without_gain = score, 0
+            entry["diverged"] = float(self.diverged)
+            if self._gains(score):
+                self.best_score, self.best_diverged, self.without_gain = score, self.diverged, 0
                 self.best_state = {
                     name: value.detach().clone() for name, value in model.state_dict().items()
                 }
@@ -112,6 +119,11 @@ class EpochTraining(L.LightningModule, ABC):
         )
         self.trainer.should_stop = self.stopped
 
+    def _gains(self, score: float) -> bool:
+        if not self.best_state:
+            return math.isfinite(score)
+        return (self.diverged, score) < (self.best_diverged, self.best_score)
+
     def on_fit_start(self) -> None:
         """Reset the losses of the running epoch."""
         self._losses: list[float] = []
@@ -120,6 +132,7 @@ class EpochTraining(L.LightningModule, ABC):
         """Keep the best weights, the curve, random state and thread count in the checkpoint."""
         checkpoint["residnet"] = {
             "best_score": self.best_score,
+            "best_diverged": self.best_diverged,
             "best_state": self.best_state,
             "without_gain": self.without_gain,
             "history": self.history,
@@ -140,6 +153,7 @@ class EpochTraining(L.LightningModule, ABC):
             kept["best_state"],
             kept["without_gain"],
         )
+        self.best_diverged = kept.get("best_diverged", 0)
         self.history, self.stopped = kept["history"], kept["stopped"]
         torch.set_rng_state(kept["random"])
         torch.set_num_threads(kept["threads"])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Iterator
-from typing import Any, final
+from typing import Any, NamedTuple, final
 
 import torch
 from torch import Tensor, nn
@@ -18,7 +18,22 @@ from residnet.training.config import TrainingConfig
 from residnet.training.epochs import EpochTraining
 from residnet.training.losses import one_step_loss, rollout_loss
 
-Validate = Callable[[HybridDynamics], float]
+
+class Score(NamedTuple):
+    """How a model does in free runs over the validation logs; the lesser score is the better one.
+
+    The error of windows that diverged says little, so that fewer of them count first.
+
+    Attributes:
+        diverged: number of windows that diverged.
+        error: mean nrmse over u, v, r; a diverged window counts with the error of `zero`.
+    """
+
+    diverged: int
+    error: float
+
+
+Validate = Callable[[HybridDynamics], Score]
 
 
 @final
@@ -162,7 +177,8 @@ class HeadTraining(EpochTraining):
     def validated(self) -> tuple[nn.Module, float]:
         """Return the averaged model, where there is one, and its free-run error."""
         model = self.model if self.average is None else self.average
-        return model, self.validate(model)
+        self.diverged, error = self.validate(model)
+        return model, error
 
 
 class EpochBatches:

@@ -35,7 +35,7 @@ def train(
         store: training windows.
         config: stages.
         scales: of the velocities, [3].
-        validate: free-run error of a model on the validation data.
+        validate: divergences and free-run error of a model on the validation data.
         seed: of weights and batches.
         folder: for checkpoints (`checkpoints/<name>/last.ckpt` is resumed from where it exists) and
             the TensorBoard log; None for neither.

@@ -94,7 +94,13 @@ class ExternalLogs:
         judged = evaluate(models, logs, config.evaluation, config.prepare.grid.step, limit)
         write_rollouts(folder.rollouts / SPLIT, judged.runs, logs)
         write_data_quality(folder, {SPLIT: logs})
-        write_metrics(folder, config, judged.rows, str(self.run.read_metrics()["selected"]))
+        chosen = self.run.read_metrics()
+        write_metrics(
+            folder, config, judged.rows, str(chosen["selected"]), chosen.get("selected_ensemble")
+        )
+        if self.run.selection.is_file():
+            # why the model was selected, and whether it is sound, is the fit's own
+            folder.write(folder.selection, self.run.selection.read_text(encoding="utf-8"))
         write_limits(folder, config, {SPLIT: judged.limits}, logs)
         return fit_outcome(folder, SPLIT)
 

@@ -22,12 +22,17 @@ from residnet.tasks.fit.config import FitTaskSettings
 
 
 def write_metrics(
-    folder: RunFolder, config: FitTaskSettings, table: Sequence[dict[str, Any]], selected: str
+    folder: RunFolder,
+    config: FitTaskSettings,
+    table: Sequence[dict[str, Any]],
+    selected: str,
+    selected_ensemble: str | None,
 ) -> None:
-    """Write metrics.json with schema, units, scales and rows."""
+    """Write metrics.json with schema, units, scales, what was selected, and rows."""
     units = {name: si_unit(unit) for name, unit in config.signals.units().items() if name in STATE}
     scales = config.evaluation.scales.named()
-    folder.write_json(folder.metrics, metrics_content(config.name, units, scales, selected, table))
+    content = metrics_content(config.name, units, scales, selected, selected_ensemble, table)
+    folder.write_json(folder.metrics, content)
 
 
 def write_limits(

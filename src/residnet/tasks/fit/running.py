@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from residnet.core.progress import say
 from residnet.data.sources import read_logs
@@ -14,6 +14,7 @@ from residnet.identification.prepared import PreparedSplits, prepare_logs
 from residnet.identification.teacher_forced import residual_table, term_table
 from residnet.judge.goodness import content
 from residnet.judge.rollout_files import write_rollouts
+from residnet.judge.sanity_file import content as sanity_content
 from residnet.runs.folder import RunFolder
 from residnet.runs.model_store import FolderStore
 from residnet.runs.task import Outcome
@@ -71,14 +72,17 @@ def _judged(
     """Run all models freely, and write everything that is found of them."""
     say("  free runs")
     fitted, step = list(identified.values()), config.prepare.grid.step
-    table: list[dict[str, Any]] = []
-    limiting: dict[str, Any] = {}
+    judged = {}
     for split in config.evaluation.splits:
-        judged = identified.evaluate(logs[split], config.data)
-        write_rollouts(folder.rollouts / split, judged.runs, judged.logs)
-        limiting[split] = judged.limits
-        table += judged.rows
-    write_metrics(folder, config, table, identified.select(table))
+        judged[split] = identified.evaluate(logs[split], config.data)
+        write_rollouts(folder.rollouts / split, judged[split].runs, judged[split].logs)
+    chosen = identified.select(judged)
+    say(f"  {chosen.reason}")
+    table = [row for part in judged.values() for row in part.rows]
+    write_metrics(folder, config, table, chosen.selected, chosen.selected_ensemble)
+    folder.write_json(folder.selection, chosen.content())
+    folder.write_json(folder.sanity, sanity_content(identified.findings))
+    limiting = {split: part.limits for split, part in judged.items()}
     write_limits(
         folder, config, limiting, [log for split in config.evaluation.splits for log in logs[split]]
     )

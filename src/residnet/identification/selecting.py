@@ -1,0 +1,129 @@
+"""The choice among the models of a fit: what each is, whether it is sound, how it does."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterable, Mapping, Sequence
+
+import torch
+
+from residnet.core.errors import UsageError
+from residnet.data.prepare import Prepared
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.heads import ClosedFormHead
+from residnet.identification.evaluation import Evaluation
+from residnet.identification.models import FittedModel
+from residnet.judge.config import EvaluationConfig
+from residnet.judge.course_stability import SteadyRun, contradiction, steady_runs
+from residnet.judge.sanity import STABILITY, Finding, check_model
+from residnet.judge.selection import Contender, Selection, blocks_of, choose, shares
+
+_CHECKED = ("train", "validation")
+"""Splits whose windows may not diverge; what the test data show comes too late for a choice."""
+
+
+def examine(
+    fitted: Iterable[FittedModel], train: Sequence[Prepared], config: EvaluationConfig, step: float
+) -> dict[str, list[Finding]]:
+    """Check the models of a fit for physical sanity, `zero` left out.
+
+    Args:
+        fitted: models of one fit.
+        train: the logs that fitted them, which may contradict an unstable model.
+        config: whose `divergence` says when a model runs away.
+        step: of the grid in s.
+    """
+    steady = steady_runs(train, step)
+    threads = torch.get_num_threads()
+    # products this small only lose time to a second thread
+    torch.set_num_threads(1)
+    try:
+        return {
+            entry.name: _examined(entry, steady, config.divergence)
+            for entry in fitted
+            if entry.spec.role != "zero"
+        }
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _examined(entry: FittedModel, steady: Sequence[SteadyRun], divergence: float) -> list[Finding]:
+    # a copy: the checks run in float64, and must not round what others hold
+    model = copy.deepcopy(entry.model).to(torch.float64).eval()
+    out = []
+    for finding in check_model(entry.spec, model, divergence=divergence):
+        fault = contradiction(model, steady) if finding.check == STABILITY else finding.fault
+        out.append(Finding(finding.model, finding.check, finding.ok, finding.text, fault))
+    return out
+
+
+def select(
+    fitted: Iterable[FittedModel],
+    judged: Mapping[str, Evaluation],
+    findings: Mapping[str, Sequence[Finding]],
+    config: EvaluationConfig,
+) -> Selection:
+    """Choose among the models of a fit by their free runs over the validation logs.
+
+    Args:
+        fitted: models to choose from, `zero` among them.
+        judged: their free runs by split; `validation` is needed, `train` shows divergences too.
+        findings: of the checks for physical sanity, by model.
+        config: its `selection` protocol decides.
+
+    Raises:
+        UsageError: where the validation logs have not been judged.
+    """
+    validation = judged.get("validation")
+    deciding = [] if validation is None else validation.runs
+    run = next((run for run in deciding if run.protocol == config.selection), None)
+    if validation is None or run is None:
+        raise UsageError(
+            f"select: no free runs over validation logs by protocol '{config.selection}'; evaluate"
+            " the validation split first"
+        )
+    blocks, labels = blocks_of(run)
+    scales = config.scales.named()
+    contenders = []
+    for entry in fitted:
+        lost = [
+            (split, free.protocol, diverged, len(free.windows))
+            for split in _CHECKED
+            if split in judged
+            for free in judged[split].runs
+            if (diverged := sum(p.diverged for p in free.predictions[entry.name]))
+        ]
+        faults = [
+            f"{diverged} of its {count} {split} windows diverged ({protocol})"
+            for split, protocol, diverged, count in lost
+        ]
+        faults += [finding.fault for finding in findings.get(entry.name, ()) if finding.fault]
+        contenders.append(
+            Contender(
+                entry.name,
+                family(entry),
+                parameter_count(entry.model),
+                shares(run, entry.name, validation.logs, scales, labels, len(blocks.weights)),
+                sum(diverged for _, _, diverged, _ in lost),
+                tuple(faults),
+            )
+        )
+    return choose(contenders, blocks)
+
+
+def family(entry: FittedModel) -> str:
+    """Return what a model is, in the words of `residnet.judge.selection.FAMILIES`."""
+    if entry.spec.role != "head":
+        refitted = entry.spec.role == "baseline" and "refit" in entry.notes
+        return "refitted baseline" if refitted else str(entry.spec.role)
+    return "closed-form head" if isinstance(entry.model.head, ClosedFormHead) else "network"
+
+
+def parameter_count(model: HybridDynamics) -> int:
+    """Return the number of fitted parameters of baseline and head together."""
+    of_head = (
+        sum(model.head.parameter_count())
+        if isinstance(model.head, ClosedFormHead)
+        else sum(parameter.numel() for parameter in model.head.parameters())
+    )
+    return round(sum(model.baseline.parameter_count()) + of_head)

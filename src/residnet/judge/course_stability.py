@@ -1,0 +1,112 @@
+"""Whether logs contradict a model that is unstable on a course.
+
+A full hull may be unstable in truth, so that an unstable model is no fault by itself. It is one
+where the vessel ran with its steering held for several times as long as the model's disturbances
+take to grow, and did not leave its course.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from residnet.core.layout import SURGE, SWAY, VELOCITIES, YAW_RATE
+from residnet.core.stretches import stretches
+from residnet.data.prepare import Prepared
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.judge.sanity import growth_rate
+from residnet.judge.sanity_points import OperatingPoint
+
+_HELD = 0.02
+_GROWN = 20.0
+_STAYED = 3.0
+_SETTLING = 0.25
+
+
+@dataclass(frozen=True)
+class SteadyRun:
+    """A stretch of a log with held inputs.
+
+    Attributes:
+        log: name of the log.
+        seconds: that it lasts, its settling left out.
+        x: mean state [6] with the pose at zero.
+        w: mean inputs [m].
+        growth: how many times farther the lateral velocities lie from their mean in its last third
+            than in its first.
+    """
+
+    log: str
+    seconds: float
+    x: np.ndarray
+    w: np.ndarray
+    growth: float
+
+
+def steady_runs(logs: Sequence[Prepared], step: float, shortest: float = 5.0) -> list[SteadyRun]:
+    """Return the stretches of logs whose inputs hold within 2 % of their ranges.
+
+    The first quarter of each is left out, in which the motion settles.
+
+    Args:
+        logs: prepared logs.
+        step: of their grid in s.
+        shortest: stretches of fewer seconds are left out.
+    """
+    joined = np.concatenate([log.w[log.usable] for log in logs])
+    tolerance = _HELD * np.maximum(np.ptp(joined, axis=0), 1e-12)
+    out = []
+    for log in logs:
+        for begin, end in _held(log, tolerance, round(shortest / step)):
+            rows = slice(begin + int(_SETTLING * (end - begin)), end)
+            y = log.smooth[rows]
+            x = np.concatenate((np.zeros(VELOCITIES.start), y[:, VELOCITIES].mean(0)))
+            lateral = y[:, SWAY : YAW_RATE + 1]
+            apart = np.abs(lateral - lateral.mean(0))
+            third = max(len(apart) // 3, 1)
+            first, last = apart[:third].mean(0), apart[-third:].mean(0)
+            growth = float((last / np.maximum(first, 1e-9)).max())
+            seconds = len(y) * step
+            out.append(SteadyRun(log.log.name, seconds, x, log.w[rows].mean(0), growth))
+    return out
+
+
+def _held(log: Prepared, tolerance: np.ndarray, shortest: int) -> Iterator[tuple[int, int]]:
+    """First sample and end of each stretch whose inputs stay within a tolerance [m] of its first.
+
+    Stretches follow each other and do not overlap.
+    """
+    for begin, end in zip(*stretches(log.piece), strict=True):
+        start = int(begin)
+        while end - start >= shortest:
+            away = (np.abs(log.w[start:end] - log.w[start]) > tolerance).any(1)
+            stop = start + (int(away.argmax()) if away.any() else end - start)
+            if stop - start >= shortest:
+                yield start, stop
+            start = max(stop, start + 1)
+
+
+def contradiction(model: HybridDynamics, runs: Sequence[SteadyRun]) -> str:
+    """Return in a few words how logs contradict an unstable model; empty where they do not.
+
+    A disturbance of the model, linearised about the mean of a steady run, would have grown
+    twentyfold over it, and the vessel's lateral velocities did not even grow threefold.
+
+    Args:
+        model: in float64 and evaluation mode.
+        runs: of the training logs, see `steady_runs`.
+    """
+    for run in sorted(runs, key=lambda run: -run.seconds):
+        x, w = torch.from_numpy(run.x), torch.from_numpy(run.w)
+        rate = growth_rate(model, OperatingPoint("", float(run.x[SURGE]), x, w, True))
+        if rate * run.seconds > math.log(_GROWN) and run.growth < _STAYED:
+            return (
+                "it is unstable where the logs are not (a disturbance would double in"
+                f" {math.log(2.0) / rate:.2g} s; log {run.log} runs steadily for"
+                f" {run.seconds:.0f} s)"
+            )
+    return ""

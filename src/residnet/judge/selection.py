@@ -1,0 +1,269 @@
+"""The choice of one model among fitted ones: the simplest sound one that is as good as the best."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from residnet.core.layout import VELOCITIES, YAW_RATE
+from residnet.data.prepare import Prepared
+from residnet.judge.freerun import FreeRun
+
+SCHEMA = "residnet.selection/1"
+FAMILIES = ("zero", "baseline", "refitted baseline", "closed-form head", "network", "ensemble")
+"""What a model is, the simplest first."""
+
+_LOGS = 5
+_BLOCKS = 8
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A model with what decides whether it is chosen.
+
+    Attributes:
+        name: of the model.
+        family: one of `FAMILIES`.
+        parameters: number of its fitted parameters.
+        shares: what each block of the validation data contributes to its mean NRMSE, [B].
+        diverged: number of its validation windows that diverged, over all protocols.
+        faults: sentences on what makes it unsound, divergences among them; empty for a sound model.
+    """
+
+    name: str
+    family: str
+    parameters: int
+    shares: np.ndarray
+    diverged: int = 0
+    faults: tuple[str, ...] = ()
+
+    @property
+    def error(self) -> float:
+        """The mean NRMSE over the validation windows."""
+        return float(self.shares.sum())
+
+    @property
+    def sound(self) -> bool:
+        """Whether nothing speaks against its use."""
+        return not self.faults
+
+    @property
+    def simplicity(self) -> tuple[int, int]:
+        """The place in the order of models: family, then the number of parameters."""
+        return FAMILIES.index(self.family), self.parameters
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """The blocks of the validation data over which errors are paired.
+
+    Attributes:
+        weights: share of each block in the mean over windows, [B]; their sum is 1.
+        of: `logs` where a block is all windows of a log, else `stretches` of logs.
+    """
+
+    weights: np.ndarray
+    of: str
+
+    def standard_error(self, one: np.ndarray, other: np.ndarray) -> float:
+        """Return the standard error of the difference of two mean errors from their shares [B].
+
+        Zero where there is a single block, which tells nothing of the spread.
+        """
+        count = len(self.weights)
+        if count < 2:
+            return 0.0
+        apart = one - other
+        rest = apart - self.weights * apart.sum()
+        return math.sqrt(count / (count - 1) * float(rest @ rest))
+
+
+@dataclass(frozen=True)
+class Selection:
+    """The chosen models, and why.
+
+    Attributes:
+        selected: name of the chosen single model.
+        selected_ensemble: name of the best ensemble; None where there is none.
+        reason: one sentence on why the single model was chosen.
+        contenders: all models, in the order that they were given.
+        blocks: over which errors were paired.
+    """
+
+    selected: str
+    selected_ensemble: str | None
+    reason: str
+    contenders: tuple[Contender, ...]
+    blocks: Blocks
+
+    def content(self) -> dict[str, Any]:
+        """Return the contents of selection.json."""
+        lead = next(entry for entry in self.contenders if entry.name == self.selected)
+        return {
+            "schema": SCHEMA,
+            "selected": self.selected,
+            "selected_ensemble": self.selected_ensemble,
+            "reason": self.reason,
+            "blocks": {"of": self.blocks.of, "count": len(self.blocks.weights)},
+            "models": [
+                {
+                    "model": entry.name,
+                    "family": entry.family,
+                    "parameters": entry.parameters,
+                    "nrmse_mean": entry.error,
+                    "difference": entry.error - lead.error,
+                    "standard_error": self.blocks.standard_error(entry.shares, lead.shares),
+                    "diverged": entry.diverged,
+                    "sound": entry.sound,
+                    "faults": list(entry.faults),
+                }
+                for entry in self.contenders
+            ],
+        }
+
+
+def choose(contenders: Iterable[Contender], blocks: Blocks) -> Selection:
+    """Choose a single model and an ensemble.
+
+    Among the sound models the simplest is chosen whose error is within one standard error of the
+    least (Breiman and others 1984, Classification and Regression Trees, section 3.4.3; paired
+    here, since all models run over the same windows). Where none but `zero` is sound, the least
+    error among the models without a diverged window is taken, if it is below the error of `zero`
+    by more than one standard error; else `zero`.
+
+    Args:
+        contenders: `zero` and at least one other.
+        blocks: of the validation data.
+    """
+    everyone = tuple(contenders)
+    single = [entry for entry in everyone if entry.family != "ensemble"]
+    ensembles = [entry for entry in everyone if entry.family == "ensemble"]
+    sound = [entry for entry in single if entry.sound]
+    if any(entry.family != "zero" for entry in sound):
+        chosen, reason = _simplest(sound, [e for e in single if not e.sound], blocks)
+    else:
+        chosen, reason = _least_bad(single, blocks)
+    best = min(
+        ensembles, key=lambda entry: (not entry.sound, entry.diverged, entry.error), default=None
+    )
+    return Selection(chosen.name, None if best is None else best.name, reason, everyone, blocks)
+
+
+def _simplest(
+    sound: Sequence[Contender], unsound: Sequence[Contender], blocks: Blocks
+) -> tuple[Contender, str]:
+    """Return the simplest sound model within one standard error of the best, and why."""
+    best = min(sound, key=lambda entry: entry.error)
+    for chosen in sorted(sound, key=lambda entry: (*entry.simplicity, entry.error)):
+        apart = chosen.error - best.error
+        if apart <= blocks.standard_error(chosen.shares, best.shares):
+            break
+    if chosen is best:
+        reason = (
+            f"{chosen.name} has the least validation error of the sound models ({chosen.error:.3g})"
+        )
+        simpler = [e for e in sound if e.simplicity < best.simplicity]
+        if simpler:
+            reason += ", and no simpler one comes within one standard error of it"
+    else:
+        within = blocks.standard_error(chosen.shares, best.shares)
+        reason = (
+            f"{chosen.name} is the simplest sound model whose validation error ({chosen.error:.3g})"
+            f" is within one standard error ({within:.2g}) of the least, that of {best.name}"
+            f" ({best.error:.3g})"
+        )
+    better = [entry for entry in unsound if entry.error < chosen.error]
+    if better:
+        named = ", ".join(f"{entry.name} ({entry.faults[0]})" for entry in better)
+        reason += f"; not considered, for they are unsound: {named}"
+    return chosen, reason + "."
+
+
+def _least_bad(single: Sequence[Contender], blocks: Blocks) -> tuple[Contender, str]:
+    """Return what is taken where no model but `zero` is sound, and why."""
+    zero = next(entry for entry in single if entry.family == "zero")
+    steady = [e for e in single if e.family != "zero" and not e.diverged]
+    best = min(steady, key=lambda entry: entry.error, default=None)
+    if best is not None and zero.error - best.error > blocks.standard_error(
+        best.shares, zero.shares
+    ):
+        return best, (
+            f"No model is sound; {best.name} has the least validation error ({best.error:.3g}) of"
+            f" those that did not diverge, and is unsound too: {'; '.join(best.faults)}."
+        )
+    worse = (
+        "every other one diverged"
+        if best is None
+        else "none that did not diverge beats it by more than one standard error"
+    )
+    return zero, f"No model but zero is sound, and {worse}: zero is taken, which predicts nothing."
+
+
+def blocks_of(run: FreeRun) -> tuple[Blocks, list[np.ndarray]]:
+    """Return the blocks of validation windows, and the number of the block of each sample.
+
+    From five logs on a block is a log, so that what is chosen holds for other logs. Fewer logs are
+    cut into contiguous stretches of equal length, about eight in all.
+
+    Returns:
+        The blocks, and for each window [L] of block numbers.
+    """
+    numbers = np.array([window.log for window in run.windows])
+    lengths = np.array([window.stop - window.start for window in run.windows])
+    logs = np.unique(numbers)
+    labels: list[np.ndarray] = [np.zeros(length, dtype=int) for length in lengths]
+    pieces = 1 if len(logs) >= _LOGS else math.ceil(_BLOCKS / len(logs))
+    for place, log in enumerate(logs.tolist()):
+        rows = np.flatnonzero(numbers == log)
+        count = min(pieces, int(lengths[rows].sum()))
+        cut = np.array_split(np.arange(lengths[rows].sum()), count)
+        flat = np.concatenate([np.full(len(part), i) for i, part in enumerate(cut)])
+        for row, part in zip(rows, np.split(flat, np.cumsum(lengths[rows])[:-1]), strict=True):
+            labels[row] = place * pieces + part
+    # a log of fewer samples than pieces leaves numbers out
+    found, flat = np.unique(np.concatenate(labels), return_inverse=True)
+    labels = np.split(flat, np.cumsum(lengths)[:-1])
+    weights = np.zeros(len(found))
+    for label in labels:
+        weights += np.bincount(label, minlength=len(found)) / (len(label) * len(labels))
+    return Blocks(weights, "logs" if pieces == 1 else "stretches"), labels
+
+
+def shares(
+    run: FreeRun,
+    model: str,
+    logs: Sequence[Prepared],
+    scales: Mapping[str, float],
+    labels: Sequence[np.ndarray],
+    count: int,
+) -> np.ndarray:
+    """Return what each block contributes to a model's mean NRMSE, [count].
+
+    A window's root mean square error is shared out in proportion to the squares, so that the sum
+    is the mean NRMSE of the rows of metrics.json.
+
+    Args:
+        run: free runs over the windows.
+        model: name of the model.
+        logs: that the windows belong to.
+        scales: of u, v, r.
+        labels: number of the block of each sample of each window.
+        count: number of blocks.
+    """
+    scale = np.array(list(scales.values()))
+    out = np.zeros(count)
+    for window, prediction, label in zip(run.windows, run.predictions[model], labels, strict=True):
+        log, rows = logs[window.log], slice(window.start, window.stop)
+        square = (prediction.states - log.y[rows])[:, VELOCITIES] ** 2
+        # as the metrics have it: u and v over usable samples, r over all
+        square[~log.usable[rows], : YAW_RATE - VELOCITIES.start] = 0.0
+        counted = np.array([log.usable[rows].sum()] * 2 + [len(square)])
+        rmse = np.sqrt(square.sum(0) / counted)
+        divisor = np.where(rmse > 0, rmse * counted * scale, 1.0)
+        sample = (square / divisor).sum(1) / (len(scale) * len(run.windows))
+        out += np.bincount(label, sample, count)
+    return out
