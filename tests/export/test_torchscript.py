@@ -187,9 +187,10 @@ def test_steps_rollout_and_warm_up_are_those_of_the_model(exported: Exported) ->
             path.append(y)
         torch.testing.assert_close(y, x, rtol=1e-5, atol=1e-5)
         torch.testing.assert_close(theirs, memory, rtol=1e-4, atol=1e-5)
-        torch.testing.assert_close(
-            module.rollout(x0, w, s), torch.stack(path, dim=1), rtol=1e-5, atol=1e-5
-        )
+        together, last, outside = module.rollout(x0, w, s)
+        torch.testing.assert_close(together, torch.stack(path, dim=1), rtol=1e-5, atol=1e-5)
+        torch.testing.assert_close(last, theirs, rtol=1e-4, atol=1e-5)
+        assert outside.shape == (batch, steps)
         empty = module.initial_state(batch)
     assert torch.equal(empty, torch.zeros(batch, exported.card["memory"]))
 
@@ -200,7 +201,8 @@ def test_everything_is_single_precision(exported: Exported) -> None:
     with torch.no_grad():
         s = module.initial_state(2)
         after, memory, outside = module.step(x, w[:, 0], s)
-        path, warm = module.rollout(x, w, s), module.warmup(x[:, None].expand(-1, 4, -1), w)
+        path, _, _ = module.rollout(x, w, s)
+        warm = module.warmup(x[:, None].expand(-1, 4, -1), w)
     assert {tensor.dtype for tensor in (s, after, memory, path, warm)} == {torch.float32}
     assert outside.dtype == torch.bool
     numbers = [value for value in exported.model.state_dict().values() if value.is_floating_point()]
@@ -220,10 +222,10 @@ def test_outside_flags_each_channel_beyond_its_range(lstm: Exported) -> None:
             row[i] = edge[i] + step
             seen.append(row)
     rows = torch.stack(seen)
-    x = torch.cat((torch.full((len(rows), 3), 1e4), rows[:, :3]), dim=1)
+    x = torch.cat((torch.full((len(rows), 3), 6e3), rows[:, :3]), dim=1)
     _, _, outside = module.step(x, rows[:, 3:], module.initial_state(len(rows)))
     assert outside.tolist() == [False] * 3 + [True] * (2 * len(LOW)), (
-        "position and heading have no range"
+        "position and heading have no training range"
     )
 
 
@@ -293,10 +295,10 @@ class NotFinite:
     def __init__(self, module: Any) -> None:
         self.warmup, self.step, self.good = module.warmup, module.step, module.rollout
 
-    def rollout(self, x: Tensor, w: Tensor, s: Tensor) -> Tensor:
-        out: Tensor = self.good(x, w, s)
+    def rollout(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        out, s, outside = self.good(x, w, s)
         out[:, -1, 5] = torch.nan
-        return out
+        return out, s, outside
 
 
 def test_a_value_that_is_not_finite_is_found(lstm: Exported) -> None:

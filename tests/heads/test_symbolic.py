@@ -225,7 +225,7 @@ def test_a_delay_is_found_inside_the_regression_and_remembered() -> None:
     assert notes["delay"]["seconds"] == pytest.approx(0.5)
     assert found(notes, "v_dot") == pytest.approx(SPRING_TRUTH, rel=1e-9)
     assert "tau: 5 steps earlier" in notes["equations"]["v_dot"]["c"]
-    assert head.n_state == 12
+    assert head.n_state == 13  # and whether there was a sample
     # step by step from the memory of a measured past: the accelerations of the record
     data = spring(log, log["w_dot"])
     with torch.no_grad():

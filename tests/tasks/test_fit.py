@@ -160,7 +160,8 @@ for k in range(40):
     single.append(x)
 assert outside.shape == (2,) and not outside.any()
 assert model.step(x, w[:, 0] * 100, m)[2].all()
-whole = model.rollout(torch.zeros(2, 6), w, s)
+whole, last, flags = model.rollout(torch.zeros(2, 6), w, s)
+assert torch.equal(last, m) and flags.shape == (2, 40) and not flags.any()
 assert (whole - torch.stack(single, 1)).abs().max() < 1e-6
 assert model.initial_state(3).shape == (3, card["memory"])
 print(float(x[0, 3]))

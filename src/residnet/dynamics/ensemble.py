@@ -74,6 +74,11 @@ class MeanHead(ResidualHead):
             memory.append(member.warmup(z))  # type: ignore[operator]
         return torch.cat(memory, dim=-1)
 
+    def memory_range(self) -> tuple[Tensor, Tensor]:
+        """Return the least and largest memory [n_state], that of all members side by side."""
+        ranges = [member.memory_range() for member in self.members]  # type: ignore[operator]
+        return torch.cat([low for low, _ in ranges]), torch.cat([high for _, high in ranges])
+
     def parameter_count(self) -> list[float]:
         """Return the parameters of each axis, those of all members together."""
         return _summed([member.parameter_count() for member in self.members])  # type: ignore[operator]

@@ -1,4 +1,20 @@
-"""What every export format shares: its name, the ending of its files, how a model is written."""
+"""What every export format shares: its name, the ending of its files, how a model is written.
+
+Whatever the format, a stepped model keeps this contract, with batches of rows B in all tensors:
+
+- `initial_state(batch) -> s`: the memory [B, n_state] without a past, zeros.
+- `warmup(y_history, w_history) -> s`: the memory that a measured past leaves, states [B, T, 6] and
+  inputs [B, T, m], oldest first. A sample that is no measurement is left out.
+- `step(x, w, s) -> (x, s, outside)`: state [B, 6], memory and flag [B] one step of `dt` later.
+- `rollout(x0, w, s) -> (x, s, outside)`: states [B, T+1, 6] from x0 on under inputs w [B, T, m],
+  the memory after the last step, and the flag of each step [B, T].
+
+`outside` is true where a velocity or an input lies beyond the training range, and where anything
+was no number or beyond what is accepted; states and memories that come out are finite always. What
+is accepted, and what stands in the place of the rest, is defined once, in `residnet.export.guard`;
+its `GuardedDynamics` is the module that formats translate. A tensor of a wrong shape is refused
+where the format can refuse, and never broadcast.
+"""
 
 from __future__ import annotations
 

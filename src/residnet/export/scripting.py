@@ -12,9 +12,29 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 Parity = TypeVar("Parity")
+
+
+def size(tensor: Tensor, dimensions: int, dimension: int) -> int:
+    """Return the size of one dimension of a tensor, 1 where the tensor has not so many.
+
+    TorchScript compiles it.
+    """
+    return tensor.shape[dimension] if tensor.dim() == dimensions else 1
+
+
+def require_shape(name: str, tensor: Tensor, shape: list[int]) -> None:
+    """Refuse a tensor of another shape, which arithmetic might broadcast.
+
+    TorchScript compiles it: Python sees `torch.jit.Error`, C++ an exception, with this text.
+
+    Raises:
+        ValueError: that names the argument and both shapes.
+    """
+    if list(tensor.shape) != shape:
+        raise ValueError(f"{name} has the shape {tensor.shape}, expected {shape}")
 
 
 def write_scripted(

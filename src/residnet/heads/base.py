@@ -79,6 +79,14 @@ class ResidualHead(nn.Module, ABC):
         """Return the memory [B, n_state] that past channels [B, T, nz], oldest first, leave."""
         return torch.zeros(z.shape[0], self.n_state, dtype=z.dtype, device=z.device)
 
+    def memory_range(self) -> tuple[Tensor, Tensor]:
+        """Return the least and the largest value [n_state] that each entry of the memory can have.
+
+        An exported model refuses a memory beyond it. Heads that do not say it take any number.
+        """
+        limit = torch.full((self.n_state,), torch.inf, dtype=torch.float64)
+        return -limit, limit
+
     def calibrate(self, samples: Samples) -> None:
         """Take scales and ranges from the training samples; called once, before the fit."""
 

@@ -27,7 +27,8 @@ class DelayConfig(Config):
 
     Attributes:
         channels: inputs that act late.
-        longest: longest delay that is tried, in steps of the grid; the memory is as long.
+        longest: longest delay that is tried, in steps of the grid; the memory holds as many
+            samples, and whether there was one.
     """
 
     channels: tuple[str, ...] = Field(min_length=1)
@@ -37,7 +38,9 @@ class DelayConfig(Config):
 class DelayLine(nn.Module):
     """The channels with some of them as they were `steps` ago.
 
-    The memory holds the last `longest` values of these, oldest first.
+    The memory holds the last `longest` values of these, oldest first, and behind them 1 once there
+    was a sample, 0 before. What lies before the first sample is taken to be like it: zeros would
+    be no state of the vessel, and a term that divides by one of them would be no number.
     """
 
     def __init__(self, config: DelayConfig | None, names: Sequence[str]) -> None:
@@ -51,7 +54,7 @@ class DelayLine(nn.Module):
         self.longest = config.longest if config is not None else 0
         self.channels = late
         self.count = len(late)
-        self.n_state = self.longest * self.count
+        self.n_state = self.longest * self.count + 1 if self.count > 0 else 0
         self.register_buffer(
             "index",
             torch.tensor([list(names).index(name) for name in late], dtype=torch.long),
@@ -66,25 +69,24 @@ class DelayLine(nn.Module):
         """Return channels [B, nz] with the late ones delayed, and the next memory [B, n_state]."""
         if self.count == 0:
             return z, s
-        line = torch.cat((s, z.index_select(-1, self.index)), dim=-1)
+        now = z.index_select(-1, self.index)
+        past = torch.where(s[..., -1:] > 0, s[..., :-1], self._repeated(now))
+        line = torch.cat((past, now), dim=-1)
         first = (self.longest - self.steps.round().to(torch.long)) * self.count
         late = line.index_select(-1, first + torch.arange(self.count, device=z.device))
-        return z.index_copy(-1, self.index, late), line[..., self.count :]
+        after = torch.cat((line[..., self.count :], torch.ones_like(s[..., -1:])), dim=-1)
+        return z.index_copy(-1, self.index, late), after
+
+    def _repeated(self, late: Tensor) -> Tensor:
+        """Return the line [..., longest * count] that late channels [..., count] fill alone."""
+        return late.unsqueeze(-2).repeat_interleave(self.longest, dim=-2).flatten(-2)
 
     def sequence(self, z: Tensor) -> Tensor:
         """Return channels [..., T, nz] with the late ones delayed, from an empty memory."""
         if self.count == 0:
             return z
         late = z.index_select(-1, self.index)
-        line = torch.cat(
-            (
-                torch.zeros_like(late[..., :1, :]).expand(
-                    late.shape[:-2] + (self.longest, self.count)  # noqa: RUF005 (TorchScript)
-                ),
-                late,
-            ),
-            dim=-2,
-        )
+        line = torch.cat((late[..., :1, :].repeat_interleave(self.longest, dim=-2), late), dim=-2)
         first = self.longest - self.steps.round().to(torch.long)
         return z.index_copy(
             -1,
@@ -93,10 +95,23 @@ class DelayLine(nn.Module):
         )
 
     def warmup(self, z: Tensor) -> Tensor:
-        """Return the memory [B, n_state] after channels [B, T, nz], zero before their first."""
+        """Return the memory [B, n_state] after channels [B, T, nz]; zeros without any."""
+        if self.count == 0 or z.shape[1] == 0:
+            return z.new_zeros((z.shape[0], self.n_state))
         late = z.index_select(-1, self.index)
-        line = torch.cat((late.new_zeros((z.shape[0], self.longest, self.count)), late), dim=1)
-        return line[:, line.shape[1] - self.longest :].reshape(z.shape[0], self.n_state)
+        line = torch.cat((late[:, :1].repeat_interleave(self.longest, dim=1), late), dim=1)
+        past = line[:, line.shape[1] - self.longest :].flatten(1)
+        return torch.cat((past, torch.ones_like(past[:, :1])), dim=-1)
+
+    def memory_range(self, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the least and largest memory [n_state], from those of all channels [nz]."""
+        if self.count == 0:
+            return low[:0], high[:0]
+        first, last = (edge[self.index].repeat(self.longest) for edge in (low, high))
+        # the memory without a past is zeros
+        return torch.cat((first.clamp(max=0.0), first.new_zeros(1))), (
+            torch.cat((last.clamp(min=0.0), last.new_ones(1)))
+        )
 
 
 class Past(NamedTuple):

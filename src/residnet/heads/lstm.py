@@ -14,6 +14,9 @@ from residnet.core.samples import Samples
 from residnet.heads.base import FeatureConfig, Features, ResidualHead, ResidualScale
 from residnet.heads.mirror import MirroredHead
 
+_FARTHEST = 1e3
+"""Largest cell state that a memory may hold: a gain of at most one each step, the gates open."""
+
 
 class LstmConfig(FeatureConfig):
     """An LSTM for all axes, or one for each.
@@ -111,6 +114,16 @@ class LstmCore(nn.Module):
         else:
             h = torch.sigmoid(o) * torch.tanh(c)
         return h, torch.cat((h, c), dim=-1)
+
+    def memory_range(self) -> tuple[Tensor, Tensor]:
+        """Return the least and largest memory [2H]: outputs below one, cells as gates allow.
+
+        A cell gains at most one each step and could go on for ever where its gates stay open; it
+        is taken for wrong beyond 1,000, where it has long saturated.
+        """
+        limit = self.bias.detach().new_ones(2 * self.hidden)
+        limit[self.hidden :] = _FARTHEST
+        return -limit, limit
 
     def sequence(self, f: Tensor) -> tuple[Tensor, Tensor]:
         """Return outputs [B, T, H] for features [B, T, F], and the memory [B, 2H] after them.
@@ -235,3 +248,8 @@ class LstmHead(ResidualHead):
     def warmup(self, z: Tensor) -> Tensor:
         """Return the memory [B, n_state] that past channels [B, T, nz] leave."""
         return torch.cat([network.sequence(z)[1] for network in self.networks], dim=-1)
+
+    def memory_range(self) -> tuple[Tensor, Tensor]:
+        """Return the least and largest memory [n_state] that the networks can have."""
+        ranges = [network.core.memory_range() for network in self.networks]
+        return torch.cat([low for low, _ in ranges]), torch.cat([high for _, high in ranges])

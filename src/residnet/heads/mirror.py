@@ -95,3 +95,8 @@ class MirroredHead(ResidualHead):
         s = self.inner.warmup(self.both(z))
         half = z.shape[0]
         return torch.cat((s[:half], s[half:]), dim=-1)
+
+    def memory_range(self) -> tuple[Tensor, Tensor]:
+        """Return the least and largest memory [n_state], the inner head's for both halves."""
+        low, high = self.inner.memory_range()
+        return low.repeat(2), high.repeat(2)

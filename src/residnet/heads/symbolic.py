@@ -116,17 +116,21 @@ class SymbolicHead(EquationHead):
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return the residual [B, 3] at channels z [B, nz], and the late inputs as memory."""
-        chosen, s = self.line(z.index_select(-1, self.features.index), s)
+        chosen, s = self.line(self.features.guarded(z), s)
         return self.basis(chosen) @ self.coefficients.to(z.dtype), s
 
     def sequence(self, z: Tensor) -> Tensor:
         """Return residuals [..., T, 3] along channels [..., T, nz], from an empty memory."""
-        chosen = self.line.sequence(z.index_select(-1, self.features.index))
+        chosen = self.line.sequence(self.features.guarded(z))
         return self.basis(chosen) @ self.coefficients.to(z.dtype)
 
     def warmup(self, z: Tensor) -> Tensor:
         """Return the memory [B, n_state] that past channels [B, T, nz], oldest first, leave."""
-        return self.line.warmup(z.index_select(-1, self.features.index))
+        return self.line.warmup(self.features.guarded(z))
+
+    def memory_range(self) -> tuple[Tensor, Tensor]:
+        """Return the least and largest late inputs: those that the features are held between."""
+        return self.line.memory_range(self.features.low, self.features.high)
 
     def contributions(self, z: Tensor, axis: int) -> dict[str, np.ndarray]:
         """Return each term of an axis times its coefficient [T], along channels z [T, nz]."""

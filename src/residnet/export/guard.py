@@ -1,0 +1,210 @@
+"""What exported models do with inputs, states and memories that no vessel has.
+
+Every format keeps to these rules, so that a bad sample never ends in a number that is not finite:
+
+- An entry is a *measurement* while it lies within its accepted range: the training range, widened
+  on either side by twice the largest magnitude in it (by one SI unit where that is zero, and angles
+  by a turn at least). Positions are accepted up to 100 km from the origin, headings up to 1,000
+  turns: beyond, float32 no longer resolves one step.
+- An entry that is not a number becomes the middle of its training range; position and heading
+  become zero. Any other entry beyond the accepted range, infinities included, becomes the nearest
+  value of its training range (of its accepted range for position and heading).
+- A memory with an entry that is not finite, or beyond what its head can have, is replaced by the
+  memory without a past.
+- A step that would leave the accepted range, or be no number, is not taken as it is: velocities are
+  held at the edge of the accepted range (or where they were, if they are no numbers), and the pose
+  moves on with the velocities before the step.
+
+The flag `outside` is true for each row in which any of this happened, and for each row with an
+entry beyond the training range. The rules have no memory of their own: the next good sample is
+answered as if the bad one had not been, from the state and memory that it is given.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import final
+
+import torch
+from torch import Tensor
+
+from residnet.core.layout import (
+    PLANAR,
+    POSITION,
+    actuators,
+    motion,
+    pose,
+    velocities,
+    velocities_on,
+)
+from residnet.dynamics.base import Dynamics
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.store import ModelSpec
+
+REACH = 2.0
+"""How far beyond the training range a value is accepted, in largest magnitudes of that range."""
+_FARTHEST = 1e5
+"""Largest north and east in m."""
+_TURNS = 2000.0 * math.pi
+"""Largest heading in rad."""
+_TURN = 2.0 * math.pi
+
+
+@final
+class GuardedDynamics(Dynamics):
+    """A model behind the rules above, whose step is defined and finite whatever it is given.
+
+    The state is x [B, 7]: that of the model and, behind it, the flag of the step that led there.
+
+    Args:
+        model: in the precision that it shall run in, float32 in exports.
+        spec: its description.
+    """
+
+    def __init__(self, model: HybridDynamics, spec: ModelSpec) -> None:
+        super().__init__(model.dt, model.integrator)
+        self.model = model
+        self.n_state = model.n_state
+        low, high, reach = (
+            torch.tensor(part, dtype=torch.float64) for part in (spec.low, spec.high, _reach(spec))
+        )
+        far = torch.full((len(PLANAR.pose),), _FARTHEST, dtype=torch.float64)
+        far[POSITION.stop :] = _TURNS
+        first, last = model.head.memory_range()
+        for name, value in {
+            "low": torch.cat((-far, low)),
+            "high": torch.cat((far, high)),
+            "least": torch.cat((-far, low - reach)),
+            "most": torch.cat((far, high + reach)),
+            "middle": torch.cat((0.0 * far, 0.5 * (low + high))),
+            "memory_low": first - 1e-3 * first.abs(),
+            "memory_high": last + 1e-3 * last.abs(),
+        }.items():
+            self.register_buffer(name, value.to(torch.float32))
+        self.low: Tensor
+        self.high: Tensor
+        self.least: Tensor
+        self.most: Tensor
+        self.middle: Tensor
+        self.memory_low: Tensor
+        self.memory_high: Tensor
+
+    def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
+        """Return x_dot [B, 7] of the model at a stage; the flag has none."""
+        return torch.cat(
+            (self.model.rate(motion(x), p, rho), torch.zeros_like(actuators(x))), dim=-1
+        )
+
+    def measured(self, x: Tensor, w: Tensor) -> Tensor:
+        """Return which samples [...] are measurements in all entries, x [..., 6], w [..., m]."""
+        seen = torch.cat((x, w), dim=-1)
+        # comparisons with what is no number are false
+        return ((seen >= self.least) & (seen <= self.most)).all(dim=-1)
+
+    def accept(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return state [B, 6], inputs [B, m] and memory as they are used, and the flag [B]."""
+        seen = torch.cat((x, w), dim=-1)
+        used = replaced(seen, self.low, self.high, self.least, self.most, self.middle)
+        remembers = self.remembers(s)
+        inside = ((seen >= self.low) & (seen <= self.high)).all(dim=-1) & remembers
+        s = torch.where(remembers.unsqueeze(-1), s, torch.zeros_like(s))
+        return motion(used), actuators(used), s, ~inside
+
+    def accept_state(self, x: Tensor) -> Tensor:
+        """Return a state [B, 6] as it is used."""
+        return replaced(
+            x,
+            motion(self.low),
+            motion(self.high),
+            motion(self.least),
+            motion(self.most),
+            motion(self.middle),
+        )
+
+    def remembers(self, s: Tensor) -> Tensor:
+        """Return which rows [B] of a memory [B, n_state] the head can have come to."""
+        possible = (s >= self.memory_low) & (s <= self.memory_high) & torch.isfinite(s)
+        return possible.all(dim=-1)
+
+    def settle(self, x: Tensor, after: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return state and memory after a step as they are given out, and the flag [B].
+
+        Args:
+            x: state before the step [B, 6], accepted.
+            after: what the model made of it [B, 6].
+            s: memory after the step [B, n_state].
+        """
+        least, most = motion(self.least), motion(self.most)
+        kept = ((after >= least) & (after <= most)).all(dim=-1, keepdim=True)
+        new = velocities_on(after)
+        held = torch.where(torch.isnan(new), velocities(x), new)
+        coasting = torch.cat((pose(x) + self.dt * self.kinematics(x), held), dim=-1)
+        coasting = torch.minimum(torch.maximum(coasting, least), most)
+        known = torch.isfinite(s).all(dim=-1, keepdim=True)
+        # a head of another package may leave what it says of its memory
+        s = torch.minimum(torch.maximum(s, self.memory_low), self.memory_high)
+        s = torch.where(known, s, torch.zeros_like(s))
+        return torch.where(kept, after, coasting), s, ~(kept & known).squeeze(-1)
+
+    def flagged_step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the state [B, 6] and the memory one step later, and the flag [B]."""
+        x, w, s, outside = self.accept(x, w, s)
+        after, s = self.model.step(x, w, s)
+        after, s, left = self.settle(x, after, s)
+        return after, s, outside | left
+
+    def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the state with its flag [B, 7] and the memory one step later."""
+        after, s, outside = self.flagged_step(motion(x), w, s)
+        return torch.cat((after, outside.to(x.dtype).unsqueeze(-1)), dim=-1), s
+
+    def warmup(self, y_history: Tensor, w_history: Tensor) -> Tensor:
+        """Return the memory [B, n_state] that a measured past leaves, bad samples left out.
+
+        In the place of a sample that is no measurement in every entry stands the last one before it
+        that is, or else the first one behind it. Without any the memory is that without a past.
+
+        Args:
+            y_history: states [B, T, 6], oldest first; T may be 0.
+            w_history: inputs [B, T, m].
+        """
+        if y_history.shape[1] == 0:
+            return torch.zeros(y_history.shape[0], self.n_state)
+        good = self.measured(y_history, w_history)
+        place = torch.arange(good.shape[1]).unsqueeze(0).expand_as(good)
+        last = torch.where(good, place, torch.full_like(place, -1)).cummax(dim=1)[0]
+        first = good.to(torch.long).argmax(dim=1, keepdim=True).expand_as(last)
+        chosen = torch.where(last >= 0, last, first).unsqueeze(-1)
+        y = y_history.gather(1, chosen.expand_as(y_history))
+        w = w_history.gather(1, chosen.expand_as(w_history))
+        s = self.model.warmup(y, w)
+        known = (good.any(dim=1) & torch.isfinite(s).all(dim=-1)).unsqueeze(-1)
+        return torch.where(known, s, torch.zeros_like(s))
+
+
+def replaced(
+    seen: Tensor, low: Tensor, high: Tensor, least: Tensor, most: Tensor, middle: Tensor
+) -> Tensor:
+    """Return values [..., k] with those that are no measurements replaced, as stated above.
+
+    Args:
+        seen: values [..., k].
+        low: smallest of the training data [k].
+        high: largest of the training data [k].
+        least: smallest accepted value [k].
+        most: largest accepted value [k].
+        middle: what stands for a value that is no number [k].
+    """
+    known = (seen >= least) & (seen <= most)
+    nearest = torch.minimum(torch.maximum(seen, low), high)
+    return torch.where(known, seen, torch.where(torch.isnan(seen), middle, nearest))
+
+
+def _reach(spec: ModelSpec) -> list[float]:
+    """Return how far beyond the training range each velocity and input is accepted."""
+    units = spec.signals.units()
+    out = []
+    for name, (low, high) in spec.ranges.items():
+        reach = REACH * (max(abs(low), abs(high)) or 0.5)
+        out.append(max(reach, _TURN) if units[name] == "rad" else reach)
+    return out
