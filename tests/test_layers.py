@@ -30,7 +30,8 @@ LAYERS = [
     {"runs"},
     {"documents"},
     {"tasks"},
-    {"terminal"},
+    {"crash"},
+    {"door", "terminal"},
     {"cli", "__main__", "face", "testing"},
 ]
 ALLOWED = {("__main__", "cli")}

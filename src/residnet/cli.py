@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import os
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from residnet.core.errors import ResidnetError
+from residnet.door import enter
 from residnet.terminal import drawn_progress
 
 if TYPE_CHECKING:
@@ -230,19 +229,7 @@ def _limit_threads() -> None:
 
 def main() -> None:
     """Run the command line; an error that a user can cause is one line and an exit code."""
-    try:
-        app(standalone_mode=True)
-    except ResidnetError as error:
-        print(f"residnet: {error}", file=sys.stderr)
-        sys.exit(error.exit_code)
-    except KeyboardInterrupt:
-        print(
-            "residnet: interrupted; continue the run with the same command and --resume",
-            file=sys.stderr,
-        )
-        sys.exit(130)
-    except BrokenPipeError:
-        sys.exit(0)
+    enter(app)
 
 
 if __name__ == "__main__":

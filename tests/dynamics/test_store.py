@@ -11,7 +11,7 @@ import torch
 
 from residnet.baselines import RegressorsConfig, StillConfig
 from residnet.core.errors import ConfigError, UsageError
-from residnet.dynamics.store import ModelSpec, load_model, model_names, save_model
+from residnet.dynamics.store import ModelSpec, load_model, model_names, rebuilt, save_model
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.vessel import load_vessel
 
@@ -57,6 +57,21 @@ def test_round_trip(tmp_path: Path) -> None:
     x, w = torch.randn(2, 6, dtype=torch.float64), torch.randn(2, 2, dtype=torch.float64) * 20
     for a, b in zip(model.step(x, w, x[:, :0]), again.step(x, w, x[:, :0]), strict=True):
         assert torch.equal(a, b)
+
+
+def test_a_rebuilt_model_is_the_loaded_one_bit_for_bit(tmp_path: Path) -> None:
+    """Training in float32 rounds buffers that are not kept; a load builds them anew."""
+    saved = spec(head={"kind": "mlp", "hidden": [3]})
+    model = saved.build().to(torch.float32)
+    save_model(tmp_path / "m", saved, model)
+    _, loaded = load_model(tmp_path / "m")
+    again = rebuilt(saved, model)
+    theirs, rounded = dict(loaded.named_buffers()), dict(model.named_buffers())
+    assert any(not torch.equal(theirs[name], rounded[name].double()) for name in theirs)
+    for name, value in [*again.named_buffers(), *again.named_parameters()]:
+        other = loaded.get_parameter(name) if name not in theirs else theirs[name]
+        assert value.dtype == other.dtype, name
+        assert torch.equal(value, other), name
 
 
 def test_a_stored_model_needs_no_vessel_file(tmp_path: Path) -> None:

@@ -145,6 +145,7 @@ def test_a_write_that_fails_leaves_the_old_file(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(Path, "write_text", full)
-    with pytest.raises(OSError, match="No space"):
+    with pytest.raises(UsageError, match=r"report.html: cannot be written \(No space"):
         folder.write(folder.report, "new and longer")
     assert folder.report.read_text() == "old"
+    assert not list(folder.path.rglob("*.partial"))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -128,6 +129,17 @@ def test_killed_and_resumed(
     assert checkpoint.is_file()
     epoch = torch.load(checkpoint, weights_only=True)["epoch"]
     assert epoch < 6 or not (out / "metrics.json").is_file()
+    assert call(monkeypatch, "run", tiny_config, "--out", out, "--resume") == 0
+    assert rows(out) == rows(tiny_run)
+
+
+def test_models_read_back_give_the_same_rows(
+    tiny_config: Path, tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Killed after the last training: what is judged has been read from the folder."""
+    out = tmp_path / "late"
+    shutil.copytree(tiny_run / "models", out / "models")
+    shutil.copy(tiny_run / "resolved.yaml", out)
     assert call(monkeypatch, "run", tiny_config, "--out", out, "--resume") == 0
     assert rows(out) == rows(tiny_run)
 

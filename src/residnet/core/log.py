@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from residnet.core.errors import DataError, UsageError
+from residnet.core.files import whole
 from residnet.core.names import CHANNEL_UNITS, nearest
 
 SCHEMA = "residnet.log/1"
@@ -120,7 +121,7 @@ class Log:
         schema = pa.table(
             {name: values[:0] for name, values in columns.items()}
         ).schema.with_metadata({"residnet": json.dumps(about)})
-        with pq.ParquetWriter(path, schema) as writer:
+        with whole(path) as file, pq.ParquetWriter(file, schema) as writer:
             # piece by piece: the columns of a large log lie on disk
             for start in range(0, max(1, len(self)), _PIECE):
                 writer.write_table(

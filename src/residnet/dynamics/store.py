@@ -9,16 +9,17 @@ from __future__ import annotations
 import hashlib
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from pydantic import Field
-from torch import nn
+from torch import Tensor, nn
 
 from residnet.baselines import BaselineConfig
 from residnet.core.config import Config, validate
 from residnet.core.errors import UsageError
+from residnet.core.files import whole
 from residnet.core.names import VELOCITY, nearest
 from residnet.core.version import __version__
 from residnet.dynamics.base import Integrator
@@ -30,6 +31,7 @@ from residnet.physics.signals import SignalsConfig
 _DESCRIPTION, _WEIGHTS = "model.json", "model.safetensors"
 
 SpecT = TypeVar("SpecT", bound="Stored")
+ModuleT = TypeVar("ModuleT", bound=nn.Module)
 
 
 class Stored(Config, ABC):
@@ -110,14 +112,31 @@ def save_model(folder: Path, spec: Stored, module: nn.Module) -> None:
     """
     from safetensors.torch import save
 
-    folder.mkdir(parents=True, exist_ok=True)
     weights = save({name: value.contiguous() for name, value in module.state_dict().items()})
-    (folder / _WEIGHTS).write_bytes(weights)
     content = spec.model_dump(mode="json", by_alias=True)
     content["sha256"] = hashlib.sha256(weights).hexdigest()
-    partial = folder / f"{_DESCRIPTION}.partial"
-    partial.write_text(json.dumps(content, indent=1) + "\n")
-    partial.replace(folder / _DESCRIPTION)
+    # an earlier description would promise other numbers between the two writes
+    (folder / _DESCRIPTION).unlink(missing_ok=True)
+    with whole(folder / _WEIGHTS) as file:
+        file.write_bytes(weights)
+    with whole(folder / _DESCRIPTION) as file:
+        file.write_text(json.dumps(content, indent=1) + "\n")
+
+
+def rebuilt(spec: Stored, module: ModuleT) -> ModuleT:
+    """Return a module as `save_model` and a load would give it back, without the files.
+
+    Numbers that are kept stay as they are; what a build computes is computed anew, in its own
+    precision. A module that was trained in float32 has rounded these.
+
+    Args:
+        spec: what the module was built from.
+        module: whose numbers are taken over.
+    """
+    again = spec.build()
+    assert isinstance(again, type(module))
+    _fill(again, module.state_dict())
+    return again.eval().requires_grad_(False)
 
 
 def load_model(folder: Path) -> tuple[ModelSpec, HybridDynamics]:
@@ -180,19 +199,27 @@ def read_weights(folder: Path, module: nn.Module) -> None:
         numbers = load(weights)
     except SafetensorError as error:
         raise UsageError(f"{file}: no safetensors file ({error}); {again}") from None
-    tensors = module.state_dict()
-    numbers = {
-        name: value.to(tensors[name].dtype) if name in tensors else value
-        for name, value in numbers.items()
-    }
     try:
-        # a module may take tensors of other sizes than it was built with, such as support vectors
-        module.load_state_dict(numbers)
+        _fill(module, numbers)
     except RuntimeError as error:
         first = str(error).splitlines()[-1].strip()
         raise UsageError(
             f"{file}: does not belong to what {_DESCRIPTION} describes ({first}); {again}"
         ) from None
+
+
+def _fill(module: nn.Module, numbers: Mapping[str, Tensor]) -> None:
+    """Fill a module with numbers, in its own precision.
+
+    A module may take tensors of other sizes than it was built with, such as support vectors.
+    """
+    tensors = module.state_dict()
+    module.load_state_dict(
+        {
+            name: value.to(tensors[name].dtype) if name in tensors else value
+            for name, value in numbers.items()
+        }
+    )
 
 
 def _description(folder: Path) -> dict[str, Any]:

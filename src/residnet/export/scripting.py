@@ -5,6 +5,7 @@ They are checked again as they lie on disk.
 
 from __future__ import annotations
 
+import io
 import json
 import warnings
 from collections.abc import Callable, Sequence
@@ -13,6 +14,8 @@ from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
+
+from residnet.core.files import whole
 
 Parity = TypeVar("Parity")
 
@@ -70,11 +73,12 @@ def write_scripted(
         warnings.filterwarnings("ignore", message=".*torch.jit.*")
         scripted = torch.jit.freeze(torch.jit.script(module), preserved_attrs=list(methods))
         contents = card(check(scripted))
-        file.parent.mkdir(parents=True, exist_ok=True)
-        partial = file.with_name(file.name + ".partial")
+        # through memory: a disk that is full is then the system's error, not one of PyTorch
+        written = io.BytesIO()
         torch.jit.save(
-            scripted, str(partial), _extra_files={"card.json": json.dumps(contents, indent=1)}
+            scripted, written, _extra_files={"card.json": json.dumps(contents, indent=1)}
         )
-        check(torch.jit.load(str(partial)))
-        partial.replace(file)
+        with whole(file) as partial:
+            partial.write_bytes(written.getvalue())
+            check(torch.jit.load(str(partial)))
     return contents

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,7 +23,7 @@ from residnet.data.sources import MeasuredLogs
 from residnet.data.windows import WindowStore
 from residnet.dynamics.ensemble import mean_of
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.store import ModelSpec
+from residnet.dynamics.store import ModelSpec, rebuilt
 from residnet.heads import ClosedFormHead
 from residnet.identification.evaluation import Evaluation, candidates, evaluate
 from residnet.identification.models import FitStore, FittedModel, NoStore
@@ -286,8 +287,13 @@ class Fitter:
         return {"validation": error, "validation_diverged": diverged}
 
     def _kept(self, fitted: FittedModel) -> FittedModel:
-        self.store.keep(fitted)
-        return fitted
+        """Keep a model and return it as a load gives it back.
+
+        What is judged is then bit for bit what is stored, and a resumed fit judges the same.
+        """
+        kept = dataclasses.replace(fitted, model=rebuilt(fitted.spec, fitted.model))
+        self.store.keep(kept)
+        return kept
 
 
 def residual_samples(model: HybridDynamics, known: Samples) -> Samples:

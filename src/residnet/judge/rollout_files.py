@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from residnet.core.files import whole
 from residnet.core.names import STATE
 from residnet.data.prepare import Prepared
 from residnet.judge.freerun import FreeRun
@@ -55,4 +56,5 @@ def write_rollouts(folder: Path, runs: Sequence[FreeRun], logs: Sequence[Prepare
         columns |= {name: y[:, STATE.index(name)] for name in _ORDER}
         columns |= {f"{name}_hat": y_hat[:, STATE.index(name)] for name in _ORDER}
         table = pa.table({name: pa.array(values) for name, values in columns.items()})
-        pq.write_table(table, folder / f"{log.log.name}.parquet", compression="zstd")
+        with whole(folder / f"{log.log.name}.parquet") as file:
+            pq.write_table(table, file, compression="zstd")

@@ -12,6 +12,7 @@ from typing import Any
 import yaml
 from markupsafe import Markup, escape
 
+from residnet.core.files import whole
 from residnet.report.blocks import Block, Code, Facts, Section
 
 _FACT_TITLES = {"git": "git revision", "python": "Python", "started": "started (UTC)"}
@@ -65,9 +66,8 @@ def write_page(
         sections=[*sections, *_made_of(run, record)],
     )
     path = run / "report.html"
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(text, encoding="utf-8")
-    partial.replace(path)
+    with whole(path) as file:
+        file.write_text(text, encoding="utf-8")
     return path
 
 

@@ -6,9 +6,13 @@ import json
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from residnet.core.errors import UsageError
+from residnet.core.files import whole
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 SUMMARY = "residnet.summary/1"
 """Schema of summary.json."""
@@ -122,14 +126,17 @@ class RunFolder:
 
     def write(self, path: Path, text: str) -> None:
         """Write a text file, whole or not at all."""
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_name(path.name + ".partial")
-        partial.write_text(text, encoding="utf-8")
-        partial.replace(path)
+        with whole(path) as file:
+            file.write_text(text, encoding="utf-8")
 
     def write_json(self, path: Path, content: Any) -> None:
         """Write JSON that every reader takes (no NaN)."""
         self.write(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
+
+    def write_table(self, path: Path, table: pd.DataFrame) -> None:
+        """Write a table as Parquet, without its index."""
+        with whole(path) as file:
+            table.to_parquet(file, index=False)
 
     def write_summary(
         self,

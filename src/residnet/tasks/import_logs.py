@@ -9,7 +9,7 @@ from typing import Any, Literal
 from pydantic import Field
 
 from residnet.core.config import ConfigPath
-from residnet.core.errors import ConfigError, UsageError
+from residnet.core.errors import ConfigError
 from residnet.core.log import Log
 from residnet.core.names import nearest
 from residnet.core.progress import report
@@ -116,12 +116,7 @@ def _globbed(root: Path, pattern: str) -> list[Path]:
 
 
 def _write(log: Log, folder: RunFolder) -> None:
-    place = folder.path / "logs" / f"{log.name}.parquet"
-    place.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        log.save(place)
-    except OSError as error:
-        raise UsageError(f"{place}: cannot be written ({error.strerror})") from error
+    log.save(folder.path / "logs" / f"{log.name}.parquet")
 
 
 def _lines(log: Log) -> list[str]:

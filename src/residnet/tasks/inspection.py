@@ -12,6 +12,7 @@ import numpy as np
 
 from residnet.core import progress
 from residnet.core.errors import ConfigError, DataError, UsageError
+from residnet.core.files import whole
 from residnet.core.log import Log
 from residnet.data.doctor import (
     Finding,
@@ -73,10 +74,8 @@ class Inspection:
         Raises:
             UsageError: where the file cannot be written.
         """
-        try:
-            file.write_text(json.dumps(self.content, indent=1) + "\n")
-        except OSError as error:
-            raise UsageError(f"--json {file}: cannot be written ({error.strerror})") from error
+        with whole(file) as place:
+            place.write_text(json.dumps(self.content, indent=1) + "\n")
 
 
 def inspect_logs(paths: Sequence[Path], config: Path | None) -> Inspection:

@@ -90,7 +90,6 @@ class SimulateConfig(ComputingTask):
         )
         count = 0
         for place, flights in places.items():
-            (folder.path / place).mkdir(parents=True, exist_ok=True)
             for flight in flights:
                 flight.log.save(folder.path / place / f"{flight.log.name}.parquet")
                 count += 1

@@ -15,6 +15,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor, nn
 
 from residnet.core.errors import FitError
+from residnet.core.files import whole
 from residnet.core.progress import report
 
 
@@ -179,9 +180,8 @@ class KeepCheckpoint(L.Callback):
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Write beside the old one, then put it in place."""
-        partial = self.path.with_suffix(".partial")
-        trainer.save_checkpoint(partial)
-        partial.replace(self.path)
+        with whole(self.path) as file:
+            trainer.save_checkpoint(file)
 
 
 class ReportProgress(L.Callback):
@@ -240,15 +240,7 @@ def run_epochs(
         module.restore(torch.load(checkpoint, weights_only=True)["residnet"])
     # killed between the last epoch and the model's file: there is nothing left to train
     if not module.finished:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            trainer.fit(
-                module,
-                ckpt_path=str(checkpoint) if checkpoint is not None else None,
-                weights_only=True,
-            )
-    if trainer.interrupted:
-        raise KeyboardInterrupt
+        _fit(trainer, module, checkpoint)
     if not module.best_state:
         raise FitError(
             f"{name}: no epoch gave a finite free run on the validation data; lower the learning"
@@ -262,6 +254,27 @@ def run_epochs(
         "epochs": len(module.history),
         "curve": module.history,
     }
+
+
+def _fit(trainer: L.Trainer, module: EpochTraining, checkpoint: Path | None) -> None:
+    """Train; an interruption is passed on, where Lightning would end the process with exit code 1.
+
+    Raises:
+        KeyboardInterrupt: from the keyboard.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            trainer.fit(
+                module,
+                ckpt_path=str(checkpoint) if checkpoint is not None else None,
+                weights_only=True,
+            )
+        except SystemExit:
+            if not trainer.interrupted:
+                raise
+    if trainer.interrupted:
+        raise KeyboardInterrupt
 
 
 def _trainer(

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from residnet.core.errors import UsageError
+from residnet.core.files import whole
 from residnet.documents.moreno2019.published import RMSE
 from residnet.judge.residual_series import block_interval
 from residnet.report.blocks import Block, Cell, Figure, Section, Table
@@ -71,7 +72,8 @@ def sections(run: Path) -> list[Section]:
         for split in _SPLITS
     ]
     content = {"schema": "residnet.moreno2019/1", "rows": rows, "pairs": pairs}
-    (run / "study.json").write_text(json.dumps(content, indent=1) + "\n")
+    with whole(run / "study.json") as file:
+        file.write_text(json.dumps(content, indent=1) + "\n")
     blocks: list[Block] = [_errors(rows), _joint(pairs), _draw(records["test"], run)]
     return [Section("Document 001 (Moreno-Salinas et al. 2019)", blocks)]
 

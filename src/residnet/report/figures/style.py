@@ -9,6 +9,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
+from residnet.core.files import whole
 from residnet.report.run_reader import RunFiles
 
 _Arguments = ParamSpec("_Arguments")
@@ -122,10 +123,8 @@ def save(figure: Any, path: Path, title: str, caption: str) -> None:
     words = PngInfo()
     words.add_itxt("Title", title)
     words.add_itxt("Description", caption)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
-    picture.save(partial, format="PNG", optimize=True, dpi=(DPI, DPI), pnginfo=words)
-    partial.replace(path)
+    with whole(path) as file:
+        picture.save(file, format="PNG", optimize=True, dpi=(DPI, DPI), pnginfo=words)
 
 
 def styles(run: RunFiles) -> dict[str, dict[str, Any]]:

@@ -22,7 +22,7 @@ from residnet.core.progress import say
 from residnet.documents.gouletas2020.autopilot import predictive
 from residnet.dynamics.learned import chosen_model
 from residnet.dynamics.rollout import Source
-from residnet.dynamics.store import load_model
+from residnet.dynamics.store import load_model, rebuilt
 from residnet.export.autopilot import export_autopilot
 from residnet.judge.autopilots import QUANTITIES, step_flights
 from residnet.judge.metrics import SCHEMA
@@ -89,8 +89,8 @@ def run_autopilot(config: AutopilotSettings, folder: RunFolder) -> Outcome:
             "rows": rows,
         },
     )
-    series.to_parquet(folder.path / FLIGHTS)
-    plants.to_parquet(folder.path / PLANTS)
+    folder.write_table(folder.path / FLIGHTS, series)
+    folder.write_table(folder.path / PLANTS, plants)
     policies = {name: controllers[name][1] for name in config.policies}
     return Outcome(
         _verdict(config, rows),
@@ -272,6 +272,8 @@ def _policy(
         )
         notes |= {"seconds": round(time.time() - started, 1), "imitates": wanted.imitate}
         store.keep_module(name, spec, policy, notes)
+        # as a resumed run reads it
+        policy = rebuilt(spec, policy)
     policy.dt = steering.dt
     say(f"  {name}: score {notes['best_validation']:.3f} after {notes['seconds']:.0f} s")
     return policy.double(), {key: value for key, value in notes.items() if key != "curve"}

@@ -109,10 +109,10 @@ def run_course(config: CourseSettings, folder: RunFolder) -> Outcome:
         "feasibility": feasible,
     }
     folder.write_json(folder.metrics, shown | {"rows": done.rows})
-    pd.concat(done.tracks, ignore_index=True).to_parquet(folder.path / TRACKS)
-    pd.concat(plans, ignore_index=True).to_parquet(folder.path / COURSES)
+    folder.write_table(folder.path / TRACKS, pd.concat(done.tracks, ignore_index=True))
+    folder.write_table(folder.path / COURSES, pd.concat(plans, ignore_index=True))
     if done.spread:
-        pd.concat(done.spread, ignore_index=True).to_parquet(folder.path / SPREAD)
+        folder.write_table(folder.path / SPREAD, pd.concat(done.spread, ignore_index=True))
     return Outcome(
         _verdict(config, done.rows),
         _main_figures(config, done.rows),

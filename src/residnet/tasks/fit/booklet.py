@@ -84,8 +84,9 @@ def write_booklet(
         folder.booklet,
         contents(config.model, config.length, config.scale, config.draws, config.level, pages),
     )
-    pd.concat([_frame(page, config.rudder()) for page in pages]).to_parquet(
-        folder.booklet.with_suffix(".parquet"), index=False
+    folder.write_table(
+        folder.booklet.with_suffix(".parquet"),
+        pd.concat([_frame(page, config.rudder()) for page in pages]),
     )
     return (
         f"booklet: {len(config.manoeuvres)} manoeuvres, {len(repeated)} measured zigzags repeated,"

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING
-
 from residnet.core.progress import say
 from residnet.data.sources import read_logs
 from residnet.identification.currents import through_currents
@@ -28,9 +25,6 @@ from residnet.tasks.fit.files import (
     write_limits,
     write_metrics,
 )
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 
 def run_fit(config: FitTaskSettings, folder: RunFolder) -> Outcome:
@@ -86,16 +80,14 @@ def _judged(
     write_limits(
         folder, config, limiting, [log for split in config.evaluation.splits for log in logs[split]]
     )
-    _write_table(folder.residuals, residual_table(fitted, logs["test"]))
-    _write_table(folder.path / "terms.parquet", term_table(fitted, logs["test"]))
+    for place, found in {
+        folder.residuals: residual_table(fitted, logs["test"]),
+        folder.path / "terms.parquet": term_table(fitted, logs["test"]),
+    }.items():
+        if len(found):
+            folder.write_table(place, found)
     splits = goodness_rows(fitted, logs, step)
     folder.write_json(folder.goodness, content(config.name, splits, step))
     if config.booklet is not None:
         refitted = identified[config.booklet.model]
         say("  " + write_booklet(folder, config.booklet, refitted, logs, identified.limit))
-
-
-def _write_table(file: Path, table: pd.DataFrame) -> None:
-    """Write a table that has rows as Parquet."""
-    if len(table):
-        table.to_parquet(file, index=False)

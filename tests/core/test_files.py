@@ -1,0 +1,44 @@
+"""Files stand in their place whole or not at all."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from residnet.core.errors import UsageError
+from residnet.core.files import whole
+
+
+def test_a_file_takes_its_place_when_it_is_complete(tmp_path: Path) -> None:
+    path = tmp_path / "deep" / "values.json"
+    with whole(path) as file:
+        file.write_text("new")
+        assert not path.exists()
+    assert path.read_text() == "new"
+    assert [entry.name for entry in path.parent.iterdir()] == ["values.json"]
+
+
+@pytest.mark.parametrize("error", [ValueError("wrong"), KeyboardInterrupt(), SystemExit(1)])
+def test_what_breaks_off_leaves_the_old_file(tmp_path: Path, error: BaseException) -> None:
+    path = tmp_path / "values.json"
+    path.write_text("old")
+
+    def broken_off() -> None:
+        with whole(path) as file:
+            file.write_text("half")
+            raise error
+
+    with pytest.raises(type(error)):
+        broken_off()
+    assert path.read_text() == "old"
+    assert [entry.name for entry in tmp_path.iterdir()] == ["values.json"]
+
+
+@pytest.mark.parametrize("name", ["x" * 300, "file/values.json"])
+def test_a_place_that_cannot_be_written_is_one_line(tmp_path: Path, name: str) -> None:
+    (tmp_path / "file").write_text("no folder")
+    path = tmp_path / name
+    with pytest.raises(UsageError, match="cannot be written") as caught, whole(path) as file:
+        file.write_text("new")
+    assert str(path) in str(caught.value)
