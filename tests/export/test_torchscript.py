@@ -27,6 +27,7 @@ from residnet.export import torchscript
 from residnet.export.torchscript import check_parity, export_torchscript
 from residnet.heads import ClosedFormHead, HeadConfig
 from residnet.physics.signals import SignalsConfig
+from residnet.testing import check_bad_inputs
 
 SIGNALS = SignalsConfig(
     inputs=("n_port", "n_stbd"), exogenous=("wind_speed", "wind_dir"), forces="wam_v_cal"
@@ -193,6 +194,10 @@ def test_steps_rollout_and_warm_up_are_those_of_the_model(exported: Exported) ->
         assert outside.shape == (batch, steps)
         empty = module.initial_state(batch)
     assert torch.equal(empty, torch.zeros(batch, exported.card["memory"]))
+
+
+def test_bad_inputs_and_memories_give_a_flag_and_finite_numbers(exported: Exported) -> None:
+    check_bad_inputs(exported.module, exported.spec, exported.model, cases=100)
 
 
 def test_everything_is_single_precision(exported: Exported) -> None:

@@ -11,6 +11,7 @@ Each function takes a part and raises an `AssertionError` of one line where it b
 
 from __future__ import annotations
 
+from residnet.testing.bad_inputs import check_bad_inputs
 from residnet.testing.baselines import check_baseline
 from residnet.testing.examples import example_models, example_samples
 from residnet.testing.exporters import check_exporter
@@ -20,6 +21,7 @@ from residnet.testing.readers import check_reader
 from residnet.testing.vessels import check_vessel
 
 __all__ = [
+    "check_bad_inputs",
     "check_baseline",
     "check_exporter",
     "check_head",
