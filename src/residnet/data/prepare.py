@@ -20,6 +20,7 @@ from residnet.core.stretches import stretch_numbers
 from residnet.data.align import GridConfig, align
 from residnet.data.derivatives import DerivativeConfig, SavitzkyGolay
 from residnet.data.masks import MaskConfig, apply_masks, scored, segments
+from residnet.data.motion import MotionConfig, complete_motion, fill_sparse
 from residnet.physics.signals import Signals
 
 
@@ -30,6 +31,8 @@ class PrepareConfig(Config):
         grid: the uniform time grid; its step is the model's dt.
         masks: which samples are excluded, and why.
         derivative: how velocities are smoothed and differentiated.
+        motion: how the motion is told where a log holds position and heading only, or some of
+            the motion at some samples only.
         trim: seconds cut from the start and the end of every log before samples are taken for
             identification.
         hold: what a model is given as an input over the step that follows a sample. `start`: the
@@ -41,6 +44,7 @@ class PrepareConfig(Config):
     grid: GridConfig
     masks: tuple[MaskConfig, ...] = ()
     derivative: DerivativeConfig = Field(default_factory=SavitzkyGolay)
+    motion: MotionConfig = MotionConfig()
     trim: Seconds = Field(default=0.0, ge=0)
     hold: Literal["start", "mean"] = "start"
 
@@ -83,7 +87,8 @@ def prepare(log: Log, split: str, columns: Sequence[str], config: PrepareConfig)
     """Align, mask, smooth and differentiate one log.
 
     Args:
-        log: canonical log; needs the channels x, y, psi, u, v, r and `columns`.
+        log: canonical log; needs the channels x, y, psi and `columns`; u, v, r come from a
+            smoother where it lacks them.
         split: which split it belongs to.
         columns: input channels, in the order of w.
         config: grid, masks, derivative.
@@ -92,8 +97,7 @@ def prepare(log: Log, split: str, columns: Sequence[str], config: PrepareConfig)
         UsageError: where a channel is missing.
         DataError: where no sample remains.
     """
-    # masks look at the samples as recorded: interpolation hides a frozen sensor
-    log = align(apply_masks(log, config.masks), config.grid)
+    log = align(_masked(log, columns, config), config.grid)
     y, w = log.stack(STATE), log.stack(tuple(columns))
     piece = np.where(np.isfinite(y).all(1) & np.isfinite(w).all(1), segments(log), -1)
     usable = scored(log) & (piece >= 0)
@@ -115,6 +119,16 @@ def prepare(log: Log, split: str, columns: Sequence[str], config: PrepareConfig)
     trimmed = (log.t >= log.t[0] + config.trim - 1e-9) & (log.t <= log.t[-1] - config.trim + 1e-9)
     held = _means(w, piece) if config.hold == "mean" else w
     return Prepared(log, split, y, smooth, nu_dot, held, w, piece, usable, usable & valid & trimmed)
+
+
+def _masked(log: Log, columns: Sequence[str], config: PrepareConfig) -> Log:
+    """Return the log with its whole motion and the masks of the config."""
+    whole = complete_motion(log, config.motion)
+    if whole is log:
+        return apply_masks(fill_sparse(log, tuple(columns), config.grid.held), config.masks)
+    # masks look at the samples as recorded: interpolation hides a frozen sensor
+    seen = apply_masks(log.replace(channels={**whole.channels, **log.channels}), config.masks)
+    return fill_sparse(whole.replace(masks=seen.masks), tuple(columns), config.grid.held)
 
 
 def _means(w: np.ndarray, piece: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ import numpy as np
 from residnet.core.errors import DataError
 from residnet.core.layout import RANGE_VELOCITIES
 from residnet.core.log import Log
+from residnet.core.progress import say
 from residnet.data.prepare import Prepared, prepare
 from residnet.identification.settings import FitSettings
 
@@ -32,7 +33,15 @@ def prepare_logs(splits: Mapping[str, Sequence[Log]], settings: FitSettings) -> 
     for logs in prepared.values():
         for log in logs:
             require_length(log, settings)
+    _tell_smoothed([log for logs in prepared.values() for log in logs])
     return prepared
+
+
+def _tell_smoothed(logs: Sequence[Prepared]) -> None:
+    """Say which channels of how many logs were not measured at every sample."""
+    made = [", ".join(log.log.meta["smoothed"]) for log in logs if "smoothed" in log.log.meta]
+    for names in dict.fromkeys(made):
+        say(f"  {names} of {made.count(names)} logs come from a smoother of the measured motion")
 
 
 def require_length(log: Prepared, settings: FitSettings) -> None:

@@ -1,0 +1,115 @@
+"""The motion of logs that hold position and heading only, or rare positions."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from known_logs import wavy
+
+from residnet.core.config import validate
+from residnet.core.errors import DataError, UsageError
+from residnet.core.log import Log
+from residnet.core.names import STATE
+from residnet.data.align import GridConfig
+from residnet.data.motion import Antenna, MotionConfig, complete_motion
+from residnet.data.prepare import PrepareConfig, prepare
+
+TRUTH = wavy(seconds=120.0)
+
+
+def measured(
+    every: int = 1,
+    noise: tuple[float, float] = (0.0, 0.0),
+    antenna: tuple[float, float] = (0.0, 0.0),
+    delay: float = 0.0,
+    kept: tuple[str, ...] = (),
+) -> Log:
+    """The log of a receiver and a compass, and of the rate sensors in `kept`."""
+    random = np.random.default_rng(1)
+    c, s, size = np.cos(TRUTH["psi"]), np.sin(TRUTH["psi"]), len(TRUTH)
+    x = TRUTH["x"] + c * antenna[0] - s * antenna[1]
+    y = TRUTH["y"] + s * antenna[0] + c * antenna[1]
+    channels = {
+        name: np.interp(TRUTH.t - delay, TRUTH.t, values) + noise[0] * random.standard_normal(size)
+        for name, values in (("x", x), ("y", y))
+    }
+    for values in channels.values():
+        values[np.arange(size) % every != 0] = np.nan
+    channels["psi"] = TRUTH["psi"] + noise[1] * random.standard_normal(size)
+    channels |= {name: TRUTH[name] for name in (*kept, "delta")}
+    return Log("measured", TRUTH.t, channels)
+
+
+def error(log: Log, name: str) -> float:
+    """The rms error of a channel over the share of its spread, ends left out."""
+    middle = slice(50, -50)
+    miss = (log[name] - TRUTH[name])[middle]
+    return float(np.sqrt(np.nanmean(miss**2)) / np.std(TRUTH[name]))
+
+
+@pytest.mark.parametrize(
+    ("log", "config", "most"),
+    [
+        (measured(), MotionConfig(), 0.002),
+        (measured(every=10), MotionConfig(), 0.02),
+        (measured(noise=(0.02, 0.003)), MotionConfig(), 0.12),
+        (measured(every=10, noise=(0.02, 0.003)), MotionConfig(), 0.15),
+        (
+            measured(every=10, antenna=(3.0, -1.0), delay=0.4),
+            MotionConfig(antenna=Antenna(x=3.0, y=-1.0), delay=0.4),
+            0.02,
+        ),
+    ],
+)
+def test_velocities_from_position_and_heading(log: Log, config: MotionConfig, most: float) -> None:
+    out = complete_motion(log, config)
+    assert {name: error(out, name) for name in STATE} == {
+        name: pytest.approx(0.0, abs=most) for name in STATE
+    }
+    assert set(out.meta["smoothed"]) >= {"u", "v", "r"}
+
+
+def test_an_antenna_that_is_not_told_is_seen_in_the_velocities() -> None:
+    log = measured(antenna=(3.0, -1.0), delay=0.4)
+    assert error(complete_motion(log, MotionConfig()), "v") > 0.2
+
+
+def test_what_is_measured_at_every_sample_stays() -> None:
+    log = measured(every=10, kept=("u", "v", "r"))
+    out = complete_motion(log, MotionConfig())
+    assert all(np.array_equal(out[name], TRUTH[name]) for name in ("psi", "u", "v", "r"))
+    assert error(out, "x") < 1e-3
+    assert complete_motion(TRUTH, MotionConfig()) is TRUTH
+
+
+def test_a_long_gap_stays_a_gap() -> None:
+    log = measured(every=10)
+    lost = (log.t > 50.0) & (log.t < 60.0)
+    x = np.where(lost, np.nan, log["x"])
+    out = complete_motion(log.replace(channels={**log.channels, "x": x}), MotionConfig())
+    assert np.isnan(out["u"][lost]).all()
+    assert np.isfinite(out["u"][(log.t < 49.0) | ((log.t > 61.0) & (log.t < 119.0))]).all()
+
+
+def test_a_fit_is_prepared_from_position_and_heading() -> None:
+    log = measured(every=10, noise=(0.02, 0.003))
+    delta = np.where(np.arange(len(log)) % 2 == 0, log["delta"], np.nan)
+    log = log.replace(channels={**log.channels, "delta": delta})
+    config = PrepareConfig(grid=GridConfig(step=0.1))
+    prepared = prepare(log, "train", ("delta",), config)
+    assert prepared.usable.mean() > 0.9
+    assert float(np.abs(prepared.w[50:-50, 0] - TRUTH["delta"][50:-50]).max()) < 2e-3
+
+
+def test_without_a_heading_there_is_no_motion() -> None:
+    channels = {name: TRUTH[name] for name in ("x", "y", "delta")}
+    with pytest.raises(UsageError, match="no channel psi; position and heading are needed"):
+        complete_motion(Log("lost", TRUTH.t, channels), MotionConfig())
+    channels["psi"] = np.full(len(TRUTH), np.nan)
+    with pytest.raises(DataError, match="1200 positions and 0 headings"):
+        complete_motion(Log("lost", TRUTH.t, channels), MotionConfig())
+
+
+def test_the_antenna_from_a_config() -> None:
+    config = validate({"antenna": {"x": "30 cm"}, "delay": "400 ms"}, MotionConfig, "here")
+    assert (config.antenna, config.delay) == (Antenna(x=0.3), 0.4)
