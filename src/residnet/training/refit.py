@@ -109,22 +109,23 @@ def refit(
     offsets = Offsets.begin(
         config.offsets, int(store.log.max()) + 1, scales / config.correlation, problem.speed
     )
-    level = first = _level(model, problem, offsets)
+    level, squares = _level(model, problem, offsets)
+    first = level
     if not torch.isfinite(first):
         raise FitError(
             "the least-squares baseline diverges within the refit's horizon; shorten `horizon` or"
             " raise the baseline's ridge"
         )
     damping, count = 1e-3, 0
-    arrow = _normal_equations(model, problem, baseline, level, offsets)
+    arrow = _normal_equations(model, problem, baseline, level, squares, offsets)
     for _ in range(config.iterations):
         offsets = with_spread(offsets, arrow, problem.share(level))
         step = _descend(model, problem, baseline, arrow, offsets, level, damping)
         if step is None:
             break
-        level, offsets, damping, gain = step
+        level, squares, offsets, damping, gain = step
         count += 1
-        arrow = _normal_equations(model, problem, baseline, level, offsets)
+        arrow = _normal_equations(model, problem, baseline, level, squares, offsets)
         if gain < 2e-4:
             break
     share = problem.share(level)
@@ -153,9 +154,9 @@ def _descend(
     offsets: Offsets,
     level: Tensor,
     damping: float,
-) -> tuple[Tensor, Offsets, float, float] | None:
-    """One step of Levenberg and Marquardt: level, offsets and damping after it, and its gain as a
-    share of the cost; None where nothing gains.
+) -> tuple[Tensor, Tensor, Offsets, float, float] | None:
+    """One step of Levenberg and Marquardt: level, errors of the windows, offsets and damping after
+    it, and its gain as a share of the cost; None where nothing gains.
     """
     share = problem.share(level)
     believing = arrow.believing(offsets, share)
@@ -165,10 +166,11 @@ def _descend(
         step, offset_step = believing.damped(damping).solve()
         _place(baseline, kept - step, problem.active)
         moved = offsets.moved(offset_step)
-        reached = _level(model, problem, moved)
+        reached, squares = _level(model, problem, moved)
         trial = reached + _prior_cost(problem, baseline, share, moved)
         if torch.isfinite(trial) and trial < cost:
-            return reached, moved, max(damping / 10, 1e-8), float(cost - trial) / float(cost)
+            gain = float(cost - trial) / float(cost)
+            return reached, squares, moved, max(damping / 10, 1e-8), gain
         damping *= 10
     _place(baseline, kept, problem.active)
     return None
@@ -224,11 +226,6 @@ def _problem(
     )
 
 
-def _window_cost(error: Tensor) -> Tensor:
-    """Mean square error of each window [B] from weighted errors [B, T, 3]."""
-    return error.square().mean((1, 2))
-
-
 def _prior_cost(
     problem: _Problem, baseline: ParametricBaseline, share: Tensor, offsets: Offsets
 ) -> Tensor:
@@ -259,15 +256,16 @@ def _ahead(model: HybridDynamics, x: Tensor, p: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def _level(model: HybridDynamics, problem: _Problem, offsets: Offsets) -> Tensor:
-    """Mean error of the windows, in units of the scales."""
+def _level(model: HybridDynamics, problem: _Problem, offsets: Offsets) -> tuple[Tensor, Tensor]:
+    """Mean error of the windows in units of the scales, and mean square error of each [B]."""
     x, total = problem.x0, []
     shifted, _ = _shifted(model, problem, offsets)
     for k in range(problem.w.shape[1]):
         x = _ahead(shifted, x, model.signals.prepare(problem.w[:, k]))
         total.append(x[:, VELOCITIES])
     error = (torch.stack(total, dim=1) - problem.nu) * problem.weight
-    return torch.sqrt(_window_cost(error) + problem.robust**2).mean()
+    squares = error.square().mean((1, 2))
+    return torch.sqrt(squares + problem.robust**2).mean(), squares
 
 
 @torch.no_grad()
@@ -276,10 +274,14 @@ def _normal_equations(
     problem: _Problem,
     baseline: ParametricBaseline,
     level: Tensor,
+    squares: Tensor,
     offsets: Offsets,
 ) -> Arrow:
     """Gauss-Newton Hessian and half the gradient of the robust cost, as yet without what is
     believed of the offsets.
+
+    The windows' weights follow from their errors `squares`, which the search for this point has
+    computed; so one matrix product a step sums over all windows.
     """
     batch, steps = problem.w.shape[:2]
     shared, logs = int(problem.active.numel()), len(offsets.value)
@@ -287,43 +289,36 @@ def _normal_equations(
     shifted, baseline_with_offsets = _shifted(model, problem, offsets)
     x = problem.x0
     sensitivity = torch.zeros(batch, 4, count, dtype=x.dtype)
-    hessian = torch.zeros(batch, count, count, dtype=x.dtype)
-    gradient = torch.zeros(batch, count, dtype=x.dtype)
-    square = torch.zeros(batch, dtype=x.dtype)
+    hessian = torch.zeros(count, count, dtype=x.dtype)
+    gradient = torch.zeros(count, dtype=x.dtype)
+    columns = torch.zeros(logs, count, len(offsets.axes), dtype=x.dtype)
+    slopes = torch.zeros_like(offsets.value)
+    window = 0.5 / torch.sqrt(squares + problem.robust**2) / (3 * steps * batch)
+    root = window.sqrt()[:, None, None] * problem.weight
     for k in range(steps):
         p = model.signals.prepare(problem.w[:, k])
         sensitivity = step_sensitivities(shifted, baseline_with_offsets, x, p, sensitivity)
         x = _ahead(shifted, x, p)
-        error = (x[:, VELOCITIES] - problem.nu[:, k]) * problem.weight[:, k]
-        seen = sensitivity[:, 1:] * problem.weight[:, k].unsqueeze(-1)
-        hessian += seen.transpose(1, 2) @ seen
-        gradient += (seen * error.unsqueeze(-1)).sum(1)
-        square += error.square().sum(1)
-    weight = 0.5 / torch.sqrt(square / (3 * steps) + problem.robust**2) / (3 * steps * batch)
+        error = (x[:, VELOCITIES] - problem.nu[:, k]) * root[:, k]
+        seen = sensitivity[:, 1:] * root[:, k].unsqueeze(-1)
+        flat = seen.reshape(-1, count)
+        hessian.addmm_(flat.T, flat)
+        gradient.addmv_(flat.T, error.reshape(-1))
+        if offsets.axes:
+            own = seen[:, :, shared:]
+            columns.index_add_(0, problem.log, seen.transpose(1, 2) @ own)
+            slopes.index_add_(0, problem.log, (own * error.unsqueeze(-1)).sum(1))
     theta = baseline.theta.flatten()[problem.active]
     belief = problem.share(level) * problem.belief
-    total = (
-        torch.einsum("b,bij->ij", weight, hessian[:, :shared, :shared])
-        + problem.precision
-        + torch.diag(problem.pull + belief)
-    )
     prior = (
         problem.precision @ (theta - problem.start)
         + problem.pull * theta
         + belief * (theta - problem.believed)
     )
-    weighted, slope = (
-        weight[:, None, None] * hessian[:, :, shared:],
-        weight[:, None] * gradient[:, shared:],
-    )
-    offset_columns = torch.zeros(logs, count, len(offsets.axes), dtype=x.dtype).index_add_(
-        0, problem.log, weighted
-    )
-    slopes = torch.zeros_like(offsets.value).index_add_(0, problem.log, slope)
     return Arrow(
-        total,
-        offset_columns[:, :shared],
-        offset_columns[:, shared:],
-        weight @ gradient[:, :shared] + prior,
+        hessian[:shared, :shared] + problem.precision + torch.diag(problem.pull + belief),
+        columns[:, :shared],
+        columns[:, shared:],
+        gradient[:shared] + prior,
         slopes,
     )
