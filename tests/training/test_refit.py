@@ -170,7 +170,7 @@ def with_step(
     with torch.no_grad():
         other.baseline.theta.view(-1)[problem.active[place]] += step
     return float(
-        module._level(other, problem, offsets)
+        module._level(other, problem, offsets)[0]
         + module._prior_cost(problem, other.baseline, problem.share(LEVEL), offsets)
     )
 
@@ -202,13 +202,21 @@ def test_sensitivities_are_those_of_the_rollout(integrator: Integrator) -> None:
             torch.testing.assert_close(found[:, :, place], central, rtol=1e-6, atol=1e-8)
 
 
+def normal_equations(
+    model: HybridDynamics, problem: module._Problem, offsets: module.Offsets
+) -> module.Arrow:
+    assert isinstance(model.baseline, RegressorBaseline)
+    squares = module._level(model, problem, offsets)[1]
+    return module._normal_equations(model, problem, model.baseline, LEVEL, squares, offsets)
+
+
 def test_normal_equations_hold_half_the_gradient_of_the_cost() -> None:
     """With m the mean square error of a window, d sqrt(m + c^2) = dm / (2 sqrt(m + c^2)); the
     prior's d (t'Pt) = 2 P t: half of both is returned.
     """
     model, problem = windy()
     assert isinstance(model.baseline, RegressorBaseline)
-    arrow = module._normal_equations(model, problem, model.baseline, LEVEL, NONE)
+    arrow = normal_equations(model, problem, NONE)
     hessian, gradient = arrow.shared, arrow.gradient
     step = 1e-5
     central = [
@@ -228,7 +236,7 @@ def test_normal_equations_hold_the_gradient_and_the_curvature_of_offsets() -> No
     assert isinstance(model.baseline, RegressorBaseline)
     offsets = offsets_of(0.03)
     share = problem.share(LEVEL)
-    arrow = module._normal_equations(model, problem, model.baseline, LEVEL, offsets)
+    arrow = normal_equations(model, problem, offsets)
     assert float(arrow.blocks[2].abs().max()) == 0.0, "a log without a window says nothing"
     believing, step = arrow.believing(offsets, share), 1e-5
     for log in range(4):
@@ -272,7 +280,7 @@ def test_hessian_is_half_that_of_the_cost_where_the_errors_vanish() -> None:
         "belief": 0 * problem.belief,
     }
     perfect = module._Problem(**fields)
-    arrow = module._normal_equations(model, perfect, model.baseline, LEVEL, NONE)
+    arrow = normal_equations(model, perfect, NONE)
     hessian, gradient = arrow.shared, arrow.gradient
     torch.testing.assert_close(gradient, torch.zeros_like(gradient), rtol=0, atol=1e-14)
     step = 3e-6
