@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 
 import torch
 
@@ -15,8 +16,9 @@ from residnet.identification.evaluation import Evaluation
 from residnet.identification.models import FittedModel
 from residnet.judge.config import EvaluationConfig
 from residnet.judge.course_stability import SteadyRun, contradiction, steady_runs
-from residnet.judge.sanity import STABILITY, Finding, check_model
+from residnet.judge.sanity import BOUNDED, DAMPING, STABILITY, Finding, check_model
 from residnet.judge.selection import Contender, Selection, blocks_of, choose, shares
+from residnet.judge.soundness import TrainingPoints, runaway, training_points, wrong_damping
 
 _CHECKED = ("train", "validation")
 """Splits whose windows may not diverge; what the test data show comes too late for a choice."""
@@ -29,17 +31,17 @@ def examine(
 
     Args:
         fitted: models of one fit.
-        train: the logs that fitted them, which may contradict an unstable model.
+        train: the logs that fitted them; what a model does where they have been makes it unsound.
         config: whose `divergence` says when a model runs away.
         step: of the grid in s.
     """
-    steady = steady_runs(train, step)
+    points, steady = training_points(train), steady_runs(train, step)
     threads = torch.get_num_threads()
     # products this small only lose time to a second thread
     torch.set_num_threads(1)
     try:
         return {
-            entry.name: _examined(entry, steady, config.divergence)
+            entry.name: _examined(entry, points, steady, config.divergence)
             for entry in fitted
             if entry.spec.role != "zero"
         }
@@ -47,14 +49,24 @@ def examine(
         torch.set_num_threads(threads)
 
 
-def _examined(entry: FittedModel, steady: Sequence[SteadyRun], divergence: float) -> list[Finding]:
+def _examined(
+    entry: FittedModel, points: TrainingPoints, steady: Sequence[SteadyRun], divergence: float
+) -> list[Finding]:
+    """All findings of a model; those that make it unsound say so first."""
     # a copy: the checks run in float64, and must not round what others hold
     model = copy.deepcopy(entry.model).to(torch.float64).eval()
-    out = []
-    for finding in check_model(entry.spec, model, divergence=divergence):
-        fault = contradiction(model, steady) if finding.check == STABILITY else finding.fault
-        out.append(Finding(finding.model, finding.check, finding.ok, finding.text, fault))
-    return out
+    found = check_model(entry.spec, model, divergence=divergence)
+    faults = {
+        DAMPING: wrong_damping(model, points),
+        STABILITY: contradiction(model, steady),
+        BOUNDED: runaway(entry.spec, model, points, divergence),
+    }
+    return [
+        replace(finding, ok=False, text=f"unsound: {fault}. {finding.text}", fault=fault)
+        if (fault := faults.get(finding.check))
+        else finding
+        for finding in found
+    ]
 
 
 def select(

@@ -36,8 +36,8 @@ class SteadyRun:
         seconds: that it lasts, its settling left out.
         x: mean state [6] with the pose at zero.
         w: mean inputs [m].
-        growth: how many times farther the lateral velocities lie from their mean in its last third
-            than in its first.
+        growth: how many times farther the lateral velocities lie from their first third's mean in
+            the last third than in the first.
     """
 
     log: str
@@ -66,8 +66,8 @@ def steady_runs(logs: Sequence[Prepared], step: float, shortest: float = 5.0) ->
             y = log.smooth[rows]
             x = np.concatenate((np.zeros(VELOCITIES.start), y[:, VELOCITIES].mean(0)))
             lateral = y[:, SWAY : YAW_RATE + 1]
-            apart = np.abs(lateral - lateral.mean(0))
-            third = max(len(apart) // 3, 1)
+            third = max(len(lateral) // 3, 1)
+            apart = np.abs(lateral - lateral[:third].mean(0))
             first, last = apart[:third].mean(0), apart[-third:].mean(0)
             growth = float((last / np.maximum(first, 1e-9)).max())
             seconds = len(y) * step

@@ -1,0 +1,130 @@
+"""What makes a model unsound inside its training data: damping of the wrong sign, running away.
+
+Both are looked at where the logs have been, at recorded states and inputs. What a model does at
+combinations that no log holds is reported by `residnet.judge.sanity`, and speaks against no choice.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from residnet.core.layout import POSE, RANGE_VELOCITIES, SURGE, VELOCITIES
+from residnet.core.names import VELOCITY
+from residnet.data.prepare import Prepared
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.store import ModelSpec
+from residnet.judge.sanity_points import acceleration
+
+_POINTS = 90
+_THIRDS = 3
+_NEGLIGIBLE = 0.05
+_LONG_RUN = 300.0
+_PAUSE = 10.0
+_SETTLED = 1e-4
+
+
+@dataclass(frozen=True)
+class TrainingPoints:
+    """Recorded states and inputs of training logs, in order of speed.
+
+    Attributes:
+        x: states [K, 6] with the pose at zero.
+        w: inputs [K, m].
+        speed: in m/s, [K].
+    """
+
+    x: Tensor
+    w: Tensor
+    speed: np.ndarray
+
+
+def training_points(logs: Sequence[Prepared]) -> TrainingPoints:
+    """Return recorded points spread evenly over the speeds, and those of extreme inputs."""
+    x = np.concatenate([log.smooth[log.usable] for log in logs])
+    w = np.concatenate([log.w[log.usable] for log in logs])
+    x[:, POSE] = 0.0
+    speed = np.hypot(*x[:, VELOCITIES][:, :2].T)
+    order = np.argsort(speed, kind="stable")
+    even = order[np.linspace(0, len(order) - 1, min(_POINTS, len(order))).round().astype(int)]
+    rows = np.union1d(even, np.concatenate((w.argmin(0), w.argmax(0))))
+    rows = rows[np.argsort(speed[rows], kind="stable")]
+    return TrainingPoints(torch.from_numpy(x[rows]), torch.from_numpy(w[rows]), speed[rows])
+
+
+def wrong_damping(model: HybridDynamics, points: TrainingPoints) -> str:
+    """Return in a few words where damping has the wrong sign; empty where it has not.
+
+    The slopes du_dot/du, dv_dot/dv and dr_dot/dr are taken at the points, the memory settled. In
+    no third of the speeds may more than half of them be positive, unless they are negligible beside
+    those of the other thirds.
+
+    Args:
+        model: in float64 and evaluation mode.
+        points: of the training logs.
+    """
+    x = points.x.clone().requires_grad_()
+    # a model may depend on no velocity at all
+    nu_dot = acceleration(model, x, points.w) + 0.0 * x[:, VELOCITIES]
+    slopes = np.stack(
+        [
+            torch.autograd.grad(nu_dot[:, i].sum(), x, retain_graph=True)[0][:, SURGE + i].numpy()
+            for i in range(len(VELOCITY))
+        ],
+        axis=1,
+    )
+    thirds = np.array_split(np.arange(len(slopes)), _THIRDS)
+    medians = np.array([np.median(slopes[rows], axis=0) for rows in thirds])
+    wrong = medians > _NEGLIGIBLE * np.abs(medians).max(0)
+    said = [
+        f"d{name}′/d{name} {medians[place, i]:+.2g} 1/s at speeds of {points.speed[rows[0]]:.2g} to"
+        f" {points.speed[rows[-1]]:.2g} m/s"
+        for place, rows in enumerate(thirds)
+        for i, name in enumerate(VELOCITY)
+        if wrong[place, i]
+    ]
+    return f"its damping has the wrong sign ({', '.join(said)})" if said else ""
+
+
+def runaway(
+    spec: ModelSpec, model: HybridDynamics, points: TrainingPoints, divergence: float
+) -> str:
+    """Return in a few words how the model runs away from recorded points; empty where it does not.
+
+    Each point's inputs are held for 300 s.
+
+    Args:
+        spec: of the model; the largest training velocities are taken from it.
+        model: in float64 and evaluation mode.
+        points: of the training logs.
+        divergence: a velocity beyond this many times its largest training value has run away.
+    """
+    reach = np.maximum(np.abs(spec.low), np.abs(spec.high))[RANGE_VELOCITIES]
+    limit = torch.from_numpy(reach).clamp(min=1e-9)
+    x, s = points.x, model.initial_state(len(points.x)).double()
+    before, pause = x[:, VELOCITIES], max(round(_PAUSE / model.dt), 1)
+    with torch.no_grad():
+        for k in range(1, round(_LONG_RUN / model.dt) + 1):
+            x, s = model.step(x, points.w, s)
+            if k % pause:
+                continue
+            ratio = torch.nan_to_num(x[:, VELOCITIES].abs() / limit, nan=math.inf).amax(1)
+            if float(ratio.max()) > divergence:
+                row = int(ratio.argmax())
+                inputs = ", ".join(
+                    f"{name} {float(value):.3g}"
+                    for name, value in zip(spec.signals.columns, points.w[row], strict=True)
+                )
+                return (
+                    f"it runs away within {k * model.dt:.0f} s from a recorded state with recorded"
+                    f" inputs ({inputs})"
+                )
+            if float(((x[:, VELOCITIES] - before).abs() / limit).max()) < _SETTLED:
+                break
+            before = x[:, VELOCITIES]
+    return ""
