@@ -1,18 +1,23 @@
 """Interrupt a small but complete fit at random moments, resume it, and compare the metrics.
 
-The fit has a refitted baseline, PLSR, an MLP, an LSTM and an ensemble, and ends with report and
-export. Each chain stops it several times by SIGKILL, SIGINT or SIGTERM and resumes it with
-`--resume`. The rows of metrics.json have to be bit for bit those of an undisturbed run. After
+The fit has a refitted baseline, PLSR, an MLP, an LSTM and an ensemble; every third chain
+exports it too. Each chain stops it several times by SIGKILL, SIGINT or SIGTERM and resumes it
+with `--resume`. The rows of metrics.json have to be bit for bit those of an undisturbed run. After
 SIGINT the exit code has to be 130, after SIGTERM 143, and standard error has to end with one line
 that names `--resume` and to hold no traceback.
 
-    python scripts/bench/kill_and_resume.py [--chains 20] [--most 4] [--seed 0] [--out FOLDER]
+Most attempts are forks of this process, which has imported everything; a share of them are fresh
+processes, whose imports are interrupted too.
+
+    python scripts/bench/kill_and_resume.py [--chains 20] [--most 4] [--seed 0] [--fresh 0.2]
+        [--out FOLDER]
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import random
 import signal
@@ -20,16 +25,22 @@ import subprocess
 import sys
 import tempfile
 import time
+import traceback
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import yaml
 
+# imported before the forks, which then begin at once
+import residnet.report.figures.style
+import residnet.tasks.fit.running
+from residnet.__main__ import main as main_of_residnet
+
 _SCHEDULE = {
     "steps": 3,
     "one_step": {"epochs": 2, "window": 2.0, "batch": 16},
-    "multi_step": [{"horizon": 1.0, "epochs": 5, "batch": 16}],
+    "multi_step": [{"horizon": 1.0, "epochs": 3, "batch": 16}],
     "start_noise": 0.1,
 }
 CONFIG: dict[str, Any] = {
@@ -38,17 +49,15 @@ CONFIG: dict[str, Any] = {
     "data": {
         "kind": "simulated",
         "vessel": "wam_v_cal",
-        "duration": 30,
+        "duration": 15,
         "substeps": 1,
         "step": 0.1,
         "trials": [
-            {"kind": "constant", "drive": [0.4, 0.9], "steer": [-0.4, 0.0, 0.4]},
-            {"kind": "zigzag", "count": 5, "heading": ["20 deg"], "start": 3},
-            {"kind": "acceleration_deceleration", "count": 3},
-            {"kind": "three_two_one_one", "count": 3, "start": 3},
+            {"kind": "zigzag", "count": 5, "heading": ["20 deg"], "start": 1},
+            {"kind": "three_two_one_one", "count": 2, "start": 1},
         ],
-        "identification": {"zigzag": 4, "acceleration_deceleration": 2, "three_two_one_one": 2},
-        "validation": {"zigzag": 1, "acceleration_deceleration": 0, "three_two_one_one": 0},
+        "identification": {"zigzag": 4, "three_two_one_one": 1},
+        "validation": {"zigzag": 1, "three_two_one_one": 0},
     },
     "prepare": {
         "grid": {"step": 0.1},
@@ -56,7 +65,7 @@ CONFIG: dict[str, Any] = {
     },
     "signals": {"inputs": ["n_port", "n_stbd"], "forces": "wam_v_cal"},
     "baseline": {"kind": "regressors", "terms": ["u", "v", "r", "tau_x", "tau_n"]},
-    "refit": {"baseline": {"horizon": 2.0, "iterations": 3}},
+    "refit": {"baseline": {"horizon": 2.0, "every": 2.0, "iterations": 3}},
     "heads": {
         "plsr": {"kind": "plsr"},
         "mlp": {"kind": "mlp", "hidden": [6], "dropout": 0.1},
@@ -67,7 +76,7 @@ CONFIG: dict[str, Any] = {
     "evaluation": {
         "protocols": {
             "manoeuvre": {"kind": "manoeuvre"},
-            "T10": {"kind": "windows", "length": 10, "first": 2, "history": 1},
+            "T5": {"kind": "windows", "length": 5, "first": 2, "history": 1},
         },
         "selection": "manoeuvre",
         "scales": {"u": 0.35, "v": 0.16, "r": 0.24},
@@ -99,29 +108,67 @@ class Attempt:
     error: str
 
 
+def _forked(words: list[str], error: Path) -> int:
+    """Start the command line in a fork of this process; returns the process's number."""
+    child = os.fork()
+    if child:
+        return child
+    code = 1
+    try:
+        with error.open("w") as stream, Path(os.devnull).open("w") as nowhere:
+            os.dup2(stream.fileno(), 2)
+            os.dup2(nowhere.fileno(), 1)
+        sys.argv = ["residnet", *words]
+        main_of_residnet()
+        code = 0
+    except SystemExit as end:
+        code = int(end.code or 0)
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        sys.stderr.flush()
+        os._exit(code)
+
+
+def _started(words: list[str], error: Path) -> int:
+    """Start the command line as a process of its own; returns its number."""
+    with error.open("w") as stream:
+        return subprocess.Popen(
+            [sys.executable, "-m", "residnet", *words], stdout=subprocess.DEVNULL, stderr=stream
+        ).pid
+
+
+def _awaited(process: int, until: float) -> int | None:
+    """Wait for a process; returns its exit code, or None where it is still at work then."""
+    while True:
+        done, status = os.waitpid(process, os.WNOHANG)
+        if done:
+            return os.waitstatus_to_exitcode(status)
+        if time.monotonic() > until:
+            return None
+        time.sleep(0.01)
+
+
 def attempt(
-    words: list[str], file: Path, after: float | None = None, number: int = signal.SIGKILL
+    words: list[str],
+    file: Path,
+    after: float | None = None,
+    number: int = signal.SIGKILL,
+    *,
+    fresh: bool = False,
 ) -> Attempt:
     """Run the command line, and send it a signal after some seconds; None leaves it in peace."""
     started = time.monotonic()
-    with file.open("w") as stream:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "residnet", *words],
-            stdout=subprocess.DEVNULL,
-            stderr=stream,
-            env={**os.environ, "OMP_NUM_THREADS": "1"},
-        )
-        try:
-            process.wait(LIMIT if after is None else after)
-        except subprocess.TimeoutExpired:
-            process.send_signal(number)
-        try:
-            code = process.wait(LIMIT)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            code = process.wait()
+    process = (_started if fresh else _forked)(words, file)
+    code = _awaited(process, started + (LIMIT if after is None else after))
+    if code is None:
+        os.kill(process, number)
+        code = _awaited(process, time.monotonic() + LIMIT)
+    if code is None:
+        os.kill(process, signal.SIGKILL)
+        code = _awaited(process, math.inf)
     error = file.read_text(errors="backslashreplace")
-    return Attempt(code, time.monotonic() - started, error)
+    return Attempt(int(code or 0), time.monotonic() - started, error)
 
 
 def faults(stopped: Attempt, number: int) -> list[str]:
@@ -145,54 +192,86 @@ def rows(run: Path) -> str:
     return json.dumps(json.loads((run / "metrics.json").read_text())["rows"])
 
 
-def chain(folder: Path, whole: Attempt, truth: str, draw: random.Random, most: int) -> list[str]:
-    """Interrupt and resume one run; returns what went wrong."""
-    words = ["run", str(folder.parent / "config.yaml"), "--out", str(folder)]
-    found, told = [], []
-    for place in range(draw.randint(1, most)):
-        after, number = draw.uniform(0.5, 1.05 * whole.seconds), draw.choice(SIGNALS)
-        stopped = attempt(
-            [*words, *(["--resume"] if place else [])],
-            folder.parent / f"{folder.name}.{place}.txt",
-            after,
-            number,
-        )
-        told.append(f"{signal.Signals(number).name} at {after:.1f} s")
-        found += faults(stopped, number)
-        if stopped.code == 0:
-            break
-    # a resumed run that is done says so again
-    last = attempt([*words, "--resume"], folder.parent / f"{folder.name}.last.txt")
-    if last.code != 0:
-        found.append(f"exit code {last.code} of the last: {last.error[-2000:]}")
-    elif rows(folder) != truth:
-        found.append("other rows in metrics.json")
-    found += [f"{file} is left over" for file in folder.rglob("*.partial")]
-    print(f"{folder.name}: {', '.join(told)}: {'; '.join(found) or 'the same rows'}", flush=True)
-    return found
+@dataclass(frozen=True)
+class Chains:
+    """What all chains have in common.
+
+    Attributes:
+        folder: of their run folders.
+        seconds: of the undisturbed run.
+        truth: its rows.
+        most: interruptions of one chain at most.
+        fresh: share of attempts in a process of their own.
+    """
+
+    folder: Path
+    seconds: float
+    truth: str
+    most: int
+    fresh: float
+
+    def run(self, chain: int, draw: random.Random) -> list[str]:
+        """Interrupt and resume one run; returns what went wrong."""
+        run = self.folder / f"chain_{chain:02d}"
+        words = _words(self.folder, run, report=chain % 3 == 0)
+        found, told = [], []
+        for place in range(draw.randint(1, self.most)):
+            after, number = draw.uniform(0.2, 1.05 * self.seconds), draw.choice(SIGNALS)
+            fresh = draw.random() < self.fresh
+            if fresh and draw.random() < 0.5:
+                after = draw.uniform(0.3, 4.0)  # while it imports
+            stopped = attempt(
+                [*words, *(["--resume"] if place else [])],
+                self.folder / f"{run.name}.{place}.txt",
+                after,
+                number,
+                fresh=fresh,
+            )
+            told.append(f"{signal.Signals(number).name} at {after:.1f} s{' (fresh)' * fresh}")
+            found += faults(stopped, number)
+            if stopped.code == 0:
+                told[-1] = "done before that"
+                break
+        # a resumed run that is done says so again
+        last = attempt([*words, "--resume"], self.folder / f"{run.name}.last.txt")
+        if last.code != 0:
+            found.append(f"exit code {last.code} of the last: {last.error[-2000:]}")
+        elif rows(run) != self.truth:
+            found.append("other rows in metrics.json")
+        found += [f"{file} is left over" for file in run.rglob("*.partial")]
+        print(f"{run.name}: {', '.join(told)}: {'; '.join(found) or 'the same rows'}", flush=True)
+        return found
+
+
+def _words(folder: Path, run: Path, *, report: bool) -> list[str]:
+    """Return the arguments of the command line; a fit without its report is a config of its own."""
+    name = "config.yaml" if report else "no_export.yaml"
+    return ["run", str(folder / name), "--out", str(run)]
 
 
 def main() -> None:
     """Run the chains and print the tally."""
+    residnet.report.figures.style.DPI = 20  # most of the time would go into the pictures
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--chains", type=int, default=20)
     parser.add_argument("--most", type=int, default=4, help="interruptions of one chain at most")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--fresh", type=float, default=0.2, help="share of fresh processes")
     parser.add_argument("--out", type=Path)
     given = parser.parse_args()
     folder = given.out or Path(tempfile.mkdtemp(prefix="interrupted-"))
     folder.mkdir(parents=True, exist_ok=True)
-    config = folder / "config.yaml"
-    config.write_text(yaml.safe_dump(CONFIG, sort_keys=False))
-    whole = attempt(["run", str(config), "--out", str(folder / "whole")], folder / "whole.txt")
+    (folder / "config.yaml").write_text(yaml.safe_dump(CONFIG, sort_keys=False))
+    small = {**CONFIG, "export": {"models": []}}
+    (folder / "no_export.yaml").write_text(yaml.safe_dump(small, sort_keys=False))
+    words = _words(folder, folder / "whole", report=False)
+    whole = attempt(words, folder / "whole.txt")
     if whole.code != 0:
         sys.exit(f"the undisturbed run ends with {whole.code}: {whole.error[-2000:]}")
     print(f"undisturbed: {whole.seconds:.0f} s, in {folder}", flush=True)
-    truth, draw = rows(folder / "whole"), random.Random(given.seed)
-    bad = sum(
-        bool(chain(folder / f"chain_{number:02d}", whole, truth, draw, given.most))
-        for number in range(given.chains)
-    )
+    chains = Chains(folder, whole.seconds, rows(folder / "whole"), given.most, given.fresh)
+    draw = random.Random(given.seed)
+    bad = sum(bool(chains.run(number, draw)) for number in range(given.chains))
     print(f"{given.chains - bad} of {given.chains} chains end with the rows of the undisturbed run")
     sys.exit(1 if bad else 0)
 
