@@ -108,9 +108,12 @@ def inspect(
     Clocks, gaps, jumps, frozen channels, reference frames, lags, copied channels and excitation
     are checked. The exit code is 1 where a fit would be misled.
     """
+    from residnet.core.files import require_file_place
     from residnet.tasks.inspection import inspect_logs
 
     _limit_threads()
+    if file is not None:
+        require_file_place(file)
     with drawn_progress():
         findings = inspect_logs(logs, config)
     print(findings.text)

@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
+import errno
+import os
+import shutil
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from residnet.core.errors import UsageError
+
+_ROOM = 20_000_000
+"""Bytes that must be free before a run."""
+_PROBE = 65_536
+_DEEPER = 300
+"""Bytes that the names of a run's own folders and files add to its path, that of a log included."""
 
 
 @contextmanager
@@ -32,6 +42,61 @@ def whole(path: Path) -> Iterator[Path]:
     except BaseException:
         _discard(partial)
         raise
+
+
+def require_room(folder: Path) -> None:
+    """Check that a folder, which need not be there yet, can be written and has room for a run.
+
+    What the system allows is tried out: rights, quotas and limits show in no other way.
+
+    Raises:
+        UsageError: where it cannot be written, its name is too long, or less than 20 MB are free.
+    """
+    try:
+        there = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+        if not there.is_dir():
+            raise UsageError(f"{there}: exists already and is no folder; give another place")
+        _require_short(folder.absolute(), there)
+        with tempfile.TemporaryFile(dir=there) as file:
+            file.write(bytes(_PROBE))
+            file.flush()
+            os.fsync(file.fileno())
+        free = shutil.disk_usage(there).free
+    except OSError as error:
+        raise not_written(folder, error) from error
+    except ValueError as error:
+        raise UsageError(f"{folder}: is no path ({error})") from error
+    if free < _ROOM:
+        raise UsageError(
+            f"{folder}: only {free / 1e6:.1f} MB are free there, and a run takes up to"
+            f" {_ROOM / 1e6:.0f} MB or more; make room or give a place with more of it"
+        )
+
+
+def require_file_place(file: Path) -> None:
+    """Check that a file can be written in its place, before the work whose result it will hold.
+
+    Raises:
+        UsageError: where it cannot.
+    """
+    try:
+        if file.is_dir():
+            raise UsageError(f"{file}: is a folder; give the name of a file")
+    except OSError as error:
+        raise not_written(file, error) from error
+    except ValueError as error:
+        raise UsageError(f"{file}: is no path ({error})") from error
+    require_room(file.parent)
+
+
+def _require_short(path: Path, there: Path) -> None:
+    """Check the lengths of names, with those in mind that a run adds to them."""
+    longest = os.pathconf(there, "PC_PATH_MAX")
+    if len(os.fsencode(path)) + _DEEPER > longest:
+        raise OSError(errno.ENAMETOOLONG, "path too long")
+    name = max((len(os.fsencode(part)) for part in path.parts), default=0)
+    if name > os.pathconf(there, "PC_NAME_MAX"):
+        raise OSError(errno.ENAMETOOLONG, "name too long")
 
 
 def not_written(path: Path, error: OSError) -> UsageError:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from residnet.core.errors import UsageError
-from residnet.core.files import whole
+from residnet.core.files import require_room, whole
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -83,24 +83,35 @@ class RunFolder:
                 configuration.
         """
         folder = cls(path)
-        if resume and overwrite:
-            raise UsageError(f"{path}: give --resume or --overwrite, not both")
-        if resume and folder.resolved.is_file() and folder._has_results():
-            if folder.resolved.read_text() != resolved:
-                raise UsageError(
-                    f"{path}: was made with another configuration ({folder.resolved} differs);"
-                    " resume with the same one or give another --out"
-                )
-            # what is done again must not look finished meanwhile
-            folder.summary.unlink(missing_ok=True)
-            return folder
-        if path.exists() and not path.is_dir():
-            raise UsageError(f"{path}: exists already and is no folder; give another --out")
-        if path.is_dir() and folder._has_results():
-            folder._make_way(overwrite)
+        folder.require(resolved, resume=resume, overwrite=overwrite)
+        if folder._has_results():
+            if resume and folder.resolved.is_file():
+                # what is done again must not look finished meanwhile
+                folder.summary.unlink(missing_ok=True)
+                return folder
+            shutil.rmtree(path)
         path.mkdir(parents=True, exist_ok=True)
         folder.write(folder.resolved, resolved)
         return folder
+
+    def require(self, resolved: str, *, resume: bool = False, overwrite: bool = False) -> None:
+        """Check that `create` will do what it is asked for; nothing is changed.
+
+        Raises:
+            UsageError: as `create`.
+        """
+        if resume and overwrite:
+            raise UsageError(f"{self.path}: give --resume or --overwrite, not both")
+        require_room(self.path)
+        if not self._has_results():
+            return
+        if not (resume and self.resolved.is_file()):
+            self._require_replaceable(overwrite)
+        elif _text(self.resolved) != resolved:
+            raise UsageError(
+                f"{self.path}: was made with another configuration ({self.resolved} differs);"
+                " resume with the same one or give another --out"
+            )
 
     @classmethod
     def open(cls, path: Path) -> RunFolder:
@@ -189,12 +200,11 @@ class RunFolder:
         return content
 
     def _has_results(self) -> bool:
-        return any(entry.name not in _BEFORE_RESULTS for entry in self.path.iterdir()) or (
-            # without a configuration the files are somebody else's
-            any(self.path.iterdir()) and not self.resolved.is_file()
-        )
+        names = {entry.name for entry in self.path.iterdir()} if self.path.is_dir() else set()
+        # without a configuration the files are somebody else's
+        return bool(names - _BEFORE_RESULTS) or (bool(names) and not self.resolved.is_file())
 
-    def _make_way(self, overwrite: bool) -> None:
+    def _require_replaceable(self, overwrite: bool) -> None:
         if not self.resolved.is_file():
             raise UsageError(
                 f"{self.path}: exists already and is not the folder of a run; give another --out"
@@ -204,4 +214,11 @@ class RunFolder:
                 f"{self.path}: exists already; give another --out, continue it with --resume, or"
                 " replace it with --overwrite"
             )
-        shutil.rmtree(self.path)
+
+
+def _text(path: Path) -> str:
+    """Return the text of a file; what is no text in it shows as escapes."""
+    try:
+        return path.read_text(encoding="utf-8", errors="backslashreplace")
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be read ({error.strerror})") from error

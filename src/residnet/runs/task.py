@@ -167,16 +167,14 @@ class Task(Config):
         Raises:
             ResidnetError: where the input does not allow it, or a result fails a check.
         """
+        place, resolved = out or Path("runs") / self.name, dump_config(self)
+        # before the check, which may read much
+        RunFolder(place).require(resolved, resume=resume, overwrite=overwrite)
         self.check()
         made_from = Provenance(
             source, overrides, self.recorded_seed(), self.input_files(), time.time()
         )
-        folder = RunFolder.create(
-            out or Path("runs") / self.name,
-            dump_config(self),
-            resume=resume,
-            overwrite=overwrite,
-        )
+        folder = RunFolder.create(place, resolved, resume=resume, overwrite=overwrite)
         return self.conduct(folder, made_from, self.carry_out, report=report)
 
     @final

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from residnet.core.config import load_config, load_mapping
 from residnet.core.errors import UsageError
+from residnet.core.files import require_file_place, require_room
 from residnet.core.names import nearest
 from residnet.core.registry import kinds
 from residnet.runs.folder import RunFolder
@@ -21,6 +22,7 @@ def report_run(path: Path) -> Path:
         UsageError: where there is no finished run, or its task is not known.
     """
     run = RunFolder.open(path)
+    require_room(path)
     return task_class(run).write_report(run)
 
 
@@ -32,6 +34,7 @@ def evaluate_run(path: Path, logs: Sequence[Path], out: Path | None) -> Finished
         ResidnetError: where a log cannot be used.
     """
     run = RunFolder.open(path)
+    require_room(out or path)
     return _task(run, "evaluate").evaluate_on(run, logs, out)
 
 
@@ -43,6 +46,7 @@ def export_run(path: Path, model: str, out: Path | None, file_format: str) -> Pa
         ExportError: where the exported model does not agree with the one that it came from.
     """
     run = RunFolder.open(path)
+    require_file_place(out or run.exports / model)
     return _task(run, "export").export_model(run, model, out, file_format)
 
 
