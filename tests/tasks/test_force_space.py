@@ -91,10 +91,11 @@ def test_exports(
 ) -> None:
     assert call(monkeypatch, "export", run, "--model", "ridge", "--format", "feed_forward") == 0
     loaded = torch.jit.load(str(run / "exports" / "ridge_feed_forward.pt"))
-    tau = loaded(
-        torch.tensor([[0.1, 0.0, 0.0]], dtype=torch.float64),
-        torch.tensor([[0.5, 0.0, 0.0]], dtype=torch.float64),
-    )
+    nu_dot = torch.tensor([[0.1, 0.0, 0.0], [torch.nan, 0.0, 0.0], [torch.inf, -1e30, 0.0]])
+    nu = torch.tensor([[0.5, 0.0, 0.0]]).expand(3, -1)
+    tau, outside = loaded(nu_dot, nu)
+    assert torch.isfinite(tau).all()
+    assert outside.tolist()[1:] == [True, True]
     assert 0.5 < float(tau[0, 0]) / (0.1 * 0.5 * 2389.657) < 2.0
     capsys.readouterr()
     assert call(monkeypatch, "export", run, "--model", "baseline", "--format", "feed_forward") == 2

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from residnet.control.heading.policy import MEMORY, HeadingPolicy
 from residnet.core.errors import ExportError
 from residnet.core.version import __version__
-from residnet.export.scripting import write_scripted
+from residnet.export.scripting import require_shape, size, within, write_scripted
 
 MEASURED = ("psi", "u", "r")
 """What an exported policy sees: heading [rad], speed [m/s], yaw rate [rad/s]."""
@@ -74,7 +74,8 @@ class ExportedPolicy(nn.Module):
     The memory s [B, 10] is that of the policy and the last command. `fault` tells that a
     measurement, the reference or the memory was no number or out of range: then the command is the
     safe one, reached at the rudder's rate. The policy's memory stays as it was; where it was wrong
-    itself, it is forgotten and begins anew.
+    itself, or would become so, it is forgotten and begins anew. Tensors of a wrong shape are
+    refused, never broadcast; other precisions are converted.
     """
 
     def __init__(
@@ -100,13 +101,12 @@ class ExportedPolicy(nn.Module):
         self.memory_low: Tensor
         self.memory_high: Tensor
         # the memory of `initial_state` at r = 0, and what it gains with r
-        self.register_buffer(
-            "begin",
-            torch.tensor([0.0, 0.0, 0.0, 0.0, 1.0, 1.0, policy.prior, 0.0, policy.prior, 0.0]),
-        )
-        self.register_buffer(
-            "begin_turn", torch.tensor([0.0, 1.0, 1.0 / (policy.gain * policy.limit), *[0.0] * 7])
-        )
+        turned = 1.0 / (policy.gain * policy.limit)
+        for name, memory in {
+            "begin": [0.0, 0.0, 0.0, 0.0, 1.0, 1.0, policy.prior, 0.0, policy.prior, 0.0],
+            "begin_turn": [0.0, 1.0, turned, *[0.0] * 7],
+        }.items():
+            self.register_buffer(name, torch.tensor(memory, dtype=torch.float32))
         self.begin: Tensor
         self.begin_turn: Tensor
         self.keep = 1.0 if safe == "hold" else 0.0
@@ -117,6 +117,8 @@ class ExportedPolicy(nn.Module):
     @torch.jit.export
     def initial_state(self, y: Tensor) -> Tensor:
         """Return the memory s [B, 10] at the first measurement y [B, 3], rudder amidships."""
+        require_shape("measured", y, [size(y, 2, 0), self.low.numel()])
+        y = y.to(torch.float32)
         good = self._good(y).unsqueeze(-1)
         return torch.cat(
             (
@@ -138,6 +140,11 @@ class ExportedPolicy(nn.Module):
             reference: heading [B, 1] in rad.
             s: memory [B, 10].
         """
+        rows = size(y, 2, 0)
+        require_shape("measured", y, [rows, self.low.numel()])
+        require_shape("reference", reference, [rows, 1])
+        require_shape("s", s, [rows, self.memory_low.numel()])
+        y, reference, s = y.to(torch.float32), reference.to(torch.float32), s.to(torch.float32)
         good = (
             self._good(y)
             & torch.isfinite(reference[:, 0])
@@ -147,10 +154,16 @@ class ExportedPolicy(nn.Module):
         reference = torch.where(good, reference, torch.zeros_like(reference))
         last = torch.nan_to_num(s[:, -1:]).clamp(-self.limit, self.limit)
         # comparisons with what is no number are false
-        remembers = ((s >= self.memory_low) & (s <= self.memory_high)).all(dim=-1, keepdim=True)
-        s = torch.where(remembers, s, self.begin + self.begin_turn * y[:, 2:])
+        remembers = within(s, self.memory_low, self.memory_high)
+        begun = self.begin + self.begin_turn * y[:, 2:]
+        s = torch.where(remembers, s, begun)
         good = good & remembers
         wish, memory = self.policy(y, reference, s[:, :-1])
+        # a memory within its range can still lead out of it, where its entries do not belong
+        # together
+        sound = within(memory, self.memory_low[:-1], self.memory_high[:-1])
+        s = torch.where(sound, s, begun)
+        good = good & sound
         wish = torch.where(good, wish, self.keep * last)
         memory = torch.where(good, memory, s[:, :-1])
         command = last + (wish - last).clamp(-self.travel, self.travel)

@@ -20,7 +20,7 @@ from residnet.control.heading.following import Following
 from residnet.control.heading.policy import HeadingPolicy
 from residnet.core.errors import ExportError
 from residnet.export.autopilot import measured_entries, memory_limits, policy_entries
-from residnet.export.scripting import write_scripted
+from residnet.export.scripting import require_shape, size, within, write_scripted
 
 MEASURED = ("x", "y", "psi", "u", "v", "r")
 """What the exported module sees: north and east [m], heading [rad], surge and sway velocity [m/s],
@@ -39,8 +39,9 @@ class ExportedCourse(nn.Module):
     The memory s is that of the guidance (place along the course, and the drift where it is
     estimated), of the policy, and the last command. `fault` tells that a measurement or the memory
     was no number or out of range: then the command is the safe one, reached at the rudder's rate,
-    and the memory stays as it was; where it was wrong itself, it is forgotten and the course begins
-    anew. `arrived` tells that the course has ended; commands go on along its last leg.
+    and the memory stays as it was; where it was wrong itself, or would become so, it is forgotten
+    and the course begins anew. `arrived` tells that the course has ended; commands go on along its
+    last leg. Tensors of a wrong shape are refused, never broadcast; other precisions are converted.
     """
 
     def __init__(
@@ -98,6 +99,10 @@ class ExportedCourse(nn.Module):
 
         It stands at the beginning of the course, rudder amidships.
         """
+        require_shape("measured", y, [size(y, 2, 0), self.low.numel()])
+        return self._begun(y.to(torch.float32))
+
+    def _begun(self, y: Tensor) -> Tensor:
         y = torch.where(self._good(y).unsqueeze(-1), y, torch.zeros_like(y))
         return torch.cat(
             (
@@ -119,18 +124,29 @@ class ExportedCourse(nn.Module):
             measured: y [B, 6], `MEASURED`.
             s: memory [B, n].
         """
+        rows = size(y, 2, 0)
+        require_shape("measured", y, [rows, self.low.numel()])
+        require_shape("s", s, [rows, self.memory_low.numel()])
+        y, s = y.to(torch.float32), s.to(torch.float32)
         good = self._good(y).unsqueeze(-1)
         y = torch.where(good, y, torch.zeros_like(y))
         last = torch.nan_to_num(s[:, -1:]).clamp(-self.limit, self.limit)
         # comparisons with what is no number are false
-        remembers = ((s >= self.memory_low) & (s <= self.memory_high)).all(dim=-1, keepdim=True)
-        s = torch.where(remembers, s, self.initial_state(y))
+        remembers = within(s, self.memory_low, self.memory_high)
+        begun = self._begun(y)
+        s = torch.where(remembers, s, begun)
         good = good & remembers
         reference, place = self.guidance(y, 0, s[:, : self.guidance.n_state])
         wish, memory = self.follower(y, reference, s[:, self.guidance.n_state : -1])
+        new = torch.cat((place, memory), dim=-1)
+        # a memory within its range can still lead out of it, where its entries do not belong
+        # together
+        sound = within(new, self.memory_low[:-1], self.memory_high[:-1])
+        s = torch.where(sound, s, begun)
+        good = good & sound
         wish = torch.where(good, wish, self.keep * last)
         command = last + (wish - last).clamp(-self.travel, self.travel)
-        after = torch.where(good, torch.cat((place, memory), dim=-1), s[:, :-1])
+        after = torch.where(good, new, s[:, :-1])
         arrived = after[:, 0] >= self.guidance.length
         return command, torch.cat((after, command), dim=-1), ~good[:, 0], arrived
 

@@ -17,7 +17,8 @@ from residnet.core.layout import PLANAR, RANGE_VELOCITIES
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
 from residnet.export.base import Exporter
-from residnet.export.scripting import write_scripted
+from residnet.export.guard import replaced, widening
+from residnet.export.scripting import require_shape, size, within, write_scripted
 from residnet.heads import ForceHead
 from residnet.physics.force_model import MOTION
 from residnet.physics.signals import FORCE_CHANNELS
@@ -42,6 +43,52 @@ class RequiredForce(nn.Module):
             nu_dot, z
         )
         return force
+
+
+@final
+class GuardedForce(nn.Module):
+    """A feed-forward whose answer is finite whatever it is given, with a flag.
+
+    Motions are treated as `residnet.export.guard` says: not a number becomes the middle of the
+    training range, what is farther off than the accepted range its nearest value.
+
+    Args:
+        model: tau [B, 3] from nu_dot and nu [B, 3].
+        ranges: of nu_dot and nu in the training data, six.
+    """
+
+    def __init__(self, model: nn.Module, ranges: Sequence[tuple[float, float]]) -> None:
+        super().__init__()
+        self.model = model
+        low, high = torch.tensor(ranges, dtype=torch.float64).T
+        reach = torch.tensor([widening(*limits) for limits in ranges], dtype=torch.float64)
+        for name, value in {
+            "low": low,
+            "high": high,
+            "least": low - reach,
+            "most": high + reach,
+            "middle": 0.5 * (low + high),
+        }.items():
+            self.register_buffer(name, value.clone())
+        self.low: Tensor
+        self.high: Tensor
+        self.least: Tensor
+        self.most: Tensor
+        self.middle: Tensor
+        self.dof = PLANAR.dof
+
+    def forward(self, nu_dot: Tensor, nu: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the force tau [B, 3] in N, N, N m and `outside` [B].
+
+        `outside` is True where a motion is beyond the training range or no number.
+        """
+        rows = size(nu, 2, 0)
+        require_shape("nu_dot", nu_dot, [rows, self.dof])
+        require_shape("nu", nu, [rows, self.dof])
+        seen = torch.cat((nu_dot, nu), dim=-1).to(torch.float64)
+        used = replaced(seen, self.low, self.high, self.least, self.most, self.middle)
+        force: Tensor = self.model(used[:, : self.dof], used[:, self.dof :])
+        return force, ~within(seen, self.low, self.high).squeeze(-1)
 
 
 def required_force(
@@ -80,7 +127,7 @@ def export_feed_forward(
     ranges: Sequence[tuple[float, float]],
     file: Path,
 ) -> dict[str, Any]:
-    """Write F(nu_dot, nu) as TorchScript with its card.
+    """Write (tau, outside) = F(nu_dot, nu) as TorchScript with its card.
 
     Args:
         model: tau [B, 3] from nu_dot and nu [B, 3].
@@ -95,6 +142,7 @@ def export_feed_forward(
         ExportError: where the exported module differs from the model.
     """
     model = model.eval()
+    guarded = GuardedForce(model, ranges).eval()
 
     def check(exported: Any) -> float:
         """Return the largest difference at random motions within the training ranges.
@@ -106,10 +154,8 @@ def export_feed_forward(
             200, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64
         ) * (high - low)
         with torch.no_grad():
-            eager, scripted = (
-                model(motion[:, : PLANAR.dof], motion[:, PLANAR.dof :]),
-                exported(motion[:, : PLANAR.dof], motion[:, PLANAR.dof :]),
-            )
+            eager = model(motion[:, : PLANAR.dof], motion[:, PLANAR.dof :])
+            scripted, _ = exported(motion[:, : PLANAR.dof], motion[:, PLANAR.dof :])
         share = float(((eager - scripted).abs().amax(0) / (eager.amax(0) - eager.amin(0))).max())
         if not share < 1e-9:
             raise ExportError(
@@ -125,7 +171,20 @@ def export_feed_forward(
                 "nu_dot": ["u_dot m/s^2", "v_dot m/s^2", "r_dot rad/s^2"],
                 "nu": ["u m/s", "v m/s", "r rad/s"],
             },
-            "returns": ["tau_x N", "tau_y N", "tau_n N m"],
+            "returns": ["tau [B, 3]: tau_x N, tau_y N, tau_n N m", "outside [B]"],
+            "bad_inputs": (
+                "a motion that is no number becomes the middle of its training range, one beyond"
+                " `accepted` the nearest value of the training range; `outside` is then true, as"
+                " for every motion beyond the training range"
+            ),
+            "accepted": {
+                name: list(limits)
+                for name, limits in zip(
+                    MOTION,
+                    zip(guarded.least.tolist(), guarded.most.tolist(), strict=True),
+                    strict=True,
+                )
+            },
             "training_range": {
                 name: list(limits) for name, limits in zip(MOTION, ranges, strict=True)
             },
@@ -134,7 +193,7 @@ def export_feed_forward(
             "safety": "TorchScript is code that runs when loaded: load only files that you trust.",
         }
 
-    return write_scripted(file, model, (), check, card)
+    return write_scripted(file, guarded, (), check, card)
 
 
 @final

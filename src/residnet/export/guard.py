@@ -200,11 +200,15 @@ def replaced(
     return torch.where(known, seen, torch.where(torch.isnan(seen), middle, nearest))
 
 
+def widening(low: float, high: float) -> float:
+    """Return how far beyond its training range a value is accepted, in its own unit."""
+    return REACH * (max(abs(low), abs(high)) or 0.5)
+
+
 def _reach(spec: ModelSpec) -> list[float]:
     """Return how far beyond the training range each velocity and input is accepted."""
     units = spec.signals.units()
-    out = []
-    for name, (low, high) in spec.ranges.items():
-        reach = REACH * (max(abs(low), abs(high)) or 0.5)
-        out.append(max(reach, _TURN) if units[name] == "rad" else reach)
-    return out
+    return [
+        max(widening(low, high), _TURN if units[name] == "rad" else 0.0)
+        for name, (low, high) in spec.ranges.items()
+    ]

@@ -28,6 +28,14 @@ def size(tensor: Tensor, dimensions: int, dimension: int) -> int:
     return tensor.shape[dimension] if tensor.dim() == dimensions else 1
 
 
+def within(values: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """Return which rows of values [B, n] lie between low and high [n] in all entries, [B, 1].
+
+    What is no number does not. TorchScript compiles it.
+    """
+    return ((values >= low) & (values <= high)).all(dim=-1, keepdim=True)
+
+
 def require_shape(name: str, tensor: Tensor, shape: list[int]) -> None:
     """Refuse a tensor of another shape, which arithmetic might broadcast.
 
