@@ -11,9 +11,15 @@ import pytest
 import torch
 from scipy.linalg import solve_continuous_are
 
-from residnet.control.heading.controllers import LqrConfig, PdConfig, PidConfig, Steering
+from residnet.control.heading.controllers import (
+    LinearRows,
+    LqrConfig,
+    PdConfig,
+    PidConfig,
+    Steering,
+)
 from residnet.control.heading.steering import SteeredPlant, fly
-from residnet.control.heading.tuning import LinearRows, TuningTask, tune
+from residnet.control.heading.tuning import TuningTask, tune
 from residnet.control.heading.turning import Turning
 from residnet.core.errors import FitError
 from residnet.physics.vessel import load_vessel

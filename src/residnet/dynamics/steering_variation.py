@@ -155,3 +155,34 @@ class VariedModel(Dynamics):
         straight = moved[:, :SWAY]
         parts = (straight, slowed) if self.travel is None else (straight, slowed, angle_after)
         return torch.cat(parts, dim=1), torch.cat((s[:, : len(VARIATION)], memory), dim=1)
+
+
+@final
+class PushedSteering(Dynamics):
+    """A varied vessel whose rudder bias changes from step to step.
+
+    Its inputs [B, m + k] are those of the vessel, then the push, an angle [rad] that is added to
+    the rudder's beside the constant bias; further columns are left alone.
+
+    Args:
+        inner: a varied vessel, whose memory begins with the variation.
+        inputs: number m of the vessel's own inputs.
+    """
+
+    def __init__(self, inner: Dynamics, inputs: int) -> None:
+        super().__init__(inner.dt, inner.integrator)
+        self.inner = inner
+        self.n_state, self.inputs = inner.n_state, inputs
+
+    def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
+        """Return the derivative of the vessel's state; steps do not need it."""
+        return self.inner.rate(x, p, rho)
+
+    def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the state after a step and the memory, whose bias is the constant one."""
+        bias = len(VARIATION) - 1
+        push = w[:, self.inputs : self.inputs + 1]
+        pushed = torch.cat((s[:, :bias], s[:, bias : bias + 1] + push, s[:, bias + 1 :]), dim=1)
+        moved, after = self.inner.step(x, w[:, : self.inputs], pushed)
+        kept = torch.cat((s[:, : bias + 1], after[:, bias + 1 :]), dim=1)
+        return moved, kept

@@ -5,7 +5,6 @@ The one time loop carries gradients through vessel and policy.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, final
@@ -71,12 +70,7 @@ class AutopilotFit(EpochTraining):
         """Validate the start too: training is kept where it brings something."""
         super().on_fit_start()
         if not self.history:
-            model, score = self.validated()
-            if math.isfinite(score):
-                self.best_score, self.best_state = (
-                    score,
-                    {name: value.detach().clone() for name, value in model.state_dict().items()},
-                )
+            self.validate_start()
 
     def on_train_epoch_start(self) -> None:
         """Seed the epoch and set the learning rate."""

@@ -65,6 +65,7 @@ class EpochTraining(L.LightningModule, ABC):
         self.best_score = math.inf
         self.best_diverged = 0
         self.best_state: dict[str, Tensor] = {}
+        self.start_score: float | None = None
         self.without_gain = 0
         self.stopped = False
         self.history: list[dict[str, float]] = []
@@ -82,6 +83,13 @@ class EpochTraining(L.LightningModule, ABC):
     def finished(self) -> bool:
         """Whether all epochs are done or training has stopped early."""
         return self.stopped or self.epoch >= self.settings.epochs
+
+    def validate_start(self) -> None:
+        """Validate before the first epoch, so that training is kept only where it helps."""
+        model, score = self.validated()
+        self.start_score = score
+        if math.isfinite(score):
+            self.best_score, self.best_state = score, _copied(model)
 
     def seed_epoch(self) -> None:
         """Seed the random numbers of the present epoch."""
@@ -106,9 +114,7 @@ class EpochTraining(L.LightningModule, ABC):
             entry["diverged"] = float(self.diverged)
             if self._gains(score):
                 self.best_score, self.best_diverged, self.without_gain = score, self.diverged, 0
-                self.best_state = {
-                    name: value.detach().clone() for name, value in model.state_dict().items()
-                }
+                self.best_state = _copied(model)
             else:
                 self.without_gain += 1
         self.history.append(entry)
@@ -135,6 +141,7 @@ class EpochTraining(L.LightningModule, ABC):
             "best_score": self.best_score,
             "best_diverged": self.best_diverged,
             "best_state": self.best_state,
+            "start_score": self.start_score,
             "without_gain": self.without_gain,
             "history": self.history,
             "stopped": self.stopped,
@@ -155,9 +162,14 @@ class EpochTraining(L.LightningModule, ABC):
             kept["without_gain"],
         )
         self.best_diverged = kept.get("best_diverged", 0)
+        self.start_score = kept.get("start_score")
         self.history, self.stopped = kept["history"], kept["stopped"]
         torch.set_rng_state(kept["random"])
         torch.set_num_threads(kept["threads"])
+
+
+def _copied(model: nn.Module) -> dict[str, Tensor]:
+    return {name: value.detach().clone() for name, value in model.state_dict().items()}
 
 
 class FinishEpoch(L.Callback):
@@ -219,7 +231,8 @@ def run_epochs(
         folder: for checkpoints and the TensorBoard log; None for neither.
 
     Returns:
-        Notes about the training: the curve by epoch, the best score, the number of parameters.
+        Notes about the training: the curve by epoch, the best score, that of the start where it was
+        validated, the number of parameters.
 
     Raises:
         FitError: where no epoch gave a finite validation.
@@ -251,6 +264,7 @@ def run_epochs(
     return {
         "parameters": sum(p.numel() for p in trained.parameters()),
         "best_validation": module.best_score,
+        "start_validation": module.start_score,
         "epochs": len(module.history),
         "curve": module.history,
     }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from typing import Annotated, Literal, NamedTuple
+from typing import Literal, NamedTuple, final
 
 import torch
 from pydantic import Field
@@ -19,10 +19,12 @@ from residnet.control.heading.document_autopilot import (
     SimulatedPredictor,
 )
 from residnet.control.heading.heading_pid import HeadingPID
+from residnet.control.heading.laws import regulator_gains
 from residnet.control.heading.steering import NominalSteering, SteeredVessel
 from residnet.control.heading.turning import Turning
 from residnet.core.config import Config, Seconds
 from residnet.core.errors import ConfigError
+from residnet.core.frames import wrap
 
 
 class Steering(NamedTuple):
@@ -41,6 +43,25 @@ class Axis(NamedTuple):
     high: float
 
 
+@final
+class LinearRows(Policy):
+    """`HeadingPID` with gains of its own for every row: kp, kd, ki [B]."""
+
+    def __init__(self, steering: Steering, gains: tuple[Tensor, Tensor, Tensor]) -> None:
+        super().__init__()
+        self.psi, self.r = steering.vessel.column("psi"), steering.vessel.column("r")
+        self.limit, self.dt = steering.limit, steering.dt
+        self.kp, self.kd, self.ki = (gain.unsqueeze(-1) for gain in gains)
+        self.n_state = 1
+
+    def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the rudder command [B, 1] and integral [B, 1]."""
+        error = wrap(reference - x[:, self.psi : self.psi + 1])
+        wish = self.kp * error - self.kd * x[:, self.r : self.r + 1] + self.ki * s
+        winding = (wish.abs() > self.limit) & (wish * error > 0)
+        return wish.clamp(-self.limit, self.limit), torch.where(winding, s, s + self.dt * error)
+
+
 class ControllerConfig(Config, ABC):
     """The config of a heading controller."""
 
@@ -53,8 +74,8 @@ class ControllerConfig(Config, ABC):
         """
 
 
-class TunedConfig(ControllerConfig, ABC):
-    """A linear law kp e - kd r + ki I whose missing parameters are tuned."""
+class TunableConfig(ControllerConfig, ABC):
+    """The config of a controller whose missing parameters are tuned."""
 
     @abstractmethod
     def parameters(self) -> dict[str, float | None]:
@@ -65,6 +86,27 @@ class TunedConfig(ControllerConfig, ABC):
         """Return the ranges that tuning searches, by parameter."""
 
     @abstractmethod
+    def rows(self, parameters: dict[str, Tensor], steering: Steering) -> Policy:
+        """Return a controller whose parameters [B] differ from row to row."""
+
+    def complete(self) -> dict[str, float]:
+        """Return the parameters by name.
+
+        Raises:
+            ConfigError: where one is still to be tuned.
+        """
+        given = self.parameters()
+        if missing := [name for name, value in given.items() if value is None]:
+            raise ConfigError(
+                f"controller without {', '.join(missing)}: tune it first or give them"
+            )
+        return {name: value for name, value in given.items() if value is not None}
+
+
+class TunedConfig(TunableConfig, ABC):
+    """A linear law kp e - kd r + ki I whose missing parameters are tuned."""
+
+    @abstractmethod
     def gains(
         self, parameters: dict[str, Tensor], turning: Turning
     ) -> tuple[Tensor, Tensor, Tensor]:
@@ -72,14 +114,9 @@ class TunedConfig(ControllerConfig, ABC):
 
     def build(self, steering: Steering) -> Policy:
         """Return a PID controller with these gains."""
-        missing = [name for name, value in self.parameters().items() if value is None]
-        if missing:
-            raise ConfigError(
-                f"controller without {', '.join(missing)}: tune it first or give them"
-            )
         parameters = {
-            name: torch.tensor(value or 0.0, dtype=torch.float64)
-            for name, value in self.parameters().items()
+            name: torch.tensor(value, dtype=torch.float64)
+            for name, value in self.complete().items()
         }
         kp, kd, ki = (float(gain) for gain in self.gains(parameters, steering.turning))
         return HeadingPID(
@@ -90,6 +127,10 @@ class TunedConfig(ControllerConfig, ABC):
             limit=steering.limit,
             dt=steering.dt if ki > 0 else None,
         )
+
+    def rows(self, parameters: dict[str, Tensor], steering: Steering) -> Policy:
+        """Return the law with gains of its own for every row."""
+        return LinearRows(steering, self.gains(parameters, steering.turning))
 
 
 class PdConfig(TunedConfig):
@@ -190,13 +231,11 @@ class LqrConfig(TunedConfig):
         self, parameters: dict[str, Tensor], turning: Turning
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return kp and kd of the weights."""
-        kp = parameters["heading_weight"].sqrt()
-        square = (
-            1.0
-            + (turning.gain * turning.time) ** 2 * parameters["rate_weight"]
-            + 2.0 * turning.gain * turning.time * kp
+        gain, time = torch.tensor(turning.gain), torch.tensor(turning.time)
+        kp, kd = regulator_gains(
+            parameters["heading_weight"], parameters["rate_weight"], gain, time
         )
-        return kp, (square.sqrt() - 1.0) / turning.gain, torch.zeros_like(kp)
+        return kp, kd, torch.zeros_like(kp)
 
 
 class BangBangConfig(ControllerConfig):
@@ -259,8 +298,3 @@ class DocumentConfig(ControllerConfig):
     def build(self, steering: Steering) -> Policy:
         """Return the controller with the exact predictor."""
         return self.law(self.predictor(steering), steering)
-
-
-AnyController = Annotated[
-    PdConfig | PidConfig | LqrConfig | BangBangConfig | DocumentConfig, Field(discriminator="kind")
-]

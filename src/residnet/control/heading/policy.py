@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from residnet.control.base import Policy
+from residnet.control.heading.stopping import braking, centred
 from residnet.control.heading.turning import Turning
 from residnet.core.frames import wrap
 
@@ -164,9 +165,9 @@ class HeadingPolicy(Policy):
         force, decay = effect * per_time * steady, damping * per_time
         steep, share, stiff, caution = torch.exp(self.law).unbind()
         counted = share * force * torch.exp(-caution * estimate[:, 6:7] / self.prior)
-        ahead, turn_rate_left = self._centred(error, r, acting, force, decay)
+        ahead, turn_rate_left = centred(error, r, acting, force, decay, self.swing)
         command_share = steep * (
-            ahead - self._braking(turn_rate_left, counted, decay, steep * force, stiff)
+            ahead - braking(turn_rate_left, counted, decay, steep * force, stiff, self.swing)
         )
         near = torch.tanh(6.0 * error)
         features = torch.cat(
@@ -230,50 +231,3 @@ class HeadingPolicy(Policy):
             (rudder, after, share, push, effect, damping, p.detach(), c.detach(), q.detach()),
             dim=-1,
         )
-
-    def _centred(
-        self, error: Tensor, r: Tensor, acting: Tensor, force: Tensor, decay: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Return the error and yaw rate [B, 1] that will be left once the rudder is centred.
-
-        The rudder acts with a share of its limit until it has gone to where it does nothing.
-        """
-        wait = acting.abs() * self.swing
-        later = r + wait * (0.5 * force * acting - decay * r)
-        return error - wait * (r + wait * (force * acting / 3.0 - 0.5 * decay * r)), later
-
-    def _braking(
-        self, r: Tensor, force: Tensor, decay: Tensor, stiffness: Tensor, stiff: Tensor
-    ) -> Tensor:
-        """Return the heading [B, 1] that passes while r_dot = -force - decay r stops the yaw rate.
-
-        It is r / nu near zero, with the same slope there.
-
-        The rudder starts from amidships and comes back there: that takes half of its swing more, or
-        a pulse that does not reach the limit. nu is chosen such that e'' + (decay + stiffness / nu)
-        e' + stiffness e = 0 has the relative damping `stiff`.
-        """
-        line = ((2.0 * stiff * torch.sqrt(stiffness) - decay) / stiffness).clamp(min=1e-3)
-        lead = (line - 0.5 * self.swing).clamp(min=1e-3)
-        end = force * lead / (1.0 - decay * lead).clamp(min=0.1)
-        if self.swing > 0.0:
-            end = torch.where(
-                line < 1.5 * self.swing, (line / 1.5).square() * force / self.swing, end
-            )
-        size = r.abs()
-        beyond = torch.maximum(size, end)
-        curve = (
-            self._distance(beyond, force, decay) - self._distance(end, force, decay) + end * line
-        )
-        return r.sign() * torch.where(size < end, size * line, curve)
-
-    def _distance(self, r: Tensor, force: Tensor, decay: Tensor) -> Tensor:
-        """Return the heading [B, 1] in which a yaw rate r > 0 is stopped.
-
-        It is the integral of r dr / (force + decay r), and what the rudder's swing adds.
-        """
-        braking_angle = (r - force / decay * torch.log1p(decay * r / force)) / decay
-        if self.swing == 0.0:
-            return braking_angle
-        pulse = r * torch.sqrt(r * self.swing / force) - 0.5 * r.square() / force
-        return braking_angle + torch.where(r < force * self.swing, pulse, 0.5 * self.swing * r)

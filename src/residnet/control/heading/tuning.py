@@ -6,16 +6,13 @@ The gains are the fastest in the worst case among those that keep an overshoot l
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import final
 
 import torch
 from torch import Tensor
 
-from residnet.control.base import Policy
-from residnet.control.heading.controllers import Steering, TunedConfig
+from residnet.control.heading.controllers import LinearRows, Steering, TunedConfig
 from residnet.control.heading.steering import fly
 from residnet.core.errors import FitError
-from residnet.core.frames import wrap
 
 
 @dataclass(frozen=True)
@@ -54,25 +51,6 @@ class Tuned:
     settling: float
     overshoot: float
     tried: int
-
-
-@final
-class LinearRows(Policy):
-    """`HeadingPID` with gains of its own for every row: kp, kd, ki [B]."""
-
-    def __init__(self, steering: Steering, gains: tuple[Tensor, Tensor, Tensor]) -> None:
-        super().__init__()
-        self.psi, self.r = steering.vessel.column("psi"), steering.vessel.column("r")
-        self.limit, self.dt = steering.limit, steering.dt
-        self.kp, self.kd, self.ki = (gain.unsqueeze(-1) for gain in gains)
-        self.n_state = 1
-
-    def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the rudder command [B, 1] and integral [B, 1]."""
-        error = wrap(reference - x[:, self.psi : self.psi + 1])
-        wish = self.kp * error - self.kd * x[:, self.r : self.r + 1] + self.ki * s
-        winding = (wish.abs() > self.limit) & (wish * error > 0)
-        return wish.clamp(-self.limit, self.limit), torch.where(winding, s, s + self.dt * error)
 
 
 def tune(

@@ -8,7 +8,8 @@ from typing import Annotated, Literal
 import torch
 from pydantic import Field, model_validator
 
-from residnet.control.heading.controllers import AnyController, BangBangConfig
+from residnet.control.heading.controllers import BangBangConfig
+from residnet.control.observed.config import AnyController
 from residnet.core.config import Config, MetresPerSecond, Radians, Seconds
 from residnet.core.names import nearest
 from residnet.data.simulated.environment import Disturbance, WindField

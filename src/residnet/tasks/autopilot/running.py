@@ -10,13 +10,14 @@ from typing import Any
 import torch
 
 from residnet.control.base import ClosedLoop, Policy
-from residnet.control.heading.controllers import AnyController, Steering, TunedConfig
+from residnet.control.heading.controllers import Steering, TunedConfig
 from residnet.control.heading.imitation import SideBySide
 from residnet.control.heading.policy import HeadingPolicy
 from residnet.control.heading.steered_model import SteeredModel
 from residnet.control.heading.steering import SteeredPlant, fly
 from residnet.control.heading.stored import HeadingPolicySpec
 from residnet.control.heading.tuning import TuningTask, tune
+from residnet.control.observed.config import AnyController
 from residnet.core.errors import ConfigError
 from residnet.core.progress import say
 from residnet.documents.gouletas2020.autopilot import predictive

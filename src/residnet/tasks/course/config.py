@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from residnet.control.courses.config import BuoyCourseConfig, Protocol
 from residnet.control.guidance.line_of_sight import AnyLineOfSight
-from residnet.control.heading.controllers import AnyController
+from residnet.control.observed.config import AnyController
 from residnet.core.config import ExistingPath, MetresPerSecond, Seconds
 from residnet.runs.task import ComputingTask
 from residnet.tasks.course.flights import CourseSpreadConfig

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import TypeAdapter
 
 from residnet.control.base import Policy
-from residnet.control.heading.controllers import AnyController
+from residnet.control.observed.config import AnyController
 from residnet.documents.gouletas2020.autopilot import load_predictive
 from residnet.tasks.course.autopilot_run import AutopilotRun
 from residnet.tasks.course.config import CourseSettings

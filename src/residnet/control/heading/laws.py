@@ -1,0 +1,114 @@
+"""Heading laws on estimated heading error and yaw rate, each with positive constants."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import ClassVar, final
+
+from torch import Tensor, nn
+
+from residnet.control.heading.stopping import braking, centred
+
+
+class HeadingLaw(nn.Module, ABC):
+    """The rudder, as a share of its limit, from heading error and yaw rate.
+
+    Attributes:
+        constants: names of the law's constants, all positive.
+    """
+
+    constants: ClassVar[tuple[str, ...]]
+
+    @abstractmethod
+    def forward(
+        self,
+        error: Tensor,
+        r: Tensor,
+        acting: Tensor,
+        force: Tensor,
+        decay: Tensor,
+        constants: list[Tensor],
+    ) -> Tensor:
+        """Return the wanted share [B, 1] of the rudder's limit; it may exceed one.
+
+        Args:
+            error: heading error [B, 1] in rad.
+            r: yaw rate [B, 1] in rad/s.
+            acting: rudder angle and push [B, 1] as a share of the limit.
+            force: yaw acceleration [B, 1] of full rudder in rad/s^2.
+            decay: 1/T [B, 1] in 1/s.
+            constants: the law's own, [1] or [B, 1] each.
+        """
+
+
+@final
+class RegulatorLaw(HeadingLaw):
+    """The linear-quadratic regulator kp e - kd r of T r_dot + r = K delta.
+
+    Its weights are those of `LqrConfig`: kp = sqrt(heading_weight), (1 + K kd)^2 = 1 + K^2 T^2
+    rate_weight + 2 K T kp.
+    """
+
+    constants: ClassVar[tuple[str, ...]] = ("heading_weight", "rate_weight")
+
+    def __init__(self, limit: float) -> None:
+        super().__init__()
+        self.limit = limit
+
+    def forward(
+        self,
+        error: Tensor,
+        r: Tensor,
+        acting: Tensor,
+        force: Tensor,
+        decay: Tensor,
+        constants: list[Tensor],
+    ) -> Tensor:
+        """Return the regulator's rudder over the limit, [B, 1]."""
+        heading, rate = regulator_gains(
+            constants[0], constants[1], force / (decay * self.limit), 1.0 / decay
+        )
+        return (heading * error - rate * r) / self.limit
+
+
+def regulator_gains(
+    heading_weight: Tensor, rate_weight: Tensor, gain: Tensor, time: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return kp [-] and kd [s] of the regulator's weights; K [1/s], T [s], shapes broadcast."""
+    kp = heading_weight.sqrt()
+    square = 1.0 + (gain * time).square() * rate_weight + 2.0 * gain * time * kp
+    return kp, (square.sqrt() - 1.0) / gain
+
+
+@final
+class StoppingLaw(HeadingLaw):
+    """The proximate time-optimal law: full rudder until only the way to stop is left.
+
+    steepness (e - g(r)) with g the heading in which counter-rudder stops the yaw rate, a straight
+    line near the reference (M. L. Workman, Adaptive proximate time-optimal servomechanisms, 1987).
+    `share` of the rudder's braking is counted on; `damping` is the relative damping near the
+    reference.
+    """
+
+    constants: ClassVar[tuple[str, ...]] = ("steepness", "share", "damping")
+
+    def __init__(self, swing: float) -> None:
+        super().__init__()
+        self.swing = swing
+
+    def forward(
+        self,
+        error: Tensor,
+        r: Tensor,
+        acting: Tensor,
+        force: Tensor,
+        decay: Tensor,
+        constants: list[Tensor],
+    ) -> Tensor:
+        """Return steepness times the heading that is left once the yaw rate is stopped, [B, 1]."""
+        steep, share, stiff = constants[0], constants[1], constants[2]
+        ahead, left = error, r
+        if self.swing > 0.0:
+            ahead, left = centred(error, r, acting, force, decay, self.swing)
+        stopping = braking(left, share * force, decay, steep * force, stiff, self.swing)
+        return steep * (ahead - stopping)

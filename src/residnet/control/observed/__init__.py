@@ -1,0 +1,1 @@
+"""Heading policies with observer and predictor, and a recurrent network beside their law."""

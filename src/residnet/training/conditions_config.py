@@ -1,0 +1,62 @@
+"""How a policy is trained under stated conditions. No Lightning here: `check` must stay quick."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field
+
+from residnet.core.config import Seconds
+from residnet.training.one_stage import OneStage
+
+
+class ConditionsTraining(OneStage):
+    """Settings of a training through the whole closed loop, under the conditions of the run.
+
+    The loss of a batch is the mean cost of its flights, with a share of the integral of the
+    absolute error that fades out. The departures from the nominal vessel in calm water grow from
+    none to all of the conditions, and every batch is drawn anew.
+
+    Attributes:
+        epochs: at most; each ends with a validation.
+        learning_rate: of Adam at the start; it falls along a cosine with every batch.
+        steps: batches of an epoch.
+        batch: flights of a batch.
+        dt: step in s of vessel and controller in training.
+        integrator: of the vessel in training.
+        hold: longest time in s before the change of heading in training.
+        duration: time in s from the change to the end of a training flight; null for that of the
+            conditions.
+        nominal: share of the training that flies the nominal vessel in calm water.
+        spread: share of the training after which the conditions are drawn in full.
+        guide: weight of the integral of the absolute error in deg s at the start.
+        faded: share of the training after which that weight is zero.
+        validation: number of flights that epochs are chosen on.
+        stretch: steps that are compiled together; 0 for none, where there is no C++ compiler.
+    """
+
+    epochs: int = Field(default=18, ge=1)
+    learning_rate: float = Field(default=4e-3, gt=0)
+    final: float = Field(default=0.0, ge=0, le=1)
+    steps: int = Field(default=100, ge=1)
+    batch: int = Field(default=384, ge=2)
+    dt: Seconds = Field(default=0.04, gt=0)
+    integrator: Annotated[str, Field(pattern="^(rk4|heun)$")] = "heun"
+    hold: Seconds = Field(default=2.0, ge=0)
+    duration: Seconds | None = Field(default=None, gt=0)
+    nominal: float = Field(default=0.05, ge=0, le=1)
+    spread: float = Field(default=0.15, ge=0, le=1)
+    guide: float = Field(default=0.01, ge=0)
+    faded: float = Field(default=0.6, gt=0, le=1)
+    validation: int = Field(default=512, ge=2)
+    stretch: int = Field(default=5, ge=0)
+
+    def share(self, progress: float) -> float:
+        """Return the share of the conditions that is drawn, at a progress of 0 to 1."""
+        if progress >= self.spread:
+            return 1.0
+        return max(progress - self.nominal, 0.0) / max(self.spread - self.nominal, 1e-9)
+
+    def guiding(self, progress: float) -> float:
+        """Return the weight of the absolute error at a progress of 0 to 1."""
+        return self.guide * max(1.0 - progress / self.faded, 0.0)

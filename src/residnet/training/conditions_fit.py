@@ -1,0 +1,171 @@
+"""Training of an observed policy under stated conditions, through the whole closed loop."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, final
+
+import torch
+from torch import Tensor, nn
+
+from residnet.control.conditions.config import ConditionsConfig
+from residnet.control.conditions.flights import ConditionedRun, fly_under
+from residnet.control.heading.steering import SteeredVessel
+from residnet.control.observed.policy import ObservedPolicy
+from residnet.core.progress import say
+from residnet.training.conditions_config import ConditionsTraining
+from residnet.training.epochs import EpochTraining, run_epochs
+
+Stretch = Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor, Tensor]]
+
+
+@final
+class ConditionsFit(EpochTraining):
+    """Trains a policy on heading changes that are drawn anew for every batch.
+
+    Args:
+        policy: what is trained, float32.
+        vessel: what it steers.
+        settings: of the training.
+        conditions: of flights and their cost.
+        seed: of batches and validation flights.
+    """
+
+    def __init__(
+        self,
+        policy: ObservedPolicy,
+        vessel: SteeredVessel,
+        settings: ConditionsTraining,
+        conditions: ConditionsConfig,
+        seed: int,
+    ) -> None:
+        super().__init__(settings, seed)
+        self.policy, self.vessel, self.conditions = policy, vessel, conditions
+        duration = conditions.duration if settings.duration is None else settings.duration
+        lengths = {"hold": min(settings.hold, conditions.hold), "duration": duration}
+        self.drawn = conditions.model_copy(update=lengths)
+        policy.at(settings.dt)
+        self.loop = ConditionedRun(vessel, policy, settings.dt, settings.integrator, torch.float32)
+        self.rollout = self.loop.rollout(max(math.ceil(conditions.delay[1] / settings.dt), 1))
+        self.run: Stretch = (
+            _compiled(self.rollout.stretch) if settings.stretch else (self.rollout.stretch)
+        )
+        random = torch.Generator().manual_seed(seed + 1_000_003)
+        self.unseen = conditions.draw(settings.validation, conditions.dt, random)
+
+    def train_dataloader(self) -> range:
+        """Return the numbers of batches; what is in them is drawn when they are used."""
+        return range(self.settings.steps)
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        """Return Adam over the policy's parameters."""
+        wanted = [p for p in self.policy.parameters() if p.requires_grad]
+        return torch.optim.Adam(wanted, lr=self.settings.learning_rate)
+
+    def on_fit_start(self) -> None:
+        """Validate the start too: training is kept where it brings something."""
+        super().on_fit_start()
+        if not self.history:
+            self.validate_start()
+
+    def on_train_epoch_start(self) -> None:
+        """Seed the epoch."""
+        self.seed_epoch()
+        self.policy.at(self.settings.dt)
+
+    def training_step(self, number: int, batch_index: int) -> Tensor:
+        """Return the loss of one batch of heading changes."""
+        settings = self.settings
+        progress = (self.epoch + number / settings.steps) / settings.epochs
+        cosine = 0.5 * (1.0 + math.cos(math.pi * progress))
+        for group in self.trainer.optimizers[0].param_groups:
+            group["lr"] = settings.learning_rate * (
+                settings.final + (1.0 - settings.final) * cosine
+            )
+        random = torch.Generator().manual_seed(int(torch.randint(2**62, (1,))))
+        changes = self.drawn.draw(settings.batch, settings.dt, random, settings.share(progress))
+        flown = self.loop.flights(changes, *self._fly(*self.loop.given(changes)))
+        found = flown.measured(self.conditions)
+        loss: Tensor = found["cost"].mean() + settings.guiding(progress) * found["iae"].mean()
+        self._losses.append(float(found["cost"].detach().mean()))
+        return loss
+
+    def _fly(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Return states and inputs of a rollout in compiled stretches, the rest as it is."""
+        # the first stretch is compiled for states with a gradient, as the others are
+        x = x.requires_grad_()
+        memory = self.rollout.source.initial(x)
+        step = self.settings.stretch or w.shape[1]
+        states, inputs = [x[:, None]], []
+        for first in range(0, w.shape[1], step):
+            part = w[:, first : first + step]
+            run = self.run if part.shape[1] == step else self.rollout.stretch
+            seen, acted, s, memory = run(x, part, s, memory)
+            x = seen[:, -1]
+            states.append(seen[:, 1:])
+            inputs.append(acted)
+        return torch.cat(states, dim=1), torch.cat(inputs, dim=1)
+
+    def on_after_backward(self) -> None:
+        """Reset the gradient of a batch where it is no number."""
+        given = [p.grad for p in self.policy.parameters() if p.grad is not None]
+        if not all(bool(torch.isfinite(grad).all()) for grad in given):
+            self.trainer.optimizers[0].zero_grad()
+
+    def validated(self) -> tuple[nn.Module, float]:
+        """Return the policy and its mean cost over the flights that epochs are chosen on."""
+        self.policy.at(self.unseen.dt)
+        flown = fly_under(self.vessel, self.policy, self.unseen, dtype=torch.float32)
+        self.policy.at(self.settings.dt)
+        return self.policy, float(flown.measured(self.conditions)["cost"].mean())
+
+
+def _compiled(stretch: Stretch) -> Stretch:
+    """Return a compiled function, or the same one where there is no working C++ compiler."""
+    fast: Stretch = torch.compile(stretch, dynamic=False)
+    chosen: list[Stretch] = []
+
+    def call(
+        x: Tensor, w: Tensor, s: Tensor, memory: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        if chosen:
+            return chosen[0](x, w, s, memory)
+        try:
+            found = fast(x, w, s, memory)
+        except Exception as error:  # whatever a compiler that is absent or broken may raise
+            reason = str(error).strip().splitlines() or [type(error).__name__]
+            say(f"  the steps are not compiled, training is slower: {reason[0][:120]}")
+            torch.compiler.reset()
+            chosen.append(stretch)
+            return stretch(x, w, s, memory)
+        chosen.append(fast)
+        return found
+
+    return call
+
+
+def train_under_conditions(
+    name: str,
+    policy: ObservedPolicy,
+    vessel: SteeredVessel,
+    settings: ConditionsTraining,
+    conditions: ConditionsConfig,
+    seed: int,
+    folder: Path | None,
+) -> dict[str, Any]:
+    """Train a policy and leave the weights of the epoch with the least cost in it.
+
+    `checkpoints/<name>/last.ckpt` in the folder is resumed where it exists.
+
+    Returns:
+        What there is to say: the curve by epoch, the cost at the start and the best one.
+
+    Raises:
+        FitError: where no epoch gave a finite cost.
+    """
+    fit = ConditionsFit(policy.float(), vessel, settings, conditions, seed)
+    notes = run_epochs(name, fit, policy, policy, folder)
+    policy.at(conditions.dt)
+    return notes

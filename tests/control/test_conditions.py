@@ -1,0 +1,146 @@
+"""Heading changes under stated conditions: what is drawn, what acts when, and their cost."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from pydantic import ValidationError
+
+from residnet.control.base import Policy
+from residnet.control.conditions.config import ConditionsConfig, gauss_markov
+from residnet.control.conditions.evolution import EvolutionConfig, evolve
+from residnet.control.conditions.flights import (
+    ConditionedFlights,
+    ConditionedLoop,
+    ConditionedRun,
+    fly_under,
+)
+from residnet.control.heading.controllers import PdConfig, Steering
+from residnet.control.heading.steering import SteeredPlant
+from residnet.control.heading.turning import Turning
+from residnet.physics.vessel import load_vessel
+
+DEG = math.pi / 180
+VESSEL = SteeredPlant(load_vessel("nomoto_oceanos").build())
+STEERING = Steering(VESSEL, Turning(3.47, 3.94, 3.2), 5 * DEG, 0.05)
+CALM = ConditionsConfig(
+    effect=(1.0, 1.0), time=(1.0, 1.0), delay=(0.0, 0.0), bias=0.0, push=0.0,
+    noise_psi=0.0, noise_r=0.0, hold=1.0, duration=6.0, dt=0.05,
+)  # fmt: skip
+
+
+class Ramp(Policy):
+    """Commands that grow by a hundredth of a degree with every step, whatever is seen."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.n_state = 1
+
+    def forward(
+        self, x: torch.Tensor, reference: torch.Tensor, s: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        return s + 0.01 * DEG, s + 0.01 * DEG
+
+
+def drawn(config: ConditionsConfig, rows: int = 4, seed: int = 3, share: float = 1.0):  # type: ignore[no-untyped-def]
+    return config.draw(rows, config.dt, torch.Generator().manual_seed(seed), share)
+
+
+def test_a_command_acts_after_its_delay_and_the_push_beside_the_bias() -> None:
+    config = CALM.model_copy(update={"delay": (0.0, 0.4), "bias": DEG, "push": 0.5 * DEG})
+    changes = drawn(config, 6)
+    run = ConditionedRun(VESSEL, Ramp(), config.dt)
+    states, inputs, _ = run.rollout(8)(*run.given(changes))
+    arrived, push, issued = inputs.unbind(2)
+    for row, delay in enumerate(changes.delay.long().tolist()):
+        shifted = torch.cat((torch.zeros(delay), issued[row])).double()[: issued.shape[1]]
+        assert torch.equal(arrived[row], shifted)
+    assert len(set(changes.delay.tolist())) > 2
+    # the yaw rate that this gives, with Nomoto's exact step, bias and push included
+    angle = arrived + push + changes.variation[:, 2:3]
+    keep, r = math.exp(-0.05 / 3.94), torch.zeros(6, dtype=torch.float64)
+    for k in range(inputs.shape[1]):
+        r = keep * r + (1 - keep) * 3.47 * angle[:, k]
+    assert torch.allclose(states[:, -1, VESSEL.column("r")], r, atol=1e-8)
+
+
+def test_the_cost_is_what_it_says() -> None:
+    changes = drawn(CALM, 1)
+    start = int(changes.start[0])
+    steps = changes.push.shape[1]
+    side = float(changes.heading.sign()[0])
+    # before the jump anything may happen; then half of the time 3 deg short, half 2 deg beyond
+    error = torch.full((1, steps), 3.0 * DEG)
+    error[0, start + 60 :] = -2.0 * DEG
+    error[0, :start] = 70 * DEG
+    command = torch.zeros(1, steps)
+    command[0, start + 5 :: 2] = DEG
+    flown = ConditionedFlights(
+        changes, changes.heading[:, None] - side * error, torch.zeros(1, steps), command
+    )
+    found = flown.measured(CALM)
+    changed = int((np.diff(command[0, : start + 120].numpy()) != 0).sum())
+    assert float(found["time_outside"]) == pytest.approx(3.0 * 3 / 4 + 3.0 * 2 / 3, rel=1e-4)
+    assert float(found["overshoot"]) == pytest.approx(2.0, rel=1e-4)
+    assert float(found["travel"]) == pytest.approx(changed, rel=1e-4)
+    assert float(found["cost"]) == pytest.approx(
+        float(found["time_outside"]) + 0.5 * 2.0 + 0.01 * changed, rel=1e-4
+    )
+
+
+def test_disturbances_have_the_statistics_that_are_stated() -> None:
+    config = ConditionsConfig(dt=0.05, duration=20.0)
+    changes = drawn(config, 400)
+    assert float(changes.push.std()) == pytest.approx(config.push, rel=0.05)
+    lag = round(config.push_time / config.dt)
+    pushed = changes.push.numpy()
+    correlation = np.mean(pushed[:, lag:] * pushed[:, :-lag]) / pushed.var()
+    assert correlation == pytest.approx(math.exp(-1), abs=0.08)
+    assert float(changes.noise[:, :, 0].std()) == pytest.approx(config.noise_psi, rel=0.02)
+    low, high = changes.variation.amin(0), changes.variation.amax(0)
+    assert 0.8 <= float(low[0]) < 0.82
+    assert 1.18 < float(high[0]) <= 1.2
+    assert float(changes.delay.max()) == round(0.4 / 0.05)
+    # a coarser step sees the same spectrum of noise, and none of it is a calm flight
+    coarse = config.draw(400, 0.2, torch.Generator().manual_seed(1))
+    assert float(coarse.noise[:, :, 1].std()) == pytest.approx(0.5 * config.noise_r, rel=0.03)
+    none = drawn(config, 50, share=0.0)
+    assert float(none.noise.abs().max()) == float(none.push.abs().max()) == 0.0
+    assert torch.equal(none.variation, torch.tensor([[1.0, 1.0, 0.0]]).expand(50, 3))
+
+
+def test_the_slow_push_is_stationary_from_its_first_sample() -> None:
+    found = gauss_markov(4000, 40, 0.02, torch.Generator().manual_seed(0))
+    assert torch.allclose(found.std(0), torch.ones(40), atol=0.06)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"effect": (1.2, 0.8)}, {"heading": (0.5, 4.0)}, {"delay": (-0.1, 0.2)}, {"wind": (9.0, 3.0)}],
+)
+def test_ranges_are_in_order(wrong: dict[str, tuple[float, float]]) -> None:
+    with pytest.raises(ValidationError, match="must be in order"):
+        ConditionsConfig(**wrong)  # type: ignore[arg-type]
+
+
+def test_evolution_finds_better_gains_than_a_grid_of_guesses_and_again_the_same() -> None:
+    config = ConditionsConfig(dt=0.1, duration=8.0, hold=0.0, delay=(0.0, 0.2))
+    settings = EvolutionConfig(flights=8, population=4, generations=5)
+    found = evolve(PdConfig(), STEERING, config, settings, 5)
+    changes = config.draw(8, 0.1, torch.Generator().manual_seed(5))
+    again = fly_under(VESSEL, PdConfig(**found.parameters).build(STEERING), changes)
+    assert found.cost == pytest.approx(float(again.measured(config)["cost"].mean()), rel=1e-2)
+    for kp in (0.5, 2.0, 6.0):
+        for damping in (0.5, 1.5):
+            law = PdConfig(kp=kp, damping_time=damping).build(STEERING)
+            guess = fly_under(VESSEL, law, changes).measured(config)["cost"].mean()
+            assert found.cost < float(guess) * 1.01
+    assert evolve(PdConfig(), STEERING, config, settings, 5) == found
+
+
+def test_the_loop_keeps_the_controllers_memory_behind_the_late_commands() -> None:
+    loop = ConditionedLoop(Ramp(), (2, 5), 1, 3)
+    assert loop.initial(torch.zeros(2, 6)).shape == (2, 4)
