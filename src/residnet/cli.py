@@ -213,11 +213,11 @@ def list_names(
 
 
 def _show(finished: Finished) -> None:
-    """Print the table and verdict of a run, its exported files and its report."""
-    if finished.outcome.table:
-        print(finished.outcome.table)
+    """Print the verdict and table of a run, its exported files and its report."""
     for sentence in finished.outcome.verdict:
         print(sentence)
+    if finished.outcome.table:
+        print(finished.outcome.table)
     for file in finished.exports:
         print(f"exported: {file}")
     if finished.folder.report.is_file():

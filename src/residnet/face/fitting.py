@@ -200,8 +200,8 @@ def metrics(
 
     Returns:
         Columns model, kind, split, protocol, manoeuvre, selected, windows, diverged, n, rmse_u,
-        rmse_v (m/s), rmse_r (rad/s), the same for mae and nrmse, nrmse_mean, position_error_end
-        (m), heading_error_end (rad).
+        rmse_v (m/s), rmse_r (rad/s), the same for mae and nrmse, nrmse_mean, note (such as "2/12
+        diverged"), position_error_end (m), heading_error_end (rad).
 
     Raises:
         UsageError: where there is no such split or manoeuvre.

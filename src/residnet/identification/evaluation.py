@@ -97,7 +97,13 @@ def candidates(
         {name: entry.notes for name, entry in models.items()},
     )
     out = [
-        Candidate(name, entry.spec.role, entry.model, reference=compared_with.get(name))
+        Candidate(
+            name,
+            entry.spec.role,
+            entry.model,
+            reference=compared_with.get(name),
+            ranges=entry.spec.ranges,
+        )
         for name, entry in models.items()
     ]
     truth = _truth(data) if isinstance(data, SimulatedTrials) else None

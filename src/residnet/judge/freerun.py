@@ -33,6 +33,8 @@ class Candidate:
             about).
         reference: name of the model that this one is compared with, window by window; None for
             none.
+        ranges: smallest and largest training value of each velocity and input; empty where they
+            are not known.
     """
 
     name: str
@@ -42,6 +44,7 @@ class Candidate:
     inputs: tuple[str, ...] | None = None
     idle: int = 0
     reference: str | None = None
+    ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

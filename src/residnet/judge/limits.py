@@ -12,6 +12,7 @@ from residnet.data.prepare import Prepared
 from residnet.judge.bootstrap import blocks
 from residnet.judge.freerun import Candidate, FreeRun, integrate
 from residnet.judge.metrics import against, nrmse_of_windows, window_errors
+from residnet.judge.trust import compared, outside, trust
 
 SCHEMA = "residnet.limits/1"
 _WORST = 3
@@ -29,7 +30,7 @@ def limits(
 ) -> dict[str, Any]:
     """Return the part of limits.json for one protocol and split.
 
-    It holds `kinematics`, `bands` and `worst`.
+    It holds `kinematics`, `bands`, `worst`, `compared`, `outside` and `trust`.
     """
     errors = {candidate.name: window_errors(run, candidate.name, logs) for candidate in candidates}
     return {
@@ -39,6 +40,9 @@ def limits(
             name: worst(run, logs, nrmse_of_windows(part, scales), part)
             for name, part in errors.items()
         },
+        "compared": compared(run, candidates, scales, errors),
+        "outside": outside(run, candidates, logs),
+        "trust": trust(run, candidates, logs, scales, step),
     }
 
 

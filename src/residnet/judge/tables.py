@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from residnet.judge.metrics import SCHEMA
+from residnet.judge.verdict import diverged_note
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -55,7 +56,8 @@ def metrics_table(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     Returns:
         Columns model, kind, split, protocol, manoeuvre (and selected where the rows have it),
         windows, diverged, n, then rmse_u, rmse_v, rmse_r (m/s, m/s, rad/s), the same for mae and
-        nrmse with nrmse_mean, and position_error_end (m), heading_error_end (rad).
+        nrmse with nrmse_mean, note (such as "2/12 diverged", where such windows count with the
+        error of `zero`), and position_error_end (m), heading_error_end (rad).
     """
     import pandas as pd
 
@@ -66,4 +68,6 @@ def _flat(row: Mapping[str, Any]) -> dict[str, Any]:
     out = {name: row[name] for name in (*_LABELS, *_COUNTS) if name in row}
     for name in _BY_CHANNEL:
         out |= {f"{name}_{channel}": value for channel, value in row[name].items()}
+    # beside the score, since the diverged windows in it are no errors of the model
+    out["note"] = diverged_note(row)
     return out | {name: row[name] for name in _ENDS}

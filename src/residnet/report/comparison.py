@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +21,13 @@ class WindowErrors:
 
     Attributes:
         keys: (log, number of the window), [W].
-        values: [W].
+        values: [W]; a window that diverged has the error of `zero`.
+        diverged: whether each did, [W].
     """
 
     keys: tuple[tuple[str, int], ...]
     values: np.ndarray
+    diverged: np.ndarray
 
 
 def window_nrmse(run: Path, model: str, split: str) -> dict[str, WindowErrors]:
@@ -42,20 +44,21 @@ def window_nrmse(run: Path, model: str, split: str) -> dict[str, WindowErrors]:
     files = RunFiles(run)
     name = files.selected if model == "selected" else model
     scales = np.array([float(files.metrics["scales"][channel]) for channel in VELOCITY])
-    found: dict[str, list[tuple[tuple[str, int], float]]] = {}
+    found: dict[str, list[tuple[tuple[str, int], float, bool]]] = {}
     for window in files.windows(split):
         if name not in window.predicted:
             raise DataError(f"{run}: no model '{name}' among {', '.join(window.predicted)}")
-        found.setdefault(window.protocol, []).append(
-            ((window.log, window.number), float((window.rmse(name) / scales).mean()))
-        )
+        error, lost = float((window.rmse(name) / scales).mean()), window.diverged[name]
+        found.setdefault(window.protocol, []).append(((window.log, window.number), error, lost))
     if not found:
         raise DataError(f"{run}: no rollouts of the split '{split}'")
     return {
         protocol: WindowErrors(
-            tuple(key for key, _ in pairs), np.array([value for _, value in pairs])
+            tuple(key for key, _, _ in entries),
+            np.array([error for _, error, _ in entries]),
+            np.array([lost for _, _, lost in entries]),
         )
-        for protocol, pairs in found.items()
+        for protocol, entries in found.items()
     }
 
 
@@ -68,12 +71,14 @@ class Variant:
         overrides: of the recipe's config.
         errors: [S, W] by protocol, NRMSE for S seeds over W windows.
         seconds: that the runs took, [S].
+        diverged: number of windows that diverged, of all seeds together, by protocol.
     """
 
     name: str
     overrides: tuple[str, ...]
     errors: Mapping[str, np.ndarray]
     seconds: tuple[float, ...]
+    diverged: Mapping[str, int] = field(default_factory=dict)
 
 
 def table(
@@ -81,9 +86,10 @@ def table(
 ) -> list[dict[str, Any]]:
     """Return one row per variant and protocol.
 
-    A row has the mean error over windows and seeds, its standard deviation over seeds (None for one
-    seed), the smallest and largest of the seeds, and the difference to the reference variant over
-    the same windows, seeds averaged first, with its 95 % interval by blocks of windows.
+    A row has the number of windows that diverged, the mean error over windows and seeds, its
+    standard deviation over seeds (None for one seed), the smallest and largest of the seeds, and
+    the difference to the reference variant over the same windows, seeds averaged first, with its
+    95 % interval by blocks of windows.
 
     Args:
         variants: what was run.
@@ -116,6 +122,7 @@ def _row(
         "protocol": protocol,
         "seeds": len(by_seed),
         "windows": errors.shape[1],
+        "diverged": variant.diverged.get(protocol, 0),
         "nrmse_mean": float(by_seed.mean()),
         "nrmse_sd": float(by_seed.std(ddof=1)) if len(by_seed) > 1 else None,
         "nrmse_range": [float(by_seed.min()), float(by_seed.max())],

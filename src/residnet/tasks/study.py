@@ -143,6 +143,12 @@ class StudyConfig(Task):
                     for protocol in keys
                 },
                 tuple(seconds[variant, seed] for seed in self.seeds),
+                {
+                    protocol: sum(
+                        int(found[variant, seed][protocol].diverged.sum()) for seed in self.seeds
+                    )
+                    for protocol in keys
+                },
             )
             for variant in self.variants
         ]
@@ -171,8 +177,18 @@ def _verdict(rows: Sequence[dict[str, Any]], reference: str) -> list[str]:
     sentences = []
     for protocol in dict.fromkeys(row["protocol"] for row in rows):
         found = [row for row in rows if row["protocol"] == protocol]
-        best = min(found, key=lambda row: float(row["nrmse_mean"]))
-        sentence = f"{protocol}: '{best['variant']}' has the least error, {best['nrmse_mean']:.4f}"
+        # the error of runs that diverged is that of zero: a steady variant comes before them
+        best = min(found, key=lambda row: (int(row["diverged"]) > 0, float(row["nrmse_mean"])))
+        steady = " of the steady ones" if any(row["diverged"] for row in found) else ""
+        sentence = (
+            f"{protocol}: '{best['variant']}' has the least error{steady}, {best['nrmse_mean']:.4f}"
+        )
+        if best["diverged"]:
+            sentence = (
+                f"{protocol}: EVERY VARIANT DIVERGED in some windows; of the errors, which count"
+                f" those windows as zero does, that of '{best['variant']}' is the least,"
+                f" {best['nrmse_mean']:.4f}"
+            )
         interval = best["difference_ci95"]
         if best["variant"] != reference and interval is not None:
             sentence += (
@@ -180,6 +196,10 @@ def _verdict(rows: Sequence[dict[str, Any]], reference: str) -> list[str]:
                 f" from '{reference}'"
             )
         sentences.append(f"{sentence}.")
+        lost = [row for row in found if row["diverged"]]
+        if lost:
+            named = ", ".join(f"'{row['variant']}' in {row['diverged']} windows" for row in lost)
+            sentences.append(f"{protocol}: free runs DIVERGED: {named}.")
     return sentences
 
 

@@ -63,7 +63,13 @@ def variants_table(rows: Sequence[Content], reference: str) -> Table:
 
 def _errors(row: Content) -> list[Cell | str]:
     bounds = row["difference_ci95"]
-    cells: list[Cell | str] = [fixed(row["nrmse_mean"], 4), fixed(row["nrmse_sd"], 4)]
+    # a study of an earlier version does not know what diverged
+    lost = int(row.get("diverged", 0))
+    note = f"{lost} diverged" if lost else ""
+    cells: list[Cell | str] = [
+        Cell(fixed(row["nrmse_mean"], 4), note, "bad" if lost else ""),
+        fixed(row["nrmse_sd"], 4),
+    ]
     if bounds is None:
         return [*cells, "", ""]
     excludes_zero = bounds[0] > 0 or bounds[1] < 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from residnet.judge.verdict import diverged_note
 from residnet.report.blocks import Block, Cell, Section, Table, Text
 from residnet.report.format import DEG, change, number, title_of
 from residnet.report.run_reader import Content, RunFiles
@@ -39,7 +40,8 @@ def _about(run: RunFiles) -> str:
         small = f"the change against the baseline on the same data, and {small}"
     return (
         "The tables give the root mean square error of each free run, averaged over the runs."
-        f" {where} Small print gives {small}."
+        f" {where} Small print gives {small}. A run that diverged counts with the error of held"
+        " velocities, and its number stands beside the score."
     )
 
 
@@ -102,7 +104,11 @@ def errors_table(run: RunFiles, split: str) -> Table:
                 [
                     Cell(protocol, mark="text"),
                     *(number(run.unit(name)[1] * row["rmse"][name]) for name in run.channels),
-                    number(row["nrmse"]["mean"]),
+                    Cell(
+                        number(row["nrmse"]["mean"]),
+                        diverged_note(row),
+                        "bad" if row["diverged"] else "",
+                    ),
                     *(
                         _quantity(run, key, row, None)
                         for key in ("position", "heading", "diverged")
@@ -156,14 +162,13 @@ def _quantity(run: RunFiles, key: str, row: Content | None, base: Content | None
         )
     if key == "nrmse":
         interval = row.get("nrmse_mean_ci95")
-        note = f"{number(interval[0])}–{number(interval[1])}" if interval else ""
-        return Cell(number(row["nrmse"]["mean"]), note)
+        spread = f"{number(interval[0])}–{number(interval[1])}" if interval else ""
+        note = "; ".join(text for text in (spread, diverged_note(row)) if text)
+        return Cell(number(row["nrmse"]["mean"]), note, "bad" if row["diverged"] else "")
     value = row["rmse"].get(key)
     if value is None:
         return Cell("–")
     worse = base is not None and value > 1.005 * base["rmse"][key]
-    return Cell(
-        number(run.unit(key)[1] * value),
-        change(value, base["rmse"][key]) if base is not None else "",
-        "bad" if worse else "",
-    )
+    against = change(value, base["rmse"][key]) if base is not None else ""
+    note = "; ".join(text for text in (against, diverged_note(row)) if text)
+    return Cell(number(run.unit(key)[1] * value), note, "bad" if worse or row["diverged"] else "")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
+from residnet.judge.verdict import diverged_note
 from residnet.report.blocks import Block, Cell, Section, Table, Text
 from residnet.report.format import DASH, DEG, fixed, number, percent, plural, signed, title_of
 from residnet.report.run_reader import Content, RunFiles
@@ -64,6 +65,8 @@ def _known(run: RunFiles, protocol: str) -> Content:
 def _how_good(lead: str, row: Content) -> str:
     drawn = row.get("ci95_blocks")
     text = f"{lead}: NRMSE {number(row['nrmse']['mean'])}"
+    if row["diverged"]:
+        text += f" ({diverged_note(row)})"
     interval = row.get("nrmse_mean_ci95")
     if interval:
         text += f", 95 % interval {number(interval[0])} to {number(interval[1])}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from residnet.judge.verdict import diverged_note
 from residnet.report.blocks import Cell, Section, Table, Text
 from residnet.report.format import DASH, number, whole
 from residnet.report.run_reader import Content, RunFiles
@@ -14,7 +15,8 @@ def section(run: RunFiles) -> Section | None:
         return None
     about = (
         "A head adds to the accelerations of a baseline what that leaves. Further baselines and"
-        " ensembles stand alone. The validation error selects."
+        " ensembles stand alone. The simplest sound model within one standard error of the least"
+        " validation error is selected."
     )
     return Section("Residual heads and further models", [Text(about, quiet=True), table])
 
@@ -54,7 +56,11 @@ def heads(run: RunFiles) -> Table | None:
             Cell(_foundation(notes, head), mark="text"),
             Cell(number(notes.get("seconds"), 2)),
             Cell(str(notes.get("epochs", DASH))),
-            Cell(number(error), mark="best" if model == run.selected else ""),
+            Cell(
+                number(error),
+                diverged_note(row) if row else "",
+                "best" if model == run.selected else "bad" if row and row["diverged"] else "",
+            ),
         ]
         table.add(run.label(model), cells, selected=model == run.selected)
     return table

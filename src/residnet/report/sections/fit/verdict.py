@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from residnet.data.doctor import summary
 from residnet.judge.sanity import Finding
+from residnet.judge.verdict import UNSEEN, Evidence
+from residnet.judge.verdict import verdict as judged
 from residnet.report.blocks import Bullets, Section
 from residnet.report.format import DEG, minus, number, percent, title_of
 from residnet.report.run_reader import Content, RunFiles
@@ -14,7 +17,7 @@ from residnet.report.sections.fit.manoeuvres import distinct
 def verdict(run: RunFiles) -> list[str]:
     """Return how good the selected model is, sentence by sentence.
 
-    It is compared with the baseline and, where the logs are simulated, with the plant.
+    It is compared with `zero`, with the baseline and, where the logs are simulated, with the plant.
 
     Raises:
         UsageError: where the folder holds no metrics.json.
@@ -26,9 +29,37 @@ def verdict(run: RunFiles) -> list[str]:
         return [
             f"The run holds no free runs of its selected model on {split} data; see the tables."
         ]
+    base = run.row(run.baseline, split, protocol)
+    out = [*judged(evidence(run, lead)), _seen(run, lead, row), _level(run, lead, row, base)]
+    truth = run.row(run.truth, split, protocol)
+    if truth is not None and run.truth != lead:
+        out.append(_against_plant(run, row, truth, base))
+    out.append(_end(run, row, base, lead))
+    out.append(_divergence(run, split))
+    return out
+
+
+def evidence(run: RunFiles, selected: str) -> Evidence:
+    """Return what the folder holds that a verdict on its selected model is passed on."""
+    protocol, split = run.protocols[0], run.focus
+    rows = {model: row for model in run.kinds if (row := run.row(model, split, protocol))}
+    inspection = run.json("doctor.json")
+    return Evidence(
+        selected,
+        split,
+        rows,
+        run.baseline or "",
+        run.json("selection.json"),
+        (run.limits.get("splits") or {}).get(split, {}).get(protocol, {}),
+        summary(inspection).tally if inspection.get("logs") else "",
+    )
+
+
+def _seen(run: RunFiles, lead: str, row: Content) -> str:
+    protocol, split = str(row["protocol"]), str(row["split"])
     unseen = (
         "that no fit has seen"
-        if split in ("test", "external")
+        if split in UNSEEN
         else f"of the {split} data (not unseen: read with care)"
     )
     why = "chosen on validation data" if run.selected else "the first head; nothing was selected"
@@ -36,17 +67,10 @@ def verdict(run: RunFiles) -> list[str]:
     runs = {"manoeuvre": "whole manoeuvre", "windows": "window"}.get(str(kind), "run") + (
         "" if row["windows"] == 1 else "s"
     )
-    out = [
+    return (
         f"Model {lead} ({why}) was free-run over {row['windows']} {runs} {unseen} (protocol"
         f" {protocol})."
-    ]
-    out.append(_level(run, lead, row, run.row(run.baseline, split, protocol)))
-    truth = run.row(run.truth, split, protocol)
-    if truth is not None and run.truth != lead:
-        out.append(_against_plant(run, row, truth, run.row(run.baseline, split, protocol)))
-    out.append(_end(run, row, run.row(run.baseline, split, protocol), lead))
-    out.append(_divergence(run, split))
-    return out
+    )
 
 
 def _level(run: RunFiles, lead: str, row: Content, base: Content | None) -> str:

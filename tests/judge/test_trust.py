@@ -1,0 +1,121 @@
+"""How far models can be trusted, on free runs whose errors are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from residnet.baselines import StillConfig
+from residnet.core.log import Log
+from residnet.data.prepare import PrepareConfig, Prepared, prepare
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.heads import ZeroHead
+from residnet.judge.freerun import Candidate, FreeRun, Prediction
+from residnet.judge.metrics import nrmse_of_windows, window_errors
+from residnet.judge.protocol import Windows
+from residnet.judge.selection import blocks_of, shares
+from residnet.judge.trust import compared, outside, trust
+from residnet.physics.signals import SignalsConfig
+
+STEP, SCALES = 0.5, {"u": 0.5, "v": 0.2, "r": 0.1}
+RANGES = {"u": (0.5, 2.0), "v": (-1.0, 1.0), "r": (-1.0, 1.0), "n": (0.0, 8.0)}
+
+
+def log(number: int) -> Prepared:
+    """A log of 41 s at a speed of its own."""
+    t = np.arange(0.0, 41.0, STEP)
+    speed = 0.6 + 0.3 * number
+    channels = {name: np.zeros(t.size) for name in ("y", "psi", "v", "r")}
+    channels |= {"x": speed * t, "u": np.full(t.size, speed), "n": np.full(t.size, 5.0)}
+    derivative = {"kind": "savitzky_golay", "window": 5 * STEP, "order": 2}
+    config = PrepareConfig.model_validate({"grid": {"step": STEP}, "derivative": derivative})
+    return prepare(Log(f"log_{number}", t, channels), "test", ("n",), config)
+
+
+def candidate(name: str, kind: str) -> Candidate:
+    signals = SignalsConfig(inputs=("n",)).build()
+    baseline = StillConfig().build(signals.names)
+    model = HybridDynamics(signals, baseline, ZeroHead(), STEP)
+    return Candidate(name, kind, model, ranges=RANGES)
+
+
+CANDIDATES = [
+    candidate("zero", "zero"),
+    candidate("baseline", "baseline"),
+    candidate("mlp", "head"),
+]
+
+
+@pytest.fixture(scope="module")
+def logs() -> list[Prepared]:
+    return [log(number) for number in range(6)]
+
+
+@pytest.fixture(scope="module")
+def run(logs: list[Prepared]) -> FreeRun:
+    """The error of zero is 0.1 throughout; the model's grows with time and passes it at 12 s."""
+    protocol = Windows(length=20.0, first=0.0, history=0.0)
+    windows = [w for i, prepared in enumerate(logs) for w in protocol.windows(prepared, i, STEP)]
+    out = FreeRun("T20", "test", windows)
+    for name in ("zero", "baseline", "mlp"):
+        out.predictions[name] = []
+        for window in windows:
+            states = logs[window.log].y[window.start : window.stop].copy()
+            age = STEP * np.arange(len(states))
+            error = {"zero": 0.1 + 0 * age, "baseline": 0.09 + 0 * age, "mlp": 0.1 * age / 12.0}
+            # a little of its own for each log, so that there is a spread
+            states[:, 3] += (1.0 + 0.01 * window.log) * error[name]
+            out.predictions[name].append(Prediction(states, False))
+    return out
+
+
+def test_the_horizon_ends_where_errors_are_no_longer_smaller(
+    run: FreeRun, logs: list[Prepared]
+) -> None:
+    entries = trust(run, CANDIDATES, logs, SCALES, STEP)["mlp"]["horizons"]
+    assert [entry["windows"] for entry in entries] == [12] * 8
+    better = [entry["high"] for entry in entries if entry["difference"]["nrmse_mean"] < 0]
+    assert max(better) == pytest.approx(12.5, abs=1.3)
+    assert all(entry["difference"]["excludes_zero"] for entry in entries[:3])
+
+
+def test_speeds_are_thirds_of_the_windows(run: FreeRun, logs: list[Prepared]) -> None:
+    entries = trust(run, CANDIDATES, logs, SCALES, STEP)["baseline"]["speeds"]
+    assert [round(entry["low"], 1) for entry in entries] == [0.6, 1.2, 1.8]
+    assert all(entry["difference"]["nrmse_mean"] < 0 for entry in entries)
+
+
+def test_every_model_is_compared_with_zero_and_the_first_baseline(
+    run: FreeRun, logs: list[Prepared]
+) -> None:
+    errors = {name: window_errors(run, name, logs) for name in run.predictions}
+    found = compared(run, CANDIDATES, SCALES, errors)
+    assert set(found["mlp"]) == {"zero", "baseline"}
+    assert set(found["baseline"]) == {"zero"}
+    apart = found["baseline"]["zero"]["nrmse_mean"]
+    expected = nrmse_of_windows(errors["baseline"], SCALES) - nrmse_of_windows(
+        errors["zero"], SCALES
+    )
+    assert apart == pytest.approx(expected.mean())
+
+
+def test_samples_outside_the_training_range_are_counted(run: FreeRun, logs: list[Prepared]) -> None:
+    # one of six logs is faster than 2 m/s
+    found = outside(run, CANDIDATES, logs)
+    assert found["share"] == pytest.approx(1 / 6)
+    assert found["channels"] == {"u": pytest.approx(1 / 6)}
+
+
+@pytest.mark.parametrize(("count", "of", "blocks"), [(6, "logs", 6), (2, "stretches", 8)])
+def test_shares_of_blocks_sum_to_the_mean_error(
+    run: FreeRun, logs: list[Prepared], count: int, of: str, blocks: int
+) -> None:
+    few = [i for i, window in enumerate(run.windows) if window.log < count]
+    part = FreeRun("T20", "test", [run.windows[i] for i in few])
+    part.predictions["mlp"] = [run.predictions["mlp"][i] for i in few]
+    found, labels = blocks_of(part)
+    assert (found.of, len(found.weights)) == (of, blocks)
+    assert found.weights.sum() == pytest.approx(1.0)
+    own = shares(part, "mlp", logs, SCALES, labels, blocks)
+    expected = nrmse_of_windows(window_errors(part, "mlp", logs), SCALES).mean()
+    assert own.sum() == pytest.approx(expected)
