@@ -13,45 +13,17 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 import torch
+from exported_models import HIGH, KINDS, LOW, VARIANTS, built, spec_of
 from torch import Tensor
 
-from residnet.baselines import RegressorsConfig
-from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.errors import ExportError
 from residnet.core.names import STATE
-from residnet.core.samples import Samples
 from residnet.dynamics.ensemble import mean_of
-from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.store import ModelSpec
 from residnet.export import torchscript
 from residnet.export.torchscript import check_parity, export_torchscript
-from residnet.heads import ClosedFormHead, HeadConfig
-from residnet.physics.signals import SignalsConfig
+from residnet.heads import HeadConfig
 from residnet.testing import check_bad_inputs
 
-SIGNALS = SignalsConfig(
-    inputs=("n_port", "n_stbd"), exogenous=("wind_speed", "wind_dir"), forces="wam_v_cal"
-).resolved()
-NAMES = SIGNALS.build().names
-FEATURES = ("u", "v", "r", "tau_x", "tau_n", "wind_u", "wind_v", "wind_mag")
-LOW, HIGH = (-0.5, -0.6, -0.4, -10.0, -12.0, 0.0, -3.0), (3.0, 0.6, 0.4, 30.0, 32.0, 9.0, 3.0)
-KINDS: dict[str, type[Any]] = {
-    config.model_fields["kind"].default: config for config in get_args(get_args(HeadConfig)[0])
-}
-# smaller than the defaults, for the sake of time
-SIZES: dict[str, dict[str, Any]] = {"mlp": {"hidden": (8,)}, "lstm": {"hidden_size": 6}}
-VARIANTS: dict[str, dict[str, Any]] = {
-    **{kind: {"kind": kind, "features": FEATURES, **SIZES.get(kind, {})} for kind in KINDS},
-    "mlp_mirror": {"kind": "mlp", "hidden": (8,), "mirror": True},
-    "lstm_mirror": {
-        "kind": "lstm",
-        "hidden_size": 5,
-        "readout": 4,
-        "memory": ("tau_x", "tau_n"),
-        "mirror": True,
-    },
-    "lstm_per_axis": {"kind": "lstm", "hidden_size": 4, "per_axis": True, "activation": "softsign"},
-}
 ROW = {
     "model": "mine",
     "split": "test",
@@ -59,56 +31,6 @@ ROW = {
     "manoeuvre": "all",
     "nrmse": {"mean": 0.1},
 }
-
-
-def spec_of(head: dict[str, Any] | None, **changes: Any) -> ModelSpec:
-    baseline = RegressorsConfig(terms=("1", "u", "v", "r", "tau_x", "tau_n", "wind_v wind_mag"))
-    content: dict[str, Any] = {
-        "schema": "residnet.model/1",
-        "name": "mine",
-        "role": "head",
-        "signals": SIGNALS.model_dump(),
-        "baseline": baseline.model_dump(),
-    }
-    content |= {"head": head, "dt": 0.1, "integrator": "rk4", "low": LOW, "high": HIGH}
-    return ModelSpec.model_validate(content | changes)
-
-
-def fill(model: HybridDynamics, seed: int = 0) -> None:
-    """A stable baseline, and a residual that is small beside it but matters."""
-    random = np.random.default_rng(seed)
-    assert isinstance(model.baseline, RegressorBaseline)
-    with torch.no_grad():
-        rows = [
-            [0, -0.5, 0, 0, 2e-3, 0, 0],
-            [0, 0, -0.8, -0.1, 0, 1e-4, 1e-3],
-            [0, 0, 0.1, -0.9, 0, 1e-3, 1e-4],
-        ]
-        model.baseline.theta.copy_(torch.tensor(rows, dtype=torch.float64))
-    z = torch.from_numpy(
-        random.normal(size=(400, len(NAMES))) * [1, 0.2, 0.2, 10, 10, 200, 1, 100, 4, 4, 2]
-        + [1.2, 0, 0, 10, 10, 200, 0, 0, 0, 0, 5]
-    )
-    target = torch.stack(
-        (0.05 * torch.tanh(z[:, 0]), 0.05 * torch.sin(z[:, 9]), 0.05 * torch.tanh(3 * z[:, 2])),
-        dim=1,
-    )
-    target = target + 0.01 * torch.from_numpy(random.normal(size=(400, 3)))
-    samples = Samples(z, target, torch.arange(400) // 40, torch.zeros(400), ("zigzag",) * 10, NAMES)
-    model.head.calibrate(samples)
-    if isinstance(model.head, ClosedFormHead):
-        model.head.solve(samples)
-    with torch.no_grad():
-        for parameter in model.head.parameters():
-            parameter.add_(0.2 * torch.randn_like(parameter))
-
-
-def built(variant: str) -> tuple[ModelSpec, HybridDynamics]:
-    torch.manual_seed(0)
-    spec = spec_of(VARIANTS[variant])
-    model = spec.build()
-    fill(model)
-    return spec, model
 
 
 # the full length is run by the tests of the task `fit`

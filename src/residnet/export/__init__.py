@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from residnet.core.registry import ThirdParty, objects, usable
 from residnet.export.base import Exporter
+from residnet.export.c.exporter import CExporter
 from residnet.export.feed_forward import FeedForwardExporter
 from residnet.export.torchscript import TorchScriptExporter
 
 __all__ = ["Exporter", "exporter", "exporters"]
 
-_BUILTIN: tuple[Exporter, ...] = (TorchScriptExporter(), FeedForwardExporter())
+_BUILTIN: tuple[Exporter, ...] = (TorchScriptExporter(), CExporter(), FeedForwardExporter())
 
 
 def exporters() -> dict[str, Exporter | ThirdParty]:

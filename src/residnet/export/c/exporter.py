@@ -1,0 +1,70 @@
+"""The format `c`: writes the files of a vessel model once they have been compiled and checked."""
+
+from __future__ import annotations
+
+import copy
+import json
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar, Literal, final
+
+import torch
+
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.store import ModelSpec
+from residnet.export.base import Exporter
+from residnet.export.c.compiled import CompiledModel, compile_shared
+from residnet.export.c.vessel import vessel_source
+from residnet.export.contract import DOUBLE, SINGLE, checked, require_numbers
+from residnet.export.torchscript import make_card
+
+_PRECISIONS: tuple[tuple[Literal["single", "double"], torch.dtype, float], ...] = (
+    ("single", torch.float32, SINGLE),
+    ("double", torch.float64, DOUBLE),
+)
+
+
+@final
+class CExporter(Exporter):
+    """One C99 source file and its header: no runtime, no allocation, no global state."""
+
+    name: ClassVar[str] = "c"
+    suffix: ClassVar[str] = ".c"
+    about: ClassVar[str] = "The model as one C99 file and header, without any runtime."
+
+    def export(
+        self,
+        spec: ModelSpec,
+        model: HybridDynamics,
+        file: Path,
+        rows: Sequence[Mapping[str, Any]],
+    ) -> Mapping[str, Any]:
+        """Write source, header and card, checked in single and in double precision."""
+        require_numbers(spec, model)
+        model = copy.deepcopy(model).eval().requires_grad_(False)
+        card = make_card(spec, model, rows, {}) | {
+            "format": "c",
+            "dtype": "float32; float64 with the macro _DOUBLE",
+            "safety": "The file is source code: compile only what you trust.",
+        }
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            source, header = folder / file.name, folder / file.with_suffix(".h").name
+            written = vessel_source(spec, model, card, header.name)
+            source.write_text(written.source)
+            header.write_text(written.header)
+            parity = {}
+            for precision, dtype, tolerance in _PRECISIONS:
+                flags = [f"-D{written.prefix.upper()}_DOUBLE"] if precision == "double" else []
+                library = compile_shared([source], folder / f"{precision}.so", flags)
+                stepped = CompiledModel(library, written.prefix, model.n_state, precision)
+                given = copy.deepcopy(model).to(dtype)
+                what = f"the C file in {precision} precision"
+                parity[precision] = checked(spec, given, stepped, what, tolerance)
+            card |= {"parity": parity}
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.with_suffix(".h").write_text(written.header)
+            file.with_suffix(".card.json").write_text(json.dumps(card, indent=1) + "\n")
+            file.write_text(written.source)
+        return card

@@ -1,0 +1,202 @@
+"""What holds for a stepped model in every format, checked before a file is written.
+
+A format's file is loaded back and driven beside the model itself: 2,000 steps from a warmed-up
+memory, then inputs, states and memories that no vessel has.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from residnet.core.errors import ExportError
+from residnet.core.layout import RANGE_INPUTS, SURGE
+from residnet.core.names import STATE
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.rollout import Rollout
+from residnet.dynamics.store import ModelSpec
+from residnet.export.guard import GuardedDynamics
+
+PARITY_STEPS = 2000
+PAST = 50
+"""Steps of measured past that warm the memory up."""
+SINGLE, DOUBLE = 1e-5, 1e-12
+"""Largest difference in each precision, as a share of a channel's range."""
+Numbers = npt.NDArray[np.floating[Any]]
+
+
+class Stepped(Protocol):
+    """A file that was written, loaded back: one vessel, arrays without a batch."""
+
+    def step(self, x: Numbers, w: Numbers, s: Numbers) -> tuple[Numbers, Numbers, bool]:
+        """Return state [6], memory [n_state] and flag one step later; inputs w [m]."""
+
+    def warmup(self, y: Numbers, w: Numbers) -> Numbers:
+        """Return the memory [n_state] that states [T, 6] and inputs [T, m] leave."""
+
+
+def require_numbers(spec: ModelSpec, model: HybridDynamics) -> None:
+    """Refuse a model whose numbers are not all finite.
+
+    Raises:
+        ExportError: that names the first such number.
+    """
+    # limits of what has no limits are infinite from the start
+    fresh = spec.build().state_dict()
+    for name, value in model.state_dict().items():
+        wrong = ~torch.isfinite(value)
+        if name in fresh and fresh[name].shape == value.shape:
+            wrong &= ~(torch.isinf(value) & (fresh[name].to(value.dtype) == value))
+        if bool(wrong.any()):
+            raise ExportError(
+                f"model {spec.name}: {name} holds {float(value[wrong][0])}, so it is no model;"
+                " fit it again"
+            )
+
+
+def checked(
+    spec: ModelSpec, model: HybridDynamics, stepped: Stepped, what: str, tolerance: float = SINGLE
+) -> dict[str, Any]:
+    """Return what a card says of the parity, once a file answers good and bad inputs as it must.
+
+    Raises:
+        ExportError: where it does not; see `require_parity` and `require_defined`.
+    """
+    shares = require_parity(spec, model, stepped, what, tolerance)
+    require_defined(spec, model, stepped, what)
+    return {"steps": PARITY_STEPS, "share_of_range": shares}
+
+
+def drive(spec: ModelSpec, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """Return states of the past [1, 50, 6] and inputs [1, 50 + steps, m] of the parity check.
+
+    Inputs sweep the training range as slow sines, so that the run passes through what the model
+    knows.
+    """
+    low, high = torch.tensor(spec.low, dtype=dtype), torch.tensor(spec.high, dtype=dtype)
+    steps = torch.arange(PARITY_STEPS + PAST, dtype=dtype)
+    phase = torch.arange(low.numel() - 3, dtype=dtype)
+    sweep = 0.5 + 0.4 * torch.sin(0.02 * (1 + 0.37 * phase)[None] * steps[:, None] + phase[None])
+    w = (low[RANGE_INPUTS] + sweep * (high - low)[RANGE_INPUTS]).unsqueeze(0)
+    y = torch.zeros(1, PAST, len(STATE), dtype=dtype)
+    y[:, :, SURGE] = 0.5 * (low[0] + high[0])
+    return y, w
+
+
+def require_parity(
+    spec: ModelSpec, model: HybridDynamics, stepped: Stepped, what: str, tolerance: float = SINGLE
+) -> dict[str, float]:
+    """Return the largest difference of each state from the model's, as a share of its range.
+
+    Args:
+        spec: the model's description.
+        model: in the precision of `stepped`.
+        stepped: what was written.
+        what: was written, for messages.
+        tolerance: largest share.
+
+    Raises:
+        ExportError: where a share is larger, or the model itself leaves what exports accept.
+    """
+    guarded = GuardedDynamics(model, spec).to(_dtype(model)).eval()
+    y, w = drive(spec, _dtype(model))
+    with torch.no_grad():
+        start = torch.cat((y[:, -1], torch.zeros_like(y[:, -1, :1])), dim=-1)
+        memory = guarded.warmup(y, w[:, :PAST])
+        eager = Rollout(guarded)(start, w[:, PAST:], memory)[0][0].numpy()
+    x, s = y[0, -1].numpy().copy(), stepped.warmup(y[0].numpy(), w[0, :PAST].numpy())
+    path = [x]
+    for k in range(PARITY_STEPS):
+        x, s, _ = stepped.step(x, w[0, PAST + k].numpy(), s)
+        path.append(x)
+    states = eager[:, : len(STATE)]
+    span = np.maximum(np.ptp(states, axis=0), 1e-6)
+    worst = np.abs(np.stack(path) - states).max(axis=0) / span
+    shares = dict(zip(STATE, worst.tolist(), strict=True))
+    if not bool((worst <= tolerance).all()):
+        raise ExportError(
+            f"model {spec.name}: {what} differs from the model by {shares} of each channel's range"
+            f" over {PARITY_STEPS} steps; allowed {tolerance:g}"
+        )
+    return shares
+
+
+def require_defined(spec: ModelSpec, model: HybridDynamics, stepped: Stepped, what: str) -> None:
+    """Refuse what answers bad inputs, states or memories otherwise than the model's guard.
+
+    Raises:
+        ExportError: that names the first entry and its value.
+    """
+    dtype = _dtype(model)
+    guarded = GuardedDynamics(model, spec).to(dtype).eval()
+    y, w = (part[0] for part in drive(spec, dtype))
+    memory = guarded.warmup(y.unsqueeze(0), w[:PAST].unsqueeze(0))[0]
+    good = torch.cat((y[-1], w[PAST], memory))
+    names = [*STATE, *spec.signals.columns, *(f"memory {i}" for i in range(memory.numel()))]
+    # a long memory is wrong in its first, its middle and its last entry
+    ends = {len(STATE) + w.shape[1], len(names) // 2, len(names) - 1}
+    places = [i for i in range(len(names)) if i < len(STATE) + w.shape[1] or i in ends]
+    cases = [(i, bad) for i in places for bad in (torch.nan, torch.inf, -torch.inf, 1e30, -1e30)]
+    rows = good.repeat(len(cases), 1)
+    for row, (i, bad) in zip(rows, cases, strict=True):
+        row[i] = bad
+    parts = [len(STATE), w.shape[1], memory.numel()]
+    x0, w0, s0 = rows.split(parts, dim=1)
+    with torch.no_grad():
+        wanted = guarded.flagged_step(x0, w0, s0)
+    for k, (i, bad) in enumerate(cases):
+        x, s, outside = stepped.step(x0[k].numpy(), w0[k].numpy(), s0[k].numpy())
+        same = (
+            np.allclose(x, wanted[0][k].numpy(), rtol=1e-4, atol=1e-4)
+            and np.allclose(s, wanted[1][k].numpy(), rtol=1e-3, atol=1e-3)
+            and bool(outside) == bool(wanted[2][k])
+        )
+        if not same:
+            raise ExportError(
+                f"model {spec.name}: {what} answers {names[i]} = {bad} with {x.tolist()}, outside"
+                f" {bool(outside)}; the model with {wanted[0][k].tolist()}, {bool(wanted[2][k])}"
+            )
+
+
+def warmed(
+    measured: Callable[[Numbers, Numbers], bool],
+    step: Callable[[Numbers, Numbers, Numbers], tuple[Numbers, Numbers, bool]],
+    y: Numbers,
+    w: Numbers,
+    empty: Numbers,
+) -> Numbers:
+    """Return the memory that steps along a measured past leave, where a format has only steps.
+
+    In the place of a sample that is no measurement stands the last one before it that is, or else
+    the first one behind it.
+    """
+    good = [k for k in range(len(y)) if measured(y[k], w[k])]
+    s, at = empty, good[0] if good else 0
+    for k in range(len(y) if good else 0):
+        at = k if k in good else at
+        s = step(y[at], w[at], s)[1]
+    return s
+
+
+def accepted(spec: ModelSpec, model: HybridDynamics) -> Callable[[Numbers, Numbers], bool]:
+    """Return what tells whether state and inputs of one sample are measurements."""
+    guard = GuardedDynamics(model, spec)
+    least, most = guard.least.numpy(), guard.most.numpy()
+
+    def measured(x: Numbers, w: Numbers) -> bool:
+        seen = np.concatenate((x, w))
+        return bool(((seen >= least) & (seen <= most)).all())
+
+    return measured
+
+
+def _dtype(model: HybridDynamics) -> torch.dtype:
+    kinds: Sequence[torch.dtype] = [
+        value.dtype for value in model.state_dict().values() if value.is_floating_point()
+    ]
+    return kinds[0] if kinds else torch.float32

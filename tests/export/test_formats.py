@@ -1,0 +1,93 @@
+"""Every export format with every kind of model: one contract, whatever the format.
+
+The exporter itself compares good and bad inputs with the model before it writes; here the file is
+loaded back as a user would.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+from exported_models import VARIANTS, built
+
+from residnet.core.errors import ExportError
+from residnet.export import contract, exporter
+from residnet.export.c.compiled import STRICT, compiler
+from residnet.export.lowering.build import lowered
+
+STEPS = 60
+
+
+@pytest.fixture(scope="module", autouse=True)
+def short_parity() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(contract, "PARITY_STEPS", STEPS)
+        yield
+
+
+@pytest.mark.exporters
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_c_holds_every_head(variant: str, tmp_path: Path) -> None:
+    spec, model = built(variant)
+    file = tmp_path / "deep" / "boat.c"
+    card = exporter("c").export(spec, model, file, [])
+    stored = json.loads((tmp_path / "deep" / "boat.card.json").read_text())
+    assert stored == json.loads(json.dumps(card))
+    for precision, allowed in (("single", 1e-5), ("double", 1e-12)):
+        assert max(card["parity"][precision]["share_of_range"].values()) <= allowed
+        assert card["parity"][precision]["steps"] == STEPS
+    assert sorted(path.name for path in file.parent.iterdir()) == [
+        "boat.c",
+        "boat.card.json",
+        "boat.h",
+    ]
+
+
+def test_c_compiles_without_warnings_and_keeps_nothing(tmp_path: Path) -> None:
+    spec, model = built("lstm")
+    exporter("c").export(spec, model, tmp_path / "boat.c", [])
+    text = (tmp_path / "boat.c").read_text()
+    assert "malloc" not in text
+    kept = [line for line in text.splitlines() if line.startswith("static") and "(" not in line]
+    assert all(line.startswith("static const") for line in kept)
+    (tmp_path / "main.c").write_text(
+        '#include "boat.h"\n#include <stdio.h>\n'
+        "int main(void) { float x[6] = {0, 0, 0, 1, 0, 0}, w[4] = {9, 9, 3, 1},"
+        " s[MINE_MEMORY + 1]; int outside;\n"
+        "mine_initial_state(s); outside = mine_step(x, w, s, x, s);"
+        ' printf("%d %.9g", outside, x[3]); return 0; }\n'
+    )
+    for flags in ((), ("-O3", "-Wconversion")):
+        subprocess.run(
+            [compiler(), *STRICT, *flags, "boat.c", "main.c", "-o", "main", "-lm"],
+            cwd=tmp_path,
+            check=True,
+        )
+        printed = subprocess.run([tmp_path / "main"], capture_output=True, text=True).stdout
+        model = model.float()
+        x, w = torch.tensor([[0.0, 0, 0, 1, 0, 0]]), torch.tensor([[9.0, 9, 3, 1]])
+        with torch.no_grad():
+            after, _ = model.step(x, w, model.initial_state(1))
+        assert printed.split()[0] == "0"
+        assert float(printed.split()[1]) == pytest.approx(float(after[0, 3]), rel=1e-6)
+
+
+def test_an_operation_that_is_not_known_is_refused_by_name() -> None:
+    with pytest.raises(ExportError, match="model mine: its step uses torch's operation 'digamma'"):
+        lowered(lambda x: torch.special.digamma(x + 1), [("x", 2)], ["y"], "model mine")
+    with pytest.raises(ExportError, match="cannot be recorded"):
+        lowered(lambda x: x if bool(x.sum() > 1) else -x, [("x", 2)], ["y"], "model mine")
+
+
+def test_a_weight_that_is_not_finite_is_refused(tmp_path: Path) -> None:
+    spec, model = built("mlp")
+    with torch.no_grad():
+        next(model.head.parameters())[0, 0] = torch.nan
+    with pytest.raises(ExportError, match=r"model mine: head.net.0.weight holds nan"):
+        exporter("c").export(spec, model, tmp_path / "boat.c", [])
+    assert not list(tmp_path.iterdir())
