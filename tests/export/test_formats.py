@@ -11,14 +11,20 @@ import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
+import casadi
+import numpy as np
+import onnxruntime
 import pytest
 import torch
-from exported_models import VARIANTS, built
+from exported_models import VARIANTS, AsTensors, built
 
 from residnet.core.errors import ExportError
 from residnet.export import contract, exporter
-from residnet.export.c.compiled import STRICT, compiler
+from residnet.export.c.compiled import STRICT, CompiledModel, compile_shared, compiler
+from residnet.export.casadi_function import CasadiModel
 from residnet.export.lowering.build import lowered
+from residnet.export.onnx_file import OnnxModel
+from residnet.testing import check_bad_inputs
 
 STEPS = 60
 
@@ -41,11 +47,47 @@ def test_c_holds_every_head(variant: str, tmp_path: Path) -> None:
     for precision, allowed in (("single", 1e-5), ("double", 1e-12)):
         assert max(card["parity"][precision]["share_of_range"].values()) <= allowed
         assert card["parity"][precision]["steps"] == STEPS
+    source = compile_shared([file], tmp_path / "boat.so")
+    stepped = CompiledModel(source, "mine", model.n_state, "single")
+    check_bad_inputs(AsTensors(stepped, spec, model), spec, model, cases=60)
     assert sorted(path.name for path in file.parent.iterdir()) == [
         "boat.c",
         "boat.card.json",
         "boat.h",
     ]
+
+
+@pytest.mark.exporters
+@pytest.mark.parametrize("variant", ["plsr", "kernel", "mlp_mirror", "lstm"])
+def test_onnx_needs_no_torch(variant: str, tmp_path: Path) -> None:
+    spec, model = built(variant)
+    card = exporter("onnx").export(spec, model, tmp_path / "boat.onnx", [])
+    assert max(card["parity"]["share_of_range"].values()) <= 1e-5
+    session = onnxruntime.InferenceSession(str(tmp_path / "boat.onnx"))
+    stored = json.loads(session.get_modelmeta().custom_metadata_map["card"])
+    assert stored == json.loads(json.dumps(card))
+    stepped = OnnxModel(tmp_path / "boat.onnx", spec, model)
+    check_bad_inputs(AsTensors(stepped, spec, model), spec, model, cases=60)
+
+
+@pytest.mark.exporters
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_casadi_has_exact_derivatives(variant: str, tmp_path: Path) -> None:
+    spec, model = built(variant)
+    card = exporter("casadi").export(spec, model, tmp_path / "boat.casadi", [])
+    assert max(card["parity"]["share_of_range"].values()) <= 1e-12
+    stepped = CasadiModel(tmp_path / "boat.casadi", spec, model)
+    model = model.double()
+    x = torch.tensor([[1.0, 2, 0.3, 1.1, 0.05, 0.02]], dtype=torch.float64)
+    w = torch.tensor([[9.0, 12, 3, 1]], dtype=torch.float64)
+    s = model.initial_state(1).double()
+    exact = torch.autograd.functional.jacobian(lambda at: model.step(at, w, s)[0][0], x)[:, 0]
+    function = stepped.function
+    symbols = [casadi.MX.sym(name, size) for name, size in (("x", 6), ("w", 4), ("s", s.shape[1]))]
+    slope = casadi.Function("slope", symbols, [casadi.jacobian(function(*symbols)[0], symbols[0])])(
+        *(part[0].numpy() for part in (x, w, s))
+    )
+    torch.testing.assert_close(torch.from_numpy(np.asarray(slope)), exact, rtol=1e-9, atol=1e-12)
 
 
 def test_c_compiles_without_warnings_and_keeps_nothing(tmp_path: Path) -> None:

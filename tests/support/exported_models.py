@@ -6,12 +6,15 @@ from typing import Any, get_args
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from residnet.baselines import RegressorsConfig
 from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.samples import Samples
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
+from residnet.export.contract import Stepped
+from residnet.export.guard import GuardedDynamics
 from residnet.heads import ClosedFormHead, HeadConfig
 from residnet.physics.signals import SignalsConfig
 
@@ -88,3 +91,34 @@ def built(variant: str) -> tuple[ModelSpec, HybridDynamics]:
     model = spec.build()
     fill(model)
     return spec, model
+
+
+class AsTensors:
+    """A loaded file of any format as a module of batches, row by row."""
+
+    def __init__(self, stepped: Stepped, spec: ModelSpec, model: HybridDynamics) -> None:
+        self.stepped, self.memory = stepped, model.n_state
+        self.guard = GuardedDynamics(model, spec)
+
+    def initial_state(self, batch: int) -> Tensor:
+        return torch.zeros(batch, self.memory)
+
+    def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        rows = [
+            self.stepped.step(*(part.numpy() for part in row)) for row in zip(x, w, s, strict=True)
+        ]
+        after, memory, outside = zip(*rows, strict=True)
+        states, memories = (torch.from_numpy(np.stack(part)) for part in (after, memory))
+        return states, memories, torch.tensor(outside)
+
+    def warmup(self, y: Tensor, w: Tensor) -> Tensor:
+        rows = zip(y.numpy(), w.numpy(), strict=True)
+        return torch.from_numpy(np.stack([self.stepped.warmup(*row) for row in rows]))
+
+    def rollout(self, x0: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        states, flags, x = [self.guard.accept_state(x0)], [], x0
+        for k in range(w.shape[1]):
+            x, s, outside = self.step(x, w[:, k], s)
+            states.append(x)
+            flags.append(outside)
+        return torch.stack(states, dim=1), s, torch.stack(flags, dim=1)

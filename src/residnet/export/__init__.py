@@ -5,12 +5,20 @@ from __future__ import annotations
 from residnet.core.registry import ThirdParty, objects, usable
 from residnet.export.base import Exporter
 from residnet.export.c.exporter import CExporter
+from residnet.export.casadi_function import CasadiExporter
 from residnet.export.feed_forward import FeedForwardExporter
+from residnet.export.onnx_file import OnnxExporter
 from residnet.export.torchscript import TorchScriptExporter
 
 __all__ = ["Exporter", "exporter", "exporters"]
 
-_BUILTIN: tuple[Exporter, ...] = (TorchScriptExporter(), CExporter(), FeedForwardExporter())
+_BUILTIN: tuple[Exporter, ...] = (
+    TorchScriptExporter(),
+    CExporter(),
+    OnnxExporter(),
+    CasadiExporter(),
+    FeedForwardExporter(),
+)
 
 
 def exporters() -> dict[str, Exporter | ThirdParty]:

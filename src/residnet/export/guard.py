@@ -105,9 +105,12 @@ class GuardedDynamics(Dynamics):
         """Return state [B, 6], inputs [B, m] and memory as they are used, and the flag [B]."""
         seen = torch.cat((x, w), dim=-1)
         used = replaced(seen, self.low, self.high, self.least, self.most, self.middle)
-        remembers = self.remembers(s)
-        inside = ((seen >= self.low) & (seen <= self.high)).all(dim=-1) & remembers
-        s = torch.where(remembers.unsqueeze(-1), s, torch.zeros_like(s))
+        inside = ((seen >= self.low) & (seen <= self.high)).all(dim=-1)
+        # no reductions over nothing: not every format has them
+        if self.n_state > 0:
+            remembers = self.remembers(s)
+            inside = inside & remembers
+            s = torch.where(remembers.unsqueeze(-1), s, torch.zeros_like(s))
         return motion(used), actuators(used), s, ~inside
 
     def accept_state(self, x: Tensor) -> Tensor:
@@ -140,6 +143,8 @@ class GuardedDynamics(Dynamics):
         held = torch.where(torch.isnan(new), velocities(x), new)
         coasting = torch.cat((pose(x) + self.dt * self.kinematics(x), held), dim=-1)
         coasting = torch.minimum(torch.maximum(coasting, least), most)
+        if self.n_state == 0:
+            return torch.where(kept, after, coasting), s, ~kept.squeeze(-1)
         known = torch.isfinite(s).all(dim=-1, keepdim=True)
         # a head of another package may leave what it says of its memory
         s = torch.minimum(torch.maximum(s, self.memory_low), self.memory_high)

@@ -1,0 +1,187 @@
+"""The format `onnx`: the model's step as an ONNX graph, memory in and out, any number of rows."""
+
+from __future__ import annotations
+
+import copy
+import importlib
+import json
+import logging
+import tempfile
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar, final
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from residnet.core.errors import ExportError
+from residnet.core.names import STATE
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.store import ModelSpec
+from residnet.export.base import Exporter
+from residnet.export.contract import (
+    Numbers,
+    accepted,
+    checked,
+    require_numbers,
+    warmed,
+)
+from residnet.export.guard import GuardedDynamics
+from residnet.export.packages import require_package
+from residnet.export.torchscript import make_card
+
+_INPUTS, _OUTPUTS = ("x", "w", "s"), ("x_after", "s_after", "outside")
+
+
+class Step(nn.Module):
+    """The guarded step as a module's forward, which exporters of graphs ask for."""
+
+    def __init__(self, model: HybridDynamics, spec: ModelSpec) -> None:
+        super().__init__()
+        self.guarded = GuardedDynamics(model, spec)
+
+    def forward(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return state [B, 6], memory [B, n_state] and flag [B] one step later."""
+        return self.guarded.flagged_step(x, w, s)
+
+
+class StepWithoutMemory(nn.Module):
+    """The guarded step of a model without a memory, as a module's forward."""
+
+    def __init__(self, model: HybridDynamics, spec: ModelSpec) -> None:
+        super().__init__()
+        self.guarded = GuardedDynamics(model, spec)
+
+    def forward(self, x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
+        """Return state [B, 6] and flag [B] one step later."""
+        x, _, outside = self.guarded.flagged_step(x, w, x[:, :0])
+        return x, outside
+
+
+class OnnxModel:
+    """An ONNX file in onnxruntime, for one vessel."""
+
+    def __init__(self, file: Path, spec: ModelSpec, model: HybridDynamics) -> None:
+        runtime = importlib.import_module("onnxruntime")
+        options = runtime.SessionOptions()
+        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        self.session: Any = runtime.InferenceSession(
+            str(file), options, providers=["CPUExecutionProvider"]
+        )
+        self.memory = model.n_state
+        self.measured = accepted(spec, model)
+
+    def step(self, x: Numbers, w: Numbers, s: Numbers) -> tuple[Numbers, Numbers, bool]:
+        """Return state, memory and flag one step later."""
+        after, memory, outside = self.rows(x[None], w[None], s[None])
+        return after[0], memory[0], bool(outside[0])
+
+    def rows(self, x: Numbers, w: Numbers, s: Numbers) -> tuple[Numbers, Numbers, Numbers]:
+        """Return states [B, 6], memories [B, n_state] and flags [B] one step later."""
+        given = {"x": np.asarray(x, np.float32), "w": np.asarray(w, np.float32)}
+        if self.memory == 0:
+            after, outside = self.session.run(["x_after", "outside"], given)
+            return after, np.asarray(s, np.float32), outside
+        after, memory, outside = self.session.run(
+            list(_OUTPUTS), given | {"s": np.asarray(s, np.float32)}
+        )
+        return after, memory, outside
+
+    def warmup(self, y: Numbers, w: Numbers) -> Numbers:
+        """Return the memory that a measured past leaves."""
+        return warmed(self.measured, self.step, y, w, np.zeros(self.memory, np.float32))
+
+
+@final
+class OnnxExporter(Exporter):
+    """An ONNX file with the state, the inputs and the memory as its inputs."""
+
+    name: ClassVar[str] = "onnx"
+    suffix: ClassVar[str] = ".onnx"
+    about: ClassVar[str] = "The model's step as ONNX, memory in and out, any number of rows."
+
+    def export(
+        self,
+        spec: ModelSpec,
+        model: HybridDynamics,
+        file: Path,
+        rows: Sequence[Mapping[str, Any]],
+    ) -> Mapping[str, Any]:
+        """Write the model in float32, its card under the key `card` of the metadata."""
+        for package in ("onnx", "onnxscript", "onnxruntime"):
+            require_package(package, "format onnx")
+        require_numbers(spec, model)
+        model = copy.deepcopy(model).float().eval().requires_grad_(False)
+        with tempfile.TemporaryDirectory() as name:
+            partial = Path(name) / file.name
+            _write(spec, model, partial)
+            stepped = OnnxModel(partial, spec, model)
+            card = make_card(spec, model, rows, {}) | {
+                "format": "onnx",
+                "parity": checked(spec, model, stepped, "the ONNX file"),
+                "safety": "The file holds numbers and operations; onnxruntime runs no code of it.",
+            }
+            _require_rows(stepped, spec, model)
+            onnx = importlib.import_module("onnx")
+            graph = onnx.load(str(partial))
+            onnx.helper.set_model_props(graph, {"card": json.dumps(card)})
+            file.parent.mkdir(parents=True, exist_ok=True)
+            ready = file.with_name(file.name + ".partial")
+            onnx.save(graph, str(ready))
+            ready.replace(file)
+        return card
+
+
+def _write(spec: ModelSpec, model: HybridDynamics, file: Path) -> None:
+    """Write the graph; a model without a memory has neither `s` nor `s_after`.
+
+    Raises:
+        ExportError: where torch cannot express the model in ONNX.
+    """
+    kept = slice(None) if model.n_state else slice(0, 2)
+    sizes = (len(STATE), len(spec.signals.columns), model.n_state)[kept]
+    step = Step(model, spec) if model.n_state else StepWithoutMemory(model, spec)
+    results = [name for name in _OUTPUTS if model.n_state or name != "s_after"]
+    rows = {0: torch.export.Dim("rows", min=1)}
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings(), torch.no_grad():
+            warnings.simplefilter("ignore")
+            program = torch.onnx.export(
+                step.eval(),
+                tuple(torch.zeros(2, size) for size in sizes),
+                dynamo=True,
+                verbose=False,
+                input_names=list(_INPUTS[kept]),
+                output_names=results,
+                dynamic_shapes=tuple(rows for _ in sizes),
+            )
+    except torch.onnx.OnnxExporterError as error:
+        first = str(error).strip().splitlines()[0]
+        raise ExportError(
+            f"model {spec.name}: ONNX cannot hold its step ({first}); export it as torchscript"
+        ) from None
+    assert program is not None
+    program.save(str(file))
+
+
+def _require_rows(stepped: OnnxModel, spec: ModelSpec, model: HybridDynamics) -> None:
+    """Refuse a graph whose rows disturb each other.
+
+    Raises:
+        ExportError: where three rows together differ from each alone.
+    """
+    generator = torch.Generator().manual_seed(0)
+    low, high = torch.tensor(spec.low), torch.tensor(spec.high)
+    seen = low + torch.rand(3, low.numel(), generator=generator) * (high - low)
+    x = torch.cat((torch.zeros(3, 3), seen[:, :3]), dim=1).numpy()
+    w, s = seen[:, 3:].numpy(), np.zeros((3, model.n_state), np.float32)
+    together = stepped.rows(x, w, s)[0]
+    alone = np.stack([stepped.step(*row)[0] for row in zip(x, w, s, strict=True)])
+    if not np.allclose(together, alone, rtol=1e-5, atol=1e-5):
+        raise ExportError(
+            f"model {spec.name}: the ONNX file gives other states for several rows at once than"
+            " for each alone"
+        )
