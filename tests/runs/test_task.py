@@ -10,7 +10,7 @@ from typing import Literal
 import pytest
 import torch
 
-from residnet.core.errors import DataError, FitError, UsageError
+from residnet.core.errors import DataError, ExportError, FitError, UsageError
 from residnet.report.blocks import Code, Section
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import ComputingTask, MainFigure, Outcome
@@ -21,7 +21,7 @@ class SampleTask(ComputingTask):
 
     task: Literal["sample"] = "sample"
     seed: int = 7
-    fault: Literal["", "raises", "fails a check"] = ""
+    fault: Literal["", "raises", "fails a check", "is not exported"] = ""
 
     def recorded_seed(self) -> int:
         return self.seed
@@ -32,16 +32,20 @@ class SampleTask(ComputingTask):
         if self.fault == "raises":
             raise FitError("nothing can be fitted")
         folder.write_json(folder.path / "found.json", {"threads": torch.get_num_threads()})
-        failure = "a flight did not end" if self.fault else ""
+        failure = "a flight did not end" if self.fault == "fails a check" else ""
         figures = {"speed": MainFigure(1.5, "m/s")}
 
-        def export() -> Sequence[Path]:
+        def diverging() -> Path:
+            raise ExportError("model wild: diverges")
+
+        def model() -> Path:
             assert folder.report.is_file()
             assert not folder.finished
             folder.write(folder.exports / "model.txt", "exported")
-            return [folder.exports / "model.txt"]
+            return folder.exports / "model.txt"
 
-        return Outcome(["It works."], figures, "a table", failure, export)
+        first = {"wild": diverging} if self.fault == "is not exported" else {}
+        return Outcome(["It works."], figures, "a table", failure, {**first, "model": model})
 
     @classmethod
     def report_sections(cls, run: RunFolder) -> Sequence[Section]:
@@ -66,6 +70,7 @@ def test_a_run_leaves_report_summary_and_mark(tmp_path: Path) -> None:
     assert "What was found" in page
     assert sorted(path.name for path in folder.path.iterdir()) == [
         "exports",
+        "exports.json",
         "found.json",
         "provenance.json",
         "report.html",
@@ -103,6 +108,20 @@ def test_a_result_that_fails_a_check_is_reported_first(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="a flight did not end"):
         SampleTask(name="checked", fault="fails a check").run(out=tmp_path / "run")
     assert RunFolder.open(tmp_path / "run").report.is_file()
+
+
+def test_an_export_that_fails_is_reported_and_the_run_complete(tmp_path: Path) -> None:
+    with pytest.raises(ExportError, match=r"model wild: diverges; the run itself is complete"):
+        SampleTask(name="wild", fault="is not exported").run(out=tmp_path / "run")
+    folder = RunFolder.open(tmp_path / "run")
+    assert (folder.exports / "model.txt").is_file()
+    page = folder.report.read_text()
+    assert "Not exported: model wild: diverges." in page
+    assert "exports/model.txt" in page.replace("<wbr>", "")
+    assert folder.read_summary()["verdict"] == ["It works.", "Not exported: model wild: diverges."]
+    # what an earlier run exported is not shown as this one's
+    SampleTask(name="wild").run(out=tmp_path / "run", overwrite=True)
+    assert "wild: diverges" not in folder.report.read_text()
 
 
 def test_without_a_report_a_run_ends_after_its_results(tmp_path: Path) -> None:

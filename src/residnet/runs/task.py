@@ -14,9 +14,11 @@ from typing import Any, ClassVar, NamedTuple, final
 from pydantic import Field
 
 from residnet.core.config import Config, dump_config, load_mapping
-from residnet.core.errors import DataError, UsageError
+from residnet.core.errors import DataError, ExportError, UsageError
 from residnet.report.blocks import Section
 from residnet.report.page import title_and_description, write_page
+from residnet.report.sections.exports import EXPORTS, exports_section
+from residnet.runs.exports import Exported, Exports, write_exports
 from residnet.runs.folder import RunFolder
 from residnet.runs.provenance import Provenance
 
@@ -48,14 +50,15 @@ class Outcome:
         table: text for the terminal; empty for none.
         failure: a line where a result fails a check; the run is complete, and ends as a `DataError`
             with this line.
-        export: writes models for controllers once the report stands, and returns their files.
+        exports: what writes each model for controllers once the report stands, by its name; one
+            that fails is reported, and the complete run ends as an `ExportError`.
     """
 
     verdict: Sequence[str] = ()
     figures: Mapping[str, MainFigure] = field(default_factory=dict)
     table: str = ""
     failure: str = ""
-    export: Callable[[], Sequence[Path]] | None = None
+    exports: Exports = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -188,30 +191,53 @@ class Task(Config):
     ) -> Finished:
         """Carry work out in the one order: provenance, work, report, exports, finished mark.
 
+        The report stands before anything is exported, and is written again with what came of it.
+
         Raises:
             ResidnetError: where the work does, or where its outcome fails a check.
+            ExportError: where the run is complete, but a model could not be exported.
         """
         made_from.write(folder)
+        # of an earlier run in this folder
+        (folder.path / EXPORTS).unlink(missing_ok=True)
         with self.resources():
             outcome = work(folder)
             figures = {name: figure.as_json() for name, figure in outcome.figures.items()}
             folder.write_summary(self.task, outcome.verdict, figures, finished=False)
             # the last time, since the report shows it and must come out the same again
             made_from.write(folder)
+            verdict, exported = list(outcome.verdict), Exported()
             if report:
-                self.write_report(folder)
-            files = outcome.export() if report and outcome.export is not None else ()
-        folder.write_summary(self.task, outcome.verdict, figures, finished=True)
+                sections = self.report_sections(folder)
+                self._write_page(folder, sections)
+                if outcome.exports:
+                    exported = write_exports(folder, outcome.exports)
+                    verdict += [f"Not exported: {fault}." for fault in exported.faults]
+                    folder.write_summary(self.task, verdict, figures, finished=False)
+                    self._write_page(folder, sections)
+        folder.write_summary(self.task, verdict, figures, finished=True)
         if outcome.failure:
             raise DataError(outcome.failure)
-        return Finished(folder, outcome, files)
+        if exported.faults:
+            raise ExportError(f"{exported.faults[0]}; the run itself is complete: {folder.report}")
+        return Finished(folder, outcome, exported.files)
 
     @classmethod
     def write_report(cls, run: RunFolder) -> Path:
         """Write figures and report from the run folder alone; returns the page's path."""
+        return cls._write_page(run, cls.report_sections(run))
+
+    @classmethod
+    def _write_page(cls, run: RunFolder, sections: Sequence[Section]) -> Path:
         title, description = title_and_description(run.path)
-        verdict = run.read_summary()["verdict"]
-        return write_page(run.path, title, description, verdict, cls.report_sections(run))
+        exports = exports_section(run.path)
+        return write_page(
+            run.path,
+            title,
+            description,
+            run.read_summary()["verdict"],
+            [*sections, *([] if exports is None else [exports])],
+        )
 
     @contextmanager
     def resources(self) -> Iterator[None]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -97,7 +98,9 @@ def run_autopilot(config: AutopilotSettings, folder: RunFolder) -> Outcome:
         _verdict(config, rows),
         _main_figures(config, rows),
         f"{settling_table(rows, config.floor).text()}\n\n{effort_table(rows).text()}",
-        export=lambda: [_export(config, folder, name, policies[name], rows) for name in policies],
+        exports={
+            name: partial(_export, config, folder, name, policies[name], rows) for name in policies
+        },
     )
 
 

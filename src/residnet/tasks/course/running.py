@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -117,7 +118,7 @@ def run_course(config: CourseSettings, folder: RunFolder) -> Outcome:
         _verdict(config, done.rows),
         _main_figures(config, done.rows),
         text_of(done.rows),
-        export=lambda: [export.write(done.rows) for export in exports],
+        exports={export.name: partial(export.write, done.rows) for export in exports},
     )
 
 
@@ -165,12 +166,17 @@ class _Export(NamedTuple):
     policy: HeadingPolicy
     autopilot: AutopilotSettings
 
+    @property
+    def name(self) -> str:
+        """Name of the file without its ending."""
+        return f"{self.config.policy}_{self.planned.protocol}"
+
     def write(self, rows: Sequence[dict[str, Any]]) -> Path:
         """Export, with the policy's rows of metrics.json in the card; returns the file."""
         from residnet.export.course import export_course
 
         config, protocol = self.config, self.planned.protocol
-        file = self.folder / f"{config.policy}_{protocol}.pt"
+        file = self.folder / f"{self.name}.pt"
         about = {
             "vessel": self.autopilot.vessel,
             "course": config.course.model_dump(mode="json"),

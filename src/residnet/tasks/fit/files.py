@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from residnet.judge.tables import metrics_content
 from residnet.report.run_reader import RunFiles
 from residnet.report.sections.fit.free_runs import errors_table
 from residnet.report.sections.fit.verdict import verdict
+from residnet.runs.exports import Exports
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import MainFigure, Outcome
 from residnet.tasks.fit.config import FitTaskSettings
@@ -83,15 +83,13 @@ def _quality(prepared: Prepared, split: str) -> dict[str, Any]:
     }
 
 
-def fit_outcome(
-    folder: RunFolder, split: str, export: Callable[[], Sequence[Path]] | None = None
-) -> Outcome:
+def fit_outcome(folder: RunFolder, split: str, exports: Exports | None = None) -> Outcome:
     """Return the verdict of a fit or an evaluation, and the errors of its selected model.
 
     Args:
         folder: where the results stand.
         split: that is shown.
-        export: writes the exports when the run ends.
+        exports: what writes each export when the run ends; None for none.
     """
     metrics = folder.read_metrics()
     evaluation = RunFiles(folder.path)
@@ -108,4 +106,6 @@ def fit_outcome(
             "heading_error_end": MainFigure(row["heading_error_end"], "rad"),
         }
     sentences = [sentence for sentence in verdict(evaluation) if sentence]
-    return Outcome(sentences, figures, errors_table(evaluation, split).text(), export=export)
+    return Outcome(
+        sentences, figures, errors_table(evaluation, split).text(), exports=exports or {}
+    )

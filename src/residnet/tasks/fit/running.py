@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from residnet.core.progress import say
 from residnet.data.sources import read_logs
 from residnet.identification.currents import through_currents
@@ -39,7 +41,10 @@ def run_fit(config: FitTaskSettings, folder: RunFolder) -> Outcome:
     return fit_outcome(
         folder,
         "test",
-        lambda: [export_model(folder, name, None, "torchscript") for name in config.export.models],
+        {
+            name: partial(export_model, folder, name, None, "torchscript")
+            for name in config.export.models
+        },
     )
 
 
