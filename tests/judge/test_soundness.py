@@ -87,7 +87,7 @@ def test_a_model_that_behaves_is_sound() -> None:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"u": (0.02, 0, 0)}, "du′/du +0.02 1/s at speeds of"),
+        ({"u": (0.02, 0, 0)}, "du′/du +0.02 1/s, positive at 100% of it"),
         ({"r": (0, -0.2, 0.1)}, "dr′/dr +0.1 1/s"),
         ({"v": (0, 0.1, 0.05)}, "dv′/dv +0.1 1/s"),
     ],
