@@ -23,6 +23,7 @@ from residnet.identification.prepared import require_window
 from residnet.identification.settings import FitSettings
 from residnet.judge.selection import Selection
 from residnet.judge.tables import metrics_table
+from residnet.judge.verdict import Evidence, verdict
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -61,6 +62,28 @@ class Models(Mapping[str, Model]):
     def selected(self) -> str:
         """Name of the simplest sound model within one standard error of the best."""
         return self.selection.selected
+
+    @cached_property
+    def verdict(self) -> list[str]:
+        """The verdict on the selected model in whole sentences, the most important first.
+
+        It speaks of the test logs where they are judged, else of the validation logs.
+        """
+        split = "test" if "test" in self.runs else "validation"
+        judged, protocol = self.runs[split].evaluation, self.settings.evaluation.selection
+        whole = [
+            row for row in judged.rows if (row["protocol"], row["manoeuvre"]) == (protocol, "all")
+        ]
+        return verdict(
+            Evidence(
+                self.selected,
+                split,
+                {row["model"]: row for row in whole},
+                "baseline",
+                self.selection.content(),
+                judged.limits.get(protocol, {}),
+            )
+        )
 
     @property
     def metrics(self) -> pd.DataFrame:

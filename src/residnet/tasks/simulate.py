@@ -99,8 +99,13 @@ class SimulateConfig(ComputingTask):
         drawings = flight_drawings({craft.name: flights for craft, flights in flown})
         write_drawings(folder.figures, drawings)
         faults = [row for row in rows if row["fault"]]
+        ended = (
+            f"{len(faults)} of {count} manoeuvres did NOT end as they should"
+            if faults
+            else f"All {count} manoeuvres ended as they should"
+        )
         verdict = [
-            f"{count} manoeuvres were flown by {' and '.join(craft.name for craft, _ in flown)};"
+            f"{ended}; they were flown by {' and '.join(craft.name for craft, _ in flown)}, and"
             " their logs are in the folder logs."
         ]
         verdict += [f"{row['craft']}, {row['log']}: {row['fault']}." for row in faults[:5]]

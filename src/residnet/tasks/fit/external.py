@@ -23,6 +23,7 @@ from residnet.runs.model_store import FolderStore
 from residnet.runs.provenance import Provenance
 from residnet.runs.task import Outcome
 from residnet.tasks.fit.config import FitTaskSettings
+from residnet.tasks.fit.doctor import write_inspection
 from residnet.tasks.fit.files import (
     fit_outcome,
     write_data_quality,
@@ -57,9 +58,9 @@ class ExternalLogs:
         self.config, self.run = config, run
         files = log_files(paths)
         self.provenance = Provenance(run.resolved, (), config.seed, files, time.time())
+        self.read = [read_external(path, config) for path in files]
         self.logs = [
-            prepare(read_external(path, config), SPLIT, config.signals.columns, config.prepare)
-            for path in files
+            prepare(log, SPLIT, config.signals.columns, config.prepare) for log in self.read
         ]
         names = [log.log.name for log in self.logs]
         for name in names:
@@ -87,6 +88,7 @@ class ExternalLogs:
         low, high = np.array(fitted[0].spec.low), np.array(fitted[0].spec.high)
         limit = velocity_limit(low, high, config.evaluation.divergence)
         say(f"{config.name}: {len(logs)} logs, {len(fitted)} models")
+        write_inspection(folder, {SPLIT: self.read}, config)
         simulated = isinstance(config.data, SimulatedTrials) and all(
             "vessel" in log.log.meta for log in logs
         )

@@ -33,9 +33,10 @@ def verdict(results: Results) -> list[str]:
         if flown:
             nearest = min(flown, key=lambda name: float(flights[name]["position_mae"]))
             before, after = (flights[name]["position_mae"] for name in (_BELIEVED, nearest))
+            moves = "falls" if after < before else "does NOT fall: it goes"
             sentences.append(
-                f"With {nearest} as feed-forward, the mean position error in the {kind} falls from"
-                f" {number(before)} m to {number(after)} m."
+                f"With {nearest} as feed-forward, the mean position error in the {kind} {moves}"
+                f" from {number(before)} m to {number(after)} m."
             )
     for name, update in results["later"].items():
         sentences.append(f"On the vessel as it is later, {name} {update['text']}.")
