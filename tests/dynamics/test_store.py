@@ -105,6 +105,13 @@ def test_a_card_that_was_tampered_with_is_refused(tmp_path: Path) -> None:
     save_model(tmp_path / "m", spec(), spec().build())
     card = tmp_path / "m" / "model.json"
     content = json.loads(card.read_text())
+    card.write_text(json.dumps(content | {"dt": 0.04}))
+    with pytest.raises(UsageError, match=r"model\.json: was edited: .*run the fit again"):
+        load_model(tmp_path / "m")
+    # an earlier version wrote no sum of the description
+    content.pop("description_sha256")
+    card.write_text(json.dumps(content))
+    load_model(tmp_path / "m")
     card.write_text(json.dumps(content | {"dt": -1.0}))
     with pytest.raises(ConfigError, match=r"model\.json.*dt"):
         load_model(tmp_path / "m")
@@ -149,6 +156,7 @@ def test_weights_of_another_module_are_refused_though_their_hash_is_right(tmp_pa
     save_model(tmp_path / "m", spec(), spec().build())
     card = tmp_path / "m" / "model.json"
     content = json.loads(card.read_text())
+    content.pop("description_sha256")
     content["baseline"] = RegressorsConfig(terms=("u", "1")).model_dump()
     card.write_text(json.dumps(content))
     with pytest.raises(UsageError, match=r"does not belong to what model.json describes"):
@@ -159,7 +167,7 @@ def test_weights_of_another_module_are_refused_though_their_hash_is_right(tmp_pa
 def test_a_description_that_is_no_json_is_refused_in_one_line(tmp_path: Path, text: str) -> None:
     save_model(tmp_path / "m", spec(), spec().build())
     (tmp_path / "m" / "model.json").write_text(text)
-    with pytest.raises(UsageError, match=r"model\.json: is no") as caught:
+    with pytest.raises(UsageError, match=r"model\.json: .* JSON.*run it again") as caught:
         load_model(tmp_path / "m")
     assert "\n" not in str(caught.value)
 
@@ -167,6 +175,8 @@ def test_a_description_that_is_no_json_is_refused_in_one_line(tmp_path: Path, te
 def test_another_kind_is_named(tmp_path: Path) -> None:
     save_model(tmp_path / "m", spec(), spec().build())
     card = tmp_path / "m" / "model.json"
-    card.write_text(card.read_text().replace("residnet.model/1", "residnet.heading_policy/1"))
+    content = json.loads(card.read_text()) | {"schema": "residnet.heading_policy/1"}
+    content.pop("description_sha256")
+    card.write_text(json.dumps(content))
     with pytest.raises(UsageError, match=r"holds 'residnet.heading_policy/1', expected"):
         load_model(tmp_path / "m")

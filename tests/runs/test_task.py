@@ -69,6 +69,7 @@ def test_a_run_leaves_report_summary_and_mark(tmp_path: Path) -> None:
     assert "It works." in page
     assert "What was found" in page
     assert sorted(path.name for path in folder.path.iterdir()) == [
+        "checksums.json",
         "exports",
         "exports.json",
         "found.json",

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from residnet.core.errors import UsageError
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 _ROOM = 20_000_000
 """Bytes that must be free before a run."""
@@ -42,6 +47,46 @@ def whole(path: Path) -> Iterator[Path]:
     except BaseException:
         _discard(partial)
         raise
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Return the JSON object that a file holds.
+
+    Raises:
+        UsageError: where there is no such file, or it does not hold a JSON object.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise UsageError(f"{path}: no such file; is this the folder of a finished run?") from None
+    except (OSError, ValueError, RecursionError) as error:
+        raise UsageError(
+            f"{path}: not readable as JSON ({error}); restore the file or run it again"
+        ) from error
+    if not isinstance(content, dict):
+        raise UsageError(
+            f"{path}: expected a JSON object, found {type(content).__name__}; restore the file or"
+            " run it again"
+        )
+    return content
+
+
+def read_table(path: Path) -> pd.DataFrame:
+    """Return the table that a Parquet file holds.
+
+    Raises:
+        UsageError: where the file is missing, cut off or no Parquet file.
+    """
+    import pandas as pd
+    import pyarrow as pa
+
+    try:
+        return pd.read_parquet(path)
+    except (OSError, ValueError, TypeError, KeyError, pa.ArrowException) as error:
+        first = next(iter(str(error).splitlines()), "")
+        raise UsageError(
+            f"{path}: not readable as Parquet ({first}); restore the file or run it again"
+        ) from error
 
 
 def require_room(folder: Path) -> None:

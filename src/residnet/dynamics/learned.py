@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 from residnet.core.errors import UsageError
+from residnet.core.files import read_json
 from residnet.core.names import nearest
 from residnet.dynamics.store import model_names
 
@@ -26,9 +26,7 @@ def chosen_model(run: Path, name: str) -> str:
         return name
     metrics = run / "metrics.json"
     selected = (
-        str(json.loads(metrics.read_text())["selected"])
-        if name == "selected" and metrics.is_file()
-        else ""
+        str(read_json(metrics).get("selected")) if name == "selected" and metrics.is_file() else ""
     )
     if selected not in names:
         raise UsageError(

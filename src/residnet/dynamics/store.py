@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from residnet.baselines import BaselineConfig
 from residnet.core.config import Config, validate
 from residnet.core.errors import UsageError
-from residnet.core.files import whole
+from residnet.core.files import read_json, whole
 from residnet.core.names import VELOCITY, nearest
 from residnet.core.version import __version__
 from residnet.dynamics.base import Integrator
@@ -29,6 +29,8 @@ from residnet.heads import HeadConfig, ZeroHead
 from residnet.physics.signals import SignalsConfig
 
 _DESCRIPTION, _WEIGHTS = "model.json", "model.safetensors"
+
+_OWN_SUM = "description_sha256"
 
 SpecT = TypeVar("SpecT", bound="Stored")
 ModuleT = TypeVar("ModuleT", bound=nn.Module)
@@ -115,6 +117,7 @@ def save_model(folder: Path, spec: Stored, module: nn.Module) -> None:
     weights = save({name: value.contiguous() for name, value in module.state_dict().items()})
     content = spec.model_dump(mode="json", by_alias=True)
     content["sha256"] = hashlib.sha256(weights).hexdigest()
+    content[_OWN_SUM] = _description_sum(content)
     # an earlier description would promise other numbers between the two writes
     (folder / _DESCRIPTION).unlink(missing_ok=True)
     with whole(folder / _WEIGHTS) as file:
@@ -165,6 +168,7 @@ def read_spec(folder: Path, kind: type[SpecT]) -> SpecT:
     """
     content = _description(folder)
     content.pop("sha256", None)
+    content.pop(_OWN_SUM, None)
     wanted = kind.model_fields["schema_name"].default
     if content.get("schema") != wanted:
         raise UsageError(
@@ -228,15 +232,20 @@ def _description(folder: Path) -> dict[str, Any]:
         raise UsageError(
             f"{folder}: no model here{nearest(folder.name, model_names(folder.parent))}"
         )
-    try:
-        content = json.loads(card.read_text())
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    content = read_json(card)
+    # descriptions of earlier versions have no sum of their own
+    if content.get(_OWN_SUM, _description_sum(content)) != _description_sum(content):
         raise UsageError(
-            f"{card}: is no JSON ({error}); restore the folder or run the fit again"
-        ) from None
-    if not isinstance(content, dict):
-        raise UsageError(f"{card}: is no description of a model; restore the folder")
+            f"{card}: was edited: its contents do not give the {_OWN_SUM} that it holds; restore"
+            " the folder or run the fit again"
+        )
     return content
+
+
+def _description_sum(content: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of a description, whose form on disk does not matter."""
+    known = {key: value for key, value in content.items() if key != _OWN_SUM}
+    return hashlib.sha256(json.dumps(known, sort_keys=True).encode()).hexdigest()
 
 
 def model_names(folder: Path) -> Sequence[str]:

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from residnet.core.errors import UsageError
+from residnet.core.files import read_json
 from residnet.core.names import STATE
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.learned import chosen_model
@@ -265,10 +266,8 @@ def load(folder: PathGiven, name: str | None = None) -> Model:
 
 
 def _notes(folder: Path) -> dict[str, Any]:
-    import json
-
     file = folder / "fit.json"
-    return dict(json.loads(file.read_text())) if file.is_file() else {}
+    return read_json(file) if file.is_file() else {}
 
 
 def export_model(

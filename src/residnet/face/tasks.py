@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, final
 
 from residnet.core.config import load_config, validate
 from residnet.core.errors import UsageError
+from residnet.core.files import read_table
 from residnet.core.names import nearest
 from residnet.core.progress import ProgressCallback
 from residnet.face.models import Model, load
@@ -74,7 +75,7 @@ class Result:
             name: of the file, as `files` has it.
 
         Raises:
-            UsageError: where there is no such file.
+            UsageError: where there is no such file, or it is no text, JSON or Parquet.
 
         Example:
             result.read("indices.json")["rows"]
@@ -83,11 +84,14 @@ class Result:
         if not file.is_file():
             raise UsageError(f"{self.folder}: no file '{name}'{nearest(str(name), self.files)}")
         if file.suffix == ".parquet":
-            import pandas as pd
-
-            return pd.read_parquet(file)
-        text = file.read_text(encoding="utf-8")
-        return json.loads(text) if file.suffix == ".json" else text
+            return read_table(file)
+        try:
+            text = file.read_text(encoding="utf-8")
+            return json.loads(text) if file.suffix == ".json" else text
+        except (OSError, ValueError, RecursionError) as error:
+            raise UsageError(
+                f"{file}: not readable ({error}); restore it or run it again"
+            ) from error
 
     def model(self, name: str = "selected") -> Model:
         """Return a model of a fit.

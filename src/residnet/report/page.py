@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import base64
-import json
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
 from markupsafe import Markup, escape
 
-from residnet.core.files import whole
+from residnet.core.config import load_mapping
+from residnet.core.files import read_json, whole
 from residnet.report.blocks import Block, Code, Facts, Section
 
 _FACT_TITLES = {"git": "git revision", "python": "Python", "started": "started (UTC)"}
@@ -74,14 +73,13 @@ def write_page(
 def title_and_description(run: Path) -> tuple[str, str]:
     """Return name and description of a run as its `resolved.yaml` gives them."""
     path = run / "resolved.yaml"
-    resolved = yaml.safe_load(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    resolved = load_mapping(path) if path.is_file() else {}
     return str(resolved.get("name") or run.name), str(resolved.get("description") or "")
 
 
 def _record(run: Path) -> Mapping[str, Any]:
     path = run / "provenance.json"
-    record: Mapping[str, Any] = json.loads(path.read_text()) if path.is_file() else {}
-    return record
+    return read_json(path) if path.is_file() else {}
 
 
 def _made_of(run: Path, record: Mapping[str, Any]) -> list[Section]:

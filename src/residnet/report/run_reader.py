@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
+from residnet.core.config import load_mapping
 from residnet.core.errors import DataError, UsageError
+from residnet.core.files import read_table
 from residnet.core.layout import RANGE_VELOCITIES
 from residnet.core.names import CHANNEL_UNITS
 from residnet.report.format import shown_unit
@@ -87,16 +88,16 @@ class RunFiles:
         if not path.is_file():
             return {}
         try:
-            return json.loads(path.read_text())
-        except ValueError as error:
-            raise DataError(f"{path}: not readable as JSON ({error})") from None
+            return json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError, RecursionError) as error:
+            raise DataError(
+                f"{path}: not readable as JSON ({error}); restore the file or run it again"
+            ) from None
 
     def frame(self, name: str) -> Any:
         """Return a parquet file of the folder as a pandas table, None where there is none."""
-        import pandas as pd
-
         path = self.path / name
-        return pd.read_parquet(path) if path.is_file() else None
+        return read_table(path) if path.is_file() else None
 
     @cached_property
     def metrics(self) -> Content:
@@ -126,7 +127,7 @@ class RunFiles:
     def resolved(self) -> Content:
         """The configuration of the run."""
         path = self.path / "resolved.yaml"
-        return (yaml.safe_load(path.read_text()) or {}) if path.is_file() else {}
+        return load_mapping(path) if path.is_file() else {}
 
     @cached_property
     def quality(self) -> Sequence[Content]:
@@ -285,11 +286,9 @@ class RunFiles:
 
     def windows(self, split: str) -> list[StoredWindow]:
         """Return all stored free runs of a split, in the order of the file names."""
-        import pandas as pd
-
         out: list[StoredWindow] = []
         for path in sorted((self.path / "rollouts" / split).glob("*.parquet")):
-            table = pd.read_parquet(path)
+            table = read_table(path)
             for (protocol, number), group in table.groupby(["protocol", "window"], sort=True):
                 parts = {str(model): part for model, part in group.groupby("model", sort=False)}
                 first = next(iter(parts.values()))

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from residnet.core.errors import UsageError
-from residnet.core.files import require_room, whole
+from residnet.core.files import read_json, require_room, whole
+from residnet.runs.checksums import require_sealed
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -118,7 +119,8 @@ class RunFolder:
         """Open the folder of a finished run.
 
         Raises:
-            UsageError: where there is no run, or it is not finished.
+            UsageError: where there is no run, it is not finished, or a result is not as it was
+                written.
         """
         folder = cls(path)
         if not folder.resolved.is_file():
@@ -128,6 +130,7 @@ class RunFolder:
                 f"{path}: the run is not finished (summary.json does not say so); continue it with"
                 f" residnet run CONFIG --out {path} --resume"
             )
+        require_sealed(path)
         return folder
 
     @property
@@ -173,7 +176,11 @@ class RunFolder:
         Raises:
             UsageError: where the file is not readable.
         """
-        return self._read(self.summary)
+        content = read_json(self.summary)
+        sentences = content.get("verdict")
+        if not isinstance(sentences, list) or not all(isinstance(text, str) for text in sentences):
+            raise UsageError(f"{self.summary}: holds no verdict; restore the file or run it again")
+        return content
 
     def read_metrics(self) -> Mapping[str, Any]:
         """Return the contents of metrics.json.
@@ -181,23 +188,12 @@ class RunFolder:
         Raises:
             UsageError: where there is no such file, or it is not readable.
         """
-        return self._read(self.metrics)
+        return read_json(self.metrics)
 
     def fit_notes(self, model: str) -> dict[str, Any]:
         """Return what models/<model>/fit.json tells of a model's fit; empty where there is none."""
         path = self.models / model / "fit.json"
-        return dict(self._read(path)) if path.is_file() else {}
-
-    def _read(self, path: Path) -> Mapping[str, Any]:
-        try:
-            content = json.loads(path.read_text(encoding="utf-8"))
-        except FileNotFoundError:
-            raise UsageError(f"{path}: no such file; is {self.path} a finished run?") from None
-        except (OSError, ValueError) as error:
-            raise UsageError(f"{path}: not readable as JSON ({error})") from None
-        if not isinstance(content, dict):
-            raise UsageError(f"{path}: expected a JSON object, found {type(content).__name__}")
-        return content
+        return read_json(path) if path.is_file() else {}
 
     def _has_results(self) -> bool:
         names = {entry.name for entry in self.path.iterdir()} if self.path.is_dir() else set()

@@ -13,6 +13,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from residnet.core.errors import UsageError
+from residnet.core.files import read_json
 from residnet.core.version import __version__
 
 if TYPE_CHECKING:
@@ -48,6 +50,23 @@ class Provenance:
     seed: int
     files: Sequence[Path]
     started: float
+
+    def require_same_inputs(self, folder: RunFolder) -> None:
+        """Check that no input file has changed since an interrupted run in the folder began.
+
+        Raises:
+            UsageError: where one has.
+        """
+        if not folder.provenance.is_file():
+            return
+        before = read_json(folder.provenance).get("inputs")
+        known = before if isinstance(before, dict) else {}
+        for path in self.files:
+            if known.get(str(path), "") != sha256(path):
+                raise UsageError(
+                    f"{path}: is not the file that the run in {folder.path} began with; bring it"
+                    " back, or begin anew with --overwrite"
+                )
 
     def write(self, folder: RunFolder) -> None:
         """Write provenance.json, with the seconds since the start."""

@@ -18,6 +18,7 @@ from residnet.core.errors import DataError, ExportError, UsageError
 from residnet.report.blocks import Section
 from residnet.report.page import title_and_description, write_page
 from residnet.report.sections.exports import EXPORTS, exports_section
+from residnet.runs.checksums import seal
 from residnet.runs.exports import Exported, Exports, write_exports
 from residnet.runs.folder import RunFolder
 from residnet.runs.provenance import Provenance
@@ -177,6 +178,8 @@ class Task(Config):
         made_from = Provenance(
             source, overrides, self.recorded_seed(), self.input_files(), time.time()
         )
+        if resume:
+            made_from.require_same_inputs(RunFolder(place))
         folder = RunFolder.create(place, resolved, resume=resume, overwrite=overwrite)
         return self.conduct(folder, made_from, self.carry_out, report=report)
 
@@ -215,6 +218,7 @@ class Task(Config):
                     verdict += [f"Not exported: {fault}." for fault in exported.faults]
                     folder.write_summary(self.task, verdict, figures, finished=False)
                     self._write_page(folder, sections)
+        seal(folder.path)
         folder.write_summary(self.task, verdict, figures, finished=True)
         if outcome.failure:
             raise DataError(outcome.failure)

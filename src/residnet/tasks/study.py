@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
@@ -16,6 +15,7 @@ from pydantic import Field, model_validator
 
 from residnet.core.config import ExistingPath, load_config
 from residnet.core.errors import UsageError
+from residnet.core.files import read_json
 from residnet.core.names import nearest
 from residnet.core.progress import report
 from residnet.report.blocks import Section
@@ -216,4 +216,4 @@ def _fit(study: StudyConfig, variant: str, seed: int, out: Path) -> float:
         load_config(study.base, overrides, FitConfig).run(
             source=study.base, overrides=overrides, out=out, resume=True, report=False
         )
-    return float(json.loads(RunFolder(out).provenance.read_text())["seconds"])
+    return float(read_json(RunFolder(out).provenance)["seconds"])

@@ -10,6 +10,7 @@ from residnet.core.errors import UsageError
 from residnet.core.files import require_file_place, require_room
 from residnet.core.names import nearest
 from residnet.core.registry import kinds
+from residnet.runs.checksums import seal
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import Finished, Task
 from residnet.tasks.union import TaskConfig
@@ -23,7 +24,10 @@ def report_run(path: Path) -> Path:
     """
     run = RunFolder.open(path)
     require_room(path)
-    return task_class(run).write_report(run)
+    page = task_class(run).write_report(run)
+    # a study writes its comparison anew with the report
+    seal(path)
+    return page
 
 
 def evaluate_run(path: Path, logs: Sequence[Path], out: Path | None) -> Finished:

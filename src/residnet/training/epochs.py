@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import math
 import warnings
@@ -14,7 +15,7 @@ import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor, nn
 
-from residnet.core.errors import FitError
+from residnet.core.errors import FitError, UsageError
 from residnet.core.files import whole
 from residnet.core.progress import report
 
@@ -78,6 +79,12 @@ class EpochTraining(L.LightningModule, ABC):
     def epoch(self) -> int:
         """Epochs finished; Lightning's own count is one behind while it restores a checkpoint."""
         return len(self.history)
+
+    @property
+    def made_of(self) -> str:
+        """A SHA-256 of settings, seed and tensor shapes, which a checkpoint must share."""
+        shapes = {name: str(list(value.shape)) for name, value in self.state_dict().items()}
+        return hashlib.sha256(f"{self.settings!r} {self.seed} {shapes}".encode()).hexdigest()
 
     @property
     def finished(self) -> bool:
@@ -148,6 +155,7 @@ class EpochTraining(L.LightningModule, ABC):
             "stage": self.settings.stage(self.epoch)[0],
             "random": torch.get_rng_state(),
             "threads": torch.get_num_threads(),
+            "made_of": self.made_of,
         }
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
@@ -236,6 +244,7 @@ def run_epochs(
 
     Raises:
         FitError: where no epoch gave a finite validation.
+        UsageError: where the checkpoint is damaged or belongs to another training.
     """
     logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
     settings: Epochs = module.settings
@@ -250,7 +259,7 @@ def run_epochs(
     checkpoint = last if last is not None and last.is_file() else None
     trainer = _trainer(settings, callbacks, logger)
     if checkpoint is not None:
-        module.restore(torch.load(checkpoint, weights_only=True)["residnet"])
+        module.restore(_kept(checkpoint, module.made_of))
     # killed between the last epoch and the model's file: there is nothing left to train
     if not module.finished:
         _fit(trainer, module, checkpoint)
@@ -268,6 +277,30 @@ def run_epochs(
         "epochs": len(module.history),
         "curve": module.history,
     }
+
+
+def _kept(checkpoint: Path, made_of: str) -> dict[str, Any]:
+    """Return what a checkpoint keeps of a training.
+
+    Raises:
+        UsageError: where it is cut off, edited or of another training.
+    """
+    what_to_do = "delete it to train from the beginning"
+    try:
+        kept: dict[str, Any] = torch.load(checkpoint, weights_only=True)["residnet"]
+        belongs = kept["made_of"] == made_of
+    except Exception as error:  # PyTorch raises whatever it likes
+        first = next(iter(str(error).splitlines()), "")[:200]
+        raise UsageError(
+            f"{checkpoint}: is no checkpoint of this training ({type(error).__name__}: {first});"
+            f" {what_to_do}"
+        ) from error
+    if not belongs:
+        raise UsageError(
+            f"{checkpoint}: belongs to a training with other settings or another network;"
+            f" {what_to_do}"
+        )
+    return kept
 
 
 def _fit(trainer: L.Trainer, module: EpochTraining, checkpoint: Path | None) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,6 +14,7 @@ from residnet.control.heading.stored import load_heading_policy
 from residnet.control.heading.turning import Turning
 from residnet.core.config import load_config
 from residnet.core.errors import ConfigError
+from residnet.core.files import read_json
 from residnet.core.names import nearest
 from residnet.physics.vessel import load_vessel
 from residnet.runs.folder import RunFolder
@@ -75,7 +75,7 @@ def ready(config: CourseSettings, folder: RunFolder) -> AutopilotRun:
     run = RunFolder.open(
         config.autopilot if config.autopilot.is_dir() else folder.path / "autopilot"
     )
-    notes = json.loads((run.path / "controllers.json").read_text())
+    notes = read_json(run.path / "controllers.json")
     steering = Steering(
         SteeredPlant(load_vessel(autopilot.vessel).build()),
         Turning(**notes["turning"]),

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from typing import Literal, final
 
 from residnet.core.config import load_config
+from residnet.core.files import read_json
 from residnet.documents.halvorsen2019.breeding.config import BreedingSettings
 from residnet.report.blocks import Section
 from residnet.runs.folder import RunFolder
@@ -63,4 +63,4 @@ class BreedingTaskConfig(BreedingSettings):
         from residnet.documents.halvorsen2019.breeding.report import sections
 
         config = load_config(run.resolved, [], cls)
-        return sections(config, json.loads((run.path / FILE).read_text())["rows"], run.path)
+        return sections(config, read_json(run.path / FILE)["rows"], run.path)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from typing import Literal, final
 
 from residnet.core.config import load_config
+from residnet.core.files import read_json
 from residnet.documents.halvorsen2019.sea_trial.config import SeaTrialSettings
 from residnet.report.blocks import Section
 from residnet.runs.folder import RunFolder
@@ -48,4 +48,4 @@ class SeaTrialTaskConfig(SeaTrialSettings):
         from residnet.documents.halvorsen2019.sea_trial.results import FILE
 
         config = load_config(run.resolved, [], cls)
-        return sections(config, json.loads((run.path / FILE).read_text()), run.path)
+        return sections(config, read_json(run.path / FILE), run.path)

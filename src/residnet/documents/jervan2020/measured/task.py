@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, final
 
 from residnet.core.config import load_config
+from residnet.core.files import read_json
 from residnet.documents.jervan2020.measured.config import ForceSettings
 from residnet.report.blocks import Section
 from residnet.runs.folder import RunFolder
@@ -57,4 +57,4 @@ class ForceResidualConfig(ForceSettings):
         from residnet.documents.jervan2020.measured.results import FILE
 
         config = load_config(run.resolved, [], cls)
-        return sections(config, json.loads((run.path / FILE).read_text()), run.path)
+        return sections(config, read_json(run.path / FILE), run.path)
