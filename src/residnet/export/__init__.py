@@ -7,6 +7,7 @@ from residnet.export.base import Exporter
 from residnet.export.c.exporter import CExporter
 from residnet.export.casadi_function import CasadiExporter
 from residnet.export.feed_forward import FeedForwardExporter
+from residnet.export.fmu.exporter import Fmu2Exporter, Fmu3Exporter
 from residnet.export.onnx_file import OnnxExporter
 from residnet.export.torchscript import TorchScriptExporter
 
@@ -17,6 +18,8 @@ _BUILTIN: tuple[Exporter, ...] = (
     CExporter(),
     OnnxExporter(),
     CasadiExporter(),
+    Fmu3Exporter(),
+    Fmu2Exporter(),
     FeedForwardExporter(),
 )
 

@@ -141,7 +141,7 @@ def _write(spec: ModelSpec, model: HybridDynamics, file: Path) -> None:
         ExportError: where torch cannot express the model in ONNX.
     """
     kept = slice(None) if model.n_state else slice(0, 2)
-    sizes = (len(STATE), len(spec.signals.columns), model.n_state)[kept]
+    sizes = [len(STATE), len(spec.signals.columns), model.n_state][kept]
     step = Step(model, spec) if model.n_state else StepWithoutMemory(model, spec)
     results = [name for name in _OUTPUTS if model.n_state or name != "s_after"]
     rows = {0: torch.export.Dim("rows", min=1)}

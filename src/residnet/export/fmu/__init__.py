@@ -1,0 +1,1 @@
+"""The formats `fmu` and `fmu2`: co-simulation units of FMI 3.0 and 2.0 around the exported C."""
