@@ -102,7 +102,7 @@ def test_no_part_of_a_plan_is_tighter_than_the_vessel_turns_and_buoys_stay_outsi
     assert np.abs(np.diff(heading)).max() <= 1.03 * planned.course.step / steady.radius
     for buoy in planned.buoys:
         assert np.hypot(inside[:, 0] - buoy.north, inside[:, 1] - buoy.east).min() >= steady.radius
-    assert planned.floor <= planned.course.length <= 1.06 * planned.floor
+    assert planned.course.length <= 1.06 * planned.reference
 
 
 def test_a_given_heading_lengthens_the_shortest_course_past_sides(vessel: SteeredPlant) -> None:
@@ -118,10 +118,10 @@ def test_a_given_heading_lengthens_the_shortest_course_past_sides(vessel: Steere
         )
         for heading in (along, along + math.pi)
     )
-    assert onward.floor == pytest.approx(free.floor, rel=2e-3)
+    assert onward.reference == pytest.approx(free.reference, rel=2e-3)
     assert onward.course.length == pytest.approx(free.course.length, rel=0.02)
-    assert away.floor > free.floor + math.pi * steady.radius
-    assert away.floor < away.course.length < 1.15 * away.floor
+    assert away.reference > free.reference + math.pi * steady.radius
+    assert free.course.length + steady.radius < away.course.length < 1.15 * away.reference
 
 
 def test_circles_of_acceptance_are_entered(vessel: SteeredPlant) -> None:
@@ -133,7 +133,7 @@ def test_circles_of_acceptance_are_entered(vessel: SteeredPlant) -> None:
     inside = planned.course.track[: int(planned.course.length / planned.course.step) + 2]
     for buoy in BUOYS:
         assert np.hypot(inside[:, 0] - buoy.north, inside[:, 1] - buoy.east).min() <= 3.4
-    assert planned.course.length <= 1.06 * planned.floor
+    assert planned.course.length <= 1.06 * planned.reference
 
 
 def test_buoys_too_close_for_the_vessel_are_refused(vessel: SteeredPlant) -> None:

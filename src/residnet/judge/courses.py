@@ -1,6 +1,6 @@
 """Measures of flights along courses: time, cross-track error, and how buoys were passed.
 
-Times are compared with the shortest possible.
+Times are compared with a reference of arcs and straight lines.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from residnet.control.courses.config import PlannedCourse
+from residnet.control.courses.course_check import Asked, passages
 
 Array = NDArray[np.float64]
 
@@ -60,54 +61,17 @@ def passes(
 ) -> list[Pass]:
     """Return how each buoy at (north, east) was passed, one after the other.
 
+    The moments follow each other, and the sum of the distances then is least.
+
     Args:
         places: of the buoys.
         within: radii in m; a vessel that starts in a circle first leaves it.
     """
-    found: list[Pass] = []
-    begin = 0
-    for i, ((north, east), radius) in enumerate(zip(places, within, strict=True)):
-        away = np.array([north, east]) - flight.track
-        distance = np.hypot(*away.T)
-        outside = np.flatnonzero(distance > radius)
-        left = int(outside[0]) if len(outside) else len(distance) - 1
-        begin = min(max(begin, left), len(distance) - 1)
-        # its turn lasts until the next buoy is nearer
-        following = (
-            np.hypot(*(np.array(places[i + 1]) - flight.track).T)
-            if i + 1 < len(places)
-            else np.full(len(distance), np.inf)
-        )
-        reached = (
-            np.flatnonzero(distance[begin:] <= distance[begin:].min() + 1e-9)[0]
-            if i + 1 == len(places)
-            else _first_dip(distance, following, begin)
-        )
-        near = begin + int(reached)
-        step = flight.track[min(near + 1, len(distance) - 1)] - flight.track[max(near - 1, 0)]
-        starboard = step[0] * away[near, 1] - step[1] * away[near, 0] > 0
-        found.append(
-            Pass(
-                float(distance[left:].min()), "starboard" if starboard else "port", near * flight.dt
-            )
-        )
-        begin = near
-    return found
-
-
-def _first_dip(distance: Array, following: Array, begin: int) -> int:
-    """Where the distance is smallest before the next buoy is nearer for good; samples from `begin`
-    on.
-    """
-    here, there = distance[begin:], following[begin:]
-    nearer = np.flatnonzero(here < there)
-    if len(nearer) == 0:
-        return int(here.argmin())
-    # one stay on this side of the middle line
-    first = int(nearer[0])
-    gone = np.flatnonzero(here[first:] >= there[first:])
-    last = first + int(gone[0]) if len(gone) else len(here)
-    return first + int(here[first:last].argmin())
+    asked = [Asked(*place, radius, "") for place, radius in zip(places, within, strict=True)]
+    return [
+        Pass(passage.least, passage.side, passage.at * flight.dt)
+        for passage in passages(flight.track, asked)
+    ]
 
 
 def row(
@@ -121,9 +85,10 @@ def row(
 ) -> dict[str, Any]:
     """Return a row of metrics.json.
 
-    `ratio` is course time over the floor's length at the service speed; `ratio_turning` takes the
-    speed that the vessel keeps in its smallest turn, for vessels that slow down. `margin` is how
-    far inside the circle that was entered least, or outside the one that was passed most closely.
+    `ratio` is course time over the reference's length at the service speed; `ratio_turning` takes
+    the speed that the vessel keeps in its smallest turn, for vessels that slow down. `margin` is
+    how far inside the circle that was entered least, or outside the one that was passed most
+    closely.
     """
     places = [(buoy.north, buoy.east) for buoy in planned.buoys]
     radii = [acceptance if planned.protocol == "enter" else buoy.radius for buoy in planned.buoys]
@@ -139,9 +104,9 @@ def row(
     out |= {
         "finished": flight.finished,
         "course_time": time,
-        "floor_time": planned.floor / speed,
-        "ratio": time * speed / planned.floor,
-        "ratio_turning": time * planned.steady.speed / planned.floor,
+        "reference_time": planned.reference / speed,
+        "ratio": time * speed / planned.reference,
+        "ratio_turning": time * planned.steady.speed / planned.reference,
         "cross_track_rms": float(np.sqrt(np.mean(flight.cross_track**2))),
         "cross_track_max": float(np.abs(flight.cross_track).max()),
         "travel": float(abs(flight.rudder[0]) + np.abs(np.diff(flight.rudder)).sum()),
@@ -186,7 +151,9 @@ def spread_row(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     time until then.
     """
     ratio, margin = (np.array([row[name] for row in rows]) for name in ("ratio", "margin"))
-    out = {name: rows[0][name] for name in ("model", "kind", "guidance", "protocol", "floor_time")}
+    out = {
+        name: rows[0][name] for name in ("model", "kind", "guidance", "protocol", "reference_time")
+    }
     return out | {
         "split": "spread",
         "n": len(rows),

@@ -5,6 +5,7 @@ Source: document 004 sections 6.1.4.2, 6.2.4.2.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
@@ -79,13 +80,11 @@ def widened(buoys: Sequence[BuoyConfig], smallest: float) -> list[BuoyConfig]:
     return [buoy.model_copy(update={"radius": max(buoy.radius, smallest)}) for buoy in buoys]
 
 
-def course_round(start: tuple[float, float], buoys: Sequence[BuoyConfig]) -> list[Piece]:
-    """Return the taut course from a point past the buoys in their order, to the last one's circle.
+def taut_course(start: tuple[float, float], buoys: Sequence[BuoyConfig]) -> list[Piece]:
+    """Return the taut course from a point round the buoys in their order, to the last one's circle.
 
-    It consists of tangents and arcs in turn.
-
-    A buoy that the course turns away from is left on its side at a distance: the course is drawn
-    without it.
+    It consists of tangents and arcs in turn, as a rope would lie that is laid round every buoy on
+    its side.
 
     Raises:
         ConfigError: where the start lies in the first circle, or circles overlap so that no tangent
@@ -93,33 +92,20 @@ def course_round(start: tuple[float, float], buoys: Sequence[BuoyConfig]) -> lis
     """
     if not buoys:
         raise ConfigError("a course needs at least one buoy")
-    remaining = list(enumerate(buoys, start=1))
-    while True:
-        pieces = _tangents(start, remaining)
-        arcs = [piece.length / piece.radius for piece in pieces if piece.turn != 0]
-        turned_from = [
-            i
-            for i, arc in enumerate(arcs)
-            if arc > math.pi and not _bends_round(start, remaining, i)
-        ]
-        if not turned_from:
-            return pieces
-        del remaining[max(turned_from, key=lambda i: arcs[i])]
+    return _tangents(start, list(enumerate(buoys, start=1)))
 
 
-def _bends_round(
-    start: tuple[float, float], buoys: Sequence[tuple[int, BuoyConfig]], place: int
-) -> bool:
-    """Return whether the line over a buoy bends towards the side that the buoy is left on.
+def overlapping(buoys: Sequence[BuoyConfig]) -> list[tuple[int, int]]:
+    """Return the numbers of following buoys that no course passes between, though it has to.
 
-    The line runs from the point before the buoy over it to the next one.
+    Their circles overlap, and they are left to different sides.
     """
-    buoy, after = buoys[place][1], buoys[place + 1][1]
-    north, east = start if place == 0 else (buoys[place - 1][1].north, buoys[place - 1][1].east)
-    bend = (buoy.north - north) * (after.east - buoy.east) - (buoy.east - east) * (
-        after.north - buoy.north
-    )
-    return (bend > 0) == (buoy.leave_to == "starboard")
+    return [
+        (number, number + 1)
+        for number, (one, two) in enumerate(itertools.pairwise(buoys), start=1)
+        if one.leave_to != two.leave_to
+        and math.hypot(two.north - one.north, two.east - one.east) < one.radius + two.radius
+    ]
 
 
 def _tangents(start: tuple[float, float], buoys: Sequence[tuple[int, BuoyConfig]]) -> list[Piece]:

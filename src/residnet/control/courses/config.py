@@ -2,27 +2,32 @@
 
 from __future__ import annotations
 
-import itertools
 import math
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pydantic import Field
 
-from residnet.control.courses.buoys import BuoyConfig, course_round, feasibility, widened
-from residnet.control.courses.course_plan import Course, plan
-from residnet.control.courses.course_search import Mark
-from residnet.control.courses.dubins import dubins_length, shortest_course
+from residnet.control.courses.buoys import (
+    BuoyConfig,
+    feasibility,
+    overlapping,
+    taut_course,
+    widened,
+)
+from residnet.control.courses.course_check import Asked, Protocol
+from residnet.control.courses.course_plan import Course, CourseRequest, plan
+from residnet.control.courses.dubins import dubins_length
+from residnet.control.courses.outline import Circle
+from residnet.control.courses.turn_table import Turns, arcs, simulated_turns
 from residnet.control.courses.turns import SteadyTurn, TurnMaker, steady_turn
 from residnet.control.heading.steering import SteeredVessel
 from residnet.control.heading.turning import Turning
-from residnet.core.config import Config, Metres, Radians, Seconds
+from residnet.core.config import Config, Metres, MetresPerSecond, Radians, Seconds
+from residnet.core.errors import ConfigError
 
-Protocol = Literal["enter", "sides"]
-"""Buoys are entered: a circle of acceptance about each; or each is passed on its side, outside its
-own circle.
-"""
+_STEP = math.log(1.12)
+"""Between the radii of the turns that a plan uses, logarithmic."""
 
 
 class BuoyCourseConfig(Config):
@@ -36,6 +41,8 @@ class BuoyCourseConfig(Config):
         share: of the rudder's limit that turns are planned with; the rest is left to keep to them.
         reach: share of the circle of acceptance that the plan reaches into from its edge, at least.
         margin: that the plan keeps from the buoys' circles, as a share of their radius.
+        current: strongest that the plan leaves room for; the vessel is displaced by it until the
+            guidance has corrected.
         lookahead: of the line-of-sight guidance.
         planning_dt: step of the simulated turns.
         turning_time: until a held rudder's turn is steady.
@@ -48,6 +55,7 @@ class BuoyCourseConfig(Config):
     share: float = Field(default=0.9, gt=0, lt=1)
     reach: float = Field(default=0.1, ge=0, lt=1)
     margin: float = Field(default=0.01, ge=0, lt=1)
+    current: MetresPerSecond = Field(default=0.0, ge=0)
     lookahead: Metres = Field(gt=0)
     planning_dt: Seconds = Field(default=0.05, gt=0)
     turning_time: Seconds = Field(default=100.0, gt=0)
@@ -62,15 +70,16 @@ class PlannedCourse:
         course: the plan.
         buoys: with radii that the vessel can follow.
         steady: the vessel's smallest turn.
-        floor: length in m of the shortest course of bounded curvature at that radius that fulfils
-            the protocol.
+        reference: length in m that times are compared with, for turns of that radius that begin at
+            once: of the taut course round all buoys where they are passed on their sides, which
+            need not be the shortest, and of the shortest course found where they are entered.
     """
 
     protocol: Protocol
     course: Course
     buoys: tuple[BuoyConfig, ...]
     steady: SteadyTurn
-    floor: float
+    reference: float
 
 
 def smallest_turn(config: BuoyCourseConfig, vessel: SteeredVessel, limit: float) -> SteadyTurn:
@@ -101,109 +110,112 @@ def plan_course(
     limit: float,
     steady: SteadyTurn,
 ) -> PlannedCourse:
-    """Return the shortest course that the nominal vessel can follow with a share of its rudder.
+    """Return the quickest course found that the nominal vessel can follow, with rudder in reserve.
 
     Raises:
-        ConfigError: where there is none.
+        ConfigError: where none is found.
     """
     buoys = tuple(widened(config.buoys, steady.radius))
-    hardest = config.share * limit
-    marks = (
-        _to_enter(config, hardest)
-        if protocol == "enter"
-        else _to_pass(config, buoys, hardest, steady.radius)
-    )
-    make = TurnMaker(vessel, turning, config.planning_dt)
-    course = plan(
-        config.start,
-        config.heading,
-        marks[:-1],
-        marks[-1],
-        make,
-        steady,
-        0.1 * turning.speed,
-        5.0 * config.lookahead,
-    )
-    return PlannedCourse(protocol, course, buoys, steady, _floor(config, protocol, buoys, steady))
-
-
-def _to_enter(config: BuoyCourseConfig, rudder: float) -> list[Mark]:
-    """Return the marks where the line from way-point to way-point bends.
-
-    One that the line enters anyway needs none.
-    """
-    depth = -(1.0 - config.reach) * config.acceptance
-    places = [config.start, *((buoy.north, buoy.east) for buoy in config.buoys)]
-    numbers = list(range(1, len(places)))
-    marks: list[Mark] = []
-    before = places[0]
-    for number, after in itertools.pairwise(numbers):
-        place, target = places[number], places[after]
-        along, across = (
-            (target[0] - before[0], target[1] - before[1]),
-            (
-                place[0] - before[0],
-                place[1] - before[1],
-            ),
+    step = 0.1 * turning.speed
+    if protocol == "sides" and (pairs := overlapping(buoys)):
+        one, two = pairs[0]
+        raise ConfigError(
+            f"buoys {one} and {two}: their circles overlap, and the course has to pass between"
+            " them; move one, or give them smaller circles"
         )
-        offset = along[0] * across[1] - along[1] * across[0]
-        inside = 0 <= along[0] * across[0] + along[1] * across[1] <= along[0] ** 2 + along[1] ** 2
-        if inside and abs(offset) <= -depth * math.hypot(*along):
-            continue
-        marks.append(Mark(number, *place, -1 if offset > 0 else 1, depth, rudder))
-        before = place
-    return [*marks, Mark(numbers[-1], *places[-1], 1, depth, rudder)]
-
-
-def _to_pass(
-    config: BuoyCourseConfig, buoys: tuple[BuoyConfig, ...], rudder: float, smallest: float
-) -> list[Mark]:
-    """Return the marks where the taut course bends round a circle."""
-    arcs = [piece for piece in course_round(config.start, buoys) if piece.turn != 0]
-    marks = []
-    for number, buoy in enumerate(buoys, start=1):
-        sign = 1 if buoy.leave_to == "starboard" else -1
-        # the centre of an arc is its buoy
-        centres = [
-            (
-                arc.north - arc.turn * arc.radius * math.sin(arc.heading),
-                arc.east + arc.turn * arc.radius * math.cos(arc.heading),
-            )
-            for arc in arcs
-        ]
-        if number == len(buoys) or any(
-            math.hypot(n - buoy.north, e - buoy.east) < 1e-6 * buoy.radius + 1e-9
-            for n, e in centres
-        ):
-            # a wide circle needs less rudder
-            needed = rudder * min(1.0, smallest / buoy.radius)
-            marks.append(
-                Mark(
-                    number, buoy.north, buoy.east, sign, (1.0 + config.margin) * buoy.radius, needed
-                )
-            )
-    return marks
-
-
-def _floor(
-    config: BuoyCourseConfig, protocol: Protocol, buoys: tuple[BuoyConfig, ...], steady: SteadyTurn
-) -> float:
-    if protocol == "sides":
-        line, *rest = course_round(config.start, buoys)
-        onto = line.length
-        if config.heading is not None:
-            end = (
-                line.north + line.length * math.cos(line.heading),
-                line.east + line.length * math.sin(line.heading),
-                line.heading,
-            )
-            onto = float(
-                dubins_length(
-                    np.array([*config.start, config.heading]), np.array(end), steady.radius
-                )
-            )
-        return onto + sum(piece.length for piece in rest)
-    points = [(buoy.north, buoy.east) for buoy in config.buoys]
-    return shortest_course(
-        (*config.start, config.heading), points, config.acceptance, steady.radius
+    current = config.current / turning.speed
+    share = config.share * (1.0 - current)
+    aside = config.current * (turning.time + config.lookahead / turning.speed)
+    margin = config.reach if protocol == "enter" else config.margin
+    circles, radii = _request(config, protocol, buoys, steady.radius / share, margin, aside)
+    rudder = limit * steady.radius / radii
+    # what a turn takes is seen from the yaw rate that it reaches, which K overstates in hard turns
+    reached = replace(turning, gain=steady.yaw_rate / limit)
+    make = TurnMaker(vessel, reached, config.planning_dt)
+    turns = simulated_turns(make, rudder, steady.radius)
+    course = plan(
+        _asked(config, protocol, buoys, circles, turns), step, 5.0 * config.lookahead, make
     )
+    reference = _reference(config, protocol, buoys, steady, turning.speed)
+    return PlannedCourse(protocol, course, buoys, steady, reference)
+
+
+def _reference(
+    config: BuoyCourseConfig,
+    protocol: Protocol,
+    buoys: tuple[BuoyConfig, ...],
+    steady: SteadyTurn,
+    speed: float,
+) -> float:
+    """Return the length in m that plans and flights are compared with."""
+    if protocol == "enter":
+        circles, radii = _request(config, protocol, buoys, steady.radius, 0.0, 0.0)
+        asked = _asked(config, protocol, buoys, circles, arcs(radii, speed))
+        return plan(asked, 0.1 * speed, 0.1 * speed).length
+    try:
+        line, *rest = taut_course(config.start, buoys)
+    except ConfigError:
+        places = np.array([config.start, *((buoy.north, buoy.east) for buoy in buoys)])
+        return float(np.hypot(*np.diff(places, axis=0).T).sum())
+    onto = line.length
+    if config.heading is not None:
+        end = (
+            line.north + line.length * math.cos(line.heading),
+            line.east + line.length * math.sin(line.heading),
+            line.heading,
+        )
+        onto = float(
+            dubins_length(np.array([*config.start, config.heading]), np.array(end), steady.radius)
+        )
+    return onto + sum(piece.length for piece in rest)
+
+
+def _asked(
+    config: BuoyCourseConfig,
+    protocol: Protocol,
+    buoys: tuple[BuoyConfig, ...],
+    circles: tuple[Circle, ...],
+    turns: Turns,
+) -> CourseRequest:
+    asked = tuple(
+        Asked(
+            buoy.north,
+            buoy.east,
+            config.acceptance if protocol == "enter" else buoy.radius,
+            buoy.leave_to,
+        )
+        for buoy in buoys
+    )
+    return CourseRequest(config.start, config.heading, circles, asked, protocol, turns)
+
+
+def _request(
+    config: BuoyCourseConfig,
+    protocol: Protocol,
+    buoys: tuple[BuoyConfig, ...],
+    tightest: float,
+    margin: float,
+    aside: float,
+) -> tuple[tuple[Circle, ...], np.ndarray]:
+    """Return the circles that a plan keeps to, and the radii in m of the turns that it uses.
+
+    A wide circle is rounded with less rudder.
+    """
+    if protocol == "enter":
+        depth = max((1.0 - margin) * config.acceptance - aside, 0.05 * config.acceptance)
+        return tuple(
+            Circle(complex(buoy.north, buoy.east), depth, 0, 0) for buoy in buoys
+        ), np.array([tightest])
+    radii = [(1.0 + margin) * buoy.radius + aside for buoy in buoys]
+    # a few rudder angles do for circles of many sizes
+    steps = [max(math.floor(math.log(radius / tightest) / _STEP), 0) for radius in radii]
+    wide = sorted({0, *steps})
+    return tuple(
+        Circle(
+            complex(buoy.north, buoy.east),
+            radius,
+            1 if buoy.leave_to == "starboard" else -1,
+            wide.index(step),
+        )
+        for buoy, radius, step in zip(buoys, radii, steps, strict=True)
+    ), tightest * np.exp(_STEP * np.array(wide))

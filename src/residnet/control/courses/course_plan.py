@@ -1,11 +1,11 @@
 """Courses that a vessel can follow: its own turns and the straight legs between.
 
-They are timed so that they keep out of circles or reach into them.
+They keep out of circles on given sides or reach into them, in the order given, and are checked.
 
 A course of arcs and tangents needs a yaw rate that jumps. A vessel with a yaw time constant T
 runs U T past the point where such an arc begins; here every turn is one that the vessel makes
-(`turns.TurnMaker`) from the motion that the turn before it left, and how long the rudder is held
-and legs last is left to find.
+(`turn_table.TurnTable`). An outline is found first (`outline.Outlines`), then how long the rudder
+is held and how long legs are (`fitting.Fit`).
 """
 
 from __future__ import annotations
@@ -15,34 +15,37 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from residnet.control.courses.course_search import (
-    CourseRequest,
-    Family,
-    Mark,
-    Problem,
-    quickest,
-    rotated,
+from residnet.control.courses.course_check import Asked, Protocol, first_fault
+from residnet.control.courses.fitting import Fit, Fitted
+from residnet.control.courses.outline import Circle, Outlines
+from residnet.control.courses.route import LEG, Bend, Route, Sketch
+from residnet.control.courses.turn_table import (
+    POINTS,
+    Array,
+    Turns,
+    following_turns,
+    state_behind,
 )
-from residnet.control.courses.turns import Array, SteadyTurn, Turn, TurnMaker
-from residnet.control.heading.turning import Turning
+from residnet.control.courses.turns import TurnMaker
+from residnet.control.courses.words import Room
 from residnet.core.errors import ConfigError
+from residnet.core.progress import report
 
-_GUESSES = ((1.05, 0.2), (1.15, 0.3), (0.0, 1.0), (0.5, 0.5))
-"""What the search begins from: circles as a multiple, and turning radii by which legs are
-shortened.
+_TRIES = ((1.0, 1.0, 1), (0.5, 1.0, 1), (0.0, 1.0, 1))
+_MORE = ((1.0, 1.5, 2), (1.0, 1.0, 2), (0.0, 1.0, 2), (0.5, 2.0, 2), (1.0, 3.0, 2))
+"""What outlines are looked for with: share of the room before and behind turns, multiple of their
+radius, and how many distances buoys may be passed at.
 """
-_WIDE = np.radians(np.array([0, *range(10, 341, 10)], dtype=float))
-_NARROW = np.radians([8.0, 4.0, 2.0, 2.0, 1.0, 1.0, 1.0, 1.0])
-"""Turned angles between the turns that are tried, round for round."""
-_FAR = 0.1
-"""Turning radii by which a mark may be missed before turns are made from the motion that they begin
-with.
-"""
-_TOLERANCE = 1e-3
-"""Of clearances, as a share of the vessel's turning radius."""
-_SETTLED = 3e-4
-"""Share of the course's time by which a round may still change it."""
+_RINGS = (0.0, 0.25)
+_TOLERANCE = 2e-3
+"""Of distances, as a share of the vessel's turning radius."""
+_NARROW = (0.1, 0.04, 0.02)
+"""Turned angles in rad between the turns that are made anew, round for round."""
+_SMALL = math.radians(1.5)
+_SHORT = 0.3
+"""Turning radii of a leg between two turns to one side that are tried as one."""
 
 
 @dataclass(frozen=True)
@@ -67,263 +70,236 @@ class Course:
     length: float
 
 
-def plan(
-    start: tuple[float, float],
-    heading: float | None,
-    marks: Sequence[Mark],
-    goal: Mark,
-    make: TurnMaker,
-    steady: SteadyTurn,
-    step: float,
-    beyond: float,
-) -> Course:
-    """Return the quickest course of turns and legs from a start past the marks to the goal.
+@dataclass(frozen=True)
+class CourseRequest:
+    """What a course is planned for.
 
-    Args:
+    Attributes:
         start: (north, east) in m.
         heading: at the start in rad; None to start on the first leg.
-        marks: in their order.
-        goal: passed at its clearance on the inner side of its turn, and the course ends abeam of
-            it; with a clearance <= 0 the course ends at that distance from it.
-        make: turns.
-        steady: the vessel's smallest turn.
+        circles: of the buoys in their order, as the plan keeps to them.
+        buoys: what the finished course has to do at each, without margins.
+        protocol: see there.
+        turns: that the vessel makes.
+    """
+
+    start: tuple[float, float]
+    heading: float | None
+    circles: tuple[Circle, ...]
+    buoys: tuple[Asked, ...]
+    protocol: Protocol
+    turns: Turns
+
+
+def plan(
+    request: CourseRequest, step: float, beyond: float, make: TurnMaker | None = None
+) -> Course:
+    """Return the quickest course found that passes the check.
+
+    It ends abeam of the last buoy, or in its circle where that is entered.
+
+    Args:
+        request: see there.
         step: between the points of the course in m.
         beyond: how far the points go on behind the end, in m.
+        make: makes each turn of the course found anew, from the motion that the one before it
+            leaves; None where turns leave none.
 
     Raises:
-        ConfigError: where marks lie too close together for the vessel's turns.
+        ConfigError: where none is found.
     """
-    request = CourseRequest(
-        np.array(start), heading, tuple(marks), goal, steady.radius, make.turning.speed
+    reasons: list[tuple[float, str]] = []
+    known: set[tuple[object, ...]] = set()
+    for number, tries in enumerate((_TRIES, *((one,) for one in _MORE))):
+        report("planning", number, 1 + len(_MORE))
+        found = []
+        for room, wide, rings in tries:
+            sketch = _outline(request, room, wide, _RINGS[:rings])
+            for outline in () if sketch is None else _simplified(request, sketch):
+                if (shape := _shape(outline)) in known:
+                    continue
+                known.add(shape)
+                fitted = _fitted(request, outline)
+                found += [one for one in fitted if _right(request, *one, step, reasons)]
+                if found:
+                    break
+        for fit, fitted in sorted(found, key=lambda one: one[1].time):
+            if make is not None:
+                fit, fitted = _joined(request, fit, fitted, make)
+            if _right(request, fit, fitted, step, reasons):
+                return _sampled(fit.route, fitted.z, step, beyond)
+    raise ConfigError(_refusal(request, reasons))
+
+
+def _simplified(request: CourseRequest, sketch: Sketch) -> list[Sketch]:
+    """Return an outline with turns joined that can be, and as it is."""
+    short = _SHORT * request.turns.radius
+    return [sketch.simplified(short, _SMALL), sketch.simplified(0.0, 1e-3)]
+
+
+def _right(
+    request: CourseRequest,
+    fit: Fit,
+    fitted: Fitted,
+    step: float,
+    reasons: list[tuple[float, str]],
+) -> bool:
+    """Return whether a course passes the check; where it does not, the reason is added."""
+    if fitted.missed > _TOLERANCE * request.turns.radius:
+        reasons.append((fitted.missed, f"buoy {fitted.worst + 1}"))
+        return False
+    course = _sampled(fit.route, fitted.z, step, step)
+    track = course.track[: math.floor(course.length / step) + 1]
+    wrong = first_fault(track, request.buoys, request.protocol, 0.5 * step)
+    if wrong is not None:
+        reasons.append((0.0, wrong))
+    return wrong is None
+
+
+def _refusal(request: CourseRequest, reasons: Sequence[tuple[float, str]]) -> str:
+    advice = "move it, give it a smaller circle, or allow more rudder"
+    if not reasons:
+        return (
+            f"no course found past the {len(request.circles)} buoys: circles leave no way between"
+            f" them; {advice}"
+        )
+    missed, what = min(reasons)
+    if missed > 0:
+        what += (
+            f": the best course found with this vessel's turns misses its circle by {missed:.3g} m"
+        )
+    return f"no course found: {what}; {advice}"
+
+
+def _shape(sketch: Sketch) -> tuple[object, ...]:
+    """Return what makes two outlines lead to the same course."""
+    return (
+        *(
+            (bend.side, bend.table, bend.passed, round(bend.angle / (2.0 * math.pi)))
+            for bend in sketch.bends
+        ),
+        sketch.passed,
     )
-    search = _Search(request, make)
-    z, turns = search.converge(
-        *search.begin([_guess(request, make.turning, wide, short) for wide, short in _GUESSES])
-    )
-    missed = search.fixed(turns).missed(z)
-    if float(missed.max()) > _TOLERANCE:
-        worst = (*marks, goal)[min(int(missed.argmax()), len(marks))].number
-        raise ConfigError(
-            f"no course found that passes mark {worst} at its clearance with this vessel's turns;"
-            " move it, or allow more rudder"
+
+
+def _outline(
+    request: CourseRequest, share: float, wide: float, rings: Sequence[float]
+) -> Sketch | None:
+    """Return the shortest outline for turns that need a share of their room."""
+
+    def room(number: int) -> Room:
+        radius, before, behind = request.turns.tables[number].fitted
+        return Room(wide * radius, share * before, share * behind)
+
+    return Outlines(
+        complex(*request.start),
+        request.heading,
+        request.circles,
+        room(0),
+        [room(circle.table) for circle in request.circles],
+        request.turns.radius,
+        rings,
+    ).find()
+
+
+def _fitted(request: CourseRequest, sketch: Sketch) -> list[tuple[Fit, Fitted]]:
+    """Return the fitted route of an outline, and the one of what is left of it when simplified."""
+    found: list[tuple[Fit, Fitted]] = []
+    radius = request.turns.radius
+    for attempt in range(3):
+        route = Route(
+            complex(*request.start),
+            tuple(bend.side for bend in sketch.bends),
+            tuple(bend.table for bend in sketch.bends),
+            request.turns,
         )
-    return _joined(request, z, turns, make.turning.speed, step, beyond)
-
-
-class _Search:
-    """Rounds of search among turns that are made ever closer to the ones chosen.
-
-    Each turn starts from the motion that the one before it leaves.
-    """
-
-    def __init__(self, request: CourseRequest, make: TurnMaker) -> None:
-        self.request, self.make = request, make
-        points = np.array(
-            [request.start, *[(mark.north, mark.east) for mark in (*request.marks, request.goal)]]
-        )
-        # no leg takes longer
-        self.leg = 1.2 * float(np.hypot(*np.diff(points, axis=0).T).max()) / make.turning.speed
-
-    def problem(self, holds: Array, rudder: Array, begin: Sequence[Array]) -> Problem:
-        """Return the problem of turns made with holds [n, K] in s from the given motions."""
-        turns = self.make(holds, rudder, begin, self.leg) if len(holds) else []
-        return Problem(
-            self.request,
-            [Family(group, self.request.unit) for group in turns],
-            self.make.turning.speed,
-        )
-
-    def fixed(self, turns: Sequence[Turn]) -> Problem:
-        """Return the problem of given turns, whose holds do not change."""
-        return Problem(
-            self.request,
-            [Family([turn], self.request.unit) for turn in turns],
-            self.make.turning.speed,
-        )
-
-    def begin(self, guesses: Sequence[tuple[Array, Array]]) -> tuple[Array, Array]:
-        """Return the times and rudder angles of the best course of turns from straight ahead.
-
-        It is searched for from each guess, and mark by mark where none of these passes all marks.
-        """
-        problems: dict[bytes, Problem] = {}
-        tries = []
-        for z, rudder in guesses:
-            if rudder.tobytes() not in problems:
-                holds = np.array([_holds(_WIDE, abs(angle), self.make.turning) for angle in rudder])
-                problems[rudder.tobytes()] = self.problem(
-                    holds, rudder, [self.make.straight] * len(rudder)
-                )
-            problem = problems[rudder.tobytes()]
-            z = quickest(problem, z, math.inf)
-            tries.append((problem.cost(z), z, rudder))
-        _, z, rudder = min(tries, key=lambda attempt: attempt[0])
-        problem = problems[rudder.tobytes()]
-        if float(problem.missed(z).max()) > _FAR:
-            z = min((z, self._mark_by_mark(problem, guesses[0][0], rudder)), key=problem.cost)
-        return z, rudder
-
-    def _mark_by_mark(self, whole: Problem, guess: Array, rudder: Array) -> Array:
-        """Return the times of a course that is searched for to one mark after the other."""
-        request, first = self.request, self.request.first
-        marks = (*request.marks, request.goal)
-        z = guess[: 2 + 2 * first]
-        for k, (mark, after) in enumerate(zip(marks, (*marks[1:], None), strict=True)):
-            problem = Problem(
-                replace(request, marks=marks[:k], goal=mark),
-                whole.families[: first + k],
-                whole.straight,
-            )
-            z = quickest(problem, z, math.inf)
-            if after is None:
-                break
-            line = np.array([after.north - mark.north, after.east - mark.east])
-            size = math.hypot(*line)
-            aside = (
-                after.turn * max(after.clearance, 0.0) - mark.turn * max(mark.clearance, 0.0)
-            ) / size
-            heading = math.atan2(line[1], line[0]) - math.asin(min(max(aside, -0.99), 0.99))
-            angle = (mark.turn * (heading - problem.legs(z)[1])) % (2.0 * math.pi)
-            hold = (
-                _holds(
-                    np.array([min(angle, _WIDE[-1])]),
-                    abs(float(rudder[first + k])),
-                    self.make.turning,
-                )[0]
-                / request.unit
-            )
-            z = np.array(
-                [*z[:-1], max(z[-1] - 0.5, 0.0), hold, max(size / request.radius - 0.5, 0.0)]
-            )
-        return z
-
-    def chain(self, z: Array, rudder: Array) -> list[Turn]:
-        """Return the turns of z, each from the motion at the end of the leg before it."""
-        turns: list[Turn] = []
-        state = self.make.straight
-        for hold, leg, angle in zip(
-            self.request.unit * z[2::2], self.request.unit * z[3::2], rudder, strict=True
-        ):
-            turns += self.make(
-                np.array([[hold]]), np.array([angle]), [state], float(leg) + self.make.turning.time
-            )[0]
-            state = turns[-1].leg(leg)
-        return turns
-
-    def converge(self, z: Array, rudder: Array) -> tuple[Array, list[Turn]]:
-        """Return the best of rounds in which turns and legs come to fit each other."""
-        turns = self.chain(z, rudder)
-        best, cost = (z, turns), self.fixed(turns).cost(z)
-        for width in _NARROW if len(rudder) else ():
-            states = [
-                turn.leg(self.request.unit * leg) for turn, leg in zip(turns, z[3::2], strict=True)
-            ]
-            spacing = width / (self.make.turning.gain * np.abs(rudder))
-            holds = np.maximum(self.request.unit * z[2::2], 2.0 * spacing)[:, None] + spacing[
-                :, None
-            ] * np.arange(-2, 3)
-            z = quickest(
-                self.problem(holds, rudder, [self.make.straight, *states[:-1]]), z, 6.0 * width
-            )
-            turns = self.chain(z, rudder)
-            before, now = cost, self.fixed(turns).cost(z)
-            if now < cost:
-                best, cost = (z, turns), now
-            if (
-                abs(now - before) < _SETTLED * before
-                and float(self.fixed(turns).missed(z).max()) < _TOLERANCE
-            ):
-                break
-        z, turns = best
-        return quickest(self.fixed(turns), z, _NARROW[-1]), turns
-
-
-def _holds(angles: Array, rudder: float, turning: Turning) -> Array:
-    """Return the times in s for which the rudder is held for turns of angles [K] in rad.
-
-    By Nomoto's model they are K d (t1 - t2), t2 = T ln(2 - exp(-t1 / T)).
-    """
-    plain = angles / (turning.gain * rudder)
-    holds = plain
-    for _ in range(100):
-        holds = plain + turning.time * np.log(2.0 - np.exp(-holds / turning.time))
-    return holds
-
-
-def _guess(
-    request: CourseRequest, turning: Turning, wide: float, short: float
-) -> tuple[Array, Array]:
-    """Return the times and signed rudder angles of tangents of circles about the marks.
-
-    The circles are wider than the marks' or, where these are entered, a share of the turning
-    radius.
-    """
-    points = np.array(
-        [request.start, *[(mark.north, mark.east) for mark in (*request.marks, request.goal)]]
-    )
-    lines = np.diff(points, axis=0)
-    sizes = np.hypot(*lines.T)
-    circles = [
-        mark.turn * wide * (mark.clearance if mark.clearance > 0 else request.radius)
-        for mark in request.marks
-    ]
-    radii = np.array([0.0, *circles, request.goal.turn * max(request.goal.clearance, 0.0)])
-    aside = np.arcsin(np.clip(np.diff(radii) / sizes, -0.99, 0.99))
-    headings = np.arctan2(lines[:, 1], lines[:, 0]) - aside
-    signs = np.array([mark.turn for mark in request.marks], dtype=float)
-    rudder = signs * np.array([mark.rudder for mark in request.marks])
-    angles = (signs * np.diff(headings)) % (2.0 * math.pi)
-    legs = np.maximum(sizes * np.cos(aside) / request.radius - short, 0.0)
-    if request.heading is not None:
-        first = math.remainder(float(headings[0]) - request.heading, 2.0 * math.pi)
-        angles = np.concatenate(([abs(first)], angles))
-        rudder = np.concatenate(([math.copysign(request.goal.rudder, first)], rudder))
-        headings, legs = np.array([request.heading]), np.concatenate(([0.0], legs))
-    z = np.zeros(2 + 2 * len(angles))
-    z[0], z[1::2] = headings[0], legs
-    z[2::2] = [
-        _holds(np.array([angle]), abs(rudder_angle), turning)[0] / request.unit
-        for angle, rudder_angle in zip(angles, rudder, strict=True)
-    ]
-    return z, rudder
+        at = route.place_of(sketch, np.array([circle.place for circle in request.circles]))
+        fit = Fit(route, request.circles, at, request.heading is None)
+        z = route.begin(sketch)
+        best = fit.solve(z)
+        found.append((fit, best))
+        if best.missed > 0.5 * radius:
+            break
+        after = _drawn(request, route, best.z, fit, sketch).simplified(_SHORT * radius, _SMALL)
+        if len(after.bends) == len(sketch.bends) or attempt == 2:
+            break
+        sketch = after
+    return found
 
 
 def _joined(
-    request: CourseRequest,
-    z: Array,
-    turns: Sequence[Turn],
-    speed: float,
-    step: float,
-    beyond: float,
-) -> Course:
-    """Return the legs and turns as one course."""
-    level, unit = float(z[0]), request.unit
-    at = request.start + speed * unit * float(z[1]) * np.array([math.cos(level), math.sin(level)])
-    parts = [(np.stack((request.start, at)), np.full(2, level), np.zeros(2))]
-    for turn, leg in zip(turns, z[3::2], strict=True):
-        held = np.where(turn.times < turn.hold, turn.rudder, -turn.rudder)
-        parts.append((at + rotated(turn.track, level), level + turn.heading, held))
-        track, heading = turn.along(np.linspace(0.0, unit * float(leg), 500))
-        parts.append((at + rotated(track, level), level + heading, np.zeros(500)))
-        at, level = parts[-1][0][-1], float(parts[-1][1][-1])
-    direction = np.array([math.cos(level), math.sin(level)])
-    parts.append((np.stack((at, at + beyond * direction)), np.full(2, level), np.zeros(2)))
-    return _sampled(parts, beyond, step)
+    request: CourseRequest, fit: Fit, fitted: Fitted, make: TurnMaker
+) -> tuple[Fit, Fitted]:
+    """Return a course whose turns begin with the motion that the turns before them leave."""
+    route, z = fit.route, fitted.z
+    sides = np.array(route.sides)
+    if len(sides) == 0:
+        return fit, fitted
+    rudder = sides * [request.turns.tables[number].rudder for number in route.numbers]
+    begin = [make.straight] * len(sides)
+    for width in _NARROW:
+        values = z * route.units
+        spacing = width / (make.turning.gain * np.abs(rudder))
+        middle = np.maximum(values[2::2], 2.0 * spacing + 0.1 * make.dt)
+        holds = middle[:, None] + spacing[:, None] * np.arange(-2, 3)
+        turns, made = following_turns(make, holds, rudder, begin, route.turns.radius)
+        begin = [make.straight]
+        for turn, leg in zip(made[:-1], values[3:-1:2], strict=True):
+            begin.append(state_behind(turn, float(leg)))
+        joined = Route(route.start, route.sides, tuple(range(len(sides))), turns)
+        fit = fit.on(joined)
+        fitted = fit.solve(np.clip(z, joined.least(), joined.most()))
+        z = fitted.z
+    return fit, fitted
 
 
-def _sampled(parts: Sequence[tuple[Array, Array, Array]], beyond: float, step: float) -> Course:
-    track, heading, rudder = (np.concatenate([part[i] for part in parts]) for i in range(3))
-    moved = np.hypot(*np.diff(track, axis=0).T)
+def _drawn(request: CourseRequest, route: Route, z: Array, fit: Fit, sketch: Sketch) -> Sketch:
+    """Return the outline of a fitted route."""
+    values, points = z * route.units, route(z).points
+    legs = values[1::2].copy()
+    passed: list[list[int]] = [[] for _ in legs]
+    bent: list[list[int]] = [[] for _ in sketch.bends]
+    for number, circle in enumerate(request.circles):
+        part = fit.window(number, len(points))
+        at = part.start + int(np.abs(points[part] - circle.place).argmin())
+        k, inside = divmod(max(at - 1, 0), LEG + POINTS)
+        (passed[k] if inside < LEG or k >= len(bent) else bent[k]).append(number)
+    bends: list[Bend] = []
+    for k, bend in enumerate(sketch.bends):
+        table = request.turns.tables[bend.table]
+        angle = float(np.interp(values[2 + 2 * k], table.holds, table.angles))
+        _, before, behind = table.fitted
+        share = min(angle / 0.8, 1.0)
+        legs[k] += share * before
+        legs[k + 1] += share * behind
+        bends.append(replace(bend, angle=angle, passed=tuple(bent[k])))
+    return Sketch(float(values[0]), tuple(legs), tuple(bends), tuple(map(tuple, passed)))
+
+
+def _sampled(route: Route, z: Array, step: float, beyond: float) -> Course:
+    """Return a route in even steps, with a straight line behind its end."""
+    parts = route.sailed(z)
+    end, level = parts[-1][0][-1], float(parts[-1][1][-1])
+    track = np.concatenate([part[0] for part in parts])
+    last = np.diff(track)[np.flatnonzero(np.abs(np.diff(track)) > 1e-9)[-1]]
+    behind = np.array([end, end + beyond * last / abs(last)])
+    parts.append((behind, np.full(2, level), 0.0))
+    places, heading, rudder = (
+        np.concatenate([part[0] for part in parts]),
+        np.concatenate([part[1] for part in parts]),
+        np.concatenate([np.full(len(part[0]), part[2]) for part in parts]),
+    )
     # where parts meet, the rudder of the next one holds
-    distinct = np.concatenate((moved > 1e-9, [True]))
-    track, heading, rudder = track[distinct], heading[distinct], rudder[distinct]
-    along = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(track, axis=0).T))))
+    distinct: NDArray[np.bool_] = np.concatenate((np.abs(np.diff(places)) > 1e-9, [True]))
+    places, heading, rudder = places[distinct], heading[distinct], rudder[distinct]
+    along = np.concatenate(([0.0], np.cumsum(np.abs(np.diff(places)))))
     at = step * np.arange(math.floor(along[-1] / step) + 1)
-    points = np.stack([np.interp(at, along, track[:, i]) for i in range(2)], axis=-1)
+    points = np.stack(
+        [np.interp(at, along, places.real), np.interp(at, along, places.imag)], axis=-1
+    )
     direction = np.unwrap(np.arctan2(*np.gradient(points, axis=0).T[::-1]))
     direction += 2.0 * math.pi * round((heading[0] - direction[0]) / (2.0 * math.pi))
-    # a command stands until the next
-    held = rudder[np.searchsorted(along, at, side="right") - 1]
+    held = rudder[np.minimum(np.searchsorted(along, at, side="right") - 1, len(rudder) - 1)]
     return Course(
         step, points, direction, np.interp(at, along, heading), held, float(along[-1]) - beyond
     )

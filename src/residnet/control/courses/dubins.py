@@ -1,12 +1,8 @@
-"""Shortest paths of bounded curvature: between poses, and through circles of acceptance.
-
-Over the speed they are a lower bound of a course's time.
-"""
+"""Shortest paths of bounded curvature between poses."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -63,43 +59,3 @@ def dubins_length(start: np.ndarray, end: np.ndarray, radius: float) -> np.ndarr
         total = radius * (_arc(side, h0, heading) + _arc(-side, heading, h1)) + straight
         best = np.where(distance >= 2.0 * radius, np.minimum(best, total), best)
     return best
-
-
-def shortest_course(
-    start: tuple[float, float, float | None],
-    points: Sequence[tuple[float, float]],
-    acceptance: float,
-    radius: float,
-    places: int = 24,
-    headings: int = 36,
-) -> float:
-    """Return the length in m of the shortest path that enters circles of acceptance in their order.
-
-    It begins at a pose (heading None: any).
-
-    Dynamic programming over `places` on each circle and `headings` there: an upper bound of the
-    shortest, which falls as both grow.
-    """
-    angle = np.linspace(0.0, _TURN, places, endpoint=False)
-    course = np.linspace(-math.pi, math.pi, headings, endpoint=False)
-    poses = np.array(
-        [(start[0], start[1], heading) for heading in (course if start[2] is None else (start[2],))]
-    )
-    cost = np.zeros(len(poses))
-    for north, east in points:
-        if acceptance > 0:
-            spots = np.stack(
-                (north + acceptance * np.cos(angle), east + acceptance * np.sin(angle)), axis=-1
-            )
-        else:
-            spots = np.array([[north, east]])
-        after = np.concatenate(
-            (np.repeat(spots, headings, axis=0), np.tile(course, len(spots))[:, None]), axis=1
-        )
-        reached = np.full(len(after), np.inf)
-        for block in range(0, len(poses), 64):
-            part = slice(block, block + 64)
-            lengths = cost[part, None] + dubins_length(poses[part, None], after[None], radius)
-            reached = np.minimum(reached, lengths.min(axis=0))
-        poses, cost = after, reached
-    return float(cost.min())

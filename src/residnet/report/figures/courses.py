@@ -26,7 +26,7 @@ _WORDS = {
     "integral": ", integral",
 }
 _AROUND = 0.3
-"""Share of the plan's size that is shown around it; what leaves this has lost the course."""
+"""Share of the course's size that is shown around it; what leaves this has lost the course."""
 _BUOY: dict[str, Any] = {
     "facecolor": "0.93",
     "edgecolor": "0.45",
@@ -81,7 +81,7 @@ def tracks(
             label=_label(controller, guidance),
             zorder=3,
         )
-    _frame(axes, plan)
+    _frame(axes, plan, buoys, radii)
     for number, (buoy, radius) in enumerate(zip(buoys, radii, strict=True), start=1):
         centre = (buoy["east"], buoy["north"])
         axes.add_patch(Circle(centre, radius, **_BUOY))
@@ -101,10 +101,18 @@ def tracks(
     return Drawing(name, "Tracks: " + rule.rstrip("."), caption, figure)
 
 
-def _frame(axes: Any, plan: pd.DataFrame) -> None:
-    edge = _AROUND * max(float(np.ptp(plan["north"])), float(np.ptp(plan["east"])))
-    axes.set_xlim(float(plan["east"].min()) - edge, float(plan["east"].max()) + edge)
-    axes.set_ylim(float(plan["north"].min()) - edge, float(plan["north"].max()) + edge)
+def _frame(
+    axes: Any, plan: pd.DataFrame, buoys: Sequence[Mapping[str, Any]], radii: Sequence[float]
+) -> None:
+    """Show the whole plan and every buoy's circle."""
+    spans = []
+    for name in ("east", "north"):
+        places, reach = np.array([buoy[name] for buoy in buoys]), np.array(radii)
+        low = min(float(plan[name].min()), float((places - reach).min()))
+        spans.append((low, max(float(plan[name].max()), float((places + reach).max()))))
+    edge = _AROUND * max(high - low for low, high in spans)
+    axes.set_xlim(spans[0][0] - edge, spans[0][1] + edge)
+    axes.set_ylim(spans[1][0] - edge, spans[1][1] + edge)
 
 
 @styled
@@ -148,7 +156,7 @@ def histories(name: str, flights: pd.DataFrame, limit: float, rule: str) -> Draw
 
 @styled
 def spread(name: str, flights: pd.DataFrame, rule: str) -> Drawing:
-    """Draw the course time of every flight of the spread over the shortest possible one.
+    """Draw the course time of every flight of the spread over that of the reference.
 
     Args:
         name: of the figure's file.
@@ -180,7 +188,7 @@ def spread(name: str, flights: pd.DataFrame, rule: str) -> Drawing:
             ends = [line - 0.38, line + 0.38]
             axes.plot(middle, ends, color="black", linewidth=1.2, zorder=4)
     axes.set(
-        xlabel="course time over the shortest possible, in water at rest",
+        xlabel="course time over that of the reference, in water at rest",
         ylim=(len(kinds) - 0.5, -0.5),
     )
     axes.set_yticks(range(len(kinds)), [_label(*kind) for kind in kinds])

@@ -6,7 +6,8 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from residnet.control.courses.config import BuoyCourseConfig, Protocol
+from residnet.control.courses.config import BuoyCourseConfig
+from residnet.control.courses.course_check import Protocol
 from residnet.control.guidance.line_of_sight import AnyLineOfSight
 from residnet.control.observed.config import AnyController
 from residnet.core.config import ExistingPath, MetresPerSecond, Seconds

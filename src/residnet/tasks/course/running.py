@@ -12,10 +12,10 @@ import pandas as pd
 from residnet.control.base import Policy, Reference
 from residnet.control.courses.config import (
     PlannedCourse,
-    Protocol,
     plan_course,
     report_feasibility,
 )
+from residnet.control.courses.course_check import Protocol
 from residnet.control.guidance.course_guidance import CourseGuidance
 from residnet.control.guidance.drift import DriftEstimate
 from residnet.control.guidance.line_of_sight import AnyLineOfSight
@@ -44,7 +44,7 @@ from residnet.tasks.course.tables import plan_table, spread_table, track_table
 
 _UNITS = {
     "course_time": "s",
-    "floor_time": "s",
+    "reference_time": "s",
     "cross_track_rms": "m",
     "cross_track_max": "m",
     "distances": "m",
@@ -92,8 +92,8 @@ def run_course(config: CourseSettings, folder: RunFolder) -> Outcome:
     for protocol in config.protocols:
         planned, guidance = plan_for(config, known, protocol)
         say(
-            f"{protocol}: planned {planned.course.length:.1f} m, shortest possible"
-            f" {planned.floor:.1f} m"
+            f"{protocol}: planned {planned.course.length:.1f} m; the reference of arcs and lines"
+            f" has {planned.reference:.1f} m"
         )
         plans.append(plan_table(planned))
         for name in controllers:
@@ -141,7 +141,7 @@ def _verdict(config: CourseSettings, rows: Sequence[dict[str, Any]]) -> list[str
             continue
         sentences.append(
             f"{protocol}: '{config.policy}' needs {flight['course_time']:.1f} s,"
-            f" {flight['ratio']:.3f} times the shortest possible time, and passes"
+            f" {flight['ratio']:.3f} times the time of the reference, and passes"
             f" {flight['passed']} of {len(config.course.buoys)} buoys as the protocol asks."
         )
     return sentences

@@ -20,13 +20,16 @@ class CourseTaskConfig(CourseSettings):
     task: Literal["course"]
 
     def check(self) -> None:
-        """Check the autopilot's run folder or config.
+        """Check the autopilot's run folder or config, and that the courses can be planned.
 
         Raises:
             UsageError: where it is a folder of something else, or of an unfinished run.
-            ConfigError: where it is no config of an autopilot, or has no such policy or peer.
+            ConfigError: where it is no config of an autopilot, or has no such policy or peer, or
+                where no course fits the vessel's turns.
         """
-        autopilot_of(self)
+        from residnet.tasks.course.planning import check_plans
+
+        check_plans(self, autopilot_of(self))
 
     def carry_out(self, folder: RunFolder) -> Outcome:
         """Train where there is no trained policy yet, plan, fly and compare.

@@ -1,0 +1,119 @@
+"""A check of courses by their points alone: order, side of the closest approach, clearance.
+
+It uses nothing of what plans them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Protocol = Literal["enter", "sides"]
+"""Buoys are entered: a circle of acceptance about each; or each is passed on its side, outside its
+own circle.
+"""
+
+
+class Asked(NamedTuple):
+    """What a course has to do at a buoy.
+
+    Attributes:
+        north, east: in m.
+        radius: of its circle in m.
+        leave_to: side that it is passed on, starboard or port.
+    """
+
+    north: float
+    east: float
+    radius: float
+    leave_to: str
+
+
+class Passage(NamedTuple):
+    """How a track passes a buoy.
+
+    Attributes:
+        at: sample of the closest approach in the buoy's turn.
+        side: that the buoy lies on there.
+        distance: there, in m.
+        least: smallest distance on the whole track after a circle in which it begins is left.
+        side_there: that the buoy lies on at that distance.
+    """
+
+    at: int
+    side: str
+    distance: float
+    least: float
+    side_there: str
+
+
+def passages(track: Array, buoys: Sequence[Asked]) -> list[Passage]:
+    """Return how a track [N, 2] passes buoys in their order.
+
+    The moments are in the order of the buoys, and the sum of the distances then is least.
+    """
+    distance = np.stack([np.hypot(*(track - (b.north, b.east)).T) for b in buoys])
+    for row, buoy in zip(distance, buoys, strict=True):
+        outside = np.flatnonzero(row >= buoy.radius)
+        if row[0] < buoy.radius and len(outside):
+            row[: outside[0]] = np.inf
+    total, choices = distance[0], []
+    number = np.arange(len(track))
+    for row in distance[1:]:
+        best = np.minimum.accumulate(total)
+        choices.append(np.maximum.accumulate(np.where(total <= best, number, 0)))
+        total = row + best
+    at = [int(total.argmin())]
+    for choice in reversed(choices):
+        at.append(int(choice[at[-1]]))
+    found = []
+    for row, buoy, here in zip(distance, buoys, reversed(at), strict=True):
+        nearest = int(row.argmin())
+        found.append(
+            Passage(
+                here,
+                _side(track, here, buoy),
+                float(row[here]),
+                float(row[nearest]),
+                _side(track, nearest, buoy),
+            )
+        )
+    return found
+
+
+def _side(track: Array, at: int, buoy: Asked) -> str:
+    """Return the side that a buoy lies on at a sample."""
+    step = track[min(at + 1, len(track) - 1)] - track[max(at - 1, 0)]
+    north, east = buoy.north - track[at, 0], buoy.east - track[at, 1]
+    return "starboard" if step[0] * east - step[1] * north > 0 else "port"
+
+
+def first_fault(
+    track: Array, buoys: Sequence[Asked], protocol: Protocol, slack: float
+) -> str | None:
+    """Return what a track [N, 2] does wrong at the first buoy where it does; None where nothing.
+
+    Args:
+        track: north, east in m.
+        buoys: in their order.
+        protocol: see there.
+        slack: of distances in m.
+    """
+    for number, (passage, buoy) in enumerate(
+        zip(passages(track, buoys), buoys, strict=True), start=1
+    ):
+        if protocol == "enter":
+            if passage.distance > buoy.radius + slack:
+                return (
+                    f"buoy {number}: passed at {passage.distance:.4g} m, its circle of"
+                    f" {buoy.radius:.4g} m is not entered in its turn"
+                )
+        elif passage.least < buoy.radius - slack:
+            return f"buoy {number}: its circle of {buoy.radius:.4g} m is cut, {passage.least:.4g} m"
+        elif {passage.side, passage.side_there} != {buoy.leave_to}:
+            return f"buoy {number}: it is not left to {buoy.leave_to} where it is nearest"
+    return None

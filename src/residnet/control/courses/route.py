@@ -1,0 +1,279 @@
+"""A route: straight legs and turns in turn, and how far its points move with their lengths."""
+
+from __future__ import annotations
+
+import cmath
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple, final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from residnet.control.courses.turn_table import POINTS, Array, Turns
+
+LEG = 12
+"""Points of a leg beside its beginning."""
+_FINE = 8
+"""Times as many points as a turn is searched with describe it in the end."""
+
+
+@dataclass(frozen=True)
+class Bend:
+    """A turn of a route before its time is known.
+
+    Attributes:
+        side: +1 to starboard, -1 to port.
+        angle: in rad.
+        table: number of the table of turns.
+        passed: buoys that are passed in it.
+    """
+
+    side: int
+    angle: float
+    table: int
+    passed: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class Sketch:
+    """A route in outline.
+
+    Attributes:
+        heading: of the first leg in rad.
+        legs: [n + 1] lengths in m.
+        bends: [n] between the legs.
+        passed: for each leg, the buoys that are passed on it.
+    """
+
+    heading: float
+    legs: tuple[float, ...]
+    bends: tuple[Bend, ...]
+    passed: tuple[tuple[int, ...], ...]
+
+    def simplified(self, short: float, small: float) -> Sketch:
+        """Return the outline with bends joined that turn to one side with a short leg between.
+
+        Bends below `small` rad are left out.
+        """
+        sketch, k = self, 0
+        while k < len(sketch.bends):
+            bend = sketch.bends[k]
+            if bend.angle < small:
+                sketch = sketch._without(k)
+                k = max(k - 1, 0)
+                continue
+            following = sketch.bends[k + 1] if k + 1 < len(sketch.bends) else None
+            if following and following.side == bend.side and sketch.legs[k + 1] < short:
+                sketch = sketch._joined(k)
+                continue
+            k += 1
+        return sketch
+
+    def _without(self, k: int) -> Sketch:
+        """Return the outline without a bend: both legs beside it are one."""
+        legs = (*self.legs[:k], self.legs[k] + self.legs[k + 1], *self.legs[k + 2 :])
+        here = (*self.passed[k], *self.bends[k].passed, *self.passed[k + 1])
+        passed = (*self.passed[:k], here, *self.passed[k + 2 :])
+        return Sketch(self.heading, legs, (*self.bends[:k], *self.bends[k + 1 :]), passed)
+
+    def _joined(self, k: int) -> Sketch:
+        """Return the outline with a bend and the next as one."""
+        one, two = self.bends[k], self.bends[k + 1]
+        wider = max(one, two, key=lambda bend: bend.angle)
+        bend = replace(
+            wider,
+            angle=one.angle + two.angle,
+            passed=(*one.passed, *self.passed[k + 1], *two.passed),
+        )
+        half = 0.5 * self.legs[k + 1]
+        legs = (
+            *self.legs[:k],
+            self.legs[k] + half,
+            self.legs[k + 2] + half,
+            *self.legs[k + 3 :],
+        )
+        passed = (*self.passed[: k + 1], *self.passed[k + 2 :])
+        return Sketch(self.heading, legs, (*self.bends[:k], bend, *self.bends[k + 2 :]), passed)
+
+
+class Drawn(NamedTuple):
+    """A route's points [S] complex in m, its length of time in s, end heading, and derivatives.
+
+    Attributes:
+        points: from the start on.
+        time: in s.
+        heading: of the last leg in rad.
+        moved: derivatives [S, nz] of the points.
+        slower: derivatives [nz] of the time.
+        turned: derivatives [nz] of the last heading.
+    """
+
+    points: np.ndarray
+    time: float
+    heading: float
+    moved: np.ndarray
+    slower: Array
+    turned: Array
+
+
+@final
+@dataclass
+class Route:
+    """A route as a function of z = (first heading, leg, hold, leg, hold, ..., leg).
+
+    Headings are in rad, legs in m and holds in s, each divided by its unit.
+
+    Attributes:
+        start: complex, in m.
+        sides: [n] of the turns.
+        numbers: [n] of their tables.
+        turns: the tables.
+        units: [2 n + 2] of z.
+    """
+
+    start: complex
+    sides: tuple[int, ...]
+    numbers: tuple[int, ...]
+    turns: Turns
+    units: Array = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.units = np.ones(2 + 2 * len(self.sides))
+        self.units[1::2] = self.turns.radius
+        self.units[2::2] = self.turns.radius / self.turns.speed
+
+    def begin(self, sketch: Sketch) -> Array:
+        """Return the z that an outline stands for; turns need room before and behind them."""
+        z = np.zeros(len(self.units))
+        z[0], legs = sketch.heading, np.array(sketch.legs)
+        for k, bend in enumerate(sketch.bends):
+            table = self.turns.tables[bend.table]
+            _, before, behind = table.fitted
+            z[2 + 2 * k] = table.hold(bend.angle)
+            part = min(bend.angle / 0.8, 1.0)
+            legs[k] -= part * before
+            legs[k + 1] -= part * behind
+        z[1::2] = np.maximum(legs, 0.0)
+        result: Array = z / self.units
+        return result
+
+    def least(self) -> Array:
+        """Return the smallest z."""
+        least = np.zeros(len(self.units))
+        least[2::2] = [self.turns.tables[number].holds[0] for number in self.numbers]
+        result: Array = least / self.units
+        return result
+
+    def most(self) -> Array:
+        """Return the largest z."""
+        most = np.full(len(self.units), np.inf)
+        most[2::2] = [self.turns.tables[number].longest for number in self.numbers]
+        result: Array = most / self.units
+        return result
+
+    def place_of(self, sketch: Sketch, buoys: np.ndarray) -> NDArray[np.intp]:
+        """Return the points [N] at which an outline passes its buoys, in their order."""
+        z = self.begin(sketch)
+        points = self(z).points
+        at, last = np.zeros(len(buoys), dtype=np.intp), 0
+        parts: list[tuple[int, int, Sequence[int]]] = []
+        place = 0
+        for k, passed in enumerate(sketch.passed):
+            parts.append((place, place + LEG, passed))
+            place += LEG
+            if k < len(sketch.bends):
+                parts.append((place, place + POINTS, sketch.bends[k].passed))
+                place += POINTS
+        for low, high, passed in parts:
+            for buoy in passed:
+                begin = min(max(low, last), high)
+                near = begin + int(np.abs(points[begin : high + 1] - buoys[buoy]).argmin())
+                at[buoy] = last = near
+        return at
+
+    def __call__(self, z: Array) -> Drawn:
+        """Return the points of z, the time, and what they change by."""
+        z = z * self.units
+        size, speed = len(z), self.turns.speed
+        level, at = float(z[0]), self.start
+        shares = np.linspace(0.0, 1.0, LEG + 1)[1:]
+        points = [np.array([at])]
+        pivots: list[tuple[complex, complex, float, int]] = []
+        legs: list[tuple[complex, float, int]] = []
+        total = 1 + LEG + len(self.sides) * (POINTS + LEG)
+        moved = np.zeros((total, size), dtype=complex)
+        slower, turned = np.zeros(size), np.zeros(size)
+        turned[0], slower[1::2], time = 1.0, 1.0 / speed, float(z[1::2].sum()) / speed
+        along, place = cmath.exp(1j * level), 1
+        points.append(at + float(z[1]) * along * shares)
+        moved[place : place + LEG, 1], at = shares * along, at + float(z[1]) * along
+        place += LEG
+        moved[place:, 1] = along
+        for k, (side, number) in enumerate(zip(self.sides, self.numbers, strict=True)):
+            hold, leg, column = float(z[2 + 2 * k]), float(z[3 + 2 * k]), 2 + 2 * k
+            track, heading, lasted = self.turns.tables[number](hold)
+            track_, heading_, lasted_ = self.turns.tables[number].change(hold)
+            if side < 0:
+                track, track_ = track.conj(), track_.conj()
+            points.append(at + along * track)
+            moved[place : place + POINTS, column] = along * track_
+            end = at + along * complex(track[-1])
+            pivots.append((end, along * complex(track_[-1]), side * float(heading_[-1]), place))
+            level += side * float(heading[-1])
+            turned[column], slower[column] = side * float(heading_[-1]), lasted_
+            time += lasted
+            along, place = cmath.exp(1j * level), place + POINTS
+            behind, course, onward, bent = self.turns.tables[number].along(leg * shares)
+            if side < 0:
+                behind, onward = behind.conj(), onward.conj()
+            points.append(end + along * behind)
+            moved[place : place + LEG, column + 1] = shares * along * onward
+            at, place = complex(points[-1][-1]), place + LEG
+            moved[place:, column + 1] = along * onward[-1]
+            level += side * float(course[-1])
+            along = cmath.exp(1j * level)
+            turned[column + 1] = side * float(bent[-1])
+            legs.append((at, turned[column + 1], place))
+        track = np.concatenate(points)
+        moved[:, 0] = 1j * (track - self.start)
+        for k, (end, turn, begin) in enumerate(legs):
+            moved[begin:, 3 + 2 * k] += 1j * turn * (track[begin:] - end)
+        for k, (end, shift, turn, begin) in enumerate(pivots):
+            behind = slice(begin + POINTS, None)
+            moved[behind, 2 + 2 * k] = shift + 1j * turn * (track[behind] - end)
+        return Drawn(
+            track, time, level, moved * self.units, slower * self.units, turned * self.units
+        )
+
+    def sailed(self, z: Array) -> list[tuple[np.ndarray, Array, float]]:
+        """Return the parts of a route: points [K] complex, vessel's headings [K], and rudder."""
+        z = z * self.units
+        level, at = float(z[0]), self.start
+        along = cmath.exp(1j * level)
+        parts = [(np.array([at, at + float(z[1]) * along]), np.full(2, level), 0.0)]
+        at += float(z[1]) * along
+        for k, (side, number) in enumerate(zip(self.sides, self.numbers, strict=True)):
+            hold, leg, table = float(z[2 + 2 * k]), float(z[3 + 2 * k]), self.turns.tables[number]
+            track, heading, lasted = table(hold)
+            share = min(hold / lasted, 1.0) if lasted > 0 else 1.0
+            over = min(max(round(share * _FINE * POINTS), 1), _FINE * POINTS)
+            track, heading = (
+                np.concatenate(([0.0], track if side > 0 else track.conj())),
+                np.concatenate(([0.0], side * heading)),
+            )
+            even = np.linspace(0.0, 1.0, POINTS + 1)
+            smooth = CubicSpline(even, np.stack((track.real, track.imag, heading.real), axis=-1))
+            fine = smooth(np.linspace(0.0, 1.0, _FINE * POINTS + 1))
+            points, heading = at + along * (fine[:, 0] + 1j * fine[:, 1]), fine[:, 2]
+            parts.append((points[: over + 1], level + heading[: over + 1], side * table.rudder))
+            parts.append((points[over:], level + heading[over:], -side * table.rudder))
+            level += float(heading[-1])
+            along, at = cmath.exp(1j * level), complex(points[-1])
+            behind, course, _, _ = table.along(leg * np.linspace(0.0, 1.0, 100) ** 2)
+            behind, course = (behind, course) if side > 0 else (behind.conj(), -course)
+            parts.append((at + along * behind, level + course, 0.0))
+            level += float(course[-1])
+            along, at = cmath.exp(1j * level), complex(parts[-1][0][-1])
+        return parts

@@ -1,0 +1,226 @@
+"""Tables of a vessel's turns from straight ahead to straight ahead, by how long the rudder is held.
+
+Positions are complex numbers, north + i east in m.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import final
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from residnet.control.courses.turns import Array, Turn, TurnMaker
+from residnet.control.heading.turning import Turning
+
+POINTS = 28
+"""Points of a turn beside its beginning."""
+_MOST = math.radians(500.0)
+"""The largest angle of a turn in a table."""
+_HOLDS = 56
+_SETTLED = 4.0
+"""Time constants after which the vessel runs straight behind a turn."""
+
+
+@final
+class TurnTable:
+    """Turns to starboard at one rudder angle, as smooth functions of the time it is held.
+
+    Args:
+        holds: [K] in s, from 0 on.
+        points: [K, POINTS] complex positions in m in the frame of the beginning; the last one is
+            where the straight leg behind the turn begins.
+        headings: [K, POINTS] of the vessel in rad; the last one is the direction of that leg.
+        times: [K] that the turns take, in s.
+        rudder: the angle that is held, in rad.
+        leg: north, east and heading of the leg behind by its length, in the frame of its beginning;
+            None for a straight one.
+    """
+
+    def __init__(
+        self,
+        holds: Array,
+        points: np.ndarray,
+        headings: Array,
+        times: Array,
+        rudder: float,
+        leg: CubicSpline | None = None,
+    ) -> None:
+        rows = np.concatenate((points.real, points.imag, headings, times[:, None]), axis=1)
+        self.rudder, self.longest = rudder, float(holds[-1])
+        self.leg, self.bent = leg, None if leg is None else leg.derivative()
+        self.spline = CubicSpline(holds, rows)
+        self.slope = self.spline.derivative()
+        self.angles, self.holds, self.ends = headings[:, -1], holds, points[:, -1]
+
+    def __call__(self, hold: float) -> tuple[np.ndarray, Array, float]:
+        """Return the points [POINTS], headings [POINTS] and the time of a turn."""
+        row = self.spline(hold)
+        return row[:POINTS] + 1j * row[POINTS : 2 * POINTS], row[2 * POINTS : -1], float(row[-1])
+
+    def change(self, hold: float) -> tuple[np.ndarray, Array, float]:
+        """Return the derivatives of the same by the time that the rudder is held."""
+        row = self.slope(hold)
+        return row[:POINTS] + 1j * row[POINTS : 2 * POINTS], row[2 * POINTS : -1], float(row[-1])
+
+    def along(self, lengths: Array) -> tuple[np.ndarray, Array, np.ndarray, Array]:
+        """Return places and headings [M] of the leg at lengths [M] in m, and their derivatives."""
+        if self.leg is None or self.bent is None:
+            none = np.zeros(len(lengths))
+            return lengths.astype(complex), none, np.ones(len(lengths), dtype=complex), none
+        known = np.minimum(lengths, self.leg.x[-1])
+        rows, bent = self.leg(known), self.bent(known)
+        onward = np.exp(1j * rows[:, 2])
+        inside = lengths <= self.leg.x[-1]
+        places = rows[:, 0] + 1j * rows[:, 1] + (lengths - known) * onward
+        moved = np.where(inside, bent[:, 0] + 1j * bent[:, 1], onward)
+        return places, rows[:, 2], moved, np.where(inside, bent[:, 2], 0.0)
+
+    def hold(self, angle: float) -> float:
+        """Return the time in s that a turn of an angle in rad is held for."""
+        return float(np.interp(angle, self.angles, self.holds))
+
+    @cached_property
+    def fitted(self) -> tuple[float, float, float]:
+        """The radius of an arc, and the straight parts in m before and behind it.
+
+        Together they lead where the turns lead, by least squares over their angles.
+        """
+        inside = (self.angles > math.radians(20.0)) & (self.angles < math.radians(300.0))
+        turned, end = np.exp(1j * self.angles[inside]), self.ends[inside]
+        columns = np.stack((1j * (1.0 - turned), np.ones_like(turned), turned), axis=1)
+        found = np.linalg.lstsq(
+            np.concatenate((columns.real, columns.imag)),
+            np.concatenate((end.real, end.imag)),
+            rcond=None,
+        )[0]
+        return float(found[0]), max(float(found[1]), 0.0), max(float(found[2]), 0.0)
+
+
+@dataclass(frozen=True)
+class Turns:
+    """The tables of a vessel by rudder angle, its speed, and its smallest radius in m."""
+
+    tables: tuple[TurnTable, ...]
+    speed: float
+    radius: float
+
+
+def arcs(radii: Array, speed: float) -> Turns:
+    """Return the turns of a vessel that yaws at once: arcs of the radii [n] in m."""
+    angles = np.linspace(0.0, _MOST, _HOLDS)
+    headings = angles[:, None] * np.linspace(0.0, 1.0, POINTS + 1)[1:]
+    tables = [
+        TurnTable(
+            angles * radius / speed,
+            1j * radius * (1.0 - np.exp(1j * headings)),
+            headings,
+            angles * radius / speed,
+            0.0,
+        )
+        for radius in radii
+    ]
+    return Turns(tuple(tables), speed, float(radii[0]))
+
+
+def simulated_turns(make: TurnMaker, rudder: Array, radius: float) -> Turns:
+    """Return the turns of a vessel at rudder angles [n] in rad, each from straight ahead.
+
+    Behind a turn the sway dies out. The leg is put where it ends up, and the last part of the turn
+    is bent towards it.
+
+    Args:
+        make: the simulated turns.
+        rudder: angles, the largest first.
+        radius: the vessel's smallest turning radius in m.
+    """
+    turning = make.turning
+    holds = np.stack([_holds(np.linspace(0.0, 1.0, _HOLDS), angle, turning) for angle in rudder])
+    tail = _SETTLED * turning.time
+    made = make(holds[:, 1:], rudder, [make.straight] * len(rudder), tail)
+    share = np.linspace(0.0, 1.0, POINTS + 1)[1:]
+    tables = []
+    for angle, held, group in zip(rudder, holds, made, strict=True):
+        points, headings, times = _sampled(group)
+        for k, turn in enumerate(group):
+            track, course = turn.along(np.linspace(0.0, tail, 60))
+            moved = float(np.hypot(*np.diff(track, axis=0).T).sum())
+            end = complex(*track[-1]) - moved * np.exp(1j * course[-1])
+            points[k] += share**3 * (end - points[k, -1])
+            headings[k] += share**3 * (course[-1] - headings[k, -1])
+        none = np.zeros((1, POINTS))
+        tables.append(
+            TurnTable(
+                held,
+                np.concatenate((none, points)),
+                np.concatenate((none, headings)),
+                np.concatenate(([0.0], times)),
+                float(angle),
+            )
+        )
+    return Turns(tuple(tables), turning.speed, radius)
+
+
+def following_turns(
+    make: TurnMaker, holds: Array, rudder: Array, begin: Sequence[Array], radius: float
+) -> tuple[Turns, list[Turn]]:
+    """Return tables of n turns, each from a motion of its own, and the middle one of each.
+
+    Args:
+        make: the simulated turns.
+        holds: [n, K] in s, K odd.
+        rudder: [n] in rad, positive to starboard.
+        begin: state of the vessel [nx] that each begins with.
+        radius: the vessel's smallest turning radius in m.
+    """
+    tail = 2.0 * _SETTLED * make.turning.time
+    made = make(holds, rudder, begin, tail)
+    tables, middles = [], []
+    for angle, held, group in zip(rudder, holds, made, strict=True):
+        points, headings, times = _sampled(group)
+        middle = group[len(group) // 2]
+        track, course = middle.along(np.linspace(0.0, tail, 80))
+        places = (track @ (1.0, 1j) - complex(*middle.track[-1])) * np.exp(-1j * middle.heading[-1])
+        leg = np.stack((places.real, places.imag, course - middle.heading[-1]), axis=-1)
+        if angle < 0:
+            points, headings = points.conj(), -headings
+            leg[:, 1:] *= -1.0
+        moved = np.concatenate(([0.0], np.cumsum(np.abs(np.diff(places)))))
+        tables.append(
+            TurnTable(held, points, headings, times, abs(float(angle)), CubicSpline(moved, leg))
+        )
+        middles.append(middle)
+    return Turns(tuple(tables), make.turning.speed, radius), middles
+
+
+def state_behind(turn: Turn, length: float) -> Array:
+    """Return the state of the vessel [nx] after a length in m of the leg behind a turn."""
+    times = np.linspace(0.0, float(turn.leg.x[-1]), 80)
+    track, _ = turn.along(times)
+    moved = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(track, axis=0).T))))
+    state: Array = turn.leg(float(np.interp(length, moved, times)))
+    return state
+
+
+def _sampled(group: Sequence[Turn]) -> tuple[np.ndarray, Array, Array]:
+    """Return points [K, POINTS], headings [K, POINTS] and times [K] of turns, even in time."""
+    share = np.linspace(0.0, 1.0, POINTS + 1)[1:]
+    points, headings = np.zeros((len(group), POINTS), dtype=complex), np.zeros((len(group), POINTS))
+    for k, turn in enumerate(group):
+        at = share * turn.times[-1]
+        north, east = (np.interp(at, turn.times, turn.track[:, i]) for i in range(2))
+        points[k], headings[k] = north + 1j * east, np.interp(at, turn.times, turn.heading)
+    return points, headings, np.array([turn.times[-1] for turn in group])
+
+
+def _holds(share: Array, rudder: float, turning: Turning) -> Array:
+    """Return the times in s for which the rudder is held, up to the largest angle of a turn.
+
+    By Nomoto's model angles are K d (t1 - t2), t2 = T ln(2 - exp(-t1 / T)).
+    """
+    longest = _MOST / (turning.gain * rudder) + math.log(2.0) * turning.time
+    return share**1.3 * longest
