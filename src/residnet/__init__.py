@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from residnet.core.progress import Progress
     from residnet.core.version import __version__
     from residnet.face.data import Data, prepare
+    from residnet.face.drafting import draft
     from residnet.face.fitting import Models, fit, metrics, select
     from residnet.face.logs import inspect, read_logs
     from residnet.face.models import Model, export_model, load, save
@@ -43,6 +44,7 @@ _HOME = {
     "autopilot": "face.tasks",
     "available": "face.parts",
     "baseline": "face.parts",
+    "draft": "face.drafting",
     "export_model": "face.models",
     "fit": "face.fitting",
     "free_run": "face.runs",
@@ -74,6 +76,7 @@ __all__ = [
     "autopilot",
     "available",
     "baseline",
+    "draft",
     "export_model",
     "fit",
     "free_run",

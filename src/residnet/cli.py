@@ -71,6 +71,39 @@ def run(
 
 
 @app.command()
+def new(
+    logs: Annotated[
+        list[Path],
+        typer.Argument(metavar="LOGS...", help="Files, folders and bags of any format."),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="CONFIG", help="File to write; my_boat.yaml if not given."),
+    ] = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace an earlier config of this name.")
+    ] = False,
+    defaults: Annotated[
+        bool, typer.Option("--defaults", help="Ask nothing: take and mark every default.")
+    ] = False,
+) -> None:
+    """Draft a complete config from logs: `residnet run` takes it as it is.
+
+    Channels, units, frames, inputs, splits, protocols and models are proposed. What the logs do
+    not tell is asked on a terminal; elsewhere the default is taken and marked as a guess.
+    """
+    from residnet.tasks.drafting.verb import new_config
+    from residnet.terminal import asked
+
+    _limit_threads()
+    with drawn_progress():
+        ask = asked() if not defaults else None
+        lines = new_config(logs, out or Path("my_boat.yaml"), ask, overwrite=overwrite)
+    for line in lines:
+        print(line)
+
+
+@app.command()
 def check(
     config: Annotated[Path, typer.Argument(metavar="CONFIG", help=_CONFIG)],
     overrides: Overrides = None,

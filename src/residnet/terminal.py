@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from residnet.core.progress import Progress, listen
+from residnet.data.drafting.questions import Answer, Question
 
 if TYPE_CHECKING:
     from rich.progress import Progress as Bars
@@ -74,3 +75,23 @@ class _Bars:
         self._bars.update(bar, completed=progress.done or 0, total=progress.total)
         if progress.total is not None and (progress.done or 0) >= progress.total:
             self._bars.remove_task(self._stages.pop(progress.stage))
+
+
+def asked() -> Answer | None:
+    """Return what asks the user; None where nobody sits at the terminal."""
+    if not (sys.stdin.isatty() and sys.stderr.isatty()):
+        return None
+    return _ask
+
+
+def _ask(question: Question) -> str:
+    """Ask one question until its answer can be used; an empty answer takes the default."""
+    options = f" ({', '.join(question.options)})" if question.options else ""
+    print(f"{question.text}: {question.reason}", file=sys.stderr)
+    asking = f"  {'.'.join(question.key)}{options} [{question.default}]: "
+    while True:
+        print(asking, end="", file=sys.stderr, flush=True)
+        given = input().strip() or question.default
+        if not question.options or given in question.options:
+            return given
+        print(f"  '{given}' is none of {', '.join(question.options)}", file=sys.stderr)

@@ -8,7 +8,11 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from residnet.core.config import Config
+from residnet.core.errors import DataError
 from residnet.core.log import Log
+from residnet.core.progress import report
+from residnet.data.division import divided
+from residnet.data.parts import data_files
 from residnet.data.readers import ReaderConfig
 from residnet.data.simulated.trials import SimulatedTrials, simulate
 from residnet.data.split import SplitConfig, check_leaks
@@ -45,17 +49,35 @@ def read_logs(config: MeasuredLogs | SimulatedTrials) -> Splits:
         for log, split in zip(simulate(manoeuvres, config), config.splits(manoeuvres), strict=True):
             splits[split].append(log)
         return splits
-    reader = config.reader.build()
-    splits = {
-        split: [reader.read(path) for path in paths]
-        for split, paths in config.split.resolve().items()
-    }
+    read = _all_logs(config)
+    if config.split.auto:
+        splits = divided(list(read.values()))
+    else:
+        splits = {
+            split: [found for part in parts if (found := part.of(read[part.path])) is not None]
+            for split, parts in config.split.parts().items()
+        }
+        for split, members in splits.items():
+            if not members:
+                kinds = ", ".join(sorted({log.manoeuvre for log in read.values()}))
+                raise DataError(f"split: no log of {split} is of its manoeuvre (there are {kinds})")
     check_leaks(splits)
     return splits
+
+
+def _all_logs(config: MeasuredLogs) -> dict[Path, Log]:
+    """Return every log of the splits, each read once."""
+    reader, files = config.reader.build(), config.split.files()
+    out = {}
+    for number, path in enumerate(files):
+        report("reading logs", number, len(files))
+        out[path] = reader.read(path)
+    report("reading logs", len(files), len(files))
+    return out
 
 
 def input_files(config: MeasuredLogs | SimulatedTrials) -> list[Path]:
     """Return files whose contents the run depends on."""
     if isinstance(config, SimulatedTrials):
         return []
-    return [path for paths in config.split.resolve().values() for path in paths]
+    return data_files(config.split.files())

@@ -9,36 +9,48 @@ from typing import Any
 import numpy as np
 from pydantic import Field, model_validator
 
-from residnet.core.config import Config, ConfigPath, load_mapping
+from residnet.core.config import Config, ConfigPath, load_mapping, validate
 from residnet.core.errors import ConfigError, DataError
 from residnet.core.log import Log
 from residnet.core.names import nearest
+from residnet.data.parts import LogPart, Part, matches, parts_of
 
 SPLITS = ("train", "validation", "test")
 
 
 class SplitConfig(Config):
-    """Files of the three splits: from a YAML file, or from patterns.
+    """Logs of the three splits: from a YAML file, from patterns, or divided by residnet.
 
     Attributes:
         file: YAML file with the keys train, validation and test, each a list of paths or patterns
             relative to `root`.
         root: folder that paths and patterns start from; by default the folder of `file`, else the
             current folder.
-        train: patterns such as `turning/*.csv` (`**` for any depth), where there is no `file`.
+        auto: patterns of logs that are divided by residnet: of each five logs, in the order of
+            their manoeuvres, the third is for validation and the fifth for the test; fewer are cut
+            in time. Copies are left out.
+        train: files, folders, bags or patterns such as `turning/*.csv` (`**` for any depth), where
+            there is no `file`; or stretches of time and logs of a manoeuvre, such as `{log:
+            trip.mcap, from: 120 s, to: 300 s}` and `{log: "*.csv", manoeuvre: zigzag}`.
         validation: the same for the logs that models are chosen on.
         test: the same for the logs that nothing is chosen on.
     """
 
     file: ConfigPath | None = None
     root: ConfigPath | None = None
-    train: tuple[str, ...] = Field(default=())
-    validation: tuple[str, ...] = Field(default=())
-    test: tuple[str, ...] = Field(default=())
+    auto: tuple[str, ...] = ()
+    train: tuple[str | LogPart, ...] = Field(default=())
+    validation: tuple[str | LogPart, ...] = Field(default=())
+    test: tuple[str | LogPart, ...] = Field(default=())
 
     @model_validator(mode="after")
     def _one_source(self) -> SplitConfig:
         named = [name for name in SPLITS if getattr(self, name)]
+        if self.auto and (named or self.file is not None):
+            given = ", ".join([*named, *(["file"] if self.file is not None else [])])
+            raise ValueError(f"give either `auto`, `file` or patterns (given: auto and {given})")
+        if self.auto:
+            return self
         if self.file is not None and named:
             raise ValueError(
                 f"give either `file` or patterns, not both (given: file and {', '.join(named)})"
@@ -46,37 +58,63 @@ class SplitConfig(Config):
         if self.file is None and len(named) < len(SPLITS):
             empty = [name for name in SPLITS if name not in named]
             raise ValueError(
-                f"no files for {', '.join(empty)}; give patterns for train, validation and test, or"
-                " one `file` that names them"
+                f"no files for {', '.join(empty)}; give patterns for train, validation and test,"
+                " one `file` that names them, or `auto` with patterns of all logs"
             )
         return self
 
-    def resolve(self) -> dict[str, list[Path]]:
-        """Return the files of each split, in the order of its patterns.
+    def parts(self) -> dict[str, list[Part]]:
+        """Return what each split consists of, in the order of its patterns; nothing of `auto`.
 
         The matches of a pattern are sorted.
 
         Raises:
-            ConfigError: where a split is empty, a pattern matches nothing, or a file or the name of
-                a log occurs in two places.
+            ConfigError: where a split is empty, a pattern matches nothing, or a stretch or the name
+                of a log occurs in two places.
         """
-        patterns = (
+        if self.auto:
+            return {}
+        entries = (
             {name: getattr(self, name) for name in SPLITS}
             if self.file is None
             else _from_file(self.file)
         )
+        root, where = self._root(), "split" if self.file is None else str(self.file)
+        parts = {
+            name: parts_of(root, wanted, f"{where}: {name}") for name, wanted in entries.items()
+        }
+        _require_distinct(parts, where)
+        return parts
+
+    def files(self) -> list[Path]:
+        """Return all logs, each once.
+
+        Raises:
+            ConfigError: as `parts`.
+        """
+        if self.auto:
+            return matches(self._root(), self.auto, "split: auto")
+        return list(dict.fromkeys(part.path for parts in self.parts().values() for part in parts))
+
+    def resolve(self) -> dict[str, list[Path]]:
+        """Return the logs of each split; nothing where `auto` divides them.
+
+        Raises:
+            ConfigError: as `parts`.
+        """
+        return {
+            split: list(dict.fromkeys(part.path for part in parts))
+            for split, parts in self.parts().items()
+        }
+
+    def _root(self) -> Path:
         root = self.root or (self.file.parent if self.file is not None else Path.cwd())
         if not root.is_dir():
             raise ConfigError(f"split: root {root} is not a folder; correct `root`")
-        where = "split" if self.file is None else str(self.file)
-        files = {
-            name: matches(root, wanted, f"{where}: {name}") for name, wanted in patterns.items()
-        }
-        _require_distinct(files, where)
-        return files
+        return root
 
 
-def _from_file(file: Path) -> dict[str, tuple[str, ...]]:
+def _from_file(file: Path) -> dict[str, tuple[str | LogPart, ...]]:
     content: dict[str, Any] = load_mapping(file)
     for key in content:
         if key not in SPLITS:
@@ -86,63 +124,42 @@ def _from_file(file: Path) -> dict[str, tuple[str, ...]]:
         if (
             not isinstance(entries, list)
             or not entries
-            or not all(isinstance(entry, str) for entry in entries)
+            or not all(isinstance(entry, str | dict) for entry in entries)
         ):
             raise ConfigError(
                 f"{file}: {name}: expected a list of at least one path or pattern, found"
                 f" {entries!r}"
             )
-    return {name: tuple(content[name]) for name in SPLITS}
+    return {
+        name: tuple(
+            entry if isinstance(entry, str) else validate(entry, LogPart, f"{file}: {name}")
+            for entry in content[name]
+        )
+        for name in SPLITS
+    }
 
 
-def matches(root: Path, patterns: Sequence[str], where: str) -> list[Path]:
-    """Return files of all patterns, each once."""
-    found: dict[Path, None] = {}
-    for pattern in patterns:
-        # a plain path may hold characters that a pattern would read otherwise
-        files = [root / pattern] if (root / pattern).is_file() else _globbed(root, pattern, where)
-        if not files:
-            parent = (root / pattern).parent
-            near = (
-                nearest(Path(pattern).name, (path.name for path in parent.iterdir()))
-                if parent.is_dir()
-                else f"; there is no folder {parent}"
-            )
-            raise ConfigError(f"{where}: '{pattern}' matches no file in {root}{near}")
-        found.update(dict.fromkeys(files))
-    return list(found)
-
-
-def _globbed(root: Path, pattern: str, where: str) -> list[Path]:
-    """Return files below `root` that a pattern matches, in order."""
-    why = "it is an absolute path" if Path(pattern).is_absolute() else ""
-    try:
-        if not why:
-            return sorted(path for path in root.glob(pattern) if path.is_file())
-    except ValueError as error:
-        why = str(error)
-    raise ConfigError(
-        f"{where}: '{pattern}' is not a pattern relative to {root} ({why}); set `root` instead"
-    )
-
-
-def _require_distinct(files: Mapping[str, Sequence[Path]], where: str) -> None:
-    seen: dict[Path, str] = {}
+def _require_distinct(parts: Mapping[str, Sequence[Part]], where: str) -> None:
+    """Stop where two splits name the same stretch, or two files would be one log."""
+    seen: list[tuple[Path, str, Part]] = []
     names: dict[str, Path] = {}
-    for split, paths in files.items():
-        for path in paths:
-            real = path.resolve()
-            if real in seen:
+    for split, members in parts.items():
+        for part in members:
+            real = part.path.resolve()
+            for other, owner, taken in seen:
+                if other == real and owner != split and part.overlaps(taken):
+                    what = "" if part.whole else "the same stretch of "
+                    raise ConfigError(
+                        f"{where}: {what}{part.path} stands in {owner} and in {split}; a"
+                        f" {'file' if part.whole else 'stretch'} belongs to one split"
+                    )
+            name = part.path.name if part.path.is_dir() else part.path.stem
+            if names.setdefault(name, real) != real:
                 raise ConfigError(
-                    f"{where}: {path} stands in {seen[real]} and in {split}; a file belongs to one"
-                    " split"
+                    f"{where}: {names[name]} and {part.path} would both be the log"
+                    f" '{name}'; rename one of the files"
                 )
-            if path.stem in names:
-                raise ConfigError(
-                    f"{where}: {names[path.stem]} and {path} would both be the log '{path.stem}';"
-                    " rename one of the files"
-                )
-            seen[real], names[path.stem] = split, path
+            seen.append((real, split, part))
 
 
 def check_leaks(logs: Mapping[str, Sequence[Log]], rows: int = 100) -> None:

@@ -63,7 +63,7 @@ class FitTaskSettings(FitSettings, ComputingTask):
             ConfigError: where they are not.
         """
         if isinstance(self.data, MeasuredLogs):
-            self.data.split.resolve()
+            self.data.split.files()
 
     def input_files(self) -> list[Path]:
         """Return the files of the measured logs."""

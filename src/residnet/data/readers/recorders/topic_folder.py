@@ -11,6 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from residnet.core.errors import DataError
+from residnet.data.drafting.words import state_channel, words_of
 from residnet.data.readers.base import require_file
 from residnet.data.readers.composing.composed import RecordingConfig
 from residnet.data.readers.composing.wanted import EVERYTHING, Wanted
@@ -126,7 +127,14 @@ def is_topic_folder(path: Path) -> bool:
     full = [head for head in heads if head]
     stamped = any(_stamp_columns(head.split(",")) is not None for head in full)
     timed = [head for head in full if set(head.split(",")) & set(_ARRIVAL)]
-    return stamped or (len(timed) > 1 and 2 * len(timed) > len(full) and len(set(timed)) > 1)
+    apart = len(timed) > 1 and 2 * len(timed) > len(full) and len(set(timed)) > 1
+    return stamped or (apart and sum(_is_whole_log(head) for head in timed) < 2)
+
+
+def _is_whole_log(head: str) -> bool:
+    """Return whether a header names position and heading, as a log by itself does."""
+    named = {state_channel(words_of(column)) for column in head.split(",")}
+    return {"x", "y", "psi"} <= named or {"latitude", "longitude", "psi"} <= named
 
 
 @final

@@ -9,9 +9,9 @@ from pydantic import Field, model_validator
 
 from residnet.core.config import Config, ConfigPath, Seconds
 from residnet.core.errors import ConfigError
+from residnet.data.parts import matches
 from residnet.data.prepare import PrepareConfig
 from residnet.data.readers import ReaderConfig
-from residnet.data.split import matches
 from residnet.documents.jervan2020.regressions import SurfaceRegression
 from residnet.documents.jervan2020.residual_model import ResidualModelConfig
 from residnet.physics.fossen import Fossen3, FossenVessel, HullConfig

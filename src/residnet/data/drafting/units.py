@@ -1,0 +1,84 @@
+"""The unit of a column from its header, else from the size of its values."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+
+from residnet.core.errors import UsageError
+from residnet.core.names import CHANNEL_UNITS
+from residnet.core.units import known_unit
+
+_IN_BRACKETS = re.compile(r"[\[({]([^\])}]*)[\])}]")
+_GERMAN = {"grad": "deg", "grad/s": "deg/s", "grad/min": "deg/min"}
+
+
+def written_unit(column: str, expected: str | None) -> str | None:
+    """Return the unit that a column's name holds, in brackets or at its end; None for none.
+
+    Args:
+        column: its name.
+        expected: SI unit of the dimension; None takes any, in brackets only.
+    """
+    texts = [text.strip() for text in _IN_BRACKETS.findall(column)]
+    if expected is not None:
+        tail = re.split(r"[\s_,;]+", _IN_BRACKETS.sub("", column).strip())
+        # `r_deg_s` and `speed_m_s` are quotients
+        texts += ["/".join(tail[-2:]), tail[-1]] if len(tail) > 1 else []
+        texts += ["/".join(tail[-3:-1] + tail[-1:])] if len(tail) > 3 and tail[-2] == "per" else []
+    for text in texts:
+        unit = _GERMAN.get(text.casefold(), text)
+        if len(unit) == 1 and unit.isalpha() and text not in _IN_BRACKETS.findall(column):
+            # a letter at the end is rather a name
+            continue
+        try:
+            return known_unit(unit, expected)
+        except UsageError:
+            continue
+    return None
+
+
+def other_dimension(column: str, expected: str) -> str | None:
+    """Return the unit in the brackets of a name where it measures something else; None for none."""
+    for text in _IN_BRACKETS.findall(column):
+        try:
+            known_unit(text.strip(), expected)
+        except UsageError:
+            try:
+                return known_unit(text.strip())
+            except UsageError:
+                continue
+    return None
+
+
+def unit_by_size(channel: str, values: np.ndarray) -> tuple[str, str]:
+    """Return the unit of a channel by the size of its values, and why.
+
+    Args:
+        channel: canonical name, or a name of one's own.
+        values: of the column [T], of all logs together.
+    """
+    known = np.abs(values[np.isfinite(values)])
+    largest = float(np.quantile(known, 0.99)) if known.size else 0.0
+    expected = CHANNEL_UNITS.get(channel) or _by_name(channel)
+    if expected == "rad":
+        limit = 7.0 if channel in ("psi", "wind_dir") or "azimuth" in channel else 1.6
+        unit = "deg" if largest > limit else "rad"
+    elif expected == "1/s":
+        unit = "rpm" if largest > 60.0 else "1/s"
+    else:
+        unit = expected
+    return unit, f"the header has no unit; values up to {largest:.3g} would be {unit}"
+
+
+def _by_name(channel: str) -> str:
+    """Return the SI unit of a channel that residnet does not know, by its name."""
+    first = channel.removeprefix("cmd_")
+    if re.match(r"n(_|$)", first):
+        return "1/s"
+    if first.startswith(("delta", "azimuth")):
+        return "rad"
+    if first.startswith(("tau_x", "tau_y", "thrust")):
+        return "N"
+    return "N m" if first.startswith("tau_n") else "-"

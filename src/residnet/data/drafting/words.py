@@ -1,0 +1,237 @@
+"""What columns are called: English, German, French, Spanish, Dutch, Norwegian and Japanese words.
+
+A name is read for what it is about (a rudder, a speed, the wind) and then for the channel that
+these make together, so that compounds and orders of words need no list of their own.
+"""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from typing import NamedTuple
+
+from residnet.core.names import ACCELERATION, CHANNEL_UNITS
+
+# what a name may be about -> parts of words, and whole words behind a bar
+_ABOUT: dict[str, str] = {
+    "time": "zeit timestamp tiempo temps tijd tidspunkt 時刻 時間 | t time stamp tid sec secs"
+    " seconds elapsed hora heure uhrzeit datum date datetime fecha utc dato",
+    "north": "north nord norte noord 北 | n northing",
+    "east": "east ost oste este oost 東 | e easting est",
+    "position": "posit 位置 | pos",
+    "x": "| x",
+    "y": "| y",
+    "latitude": "latit breitengrad breedte bredde 緯度 | lat breite",
+    "longitude": "longit langengrad lengte lengde 経度 | lon lng laenge lange",
+    "heading": "heading steuerkurs gierwinkel rumbo voorliggende heng kurswinkel 船首方位 方位"
+    " 回頭角 lacet guinada | psi yaw hdg cap koers kurs kompass compass koersen kompassi"
+    " peiling hdt",
+    "ground": "ground grund fond grond grunn 対地 | cog sog smg cmg",
+    "course": "course | cog cmg",
+    "rate": "rate geschwind vitesse velocidad snelheid hastighet 速度 角速度 | speed velo"
+    " velocity rot",
+    "turn": "turn dreh gier wende drei giring 回頭 virage giro guin | rot angvelo yaw",
+    "turn_rate": "turnrate drehrate gierrate wenderate drehgeschwind giergeschwind"
+    " wendegeschwind angvelo yawrate draaisnelheid giersnelheid svinghastighet dreiehastighet"
+    " 回頭角速度 | rot yawrate",
+    "angular": "angul winkelgeschwind hoeksnelheid vinkelhastighet 角速度 | gyro gyrz",
+    "speed": "speed velo 風速 geschwind vitesse velocidad snelheid hastighet 速度 船速 fahrt"
+    " 速力 | velo sog stw fart vel spd log",
+    "surge": "surge langsgeschw laengsgeschw longitudinal avance avante voraus vooruit"
+    " fremover 前後 langs | u forward ahead",
+    "sway": "sway quergeschw seitlich lateral dwars tverr sideveis 左右 derive transvers"
+    " querab sidewards sideways | v vm quer",
+    "rudder": "rudder ruder gouvernail timon roer rorv 舵 safran barre | delta rudder ror rsa",
+    "propeller": "propel schraube helice schroef 推進 プロペラ propulseur | prop screw shaft"
+    " welle eje arbre aksel 軸",
+    "engine": "engine motor maschine maquina moteur hovedmaskin 主機 | main",
+    "revolutions": "drehzahl revolution umdreh tours toerental omdreining turtall 回転 revoluc"
+    " | rpm rps rev revs n",
+    "thrust": "thrust schub poussee empuje stuwkracht skyv 推力",
+    "torque": "torque drehmoment couple koppel dreiemoment トルク",
+    "power": "power leistung puissance potencia vermogen effekt 出力",
+    "throttle": "throttle gashebel lever hebel | gas pwm",
+    "azimuth": "azimu schottel pod | azi nozzle",
+    "servo": "servo rcou",
+    "force": "force kraft fuerza kracht 力 tau",
+    "wind": "wind vind vent viento 風",
+    "true": "true wahr vrai verdadero real ware sann 真",
+    "relative": "relativ apparent scheinb aparente schijnb tilsyn 相対 gemessen measured",
+    "direction": "direction richtung direccion richting retning angle winkel 方向 風向 | dir"
+    " from angulo hoek vinkel",
+    "angle": "angle winkel angulo hoek vinkel lage 角 | ang",
+    "roll": "roll roulis balanceo krenging 横揺 kranken slagside | phi heel",
+    "pitch": "pitch tangage cabeceo stampf | theta trim",
+    "acceleration": "accel beschleun versnell akselerasjon 加速 | udot vdot rdot dot acc",
+    "command": "command order soll setpoint consigne befehl ordre gevraagd onsket 指令 demand"
+    " reference desired | cmd set ref des",
+    "port": "backbord babord babor bakboord 左舷 portside | port bb ps",
+    "starboard": "starboard steuerbord tribord estribor stuurboord styrbord 右舷 | stbd sb stb",
+    "current": "current stromung courant corriente stroming 潮流",
+    "depth": "depth tiefe profond profund diepte dybde 水深",
+    "voltage": "volt spannung tension | amp ampere current_a",
+    "age": "| age alter",
+    "estimate": "estimat filtered hat mean | est",
+    "measured": "| meas measured actual ist",
+    "allocated": "alloc",
+}
+
+
+MOTION = ("x", "y", "psi", "u", "v", "r", "p", "phi", "wind_speed", "wind_dir")
+"""Channels of the motion and of the wind."""
+
+
+class Words(NamedTuple):
+    """What a column's name is about.
+
+    Attributes:
+        text: the name without units and punctuation, in lower case and plain letters.
+        about: what it is about.
+        number: the number behind it, of several alike; None where there is none.
+    """
+
+    text: str
+    about: frozenset[str]
+    number: int | None
+
+    def has(self, *names: str) -> bool:
+        """Return whether the name is about all of these."""
+        return self.about.issuperset(names)
+
+    def lacks(self, *names: str) -> bool:
+        """Return whether the name is about none of these."""
+        return self.about.isdisjoint(names)
+
+
+_IN_BRACKETS = re.compile(r"[\[({][^\])}]*[\])}]")
+
+
+def plain(name: str) -> str:
+    """Return a name in lower case and plain letters, its words apart, its units left out."""
+    text = _IN_BRACKETS.sub(" ", name)
+    text = re.sub(r"([a-z])([A-Z])", r"\1 \2", text)
+    text = text.replace("ß", "ss").replace("ø", "o").replace("Ø", "O").replace("æ", "ae")
+    decomposed = unicodedata.normalize("NFKD", text)
+    # voicing marks of kana are letters, not accents
+    letters = "".join(c for c in decomposed if not unicodedata.combining(c) or c in "\u3099\u309a")
+    joined = unicodedata.normalize("NFC", letters).lower()
+    return " ".join(re.split(r"[\W_]+", joined)).strip()
+
+
+def words_of(name: str) -> Words:
+    """Return what a column's name is about."""
+    text = plain(name)
+    tokens = text.split()
+    number = next((int(token) for token in reversed(tokens) if token.isdigit()), None)
+    bare = [re.sub(r"\d+$", "", token) for token in tokens if not token.isdigit()]
+    if number is None:
+        tail = re.search(r"[a-z](\d+)$", tokens[-1]) if tokens else None
+        number = int(tail.group(1)) if tail else None
+    about = {thing for thing in _ABOUT if _fits(thing, text, bare)}
+    return Words(text, frozenset(about), number)
+
+
+def _fits(thing: str, text: str, tokens: list[str]) -> bool:
+    parts, _, whole = _ABOUT[thing].partition("|")
+    if set(whole.split()) & set(tokens):
+        return True
+    # the German word for speed holds the wind
+    text = text.replace("geschwind", "") if thing == "wind" else text
+    return any(
+        part in text if len(part) > 3 or not part.isascii() else part in tokens
+        for part in parts.split()
+    )
+
+
+def state_channel(words: Words) -> str | None:
+    """Return the channel of the motion or of the wind that a name stands for; None for none."""
+    w, name = words, words.text.replace(" ", "_")
+    if name in MOTION:
+        return name
+    if w.has("wind"):
+        if w.has("relative") and not w.has("true"):
+            return None
+        if w.has("speed") and "dir" not in w.text.split():
+            return "wind_speed"
+        return "wind_dir" if w.has("direction") else None
+    if not w.lacks("command", "acceleration", "rudder", "propeller", "current", "depth", "age"):
+        return None
+    if not w.lacks("engine", "revolutions", "throttle", "azimuth", "servo", "thrust", "torque"):
+        return None
+    if w.has("latitude"):
+        return "latitude"
+    if w.has("longitude"):
+        return "longitude"
+    if w.has("roll"):
+        return "p" if w.has("rate") or w.has("angular") else "phi"
+    if w.has("turn_rate") or (w.has("heading") and w.has("rate")) or w.text in ("r", "r mid"):
+        return "r"
+    if (w.has("turn") and w.has("rate")) or (w.has("angular") and w.text.endswith((" z", " r"))):
+        return "r"
+    return _place(w) or _velocity(w)
+
+
+def _place(w: Words) -> str | None:
+    """Return x, y or psi."""
+    if w.has("heading") and w.lacks("ground"):
+        return "psi"
+    if w.lacks("speed", "angle", "force"):
+        if w.has("north") or (w.has("x") and (w.has("position") or w.text in ("x", "x m"))):
+            return "x"
+        if w.has("east") or (w.has("y") and (w.has("position") or w.text in ("y", "y m"))):
+            return "y"
+    return None
+
+
+def _velocity(w: Words) -> str | None:
+    """Return u or v, or `speed` where only its size is meant."""
+    if w.has("north") or w.has("east") or w.has("angular") or w.has("voltage"):
+        return None
+    if w.has("sway"):
+        return "v"
+    if w.has("surge"):
+        return "u"
+    return "speed" if w.has("speed") else None
+
+
+def input_channel(words: Words) -> str | None:
+    """Return the channel of an actuator that a name stands for; None where it names none."""
+    w, name = words, words.text.replace(" ", "_")
+    if name in CHANNEL_UNITS and name not in (*MOTION, "t", *ACCELERATION):
+        return name
+    if w.has("wind") or w.has("age") or w.has("power") or w.has("voltage") or w.has("torque"):
+        return None
+    side = "_port" if w.has("port") else "_stbd" if w.has("starboard") else ""
+    side = side or (f"_{w.number}" if w.number is not None else "")
+    if w.has("force") and (forced := _force(w)):
+        return forced
+    if w.has("azimuth"):
+        return f"azimuth{side}{_ordered(w)}"
+    if w.has("rudder"):
+        name = "delta" if w.lacks("rate") else "delta_rate"
+        return f"cmd_{name}{side}" if w.has("command") else f"{name}{side}"
+    turning = w.has("revolutions") or w.has("propeller") or (w.has("engine") and w.lacks("angle"))
+    if turning and w.lacks("thrust"):
+        return f"cmd_n{side}" if w.has("command") else f"n{side}"
+    if w.has("thrust"):
+        return f"thrust{side}{_ordered(w)}"
+    if w.has("throttle") or w.has("servo"):
+        return f"{'servo' if w.has('servo') else 'throttle'}{side}"
+    if w.about and w.about <= {"port", "starboard", "command", "measured"}:
+        return f"cmd{side}" if w.has("command") else f"n{side}"
+    return None
+
+
+def _ordered(w: Words) -> str:
+    return "_cmd" if w.has("command") else ""
+
+
+def _force(w: Words) -> str | None:
+    """Return the name of a force or moment in body axes, with what tells it from others alike."""
+    axis = next((axis for axis in ("x", "y", "n", "z") if axis in w.text.split()), None)
+    if axis is None or not w.text.startswith("tau"):
+        return None
+    kind = next(
+        (f"_{name}" for name in ("command", "estimate", "measured", "allocated") if w.has(name)), ""
+    )
+    return f"tau_{'n' if axis == 'z' else axis}{kind}"

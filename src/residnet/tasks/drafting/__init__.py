@@ -1,0 +1,1 @@
+"""A complete config of a fit, drafted from logs: `residnet new`."""

@@ -1,0 +1,321 @@
+"""A complete config of a fit from logs alone, with a comment wherever it is a guess."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from residnet.core.config import validate
+from residnet.core.errors import DataError, ResidnetError, UsageError
+from residnet.core.log import Log
+from residnet.core.progress import say
+from residnet.data.division import divided, without_copies
+from residnet.data.doctor import inspect
+from residnet.data.drafting.physics import Raw, turns_to
+from residnet.data.drafting.questions import Answer, Marks
+from residnet.data.drafting.tables import CHANNELS
+from residnet.data.prepare import PrepareConfig, prepare
+from residnet.tasks.drafting import recipe
+from residnet.tasks.drafting.inputs import INPUTS, driving
+from residnet.tasks.drafting.logs import ReadLogs, found_logs, read_all
+from residnet.tasks.drafting.yaml_text import commented
+from residnet.tasks.fit.task import FitConfig
+
+_INSPECTED = 12
+"""Logs that the data doctor looks at."""
+
+
+@dataclass(frozen=True)
+class Draft:
+    """A config that runs, and what of it is a guess.
+
+    Attributes:
+        config: the content of the YAML file.
+        guesses: key -> why its value is a guess.
+        text: the YAML with its comments.
+    """
+
+    config: dict[str, Any]
+    guesses: tuple[tuple[str, str], ...]
+    text: str
+
+    def save(self, file: Path | str) -> Path:
+        """Write the config as YAML with its comments; returns the path of the file.
+
+        Raises:
+            UsageError: where the file cannot be written.
+        """
+        path = Path(file)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(self.text, encoding="utf-8")
+        except OSError as error:
+            raise UsageError(f"{path}: cannot be written ({error.strerror})") from error
+        return path
+
+
+def drafted(paths: Sequence[Path], folder: Path, name: str, answer: Answer | None = None) -> Draft:
+    """Return a config for logs that the task `fit` runs as it is.
+
+    Args:
+        paths: files, folders and bags.
+        folder: where the config will lie; its paths start from there.
+        name: of the run.
+        answer: answers questions; None takes every default and marks it.
+
+    Raises:
+        UsageError: where a path does not exist, or nothing drives the vessel in the logs.
+        DataError: where no log can be used.
+    """
+    marks = Marks(answer)
+    read = read_all(found_logs(paths), marks)
+    inputs = driving(list(read.whole.values()), marks)
+    if not inputs:
+        held = ", ".join(next(iter(read.whole.values())).channels)
+        raise UsageError(
+            "no channel of the logs is a rudder, a propeller or another command (they hold"
+            f" {held}); a model needs what drives the vessel: name its column, for example"
+            " 'rudder [deg]'"
+        )
+    read = _rudder_side(read, inputs, marks)
+    renamed, inputs = _plain_names(read, inputs, marks)
+    return _assembled(renamed, inputs, folder, name, marks)
+
+
+def _rudder_side(read: ReadLogs, inputs: Sequence[str], marks: Marks) -> ReadLogs:
+    """Turn the sign of rudders whose positive angles turn the vessel to port."""
+    channels = read.reader.get("channels", {})
+    for name in inputs:
+        if not name.removeprefix("cmd_").startswith("delta"):
+            continue
+        logs = [Raw(log.t, {name: log[name]}) for log in read.whole.values()]
+        rate = {i: log["r"] for i, log in enumerate(read.whole.values())}
+        slope, error = turns_to(logs, name, rate)
+        key = (*CHANNELS, name) if name in channels else INPUTS
+        if abs(slope) < 4.0 * error:
+            marks.guess(key, f"the logs do not tell to which side {name} turns the vessel")
+        elif slope < 0.0 and name in channels:
+            entry = channels[name]
+            entry["sign"] = -1 * int(entry.get("sign", 1))
+            text = f"positive values turned the vessel to port in the logs ({-slope / error:.0f}"
+            marks.guess(key, f"{text} standard errors): the sign is turned")
+            for logs_of in (read.logs, read.whole):
+                logs_of.update({path: _turned(log, name) for path, log in logs_of.items()})
+        elif slope < 0.0:
+            marks.guess(key, f"positive values of {name} turned the vessel to port in the logs")
+    return read
+
+
+def _turned(log: Log, name: str) -> Log:
+    """Return a log with one channel of the other sign."""
+    return log.replace(channels={**log.channels, name: -log[name]})
+
+
+def _plain_names(
+    read: ReadLogs, inputs: Sequence[str], marks: Marks
+) -> tuple[ReadLogs, tuple[str, ...]]:
+    """Rename chosen forces to tau_x, tau_y, tau_n, and drop channels that nothing uses."""
+    new = {name: name for name in inputs}
+    for name in inputs:
+        for force in ("tau_x", "tau_y", "tau_n"):
+            if name.startswith(f"{force}_"):
+                new[name] = force
+    channels = read.reader.get("channels")
+    state = ("x", "y", "psi", "u", "v", "r", "wind_speed", "wind_dir")
+    if channels:
+        kept = {
+            new.get(name, name): entry
+            for name, entry in channels.items()
+            if name in state or name in new
+        }
+        read.reader["channels"] = kept
+        marks.rename(CHANNELS, {name: new.get(name, name) for name in (*state, *new)})
+    for logs in (read.logs, read.whole):
+        for path, log in list(logs.items()):
+            changed = {new.get(key, key): values for key, values in log.channels.items()}
+            units = {new.get(key, key): unit for key, unit in log.units.items()}
+            logs[path] = log.replace(channels=changed, units=units)
+    return read, tuple(new.values())
+
+
+def _assembled(
+    read: ReadLogs, inputs: tuple[str, ...], folder: Path, name: str, marks: Marks
+) -> Draft:
+    whole = list(read.whole.values())
+    time = recipe.timing(whole)
+    wind = recipe.exogenous(whole)
+    codes = _findings(list(read.logs.values()), inputs, marks)
+    preparation = _preparation(time, whole, inputs, codes)
+    usable = _usable(read, (*inputs, *wind), preparation)
+    split, splits = _split(read, usable, folder, marks)
+    judged = [*splits["validation"], *splits["test"]]
+    length = recipe.window_length(judged, time.memory)
+    split, splits = _long_enough(split, splits, length, marks)
+    samples = int(sum(log.t[-1] - log.t[0] for log in splits["train"]) / time.step)
+    protocols = recipe.protocols(length)
+    recipe.mark_timing(time, length, marks)
+    plan = recipe.models(inputs, bool(wind), time, length, samples)
+    scales = recipe.scales([*splits["train"], *splits["validation"]])
+    marks.note(("evaluation", "scales"), "standard deviations over training and validation logs")
+    config = {
+        "task": "fit",
+        "name": name,
+        "description": f"Drafted by residnet new from {len(usable)} logs",
+        "data": {"kind": "measured", "reader": read.reader, "split": split},
+        "prepare": preparation,
+        "signals": {"inputs": list(inputs), **({"exogenous": list(wind)} if wind else {})},
+        "integrator": "semi_implicit_euler",
+        **plan,
+        "evaluation": {
+            "protocols": protocols,
+            "selection": next(iter(protocols)),
+            "scales": scales,
+        },
+    }
+    validate(config, FitConfig, "draft", folder)
+    head = _head(read, marks)
+    guesses = tuple((".".join(key), text) for key, text in marks.guesses)
+    return Draft(config, guesses, commented(config, marks.comments, head))
+
+
+def _preparation(
+    time: recipe.Timing, logs: Sequence[Log], inputs: Sequence[str], codes: set[str]
+) -> dict[str, Any]:
+    held = recipe.held(logs, inputs)
+    grid: dict[str, Any] = {"step": f"{time.step:g} s"}
+    grid |= {"held": list(held)} if held else {}
+    masks = [{"kind": "frozen"}] if "frozen" in codes else []
+    return {
+        "grid": grid,
+        **({"masks": masks} if masks else {}),
+        "derivative": {"kind": "savitzky_golay", "window": f"{time.window:g} s", "order": 2},
+        "hold": "start" if len(held) == len(inputs) else "mean",
+    }
+
+
+def _findings(logs: Sequence[Log], inputs: Sequence[str], marks: Marks) -> set[str]:
+    """Return the codes of what the data doctor finds, and write its findings down."""
+    codes: set[str] = set()
+    told: dict[str, list[str]] = {}
+    for log in logs[:: max(1, len(logs) // _INSPECTED)]:
+        try:
+            found = inspect(log, [name for name in inputs if name in log.channels])
+        except ResidnetError as error:
+            marks.note(("data",), f"data doctor: {log.name}: {error}")
+            continue
+        for finding in found.findings:
+            if finding.level != "note":
+                codes.add(finding.code)
+                told.setdefault(finding.code, []).append(f"{log.name}: {finding.text}")
+    for texts in told.values():
+        more = f" (and {len(texts) - 1} more logs)" if len(texts) > 1 else ""
+        marks.note(("data",), f"data doctor: {texts[0][:300]}{more}")
+    return codes
+
+
+def _usable(
+    read: ReadLogs, columns: Sequence[str], preparation: Mapping[str, Any]
+) -> dict[Path, Log]:
+    """Return the logs that can be prepared; the others are left out with the reason."""
+    config = validate(dict(preparation), PrepareConfig, "draft")
+    out: dict[Path, Log] = {}
+    for path, log in read.logs.items():
+        try:
+            prepared = prepare(log, "train", columns, config)
+        except ResidnetError as error:
+            read.left_out[path] = str(error)
+            continue
+        if prepared.good.any():
+            out[path] = read.whole[path]
+        else:
+            read.left_out[path] = "no stretch is as long as the window of the derivative"
+    if not out:
+        raise DataError(next(iter(read.left_out.values())))
+    kept = {log.name for log in without_copies(list(out.values()))}
+    for path, log in list(out.items()):
+        if log.name not in kept:
+            read.left_out[path] = "its rows are a copy of part of another log"
+            del out[path]
+    return out
+
+
+def _split(
+    read: ReadLogs, usable: Mapping[Path, Log], folder: Path, marks: Marks
+) -> tuple[dict[str, Any], dict[str, list[Log]]]:
+    """Return the split as a config has it, and its logs with their whole motion."""
+    splits = divided(list(usable.values()))
+    paths = {log.name: path for path, log in usable.items()}
+    common = Path(os.path.commonpath([path.resolve().parent for path in usable]))
+    root = _relative(common, folder)
+    entries: dict[str, list[Any]] = {}
+    for split, logs in splits.items():
+        entries[split] = []
+        for log in logs:
+            ends = log.meta.get("stretch")
+            path = next(
+                path
+                for name, path in paths.items()
+                if (ends and log.name.startswith(name)) or name == log.name
+            )
+            entry: Any = path.resolve().relative_to(common).as_posix()
+            if ends:
+                source = usable[path]
+                entry = {"log": entry}
+                entry |= {"from": f"{ends[0]:g} s"} if ends[0] > source.t[0] else {}
+                entry |= {"to": f"{ends[1]:g} s"} if ends[1] < source.t[-1] else {}
+            entries[split].append(entry)
+    cut = any(isinstance(entry, dict) for found in entries.values() for entry in found)
+    why = (
+        "few logs: each is cut in time"
+        if cut
+        else "of each five logs, in the order of their manoeuvres, one is for validation and one"
+        " for the test"
+    )
+    marks.guess(("data", "split"), f"{why}; logs of one day may be alike, so check the choice")
+    return {"root": root, **entries}, splits
+
+
+def _relative(path: Path, folder: Path) -> str:
+    """Return a path as seen from a folder, absolute where it lies far from it."""
+    near = os.path.relpath(path, folder.resolve())
+    return path.as_posix() if near.count("..") > 2 else Path(near).as_posix()
+
+
+def _long_enough(
+    split: dict[str, Any], splits: dict[str, list[Log]], length: float, marks: Marks
+) -> tuple[dict[str, Any], dict[str, list[Log]]]:
+    """Move logs that are too short to be judged to the training."""
+    shortest = 1.2 * min(
+        float(entry["length"].split()[0]) for entry in recipe.protocols(length).values()
+    )
+    for name in ("validation", "test"):
+        for entry, log in list(zip(split[name], splits[name], strict=True)):
+            if log.t[-1] - log.t[0] >= shortest or len(split[name]) == 1:
+                continue
+            split[name].remove(entry)
+            splits[name] = [other for other in splits[name] if other is not log]
+            split["train"].append(entry)
+            splits["train"].append(log)
+            marks.note(("data", "split"), f"{log.name} is too short to be judged on")
+    return split, splits
+
+
+def _head(read: ReadLogs, marks: Marks) -> list[str]:
+    lines = [
+        "Drafted by `residnet new` from the logs alone. Lines with 'guess' say what the logs do not"
+        " tell, and why this value was taken: read them before the results are trusted."
+    ]
+    for path, reason in read.left_out.items():
+        lines.append(f"left out: {path.name}: {reason}")
+    if "smoothed" in next(iter(read.whole.values())).meta:
+        names = ", ".join(next(iter(read.whole.values())).meta["smoothed"])
+        lines.append(
+            f"{names} are not measured at every sample: a smoother makes them from position and"
+            " heading. Where the antenna stands off the vessel's centre, or its positions come"
+            " late, add prepare.motion: {antenna: {x: ..., y: ...}, delay: ...}."
+        )
+    say(f"{len(read.logs)} logs were read, {len(read.left_out)} left out")
+    return lines

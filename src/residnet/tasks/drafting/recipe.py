@@ -1,0 +1,212 @@
+"""The numbers of a fit that follow from logs: step, windows, scales, models, training."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from residnet.core.log import Log
+from residnet.core.names import VELOCITY
+from residnet.data.drafting.questions import Marks
+from residnet.physics.environment.wind import WIND_INPUTS
+from residnet.tasks.drafting.inputs import roles
+
+_WINDOWS = (100.0, 60.0, 40.0, 30.0, 20.0, 10.0, 5.0, 2.0, 1.0)
+_HULL = ("u v", "u r", "v r", "u|u|", "v|v|", "r|r|", "v|r|", "r|v|")
+_EFFORT = 24_000
+"""Steps of rollouts that a network is trained through, in batches: about a minute."""
+
+
+@dataclass(frozen=True)
+class Timing:
+    """How fast a vessel is, by its logs.
+
+    Attributes:
+        interval: usual step of the logs, s.
+        memory: time after which the yaw rate (or the speed) is another, s.
+        step: of the grid, s.
+        window: of the derivative, s.
+    """
+
+    interval: float
+    memory: float
+    step: float
+    window: float
+
+
+def timing(logs: Sequence[Log]) -> Timing:
+    """Return the time scales of logs that hold velocities."""
+    interval = float(np.median([np.median(np.diff(log.t)) for log in logs]))
+    memories = [_memory(log) for log in logs]
+    memory = float(np.median([m for m in memories if np.isfinite(m)] or [20.0 * interval]))
+    step = _readable(interval * max(1, int(memory / 40.0 / interval)))
+    samples = max(7, 2 * round(0.5 * memory / 5.0 / step) + 1)
+    return Timing(interval, memory, step, _readable(min(samples, 41) * step))
+
+
+def _memory(log: Log) -> float:
+    """Return the time in s after which the yaw rate is correlated by 1/e only."""
+    values = log["r"] if "r" in log.channels else log["u"]
+    known = np.isfinite(values)
+    if known.sum() < 50:
+        return float("nan")
+    t, x = log.t[known], values[known] - values[known].mean()
+    step = float(np.median(np.diff(t)))
+    even = np.interp(np.arange(t[0], t[-1], step), t, x)[:20_000]
+    power = np.abs(np.fft.rfft(even, 2 * even.size)) ** 2
+    correlation = np.fft.irfft(power)[: even.size]
+    below = np.flatnonzero(correlation < correlation[0] / np.e)
+    return float(below[0] * step) if below.size else float("nan")
+
+
+def _readable(value: float) -> float:
+    return float(f"{value:.6g}")
+
+
+def window_length(logs: Sequence[Log], memory: float) -> float:
+    """Return the length of free runs that most of the logs hold, s."""
+    lengths = sorted(float(log.t[-1] - log.t[0]) for log in logs)
+    usual = lengths[int(0.25 * (len(lengths) - 1))] if lengths else 1.0
+    room = [length for length in _WINDOWS if 1.15 * length <= usual] or [0.5 * usual]
+    return next((length for length in room if length <= 15.0 * memory), room[-1])
+
+
+def protocols(length: float) -> dict[str, Any]:
+    """Return two protocols: free runs of a length and of a third of it."""
+    short = max((w for w in _WINDOWS if w <= 0.4 * length), default=0.5 * length)
+    first = min(5.0, 0.1 * length)
+    return {
+        f"T{seconds:g}".replace(".", "_"): {
+            "kind": "windows",
+            "length": f"{seconds:g} s",
+            "first": f"{first:g} s",
+            "history": f"{first:g} s",
+        }
+        for seconds in (length, short)
+    }
+
+
+def scales(logs: Sequence[Log]) -> dict[str, Any]:
+    """Return the standard deviations of the velocities, in units that read well."""
+    spread = {
+        name: float(np.nanstd(np.concatenate([log[name] for log in logs]))) for name in VELOCITY
+    }
+    least = 1e-4
+    return {
+        "u": f"{max(spread['u'], least):.3g} m/s",
+        "v": f"{max(spread['v'], least):.3g} m/s",
+        "r": f"{np.degrees(max(spread['r'], least)):.3g} deg/s",
+    }
+
+
+def held(logs: Sequence[Log], inputs: Sequence[str]) -> tuple[str, ...]:
+    """Return the inputs that rest at one value most of the time, as commands do."""
+    out = []
+    for name in inputs:
+        resting = [float(np.mean(np.diff(log[name]) == 0.0)) for log in logs if len(log) > 1]
+        if resting and np.median(resting) > 0.9:
+            out.append(name)
+    return tuple(out)
+
+
+def models(inputs: Sequence[str], wind: bool, time: Timing, length: float, samples: int) -> Any:
+    """Return baselines, refit, heads, base_of and training of a config.
+
+    Args:
+        inputs: of the models.
+        wind: whether the true wind is known.
+        time: of the logs.
+        length: of the free runs that models are chosen by, s.
+        samples: for training, on the grid.
+    """
+    acting = roles(inputs)
+    extra = [name for name in inputs if name == "tau_y"]
+    linear: dict[str, Any] = {"kind": "regressors", "ridge": 1e-6, "sets": ["linear"]}
+    linear["terms"] = [*extra, *(["wind_u", "wind_v"] if wind else [])]
+    if not linear["terms"]:
+        del linear["terms"]
+    physics: dict[str, Any] = {"kind": "regressors", "ridge": 1e-4}
+    if acting["drive"] and acting["steer"] and set(inputs) == {*acting["drive"], *acting["steer"]}:
+        physics["sets"] = ["fossen", *(["wind"] if wind else [])]
+        known = {"drive": ("n",), "steer": ("delta",)}
+        physics |= {key: list(names) for key, names in acting.items() if names != known[key]}
+    else:
+        physics["sets"] = ["linear", *(["wind"] if wind else [])]
+        physics["terms"] = [*_HULL, *extra, *(term for name in inputs for term in _acting(name))]
+    horizon = _readable(_seconds(0.2 * length))
+    plan: dict[str, Any] = {
+        "baseline": linear,
+        "baselines": {"physics": physics},
+        "refit": {
+            "physics": {"horizon": f"{horizon:g} s", "every": f"{horizon:g} s", "prior": 0.01}
+        },
+        "heads": {"plsr": {"kind": "plsr"}, "mlp": {"kind": "mlp", "hidden": _hidden(samples)}},
+        "base_of": {"plsr": "physics", "mlp": "physics"},
+        "training": {"mlp": _training(time.step, length)},
+    }
+    return plan
+
+
+def _acting(name: str) -> list[str]:
+    """Return the terms of an input of which only its kind is known."""
+    if name in ("tau_x", "tau_y", "tau_n"):
+        return []
+    if name.removeprefix("cmd_").startswith(("delta", "azimuth")):
+        return [f"u|u| {name}"]
+    return [f"{name}|{name}|", f"|{name}| u"]
+
+
+def _hidden(samples: int) -> list[int]:
+    return [16] if samples < 5_000 else [16, 16] if samples < 50_000 else [32, 32]
+
+
+def _seconds(value: float) -> float:
+    """Return a time of one or two digits near a value, s."""
+    return float(f"{value:.2g}") if value >= 0.01 else 0.01
+
+
+def _training(step: float, length: float) -> dict[str, Any]:
+    """Return the training of a network in free run, over growing horizons."""
+    horizons = sorted({_seconds(min(share * length, 120 * step)) for share in (0.08, 0.16, 0.3)})
+    cost = sum(weight * h / step for weight, h in zip((1, 2, 3), horizons, strict=False))
+    unit = max(1, min(4, round(_EFFORT / 25.0 / max(cost, 1.0))))
+    stages = [
+        {
+            "horizon": f"{h:g} s",
+            "epochs": weight * unit,
+            "batch": 128,
+            "learning_rate": 3e-3 if weight < 3 else 1.5e-3,
+            "final": 0.5 if weight < 3 else 0.05,
+        }
+        for weight, h in zip((1, 2, 3), horizons, strict=False)
+    ]
+    return {
+        "history": f"{min(2.0, 0.1 * length):g} s",
+        "one_step": {"epochs": 0},
+        "multi_step": stages,
+        "steps": 25,
+        "average": 0.98,
+        "weight_decay": 0.001,
+        "robust": 0.05,
+    }
+
+
+def exogenous(logs: Sequence[Log]) -> tuple[str, ...]:
+    """Return the channels of the true wind where every log holds them."""
+    there = all(set(WIND_INPUTS) <= set(log.channels) for log in logs)
+    return WIND_INPUTS if there else ()
+
+
+def mark_timing(time: Timing, length: float, marks: Marks) -> None:
+    """Write down what the numbers of time follow from."""
+    marks.note(
+        ("prepare", "grid"),
+        f"logs have a sample each {time.interval:.3g} s, and a yaw rate that stays alike for"
+        f" {time.memory:.3g} s",
+    )
+    marks.note(
+        ("evaluation", "protocols"), f"free runs of {length:g} s fit into most logs for judging"
+    )

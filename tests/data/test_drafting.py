@@ -1,0 +1,172 @@
+"""Channel maps from tables that nobody described: names, units, signs and axes are found again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import foreign_tables
+import numpy as np
+import pytest
+from foreign_tables import CHANNELS, NAMES, Style
+
+import residnet
+from residnet.core.config import validate
+from residnet.core.log import Log
+from residnet.data.drafting.questions import Marks, Question
+from residnet.data.drafting.tables import draft_tables
+from residnet.data.drafting.units import written_unit
+from residnet.data.drafting.words import input_channel, state_channel, words_of
+from residnet.data.readers import ReaderConfig
+
+GERMAN = Style(
+    language="German",
+    units={"psi": "°", "u": "kn", "v": "kn", "r": "°/min", "delta": "°", "n": "U/min"},
+    delimiter=";",
+    decimal=",",
+    dates="%d.%m.%Y %H:%M:%S,%f",
+    encoding="cp1252",
+)
+STYLES = {
+    "SI without units": Style(told=False),
+    "degrees without units": Style(
+        told=False, units={"psi": "deg", "r": "deg/s", "delta": "deg", "n": "rpm"}
+    ),
+    "knots and minutes without units": Style(
+        told=False, units={"psi": "deg", "u": "kn", "v": "kn", "r": "°/min", "delta": "deg"}
+    ),
+    "port is positive": Style(told=False, signs=("v", "r")),
+    "German": GERMAN,
+    "Japanese": Style(
+        language="Japanese",
+        units={"psi": "°", "u": "kn", "v": "kn", "r": "deg/s", "delta": "deg", "n": "rpm"},
+        encoding="cp932",
+    ),
+    "French": Style(language="French", units={"u": "km/h", "v": "km/h"}, delimiter=";"),
+    "Dutch": Style(language="Dutch", units={"psi": "deg", "n": "1/min"}, delimiter="\t"),
+}
+
+
+@pytest.fixture(scope="module")
+def logs() -> list[Log]:
+    """Zigzags and turns of a ship with rudder and propeller."""
+    trials: list[dict[str, Any]] = [
+        {"kind": "zigzag", "drive": 0.8, "steer": 0.5, "heading": "20 deg", "start": 3},
+        {"kind": "turning_circle", "drive": 0.9, "steer": 0.4, "start": 3},
+        {"kind": "zigzag", "drive": 0.6, "steer": -0.4, "heading": "10 deg", "start": 3},
+    ]
+    noise = {"u": 0.02, "v": 0.02, "r": 0.002}
+    flown = residnet.simulate(
+        "example_rudder_boat", trials, duration=90.0, step=0.1, noise=noise, seed=4
+    )
+    return list(flown.logs)
+
+
+@pytest.mark.parametrize("style", STYLES.values(), ids=STYLES.keys())
+def test_a_table_is_read_as_it_was(style: Style, logs: list[Log], tmp_path: Path) -> None:
+    files, marks = foreign_tables.write(logs, tmp_path, style), Marks()
+    draft = draft_tables(files, marks)
+    reader = validate(draft.content, ReaderConfig, "here").build()
+    for file, truth in zip(files, logs, strict=True):
+        read = reader.read(file)
+        for name in set(CHANNELS) & set(truth.channels):
+            there, was = read[name], truth[name]
+            if name == "psi":
+                there = there - 2 * np.pi * np.rint((there[0] - was[0]) / (2 * np.pi))
+            size = float(np.abs(was).max()) + 1e-3
+            np.testing.assert_allclose(there, was, atol=1e-6 * size, err_msg=name)
+    told = {".".join(key) for key, _ in marks.guesses}
+    if not style.told:
+        assert {f"data.reader.channels.{name}" for name in ("psi", "u", "r", "delta")} <= told
+
+
+@pytest.mark.parametrize("language", NAMES)
+def test_words_of_a_language(language: str) -> None:
+    time, *columns = NAMES[language]
+    assert words_of(time).has("time")
+    found = [state_channel(words_of(name)) or input_channel(words_of(name)) for name in columns]
+    assert found == list(CHANNELS)
+
+
+@pytest.mark.parametrize(
+    ("column", "channel"),
+    [
+        ("wind_dir_relative_mid [rad]", None),
+        ("scheinbare Windrichtung [°]", None),
+        ("wind_velo_true [m/s]", "wind_speed"),
+        ("Kurs über Grund [°]", None),
+        ("course over ground", None),
+        ("speed over ground [kn]", "speed"),
+        ("rudder_cmd", "cmd_delta"),
+        ("engine rpm port", "n_port"),
+        ("tau_n_est", "tau_n_estimate"),
+        ("alloc_age", None),
+        ("roll rate", "p"),
+        ("Latitude", "latitude"),
+    ],
+)
+def test_what_a_name_is_about(column: str, channel: str | None) -> None:
+    words = words_of(column)
+    assert (state_channel(words) or input_channel(words)) == channel
+
+
+@pytest.mark.parametrize(
+    ("column", "expected", "unit"),
+    [
+        ("r [°/min]", "rad/s", "deg/min"),
+        ("yaw_rate_deg_s", "rad/s", "deg/s"),
+        ("speed (kn)", "m/s", "kn"),
+        ("heading deg", "rad", "deg"),
+        ("Winkel [Grad]", "rad", "deg"),
+        ("n [U/min]", "1/s", "1/min"),
+        ("course", "rad", None),
+        ("tau_n", "N m", None),
+    ],
+)
+def test_the_unit_in_a_header(column: str, expected: str, unit: str | None) -> None:
+    assert written_unit(column, expected) == unit
+
+
+def test_axes_that_are_called_by_letters(logs: list[Log], tmp_path: Path) -> None:
+    # x east, y north, heading counter-clockwise from east, velocities forward and to port
+    turned = []
+    for log in logs:
+        new = {
+            **log.channels,
+            "x": log["y"],
+            "y": log["x"],
+            "psi": np.pi / 2 - log["psi"],
+            "v": -log["v"],
+            "r": -log["r"],
+        }
+        turned.append(log.replace(channels=new))
+    names = dict(zip(NAMES["English"][1:3], ("x", "y"), strict=True))
+    files = foreign_tables.write(turned, tmp_path, Style())
+    for file in files:
+        head, _, rest = file.read_text().partition("\n")
+        for old, letter in names.items():
+            head = head.replace(old, letter)
+        file.write_text(f"{head}\n{rest}")
+    marks = Marks()
+    channels = draft_tables(files, marks).content["channels"]
+    # the mirror image fits as well, and is marked
+    assert (channels["x"]["column"], "frame" in channels["psi"]) == ("x [m]", False)
+    assert "data.reader.channels.x" in {".".join(key) for key, _ in marks.guesses}
+
+
+def test_a_header_that_is_wrong_is_asked_about(logs: list[Log], tmp_path: Path) -> None:
+    files = foreign_tables.write(logs, tmp_path, Style(units={"r": "°/min"}))
+    for file in files:
+        file.write_text(file.read_text().replace("[°/min]", "[deg/s]"))
+    asked: list[Question] = []
+
+    def answer(question: Question) -> str:
+        asked.append(question)
+        return question.default
+
+    content = draft_tables(files, Marks(answer)).content
+    assert content["channels"]["r"]["unit"] == "deg/min"
+    assert [question.options for question in asked] == [("deg/min", "deg/s")]
+    marks = Marks()
+    draft_tables(files, marks)
+    assert any("the header says deg/s" in text for _, text in marks.guesses)

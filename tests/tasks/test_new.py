@@ -1,0 +1,109 @@
+"""`residnet new`: a config from logs alone that `check` takes, its guesses marked."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import foreign_tables
+import numpy as np
+import pytest
+import yaml
+from foreign_tables import Style
+
+import residnet
+from residnet.core.errors import DataError, UsageError
+from residnet.core.log import Log
+from residnet.data.drafting.questions import Question
+from residnet.tasks.drafting.verb import new_config
+from residnet.tasks.loading import load_task
+
+
+@pytest.fixture(scope="module")
+def logs() -> list[Log]:
+    """Zigzags of a ship: six, of three heading angles."""
+    trials = [
+        {"kind": "zigzag", "drive": drive, "steer": 0.5, "heading": angle, "start": 3}
+        for drive in (0.6, 0.9)
+        for angle in ("10 deg", "20 deg", "30 deg")
+    ]
+    flown = residnet.simulate("example_rudder_boat", trials, duration=60.0, step=0.1, seed=4)
+    return list(flown.logs)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory, logs: list[Log]) -> Path:
+    folder = tmp_path_factory.mktemp("drafts")
+    style = Style(told=False, units={"psi": "deg", "u": "kn", "v": "kn", "r": "°/min"})
+    foreign_tables.write(logs, folder / "trials", Style(**{**style.__dict__, "signs": ("delta",)}))
+    return folder
+
+
+def test_a_config_from_logs_alone(folder: Path) -> None:
+    out = folder / "boat.yaml"
+    lines = new_config([folder / "trials"], out, None, overwrite=False)
+    assert lines[-1] == f"next: residnet run {out}"
+    load_task(out).check()
+    text = out.read_text()
+    content = yaml.safe_load(text)
+    channels = content["data"]["reader"]["channels"]
+    assert (channels["r"]["unit"], channels["u"]["unit"]) == ("deg/min", "kn")
+    assert channels["delta"]["sign"] == -1
+    assert content["signals"]["inputs"] == ["delta", "n"]
+    assert content["baselines"]["physics"]["sets"] == ["fossen"]
+    assert {name: len(content["data"]["split"][name]) for name in ("train", "test")} == {
+        "train": 4,
+        "test": 1,
+    }
+    # whatever was guessed stands above its key
+    for line in ("r: {column: yaw rate", "delta: {column: rudder", "time: {column: time"):
+        above = text[: text.index(line)].rstrip().splitlines()[-1]
+        assert above.strip().startswith("#"), line
+
+
+def test_the_same_from_python(folder: Path) -> None:
+    draft = residnet.draft(folder / "trials", name="boat", folder=folder)
+    assert draft.config == yaml.safe_load((folder / "boat.yaml").read_text())
+    assert "data.split" in dict(draft.guesses)
+
+
+def test_a_file_is_not_replaced_unasked(folder: Path) -> None:
+    file = folder / "kept.yaml"
+    file.write_text("mine")
+    with pytest.raises(UsageError, match="exists; give --overwrite"):
+        new_config([folder / "trials"], file, None, overwrite=False)
+    with pytest.raises(UsageError, match=r"name it .*boat\.txt\.yaml"):
+        new_config([folder / "trials"], folder / "boat.txt", None, overwrite=False)
+
+
+def test_one_log_is_cut_in_time(folder: Path, logs: list[Log]) -> None:
+    only = sorted((folder / "trials").glob("*.csv"))[0]
+    draft = residnet.draft(only, folder=folder)
+    assert draft.config["data"]["split"]["test"] == [{"log": only.name, "from": "47.9 s"}]
+    assert any("cut in time" in why for _, why in draft.guesses)
+
+
+def test_answers_are_taken(folder: Path, logs: list[Log], tmp_path: Path) -> None:
+    files = foreign_tables.write(logs, tmp_path, Style(units={"r": "°/min"}))
+    for file in files:
+        file.write_text(file.read_text().replace("[°/min]", "[deg/s]"))
+
+    def answer(question: Question) -> str:
+        return question.options[-1]
+
+    draft = residnet.draft(tmp_path, folder=tmp_path, answer=answer)
+    assert draft.config["data"]["reader"]["channels"]["r"]["unit"] == "deg/s"
+    assert "answered 'deg/s' in place of 'deg/min'" in draft.text
+
+
+def test_what_cannot_be_drafted(folder: Path, logs: list[Log], tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="no such file or folder"):
+        residnet.draft(tmp_path / "nowhere")
+    with pytest.raises(UsageError, match="holds no log of a format"):
+        residnet.draft(tmp_path)
+    still = [log.replace(channels={**log.channels, "n": np.full(len(log), 3.0)}) for log in logs]
+    foreign_tables.write(still, tmp_path / "still", Style(left_out=("delta",)))
+    with pytest.raises(UsageError, match="no channel of the logs is a rudder"):
+        residnet.draft(tmp_path / "still")
+    foreign_tables.write(logs, tmp_path / "lost", Style(left_out=("psi",)))
+    with pytest.raises((UsageError, DataError), match="no channel psi"):
+        residnet.draft(tmp_path / "lost")
