@@ -214,6 +214,37 @@ def export(
 
 
 @app.command()
+def ardupilot(
+    source: Annotated[
+        str, typer.Argument(metavar="VESSEL|RUN", help="A vessel, or the folder of a finished fit.")
+    ],
+    model: Annotated[
+        str, typer.Option("--model", metavar="NAME", help="Name of the model of a run.")
+    ] = "selected",
+    servo: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--servo",
+            metavar="COMMAND=OUTPUT:LOW:HIGH",
+            help="Servo output of a command and its values at 1000 and 2000 us, SI.",
+        ),
+    ] = None,
+    port: Annotated[int, typer.Option("--port", help="UDP port that ArduPilot sends to.")] = 9002,
+) -> None:
+    """Simulate a vessel or a learned model for ArduPilot (sim_vehicle.py --model JSON)."""
+    from residnet.simulators.ardupilot import ArduPilotBackEnd, servos
+    from residnet.simulators.vehicle import vehicle
+
+    _limit_threads()
+    boat = vehicle(source, model=model, dt=0.0025)
+    end = ArduPilotBackEnd(boat, servos(boat, servo or ()), port)
+    print(f"{boat.name} listens at UDP port {end.port}; Ctrl-C ends it", flush=True)
+    for name, at in zip(boat.inputs, end.servos, strict=False):
+        print(f"  {name}: servo output {at.channel}, {at.low:g} to {at.high:g}", flush=True)
+    end.serve()
+
+
+@app.command()
 def report(folder: RunPath) -> None:
     """Write the figures and the report of a finished run again."""
     from residnet.tasks.verbs import report_run

@@ -1,0 +1,218 @@
+"""A physics back end for ArduPilot's software in the loop, over its JSON interface.
+
+ArduPilot sends a binary packet of servo outputs over UDP and waits for a line of JSON with what the
+inertial sensors measure (ArduPilot, libraries/SITL/examples/JSON/readme.md). Packets of 16 servos
+carry the number 18458, those of 32 the number 29569, then the frame rate, the frame count and the
+pulse widths, all little-endian.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import socket
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import final
+
+import torch
+from torch import Tensor
+
+from residnet.core.errors import UsageError
+from residnet.core.names import nearest
+from residnet.core.progress import say
+from residnet.simulators.vehicle import Vehicle
+
+_PACKETS = {18458: struct.Struct("<HHI16H"), 29569: struct.Struct("<HHI32H")}
+_GRAVITY = 9.80665
+_PULSES = (800, 2200)
+"""Pulse widths in us that a servo output can have; 0 means none yet."""
+_RATES = (10, 4000)
+"""Frame rates in Hz that are accepted."""
+
+
+@dataclass(frozen=True)
+class Servo:
+    """Which servo output stands for a command.
+
+    Attributes:
+        channel: number of the output, from 1.
+        low: command at 1000 us, SI.
+        high: command at 2000 us, SI.
+    """
+
+    channel: int
+    low: float
+    high: float
+
+    def command(self, pulse: int) -> float:
+        """Return the command that a pulse width stands for; the middle where there is none."""
+        share = 0.5 if pulse == 0 else min(max((pulse - 1000) / 1000, 0.0), 1.0)
+        return self.low + share * (self.high - self.low)
+
+
+def servos(vehicle: Vehicle, given: Sequence[str] = ()) -> list[Servo]:
+    """Return the servo output of each command, from texts such as `cmd_delta=1:-0.6:0.6`.
+
+    Commands that are not given take the outputs 1, 3, 2, 4, 5 ... in their order (ArduPilot's
+    rovers steer by output 1 and drive by output 3, those with two motors likewise), over their
+    whole range.
+
+    Raises:
+        UsageError: where a text cannot be read.
+    """
+    names = vehicle.inputs[: vehicle.commands]
+    order = [1, 3, 2, *range(4, 33)]
+    found = {
+        name: Servo(order[i], float(vehicle.low[i]), float(vehicle.high[i]))
+        for i, name in enumerate(names)
+    }
+    for text in given:
+        name, _, rest = text.partition("=")
+        parts = rest.split(":")
+        try:
+            channel, low, high = int(parts[0]), *(float(part) for part in parts[1:3])
+        except ValueError:
+            raise UsageError(
+                f"servo '{text}': expected COMMAND=OUTPUT:LOW:HIGH, for example"
+                f" {names[0]}=1:{float(vehicle.low[0]):g}:{float(vehicle.high[0]):g}"
+            ) from None
+        if name not in names:
+            raise UsageError(f"servo '{text}': no command '{name}'{nearest(name, names)}")
+        if not 1 <= channel <= 32:
+            raise UsageError(f"servo '{text}': outputs are numbered 1 to 32")
+        found[name] = Servo(channel, low, high)
+    return [found[name] for name in names]
+
+
+@final
+class ArduPilotBackEnd:
+    """Answers ArduPilot's packets with the motion of a vehicle.
+
+    Frames advance by the frame rate that ArduPilot asks for. The vehicle has steps of its own, so
+    that inputs act from its next step on and the motion between two of its steps is interpolated.
+    A packet that comes twice is answered twice and advances nothing; one that is lost is never
+    made up for; a frame count that goes back begins anew; what is no such packet is left out.
+
+    Args:
+        vehicle: what moves.
+        servos: one for each of its commands.
+        port: UDP port that ArduPilot sends to; 0 takes a free one.
+        host: address to listen at.
+    """
+
+    def __init__(
+        self, vehicle: Vehicle, servos: Sequence[Servo], port: int = 9002, host: str = "127.0.0.1"
+    ) -> None:
+        self.vehicle, self.servos = vehicle, list(servos)
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            self.socket.bind((host, port))
+        except OSError as error:
+            raise UsageError(
+                f"UDP port {port}: cannot listen there ({error.strerror}); stop what uses it or"
+                " name another"
+            ) from None
+        self.port = int(self.socket.getsockname()[1])
+        self.refused = 0
+        self.missed = 0
+        self._begin()
+
+    def _begin(self) -> None:
+        """Stand at the start."""
+        self.last = -1
+        self.reply = b""
+        self.time = 0.0
+        self.steps = 0
+        x = self.vehicle.start.unsqueeze(0)
+        self.before = self.after = x
+        self.memory = self.vehicle.dynamics.initial_state(1).to(x.dtype)
+
+    def serve(self, packets: int | None = None, timeout: float | None = None) -> None:
+        """Answer packets until so many have been answered, or none has come for `timeout` s."""
+        self.socket.settimeout(timeout)
+        answered = 0
+        while packets is None or answered < packets:
+            try:
+                data, sender = self.socket.recvfrom(4096)
+            except TimeoutError:
+                return
+            except ConnectionError:
+                # the other side has gone; another may come
+                continue
+            reply = self.answer(data)
+            if reply is not None:
+                self.socket.sendto(reply, sender)
+                answered += 1
+
+    def close(self) -> None:
+        """Give the port back."""
+        self.socket.close()
+
+    def answer(self, data: bytes) -> bytes | None:
+        """Return the reply to a packet; None to what is no packet of ArduPilot."""
+        layout = _PACKETS.get(int.from_bytes(data[:2], "little"))
+        if layout is None or len(data) != layout.size:
+            self.refused += 1
+            return None
+        _, rate, frame, *pulses = layout.unpack(data)
+        wrong = any(pulse and not _PULSES[0] <= pulse <= _PULSES[1] for pulse in pulses)
+        if wrong or not _RATES[0] <= rate <= _RATES[1]:
+            self.refused += 1
+            return None
+        if frame == self.last:
+            return self.reply
+        if frame < self.last:
+            say("ArduPilot began anew")
+            self._begin()
+        elif self.last >= 0:
+            self.missed += frame - self.last - 1
+        self.last = frame
+        self._advance(1.0 / rate, pulses)
+        self.reply = self._measured()
+        return self.reply
+
+    def _advance(self, seconds: float, pulses: Sequence[int]) -> None:
+        """Move on in time; the vehicle steps where its own time has come."""
+        self.time += seconds
+        dt = self._dt
+        while self.steps * dt < self.time - 1e-9:
+            commands = torch.tensor(
+                [[servo.command(pulses[servo.channel - 1]) if servo.channel <= len(pulses) else
+                  servo.command(0) for servo in self.servos]],
+                dtype=self.after.dtype,
+            )  # fmt: skip
+            self.before = self.after
+            with torch.no_grad():
+                after, memory = self.vehicle.dynamics.step(
+                    self.before, self.vehicle.inputs_at(commands), self.memory
+                )
+            if bool(torch.isfinite(after).all()) and bool(torch.isfinite(memory).all()):
+                self.after, self.memory = after, memory
+            self.steps += 1
+
+    @property
+    def _dt(self) -> float:
+        return self.vehicle.dynamics.dt
+
+    def _measured(self) -> bytes:
+        """Return what sensors measure now, as the interface has it."""
+        share = min(max(self.time / self._dt - (self.steps - 1), 0.0), 1.0)
+        state: Tensor = self.before[0] + share * (self.after[0] - self.before[0])
+        change = ((self.after[0] - self.before[0]) / self._dt).tolist()
+        north, east, psi, u, v, r = state[:6].tolist()
+        cos, sin = math.cos(psi), math.sin(psi)
+        wrapped = math.remainder(psi, 2 * math.pi)
+        reply = {
+            "timestamp": self.time,
+            "imu": {
+                "gyro": [0.0, 0.0, r],
+                # what an accelerometer feels: the motion of a turning frame, and not to fall
+                "accel_body": [change[3] - r * v, change[4] + r * u, -_GRAVITY],
+            },
+            "position": [north, east, 0.0],
+            "attitude": [0.0, 0.0, wrapped],
+            "velocity": [u * cos - v * sin, u * sin + v * cos, 0.0],
+        }
+        return b"\n" + json.dumps(reply, separators=(",", ":")).encode() + b"\n"

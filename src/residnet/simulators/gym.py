@@ -1,0 +1,195 @@
+"""A Gymnasium environment over any vessel or learned model, single and vectorised.
+
+Needs the extra `gymnasium`. An action in [-1, 1] covers each command's range; an observation holds
+the velocities, what the task shows of its goal, and the last action.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal, final
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from torch import Tensor
+
+from residnet.simulators.tasks import motion_seen, task_named
+from residnet.simulators.vehicle import Vehicle
+
+Task = Literal["heading", "course", "docking"]
+_AWAY = 1e4
+"""Speeds in cruise speeds beyond which a motion has diverged."""
+
+
+class Episodes:
+    """Episodes of one task side by side, in tensors.
+
+    Args:
+        vehicle: what moves.
+        task: name of the task.
+        rows: number of episodes side by side.
+        steps: length of an episode.
+    """
+
+    def __init__(self, vehicle: Vehicle, task: str, rows: int, steps: int) -> None:
+        self.vehicle, self.task, self.rows, self.steps = vehicle, task_named(task), rows, steps
+        self.random = torch.Generator()
+        self.random.seed()
+        self.size = 3 + self.task.seen + vehicle.commands
+        dtype = vehicle.start.dtype
+        self.middle = 0.5 * (vehicle.low + vehicle.high).to(dtype)
+        self.half = 0.5 * (vehicle.high - vehicle.low).to(dtype)
+        self.x = vehicle.start.expand(rows, -1).clone()
+        self.s = vehicle.dynamics.initial_state(rows).to(dtype)
+        self.goal = torch.zeros(rows, self.task.goal, dtype=dtype)
+        self.last = torch.zeros(rows, vehicle.commands, dtype=dtype)
+        self.count = torch.zeros(rows, dtype=torch.long)
+
+    def begin(self, which: Tensor) -> None:
+        """Begin the episodes `which` [B] anew: at the start, at a speed drawn up to the cruise."""
+        n = int(which.sum())
+        if n == 0:
+            return
+        start = self.vehicle.start.expand(n, -1).clone()
+        share = torch.rand(n, generator=self.random, dtype=torch.float64).to(start.dtype)
+        start[:, 3] = start[:, 3] + (self.vehicle.cruise - start[:, 3]) * share
+        self.x[which] = start
+        self.s[which] = self.vehicle.dynamics.initial_state(n).to(start.dtype)
+        self.goal[which] = self.task.draw(start, self.random, self.vehicle.cruise)
+        self.last[which] = 0.0
+        self.count[which] = 0
+
+    def observation(self) -> np.ndarray:
+        """Return what is seen, [B, size] float32."""
+        cruise = self.vehicle.cruise
+        parts = (motion_seen(self.x, cruise), self.task.observe(self.x, self.goal, cruise))
+        seen: np.ndarray = torch.cat((*parts, self.last), dim=-1).float().numpy()
+        return seen
+
+    def advance(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Step all episodes; return reward, diverged and finished, each [B]."""
+        given = torch.as_tensor(np.asarray(actions), dtype=self.x.dtype)
+        action = torch.nan_to_num(given).clamp(-1.0, 1.0)
+        w = self.vehicle.inputs_at(self.middle + self.half * action)
+        with torch.no_grad():
+            after, memory = self.vehicle.dynamics.step(self.x, w, self.s)
+        far = (after[:, 3:5].abs() > _AWAY * self.vehicle.cruise).any(dim=-1)
+        lost = far | ~torch.isfinite(after).all(dim=-1) | ~torch.isfinite(memory).all(dim=-1)
+        if bool(lost.any()):
+            after = torch.where(lost.unsqueeze(-1), self.x, after)
+            memory = torch.where(lost.unsqueeze(-1), self.s, memory)
+        reward = self.task.reward(after, self.goal, self.vehicle.cruise)
+        # quick changes of a command wear the actuators
+        reward = reward - 0.05 * (action - self.last).square().mean(dim=-1) - 10.0 * lost
+        self.x, self.s, self.last = after, memory, action
+        self.count += 1
+        return (
+            reward.double().numpy(),
+            lost.numpy(),
+            (self.count >= self.steps).numpy(),
+        )
+
+    def spaces(self) -> tuple[spaces.Box, spaces.Box]:
+        """Return the spaces of one observation and of one action."""
+        return (
+            spaces.Box(-np.inf, np.inf, (self.size,), np.float32),
+            spaces.Box(-1.0, 1.0, (self.vehicle.commands,), np.float32),
+        )
+
+
+@final
+class VesselEnv(gymnasium.Env[np.ndarray, np.ndarray]):
+    """One vessel that learns one task.
+
+    Args:
+        vehicle: see `residnet.simulators.vehicle.vehicle`.
+        task: heading, course or docking.
+        seconds: length of an episode.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 (as in the base class)
+
+    def __init__(self, vehicle: Vehicle, task: Task = "heading", seconds: float = 60.0) -> None:
+        steps = max(1, round(seconds / vehicle.dynamics.dt))
+        self.episodes = Episodes(vehicle, task, 1, steps)
+        self.observation_space, self.action_space = self.episodes.spaces()
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Begin an episode; the same seed draws the same goals."""
+        super().reset(seed=seed)
+        if seed is not None:
+            self.episodes.random.manual_seed(seed)
+        self.episodes.begin(torch.ones(1, dtype=torch.bool))
+        return self.episodes.observation()[0], {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Step once; an episode is terminated where its motion diverges."""
+        reward, lost, finished = self.episodes.advance(np.asarray(action)[None])
+        return (
+            self.episodes.observation()[0],
+            float(reward[0]),
+            bool(lost[0]),
+            bool(finished[0] and not lost[0]),
+            {},
+        )
+
+
+@final
+class VesselVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+    """Many vessels that learn one task, stepped as one batch.
+
+    An episode that has ended begins anew with the next step, whose action is left out.
+
+    Args:
+        vehicle: see `residnet.simulators.vehicle.vehicle`.
+        num_envs: number of vessels.
+        task: heading, course or docking.
+        seconds: length of an episode.
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012 (as in the base class)
+        "render_modes": [],
+        "autoreset_mode": AutoresetMode.NEXT_STEP,
+    }
+
+    def __init__(
+        self, vehicle: Vehicle, num_envs: int, task: Task = "heading", seconds: float = 60.0
+    ) -> None:
+        steps = max(1, round(seconds / vehicle.dynamics.dt))
+        self.num_envs = num_envs
+        self.episodes = Episodes(vehicle, task, num_envs, steps)
+        self.single_observation_space, self.single_action_space = self.episodes.spaces()
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.ended = torch.zeros(num_envs, dtype=torch.bool)
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Begin all episodes; the same seed draws the same goals."""
+        first = seed[0] if isinstance(seed, list) else seed
+        super().reset(seed=first)
+        if first is not None:
+            self.episodes.random.manual_seed(first)
+        self.episodes.begin(torch.ones(self.num_envs, dtype=torch.bool))
+        self.ended[:] = False
+        return self.episodes.observation(), {}
+
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Step all; those that had ended stand at their new start, with no reward."""
+        reward, lost, finished = self.episodes.advance(actions)
+        anew = self.ended
+        if bool(anew.any()):
+            self.episodes.begin(anew)
+            still = ~anew.numpy()
+            reward, lost, finished = reward * still, lost & still, finished & still
+        truncated = finished & ~lost
+        self.ended = torch.from_numpy(lost | truncated)
+        return self.episodes.observation(), reward, lost, truncated, {}
