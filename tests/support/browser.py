@@ -9,12 +9,58 @@ import shutil
 import subprocess
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 _NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 _MEASURE = """
+const deepest = (root, name) => {
+  for (const part of root.querySelectorAll("*")) {
+    if (part.localName === name) return part;
+    const inside = part.shadowRoot && deepest(part.shadowRoot, name);
+    if (inside) return inside;
+  }
+  return null;
+};
+const inked = canvas => {
+  const data = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data;
+  let count = 0;
+  for (let i = 3; i < data.length; i += 4) count += data[i] > 0;
+  return count > 200;
+};
+const use = async (page, pause) => {
+  const root = page.querySelector(".explorer");
+  if (root === null) return {};
+  const plots = page.defaultView.Bokeh.documents[0];
+  const plot = plots.get_model_by_name(root.id + "-1"), range = plot.x_range;
+  const width = () => range.end - range.start, begin = width();
+  const press = async text => {
+    const button = [...root.querySelectorAll("button")].find(b => b.textContent === text);
+    button.focus();
+    const focused = page.activeElement === button;
+    button.click();
+    await pause();
+    return focused;
+  };
+  const focused = await press("Zoom in"), near = width();
+  await press("Reset");
+  const again = width(), box = root.querySelector("input");
+  box.click();
+  const hidden = plot.renderers.find(curve => curve.name === box.value).visible === false;
+  const list = root.querySelector("select"), note = () => root.querySelector(".note").textContent;
+  const first = note();
+  list.value = String(list.length - 1);
+  list.dispatchEvent(new Event("change"));
+  await pause();
+  return {focused: focused, zoomed: near / begin, reset: again / begin, hidden: hidden,
+          chosen: note() !== first};
+};
 const frame = document.querySelector("iframe");
-frame.onload = () => {
+const drawn = page => page.documentElement.classList.contains("drawn");
+frame.onload = async () => {
   const page = frame.contentDocument, root = page.documentElement;
+  const pause = () => new Promise(done => setTimeout(done, 50));
+  while (page.querySelector(".explorer") && !drawn(page)) await pause();
+  await pause();
   page.querySelectorAll("details").forEach(part => part.open = true);
   const broken = [];
   page.querySelectorAll("td, th, h1, h2, h3, p, li, summary, figcaption").forEach(box => {
@@ -30,7 +76,19 @@ frame.onload = () => {
       }
     }
   });
-  const found = {scroll: root.scrollWidth, width: root.clientWidth, broken: broken};
+  let smallest = 99;
+  const walker = page.createTreeWalker(page.querySelector("main"), NodeFilter.SHOW_TEXT);
+  while (walker.nextNode()) {
+    const box = walker.currentNode.parentElement;
+    if (walker.currentNode.data.trim() && box.getClientRects().length)
+      smallest = Math.min(smallest, parseFloat(page.defaultView.getComputedStyle(box).fontSize));
+  }
+  const panels = [...page.querySelectorAll(".panel")].map(panel => {
+    const canvas = deepest(panel, "canvas");
+    return canvas !== null && canvas.width > 0 && inked(canvas);
+  });
+  const found = {scroll: root.scrollWidth, width: root.clientWidth, broken: broken,
+                 smallest: smallest, panels: panels, used: await use(page, pause)};
   document.querySelector("pre").textContent = JSON.stringify(found);
 };
 frame.srcdoc = document.querySelector("template").innerHTML;
@@ -44,10 +102,16 @@ class Layout:
     Attributes:
         overflow: by how many pixels the page is wider than its window.
         broken: words that do not stand in one line.
+        smallest: size of the smallest text in pixels.
+        panels: for each panel of an interactive figure, whether something is drawn in it.
+        used: what became of pressing the first interactive figure's controls; empty without one.
     """
 
     overflow: int
     broken: list[str]
+    smallest: float
+    panels: list[bool]
+    used: dict[str, Any]
 
 
 def browser() -> str | None:
@@ -71,4 +135,10 @@ def layout(page: Path, width: int, scratch: Path) -> Layout:
     shown = re.search(r"<pre>(\{.*?\})</pre>", dump, re.DOTALL)
     assert shown is not None, "the browser did not measure the page"
     found = json.loads(html.unescape(shown[1]))
-    return Layout(found["scroll"] - found["width"], found["broken"])
+    return Layout(
+        found["scroll"] - found["width"],
+        found["broken"],
+        found["smallest"],
+        found["panels"],
+        found["used"],
+    )

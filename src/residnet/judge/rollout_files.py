@@ -12,14 +12,26 @@ from residnet.core.names import STATE
 from residnet.data.prepare import Prepared
 from residnet.judge.freerun import FreeRun
 
+INPUT = "input_"
+"""Stands before the name of an input among the columns."""
+
 _ORDER = ("u", "v", "r", "psi", "x", "y")
 
 
-def write_rollouts(folder: Path, runs: Sequence[FreeRun], logs: Sequence[Prepared]) -> None:
-    """Write one file per log of a split; `runs` are the protocols of that split.
+def write_rollouts(
+    folder: Path, runs: Sequence[FreeRun], logs: Sequence[Prepared], inputs: Sequence[str]
+) -> None:
+    """Write one file per log of a split.
 
     Columns: protocol, model, window, t (s, the log's clock), usable, diverged, then u, v, r, psi,
-    x, y as measured and with `_hat` as predicted (SI, rad).
+    x, y as measured and with `_hat` as predicted (SI, rad), and the inputs that are held over the
+    step after each sample with `input_` before their names.
+
+    Args:
+        folder: for the files.
+        runs: protocols of a split.
+        logs: of the split.
+        inputs: names of the inputs, in the order of their columns.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -31,6 +43,7 @@ def write_rollouts(folder: Path, runs: Sequence[FreeRun], logs: Sequence[Prepare
         }
         measured: list[np.ndarray] = []
         predicted: list[np.ndarray] = []
+        given: list[np.ndarray] = []
         for run in runs:
             of_log = [i for i, window in enumerate(run.windows) if window.log == number]
             for model, predictions in run.predictions.items():
@@ -48,6 +61,7 @@ def write_rollouts(folder: Path, runs: Sequence[FreeRun], logs: Sequence[Prepare
                     parts["t"].append(log.log.t[rows])
                     parts["usable"].append(log.usable[rows])
                     measured.append(log.y[rows])
+                    given.append(log.w[rows])
                     predicted.append(predictions[i].states)
         if not measured:
             continue
@@ -55,6 +69,8 @@ def write_rollouts(folder: Path, runs: Sequence[FreeRun], logs: Sequence[Prepare
         y, y_hat = np.concatenate(measured), np.concatenate(predicted)
         columns |= {name: y[:, STATE.index(name)] for name in _ORDER}
         columns |= {f"{name}_hat": y_hat[:, STATE.index(name)] for name in _ORDER}
+        w = np.concatenate(given)
+        columns |= {f"{INPUT}{name}": w[:, place] for place, name in enumerate(inputs)}
         table = pa.table({name: pa.array(values) for name, values in columns.items()})
         with whole(folder / f"{log.log.name}.parquet") as file:
             pq.write_table(table, file, compression="zstd")

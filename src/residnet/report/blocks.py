@@ -229,12 +229,15 @@ class Section:
         title: a few words.
         blocks: what it shows, from top to bottom.
         folded: closed at first, for what most readers skip.
+        pictures: its figures show what interactive ones show too: hidden on a screen where those
+            are drawn, until a button is pressed; always printed.
     """
 
     kind: ClassVar[str] = "section"
     title: str
     blocks: Sequence[Block | None] = field(default_factory=tuple)
     folded: bool = False
+    pictures: bool = False
 
     @property
     def shown(self) -> list[Block]:

@@ -8,6 +8,7 @@ from residnet.judge.sanity_file import read_findings
 from residnet.report.blocks import Section
 from residnet.report.figures.files import figures_section
 from residnet.report.figures.fit import write_figures
+from residnet.report.interactive.free_runs import explorers
 from residnet.report.page import write_page
 from residnet.report.run_reader import RunFiles
 from residnet.report.sections.fit import (
@@ -70,6 +71,7 @@ def fit_sections(run: RunFiles) -> list[Section]:
     findings = read_findings(run.path, divergence=divergence)
     found = [
         caution_section(run, findings),
+        _interactive(run),
         limits.section(run),
         data.section(run),
         doctor.section(run),
@@ -81,6 +83,12 @@ def fit_sections(run: RunFiles) -> list[Section]:
         sanity.section(run, findings),
     ]
     return [section for section in found if section is not None]
+
+
+def _interactive(run: RunFiles) -> Section | None:
+    """Return the section of interactive figures, None where there are no free runs."""
+    found = explorers(run)
+    return Section("Runs to look into", found) if found else None
 
 
 def _models(run: RunFiles) -> Section | None:

@@ -13,6 +13,8 @@ from markupsafe import Markup, escape
 from residnet.core.config import load_mapping
 from residnet.core.files import read_json, whole
 from residnet.report.blocks import Block, Code, Facts, Section
+from residnet.report.interactive.drawing import draw
+from residnet.report.interactive.explorer import Explorer
 
 _FACT_TITLES = {"git": "git revision", "python": "Python", "started": "started (UTC)"}
 _FACTS = ("residnet", "git", "seed", "python", "machine", "started")
@@ -27,7 +29,8 @@ def write_page(
 ) -> Path:
     """Write `report.html` of a run folder, whole or not at all.
 
-    The page stands alone: pictures and styles are inside, nothing is loaded and nothing runs.
+    The page stands alone: pictures, styles and scripts are inside, and nothing is loaded. Without
+    JavaScript, and in print, pictures stand where interactive figures would.
     Provenance and configuration are added at its end where the folder holds `provenance.json` and
     `resolved.yaml`.
 
@@ -56,13 +59,15 @@ def write_page(
         lstrip_blocks=True,
     )
     environment.filters |= {"breakable": _breakable, "embedded": _embedded, "anchor": _anchor}
+    parts = [*sections, *_made_of(run, record)]
     text = environment.get_template("page.html.j2").render(
         title=title,
         description=description,
         version=str(record.get("residnet") or ""),
         date=str(record.get("started") or "")[:10],
         verdict=[sentence for sentence in verdict if sentence],
-        sections=[*sections, *_made_of(run, record)],
+        sections=parts,
+        interactive=draw(_explorers(parts)),
     )
     path = run / "report.html"
     with whole(path) as file:
@@ -75,6 +80,17 @@ def title_and_description(run: Path) -> tuple[str, str]:
     path = run / "resolved.yaml"
     resolved = load_mapping(path) if path.is_file() else {}
     return str(resolved.get("name") or run.name), str(resolved.get("description") or "")
+
+
+def _explorers(blocks: Sequence[Block]) -> list[Explorer]:
+    """Return the interactive figures among blocks and the sections that they hold."""
+    found: list[Explorer] = []
+    for block in blocks:
+        if isinstance(block, Explorer):
+            found.append(block)
+        elif isinstance(block, Section):
+            found += _explorers(block.shown)
+    return found
 
 
 def _record(run: Path) -> Mapping[str, Any]:

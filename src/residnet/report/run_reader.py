@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from residnet.core.errors import DataError, UsageError
 from residnet.core.files import read_table
 from residnet.core.layout import RANGE_VELOCITIES
 from residnet.core.names import CHANNEL_UNITS
+from residnet.judge.rollout_files import INPUT
 from residnet.report.format import shown_unit
 
 Content = Mapping[str, Any]
@@ -40,6 +41,7 @@ class StoredWindow:
         measured: [T, 6] of u, v, r, psi, x, y in SI and rad.
         predicted: the same by model.
         diverged: by model.
+        inputs: values [T] by name, SI and rad; empty where the run has stored none.
     """
 
     log: str
@@ -51,6 +53,7 @@ class StoredWindow:
     measured: np.ndarray
     predicted: dict[str, np.ndarray]
     diverged: dict[str, bool]
+    inputs: dict[str, np.ndarray] = field(default_factory=dict)
 
     def rmse(self, model: str) -> np.ndarray:
         """Return the root mean square errors [3] of u, v (usable samples) and r (all samples)."""
@@ -307,6 +310,11 @@ class RunFiles:
                         },
                         diverged={
                             model: bool(part["diverged"].any()) for model, part in parts.items()
+                        },
+                        inputs={
+                            name.removeprefix(INPUT): first[name].to_numpy(float)
+                            for name in table.columns
+                            if name.startswith(INPUT)
                         },
                     )
                 )

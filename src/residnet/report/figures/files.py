@@ -73,4 +73,4 @@ def read_figures(folder: Path) -> list[Figure]:
 def figures_section(folder: Path) -> Section | None:
     """Return a section with all figures of a folder, None where there are none."""
     figures = read_figures(folder)
-    return Section("Figures", figures) if figures else None
+    return Section("Figures", figures, pictures=True) if figures else None

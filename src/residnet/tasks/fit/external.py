@@ -94,7 +94,7 @@ class ExternalLogs:
         )
         models = [c for c in candidates(fitted, config.data) if c.kind != "truth" or simulated]
         judged = evaluate(models, logs, config.evaluation, config.prepare.grid.step, limit)
-        write_rollouts(folder.rollouts / SPLIT, judged.runs, logs)
+        write_rollouts(folder.rollouts / SPLIT, judged.runs, logs, config.signals.columns)
         write_data_quality(folder, {SPLIT: logs})
         chosen = self.run.read_metrics()
         write_metrics(

@@ -74,7 +74,9 @@ def _judged(
     judged = {}
     for split in config.evaluation.splits:
         judged[split] = identified.evaluate(logs[split], config.data)
-        write_rollouts(folder.rollouts / split, judged[split].runs, judged[split].logs)
+        write_rollouts(
+            folder.rollouts / split, judged[split].runs, judged[split].logs, config.signals.columns
+        )
     chosen = identified.select(judged)
     say(f"  {chosen.reason}")
     table = [row for part in judged.values() for row in part.rows]

@@ -1,0 +1,204 @@
+"""Explorers drawn with Bokeh: the parts of a page and the data of their cases."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from residnet.report.interactive.explorer import INK, Case, Explorer, Panel
+
+if TYPE_CHECKING:
+    from bokeh.models import ColumnDataSource
+    from bokeh.plotting import figure as Canvas
+
+_LEVELS = 65_000
+"""Steps into which the range of a curve is divided: finer than any screen."""
+_GAP = 65_535
+_FONT = "12px"
+_MARGIN = 68
+"""Pixels left of every panel, so that time axes stand under each other."""
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """What a page holds of its explorers.
+
+    Attributes:
+        parts: HTML of the panels of each explorer by its name.
+        cases: the explorer's cases as JSON, curves in base 64, by its name.
+        script: that draws all panels.
+        library: BokehJS itself, so that the page loads nothing.
+    """
+
+    parts: dict[str, list[str]]
+    cases: dict[str, str]
+    script: str
+    library: str
+
+
+def draw(explorers: Sequence[Explorer]) -> Drawn | None:
+    """Draw the explorers of a page; None where there are none."""
+    if not explorers:
+        return None
+    from bokeh.embed import components
+    from bokeh.resources import Resources
+
+    canvases = {
+        f"{explorer.name}-{number}": canvas
+        for explorer in explorers
+        for number, canvas in enumerate(_panels(explorer))
+    }
+    script, parts = components(canvases)
+    library = Resources(mode="inline", components=["bokeh"], minified=True).render_js()
+    return Drawn(
+        {
+            explorer.name: [
+                parts[f"{explorer.name}-{number}"] for number in range(len(explorer.panels))
+            ]
+            for explorer in explorers
+        },
+        {explorer.name: _cases(explorer) for explorer in explorers},
+        script,
+        library,
+    )
+
+
+def _panels(explorer: Explorer) -> list[Canvas]:
+    """Return the panels; those of curves share their horizontal axis and a cursor."""
+    from bokeh.models import ColumnDataSource, CrosshairTool, DataRange1d, Span
+
+    time_axis: Any = DataRange1d(only_visible=True)
+    cursor = Span(dimension="height", line_dash="dotted", line_width=1)
+    out = []
+    for number, panel in enumerate(explorer.panels):
+        columns = _columns(explorer, explorer.cases[0], number)
+        canvas = _canvas(explorer, panel, number, time_axis, ColumnDataSource(columns))
+        if panel.kind == "curves":
+            canvas.add_tools(CrosshairTool(dimensions="height", overlay=cursor))
+        out.append(canvas)
+    return out
+
+
+def _canvas(
+    explorer: Explorer, panel: Panel, number: int, time_axis: Any, source: ColumnDataSource
+) -> Canvas:
+    from bokeh.models import BoxZoomTool, DataRange1d, HoverTool
+    from bokeh.plotting import figure
+
+    # what is switched off does not widen the axes
+    options: dict[str, Any] = {
+        "x_range": time_axis if panel.kind == "curves" else DataRange1d(only_visible=True),
+        "y_range": DataRange1d(only_visible=True),
+    }
+    if panel.kind == "map":
+        options["match_aspect"] = True
+    if panel.logarithmic:
+        options["y_axis_type"] = "log"
+    canvas = figure(
+        name=f"{explorer.name}-{number}",
+        title=panel.title,
+        height=panel.height,
+        sizing_mode="stretch_width",
+        toolbar_location=None,
+        tools=[],
+        min_border_left=_MARGIN,
+        min_border_right=12,
+        output_backend="canvas",
+        **options,
+    )
+    # the page scrolls under a finger; dragging zooms only after a button was pressed
+    canvas.stylesheets = [":host .bk-events { touch-action: pan-y pinch-zoom; }"]
+    over = [_curve(explorer, panel, name, source) for name in explorer.names(number)]
+    canvas.renderers.extend(over)
+    hover = HoverTool(
+        renderers=over,
+        mode="mouse" if panel.kind != "curves" else "vline",
+        tooltips=[("$name", "@$name{0.000 a}")] if panel.kind == "curves" else [("", "$name")],
+        point_policy="follow_mouse",
+    )
+    canvas.add_tools(hover, BoxZoomTool(match_aspect=panel.kind == "map"))
+    canvas.toolbar.active_drag = None
+    canvas.xaxis.axis_label = panel.x_label or None
+    canvas.title.text_font_size = _FONT
+    for axis in canvas.axis:
+        axis.major_label_text_font_size = _FONT
+        axis.axis_label_text_font_size = _FONT
+        axis.axis_label_text_font_style = "normal"
+    canvas.yaxis.ticker.desired_num_ticks = 4
+    canvas.xaxis.ticker.desired_num_ticks = 5
+    return canvas
+
+
+def _curve(explorer: Explorer, panel: Panel, name: str, source: ColumnDataSource) -> Any:
+    """Return the renderer of a curve, added to nothing yet."""
+    from bokeh.models import GlyphRenderer, Line, Scatter
+
+    look = explorer.looks[name]
+    color = "#808080" if look.color == INK else look.color
+    x = f"x of {name}"
+    if panel.kind == "cloud":
+        glyph: Any = Scatter(x=x, y=name, size=4, fill_color=color, line_color=None, fill_alpha=0.6)
+    else:
+        glyph = Line(x=x, y=name, line_color=color, line_dash=look.dash, line_width=look.width)
+    return GlyphRenderer(data_source=source, glyph=glyph, name=name, visible=look.shown)
+
+
+def _columns(explorer: Explorer, case: Case, panel: int) -> dict[str, np.ndarray]:
+    """Return the columns of a panel's source; shorter curves are filled with gaps."""
+    curves = case.curves[panel]
+    longest = max((len(x) for x, _ in curves.values()), default=0)
+    out = {}
+    for name in explorer.names(panel):
+        x, y = curves.get(name, (np.empty(0), np.empty(0)))
+        for column, values in ((f"x of {name}", x), (name, y)):
+            out[column] = np.full(longest, np.nan)
+            out[column][: len(values)] = values
+    return out
+
+
+def _cases(explorer: Explorer) -> str:
+    """Return the cases as JSON that may stand in a page's script."""
+    content = {
+        "looks": {
+            name: {"color": look.color, "shown": look.shown}
+            for name, look in explorer.looks.items()
+        },
+        "panels": len(explorer.panels),
+        "cases": [
+            {
+                "title": case.title,
+                "note": case.note,
+                "panels": [
+                    _packed(_columns(explorer, case, number))
+                    for number in range(len(explorer.panels))
+                ],
+            }
+            for case in explorer.cases
+        ],
+    }
+    return json.dumps(content, separators=(",", ":"), ensure_ascii=True).replace("<", "\\u003c")
+
+
+def _packed(columns: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """Return columns as 16-bit numbers with offset and step; equal columns are stored once."""
+    out: dict[str, Any] = {}
+    stored: dict[bytes, str] = {}
+    for name, values in columns.items():
+        key = values.tobytes()
+        if key in stored:
+            out[name] = stored[key]
+            continue
+        stored[key] = name
+        finite = np.isfinite(values)
+        low = float(values[finite].min()) if finite.any() else 0.0
+        span = float(values[finite].max()) - low if finite.any() else 0.0
+        step = span / _LEVELS if span > 0 else 1.0
+        levels = np.full(len(values), _GAP, dtype="<u2")
+        levels[finite] = np.round((values[finite] - low) / step)
+        out[name] = [low, step, base64.b64encode(levels.tobytes()).decode("ascii")]
+    return out

@@ -1,0 +1,108 @@
+"""What an interactive figure shows: cases to choose from, panels, and curves that can be hidden."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import ClassVar, Literal, TypeAlias
+
+import numpy as np
+
+INK = "ink"
+"""The colour of text, for what was measured: black on paper, light on a dark screen."""
+
+PanelKind: TypeAlias = Literal["curves", "map", "cloud"]
+
+
+@dataclass(frozen=True)
+class Look:
+    """How the curves of one name look in every panel.
+
+    Attributes:
+        label: beside its switch.
+        color: as CSS has it, or `INK`.
+        dash: of its line as Bokeh has it: `solid`, `dashed`, `dotted`, `dashdot`, `dotdash`.
+        width: of its line in pixels.
+        shown: whether it is switched on at first.
+    """
+
+    label: str
+    color: str
+    dash: str = "solid"
+    width: float = 1.8
+    shown: bool = True
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One set of axes.
+
+    Attributes:
+        title: above it, in words and with its unit.
+        x_label: of the horizontal axis with its unit, empty where a panel beneath names it.
+        kind: `curves` share their horizontal axis, a `map` has equal scales, a `cloud` is of
+            points.
+        height: in pixels.
+        logarithmic: whether the vertical axis is.
+    """
+
+    title: str
+    x_label: str = ""
+    kind: PanelKind = "curves"
+    height: int = 170
+    logarithmic: bool = False
+
+
+Curve: TypeAlias = tuple[np.ndarray, np.ndarray]
+"""Horizontal and vertical values [T] of one curve, NaN where there is a gap."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """What all panels show at a time.
+
+    Attributes:
+        title: in the list to choose from.
+        curves: for each panel, curves by name.
+        note: a sentence on the case, empty where nothing is to be said.
+    """
+
+    title: str
+    curves: Sequence[Mapping[str, Curve]]
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Explorer:
+    """An interactive figure: one case of several, in panels with switches for its curves.
+
+    Attributes:
+        name: of its parts on the page, letters and `-`.
+        title: a few words.
+        caption: whole sentences that say what to look for.
+        chooser: what the cases are, beside the list to choose from.
+        looks: of the curves by name, in the order of the switches.
+        panels: from top to bottom.
+        cases: at least one.
+    """
+
+    kind: ClassVar[str] = "explorer"
+    name: str
+    title: str
+    caption: str
+    chooser: str
+    looks: Mapping[str, Look]
+    panels: Sequence[Panel]
+    cases: Sequence[Case] = field(default_factory=tuple)
+
+    def names(self, panel: int) -> list[str]:
+        """Return the names of the curves that a panel shows in any case, in order."""
+        present = {name for case in self.cases for name in case.curves[panel]}
+        return [name for name in self.looks if name in present]
+
+
+def thinned(length: int, most: int) -> np.ndarray:
+    """Return the numbers of evenly spaced samples, at most so many, the first and last included."""
+    if length <= most:
+        return np.arange(length)
+    return np.unique(np.linspace(0, length - 1, most).round().astype(int))
