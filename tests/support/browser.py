@@ -77,7 +77,8 @@ frame.onload = async () => {
     }
   });
   let smallest = 99;
-  const walker = page.createTreeWalker(page.querySelector("main"), NodeFilter.SHOW_TEXT);
+  const place = page.querySelector("main") || page.body;
+  const walker = page.createTreeWalker(place, NodeFilter.SHOW_TEXT);
   while (walker.nextNode()) {
     const box = walker.currentNode.parentElement;
     if (walker.currentNode.data.trim() && box.getClientRects().length)

@@ -96,6 +96,7 @@ def test_same_seed_same_metrics(
     assert rows(tmp_path / "again") == rows(tiny_run)
 
 
+@pytest.mark.whole_runs
 def test_another_seed_other_head(
     tiny_config: Path, tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -20,6 +21,10 @@ _LEVELS = 65_000
 """Steps into which the range of a curve is divided: finer than any screen."""
 _GAP = 65_535
 _FONT = "12px"
+_RANDOM = re.compile(
+    r"\b[0-9a-f]{8}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{12}\b|(?<=\")p\d{4,}(?=\")"
+)
+"""Names that Bokeh gives to the parts of a page and to its models."""
 _MARGIN = 68
 """Pixels left of every panel, so that time axes stand under each other."""
 
@@ -53,7 +58,9 @@ def draw(explorers: Sequence[Explorer]) -> Drawn | None:
         for explorer in explorers
         for number, canvas in enumerate(_panels(explorer))
     }
-    script, parts = components(canvases)
+    script, given = components(canvases)
+    script, *divisions = _numbered([script, *given.values()])
+    parts = dict(zip(given, divisions, strict=True))
     library = Resources(mode="inline", components=["bokeh"], minified=True).render_js()
     return Drawn(
         {
@@ -66,6 +73,16 @@ def draw(explorers: Sequence[Explorer]) -> Drawn | None:
         script,
         library,
     )
+
+
+def _numbered(texts: Sequence[str]) -> list[str]:
+    """Return texts whose random names are counted, so that the same run has the same page."""
+    names: dict[str, str] = {}
+
+    def counted(found: re.Match[str]) -> str:
+        return names.setdefault(found[0], f"bokeh-{len(names)}")
+
+    return [_RANDOM.sub(counted, text) for text in texts]
 
 
 def _panels(explorer: Explorer) -> list[Canvas]:

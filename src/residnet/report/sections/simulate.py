@@ -8,6 +8,7 @@ from typing import Any
 from residnet.report.blocks import Block, Bullets, Cell, Section, Table, Text
 from residnet.report.figures.files import figures_section
 from residnet.report.format import DASH, fixed, number, shown_unit
+from residnet.report.interactive.flights import flight_explorer
 from residnet.report.run_reader import Content, RunFiles
 from residnet.report.sections.indices import index_title
 
@@ -19,6 +20,12 @@ def sections(run: RunFiles) -> list[Section]:
     """Return the manoeuvring indices and the figures that stand in the folder."""
     content = run.json("indices.json")
     out = [_indices(content)] if content.get("rows") else []
+    flown = {"flown": run.path / "logs"}
+    if (run.path / "model_logs").is_dir():
+        flown = {"vessel": run.path / "logs", "model": run.path / "model_logs"}
+    explorer = flight_explorer(flown)
+    if explorer is not None:
+        out.append(Section("Runs to look into", [explorer]))
     figures = figures_section(run.path / "figures")
     return [*out, figures] if figures else out
 
