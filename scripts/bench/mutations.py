@@ -282,6 +282,18 @@ def _place(given: Path | None) -> Iterator[Path]:
             yield folder
 
 
+def _warm_up(folder: Path) -> None:
+    """Run once in this process, so that the forks find everything imported."""
+    config = folder / "warm_up.yaml"
+    config.write_text(yaml.safe_dump(measured(folder), sort_keys=False))
+    with (
+        Path(os.devnull).open("w") as nowhere,
+        contextlib.redirect_stdout(nowhere),
+        contextlib.redirect_stderr(nowhere),
+    ):
+        command("run", config, "--out", folder / "warm_up", "--overwrite")()
+
+
 def main() -> None:
     """Do what is asked for and print the tallies."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
@@ -296,6 +308,7 @@ def main() -> None:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     bad = 0
     with _place(given.out) as folder:
+        _warm_up(folder)
         work: dict[str, Any] = {
             "tables": lambda draw: tables(given.tables, folder, draw),
             "configs": lambda draw: configs(given.configs, folder, draw, given.tasks),

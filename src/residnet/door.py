@@ -104,7 +104,8 @@ def _told(error: Exception) -> tuple[str, int]:
     """Return the line about an error and the exit code."""
     if isinstance(error, ResidnetError):
         return str(error), error.exit_code
-    if isinstance(error, MemoryError):
+    # PyTorch has no error of its own for memory
+    if isinstance(error, MemoryError) or "can't allocate memory" in str(error):
         return "the memory of this machine is used up; take fewer or shorter logs", 1
     if isinstance(error, OSError) and error.errno in _OF_THE_SYSTEM:
         place = "" if error.filename is None else f"{error.filename}: "

@@ -270,3 +270,18 @@ def test_what_is_not_there_cannot_be_taken_away(
     with pytest.raises(ConfigError, match=message) as caught:
         load_config(path, [override], Parts)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "number", ["1234567890123456789012", "-0xffffffffffffffffff", "1e200", "-1e31", "1e-200"]
+)
+def test_numbers_that_no_vessel_has_are_refused(tmp_path: Path, number: str) -> None:
+    path = tmp_path / "fit.yaml"
+    path.write_text(f"task: fit\ndt: {number}\n")
+    with pytest.raises(ConfigError, match=r"fit.yaml:2: dt: expected a number of usual size"):
+        load_config(path, [], Fit)
+
+
+def test_a_file_without_end_is_refused() -> None:
+    with pytest.raises(ConfigError, match="/dev/zero: is longer than 2 MB"):
+        load_config(Path("/dev/zero"), [], Fit)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from residnet.core.config import (
     load_config,
     load_mapping,
 )
+from residnet.core.config_yaml import parse
 from residnet.core.errors import ConfigError
 
 
@@ -66,8 +68,8 @@ def test_merge_keys_are_not_duplicates_and_are_not_shared(load: Callable[..., Fi
         (b"a: !!timestamp 2024-01-01\n", ":1:4: not YAML: could not determine a constructor"),
         (b"? [a]\n: 1\n", ":1:3: not YAML: a key must be plain text"),
         (b"a: *nowhere\n", ":1:4: not YAML: found undefined alias"),
-        (b"a: &a [*a]\n", ": nested too deeply, or refers to itself"),
-        (b"[" * 5000, ": nested too deeply"),
+        (b"a: &a [*a]\n", ": stands for more than 200000 values, or refers to itself"),
+        (b"[" * 5000, ":1:62: not YAML: nested more than 60 levels deep"),
         (b"a: \x01\n", ": not YAML: "),
         (b"a: \xff\n", ": not UTF-8 text (byte 3)"),
         (b"a: 1\nb:\n  c: 1\n  d: 2\n  c: 3\n", ":5: duplicate key 'c', first on line 3"),
@@ -96,3 +98,37 @@ def test_byte_order_mark_is_skipped(tmp_path: Path) -> None:
     path = tmp_path / "a.yaml"
     path.write_bytes(b"\xef\xbb\xbfa: 1\n")
     assert load_mapping(path) == {"a": 1}
+
+
+_BOMB = "\n".join(
+    ["a0: &a0 [x, x]", *(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 12))]
+)
+_MERGES = "\n".join(
+    [
+        "a0: &a0 {x: 1}",
+        *(f"a{i}: &a{i} {{<<: [{', '.join([f'*a{i - 1}'] * 9)}]}}" for i in range(1, 12)),
+    ]
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        (_BOMB, "stands for more than 200000 values"),
+        (_MERGES, "stands for more than 200000 values"),
+        ("a: &a [*a]", "refers to itself"),
+        ("a: " + "[" * 100_000, "nested more than 60 levels"),
+        ("a: " + "{b: " * 100_000, "nested more than 60 levels"),
+        ("a:\n" + "- " * 10_000, "nested more than 60 levels"),
+        ("a: " + "9" * 5000, "whole number of 5000 digits"),
+        ("a: 0x" + "f" * 9000, "whole number of 9002 digits"),
+    ],
+    ids=["aliases", "merges", "itself", "brackets", "braces", "dashes", "digits", "hex"],
+)
+def test_what_would_take_minutes_is_one_line_at_once(text: str, told: str) -> None:
+    started = time.process_time()
+    with pytest.raises(ConfigError, match=told) as caught:
+        parse(text, "x.yaml")
+    assert str(caught.value).startswith("x.yaml")
+    assert len(str(caught.value)) < 200
+    assert time.process_time() - started < 2.0

@@ -93,3 +93,16 @@ def test_damage(
             assert len(result) < 600
             assert path.name in result
     assert capfd.readouterr() == ("", "")
+
+
+def test_a_dataset_that_claims_more_than_its_file_holds_is_one_line(tmp_path: Path) -> None:
+    """Its size is a number in the file; reading it would take the machine's memory."""
+    import h5py
+
+    path = tmp_path / "huge.h5"
+    with h5py.File(path, "w") as file:
+        file.create_dataset("t", shape=(10**13,), dtype="f8", chunks=(10**6,))
+        file.create_dataset("u", data=np.zeros(100))
+    with pytest.raises(DataError, match=r"huge.h5: /t claims 8e\+04 GB in a file of") as caught:
+        Hdf5Config().build().read(path)
+    assert "\n" not in str(caught.value)

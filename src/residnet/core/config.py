@@ -7,6 +7,7 @@ with a unit (`20 deg`). Every error is one line.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -62,6 +63,9 @@ __all__ = [
 
 T = TypeVar("T")
 
+_LONGEST_FILE = 2_000_000
+_HUGE = 1e30
+
 
 class Config(BaseModel):
     """The base of all configs: frozen, without unknown keys, finite numbers only.
@@ -104,7 +108,12 @@ class _Origin:
 
 def _read(path: Path) -> tuple[dict[str, Any], Node]:
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        # a device has no end
+        with path.open("rb") as file:
+            content = file.read(_LONGEST_FILE + 1)
+        if len(content) > _LONGEST_FILE:
+            raise ConfigError(f"{path}: is longer than {_LONGEST_FILE / 1e6:.0f} MB; no config is")
+        text = content.decode("utf-8-sig")
     except FileNotFoundError as error:
         raise ConfigError(f"{path}: no such file") from error
     except IsADirectoryError as error:
@@ -113,6 +122,8 @@ def _read(path: Path) -> tuple[dict[str, Any], Node]:
         raise ConfigError(f"{path}: not UTF-8 text (byte {error.start})") from error
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read ({error.strerror})") from error
+    except ValueError as error:
+        raise ConfigError(f"{str(path)!r}: is no path ({error})") from error
     data, root = parse(text, str(path))
     if root is None or data is None:
         raise ConfigError(f"{path}: empty; expected a mapping of keys to values")
@@ -187,6 +198,8 @@ def validate(data: Any, model: Any, where: str, folder: Path | None = None) -> A
 
 
 def _validated(data: Any, model: Any, origin: _Origin, folder: Path | None) -> Any:
+    # what is computed, as in a model's description, may be as good as zero
+    _require_usual(data, origin, 0.0 if origin.root is None else 1.0 / _HUGE)
     # pydantic is strict without refusing lists for tuples or text for enums and paths only when it
     # reads JSON
     try:
@@ -197,6 +210,33 @@ def _validated(data: Any, model: Any, origin: _Origin, folder: Path | None) -> A
         raise ConfigError(describe(error, model, origin.source)) from error
     except PydanticSerializationError as error:
         raise ConfigError(f"{origin.where}: holds a value that YAML cannot ({error})") from error
+
+
+def _require_usual(data: Any, origin: _Origin, least: float, path: KeyPath = ()) -> None:
+    """Stop at numbers that no vessel has: they would overflow wherever they are first used.
+
+    Raises:
+        ConfigError: with the key of the number.
+    """
+    if isinstance(data, dict | list):
+        items = data.items() if isinstance(data, dict) else enumerate(data)
+        for key, value in items:
+            _require_usual(value, origin, least, (*path, key))
+    elif isinstance(data, int | float) and not _usual(data, least):
+        key = ".".join(map(str, path))
+        raise ConfigError(
+            f"{origin.source(path)}: {key}: expected a number of usual size (given"
+            f" {f'one of {data.bit_length()} bits' if isinstance(data, int) else data})"
+        )
+
+
+def _usual(number: float, least: float) -> bool:
+    if number == 0 or isinstance(number, bool):
+        return True
+    if isinstance(number, int):
+        return abs(number) < 2**63
+    # that it is no number is said with what was expected
+    return not math.isfinite(number) or least <= abs(number) <= _HUGE
 
 
 def dump_config(config: BaseModel) -> str:

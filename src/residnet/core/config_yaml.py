@@ -19,6 +19,9 @@ from residnet.core.errors import ConfigError
 KeyPath = tuple[str | int, ...]
 """Where a value stands in a config: keys of mappings and indices of lists."""
 
+_MOST_VALUES = 200_000
+_DEEPEST = 60
+_LONGEST_NUMBER = 400
 _PREFIX = "tag:yaml.org,2002:"
 # in the order in which they are tried: a whole number is also a valid float
 _SCALARS: tuple[tuple[str, str, str], ...] = (
@@ -57,8 +60,27 @@ class _Loader(yaml.SafeLoader):
         self.flatten_mapping(node)
         return {key.value: self.construct_object(value, deep=deep) for key, value in node.value}
 
+    def fetch_flow_collection_start(self, TokenClass: type[Any]) -> None:
+        self._require_flat(self.flow_level)
+        super().fetch_flow_collection_start(TokenClass)
+
+    def add_indent(self, column: int) -> bool:
+        self._require_flat(len(self.indents))
+        return bool(super().add_indent(column))
+
+    def _require_flat(self, depth: int) -> None:
+        # the scanner would first look to the end of thousands of brackets, which takes minutes
+        if depth > _DEEPEST:
+            raise yaml.scanner.ScannerError(
+                None, None, f"nested more than {_DEEPEST} levels deep", self.get_mark()
+            )
+
     def construct_whole_number(self, node: ScalarNode) -> int:
         text = node.value
+        if len(text) > _LONGEST_NUMBER:
+            raise yaml.constructor.ConstructorError(
+                None, None, f"a whole number of {len(text)} digits", node.start_mark
+            )
         return int(text, 0) if text.startswith(("0x", "0o")) else int(text)
 
 
@@ -122,7 +144,10 @@ def parse(text: str, where: str, *, located: bool = True) -> tuple[Any, Node | N
         # inside try: the constructor already rejects characters that YAML does not allow
         loader = _Loader(text)
         node = loader.get_single_node()
-        return (None, None) if node is None else (_unshared(loader.construct_document(node)), node)
+        if node is None:
+            return None, None
+        _require_small(node, where)
+        return _unshared(loader.construct_document(node)), node
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         problem = error.problem or error.context or "cannot be read"
@@ -136,6 +161,34 @@ def parse(text: str, where: str, *, located: bool = True) -> tuple[Any, Node | N
         raise ConfigError(f"{where}: not YAML: {' '.join(str(error).split())}") from error
     except RecursionError as error:
         raise ConfigError(f"{where}: nested too deeply, or refers to itself") from error
+
+
+def _require_small(root: Node, where: str) -> None:
+    """Stop before aliases are written out that stand for more values than any config has.
+
+    Raises:
+        ConfigError: where there are too many of them, or one stands within itself.
+    """
+    sizes: dict[int, int] = {}
+
+    def size(node: Node) -> int:
+        if id(node) not in sizes:
+            sizes[id(node)] = _MOST_VALUES + 1  # met again meanwhile: it stands within itself
+            children = (
+                [part for pair in node.value for part in pair]
+                if isinstance(node, MappingNode)
+                else node.value
+                if isinstance(node, SequenceNode)
+                else []
+            )
+            sizes[id(node)] = 1 + sum(map(size, children))
+        return sizes[id(node)]
+
+    if size(root) > _MOST_VALUES:
+        raise ConfigError(
+            f"{where}: stands for more than {_MOST_VALUES} values, or refers to itself; write out"
+            " what its aliases mean"
+        )
 
 
 def _unshared(value: Any) -> Any:

@@ -33,8 +33,11 @@ def config_file(path: Path) -> Path:
     Raises:
         ConfigError: where there is neither; the message names the nearest shipped config.
     """
-    if path.is_file() or path.suffix or path.is_absolute():
-        return path
+    try:
+        if path.is_file() or path.suffix or path.is_absolute():
+            return path
+    except OSError as error:
+        raise ConfigError(f"{path}: is no path ({error.strerror})") from error
     shipped = shipped_configs()
     name = path.as_posix()
     if name not in shipped:

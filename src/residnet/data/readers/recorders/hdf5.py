@@ -20,6 +20,9 @@ if TYPE_CHECKING:
     import h5py
 
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
+_ALWAYS_HELD = 200_000_000
+_MOST_COMPRESSED = 1000
+"""Bytes of a dataset for each byte of its file at most; a constant channel has some 900."""
 
 
 @final
@@ -81,12 +84,27 @@ def load_hdf5(
                 )
             )
             for dataset in found:
+                _require_held(path, dataset)
                 leaves.update(_vectors(dataset))
             return tree_recording(path, leaves, time or TreeTime(), wanted)
     except (OSError, RuntimeError, KeyError, ValueError) as error:
         raise DataError(
             f"{path}: damaged or not an HDF5 file ({' '.join(str(error).split())[:200]})"
         ) from error
+
+
+def _require_held(path: Path, dataset: h5py.Dataset) -> None:
+    """Check that a dataset is not larger than its file can hold; a size is only a number in it.
+
+    Raises:
+        DataError: where it claims far more than the file has, even compressed.
+    """
+    claimed, held = dataset.size * dataset.dtype.itemsize, path.stat().st_size
+    if claimed > max(_ALWAYS_HELD, _MOST_COMPRESSED * held):
+        raise DataError(
+            f"{path}: {dataset.name} claims {claimed / 1e9:.3g} GB in a file of {held / 1e6:.3g}"
+            " MB; the file is damaged, or was made and never filled"
+        )
 
 
 def _vectors(dataset: h5py.Dataset) -> dict[str, Vector]:
