@@ -288,6 +288,7 @@ def _warm_up(folder: Path) -> None:
     config.write_text(yaml.safe_dump(measured(folder), sort_keys=False))
     with (
         Path(os.devnull).open("w") as nowhere,
+        contextlib.suppress(SystemExit),
         contextlib.redirect_stdout(nowhere),
         contextlib.redirect_stderr(nowhere),
     ):

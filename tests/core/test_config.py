@@ -272,9 +272,7 @@ def test_what_is_not_there_cannot_be_taken_away(
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    "number", ["1234567890123456789012", "-0xffffffffffffffffff", "1e200", "-1e31", "1e-200"]
-)
+@pytest.mark.parametrize("number", ["1234567890123456789012", "1e200", "-1e31", "1e-200"])
 def test_numbers_that_no_vessel_has_are_refused(tmp_path: Path, number: str) -> None:
     path = tmp_path / "fit.yaml"
     path.write_text(f"task: fit\ndt: {number}\n")
