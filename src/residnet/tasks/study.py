@@ -4,9 +4,11 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import active_children, get_context
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -14,7 +16,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from residnet.core.config import ExistingPath, load_config
-from residnet.core.errors import UsageError
+from residnet.core.errors import FitError, UsageError
 from residnet.core.files import read_json
 from residnet.core.names import nearest
 from residnet.core.progress import report
@@ -117,8 +119,7 @@ class StudyConfig(Task):
                 seconds.append(_fit(*job))
             report("fits of the study", len(jobs), len(jobs))
         else:
-            with ProcessPoolExecutor(self.workers, mp_context=get_context("spawn")) as pool:
-                seconds = list(pool.map(_fit, *zip(*jobs, strict=True)))
+            seconds = _side_by_side(self.workers, jobs)
         names = [(variant, seed) for _, variant, seed, _ in jobs]
         return self._write(folder, dict(zip(names, seconds, strict=True)))
 
@@ -207,6 +208,34 @@ def _main_figures(rows: Sequence[dict[str, Any]]) -> dict[str, MainFigure]:
     return {
         f"nrmse_{row['variant']}_{row['protocol']}": MainFigure(row["nrmse_mean"]) for row in rows
     }
+
+
+def _side_by_side(workers: int, jobs: Sequence[tuple[StudyConfig, str, int, Path]]) -> list[float]:
+    """Fit in processes side by side; an interruption ends them all at once.
+
+    Raises:
+        FitError: where the system ends a process.
+    """
+    with ProcessPoolExecutor(
+        workers, mp_context=get_context("spawn"), initializer=_leave_interruptions
+    ) as pool:
+        try:
+            return list(pool.map(_fit, *zip(*jobs, strict=True)))
+        except BrokenProcessPool as error:
+            raise FitError(
+                "workers: the system has ended one of the processes; the memory may not be enough"
+                " for so many side by side, so give fewer and continue with --resume"
+            ) from error
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in active_children():
+                process.terminate()
+            raise
+
+
+def _leave_interruptions() -> None:
+    """Leave Ctrl-C, which reaches every process of a terminal, to the one that began them."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _fit(study: StudyConfig, variant: str, seed: int, out: Path) -> float:
