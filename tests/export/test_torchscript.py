@@ -19,7 +19,7 @@ from torch import Tensor
 from residnet.core.errors import ExportError
 from residnet.core.names import STATE
 from residnet.dynamics.ensemble import mean_of
-from residnet.export import torchscript
+from residnet.export import contract, torchscript
 from residnet.export.torchscript import check_parity, export_torchscript
 from residnet.heads import HeadConfig
 from residnet.testing import check_bad_inputs
@@ -34,13 +34,13 @@ ROW = {
 
 
 # the full length is run by the tests of the task `fit`
-FULL, STEPS = torchscript.PARITY_STEPS, 120
+FULL, STEPS = contract.PARITY_STEPS, 120
 
 
 @pytest.fixture(scope="module", autouse=True)
 def short_parity() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(torchscript, "PARITY_STEPS", STEPS)
+        patch.setattr(contract, "PARITY_STEPS", STEPS)
         yield
 
 
@@ -82,7 +82,7 @@ def test_the_union_is_covered() -> None:
 def test_parity_is_stated_and_small(exported: Exported) -> None:
     parity = exported.card["parity"]
     assert parity["steps"] == STEPS
-    assert FULL == 1000
+    assert FULL == 2000
     assert list(parity["share_of_range"]) == list(STATE)
     assert all(0 <= share <= 1e-5 for share in parity["share_of_range"].values())
 

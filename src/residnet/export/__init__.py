@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from residnet.core.registry import ThirdParty, objects, usable
+from residnet.export.aoti import AotiExporter
 from residnet.export.base import Exporter
 from residnet.export.c.exporter import CExporter
 from residnet.export.casadi_function import CasadiExporter
@@ -20,6 +21,7 @@ _BUILTIN: tuple[Exporter, ...] = (
     CasadiExporter(),
     Fmu3Exporter(),
     Fmu2Exporter(),
+    AotiExporter(),
     FeedForwardExporter(),
 )
 

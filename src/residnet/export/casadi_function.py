@@ -17,12 +17,12 @@ from residnet.core.names import STATE
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
 from residnet.export.base import Exporter
+from residnet.export.card import make_card
 from residnet.export.contract import DOUBLE, Numbers, accepted, checked, require_numbers, warmed
 from residnet.export.guard import GuardedDynamics
 from residnet.export.lowering.build import lowered
 from residnet.export.lowering.program import Fold, Map, Pick, Product, Program
 from residnet.export.packages import require_package
-from residnet.export.torchscript import make_card
 
 _RESULTS = ("x_after", "s_after", "outside")
 _UNARY = (

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from residnet.core.errors import ExportError
-from residnet.core.layout import RANGE_INPUTS, SURGE
+from residnet.core.layout import RANGE_INPUTS, SURGE, motion
 from residnet.core.names import STATE
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
@@ -88,6 +88,27 @@ def drive(spec: ModelSpec, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
     return y, w
 
 
+def require_sound(spec: ModelSpec, model: HybridDynamics, states: Tensor) -> None:
+    """Refuse a model that diverges in a free run whose inputs stay within the training range.
+
+    Raises:
+        ExportError: that names the first step and channel beyond what exports accept.
+    """
+    guard = GuardedDynamics(model, spec)
+    least, most = motion(guard.least), motion(guard.most)
+    wrong = ~((states[0] >= least) & (states[0] <= most))
+    if not bool(wrong.any()):
+        return
+    k = int(wrong.any(dim=1).to(torch.int).argmax())
+    i = int(wrong[k].to(torch.int).argmax())
+    raise ExportError(
+        f"model {spec.name}: diverges in the export's free run, though its inputs stay within the"
+        f" training range: {STATE[i]} is {float(states[0, k, i]):.3g} after {k * spec.dt:g} s,"
+        f" accepted {float(least[i]):.3g} to {float(most[i]):.3g}; not exported, choose another"
+        " model"
+    )
+
+
 def require_parity(
     spec: ModelSpec, model: HybridDynamics, stepped: Stepped, what: str, tolerance: float = SINGLE
 ) -> dict[str, float]:
@@ -103,18 +124,16 @@ def require_parity(
     Raises:
         ExportError: where a share is larger, or the model itself leaves what exports accept.
     """
-    guarded = GuardedDynamics(model, spec).to(_dtype(model)).eval()
     y, w = drive(spec, _dtype(model))
     with torch.no_grad():
-        start = torch.cat((y[:, -1], torch.zeros_like(y[:, -1, :1])), dim=-1)
-        memory = guarded.warmup(y, w[:, :PAST])
-        eager = Rollout(guarded)(start, w[:, PAST:], memory)[0][0].numpy()
+        eager = Rollout(model)(y[:, -1], w[:, PAST:], model.warmup(y, w[:, :PAST]))[0]
+    require_sound(spec, model, eager)
     x, s = y[0, -1].numpy().copy(), stepped.warmup(y[0].numpy(), w[0, :PAST].numpy())
     path = [x]
     for k in range(PARITY_STEPS):
         x, s, _ = stepped.step(x, w[0, PAST + k].numpy(), s)
         path.append(x)
-    states = eager[:, : len(STATE)]
+    states = eager[0].numpy()
     span = np.maximum(np.ptp(states, axis=0), 1e-6)
     worst = np.abs(np.stack(path) - states).max(axis=0) / span
     shares = dict(zip(STATE, worst.tolist(), strict=True))

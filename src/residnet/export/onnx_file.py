@@ -14,13 +14,13 @@ from typing import Any, ClassVar, final
 
 import numpy as np
 import torch
-from torch import Tensor, nn
 
 from residnet.core.errors import ExportError
 from residnet.core.names import STATE
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
 from residnet.export.base import Exporter
+from residnet.export.card import make_card
 from residnet.export.contract import (
     Numbers,
     accepted,
@@ -28,36 +28,10 @@ from residnet.export.contract import (
     require_numbers,
     warmed,
 )
-from residnet.export.guard import GuardedDynamics
 from residnet.export.packages import require_package
-from residnet.export.torchscript import make_card
+from residnet.export.stepping import Step, StepWithoutMemory
 
 _INPUTS, _OUTPUTS = ("x", "w", "s"), ("x_after", "s_after", "outside")
-
-
-class Step(nn.Module):
-    """The guarded step as a module's forward, which exporters of graphs ask for."""
-
-    def __init__(self, model: HybridDynamics, spec: ModelSpec) -> None:
-        super().__init__()
-        self.guarded = GuardedDynamics(model, spec)
-
-    def forward(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return state [B, 6], memory [B, n_state] and flag [B] one step later."""
-        return self.guarded.flagged_step(x, w, s)
-
-
-class StepWithoutMemory(nn.Module):
-    """The guarded step of a model without a memory, as a module's forward."""
-
-    def __init__(self, model: HybridDynamics, spec: ModelSpec) -> None:
-        super().__init__()
-        self.guarded = GuardedDynamics(model, spec)
-
-    def forward(self, x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
-        """Return state [B, 6] and flag [B] one step later."""
-        x, _, outside = self.guarded.flagged_step(x, w, x[:, :0])
-        return x, outside
 
 
 class OnnxModel:

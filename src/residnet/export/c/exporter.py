@@ -16,8 +16,8 @@ from residnet.dynamics.store import ModelSpec
 from residnet.export.base import Exporter
 from residnet.export.c.compiled import CompiledModel, compile_shared
 from residnet.export.c.vessel import vessel_source
+from residnet.export.card import make_card
 from residnet.export.contract import DOUBLE, SINGLE, checked, require_numbers
-from residnet.export.torchscript import make_card
 
 _PRECISIONS: tuple[tuple[Literal["single", "double"], torch.dtype, float], ...] = (
     ("single", torch.float32, SINGLE),

@@ -21,9 +21,9 @@ from residnet.dynamics.store import ModelSpec
 from residnet.export.base import Exporter
 from residnet.export.c.compiled import CompiledModel, compile_shared
 from residnet.export.c.vessel import CSource, vessel_source
+from residnet.export.card import make_card
 from residnet.export.contract import DOUBLE, checked, require_numbers
 from residnet.export.fmu.description import NAME, description
-from residnet.export.torchscript import make_card
 
 _BUILD = """<?xml version="1.0" encoding="UTF-8"?>
 <fmiBuildDescription fmiVersion="3.0">

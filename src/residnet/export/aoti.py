@@ -1,0 +1,98 @@
+"""The format `aoti`: the model's step compiled ahead of time by torch, for this machine."""
+
+from __future__ import annotations
+
+import copy
+import json
+import tempfile
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar, final
+
+import numpy as np
+import torch
+
+from residnet.core.errors import ExportError
+from residnet.core.names import STATE
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.store import ModelSpec
+from residnet.export.base import Exporter
+from residnet.export.card import make_card
+from residnet.export.contract import Numbers, accepted, checked, require_numbers, warmed
+from residnet.export.stepping import Step
+
+
+class AotiModel:
+    """A compiled package, loaded back, for one vessel."""
+
+    def __init__(self, file: Path, spec: ModelSpec, model: HybridDynamics) -> None:
+        self.package: Any = torch._inductor.aoti_load_package(str(file))
+        self.memory = model.n_state
+        self.measured = accepted(spec, model)
+
+    def step(self, x: Numbers, w: Numbers, s: Numbers) -> tuple[Numbers, Numbers, bool]:
+        """Return state, memory and flag one step later."""
+        given = [torch.from_numpy(np.asarray(part, np.float32)).unsqueeze(0) for part in (x, w, s)]
+        after, memory, outside = self.package(*given)
+        return after[0].numpy(), memory[0].numpy(), bool(outside[0])
+
+    def warmup(self, y: Numbers, w: Numbers) -> Numbers:
+        """Return the memory that a measured past leaves."""
+        return warmed(self.measured, self.step, y, w, np.zeros(self.memory, np.float32))
+
+
+@final
+class AotiExporter(Exporter):
+    """An AOTInductor package, which C++ and Python load with libtorch."""
+
+    name: ClassVar[str] = "aoti"
+    suffix: ClassVar[str] = ".pt2"
+    about: ClassVar[str] = "The model's step compiled for this machine (AOTInductor), one row."
+
+    def export(
+        self,
+        spec: ModelSpec,
+        model: HybridDynamics,
+        file: Path,
+        rows: Sequence[Mapping[str, Any]],
+    ) -> Mapping[str, Any]:
+        """Compile the model in float32; the card stands beside the package."""
+        require_numbers(spec, model)
+        model = copy.deepcopy(model).float().eval().requires_grad_(False)
+        with tempfile.TemporaryDirectory() as name:
+            partial = Path(name) / "model.pt2"
+            _compile(spec, model, partial)
+            stepped = AotiModel(partial, spec, model)
+            card = make_card(spec, model, rows, {}) | {
+                "format": "aoti",
+                "parity": checked(spec, model, stepped, "the compiled package"),
+                "safety": "The package holds machine code that runs when loaded: load only what"
+                " you trust. It is for the kind of machine that it was made on.",
+            }
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.with_suffix(".card.json").write_text(json.dumps(card, indent=1) + "\n")
+            file.write_bytes(partial.read_bytes())
+        return card
+
+
+def _compile(spec: ModelSpec, model: HybridDynamics, file: Path) -> None:
+    """Write the package.
+
+    Raises:
+        ExportError: where torch cannot compile the step, or there is no C++ compiler.
+    """
+    sizes = (len(STATE), len(spec.signals.columns), model.n_state)
+    examples = tuple(torch.zeros(1, size) for size in sizes)
+    try:
+        with warnings.catch_warnings(), torch.no_grad():
+            warnings.simplefilter("ignore")
+            program = torch.export.export(Step(model, spec).eval(), examples)
+            torch._inductor.aoti_compile_and_package(program, package_path=str(file))
+    except (RuntimeError, OSError) as error:
+        # what torch raises here has no class of its own
+        first = str(error).strip().splitlines() or [type(error).__name__]
+        raise ExportError(
+            f"model {spec.name}: cannot be compiled ahead of time ({first[0]}); export it as c or"
+            " torchscript"
+        ) from None
