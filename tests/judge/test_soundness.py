@@ -123,6 +123,9 @@ def test_an_unstable_model_is_contradicted_by_a_vessel_that_turns_steadily_only(
     said = contradiction(model, steady_runs([log()], STEP))
     assert "unstable where the logs are not" in said
     assert contradiction(model, steady_runs([log(settles=False)], STEP)) == ""
+    # a straight run that nothing disturbs proves nothing
+    straight = [run for run in steady_runs([log()], STEP) if run.w[1] == 0.0]
+    assert contradiction(model, straight) == ""
     # one that grows too slowly for the logs to tell
     _, slow = made({"v": (0, -0.3, -0.38), "r": (0, -0.4, -0.5)})
     assert contradiction(slow, steady_runs([log()], STEP)) == ""
@@ -134,3 +137,4 @@ def test_steady_runs_are_stretches_of_held_inputs() -> None:
     assert runs[1].w.tolist() == pytest.approx([8.0, 0.5])
     assert runs[1].x[5] == pytest.approx(0.1, abs=0.002)
     assert runs[1].growth < 2.0
+    assert runs[0].decay < 3.0 < runs[1].decay
