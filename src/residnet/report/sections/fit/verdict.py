@@ -200,7 +200,10 @@ def cautions(run: RunFiles, findings: Sequence[Finding]) -> list[str]:
         text for text in (worse_than_reference(run, protocol) for protocol in run.protocols) if text
     ]
     if lead is not None and lead == run.baseline and run.heads:
-        out.append("No head beats the baseline on validation data: the baseline was selected.")
+        out.append(
+            "The baseline was selected: on validation data no sound model is better by more than one"
+            " standard error."
+        )
     # the first sentence; the figures stand in the section on sanity
     failed = [finding for finding in findings if finding.ok is False and finding.model == lead]
     out += [
