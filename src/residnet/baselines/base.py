@@ -105,6 +105,13 @@ class IdentifiedConfig(Config, ABC):
             ConfigError: where a channel that it needs is missing.
         """
 
+    def require_samples(self, samples: Samples) -> None:
+        """Check that samples hold the manoeuvres that this baseline is identified from.
+
+        Raises:
+            FitError: where they do not.
+        """
+
     @abstractmethod
     def solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
         """Identify from samples whose target is the measured acceleration.

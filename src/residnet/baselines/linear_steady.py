@@ -69,20 +69,46 @@ class LinearSteadyConfig(IdentifiedConfig):
                 table.append(Coefficient(f"{'uvr'[axis]}_dot", term, value, error))
         return [Solution({}, {"theta": theta}, tuple(table))]
 
+    def require_samples(self, samples: Samples) -> None:
+        """Check that there are constant manoeuvres, and those that identify speed and steering.
+
+        Raises:
+            FitError: where there are not.
+        """
+        self._settled(samples)
+        for kinds in (self.speed, self.steering):
+            self._dynamic(samples, kinds)
+
+    def _settled(self, samples: Samples) -> Samples:
+        """Return the samples of constant manoeuvres once their transients have passed."""
+        settled = samples.of_kinds(self.steady)
+        settled = settled.where(settled.t >= self.settled)
+        count = torch.unique(settled.group).numel()
+        if count < 3:
+            raise FitError(
+                "baseline 'linear_steady' needs at least 3 constant-input manoeuvres of kinds"
+                f" {list(self.steady)} longer than {self.settled:g} s, the data have {count}; kinds"
+                f" in the data: {sorted(set(samples.kinds))}"
+            )
+        return settled
+
+    def _dynamic(self, samples: Samples, kinds: tuple[str, ...]) -> Samples:
+        """Return the samples of some kinds of manoeuvre."""
+        dynamic = samples.of_kinds(kinds)
+        if len(dynamic) == 0:
+            raise FitError(
+                f"baseline 'linear_steady' needs manoeuvres of kinds {list(kinds)}; kinds in the"
+                f" data: {sorted(set(samples.kinds))}"
+            )
+        return dynamic
+
     def _steady_states(self, samples: Samples, states: tuple[str, ...], drive: str) -> Solution:
         """Return Phi and Phi_bias [2, n] as the rows of a fit.
 
         It is made of the means of the settled part of every constant manoeuvre.
         """
-        settled = samples.of_kinds(self.steady)
-        settled = settled.where(settled.t >= self.settled)
+        settled = self._settled(samples)
         present, index = torch.unique(settled.group, return_inverse=True)
-        if present.numel() < 3:
-            raise FitError(
-                "baseline 'linear_steady' needs at least 3 constant-input manoeuvres of kinds"
-                f" {list(self.steady)} longer than {self.settled:g} s, the data have"
-                f" {present.numel()}; kinds in the data: {sorted(set(samples.kinds))}"
-            )
         columns = torch.stack([settled.column(name) for name in (*states, drive)], dim=1)
         count = torch.bincount(index).to(columns.dtype)[:, None]
         means = (
@@ -109,12 +135,7 @@ class LinearSteadyConfig(IdentifiedConfig):
         First stands A, then B = -A Phi and -A Phi_bias with propagated errors.
         """
         steady = self._steady_states(samples, states, drive)
-        dynamic = samples.of_kinds(kinds)
-        if len(dynamic) == 0:
-            raise FitError(
-                f"baseline 'linear_steady' needs manoeuvres of kinds {list(kinds)}; kinds in the"
-                f" data: {sorted(set(samples.kinds))}"
-            )
+        dynamic = self._dynamic(samples, kinds)
         x = torch.stack([dynamic.column(name) for name in states], dim=1)
         deviation = (
             x - dynamic.column(drive)[:, None] * steady.coefficients[0] - steady.coefficients[1]

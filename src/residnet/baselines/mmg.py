@@ -185,6 +185,14 @@ class MMGConfig(IdentifiedConfig):
             MMGForces(self.hull, self.propeller, self.rudder, (u, v, r, n, delta)), priors
         )
 
+    def require_samples(self, samples: Samples) -> None:
+        """Check that there are manoeuvres to fit on.
+
+        Raises:
+            FitError: where there are none of the kinds that are asked for.
+        """
+        of_manoeuvres(samples, self.manoeuvres)
+
     def solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
         """Return the most likely parameters given accelerations and priors, by Gauss-Newton.
 

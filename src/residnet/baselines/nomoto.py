@@ -46,6 +46,14 @@ class _SteeringConfig(IdentifiedConfig):
         require(names, ("u", "v", "r", self.drive, self.steer), "a Nomoto baseline")
         return RegressorBaseline(self.rows(), names, self.held)
 
+    def require_samples(self, samples: Samples) -> None:
+        """Check that there are manoeuvres to fit on.
+
+        Raises:
+            FitError: where there are none of the kinds that are asked for.
+        """
+        of_manoeuvres(samples, self.manoeuvres)
+
     def lag(self, baseline: RegressorBaseline, samples: Samples, axis: int) -> Solution:
         """Fit one axis as a first-order lag by least squares.
 

@@ -200,6 +200,14 @@ class RegressorsConfig(IdentifiedConfig):
         """Return the module, coefficients zero, for channels `names`."""
         return RegressorBaseline(self.rows(names), names)
 
+    def require_samples(self, samples: Samples) -> None:
+        """Check that there are manoeuvres to fit on.
+
+        Raises:
+            FitError: where there are none of the kinds that are asked for.
+        """
+        of_manoeuvres(samples, self.manoeuvres)
+
     def solutions(self, baseline: Baseline, samples: Samples) -> list[Solution]:
         """Return one solution for each penalty.
 

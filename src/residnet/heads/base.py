@@ -105,6 +105,13 @@ class ResidualHead(nn.Module, ABC):
 class ClosedFormHead(ResidualHead):
     """A head whose parameters come from a closed-form solution."""
 
+    def require_samples(self, samples: Samples) -> None:
+        """Check that samples are of as many manoeuvres as the fit divides them into.
+
+        Raises:
+            FitError: where they are not.
+        """
+
     @abstractmethod
     def solutions(self, samples: Samples) -> list[Solution]:
         """Fit samples whose target is the residual [N, 3].

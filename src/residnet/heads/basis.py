@@ -17,7 +17,7 @@ from residnet.core.names import ACCELERATION
 from residnet.core.samples import Samples
 from residnet.heads.base import ClosedFormHead, FeatureConfig, Features
 from residnet.physics.terms import TermLibrary, polynomial_terms
-from residnet.regression.estimator import Estimator, require_finite, usual_folds
+from residnet.regression.estimator import Estimator, fold_numbers, require_finite, usual_folds
 from residnet.regression.solutions import Solution
 
 
@@ -98,6 +98,14 @@ class BasisHead(ClosedFormHead):
     @abstractmethod
     def estimator(self, folds: int | None) -> Estimator:
         """Return the estimator of the coefficients, cross-validated over so many folds."""
+
+    def require_samples(self, samples: Samples) -> None:
+        """Check that there are as many manoeuvres as folds.
+
+        Raises:
+            FitError: where there are fewer.
+        """
+        fold_numbers(samples.group, self.folds or usual_folds(samples.group))
 
     def solutions(self, samples: Samples) -> list[Solution]:
         """Return the solutions of the estimator; see `ClosedFormHead.solutions`."""

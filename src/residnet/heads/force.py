@@ -117,6 +117,14 @@ class ForceHead(ClosedFormHead):
                     torch.inf,
                 )
 
+    def require_samples(self, samples: Samples) -> None:
+        """Check that there are as many manoeuvres as folds.
+
+        Raises:
+            FitError: where there are fewer.
+        """
+        self.inner.require_samples(samples)
+
     def solutions(self, samples: Samples) -> list[Solution]:
         """Return those solutions of the basis functions that can run forward.
 

@@ -17,7 +17,7 @@ from residnet.core.samples import Samples
 from residnet.heads.base import ClosedFormHead, FeatureConfig, Features
 from residnet.physics.terms import TermLibrary
 from residnet.regression.equation_rows import step_of, unbroken_stretches
-from residnet.regression.estimator import usual_folds
+from residnet.regression.estimator import fold_numbers, usual_folds
 from residnet.regression.kernel.functions import Polynomial, Rbf
 from residnet.regression.kernel.path import Path
 from residnet.regression.kernel.recursion import Recursion
@@ -137,6 +137,14 @@ class KernelHead(ClosedFormHead):
     def parameter_count(self) -> list[float]:
         """Return the effective number of parameters of each axis, the trace of the smoother."""
         return [float(count) for count in self.effective]
+
+    def require_samples(self, samples: Samples) -> None:
+        """Check that there are as many manoeuvres as folds.
+
+        Raises:
+            FitError: where there are fewer.
+        """
+        fold_numbers(samples.group, self.folds or usual_folds(samples.group))
 
     def solutions(self, samples: Samples) -> list[Solution]:
         """Return the solution of the least error of each axis, then what free runs may prefer.

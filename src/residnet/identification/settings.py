@@ -7,7 +7,7 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from residnet.baselines import BaselineConfig, RegressorBaseline
+from residnet.baselines import BaselineConfig, ParametricBaseline, RegressorBaseline
 from residnet.core.config import Config
 from residnet.core.errors import ConfigError
 from residnet.core.names import nearest
@@ -99,6 +99,12 @@ class FitSettings(Config):
                 head.set_mass(baseline.mass())
             except ConfigError as error:
                 raise ValueError(f"heads.{key}: {error}") from None
+        for name in self.refit:
+            if not isinstance(self.all_baselines[name].build(names), ParametricBaseline):
+                raise ValueError(
+                    f"refit.{name}: a refit through rollouts needs a baseline of kind 'regressors',"
+                    " 'linear_steady', 'mmg', 'nomoto' or 'nomoto_sideslip'"
+                )
         if self.current is not None:
             name, baselines = self.current.baseline, self.all_baselines
             require_known("current.baseline", (name,), baselines, "baseline")

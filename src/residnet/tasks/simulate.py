@@ -10,7 +10,7 @@ from pydantic import model_validator
 
 from residnet.core.progress import say
 from residnet.data.simulated.flying import Craft, Flight
-from residnet.data.simulated.trials import SimulatedTrials, fly_trials, trials_craft
+from residnet.data.simulated.trials import SimulatedTrials, fly_trials, stand_ins, trials_craft
 from residnet.manoeuvres import Replay
 from residnet.physics.vessel import load_vessel
 from residnet.report.blocks import Section
@@ -45,6 +45,8 @@ class SimulateConfig(ComputingTask):
                 "give programme (manoeuvres on a vessel or a model) or data (trials with splits),"
                 " one of the two"
             )
+        if self.data is not None:
+            self.data.splits(self.data.draw())
         return self
 
     def check(self) -> None:
@@ -55,6 +57,8 @@ class SimulateConfig(ComputingTask):
         """
         if self.programme is not None:
             self.programme.check()
+        if self.data is not None:
+            stand_ins(self.data)
 
     def input_files(self) -> list[Path]:
         """Return the logs that are replayed, and the files of the learned model."""

@@ -17,6 +17,7 @@ from residnet.dynamics.rollout import Rollout
 from residnet.training.config import TrainingConfig
 from residnet.training.epochs import EpochTraining
 from residnet.training.losses import one_step_loss, rollout_loss
+from residnet.training.stage_windows import stage_windows, stages
 
 
 class Score(NamedTuple):
@@ -59,34 +60,7 @@ class HeadTraining(EpochTraining):
         self.store = store
         self.scales = scales
         self.validate = validate
-        self.batches = [
-            self._batches(stage, length, batch)
-            for stage, (length, batch) in enumerate(self._stages())
-        ]
-
-    def _stages(self) -> list[tuple[int, int]]:
-        dt, config = self.model.dt, self.settings
-        return [(round(config.one_step.window / dt), config.one_step.batch)] + [
-            (round(s.horizon / dt) + 1, s.batch) for s in config.multi_step
-        ]
-
-    def _batches(self, stage: int, length: int, batch: int) -> list[WindowBatches]:
-        """Where the windows of a stage's batches come from: anywhere, then the beginnings of
-        stretches.
-        """
-        beginnings, steps = self.settings.beginnings, self.settings.steps
-        if stage == 0 and self.settings.one_step.epochs == 0:
-            return []
-        if beginnings is None:
-            return [WindowBatches(self.store.starts(length), batch, steps)]
-        few = min(max(round(beginnings.share * batch), 1), batch - 1)
-        begins = self.store.beginnings(
-            length, 0 if stage == 0 else max(round(beginnings.initial / self.model.dt), 1)
-        )
-        return [
-            WindowBatches(self.store.starts(length), batch - few, steps),
-            WindowBatches(begins, few, steps),
-        ]
+        self.batches = stage_windows(config, store, model.dt)
 
     def train_dataloader(self) -> EpochBatches:
         """Return window starts [batch], `steps` times an epoch."""
@@ -118,7 +92,7 @@ class HeadTraining(EpochTraining):
     def training_step(self, starts: Tensor, batch_index: int) -> Tensor:
         """Return the loss of one batch of windows."""
         stage, _ = self.settings.stage(self.epoch)
-        length, _ = self._stages()[stage]
+        length, _ = stages(self.settings, self.model.dt)[stage]
         loss = (
             self._one_step(starts, length)
             if stage == 0

@@ -184,6 +184,28 @@ def _place(baseline: ParametricBaseline, values: Tensor, active: Tensor) -> None
         baseline.theta.copy_(flat.reshape(baseline.theta.shape))
 
 
+def free_run_starts(store: WindowStore, config: RefitConfig, dt: float) -> Tensor:
+    """Return the rows at which the free runs of a refit start.
+
+    Args:
+        store: training windows.
+        config: settings.
+        dt: step in s.
+
+    Raises:
+        FitError: where no log is long enough.
+    """
+    steps, every = round(config.horizon / dt), max(round(config.every / dt), 1)
+    starts = store.starts(steps + 1)
+    starts = starts[store.depth[starts] % every == 0]
+    if starts.numel() == 0:
+        raise FitError(
+            f"no training log holds a free run of {config.horizon:g} s for the refit; shorten"
+            " `horizon`"
+        )
+    return starts
+
+
 def _problem(
     model: HybridDynamics,
     baseline: ParametricBaseline,
@@ -192,14 +214,8 @@ def _problem(
     config: RefitConfig,
     scales: Tensor,
 ) -> _Problem:
-    steps, every = round(config.horizon / model.dt), max(round(config.every / model.dt), 1)
-    starts = store.starts(steps + 1)
-    starts = starts[store.depth[starts] % every == 0]
-    if starts.numel() == 0:
-        raise FitError(
-            f"no training log holds a free run of {config.horizon:g} s for the refit; shorten"
-            " `horizon`"
-        )
+    steps = round(config.horizon / model.dt)
+    starts = free_run_starts(store, config, model.dt)
     take = store.take
     nu = take(store.y, starts + 1, steps)[..., VELOCITIES]
     usable = take(store.usable, starts + 1, steps).to(scales.dtype).unsqueeze(-1)

@@ -179,15 +179,20 @@ def fly(
 
 def _channels(craft: Craft, sea: Sea, states: Tensor, inputs: Tensor) -> dict[str, np.ndarray]:
     """Return the channels [T] of a flight's log from states [T, nx] and inputs [T, m]."""
-    channels = {
-        name: states[:, column].numpy().copy()
-        for column, name in enumerate(craft.helm.state)
-        if not name.startswith("_")
-    }
-    logged = [*craft.helm.inputs[: craft.commands], *sea.disturbance.logged]
-    return channels | {
-        name: inputs[:, craft.helm.inputs.index(name)].numpy().copy() for name in logged
-    }
+    channels = dict(zip(craft.helm.state, states.T, strict=True)) | dict(
+        zip(craft.helm.inputs, inputs.T, strict=True)
+    )
+    return {name: channels[name].numpy().copy() for name in logged_channels(craft, sea)}
+
+
+def logged_channels(craft: Craft, sea: Sea) -> tuple[str, ...]:
+    """Return the names of the channels of a flight's log: states, commands, what is measured."""
+    names = [
+        *(name for name in craft.helm.state if not name.startswith("_")),
+        *craft.helm.inputs[: craft.commands],
+        *sea.disturbance.logged,
+    ]
+    return tuple(dict.fromkeys(names))
 
 
 def _surroundings(

@@ -12,8 +12,17 @@ from pydantic import Field, model_validator
 from residnet.core.config import Config, Seconds
 from residnet.core.errors import ConfigError
 from residnet.core.log import Log
+from residnet.core.names import CHANNEL_UNITS
 from residnet.data.simulated.environment import Disturbance
-from residnet.data.simulated.flying import Craft, Flight, Sea, fly
+from residnet.data.simulated.flying import (
+    Craft,
+    Flight,
+    Sea,
+    fly,
+    log_names,
+    logged_channels,
+    source_of,
+)
 from residnet.data.simulated.sensors import SensorNoise
 from residnet.dynamics.simulated import PlantDynamics
 from residnet.manoeuvres import FamilyConfig, Helm, Manoeuvre
@@ -113,6 +122,31 @@ def fly_trials(manoeuvres: Sequence[Manoeuvre], config: SimulatedTrials) -> list
     craft = trials_craft(config)
     sea = Sea(plant, config.disturbance, config.noise, config.seed)
     return fly(craft, manoeuvres, sea, config.duration, config.step, {"vessel": config.vessel})
+
+
+def stand_ins(config: SimulatedTrials) -> list[Log]:
+    """Return logs with the names, channels, lengths and kinds of those of `simulate`, unflown.
+
+    Their channels are slow sines: they tell what a run can be made of, before anything is flown.
+
+    Raises:
+        UsageError: where the vessel lacks what a manoeuvre needs.
+    """
+    plant = load_vessel(config.vessel).build()
+    craft, sea = trials_craft(config), Sea(plant, config.disturbance, config.noise, config.seed)
+    manoeuvres = config.draw()
+    source_of(manoeuvres, craft.helm, torch.arange(2, dtype=torch.float64) * config.step)
+    out = []
+    for manoeuvre, name in zip(manoeuvres, log_names(manoeuvres), strict=True):
+        manoeuvre.begin(craft.start[0], craft.helm.state)
+        t = np.arange(max(round(manoeuvre.lasts(config.duration) / config.step), 2)) * config.step
+        channels = {
+            channel: 1.0 + np.sin(0.1 * t + place)
+            for place, channel in enumerate(logged_channels(craft, sea))
+        }
+        units = {channel: CHANNEL_UNITS.get(channel, "-") for channel in channels}
+        out.append(Log(name, t, channels, units, manoeuvre.kind))
+    return out
 
 
 def trials_craft(config: SimulatedTrials) -> Craft:

@@ -15,7 +15,7 @@ from residnet.core.log import Log
 from residnet.core.names import VELOCITY, nearest
 from residnet.data.prepare import Prepared
 from residnet.data.simulated.environment import Disturbance
-from residnet.data.simulated.flying import Craft, Flight, Sea, fly
+from residnet.data.simulated.flying import Craft, Flight, Sea, fly, source_of
 from residnet.data.simulated.sensors import SensorNoise
 from residnet.dynamics.actuated import ActuatedDynamics
 from residnet.dynamics.gear import GivenGear, InputShare
@@ -92,6 +92,19 @@ def write_booklet(
         f"booklet: {len(config.manoeuvres)} manoeuvres, {len(repeated)} measured zigzags repeated,"
         f" {config.draws} draws each"
     )
+
+
+def require_flyable(config: BookletConfig, fitted: FittedModel) -> None:
+    """Check that a model can be steered through the booklet's manoeuvres; nothing is flown.
+
+    Raises:
+        ConfigError: where an input or a state is not the model's.
+        UsageError: where the model lacks what a manoeuvre needs.
+    """
+    craft = _craft(config, fitted, config.inputs)
+    source_of(config.manoeuvres, craft.helm, torch.arange(2, dtype=torch.float64) * fitted.spec.dt)
+    for manoeuvre in config.manoeuvres:
+        manoeuvre.begin(craft.start[0], craft.helm.state)
 
 
 def _craft(config: BookletConfig, fitted: FittedModel, inputs: Mapping[str, InputShare]) -> Craft:

@@ -8,7 +8,7 @@ from pydantic import model_validator
 
 from residnet.core.config import Config
 from residnet.data.simulated.trials import SimulatedTrials
-from residnet.data.sources import DataConfig, MeasuredLogs, input_files
+from residnet.data.sources import DataConfig, input_files
 from residnet.documents import StudyName
 from residnet.identification.settings import FitSettings, require_known
 from residnet.judge.booklet import BookletConfig
@@ -57,13 +57,15 @@ class FitTaskSettings(FitSettings, ComputingTask):
         return self
 
     def check(self) -> None:
-        """Check that the logs' files are there and no split is empty.
+        """Check that the logs hold what every part of the fit asks for, without fitting.
 
         Raises:
-            ConfigError: where they are not.
+            ResidnetError: where a file or a channel is missing, a log cannot be read, or manoeuvres
+                are too few or too short.
         """
-        if isinstance(self.data, MeasuredLogs):
-            self.data.split.files()
+        from residnet.tasks.fit.inputs import check_logs
+
+        check_logs(self)
 
     def input_files(self) -> list[Path]:
         """Return the files of the measured logs."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
+from residnet.core.errors import DataError
 from residnet.core.progress import say
-from residnet.data.sources import read_logs
 from residnet.identification.currents import through_currents
+from residnet.identification.evaluation import Evaluation
 from residnet.identification.fit import Identified, fit
 from residnet.identification.goodness import goodness_rows
 from residnet.identification.prepared import PreparedSplits, prepare_logs
@@ -27,6 +29,7 @@ from residnet.tasks.fit.files import (
     write_limits,
     write_metrics,
 )
+from residnet.tasks.fit.inputs import take_logs
 
 
 def run_fit(config: FitTaskSettings, folder: RunFolder) -> Outcome:
@@ -38,7 +41,8 @@ def run_fit(config: FitTaskSettings, folder: RunFolder) -> Outcome:
     logs = _prepared(config, folder)
     identified = fit(logs, config, store=FolderStore(folder))
     _judged(config, folder, identified, logs)
-    return fit_outcome(
+    failure = _booklet(config, folder, identified, logs)
+    outcome = fit_outcome(
         folder,
         "test",
         {
@@ -46,6 +50,7 @@ def run_fit(config: FitTaskSettings, folder: RunFolder) -> Outcome:
             for name in config.export.models
         },
     )
+    return replace(outcome, failure=failure)
 
 
 def _prepared(config: FitTaskSettings, folder: RunFolder) -> PreparedSplits:
@@ -54,7 +59,7 @@ def _prepared(config: FitTaskSettings, folder: RunFolder) -> PreparedSplits:
     Where they ran in currents, they are taken through the water.
     """
     say(f"{config.name}: reading logs")
-    read = read_logs(config.data)
+    read = take_logs(config)
     write_inspection(folder, read, config)
     logs = prepare_logs(read, config)
     say("  " + ", ".join(f"{split} {len(members)} logs" for split, members in logs.items()))
@@ -71,7 +76,7 @@ def _judged(
     """Run all models freely, and write everything that is found of them."""
     say("  free runs")
     fitted, step = list(identified.values()), config.prepare.grid.step
-    judged = {}
+    judged: dict[str, Evaluation] = {}
     for split in config.evaluation.splits:
         judged[split] = identified.evaluate(logs[split], config.data)
         write_rollouts(
@@ -95,6 +100,18 @@ def _judged(
             folder.write_table(place, found)
     splits = goodness_rows(fitted, logs, step)
     folder.write_json(folder.goodness, content(config.name, splits, step))
-    if config.booklet is not None:
-        refitted = identified[config.booklet.model]
+
+
+def _booklet(
+    config: FitTaskSettings, folder: RunFolder, identified: Identified, logs: PreparedSplits
+) -> str:
+    """Fly the booklet where one is asked for; return a line where the model cannot."""
+    if config.booklet is None:
+        return ""
+    refitted = identified[config.booklet.model]
+    try:
         say("  " + write_booklet(folder, config.booklet, refitted, logs, identified.limit))
+    except DataError as error:
+        # the fit itself is done, and its report is worth having
+        return str(error)
+    return ""
