@@ -84,8 +84,8 @@ def test_the_cost_is_what_it_says() -> None:
     found = flown.measured(CALM)
     changed = int((np.diff(command[0, : start + 120].numpy()) != 0).sum())
     assert float(found["time_outside"]) == pytest.approx(3.0 * 3 / 4 + 3.0 * 2 / 3, rel=1e-4)
-    assert float(found["overshoot"]) == pytest.approx(2.0, rel=1e-4)
-    assert float(found["travel"]) == pytest.approx(changed, rel=1e-4)
+    assert float(found["overshoot"]) == pytest.approx(2.0 * DEG, rel=1e-4)
+    assert float(found["travel"]) == pytest.approx(changed * DEG, rel=1e-4)
     assert float(found["cost"]) == pytest.approx(
         float(found["time_outside"]) + 0.5 * 2.0 + 0.01 * changed, rel=1e-4
     )

@@ -18,9 +18,9 @@ from residnet.dynamics.steering_variation import PushedSteering
 QUANTITIES = {
     "cost": "s",
     "time_outside": "s",
-    "overshoot": "deg",
-    "travel": "deg",
-    "iae": "deg s",
+    "overshoot": "rad",
+    "travel": "rad",
+    "iae": "rad s",
 }
 """Of a flight, with units: the cost, its three parts, and the integral of the absolute error."""
 
@@ -86,19 +86,37 @@ class ConditionedFlights:
         """New heading less heading [B, T] in rad, wrapped."""
         return wrap(self.changes.heading[:, None] - self.psi)
 
+    def swing(self, after: float) -> tuple[Tensor, Tensor]:
+        """Return how far heading and rudder command [B] in rad move, peak to peak.
+
+        Args:
+            after: time in s from the change of heading on, up to the flight's end.
+        """
+        steps = torch.arange(self.psi.shape[1])
+        late = steps >= self.changes.start[:, None] + round(after / self.changes.dt)
+
+        def between(values: Tensor) -> Tensor:
+            highest = torch.where(late, values, -torch.inf).amax(1)
+            return highest - torch.where(late, values, torch.inf).amin(1)
+
+        return between(self.psi), between(self.command)
+
     def measured(self, conditions: ConditionsConfig) -> dict[str, Tensor]:
         """Return each of `QUANTITIES` by flight, [B]; what is no number is left so."""
-        degrees, dt = 180.0 / torch.pi, self.changes.dt
+        dt, degrees = self.changes.dt, 180.0 / torch.pi
         counted = self.changes.counted().to(self.psi.dtype)
-        error = degrees * self.error
+        error = self.error
         size = error.abs()
-        band = degrees * conditions.band
-        outside = (counted * size / (size + band)).sum(1) * dt
+        outside = (counted * size / (size + conditions.band)).sum(1) * dt
         beyond = -error * self.changes.heading.sign()[:, None]
         overshoot = (beyond * counted).amax(1).clamp(min=0.0)
         moved = torch.diff(self.command, dim=1, prepend=torch.zeros_like(self.command[:, :1]))
-        travel = degrees * (moved.abs() * counted).sum(1)
-        cost = outside + conditions.overshoot_weight * overshoot + conditions.travel_weight * travel
+        travel = (moved.abs() * counted).sum(1)
+        cost = (
+            outside
+            + degrees * conditions.overshoot_weight * overshoot
+            + degrees * conditions.travel_weight * travel
+        )
         values = (cost, outside, overshoot, travel, (size * counted).sum(1) * dt)
         return dict(zip(QUANTITIES, values, strict=True))
 

@@ -17,7 +17,7 @@ _BAND: dict[str, Any] = {"color": "0.4", "linewidth": 0.8, "linestyle": ":"}
 _LINES: tuple[Any, ...] = ("-", (0, (6, 1.5)), "-.", (0, (2, 1)), (0, (4, 1, 1, 1)), "--", ":")
 
 
-def _looks(kinds: Mapping[str, str]) -> dict[str, dict[str, Any]]:
+def looks(kinds: Mapping[str, str]) -> dict[str, dict[str, Any]]:
     """Return colour and line of each controller, which differ without colour too.
 
     Policies have the widest lines and lie on top.
@@ -61,7 +61,7 @@ def responses(
     figure = new_figure(6.6)
     axes = figure.subplots(4, 1, sharex=True, height_ratios=(1.3, 1.0, 1.0, 1.0))
     handles: dict[str, Any] = {}
-    for controller, look in _looks(kinds).items():
+    for controller, look in looks(kinds).items():
         flights = series[series["controller"] == controller]
         for axis, (quantity, text) in zip(axes, quantities, strict=True):
             wide: Any = DEG * flights.pivot_table(
@@ -113,7 +113,7 @@ def distributions(plants: pd.DataFrame, kinds: Mapping[str, str], name: str) -> 
     axes = figure.subplots(3, 2, sharey=True).flatten()
     handles: dict[str, Any] = {}
     for axis, (quantity, scale, text) in zip(axes, quantities, strict=False):
-        for controller, look in _looks(kinds).items():
+        for controller, look in looks(kinds).items():
             of_controller = plants.loc[plants["controller"] == controller, quantity]
             found = scale * of_controller.sort_values().to_numpy()
             share = np.arange(len(found) + 1) / len(found)

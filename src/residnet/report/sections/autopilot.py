@@ -9,9 +9,11 @@ from typing import Any
 
 from residnet.report.blocks import Block, Cell, Code, Figure, Section, Table, Text
 from residnet.report.figures.autopilot import distributions, responses
+from residnet.report.figures.conditions import costs, learning
 from residnet.report.figures.files import figures_section, write_drawings
 from residnet.report.format import DEG, fixed
 from residnet.report.run_reader import Content, RunFiles
+from residnet.report.sections.conditions import CONDITIONS, conditions_section
 
 FLIGHTS = "flights.parquet"
 """Responses at the corners of the spread."""
@@ -21,16 +23,23 @@ PLANTS = "plants.parquet"
 
 def draw(run: RunFiles) -> list[Figure]:
     """Write the figures of an autopilot run from its folder alone; returns them."""
-    kinds = {row["model"]: row["kind"] for row in run.rows}
+    kinds = {row["model"]: row["kind"] for row in run.rows if row["protocol"] == "conditions"}
     test = run.resolved["test"]
     flights, plants = run.frame(FLIGHTS), run.frame(PLANTS)
-    return write_drawings(
-        run.path / "figures",
-        [
-            responses(flights, kinds, test["heading"], test["band"], run.title),
-            distributions(plants, kinds, run.title),
-        ],
-    )
+    flown = {row["model"]: row["kind"] for row in run.rows if row["protocol"] == "nominal"}
+    drawings = [
+        responses(flights, flown, test["heading"], test["band"], run.title),
+        distributions(plants, flown, run.title),
+    ]
+    conditioned = run.frame(CONDITIONS)
+    if conditioned is not None:
+        drawings.append(costs(conditioned, kinds, run.title))
+    fits = {
+        name: run.json(f"models/{name}/fit.json") for name in run.resolved.get("recurrent") or {}
+    }
+    if fits:
+        drawings.append(learning(fits, run.title))
+    return write_drawings(run.path / "figures", drawings)
 
 
 def sections(run: RunFiles) -> list[Section]:
@@ -41,6 +50,7 @@ def sections(run: RunFiles) -> list[Section]:
     """
     controllers = run.json("controllers.json")
     found: list[Section | None] = [
+        conditions_section(run),
         Section(
             "Controllers compared",
             [
@@ -81,7 +91,7 @@ def settling_table(rows: Sequence[Content], floor: str | None) -> Table:
             "not settled",
         ]
     )
-    for name in dict.fromkeys(row["model"] for row in rows):
+    for name in dict.fromkeys(row["model"] for row in rows if row["protocol"] == "nominal"):
         nominal, corners, random, bias = (
             find[(name, protocol)] for protocol in ("nominal", "corners", "random", "bias")
         )
@@ -109,7 +119,7 @@ def settling_table(rows: Sequence[Content], floor: str | None) -> Table:
 def effort_table(rows: Sequence[Content]) -> Table:
     """Return what a change of heading costs over random vessels, and what a course costs at sea."""
     find = {(row["model"], row["protocol"]): row for row in rows}
-    names = list(dict.fromkeys(row["model"] for row in rows))
+    names = list(dict.fromkeys(row["model"] for row in rows if row["protocol"] == "random"))
     sea = [row for row in rows if row["protocol"] == "sea"]
     rolls = any("heel_rms" in row for row in sea)
     groups = [("absolute error [deg s]", 2), ("rudder travel [deg]", 2), ("energy [deg² s]", 2)]
@@ -140,7 +150,9 @@ def _definition(config: Mapping[str, Any]) -> list[str]:
         f" {test['plants']} vessels drawn from it. Overshoot: the largest over both. Bias: largest"
         f" error after {test['bias_time']:g} s under {math.degrees(test['bias']):.3g} deg of"
         " constant rudder bias. Not settled: number of changes outside the band at their end.",
-        "Linear controllers are tuned for the least worst settling time with at most"
+        "Linear controllers are tuned by the cost under the stated conditions."
+        if config.get("conditions")
+        else "Linear controllers are tuned for the least worst settling time with at most"
         f" {math.degrees(test['overshoot']):.3g} deg of overshoot at the corners of the spread.",
     ]
 

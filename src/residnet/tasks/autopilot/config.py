@@ -8,8 +8,10 @@ from typing import Annotated, Literal
 import torch
 from pydantic import Field, model_validator
 
+from residnet.control.conditions.config import ConditionsConfig
+from residnet.control.conditions.evolution import EvolutionConfig
 from residnet.control.heading.controllers import BangBangConfig
-from residnet.control.observed.config import AnyController
+from residnet.control.observed.config import AnyController, ObservedConfig
 from residnet.core.config import Config, MetresPerSecond, Radians, Seconds
 from residnet.core.names import nearest
 from residnet.data.simulated.environment import Disturbance, WindField
@@ -19,6 +21,7 @@ from residnet.physics.environment.waves import WavesConfig
 from residnet.physics.vessel import VesselName, load_vessel
 from residnet.runs.task import ComputingTask
 from residnet.training.autopilot_config import AutopilotTraining, SpreadConfig
+from residnet.training.conditions_config import ConditionsTraining
 
 _Units = Annotated[int, Field(ge=1)]
 _Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
@@ -54,6 +57,38 @@ class PolicyConfig(Config):
     training: AutopilotTraining = AutopilotTraining()
     learned: LearnedConfig | None = None
     imitate: _Name | None = None
+
+
+class RecurrentConfig(Config):
+    """A heading policy with observer and predictor, trained under the run's conditions.
+
+    Attributes:
+        start: name of a peer with an observer, of kind `ptos` or `lqr_observer`; its constants as
+            tuned are where training begins, and they are trained too.
+        units: of the recurrent network beside the law; 0 trains the constants alone.
+        training: how it is trained.
+    """
+
+    start: _Name
+    units: int = Field(default=16, ge=0)
+    training: ConditionsTraining = ConditionsTraining()
+
+
+class JudgedConditions(Config):
+    """The conditions that all controllers of a run are tuned, trained and judged under.
+
+    Attributes:
+        stated: the conditions themselves, with the cost of a flight.
+        flights: number of judged flights, which no tuning or training sees.
+        beyond: further conditions by name, outside of those of tuning and training, that
+            controllers are judged under only.
+        evolution: the search for the constants of peers.
+    """
+
+    stated: ConditionsConfig = ConditionsConfig()
+    flights: int = Field(default=1500, ge=2)
+    beyond: dict[_Name, ConditionsConfig] = Field(default_factory=dict)
+    evolution: EvolutionConfig = EvolutionConfig()
 
 
 class StepTestConfig(Config):
@@ -108,6 +143,10 @@ class AutopilotSettings(ComputingTask):
         test: the step of the heading reference that all controllers fly.
         policies: neural policies by name.
         predictive: the document's own autopilots, by name.
+        conditions: that all controllers are tuned, trained and judged under; null to tune linear
+            peers for the step of `test` alone.
+        recurrent: policies with observer, predictor and recurrent network, by name, trained under
+            `conditions`.
         peers: by name; gains that are left out are tuned.
         floor: peer that knows the vessel exactly: the others are measured in multiples of its
             settling time.
@@ -122,7 +161,9 @@ class AutopilotSettings(ComputingTask):
     turning_time: Seconds = Field(default=100.0, gt=0)
     spread: SpreadConfig = SpreadConfig()
     test: StepTestConfig
-    policies: dict[_Name, PolicyConfig] = Field(min_length=1)
+    policies: dict[_Name, PolicyConfig] = Field(default_factory=dict)
+    conditions: JudgedConditions | None = None
+    recurrent: dict[_Name, RecurrentConfig] = Field(default_factory=dict)
     predictive: dict[_Name, PredictiveConfig] = Field(default_factory=dict)
     peers: dict[_Name, AnyController] = Field(default_factory=dict)
     floor: _Name | None = None
@@ -131,7 +172,9 @@ class AutopilotSettings(ComputingTask):
 
     @model_validator(mode="after")
     def _names(self) -> AutopilotSettings:
-        names = [*self.policies, *self.predictive, *self.peers]
+        names = [*self.policies, *self.recurrent, *self.predictive, *self.peers]
+        if not self.policies and not self.recurrent:
+            raise ValueError("policies: give at least one policy here or under 'recurrent'")
         if twice := sorted({name for name in names if names.count(name) > 1}):
             raise ValueError(f"'{twice[0]}' names two controllers; names are unique in a run")
         for name, policy in self.policies.items():
@@ -145,6 +188,32 @@ class AutopilotSettings(ComputingTask):
         return self
 
     @model_validator(mode="after")
+    def _under_conditions(self) -> AutopilotSettings:
+        for name, wanted in self.recurrent.items():
+            if self.conditions is None:
+                raise ValueError(f"recurrent.{name}: give 'conditions' to train it under")
+            if not isinstance(self.peers.get(wanted.start), ObservedConfig):
+                raise ValueError(
+                    f"recurrent.{name}.start: '{wanted.start}' must name a peer of kind ptos or"
+                    " lqr_observer"
+                )
+        for name, peer in self.peers.items():
+            observed = isinstance(peer, ObservedConfig)
+            if observed and self.conditions is None and None in peer.parameters().values():
+                raise ValueError(
+                    f"peers.{name}: give all constants, or 'conditions' to tune them under"
+                )
+        if self.conditions is not None:
+            flown = {"stated": self.conditions.stated, **self.conditions.beyond}
+            for name, conditions in flown.items():
+                if conditions.dt != self.test.dt:
+                    raise ValueError(
+                        f"conditions.{name}: dt must be that of test, {self.test.dt:g} s, given"
+                        f" {conditions.dt:g} s"
+                    )
+        return self
+
+    @model_validator(mode="after")
     def _felt(self) -> AutopilotSettings:
         plant = load_vessel(self.vessel).build()
         one = torch.ones(1, dtype=torch.float64)
@@ -155,10 +224,14 @@ class AutopilotSettings(ComputingTask):
                 f" {self.rudder:.4g}"
             )
         self.test.weather().check(plant, self.vessel)
-        for name in self.spread.needs():
+        needs = {name: "spread" for name in self.spread.needs()}
+        if self.conditions is not None:
+            for conditions in (self.conditions.stated, *self.conditions.beyond.values()):
+                needs |= {name: "conditions" for name in conditions.needs()}
+        for name, key in needs.items():
             if name not in plant.inputs:
                 raise ValueError(
-                    f"spread: vessel '{self.vessel}' has no input '{name}'; it has"
+                    f"{key}: vessel '{self.vessel}' has no input '{name}'; it has"
                     f" {', '.join(plant.inputs)}"
                 )
         return self

@@ -10,25 +10,24 @@ from typing import Any
 
 import torch
 
-from residnet.control.base import ClosedLoop, Policy
+from residnet.control.base import Policy
 from residnet.control.heading.controllers import Steering, TunedConfig
-from residnet.control.heading.imitation import SideBySide
 from residnet.control.heading.policy import HeadingPolicy
 from residnet.control.heading.steered_model import SteeredModel
-from residnet.control.heading.steering import SteeredPlant, fly
+from residnet.control.heading.steering import SteeredPlant
 from residnet.control.heading.stored import HeadingPolicySpec
 from residnet.control.heading.tuning import TuningTask, tune
-from residnet.control.observed.config import AnyController
+from residnet.control.observed.config import AnyController, ObservedConfig
 from residnet.core.errors import ConfigError
 from residnet.core.progress import say
 from residnet.documents.gouletas2020.autopilot import predictive
 from residnet.dynamics.learned import chosen_model
-from residnet.dynamics.rollout import Source
 from residnet.dynamics.store import load_model, rebuilt
 from residnet.export.autopilot import export_autopilot
-from residnet.judge.autopilots import QUANTITIES, step_flights
+from residnet.judge.autopilots import QUANTITIES
 from residnet.judge.metrics import SCHEMA
 from residnet.physics.vessel import load_vessel
+from residnet.report.sections.conditions import CONDITIONS, cost_verdict
 from residnet.report.sections.autopilot import (
     FLIGHTS,
     PLANTS,
@@ -40,6 +39,13 @@ from residnet.runs.model_store import FolderStore
 from residnet.runs.task import MainFigure, Outcome
 from residnet.tasks.autopilot.comparison import compare
 from residnet.tasks.autopilot.config import AutopilotSettings, PolicyConfig
+from residnet.tasks.autopilot.scores import CommandDifference, SettlingScore
+from residnet.tasks.autopilot.under_conditions import (
+    companions,
+    completed,
+    judge_all,
+    trained_policy,
+)
 from residnet.training.autopilot import train_autopilot
 
 
@@ -70,11 +76,27 @@ def run_autopilot(config: AutopilotSettings, folder: RunFolder) -> Outcome:
         policy, notes[name] = _policy(name, wanted, school, config, folder, teacher)
         policy.read_from(vessel.state)
         controllers = {name: ("policy", policy), **controllers}
+    judged = dict(controllers)
+    if config.conditions is not None:
+        for name, learner in config.recurrent.items():
+            start = complete[learner.start]
+            assert isinstance(start, ObservedConfig)
+            spec, observed, found = trained_policy(
+                name, learner, start, steering, config, config.conditions, folder
+            )
+            notes[name] = {key: value for key, value in found.items() if key != "curve"}
+            learned = {name: ("policy" if learner.units else "constants", observed)}
+            controllers = {**learned, **controllers}
+            judged = {**learned, **companions(name, learner, spec, observed), **judged}
     folder.write_json(
         folder.path / "controllers.json",
         {"schema": "residnet.controllers/1", "turning": vars(turning), "controllers": notes},
     )
     rows, series, plants = compare(controllers, vessel, config)
+    if config.conditions is not None:
+        more, flown = judge_all(judged, config, config.conditions)
+        rows += more
+        folder.write_table(folder.path / CONDITIONS, flown)
     folder.write_json(
         folder.metrics,
         {
@@ -82,6 +104,10 @@ def run_autopilot(config: AutopilotSettings, folder: RunFolder) -> Outcome:
             "run": config.name,
             "channels": {
                 **QUANTITIES,
+                "cost": "s",
+                "time_outside": "s",
+                "heading_swing": "rad",
+                "rudder_swing": "rad",
                 "error_end": "rad",
                 "heading_rms": "rad",
                 "rudder_rms": "rad",
@@ -93,7 +119,7 @@ def run_autopilot(config: AutopilotSettings, folder: RunFolder) -> Outcome:
     )
     folder.write_table(folder.path / FLIGHTS, series)
     folder.write_table(folder.path / PLANTS, plants)
-    policies = {name: controllers[name][1] for name in config.policies}
+    policies = {name: controllers[name][1] for name in (*config.policies, *config.recurrent)}
     return Outcome(
         _verdict(config, rows),
         _main_figures(config, rows),
@@ -111,7 +137,7 @@ def _settling(
     found = {(row["model"], row["protocol"]): row["settling"] for row in rows if "settling" in row}
     return {
         name: (found[name, "nominal"]["max"], found[name, "corners"]["max"])
-        for name in config.policies
+        for name in (*config.policies, *config.recurrent)
     }
 
 
@@ -129,10 +155,10 @@ def _verdict(config: AutopilotSettings, rows: list[dict[str, Any]]) -> list[str]
             if (row["model"], row["protocol"]) == (config.floor, "nominal")
         )
         sentences.append(
-            f"The fastest possible change, by '{config.floor}' that knows the vessel exactly, takes"
-            f" {floor:.2f} s."
+            f"The fastest possible change of the nominal vessel, by '{config.floor}' that knows it"
+            f" exactly, takes {floor:.2f} s."
         )
-    return sentences
+    return [*cost_verdict(rows), *sentences]
 
 
 def _main_figures(config: AutopilotSettings, rows: list[dict[str, Any]]) -> dict[str, MainFigure]:
@@ -140,6 +166,9 @@ def _main_figures(config: AutopilotSettings, rows: list[dict[str, Any]]) -> dict
     for name, (nominal, worst) in _settling(config, rows).items():
         figures[f"{name}_settling_nominal"] = MainFigure(nominal, "s")
         figures[f"{name}_settling_worst"] = MainFigure(worst, "s")
+    for row in rows:
+        if row["protocol"] == "conditions" and row["model"] in config.recurrent:
+            figures[f"{row['model']}_cost"] = MainFigure(row["cost"]["mean"], "s")
     return figures
 
 
@@ -165,6 +194,8 @@ def _peer(
     name: str, peer: AnyController, steering: Steering, config: AutopilotSettings
 ) -> tuple[AnyController, dict[str, Any]]:
     """Return a peer with all its gains, and notes on its tuning."""
+    if config.conditions is not None:
+        return completed(name, peer, steering, config, config.conditions)
     if not isinstance(peer, TunedConfig):
         return peer, {"config": peer.model_dump(mode="json")}
     test = config.test
@@ -259,9 +290,9 @@ def _policy(
         # is compared at that of flights
         shown = None if teacher is None else teacher.build(steering._replace(dt=wanted.training.dt))
         score = (
-            _Score(steering, config)
+            SettlingScore(steering, config)
             if teacher is None
-            else _CommandDifference(steering, config, teacher.build(steering))
+            else CommandDifference(steering, config, teacher.build(steering))
         )
         notes = train_autopilot(
             name,
@@ -281,60 +312,3 @@ def _policy(
     policy.dt = steering.dt
     say(f"  {name}: score {notes['best_validation']:.3f} after {notes['seconds']:.0f} s")
     return policy.double(), {key: value for key, value in notes.items() if key != "curve"}
-
-
-class _Score:
-    """The score of a policy: mean and worst settling time in s, and a penalty on overshoot.
-
-    Both are taken over the corners of the spread.
-    """
-
-    def __init__(self, steering: Steering, config: AutopilotSettings) -> None:
-        self.steering, self.test, self.corners = steering, config.test, config.spread.corners()
-
-    def __call__(self, policy: HeadingPolicy) -> float:
-        test = self.test
-        policy.dt = test.dt
-        flights = step_flights(
-            self.steering.vessel, policy, self.corners, test.heading, test.dt, test.duration
-        )
-        settled = flights.settled(test.band)
-        beyond = (flights.overshoot() - 0.9 * test.overshoot).clamp(min=0.0) / test.overshoot
-        return float(settled.mean() + 2.0 * settled.max() + 0.5 * test.duration * beyond.amax())
-
-
-class _CommandDifference:
-    """The root mean square in rad of how the commands of a policy differ from its teacher's.
-
-    The teacher sees what the policy flies.
-    """
-
-    def __init__(self, steering: Steering, config: AutopilotSettings, teacher: Policy) -> None:
-        self.steering, self.test, self.corners, self.teacher = (
-            steering,
-            config.test,
-            config.spread.corners(),
-            teacher.double(),
-        )
-
-    def __call__(self, policy: HeadingPolicy) -> float:
-        test, rows = self.test, len(self.corners)
-        policy.dt = test.dt
-        beside: list[SideBySide] = []
-
-        def watched(source: Source) -> Source:
-            assert isinstance(source, ClosedLoop)
-            beside.append(SideBySide(source.policy, self.teacher, source.reference))
-            return beside[0]
-
-        heading = torch.full((rows,), test.heading)
-        flights = fly(
-            self.steering.vessel,
-            policy,
-            heading,
-            self.corners,
-            dt=test.dt,
-            duration=test.duration,
-            surround=watched,
-        )
-        return math.sqrt(float(beside[0].total) / flights.inputs.shape[1])

@@ -1,0 +1,90 @@
+"""Heading controllers judged under stated conditions: rows of metrics.json, and each flight."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pandas as pd
+import torch
+
+from residnet.control.base import Policy
+from residnet.control.conditions.config import ConditionsConfig, HeadingChanges
+from residnet.control.conditions.flights import fly_under
+from residnet.control.heading.steering import SteeredVessel
+from residnet.judge.autopilots import distribution
+
+QUIET_FLIGHTS = 100
+QUIET_AFTER = 20.0
+"""Time in s after the change from which a flight without noise is looked at for swinging."""
+_QUIET_FOR = 10.0
+
+
+def quiet(conditions: ConditionsConfig) -> ConditionsConfig:
+    """Return the conditions without noise and slow push, with flights long enough to settle."""
+    return conditions.model_copy(
+        update={
+            "noise_psi": 0.0,
+            "noise_r": 0.0,
+            "push": 0.0,
+            "hold": 0.0,
+            "duration": QUIET_AFTER + _QUIET_FOR,
+        }
+    )
+
+
+def drawn(conditions: ConditionsConfig, flights: int, seed: int) -> HeadingChanges:
+    """Return flights that no tuning or training has seen, the same for all controllers."""
+    random = torch.Generator().manual_seed(seed + 2_000_003)
+    return conditions.draw(flights, conditions.dt, random)
+
+
+def judged(
+    controller: str,
+    kind: str,
+    protocol: str,
+    vessel: SteeredVessel,
+    policy: Policy,
+    conditions: ConditionsConfig,
+    changes: HeadingChanges,
+) -> tuple[dict[str, Any], pd.DataFrame]:
+    """Return a row of metrics.json, and a table with a line for each flight, in SI units.
+
+    A flight whose heading is no number counts as diverged, and with a heading error of 180 deg all
+    the time in the means.
+    """
+    flown = fly_under(vessel, policy, changes)
+    finite = torch.isfinite(flown.psi).all(1) & torch.isfinite(flown.command).all(1)
+    worst = conditions.duration + 0.5 * 180.0
+    found = {
+        name: torch.where(finite, values, worst if name == "cost" else torch.nan)
+        for name, values in flown.measured(conditions).items()
+    }
+    row = {"model": controller, "kind": kind, "split": "simulated", "protocol": protocol}
+    kept = {name: values if name == "cost" else values[finite] for name, values in found.items()}
+    figures = {name: distribution(values) for name, values in kept.items() if len(values)}
+    table = pd.DataFrame(
+        {
+            "controller": controller,
+            "protocol": protocol,
+            "flight": range(len(finite)),
+            **{name: values.numpy() for name, values in found.items()},
+        }
+    )
+    return {**row, **figures, "n": len(finite), "diverged": int((~finite).sum())}, table
+
+
+def swinging(
+    controller: str, kind: str, vessel: SteeredVessel, policy: Policy, changes: HeadingChanges
+) -> dict[str, Any]:
+    """Return the row of metrics.json of flights without noise: what still swings at their end."""
+    flown = fly_under(vessel, policy, changes)
+    heading, rudder = flown.swing(QUIET_AFTER)
+    return {
+        "model": controller,
+        "kind": kind,
+        "split": "simulated",
+        "protocol": "quiet",
+        "heading_swing": distribution(heading),
+        "rudder_swing": distribution(rudder),
+        "n": len(heading),
+    }
