@@ -70,6 +70,11 @@ def _policy(name: str) -> tuple[str, ...]:
     return tuple(f"policies.{name}.training.{key}" for key in ("epochs=1", "steps=1", "batch=16"))
 
 
+def _recurrent(name: str) -> tuple[str, ...]:
+    short = ("epochs=1", "steps=1", "batch=16", "validation=16", "hold=0 s", "stretch=0")
+    return tuple(f"recurrent.{name}.training.{key}" for key in short)
+
+
 def _predictor(name: str) -> tuple[str, ...]:
     return (f"predictive.{name}.training={{states: 300, epochs: 5, batch: 50}}",)
 
@@ -84,6 +89,22 @@ _TANKER = (
 _FERRY = ("course.interval=10 s",)
 _STEP_TEST = ("test.plants=2", "tuning_points=16")
 _PEERS = ("test.dt=0.1 s",)
+
+_CONDITIONS = (
+    "conditions.flights=8",
+    "conditions.stated.dt=0.1 s",
+    "conditions.stated.duration=6 s",
+    "conditions.stated.hold=1 s",
+    "conditions.beyond={delay: {dt: 0.1 s, duration: 6 s, hold: 1 s, delay: [0.6 s, 0.6 s]}}",
+    "conditions.evolution={flights: 2, population: 2, generations: 1}",
+    *_recurrent("learned"),
+    *_recurrent("constants"),
+    "recurrent.learned.training.dt=0.1 s",
+    "recurrent.constants.training.dt=0.1 s",
+    "test.dt=0.1 s",
+    "test.plants=2",
+    "test.bias_time=20 s",
+)
 
 SHORT: dict[str, Short] = {
     "quickstart": Short((*_TRIALS, *_trained("mlp", "lstm"))),
@@ -101,6 +122,9 @@ SHORT: dict[str, Short] = {
     "milliampere_raw": Short(data="milliampere"),
     "autopilot_nomoto": Short((*_policy("policy"), *_predictor("document"), *_STEP_TEST, *_PEERS)),
     "autopilot_nomoto_rate": Short((*_policy("policy"), *_STEP_TEST, *_PEERS)),
+    "autopilot_conditions": Short((*_CONDITIONS, *_predictor("document"))),
+    "autopilot_conditions_rate": Short(_CONDITIONS),
+    "autopilot_conditions_patrol": Short((*_CONDITIONS, "test.sea_time=10 s")),
     "autopilot_patrol": Short(
         (
             *_policy("policy"),

@@ -15,7 +15,7 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from residnet.control.heading.policy import MEMORY, HeadingPolicy
+from residnet.control.heading.keeper import HeadingKeeper
 from residnet.core.errors import ExportError
 from residnet.core.version import __version__
 from residnet.export.scripting import require_shape, size, within, write_scripted
@@ -35,8 +35,8 @@ class Limits(NamedTuple):
     r: tuple[float, float]
 
 
-def memory_limits(policy: HeadingPolicy, turn: float) -> list[tuple[float, float]]:
-    """Return the ranges [low, high] of an exported policy's memory, by `MEMORY` and last command.
+def memory_limits(policy: HeadingKeeper, turn: float) -> list[tuple[float, float]]:
+    """Return the ranges [low, high] of an exported policy's memory and last command.
 
     They hold what its own steps can lead to, with some room.
 
@@ -44,34 +44,14 @@ def memory_limits(policy: HeadingPolicy, turn: float) -> list[tuple[float, float
         policy: see there.
         turn: fastest yaw rate [rad/s] that is accepted.
     """
-    angle, variance = 1.001 * policy.limit, 2.0 * policy.prior
-    # at a third of the speed the rudder that a turn stands for is three times as large
-    share = 4.0 * turn / (policy.gain * policy.limit) + 2.0
-    ranges = {
-        "rudder": angle,
-        "yaw_rate": 1.001 * turn,
-        "turning": share,
-        "push": angle,
-        "effect": 3.0,
-        "damping": 3.0,
-        "effect_variance": variance,
-        "covariance": variance,
-        "damping_variance": variance,
-    }
-    signed = [(-ranges[name], ranges[name]) for name in MEMORY]
-    return [
-        *(
-            (0.0, high) if name in ("effect", "damping") else (low, high)
-            for name, (low, high) in zip(MEMORY, signed, strict=True)
-        ),
-        (-angle, angle),
-    ]
+    angle = 1.001 * policy.limit
+    return [*policy.memory_ranges(turn).values(), (-angle, angle)]
 
 
 class ExportedPolicy(nn.Module):
     """What a controller calls once per step; float32, SI and radians.
 
-    The memory s [B, 10] is that of the policy and the last command. `fault` tells that a
+    The memory s [B, n] is that of the policy and the last command. `fault` tells that a
     measurement, the reference or the memory was no number or out of range: then the command is the
     safe one, reached at the rudder's rate. The policy's memory stays as it was; where it was wrong
     itself, or would become so, it is forgotten and begins anew. Tensors of a wrong shape are
@@ -79,7 +59,7 @@ class ExportedPolicy(nn.Module):
     """
 
     def __init__(
-        self, policy: HeadingPolicy, limits: Limits, safe: Literal["hold", "amidships"]
+        self, policy: HeadingKeeper, limits: Limits, safe: Literal["hold", "amidships"]
     ) -> None:
         super().__init__()
         self.policy = policy
@@ -100,15 +80,6 @@ class ExportedPolicy(nn.Module):
         )
         self.memory_low: Tensor
         self.memory_high: Tensor
-        # the memory of `initial_state` at r = 0, and what it gains with r
-        turned = 1.0 / (policy.gain * policy.limit)
-        for name, memory in {
-            "begin": [0.0, 0.0, 0.0, 0.0, 1.0, 1.0, policy.prior, 0.0, policy.prior, 0.0],
-            "begin_turn": [0.0, 1.0, turned, *[0.0] * 7],
-        }.items():
-            self.register_buffer(name, torch.tensor(memory, dtype=torch.float32))
-        self.begin: Tensor
-        self.begin_turn: Tensor
         self.keep = 1.0 if safe == "hold" else 0.0
         # a large number where the rudder has no rate: infinity times zero would be no number
         self.travel = min(policy.rate * policy.dt, 2.0 * policy.limit)
@@ -116,7 +87,7 @@ class ExportedPolicy(nn.Module):
 
     @torch.jit.export
     def initial_state(self, y: Tensor) -> Tensor:
-        """Return the memory s [B, 10] at the first measurement y [B, 3], rudder amidships."""
+        """Return the memory s [B, n] at the first measurement y [B, 3], rudder amidships."""
         require_shape("measured", y, [size(y, 2, 0), self.low.numel()])
         y = y.to(torch.float32)
         good = self._good(y).unsqueeze(-1)
@@ -133,12 +104,12 @@ class ExportedPolicy(nn.Module):
 
     @torch.jit.export
     def step(self, y: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the rudder command [B, 1] in rad, memory [B, 10] and fault [B].
+        """Return the rudder command [B, 1] in rad, memory [B, n] and fault [B].
 
         Args:
             measured: y [B, 3] = (psi, u, r).
             reference: heading [B, 1] in rad.
-            s: memory [B, 10].
+            s: memory [B, n].
         """
         rows = size(y, 2, 0)
         require_shape("measured", y, [rows, self.low.numel()])
@@ -155,7 +126,7 @@ class ExportedPolicy(nn.Module):
         last = torch.nan_to_num(s[:, -1:]).clamp(-self.limit, self.limit)
         # comparisons with what is no number are false
         remembers = within(s, self.memory_low, self.memory_high)
-        begun = self.begin + self.begin_turn * y[:, 2:]
+        begun = torch.cat((self.policy.initial_state(y), torch.zeros_like(last)), dim=1)
         s = torch.where(remembers, s, begun)
         good = good & remembers
         wish, memory = self.policy(y, reference, s[:, :-1])
@@ -174,7 +145,7 @@ class ExportedPolicy(nn.Module):
         return self.step(y, reference, s)
 
 
-def for_export(policy: HeadingPolicy, safe: Literal["hold", "amidships"]) -> ExportedPolicy:
+def for_export(policy: HeadingKeeper, safe: Literal["hold", "amidships"]) -> ExportedPolicy:
     """Return the policy in float32 with its checks.
 
     It takes headings up to 1000 turns, three times its speed, five times the steady turn at full
@@ -192,7 +163,7 @@ def for_export(policy: HeadingPolicy, safe: Literal["hold", "amidships"]) -> Exp
 
 def export_autopilot(
     name: str,
-    policy: HeadingPolicy,
+    policy: HeadingKeeper,
     file: Path,
     *,
     safe: Literal["hold", "amidships"],
@@ -275,7 +246,7 @@ def _card(
         "policy": name,
         "measured": measured_entries(MEASURED, ("rad", "m/s", "rad/s"), module.low, module.high),
         "reference": [{"name": "heading", "unit": "rad"}],
-        "memory": [*MEMORY, "last_command"],
+        "memory": [*module.policy.memory_ranges(1.0), "last_command"],
         "fault": (
             "measurement, reference or memory no number or out of range: command"
             f" {'held' if safe == 'hold' else 'amidships'}, flag set"
@@ -297,7 +268,7 @@ def measured_entries(
     ]
 
 
-def policy_entries(policy: HeadingPolicy) -> dict[str, Any]:
+def policy_entries(policy: HeadingKeeper) -> dict[str, Any]:
     """Return what the cards of all exported heading policies say."""
     return {
         "command": [
@@ -310,10 +281,7 @@ def policy_entries(policy: HeadingPolicy) -> dict[str, Any]:
         ],
         "dt": policy.dt,
         "dtype": "float32",
-        "hidden": [layer.out_features for layer in policy.network if isinstance(layer, nn.Linear)][
-            :-1
-        ],
-        "observer": policy.observer,
+        **policy.described(),
         "turning": {"K": policy.gain, "T": policy.time, "speed": policy.speed},
         "frame": "NED; psi clockwise from north; delta > 0 turns to starboard",
         "versions": {"residnet": __version__, "torch": torch.__version__},

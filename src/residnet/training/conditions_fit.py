@@ -88,7 +88,9 @@ class ConditionsFit(EpochTraining):
         changes = self.drawn.draw(settings.batch, settings.dt, random, settings.share(progress))
         flown = self.loop.flights(changes, *self._fly(*self.loop.given(changes)))
         found = flown.measured(self.conditions)
-        loss: Tensor = found["cost"].mean() + math.degrees(settings.guiding(progress)) * found["iae"].mean()
+        loss: Tensor = (
+            found["cost"].mean() + math.degrees(settings.guiding(progress)) * found["iae"].mean()
+        )
         self._losses.append(float(found["cost"].detach().mean()))
         return loss
 

@@ -6,14 +6,13 @@ The observer estimates what pushes the bow.
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Sequence
-from typing import final
+from typing import Any, final
 
 import torch
 from torch import Tensor, nn
 
-from residnet.control.base import Policy
+from residnet.control.heading.keeper import HeadingKeeper
 from residnet.control.heading.stopping import braking, centred
 from residnet.control.heading.turning import Turning
 from residnet.core.frames import wrap
@@ -36,7 +35,7 @@ _DOUBT = 0.02
 
 
 @final
-class HeadingPolicy(Policy):
+class HeadingPolicy(HeadingKeeper):
     """The law delta = k (e - g(r)) + phi - b, saturated: time-optimal law, network and observer.
 
     phi is a network that corrects a proximate time-optimal law, b a push that is taken away.
@@ -77,11 +76,9 @@ class HeadingPolicy(Policy):
         hidden: Sequence[int] = (24, 24),
         observer: float = 8.0,
     ) -> None:
-        super().__init__()
+        super().__init__(turning, limit, rate, dt)
         self.read_from(state)
-        self.gain, self.time, self.speed = turning.gain, turning.time, turning.speed
-        self.limit, self.dt, self.observer = limit, dt, observer
-        self.rate = math.inf if rate is None else rate
+        self.observer = observer
         # from amidships to the limit
         self.swing = limit / self.rate
         self.n_state = len(MEMORY)
@@ -110,6 +107,30 @@ class HeadingPolicy(Policy):
         This serves a vessel other than the one that the policy was trained on.
         """
         self.psi, self.u, self.r = state.index("psi"), state.index("u"), state.index("r")
+
+    def memory_ranges(self, turn: float) -> dict[str, tuple[float, float]]:
+        """Return what the entries of the memory can be, [low, high] by name, with some room."""
+        angle, variance = 1.001 * self.limit, 2.0 * self.prior
+        # at a third of the speed the rudder that a turn stands for is three times as large
+        share = 4.0 * turn / (self.gain * self.limit) + 2.0
+        most = {
+            "rudder": angle,
+            "yaw_rate": 1.001 * turn,
+            "turning": share,
+            "push": angle,
+            "effect": 3.0,
+            "damping": 3.0,
+            "effect_variance": variance,
+            "covariance": variance,
+            "damping_variance": variance,
+        }
+        positive = ("effect", "damping")
+        return {name: (0.0 if name in positive else -most[name], most[name]) for name in MEMORY}
+
+    def described(self) -> dict[str, Any]:
+        """Return widths of the layers and bandwidth of the observer."""
+        layers = [layer.out_features for layer in self.network if isinstance(layer, nn.Linear)]
+        return {"kind": "time_optimal", "hidden": layers[:-1], "observer": self.observer}
 
     def initial_state(self, x: Tensor) -> Tensor:
         """Return the memory [B, 9] at the start: rudder amidships, a steady yaw rate, no push.

@@ -14,6 +14,9 @@ CONSTANTS = ("heading_rate", "yaw_rate_rate", "push_rate", "cross_rate")
 """Of the observer: how fast heading, yaw rate and push follow what is measured in 1/s, and how
 fast the yaw rate follows the heading's innovation in 1/s^2."""
 
+_LOST = 0.35
+"""Difference in rad between measured and expected heading beyond which the estimate is lost."""
+
 
 class Estimate(NamedTuple):
     """What is known of the vessel at a step, each [B, 1], SI.
@@ -39,7 +42,8 @@ class HeadingObserver(nn.Module):
     """A Luenberger observer of T r_dot + r = K (delta + push), with a predictor.
 
     The rudder is taken to act `lag` seconds after its command; the predictor adds what the commands
-    of these seconds will do, in closed form. K grows and T falls with the speed.
+    of these seconds will do, in closed form. K grows and T falls with the speed. Where heading or
+    yaw rate are far from what was expected, the estimate begins anew at what is measured.
 
     Args:
         turning: K, T and speed of the vessel about straight ahead.
@@ -51,7 +55,7 @@ class HeadingObserver(nn.Module):
     def __init__(self, turning: Turning, limit: float, lag: float, dt: float) -> None:
         super().__init__()
         self.gain, self.time = turning.gain, turning.time
-        self.limit, self.lag = limit, lag
+        self.limit, self.lag, self.lost = limit, lag, _LOST
         self.dt, self.pending = dt, round(lag / dt)
         self.register_buffer("left", torch.zeros(0), persistent=False)
         self.left: Tensor
@@ -85,6 +89,14 @@ class HeadingObserver(nn.Module):
             constants: `CONSTANTS`, [1] or [B, 1] each.
         """
         surprise_heading, surprise_r = wrap(psi - heading), r - yaw_rate
+        # no vessel does this within a step: measurements were missing, and the estimate is taken
+        # up anew where they come back, with the push as it was
+        full = 3.0 * self.gain * ratio * self.limit
+        lost = (surprise_heading.abs() > self.lost) | (surprise_r.abs() > full)
+        heading, yaw_rate = torch.where(lost, psi, heading), torch.where(lost, r, yaw_rate)
+        nothing = torch.zeros_like(surprise_r)
+        surprise_heading = torch.where(lost, nothing, surprise_heading)
+        surprise_r = torch.where(lost, nothing, surprise_r)
         shares = [1.0 - torch.exp(-self.dt * rate) for rate in constants[:2]]
         turn = shares[1] * surprise_r + self.dt * constants[3] * surprise_heading
         heading, yaw_rate = heading + shares[0] * surprise_heading, yaw_rate + turn

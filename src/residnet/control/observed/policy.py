@@ -5,12 +5,12 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Mapping, Sequence
-from typing import final
+from typing import Any, final
 
 import torch
 from torch import Tensor
 
-from residnet.control.base import Policy
+from residnet.control.heading.keeper import HeadingKeeper
 from residnet.control.heading.laws import HeadingLaw
 from residnet.control.heading.turning import Turning
 from residnet.control.observed.cell import OddCell
@@ -20,11 +20,11 @@ from residnet.core.frames import wrap
 FIXED = ("heading", "yaw_rate", "push", "rudder", "last_command")
 """Memory of every observed policy; pending rudder angles and the network's units stand behind."""
 _FEATURES = 11
-_DEG = math.pi / 180.0
+_DEGREE = math.pi / 180.0
 
 
 @final
-class ObservedPolicy(Policy):
+class ObservedPolicy(HeadingKeeper):
     """The command clamp(limit (law + network) - push), with the law on estimates.
 
     An observer estimates heading, yaw rate and push, a predictor where they will be once the
@@ -62,11 +62,9 @@ class ObservedPolicy(Policy):
         units: int = 0,
         trained_at: float = 0.04,
     ) -> None:
-        super().__init__()
+        super().__init__(turning, limit, rate, dt)
         self.read_from(state)
-        self.gain, self.time, self.speed = turning.gain, turning.time, turning.speed
-        self.limit, self.units = limit, units
-        self.rate = math.inf if rate is None else rate
+        self.units, self.degree = units, _DEGREE
         self.law = law
         self.observer = HeadingObserver(turning, limit, lag, dt)
         self.names = (*law.constants, *CONSTANTS)
@@ -75,7 +73,7 @@ class ObservedPolicy(Policy):
         self.constants = torch.nn.Parameter(torch.stack(values, dim=-1).log())
         self.network = OddCell(_FEATURES, max(units, 1), trained_at).requires_grad_(units > 0)
         self.trained_at = trained_at
-        self.dt, self.travel, self.n_state = dt, 0.0, 0
+        self.travel = 0.0
         self.at(dt)
 
     def at(self, dt: float) -> None:
@@ -100,6 +98,24 @@ class ObservedPolicy(Policy):
         """Return the constants by name."""
         found = torch.exp(self.constants.detach()).tolist()
         return dict(zip(self.names, found, strict=True))
+
+    def memory_ranges(self, turn: float) -> dict[str, tuple[float, float]]:
+        """Return what the entries of the memory can be, [low, high] by name, with some room."""
+        angle, half = 1.001 * self.limit, 1.001 * math.pi
+        most = dict(zip(FIXED, (half, 3.0 * turn, angle, angle, angle), strict=True))
+        most |= {f"pending_{k}": angle for k in range(self.observer.pending)}
+        most |= {f"unit_{k}": 1.001 for k in range(self.units)}
+        return {name: (-high, high) for name, high in most.items()}
+
+    def described(self) -> dict[str, Any]:
+        """Return the constants of law and observer, the predictor's lag and the network's units."""
+        return {
+            "kind": "observed",
+            "constants": self.values(),
+            "lag": self.observer.lag,
+            "units": self.units,
+            "trained_at": self.trained_at,
+        }
 
     def initial_state(self, x: Tensor) -> Tensor:
         """Return the memory at the start: heading and yaw rate as seen, rudder amidships."""
@@ -144,14 +160,14 @@ class ObservedPolicy(Policy):
             noise = math.sqrt(self.dt / self.trained_at)
             features = torch.cat(
                 (
-                    torch.tanh(wrap(reference - psi) / _DEG),
-                    torch.tanh(error / _DEG),
-                    torch.tanh(error / (5.0 * _DEG)),
-                    error / (30.0 * _DEG),
+                    torch.tanh(wrap(reference - psi) / self.degree),
+                    torch.tanh(error / self.degree),
+                    torch.tanh(error / (5.0 * self.degree)),
+                    error / (30.0 * self.degree),
                     1.7 * seen.r_ahead / full,
                     torch.tanh(17.0 * seen.r_ahead / full),
                     5.0 * seen.push / self.limit,
-                    (3.0 * noise / _DEG) * seen.surprise_heading,
+                    (3.0 * noise / self.degree) * seen.surprise_heading,
                     (52.0 * noise) * seen.surprise_r / full,
                     last / self.limit,
                     torch.tanh(law),

@@ -198,8 +198,9 @@ class AutopilotSettings(ComputingTask):
                     " lqr_observer"
                 )
         for name, peer in self.peers.items():
-            observed = isinstance(peer, ObservedConfig)
-            if observed and self.conditions is None and None in peer.parameters().values():
+            if self.conditions is not None or not isinstance(peer, ObservedConfig):
+                continue
+            if None in peer.parameters().values():
                 raise ValueError(
                     f"peers.{name}: give all constants, or 'conditions' to tune them under"
                 )
@@ -224,10 +225,10 @@ class AutopilotSettings(ComputingTask):
                 f" {self.rudder:.4g}"
             )
         self.test.weather().check(plant, self.vessel)
-        needs = {name: "spread" for name in self.spread.needs()}
+        needs = dict.fromkeys(self.spread.needs(), "spread")
         if self.conditions is not None:
             for conditions in (self.conditions.stated, *self.conditions.beyond.values()):
-                needs |= {name: "conditions" for name in conditions.needs()}
+                needs |= dict.fromkeys(conditions.needs(), "conditions")
         for name, key in needs.items():
             if name not in plant.inputs:
                 raise ValueError(

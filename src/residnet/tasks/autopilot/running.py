@@ -12,6 +12,7 @@ import torch
 
 from residnet.control.base import Policy
 from residnet.control.heading.controllers import Steering, TunedConfig
+from residnet.control.heading.keeper import HeadingKeeper
 from residnet.control.heading.policy import HeadingPolicy
 from residnet.control.heading.steered_model import SteeredModel
 from residnet.control.heading.steering import SteeredPlant
@@ -27,13 +28,13 @@ from residnet.export.autopilot import export_autopilot
 from residnet.judge.autopilots import QUANTITIES
 from residnet.judge.metrics import SCHEMA
 from residnet.physics.vessel import load_vessel
-from residnet.report.sections.conditions import CONDITIONS, cost_verdict
 from residnet.report.sections.autopilot import (
     FLIGHTS,
     PLANTS,
     effort_table,
     settling_table,
 )
+from residnet.report.sections.conditions import CONDITIONS, cost_table, cost_verdict
 from residnet.runs.folder import RunFolder
 from residnet.runs.model_store import FolderStore
 from residnet.runs.task import MainFigure, Outcome
@@ -120,10 +121,13 @@ def run_autopilot(config: AutopilotSettings, folder: RunFolder) -> Outcome:
     folder.write_table(folder.path / FLIGHTS, series)
     folder.write_table(folder.path / PLANTS, plants)
     policies = {name: controllers[name][1] for name in (*config.policies, *config.recurrent)}
+    tables = [settling_table(rows, config.floor), effort_table(rows)]
+    if config.conditions is not None:
+        tables.insert(0, cost_table(rows))
     return Outcome(
         _verdict(config, rows),
         _main_figures(config, rows),
-        f"{settling_table(rows, config.floor).text()}\n\n{effort_table(rows).text()}",
+        "\n\n".join(table.text() for table in tables),
         exports={
             name: partial(_export, config, folder, name, policies[name], rows) for name in policies
         },
@@ -180,10 +184,14 @@ def _export(
     rows: list[dict[str, Any]],
 ) -> Path:
     """Export a policy, with its rows of metrics.json in the card; returns the file."""
-    assert isinstance(policy, HeadingPolicy)
-    learned = config.policies[name].learned
-    about = {"vessel": config.vessel, "spread": config.spread.model_dump(mode="json")}
-    about |= {} if learned is None else {"learned": learned.model_dump(mode="json")}
+    assert isinstance(policy, HeadingKeeper)
+    about: dict[str, Any] = {"vessel": config.vessel}
+    if name in config.policies:
+        learned = config.policies[name].learned
+        about |= {"spread": config.spread.model_dump(mode="json")}
+        about |= {} if learned is None else {"learned": learned.model_dump(mode="json")}
+    elif config.conditions is not None:
+        about |= {"conditions": config.conditions.stated.model_dump(mode="json")}
     metrics = [row for row in rows if row["model"] == name]
     file = folder.exports / f"{name}.pt"
     export_autopilot(name, policy, file, safe=config.safe, about=about, metrics=metrics)

@@ -49,8 +49,9 @@ class AutopilotConfig(AutopilotSettings):
         Raises:
             UsageError: where there is no such policy, or another format is given.
         """
-        if model not in self.policies:
-            raise UsageError(f"{run.path}: no policy '{model}'{nearest(model, self.policies)}")
+        policies = {**self.policies, **self.recurrent}
+        if model not in policies:
+            raise UsageError(f"{run.path}: no policy '{model}'{nearest(model, policies)}")
         if file_format != "torchscript":
             raise UsageError(
                 f"{run.path}: policies are exported as torchscript, not as {file_format}"

@@ -1,0 +1,129 @@
+"""The task `autopilot` under stated conditions: rows, verdict, report, export and wrong configs."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+import torch
+import yaml
+from tiny import call
+
+STATED = {"dt": "0.1 s", "duration": "6 s", "hold": "0 s", "delay": ["0 s", "0.3 s"]}
+TRAINING = {
+    "epochs": 1, "steps": 1, "batch": 8, "dt": "0.1 s", "hold": "0 s", "validation": 8,
+    "stretch": 0,
+}  # fmt: skip
+SMALL: dict[str, Any] = {
+    "task": "autopilot",
+    "name": "small",
+    "vessel": "nomoto_oceanos",
+    "rudder": "5 deg",
+    "turning_time": "40 s",
+    "test": {"dt": "0.1 s", "duration": "8 s", "plants": 2, "bias_time": "10 s"},
+    "conditions": {
+        "stated": STATED,
+        "flights": 12,
+        "beyond": {"late": {**STATED, "delay": ["0.6 s", "0.6 s"]}},
+        "evolution": {"flights": 4, "population": 2, "generations": 1},
+    },
+    "recurrent": {
+        "learned": {"start": "ptos", "units": 3, "training": TRAINING},
+        "constants": {"start": "ptos", "units": 0, "training": TRAINING},
+    },
+    "peers": {
+        "pd": {"kind": "pd", "kp": 1.5, "damping_time": "1.3 s"},
+        "ptos": {"kind": "ptos", "lag": "0.3 s"},
+    },
+}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("conditions")
+    config = folder / "small.yaml"
+    config.write_text(yaml.safe_dump(SMALL))
+    with pytest.MonkeyPatch.context() as patch:
+        assert call(patch, "run", config, "--out", folder / "run") == 0
+    return folder / "run"
+
+
+def rows(run: Path) -> dict[tuple[str, str], dict[str, Any]]:
+    found = json.loads((run / "metrics.json").read_text())["rows"]
+    return {(row["model"], row["protocol"]): row for row in found}
+
+
+def test_every_controller_and_every_companion_is_judged_on_the_same_flights(run: Path) -> None:
+    found = rows(run)
+    kinds = {model: row["kind"] for (model, test), row in found.items() if test == "conditions"}
+    assert kinds == {
+        "learned": "policy",
+        "learned untrained": "untrained",
+        "learned network off": "network_off",
+        "constants": "constants",
+        "pd": "classical",
+        "ptos": "classical",
+    }
+    for model in kinds:
+        assert found[(model, "conditions")]["n"] == found[(model, "beyond_late")]["n"] == 12
+        assert found[(model, "quiet")]["rudder_swing"]["max"] >= 0
+    # before training the policy is the law as tuned
+    law, untrained = (found[(name, "conditions")] for name in ("ptos", "learned untrained"))
+    assert untrained["cost"]["mean"] == pytest.approx(law["cost"]["mean"], rel=1e-6)
+    assert found[("learned", "nominal")]["kind"] == "policy"
+
+
+def test_a_row_agrees_with_the_flights_that_it_sums_up(run: Path) -> None:
+    flights = pd.read_parquet(run / "conditions.parquet")
+    for (model, test), row in rows(run).items():
+        if "cost" in row:
+            own = flights[(flights["controller"] == model) & (flights["protocol"] == test)]
+            for name in ("cost", "overshoot", "travel"):
+                assert own[name].mean() == pytest.approx(row[name]["mean"])
+
+
+def test_the_page_shows_costs_and_the_start_of_the_learning_curve(run: Path) -> None:
+    text = (run / "report.html").read_text()
+    for words in ("Under the stated conditions", "policy, network set to zero", "epoch 0 is"):
+        assert words in text
+    fit = json.loads((run / "models" / "learned" / "fit.json").read_text())
+    assert fit["best_validation"] <= fit["start_validation"]
+    assert json.loads((run / "summary.json").read_text())["finished"]
+
+
+def test_a_learned_policy_is_exported_with_its_card(run: Path) -> None:
+    extra = {"card.json": ""}
+    module = torch.jit.load(str(run / "exports" / "learned.pt"), _extra_files=extra)
+    card = json.loads(extra["card.json"])
+    assert card["kind"] == "observed"
+    assert card["units"] == 3
+    assert card["conditions"]["delay"] == [0.0, 0.3]
+    state = module.initial_state(torch.tensor([[0.0, 3.2, 0.0]]))
+    assert state.shape == (1, len(card["memory"]))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"conditions": None}, "give 'conditions' to train it under"),
+        ({"peers": {"ptos": {"kind": "pd"}}}, "must name a peer of kind ptos"),
+        ({"recurrent": {}, "policies": {}}, "give at least one policy"),
+        ({"conditions": {"stated": {**STATED, "dt": "0.05 s"}}}, "dt must be that of test"),
+        ({"conditions": {"stated": {**STATED, "current": 0.5}}}, "no input 'current_north'"),
+        ({"conditions": {"stated": {**STATED, "delay": ["0.4 s", "0.1 s"]}}}, "in order"),
+    ],
+)
+def test_wrong_configs_are_said_in_a_line(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    change: dict[str, Any],
+    words: str,
+) -> None:
+    path = tmp_path / "wrong.yaml"
+    path.write_text(yaml.safe_dump({**SMALL, **change}))
+    assert call(monkeypatch, "check", path) == 2
+    assert words in capsys.readouterr().err
