@@ -43,10 +43,8 @@ def test_lags_are_measured_in_seconds(lag: float) -> None:
     report = inspect(wavy(lag=lag))
     for name in "uvr":
         finding = one(report, f"follows_{name}")
-        assert finding.level == "will mislead"
         assert ("trails" if lag > 0 else "leads") in finding.text
         assert finding.figures["lag"] == pytest.approx(lag, abs=0.05)
-    assert report.misled
 
 
 def test_wrong_conventions_are_named() -> None:
@@ -244,7 +242,6 @@ def test_lever_arm_and_current_are_measured() -> None:
         inspect(changed(log, x=log["x"] - 0.99 * c + 0.4 * s, y=log["y"] - 0.99 * s - 0.4 * c)),
         "lever_arm",
     )
-    assert arm.level == "will mislead"
     assert [arm.figures["value_1"], arm.figures["value_2"]] == pytest.approx(
         [-0.99, -0.4], abs=0.01
     )
@@ -296,13 +293,8 @@ def test_logs_beside_each_other() -> None:
         "second goes on where first ends"
         in one(inspect_together([second, first]), "continued").text
     )
-    assert (
-        one(
-            inspect_together([first, second], splits={"first": "train", "second": "test"}),
-            "continued",
-        ).level
-        == "will mislead"
-    )
+    torn = inspect_together([first, second], splits={"first": "train", "second": "test"})
+    assert "they stand in train and test" in one(torn, "continued").text
     other = Log(
         "other",
         log.t,

@@ -9,6 +9,7 @@ from functools import cache
 import numpy as np
 import pytest
 from planted import FAULTS, SHIPS, Fault, Ship, clean
+from planted_channels import HARMLESS
 
 from residnet.core.log import Log
 from residnet.data.doctor import Finding, inspect, inspect_together
@@ -29,11 +30,13 @@ def trials(ship: str, seed: int) -> tuple[Log, ...]:
     )
 
 
-def loud(logs: list[Log]) -> list[Finding]:
+def told(logs: list[Log]) -> list[Finding]:
     found = [finding for log in logs for finding in inspect(log).findings]
-    return [
-        finding for finding in (*found, *inspect_together(logs).findings) if finding.level != "note"
-    ]
+    return [*found, *inspect_together(logs).findings]
+
+
+def loud(logs: list[Log]) -> list[Finding]:
+    return [finding for finding in told(logs) if finding.level != "note"]
 
 
 @pytest.mark.parametrize("ship", _VESSELS, ids=lambda ship: ship.name)
@@ -52,7 +55,8 @@ def test_planted_faults_are_named(fault: Fault, ship: Ship) -> None:
     for seed in _SEEDS:
         random = np.random.default_rng([seed, FAULTS.index(fault)])
         logs = list(trials(ship.name, seed))[:3]
-        said = loud(fault.plant(ship, [logs[i] for i in random.permutation(3)], random))
+        sick = fault.plant(ship, [logs[i] for i in random.permutation(3)], random)
+        said = told(sick) if fault.name in HARMLESS else loud(sick)
         assert any(finding.code in fault.codes for finding in said), [
             finding.text for finding in said
         ]

@@ -238,7 +238,7 @@ def test_a_log_without_hard_masks_is_one_piece() -> None:
 def test_configs_read_quantities_and_refuse_nonsense() -> None:
     rule = validate({"kind": "frozen", "after": "500 ms"}, MaskConfig, "test")
     assert rule == Frozen(after=0.5)
-    assert {"frozen", "gap", "nan", "jump", "outlier", "hampel", "input_jump"} == set(
+    assert {"frozen", "gap", "nan", "jump", "outlier", "hampel", "spike", "input_jump"} == set(
         TypeAdapter(MaskConfig).json_schema()["discriminator"]["mapping"],
     )
     for faulty in (

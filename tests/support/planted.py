@@ -146,13 +146,14 @@ Plant = Callable[[Ship, list[Log], np.random.Generator], list[Log]]
 @dataclass(frozen=True)
 class Fault:
     """A fault of `ships`: `plant` damages the first of some logs, `codes` are the findings that
-    name it.
+    name it. `hosts` are further kinds of logs that it can be planted in.
     """
 
     name: str
     codes: tuple[str, ...]
     plant: Plant
     ships: tuple[str, ...] = tuple(ship.name for ship in SHIPS)
+    hosts: tuple[str, ...] = ()
 
 
 def _one(damage: Callable[[Ship, Log, np.random.Generator], Log]) -> Plant:
@@ -332,7 +333,7 @@ FAULTS = (
     Fault("repeated stamps", ("duplicate_rows",), _one(_same_stamp)),
     Fault("repeated rows", ("repeated_rows",), _one(_same_rows)),
     Fault("NaN stretch", ("nan",), _one(_nan)),
-    Fault("outliers", ("outliers",), _one(_spiky)),
+    Fault("outliers", ("outliers", "spikes"), _one(_spiky)),
     Fault("frozen sensor", ("frozen",), _one(_freeze)),
     Fault("clipping", ("clipping",), _one(_clip)),
     Fault(
@@ -419,13 +420,10 @@ def _driving(log: Log) -> list[str]:
 
 
 def _steer_reversed(ship: Ship, log: Log) -> Log:
-    if ship.name == "wam_v":
-        return _with(
-            log,
-            n_port=log["n_stbd"],
-            n_stbd=log["n_port"],
-            cmd_port=log["cmd_stbd"],
-            cmd_stbd=log["cmd_port"],
-        )
+    if "n_port" in log.channels:
+        pairs = (("n_port", "n_stbd"), ("cmd_port", "cmd_stbd"))
+        pairs = tuple(pair for pair in pairs if pair[0] in log.channels)
+        swapped = {a: log[b] for a, b in pairs} | {b: log[a] for a, b in pairs}
+        return _with(log, **swapped)
     names = [name for name in _driving(log) if "delta" in name or "tau_n" in name]
     return _with(log, **{name: -log[name] for name in names})

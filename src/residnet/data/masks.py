@@ -20,7 +20,7 @@ from pydantic import Field
 from residnet.core.config import Config, Seconds
 from residnet.core.log import Log
 from residnet.core.stretches import stretch_numbers, stretches
-from residnet.data.outliers import far_from_median, steps_above
+from residnet.data.outliers import far_from_median, spike_cells, steps_above
 from residnet.data.readers.base import unwrap
 
 HARD = "hard:"
@@ -227,6 +227,21 @@ class Hampel(Mask):
 
 
 @final
+class Spike(Mask):
+    """Single samples, or pairs, that leave all others and return at once.
+
+    Every run leaves them out by itself (`residnet.data.outliers.spike_cells`).
+    """
+
+    kind: Literal["spike"] = "spike"
+
+    def apply(self, log: Log) -> np.ndarray:
+        """Return [T] bool; see `Mask.apply`."""
+        cells = spike_cells(log).values()
+        return np.logical_or.reduce([np.zeros(len(log), dtype=bool), *cells])
+
+
+@final
 class InputJump(Mask):
     """Steps of the inputs of more than `limit` per sample, with the seconds around them.
 
@@ -260,7 +275,8 @@ class InputJump(Mask):
 
 
 MaskConfig = Annotated[
-    Frozen | Gap | Missing | Jump | Outlier | Hampel | InputJump, Field(discriminator="kind")
+    Frozen | Gap | Missing | Jump | Outlier | Hampel | Spike | InputJump,
+    Field(discriminator="kind"),
 ]
 """Any masking rule; its `kind` says which."""
 

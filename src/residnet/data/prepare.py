@@ -12,7 +12,7 @@ from pydantic import Field
 
 from residnet.core.config import Config, Seconds
 from residnet.core.errors import DataError
-from residnet.core.layout import POSE, VELOCITIES
+from residnet.core.layout import POSE, RANGE_VELOCITIES, VELOCITIES
 from residnet.core.log import Log
 from residnet.core.names import STATE
 from residnet.core.samples import Samples
@@ -21,7 +21,12 @@ from residnet.data.align import GridConfig, align
 from residnet.data.derivatives import DerivativeConfig, SavitzkyGolay
 from residnet.data.masks import MaskConfig, apply_masks, scored, segments
 from residnet.data.motion import MotionConfig, complete_motion, fill_sparse
+from residnet.data.outliers import without_spikes
+from residnet.data.plausible import beyond_belief
 from residnet.physics.signals import Signals
+
+# share of the samples at either end of a velocity's range that may be bad
+_FEW = 0.005
 
 
 class PrepareConfig(Config):
@@ -86,6 +91,8 @@ class Prepared:
 def prepare(log: Log, split: str, columns: Sequence[str], config: PrepareConfig) -> Prepared:
     """Align, mask, smooth and differentiate one log.
 
+    Single samples that no vessel follows are bridged and left out (`Log.meta["spikes"]`).
+
     Args:
         log: canonical log; needs the channels x, y, psi and `columns`; u, v, r come from a
             smoother where it lacks them.
@@ -95,8 +102,9 @@ def prepare(log: Log, split: str, columns: Sequence[str], config: PrepareConfig)
 
     Raises:
         UsageError: where a channel is missing.
-        DataError: where no sample remains.
+        DataError: where no sample remains, or a value is none that a vessel can have.
     """
+    log = without_spikes(_plausible(log, columns))
     log = align(_masked(log, columns, config), config.grid)
     y, w = log.stack(STATE), log.stack(tuple(columns))
     piece = np.where(np.isfinite(y).all(1) & np.isfinite(w).all(1), segments(log), -1)
@@ -119,6 +127,24 @@ def prepare(log: Log, split: str, columns: Sequence[str], config: PrepareConfig)
     trimmed = (log.t >= log.t[0] + config.trim - 1e-9) & (log.t <= log.t[-1] - config.trim + 1e-9)
     held = _means(w, piece) if config.hold == "mean" else w
     return Prepared(log, split, y, smooth, nu_dot, held, w, piece, usable, usable & valid & trimmed)
+
+
+def _plausible(log: Log, columns: Sequence[str]) -> Log:
+    """Return the log.
+
+    Raises:
+        DataError: where a channel that a model needs has a value that no vessel can have.
+    """
+    for name in (*STATE, *columns):
+        if name in log.channels:
+            bad = np.flatnonzero(beyond_belief(log[name], log.units[name]))
+            if bad.size:
+                raise DataError(
+                    f"log {log.name}: {name} is {log[name][bad[0]]:g} {log.units[name]} at t ="
+                    f" {log.t[bad[0]]:.2f} s, which no vessel reaches ({bad.size} such samples);"
+                    " correct them, or set them to NaN"
+                )
+    return log
 
 
 def _masked(log: Log, columns: Sequence[str], config: PrepareConfig) -> Log:
@@ -190,9 +216,15 @@ def samples(logs: Sequence[Prepared], signals: Signals) -> Samples:
 def envelope(logs: Sequence[Prepared]) -> tuple[np.ndarray, np.ndarray]:
     """Return the lowest and highest measured velocities and inputs, [3 + m] each.
 
-    Only usable samples count.
+    Only usable samples count, and velocities no further beyond the quantiles of 0.5 % and 99.5 %
+    than these lie apart.
     """
     joined = np.concatenate(
         [np.concatenate((p.y[p.usable, VELOCITIES], p.w[p.usable]), axis=1) for p in logs]
     )
-    return joined.min(0), joined.max(0)
+    low, high = joined.min(0), joined.max(0)
+    # a few bad samples must not widen the range in which a free run counts as sound
+    few, most = np.quantile(joined[:, RANGE_VELOCITIES], (_FEW, 1.0 - _FEW), axis=0)
+    low[RANGE_VELOCITIES] = np.maximum(low[RANGE_VELOCITIES], few - (most - few))
+    high[RANGE_VELOCITIES] = np.minimum(high[RANGE_VELOCITIES], most + (most - few))
+    return low, high

@@ -34,7 +34,17 @@ def prepare_logs(splits: Mapping[str, Sequence[Log]], settings: FitSettings) -> 
         for log in logs:
             require_length(log, settings)
     _tell_smoothed([log for logs in prepared.values() for log in logs])
+    _tell_spikes([log for logs in prepared.values() for log in logs])
     return prepared
+
+
+def _tell_spikes(logs: Sequence[Prepared]) -> None:
+    """Say how many single samples of which logs were left out because they stand far out."""
+    for log in logs:
+        spikes = log.log.meta.get("spikes", {})
+        if spikes:
+            counts = ", ".join(f"{name} {count}" for name, count in spikes.items())
+            say(f"  {log.log.name}: spikes are bridged and left out (samples: {counts})")
 
 
 def _tell_smoothed(logs: Sequence[Prepared]) -> None:
@@ -78,7 +88,8 @@ def velocity_limit(low: np.ndarray, high: np.ndarray, divergence: float) -> np.n
     """Return the |u, v, r| [3] beyond which a free run has diverged.
 
     Args:
-        low: smallest training velocities (and inputs, which are not used), [3 + m].
+        low: smallest training velocities (and inputs, which are not used), [3 + m], from robust
+            quantiles (`residnet.data.prepare.envelope`).
         high: largest ones, [3 + m].
         divergence: the multiple of the largest training value.
     """

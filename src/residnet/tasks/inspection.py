@@ -40,7 +40,7 @@ _ILL_CONDITIONED = 1e6
 
 
 @dataclass(frozen=True)
-class _Setup:
+class Reading:
     """What a config says about logs: reader, inputs, masks, and the split of each file."""
 
     reader: LogReader | None = None
@@ -90,7 +90,7 @@ def inspect_logs(paths: Sequence[Path], config: Path | None) -> Inspection:
         ResidnetError: where a path does not exist, the config cannot be used, or the only log
             cannot be read.
     """
-    setup = _Setup() if config is None else _setup(config)
+    setup = Reading() if config is None else reading(config)
     files = log_files(paths, setup.folders or config is None)
     logs: list[Log] = []
     reports: list[Report] = []
@@ -125,10 +125,15 @@ def inspect_logs(paths: Sequence[Path], config: Path | None) -> Inspection:
     return Inspection("\n".join((*summary(content).lines, *lines)), content)
 
 
-def _setup(config: Path) -> _Setup:
+def reading(config: Path) -> Reading:
+    """Return what a config says about the logs that it reads.
+
+    Raises:
+        ConfigError: where it is no config of logs.
+    """
     task = load_task(config, [])
     if isinstance(task, ImportConfig):
-        return _Setup(task.reader.build(), isinstance(task.reader, RecordingConfig))
+        return Reading(task.reader.build(), isinstance(task.reader, RecordingConfig))
     if not isinstance(task, FitConfig) or not isinstance(task.data, MeasuredLogs):
         raise ConfigError(
             f"{config}: has no channel map (data.kind is not 'measured'); leave --config out for"
@@ -145,7 +150,7 @@ def _setup(config: Path) -> _Setup:
         splits = {}
     named = {path.stem: split for path, split in splits.items()}
     reader = task.data.reader
-    return _Setup(
+    return Reading(
         reader.build(),
         isinstance(reader, RecordingConfig),
         task.signals.columns,
@@ -155,7 +160,7 @@ def _setup(config: Path) -> _Setup:
     )
 
 
-def _read(path: Path, setup: _Setup) -> tuple[Log, list[str]]:
+def _read(path: Path, setup: Reading) -> tuple[Log, list[str]]:
     """Return the log in a file, and the lines of the channel map that was guessed for it."""
     if setup.reader is not None:
         return setup.reader.read(path), []

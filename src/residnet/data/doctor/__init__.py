@@ -9,12 +9,18 @@ import numpy as np
 from residnet.core.errors import DataError
 from residnet.core.log import Log
 from residnet.data.align import GridConfig, align
+from residnet.data.doctor.actuators.between import between_findings
+from residnet.data.doctor.actuators.propeller import propeller_findings
+from residnet.data.doctor.actuators.rudder import rudder_findings
+from residnet.data.doctor.actuators.timing import timing_findings
 from residnet.data.doctor.clock import clock_findings, order_findings
 from residnet.data.doctor.compare import comparison_findings
+from residnet.data.doctor.effects import Effects
 from residnet.data.doctor.excitation import excitation_findings, set_findings
 from residnet.data.doctor.findings import Finding, Level, Report, imported, inspection
 from residnet.data.doctor.frames import frame_findings
 from residnet.data.doctor.inputs import input_findings
+from residnet.data.doctor.sensors.fixes import fix_findings
 from residnet.data.doctor.signals import MEASURED, without
 from residnet.data.doctor.summary import Summary, summary
 from residnet.data.doctor.values import channel_findings, value_findings
@@ -31,6 +37,10 @@ __all__ = [
     "inspection",
     "summary",
 ]
+
+
+# findings about single samples of pose and velocities
+_DOUBTED = ("frozen", "outliers", "spikes", "clipping", "interpolated")
 
 
 def inspect(log: Log, inputs: Sequence[str] | None = None, masks: Sequence[Mask] = ()) -> Report:
@@ -68,7 +78,21 @@ def inspect(log: Log, inputs: Sequence[str] | None = None, masks: Sequence[Mask]
         ~apply_masks(log, masks).usable if masks and not broken else np.zeros(len(log), dtype=bool)
     )
     excused = [finding.excused(left_out) for finding in (*findings, *broken)]
+    if not broken and any(finding.level == "will mislead" for finding in excused):
+        effects = Effects(_without_masked(unwrapped(log), left_out), driving)
+        excused = [effects.measured(finding) for finding in excused]
     return Report(log.name, tuple(excused), str(log.meta.get("source", "")))
+
+
+def _without_masked(log: Log, left_out: np.ndarray) -> Log:
+    """Return the log with NaN in the measured channels where the masks leave samples out."""
+    if not left_out.any():
+        return log
+    channels = {
+        name: without(values, left_out) if name in MEASURED else values
+        for name, values in log.channels.items()
+    }
+    return log.replace(channels=channels)
 
 
 def _contents(log: Log, driving: Sequence[str]) -> list[Finding]:
@@ -80,7 +104,9 @@ def _contents(log: Log, driving: Sequence[str]) -> list[Finding]:
         *findings,
         *values,
         *_frames(_trusted(log, values)),
+        *fix_findings(log),
         *input_findings(log, driving),
+        *_actuators(_trusted(log, values), driving),
         *excitation_findings(log, driving),
     ]
 
@@ -88,9 +114,7 @@ def _contents(log: Log, driving: Sequence[str]) -> list[Finding]:
 def _trusted(log: Log, findings: Sequence[Finding]) -> Log:
     """Return the log with NaN where a finding about values says that pose or velocity is wrong."""
     doubted = [
-        finding.at
-        for finding in findings
-        if finding.at is not None and finding.code in ("frozen", "outliers", "clipping")
+        finding.at for finding in findings if finding.at is not None and finding.code in _DOUBTED
     ]
     bad = np.logical_or.reduce(doubted) if doubted else np.zeros(len(log), dtype=bool)
     if bad.mean() > 0.5:
@@ -110,6 +134,15 @@ def _frames(log: Log) -> list[Finding]:
         return [Finding("fatal", "clock_span", f"frames not checked: {error}")]
 
 
+def _actuators(log: Log, driving: Sequence[str]) -> list[Finding]:
+    """Return what the motion says against propellers and rudders."""
+    return [
+        *propeller_findings(log, driving),
+        *rudder_findings(log, driving),
+        *timing_findings(log, driving),
+    ]
+
+
 def inspect_together(
     logs: Sequence[Log],
     inputs: Sequence[str] | None = None,
@@ -127,4 +160,5 @@ def inspect_together(
     """
     sound = [log for log in logs if not order_findings(log)]
     found = [*comparison_findings(sound, splits), *set_findings(sound, inputs)] if sound else []
+    found += between_findings(sound, inputs)
     return Report("together", tuple(found))

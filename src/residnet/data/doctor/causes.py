@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from residnet.core.log import Log
-from residnet.data.doctor.findings import Finding, Level
+from residnet.data.doctor.findings import Finding, Level, raised, scaled, shifted, with_channels
 from residnet.data.doctor.kinematics import Cause
 
 # a lag below this matters to no rollout of a vessel, s
@@ -33,12 +33,14 @@ class Limit:
 
 _SHIFT = "shift it in time, or estimate the lag where the reader can"
 YAW_LIMITS = {
-    "gain": Limit("r is too large against psi by a share of", "", 0.1, "correct its unit or scale"),
+    "gain": Limit(
+        "r is too large against psi by a share of", "", 0.06, "correct its unit or scale"
+    ),
     "lag": Limit("r trails psi by", "s", LEAST_LAG, _SHIFT, steps=1.0),
 }
 POSITION_LIMITS = {
     "gain_u": Limit(
-        "u is too large against the position by a share of", "", 0.1, "correct its unit or scale"
+        "u is too large against the position by a share of", "", 0.04, "correct its unit or scale"
     ),
     "gain_v": Limit(
         "v is too large against the position by a share of", "", 0.25, "correct its unit or scale"
@@ -46,7 +48,7 @@ POSITION_LIMITS = {
     "gain": Limit(
         "u, v are too large against the position by a share of",
         "",
-        0.1,
+        0.04,
         "correct their unit or scale",
     ),
     "heading": Limit(
@@ -83,9 +85,16 @@ POSITION_LIMITS = {
 
 
 def cause_findings(
-    causes: dict[str, Cause], limits: dict[str, Limit], log: Log
+    causes: dict[str, Cause], limits: dict[str, Limit], log: Log, pair: tuple[str, ...]
 ) -> Iterator[Finding]:
-    """Return the findings for the causes that are certain and large enough to matter."""
+    """Return the findings for the causes that are certain and large enough to matter.
+
+    Args:
+        causes: what explains a difference between pose and velocities.
+        limits: from what size on they may mislead.
+        log: that they were found in.
+        pair: channels that are compared with the pose.
+    """
     step = float(np.median(np.diff(log.t)))
     speed = (
         float(np.sqrt(np.nanmean(log["u"] ** 2 + log["v"] ** 2)))
@@ -117,5 +126,46 @@ def cause_findings(
         }
         unit = f" {limit.unit}" if limit.unit else ""
         yield Finding(
-            level, name, f"{text}: {values}{unit}", figures, limit.action if level != "note" else ""
+            level,
+            name,
+            f"{text}: {values}{unit}",
+            figures,
+            limit.action if level != "note" else "",
+            repair=_REPAIRS[name](cause.values, pair) if name in _REPAIRS else None,
         )
+
+
+_Repair = Callable[[Log], Log]
+
+
+def _moved(values: np.ndarray, pair: tuple[str, ...]) -> _Repair:
+    """Return the correction of positions that belong to a point so far from the centre."""
+
+    def repair(log: Log) -> Log:
+        arm = (values[0] + 1j * values[1]) * np.exp(1j * log["psi"])
+        return with_channels(log, x=log["x"] - arm.real, y=log["y"] - arm.imag)
+
+    return repair
+
+
+def _unbiased(values: np.ndarray, pair: tuple[str, ...]) -> _Repair:
+    def repair(log: Log) -> Log:
+        return with_channels(log, u=log["u"] - values[0], v=log["v"] - values[1])
+
+    return repair
+
+
+# cause -> what corrects it, given its values and the channels that are compared with the pose
+_REPAIRS: dict[str, Callable[[np.ndarray, tuple[str, ...]], _Repair]] = {
+    "gain": lambda values, pair: scaled(pair, 1.0 + values[0]),
+    "gain_u": lambda values, pair: scaled(("u",), 1.0 + values[0]),
+    "gain_v": lambda values, pair: scaled(("v",), 1.0 + values[0]),
+    "lag": lambda values, pair: shifted(pair, values[0]),
+    "lag_u": lambda values, pair: shifted(("u",), values[0]),
+    "lag_v": lambda values, pair: shifted(("v",), values[0]),
+    "lag_psi": lambda values, pair: shifted(("psi",), values[0]),
+    "lag_xy": lambda values, pair: shifted(("x", "y"), values[0]),
+    "heading": lambda values, pair: raised("psi", values[0]),
+    "lever_arm": _moved,
+    "bias": _unbiased,
+}

@@ -92,6 +92,9 @@ def _copy(
         else ""
     )
     level: Level = "fatal" if across else "will mislead"
+    if splits and not (a.name in splits and b.name in splits):
+        # the config leaves one of them out already
+        level = "note"
     if count >= max(len(a), len(b)) - 1:
         return Finding(
             level,
@@ -148,7 +151,7 @@ def _continued(a: Log, b: Log, splits: Mapping[str, str]) -> Iterator[Finding]:
     )
     text += f"; they stand in {splits[a.name]} and {splits[b.name]}" if torn else ""
     action = "keep them in one split" if torn or not splits else ""
-    yield Finding("will mislead" if torn else "note", "continued", text, {"pause": pause}, action)
+    yield Finding("note", "continued", text, {"pause": pause}, action)
 
 
 def _overlapping(a: Log, b: Log) -> Iterator[Finding]:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
 
+from residnet.core.log import Log
 from residnet.data.doctor.summary import LEVELS, summary
 
 Level = Literal["note", "will mislead", "fatal"]
@@ -30,6 +31,9 @@ class Finding:
         at: [T] bool, the samples concerned, where it concerns single samples.
         effect: what it does to a fit, measured: the share by which what a cheap one-step fit
             predicts changes without it; None where that was not measured.
+        channels: that the samples concerned belong to, where it concerns single samples.
+        repair: returns a log with the fault corrected, where the finding says how; what it changes
+            is measured.
     """
 
     level: Level
@@ -39,6 +43,8 @@ class Finding:
     action: str = ""
     at: np.ndarray | None = field(default=None, repr=False, compare=False)
     effect: float | None = None
+    channels: tuple[str, ...] = ()
+    repair: Callable[[Log], Log] | None = field(default=None, repr=False, compare=False)
 
     @property
     def line(self) -> str:
@@ -175,3 +181,37 @@ def unit_slip(factor: float) -> str:
         return ""
     best = min(_SLIPS, key=lambda known: abs(math.log(known / factor)))
     return _SLIPS[best] if abs(math.log(best / factor)) < 0.08 else ""
+
+
+def with_channels(log: Log, **channels: np.ndarray) -> Log:
+    """Return the log with some channels changed."""
+    return log.replace(channels={**log.channels, **channels})
+
+
+def shifted(names: Sequence[str], lag: float) -> Callable[[Log], Log]:
+    """Return the correction of channels that trail by `lag` in s."""
+
+    def repair(log: Log) -> Log:
+        return with_channels(
+            log, **{name: np.interp(log.t + lag, log.t, log[name]) for name in names}
+        )
+
+    return repair
+
+
+def scaled(names: Sequence[str], factor: float) -> Callable[[Log], Log]:
+    """Return the correction of channels that are too large by `factor`."""
+
+    def repair(log: Log) -> Log:
+        return with_channels(log, **{name: log[name] / factor for name in names})
+
+    return repair
+
+
+def raised(name: str, offset: float) -> Callable[[Log], Log]:
+    """Return the correction of a channel that is too small by `offset`, SI."""
+
+    def repair(log: Log) -> Log:
+        return with_channels(log, **{name: log[name] + offset})
+
+    return repair

@@ -57,8 +57,9 @@ def follow_findings(
             "correct the unit in the channel map",
         )
     elif correlation > 0.9 and abs(lag) > max(LEAST_LAG, motion.step) and clear and certain:
+        # how far it misleads is measured with the causes, which tell the channels apart
+        level = "note"
         text = f"{text}; it {'trails' if lag > 0.0 else 'leads'}, a filter or another clock"
-        action = "shift it, or estimate the lag where the reader can"
     else:
         level = "note"
     yield Finding(

@@ -13,10 +13,11 @@ import numpy as np
 from residnet.core.log import Log
 from residnet.core.names import VELOCITY
 from residnet.data.doctor.causes import POSITION_LIMITS, YAW_LIMITS, cause_findings
-from residnet.data.doctor.findings import Finding, Level
+from residnet.data.doctor.findings import Finding, Level, raised
 from residnet.data.doctor.following import FEWEST_SAMPLES, follow_findings, slip_in_words
 from residnet.data.doctor.kinematics import Cause, position_causes, yaw_causes
 from residnet.data.doctor.rates import Rates, average_rates
+from residnet.data.doctor.sensors.course import course_findings
 from residnet.data.doctor.signals import noise_of
 
 # a reference must vary by this share of the speed (or this yaw rate, rad/s) before a correlation
@@ -25,6 +26,7 @@ _SHARE_OF_SPEED = 0.05
 _LEAST_YAW = math.radians(0.1)
 # from here on a gyro's bias, or the heading lost to it over the log, misleads
 _LEAST_BIAS = math.radians(0.03)
+_SHARE_OF_YAW = 0.05
 _MOST_DRIFT = math.radians(15.0)
 # (change of sign, constant angle in deg) -> how a user would say it; psi, y and v reversed cover
 # all, because any two equal the third
@@ -59,6 +61,7 @@ def frame_findings(log: Log) -> list[Finding]:
     if "u" in moving and "v" in moving:
         convention = _velocity(motion)
         findings += [*convention, *_position_jumps(log, motion.step)]
+        findings += course_findings(log, motion)
         # an offset or a current is found by the comparison of increments, wrong axes are not
         if any(
             finding.figures.get("coherence", 0.0) > 0.8
@@ -68,7 +71,7 @@ def frame_findings(log: Log) -> list[Finding]:
             causes = position_causes(log)
             findings += [
                 *_follows_ground(log, motion, causes),
-                *cause_findings(causes, POSITION_LIMITS, log),
+                *cause_findings(causes, POSITION_LIMITS, log, ("u", "v")),
             ]
     if "r" in moving:
         findings += _yaw(log, motion)
@@ -197,12 +200,16 @@ def _position_jumps(log: Log, step: float) -> Iterator[Finding]:
             "largest": float(excess[worst]),
             "t": float(log.t[worst + 1]),
         }
+        at = np.zeros(len(log), dtype=bool)
+        at[over] = at[over + 1] = True
         yield Finding(
             "will mislead",
             "position_jump",
             text,
             figures,
             "mask them (kind: frozen or jump), or split the log there",
+            at,
+            channels=("x", "y"),
         )
 
 
@@ -236,6 +243,8 @@ def _yaw(log: Log, motion: Rates) -> Iterator[Finding]:
             text,
             figures,
             "mask it (kind: jump, channel: psi), or split the log there",
+            np.append(over, False) | np.append(False, over),
+            channels=("psi",),
         )
     if all(finding.level == "note" or "lag" in finding.action for finding in follows):
         yield from _drift(log, causes)
@@ -253,7 +262,7 @@ def _drift(log: Log, causes: dict[str, Cause]) -> Iterator[Finding]:
     known = causes.get("bias") or causes.get("ramp")
     bias = end / span
     sure = known is not None and known.sure
-    strong = sure and (abs(bias) > _LEAST_BIAS or most > _MOST_DRIFT)
+    strong = sure and (abs(bias) > max(_LEAST_BIAS, _SHARE_OF_YAW * spread) or most > _MOST_DRIFT)
     text = (
         f"heading minus the integral of r: {math.degrees(end):+.1f} deg at the end, at most"
         f" {math.degrees(most):.1f} deg, a bias of {math.degrees(bias):+.4f} deg/s"
@@ -261,5 +270,6 @@ def _drift(log: Log, causes: dict[str, Cause]) -> Iterator[Finding]:
     )
     level: Level = "will mislead" if strong else "note"
     action = "take the bias off r, or use the rate of psi in its place" if strong else ""
-    yield Finding(level, "yaw_drift", text, {"end": end, "most": most, "bias": bias}, action)
-    yield from cause_findings(causes, YAW_LIMITS, log)
+    figures = {"end": end, "most": most, "bias": bias}
+    yield Finding(level, "yaw_drift", text, figures, action, repair=raised("r", bias))
+    yield from cause_findings(causes, YAW_LIMITS, log, ("r",))

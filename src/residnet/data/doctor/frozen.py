@@ -17,6 +17,7 @@ _LEAST_RUN = 5
 # after a receiver's freeze its filter needs so long to recover, s
 _RECOVERY = 2.0
 # a turn of less than this during a held heading does no harm, rad
+_STEADY = 3.0
 _NEGLIGIBLE_ANGLE = math.radians(0.1)
 
 
@@ -75,6 +76,9 @@ def _frozen(log: Log, name: str, held: np.ndarray) -> Finding:
         "t": float(log.t[starts[longest]]),
     }
     level: Level = "fatal" if share > 0.5 else "will mislead"
+    # a coarse compass rests for a moment wherever a heading is steady
+    if name in ("psi", "phi") and float(seconds[longest]) < _STEADY:
+        level = "note"
     return Finding(
         level,
         "frozen",
@@ -82,6 +86,7 @@ def _frozen(log: Log, name: str, held: np.ndarray) -> Finding:
         figures,
         f"mask them and what follows (kind: frozen, channels: [{channels}])",
         at,
+        channels=tuple(channels.split(", ")),
     )
 
 

@@ -145,6 +145,9 @@ def _size(log: Log, name: str) -> Iterator[Finding]:
 
 def _excursions(log: Log, name: str) -> Iterator[Finding]:
     """Return the values far outside the rest of the channel that return within a second."""
+    if log.units[name] == "rad" and name not in _STEERING:
+        # a direction may go anywhere at once, as that of a light wind does
+        return
     values = log[name]
     step = float(np.median(np.diff(log.t)))
     half = max(round(1.5 / step), 3)
@@ -178,6 +181,7 @@ def _excursions(log: Log, name: str) -> Iterator[Finding]:
             figures,
             f"mask them (kind: hampel, channels: [{name}])",
             far,
+            channels=(name,),
         )
 
 

@@ -43,25 +43,14 @@ def response_findings(log: Log, inputs: Sequence[str]) -> Iterator[Finding]:
     answer = None if found is None else _answer(log, found[1])
     if found is None or answer is None:
         return
-    name, step = found[0], float(np.median(np.diff(log.t)))
-    late = max(0.7, 3.0 * step)
+    name = found[0]
     figures = {
         "effect": answer.effect,
         "t": answer.sure,
         "lag": answer.lag,
         "better": answer.better,
     }
-    if answer.better > _BETTER and answer.lag < -late and abs(answer.best_sure) > _SURE:
-        text = f"the yaw rate answers {name} {-answer.lag:.2f} s before it is given "
-        text += f"(a yaw model leaves {answer.better:.1f} times less with the inputs shifted)"
-        yield Finding(
-            "will mislead",
-            "acausal",
-            text,
-            figures,
-            "the clocks of inputs and motion differ: shift one of them",
-        )
-    elif (
+    if (
         answer.sure < -_SURE
         and answer.worth > _WORTH
         and (answer.better < _BETTER or answer.best_sure < 0.0)
@@ -75,15 +64,6 @@ def response_findings(log: Log, inputs: Sequence[str]) -> Iterator[Finding]:
     elif answer.sure > _SURE:
         text = f"positive {name} turns the vessel to starboard ({answer.sure:.0f} standard errors)"
         yield Finding("note", "rudder_sign", text, figures)
-    if answer.better > _BETTER and answer.lag > late and answer.best_sure > _SURE:
-        action = "an actuator's lag, or another clock"
-        yield Finding(
-            "note",
-            "answer_delay",
-            f"the yaw rate answers {name} {answer.lag:.2f} s late",
-            figures,
-            action,
-        )
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,13 @@ from residnet.core.names import STATE, VELOCITY
 from residnet.core.stretches import stretches
 from residnet.data.doctor.findings import Finding, Level, share_of, show
 from residnet.data.doctor.frozen import frozen_findings, sample_and_hold
+from residnet.data.doctor.sensors.interpolated import interpolated_findings
+from residnet.data.doctor.sensors.repeated import repeated_findings
+from residnet.data.doctor.sensors.single import absurd_findings, spike_findings
 from residnet.data.doctor.signals import MEASURED, noise_of, spikes, without
 
+# a change of level is one from this share of the range on
+_LEVEL = 0.3
 # levels between the 5th and the 95th percentile below which a resolution is too coarse
 _FEWEST_LEVELS = 50
 
@@ -43,7 +48,11 @@ def value_findings(log: Log, inputs: Sequence[str]) -> list[Finding]:
     return [
         *_missing(log),
         *_repeats(log),
+        *absurd_findings(log),
         *frozen_findings(log, measured),
+        *repeated_findings(log),
+        *interpolated_findings(log, measured),
+        *spike_findings(log),
         *_outliers(log, measured),
         *_single_channels(log, measured),
     ]
@@ -147,6 +156,7 @@ def _outliers(log: Log, measured: Sequence[str]) -> Iterator[Finding]:
             {"count": count, "share": count / len(log), "t": float(log.t[worst])},
             _HAMPEL.format(name),
             far,
+            channels=(name,),
         )
 
 
@@ -180,7 +190,13 @@ def _clipping(log: Log, name: str) -> Iterator[Finding]:
         at = log[name] == levels[end]
         figures = {"count": count, "share": share, "limit": float(levels[end])}
         yield Finding(
-            "will mislead", "clipping", text, figures, "mask them, or log with a wider range", at
+            "will mislead",
+            "clipping",
+            text,
+            figures,
+            "mask them, or log with a wider range",
+            at,
+            channels=(name,),
         )
 
 
@@ -224,7 +240,7 @@ def _steps(log: Log, name: str) -> Iterator[Finding]:
     )
     beside = np.sort(around, axis=1)[:, -2]
     span = float(np.nanquantile(values, 0.99) - np.nanquantile(values, 0.01))
-    over = np.nan_to_num(change) > np.maximum(np.maximum(8.0 * noise, 4.0 * beside), 0.1 * span)
+    over = np.nan_to_num(change) > np.maximum(np.maximum(8.0 * noise, 4.0 * beside), _LEVEL * span)
     if over.any():
         at = int(np.argmax(np.where(over, change, 0.0)))
         text = (
@@ -241,4 +257,5 @@ def _steps(log: Log, name: str) -> Iterator[Finding]:
             figures,
             action,
             np.append(False, over) | np.append(over, False),
+            channels=(name,),
         )

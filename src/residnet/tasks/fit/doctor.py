@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from residnet.core.log import Log
 from residnet.core.progress import say
 from residnet.data.doctor import inspect, inspect_together, inspection, summary
+from residnet.data.masks import Spike
 from residnet.runs.folder import RunFolder
 from residnet.tasks.fit.config import FitTaskSettings
 
@@ -16,7 +17,9 @@ def write_inspection(
 ) -> None:
     """Write doctor.json: what the doctor finds in all logs as the run's masks leave them."""
     logs = [log for members in splits.values() for log in members]
-    reports = [inspect(log, config.signals.columns, config.prepare.masks) for log in logs]
+    reports = [
+        inspect(log, config.signals.columns, (*config.prepare.masks, Spike())) for log in logs
+    ]
     split_of = {log.name: split for split, members in splits.items() for log in members}
     together = inspect_together(logs, config.signals.columns, split_of)
     content = inspection(reports, together)

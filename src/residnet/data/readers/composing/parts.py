@@ -10,6 +10,7 @@ import numpy as np
 from residnet.core.errors import DataError
 from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS, to_si
+from residnet.data.plausible import without_fills
 from residnet.data.readers.base import unwrap
 from residnet.data.readers.composing.geodesy import tangent_plane
 from residnet.data.readers.composing.orientation import (
@@ -120,7 +121,7 @@ def channel_parts(
         if own_rows:
             series = series.where(np.isfinite(series[entries[own_rows].field]))
         values = {
-            name: entry.convert(name, field_values(recording, series, entry.field))
+            name: entry.convert(name, without_fills(field_values(recording, series, entry.field)))
             for name, entry in entries.items()
         }
         units = {name: entry.si(name) for name, entry in entries.items()}

@@ -81,6 +81,12 @@ class Conversion(Config):
         """Return the SI unit of channel `name`."""
         return si_unit(known_unit(self.unit, CHANNEL_UNITS.get(name)))
 
+    def in_si(self, name: str, raw: np.ndarray) -> np.ndarray:
+        """Return the size of the values [T] of channel `name` in SI, whatever their frame."""
+        gain = to_si(self.unit, CHANNEL_UNITS.get(name)) * self.scale
+        size: np.ndarray = np.abs(gain * (raw - self.offset))
+        return size
+
     def convert(self, name: str, raw: np.ndarray) -> np.ndarray:
         """Return the values [T] of channel `name` in residnet's unit, sign and frame.
 

@@ -10,7 +10,9 @@ import numpy as np
 
 from residnet.core.errors import DataError
 from residnet.core.names import to_si
+from residnet.data.plausible import beyond_belief, fills, largest
 from residnet.data.readers.base import require_increasing, require_samples, require_values
+from residnet.data.readers.recording import Remark, remark
 from residnet.data.readers.spool import Spool
 from residnet.data.readers.tables.channel_map import ChannelMap
 
@@ -35,6 +37,7 @@ class Rows:
         self._time, self._time_unit = time
         self._spool = Spool(1 + len(channels), on_disk=on_disk)
         self._count, self._end = 0, 0
+        self._fills: dict[str, int] = {}
         self._has_values = dict.fromkeys(channels, False)
         self._heading = np.nan
         self._places: list[tuple[int, range | np.ndarray]] = []
@@ -45,7 +48,8 @@ class Rows:
         `first` is the index of the first row.
 
         Raises:
-            DataError: where a row has measurements but no time.
+            DataError: where a row has measurements but no time, or a value is none that a vessel
+                can have.
         """
         finite = [np.isfinite(channel) for channel in values[1:]]
         known, clock = np.logical_or.reduce(finite), np.isfinite(values[0])
@@ -74,6 +78,11 @@ class Rows:
             self._channels.items(), values[1:], finite, strict=True
         ):
             self._has_values[name] |= bool(has_value.any())
+            filled = fills(raw)
+            if filled.any():
+                self._fills[name] = self._fills.get(name, 0) + int(filled.sum())
+                raw = np.where(filled, np.nan, raw)
+            self._require_plausible(name, entry, raw, first)
             channels.append(self._continued(name, entry.convert(name, raw[index])))
         self._spool.add([values[0][index] * to_si(self._time_unit), *channels])
         measured = np.flatnonzero(known[index])
@@ -97,6 +106,34 @@ class Rows:
             if not has_value:
                 require_values(self._path, name, entry.column, np.full(t.size, np.nan))
         return t, dict(zip(self._channels, values, strict=True))
+
+    def remarks(self) -> list[Remark]:
+        """Return what was seen on the way, in the form of `Log.meta["findings"]`."""
+        return [
+            remark(
+                "note",
+                "fill_values",
+                f"{count} cells of {name} hold a fill value and count as missing",
+                count=count,
+            )
+            for name, count in self._fills.items()
+        ]
+
+    def _require_plausible(self, name: str, entry: ChannelMap, raw: np.ndarray, first: int) -> None:
+        """Stop at a value that no vessel can have.
+
+        Raises:
+            DataError: naming its row and column.
+        """
+        unit = entry.si(name)
+        bad = np.flatnonzero(beyond_belief(entry.in_si(name, raw), unit))
+        if bad.size:
+            i = int(bad[0])
+            raise DataError(
+                f"{self._path}: {self._row(first + i)}, column '{entry.column}': {raw[i]:g} makes"
+                f" {name} larger than {largest(unit):g} {unit}, which no vessel reaches"
+                f" ({bad.size} such cells); correct or empty them, or correct the unit"
+            )
 
     def _continued(self, name: str, values: np.ndarray) -> np.ndarray:
         """Return a piece of a channel; a heading goes on from the piece before."""

@@ -201,13 +201,14 @@ class TableReader(LogReader):
 
         See `LogReader.read`. A large file's channels lie in temporary files, not in memory.
 
-        Rows without a measurement at either end, and blank rows, are dropped and counted; other
+        Fill values far from all else (-999, 9.97e36) count as missing, and are counted. Rows
+        without a measurement at either end, and blank rows, are dropped and counted; other
         rows keep NaN where a channel was not measured.
 
         Raises:
             UsageError: where the file or a column is missing.
-            DataError: where the file is empty, a cell is no finite number, a channel holds no
-                number, or time is missing, repeats or runs backwards.
+            DataError: where the file is empty, a cell is no finite number or none that a vessel can
+                have, a channel holds no number, or time is missing, repeats or runs backwards.
         """
         require_file(path)
         maps = self._config.channels
@@ -248,7 +249,7 @@ class TableReader(LogReader):
         )
         units = {name: entry.si(name) for name, entry in maps.items()}
         meta = provenance(path, read + cut, read + cut - t.size)
-        findings = list(dates.remarks) if dates else []
+        findings = [*(dates.remarks if dates else []), *rows.remarks()]
         if cut:
             findings.append(
                 remark("note", "cut_line", "the file ends within its last line, which is left out")

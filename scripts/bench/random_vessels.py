@@ -1,0 +1,185 @@
+"""Vessels drawn at random, of 2 to 100 m, with one propeller and a rudder or with two propellers.
+
+They are simulated together, in units of their own length and speed, by code that shares nothing
+with residnet: a hull in surge, sway and yaw, actuators with rate and lag, gusts, noise. None has
+the parameters of a shipped vessel.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "support"))
+
+from planted import Ship
+
+from residnet.core.log import Log
+
+_SAMPLES = 1800
+_SUBSTEPS = 2
+KINDS = ("boat", "twin")
+
+
+@dataclass(frozen=True)
+class Vessels:
+    """Parameters of B vessels, [B] each; hydrodynamic ones in units of length and speed."""
+
+    length: np.ndarray
+    speed: np.ndarray
+    surge: np.ndarray
+    drift: np.ndarray
+    sway: np.ndarray
+    cross: np.ndarray
+    rudder_sway: np.ndarray
+    yaw: np.ndarray
+    yaw_square: np.ndarray
+    munk: np.ndarray
+    rudder_yaw: np.ndarray
+    race: np.ndarray
+    brake: np.ndarray
+    revolutions: np.ndarray
+    gust: np.ndarray
+
+
+def draw(random: np.random.Generator, count: int) -> Vessels:
+    """Draw vessels; their yaw is damped, and they turn in two to five lengths."""
+
+    def between(low: float, high: float) -> np.ndarray:
+        return np.exp(random.uniform(np.log(low), np.log(high), count))
+
+    length = between(2.0, 100.0)
+    speed = between(0.12, 0.35) * np.sqrt(9.81 * length)
+    return Vessels(
+        length=length,
+        speed=speed,
+        surge=between(0.08, 0.3),
+        drift=between(0.4, 0.8),
+        sway=between(0.8, 1.6),
+        cross=between(0.5, 2.0),
+        rudder_sway=between(0.1, 0.3),
+        yaw=between(1.0, 2.5),
+        yaw_square=between(0.3, 1.5),
+        munk=between(0.1, 0.5),
+        rudder_yaw=between(1.0, 2.5),
+        race=between(0.2, 0.8),
+        brake=between(0.05, 0.2),
+        # a propeller of 2 to 6 % of the length, with an advance of .5 to 1 of its diameter
+        revolutions=speed / (between(0.5, 1.0) * between(0.02, 0.06) * length),
+        gust=between(0.002, 0.02),
+    )
+
+
+def random_logs(kind: str, seed: int, count: int) -> list[list[Log]]:
+    """Return three logs of each of `count` vessels: a zigzag, random steps, and steps of both."""
+    random = np.random.default_rng([seed, KINDS.index(kind)])
+    vessels = draw(random, count)
+    unit = vessels.length / vessels.speed
+    step = np.array([0.05, 0.1, 0.2, 0.5, 1.0])
+    step = step[np.argmin(np.abs(step[:, None] - unit / 15.0), axis=0)]
+    flights = [_fly(vessels, kind, what, step, random) for what in range(3)]
+    return [
+        [_log(vessels, kind, flight, step, i, k, random) for k, flight in enumerate(flights)]
+        for i in range(count)
+    ]
+
+
+def ship_of(kind: str, log: Log) -> Ship:
+    """The description of a host that planted faults need, in proportion to the vessel."""
+    length = float(log.meta["length"])
+    unit = length / float(log.meta["speed"])
+    lag = (max(0.7, 0.15 * unit), max(1.4, 0.3 * unit))
+    bias = (np.degrees(0.015 / unit), np.degrees(0.04 / unit))
+    names = ("n_port", "n_port", "n_port") if kind == "twin" else ("delta", "delta", "delta")
+    arm = (0.2 * length, 0.5 * length)
+    return Ship(kind, kind, "0 s", "0 s", {}, lag, arm, bias, (names[0],), names[1], names[2])
+
+
+def _fly(
+    vessels: Vessels, kind: str, what: int, step: np.ndarray, random: np.random.Generator
+) -> dict[str, np.ndarray]:
+    """Return state and actuators [_SAMPLES, B] in units of length and speed."""
+    count = vessels.length.size
+    unit = vessels.length / vessels.speed
+    dt = step / unit / _SUBSTEPS
+    x, y, psi, u, v, r = (np.zeros(count) for _ in range(6))
+    psi = random.uniform(-3.0, 3.0, count)
+    u = np.full(count, 0.7)
+    side, drive = np.zeros(count), np.full(count, 0.8)
+    turn, power = np.zeros(count), np.full(count, 0.8)
+    course, until, powered = psi.copy(), np.zeros(count), np.zeros(count)
+    angle, limit = random.uniform(0.17, 0.52, count), random.uniform(0.17, 0.4, count)
+    sign = random.choice([-1.0, 1.0], count)
+    gusts = np.zeros((3, count))
+    out = {
+        name: np.zeros((_SAMPLES, count))
+        for name in ["x", "y", "psi", "u", "v", "r", "side", "drive"]
+    }
+    for k in range(_SAMPLES):
+        for name, values in zip(out, (x, y, psi, u, v, r, side, drive), strict=True):
+            out[name][k] = values
+        now = k * step / unit
+        if what == 0:
+            sign = np.where(sign * (psi - course) > limit, -sign, sign)
+            turn = np.where(now > 3.0, sign * angle, 0.0)
+        else:
+            fresh = now >= until
+            turn = np.where(fresh, random.uniform(-0.55, 0.55, count), turn)
+            until = np.where(fresh, now + random.uniform(2.0, 8.0, count), until)
+        if what == 2:
+            fresh = now >= powered
+            power = np.where(fresh, random.uniform(0.4, 1.1, count), power)
+            powered = np.where(fresh, now + random.uniform(8.0, 20.0, count), powered)
+        for _ in range(_SUBSTEPS):
+            gusts += dt * (-gusts / 3.0) + np.sqrt(dt) * random.standard_normal((3, count)) * (
+                vessels.gust * 0.8
+            )
+            side = side + np.clip(turn - side, -0.5 * dt, 0.5 * dt)
+            drive = drive + dt / 0.3 * (power - drive)
+            thrust = 1.4 * drive * np.abs(drive) - 0.4 * drive * u
+            if kind == "twin":
+                steer = 0.8 * drive * side
+            else:
+                flow = (1.0 - vessels.race) * u * np.abs(u) + vessels.race * drive * np.abs(drive)
+                steer = flow * np.sin(side)
+            du = vessels.surge * (thrust - u * np.abs(u)) + 0.6 * v * r + gusts[0]
+            du = du - vessels.brake * u * np.abs(u) * side**2
+            dv = -vessels.sway * np.abs(u) * v - vessels.cross * v * np.abs(v)
+            dv = dv - vessels.drift * u * r - vessels.rudder_sway * steer + gusts[1]
+            dr = -vessels.yaw * np.abs(u) * r - vessels.yaw_square * r * np.abs(r)
+            dr = dr - vessels.munk * u * v + vessels.rudder_yaw * steer + gusts[2]
+            u, v, r = u + dt * du, v + dt * dv, r + dt * dr
+            x = x + dt * (u * np.cos(psi) - v * np.sin(psi))
+            y = y + dt * (u * np.sin(psi) + v * np.cos(psi))
+            psi = psi + dt * r
+    return out
+
+
+def _log(
+    vessels: Vessels,
+    kind: str,
+    flight: dict[str, np.ndarray],
+    step: np.ndarray,
+    i: int,
+    k: int,
+    random: np.random.Generator,
+) -> Log:
+    length, speed = float(vessels.length[i]), float(vessels.speed[i])
+    scale = {"x": length, "y": length, "psi": 1.0, "u": speed, "v": speed, "r": speed / length}
+    accuracy = random.uniform(0.3, 1.5)
+    noise = {"x": 0.005, "y": 0.005, "psi": 0.003, "u": 0.01, "v": 0.01, "r": 0.005}
+    channels = {
+        name: size
+        * (flight[name][:, i] + accuracy * noise[name] * random.standard_normal(_SAMPLES))
+        for name, size in scale.items()
+    }
+    side, drive, most = flight["side"][:, i], flight["drive"][:, i], float(vessels.revolutions[i])
+    if kind == "twin":
+        channels |= {"n_port": most * drive * (1.0 + side), "n_stbd": most * drive * (1.0 - side)}
+    else:
+        channels |= {"n": most * drive, "delta": side}
+    t = float(step[i]) * np.arange(_SAMPLES)
+    return Log(f"{kind}_{i}_{k}", t, channels, meta={"length": length, "speed": speed})

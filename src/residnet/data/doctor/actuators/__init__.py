@@ -1,0 +1,1 @@
+"""Findings about propellers and rudders that the vessel's motion contradicts."""

@@ -1,0 +1,1 @@
+"""Findings about receivers and compasses that show what they did not measure."""
