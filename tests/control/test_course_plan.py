@@ -244,3 +244,37 @@ def test_a_vessel_that_sways_and_rolls_follows_turns_that_join_each_other() -> N
         aside.append(abs(float(guidance.error(state[None], place[:, 0])[1])))
     assert float(place) >= planned.course.length
     assert max(aside) < 0.5
+
+
+def test_a_course_that_turns_back_leaves_every_buoy_on_its_side_outside_its_circle(
+    vessel: SteeredPlant,
+) -> None:
+    """Buoys to and fro with sides that need loops; judged by the points of the plan alone."""
+    places = [(60.0, 0.0, "port"), (10.0, 25.0, "port"), (75.0, 45.0, "starboard")]
+    places += [(60.0, -45.0, "starboard")]
+    buoys = tuple(
+        BuoyConfig(north=north, east=east, leave_to=side, radius=10) for north, east, side in places
+    )
+    wanted = WANTED.model_copy(update={"buoys": buoys})
+    steady = smallest_turn(wanted, vessel, LIMIT)
+    planned = plan_course(wanted, "sides", vessel, TURNING, LIMIT, steady)
+    track = planned.course.track[: int(planned.course.length / planned.course.step) + 2]
+    passed = -1
+    for north, east, side in places:
+        away = np.array([north, east]) - track
+        distance = np.hypot(*away.T)
+        assert distance.min() >= steady.radius
+        near = int(distance.argmin())
+        assert near > passed
+        passed = near
+        step = track[min(near + 1, len(track) - 1)] - track[near - 1]
+        assert (step[0] * away[near, 1] - step[1] * away[near, 0] > 0) == (side == "starboard")
+
+
+def test_a_current_that_is_planned_for_keeps_the_course_farther_off(vessel: SteeredPlant) -> None:
+    steady = smallest_turn(WANTED, vessel, LIMIT)
+    wanted = WANTED.model_copy(update={"current": 0.3})
+    planned = plan_course(wanted, "sides", vessel, TURNING, LIMIT, steady)
+    for buoy in planned.buoys:
+        away = planned.course.track - (buoy.north, buoy.east)
+        assert np.hypot(*away.T).min() >= steady.radius + 0.3 * TURNING.time

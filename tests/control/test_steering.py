@@ -134,3 +134,29 @@ def test_a_flight_is_what_an_ode_solver_says() -> None:
     # the rudder moves in steps, which is half a step late
     assert float(flights.state("psi")[0, -1]) == pytest.approx(truth[0], rel=5e-3)
     assert float(flights.state("r")[0, -1]) == pytest.approx(truth[1], rel=5e-3)
+
+
+def test_the_turn_of_a_slow_vessel_is_waited_for() -> None:
+    """Nomoto's model of second order: the area above the answer is T1 + T2 - T3."""
+    turning = SteeredPlant(load_vessel("nomoto_mariner_yaw").build()).turning(5 * DEG, 100.0, 0.2)
+    assert turning.gain == pytest.approx(0.18499155, rel=0.01)
+    assert turning.time == pytest.approx(117.97831 + 7.7630075 - 18.530161, rel=0.02)
+
+
+def test_a_yaw_rate_that_overshoots_has_the_time_constant_of_a_zigzag() -> None:
+    """The Mariner turns far less in a hard turn than about straight ahead."""
+    turning = SteeredPlant(load_vessel("mariner").build()).turning(20 * DEG, 60.0, 0.4)
+    assert 0.02 < turning.gain < 0.06
+    assert 15.0 < turning.time < 40.0
+
+
+def test_a_vessel_that_starts_at_rest_runs_up_and_has_the_rate_of_its_lagging_rudder() -> None:
+    boat = SteeredPlant(load_vessel("example_rudder_boat").build())
+    x, w = boat.start(torch.ones(1, dtype=torch.float64))
+    speed = float(x[0, boat.column("u")])
+    assert speed > 3.0
+    assert boat.rate == pytest.approx(25 * DEG)
+    variation = torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64)
+    for _ in range(50):
+        x, variation = boat.model(0.1).step(x, w, variation)
+    assert float(x[0, boat.column("u")]) == pytest.approx(speed, rel=1e-4)

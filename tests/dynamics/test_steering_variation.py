@@ -47,3 +47,21 @@ def test_no_variation_is_the_plant(name: str) -> None:
 def test_vessels_without_a_rudder_command_are_refused() -> None:
     with pytest.raises(ConfigError, match="cmd_delta"):
         VariedPlant(load_vessel("wam_v_cal").build(), 0.1)
+
+
+def test_a_rudder_with_a_lag_moves_within_the_step_and_its_effect_is_varied() -> None:
+    """Half of the effect at twice the angle turns the hull alike, while the gear moves on."""
+    plant = load_vessel("mariner").build()
+    model, column = VariedPlant(plant, 0.5), plant.state.index("delta")
+    x, w = plant.approach(2), torch.zeros(2, len(plant.inputs), dtype=torch.float64)
+    w[:, : plant.commands] = plant.demand(torch.ones(2), torch.zeros(2)).double()
+    x[:, column] = torch.tensor([0.1, 0.2], dtype=torch.float64)
+    w[:, 0] = x[:, column]
+    s = torch.tensor([[1.0, 1.0, 0.0], [0.5, 1.0, 0.0]], dtype=torch.float64)
+    after, _ = model.step(x, w, s)
+    hull = [i for i in range(x.shape[1]) if i != column]
+    assert torch.allclose(after[0, hull], after[1, hull], atol=1e-12)
+    assert torch.equal(after[:, column], x[:, column])
+    w[:, 0] = 0.3
+    moved, _ = model.step(x, w, s)
+    assert bool((moved[:, column] > x[:, column]).all())

@@ -26,7 +26,7 @@ angle [rad] that is added to the rudder's.
 class VariedPlant(Dynamics):
     """A plant of which each row has its own rudder effect, time constants and rudder bias.
 
-    It is stepped by RK4 with held actuators.
+    It is stepped by RK4, with held actuators where these stand still within a step.
 
     Its memory s [B, 3] is the variation, constant over a rollout: rows of ones and a zero bias are
     the plant itself. With Nomoto's model of first order, T r_dot + r = K delta, `effect` multiplies
@@ -34,7 +34,7 @@ class VariedPlant(Dynamics):
     feels, and `time` divides the accelerations in sway and yaw.
 
     Raises:
-        ConfigError: where the vessel has no rudder, or one that moves within a step.
+        ConfigError: where the vessel has no rudder.
     """
 
     def __init__(self, plant: Plant, dt: float, integrator: str = "rk4") -> None:
@@ -50,27 +50,37 @@ class VariedPlant(Dynamics):
         slowed = torch.tensor([1.0 if name in ("v", "r") else 0.0 for name in plant.state])
         self.register_buffer("slowed", slowed, persistent=False)
         self.slowed: Tensor
+        gear = torch.tensor([1.0 if "delta" in name else 0.0 for name in plant.state])
+        self.register_buffer("gear", gear, persistent=False)
+        self.gear: Tensor
         x, w = plant.approach(1), torch.zeros(1, len(plant.inputs), dtype=torch.float64)
         w[:, 0] = 0.1
-        if any(name.startswith("_delta") for name in plant.state) or (
-            self.rudder >= 0 and bool(plant.rate(x, w)[0, self.rudder] != 0)
-        ):
-            raise ConfigError(
-                "a varied plant holds the rudder over a step: give the rudder the response"
-                " 'immediate' (with or without a rate)"
-            )
+        # a rudder with a lag moves within a step
+        self.moving = self.rudder >= 0 and bool(plant.rate(x, w)[0, self.rudder] != 0)
 
     def initial_state(self, batch: int) -> Tensor:
         """Return the plant itself, [batch, 3]."""
         return torch.tensor([1.0, 1.0, 0.0]).expand(batch, 3)
 
     def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
-        """Return x_dot [B, nx] from the rudder angle that the water feels.
+        """Return x_dot [B, nx] of a rudder whose effect is varied.
 
-        rho [B, 2] holds that angle and 1/time - 1.
+        rho [B, 3] holds what multiplies the rudder's angle, what is added to it, and 1/time - 1.
         """
-        x_dot = self.plant.held_rate(self._felt(x, rho[:, :1]), p)
-        return x_dot * (1.0 + self.slowed.to(x.dtype) * rho[:, 1:])
+        slower = 1.0 + self.slowed.to(x.dtype) * rho[:, 2:]
+        if self.rudder < 0:
+            rate: Tensor = self.plant.held_rate(x, p) * slower
+            return rate
+        angle = x[:, self.rudder : self.rudder + 1] * rho[:, :1] + rho[:, 1:2]
+        felt = self._felt(x, angle)
+        if not self.moving:
+            held: Tensor = self.plant.held_rate(felt, p) * slower
+            return held
+        hull = self.plant.rate(felt, p) * slower
+        # the steering gear knows its own angle
+        own = self.plant.rate(x, p)
+        gear = self.gear.to(x.dtype)
+        return hull * (1.0 - gear) + own * gear
 
     def _felt(self, x: Tensor, angle: Tensor) -> Tensor:
         if self.rudder < 0:
@@ -79,13 +89,16 @@ class VariedPlant(Dynamics):
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return the state after a step; the variation passes through."""
-        angle = (x[:, self.rudder : self.rudder + 1] if self.rudder >= 0 else w[:, :1]) * s[
-            :, :1
-        ] + s[:, 2:]
-        held = torch.cat((angle, w[:, 1:]), dim=-1)
-        p = self.plant.prepare(self._felt(x, angle), held)
-        moved = self.integrate(x, p, torch.cat((angle, 1.0 / s[:, 1:2] - 1.0), dim=-1))
-        return self.plant.end_step(moved, w, self.dt), s
+        varied = torch.cat((s[:, :1], s[:, 2:3], 1.0 / s[:, 1:2] - 1.0), dim=-1)
+        if self.moving:
+            p = self.plant.prepare(x, w)
+        else:
+            angle = (x[:, self.rudder : self.rudder + 1] if self.rudder >= 0 else w[:, :1]) * s[
+                :, :1
+            ] + s[:, 2:]
+            held = torch.cat((angle, w[:, 1:]), dim=-1)
+            p = self.plant.prepare(self._felt(x, angle), held)
+        return self.plant.end_step(self.integrate(x, p, varied), w, self.dt), s
 
 
 @final

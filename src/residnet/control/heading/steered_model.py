@@ -42,6 +42,7 @@ class SteeredModel(SteeredVessel):
                 "heading control needs a model that is driven by 'delta' or 'cmd_delta'; its"
                 f" inputs are {', '.join(columns)}"
             )
+        self.any_step = model.n_state == 0
         self.take: list[int] = []
         for name in columns:
             command = commanded(name)

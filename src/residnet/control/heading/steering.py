@@ -11,12 +11,19 @@ import torch
 from torch import Tensor
 
 from residnet.control.base import ClosedLoop, GivenReference, Policy
-from residnet.control.heading.turning import Turning, measure_turning
+from residnet.control.heading.turning import Steered, Turning, measure_turning
+from residnet.core.errors import ConfigError
 from residnet.core.frames import wrap
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.rollout import Rollout, Source
 from residnet.dynamics.steering_variation import VariedPlant
 from residnet.physics.plant import HullPlant, Plant
+
+_LONG_STEP = 0.4
+"""Longest step in s by which a vessel's answer to its rudder is measured."""
+_MOTION = ("x", "y", "psi", "phi", "u", "v", "r", "p")
+_RUN_UP = (0.1, 6000)
+"""Step in s and steps of the run from rest to the speed of a straight course."""
 
 
 class SteeredVessel(ABC):
@@ -26,11 +33,13 @@ class SteeredVessel(ABC):
         state: names of the columns of x.
         inputs: names of the columns of w.
         rate: of the rudder in rad/s; None where it stands at its command at once.
+        any_step: whether `model` can be built with steps of any length.
     """
 
     state: tuple[str, ...]
     inputs: tuple[str, ...]
     rate: float | None
+    any_step: bool = True
 
     @abstractmethod
     def model(self, dt: float, integrator: str = "rk4") -> Dynamics:
@@ -58,18 +67,19 @@ class SteeredVessel(ABC):
 
     @final
     def turning(self, angle: float, duration: float, dt: float = 0.02) -> Turning:
-        """Return K and T at the service speed, from the answer to a held rudder angle [rad]."""
+        """Return K and T at the service speed, from answers to a rudder angle.
+
+        Args:
+            angle: of the rudder in rad.
+            duration: until the turn is steady, in s.
+            dt: step in s; later steps are longer.
+        """
         x, w = self.start(torch.ones(1, dtype=torch.float64))
         variation = torch.tensor([[1.0, 1.0, 0.0]], dtype=torch.float64)
-        return measure_turning(
-            self.model(dt),
-            x,
-            w,
-            self.memory(variation),
-            (self.column("u"), self.column("r")),
-            angle,
-            duration,
-        )
+        columns = (self.column("u"), self.column("r"), self.column("psi"))
+        steps = (dt, max(dt, _LONG_STEP) if self.any_step else dt)
+        steered = Steered(self.model, x, w, self.memory(variation), columns, steps)
+        return measure_turning(steered, angle, duration)
 
 
 @final
@@ -82,6 +92,7 @@ class SteeredPlant(SteeredVessel):
         self.plant = plant
         self.state, self.inputs = plant.state, plant.inputs
         self.rate = _rudder_rate(plant)
+        self._straight = _straight(plant)
 
     def model(self, dt: float, integrator: str = "rk4") -> Dynamics:
         """Return the varied plant, for steps of dt seconds."""
@@ -89,7 +100,7 @@ class SteeredPlant(SteeredVessel):
 
     def start(self, speed: Tensor) -> tuple[Tensor, Tensor]:
         """Return states and inputs of straight courses; thrust grows with the speed squared."""
-        x = self.plant.approach(len(speed)).to(speed.dtype).clone()
+        x = self._straight.to(speed.dtype).repeat(len(speed), 1)
         x[:, self.column("u")] *= speed
         command = self.plant.demand(speed.square(), torch.zeros_like(speed))
         return x, torch.cat(
@@ -122,17 +133,52 @@ class NominalSteering(Dynamics):
         return self.inner.step(x, w, self.nominal.to(x.dtype).expand(x.shape[0], -1))[0], s
 
 
-def _rudder_rate(plant: Plant) -> float | None:
-    """Return the rate of the steering gear in rad/s; None for a rudder that follows at once.
+def _straight(plant: Plant) -> Tensor:
+    """Return the state [1, nx] of a straight course at the service speed.
 
-    It is seen from what a small and a large angle lead to in a short time.
+    A vessel that trials start from at rest runs up to its speed at full drive.
+    """
+    x = plant.approach(1)
+    column = plant.state.index("u")
+    if float(x[0, column]) != 0.0:
+        return x
+    one = torch.ones(1, dtype=torch.float64)
+    command = plant.demand(one, torch.zeros_like(one))
+    w = torch.cat((command, command.new_zeros(1, len(plant.inputs) - command.shape[1])), dim=1)
+    model, variation = VariedPlant(plant, _RUN_UP[0]), torch.tensor([[1.0, 1.0, 0.0]])
+    with torch.no_grad():
+        for k in range(_RUN_UP[1]):
+            before = float(x[0, column])
+            x, _ = model.step(x, w, variation.double())
+            if k > 100 and abs(float(x[0, column]) - before) < 1e-7 * max(abs(before), 1e-3):
+                break
+    if not float(x[0, column]) > 0.0:
+        raise ConfigError(
+            "heading control needs a vessel that makes way ahead at full drive; this one reaches"
+            f" {float(x[0, column]):.3g} m/s"
+        )
+    straight = plant.approach(1)
+    straight[:, column] = x[:, column]
+    others = [i for i, name in enumerate(plant.state) if name not in _MOTION]
+    straight[:, others] = x[:, others]
+    return straight
+
+
+def _rudder_rate(plant: Plant) -> float | None:
+    """Return the rate of the steering gear in rad/s; None for a rudder without one.
+
+    It is seen from what two large angles lead to: where both move the rudder alike, its rate holds.
     """
     if "delta" not in plant.state:
         return None
     column, dt = plant.state.index("delta"), 1e-3
     x, w = plant.approach(1), torch.zeros(1, len(plant.inputs), dtype=torch.float64)
-    w[:, 0] = 1.0
-    return float(plant.end_step(x, w, dt)[0, column]) / dt
+    rates = []
+    for angle in (1.0, 0.5):
+        w[:, 0] = angle
+        moved = float(plant.end_step(x, w, dt)[0, column] - x[0, column]) / dt
+        rates.append(moved + float(plant.rate(x, w)[0, column]))
+    return rates[0] if abs(rates[0] - rates[1]) <= 1e-6 * abs(rates[0]) else None
 
 
 @final

@@ -1,14 +1,29 @@
-"""A vessel's response to its rudder about straight ahead, as Nomoto's K and T."""
+"""A vessel's response to its rudder at an angle, as Nomoto's K and T."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from residnet.control.heading.response import Record, fit_response
 from residnet.core.errors import FitError
 from residnet.dynamics.base import Dynamics
+
+_STEPS = 400
+_STEADY = 0.1
+"""Share of the yaw rate by which it may still change over the last half of the time."""
+_OVERSHOOT = 0.02
+_PATIENCE = 8
+"""Times the duration given that a turn is waited for."""
+_SWITCHES = 6
+_FINE = 25
+"""Steps until a zigzag's first change of rudder."""
+_LONGEST = 12000
+"""Steps after which a zigzag is given up."""
 
 
 @dataclass(frozen=True)
@@ -20,45 +35,116 @@ class Turning:
     speed: float
 
 
-def measure_turning(
-    model: Dynamics,
-    x: Tensor,
-    w: Tensor,
-    s: Tensor,
-    columns: tuple[int, int],
-    angle: float,
-    duration: float,
-) -> Turning:
-    """Return K and T from the answer to a rudder angle that is held.
+@dataclass(frozen=True)
+class Steered:
+    """What K and T are measured on.
 
-    Args:
-        model: of the vessel.
+    Attributes:
+        build: returns the model of the vessel with steps of a length in s.
         x: straight ahead at its speed, [1, nx].
         w: inputs [1, m] of that motion; the first is the rudder command.
         s: memory [1, n_state] of the model.
-        columns: of u and r in the state.
+        columns: of u, r and psi in the state.
+        steps: the first length of a step and the largest, in s.
+    """
+
+    build: Callable[[float], Dynamics]
+    x: Tensor
+    w: Tensor
+    s: Tensor
+    columns: tuple[int, int, int]
+    steps: tuple[float, float]
+
+
+def measure_turning(steered: Steered, angle: float, duration: float) -> Turning:
+    """Return K and T of the answer to a rudder angle.
+
+    The angle is held first: T is the area above the yaw rate's answer over its end. The yaw rate of
+    a vessel that hardly holds its course overshoots in hard turns, or is not steady for long. Then
+    K and T are those that simulate its yaw rate best in a zigzag, with a delay beside them.
+
+    Args:
+        steered: the vessel.
         angle: of the rudder in rad.
         duration: until the turn is steady, in s.
 
     Raises:
-        FitError: where the vessel does not turn towards the rudder and stay there.
+        FitError: where the vessel does not answer its rudder so that it can be steered.
     """
-    u, r = columns
-    speed = float(x[0, u])
-    w = w.clone()
-    w[:, 0] = angle
-    rates = []
-    with torch.no_grad():
-        for _ in range(round(duration / model.dt)):
-            x, s = model.step(x, w, s)
-            rates.append(float(x[0, r]))
-    steady = rates[-1]
-    if not steady * angle > 0 or abs(rates[-1] - rates[len(rates) // 2]) > 0.1 * abs(steady):
+    speed = float(steered.x[0, steered.columns[0]])
+    times, rates, headings = _held(steered, angle, duration)
+    while times[-1] < _PATIENCE * duration and not _settled(times, rates):
+        times, rates, headings = _held(steered, angle, 2.0 * float(times[-1]))
+    if not np.isfinite(rates).all():
+        raise FitError(f"the vessel's motion does not stay finite at {angle:.3g} rad of rudder")
+    steady = float(rates[-1])
+    straight = steady * angle > 0 and _settled(times, rates)
+    if straight and (rates / steady).max() <= 1.0 + _OVERSHOOT:
+        area = float(np.trapezoid(steady - rates, times))
+        if area > 0:
+            return Turning(gain=steady / angle, time=area / steady, speed=speed)
+    turned = np.flatnonzero(headings * np.sign(angle) >= abs(angle))
+    if len(turned) == 0:
         raise FitError(
-            f"the vessel's turn at {angle:.3g} rad of rudder is not steady after {duration:g} s;"
-            " train on a vessel that holds its course"
+            f"at {angle:.3g} rad of rudder the vessel does not turn by as much to that side within"
+            f" {times[-1]:.3g} s; it cannot be steered (check the sign of its rudder and the limit)"
         )
-    # T is the area above the rate's answer, in which lags and overshoots count as they matter
-    gain = steady / angle
-    area = (0.5 * steady + sum(steady - rate for rate in rates)) * model.dt
-    return Turning(gain=gain, time=max(area / steady, model.dt), speed=speed)
+    first = float(times[turned[0]])
+    found = fit_response([_zigzag(steered, angle, first)], 0.5 * first)
+    return Turning(gain=found.gain, time=found.time, speed=speed)
+
+
+def _settled(times: np.ndarray, rates: np.ndarray) -> bool:
+    """Return whether a yaw rate is steady over the last half of the time."""
+    half, steady = rates[np.searchsorted(times, 0.5 * times[-1]) :], rates[-1]
+    overshoots = np.abs(rates).max() > (1.0 + _STEADY) * abs(steady)
+    return bool(overshoots or np.abs(half - steady).max() <= _STEADY * abs(steady))
+
+
+def _held(
+    steered: Steered, angle: float, duration: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return times, yaw rates and headings [N] under a held rudder, in steps that grow."""
+    _, r, psi = steered.columns
+    x, w, s = steered.x, steered.w.clone(), steered.s
+    w[:, 0] = angle
+    times, rates, headings = [0.0], [0.0], [0.0]
+    dt = steered.steps[0]
+    with torch.no_grad():
+        while times[-1] < duration - 0.5 * dt:
+            model = steered.build(dt)
+            for _ in range(min(_STEPS, round((duration - times[-1]) / dt))):
+                x, s = model.step(x, w, s)
+                times.append(times[-1] + dt)
+                rates.append(float(x[0, r]))
+                headings.append(float(x[0, psi] - steered.x[0, psi]))
+            dt = min(2.0 * dt, steered.steps[1])
+    return np.array(times), np.array(rates), np.array(headings)
+
+
+def _zigzag(steered: Steered, angle: float, first: float) -> Record:
+    """Return a zigzag in which the heading goes as far to each side as the rudder.
+
+    `first` is the time in s until its first change of rudder.
+    """
+    _, r, psi = steered.columns
+    low, high = steered.steps
+    dt = low if high <= low else min(max(first / _FINE, low), high)
+    model, x, w, s = steered.build(dt), steered.x, steered.w.clone(), steered.s
+    side, switches, rates, rudder = float(np.sign(angle)), 0, [], []
+    with torch.no_grad():
+        while switches < _SWITCHES:
+            if len(rates) > _LONGEST:
+                raise FitError(
+                    f"a zigzag with {abs(angle):.3g} rad of rudder does not turn the vessel back"
+                    f" within {dt * _LONGEST:.3g} s; it cannot be steered with so little rudder"
+                )
+            heading = float(x[0, psi] - steered.x[0, psi])
+            if side * heading > abs(angle):
+                side, switches = -side, switches + 1
+            w[:, 0] = side * abs(angle)
+            rates.append(float(x[0, r]))
+            rudder.append(side * abs(angle))
+            x, s = model.step(x, w, s)
+    rate = np.array(rates)
+    return Record(dt, np.array(rudder), rate, np.isfinite(rate))

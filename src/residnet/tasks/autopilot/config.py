@@ -11,8 +11,10 @@ from pydantic import Field, model_validator
 from residnet.control.conditions.config import ConditionsConfig
 from residnet.control.conditions.evolution import EvolutionConfig
 from residnet.control.heading.controllers import BangBangConfig
+from residnet.control.heading.steering import SteeredPlant
 from residnet.control.observed.config import AnyController, ObservedConfig
 from residnet.core.config import Config, MetresPerSecond, Radians, Seconds
+from residnet.core.errors import ConfigError, FitError
 from residnet.core.names import nearest
 from residnet.data.simulated.environment import Disturbance, WindField
 from residnet.documents.gouletas2020.config import PredictiveConfig
@@ -238,14 +240,19 @@ class AutopilotSettings(ComputingTask):
         return self
 
     def check(self) -> None:
-        """Check that the runs of learned models are there.
+        """Check that the vessel answers its rudder, and that the runs of learned models are there.
 
         Raises:
-            UsageError: where one is not.
+            UsageError: where a run is not there.
+            ConfigError: where no policy can steer the vessel.
         """
         for policy in self.policies.values():
             if policy.learned is not None:
                 chosen_model(policy.learned.run, policy.learned.model)
+        try:
+            SteeredPlant(load_vessel(self.vessel).build()).turning(self.rudder, self.turning_time)
+        except FitError as error:
+            raise ConfigError(f"vessel '{self.vessel}' cannot be steered: {error}") from error
 
     def recorded_seed(self) -> int:
         """Return the seed of weights, batches and random vessels."""

@@ -1,0 +1,84 @@
+"""Nomoto's K and T and the delay of a vessel's steering, identified from its logs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from residnet.control.heading.response import Record, SteeringResponse, fit_response
+from residnet.core.errors import DataError
+from residnet.core.log import Log
+
+_RUDDERS = ("cmd_delta", "delta")
+_SAMPLES = 50
+_LEAST = 1e-3
+"""Least spread of the rudder in rad, rms."""
+
+
+class IdentifiedSteering(NamedTuple):
+    """What logs say about a vessel's steering.
+
+    Attributes:
+        response: K, T, delay and how well they simulate the yaw rates.
+        speed: mean surge velocity in m/s; NaN where no log has it.
+    """
+
+    response: SteeringResponse
+    speed: float
+
+
+def identify_steering(
+    logs: Sequence[Log], rudder: str | None = None, longest_delay: float = 2.0
+) -> IdentifiedSteering:
+    """Return K, T and delay of the vessel that logs are of.
+
+    Args:
+        logs: with yaw rate `r` or heading `psi`, and the rudder; turns to both sides tell most.
+        rudder: channel of the rudder angle; by default the command where a log has it, since the
+            delay of the steering gear counts, otherwise the measured angle.
+        longest_delay: that is searched for, in s.
+
+    Raises:
+        DataError: where a log lacks the channels, or the rudder hardly moves.
+        FitError: where no response to the rudder is found.
+    """
+    if not logs:
+        raise DataError("steering: no logs given")
+    records = [_record(log, rudder) for log in logs]
+    spread = max(float(np.std(record.rudder)) for record in records)
+    if spread < _LEAST:
+        raise DataError(
+            f"steering: the rudder of the logs moves by {spread:.2g} rad (rms); K and T need turns,"
+            " such as a zigzag"
+        )
+    speeds = [log["u"][log.usable] for log in logs if "u" in log.channels]
+    speed = float(np.nanmean(np.concatenate(speeds))) if speeds else float("nan")
+    return IdentifiedSteering(fit_response(records, longest_delay), speed)
+
+
+def _record(log: Log, rudder: str | None) -> Record:
+    """Return a log on a uniform grid at its median step."""
+    names = _RUDDERS if rudder is None else (rudder,)
+    name = next((name for name in names if name in log.channels), None)
+    source = next((name for name in ("r", "psi") if name in log.channels), None)
+    if name is None or source is None:
+        raise DataError(
+            f"log {log.name}: K and T need the rudder ({' or '.join(names)}) and the yaw rate r or"
+            f" the heading psi; it has {', '.join(log.channels)}"
+        )
+    usable = log.usable & np.isfinite(log[source]) & np.isfinite(log[name])
+    if int(usable.sum()) < _SAMPLES:
+        raise DataError(
+            f"log {log.name}: {int(usable.sum())} usable samples, {_SAMPLES} are needed"
+        )
+    dt = float(np.median(np.diff(log.t)))
+    grid = np.arange(log.t[0], log.t[-1] + 0.5 * dt, dt)
+    good = log.t[usable]
+    values = np.interp(grid, good, log[source][usable])
+    rate = values if source == "r" else np.gradient(values, dt)
+    # a command stands until the next
+    held = np.clip(np.searchsorted(good, grid + 1e-9 * dt, side="right") - 1, 0, None)
+    near = np.clip(np.searchsorted(log.t, grid - 0.5 * dt), 0, len(log.t) - 1)
+    return Record(dt, log[name][usable][held], rate, usable[near])

@@ -1,0 +1,55 @@
+"""K, T and delay from logs of Nomoto's equation that the test integrates itself."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from residnet.core.errors import DataError, FitError
+from residnet.core.log import Log
+from residnet.identification.steering import identify_steering
+
+
+def sailed(gain: float, time: float, delay: float, bias: float, noise: float, seed: int) -> Log:
+    """A zigzag of T r_dot + r = K (delta(t - delay) + bias), by Euler's rule in small steps."""
+    dt, fine, rng = 0.5, 50, np.random.default_rng(seed)
+    rate, heading, side = 0.01, 0.0, 1.0
+    commands, rates, held = [], [], [0.0] * max(round(delay / dt * fine), 1)
+    for _ in range(800):
+        if side * heading > math.radians(20):
+            side = -side
+        commands.append(side * math.radians(10))
+        rates.append(rate)
+        for _ in range(fine):
+            held.append(commands[-1])
+            rudder = held[-1 - round(delay / dt * fine)]
+            rate += dt / fine * (gain * (rudder + bias) - rate) / time
+            heading += dt / fine * rate
+    values = np.array(rates) + noise * rng.normal(size=len(rates))
+    channels = {"r": values, "cmd_delta": np.array(commands), "u": np.full(len(rates), 7.0)}
+    return Log(f"log{seed}", dt * np.arange(len(rates)), channels)
+
+
+def test_gain_time_constant_delay_and_bias_are_found() -> None:
+    logs = [sailed(0.12, 18.0, 1.5, 0.01, 2e-4, seed) for seed in (0, 1)]
+    found, speed = identify_steering(logs, longest_delay=5.0)
+    assert found.gain == pytest.approx(0.12, rel=0.02)
+    assert found.time == pytest.approx(18.0, rel=0.03)
+    assert found.delay == pytest.approx(1.5, abs=0.3)
+    assert found.bias == pytest.approx(0.01, abs=1e-3)
+    assert found.rms == pytest.approx(2e-4, rel=0.2)
+    assert speed == pytest.approx(7.0)
+
+
+def test_what_is_no_response_to_the_rudder_is_refused() -> None:
+    log = sailed(0.12, 18.0, 0.0, 0.0, 0.0, 0)
+    turned = {**log.channels, "cmd_delta": -log["cmd_delta"]}
+    with pytest.raises(FitError, match="sign"):
+        identify_steering([log.replace(channels=turned)])
+    still = {**log.channels, "cmd_delta": np.zeros(len(log))}
+    with pytest.raises(DataError, match="zigzag"):
+        identify_steering([log.replace(channels=still)])
+    with pytest.raises(DataError, match="yaw rate"):
+        identify_steering([log.replace(channels={"u": log["u"]})])
