@@ -2,9 +2,10 @@
 
     python scripts/bench/export.py [--models plsr mlp lstm] [--no-aoti] [--no-cpp]
 
-Prints one table: CPU time of a step, its share of the eager step, and the first call in steady
-steps. C is timed in a C loop, TorchScript in Python and in C++ (with the executor settings that
-stand in its card).
+Prints one table: CPU time of a step, its share of the eager step of the model alone, and the first
+call in steady steps. All formats check their inputs besides, which the model alone does not. C is
+timed in a C loop, TorchScript in Python and in C++ (with the executor settings that stand in its
+card).
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from residnet.export import contract, exporter  # noqa: E402
 from residnet.export.aoti import AotiModel  # noqa: E402
 from residnet.export.c.compiled import compiler  # noqa: E402
 from residnet.export.casadi_function import CasadiModel  # noqa: E402
+from residnet.export.guard import GuardedDynamics  # noqa: E402
 from residnet.export.onnx_file import OnnxModel  # noqa: E402
 
 SIZES = {"mlp": {"hidden": (64, 64)}, "lstm": {"hidden_size": 64}}
@@ -110,10 +112,14 @@ def rows(
     out = []
     with torch.inference_mode():
         out.append(("eager", *timed(lambda: model.step(x, w, s))))
-        torch._C._jit_set_profiling_executor(False)
-        torch._C._set_graph_executor_optimize(False)
+        guarded = GuardedDynamics(model, spec).eval()
+        out.append(("eager, checked inputs", *timed(lambda: guarded.flagged_step(x, w, s))))
         scripted = torch.jit.load(str(files["torchscript"]))
-        out.append(("torchscript, Python", *timed(lambda: scripted.step(x, w, s))))
+        for on in (False, True):
+            torch._C._jit_set_profiling_executor(on)
+            torch._C._set_graph_executor_optimize(on)
+            if not on:
+                out.append(("torchscript, Python", *timed(lambda: scripted.step(x, w, s))))
         if cpp is not None:
             program = [str(cpp), str(files["torchscript"]), "4", "400"]
             out.append(("torchscript, C++", *printed(program)))
@@ -141,7 +147,7 @@ def main() -> None:
     contract.PARITY_STEPS = 50
     with tempfile.TemporaryDirectory() as name:
         cpp = None if given.no_cpp else cpp_program(Path(name))
-        print(f"{'model':8}{'format':22}{'step us':>10}{'of eager':>10}{'first call':>14}")
+        print(f"{'model':8}{'format':24}{'step us':>10}{'of eager':>10}{'first call':>14}")
         for variant in given.models:
             folder = Path(name) / variant
             folder.mkdir()
@@ -149,7 +155,7 @@ def main() -> None:
             eager = measured[0][2]
             for kind, first, step in measured:
                 print(
-                    f"{variant:8}{kind:22}{step:10.2f}{step / eager:10.4f}"
+                    f"{variant:8}{kind:24}{step:10.2f}{step / eager:10.4f}"
                     f"{first / step:8.0f} steps",
                     flush=True,
                 )

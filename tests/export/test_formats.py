@@ -18,9 +18,13 @@ import pytest
 import torch
 from exported_models import VARIANTS, AsTensors, built
 
+from residnet.control.heading.policy import HeadingPolicy
+from residnet.control.heading.turning import Turning
 from residnet.core.errors import ExportError
 from residnet.export import contract, exporter
+from residnet.export.autopilot import MEASURED
 from residnet.export.c.compiled import STRICT, CompiledModel, compile_shared, compiler
+from residnet.export.c.policy import export_autopilot_as_c
 from residnet.export.casadi_function import CasadiModel
 from residnet.export.lowering.build import lowered
 from residnet.export.onnx_file import OnnxModel
@@ -133,3 +137,14 @@ def test_a_weight_that_is_not_finite_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ExportError, match=r"model mine: head.net.0.weight holds nan"):
         exporter("c").export(spec, model, tmp_path / "boat.c", [])
     assert not list(tmp_path.iterdir())
+
+
+def test_a_policy_is_written_as_c(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    turning = Turning(0.2, 3.9, 3.2)
+    policy = HeadingPolicy(MEASURED, turning=turning, limit=0.35, dt=0.02, rate=0.2, hidden=(8,))
+    card = {"dt": 0.02, "parity": {"steps": 1000}}
+    export_autopilot_as_c("pilot", policy, tmp_path / "pilot.c", safe="hold", card=card)
+    stored = json.loads((tmp_path / "pilot.card.json").read_text())
+    assert stored["parity"]["share_of_limit"] <= 1e-4
+    assert "int pilot_step(const pilot_real *y" in (tmp_path / "pilot.h").read_text()

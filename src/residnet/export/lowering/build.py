@@ -273,6 +273,10 @@ class _Builder:
         out = given if min is None else self.map("maximum", example, given, min)
         return out if max is None else self.map("minimum", example, out, max)
 
+    def do_copy(self, example: Tensor, given: Value, source: Value, *_: Any) -> Value:
+        cells = self.cells(self.cast(source, source.example.to(example.dtype)))
+        return Value(example, cells.expand(example.shape))
+
     def do_mm(self, example: Tensor, a: Value, b: Value) -> Value:
         return self.products(example, self.cells(a), self.cells(b), None)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -46,21 +47,40 @@ class AutopilotConfig(AutopilotSettings):
     def export_model(self, run: RunFolder, model: str, out: Path | None, file_format: str) -> Path:
         """Return the file of a policy, which was exported and checked when the run ended.
 
+        As C it is written from the stored policy now.
+
         Raises:
             UsageError: where there is no such policy, or another format is given.
         """
         policies = {**self.policies, **self.recurrent}
         if model not in policies:
             raise UsageError(f"{run.path}: no policy '{model}'{nearest(model, policies)}")
-        if file_format != "torchscript":
+        if file_format not in ("torchscript", "c"):
             raise UsageError(
-                f"{run.path}: policies are exported as torchscript, not as {file_format}"
+                f"{run.path}: policies are exported as torchscript or c, not as {file_format}"
             )
         file = run.exports / f"{model}.pt"
         if not file.is_file():
             raise UsageError(f"{file}: no such file; the run writes it at its end")
+        if file_format == "c":
+            return self._export_as_c(run, model, file, out or file.with_suffix(".c"))
         if out is None:
             return file
         out.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(file, out)
         return out
+
+    def _export_as_c(self, run: RunFolder, model: str, scripted: Path, file: Path) -> Path:
+        """Write a policy as C, at the step and with the card of its TorchScript file."""
+        import torch
+
+        from residnet.control.heading.stored import load_heading_policy
+        from residnet.export.c.policy import export_autopilot_as_c
+
+        extra = {"card.json": ""}
+        torch.jit.load(str(scripted), _extra_files=extra)
+        card = json.loads(extra["card.json"])
+        policy = load_heading_policy(run.models / model)
+        policy.dt = card["dt"]
+        export_autopilot_as_c(model, policy, file, safe=self.safe, card=card)
+        return file
