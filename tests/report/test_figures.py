@@ -152,3 +152,15 @@ def test_a_folder_with_metrics_alone_gives_the_bars_alone(tmp_path: Path) -> Non
 def test_a_folder_without_metrics_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"no metrics\.json"):
         write_figures(RunFiles(tmp_path))
+
+
+def test_damaged_pictures_are_passed_over(tmp_path: Path) -> None:
+    """A report draws them again; nothing of them is needed."""
+    whole, folder = tmp_path / "whole.png", tmp_path / "figures"
+    Image.new("RGB", (40, 30)).save(whole)
+    folder.mkdir()
+    for cut in (0, 4, 20, 40, 60):
+        (folder / f"cut_{cut}.png").write_bytes(whole.read_bytes()[:cut])
+    (folder / "folder.png").mkdir()
+    (folder / "foreign.png").write_text("no picture")
+    assert read_figures(folder) == []

@@ -16,7 +16,9 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+import yaml
 from tiny import call
+from tiny_tasks import measured
 
 
 def rows(run: Path) -> list[dict[str, Any]]:
@@ -143,6 +145,20 @@ def test_models_read_back_give_the_same_rows(
     shutil.copy(tiny_run / "resolved.yaml", out)
     assert call(monkeypatch, "run", tiny_config, "--out", out, "--resume") == 0
     assert rows(out) == rows(tiny_run)
+
+
+@pytest.mark.whole_runs
+def test_evaluate_on_the_training_logs_gives_the_numbers_of_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = tmp_path / "config.yaml"
+    config.write_text(yaml.safe_dump(measured(tmp_path), sort_keys=False))
+    assert call(monkeypatch, "run", config, "--out", tmp_path / "run") == 0
+    logs = [word for i in range(4) for word in ("--logs", tmp_path / "logs" / f"log_{i}.csv")]
+    out = tmp_path / "again"
+    assert call(monkeypatch, "evaluate", tmp_path / "run", *logs, "--out", out) == 0
+    own = [row for row in rows(tmp_path / "run") if row["split"] == "train"]
+    assert rows(out) == [row | {"split": "external"} for row in own]
 
 
 def test_resume_needs_the_same_configuration(

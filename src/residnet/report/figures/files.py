@@ -57,14 +57,18 @@ def write_drawings(folder: Path, drawings: Iterable[Drawing]) -> list[Figure]:
 def read_figures(folder: Path) -> list[Figure]:
     """Return the figures of a folder with their captions, in the order of their names.
 
-    Pictures without a caption were not written by residnet and are left out.
+    Pictures without a caption were not written by residnet and are left out, as damaged ones are.
     """
     from PIL import Image
 
     out: list[Figure] = []
     for path in sorted(folder.glob("*.png")):
-        with Image.open(path) as picture:
-            words = dict(picture.info)
+        try:
+            with Image.open(path) as picture:
+                words = dict(picture.info)
+        except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
+            # damaged: it is drawn again, or is not one of residnet
+            continue
         if "Title" in words and "Description" in words:
             out.append(Figure(path, str(words["Title"]), str(words["Description"])))
     return out
