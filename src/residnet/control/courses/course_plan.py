@@ -124,7 +124,7 @@ def plan(
                 if found:
                     break
         for fit, fitted in sorted(found, key=lambda one: one[1].time):
-            if make is not None:
+            if make is not None and not request.turns.settled:
                 fit, fitted = _joined(request, fit, fitted, make)
             if _right(request, fit, fitted, step, reasons):
                 return _sampled(fit.route, fitted.z, step, beyond)

@@ -162,6 +162,7 @@ class Route:
     def least(self) -> Array:
         """Return the smallest z."""
         least = np.zeros(len(self.units))
+        least[0] = -np.inf
         least[2::2] = [self.turns.tables[number].holds[0] for number in self.numbers]
         result: Array = least / self.units
         return result

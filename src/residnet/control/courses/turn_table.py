@@ -22,6 +22,8 @@ POINTS = 28
 _MOST = math.radians(500.0)
 """The largest angle of a turn in a table."""
 _HOLDS = 56
+_NOTHING = 2e-3
+"""Below it what a turn leaves does not count: shares of speed and radius, and rad."""
 _SETTLED = 4.0
 """Time constants after which the vessel runs straight behind a turn."""
 
@@ -103,11 +105,19 @@ class TurnTable:
 
 @dataclass(frozen=True)
 class Turns:
-    """The tables of a vessel by rudder angle, its speed, and its smallest radius in m."""
+    """The tables of a vessel by rudder angle.
+
+    Attributes:
+        tables: of turns, that of the largest rudder angle first.
+        speed: on straight legs, in m/s.
+        radius: the smallest of a turn, in m.
+        settled: whether turns leave no motion that the turns behind them begin with.
+    """
 
     tables: tuple[TurnTable, ...]
     speed: float
     radius: float
+    settled: bool = True
 
 
 def arcs(radii: Array, speed: float) -> Turns:
@@ -143,13 +153,16 @@ def simulated_turns(make: TurnMaker, rudder: Array, radius: float) -> Turns:
     tail = _SETTLED * turning.time
     made = make(holds[:, 1:], rudder, [make.straight] * len(rudder), tail)
     share = np.linspace(0.0, 1.0, POINTS + 1)[1:]
-    tables = []
+    tables, left = [], 0.0
     for angle, held, group in zip(rudder, holds, made, strict=True):
         points, headings, times = _sampled(group)
         for k, turn in enumerate(group):
             track, course = turn.along(np.linspace(0.0, tail, 60))
             moved = float(np.hypot(*np.diff(track, axis=0).T).sum())
             end = complex(*track[-1]) - moved * np.exp(1j * course[-1])
+            slower = abs(moved / (turning.speed * tail) - 1.0)
+            aside = abs(end - points[k, -1]) / radius
+            left = max(left, slower, aside, abs(float(course[-1]) - headings[k, -1]))
             points[k] += share**3 * (end - points[k, -1])
             headings[k] += share**3 * (course[-1] - headings[k, -1])
         none = np.zeros((1, POINTS))
@@ -162,7 +175,7 @@ def simulated_turns(make: TurnMaker, rudder: Array, radius: float) -> Turns:
                 float(angle),
             )
         )
-    return Turns(tuple(tables), turning.speed, radius)
+    return Turns(tuple(tables), turning.speed, radius, left < _NOTHING)
 
 
 def following_turns(
