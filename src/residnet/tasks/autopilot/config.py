@@ -11,14 +11,11 @@ from pydantic import Field, model_validator
 from residnet.control.conditions.config import ConditionsConfig
 from residnet.control.conditions.evolution import EvolutionConfig
 from residnet.control.heading.controllers import BangBangConfig
-from residnet.control.heading.steering import SteeredPlant
 from residnet.control.observed.config import AnyController, ObservedConfig
 from residnet.core.config import Config, MetresPerSecond, Radians, Seconds
-from residnet.core.errors import ConfigError, FitError
 from residnet.core.names import nearest
 from residnet.data.simulated.environment import Disturbance, WindField
 from residnet.documents.gouletas2020.config import PredictiveConfig
-from residnet.dynamics.learned import chosen_model
 from residnet.physics.environment.waves import WavesConfig
 from residnet.physics.vessel import VesselName, load_vessel
 from residnet.runs.task import ComputingTask
@@ -240,19 +237,14 @@ class AutopilotSettings(ComputingTask):
         return self
 
     def check(self) -> None:
-        """Check that the vessel answers its rudder, and that the runs of learned models are there.
+        """Check that the vessel and the learned models of it are there and turn steadily.
 
         Raises:
-            UsageError: where a run is not there.
-            ConfigError: where no policy can steer the vessel.
+            ResidnetError: where one is missing, does not fit, or does not hold its turn.
         """
-        for policy in self.policies.values():
-            if policy.learned is not None:
-                chosen_model(policy.learned.run, policy.learned.model)
-        try:
-            SteeredPlant(load_vessel(self.vessel).build()).turning(self.rudder, self.turning_time)
-        except FitError as error:
-            raise ConfigError(f"vessel '{self.vessel}' cannot be steered: {error}") from error
+        from residnet.tasks.autopilot.requirements import check_vessels
+
+        check_vessels(self)
 
     def recorded_seed(self) -> int:
         """Return the seed of weights, batches and random vessels."""

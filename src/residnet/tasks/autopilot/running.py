@@ -14,16 +14,13 @@ from residnet.control.base import Policy
 from residnet.control.heading.controllers import Steering, TunedConfig
 from residnet.control.heading.keeper import HeadingKeeper
 from residnet.control.heading.policy import HeadingPolicy
-from residnet.control.heading.steered_model import SteeredModel
 from residnet.control.heading.steering import SteeredPlant
 from residnet.control.heading.stored import HeadingPolicySpec
 from residnet.control.heading.tuning import TuningTask, tune
 from residnet.control.observed.config import AnyController, ObservedConfig
-from residnet.core.errors import ConfigError
 from residnet.core.progress import say
 from residnet.documents.gouletas2020.autopilot import predictive
-from residnet.dynamics.learned import chosen_model
-from residnet.dynamics.store import load_model, rebuilt
+from residnet.dynamics.store import rebuilt
 from residnet.export.autopilot import export_autopilot
 from residnet.judge.autopilots import QUANTITIES
 from residnet.judge.metrics import SCHEMA
@@ -40,6 +37,7 @@ from residnet.runs.model_store import FolderStore
 from residnet.runs.task import MainFigure, Outcome
 from residnet.tasks.autopilot.comparison import compare
 from residnet.tasks.autopilot.config import AutopilotSettings, PolicyConfig
+from residnet.tasks.autopilot.requirements import learned_vessel
 from residnet.tasks.autopilot.scores import CommandDifference, SettlingScore
 from residnet.tasks.autopilot.under_conditions import (
     companions,
@@ -252,19 +250,12 @@ def _school(
             if config.spread.weather
             else steering
         )
-    if config.spread.weather:
-        raise ConfigError(
-            f"policies.{name}.learned: a learned model feels no wind or current; leave them out of"
-            " spread"
-        )
-    chosen = chosen_model(wanted.learned.run, wanted.learned.model)
-    spec, model = load_model(wanted.learned.run / "models" / chosen)
     assert isinstance(steering.vessel, SteeredPlant)
-    vessel = SteeredModel(model, spec.signals.columns, spec.hold, steering.vessel)
+    vessel = learned_vessel(name, wanted, steering.vessel, config)
     turning = vessel.turning(config.rudder, config.turning_time, wanted.training.dt)
     say(
-        f"  {name} learns on {wanted.learned.run}/models/{chosen}: K = {turning.gain:.4g} 1/s, T ="
-        f" {turning.time:.4g} s"
+        f"  {name} learns on {wanted.learned.model} of {wanted.learned.run}: K ="
+        f" {turning.gain:.4g} 1/s, T = {turning.time:.4g} s"
     )
     return steering._replace(vessel=vessel, turning=turning)
 

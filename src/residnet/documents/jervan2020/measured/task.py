@@ -25,12 +25,16 @@ class ForceResidualConfig(ForceSettings):
     task: Literal["force_residual"]
 
     def check(self) -> None:
-        """Check that the logs are there.
+        """Check that the logs can be read and hold the folds and segments that are asked for.
 
         Raises:
-            ConfigError: where they are not.
+            ResidnetError: where they do not.
         """
-        self.data.files()
+        from residnet.documents.jervan2020.measured.data import read_measured
+
+        measured = read_measured(self)
+        for part in measured.part.unique().tolist():
+            measured.split(part, self.validation.gap)
 
     def input_files(self) -> Sequence[Path]:
         """Return the paths of the logs."""
