@@ -235,7 +235,8 @@ def mutated_folder(run: Path, foreign: Sequence[Path], rng: random.Random) -> st
     name = path.relative_to(run)
     how = rng.choice(["bytes", "bytes", "edit", "edit", "edit", "gone", "swap", "other"])
     if how == "edit" and path.suffix in (".json", ".yaml"):
-        content = yaml.safe_load(path.read_text())
+        text = path.read_text()
+        content = json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)
         told = edited(content, rng)
         if path.suffix == ".json":
             path.write_text(json.dumps(content))

@@ -33,7 +33,7 @@ def complaint(work: Callable[[Path], object], path: Path) -> str:
 def test_mutated_configs_are_valid_or_one_line(name: str, tmp_path: Path) -> None:
     config, draw = TINY_TASKS[name](tmp_path), random.Random(name)
     file = tmp_path / "config.yaml"
-    for number in range(50):
+    for number in range(10):
         data, told = mutated_config(config, draw)
         file.write_bytes(data)
         line = complaint(load_task, file)
@@ -44,25 +44,20 @@ def test_mutated_configs_are_valid_or_one_line(name: str, tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("name", ["actuators", "imported"])
-def test_mutated_configs_run_or_end_in_one_line(
-    name: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_mutated_configs_run_or_end_in_one_line(name: str, tmp_path: Path) -> None:
     config, draw = TINY_TASKS[name](tmp_path), random.Random(name)
-    file, ends = tmp_path / "config.yaml", set()
+    file, done = tmp_path / "config.yaml", 0
     for number in range(25):
         data, told = mutated_config(config, draw)
         file.write_bytes(data)
-        code = call(monkeypatch, "run", file, "--out", tmp_path / "run", "--overwrite")
-        lines = [x for x in capsys.readouterr().err.splitlines() if x.startswith("residnet: ")]
-        assert code in (0, 1, 2), (number, told)
-        assert len(lines) == (code != 0), (number, told)
-        assert not list(tmp_path.glob("residnet-crash-*")), (number, told, lines)
-        ends.add(code)
-    assert {0, 2} <= ends
+        line = complaint(
+            lambda path: load_task(path).run(out=tmp_path / "run", overwrite=True, report=False),
+            file,
+        )
+        assert "\n" not in line, (number, told)
+        assert len(line) < 2000, (number, told)
+        done += not line
+    assert 0 < done < 25
 
 
 def test_damaged_run_folders_are_refused_in_one_line(tiny_run: Path, tmp_path: Path) -> None:
