@@ -20,10 +20,9 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "support"))
-sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from planted import FAULTS, SHIPS, Fault, Ship, clean
-from planted_channels import CHANNEL_FAULTS, HARMLESS, Undecidable
+from planted_channels import CHANNEL_FAULTS, HARMLESS, Undecidable, anywhere
 from random_vessels import KINDS, random_logs, ship_of
 
 from residnet.core.errors import ResidnetError
@@ -139,7 +138,11 @@ def main() -> None:
     names = list(dict.fromkeys(host.ship.name for host in hosts))
     table: dict[tuple[str, str], list[bool]] = {}
     checked, loud = 0, 0
-    faults = [f for f in (*FAULTS, *CHANNEL_FAULTS) if not given.faults or f.name in given.faults]
+    faults = [
+        f
+        for f in (*map(anywhere, FAULTS), *CHANNEL_FAULTS)
+        if not given.faults or f.name in given.faults
+    ]
     for number, host in enumerate(hosts):
         if not given.faults:
             for log, text in zip(host.logs, alarms(host), strict=True):

@@ -63,6 +63,12 @@ def _rudder_bias(ship: Ship, log: Log, random: np.random.Generator) -> Log:
 
 def _rudder_clipped(ship: Ship, log: Log, random: np.random.Generator) -> Log:
     limit = 0.6 * float(np.nanmax(np.abs(log["delta"])))
+    # cut at its only angle a record shows a smaller rudder, and no fault
+    hold = max(round(2.0 * ship.lag[0] / float(np.median(np.diff(log.t)))), 5)
+    rests = np.abs(log["delta"][hold:] - log["delta"][:-hold]) < 0.02 * limit
+    between = np.abs(log["delta"][hold:])
+    if float((rests & (between > 0.15 * limit) & (between < 0.95 * limit)).mean()) < 0.1:
+        raise Undecidable
     return _with(log, delta=np.clip(log["delta"], -limit, limit))
 
 
@@ -131,7 +137,10 @@ def _repeated_fix(ship: Ship, log: Log, random: np.random.Generator) -> Log:
 
 def _one_cell(size: str):
     def damage(ship: Ship, log: Log, random: np.random.Generator) -> Log:
-        names = [name for name in log.channels if float(np.ptp(log[name])) > 1e-6]
+        # a wind may come from anywhere at any moment
+        names = [
+            name for name in log.channels if float(np.ptp(log[name])) > 1e-6 and name != "wind_dir"
+        ]
         name = str(random.choice(names))
         values = log[name].copy()
         at = int(random.integers(20, len(log) - 20))
@@ -218,7 +227,10 @@ CHANNEL_FAULTS = (
     Fault("positions scaled", ("positions_scaled",), _one(_positions_scaled), _ALL),
     Fault("clock 9.5 % off", ("clock_rate", "gain"), _one(_clock), _ALL),
     Fault(
-        "rows repeat the fix", ("repeated_fix", "repeated_rows", "held"), _one(_repeated_fix), _ALL
+        "rows repeat the fix",
+        ("repeated_fix", "repeated_rows", "held", "frozen"),
+        _one(_repeated_fix),
+        _ALL,
     ),
     Fault("one spike", _ONE_VALUE, _one_cell("spike"), _ALL),
     Fault("fill value", _ONE_VALUE, _one_cell("fill"), _ALL),

@@ -63,7 +63,7 @@ def fills(values: np.ndarray) -> np.ndarray:
     low, high = float(rest.min()), float(rest.max())
     span = high - low
     far: np.ndarray = (values < low - span) | (values > high + span)
-    return candidate & far
+    return np.asarray(candidate & far)
 
 
 def without_fills(values: np.ndarray) -> np.ndarray:

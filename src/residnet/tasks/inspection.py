@@ -23,6 +23,7 @@ from residnet.data.doctor import (
     inspection,
     summary,
 )
+from residnet.data.doctor.dates import date_findings
 from residnet.data.doctor.draft import draft_map
 from residnet.data.doctor.excitation import conditioning
 from residnet.data.masks import Mask
@@ -100,7 +101,7 @@ def inspect_logs(paths: Sequence[Path], config: Path | None) -> Inspection:
         progress.report("inspecting logs", number, len(files))
         try:
             log, draft = _read(path, setup)
-            report = inspect(log, setup.inputs, setup.masks)
+            report = inspect(log, setup.inputs, setup.masks).joined(date_findings(log, path))
         except DataError as error:
             if len(files) == 1:
                 raise

@@ -97,6 +97,10 @@ class Report:
         """Whether a fit to this log would be misled: any finding is above a note."""
         return any(finding.level != "note" for finding in self.findings)
 
+    def joined(self, further: Sequence[Finding]) -> Report:
+        """Return the report with further findings."""
+        return dataclasses.replace(self, findings=(*self.findings, *further))
+
     def find(self, code: str) -> tuple[Finding, ...]:
         """Return the findings of one code."""
         return tuple(finding for finding in self.findings if finding.code == code)

@@ -22,6 +22,9 @@ def write_inspection(
     ]
     split_of = {log.name: split for split, members in splits.items() for log in members}
     together = inspect_together(logs, config.signals.columns, split_of)
+    for report in reports:
+        for finding in report.find("fill_values"):
+            say(f"  {report.name}: {finding.text}")
     content = inspection(reports, together)
     folder.write_json(folder.path / "doctor.json", content)
     if content["misled"]:

@@ -25,6 +25,8 @@ _AT_END = 0.03
 _HARDER = 1.3
 _SURE_AT_END = 4.5
 _VISITS = 3
+_UNEXPLAINED = 4.5
+_MANY_VISITS = 8
 
 
 @dataclass(frozen=True)
@@ -95,31 +97,83 @@ def _yaw_fit(
 
 def _cut_off(log: Log, name: str) -> Iterator[Finding]:
     """Return a rudder at whose recorded limit the vessel turns harder than the angle explains."""
+    if "u" not in log.channels or "r" not in log.channels:
+        return
     values = log[name]
     size = float(np.nanmax(np.abs(values)))
     at_end = np.abs(values) > 0.999 * size
     # a turning circle goes there once, and all of it lies there
     if not _AT_END < float(at_end.mean()) < 1.0 - _AT_END or stretches(at_end)[0].size < _VISITS:
         return
-    found = _yaw_fit(log, name, [np.sign(values) * at_end])
-    if found is None:
-        return
-    coefficients, spread = found
-    effect, beyond = float(coefficients[1]) * size, float(coefficients[2])
-    sure = beyond / max(float(np.sqrt(spread[2, 2])), 1e-300) * np.sign(effect)
-    if beyond / effect > _HARDER - 1.0 and sure > _SURE_AT_END:
+    beyond = max(_harder(log, name, at_end), _unexplained(log, name, at_end))
+    if beyond > 0.0:
         text = (
-            f"at {math.degrees(size):.1f} deg of {name} the vessel turns"
-            f" {100.0 * beyond / effect:.0f} % harder than smaller angles explain: its record is"
-            " cut off there"
+            f"at {math.degrees(size):.1f} deg of {name} the vessel turns harder than smaller angles"
+            f" explain ({beyond:.1f} times what they leave open): its record is cut off there"
         )
         yield Finding(
             "will mislead",
             "rudder_clipped",
             text,
-            {"limit": size, "harder": beyond / effect, "t": float(sure)},
+            {"limit": size, "harder": beyond},
             "log with a wider range, or leave these parts out",
         )
+
+
+def _harder(log: Log, name: str, at_end: np.ndarray) -> float:
+    """Return the rudder effect beyond the recorded limit in standard errors; 0 where it is small.
+
+    The ramps of a zigzag tell the effect of smaller angles.
+    """
+    found = _yaw_fit(log, name, [np.sign(log[name]) * at_end])
+    if found is None:
+        return 0.0
+    coefficients, spread = found
+    effect = float(coefficients[1]) * float(np.nanmax(np.abs(log[name])))
+    beyond = float(coefficients[2])
+    sure = abs(beyond) / max(float(np.sqrt(spread[2, 2])), 1e-300)
+    return sure if beyond / effect > _HARDER - 1.0 and sure > _SURE_AT_END else 0.0
+
+
+def _unexplained(log: Log, name: str, at_end: np.ndarray) -> float:
+    """Return how much harder the vessel turns at the limit, over what a fit elsewhere leaves.
+
+    The fit is one to all that lies off the limit, so it must hold rests at smaller angles; 0 where
+    it does not, or explains what happens at the limit.
+    """
+    first, size = blocks_of(log, ("r",))
+    u, r, values = log["u"], log["r"], log[name]
+    v = log["v"] if "v" in log.channels else np.zeros(len(log))
+    flows = [u * np.abs(u)] + [log[n] * np.abs(log[n]) for n in ("n",) if n in log.channels]
+    columns = [*flows, *(flow * values for flow in flows)]
+    columns += [np.abs(u) * r, r * np.abs(r), np.abs(u) * v, v * np.abs(v)]
+    x = integrals(np.stack(columns, axis=-1), log.t, first, size)
+    y = r[first + size] - r[first]
+    count = np.append(0, np.cumsum(at_end))
+    ends = count[first + size + 1] - count[first]
+    known = np.isfinite(x).all(axis=1) & np.isfinite(y)
+    inside, outside = known & (ends == size + 1), known & (ends == 0)
+    moved = np.abs(values[first + size] - values[first]) + np.abs(
+        values[first + size // 2] - values[first]
+    )
+    most = float(np.nanmax(np.abs(values)))
+    resting = outside & (moved < 0.05 * most) & (np.abs(values[first]) > 0.15 * most)
+    few = stretches(at_end)[0].size < _MANY_VISITS
+    if few or inside.sum() < 10 or resting.sum() < 20:
+        return 0.0
+    scale = np.maximum(np.sqrt(np.mean(x[outside] ** 2, axis=0)), 1e-300)
+    fitted = np.linalg.lstsq(x[outside] / scale, y[outside], rcond=1e-8)[0] / scale
+    usual = float(np.sqrt(np.mean((y - x @ fitted)[outside] ** 2)))
+    side = np.sign(values[first[inside]]) * np.sign(_effect(fitted, flows))
+    harder = float(np.mean((y - x @ fitted)[inside] * side)) / max(usual, 1e-300)
+    return harder if harder > _UNEXPLAINED else 0.0
+
+
+def _effect(fitted: np.ndarray, flows: list[np.ndarray]) -> float:
+    """Return the mean effect of the rudder in a fit whose first columns are flows, then rudder."""
+    count = len(flows)
+    parts = zip(fitted[count : 2 * count], flows, strict=True)
+    return float(sum(value * np.nanmean(flow) for value, flow in parts))
 
 
 def rudder_findings(log: Log, inputs: Sequence[str]) -> Iterator[Finding]:

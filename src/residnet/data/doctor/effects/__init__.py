@@ -73,9 +73,10 @@ class Effects:
         `learned` says whether a fit sees the channels concerned, and not dead reckoning alone.
         """
         others = [np.roll(at, shift) for shift in self._shifts(at)]
-        place = _beyond(self._astray, reckoning_error(self._log, at))
+        astray = _beyond(self._astray, reckoning_error(self._log, at))
         by_chance = [_beyond(self._astray, reckoning_error(self._log, one)) for one in others]
-        place = _counted(_beyond(place, _size(by_chance)))
+        chance = np.sqrt(np.mean(np.square(by_chance), axis=0))
+        place = _counted(_beyond(astray, chance))
         if not learned:
             return place
         rows = self._rows.apart_from(at)
@@ -83,8 +84,8 @@ class Effects:
             return None if place < LEAST_EFFECT else place
         change, left = self._without(at)
         usual = [self._without(one) for one in others]
-        chance = np.mean([moved**2 for moved, _ in usual], axis=0)
-        change = np.sqrt(np.maximum(change**2 - chance, 0.0))
+        by_data = np.mean([moved**2 for moved, _ in usual], axis=0)
+        change = np.sqrt(np.maximum(change**2 - by_data, 0.0))
         contained = self._contained(left, np.min([part for _, part in usual], axis=0))
         return max(_harm(change, self._rows, self._fit), contained, place)
 
@@ -141,10 +142,11 @@ def _size(values: Iterable[float] | np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(np.asarray(list(values))))))
 
 
-def _beyond(value: float, usual: float) -> float:
-    return float(np.sqrt(max(value**2 - usual**2, 0.0)))
+def _beyond(value: np.ndarray, usual: np.ndarray) -> np.ndarray:
+    return np.asarray(np.sqrt(np.maximum(value**2 - usual**2, 0.0)))
 
 
-def _counted(place: float) -> float:
-    """Return a change of dead reckoning, 0 where it is within what receivers do."""
-    return place if place >= _LEAST_PLACE else 0.0
+def _counted(place: np.ndarray) -> float:
+    """Return the larger change of dead reckoning [2], 0 where it is within what receivers do."""
+    largest = float(place.max())
+    return largest if largest >= _LEAST_PLACE else 0.0

@@ -73,7 +73,7 @@ class OneStep:
         count = max(int(rows.sum()), 1)
         gram, moments = x.T @ x / count, x.T @ y / count
         coefficients: np.ndarray = np.linalg.solve(gram + _RIDGE * np.eye(x.shape[1]), moments)
-        return coefficients / size[:, None]
+        return np.asarray(coefficients / size[:, None])
 
     def residual(self, fitted: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
         """Return what a fit leaves of each velocity's changes [n], root mean square."""
@@ -91,7 +91,7 @@ class OneStep:
     @property
     def spread(self) -> np.ndarray:
         """Standard deviation of the changes of each velocity [n]."""
-        return np.maximum(self.change.std(axis=0), 1e-12)
+        return np.asarray(np.maximum(self.change.std(axis=0), 1e-12))
 
 
 def blocks_of(log: Log, moving: Sequence[str]) -> tuple[np.ndarray, int]:
@@ -126,7 +126,7 @@ def integrals(table: np.ndarray, t: np.ndarray, first: np.ndarray, size: int) ->
     area = 0.5 * np.diff(t)[:, None] * (filled[1:] + filled[:-1])
     total = np.concatenate((np.zeros((1, table.shape[1])), np.cumsum(area, axis=0)))
     count = np.append(0, np.cumsum(bad))
-    out = total[first + size] - total[first]
+    out: np.ndarray = np.asarray(total[first + size] - total[first])
     out[count[first + size + 1] > count[first]] = np.nan
     return out
 

@@ -10,8 +10,10 @@ from residnet.core.log import Log
 _WINDOW = 60.0
 
 
-def reckoning_error(log: Log, without: np.ndarray | None = None) -> float:
-    """Return the error of dead reckoning over windows of a minute, as a share of the way sailed.
+def reckoning_error(log: Log, without: np.ndarray | None = None) -> np.ndarray:
+    """Return the errors [2] of dead reckoning over a minute in place and heading, as shares.
+
+    They are shares of the way sailed.
 
     An error of the heading counts with the share by which it displaces the end of a straight way.
 
@@ -23,15 +25,15 @@ def reckoning_error(log: Log, without: np.ndarray | None = None) -> float:
     step = float(np.median(np.diff(log.t)))
     size = min(round(_WINDOW / step), len(log) // 3)
     if size < 2:
-        return 0.0
+        return np.zeros(2)
     bad = np.zeros(len(log), dtype=bool) if without is None else without
     count = np.append(0, np.cumsum(bad))
     first = np.flatnonzero(count[size + 1 :] == count[: -size - 1])
     if first.size < 0.2 * (len(log) - size):
         first = np.flatnonzero(~bad[:-size] & ~bad[size:])
     if not first.size:
-        return 0.0
-    return max(_place(log, first, size), _heading(log, first, size))
+        return np.zeros(2)
+    return np.array([_place(log, first, size), _heading(log, first, size)])
 
 
 def _place(log: Log, first: np.ndarray, size: int) -> float:
@@ -62,15 +64,15 @@ def _bridged(values: np.ndarray, t: np.ndarray) -> np.ndarray:
     """Return the values [T] with straight lines where some are missing."""
     known = np.isfinite(values)
     if known.all() or not known.any():
-        return np.nan_to_num(values)
+        return np.asarray(np.nan_to_num(values))
     filled: np.ndarray = np.interp(t, t[known], values[known])
     return filled
 
 
 def _change(values: np.ndarray, first: np.ndarray, size: int) -> np.ndarray:
-    change: np.ndarray = values[first + size] - values[first]
-    return change
+    return np.asarray(values[first + size] - values[first])
 
 
 def _integral(rate: np.ndarray, t: np.ndarray) -> np.ndarray:
-    return np.append(0.0, np.cumsum(0.5 * np.diff(t) * (rate[1:] + rate[:-1])))
+    area: np.ndarray = np.cumsum(0.5 * np.diff(t) * (rate[1:] + rate[:-1]))
+    return np.append(0.0, area)

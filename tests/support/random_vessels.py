@@ -7,14 +7,9 @@ the parameters of a shipped vessel.
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "support"))
-
 from planted import Ship
 
 from residnet.core.log import Log
