@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import foreign_tables
 import numpy as np
 import pytest
+import written_logs
+import written_recorders
 import yaml
 from foreign_tables import Style
 
 import residnet
+from residnet.core.config import validate
 from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
 from residnet.data.drafting.questions import Question
+from residnet.data.readers import ReaderConfig
 from residnet.tasks.drafting.verb import new_config
 from residnet.tasks.loading import load_task
 
@@ -102,8 +107,37 @@ def test_what_cannot_be_drafted(folder: Path, logs: list[Log], tmp_path: Path) -
         residnet.draft(tmp_path)
     still = [log.replace(channels={**log.channels, "n": np.full(len(log), 3.0)}) for log in logs]
     foreign_tables.write(still, tmp_path / "still", Style(left_out=("delta",)))
-    with pytest.raises(UsageError, match="no channel of the logs is a rudder"):
-        residnet.draft(tmp_path / "still")
+    draft = residnet.draft(tmp_path / "still", folder=tmp_path)
+    assert draft.config["signals"]["inputs"] == []
+    assert "no channel of the logs is a rudder" in dict(draft.guesses)["signals.inputs"]
     foreign_tables.write(logs, tmp_path / "lost", Style(left_out=("psi",)))
     with pytest.raises((UsageError, DataError), match="no channel psi"):
         residnet.draft(tmp_path / "lost")
+
+
+WRITERS: dict[str, Callable[[Log, Path], Path]] = {
+    "csv": written_logs.csv,
+    "mat5": written_logs.mat5,
+    "mcap": written_logs.mcap,
+    "bag2": written_logs.bag2,
+    "nmea": written_recorders.nmea,
+    "ulog": written_recorders.ulog,
+}
+
+
+@pytest.mark.parametrize("write", WRITERS)
+def test_logs_of_a_simulated_boat_as_recorders_write_them(write: str, tmp_path: Path) -> None:
+    needs = {"mcap": "rosbags", "bag2": "rosbags", "nmea": "pynmea2", "ulog": "pyulog"}
+    if write in needs:
+        pytest.importorskip(needs[write])
+    log = written_logs.trial(60.0)
+    path = WRITERS[write](log, tmp_path)
+    draft = residnet.draft(path, folder=tmp_path)
+    told = {"csv", "mat5", "mcap", "bag2"}
+    assert set(draft.config["signals"]["inputs"]) == (
+        {"cmd_port", "cmd_stbd"} if write in told else set()
+    )
+    guessed = " ".join(why for _, why in draft.guesses)
+    assert ("can only predict how the vessel coasts" in guessed) == (write not in told)
+    read = validate(draft.config["data"]["reader"], ReaderConfig, "here").build().read(path)
+    np.testing.assert_allclose(read["u"][5:-5], log["u"][5:-5], atol=2e-3)

@@ -126,7 +126,7 @@ def parts_of(root: Path, entries: Sequence[str | LogPart], where: str) -> list[P
 
 def logs_below(folder: Path) -> list[Path]:
     """Return the recordings and files of logs in a folder, in order; a recording is one log."""
-    if format_of(folder) is not None:
+    if format_of(folder) is not None and not _holds_recordings(folder):
         return [folder]
     found: list[Path] = []
     for path in sorted(folder.iterdir()):
@@ -137,6 +137,13 @@ def logs_below(folder: Path) -> list[Path]:
         elif path.suffix.lower() in LOG_ENDINGS:
             found.append(path)
     return found
+
+
+def _holds_recordings(folder: Path) -> bool:
+    """Return whether the folders in a folder hold files of the same names, as recordings do."""
+    below = [path for path in folder.iterdir() if path.is_dir()]
+    names = [frozenset(f.relative_to(path) for f in files_of(path)) for path in below]
+    return any(names.count(held) > 1 and len(held) > 1 for held in names)
 
 
 def data_files(paths: Iterable[Path]) -> list[Path]:

@@ -8,7 +8,7 @@ the predicted heading and velocity.
 from __future__ import annotations
 
 import torch
-from pydantic import Field, model_validator
+from pydantic import model_validator
 from torch import Tensor, nn
 
 from residnet.core.config import Config
@@ -37,7 +37,7 @@ class SignalsConfig(Config):
             tau_n; or the thrusters themselves.
     """
 
-    inputs: tuple[str, ...] = Field(min_length=1)
+    inputs: tuple[str, ...]
     exogenous: tuple[str, ...] = ()
     forces: str | DifferentialThrustConfig | None = None
 

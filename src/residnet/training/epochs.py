@@ -112,8 +112,10 @@ class EpochTraining(L.LightningModule, ABC):
         entry = {
             "epoch": float(self.epoch),
             "stage": float(stage),
-            "loss": sum(self._losses) / max(len(self._losses), 1),
         }
+        loss = sum(self._losses) / max(len(self._losses), 1)
+        # a loss beyond all numbers has none; JSON knows no other way to say so
+        entry |= {"loss": loss} if math.isfinite(loss) else {}
         self._losses.clear()
         if last or (self.epoch + 1) % self.settings.validate_every == 0:
             model, score = self.validated()
@@ -217,7 +219,7 @@ class ReportProgress(L.Callback):
         done, last = trainer.current_epoch + 1, pl_module.history[-1]
         line = (
             f"  {self.name}: epoch {done}/{self.epochs}, stage {int(last['stage'])}, loss"
-            f" {last['loss']:.4g}, best validation {pl_module.best_score:.4g}"
+            f" {last.get('loss', math.nan):.4g}, best validation {pl_module.best_score:.4g}"
         )
         shown = done % max(self.epochs // 10, 1) == 0 or done == self.epochs
         report(f"training {self.name}", done, self.epochs, line if shown else "")

@@ -1,14 +1,168 @@
-"""The reader of recordings that describe themselves."""
+"""The reader of recordings: what describes itself is taken, checked, and completed by names."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from residnet.core.errors import ResidnetError
+from residnet.core.log import Log
+from residnet.data.drafting.physics import FRAMES, Raw, along, follows, motion_of
 from residnet.data.drafting.questions import Marks
+from residnet.data.drafting.sources import found_sources, step_of
+from residnet.data.drafting.tables import CHANNELS, READER
+from residnet.data.drafting.units import unit_by_size
+from residnet.data.drafting.words import MOTION, input_channel, words_of
+from residnet.data.readers.composing.compose import Plan
+from residnet.data.readers.detect import AutoConfig, recording_for
+from residnet.data.readers.messages.standard import standard_plan
+from residnet.data.readers.recording import Recording
+
+_COHERENT = 0.7
+"""How well position, heading and velocities fit together in a recording that is taken as it is."""
+_SLOW = 0.6
+"""Interval in s from which a pose is looked for that comes more often."""
+_FEWEST = 20
+
+
+@dataclass(frozen=True)
+class _Input:
+    """A field that may drive the vessel."""
+
+    channel: str
+    topic: str
+    field: str
+    values: np.ndarray
 
 
 def draft_recordings(paths: Sequence[Path], marks: Marks) -> dict[str, Any]:
-    """Return the reader of recordings of one format."""
-    return {"kind": "auto"}
+    """Return the reader of recordings of one format.
+
+    Standard messages map themselves. Where position, heading and velocities do not fit together by
+    them, or the pose comes rarely, other topics and frames are tried. Inputs are found by names.
+
+    Args:
+        paths: files and folders.
+        marks: is told what is not sure.
+
+    Raises:
+        UsageError: where the first one cannot be read.
+        DataError: where it holds nothing that can be used.
+    """
+    recording = recording_for(paths[0])
+    content: dict[str, Any] = {"kind": "auto"}
+    if len({path.resolve().parent for path in paths}) > 1:
+        content["manoeuvre"] = "folder"
+        marks.guess((*READER, "manoeuvre"), "the kind of manoeuvre is taken from the folder's name")
+    log = _read(paths[0])
+    plan = standard_plan(recording, Plan())
+    taken = _taken(plan)
+    step = _interval(log, plan, recording)
+    if log is None or not _sound(log, marks) or step > _SLOW:
+        whole = log is not None and {"x", "y", "psi"} <= set(log.channels)
+        found = found_sources(recording, marks, _COHERENT if whole else 0.0)
+        if found is None and whole:
+            text = "position, heading and velocities fit together badly: check the frames"
+            marks.guess(READER, text)
+        elif found is not None:
+            content |= found.content
+            taken, step = found.taken, found.step
+    content["clock"] = {"kind": "uniform", "step": f"{float(f'{step:.2g}'):g} s"}
+    marks.note((*READER, "clock"), "as often as the heading or the position comes")
+    known = set(log.channels) if log is not None and "standard_messages" not in content else set()
+    channels = dict(content.pop("channels", {}))
+    for found_input in _inputs(recording, taken):
+        name = found_input.channel
+        if name not in known and name not in channels:
+            channels[name] = _entry(found_input, marks)
+    if channels:
+        content["channels"] = channels
+    return content
+
+
+def _read(path: Path) -> Log | None:
+    try:
+        return AutoConfig().build().read(path)
+    except ResidnetError:
+        return None
+
+
+def _taken(plan: Plan) -> set[tuple[str, str]]:
+    """Return the topics and fields that a plan takes."""
+    out = {(entry.topic or "", entry.field) for entry in plan.channels.values()}
+    for source in (plan.position, plan.heading):
+        if source is not None:
+            out |= {(source.topic or "", field) for field in source.fields}
+    return out
+
+
+def _sound(log: Log, marks: Marks) -> bool:
+    """Return whether position, heading and velocities fit together as they are."""
+    if not {"x", "y", "psi"} <= set(log.channels):
+        return False
+    raw = Raw(log.t, log.channels)
+    scores = []
+    for frame in FRAMES:
+        motion = [motion_of(raw, "rad", frame)]
+        if motion[0] is None:
+            return True
+        fits = [follows([raw], motion, name) for name in ("u", "v") if name in log.channels]
+        if len(fits) == 2:
+            scores.append(sum(f.correlation * np.sign(f.factor) for f in fits) / 2)
+        else:
+            scores.append(along(motion))
+    if scores[0] < _COHERENT and max(scores) > scores[0] + 0.1:
+        return False
+    if scores[0] < 0.3:
+        text = f"position, heading and velocities fit together badly ({scores[0]:.2f} of 1)"
+        marks.guess(READER, f"{text}: check the frames")
+    return True
+
+
+def _interval(log: Log | None, plan: Plan, recording: Recording) -> float:
+    """Return the shorter of the usual steps of position and heading, s."""
+    topics = [source.topic for source in (plan.position, plan.heading) if source is not None]
+    steps = [step_of(recording.series[topic]) for topic in topics if topic in recording.series]
+    if steps:
+        return max(min(steps), 0.02)
+    return float(np.median(np.diff(log.t))) if log is not None else 1.0
+
+
+def _inputs(recording: Recording, taken: set[tuple[str, str]]) -> list[_Input]:
+    """Return the fields whose topics and names are those of actuators."""
+    out: dict[str, _Input] = {}
+    for series in recording.series.values():
+        fitting = [
+            (field, input_channel(words_of(f"{series.name} {field}"))) for field in series.fields
+        ]
+        several = sum(channel is not None for _, channel in fitting) > 1
+        for field, channel in fitting:
+            values = series[field]
+            known = values[np.isfinite(values)]
+            if channel is None or (series.name, field) in taken or known.size < _FEWEST:
+                continue
+            if channel in MOTION or float(np.ptp(known)) == 0.0:
+                continue
+            # of several fields that a topic names alike only a number tells them apart
+            if several and channel in out and out[channel].topic == series.name:
+                continue
+            out.setdefault(channel, _Input(channel, series.name, field, values))
+    return list(out.values())
+
+
+def _entry(found: _Input, marks: Marks) -> dict[str, Any]:
+    key = (*CHANNELS, found.channel)
+    entry: dict[str, Any] = {"topic": found.topic, "field": found.field}
+    known = found.values[np.isfinite(found.values)]
+    low, high = (float(level) for level in np.quantile(known, (0.01, 0.99)))
+    pulses = low >= 800.0 and high <= 2300.0 and high > 1200.0
+    if pulses and not found.channel.startswith(("n", "cmd_n")):
+        marks.guess(key, "pulses of a servo; 1500 us are taken as neutral, 500 us as all the way")
+        return {**entry, "unit": "-", "offset": 1500, "scale": 0.002, "hold": True}
+    unit, reason = unit_by_size(found.channel, found.values)
+    marks.guess(key, f"taken by its name; {reason}")
+    return {**entry, "unit": unit, "hold": True}

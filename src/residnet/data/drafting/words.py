@@ -50,7 +50,7 @@ _ABOUT: dict[str, str] = {
     "thrust": "thrust schub poussee empuje stuwkracht skyv 推力",
     "torque": "torque drehmoment couple koppel dreiemoment トルク",
     "power": "power leistung puissance potencia vermogen effekt 出力",
-    "throttle": "throttle gashebel lever hebel | gas pwm",
+    "throttle": "throttle actuator gashebel lever hebel | gas pwm",
     "azimuth": "azimu schottel pod | azi nozzle",
     "servo": "servo rcou",
     "force": "force kraft fuerza kracht 力 tau",
@@ -199,12 +199,14 @@ def input_channel(words: Words) -> str | None:
     w, name = words, words.text.replace(" ", "_")
     if name in CHANNEL_UNITS and name not in (*MOTION, "t", *ACCELERATION):
         return name
-    if w.has("wind") or w.has("age") or w.has("power") or w.has("voltage") or w.has("torque"):
+    if w.has("wind") or w.has("age") or w.has("power") or w.has("voltage"):
         return None
     side = "_port" if w.has("port") else "_stbd" if w.has("starboard") else ""
     side = side or (f"_{w.number}" if w.number is not None else "")
     if w.has("force") and (forced := _force(w)):
         return forced
+    if w.has("torque"):
+        return None
     if w.has("azimuth"):
         return f"azimuth{side}{_ordered(w)}"
     if w.has("rudder"):
@@ -229,7 +231,10 @@ def _ordered(w: Words) -> str:
 def _force(w: Words) -> str | None:
     """Return the name of a force or moment in body axes, with what tells it from others alike."""
     axis = next((axis for axis in ("x", "y", "n", "z") if axis in w.text.split()), None)
-    if axis is None or not w.text.startswith("tau"):
+    moment = w.has("torque")
+    if axis is None or not w.text.startswith("tau") or (moment and axis in "xy"):
+        return None
+    if axis == "z" and not moment and "force" in w.text:
         return None
     kind = next(
         (f"_{name}" for name in ("command", "estimate", "measured", "allocated") if w.has(name)), ""

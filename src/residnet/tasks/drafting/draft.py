@@ -75,10 +75,11 @@ def drafted(paths: Sequence[Path], folder: Path, name: str, answer: Answer | Non
     inputs = driving(list(read.whole.values()), marks)
     if not inputs:
         held = ", ".join(next(iter(read.whole.values())).channels)
-        raise UsageError(
+        marks.guess(
+            INPUTS,
             "no channel of the logs is a rudder, a propeller or another command (they hold"
-            f" {held}); a model needs what drives the vessel: name its column, for example"
-            " 'rudder [deg]'"
+            f" {held}): a model without them can only predict how the vessel coasts; name the"
+            " columns that drive it",
         )
     read = _rudder_side(read, inputs, marks)
     renamed, inputs = _plain_names(read, inputs, marks)
@@ -169,6 +170,7 @@ def _assembled(
         "signals": {"inputs": list(inputs), **({"exogenous": list(wind)} if wind else {})},
         "integrator": "semi_implicit_euler",
         **plan,
+        "export": {"models": []},
         "evaluation": {
             "protocols": protocols,
             "selection": next(iter(protocols)),

@@ -16,8 +16,8 @@ from residnet.tasks.drafting.inputs import roles
 
 _WINDOWS = (100.0, 60.0, 40.0, 30.0, 20.0, 10.0, 5.0, 2.0, 1.0)
 _HULL = ("u v", "u r", "v r", "u|u|", "v|v|", "r|r|", "v|r|", "r|v|")
-_EFFORT = 24_000
-"""Steps of rollouts that a network is trained through, in batches: about a minute."""
+_EFFORT = 12_000
+"""Steps of rollouts that a network is trained through, in batches: about half a minute."""
 
 
 @dataclass(frozen=True)
@@ -147,6 +147,10 @@ def models(inputs: Sequence[str], wind: bool, time: Timing, length: float, sampl
         "base_of": {"plsr": "physics", "mlp": "physics"},
         "training": {"mlp": _training(time.step, length)},
     }
+    if not inputs:
+        # a network has nothing to learn from a vessel that nothing is known to drive
+        plan |= {"heads": {"plsr": {"kind": "plsr"}}, "base_of": {"plsr": "physics"}}
+        del plan["training"]
     return plan
 
 

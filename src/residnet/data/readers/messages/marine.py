@@ -230,6 +230,32 @@ class NmeaRudder(Message):
         )
 
 
+@final
+class NmeaRevolutions(Message):
+    """NMEA RPM: revolutions of an engine or shaft; of several, those of each are told apart."""
+
+    types = ("RPM",)
+    conversion: ClassVar[str] = _CONVERSION
+
+    def plan(self, series: Series) -> Plan:
+        """Return the channels that a series of this message gives."""
+        if not series.has("speed"):
+            return Plan()
+        senders = [] if series.sender is None else sorted(set(series.sender.tolist()))
+        if len(senders) < 2:
+            return Plan({"n": FieldMap(topic=series.name, field="speed", unit="rpm")})
+        # odd numbers are to starboard, even ones to port
+        sides = {"1": "n_stbd", "2": "n_port"}
+        return Plan(
+            {
+                sides.get(sender, f"n_{sender}"): FieldMap(
+                    topic=series.name, field="speed", unit="rpm", sender=sender
+                )
+                for sender in senders
+            }
+        )
+
+
 MARINE: tuple[Message, ...] = (
     Px4LocalPosition(),
     Px4Attitude(),
@@ -244,5 +270,6 @@ MARINE: tuple[Message, ...] = (
     NmeaHeading(),
     NmeaRateOfTurn(),
     NmeaRudder(),
+    NmeaRevolutions(),
 )
 """In the order in which they are asked: the one that says most of each system first."""

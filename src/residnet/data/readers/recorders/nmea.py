@@ -202,9 +202,17 @@ class _Lines:
             )
             fields = {field: sentences.column(i) for i, field in enumerate(sentences.names)}
             series[name] = Series(
-                name, f"nmea/{name}", fields, stamp, arrival, None, remarks_of_topic
+                name, f"nmea/{name}", fields, stamp, arrival, _senders(fields), remarks_of_topic
             )
         return Recording(path, series, epoch, (path,), tuple(remarks))
+
+
+def _senders(fields: dict[str, np.ndarray]) -> np.ndarray | None:
+    """Return the number of the engine that each row [T] is about; None where there is none."""
+    number = fields.get("engine_no")
+    if number is None or not np.isfinite(number).all():
+        return None
+    return np.array([f"{value:g}" for value in number.tolist()], dtype=object)
 
 
 def _between(number: np.ndarray, ticks: np.ndarray) -> np.ndarray:
