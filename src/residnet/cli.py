@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -21,10 +22,30 @@ app = typer.Typer(
         " validation in free run, and export for controllers."
     ),
     no_args_is_help=True,
-    add_completion=False,
+    add_completion=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
+
+
+def _version(wanted: bool) -> None:
+    """Print the version and end, where it was asked for."""
+    if wanted:
+        from residnet.core.version import __version__
+
+        print(f"residnet {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _common(
+    version: Annotated[
+        bool,
+        typer.Option("--version", callback=_version, is_eager=True, help="Print the version."),
+    ] = False,
+) -> None:
+    """Options of all commands."""
+
 
 Overrides = Annotated[
     list[str] | None,
@@ -53,13 +74,23 @@ def run(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace an earlier run in its folder.")
     ] = False,
+    quiet: Annotated[
+        bool, typer.Option("--quiet", help="Show no progress, the result only.")
+    ] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print summary.json and the run's folder, for machines.")
+    ] = False,
+    verbose: Annotated[
+        bool, typer.Option("-v", "--verbose", help="Write all progress into RUN/log.txt.")
+    ] = False,
 ) -> None:
     """Carry out a run: fit, evaluate, report and export, or any other task."""
     from residnet.tasks.loading import config_file, load_task
 
     _limit_threads()
     task = load_task(config, overrides or [])
-    with drawn_progress():
+    told: list[str] = []
+    with drawn_progress(quiet=quiet or as_json, kept=told):
         finished = task.run(
             source=config_file(config),
             overrides=overrides or [],
@@ -67,7 +98,13 @@ def run(
             resume=resume,
             overwrite=overwrite,
         )
-    _show(finished)
+    if verbose:
+        finished.folder.write(finished.folder.path / "log.txt", "".join(told))
+    if as_json:
+        place = {"folder": str(finished.folder.path), "report": str(finished.folder.report)}
+        print(json.dumps({**finished.folder.read_summary(), **place}, indent=1))
+    else:
+        _show(finished)
 
 
 @app.command()
@@ -99,6 +136,25 @@ def new(
     with drawn_progress():
         ask = asked() if not defaults else None
         lines = new_config(logs, out or Path("my_boat.yaml"), ask, overwrite=overwrite)
+    for line in lines:
+        print(line)
+
+
+@app.command()
+def demo(
+    folder: Annotated[
+        Path, typer.Argument(metavar="[DIR]", help="Folder to write into; demo if not given.")
+    ] = Path("demo"),
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace the logs of an earlier demo.")
+    ] = False,
+) -> None:
+    """Write realistic logs of a simulated boat to try things on, as csv and MCAP."""
+    from residnet.tasks.demo import write_demo
+
+    _limit_threads()
+    with drawn_progress():
+        lines = write_demo(folder, overwrite=overwrite)
     for line in lines:
         print(line)
 
@@ -251,6 +307,36 @@ def report(folder: RunPath) -> None:
 
     _limit_threads()
     print(report_run(folder))
+
+
+@app.command()
+def compare(
+    folders: Annotated[
+        list[Path], typer.Argument(metavar="RUN RUN...", help="Folders of finished fits.")
+    ],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of the page.")] = Path(
+        "comparison"
+    ),
+) -> None:
+    """Set finished fits side by side: errors on common logs, paired intervals, configs."""
+    from residnet.tasks.compare.comparing import compare_runs
+
+    _limit_threads()
+    text, page = compare_runs(folders, out)
+    print(text)
+    print(f"page: {page}")
+
+
+@app.command()
+def runs(
+    folder: Annotated[Path, typer.Argument(metavar="[DIR]", help="Folder of runs.")] = Path("runs"),
+    as_json: Annotated[bool, typer.Option("--json", help="Print the list as JSON.")] = False,
+) -> None:
+    """List the runs below a folder with task, state, best figure and age."""
+    from residnet.tasks.run_list import runs_below, runs_text
+
+    entries = runs_below(folder)
+    print(json.dumps(entries, indent=1) if as_json else runs_text(folder, entries))
 
 
 @app.command(name="list")

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from residnet.core.progress import Progress, listen
+from residnet.core.progress import Progress, ProgressCallback, listen
 from residnet.data.drafting.questions import Answer, Question
 
 if TYPE_CHECKING:
@@ -16,14 +17,19 @@ if TYPE_CHECKING:
 
 
 @contextmanager
-def drawn_progress() -> Iterator[None]:
-    """Draw the progress of everything within the context on standard error."""
-    if not sys.stderr.isatty():
-        with listen(_Lines()):
+def drawn_progress(*, quiet: bool = False, kept: list[str] | None = None) -> Iterator[None]:
+    """Draw the progress of everything within the context on standard error.
+
+    Args:
+        quiet: draw nothing.
+        kept: is given every line, with the time of day, whatever is drawn.
+    """
+    if quiet or not sys.stderr.isatty():
+        with listen(_Kept(kept, None if quiet else _Lines())):
             yield
         return
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
     from rich.progress import Progress as Bars
 
     console = Console(stderr=True, highlight=False, markup=False)
@@ -31,10 +37,25 @@ def drawn_progress() -> Iterator[None]:
         TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
-        TimeElapsedColumn(),
+        TimeRemainingColumn(elapsed_when_finished=True),
     )
-    with Bars(*columns, console=console, transient=True) as bars, listen(_Bars(bars)):
+    with Bars(*columns, console=console, transient=True) as bars, listen(_Kept(kept, _Bars(bars))):
         yield
+
+
+class _Kept:
+    """Keeps the lines that are told, and hands everything on."""
+
+    def __init__(self, kept: list[str] | None, then: ProgressCallback | None) -> None:
+        self._kept, self._then = kept, then
+
+    def __call__(self, progress: Progress) -> None:
+        if self._kept is not None and (progress.message or progress.done == progress.total):
+            text = progress.message or f"{progress.stage}: done"
+            if progress.message or progress.done is not None:
+                self._kept.append(f"{time.strftime('%H:%M:%S')} {text.strip()}\n")
+        if self._then is not None:
+            self._then(progress)
 
 
 class _Lines:

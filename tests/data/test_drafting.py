@@ -97,6 +97,7 @@ def test_words_of_a_language(language: str) -> None:
         ("Kurs über Grund [°]", None),
         ("course over ground", None),
         ("speed over ground [kn]", "speed"),
+        ("speed to starboard [kn]", "v"),
         ("rudder_cmd", "cmd_delta"),
         ("engine rpm port", "n_port"),
         ("tau_n_est", "tau_n_estimate"),

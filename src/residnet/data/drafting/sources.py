@@ -184,11 +184,29 @@ def _score(
     motion = motion_of(pose, "rad", FRAMES[0])
     if motion is None:
         return -1.0, None
-    fits = [(_agreement(pose, motion, pair), pair[0].name) for pair in velocities]
+    still = Raw(pose.t, {**pose.columns, "psi": np.zeros(pose.t.size)})
+    ground = motion_of(still, "rad", FRAMES[0])
+    fits = [
+        (_agreement(pose, motion, pair), pair[0].name)
+        for pair in velocities
+        if ground is None or not _over_ground(still, ground, pair)
+    ]
     best = max(fits, default=(-1.0, ""))
     if best[0] > 0.3:
         return best[0], best[1]
     return along([motion]), None
+
+
+def _over_ground(still: Raw, ground: Motion, pair: tuple[Series, str, str]) -> bool:
+    """Return whether a velocity counts along north and east, and says nothing of the heading."""
+    series, first, second = pair
+    return (
+        max(
+            _agreement(still, ground, (series, first, second)),
+            _agreement(still, ground, (series, second, first)),
+        )
+        > 0.85
+    )
 
 
 def _agreement(pose: Raw, motion: Motion, pair: tuple[Series, str, str]) -> float:

@@ -191,6 +191,8 @@ def _velocity(w: Words) -> str | None:
         return "v"
     if w.has("surge"):
         return "u"
+    if w.has("speed") and not w.lacks("port", "starboard"):
+        return "v"
     return "speed" if w.has("speed") else None
 
 

@@ -1,0 +1,169 @@
+"""What `residnet compare` makes of runs: one table, one page, and what their configs differ in."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from residnet.core.config import load_mapping
+from residnet.core.errors import UsageError
+from residnet.report.blocks import Block, Cell, Figure, Section, Table
+from residnet.report.page import write_page
+from residnet.tasks.compare.errors import JudgedRun, common_windows, judged_runs, paired
+
+_MOST = 60
+
+
+def compare_runs(paths: Sequence[Path], out: Path) -> tuple[str, Path]:
+    """Compare finished fits; returns the table for the terminal and the page.
+
+    Args:
+        paths: folders of the runs; the first is what the others are compared with.
+        out: folder of the page.
+
+    Raises:
+        UsageError: where a folder holds no finished fit, or the page cannot be written.
+    """
+    runs = judged_runs(paths)
+    pairs, metrics, configs = paired(runs), metrics_table(runs), config_table(runs)
+    paired_rows = paired_table(runs, pairs)
+    verdict = [_sentence(runs, pairs)]
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        blocks: list[Block] = [_curves(runs, out)] if pairs else []
+        sections = [
+            Section("On common logs", [paired_rows, *blocks]),
+            Section("Every model of every run", [metrics]),
+            Section("Where the configs differ", [configs]),
+        ]
+        names = " against ".join(run.name for run in runs)
+        page = write_page(out, "Runs compared", names, verdict, sections)
+    except OSError as error:
+        raise UsageError(f"{out}: cannot be written ({error.strerror})") from error
+    text = "\n\n".join([metrics.text(), paired_rows.text(), configs.text(), verdict[0]])
+    return text, page
+
+
+def metrics_table(runs: Sequence[JudgedRun]) -> Table:
+    """Return the errors of all models of all runs."""
+    table = Table(
+        ["run", "model", "protocol", "u [m/s]", "v [m/s]", "r [deg/s]", "NRMSE [-]", "diverged"],
+        caption="Errors in free run on the test split of each run, by that run's own scales.",
+    )
+    for run in runs:
+        for number, row in enumerate(run.rows()):
+            selected = row["model"] == run.selected
+            rmse = row["rmse"]
+            cells = [
+                Cell(f"{row['model']}{' (selected)' if selected else ''}", mark="text"),
+                Cell(str(row["protocol"]), mark="text"),
+                Cell(f"{rmse['u']:.3g}"),
+                Cell(f"{rmse['v']:.3g}"),
+                Cell(f"{np.degrees(rmse['r']):.3g}"),
+                Cell(f"{row['nrmse']['mean']:.3g}"),
+                Cell(f"{row['diverged']}/{row['windows']}"),
+            ]
+            table.add(run.name, cells, rule=number == 0, selected=selected)
+    return table
+
+
+def paired_table(runs: Sequence[JudgedRun], pairs: Mapping[str, Mapping[str, Any]]) -> Table:
+    """Return the paired differences of the selected models to that of the first run."""
+    table = Table(
+        ["run", "model", "protocol", "windows", "NRMSE [-]", "difference", "95 % interval"],
+        caption=(
+            "Selected models over the windows that all runs were judged on, by the scales of"
+            f" {runs[0].name}; differences to {runs[0].name}, negative where the run is better."
+        ),
+    )
+    for protocol, entries in pairs.items():
+        for number, run in enumerate(runs):
+            entry = entries[run.name]
+            interval = entry["ci95"]
+            told = (
+                "too few logs" if interval is None else f"{interval[0]:+.3f} to {interval[1]:+.3f}"
+            )
+            first = number == 0
+            cells = [
+                Cell(run.selected, mark="text"),
+                Cell(protocol, mark="text"),
+                Cell(str(entry["windows"])),
+                Cell(f"{entry['mean']:.3g}"),
+                Cell("" if first else f"{entry['nrmse_mean']:+.3f}"),
+                Cell("" if first else told),
+            ]
+            table.add(run.name, cells, rule=first)
+    return table
+
+
+def config_table(runs: Sequence[JudgedRun]) -> Table:
+    """Return the keys of the configs that differ."""
+    flat = [dict(_flat(load_mapping(run.folder.resolved), "")) for run in runs]
+    keys = [
+        key
+        for key in dict.fromkeys(key for one in flat for key in one)
+        if len({one.get(key, "(absent)") for one in flat}) > 1 and key != "name"
+    ]
+    more = f" The first {_MOST} of {len(keys)} keys." if len(keys) > _MOST else ""
+    table = Table(
+        ["key", *(run.name for run in runs)],
+        caption=f"{len(keys) or 'No'} keys of the configs differ.{more}",
+    )
+    for key in keys[:_MOST]:
+        table.add(key, [Cell(one.get(key, "(absent)"), mark="text") for one in flat])
+    return table
+
+
+def _flat(value: Any, path: str) -> list[tuple[str, str]]:
+    if isinstance(value, Mapping) and value:
+        return [
+            pair
+            for key, inner in value.items()
+            for pair in _flat(inner, f"{path}.{key}" if path else str(key))
+        ]
+    text = str(value)
+    return [(path, text if len(text) <= 80 else f"{text[:77]}...")]
+
+
+def _sentence(runs: Sequence[JudgedRun], pairs: Mapping[str, Mapping[str, Any]]) -> str:
+    if not pairs:
+        return "The runs have no window of a log in common: their errors stand beside each other."
+    protocol, entries = next(iter(pairs.items()))
+    best = min(runs, key=lambda run: float(entries[run.name]["mean"]))
+    if best is runs[0]:
+        return f"Over the common windows of {protocol}, no run is better than {best.name}."
+    entry = entries[best.name]
+    sure = entry["excludes_zero"]
+    return (
+        f"Over {entry['windows']} common windows of {protocol}, {best.name} ({best.selected}) has"
+        f" the least error: {entry['nrmse_mean']:+.3f} against {runs[0].name}"
+        + (", beyond chance." if sure else ", which may be chance.")
+    )
+
+
+def _curves(runs: Sequence[JudgedRun], out: Path) -> Block:
+    """Draw how the errors of the selected models grow over the common windows."""
+    from residnet.report.figures.style import new_figure, save
+
+    windows = common_windows(runs)
+    protocol = windows[0][1]
+    chosen = [window for window in windows if window[1] == protocol]
+    shortest = min(len(runs[0].series[window][0]) for window in chosen)
+    figure = new_figure(3.2)
+    axes = figure.subplots()
+    for run in runs:
+        size = np.stack([(run.series[window][1][:shortest] ** 2) for window in chosen])
+        growth = np.sqrt(np.nanmean(size, axis=0)) / runs[0].scales
+        axes.plot(run.series[chosen[0]][0][:shortest], growth.mean(axis=1), label=run.name)
+    axes.set_xlabel("time from the start of a free run [s]")
+    axes.set_ylabel("error [-]")
+    axes.legend()
+    title = "Error against horizon"
+    caption = f"Selected models over {len(chosen)} common windows of {protocol}, mean over u, v, r."
+    (out / "figures").mkdir(exist_ok=True)
+    path = out / "figures" / "horizon.png"
+    save(figure, path, title, caption)
+    return Figure(path, title, caption)

@@ -1,0 +1,168 @@
+"""Realistic logs of a simulated boat with the faults of real ones, to try things on."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from residnet.core.config import validate
+from residnet.core.errors import UsageError
+from residnet.core.log import Log
+from residnet.core.progress import report
+from residnet.data.simulated.trials import SimulatedTrials, simulate
+
+TRIALS: dict[str, Any] = {
+    "vessel": "example_rudder_boat",
+    "seed": 11,
+    "duration": "80 s",
+    "step": "0.1 s",
+    "trials": [
+        {"kind": "zigzag", "count": 8, "heading": ["10 deg", "20 deg"], "drive": [0.5, 0.9]},
+        {"kind": "constant", "drive": [0.5, 0.8], "steer": [-0.5, 0.5]},
+        {"kind": "three_two_one_one", "count": 4},
+    ],
+    "disturbance": {
+        "wind": {"speed": "8 kn", "direction": "220 deg", "gust": 0.6, "correlation": "8 s"}
+    },
+    "noise": {
+        "u": 0.03,
+        "v": 0.03,
+        "r": "0.2 deg/s",
+        "sensors": {
+            # the receiver tells where the antenna was 0.3 s ago
+            "x": {"noise": 0.03, "latency": "300 ms"},
+            "y": {"noise": 0.03, "latency": "300 ms"},
+            "psi": {"noise": "0.3 deg"},
+            # the rudder's zero was set by eye
+            "delta": {"bias": "2 deg", "noise": "0.1 deg"},
+            "n": {"noise": 0.05},
+            "wind_speed": {"noise": 0.3},
+            "wind_dir": {"noise": "3 deg"},
+        },
+    },
+    "identification": {"zigzag": 6, "constant": 3, "three_two_one_one": 3},
+    "validation": {"zigzag": 2, "constant": 1, "three_two_one_one": 1},
+}
+COLUMNS = {
+    "x": ("north [m]", 1.0),
+    "y": ("east [m]", 1.0),
+    "psi": ("heading [deg]", 180.0 / np.pi),
+    "u": ("speed ahead [kn]", 3600.0 / 1852.0),
+    "v": ("speed to starboard [kn]", 3600.0 / 1852.0),
+    "r": ("rate of turn [deg/min]", 10800.0 / np.pi),
+    "delta": ("rudder [deg]", 180.0 / np.pi),
+    "n": ("propeller [rpm]", 60.0),
+    "wind_speed": ("true wind speed [kn]", 3600.0 / 1852.0),
+    "wind_dir": ("true wind direction [deg]", 180.0 / np.pi),
+}
+_GAP = (30.0, 32.5)
+"""Seconds that every fifth log lacks."""
+_EPOCH = 1_717_000_000
+
+
+def write_demo(folder: Path, *, overwrite: bool = False) -> list[str]:
+    """Write the logs as csv, and as MCAP where rosbags is installed; returns what to say.
+
+    Args:
+        folder: that the folders csv and mcap are made in.
+        overwrite: replace them.
+
+    Raises:
+        UsageError: where they exist already, or cannot be written.
+    """
+    for name in ("csv", "mcap"):
+        if (folder / name).exists() and not overwrite:
+            raise UsageError(f"{folder / name}: exists; give --overwrite, or another folder")
+        shutil.rmtree(folder / name, ignore_errors=True)
+    config = validate(TRIALS, SimulatedTrials, "demo")
+    logs = [_with_gap(log, number) for number, log in enumerate(simulate(config.draw(), config))]
+    try:
+        (folder / "csv").mkdir(parents=True)
+        for number, log in enumerate(logs):
+            report("writing logs", number, len(logs))
+            _csv(log, folder / "csv" / f"{log.name}.csv")
+        report("writing logs", len(logs), len(logs))
+    except OSError as error:
+        raise UsageError(f"{folder}: cannot be written ({error.strerror})") from error
+    seconds = sum(float(log.t[-1] - log.t[0]) for log in logs)
+    lines = [
+        f"{len(logs)} logs of a simulated boat in wind, {seconds / 60.0:.0f} minutes: {folder}/csv",
+        "their faults: positions 0.3 s late, a rudder that stands 2 degrees off, gaps, noise",
+    ]
+    return [*lines, *_mcap_lines(logs, folder / "mcap"), f"next: residnet new {folder}/csv"]
+
+
+def _with_gap(log: Log, number: int) -> Log:
+    """Return every fifth log without some seconds."""
+    keep = np.ones(len(log), dtype=bool)
+    if number % 5 == 0:
+        keep = (log.t < _GAP[0]) | (log.t >= _GAP[1])
+    channels = {name: log[name][keep] for name in COLUMNS if name in log.channels}
+    return log.replace(t=log.t[keep], channels=channels, masks={})
+
+
+def _csv(log: Log, file: Path) -> None:
+    import pandas as pd
+
+    table = {"time [s]": np.round(log.t, 3)}
+    for name, (column, factor) in COLUMNS.items():
+        values = log[name] * factor
+        table[column] = np.remainder(values, 360.0) if name in ("psi", "wind_dir") else values
+    pd.DataFrame(table).to_csv(file, index=False, float_format="%.4f")
+
+
+def _mcap_lines(logs: Sequence[Log], folder: Path) -> list[str]:
+    """Write the logs as MCAP; returns what to say."""
+    try:
+        from rosbags.rosbag2 import StoragePlugin, Writer
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError:
+        return ["MCAP is left out: it needs rosbags (pip install 'residnet[ros]')"]
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    folder.mkdir(parents=True)
+    for number, log in enumerate(logs):
+        report("writing MCAP", number, len(logs))
+        whole = folder / f"{log.name}_bag"
+        with Writer(whole, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+            _messages(log, writer, store)
+        next(whole.glob("*.mcap")).rename(folder / f"{log.name}.mcap")
+        shutil.rmtree(whole)
+    report("writing MCAP", len(logs), len(logs))
+    return [f"the same as MCAP: {folder}"]
+
+
+def _messages(log: Log, writer: Any, store: Any) -> None:
+    """Write odometry by REP-103, and each other channel as a number of its own topic."""
+    odometry, number = "nav_msgs/msg/Odometry", "std_msgs/msg/Float64"
+    types = store.types
+    pose = writer.add_connection("/odometry", odometry, typestore=store)
+    others = [name for name in log.channels if name not in ("x", "y", "psi", "u", "v", "r")]
+    topics = {name: writer.add_connection(f"/{name}", number, typestore=store) for name in others}
+    yaw = np.remainder(np.pi / 2 - log["psi"] + np.pi, 2 * np.pi) - np.pi
+    vector, none = types["geometry_msgs/msg/Vector3"], np.zeros(36)
+    for i, t in enumerate(log.t.tolist()):
+        at = _EPOCH * 10**9 + round(t * 1e9)
+        stamp = types["builtin_interfaces/msg/Time"](sec=at // 10**9, nanosec=at % 10**9)
+        turned = types["geometry_msgs/msg/Quaternion"](
+            x=0.0, y=0.0, z=float(np.sin(yaw[i] / 2)), w=float(np.cos(yaw[i] / 2))
+        )
+        point = types["geometry_msgs/msg/Point"](x=log["y"][i], y=log["x"][i], z=0.0)
+        twist = types["geometry_msgs/msg/Twist"](
+            linear=vector(log["u"][i], -log["v"][i], 0.0), angular=vector(0.0, 0.0, -log["r"][i])
+        )
+        message = types[odometry](
+            header=types["std_msgs/msg/Header"](stamp=stamp, frame_id="odom"),
+            child_frame_id="base_link",
+            pose=types["geometry_msgs/msg/PoseWithCovariance"](
+                types["geometry_msgs/msg/Pose"](point, turned), none
+            ),
+            twist=types["geometry_msgs/msg/TwistWithCovariance"](twist, none),
+        )
+        writer.write(pose, at, store.serialize_cdr(message, odometry))
+        for name, topic in topics.items():
+            value = types[number](data=float(log[name][i]))
+            writer.write(topic, at, store.serialize_cdr(value, number))

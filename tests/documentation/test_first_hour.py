@@ -1,0 +1,56 @@
+"""The tutorial of the first hour, followed literally in an empty folder."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PAGE = Path(__file__).parents[2] / "docs" / "tutorials" / "first_hour.md"
+
+
+@pytest.mark.whole_runs
+def test_the_tutorial_ends_with_the_numbers_that_it_prints(tmp_path: Path) -> None:
+    text = PAGE.read_text()
+    lines = [
+        line for block in re.findall(r"```sh\n(.*?)```", text, re.S) for line in block.split("\n")
+    ]
+    commands = [shlex.split(line) for line in lines if line]
+    assert [command[:2] for command in commands] == [
+        ["residnet", verb] for verb in ("demo", "new", "run", "runs")
+    ]
+    said = ""
+    for command in commands:
+        done = subprocess.run(
+            [sys.executable, "-m", "residnet.cli", *command[1:]],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            env=os.environ,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
+        said = done.stdout
+    assert "finished" in said
+    assert (tmp_path / "runs" / "boat" / "report.html").is_file()
+    assert len(re.findall("# guess", (tmp_path / "boat.yaml").read_text())) == 2
+    metrics = json.loads((tmp_path / "runs" / "boat" / "metrics.json").read_text())
+    assert metrics["selected"] == "physics"
+    printed = re.findall(r"^\| (\w+) \| ([\d.]+) \| ([\d.]+) \| ([\d.]+) \|$", text, re.M)
+    assert [name for name, *_ in printed] == ["zero", "baseline", "physics"]
+    for name, *numbers in printed:
+        row = next(
+            row
+            for row in metrics["rows"]
+            if (row["model"], row["split"], row["protocol"], row["manoeuvre"])
+            == (name, "test", "T30", "all")
+        )
+        found = [row["rmse"]["u"], row["rmse"]["v"], math.degrees(row["rmse"]["r"])]
+        assert found == pytest.approx([float(number) for number in numbers], rel=0.02), name
