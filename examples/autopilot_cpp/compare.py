@@ -2,6 +2,7 @@
 step takes.
 
 python examples/autopilot_cpp/compare.py RUN/exports/policy.pt BUILD/autopilot [--seconds 40]
+    [--delay 0.2] [--noise 0.1]
 """
 
 from __future__ import annotations
@@ -14,60 +15,77 @@ import statistics
 import subprocess
 import tempfile
 import time
+from collections import deque
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
 
+class Conditions(NamedTuple):
+    """K [1/s], T [s] and speed of the vessel, step [s], delay [s], noise [rad] and [rad/s]."""
+
+    gain: float
+    time: float
+    speed: float
+    dt: float
+    delay: float
+    noise_psi: float
+    noise_r: float
+
+
+def even_noise() -> Iterator[float]:
+    """Even noise of unit variance, as `autopilot.cpp` draws it."""
+    mask, state = 2**64 - 1, 1
+    while True:
+        state = (state + 0x9E3779B97F4A7C15) & mask
+        z = ((state ^ (state >> 30)) * 0xBF58476D1CE4E5B9) & mask
+        z = ((z ^ (z >> 27)) * 0x94D049BB133111EB) & mask
+        z ^= z >> 31
+        yield ((z >> 11) / 2**53 - 0.5) * math.sqrt(12.0)
+
+
 def fly(
-    policy: Any, gain: float, constant: float, speed: float, dt: float, heading: float, steps: int
+    policy: Any, given: Conditions, heading: float, steps: int
 ) -> tuple[list[tuple[float, float, float]], float]:
     """Heading, yaw rate and rudder by step, and the median time of a step in microseconds."""
     track, taken, psi, r = [], [], 0.0, 0.0
-    decay = math.exp(-dt / constant)
+    dt, drawn = given.dt, even_noise()
+    late = deque([0.0] * round(given.delay / dt))
+    decay = math.exp(-dt / given.time)
     y, reference = torch.zeros(1, 3), torch.full((1, 1), heading)
-    y[0, 1] = speed
+    y[0, 1] = given.speed
     with torch.inference_mode():
         memory = policy.initial_state(y)
         for _ in range(steps):
-            y[0, 0], y[0, 2] = psi, r
+            y[0, 0] = psi + given.noise_psi * next(drawn)
+            y[0, 2] = r + given.noise_r * next(drawn)
             begin = time.perf_counter()
             command, memory, _ = policy.step(y, reference, memory)
             delta = float(command)
             taken.append(1e6 * (time.perf_counter() - begin))
             track.append((psi, r, delta))
-            steady = gain * delta
-            psi += steady * dt + (r - steady) * constant * (1.0 - decay)
+            late.append(delta)
+            steady = given.gain * late.popleft()
+            psi += steady * dt + (r - steady) * given.time * (1.0 - decay)
             r = steady + (r - steady) * decay
     return track, statistics.median(taken[10:])
 
 
-def eager(policy: Any) -> Any:
+def eager(folder: Path, card: dict[str, Any]) -> Any:
     """The policy without compilation: the same operations, called one by one from Python."""
-    from residnet.control.heading.policy import HeadingPolicy
-    from residnet.control.heading.turning import Turning
-    from residnet.export.autopilot import ExportedPolicy, Limits
+    from residnet.control.heading.stored import load_heading_policy
+    from residnet.control.observed.stored import load_observed_policy
+    from residnet.export.autopilot import for_export
 
-    card = policy["card"]
-    state = policy["state"]
-    turning = card["turning"]
-    own = HeadingPolicy(
-        ("psi", "u", "r"),
-        turning=Turning(turning["K"], turning["T"], turning["speed"]),
-        limit=card["command"][0]["limit"],
-        dt=card["dt"],
-        rate=card["command"][0]["rate"],
-        hidden=card["hidden"],
-        observer=card["observer"],
-    )
-    own.load_state_dict(state)
-    limits = [tuple(entry["range"]) for entry in card["measured"]]
-    return ExportedPolicy(
-        own.eval().requires_grad_(False),
-        Limits(*limits),
-        "hold" if "held" in card["fault"] else "amidships",
-    ).eval()
+    if card["kind"] == "observed":
+        policy = load_observed_policy(folder)
+        policy.at(card["dt"])
+    else:
+        policy = load_heading_policy(folder)
+        policy.dt = card["dt"]
+    return for_export(policy, "hold" if "held" in card["fault"] else "amidships")
 
 
 def main() -> None:
@@ -77,21 +95,19 @@ def main() -> None:
     parser.add_argument("program", type=Path)
     parser.add_argument("--heading", type=float, default=30.0, help="degrees")
     parser.add_argument("--seconds", type=float, default=40.0)
+    parser.add_argument("--delay", type=float, default=0.2, help="of the commands in s")
+    parser.add_argument("--noise", type=float, default=0.1, help="degrees, degrees a second")
     given = parser.parse_args()
     torch.set_num_threads(1)
-    from safetensors.torch import load_file
-
     extra = {"card.json": ""}
     compiled = torch.jit.load(str(given.policy), _extra_files=extra)
     card = json.loads(extra["card.json"])
-    weights = given.policy.parent.parent / "models" / card["policy"] / "weights.safetensors"
-    plain = eager({"card": card, "state": load_file(weights)})
-    k, t, speed, dt = (
-        card["turning"]["K"],
-        card["turning"]["T"],
-        card["turning"]["speed"],
-        card["dt"],
+    plain = eager(given.policy.parent.parent / "models" / card["policy"], card)
+    turning, noise = card["turning"], math.radians(given.noise)
+    flown = Conditions(
+        turning["K"], turning["T"], turning["speed"], card["dt"], given.delay, noise, noise
     )
+    dt = flown.dt
     heading, steps = math.radians(given.heading), round(given.seconds / dt)
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "track.csv"
@@ -99,7 +115,7 @@ def main() -> None:
             str(given.program),
             str(given.policy),
             str(file),
-            *(repr(v) for v in (k, t, speed, dt, heading, given.seconds)),
+            *map(repr, (*flown[:4], heading, given.seconds, *flown[4:])),
         ]
         print(subprocess.run(words, capture_output=True, text=True, check=True).stdout.rstrip())
         with file.open() as lines:
@@ -108,7 +124,7 @@ def main() -> None:
                 for row in csv.DictReader(lines)
             ]
     for name, policy in (("eager Python", plain), ("TorchScript in Python", compiled)):
-        mine, median = fly(policy, k, t, speed, dt, heading, steps)
+        mine, median = fly(policy, flown, heading, steps)
         worst = max(
             abs(a - b)
             for one, other in zip(mine, theirs, strict=True)

@@ -6,6 +6,7 @@ import csv
 import math
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,9 @@ import torch
 
 from residnet.control.heading.policy import HeadingPolicy
 from residnet.control.heading.steering import SteeredPlant
+from residnet.control.observed.config import PtosConfig
+from residnet.control.observed.stored import ObservedPolicySpec
+from residnet.dynamics.store import save_model
 from residnet.export.autopilot import export_autopilot
 from residnet.physics.vessel import load_vessel
 
@@ -93,6 +97,34 @@ def test_it_steers_as_python_does(program: Path, policy: Path, tmp_path: Path) -
         psi += steady * DT + (r - steady) * TIME * (1.0 - decay)
         r = steady + (r - steady) * decay
     assert psi == pytest.approx(HEADING, abs=math.radians(0.1))
+
+
+def test_an_observed_policy_steers_alike_with_delay_and_noise(
+    program: Path, tmp_path: Path
+) -> None:
+    """The example's own comparison: the same track in C++ and in Python, with commands 0.2 s late
+    and noise of 0.1 deg and 0.1 deg/s.
+    """
+    law = PtosConfig(
+        lag=0.3, steepness=37.0, share=0.65, damping=0.88, heading_rate=2.0, yaw_rate_rate=5.0,
+        push_rate=1.0, cross_rate=0.3,
+    )  # fmt: skip
+    torch.manual_seed(0)
+    spec = ObservedPolicySpec(
+        state=("psi", "u", "r"), gain=GAIN, time=TIME, speed=SPEED, limit=math.radians(5),
+        rate=None, dt=DT, trained_at=0.04, law=law, units=4,
+    )  # fmt: skip
+    own = spec.build().requires_grad_(False)
+    own.network.out.weight.normal_(std=0.02)
+    save_model(tmp_path / "models" / "p", spec, own)
+    file = tmp_path / "exports" / "p.pt"
+    file.parent.mkdir()
+    export_autopilot("p", own, file, safe="amidships", about={}, metrics=[])
+    words = [sys.executable, str(SOURCE / "compare.py"), str(file), str(program), "--seconds", "8"]
+    said = subprocess.run(words, capture_output=True, text=True, check=True).stdout
+    differences = [float(line.split()[-1]) for line in said.splitlines() if "difference" in line]
+    assert len(differences) == 2
+    assert max(differences) < 1e-4
 
 
 def test_wrong_calls_end_with_a_line(program: Path, policy: Path, tmp_path: Path) -> None:

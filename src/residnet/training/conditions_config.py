@@ -20,6 +20,7 @@ class ConditionsTraining(OneStage):
     Attributes:
         epochs: at most; each ends with a validation.
         learning_rate: of Adam at the start; it falls along a cosine with every batch.
+        final: share of it at the end.
         steps: batches of an epoch.
         batch: flights of a batch.
         dt: step in s of vessel and controller in training.

@@ -145,8 +145,8 @@ def completed(
     config: AutopilotSettings,
     stated: JudgedConditions,
 ) -> tuple[AnyController, dict[str, Any]]:
-    """Return a peer ready to fly, tuned where it has constants to tune, and notes on it."""
-    if not isinstance(peer, TunableConfig):
+    """Return a peer ready to fly, tuned where it lacks constants, and notes on it."""
+    if not isinstance(peer, TunableConfig) or None not in peer.parameters().values():
         return peer, {"config": peer.model_dump(mode="json")}
     found, notes = tuned_peer(name, peer, steering, config, stated)
     return type(peer).model_validate(found.model_dump()), notes
