@@ -123,6 +123,16 @@ def test_c_compiles_without_warnings_and_keeps_nothing(tmp_path: Path) -> None:
         assert float(printed.split()[1]) == pytest.approx(float(after[0, 3]), rel=1e-6)
 
 
+@pytest.mark.parametrize("left", [0, 5])
+def test_coefficients_of_zero_are_left_out(left: int, tmp_path: Path) -> None:
+    """A closed-form fit may find that most terms are nothing, or all of them."""
+    spec, model = built("plsr")
+    with torch.no_grad():
+        model.head.coefficients[left:] = 0.0  # type: ignore[index, operator]
+    card = exporter("c").export(spec, model, tmp_path / "boat.c", [])
+    assert max(card["parity"]["double"]["share_of_range"].values()) <= 1e-12
+
+
 def test_an_operation_that_is_not_known_is_refused_by_name() -> None:
     with pytest.raises(ExportError, match="model mine: its step uses torch's operation 'digamma'"):
         lowered(lambda x: torch.special.digamma(x + 1), [("x", 2)], ["y"], "model mine")

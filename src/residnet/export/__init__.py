@@ -10,6 +10,7 @@ from residnet.export.casadi_function import CasadiExporter
 from residnet.export.feed_forward import FeedForwardExporter
 from residnet.export.fmu.exporter import Fmu2Exporter, Fmu3Exporter
 from residnet.export.onnx_file import OnnxExporter
+from residnet.export.parameters.exporter import ParametersExporter
 from residnet.export.torchscript import TorchScriptExporter
 
 __all__ = ["Exporter", "exporter", "exporters"]
@@ -22,6 +23,7 @@ _BUILTIN: tuple[Exporter, ...] = (
     Fmu3Exporter(),
     Fmu2Exporter(),
     AotiExporter(),
+    ParametersExporter(),
     FeedForwardExporter(),
 )
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, ClassVar, final
 
 import numpy as np
+import torch
 
 from residnet.core.errors import ExportError
 from residnet.core.names import STATE
@@ -18,7 +19,7 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
 from residnet.export.base import Exporter
 from residnet.export.card import make_card
-from residnet.export.contract import DOUBLE, Numbers, accepted, checked, require_numbers, warmed
+from residnet.export.contract import Numbers, accepted, checked, require_numbers, warmed
 from residnet.export.guard import GuardedDynamics
 from residnet.export.lowering.build import lowered
 from residnet.export.lowering.program import Fold, Map, Pick, Product, Program
@@ -229,7 +230,7 @@ class CasadiExporter(Exporter):
             card = make_card(spec, model, rows, {}) | {
                 "format": "casadi",
                 "dtype": "float64",
-                "parity": checked(spec, model, stepped, "the CasADi function", DOUBLE),
+                "parity": checked(spec, model, stepped, "the CasADi function", torch.float64),
                 "safety": "The file holds expressions only.",
             }
             file.parent.mkdir(parents=True, exist_ok=True)

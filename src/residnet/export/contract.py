@@ -6,7 +6,7 @@ memory, then inputs, states and memories that no vessel has.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import numpy as np
@@ -60,15 +60,19 @@ def require_numbers(spec: ModelSpec, model: HybridDynamics) -> None:
 
 
 def checked(
-    spec: ModelSpec, model: HybridDynamics, stepped: Stepped, what: str, tolerance: float = SINGLE
+    spec: ModelSpec,
+    model: HybridDynamics,
+    stepped: Stepped,
+    what: str,
+    dtype: torch.dtype = torch.float32,
 ) -> dict[str, Any]:
     """Return what a card says of the parity, once a file answers good and bad inputs as it must.
 
     Raises:
         ExportError: where it does not; see `require_parity` and `require_defined`.
     """
-    shares = require_parity(spec, model, stepped, what, tolerance)
-    require_defined(spec, model, stepped, what)
+    shares = require_parity(spec, model, stepped, what, dtype)
+    require_defined(spec, model, stepped, what, dtype)
     return {"steps": PARITY_STEPS, "share_of_range": shares}
 
 
@@ -110,7 +114,11 @@ def require_sound(spec: ModelSpec, model: HybridDynamics, states: Tensor) -> Non
 
 
 def require_parity(
-    spec: ModelSpec, model: HybridDynamics, stepped: Stepped, what: str, tolerance: float = SINGLE
+    spec: ModelSpec,
+    model: HybridDynamics,
+    stepped: Stepped,
+    what: str,
+    dtype: torch.dtype = torch.float32,
 ) -> dict[str, float]:
     """Return the largest difference of each state from the model's, as a share of its range.
 
@@ -119,12 +127,13 @@ def require_parity(
         model: in the precision of `stepped`.
         stepped: what was written.
         what: was written, for messages.
-        tolerance: largest share.
+        dtype: precision of both, float32 or float64.
 
     Raises:
         ExportError: where a share is larger, or the model itself leaves what exports accept.
     """
-    y, w = drive(spec, _dtype(model))
+    tolerance = DOUBLE if dtype == torch.float64 else SINGLE
+    y, w = drive(spec, dtype)
     with torch.no_grad():
         eager = Rollout(model)(y[:, -1], w[:, PAST:], model.warmup(y, w[:, :PAST]))[0]
     require_sound(spec, model, eager)
@@ -145,13 +154,18 @@ def require_parity(
     return shares
 
 
-def require_defined(spec: ModelSpec, model: HybridDynamics, stepped: Stepped, what: str) -> None:
+def require_defined(
+    spec: ModelSpec,
+    model: HybridDynamics,
+    stepped: Stepped,
+    what: str,
+    dtype: torch.dtype = torch.float32,
+) -> None:
     """Refuse what answers bad inputs, states or memories otherwise than the model's guard.
 
     Raises:
         ExportError: that names the first entry and its value.
     """
-    dtype = _dtype(model)
     guarded = GuardedDynamics(model, spec).to(dtype).eval()
     y, w = (part[0] for part in drive(spec, dtype))
     memory = guarded.warmup(y.unsqueeze(0), w[:PAST].unsqueeze(0))[0]
@@ -212,10 +226,3 @@ def accepted(spec: ModelSpec, model: HybridDynamics) -> Callable[[Numbers, Numbe
         return bool(((seen >= least) & (seen <= most)).all())
 
     return measured
-
-
-def _dtype(model: HybridDynamics) -> torch.dtype:
-    kinds: Sequence[torch.dtype] = [
-        value.dtype for value in model.state_dict().values() if value.is_floating_point()
-    ]
-    return kinds[0] if kinds else torch.float32

@@ -43,9 +43,9 @@ def compile_shared(sources: Sequence[Path], out: Path, flags: Sequence[str] = ()
     call = [compiler(), "-O2", *STRICT, "-shared", "-fPIC", *flags, *map(str, sources)]
     done = subprocess.run([*call, "-o", str(out), "-lm"], capture_output=True, text=True)
     if done.returncode:
-        raise ExportError(
-            f"{sources[0].name}: does not compile ({done.stderr.strip().splitlines()[0]})"
-        )
+        lines = done.stderr.strip().splitlines()
+        said = next((line for line in lines if "error" in line), "no message")
+        raise ExportError(f"{sources[0].name}: does not compile ({said})")
     return out
 
 

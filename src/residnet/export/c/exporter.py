@@ -17,11 +17,11 @@ from residnet.export.base import Exporter
 from residnet.export.c.compiled import CompiledModel, compile_shared
 from residnet.export.c.vessel import vessel_source
 from residnet.export.card import make_card
-from residnet.export.contract import DOUBLE, SINGLE, checked, require_numbers
+from residnet.export.contract import checked, require_numbers
 
-_PRECISIONS: tuple[tuple[Literal["single", "double"], torch.dtype, float], ...] = (
-    ("single", torch.float32, SINGLE),
-    ("double", torch.float64, DOUBLE),
+_PRECISIONS: tuple[tuple[Literal["single", "double"], torch.dtype], ...] = (
+    ("single", torch.float32),
+    ("double", torch.float64),
 )
 
 
@@ -55,13 +55,13 @@ class CExporter(Exporter):
             source.write_text(written.source)
             header.write_text(written.header)
             parity = {}
-            for precision, dtype, tolerance in _PRECISIONS:
+            for precision, dtype in _PRECISIONS:
                 flags = [f"-D{written.prefix.upper()}_DOUBLE"] if precision == "double" else []
                 library = compile_shared([source], folder / f"{precision}.so", flags)
                 stepped = CompiledModel(library, written.prefix, model.n_state, precision)
                 given = copy.deepcopy(model).to(dtype)
                 what = f"the C file in {precision} precision"
-                parity[precision] = checked(spec, given, stepped, what, tolerance)
+                parity[precision] = checked(spec, given, stepped, what, dtype)
             card |= {"parity": parity}
             file.parent.mkdir(parents=True, exist_ok=True)
             file.with_suffix(".h").write_text(written.header)

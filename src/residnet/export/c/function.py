@@ -191,10 +191,14 @@ class FunctionBody:
     def product(self, instruction: Product) -> None:
         """Write a vector times a matrix; loops run along the results, which compilers vectorise."""
         out, left, right = instruction.out, instruction.left, instruction.right
-        rows, columns = right.shape
-        if rows * columns <= _WRITTEN_OUT:
+        # what meets zeros alone has not been made
+        wanted = self.program.needed[out.start : out.start + out.size]
+        kept = (~instruction.zero & wanted).any(axis=1)
+        if right.size <= _WRITTEN_OUT or not kept.any():
             self.small_product(instruction)
             return
+        left, right = left[kept], right[kept]
+        rows, columns = right.shape
         even = self.pattern(left)
         if even is None:
             copy = self.program.made(rows, "real")

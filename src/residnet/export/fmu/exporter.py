@@ -15,6 +15,8 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, ClassVar, Literal, final
 
+import torch
+
 from residnet.core.errors import ExportError
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
@@ -22,7 +24,7 @@ from residnet.export.base import Exporter
 from residnet.export.c.compiled import CompiledModel, compile_shared
 from residnet.export.c.vessel import CSource, vessel_source
 from residnet.export.card import make_card
-from residnet.export.contract import DOUBLE, checked, require_numbers
+from residnet.export.contract import checked, require_numbers
 from residnet.export.fmu.description import NAME, description
 
 _BUILD = """<?xml version="1.0" encoding="UTF-8"?>
@@ -71,7 +73,7 @@ class FmuExporter(Exporter):
                 folder / f"{NAME}{_library_suffix()}",
             )
             stepped = CompiledModel(library, written.prefix, model.n_state, "double")
-            card |= {"parity": checked(spec, model, stepped, "the FMU's code", DOUBLE)}
+            card |= {"parity": checked(spec, model, stepped, "the FMU's code", torch.float64)}
             file.parent.mkdir(parents=True, exist_ok=True)
             partial = file.with_name(file.name + ".partial")
             with zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as archive:

@@ -1,0 +1,1 @@
+"""The format `parameters`: a baseline's coefficients in the forms of other simulators."""

@@ -1,0 +1,120 @@
+"""Exported coefficients, read back and simulated as PythonVehicleSimulator and MSS do."""
+
+from __future__ import annotations
+
+import json
+import runpy
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import torch
+from exported_models import built
+
+from residnet.core.errors import UsageError
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.store import ModelSpec
+from residnet.export import exporter
+
+FORCES = ("tau_x", "tau_y", "tau_n")
+
+
+def believed() -> tuple[ModelSpec, HybridDynamics]:
+    """The WAM-V's hull as it is believed, driven by forces."""
+    spec = ModelSpec.model_validate(
+        {
+            "schema": "residnet.model/1",
+            "name": "hull",
+            "role": "baseline",
+            "signals": {"inputs": FORCES},
+            "baseline": {"kind": "believed", "vessel": "wam_v_cal"},
+            "dt": 0.05,
+            "integrator": "rk4",
+            "low": (-0.5, -0.5, -0.5, -200.0, -50.0, -300.0),
+            "high": (3.0, 0.5, 0.5, 400.0, 50.0, 300.0),
+        }
+    )
+    return spec, spec.build().double()
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("parameters")
+    (folder / "hull.masses.yaml").write_text("mass: 180\ninertia: 446\n")
+    exporter("parameters").export(*believed(), folder / "hull.parameters.json", [])
+    return folder
+
+
+def zigzag(step: Any, dt: float) -> list[float]:
+    """Overshoots in degrees of a 20/20 zigzag steered by a moment of 150 N m."""
+    psi, nu, side, farthest = 0.0, np.zeros(3), 1.0, 0.0
+    overshoots: list[float] = []
+    for _ in range(round(120.0 / dt)):
+        nu = step(nu, np.array([250.0, 0.0, 150.0 * side]))
+        psi += dt * nu[2]
+        # how far the heading goes on to the side that is being left
+        farthest = max(farthest, -side * psi)
+        if side * psi > np.radians(20.0):
+            overshoots.append(float(np.degrees(farthest)) - 20.0)
+            side, farthest = -side, 0.0
+    return overshoots[1:]
+
+
+def test_a_zigzag_has_the_overshoots_of_the_baseline(written: Path) -> None:
+    _, model = believed()
+    dt = 0.01
+    boat = runpy.run_path(str(written / "hull_vehicle.py"))["Hull"]()
+    card = json.loads((written / "hull.parameters.json").read_text())
+    mass, linear, quadratic = (np.array(card[name]) for name in ("M", "D", "D_n"))
+
+    def simulator(nu: np.ndarray, tau: np.ndarray) -> np.ndarray:
+        six = np.zeros(6)
+        six[[0, 1, 5]] = nu
+        after = boat.dynamics(np.zeros(6), six, np.zeros(3), tau, dt)[0]
+        return np.asarray(after[[0, 1, 5]])
+
+    def mss(nu: np.ndarray, tau: np.ndarray) -> np.ndarray:
+        """m2c of MSS in three degrees of freedom, its symmetric part first."""
+        whole = 0.5 * (mass + mass.T)
+        c = np.zeros((3, 3))
+        c[0, 2] = -whole[1, 1] * nu[1] - whole[1, 2] * nu[2]
+        c[1, 2] = whole[0, 0] * nu[0]
+        c[2, :2] = -c[:2, 2]
+        rest = tau - c @ nu - linear @ nu - quadratic @ (np.abs(nu) * nu)
+        return nu + dt * np.linalg.solve(mass, rest)
+
+    def own(nu: np.ndarray, tau: np.ndarray) -> np.ndarray:
+        z = torch.from_numpy(np.concatenate((nu, tau)))[None]
+        with torch.no_grad():
+            return nu + dt * model.baseline(z)[0].numpy()
+
+    wanted, first, second = (zigzag(step, dt) for step in (own, simulator, mss))
+    assert len(wanted) >= 2
+    np.testing.assert_allclose(first, wanted, atol=0.5)
+    np.testing.assert_allclose(second, wanted, atol=0.5)
+    assert card["share_left_out"]["u"] < 1e-9
+    assert 0.1 < card["share_left_out"]["v"] < 0.3
+    # the only terms of this hull that the form has no place for
+    assert card["terms_left_out"] == {"u_dot": [], "v_dot": ["|u|v"], "r_dot": ["|u|v"]}
+
+
+def test_gazebo_gets_added_masses_and_resistances(written: Path) -> None:
+    card = json.loads((written / "hull.parameters.json").read_text())
+    text = (written / "hull.sdf").read_text()
+    gz, vrx = ElementTree.fromstring(f"<sdf>{text}</sdf>").findall("plugin")
+    for plugin, sign in ((gz, -1.0), (vrx, 1.0)):
+        found = {child.tag: child.text for child in plugin}
+        assert float(found["xDotU"] or "") == pytest.approx(sign * (card["M"][0][0] - 180))
+        assert float(found["nDotR"] or "") == pytest.approx(sign * (card["M"][2][2] - 446))
+        assert float(found["xU"] or "") == pytest.approx(sign * card["D"][0][0])
+
+
+def test_what_cannot_be_told_is_asked_for(tmp_path: Path) -> None:
+    spec, model = believed()
+    with pytest.raises(UsageError, match=r"hull.masses.yaml: write there mass \(kg\), inertia"):
+        exporter("parameters").export(spec, model, tmp_path / "hull.parameters.json", [])
+    with pytest.raises(UsageError, match="accelerations do not tell all masses"):
+        exporter("parameters").export(*built("mlp"), tmp_path / "mlp.parameters.json", [])
+    assert not list(tmp_path.iterdir())
