@@ -69,7 +69,7 @@ def coefficients(spec: ModelSpec, model: HybridDynamics) -> Coefficients:
             f" ({', '.join(missing) or 'the forces act alike'} is not among the baseline's terms);"
             " fit a baseline of kind believed, or one of regressors with tau_x, tau_y and tau_n"
         )
-    mass = np.linalg.inv(by_force)
+    mass: Matrix = np.linalg.inv(by_force).astype(np.float64)
     low, high = np.array(spec.low[:3]), np.array(spec.high[:3])
     nu = np.random.default_rng(0).uniform(low, high, (_SAMPLES, 3))
     z = np.zeros((_SAMPLES, len(model.signals.names)))
