@@ -23,12 +23,11 @@ from residnet.control.courses.outline import Circle, Outlines
 from residnet.control.courses.route import LEG, Bend, Route, Sketch
 from residnet.control.courses.turn_table import (
     POINTS,
-    Array,
     Turns,
     following_turns,
     state_behind,
 )
-from residnet.control.courses.turns import TurnMaker
+from residnet.control.courses.turns import Array, TurnMaker
 from residnet.control.courses.words import Room
 from residnet.core.errors import ConfigError
 from residnet.core.progress import report
@@ -43,6 +42,8 @@ _TOLERANCE = 2e-3
 """Of distances, as a share of the vessel's turning radius."""
 _NARROW = (0.1, 0.04, 0.02)
 """Turned angles in rad between the turns that are made anew, round for round."""
+_UNCHANGED = 1e-3
+"""Largest change of z with which turns made anew fit each other."""
 _SMALL = math.radians(1.5)
 _SHORT = 0.3
 """Turning radii of a leg between two turns to one side that are tried as one."""
@@ -112,15 +113,15 @@ def plan(
     known: set[tuple[object, ...]] = set()
     for number, tries in enumerate((_TRIES, *((one,) for one in _MORE))):
         report("planning", number, 1 + len(_MORE))
-        found = []
+        found: list[tuple[Fit, Fitted]] = []
         for room, wide, rings in tries:
             sketch = _outline(request, room, wide, _RINGS[:rings])
             for outline in () if sketch is None else _simplified(request, sketch):
                 if (shape := _shape(outline)) in known:
                     continue
                 known.add(shape)
-                fitted = _fitted(request, outline)
-                found += [one for one in fitted if _right(request, *one, step, reasons)]
+                every = _fitted(request, outline)
+                found += [one for one in every if _right(request, *one, step, reasons)]
                 if found:
                     break
         for fit, fitted in sorted(found, key=lambda one: one[1].time):
@@ -248,8 +249,11 @@ def _joined(
             begin.append(state_behind(turn, float(leg)))
         joined = Route(route.start, route.sides, tuple(range(len(sides))), turns)
         fit = fit.on(joined)
-        fitted = fit.solve(np.clip(z, joined.least(), joined.most()))
+        before, z = z, np.clip(z, joined.least(), joined.most())
+        fitted = fit.solve(z)
         z = fitted.z
+        if np.abs(z - before).max() < _UNCHANGED:
+            break
     return fit, fitted
 
 

@@ -14,7 +14,7 @@ from scipy.optimize import Bounds, minimize
 
 from residnet.control.courses.outline import Circle
 from residnet.control.courses.route import Drawn, Route
-from residnet.control.courses.turn_table import Array
+from residnet.control.courses.turns import Array
 
 _ROUNDS = 40
 _QUICKER = 3
@@ -31,6 +31,9 @@ _NEAR = 3.0
 """Turning radii from a circle within which a part of the course is kept an eye on."""
 FARTHEST = 0.3
 """How much farther off than its circle a buoy may be passed, in turning radii."""
+
+
+_Results = tuple[float, Array, Array, Array, Array, Array, np.ndarray]
 
 
 class Fitted(NamedTuple):
@@ -70,6 +73,7 @@ class Fit:
         self.edges = np.concatenate(([0], middle, [-1]))
         self.others: list[tuple[int, int]] = []
         self.seen: Array | None = None
+        self.last: _Results
 
     def on(self, route: Route) -> Fit:
         """Return the same problem with other tables of turns."""
@@ -125,7 +129,7 @@ class Fit:
         sign = 1.0 if (piece[near].conjugate() * offset[near]).imag >= 0 else -1.0
         return _Near(distance, sign, change)
 
-    def results(self, z: Array) -> tuple[float, Array, Array, Array, Array, Array, Array]:
+    def results(self, z: Array) -> _Results:
         """Return the time, what must not be negative, what must vanish, and their derivatives."""
         if self.seen is not None and np.array_equal(self.seen, z):
             return self.last
@@ -251,7 +255,7 @@ class Fit:
             constraints=constraints,
             options={"maxiter": _ROUNDS, "ftol": 1e-5 * (weight or 1.0)},
         )
-        z = np.clip(result.x, least, most)
+        z: Array = np.clip(result.x, least, most)
         if (
             not np.isfinite(z).all()
             or self.missed(begin)[0] <= self.missed(z)[0] - 1e-3 * self.unit

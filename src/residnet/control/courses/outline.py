@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from residnet.control.courses.route import Bend, Sketch
-from residnet.control.courses.turn_table import Array
+from residnet.control.courses.turns import Array
 from residnet.control.courses.words import SIDES, Paths, Room, clear, from_line, paths
 
 _ANGLES = 36

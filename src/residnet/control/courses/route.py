@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from residnet.control.courses.turn_table import POINTS, Array, Turns
+from residnet.control.courses.turn_table import POINTS, Turns
+from residnet.control.courses.turns import Array
 
 LEG = 12
 """Points of a leg beside its beginning."""
@@ -181,8 +182,8 @@ class Route:
         at, last = np.zeros(len(buoys), dtype=np.intp), 0
         parts: list[tuple[int, int, Sequence[int]]] = []
         place = 0
-        for k, passed in enumerate(sketch.passed):
-            parts.append((place, place + LEG, passed))
+        for k, on_leg in enumerate(sketch.passed):
+            parts.append((place, place + LEG, on_leg))
             place += LEG
             if k < len(sketch.bends):
                 parts.append((place, place + POINTS, sketch.bends[k].passed))
@@ -242,8 +243,8 @@ class Route:
         for k, (end, turn, begin) in enumerate(legs):
             moved[begin:, 3 + 2 * k] += 1j * turn * (track[begin:] - end)
         for k, (end, shift, turn, begin) in enumerate(pivots):
-            behind = slice(begin + POINTS, None)
-            moved[behind, 2 + 2 * k] = shift + 1j * turn * (track[behind] - end)
+            later = slice(begin + POINTS, None)
+            moved[later, 2 + 2 * k] = shift + 1j * turn * (track[later] - end)
         return Drawn(
             track, time, level, moved * self.units, slower * self.units, turned * self.units
         )

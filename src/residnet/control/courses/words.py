@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from residnet.control.courses.turn_table import Array
+from residnet.control.courses.turns import Array
 
 _FULL = 2.0 * math.pi
 SIDES = ((1, 1), (-1, -1), (1, -1), (-1, 1))
@@ -73,9 +73,9 @@ def paths(
         needed = room.behind * np.minimum(first / _WIDE, 1.0) + room.before * np.minimum(
             last / _WIDE, 1.0
         )
-        possible = straight >= needed - 1e-9
+        possible = np.asarray(straight >= needed - 1e-9)
         if one != two:
-            possible &= far >= 2.0 * room.radius
+            possible = possible & (far >= 2.0 * room.radius)
         length = np.where(possible, room.radius * (first + last) + straight, np.inf)
         found.append((first, last, straight, heading, length))
     return Paths(*(np.stack(part) for part in zip(*found, strict=True)))

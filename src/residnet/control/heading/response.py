@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,7 +83,9 @@ def fit_response(records: Sequence[Record], longest_delay: float) -> SteeringRes
 
     begin = min(grid, key=cost)
     step = longest_delay / (_DELAYS - 1)
-    found = minimize(
+    # its types know no options of this method
+    search: Any = minimize
+    found = search(
         cost,
         begin,
         method="Nelder-Mead",

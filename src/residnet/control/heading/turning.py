@@ -131,7 +131,9 @@ def _zigzag(steered: Steered, angle: float, first: float) -> Record:
     low, high = steered.steps
     dt = low if high <= low else min(max(first / _FINE, low), high)
     model, x, w, s = steered.build(dt), steered.x, steered.w.clone(), steered.s
-    side, switches, rates, rudder = float(np.sign(angle)), 0, [], []
+    side, switches = float(np.sign(angle)), 0
+    rates: list[float] = []
+    rudder: list[float] = []
     with torch.no_grad():
         while switches < _SWITCHES:
             if len(rates) > _LONGEST:
