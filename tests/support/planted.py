@@ -335,7 +335,7 @@ FAULTS = (
     Fault("NaN stretch", ("nan",), _one(_nan)),
     Fault("outliers", ("outliers", "spikes"), _one(_spiky)),
     Fault("frozen sensor", ("frozen",), _one(_freeze)),
-    Fault("clipping", ("clipping",), _one(_clip)),
+    Fault("clipping", ("clipping", "frozen"), _one(_clip)),
     Fault(
         "r in deg/s",
         ("follows_r", "gain"),

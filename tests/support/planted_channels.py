@@ -34,7 +34,7 @@ _RUDDERS = ("delta",)
 
 def anywhere(fault: Fault) -> Fault:
     """A fault of the shipped vessels, to be planted in other logs too where these can show it."""
-    needs = {"rudder in deg": ("boat", "tanker"), "stuck actuator": ()}
+    needs = {"rudder in deg": ("boat", "tanker"), "stuck actuator": (), "no excitation": ()}
     hosts = needs.get(fault.name, ("boat", "twin", "tanker"))
     return dataclasses.replace(fault, hosts=hosts)
 

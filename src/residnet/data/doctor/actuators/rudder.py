@@ -182,7 +182,11 @@ def rudder_findings(log: Log, inputs: Sequence[str]) -> Iterator[Finding]:
         if name not in inputs:
             continue
         neutral = neutral_angle(log, name)
-        if neutral is not None and abs(neutral.angle) > max(_FAR, _SURE * neutral.error):
+        if neutral is not None and neutral.effect < -_SURE * neutral.effect_error:
+            text = f"positive {name} turns the vessel to port"
+            action = "turn it in the channel map (sign: -1), and check the sign of r and psi"
+            yield Finding("will mislead", "rudder_sign", text, {"effect": neutral.effect}, action)
+        elif neutral is not None and abs(neutral.angle) > max(_FAR, _SURE * neutral.error):
             text = (
                 f"the vessel goes straight at {name} = {math.degrees(neutral.angle):+.1f} +-"
                 f" {math.degrees(2.0 * neutral.error):.1f} deg"
