@@ -14,6 +14,7 @@ import residnet
 from residnet.core.config import validate
 from residnet.core.log import Log
 from residnet.data.drafting.questions import Marks, Question
+from residnet.data.drafting.sheets import peek
 from residnet.data.drafting.tables import draft_tables
 from residnet.data.drafting.units import written_unit
 from residnet.data.drafting.words import input_channel, state_channel, words_of
@@ -78,6 +79,17 @@ def test_a_table_is_read_as_it_was(style: Style, logs: list[Log], tmp_path: Path
     told = {".".join(key) for key, _ in marks.guesses}
     if not style.told:
         assert {f"data.reader.channels.{name}" for name in ("psi", "u", "r", "delta")} <= told
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "cp1252"])
+@pytest.mark.parametrize("language", ["German", "French", "Spanish", "Norwegian"])
+def test_the_encoding_of_a_header(language: str, encoding: str, tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    names = [f"{name} [°]" for name in NAMES[language]]
+    path.write_text(";".join(names) + "\n" + ";".join("1,5" for _ in names) + "\n", encoding)
+    sheet = peek(path)
+    assert sheet.header == tuple(names)
+    assert (sheet.about["delimiter"], sheet.about["decimal"]) == (";", ",")
 
 
 @pytest.mark.parametrize("language", NAMES)

@@ -28,6 +28,7 @@ ENDINGS = (".csv", ".tsv", ".txt", ".dat", ".xlsx", ".parquet")
 _ROWS = 20_000
 _HEAD = 1 << 16
 _JAPANESE = re.compile(r"[\u3040-\u30ff\u4e00-\u9fff]")
+_LATIN = re.compile(r"[\x00-\x7fÀ-ÿ°º²³µ·±´×–’]*")
 _COMMA = re.compile(r"\s*-?\d+,\d+(?:[eE][-+]?\d+)?\s*")
 _DAY = r"\d\s*[-./年]\s*\w{1,9}\s*[-./月]"
 _POINT = re.compile(r"\s*-?\d+\.\d+(?:[eE][-+]?\d+)?\s*")
@@ -140,14 +141,18 @@ def _csv(path: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]]:
 def _encoding(head: bytes) -> str:
     """Return the encoding of a text from its first bytes."""
     whole = head[: head.rfind(b"\n") + 1] or head
-    for encoding in ("utf-8", "cp932"):
-        try:
-            text = whole.decode(encoding)
-        except UnicodeDecodeError:
-            continue
-        if encoding == "utf-8" or _JAPANESE.search(text):
-            return encoding
-    return "cp1252"
+    try:
+        whole.decode("utf-8")
+        return "utf-8"
+    except UnicodeDecodeError:
+        # a Latin letter and the next one may look like one Japanese sign, but not the other way
+        if _LATIN.fullmatch(whole.decode("cp1252", errors="replace")):
+            return "cp1252"
+    try:
+        japanese = _JAPANESE.search(whole.decode("cp932"))
+    except UnicodeDecodeError:
+        japanese = None
+    return "cp932" if japanese else "cp1252"
 
 
 def _delimiter(lines: list[str]) -> str:
