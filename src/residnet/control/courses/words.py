@@ -116,7 +116,7 @@ def clear(
         _from_arc(end, sides[:, 1], found.heading, found.last, back, ends, radius, centres),
     )
     distance = np.minimum(distance, from_line(out, back, centres))
-    free: NDArray[np.bool_] = (distance >= radii).all(axis=1)
+    free: NDArray[np.bool_] = np.all(np.asarray(distance >= radii), axis=1)
     return free
 
 
