@@ -346,3 +346,15 @@ def test_the_tally_counts_logs_and_names_what_to_fix_first() -> None:
     assert counted.tally.startswith("Data doctor: 1 of 2 logs hold something")
     assert counted.first.startswith("First fix this: sick: ")
     assert [ill["tally"], ill["first"]] == counted.lines
+
+
+def test_a_jump_behind_a_gap_is_told_at_its_samples() -> None:
+    log = wavy()
+    x = log["x"].copy()
+    x[1200:] += 1.0
+    keep = np.r_[0:500, 560:2000]
+    sick = changed(log, x=x)
+    gap = Log("gap", sick.t[keep], {name: values[keep] for name, values in sick.channels.items()})
+    finding = one(inspect(gap), "position_jump")
+    assert finding.at is not None
+    assert finding.at.shape == gap.t.shape

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -127,9 +128,18 @@ def _trusted(log: Log, findings: Sequence[Finding]) -> Log:
     )
 
 
+def _at_samples(finding: Finding, grid: np.ndarray, t: np.ndarray) -> Finding:
+    """Return a finding about points of a grid [G] as one about the samples at t [T]."""
+    if finding.at is None:
+        return finding
+    near = np.searchsorted(grid - grid[0], t - t[0] - 1e-9)
+    return dataclasses.replace(finding, at=finding.at[np.minimum(near, grid.size - 1)])
+
+
 def _frames(log: Log) -> list[Finding]:
     try:
-        return frame_findings(align(log, GridConfig(step=float(np.median(np.diff(log.t))))))
+        grid = align(log, GridConfig(step=float(np.median(np.diff(log.t)))))
+        return [_at_samples(finding, grid.t, log.t) for finding in frame_findings(grid)]
     except DataError as error:
         return [Finding("fatal", "clock_span", f"frames not checked: {error}")]
 
