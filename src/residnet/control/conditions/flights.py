@@ -109,7 +109,8 @@ class ConditionedFlights:
         size = error.abs()
         outside = (counted * size / (size + conditions.band)).sum(1) * dt
         beyond = -error * self.changes.heading.sign()[:, None]
-        overshoot = (beyond * counted).amax(1).clamp(min=0.0)
+        # plus zero: no negative zero is shown
+        overshoot = (beyond * counted).amax(1).clamp(min=0.0) + 0.0
         moved = torch.diff(self.command, dim=1, prepend=torch.zeros_like(self.command[:, :1]))
         travel = (moved.abs() * counted).sum(1)
         cost = (
