@@ -238,7 +238,7 @@ class Spike(Mask):
     def apply(self, log: Log) -> np.ndarray:
         """Return [T] bool; see `Mask.apply`."""
         cells = spike_cells(log).values()
-        return np.logical_or.reduce([np.zeros(len(log), dtype=bool), *cells])
+        return np.asarray(np.logical_or.reduce([np.zeros(len(log), dtype=bool), *cells]))
 
 
 @final

@@ -51,9 +51,10 @@ def draw(explorers: Sequence[Explorer]) -> Drawn | None:
     if not explorers:
         return None
     from bokeh.embed import components
+    from bokeh.model import Model
     from bokeh.resources import Resources
 
-    canvases = {
+    canvases: dict[str, Model] = {
         f"{explorer.name}-{number}": canvas
         for explorer in explorers
         for number, canvas in enumerate(_panels(explorer))
@@ -87,14 +88,16 @@ def _numbered(texts: Sequence[str]) -> list[str]:
 
 def _panels(explorer: Explorer) -> list[Canvas]:
     """Return the panels; those of curves share their horizontal axis and a cursor."""
-    from bokeh.models import ColumnDataSource, CrosshairTool, DataRange1d, Span
+    from bokeh.models import ColumnDataSource, CrosshairTool, DataRange1d
+    from bokeh.models.annotations import Span
 
     time_axis: Any = DataRange1d(only_visible=True)
     cursor = Span(dimension="height", line_dash="dotted", line_width=1)
     out = []
     for number, panel in enumerate(explorer.panels):
-        columns = _columns(explorer, explorer.cases[0], number)
-        canvas = _canvas(explorer, panel, number, time_axis, ColumnDataSource(columns))
+        columns: dict[str, Any] = dict(_columns(explorer, explorer.cases[0], number))
+        source = ColumnDataSource(columns)
+        canvas = _canvas(explorer, panel, number, time_axis, source)
         if panel.kind == "curves":
             canvas.add_tools(CrosshairTool(dimensions="height", overlay=cursor))
         out.append(canvas)
@@ -104,7 +107,8 @@ def _panels(explorer: Explorer) -> list[Canvas]:
 def _canvas(
     explorer: Explorer, panel: Panel, number: int, time_axis: Any, source: ColumnDataSource
 ) -> Canvas:
-    from bokeh.models import BoxZoomTool, DataRange1d, HoverTool
+    from bokeh.models import BasicTicker, BoxZoomTool, DataRange1d, HoverTool
+    from bokeh.models.annotations import Title
     from bokeh.plotting import figure
 
     # what is switched off does not widen the axes
@@ -118,7 +122,7 @@ def _canvas(
         options["y_axis_type"] = "log"
     canvas = figure(
         name=f"{explorer.name}-{number}",
-        title=panel.title,
+        title=Title(text=panel.title, text_font_size=_FONT),
         height=panel.height,
         sizing_mode="stretch_width",
         toolbar_location=None,
@@ -141,19 +145,20 @@ def _canvas(
     canvas.add_tools(hover, BoxZoomTool(match_aspect=panel.kind == "map"))
     canvas.toolbar.active_drag = None
     canvas.xaxis.axis_label = panel.x_label or None
-    canvas.title.text_font_size = _FONT
     for axis in canvas.axis:
         axis.major_label_text_font_size = _FONT
         axis.axis_label_text_font_size = _FONT
         axis.axis_label_text_font_style = "normal"
-    canvas.yaxis.ticker.desired_num_ticks = 4
-    canvas.xaxis.ticker.desired_num_ticks = 5
+    if not panel.logarithmic:
+        canvas.yaxis.ticker = BasicTicker(desired_num_ticks=4)
+    canvas.xaxis.ticker = BasicTicker(desired_num_ticks=5)
     return canvas
 
 
 def _curve(explorer: Explorer, panel: Panel, name: str, source: ColumnDataSource) -> Any:
     """Return the renderer of a curve, added to nothing yet."""
-    from bokeh.models import GlyphRenderer, Line, Scatter
+    from bokeh.models import Line, Scatter
+    from bokeh.models.renderers import GlyphRenderer
 
     look = explorer.looks[name]
     color = "#808080" if look.color == INK else look.color
