@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -227,7 +228,7 @@ def test_a_simulation_by_function_mapping_and_command_line_is_one(
     config = {"task": "simulate", "name": "flown", "programme": programme}
     run = cli_rows(config, tmp_path, monkeypatch)
     result = residnet.run(config)
-    assert result.read("indices.json") == RunFolder(run.path)._read(run.path / "indices.json")
+    assert result.read("indices.json") == json.loads((run.path / "indices.json").read_text())
     trials = residnet.simulate(**programme)
     for log in trials.logs:
         stored = residnet.Log.load(run.path / "logs" / f"{log.name}.parquet")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -131,7 +132,8 @@ def test_evolution_finds_better_gains_than_a_grid_of_guesses_and_again_the_same(
     settings = EvolutionConfig(flights=8, population=4, generations=5)
     found = evolve(PdConfig(), STEERING, config, settings, 5)
     changes = config.draw(8, 0.1, torch.Generator().manual_seed(5))
-    again = fly_under(VESSEL, PdConfig(**found.parameters).build(STEERING), changes)
+    gains: dict[str, Any] = dict(found.parameters)
+    again = fly_under(VESSEL, PdConfig(**gains).build(STEERING), changes)
     assert found.cost == pytest.approx(float(again.measured(config)["cost"].mean()), rel=1e-2)
     for kp in (0.5, 2.0, 6.0):
         for damping in (0.5, 1.5):

@@ -5,6 +5,7 @@ their own.
 from __future__ import annotations
 
 import math
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -250,6 +251,7 @@ def test_a_course_that_turns_back_leaves_every_buoy_on_its_side_outside_its_circ
     vessel: SteeredPlant,
 ) -> None:
     """Buoys to and fro with sides that need loops; judged by the points of the plan alone."""
+    places: list[tuple[float, float, Literal["starboard", "port"]]]
     places = [(60.0, 0.0, "port"), (10.0, 25.0, "port"), (75.0, 45.0, "starboard")]
     places += [(60.0, -45.0, "starboard")]
     buoys = tuple(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -21,7 +22,12 @@ from residnet.physics.vessel import load_vessel
 
 DEG = math.pi / 180
 STATE = ("psi", "u", "r")
-RATES = {"heading_rate": 2.0, "yaw_rate_rate": 5.0, "push_rate": 1.0, "cross_rate": 0.3}
+RATES: dict[str, Any] = {
+    "heading_rate": 2.0,
+    "yaw_rate_rate": 5.0,
+    "push_rate": 1.0,
+    "cross_rate": 0.3,
+}
 PTOS = PtosConfig(lag=0.3, steepness=37.0, share=0.65, damping=0.88, **RATES)
 LQR = ObservedLqrConfig(lag=0.3, heading_weight=4.0, rate_weight=1.0, **RATES)
 

@@ -421,8 +421,8 @@ def _driving(log: Log) -> list[str]:
 
 def _steer_reversed(ship: Ship, log: Log) -> Log:
     if "n_port" in log.channels:
-        pairs = (("n_port", "n_stbd"), ("cmd_port", "cmd_stbd"))
-        pairs = tuple(pair for pair in pairs if pair[0] in log.channels)
+        sides = (("n_port", "n_stbd"), ("cmd_port", "cmd_stbd"))
+        pairs = [pair for pair in sides if pair[0] in log.channels]
         swapped = {a: log[b] for a, b in pairs} | {b: log[a] for a, b in pairs}
         return _with(log, **swapped)
     names = [name for name in _driving(log) if "delta" in name or "tau_n" in name]
