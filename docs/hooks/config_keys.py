@@ -207,8 +207,9 @@ def keys(config: type[BaseModel]) -> Iterator[Key]:
     for name, field in config.model_fields.items():
         if name != chosen:
             kind = described_type(field.annotation, field.metadata) + limits(field)
-            text = field.description or texts.get(name)
-            yield Key(field.alias or name, kind, default(field), text)
+            key = field.alias or name
+            text = field.description or texts.get(key) or texts.get(name)
+            yield Key(key, kind, default(field), text)
 
 
 def undocumented() -> list[str]:
