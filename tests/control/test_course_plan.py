@@ -244,7 +244,8 @@ def test_a_vessel_that_sways_and_rolls_follows_turns_that_join_each_other() -> N
         _, place = guidance(state[None], 0, place)
         aside.append(abs(float(guidance.error(state[None], place[:, 0])[1])))
     assert float(place) >= planned.course.length
-    assert max(aside) < 0.5
+    # two of a hundred of the hull's length, where one turn joins the next
+    assert max(aside) < 0.02 * 51.5
 
 
 def test_a_course_that_turns_back_leaves_every_buoy_on_its_side_outside_its_circle(

@@ -97,8 +97,8 @@ def test_faults_of_formats_and_vessels(installed: Path) -> None:
     assert isinstance(exporters()["odd"], registry.ThirdParty)
     with pytest.raises(ConfigError, match=r"format 'odd' of the package made 1\.0 cannot be"):
         exporter("odd")
-    with pytest.raises(ConfigError, match=r"no export format 'onxx'; valid: .*torchscript"):
-        exporter("onxx")
+    with pytest.raises(ConfigError, match=r"no export format 'gguf'; valid: .*torchscript"):
+        exporter("gguf")
 
 
 def test_a_vessel_package_without_files(installed: Path) -> None:

@@ -170,7 +170,6 @@ def test_a_resolved_config_needs_no_vessel_file() -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"inputs": []}, "at least 1"),
         ({"exogenous": ["wind_sped", "wind_dir"]}, "did you mean 'wind_speed'"),
         ({"exogenous": ["wind_speed"]}, "needs both wind_speed and wind_dir"),
         ({"inputs": ["n", "n"]}, r"\['n'\] are named twice"),

@@ -127,7 +127,7 @@ def made_course(run: Path) -> Path:
                 "split": "simulated",
                 "finished": True,
                 "course_time": 61.5,
-                "floor_time": 60.0,
+                "reference_time": 60.0,
                 "ratio": 1.025,
                 "ratio_turning": 0.95,
                 "margin": -0.5,
@@ -150,7 +150,7 @@ def made_course(run: Path) -> Path:
                 "margin": 1.0,
                 "margin_worst": -2.0,
                 "cross_track_rms": 0.9,
-                "floor_time": 60.0,
+                "reference_time": 60.0,
             }
         )
         place = {"north": 2 * t, "east": t, "protocol": protocol}

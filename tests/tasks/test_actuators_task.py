@@ -105,7 +105,7 @@ def test_logs_become_lines_of_a_vessel_file(
         ("bollard.pull.column", "tension", 2, "no column 'tension'"),
         ("bollard.thrusters", 0, 2, "greater than or equal to 1"),
         ("bollard.files", ["bolard.csv"], 2, "no such file"),
-        ("step.t.unit", "sec", 2, "unknown unit 'sec'"),
+        ("step.t.unit", "fortnight", 2, "unknown unit 'fortnight'"),
         ("step.t.column", "cmd", 1, "time repeats"),
         ("bolard", {}, 2, "did you mean 'bollard'"),
     ],

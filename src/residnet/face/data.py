@@ -84,7 +84,7 @@ class Data:
 
 def prepare(
     logs: LogsGiven | Mapping[str, Any],
-    inputs: Sequence[str] = (),
+    inputs: Sequence[str] | None = None,
     *,
     step: float | str | None = None,
     exogenous: Sequence[str] = (),
@@ -114,7 +114,8 @@ def prepare(
         logs: a list of logs (of each five, in the order of their manoeuvres, the third is for
             validation and the fifth for the test; at least three), a mapping from `train`,
             `validation` and `test` to logs, or the `data` section of a config.
-        inputs: command channels that drive the model, in order.
+        inputs: command channels that drive the model, in order; an empty list for a model without
+            any.
         step: of the grid in s.
         exogenous: channels that nobody commands: wind_speed and wind_dir.
         forces: a vessel whose thrusters turn the inputs into tau_x, tau_y, tau_n.
@@ -136,7 +137,7 @@ def prepare(
 
     Raises:
         ConfigError: where a setting is wrong.
-        UsageError: where a channel is missing.
+        UsageError: where a channel is missing, or no inputs are named.
         DataError: where a log holds nothing to learn from or to predict, or splits share data.
 
     Example:
@@ -147,6 +148,11 @@ def prepare(
             return _external(logs, like)
         splits, source = _splits(logs)
         every = [log for members in splits.values() for log in members]
+        if inputs is None:
+            raise UsageError(
+                "prepare: inputs: name the channels that drive the vessel; the first log has"
+                f" {', '.join(every[0].channels)} (an empty list makes a model without commands)"
+            )
         settings = {
             "inputs": list(inputs) if not isinstance(inputs, str) else inputs,
             "exogenous": exogenous,
