@@ -119,6 +119,7 @@ def test_what_the_believed_hull_lacks_stands_beside_what_was_found() -> None:
     assert set(truth) <= set(FERRY_TERMS)
 
 
+@pytest.mark.whole_runs
 def test_feed_forward_alone_and_a_model_that_cannot_run_forward(tmp_path: Path) -> None:
     found = study(
         config(

@@ -91,6 +91,7 @@ def test_truth_and_heads_beat_the_baseline(tiny_run: Path) -> None:
     assert sum(row["diverged"] for row in rows(tiny_run)) == 0
 
 
+@pytest.mark.whole_runs
 def test_same_seed_same_metrics(
     tiny_config: Path, tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -111,6 +112,7 @@ def test_another_seed_other_head(
     assert changed == {"lstm", "mean"}
 
 
+@pytest.mark.whole_runs
 def test_killed_and_resumed(
     tiny_config: Path, tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -136,6 +138,7 @@ def test_killed_and_resumed(
     assert rows(out) == rows(tiny_run)
 
 
+@pytest.mark.whole_runs
 def test_models_read_back_give_the_same_rows(
     tiny_config: Path, tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
