@@ -13,7 +13,7 @@ from residnet.baselines.regressors import RegressorBaseline
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec, save_model
 from residnet.heads.lstm import LstmHead
-from residnet.judge.sanity import (
+from residnet.judge.verdict.sanity import (
     BOUNDED,
     CHECKS,
     DAMPING,
@@ -25,7 +25,7 @@ from residnet.judge.sanity import (
     check_run,
     growth_rate,
 )
-from residnet.judge.sanity_points import Mirror, acceleration, operating_points
+from residnet.judge.verdict.sanity_points import Mirror, acceleration, operating_points
 from residnet.physics.signals import SignalsConfig
 
 # u_dot, v_dot, r_dot by term: a vessel that behaves

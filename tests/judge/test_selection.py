@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from residnet.judge.selection import Blocks, Contender, Selection, choose
+from residnet.judge.verdict.selection import Blocks, Contender, Selection, choose
 
 EVEN = Blocks(np.full(5, 0.2), "logs")
 JITTER = np.array([1.0, -1.0, 2.0, -2.0, 0.0])

@@ -15,8 +15,8 @@ from residnet.core.log import Log
 from residnet.data.prepare import PrepareConfig, Prepared, prepare
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
-from residnet.judge.course_stability import contradiction, steady_runs
-from residnet.judge.soundness import runaway, training_points, wrong_damping
+from residnet.judge.verdict.course_stability import contradiction, steady_runs
+from residnet.judge.verdict.soundness import runaway, training_points, wrong_damping
 from residnet.physics.signals import SignalsConfig
 
 STEP = 0.5

@@ -13,8 +13,8 @@ from residnet.heads import ZeroHead
 from residnet.judge.freerun import Candidate, FreeRun, Prediction
 from residnet.judge.metrics import nrmse_of_windows, window_errors
 from residnet.judge.protocol import Windows
-from residnet.judge.selection import blocks_of, shares
-from residnet.judge.trust import compared, outside, trust
+from residnet.judge.verdict.selection import blocks_of, shares
+from residnet.judge.verdict.trust import compared, outside, trust
 from residnet.physics.signals import SignalsConfig
 
 STEP, SCALES = 0.5, {"u": 0.5, "v": 0.2, "r": 0.1}

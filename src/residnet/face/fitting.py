@@ -21,9 +21,9 @@ from residnet.identification.fit import Identified
 from residnet.identification.fit import fit as identify
 from residnet.identification.prepared import require_window
 from residnet.identification.settings import FitSettings
-from residnet.judge.selection import Selection
 from residnet.judge.tables import metrics_table
-from residnet.judge.verdict import Evidence, verdict
+from residnet.judge.verdict.selection import Selection
+from residnet.judge.verdict.sentences import Evidence, verdict
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -32,8 +32,8 @@ from residnet.identification.selecting import examine, select
 from residnet.identification.settings import FitSettings
 from residnet.identification.solution_choice import choose_solution
 from residnet.identification.validation import ValidationScore
-from residnet.judge.sanity import Finding
-from residnet.judge.selection import Selection
+from residnet.judge.verdict.sanity import Finding
+from residnet.judge.verdict.selection import Selection
 from residnet.training.config import TrainingConfig
 from residnet.training.refit import refit
 

@@ -15,10 +15,10 @@ from residnet.heads import ClosedFormHead
 from residnet.identification.evaluation import Evaluation
 from residnet.identification.models import FittedModel
 from residnet.judge.config import EvaluationConfig
-from residnet.judge.course_stability import SteadyRun, contradiction, steady_runs
-from residnet.judge.sanity import BOUNDED, DAMPING, STABILITY, Finding, check_model
-from residnet.judge.selection import Contender, Selection, blocks_of, choose, shares
-from residnet.judge.soundness import TrainingPoints, runaway, training_points, wrong_damping
+from residnet.judge.verdict.course_stability import SteadyRun, contradiction, steady_runs
+from residnet.judge.verdict.sanity import BOUNDED, DAMPING, STABILITY, Finding, check_model
+from residnet.judge.verdict.selection import Contender, Selection, blocks_of, choose, shares
+from residnet.judge.verdict.soundness import TrainingPoints, runaway, training_points, wrong_damping
 
 _CHECKED = ("train", "validation")
 """Splits whose windows may not diverge; what the test data show comes too late for a choice."""

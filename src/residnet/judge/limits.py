@@ -12,7 +12,7 @@ from residnet.data.prepare import Prepared
 from residnet.judge.bootstrap import blocks
 from residnet.judge.freerun import Candidate, FreeRun, integrate
 from residnet.judge.metrics import against, nrmse_of_windows, window_errors
-from residnet.judge.trust import compared, outside, trust
+from residnet.judge.verdict.trust import compared, outside, trust
 
 SCHEMA = "residnet.limits/1"
 _WORST = 3

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from residnet.judge.metrics import SCHEMA
-from residnet.judge.verdict import diverged_note
+from residnet.judge.verdict.sentences import diverged_note
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from residnet.judge.sanity_file import read_findings
+from residnet.judge.verdict.sanity_file import read_findings
 from residnet.report.blocks import Section
 from residnet.report.figures.files import figures_section
 from residnet.report.figures.fit import write_figures

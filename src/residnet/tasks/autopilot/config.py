@@ -236,16 +236,6 @@ class AutopilotSettings(ComputingTask):
                 )
         return self
 
-    def check(self) -> None:
-        """Check that the vessel and the learned models of it are there and turn steadily.
-
-        Raises:
-            ResidnetError: where one is missing, does not fit, or does not hold its turn.
-        """
-        from residnet.tasks.autopilot.requirements import check_vessels
-
-        check_vessels(self)
-
     def recorded_seed(self) -> int:
         """Return the seed of weights, batches and random vessels."""
         return self.seed

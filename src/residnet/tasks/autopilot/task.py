@@ -25,6 +25,16 @@ class AutopilotConfig(AutopilotSettings):
 
     verbs: ClassVar[tuple[str, ...]] = ("report", "export")
 
+    def check(self) -> None:
+        """Check that the vessel and the learned models of it are there and turn steadily.
+
+        Raises:
+            ResidnetError: where one is missing, does not fit, or does not hold its turn.
+        """
+        from residnet.tasks.autopilot.requirements import check_vessels
+
+        check_vessels(self)
+
     def carry_out(self, folder: RunFolder) -> Outcome:
         """Train, tune and compare.
 

@@ -56,17 +56,6 @@ class FitTaskSettings(FitSettings, ComputingTask):
                 )
         return self
 
-    def check(self) -> None:
-        """Check that the logs hold what every part of the fit asks for, without fitting.
-
-        Raises:
-            ResidnetError: where a file or a channel is missing, a log cannot be read, or manoeuvres
-                are too few or too short.
-        """
-        from residnet.tasks.fit.inputs import check_logs
-
-        check_logs(self)
-
     def input_files(self) -> list[Path]:
         """Return the files of the measured logs."""
         return input_files(self.data)

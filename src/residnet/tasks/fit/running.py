@@ -15,7 +15,7 @@ from residnet.identification.prepared import PreparedSplits, prepare_logs
 from residnet.identification.teacher_forced import residual_table, term_table
 from residnet.judge.goodness import content
 from residnet.judge.rollout_files import write_rollouts
-from residnet.judge.sanity_file import content as sanity_content
+from residnet.judge.verdict.sanity_file import content as sanity_content
 from residnet.runs.folder import RunFolder
 from residnet.runs.model_store import FolderStore
 from residnet.runs.task import Outcome

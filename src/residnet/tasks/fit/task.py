@@ -20,6 +20,17 @@ class FitConfig(FitTaskSettings):
 
     verbs: ClassVar[tuple[str, ...]] = ("report", "evaluate", "export")
 
+    def check(self) -> None:
+        """Check that the logs hold what every part of the fit asks for, without fitting.
+
+        Raises:
+            ResidnetError: where a file or a channel is missing, a log cannot be read, or manoeuvres
+                are too few or too short.
+        """
+        from residnet.tasks.fit.inputs import check_logs
+
+        check_logs(self)
+
     def carry_out(self, folder: RunFolder) -> Outcome:
         """Fit all models and judge them in free run.
 

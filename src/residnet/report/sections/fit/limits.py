@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from residnet.judge.verdict import diverged_note
+from residnet.judge.verdict.sentences import diverged_note
 from residnet.report.blocks import Block, Cell, Section, Table, Text
 from residnet.report.format import DASH, DEG, fixed, number, percent, plural, signed, title_of
 from residnet.report.run_reader import Content, RunFiles

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from residnet.judge.verdict import diverged_note
+from residnet.judge.verdict.sentences import diverged_note
 from residnet.report.blocks import Cell, Section, Table, Text
 from residnet.report.format import DASH, number, whole
 from residnet.report.run_reader import Content, RunFiles

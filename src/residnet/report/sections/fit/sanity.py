@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from residnet.judge.sanity import CHECKS, Finding
+from residnet.judge.verdict.sanity import CHECKS, Finding
 from residnet.report.blocks import Cell, Facts, Section, Table
 from residnet.report.format import minus
 from residnet.report.run_reader import RunFiles

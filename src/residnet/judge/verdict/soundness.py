@@ -1,7 +1,8 @@
 """What makes a model unsound inside its training data: damping of the wrong sign, running away.
 
 Both are looked at where the logs have been, at recorded states and inputs. What a model does at
-combinations that no log holds is reported by `residnet.judge.sanity`, and speaks against no choice.
+combinations that no log holds is reported by `residnet.judge.verdict.sanity`, and speaks against
+no choice.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from residnet.core.names import VELOCITY
 from residnet.data.prepare import Prepared
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
-from residnet.judge.sanity_points import acceleration
+from residnet.judge.verdict.sanity_points import acceleration
 
 _POINTS = 90
 _NEGLIGIBLE = 0.05

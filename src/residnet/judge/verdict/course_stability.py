@@ -19,8 +19,8 @@ from residnet.core.layout import SURGE, SWAY, VELOCITIES, YAW_RATE
 from residnet.core.stretches import stretches
 from residnet.data.prepare import Prepared
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.judge.sanity import growth_rate
-from residnet.judge.sanity_points import OperatingPoint
+from residnet.judge.verdict.sanity import growth_rate
+from residnet.judge.verdict.sanity_points import OperatingPoint
 
 _HELD = 0.02
 _GROWN = 20.0

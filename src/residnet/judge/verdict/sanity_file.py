@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from residnet.core.errors import DataError
-from residnet.judge.sanity import Finding, check_run
+from residnet.judge.verdict.sanity import Finding, check_run
 
 SCHEMA = "residnet.sanity/1"
 

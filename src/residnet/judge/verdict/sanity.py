@@ -14,7 +14,7 @@ from residnet.core.layout import LATERAL, RANGE_INPUTS, RANGE_VELOCITIES, SURGE,
 from residnet.core.names import STATE, VELOCITY
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec, load_model, model_names
-from residnet.judge.sanity_points import (
+from residnet.judge.verdict.sanity_points import (
     Mirror,
     OperatingPoint,
     acceleration,
