@@ -15,6 +15,7 @@ from random_vessels import random_logs, ship_of
 
 from residnet.core.log import Log
 from residnet.data.doctor import inspect, inspect_together
+from residnet.data.doctor.actuators.propeller import propeller_findings
 from residnet.data.outliers import spike_cells, without_spikes
 from residnet.data.plausible import beyond_belief, fills
 
@@ -61,3 +62,29 @@ def test_fill_values_are_told_from_measurements() -> None:
     values[3], values[7] = -9999.0, np.float32(9.96921e36)
     assert np.flatnonzero(fills(values)).tolist() == [3, 7]
     assert beyond_belief(np.array([3.0, 1e4, np.nan]), "m/s").tolist() == [False, True, False]
+
+
+def twin(port: float, stbd: float, yaw: float, speed: float) -> Log:
+    """A vessel with two propellers and no rudder at steady revolutions."""
+    t = np.arange(600) * 0.1
+    noise = np.random.default_rng(0)
+    u = speed + 0.01 * noise.normal(size=t.size)
+    r = yaw + 0.002 * noise.normal(size=t.size)
+    n_port, n_stbd = (np.full(t.size, value) for value in (port, stbd))
+    return Log("twin", t, {"u": u, "r": r, "n_port": n_port, "n_stbd": n_stbd})
+
+
+@pytest.mark.parametrize(
+    ("log", "said"),
+    [
+        (twin(-10.0, 30.0, -0.3, 0.8), []),  # it turns to port because one runs astern
+        (twin(-20.0, 20.0, 0.0, 1.2), ["propeller_sign"]),  # it would turn, and does not
+        (twin(-20.0, -20.0, 0.0, 1.2), ["propeller_sign"] * 2),
+        (twin(34.0, 34.0, 0.0, 1.9), []),  # who does not steer does not turn
+        (twin(1200.0, 600.0, -0.3, 1.2), ["unit", "unit"]),
+        (twin(0.8, 30.0, -0.3, 0.9), []),  # one hardly turns, the other drives
+    ],
+)
+def test_two_propellers_steer_by_their_difference(log: Log, said: list[str]) -> None:
+    found = propeller_findings(log, ["n_port", "n_stbd"])
+    assert [finding.code for finding in found] == said

@@ -66,7 +66,8 @@ def test_every_block_is_drawn_and_nothing_is_loaded_or_run(tmp_path: Path) -> No
     text = path.read_text()
     page = Page(text)
     assert path == tmp_path / "report.html"
-    assert "<strong>It works.</strong> Well." in text
+    assert "<strong>It works.</strong>" in text
+    assert "<li>Well.</li>" in text
     assert "run &amp; all" in text
     assert "A &lt;b&gt;." in text
     assert page.tables == [

@@ -20,6 +20,8 @@ _FACT_TITLES = {"git": "git revision", "python": "Python", "started": "started (
 _FACTS = ("residnet", "git", "seed", "python", "machine", "started")
 
 
+_UNIT = re.compile(r"(?<=\d) (?=(?:%|m|s|deg|m/s|deg/s|1/s|N|kN)(?![\w/]))")
+"""The space between a number and its unit."""
 _LONG = 20
 """Least number of characters of a name that may break in the middle."""
 
@@ -140,12 +142,16 @@ def _anchor(title: str) -> str:
 
 
 def _breakable(text: str) -> Markup:
-    """Return escaped text whose long names and paths may break after underscores and slashes."""
+    """Return escaped text whose long names and paths may break after underscores and slashes.
+
+    A number and its unit stay in one line.
+    """
 
     def broken(found: re.Match[str]) -> str:
         return re.sub(r"([_/])", r"\1<wbr>", found[0])
 
-    return Markup(re.sub(rf"\S{{{_LONG},}}", broken, str(escape(text))))
+    together = _UNIT.sub("\u00a0", str(escape(text)))
+    return Markup(re.sub(rf"\S{{{_LONG},}}", broken, together))
 
 
 def _embedded(path: Path) -> str:

@@ -124,7 +124,7 @@ def trusted(evidence: Evidence) -> list[str]:
         text += (
             f", and at mean speeds of {speeds[0]:.2g} to {speeds[1]:.2g} m/s"
             if speeds is not None
-            else ", but at no third of the speeds alone"
+            else ", but in no band of speeds alone"
         )
     return [f"{text}: there its errors are {criterion}."]
 

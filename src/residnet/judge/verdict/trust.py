@@ -21,7 +21,9 @@ from residnet.judge.metrics import nrmse_of_windows
 
 ZERO = "zero"
 _PARTS = 8
-_BANDS = 3
+_MOST_BANDS = 3
+_OF_A_BAND = 5
+"""Windows that a band of speeds has where there are so many: fewer logs have no interval."""
 _LEAST = 3
 
 
@@ -100,8 +102,8 @@ def trust(
     Returns:
         By model `horizons` and `speeds`, each a list of entries with `low` and `high` (s after the
         start, or m/s), `windows`, and `difference` to `zero` as in metrics.json. Horizons are
-        eighths of the longest window, speeds thirds of the windows by mean speed. Parts of fewer
-        than three windows are left out.
+        eighths of the longest window, speeds up to three equal parts of the windows by mean speed.
+        Parts of fewer than three windows are left out.
     """
     if ZERO not in run.predictions:
         return {}
@@ -131,7 +133,7 @@ def trust(
             entry = _entry(own[:, part], zero[:, part], numbers, there)
             horizons += [{"low": begin * step, "high": end * step, **e} for e in entry]
         bands = []
-        for there in _thirds(speeds):
+        for there in _bands(speeds):
             entry = _entry(whole[candidate.name], whole[ZERO], numbers, there)
             low, high = float(speeds[there].min()), float(speeds[there].max())
             bands += [{"low": low, "high": high, **e} for e in entry]
@@ -174,8 +176,9 @@ def _by_part(
     return out
 
 
-def _thirds(values: np.ndarray) -> list[np.ndarray]:
-    """[W] bool of each third that has a window, lowest first; equal values stay together."""
-    edges = np.quantile(values, np.arange(1, _BANDS) / _BANDS)
+def _bands(values: np.ndarray) -> list[np.ndarray]:
+    """[W] bool of each band that has a window, lowest first; equal values stay together."""
+    count = min(max(len(values) // _OF_A_BAND, 1), _MOST_BANDS)
+    edges = np.quantile(values, np.arange(1, count) / count)
     place = np.searchsorted(edges, values, side="left")
-    return [place == band for band in range(_BANDS) if (place == band).any()]
+    return [place == band for band in range(count) if (place == band).any()]

@@ -112,7 +112,11 @@ def _chosen(run: RunFiles, windows: Sequence[StoredWindow]) -> list[tuple[Stored
             if window.protocol == protocol and judge in window.predicted:
                 groups.setdefault((protocol, window.manoeuvre), []).append(window)
     ranked: list[tuple[int, int, StoredWindow, str]] = []
-    for place, members in enumerate(groups.values()):
+    # the kind of manoeuvre with the most runs comes first
+    by_count = sorted(
+        groups.items(), key=lambda item: (run.protocols.index(item[0][0]), -len(item[1]))
+    )
+    for place, (_, members) in enumerate(by_count):
         members.sort(key=lambda window: float((window.rmse(judge) / divisor).mean()))
         middle = (len(members) - 1) // 2
         for order, (index, rank) in enumerate(((middle, 1), (len(members) - 1, 2), (0, 0))):
