@@ -157,7 +157,7 @@ class MMGConfig(IdentifiedConfig):
     beliefs: dict[str, tuple[float, Annotated[float, Field(ge=0)]]] = Field(default_factory=dict)
     revolutions: str = "n"
     angle: str = "delta"
-    correlation: int = Field(default=100, ge=1)
+    correlation: int = Field(default=100, ge=1, le=100_000)
     manoeuvres: tuple[str, ...] = ()
 
     @model_validator(mode="after")

@@ -43,7 +43,7 @@ class BasisConfig(FeatureConfig):
     terms: tuple[str, ...] = ()
     degree: int = Field(default=2, ge=1, le=4)
     choose: Literal["one_step", "free_run"] = "free_run"
-    folds: int | None = Field(default=None, ge=2)
+    folds: int | None = Field(default=None, ge=2, le=1_000)
 
     @model_validator(mode="after")
     def _space(self) -> Self:

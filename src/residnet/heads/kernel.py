@@ -53,7 +53,7 @@ class KernelConfig(FeatureConfig):
         default=(1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1), min_length=1
     )
     choose: Literal["one_step", "recursion", "free_run"] = "free_run"
-    folds: int | None = Field(default=None, ge=2)
+    folds: int | None = Field(default=None, ge=2, le=1_000)
 
     def build(self, names: Sequence[str]) -> KernelHead:
         """Return the module for channels `names`."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal, final
+from typing import Annotated, Literal, final
 
 import torch
 from pydantic import Field
@@ -21,6 +21,9 @@ ACTIVATIONS: dict[str, type[nn.Module]] = {
 }
 
 
+_Units = Annotated[int, Field(ge=1, le=10_000)]
+
+
 class MlpConfig(FeatureConfig):
     """A network of layers with one activation.
 
@@ -34,7 +37,7 @@ class MlpConfig(FeatureConfig):
     """
 
     kind: Literal["mlp"] = "mlp"
-    hidden: tuple[int, ...] = Field(default=(64, 64), min_length=1)
+    hidden: tuple[_Units, ...] = Field(default=(64, 64), min_length=1, max_length=100)
     activation: Literal["tanh", "silu", "relu", "softsign"] = "tanh"
     dropout: float = Field(default=0.0, ge=0, lt=1)
     mirror: bool = False

@@ -51,9 +51,9 @@ class BookletConfig(Config):
     inputs: dict[str, InputShare]
     initial: dict[str, float | str] = Field(default_factory=dict)
     manoeuvres: tuple[ManoeuvreConfig, ...] = Field(min_length=1)
-    duration: Seconds = Field(default=600.0, gt=0)
+    duration: Seconds = Field(default=600.0, gt=0, le=86_400)
     repeat: tuple[str, ...] = ("validation", "test")
-    draws: int = Field(default=100, ge=20)
+    draws: int = Field(default=100, ge=20, le=100_000)
     level: float = Field(default=0.95, gt=0, lt=1)
     seed: int = Field(default=0, ge=0)
 

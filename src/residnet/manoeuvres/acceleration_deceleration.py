@@ -50,7 +50,7 @@ class AccelerationDecelerationFamily(Config):
     """
 
     kind: Literal["acceleration_deceleration"] = "acceleration_deceleration"
-    count: int = Field(ge=1)
+    count: int = Field(ge=1, le=10_000)
     high: Range = (0.4, 1.0)
     low: Range = (0.0, 0.3)
     hold: tuple[Seconds, Seconds] = (6.0, 12.0)

@@ -137,7 +137,7 @@ class _Family(Config):
         start: when they begin in s.
     """
 
-    count: int = Field(ge=1)
+    count: int = Field(ge=1, le=10_000)
     drive: Range = (0.3, 0.7)
     drive_amplitude: Range = (0.0, 0.3)
     steer_amplitude: Range = (0.2, 1.0)

@@ -52,7 +52,7 @@ class ThreeTwoOneOneFamily(Config):
     """
 
     kind: Literal["three_two_one_one"] = "three_two_one_one"
-    count: int = Field(ge=1)
+    count: int = Field(ge=1, le=10_000)
     unit: tuple[Seconds, Seconds] = (2.0, 4.0)
     steer: Range = (0.4, 1.0)
     drive: Range = (0.1, 0.9)

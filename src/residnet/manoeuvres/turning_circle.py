@@ -133,7 +133,7 @@ class TurningCircleFamily(Config):
     """
 
     kind: Literal["turning_circle"] = "turning_circle"
-    count: int = Field(ge=1)
+    count: int = Field(ge=1, le=10_000)
     steer: Range = (0.25, 1.0)
     drive: Range = (0.2, 1.0)
     start: Seconds = 5.0

@@ -147,7 +147,7 @@ class ZigzagFamily(Config):
     """
 
     kind: Literal["zigzag"] = "zigzag"
-    count: int = Field(ge=1)
+    count: int = Field(ge=1, le=10_000)
     heading: tuple[Radians, ...] = Field(min_length=1)
     steer: Range = (0.25, 1.0)
     drive: Range = (0.2, 1.0)

@@ -265,7 +265,7 @@ class ComputingTask(Task):
             products of these models.
     """
 
-    threads: int = Field(default=1, ge=1)
+    threads: int = Field(default=1, ge=1, le=1_024)
 
     @contextmanager
     def resources(self) -> Iterator[None]:

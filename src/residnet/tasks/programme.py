@@ -12,6 +12,7 @@ from torch import Tensor
 from residnet.core.config import Config, ExistingPath, Metres, Quantity, Seconds
 from residnet.core.errors import ConfigError, UsageError
 from residnet.core.names import CHANNEL_UNITS, nearest
+from residnet.core.steps import check_steps
 from residnet.data.readers import ReaderConfig
 from residnet.data.readers.tables.canonical import CanonicalConfig
 from residnet.data.simulated.environment import Disturbance
@@ -87,7 +88,7 @@ class Programme(Config):
     families: tuple[FamilyConfig, ...] = ()
     duration: Seconds = Field(default=600.0, gt=0)
     step: Seconds | None = Field(default=None, gt=0)
-    substeps: int = Field(default=5, ge=1)
+    substeps: int = Field(default=5, ge=1, le=1_000)
     initial: dict[str, float | str] = Field(default_factory=dict)
     length: Metres | None = Field(default=None, gt=0)
     reader: ReaderConfig = CanonicalConfig()
@@ -109,7 +110,10 @@ class Programme(Config):
             raise ValueError("nothing flies: give vessel, model or both")
         if not self.manoeuvres and not self.families:
             raise ValueError("nothing is flown: give manoeuvres, families or both")
-        names = log_names(self.draw())
+        drawn = self.draw()
+        for manoeuvre in drawn:
+            check_steps(manoeuvre.duration or self.duration, self.step or STEP)
+        names = log_names(drawn)
         if repeated := [name for name in names if names.count(name) > 1]:
             raise ValueError(f"two manoeuvres are named '{repeated[0]}'")
         try:

@@ -54,7 +54,7 @@ class StudyConfig(Task):
     model: str = "selected"
     split: Literal["validation", "test"] = "test"
     seeds: tuple[Annotated[int, Field(ge=0)], ...] = Field(default=(0, 1, 2), min_length=1)
-    workers: int = Field(default=1, ge=1)
+    workers: int = Field(default=1, ge=1, le=1_024)
 
     @model_validator(mode="after")
     def _combination(self) -> StudyConfig:

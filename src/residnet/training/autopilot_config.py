@@ -124,8 +124,8 @@ class AutopilotTraining(OneStage):
         smoothness: weight of the squared changes of the command.
     """
 
-    steps: int = Field(default=15, ge=1)
-    batch: int = Field(default=256, ge=16)
+    steps: int = Field(default=15, ge=1, le=100_000)
+    batch: int = Field(default=256, ge=16, le=1_000_000)
     dt: Seconds = Field(default=0.1, gt=0)
     integrator: Annotated[str, Field(pattern="^(rk4|heun)$")] = "rk4"
     horizon: Seconds = Field(default=10.0, gt=0)

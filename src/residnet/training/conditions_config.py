@@ -36,11 +36,11 @@ class ConditionsTraining(OneStage):
         stretch: steps that are compiled together; 0 for none, where there is no C++ compiler.
     """
 
-    epochs: int = Field(default=18, ge=1)
+    epochs: int = Field(default=18, ge=1, le=100_000)
     learning_rate: float = Field(default=4e-3, gt=0)
     final: float = Field(default=0.0, ge=0, le=1)
-    steps: int = Field(default=100, ge=1)
-    batch: int = Field(default=384, ge=2)
+    steps: int = Field(default=100, ge=1, le=100_000)
+    batch: int = Field(default=384, ge=2, le=1_000_000)
     dt: Seconds = Field(default=0.04, gt=0)
     integrator: Annotated[str, Field(pattern="^(rk4|heun)$")] = "heun"
     hold: Seconds = Field(default=2.0, ge=0)
@@ -49,8 +49,8 @@ class ConditionsTraining(OneStage):
     spread: float = Field(default=0.15, ge=0, le=1)
     guide: float = Field(default=0.01, ge=0)
     faded: float = Field(default=0.6, gt=0, le=1)
-    validation: int = Field(default=512, ge=2)
-    stretch: int = Field(default=5, ge=0)
+    validation: int = Field(default=512, ge=2, le=1_000_000)
+    stretch: int = Field(default=5, ge=0, le=1_000)
 
     def share(self, progress: float) -> float:
         """Return the share of the conditions that is drawn, at a progress of 0 to 1."""

@@ -20,10 +20,10 @@ class OneStep(Config):
         final: share of the learning rate at the stage's end.
     """
 
-    epochs: int = Field(default=10, ge=0)
+    epochs: int = Field(default=10, ge=0, le=100_000)
     window: Seconds = Field(default=5.0, gt=0)
     washout: Seconds = Field(default=0.0, ge=0)
-    batch: int = Field(default=64, ge=1)
+    batch: int = Field(default=64, ge=1, le=1_000_000)
     learning_rate: float = Field(default=2e-3, gt=0)
     final: float = Field(default=1.0, gt=0, le=1)
 
@@ -49,8 +49,8 @@ class MultiStep(Config):
     """
 
     horizon: Seconds = Field(gt=0)
-    epochs: int = Field(ge=1)
-    batch: int = Field(default=128, ge=1)
+    epochs: int = Field(ge=1, le=100_000)
+    batch: int = Field(default=128, ge=1, le=1_000_000)
     learning_rate: float = Field(default=1e-3, gt=0)
     final: float = Field(default=1.0, gt=0, le=1)
 
@@ -98,7 +98,7 @@ class TrainingConfig(Config):
 
     one_step: OneStep = OneStep()
     multi_step: tuple[MultiStep, ...] = ()
-    steps: int = Field(default=25, ge=1)
+    steps: int = Field(default=25, ge=1, le=100_000)
     history: Seconds = Field(default=0.5, ge=0)
     beginnings: Beginnings | None = None
     start_noise: float = Field(default=0.0, ge=0)

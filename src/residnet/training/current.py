@@ -47,7 +47,7 @@ class CurrentConfig(Config):
 
     baseline: str = "baseline"
     spread: MetresPerSecond = Field(default=0.5, gt=0)
-    iterations: int = Field(default=40, ge=1)
+    iterations: int = Field(default=40, ge=1, le=10_000)
 
 
 def estimate_currents(

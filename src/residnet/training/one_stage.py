@@ -21,7 +21,7 @@ class OneStage(Config):
         validate_every: epochs between validations.
     """
 
-    epochs: int = Field(default=20, ge=1)
+    epochs: int = Field(default=20, ge=1, le=100_000)
     learning_rate: float = Field(default=1e-2, gt=0)
     final: float = Field(default=0.02, gt=0, le=1)
     gradient_clip: float = Field(default=1.0, gt=0)

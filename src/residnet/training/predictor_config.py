@@ -26,12 +26,12 @@ class PredictorTraining(OneStage):
         batch: states.
     """
 
-    states: int = Field(default=4000, ge=100)
+    states: int = Field(default=4000, ge=100, le=10_000_000)
     wander: Seconds = Field(default=30.0, gt=0)
     hold: Seconds = Field(default=4.0, gt=0)
     scatter: float = Field(default=0.2, ge=0)
-    epochs: int = Field(default=50, ge=1)
-    batch: int = Field(default=100, ge=1)
+    epochs: int = Field(default=50, ge=1, le=100_000)
+    batch: int = Field(default=100, ge=1, le=1_000_000)
     learning_rate: float = Field(default=2e-2, gt=0)
     final: float = Field(default=0.01, gt=0, le=1)
     gradient_clip: float = Field(default=10.0, gt=0)

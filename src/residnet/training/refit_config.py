@@ -35,4 +35,4 @@ class RefitConfig(Config):
     robust: float = Field(default=0.05, gt=0)
     correlation: Seconds = Field(default=10.0, gt=0)
     offsets: OffsetsConfig | None = None
-    iterations: int = Field(default=10, ge=1)
+    iterations: int = Field(default=10, ge=1, le=10_000)

@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 from torch import Tensor
 
 from residnet.core.config import Config, MetresPerSecond, Radians, RadiansPerSecond, Seconds
+from residnet.core.steps import check_steps
 
 Range = Annotated[tuple[float, float], Field(description="low and high multiple")]
 _EXTRA = ("push", "reference", "noise_psi", "noise_r", "delay")
@@ -73,6 +74,7 @@ class ConditionsConfig(Config):
             "delay": (*self.delay, 0.0, 60.0),
             "heading": (*self.heading, 1e-3, 3.1),
         }
+        check_steps(self.hold + self.duration, self.dt)
         if self.wind is not None:
             ranges["wind"] = (*self.wind, 0.0, 60.0)
         for name, (low, high, least, most) in ranges.items():

@@ -31,9 +31,9 @@ class EvolutionConfig(Config):
         tolerance: the search ends where the costs of a generation differ by less than this share.
     """
 
-    flights: int = Field(default=64, ge=2)
-    population: int = Field(default=8, ge=2)
-    generations: int = Field(default=25, ge=1)
+    flights: int = Field(default=64, ge=2, le=1_000_000)
+    population: int = Field(default=8, ge=2, le=10_000)
+    generations: int = Field(default=25, ge=1, le=10_000)
     tolerance: float = Field(default=1e-4, ge=0)
 
 

@@ -277,7 +277,7 @@ class DocumentConfig(ControllerConfig):
 
     kind: Literal["document"] = "document"
     horizon: Seconds = Field(gt=0)
-    candidates: int = Field(default=41, ge=3)
+    candidates: int = Field(default=41, ge=3, le=10_001)
     weight: float = Field(default=0.2, ge=0, le=1)
 
     def predictor(self, steering: Steering) -> SimulatedPredictor:

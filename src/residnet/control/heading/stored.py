@@ -70,7 +70,7 @@ class PredictorSpec(Stored):
         default="residnet.heading_predictor/1", alias="schema"
     )
     state: tuple[str, ...]
-    candidates: int = Field(ge=1)
+    candidates: int = Field(ge=1, le=10_001)
     hidden: tuple[int, ...]
     linear: bool
 

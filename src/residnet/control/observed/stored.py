@@ -42,7 +42,7 @@ class ObservedPolicySpec(Stored):
     dt: float = Field(gt=0)
     trained_at: float = Field(gt=0)
     law: AnyObserved
-    units: int = Field(ge=0)
+    units: int = Field(ge=0, le=10_000)
 
     def build(self) -> ObservedPolicy:
         """Return the policy with its network not yet trained."""

@@ -13,6 +13,7 @@ from residnet.core.config import Config, Seconds
 from residnet.core.errors import ConfigError
 from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS
+from residnet.core.steps import check_steps
 from residnet.data.simulated.environment import Disturbance
 from residnet.data.simulated.flying import (
     Craft,
@@ -54,7 +55,7 @@ class SimulatedTrials(Config):
     trials: tuple[FamilyConfig, ...] = Field(min_length=1)
     duration: Seconds = Field(default=60.0, gt=0)
     step: Seconds = Field(default=0.05, gt=0)
-    substeps: int = Field(default=5, ge=1)
+    substeps: int = Field(default=5, ge=1, le=1_000)
     noise: SensorNoise = SensorNoise()
     disturbance: Disturbance = Disturbance()
     identification: dict[str, int]
@@ -79,6 +80,8 @@ class SimulatedTrials(Config):
             )
         except ConfigError as error:
             raise ValueError(str(error)) from None
+        for manoeuvre in self.draw():
+            check_steps(manoeuvre.duration or self.duration, self.step)
         return self
 
     def draw(self) -> list[Manoeuvre]:

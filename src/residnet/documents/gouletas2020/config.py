@@ -31,7 +31,7 @@ class PredictiveConfig(Config):
     """
 
     horizon: Seconds = Field(gt=0)
-    candidates: int = Field(default=41, ge=3)
+    candidates: int = Field(default=41, ge=3, le=10_001)
     weight: float = Field(default=0.2, ge=0, le=1)
     hidden: Annotated[tuple[_Units, ...], Field(min_length=1)] = (20,)
     linear: bool = False

@@ -58,7 +58,7 @@ class EvolutionConfig(Config):
     operators: tuple[Operator, ...] = ("+", "*", "abs")
     one: bool = False
     constants: tuple[float, float] | None = None
-    tournament: int = Field(default=5, ge=1)
+    tournament: int = Field(default=5, ge=1, le=10_000)
     crossover: float = Field(default=0.5, ge=0, le=1)
     mutation: float = Field(default=0.3, ge=0, le=1)
     depth: int = Field(default=10, ge=1, le=17)
@@ -74,7 +74,7 @@ class EvolutionConfig(Config):
     elite: int = Field(default=1, ge=0)
     goal: float = Field(default=1e-12, ge=0, lt=1)
     patience: int = Field(default=10, ge=1)
-    rows: int = Field(default=600, ge=20)
+    rows: int = Field(default=600, ge=20, le=10_000_000)
 
     @model_validator(mode="after")
     def _possible(self) -> EvolutionConfig:

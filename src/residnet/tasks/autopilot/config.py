@@ -14,6 +14,7 @@ from residnet.control.heading.controllers import BangBangConfig
 from residnet.control.observed.config import AnyController, ObservedConfig
 from residnet.core.config import Config, MetresPerSecond, Radians, Seconds
 from residnet.core.names import nearest
+from residnet.core.steps import check_steps
 from residnet.data.simulated.environment import Disturbance, WindField
 from residnet.documents.gouletas2020.config import PredictiveConfig
 from residnet.physics.environment.waves import WavesConfig
@@ -69,7 +70,7 @@ class RecurrentConfig(Config):
     """
 
     start: _Name
-    units: int = Field(default=16, ge=0)
+    units: int = Field(default=16, ge=0, le=10_000)
     training: ConditionsTraining = ConditionsTraining()
 
 
@@ -85,7 +86,7 @@ class JudgedConditions(Config):
     """
 
     stated: ConditionsConfig = ConditionsConfig()
-    flights: int = Field(default=1500, ge=2)
+    flights: int = Field(default=1500, ge=2, le=1_000_000)
     beyond: dict[_Name, ConditionsConfig] = Field(default_factory=dict)
     evolution: EvolutionConfig = EvolutionConfig()
 
@@ -114,13 +115,19 @@ class StepTestConfig(Config):
     overshoot: Radians = Field(default=0.0017453292519943296, gt=0)
     dt: Seconds = Field(default=0.02, gt=0)
     duration: Seconds = Field(gt=0)
-    plants: int = Field(default=200, ge=1)
+    plants: int = Field(default=200, ge=1, le=100_000)
     bias: Radians = Field(default=0.017453292519943295, ge=0)
     bias_error: Radians = Field(default=0.0034906585039886592, gt=0)
     bias_time: Seconds = Field(default=60.0, gt=0)
     wind: MetresPerSecond | None = Field(default=None, gt=0)
     sea: WavesConfig | None = None
     sea_time: Seconds = Field(default=120.0, gt=0)
+
+    @model_validator(mode="after")
+    def _flown_in_time(self) -> StepTestConfig:
+        for name in ("duration", "bias_time", "sea_time"):
+            check_steps(getattr(self, name), self.dt, name)
+        return self
 
     def weather(self) -> Disturbance:
         """Return the wind and waves that the vessel must be able to feel."""
@@ -166,7 +173,7 @@ class AutopilotSettings(ComputingTask):
     predictive: dict[_Name, PredictiveConfig] = Field(default_factory=dict)
     peers: dict[_Name, AnyController] = Field(default_factory=dict)
     floor: _Name | None = None
-    tuning_points: int = Field(default=256, ge=16)
+    tuning_points: int = Field(default=256, ge=16, le=100_000)
     safe: Literal["hold", "amidships"] = "amidships"
 
     @model_validator(mode="after")

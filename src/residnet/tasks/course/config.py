@@ -11,6 +11,7 @@ from residnet.control.courses.course_check import Protocol
 from residnet.control.guidance.line_of_sight import AnyLineOfSight
 from residnet.control.observed.config import AnyController
 from residnet.core.config import ExistingPath, MetresPerSecond, Seconds
+from residnet.core.steps import check_steps
 from residnet.runs.task import ComputingTask
 from residnet.tasks.course.flights import CourseSpreadConfig
 
@@ -63,6 +64,7 @@ class CourseSettings(ComputingTask):
         kinds = [law.kind for law in self.line_of_sight]
         if len(set(kinds)) < len(kinds):
             raise ValueError(f"line_of_sight: each kind once, given {', '.join(kinds)}")
+        check_steps(self.duration, self.dt)
         return self
 
     def recorded_seed(self) -> int:

@@ -54,7 +54,7 @@ class CourseSpreadConfig(Config):
         current: speed of the current in m/s.
     """
 
-    flights: int = Field(default=50, ge=2)
+    flights: int = Field(default=50, ge=2, le=1_000_000)
     seed: int = Field(default=0, ge=0)
     effect: tuple[float, float] = (0.9, 1.1)
     time: tuple[float, float] = (0.9, 1.1)

@@ -126,7 +126,7 @@ class BreedingSettings(Task):
     head: GeneticConfig = Field(default_factory=GeneticConfig)
     rows: Axis
     columns: Axis
-    repeats: int = Field(default=10, ge=1)
+    repeats: int = Field(default=10, ge=1, le=10_000)
     threshold: float = Field(default=5e-6, gt=0)
     published: Matrix | None = None
     published_error: Matrix | None = None

@@ -90,7 +90,7 @@ class StandardFitConfig(Config):
     mass: float = Field(default=4935.14, gt=0)
     weights: tuple[float, float, float] = (1.0, 1.0, 10.0)
     bounds: dict[str, tuple[float, float]] = Field(default_factory=dict)
-    starts: int = Field(default=4, ge=1)
+    starts: int = Field(default=4, ge=1, le=10_000)
     seed: int = Field(default=0, ge=0)
     thin: int = Field(default=2, ge=1)
 

@@ -77,7 +77,7 @@ class FoldsConfig(Config):
             orders and penalties, and that the intervals resample.
     """
 
-    folds: int = Field(default=5, ge=2)
+    folds: int = Field(default=5, ge=2, le=1_000)
     gap: Seconds = Field(default=5.0, ge=0)
     segment: Seconds = Field(default=30.0, gt=0)
 
