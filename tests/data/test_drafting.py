@@ -7,6 +7,7 @@ from typing import Any
 
 import foreign_tables
 import numpy as np
+import pandas as pd
 import pytest
 from foreign_tables import CHANNELS, NAMES, Style
 
@@ -79,6 +80,18 @@ def test_a_table_is_read_as_it_was(style: Style, logs: list[Log], tmp_path: Path
     told = {".".join(key) for key, _ in marks.guesses}
     if not style.told:
         assert {f"data.reader.channels.{name}" for name in ("psi", "u", "r", "delta")} <= told
+
+
+def test_a_heading_that_is_not_wrapped_may_be_large_in_radians(
+    logs: list[Log], tmp_path: Path
+) -> None:
+    """Its size says degrees, and only the motion tells that it is not."""
+    turning = logs[1]
+    assert float(np.ptp(turning["psi"])) > 7.0
+    columns = {"t": turning.t, **{name: turning[name] for name in ("x", "y", "psi", "u", "v", "r")}}
+    pd.DataFrame(columns).to_csv(tmp_path / "turn.csv", index=False)
+    channels = draft_tables([tmp_path / "turn.csv"], Marks()).content["channels"]
+    assert (channels["psi"]["unit"], channels["r"]["unit"]) == ("rad", "rad/s")
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "cp1252"])

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -134,24 +135,38 @@ def _interval(log: Log | None, plan: Plan, recording: Recording) -> float:
 
 def _inputs(recording: Recording, taken: set[tuple[str, str]]) -> list[_Input]:
     """Return the fields whose topics and names are those of actuators."""
-    out: dict[str, _Input] = {}
+    found: dict[str, list[_Input]] = {}
     for series in recording.series.values():
-        fitting = [
-            (field, input_channel(words_of(f"{series.name} {field}"))) for field in series.fields
-        ]
-        several = sum(channel is not None for _, channel in fitting) > 1
-        for field, channel in fitting:
+        for field in series.fields:
+            channel = input_channel(words_of(f"{series.name} {field}"))
             values = series[field]
             known = values[np.isfinite(values)]
             if channel is None or (series.name, field) in taken or known.size < _FEWEST:
                 continue
-            if channel in MOTION or float(np.ptp(known)) == 0.0:
-                continue
-            # of several fields that a topic names alike only a number tells them apart
-            if several and channel in out and out[channel].topic == series.name:
-                continue
-            out.setdefault(channel, _Input(channel, series.name, field, values))
-    return list(out.values())
+            if channel not in MOTION and float(np.ptp(known)) > 0.0:
+                found.setdefault(channel, []).append(_Input(channel, series.name, field, values))
+    return [entry for same in found.values() for entry in _numbered(same)]
+
+
+def _numbered(same: Sequence[_Input]) -> list[_Input]:
+    """Return what to take of fields that stand for one channel, by names of their own.
+
+    Several actuators of one topic are told apart by a number alone, `control[0]` and `control[1]`:
+    each is taken. Of other fields the first one is.
+    """
+    first = same[0]
+    alike = [
+        entry
+        for entry in same
+        if entry.topic == first.topic
+        and re.sub(r"\d+", "#", entry.field) == re.sub(r"\d+", "#", first.field)
+    ]
+    if len(alike) == 1:
+        return alike
+    return [
+        replace(entry, channel=f"{entry.channel}_{number}")
+        for number, entry in enumerate(alike, start=1)
+    ]
 
 
 def _entry(found: _Input, marks: Marks) -> dict[str, Any]:

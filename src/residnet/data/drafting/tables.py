@@ -185,7 +185,10 @@ class _Channels:
         """Find the unit and frame of the heading under which the vessel moves where it points."""
         written = written_unit(self._names["psi"], "rad")
         sized, _ = unit_by_size("psi", self._values("psi"))
-        tried = [written] if written else ["deg"] if sized == "deg" else ["rad", "deg"]
+        # a heading that is not wrapped is large in radians too: its size decides only where the
+        # motion does not
+        other = "rad" if sized == "deg" else "deg"
+        tried = [written] if written else [sized, other]
         best = (-np.inf, "rad", FRAMES[0])
         for unit in tried:
             for frame in FRAMES:
