@@ -1,7 +1,6 @@
 """Equations recovered from simulated logs: how often, how exactly, and how fast, on one thread.
 
-    python scripts/bench/symbolic.py [--parts exact,steps,spring,noise,velocities,delay] [--designs
-    10]
+    python scripts/bench/symbolic.py [--parts exact,random,late,ships] [--designs 10] [--seed 0]
 
     exact       all six equations of Odin (document 000, (6.6)-(6.8), (6.21)-(6.23)) from random
                 multi-sine designs with accelerations given; a coefficient counts within 1 %
@@ -11,11 +10,15 @@
                 the smallest true term in standard errors (Cramer-Rao bound), "possible" how often
                 an efficient estimate of that term alone would pass plain BIC
     velocities  the force model from velocities alone with 1 % noise, estimators side by side
+    random      six random equations for each design, with products, magnitudes and ratios, and 0.1
+                standard deviations of noise: how often the structure is exactly the true one
+    late        the same with inputs that act 0.3 s late
+    ships       random ships with propeller and rudder, no settings at all, without and with noise
     delay       a delay of 0.5 s, 10 % noise on all channels: one profile, and a regression for
                 every shift as the document does
 
-Truth and designs stand in tests/support/made_odin.py. Times are of the wall, of the terms' values,
-factorisation and search together.
+Truth and designs stand in tests/support/made_odin.py and made_equations.py. Times are of the wall,
+of the terms' values, factorisation and search together.
 """
 
 from __future__ import annotations
@@ -35,6 +38,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "support"))
 import numpy as np
 import pandas as pd
 import torch
+from made_equations import CHANNELS, SPACE, Drawn, draw, draw_ship
 from made_odin import FORCE_TRUTH, JET_TRUTH, MSD_TRUTH, force_logs, jet_logs, msd_log, step_log
 from scipy.stats import norm
 
@@ -96,7 +100,7 @@ def right(found: Mapping[str, float], truth: Mapping[str, float], within: float 
     )
 
 
-def exact(count: int) -> None:
+def exact(count: int, _: int) -> None:
     times, good, worst = [], 0, 0.0
     for force, jet in zip(force_logs(count), jet_logs(count), strict=True):
         a, _, seconds_a = regress(force, FORCES, FORCE, accelerations(force))
@@ -124,7 +128,7 @@ def exact(count: int) -> None:
     )
 
 
-def steps(_: int) -> None:
+def steps(_: int, __: int) -> None:
     for file in sorted(
         Path(os.environ.get("RESIDNET_GOLDEN", "/nowhere")).glob("g2_odin/jetA*.csv.gz")
     ):
@@ -141,7 +145,7 @@ def steps(_: int) -> None:
         )
 
 
-def spring(_: int) -> None:
+def spring(_: int, __: int) -> None:
     log = msd_log()
     found, _, seconds = regress(log, SPRING, MSD, log["w_dot"][:, None])
     print(
@@ -168,7 +172,7 @@ RECORDS: dict[str, tuple[float, float, tuple[float, float]]] = {
 }
 
 
-def noise(_: int) -> None:
+def noise(_: int, __: int) -> None:
     for label, args in RECORDS.items():
         good, each, named, times, worth = 0, np.zeros(3, dtype=int), 0, [], []
         for number, log in enumerate(force_logs(15, *args)):
@@ -241,7 +245,7 @@ def measured(log: Log, seed: int, window: float, *, masked: bool) -> Samples:
     )
 
 
-def velocities(_: int) -> None:
+def velocities(_: int, __: int) -> None:
     logs = [step_log(number, 900.0, 0.02, 15.0) for number in range(3)]
     print(
         "velocities  1 % noise, forces in steps of 15 s, 900 s at 50 Hz, three records: equations"
@@ -273,7 +277,7 @@ def velocities(_: int) -> None:
         print(f"            {label:40s}{cells[0]:>22s}{cells[1]:>22s}{np.median(taken):9.2f}")
 
 
-def delay(_: int) -> None:
+def delay(_: int, __: int) -> None:
     log, longest = msd_log(delay=0.5), 20
     hits, times, same = [0, 0], [[], []], 0.0
     one = np.ones(len(log["t"]))
@@ -318,6 +322,46 @@ def delay(_: int) -> None:
     )
 
 
+def drawn(label: str, designs: list[Drawn], config: dict[str, Any], delay: int = 0) -> None:
+    """Print how often the structure of each drawn equation is found, and the delay."""
+    good, late, count, times = 0, 0, 0, []
+    for design in designs:
+        head = SymbolicConfig.model_validate(config).build(CHANNELS)
+        head.calibrate(design.samples)
+        started = time.perf_counter()
+        notes = head.solve(design.samples)
+        times.append(time.perf_counter() - started)
+        late += int(notes.get("delay", {"steps": 0})["steps"] == delay)
+        for axis, truth in zip(ACCELERATION, design.truth, strict=True):
+            found = {c["term"]: c["value"] for c in notes["coefficients"] if c["axis"] == axis}
+            good, count = good + int(set(found) == set(truth)), count + 1
+    print(
+        f"{label:11s} structure right in {good} of {count}, delay in {late} of {len(designs)};"
+        f" {np.median(times):.2f} s for three equations (median), {max(times):.2f} s (slowest)"
+    )
+
+
+def random_equations(count: int, first: int) -> None:
+    designs = [draw(seed) for seed in range(first, first + 2 * count)]
+    drawn("random", designs, {"candidates": SPACE.model_dump()})
+
+
+def late(count: int, first: int) -> None:
+    """Inputs that act three samples late."""
+    designs = [draw(seed, delay=3) for seed in range(first, first + 2 * count)]
+    config = {
+        "candidates": SPACE.model_dump(),
+        "delay": {"channels": ["n", "delta"], "longest": 10},
+    }
+    drawn("late", designs, config, 3)
+
+
+def ships(count: int, first: int) -> None:
+    for noise_level in (0.0, 0.1):
+        designs = [draw_ship(seed, noise=noise_level) for seed in range(first, first + 2 * count)]
+        drawn(f"ships {noise_level:g}", designs, {})
+
+
 def _refit(z: Log, shift: int, longest: int) -> float:
     end = len(z["x"])
     x = np.stack(
@@ -327,8 +371,11 @@ def _refit(z: Log, shift: int, longest: int) -> float:
     return float(left @ left)
 
 
-PARTS: dict[str, Callable[[int], None]] = {
+PARTS: dict[str, Callable[[int, int], None]] = {
     "exact": exact,
+    "random": random_equations,
+    "late": late,
+    "ships": ships,
     "steps": steps,
     "spring": spring,
     "noise": noise,
@@ -344,14 +391,15 @@ def main() -> None:
     )
     parser.add_argument("--parts", default=",".join(PARTS), help="which parts, separated by commas")
     parser.add_argument(
-        "--designs", type=int, default=10, help="random designs of the part `exact`"
+        "--designs", type=int, default=10, help="designs of the parts that draw them"
     )
+    parser.add_argument("--seed", type=int, default=0, help="first seed of what is drawn")
     options = parser.parse_args()
     torch.set_num_threads(1)
     for part in options.parts.split(","):
         if part not in PARTS:
             parser.error(f"no part '{part}'; valid: {', '.join(PARTS)}")
-        PARTS[part](options.designs)
+        PARTS[part](options.designs, options.seed)
 
 
 if __name__ == "__main__":

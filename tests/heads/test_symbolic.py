@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from made_equations import SPACE, draw, draw_ship
 from made_odin import FORCE_TRUTH, JET_TRUTH, MSD_TRUTH, force_logs, jet_logs, msd_log, step_log
 
 from residnet.core.names import ACCELERATION
@@ -90,6 +91,29 @@ def test_the_jets_equations_from_steps(file: Path) -> None:
         assert notes["equations"][axis]["exact"]
         if not notes["equations"][axis]["same_as_simpler"]:
             assert found(notes, axis) == pytest.approx(terms, rel=0.01)
+
+
+@pytest.mark.parametrize("delay", [0, 3])
+def test_structure_of_random_equations_with_products_magnitudes_and_ratios(delay: int) -> None:
+    """A tenth of a standard deviation of noise; inputs at once or 0.3 s late."""
+    right = 0
+    for seed in (3, 4):
+        drawn = draw(seed, delay=delay)
+        config: dict[str, Any] = {"candidates": SPACE.model_dump()}
+        if delay:
+            config["delay"] = {"channels": ["n", "delta"], "longest": 5}
+        _, notes = fitted(config, drawn.samples)
+        for axis, terms in zip(ACCELERATION, drawn.truth, strict=True):
+            right += set(found(notes, axis)) == set(terms)
+        assert notes.get("delay", {"steps": 0})["steps"] == delay
+    assert right == 6
+
+
+def test_ships_are_known_without_settings() -> None:
+    drawn = draw_ship(1)
+    _, notes = fitted({}, drawn.samples)
+    for axis, terms in zip(ACCELERATION, drawn.truth, strict=True):
+        assert found(notes, axis) == pytest.approx(terms, rel=1e-6)
 
 
 def test_two_levels_of_an_input_do_not_tell_its_square() -> None:

@@ -68,6 +68,22 @@ def test_all_other_channels_are_inputs_unless_named() -> None:
     assert [c.term for c in extra if "tau" in c.term] == ["tau_x inv(u)"]
 
 
+def test_candidates_know_propellers_and_rudders_unless_told_otherwise() -> None:
+    """Thrust of both directions, lift in the flow past the hull and in the propeller's."""
+    ship = {"n |n|", "u |n|", "u^2 delta", "u |u| delta", "|u| delta", "n |n| delta", "u n delta"}
+    found = {c.term for c in CandidatesConfig().candidates(("u", "v", "r", "n", "delta"))}
+    assert ship <= found
+    assert not ship & {
+        c.term for c in CandidatesConfig(input_degree=1).candidates(("u", "v", "r", "n", "delta"))
+    }
+    plain = CandidatesConfig(magnitudes=False).candidates(("u", "v", "r", "n", "delta"))
+    assert {"u^2 delta", "n^2 delta"} <= {c.term for c in plain}
+    assert not any("|" in c.term for c in plain)
+    assert {"|r|", "r |r|", "delta |delta|"} <= {
+        c.term for c in CandidatesConfig().candidates(("r", "delta"))
+    }
+
+
 def test_unknown_channels_are_named() -> None:
     with pytest.raises(
         ConfigError, match="'nozle' is not a channel of the model; did you mean 'nozzle'"

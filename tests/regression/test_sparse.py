@@ -212,6 +212,22 @@ def test_noise_does_not_set_columns_apart() -> None:
     assert coarser(reduced, 0.0).rank == 5
 
 
+def test_a_term_close_to_simpler_ones_is_taken_where_the_criterion_prefers_it() -> None:
+    """u^2 n^2 differs from simpler terms by less than a hundredth, and explains the target."""
+    random = np.random.default_rng(3)
+    u, n = random.uniform(0.8, 1.6, 2000), random.uniform(8.0, 12.0, 2000)
+    w = random.normal(size=2000)
+    names = ["1", "u", "n", "w", "u^2", "n^2", "u n", "u^2 n", "u n^2", "u^2 n^2"]
+    x = np.stack(
+        (np.ones(2000), u, n, w, u**2, n**2, u * n, u**2 * n, u * n**2, u**2 * n**2), axis=1
+    )
+    y = u**2 * n**2 / 100.0 + w
+    y += 0.05 * y.std() * random.normal(size=2000)
+    reduced = reduce(x, y[:, None], names, [0, 1, 1, 1, 2, 2, 2, 3, 3, 4])
+    assert "u^2 n^2" not in coarser(reduced, 1e-2).names
+    assert set(find(reduced, 0, SearchConfig())[0].terms) == {"w", "u^2 n^2"}
+
+
 def test_terms_that_the_data_cannot_tell_apart_are_named() -> None:
     random = np.random.default_rng(0)
     a = random.normal(size=200)

@@ -6,7 +6,7 @@ Motions multiply motions, inputs multiply inputs, and only what is named couples
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from itertools import combinations_with_replacement, product
+from itertools import combinations, combinations_with_replacement, product
 from typing import NamedTuple
 
 from pydantic import Field
@@ -41,7 +41,10 @@ class CandidatesConfig(Config):
         motion_degree: highest degree of their products.
         magnitudes: whether factors also stand as magnitudes, as in `u|u|`.
         inputs: channels whose products enter; None: all that are neither motions nor angles.
-        input_degree: highest degree of their products.
+        input_degree: highest degree of their products, all factors plain; None: 1 where `coupling`
+            is given, otherwise what propellers and rudders need: the first and second degree with
+            magnitudes as in `n|n|`, times u and |u|, those of one input also times u^2 and `u|u|`
+            as in `u^2 delta`, and squares of one times another as in `n|n| delta`.
         angles: inputs that enter as sine and cosine.
         coupling: motions that products of inputs are multiplied by.
         coupling_degree: highest degree of these factors.
@@ -52,7 +55,7 @@ class CandidatesConfig(Config):
     motion_degree: int = Field(default=2, ge=0, le=4)
     magnitudes: bool = True
     inputs: tuple[str, ...] | None = None
-    input_degree: int = Field(default=1, ge=0, le=4)
+    input_degree: int | None = Field(default=None, ge=0, le=4)
     angles: tuple[str, ...] = ()
     coupling: tuple[str, ...] = ()
     coupling_degree: int = Field(default=1, ge=1, le=4)
@@ -77,17 +80,46 @@ class CandidatesConfig(Config):
                     f"candidates: '{name}' is not a channel of the model{nearest(name, names)}"
                 )
         flows = _products(motions, self.motion_degree, magnitudes=self.magnitudes)
-        driven = product(
-            _products(self.coupling, self.coupling_degree if self.coupling else 0),
-            _products(inputs, self.input_degree),
-            ["", *(f"{function}({angle})" for angle in angles for function in ("sin", "cos"))],
-        )
-        texts = [
-            *flows,
-            *(" ".join(part for part in parts if part) for parts in driven),
-            *self.extra,
-        ]
+        turns = ["", *(f"{function}({angle})" for angle in angles for function in ("sin", "cos"))]
+        texts = [*flows, *_joined(self._driven(motions, inputs), turns), *self.extra]
         return rated(dict.fromkeys(text or "1" for text in texts), names)
+
+    def _driven(self, motions: Sequence[str], inputs: Sequence[str]) -> list[str]:
+        """Return the products of inputs and coupled motions."""
+        if self.input_degree is None and not self.coupling:
+            return _of_ships("u" if "u" in motions else "", inputs, magnitudes=self.magnitudes)
+        degree = 1 if self.input_degree is None else self.input_degree
+        coupled = _products(self.coupling, self.coupling_degree if self.coupling else 0)
+        return _joined(coupled, _products(inputs, degree))
+
+
+def _of_ships(speed: str, inputs: Sequence[str], *, magnitudes: bool) -> list[str]:
+    """Return what propellers and rudders add to an equation: thrust, and lift in their flow."""
+    first, second = (
+        _products([speed] if speed else [], degree, magnitudes=magnitudes) for degree in (1, 2)
+    )
+    one = [t for name in inputs for t in _products([name], 2, magnitudes=magnitudes)[1:]]
+    pairs = [
+        t
+        for a, b in combinations(inputs, 2)
+        for t in _joined(
+            _products([a], 1, magnitudes=magnitudes)[1:],
+            _products([b], 1, magnitudes=magnitudes)[1:],
+        )
+    ]
+    squares = [
+        f"{square} {other}"
+        for name in inputs
+        for square in ([f"{name}^2", f"{name} |{name}|"] if magnitudes else [f"{name}^2"])
+        for other in inputs
+        if other != name
+    ]
+    return ["", *_joined(second, one), *_joined(first, pairs), *squares]
+
+
+def _joined(*choices: Sequence[str]) -> list[str]:
+    """Return the products of one text out of each list."""
+    return [" ".join(part for part in parts if part) for parts in product(*choices)]
 
 
 def rated(terms: Iterable[str], names: Sequence[str]) -> tuple[Candidate, ...]:
@@ -109,8 +141,6 @@ def rated(terms: Iterable[str], names: Sequence[str]) -> tuple[Candidate, ...]:
 
 def _products(names: Sequence[str], degree: int, *, magnitudes: bool = False) -> list[str]:
     """Return the products up to a degree, the empty one first.
-
-    Of one channel's factors at most one stands as a magnitude, since |x|^2 is x^2.
 
     Of one channel's factors at most one stands as a magnitude, since |x|^2 is x^2.
     """

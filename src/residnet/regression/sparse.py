@@ -42,9 +42,11 @@ class SearchConfig(Config):
             ln(RSS) + k ln(n) + 2 gamma ln(J over k); 0 is BIC.
         precision: error relative to the target below which a fit counts as exact.
         swaps: most terms that are taken out at once, for as many others or one less.
-        resolution: share of its length by which a term must differ from simpler ones where the data
-            are noisy (or the unexplained share of the target, if that is less). u|u| differs from
-            u^2 by noise alone on a vessel that is at rest for a moment and never goes astern.
+        resolution: share of its length by which a term must differ from simpler ones to need no
+            further evidence where the data are noisy (or the unexplained share of the target, if
+            that is less). A term that differs by less is taken where the criterion strongly prefers
+            an equation with it. u|u| differs from u^2 by noise alone on a vessel that is at rest
+            for a moment and never goes astern.
     """
 
     max_terms: int = Field(default=30, ge=1, le=80)
@@ -117,11 +119,36 @@ def find(reduced: Reduced, target: int, config: SearchConfig) -> tuple[Equation,
     if fine.share <= _NOISY:
         return fine, reduced
     coarse = coarser(reduced, limit)
-    return (
-        (fine, reduced)
-        if coarse.rank == reduced.rank
-        else (_search(coarse, target, config), coarse)
+    if coarse.rank == reduced.rank:
+        return fine, reduced
+    simple = _search(coarse, target, config)
+    # what the coarse search found is another start of the fine one
+    again = _from(reduced, target, config, simple)
+    best = min(fine, again, key=lambda equation: equation.criterion)
+    preferred = simple.criterion <= best.criterion + _EVIDENCE
+    return (simple, coarse) if preferred else (best, reduced)
+
+
+def _from(reduced: Reduced, target: int, config: SearchConfig, start: Equation) -> Equation:
+    """Return the best equation that swaps lead to from the terms of another."""
+    stage = int(reduced.degree.max())
+    search = Search(
+        reduced.r,
+        reduced.y[:, target],
+        _rule(reduced, target, reduced.rank, config),
+        config.max_terms,
     )
+    chosen = [reduced.names.index(term) for term in start.terms]
+    return _equation(
+        reduced, target, search, search.trimmed(search.refine(chosen, config.swaps)), stage
+    )
+
+
+def _rule(reduced: Reduced, target: int, width: int, config: SearchConfig) -> Criterion:
+    """Return the criterion of a search among the first `width` candidates."""
+    y = reduced.y[:, target]
+    samples = float(reduced.samples[target])
+    return Criterion(samples, width, config.gamma, float(y @ y), config.precision)
 
 
 def _search(reduced: Reduced, target: int, config: SearchConfig) -> Equation:
@@ -137,9 +164,7 @@ def _search(reduced: Reduced, target: int, config: SearchConfig) -> Equation:
     best: tuple[float, list[int], Search, int] | None = None
     for stage in np.unique(reduced.degree).tolist():
         width = int((reduced.degree <= stage).sum())
-        rule = Criterion(
-            float(reduced.samples[target]), width, config.gamma, energy, config.precision
-        )
+        rule = _rule(reduced, target, width, config)
         search = Search(reduced.r[:, :width], y, rule, config.max_terms)
         value, chosen = search.start()
         if best is None or value < best[0]:
@@ -148,7 +173,9 @@ def _search(reduced: Reduced, target: int, config: SearchConfig) -> Equation:
             break
     assert best is not None
     _, chosen, search, stage = best
-    return _equation(reduced, target, search, search.refine(chosen, config.swaps), stage)
+    return _equation(
+        reduced, target, search, search.trimmed(search.refine(chosen, config.swaps)), stage
+    )
 
 
 def _equation(

@@ -15,12 +15,20 @@ not.
 """
 _PARALLEL = 1e-12
 """One less the squared cosine of two columns up to which they count as one."""
+_POSITIVE = 3.0
+"""Difference of the criterion from which one term more counts as evident: between positive and
+strong evidence (Kass and Raftery 1995).
+"""
 _GAIN = 1e-6
 """Least gain of the criterion for which columns are swapped."""
 _BLOCK = 4_000_000
 """Numbers held at once by the batched swaps."""
 _PAIR_CANDIDATES = 40
 """Candidates, best single ones first, of which pairs are tried."""
+_BEAM = 6
+"""Sets of columns of one size that are followed side by side."""
+_PATIENCE = 2
+"""Sizes without a gain of the criterion after which these ways end."""
 
 
 class Criterion(NamedTuple):
@@ -97,11 +105,15 @@ class Search:
         return LeftOver(columns, target)
 
     def start(self) -> tuple[float, list[int]]:
-        """Return criterion and columns of the better of two ways.
+        """Return criterion and columns of the best of three ways.
 
-        Forward and back again, and back from all columns where there are enough samples.
+        Forward and back again; unless that is exact, several ways forward side by side, and back
+        from all columns where there are enough samples.
         """
         ways = [self.backward(self.forward())]
+        if self.rule.exact(self.rss(ways[0][1])):
+            return ways[0]
+        ways.append(self.beam())
         if self.rule.samples > 4 * self.r.shape[1]:
             ways.append(self.backward(list(range(self.r.shape[1]))))
         return min(ways)
@@ -135,6 +147,35 @@ class Search:
             if float(target @ target) <= self.rule.precision**2 * self.rule.energy:
                 break
         return chosen
+
+    def beam(self) -> tuple[float, list[int]]:
+        """Return the best criterion on several ways forward side by side, and its columns.
+
+        Each size keeps the best sets of the size before with one column more. A single way takes a
+        column that stands for two true ones and seldom finds back.
+        """
+        best: tuple[float, list[int]] = (float(self.rule.value(float(self.y @ self.y), 0)), [])
+        sets, idle = np.zeros((1, 0), dtype=int), 0
+        while sets.shape[1] < self.max_terms and idle < _PATIENCE:
+            columns, target = _projected(self.r, self.y, sets)
+            gains = _single_gains(columns, target, sets)
+            left = np.square(target).sum(axis=1)[:, None] - gains
+            left[gains < 0.0] = np.inf
+            order = np.argsort(left, axis=None)[: 4 * _BEAM]
+            order = order[np.isfinite(left.ravel()[order])]
+            if not order.size:
+                break
+            rows, added = np.unravel_index(order, left.shape)
+            grown = np.sort(np.concatenate((sets[rows], added[:, None]), axis=1), axis=1)
+            _, first = np.unique(grown, axis=0, return_index=True)
+            sets = grown[np.sort(first)[:_BEAM]]
+            value = self.value(sets[0].tolist())
+            idle = idle + 1
+            if value < best[0]:
+                best, idle = (value, sets[0].tolist()), 0
+            if self.rule.exact(self.rss(sets[0].tolist())):
+                break
+        return best
 
     def backward(self, chosen: list[int]) -> tuple[float, list[int]]:
         """Return the best criterion on the way from the chosen columns to none, and its columns.
@@ -178,6 +219,23 @@ class Search:
                     value, chosen = min(found, self.backward(found[1]))
                     again = True
                     break
+        return chosen
+
+    def trimmed(self, chosen: list[int]) -> list[int]:
+        """Return the columns without those, least useful first, for which there is no evidence.
+
+        Among many candidates one target in some dozens has a column that fits its noise well enough
+        for the criterion alone.
+        """
+        chosen, value = list(chosen), self.value(chosen)
+        while chosen and not self.rule.exact(self.rss(chosen)):
+            estimate, inverse = coefficients(self.r[:, chosen], self.y)
+            least = int((np.square(estimate) / np.square(inverse).sum(axis=1)).argmin())
+            fewer = chosen[:least] + chosen[least + 1 :]
+            without = self.value(fewer)
+            if without > value + _POSITIVE:
+                break
+            chosen, value = fewer, without
         return chosen
 
     def _swapped(self, chosen: list[int], out: int, into: int) -> tuple[float, list[int]] | None:
