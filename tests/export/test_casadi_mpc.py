@@ -24,6 +24,7 @@ SHORT = (
     "data.substeps=1",
     "data.duration=40 s",
     "prepare.grid.step=0.1 s",
+    "baseline.settled=20 s",
     "prepare.derivative.window=1.1 s",
     "~heads.mlp",
     "~heads.lstm",
