@@ -61,9 +61,12 @@ def test_manoeuvres_stand_apart(run: Path) -> None:
 
 
 def test_verdict(run: Path) -> None:
-    page = html.unescape(write_fit_page(RunFiles(run)).read_text())
+    page = html.unescape(write_fit_page(RunFiles(run)).read_text()).replace("\u00a0", " ")
     verdict = re.search(r'<section class="verdict".*?</section>', page, re.DOTALL)
     assert verdict is not None
+    assert "On test data model plsr is" in verdict[0]
+    figures = re.search(r"Figures of plsr</h2>.*?</section>", page, re.DOTALL)
+    assert figures is not None
     for part in (
         (
             "Model plsr (chosen on validation data) was free-run over 6 whole manoeuvres that no"
@@ -78,7 +81,8 @@ def test_verdict(run: Path) -> None:
         ),
         "No free run of any model diverged on test data.",
     ):
-        assert part in verdict[0]
+        assert part in figures[0].replace("<wbr>", "")
+        assert part not in verdict[0]
     assert "Before you use it" not in page
 
 
@@ -90,7 +94,7 @@ def test_bad_news_is_told(run: Path) -> None:
             line["rmse"] = line["rmse"] | {"v": 0.06}
             line["nrmse"] = line["nrmse"] | {"mean": 0.3}
     write_json(run / "metrics.json", content)
-    page = html.unescape(write_fit_page(RunFiles(run)).read_text())
+    page = html.unescape(write_fit_page(RunFiles(run)).read_text()).replace("\u00a0", " ")
     assert (
         "DIVERGED on test data, counted with the error of held velocities: plsr 2 of 6 (T30), plsr"
         " 2 of 6 (whole)." in page

@@ -37,7 +37,9 @@ class Page(HTMLParser):
 
     def handle_data(self, data: str) -> None:
         if "td" in self.open or "th" in self.open:
-            self.tables[-1][-1][-1] += ("|" if "small" in self.open else "") + data
+            # a number and its unit are kept together, which no test is about
+            text = data.replace("\u00a0", " ")
+            self.tables[-1][-1][-1] += ("|" if "small" in self.open else "") + text
 
     def table(self, corner: str, first: str) -> dict[str, list[str]]:
         """Return the cells by row label of the table with that corner and that row label."""

@@ -24,6 +24,7 @@ from residnet.report.sections.fit import (
     sanity,
 )
 from residnet.report.sections.fit.verdict import caution_section, verdict
+from residnet.report.sections.fit.verdict import figures_section as selected_section
 
 _DIVERGENCE = 3.0
 """Times the training envelope beyond which a run has diverged, where the config gives none."""
@@ -71,6 +72,7 @@ def fit_sections(run: RunFiles) -> list[Section]:
     findings = read_findings(run.path, divergence=divergence)
     found = [
         caution_section(run, findings),
+        selected_section(run),
         _interactive(run),
         limits.section(run),
         data.section(run),

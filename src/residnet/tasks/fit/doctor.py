@@ -27,6 +27,6 @@ def write_inspection(
             say(f"  {report.name}: {finding.text}")
     content = inspection(reports, together)
     folder.write_json(folder.path / "doctor.json", content)
-    if content["misled"]:
-        for line in summary(content).lines:
-            say(f"  {line}")
+    # the tally stands in the verdict; what may be corrected is told before the fit takes its time
+    if first := summary(content).first:
+        say(f"  {first}")

@@ -83,7 +83,7 @@ def _judged(
             folder.rollouts / split, judged[split].runs, judged[split].logs, config.signals.columns
         )
     chosen = identified.select(judged)
-    say(f"  {chosen.reason}")
+    say(f"  selected: {chosen.selected}")
     table = [row for part in judged.values() for row in part.rows]
     write_metrics(folder, config, table, chosen.selected, chosen.selected_ensemble)
     folder.write_json(folder.selection, chosen.content())

@@ -17,26 +17,38 @@ from residnet.report.sections.fit.manoeuvres import distinct
 def verdict(run: RunFiles) -> list[str]:
     """Return how good the selected model is, sentence by sentence.
 
-    It is compared with `zero`, with the baseline and, where the logs are simulated, with the plant.
-
     Raises:
         UsageError: where the folder holds no metrics.json.
     """
-    protocol, split = run.protocols[0], run.focus
-    lead = run.selected or (run.heads[0] if run.heads else run.baseline)
+    lead = leading(run)
+    if lead is None or run.row(lead, run.focus, run.protocols[0]) is None:
+        return [
+            f"The run holds no free runs of its selected model on {run.focus} data; see the tables."
+        ]
+    return judged(evidence(run, lead))
+
+
+def leading(run: RunFiles) -> str | None:
+    """Return the model that a verdict is on: the selected one, else the first head."""
+    return run.selected or (run.heads[0] if run.heads else run.baseline)
+
+
+def figures_section(run: RunFiles) -> Section | None:
+    """Return the figures behind the verdict in words, None where the model has no free runs.
+
+    The model is compared with the baseline and, where the logs are simulated, with the plant.
+    """
+    protocol, split, lead = run.protocols[0], run.focus, leading(run)
     row = run.row(lead, split, protocol)
     if lead is None or row is None:
-        return [
-            f"The run holds no free runs of its selected model on {split} data; see the tables."
-        ]
+        return None
     base = run.row(run.baseline, split, protocol)
-    out = [*judged(evidence(run, lead)), _seen(run, lead, row), _level(run, lead, row, base)]
+    out = [_seen(run, lead, row), _level(run, lead, row, base)]
     truth = run.row(run.truth, split, protocol)
     if truth is not None and run.truth != lead:
         out.append(_against_plant(run, row, truth, base))
-    out.append(_end(run, row, base, lead))
-    out.append(_divergence(run, split))
-    return out
+    out += [_end(run, row, base, lead), _divergence(run, split)]
+    return Section(f"Figures of {lead}", [Bullets([minus(text) for text in out if text])])
 
 
 def evidence(run: RunFiles, selected: str) -> Evidence:
