@@ -40,13 +40,15 @@ class Vessels:
     gust: np.ndarray
 
 
-def draw(random: np.random.Generator, count: int) -> Vessels:
+def draw(
+    random: np.random.Generator, count: int, shortest: float = 2.0, longest: float = 100.0
+) -> Vessels:
     """Draw vessels; their yaw is damped, and they turn in two to five lengths."""
 
     def between(low: float, high: float) -> np.ndarray:
         return np.exp(random.uniform(np.log(low), np.log(high), count))
 
-    length = between(2.0, 100.0)
+    length = between(shortest, longest)
     speed = between(0.12, 0.35) * np.sqrt(9.81 * length)
     return Vessels(
         length=length,
@@ -82,6 +84,33 @@ def random_logs(kind: str, seed: int, count: int) -> list[list[Log]]:
     ]
 
 
+def small_boat_logs(kind: str, seed: int, flights: int, seconds: float) -> list[Log]:
+    """Return logs of one small boat of 1 to 8 m: paths followed, zigzags and steps in turn.
+
+    Its noise is up to eight times that of `random_logs`, and its path is held by a course
+    controller, so that the inputs answer the motion.
+
+    Args:
+        kind: one of `KINDS`.
+        seed: of the boat, its paths and its noise.
+        flights: number of logs.
+        seconds: length of each.
+    """
+    random = np.random.default_rng([seed, KINDS.index(kind), 1])
+    vessels = draw(random, 1, longest=8.0, shortest=1.0)
+    unit = vessels.length / vessels.speed
+    step = np.full(1, 0.1 if unit[0] < 4.0 else 0.2)
+    samples = round(seconds / float(step[0]))
+    noise = float(np.exp(random.uniform(0.0, np.log(8.0))))
+    return [
+        _log(vessels, kind, flight, step, 0, k, random, noise)
+        for k, flight in enumerate(
+            _fly(vessels, kind, (3, 0, 3, 1, 3, 2)[k % 6], step, random, samples)
+            for k in range(flights)
+        )
+    ]
+
+
 def ship_of(kind: str, log: Log) -> Ship:
     """The description of a host that planted faults need, in proportion to the vessel."""
     length = float(log.meta["length"])
@@ -94,9 +123,18 @@ def ship_of(kind: str, log: Log) -> Ship:
 
 
 def _fly(
-    vessels: Vessels, kind: str, what: int, step: np.ndarray, random: np.random.Generator
+    vessels: Vessels,
+    kind: str,
+    what: int,
+    step: np.ndarray,
+    random: np.random.Generator,
+    samples: int = _SAMPLES,
 ) -> dict[str, np.ndarray]:
-    """Return state and actuators [_SAMPLES, B] in units of length and speed."""
+    """Return state and actuators [samples, B] in units of length and speed.
+
+    `what` is 0 for a zigzag, 1 for steps of the steering, 2 for steps of both, 3 for courses that
+    a controller holds.
+    """
     count = vessels.length.size
     unit = vessels.length / vessels.speed
     dt = step / unit / _SUBSTEPS
@@ -110,21 +148,26 @@ def _fly(
     sign = random.choice([-1.0, 1.0], count)
     gusts = np.zeros((3, count))
     out = {
-        name: np.zeros((_SAMPLES, count))
+        name: np.zeros((samples, count))
         for name in ["x", "y", "psi", "u", "v", "r", "side", "drive"]
     }
-    for k in range(_SAMPLES):
+    for k in range(samples):
         for name, values in zip(out, (x, y, psi, u, v, r, side, drive), strict=True):
             out[name][k] = values
         now = k * step / unit
         if what == 0:
             sign = np.where(sign * (psi - course) > limit, -sign, sign)
             turn = np.where(now > 3.0, sign * angle, 0.0)
+        elif what == 3:
+            fresh = now >= until
+            course = np.where(fresh, course + random.uniform(-1.6, 1.6, count), course)
+            until = np.where(fresh, now + random.uniform(6.0, 18.0, count), until)
+            turn = np.clip(1.2 * (course - psi) - 0.6 * r, -angle, angle)
         else:
             fresh = now >= until
             turn = np.where(fresh, random.uniform(-0.55, 0.55, count), turn)
             until = np.where(fresh, now + random.uniform(2.0, 8.0, count), until)
-        if what == 2:
+        if what in (2, 3):
             fresh = now >= powered
             power = np.where(fresh, random.uniform(0.4, 1.1, count), power)
             powered = np.where(fresh, now + random.uniform(8.0, 20.0, count), powered)
@@ -161,14 +204,15 @@ def _log(
     i: int,
     k: int,
     random: np.random.Generator,
+    noisy: float = 1.0,
 ) -> Log:
+    count = len(flight["x"])
     length, speed = float(vessels.length[i]), float(vessels.speed[i])
     scale = {"x": length, "y": length, "psi": 1.0, "u": speed, "v": speed, "r": speed / length}
-    accuracy = random.uniform(0.3, 1.5)
+    accuracy = noisy * random.uniform(0.3, 1.5)
     noise = {"x": 0.005, "y": 0.005, "psi": 0.003, "u": 0.01, "v": 0.01, "r": 0.005}
     channels = {
-        name: size
-        * (flight[name][:, i] + accuracy * noise[name] * random.standard_normal(_SAMPLES))
+        name: size * (flight[name][:, i] + accuracy * noise[name] * random.standard_normal(count))
         for name, size in scale.items()
     }
     side, drive, most = flight["side"][:, i], flight["drive"][:, i], float(vessels.revolutions[i])
@@ -176,5 +220,5 @@ def _log(
         channels |= {"n_port": most * drive * (1.0 + side), "n_stbd": most * drive * (1.0 - side)}
     else:
         channels |= {"n": most * drive, "delta": side}
-    t = float(step[i]) * np.arange(_SAMPLES)
+    t = float(step[i]) * np.arange(count)
     return Log(f"{kind}_{i}_{k}", t, channels, meta={"length": length, "speed": speed})

@@ -81,8 +81,15 @@ def trained(
 ) -> tuple[HybridDynamics, dict[str, Any]]:
     model, residual, store = prepared(logs)
     settings = TrainingConfig.model_validate({"steps": 3, "one_step": ONE_STEP, **config})
-    notes = train("mlp", model, residual, store, settings, SCALES, validate, 0, folder)
+    spread = coefficient_spread(model)
+    notes = train("mlp", model, residual, store, settings, SCALES, validate, 0, folder, spread)
     return model, notes
+
+
+def coefficient_spread(model: HybridDynamics) -> Tensor:
+    """A covariance in which every coefficient is known to a hundredth."""
+    count = model.baseline.free_indices().numel()  # type: ignore[operator]
+    return 1e-4 * torch.eye(count, dtype=torch.float64)
 
 
 def same(one: dict[str, Tensor], two: dict[str, Tensor]) -> bool:
@@ -94,7 +101,8 @@ def untrained(logs: Sequence[Prepared], head: Any = None, **config: Any) -> Head
     model, residual, store = prepared(logs, head)
     model.head.calibrate(residual)
     settings = TrainingConfig.model_validate({"steps": 3, "one_step": ONE_STEP, **config})
-    return HeadTraining(model.float(), store, settings, SCALES.float(), Scripted([1.0]), 0)
+    spread = coefficient_spread(model)
+    return HeadTraining(model.float(), store, settings, SCALES.float(), Scripted([1.0]), 0, spread)
 
 
 def test_training_lowers_the_free_run_error(tmp_path: Path) -> None:
@@ -237,6 +245,8 @@ def test_the_baseline_moves_only_where_it_may(
     theta = [seen["baseline.theta"] for seen in validate.seen]
     assert torch.equal(theta[0], theta[1]), "one-step epochs leave the baseline alone"
     assert torch.equal(theta[1], theta[3]) == (not moves)
+    # nine batches at a hundredth's learning rate: a few standard errors at most
+    assert float((theta[3] - theta[1]).abs().max()) < 0.05
 
 
 def test_learning_rates_fall_along_a_cosine_in_each_stage(
@@ -270,10 +280,11 @@ def test_weight_decay_acts_on_matrices_of_the_head_only(logs: list[Prepared]) ->
         for group in module.configure_optimizers().param_groups
         for p in group["params"]
     }
-    for name, parameter in module.model.named_parameters():
-        assert decayed[id(parameter)] == (
-            0.3 if name.startswith("head") and name.endswith("weight") else 0.0
-        ), name
+    for name, parameter in module.model.head.named_parameters(prefix="head"):
+        assert decayed[id(parameter)] == (0.3 if name.endswith("weight") else 0.0), name
+    assert module.calibration is not None
+    assert id(module.calibration.moved) in decayed, "coefficients move as standard errors"
+    assert id(module.model.baseline.theta) not in decayed
 
 
 def test_batches_hold_their_share_of_beginnings(logs: list[Prepared]) -> None:

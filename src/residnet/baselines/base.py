@@ -55,6 +55,10 @@ class ParametricBaseline(Baseline, ABC):
         """Return the places [P] in theta, flattened, of the parameters that may move."""
 
     @abstractmethod
+    def free_names(self) -> list[tuple[str, str]]:
+        """Return (axis, term) of each free parameter, as the table of coefficients has them [P]."""
+
+    @abstractmethod
     def sensitivity(self, z: Tensor) -> Tensor:
         """Return the derivatives [B, 3, P] of nu_dot with respect to the free parameters.
 
@@ -77,10 +81,18 @@ class ParametricBaseline(Baseline, ABC):
 
     @abstractmethod
     def asymmetry(self, samples: Samples) -> Tensor:
-        """Return the information [P] about parameters that a mirror-symmetric vessel cannot have.
+        """Return the information [P, P] about what a mirror-symmetric vessel cannot have.
 
-        It is zero for all other free parameters.
+        It is zero where nothing is known of the mirror. Terms of the wrong parity, and differences
+        between a coefficient and that of the term's mirror image, cost by it.
         """
+
+    def feeding(self) -> list[int]:
+        """Return the free parameters, counted among these, whose sign feeds energy as they are.
+
+        Empty for a baseline whose form does not allow it, or that is not asked to look.
+        """
+        return []
 
     @abstractmethod
     def updated_table(self, table: Sequence[Coefficient], errors: Tensor) -> list[Coefficient]:

@@ -71,6 +71,10 @@ class MMGBaseline(ParametricBaseline):
         """Return the places [P] of the parameters whose prior is not fixed."""
         return torch.nonzero(torch.tensor(self.sd) > 0).squeeze(1)
 
+    def free_names(self) -> list[tuple[str, str]]:
+        """Return (axis, name) of each parameter whose prior is not fixed [P]."""
+        return [(axis_of(PARAMETERS[i]), PARAMETERS[i]) for i in self.free_indices().tolist()]
+
     def sensitivity(self, z: Tensor) -> Tensor:
         """Return d nu_dot / d theta [B, 3, P], by central differences of all parameters at once.
 
@@ -107,8 +111,9 @@ class MMGBaseline(ParametricBaseline):
         )
 
     def asymmetry(self, samples: Samples) -> Tensor:
-        """Return zeros [P]: what is asymmetric here has a prior of its own."""
-        return torch.zeros(self.free_indices().numel(), dtype=torch.float64)
+        """Return zeros [P, P]: what is asymmetric here has a prior of its own."""
+        count = self.free_indices().numel()
+        return torch.zeros(count, count, dtype=torch.float64)
 
     def updated_table(self, table: Sequence[Coefficient], errors: Tensor) -> list[Coefficient]:
         """Return every parameter as it is now."""

@@ -14,7 +14,7 @@ from residnet.baselines.base import Baseline, IdentifiedConfig, ParametricBaseli
 from residnet.baselines.sets import Roles, SetName, expand, merged
 from residnet.core.names import ACCELERATION, VELOCITY
 from residnet.core.samples import Samples
-from residnet.physics.symmetry import wrong_parity
+from residnet.physics.symmetry import dissipates, mirrored_terms, wrong_parity
 from residnet.physics.terms import TermLibrary
 from residnet.regression.least_squares import LeastSquares
 from residnet.regression.solutions import Coefficient, Solution
@@ -35,9 +35,10 @@ class RegressorBaseline(ParametricBaseline):
         rows: Sequence[Sequence[str]],
         names: Sequence[str],
         held: Sequence[tuple[int, str]] = (),
+        dissipative: bool = False,
     ) -> None:
         """From the terms of each axis; `held`: (axis, term) of coefficients that a refit through
-        rollouts must leave as they are.
+        rollouts must leave as they are; `dissipative`: no term may feed energy.
         """
         terms = list(dict.fromkeys(term for row in rows for term in row))
         super().__init__(torch.zeros(3, len(terms), dtype=torch.float64))
@@ -48,6 +49,8 @@ class RegressorBaseline(ParametricBaseline):
         self.register_buffer("allowed", allowed, persistent=False)
         self.allowed: Tensor
         self.held = tuple((axis, terms.index(term)) for axis, term in held)
+        self.dissipative = dissipative
+        self.names = tuple(names)
 
     def forward(self, z: Tensor) -> Tensor:
         """Return nu_dot [..., 3] at channels z [..., nz]."""
@@ -69,6 +72,14 @@ class RegressorBaseline(ParametricBaseline):
         for axis, column in self.held:
             free[axis, column] = False
         return torch.nonzero(free.flatten()).squeeze(1)
+
+    def free_names(self) -> list[tuple[str, str]]:
+        """Return (axis, term) of each free coefficient [P]."""
+        terms = self.library.terms
+        return [
+            (ACCELERATION[i // len(terms)], terms[i % len(terms)])
+            for i in self.free_indices().tolist()
+        ]
 
     def sensitivity(self, z: Tensor) -> Tensor:
         """Return d nu_dot / d theta [B, 3, P]: a coefficient moves its own axis by its term."""
@@ -96,14 +107,40 @@ class RegressorBaseline(ParametricBaseline):
         return none, none
 
     def asymmetry(self, samples: Samples) -> Tensor:
-        """Return the mean information of a sample [P] about terms of the wrong parity."""
+        """Return the mean information of a sample [P, P] about what breaks the mirror symmetry."""
         phi, variance = self._residual(samples)
-        odd = [
-            [float(wrong_parity(term, axis, samples.names)) for term in self.library.terms]
-            for axis in range(3)
+        terms, energy = self.library.terms, phi.square().mean(0)
+        images = mirrored_terms(terms, samples.names)
+        if images is None:
+            # of single terms some parity may be known where that of all channels is not
+            wrong = [wrong_parity(t, i, samples.names) for i in range(3) for t in terms]
+            images = {}
+        else:
+            wrong = [False] * (3 * len(terms))
+        out = torch.diag(torch.tensor(wrong, dtype=torch.float64) * energy.repeat(3))
+        for axis, turned in enumerate((1, -1, -1)):
+            for place, (other, sign) in images.items():
+                # a quarter: the image of a term of the wrong parity is the term with minus
+                apart = torch.zeros(3 * len(terms), dtype=torch.float64)
+                apart[axis * len(terms) + place] += 0.5
+                apart[axis * len(terms) + other] -= 0.5 * sign * turned
+                out += energy[place] * torch.outer(apart, apart)
+        out = out / variance.repeat_interleave(len(terms))[:, None]
+        free = self.free_indices()
+        return out[free][:, free]
+
+    def feeding(self) -> list[int]:
+        """Return the free coefficients, by their number among these, that feed energy."""
+        if not self.dissipative:
+            return []
+        count = self.library.count
+        flat = self.theta.flatten().tolist()
+        return [
+            i
+            for i, place in enumerate(self.free_indices().tolist())
+            if flat[place] > 0.0
+            and dissipates(self.library.terms[place % count], place // count, self.names)
         ]
-        pull = torch.tensor(odd, dtype=torch.float64) * phi.square().mean(0) / variance[:, None]
-        return pull.flatten()[self.free_indices()]
 
     def updated_table(self, table: Sequence[Coefficient], errors: Tensor) -> list[Coefficient]:
         """Return coefficients and ratios as theta is now; a ratio keeps its error."""
@@ -112,11 +149,7 @@ class RegressorBaseline(ParametricBaseline):
             f"{name}_dot": dict(zip(terms, self.theta[axis].tolist(), strict=True))
             for axis, name in enumerate(VELOCITY)
         }
-        names = [
-            (f"{VELOCITY[i // len(terms)]}_dot", terms[i % len(terms)])
-            for i in self.free_indices().tolist()
-        ]
-        known = dict(zip(names, errors.tolist(), strict=True))
+        known = dict(zip(self.free_names(), errors.tolist(), strict=True))
         return [
             (
                 replace(c, value=c.ratio.of(rows[c.axis]))
@@ -161,6 +194,8 @@ class RegressorsConfig(IdentifiedConfig):
         ridge: penalty as a share of each regressor's energy, 0 for ordinary least squares; of
             several the one whose free run is best on validation data.
         manoeuvres: kinds of manoeuvre to fit on; empty for all.
+        dissipative: terms along an axis' own velocity, such as u|u| in surge or v|r| in sway, whose
+            sign would feed energy are left out, and the others fitted again; a refit does the same.
     """
 
     kind: Literal["regressors"] = "regressors"
@@ -170,6 +205,7 @@ class RegressorsConfig(IdentifiedConfig):
     steer: tuple[str, ...] = ()
     ridge: Penalty | Annotated[tuple[Penalty, ...], Field(min_length=2)] = 0.0
     manoeuvres: tuple[str, ...] = ()
+    dissipative: bool = False
 
     @model_validator(mode="after")
     def _rows(self) -> RegressorsConfig:
@@ -198,7 +234,7 @@ class RegressorsConfig(IdentifiedConfig):
 
     def build(self, names: Sequence[str]) -> RegressorBaseline:
         """Return the module, coefficients zero, for channels `names`."""
-        return RegressorBaseline(self.rows(names), names)
+        return RegressorBaseline(self.rows(names), names, dissipative=self.dissipative)
 
     def require_samples(self, samples: Samples) -> None:
         """Check that there are manoeuvres to fit on.
@@ -218,16 +254,33 @@ class RegressorsConfig(IdentifiedConfig):
         chosen = of_manoeuvres(samples, self.manoeuvres)
         estimator = LeastSquares(self.ridge if isinstance(self.ridge, tuple) else (self.ridge,))
         phi = baseline.library(chosen.z)
-        fits = []
-        for axis, output in enumerate(ACCELERATION):
-            columns = baseline.columns(axis)
-            fits.append(
-                estimator.fit(
-                    phi[:, columns],
-                    chosen.target[:, [axis]],
-                    chosen.group,
-                    names=[baseline.library.terms[j] for j in columns],
-                    outputs=(output,),
-                )
+        terms = baseline.library.terms
+
+        def fitted(axis: int, columns: list[int]) -> list[Solution]:
+            return estimator.fit(
+                phi[:, columns],
+                chosen.target[:, [axis]],
+                chosen.group,
+                names=[terms[j] for j in columns],
+                outputs=(ACCELERATION[axis],),
             )
+
+        fits = []
+        for axis in range(len(ACCELERATION)):
+            columns = baseline.columns(axis)
+            found = fitted(axis, columns)
+            while feeding := self._feeding(found, axis, chosen.names):
+                columns = [j for j in columns if terms[j] not in feeding]
+                found = fitted(axis, columns)
+            fits.append(found)
         return [baseline.solution(axes, axes[0].choice) for axes in zip(*fits, strict=True)]
+
+    def _feeding(self, solutions: Sequence[Solution], axis: int, names: Sequence[str]) -> set[str]:
+        """Return terms that feed energy in every solution and may not."""
+        if not self.dissipative:
+            return set()
+        found = [
+            {c.term for c in one.table if c.value > 0.0 and dissipates(c.term, axis, names)}
+            for one in solutions
+        ]
+        return set.intersection(*found)

@@ -9,7 +9,8 @@ from typing import Literal, NamedTuple
 from residnet.core.errors import ConfigError
 from residnet.core.names import VELOCITY, nearest
 from residnet.physics.signals import FORCE_CHANNELS, WIND_CHANNELS
-from residnet.physics.terms import Factor, parse_term, polynomial_terms
+from residnet.physics.symmetry import meaning
+from residnet.physics.terms import Factor, polynomial_terms
 
 SetName = Literal["linear", "fossen", "abkowitz", "astern", "wind", "polynomial_1", "polynomial_2"]
 
@@ -202,20 +203,5 @@ def merged(terms: Sequence[str], names: Sequence[str]) -> tuple[str, ...]:
     """
     seen: dict[frozenset[tuple[Factor, int, bool]], str] = {}
     for term in terms:
-        seen.setdefault(_meaning(term, names), term)
+        seen.setdefault(meaning(term, names, {}), term)
     return tuple(seen.values())
-
-
-def _meaning(term: str, names: Sequence[str]) -> frozenset[tuple[Factor, int, bool]]:
-    """Return what a term multiplies.
-
-    Each thing stands without its power or magnitude, with its whole power, and with whether the
-    product changes sign with it.
-    """
-    power: dict[Factor, int] = {}
-    odd: dict[Factor, bool] = {}
-    for factor in parse_term(term, names):
-        thing = factor._replace(power=1, magnitude=False)
-        power[thing] = power.get(thing, 0) + factor.power
-        odd[thing] = odd.get(thing, False) ^ (not factor.magnitude and factor.power % 2 != 0)
-    return frozenset((thing, power[thing], odd[thing]) for thing in power)

@@ -34,6 +34,10 @@ class LstmConfig(FeatureConfig):
         per_axis: one network for each of surge, sway, yaw, as document 003 has it.
         axis_features: channels of each axis' network, where they differ; needs `per_axis`.
         mirror: make the residual mirror-symmetric between port and starboard by construction.
+        encoder: a second LSTM with weights of its own reads the measured past, and its memory is
+            what a free run starts from; otherwise the same weights do both (Forgione and Piga 2021,
+            Continuous-time system identification with neural networks, section 3; Weber and others
+            2021, Non-linear RNN identification: diagnosis and simulation).
     """
 
     kind: Literal["lstm"] = "lstm"
@@ -45,6 +49,7 @@ class LstmConfig(FeatureConfig):
     per_axis: bool = False
     axis_features: dict[Literal["u", "v", "r"], tuple[str, ...]] | None = None
     mirror: bool = False
+    encoder: bool = False
 
     @model_validator(mode="after")
     def _axes(self) -> LstmConfig:
@@ -164,7 +169,11 @@ class LstmNetwork(nn.Module):
             persistent=False,
         )
         self.seen: Tensor
-        self.core = LstmCore(len(seen), config.hidden_size, config.activation == "softsign")
+        softsign = config.activation == "softsign"
+        self.core = LstmCore(len(seen), config.hidden_size, softsign)
+        self.encoder: LstmCore | None = (
+            LstmCore(self.features.count, config.hidden_size, softsign) if config.encoder else None
+        )
         self.dropout = nn.Dropout(config.dropout)
         self.skip = config.readout > 0
         out = nn.Linear(config.readout or config.hidden_size, outputs)
@@ -179,6 +188,11 @@ class LstmNetwork(nn.Module):
             else nn.Sequential()
         )
         self.readout = nn.Sequential(*mixer, out)
+
+    def silence(self) -> None:
+        """Set the output to zero."""
+        for parameter in self.readout[-1].parameters():
+            nn.init.zeros_(parameter)
 
     def remembered(self, f: Tensor) -> Tensor:
         """Return the features that the memory sees."""
@@ -195,6 +209,13 @@ class LstmNetwork(nn.Module):
         f = self.features(z)
         h, s = self.core(self.remembered(f), s)
         return self.read(h, f), s
+
+    def memory_after(self, z: Tensor) -> Tensor:
+        """Return the memory [B, 2H] that past channels [B, T, nz] leave."""
+        f = self.features(z)
+        if self.encoder is not None:
+            return self.encoder.sequence(f)[1]
+        return self.core.sequence(self.remembered(f))[1]
 
     def sequence(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """Return [B, T, outputs] for channels [B, T, nz], and the memory after them."""
@@ -225,6 +246,11 @@ class LstmHead(ResidualHead):
             network.features.calibrate(samples)
         self.scale.calibrate(samples)
 
+    def silence(self) -> None:
+        """Set the residual to zero: the last layer of each network."""
+        for network in self.networks:
+            network.silence()
+
     def residual_std(self) -> Tensor:
         """Return the standard deviation of the residual on the training samples, [3]."""
         return self.scale.spread
@@ -247,7 +273,7 @@ class LstmHead(ResidualHead):
 
     def warmup(self, z: Tensor) -> Tensor:
         """Return the memory [B, n_state] that past channels [B, T, nz] leave."""
-        return torch.cat([network.sequence(z)[1] for network in self.networks], dim=-1)
+        return torch.cat([network.memory_after(z) for network in self.networks], dim=-1)
 
     def memory_range(self) -> tuple[Tensor, Tensor]:
         """Return the least and largest memory [n_state] that the networks can have."""

@@ -65,6 +65,10 @@ class MirroredHead(ResidualHead):
         )
         self.inner.calibrate(both)
 
+    def silence(self) -> None:
+        """Set the residual to zero."""
+        self.inner.silence()
+
     def residual_std(self) -> Tensor:
         """Return the standard deviation of the residual on the training samples, [3]."""
         return self.inner.residual_std()

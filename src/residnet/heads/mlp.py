@@ -74,6 +74,11 @@ class MlpHead(ResidualHead):
         self.features.calibrate(samples)
         self.scale.calibrate(samples)
 
+    def silence(self) -> None:
+        """Set the residual to zero: the last layer."""
+        for parameter in self.net[-1].parameters():
+            nn.init.zeros_(parameter)
+
     def residual_std(self) -> Tensor:
         """Return the standard deviation of the residual on the training samples, [3]."""
         return self.scale.spread

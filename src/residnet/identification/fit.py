@@ -2,40 +2,24 @@
 
 from __future__ import annotations
 
-import copy
-import dataclasses
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-import torch
 
-from residnet.baselines import BaselineConfig, Coefficient, ParametricBaseline, StillConfig
-from residnet.core.errors import FitError
 from residnet.core.progress import say
-from residnet.core.samples import Samples
-from residnet.data.prepare import Prepared, envelope, samples
+from residnet.data.prepare import Prepared
 from residnet.data.simulated.trials import SimulatedTrials
 from residnet.data.sources import MeasuredLogs
-from residnet.data.windows import WindowStore
-from residnet.dynamics.ensemble import mean_of
-from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.store import ModelSpec, rebuilt
-from residnet.heads import ClosedFormHead
 from residnet.identification.evaluation import Evaluation, candidates, evaluate
+from residnet.identification.fitter import Fitter
 from residnet.identification.models import FitStore, FittedModel, NoStore
-from residnet.identification.prepared import velocity_limit
 from residnet.identification.selecting import examine, select
 from residnet.identification.settings import FitSettings
-from residnet.identification.solution_choice import choose_solution
-from residnet.identification.validation import ValidationScore
+from residnet.identification.standard import TIED
 from residnet.judge.verdict.sanity import Finding
 from residnet.judge.verdict.selection import Selection
-from residnet.training.config import TrainingConfig
-from residnet.training.refit import refit
 
 
 @dataclass(frozen=True)
@@ -70,9 +54,12 @@ class Identified(Mapping[str, FittedModel]):
     @cached_property
     def findings(self) -> dict[str, list[Finding]]:
         """What the checks for physical sanity find, by model; `zero` is left out."""
-        settings = self.settings
-        step = settings.prepare.grid.step
-        return examine(self.values(), self.train, settings.evaluation, step)
+        return self.findings_of(list(self.values()))
+
+    def findings_of(self, fitted: Sequence[FittedModel]) -> dict[str, list[Finding]]:
+        """Return what the checks for physical sanity find of some models."""
+        step = self.settings.prepare.grid.step
+        return examine(fitted, self.train, self.settings.evaluation, step)
 
     def select(self, judged: Mapping[str, Evaluation]) -> Selection:
         """Choose a single model and an ensemble by their free runs.
@@ -111,203 +98,39 @@ def fit(
         DataError: where a split holds no sample or no window.
     """
     fitter = Fitter(logs, settings, store or NoStore())
-    baselines = {name: fitter.baseline(name) for name in settings.all_baselines}
-    models = {"zero": fitter.zero(), **baselines}
-    for name, baseline in baselines.items():
-        say(f"  {name}: {_said(baseline)}")
+    settings = fitter.settings
+    models = {"zero": fitter.zero()}
+    for name in settings.all_baselines:
+        models[name] = fitter.baseline(name)
+        say(f"  {name}: {_said(models[name])}")
     for name in settings.heads:
         say(f"  fitting {name}")
-        head = fitter.head(name, baselines[settings.baseline_name_of(name)].model)
-        say(f"  {name}: {_said(head)} after {head.notes['seconds']:.1f} s")
-        models[name] = head
+        begin = settings.training[name].begin_with if name in settings.training else None
+        base = models[settings.baseline_name_of(name)]
+        models[name] = fitter.head(name, base, None if begin is None else models[begin])
+        say(f"  {name}: {_said(models[name])} after {models[name].notes['seconds']:.1f} s")
     for name, members in settings.ensembles.items():
         models[name] = fitter.ensemble(name, [models[member] for member in members])
         say(f"  {name}: {_said(models[name])}")
-    return Identified(settings, models, fitter.limit, fitter.train)
+    identified = Identified(settings, models, fitter.limit, fitter.train)
+    if settings.recipe is not None:
+        _add_tied(identified, fitter, logs)
+    return identified
 
 
-class Fitter:
-    """The single steps of a fit on one set of logs.
-
-    Args:
-        logs: prepared logs by split; `train` and `validation` are used.
-        settings: of the fit.
-        store: keeps every model as it is done.
-    """
-
-    def __init__(
-        self, logs: Mapping[str, Sequence[Prepared]], settings: FitSettings, store: FitStore
-    ) -> None:
-        self.settings = settings
-        self.store = store
-        self.train = logs["train"]
-        self.signals = settings.signals.build()
-        self.low, self.high = envelope(self.train)
-        self.limit = velocity_limit(self.low, self.high, settings.evaluation.divergence)
-        self.samples = samples(self.train, self.signals)
-        self.scales = torch.from_numpy(settings.evaluation.scales.array())
-        self.validate = ValidationScore(
-            logs["validation"], settings.evaluation, settings.prepare.grid.step, self.limit
-        )
-
-    def spec(self, name: str, role: str, baseline: BaselineConfig) -> ModelSpec:
-        """Return the description of a model of this fit.
-
-        Args:
-            name: of the model.
-            role: zero, baseline, head or ensemble.
-            baseline: that it is or stands on.
-        """
-        settings = self.settings
-        return ModelSpec.model_validate(
-            {
-                "schema": "residnet.model/1",
-                "name": name,
-                "role": role,
-                "signals": settings.signals.resolved().model_dump(),
-                "baseline": baseline.resolved().model_dump(),
-                "head": settings.heads[name].model_dump() if role == "head" else None,
-                "dt": settings.prepare.grid.step,
-                "integrator": settings.integrator,
-                "hold": settings.prepare.hold,
-                "low": self.low.tolist(),
-                "high": self.high.tolist(),
-            }
-        )
-
-    def zero(self) -> FittedModel:
-        """Return the model that holds the velocities."""
-        spec = self.spec("zero", "zero", StillConfig())
-        return self._kept(FittedModel(spec, spec.build(), {}))
-
-    def baseline(self, name: str = "baseline") -> FittedModel:
-        """Identify a baseline; refit it through rollouts where the settings ask for it."""
-        spec = self.spec(name, "baseline", self.settings.all_baselines[name])
-        model = spec.build()
-        started = time.perf_counter()
-        solutions = spec.baseline.solutions(model.baseline, self.samples)
-        solution, tried = choose_solution(model, model.baseline, solutions, self.validate)
-        table, covariance = list(solution.table), None
-        notes: dict[str, Any] = {
-            "samples": len(self.samples),
-            **solution.choice,
-            **tried,
-            "least_squares": self.validate(model).error,
-        }
-        if name in self.settings.refit:
-            table, covariance = self._refit(name, model, table, notes)
-        notes["coefficients"] = [_coefficient_row(entry) for entry in table]
-        notes |= self._validated(model)
-        notes["seconds"] = round(time.perf_counter() - started, 1)
-        return self._kept(FittedModel(spec, model, notes, covariance))
-
-    def _refit(
-        self, name: str, model: HybridDynamics, table: list[Coefficient], notes: dict[str, Any]
-    ) -> tuple[list[Coefficient], torch.Tensor | None]:
-        """Move a baseline's coefficients through rollouts; returns their new table and covariance
-        and adds to the notes.
-        """
-        refitted = refit(
-            model,
-            self.samples,
-            WindowStore.gather(self.train, torch.float64),
-            self.settings.refit[name],
-            self.scales,
-        )
-        assert isinstance(model.baseline, ParametricBaseline)
-        notes["refit"] = refitted.notes
-        if refitted.offsets.axes:
-            notes["offsets"] = refitted.offsets.table([log.log.name for log in self.train])
-        return model.baseline.updated_table(table, refitted.errors), refitted.covariance
-
-    def head(self, name: str, baseline: HybridDynamics) -> FittedModel:
-        """Fit one head on top of a baseline, or take it from the store where it is finished there.
-
-        Args:
-            name: of the head in the settings.
-            baseline: the fitted model that the head stands on.
-
-        Raises:
-            FitError: where the data do not determine the head.
-        """
-        finished = self.store.finished(name)
-        if finished is not None:
-            return finished
-        spec = self.spec(name, "head", self.settings.baseline_of(name))
-        # seeded by the head's name, so that adding a head changes no other
-        seed = self.settings.seed * 1_000 + sum(map(ord, name))
-        torch.manual_seed(seed)
-        model = spec.build()
-        model.baseline.load_state_dict(copy.deepcopy(baseline.baseline.state_dict()))
-        residual = residual_samples(model, self.samples)
-        started = time.perf_counter()
-        if isinstance(model.head, ClosedFormHead):
-            model.head.calibrate(residual)
-            try:
-                solutions = model.head.solutions(residual)
-                solution, tried = choose_solution(model, model.head, solutions, self.validate)
-            except FitError as error:
-                raise FitError(f"head {name}: {error}") from None
-            notes = solution.choice | solution.notes | tried
-        else:
-            notes = self._train(name, model, residual, seed)
-        notes |= {
-            "baseline": self.settings.baseline_name_of(name),
-            "seconds": round(time.perf_counter() - started, 1),
-            **self._validated(model),
-        }
-        return self._kept(FittedModel(spec, model, notes))
-
-    def ensemble(self, name: str, members: Sequence[FittedModel]) -> FittedModel:
-        """Return the mean of fitted models as one model."""
-        spec = self.spec(name, "ensemble", StillConfig()).model_copy(
-            update={"members": tuple(member.spec for member in members)}
-        )
-        model = mean_of([copy.deepcopy(member.model).to(torch.float64) for member in members])
-        notes: dict[str, Any] = {
-            "members": [member.name for member in members],
-            **self._validated(model),
-        }
-        return self._kept(FittedModel(spec, model, notes))
-
-    def _train(
-        self, name: str, model: HybridDynamics, residual: Samples, seed: int
-    ) -> dict[str, Any]:
-        from residnet.training.trainer import train
-
-        settings = self.settings.training.get(name, TrainingConfig())
-        windows, folder = WindowStore.gather(self.train), self.store.training_folder
-        return train(
-            name, model, residual, windows, settings, self.scales, self.validate, seed, folder
-        )
-
-    def _validated(self, model: HybridDynamics) -> dict[str, Any]:
-        """Notes on a model's free runs over the validation logs."""
-        diverged, error = self.validate(model)
-        return {"validation": error, "validation_diverged": diverged}
-
-    def _kept(self, fitted: FittedModel) -> FittedModel:
-        """Keep a model and return it as a load gives it back.
-
-        What is judged is then bit for bit what is stored, and a resumed fit judges the same.
-        """
-        kept = dataclasses.replace(fitted, model=rebuilt(fitted.spec, fitted.model))
-        self.store.keep(kept)
-        return kept
-
-
-def residual_samples(model: HybridDynamics, known: Samples) -> Samples:
-    """Return samples whose target is what the model's baseline leaves.
-
-    That is an acceleration (document 003 (19)) or a force (document 002 (3.20)), as the model's
-    head wants it.
-
-    Args:
-        model: with its baseline filled in.
-        known: samples whose target is the measured acceleration.
-    """
-    with torch.no_grad():
-        return model.head.residual_target(known, model.baseline(known.z))
+def _add_tied(
+    identified: Identified, fitter: Fitter, logs: Mapping[str, Sequence[Prepared]]
+) -> None:
+    """Add the mean of the models that validation data cannot tell from the best."""
+    judged = {split: identified.evaluate(logs[split]) for split in ("train", "validation")}
+    chosen = identified.select(judged)
+    if len(chosen.tied) < 2:
+        say("  tied: no model comes within one standard error of the best; there is no mean")
+        return
+    model = fitter.ensemble(TIED, [identified.models[name] for name in chosen.tied])
+    identified.models[TIED] = model
+    identified.findings.update(identified.findings_of([model]))
+    say(f"  {TIED}: {_said(model)} (mean of {', '.join(chosen.tied)})")
 
 
 def _said(fitted: FittedModel) -> str:
@@ -315,12 +138,3 @@ def _said(fitted: FittedModel) -> str:
     diverged = fitted.notes.get("validation_diverged", 0)
     lost = f" ({diverged} windows DIVERGED)" if diverged else ""
     return f"validation free-run error {fitted.notes['validation']:.4f}{lost}"
-
-
-def _coefficient_row(entry: Coefficient) -> dict[str, Any]:
-    return {
-        "axis": entry.axis,
-        "term": entry.term,
-        "value": entry.value,
-        "standard_error": entry.error,
-    }

@@ -5,7 +5,7 @@ from __future__ import annotations
 from residnet.core.errors import FitError
 from residnet.data.windows import WindowStore
 from residnet.heads import ClosedFormHead
-from residnet.identification.fit import Fitter
+from residnet.identification.fitter import Fitter
 from residnet.identification.models import NoStore
 from residnet.identification.prepared import PreparedSplits
 from residnet.identification.settings import FitSettings

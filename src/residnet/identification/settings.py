@@ -3,17 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Annotated
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import (
+    Field,
+    SerializerFunctionWrapHandler,
+    model_serializer,
+    model_validator,
+)
 
-from residnet.baselines import BaselineConfig, ParametricBaseline, RegressorBaseline
-from residnet.core.config import Config
+from residnet.baselines import (
+    BaselineConfig,
+    ParametricBaseline,
+    RegressorBaseline,
+    StillConfig,
+)
+from residnet.core.config import Config, validate
 from residnet.core.errors import ConfigError
 from residnet.core.names import nearest
 from residnet.data.prepare import PrepareConfig
 from residnet.dynamics.base import Integrator
 from residnet.heads import HeadConfig
+from residnet.identification.standard import PARTS, TIED, Facts, portfolio
 from residnet.judge.config import EvaluationConfig
 from residnet.physics.signals import SignalsConfig
 from residnet.training.config import TrainingConfig
@@ -23,35 +34,24 @@ from residnet.training.refit_config import RefitConfig
 _RESERVED = ("zero", "baseline", "truth")
 
 
-class FitSettings(Config):
-    """Settings of an identification.
+class Parts(Config):
+    """The models of a fit.
 
     Attributes:
-        seed: of weights and batches.
-        prepare: grid, masks, derivatives.
-        signals: inputs of the models.
-        integrator: of the models; their step is the grid's.
-        baseline: the known part.
+        baseline: the known part; a fit without a recipe needs one.
         baselines: further baselines by name; free-run beside the first, and heads may stand on
             them.
-        current: training and validation logs ran in constant currents that are estimated first;
-            null for water at rest.
         refit: baselines (by name, `baseline` for the first) whose coefficients are moved through
             rollouts after least squares.
         heads: residual heads by name.
-        base_of: the baseline that a head stands on, by the head's name; `baseline` where absent.
+        base_of: the baseline that a head stands on, by the head's name; `baseline` where absent,
+            `zero` for a head that is the whole model.
         ensembles: models whose mean acceleration makes another model, by its name.
         training: of network heads by the name of the head; the defaults where absent.
-        evaluation: protocols and scales.
     """
 
-    seed: int = Field(default=0, ge=0)
-    prepare: PrepareConfig
-    signals: SignalsConfig
-    integrator: Integrator = "rk4"
-    baseline: BaselineConfig
+    baseline: BaselineConfig = StillConfig()
     baselines: dict[str, BaselineConfig] = Field(default_factory=dict)
-    current: CurrentConfig | None = None
     refit: dict[str, RefitConfig] = Field(default_factory=dict)
     heads: dict[str, HeadConfig] = Field(default_factory=dict)
     base_of: dict[str, str] = Field(default_factory=dict)
@@ -59,7 +59,60 @@ class FitSettings(Config):
         default_factory=dict
     )
     training: dict[str, TrainingConfig] = Field(default_factory=dict)
+
+
+class FitSettings(Parts):
+    """Settings of an identification.
+
+    Attributes:
+        seed: of weights and batches.
+        prepare: grid, masks, derivatives.
+        signals: inputs of the models.
+        integrator: of the models; their step is the grid's.
+        current: training and validation logs ran in constant currents that are estimated first;
+            null for water at rest.
+        evaluation: protocols and scales.
+        recipe: `standard` fits a portfolio in place of `baseline`, `baselines`, `refit`, `heads`,
+            `base_of`, `ensembles` and `training`: a linear model and a hull, both refitted, a
+            network on each, hull and network calibrated together, and a network alone; their terms,
+            sizes and trainings follow from the logs. The mean of the models that validation data
+            cannot tell from the best is named `tied`. Null for parts of your own.
+    """
+
+    seed: int = Field(default=0, ge=0)
+    prepare: PrepareConfig
+    signals: SignalsConfig
+    integrator: Integrator = "rk4"
+    current: CurrentConfig | None = None
     evaluation: EvaluationConfig
+    recipe: Literal["standard"] | None = None
+
+    @model_validator(mode="after")
+    def _of_recipe(self) -> FitSettings:
+        """Put the portfolio in the place of the parts, as it is before any log is read."""
+        given = [key for key in PARTS if key in self.model_fields_set]
+        if self.recipe is None:
+            if "baseline" not in given:
+                raise ValueError("baseline: missing; name its kind, or take `recipe: standard`")
+            return self
+        if given:
+            raise ValueError(
+                f"recipe: standard stands in place of {', '.join(PARTS)}; leave '{given[0]}' out"
+            )
+        return self.with_parts(Facts.supposed(self.signals.build().names))
+
+    def with_parts(self, facts: Facts) -> Self:
+        """Return the settings with the parts of the recipe for what is known of the logs."""
+        parts = validate(portfolio(facts), Parts, "recipe")
+        return self.model_copy(update={key: getattr(parts, key) for key in PARTS})
+
+    @model_serializer(mode="wrap")
+    def _as_given(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out what the recipe stands in place of."""
+        content: dict[str, Any] = plain(self)
+        if self.recipe is not None:
+            content = {key: value for key, value in content.items() if key not in PARTS}
+        return content
 
     @model_validator(mode="after")
     def _combination(self) -> FitSettings:
@@ -78,12 +131,28 @@ class FitSettings(Config):
                 )
         require_known("training", self.training, self.heads, "head")
         require_known("base_of", self.base_of, self.heads, "head")
-        require_known("base_of", self.base_of.values(), baselines, "baseline")
+        require_known("base_of", self.base_of.values(), ("zero", *baselines), "baseline")
+        self._trainings_begin()
         require_known("refit", self.refit, baselines, "baseline")
         members = (name for names in self.ensembles.values() for name in names)
         require_known("ensembles", members, single, "model")
         self._parts_fit_together()
         return self
+
+    def _trainings_begin(self) -> None:
+        """Check that trainings start from heads that are fitted before and are alike."""
+        before: list[str] = []
+        for name, head in self.heads.items():
+            begin = self.training[name].begin_with if name in self.training else None
+            key = f"training.{name}.begin_with"
+            if begin is not None:
+                require_known(key, (begin,), before, "head before it")
+                same = self.baseline_name_of(begin) == self.baseline_name_of(name)
+                if self.heads[begin] != head or not same:
+                    raise ValueError(
+                        f"{key}: '{begin}' has other settings or stands on another baseline"
+                    )
+            before.append(name)
 
     def _parts_fit_together(self) -> None:
         """Build every part once, so that what does not fit together is refused before any work."""
@@ -99,6 +168,13 @@ class FitSettings(Config):
                 head.set_mass(baseline.mass())
             except ConfigError as error:
                 raise ValueError(f"heads.{key}: {error}") from None
+        for name, training in self.training.items():
+            moved = self.baseline_of(name).build(names)
+            if training.refit_baseline and not isinstance(moved, ParametricBaseline):
+                raise ValueError(
+                    f"training.{name}.refit_baseline: the baseline of '{name}' has no coefficients"
+                    " that may move; leave it out"
+                )
         for name in self.refit:
             if not isinstance(self.all_baselines[name].build(names), ParametricBaseline):
                 raise ValueError(
@@ -122,7 +198,8 @@ class FitSettings(Config):
     @property
     def model_names(self) -> tuple[str, ...]:
         """Names of all models but `zero`: baselines, heads, ensembles."""
-        return (*self.all_baselines, *self.heads, *self.ensembles)
+        tied = () if self.recipe is None else (TIED,)
+        return (*self.all_baselines, *self.heads, *self.ensembles, *tied)
 
     def baseline_name_of(self, head: str) -> str:
         """Return the name of the baseline that a head stands on."""
@@ -130,7 +207,8 @@ class FitSettings(Config):
 
     def baseline_of(self, head: str) -> BaselineConfig:
         """Return the settings of the baseline that a head stands on."""
-        return self.all_baselines[self.baseline_name_of(head)]
+        name = self.baseline_name_of(head)
+        return StillConfig() if name == "zero" else self.all_baselines[name]
 
 
 def require_known(key: str, given: Iterable[str], valid: Iterable[str], what: str) -> None:

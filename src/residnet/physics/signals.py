@@ -19,6 +19,7 @@ from residnet.core.names import CHANNEL_UNITS, STATE, VELOCITY, nearest
 from residnet.physics.actuators import DifferentialThrustConfig
 from residnet.physics.environment.wind import WIND_INPUTS
 from residnet.physics.fossen import FossenConfig
+from residnet.physics.symmetry import ChannelNames
 from residnet.physics.vessel import load_vessel
 
 WIND_CHANNELS = ("wind_u", "wind_v", "wind_mag")
@@ -35,11 +36,15 @@ class SignalsConfig(Config):
             air relative to the vessel in body axes.
         forces: a vessel (by name or file) whose thrusters turn the two inputs into tau_x, tau_y,
             tau_n; or the thrusters themselves.
+        pairs: inputs to port and starboard that change places in the mirror, such as
+            [[left, right]]; those that end in `_port` and `_stbd` are known without. Angles change
+            their sign too.
     """
 
     inputs: tuple[str, ...]
     exogenous: tuple[str, ...] = ()
     forces: str | DifferentialThrustConfig | None = None
+    pairs: tuple[tuple[str, str], ...] = ()
 
     @model_validator(mode="after")
     def _combination(self) -> SignalsConfig:
@@ -61,6 +66,12 @@ class SignalsConfig(Config):
         }
         if repeated:
             raise ValueError(f"inputs {sorted(repeated)} are named twice")
+        paired = [name for pair in self.pairs for name in pair]
+        for name in paired:
+            if name not in self.inputs:
+                raise ValueError(f"pairs: no input '{name}'{nearest(name, self.inputs)}")
+            if paired.count(name) > 1:
+                raise ValueError(f"pairs: '{name}' is named twice")
         computed = (
             STATE
             + (FORCE_CHANNELS if self.forces is not None else ())
@@ -131,7 +142,7 @@ class Signals(nn.Module):
         names = VELOCITY + config.inputs
         names += FORCE_CHANNELS if self.forces else ()
         names += WIND_CHANNELS if self.wind else ()
-        self.names: tuple[str, ...] = names
+        self.names: tuple[str, ...] = ChannelNames(names, config.pairs)
         self.count = len(names)
 
     def prepare(self, w: Tensor) -> Tensor:

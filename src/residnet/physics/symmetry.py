@@ -2,14 +2,51 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from typing import final
 
 from residnet.core.names import VELOCITY
-from residnet.physics.terms import EVEN_FUNCTIONS, parse_term
+from residnet.physics.terms import EVEN_FUNCTIONS, Factor, parse_term
 
 _ODD = ("v", "r", "delta", "tau_y", "tau_n", "wind_v")
+_ANGLES = ("delta", "rudder", "azimuth")
 _EVEN = ("u", "n", "tau_x", "wind_u", "wind_mag")
-_OTHER_SIDE = {"port": "stbd", "stbd": "port"}
+
+
+_SIDES = (("port", "stbd"),)
+"""Endings of names of a channel on one side and of its partner on the other."""
+
+
+@final
+class ChannelNames(tuple[str, ...]):
+    """Names of channels, a tuple; `partners` says which change places, as declared or by ending.
+
+    A channel that ends in `_port` has the one that ends in `_stbd` for its partner.
+    """
+
+    partners: Mapping[str, str]
+
+    def __new__(cls, names: Iterable[str], pairs: Iterable[tuple[str, str]] = ()) -> ChannelNames:
+        """From the names, and the pairs that are declared."""
+        made = super().__new__(cls, names)
+        both = [*pairs, *_by_ending(made)]
+        made.partners = {**dict(both), **{b: a for a, b in both}}
+        return made
+
+
+def partners_of(names: Sequence[str]) -> Mapping[str, str]:
+    """Return the partner on the other side of each channel that has one."""
+    return (names if isinstance(names, ChannelNames) else ChannelNames(names)).partners
+
+
+def _by_ending(names: Sequence[str]) -> list[tuple[str, str]]:
+    out = []
+    for name in names:
+        stem, _, side = name.rpartition("_")
+        for one, other in _SIDES:
+            if stem and side == one and f"{stem}_{other}" in names:
+                out.append((name, f"{stem}_{other}"))
+    return out
 
 
 def channel_parity(name: str) -> int | None:
@@ -53,13 +90,77 @@ def mirrored_channels(names: Sequence[str]) -> tuple[list[int], list[float]] | N
 
     Channels of a port/starboard pair change places.
     """
+    partners = partners_of(names)
     index, sign = [], []
     for place, name in enumerate(names):
-        other = _OTHER_SIDE.get(name.rpartition("_")[2])
-        partner = f"{name.rpartition('_')[0]}_{other}" if other else name
-        parity = 1 if other else channel_parity(name)
-        if partner not in names or parity is None:
+        parity = pair_parity(name) if name in partners else channel_parity(name)
+        if parity is None:
             return None
-        index.append(names.index(partner) if other else place)
+        index.append(names.index(partners[name]) if name in partners else place)
         sign.append(float(parity))
     return index, sign
+
+
+def pair_parity(name: str) -> int:
+    """Return the sign that a channel of a pair changes places with: -1 for an angle, else +1."""
+    plain = name.removeprefix("cmd_")
+    return -1 if plain.startswith(_ANGLES) else 1
+
+
+def mirrored_terms(terms: Sequence[str], names: Sequence[str]) -> dict[int, tuple[int, int]] | None:
+    """Return the place and the sign of each term's mirror image, by the place of the term.
+
+    Terms whose image is not among them are left out; None where a channel's parity is not known.
+    """
+    mirror = mirrored_channels(names)
+    if mirror is None:
+        return None
+    image = {name: (names[i], s) for name, i, s in zip(names, *mirror, strict=True)}
+    meanings = {meaning(term, names, {}): place for place, term in enumerate(terms)}
+    out = {}
+    for place, term in enumerate(terms):
+        sign = 1
+        for factor in parse_term(term, names):
+            even = factor.magnitude or factor.function in EVEN_FUNCTIONS
+            if image[factor.name][1] < 0 and not even and factor.power % 2 == 1:
+                sign = -sign
+        found = meanings.get(meaning(term, names, {n: other for n, (other, _) in image.items()}))
+        if found is not None:
+            out[place] = (found, sign)
+    return out
+
+
+def meaning(
+    term: str, names: Sequence[str], renamed: Mapping[str, str]
+) -> frozenset[tuple[Factor, int, bool]]:
+    """Return what a term multiplies, its channels renamed; the same for `v u` and `u v`.
+
+    Each thing stands without its power or magnitude, with its whole power, and with whether the
+    product changes sign with it.
+    """
+    power: dict[Factor, int] = {}
+    odd: dict[Factor, bool] = {}
+    for factor in parse_term(term, names):
+        name = renamed.get(factor.name, factor.name)
+        thing = factor._replace(name=name, power=1, magnitude=False)
+        power[thing] = power.get(thing, 0) + factor.power
+        odd[thing] = odd.get(thing, False) ^ (not factor.magnitude and factor.power % 2 != 0)
+    return frozenset((thing, power[thing], odd[thing]) for thing in power)
+
+
+def dissipates(term: str, axis: int, names: Sequence[str]) -> bool:
+    """Return whether a term acts along its axis' own velocity, whatever the other channels are.
+
+    Its power is then of one sign: with a positive coefficient it feeds energy at any state. Such
+    are `u` and `u|u|` in surge, `v|r|` in sway, `|n| r` in yaw, and not `u v` in sway, whose sign
+    goes with the speed.
+
+    Args:
+        term: a product of channels.
+        axis: 0 surge, 1 sway, 2 yaw.
+        names: channels that may appear.
+    """
+    parts = meaning(term, names, {})
+    odd = {thing.name for thing, _, changes in parts if changes}
+    functions = any(thing.function for thing, _, _ in parts)
+    return odd == {VELOCITY[axis]} and not functions

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
 from residnet.core.layout import velocities
 from residnet.dynamics.hybrid import HybridDynamics
-from residnet.dynamics.rollout import Rollout
+
+FreeRun = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
+"""Initial states, inputs and memory to states, inputs and memory, as `Rollout` has it."""
 
 
 def one_step_loss(
@@ -31,7 +35,7 @@ def one_step_loss(
 
 
 def rollout_loss(
-    rollout: Rollout,
+    rollout: FreeRun,
     x0: Tensor,
     w: Tensor,
     s: Tensor,
@@ -45,7 +49,7 @@ def rollout_loss(
     The mean square, or the mean over windows of their root mean square.
 
     Args:
-        rollout: the free run of the model.
+        rollout: the free run of the model, as `Rollout` gives it.
         x0: initial states [B, 6].
         w: inputs [B, T, m].
         s: initial memory [B, n_state].

@@ -9,15 +9,20 @@ from typing import Any, NamedTuple, final
 
 import torch
 from torch import Tensor, nn
+from torch.func import functional_call
 
 from residnet.core.layout import POSE, VELOCITIES
 from residnet.data.windows import WindowBatches, WindowStore
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
+from residnet.training.calibration import PACE, Calibration
 from residnet.training.config import TrainingConfig
 from residnet.training.epochs import EpochTraining
-from residnet.training.losses import one_step_loss, rollout_loss
+from residnet.training.losses import FreeRun, one_step_loss, rollout_loss
 from residnet.training.stage_windows import stage_windows, stages
+
+_BACK = 1e-3
+"""Weight decay of coefficients, in units of their standard errors."""
 
 
 class Score(NamedTuple):
@@ -52,9 +57,15 @@ class HeadTraining(EpochTraining):
         scales: Tensor,
         validate: Validate,
         seed: int,
+        covariance: Tensor | None = None,
     ) -> None:
         super().__init__(config, seed)
         self.model = model
+        self.calibration = (
+            Calibration(model, covariance)
+            if config.refit_baseline and covariance is not None
+            else None
+        )
         self.average = copy.deepcopy(model).requires_grad_(False) if config.average > 0 else None
         self.rollout = Rollout(model)
         self.store = store
@@ -73,9 +84,19 @@ class HeadTraining(EpochTraining):
             {"params": [p for p in head if p.ndim > 1], "weight_decay": self.settings.weight_decay},
             {"params": [p for p in head if p.ndim <= 1], "weight_decay": 0.0},
         ]
-        if self.settings.refit_baseline:
-            groups.append({"params": list(self.model.baseline.parameters()), "weight_decay": 0.0})
+        if self.calibration is not None:
+            # where the data say nothing, a coefficient goes back to where its refit put it
+            moved = list(self.calibration.parameters())
+            groups.append({"params": moved, "weight_decay": _BACK, "pace": PACE})
         return torch.optim.AdamW(groups, lr=1e-3)
+
+    def on_fit_start(self) -> None:
+        """Reset the losses; a model that is trained further is a candidate as it is."""
+        super().on_fit_start()
+        begun = self.settings.from_baseline or self.settings.begin_with is not None
+        if begun and self.epoch == 0:
+            self.validate_start()
+            self.best_diverged = self.diverged
 
     def on_train_epoch_start(self) -> None:
         """Seed the epoch and set the stage's learning rate."""
@@ -84,10 +105,9 @@ class HeadTraining(EpochTraining):
         schedule = self.settings.one_step if stage == 0 else self.settings.multi_step[stage - 1]
         progress = 0.5 * (1 - math.cos(math.pi * epoch / max(schedule.epochs - 1, 1)))
         rate = schedule.learning_rate * (1 - progress * (1 - schedule.final))
-        for parameter in self.model.baseline.parameters():
-            parameter.requires_grad_(self.settings.refit_baseline and stage > 0)
+        self.model.baseline.requires_grad_(False)
         for group in self.trainer.optimizers[0].param_groups:
-            group["lr"] = rate
+            group["lr"] = rate * group.get("pace", 1.0)
 
     def training_step(self, starts: Tensor, batch_index: int) -> Tensor:
         """Return the loss of one batch of windows."""
@@ -135,12 +155,25 @@ class HeadTraining(EpochTraining):
             x0 = torch.cat((x0[:, POSE], x0[:, VELOCITIES] + noise), dim=1)
         w, y = take(self.store.w, starts, length - 1), take(self.store.y, starts + 1, length - 1)
         usable = take(self.store.usable, starts + 1, length - 1)
+        run: FreeRun = self.rollout
+        if self.calibration is not None:
+            moved = {"model.baseline.theta": self.calibration()}
+
+            def run(x0: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+                out: tuple[Tensor, Tensor, Tensor] = functional_call(
+                    self.rollout, moved, (x0, w, s)
+                )
+                return out
+
         return rollout_loss(
-            self.rollout, x0, w, torch.cat(memories), y, usable, self.scales, self.settings.robust
+            run, x0, w, torch.cat(memories), y, usable, self.scales, self.settings.robust
         )
 
     def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
-        """Move the averaged weights."""
+        """Put moved coefficients into the model, and move the averaged weights."""
+        if self.calibration is not None:
+            with torch.no_grad():
+                self.model.baseline.theta.copy_(self.calibration())
         if self.average is None:
             return
         # a short memory at first, or the average would remember the untrained start

@@ -24,7 +24,15 @@ from residnet.data.windows import WindowStore
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.training.offsets import Arrow, Offsets, with_spread
 from residnet.training.refit_config import RefitConfig
+from residnet.training.refit_problem import Problem, free_run_starts, problem_of
 from residnet.training.sensitivities import OffsetBaseline, step_sensitivities
+
+__all__ = ["Refitted", "free_run_starts", "refit"]
+
+_ROUNDS = 4
+"""Times that terms which feed energy are looked for."""
+_OPEN = 0.5
+"""Share of a parameter's information that is the prior's, from which on the data leave it open."""
 
 
 @dataclass(frozen=True)
@@ -33,53 +41,21 @@ class Refitted:
 
     Attributes:
         covariance: of the free parameters, [P, P]; what offsets leave open is in it.
-        notes: cost before and after, iterations, windows, horizon, independent errors.
+        notes: cost before and after, iterations, windows, horizon, independent errors; terms that
+            were left out, since their sign would feed energy.
+        open: which free parameters the data leave open, so that their prior says what they are [P].
         offsets: of each log in the store.
     """
 
     covariance: Tensor
     notes: dict[str, Any]
     offsets: Offsets
+    open: Tensor
 
     @property
     def errors(self) -> Tensor:
         """Standard errors [P] of the free parameters."""
         return self.covariance.diagonal().clamp(min=0.0).sqrt()
-
-
-@dataclass(frozen=True)
-class _Problem:
-    """Windows x0 [B, 6], w [B, T, m], measured nu [B, T, 3], weights [B, T, 3] (0 or 1/scale);
-    numbers of the free parameters [P]; precision [P, P] about where least squares put them [P],
-    pull to zero [P]; beliefs, mean and precision [P]; count of independent errors per channel; log
-    of each window [B]; speed at which offsets are what they are said to be.
-    """
-
-    x0: Tensor
-    w: Tensor
-    nu: Tensor
-    weight: Tensor
-    active: Tensor
-    precision: Tensor
-    start: Tensor
-    pull: Tensor
-    believed: Tensor
-    belief: Tensor
-    count: float
-    robust: float
-    log: Tensor
-    speed: float
-
-    def share(self, level: Tensor) -> Tensor:
-        """Return half of what one unit of minus the logarithm of a probability costs.
-
-        The cost is `level`.
-
-        With c the mean square error of three channels of so many independent errors each, that
-        logarithm grows by 3 N / 2c for each unit of c, and the cost sqrt(c + robust^2) by 1 / (2
-        cost).
-        """
-        return (level.square() - self.robust**2).clamp(min=1e-12) / (6.0 * self.count * level)
 
 
 def refit(
@@ -103,22 +79,69 @@ def refit(
             "a refit through rollouts needs a baseline of kind 'regressors', 'linear_steady',"
             " 'mmg', 'nomoto' or 'nomoto_sideslip'"
         )
-    problem = _problem(model, baseline, samples, store, config, scales)
+    problem = problem_of(model, baseline, samples, store, config, scales)
     # spreads that are to be estimated start from what moves a velocity by its scale while errors
     # hang together
     offsets = Offsets.begin(
         config.offsets, int(store.log.max()) + 1, scales / config.correlation, problem.speed
     )
-    level, squares = _level(model, problem, offsets)
-    first = level
+    level, _ = _level(model, problem, offsets)
+    first, count = level, 0
     if not torch.isfinite(first):
         raise FitError(
             "the least-squares baseline diverges within the refit's horizon; shorten `horizon` or"
             " raise the baseline's ridge"
         )
+    for _round in range(_ROUNDS):
+        level, offsets, steps = _minimised(model, problem, baseline, offsets, config.iterations)
+        count += steps
+        feeding = baseline.feeding()
+        if not feeding:
+            break
+        problem = problem.at_rest(feeding)
+        _place(baseline, _values(baseline, problem), problem.active)
+    arrow = _normal_equations(model, problem, baseline, *_level(model, problem, offsets), offsets)
+    share = problem.share(level)
+    believing = arrow.believing(offsets, share)
+    inverse = torch.linalg.pinv(believing.reduced()[0], hermitian=True)
+    inverse[problem.still] = 0.0
+    inverse[:, problem.still] = 0.0
+    error = (share * believing.variances(inverse)).clamp(min=0.0).sqrt()
+    notes = {
+        "cost_before": float(first),
+        "cost_after": float(level),
+        "iterations": count,
+        "windows": len(problem.x0),
+        "horizon": config.horizon,
+        "independent_errors": round(problem.count, 1),
+        "at_rest": torch.nonzero(problem.still).squeeze(1).tolist(),
+    }
+    known = problem.precision + problem.pull + torch.diag(share * problem.belief)
+    from_prior = (inverse @ known).diagonal()
+    return Refitted(
+        share * inverse, notes, replace(offsets, error=error), (from_prior > _OPEN) | problem.still
+    )
+
+
+def _values(baseline: ParametricBaseline, problem: Problem) -> Tensor:
+    """Return the free parameters as they are, those that are to rest at zero."""
+    values = baseline.theta.detach().flatten()[problem.active].clone()
+    values[problem.still] = 0.0
+    return values
+
+
+def _minimised(
+    model: HybridDynamics,
+    problem: Problem,
+    baseline: ParametricBaseline,
+    offsets: Offsets,
+    iterations: int,
+) -> tuple[Tensor, Offsets, int]:
+    """Move parameters and offsets to the minimum; returns its level and the number of steps."""
+    level, squares = _level(model, problem, offsets)
     damping, count = 1e-3, 0
     arrow = _normal_equations(model, problem, baseline, level, squares, offsets)
-    for _ in range(config.iterations):
+    for _ in range(iterations):
         offsets = with_spread(offsets, arrow, problem.share(level))
         step = _descend(model, problem, baseline, arrow, offsets, level, damping)
         if step is None:
@@ -128,27 +151,12 @@ def refit(
         arrow = _normal_equations(model, problem, baseline, level, squares, offsets)
         if gain < 2e-4:
             break
-    share = problem.share(level)
-    believing = arrow.believing(offsets, share)
-    inverse = torch.linalg.pinv(believing.reduced()[0], hermitian=True)
-    notes = {
-        "cost_before": float(first),
-        "cost_after": float(level),
-        "iterations": count,
-        "windows": len(problem.x0),
-        "horizon": config.horizon,
-    }
-    error = (share * believing.variances(inverse)).clamp(min=0.0).sqrt()
-    return Refitted(
-        share * inverse,
-        notes | {"independent_errors": round(problem.count, 1)},
-        replace(offsets, error=error),
-    )
+    return level, offsets, count
 
 
 def _descend(
     model: HybridDynamics,
-    problem: _Problem,
+    problem: Problem,
     baseline: ParametricBaseline,
     arrow: Arrow,
     offsets: Offsets,
@@ -184,77 +192,17 @@ def _place(baseline: ParametricBaseline, values: Tensor, active: Tensor) -> None
         baseline.theta.copy_(flat.reshape(baseline.theta.shape))
 
 
-def free_run_starts(store: WindowStore, config: RefitConfig, dt: float) -> Tensor:
-    """Return the rows at which the free runs of a refit start.
-
-    Args:
-        store: training windows.
-        config: settings.
-        dt: step in s.
-
-    Raises:
-        FitError: where no log is long enough.
-    """
-    steps, every = round(config.horizon / dt), max(round(config.every / dt), 1)
-    starts = store.starts(steps + 1)
-    starts = starts[store.depth[starts] % every == 0]
-    if starts.numel() == 0:
-        raise FitError(
-            f"no training log holds a free run of {config.horizon:g} s for the refit; shorten"
-            " `horizon`"
-        )
-    return starts
-
-
-def _problem(
-    model: HybridDynamics,
-    baseline: ParametricBaseline,
-    samples: Samples,
-    store: WindowStore,
-    config: RefitConfig,
-    scales: Tensor,
-) -> _Problem:
-    steps = round(config.horizon / model.dt)
-    starts = free_run_starts(store, config, model.dt)
-    take = store.take
-    nu = take(store.y, starts + 1, steps)[..., VELOCITIES]
-    usable = take(store.usable, starts + 1, steps).to(scales.dtype).unsqueeze(-1)
-    # r comes from a gyro, which a frozen position does not disturb
-    weight = torch.cat((usable, usable, torch.ones_like(usable)), dim=-1) / scales
-    active = baseline.free_indices()
-    covered = (starts[:, None] + torch.arange(1, steps + 1)).unique().numel()
-    believed, belief = baseline.prior()
-    return _Problem(
-        store.y[starts],
-        take(store.w, starts, steps),
-        nu,
-        weight,
-        active,
-        config.prior * baseline.information(samples),
-        baseline.theta.detach().flatten()[active].clone(),
-        config.asymmetric * baseline.asymmetry(samples),
-        believed,
-        belief,
-        max(covered * model.dt / config.correlation, 1.0),
-        config.robust,
-        store.log[starts],
-        float(nu[:, :, :2].square().sum(2).mean().sqrt()),
-    )
-
-
 def _prior_cost(
-    problem: _Problem, baseline: ParametricBaseline, share: Tensor, offsets: Offsets
+    problem: Problem, baseline: ParametricBaseline, share: Tensor, offsets: Offsets
 ) -> Tensor:
     theta = baseline.theta.detach().flatten()[problem.active]
     moved, off = theta - problem.start, theta - problem.believed
     believed = (problem.belief * off.square()).sum() + offsets.unlikely()
-    return (
-        moved @ problem.precision @ moved + (problem.pull * theta.square()).sum() + share * believed
-    )
+    return moved @ problem.precision @ moved + theta @ problem.pull @ theta + share * believed
 
 
 def _shifted(
-    model: HybridDynamics, problem: _Problem, offsets: Offsets
+    model: HybridDynamics, problem: Problem, offsets: Offsets
 ) -> tuple[HybridDynamics, ParametricBaseline | OffsetBaseline]:
     """The model with the offset of its log in every window, and its baseline."""
     assert isinstance(model.baseline, ParametricBaseline)
@@ -272,7 +220,7 @@ def _ahead(model: HybridDynamics, x: Tensor, p: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def _level(model: HybridDynamics, problem: _Problem, offsets: Offsets) -> tuple[Tensor, Tensor]:
+def _level(model: HybridDynamics, problem: Problem, offsets: Offsets) -> tuple[Tensor, Tensor]:
     """Mean error of the windows in units of the scales, and mean square error of each [B]."""
     x, total = problem.x0, []
     shifted, _ = _shifted(model, problem, offsets)
@@ -287,7 +235,7 @@ def _level(model: HybridDynamics, problem: _Problem, offsets: Offsets) -> tuple[
 @torch.no_grad()
 def _normal_equations(
     model: HybridDynamics,
-    problem: _Problem,
+    problem: Problem,
     baseline: ParametricBaseline,
     level: Tensor,
     squares: Tensor,
@@ -328,13 +276,17 @@ def _normal_equations(
     belief = problem.share(level) * problem.belief
     prior = (
         problem.precision @ (theta - problem.start)
-        + problem.pull * theta
+        + problem.pull @ theta
         + belief * (theta - problem.believed)
     )
+    whole = hessian[:shared, :shared] + problem.precision + problem.pull + torch.diag(belief)
+    moving = ~problem.still
+    # what rests at zero has a row of its own, and takes no step
+    alone = torch.diag(torch.where(moving, torch.zeros_like(theta), whole.diagonal()))
     return Arrow(
-        hessian[:shared, :shared] + problem.precision + torch.diag(problem.pull + belief),
-        columns[:, :shared],
+        torch.where(moving[:, None] & moving, whole, alone),
+        columns[:, :shared] * moving[:, None],
         columns[:, shared:],
-        gradient[:shared] + prior,
+        (gradient[:shared] + prior) * moving,
         slopes,
     )

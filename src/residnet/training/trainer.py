@@ -25,6 +25,7 @@ def train(
     validate: Validate,
     seed: int,
     folder: Path | None,
+    covariance: torch.Tensor | None = None,
 ) -> dict[str, Any]:
     """Train the head of a model and leave the weights that validated best in it (float32).
 
@@ -39,6 +40,7 @@ def train(
         seed: of weights and batches.
         folder: for checkpoints (`checkpoints/<name>/last.ckpt` is resumed from where it exists) and
             the TensorBoard log; None for neither.
+        covariance: of the baseline's coefficients [P, P], for a training that moves them too.
 
     Returns:
         Notes about the training: the curve by epoch, the best score, the number of parameters.
@@ -46,8 +48,11 @@ def train(
     Raises:
         FitError: where training never gave a finite free run.
     """
-    model.head.calibrate(samples)
-    module = HeadTraining(
-        model.to(torch.float32), store, config, scales.to(torch.float32), validate, seed
-    )
+    if config.begin_with is None:
+        # weights that are there already belong to the scales that they were trained with
+        model.head.calibrate(samples)
+    if config.from_baseline:
+        model.head.silence()
+    scale = scales.to(torch.float32)
+    module = HeadTraining(model.to(torch.float32), store, config, scale, validate, seed, covariance)
     return run_epochs(name, module, model, model.head, folder)

@@ -100,6 +100,18 @@ class Selection:
     contenders: tuple[Contender, ...]
     blocks: Blocks
 
+    @property
+    def tied(self) -> tuple[str, ...]:
+        """Names of the sound single models within one standard error of the best, `zero` aside."""
+        single = [e for e in self.contenders if e.family not in ("ensemble", "zero") and e.sound]
+        best = min(single, key=lambda entry: entry.error, default=None)
+        return tuple(
+            entry.name
+            for entry in single
+            if best is not None
+            and entry.error - best.error <= self.blocks.standard_error(entry.shares, best.shares)
+        )
+
     def content(self) -> dict[str, Any]:
         """Return the contents of selection.json."""
         lead = next(entry for entry in self.contenders if entry.name == self.selected)

@@ -1,0 +1,270 @@
+"""The single steps of a fit: zero, a baseline, a head on a baseline, the mean of models."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from residnet.baselines import BaselineConfig, Coefficient, ParametricBaseline, StillConfig
+from residnet.core.errors import FitError
+from residnet.core.samples import Samples
+from residnet.data.prepare import Prepared, envelope, samples
+from residnet.data.windows import WindowStore
+from residnet.dynamics.ensemble import mean_of
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.store import ModelSpec, rebuilt
+from residnet.heads import ClosedFormHead
+from residnet.identification.models import FitStore, FittedModel
+from residnet.identification.prepared import velocity_limit
+from residnet.identification.prior_choice import choose_prior
+from residnet.identification.settings import FitSettings
+from residnet.identification.settling import settled
+from residnet.identification.solution_choice import choose_solution
+from residnet.identification.validation import ValidationScore
+from residnet.training.config import TrainingConfig
+from residnet.training.refit import refit
+
+_ALIKE = 20
+"""Samples in a row whose errors hang together, where nothing else is known."""
+
+
+class Fitter:
+    """The single steps of a fit on one set of logs.
+
+    Args:
+        logs: prepared logs by split; `train` and `validation` are used.
+        settings: of the fit.
+        store: keeps every model as it is done.
+    """
+
+    def __init__(
+        self, logs: Mapping[str, Sequence[Prepared]], settings: FitSettings, store: FitStore
+    ) -> None:
+        self.store = store
+        self.train = logs["train"]
+        self.known = [*logs["train"], *logs["validation"]]
+        self.signals = settings.signals.build()
+        self.low, self.high = envelope(self.train)
+        self.limit = velocity_limit(self.low, self.high, settings.evaluation.divergence)
+        self.samples = samples(self.train, self.signals)
+        self.settings = settled(settings, self.samples, self.known)
+        self.scales = torch.from_numpy(settings.evaluation.scales.array())
+        self.validate = ValidationScore(
+            logs["validation"], settings.evaluation, settings.prepare.grid.step, self.limit
+        )
+
+    def spec(self, name: str, role: str, baseline: BaselineConfig) -> ModelSpec:
+        """Return the description of a model of this fit.
+
+        Args:
+            name: of the model.
+            role: zero, baseline, head or ensemble.
+            baseline: that it is or stands on.
+        """
+        settings = self.settings
+        return ModelSpec.model_validate(
+            {
+                "schema": "residnet.model/1",
+                "name": name,
+                "role": role,
+                "signals": settings.signals.resolved().model_dump(),
+                "baseline": baseline.resolved().model_dump(),
+                "head": settings.heads[name].model_dump() if role == "head" else None,
+                "dt": settings.prepare.grid.step,
+                "integrator": settings.integrator,
+                "hold": settings.prepare.hold,
+                "low": self.low.tolist(),
+                "high": self.high.tolist(),
+            }
+        )
+
+    def zero(self) -> FittedModel:
+        """Return the model that holds the velocities."""
+        spec = self.spec("zero", "zero", StillConfig())
+        return self._kept(FittedModel(spec, spec.build(), {}))
+
+    def baseline(self, name: str = "baseline") -> FittedModel:
+        """Identify a baseline; refit it through rollouts where the settings ask for it."""
+        spec = self.spec(name, "baseline", self.settings.all_baselines[name])
+        model = spec.build()
+        started = time.perf_counter()
+        solutions = spec.baseline.solutions(model.baseline, self.samples)
+        solution, tried = choose_solution(model, model.baseline, solutions, self.validate)
+        table, covariance = list(solution.table), None
+        notes: dict[str, Any] = {
+            "samples": len(self.samples),
+            **solution.choice,
+            **tried,
+            "least_squares": self.validate(model).error,
+        }
+        if name in self.settings.refit:
+            table, covariance = self._refit(name, model, table, notes)
+        notes["coefficients"] = [_coefficient_row(entry) for entry in table]
+        notes |= self._validated(model)
+        notes["seconds"] = round(time.perf_counter() - started, 1)
+        return self._kept(FittedModel(spec, model, notes, covariance))
+
+    def _refit(
+        self, name: str, model: HybridDynamics, table: list[Coefficient], notes: dict[str, Any]
+    ) -> tuple[list[Coefficient], torch.Tensor | None]:
+        """Move a baseline's coefficients through rollouts; returns their new table and covariance
+        and adds to the notes.
+        """
+        config = self.settings.refit[name]
+        if len(config.priors) > 1:
+            spec = self.spec(name, "baseline", self.settings.all_baselines[name])
+            choice = choose_prior(name, spec, config, self.settings, self.known, self.limit)
+            notes["prior_choice"] = choice.table
+            if choice.prior is None:
+                return table, None
+            config = config.with_prior(choice.prior)
+        store = WindowStore.gather(self.train, torch.float64)
+        refitted = refit(model, self.samples, store, config, self.scales)
+        assert isinstance(model.baseline, ParametricBaseline)
+        notes["prior"] = config.priors[0]
+        names = model.baseline.free_names()
+        notes["open"] = [
+            name for name, lies in zip(names, refitted.open.tolist(), strict=True) if lies
+        ]
+        notes["feeding"] = [names[i] for i in refitted.notes["at_rest"]]
+        notes["refit"] = refitted.notes
+        if refitted.offsets.axes:
+            notes["offsets"] = refitted.offsets.table([log.log.name for log in self.train])
+        return model.baseline.updated_table(table, refitted.errors), refitted.covariance
+
+    def head(
+        self, name: str, baseline: FittedModel, begin: FittedModel | None = None
+    ) -> FittedModel:
+        """Fit one head on top of a baseline, or take it from the store where it is finished there.
+
+        Args:
+            name: of the head in the settings.
+            baseline: the fitted model that the head stands on.
+            begin: whose weights its training starts from; None for random ones.
+
+        Raises:
+            FitError: where the data do not determine the head.
+        """
+        finished = self.store.finished(name)
+        if finished is not None:
+            return finished
+        spec = self.spec(name, "head", self.settings.baseline_of(name))
+        # seeded by the head's name, so that adding a head changes no other
+        seed = self.settings.seed * 1_000 + sum(map(ord, name))
+        torch.manual_seed(seed)
+        model = spec.build()
+        model.baseline.load_state_dict(copy.deepcopy(baseline.model.baseline.state_dict()))
+        residual = residual_samples(model, self.samples)
+        started = time.perf_counter()
+        if isinstance(model.head, ClosedFormHead):
+            model.head.calibrate(residual)
+            try:
+                solutions = model.head.solutions(residual)
+                solution, tried = choose_solution(model, model.head, solutions, self.validate)
+            except FitError as error:
+                raise FitError(f"head {name}: {error}") from None
+            notes = solution.choice | solution.notes | tried
+        else:
+            if begin is not None:
+                model.head.load_state_dict(copy.deepcopy(begin.model.head.state_dict()))
+            notes = self._train(name, model, residual, seed, baseline.covariance)
+        notes |= {
+            "baseline": self.settings.baseline_name_of(name),
+            "seconds": round(time.perf_counter() - started, 1),
+            **self._validated(model),
+        }
+        return self._kept(FittedModel(spec, model, notes))
+
+    def ensemble(self, name: str, members: Sequence[FittedModel]) -> FittedModel:
+        """Return the mean of fitted models as one model."""
+        spec = self.spec(name, "ensemble", StillConfig()).model_copy(
+            update={"members": tuple(member.spec for member in members)}
+        )
+        model = mean_of([copy.deepcopy(member.model).to(torch.float64) for member in members])
+        notes: dict[str, Any] = {
+            "members": [member.name for member in members],
+            **self._validated(model),
+        }
+        return self._kept(FittedModel(spec, model, notes))
+
+    def _train(
+        self,
+        name: str,
+        model: HybridDynamics,
+        residual: Samples,
+        seed: int,
+        covariance: Tensor | None,
+    ) -> dict[str, Any]:
+        from residnet.training.trainer import train
+
+        settings = self.settings.training.get(name, TrainingConfig())
+        windows, folder = WindowStore.gather(self.train), self.store.training_folder
+        spread = covariance
+        if settings.refit_baseline and spread is None:
+            spread = least_squares_covariance(model.baseline, self.samples)
+        return train(
+            name,
+            model,
+            residual,
+            windows,
+            settings,
+            self.scales,
+            self.validate,
+            seed,
+            folder,
+            spread,
+        )
+
+    def _validated(self, model: HybridDynamics) -> dict[str, Any]:
+        """Notes on a model's free runs over the validation logs."""
+        diverged, error = self.validate(model)
+        return {"validation": error, "validation_diverged": diverged}
+
+    def _kept(self, fitted: FittedModel) -> FittedModel:
+        """Keep a model and return it as a load gives it back.
+
+        What is judged is then bit for bit what is stored, and a resumed fit judges the same.
+        """
+        kept = dataclasses.replace(fitted, model=rebuilt(fitted.spec, fitted.model))
+        self.store.keep(kept)
+        return kept
+
+
+def least_squares_covariance(baseline: nn.Module, known: Samples) -> Tensor | None:
+    """Return the covariance [P, P] of a baseline's coefficients from accelerations alone.
+
+    None where it has no coefficients that may move.
+    """
+    if not isinstance(baseline, ParametricBaseline):
+        return None
+    information = len(known) / _ALIKE * baseline.information(known)
+    return torch.linalg.pinv(information, hermitian=True)
+
+
+def residual_samples(model: HybridDynamics, known: Samples) -> Samples:
+    """Return samples whose target is what the model's baseline leaves.
+
+    That is an acceleration (document 003 (19)) or a force (document 002 (3.20)), as the model's
+    head wants it.
+
+    Args:
+        model: with its baseline filled in.
+        known: samples whose target is the measured acceleration.
+    """
+    with torch.no_grad():
+        return model.head.residual_target(known, model.baseline(known.z))
+
+
+def _coefficient_row(entry: Coefficient) -> dict[str, Any]:
+    return {
+        "axis": entry.axis,
+        "term": entry.term,
+        "value": entry.value,
+        "standard_error": entry.error,
+    }

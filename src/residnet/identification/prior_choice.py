@@ -1,0 +1,183 @@
+"""How strongly a refit holds on to least squares, chosen by free runs over folds of the logs."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from residnet.core.errors import DataError, ResidnetError
+from residnet.core.samples import Samples
+from residnet.data.prepare import Prepared, samples
+from residnet.data.windows import WindowStore
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.store import ModelSpec
+from residnet.identification.folds import Fold, folds_of
+from residnet.identification.settings import FitSettings
+from residnet.judge.config import EvaluationConfig
+from residnet.judge.freerun import Candidate, FreeRun, Prediction, free_run
+from residnet.judge.protocol import Window, Windows
+from residnet.judge.verdict.selection import blocks_of, shares
+from residnet.training.refit import refit
+from residnet.training.refit_config import RefitConfig
+
+Prior = float | None
+"""A strength of the prior; None for least squares as it is."""
+
+
+@dataclass(frozen=True)
+class PriorChoice:
+    """The strength that is taken, and what it was compared with.
+
+    Attributes:
+        prior: None where least squares stay as they are.
+        table: for fit.json: prior, free-run error over the held-out windows, the difference to the
+            best with its standard error, windows that diverged.
+    """
+
+    prior: Prior
+    table: list[dict[str, Any]]
+
+
+def choose_prior(
+    name: str,
+    spec: ModelSpec,
+    config: RefitConfig,
+    settings: FitSettings,
+    logs: Sequence[Prepared],
+    limit: np.ndarray,
+) -> PriorChoice:
+    """Return the strongest prior that is within one paired standard error of the best.
+
+    Fewer divergences come before less error. A refit that fails in a fold counts there as if every
+    window had diverged.
+
+    Args:
+        name: of the baseline.
+        spec: that it is built from.
+        config: of its refit.
+        settings: of the fit.
+        logs: for training and validation; folds are made of them.
+        limit: of |u, v, r| [3] beyond which a free run has diverged.
+
+    Raises:
+        DataError: where no fold holds a window to judge by.
+    """
+    priors: list[Prior] = [*config.priors, None]
+    step, scales = settings.prepare.grid.step, torch.from_numpy(settings.evaluation.scales.array())
+    pool: list[Prepared] = []
+    windows: list[Window] = []
+    predicted: dict[str, list[Prediction]] = {_key(prior): [] for prior in priors}
+    for fold in folds_of(logs, config.folds):
+        found = _windows(fold.held_out, settings.evaluation, config, step)
+        if not found:
+            continue
+        for prior, model in _fitted(spec, config, fold, priors, scales):
+            # beyond a limit of nothing every free run has diverged
+            most = np.full(3, -1.0) if model is None else limit
+            predicted[_key(prior)] += _predicted(
+                model or spec.build(), found, fold.held_out, step, most
+            )
+        offset = len(pool)
+        windows += [_moved(window, offset) for window in found]
+        pool += fold.held_out
+    if not windows:
+        raise DataError(
+            f"refit.{name}: no part of the training and validation logs holds a free run of"
+            f" {config.horizon:g} s to choose the prior by; give one prior, or longer logs"
+        )
+    return _chosen(priors, FreeRun("", "", windows, predicted), pool, settings.evaluation)
+
+
+def _key(prior: Prior) -> str:
+    return "least squares" if prior is None else f"{prior:g}"
+
+
+def _windows(
+    logs: Sequence[Prepared], evaluation: EvaluationConfig, config: RefitConfig, step: float
+) -> list[Window]:
+    """Return windows of the protocol that chooses, of the refit's horizon where none is there."""
+    chosen = evaluation.protocols[evaluation.selection]
+    shorter = Windows(length=config.horizon, first=0.0, history=0.0)
+    for protocol in (chosen, shorter):
+        found = [w for number, log in enumerate(logs) for w in protocol.windows(log, number, step)]
+        if found:
+            return found
+    return []
+
+
+def _fitted(
+    spec: ModelSpec,
+    config: RefitConfig,
+    fold: Fold,
+    priors: Sequence[Prior],
+    scales: torch.Tensor,
+) -> list[tuple[Prior, HybridDynamics | None]]:
+    """Return a model for each prior, None where the fold's logs do not give one."""
+    model = spec.build()
+    try:
+        known: Samples = samples(fold.fitted, model.signals)
+        first = spec.baseline.solutions(model.baseline, known)[0]
+        store = WindowStore.gather(fold.fitted, torch.float64)
+    except ResidnetError:
+        return [(prior, None) for prior in priors]
+    model.baseline.load_state_dict(first.state, strict=False)
+
+    def moved(prior: float) -> HybridDynamics | None:
+        own = copy.deepcopy(model)
+        try:
+            refit(own, known, store, config.with_prior(prior), scales)
+        except ResidnetError:
+            return None
+        return own
+
+    return [(prior, model if prior is None else moved(prior)) for prior in priors]
+
+
+def _predicted(
+    model: HybridDynamics,
+    windows: Sequence[Window],
+    logs: Sequence[Prepared],
+    step: float,
+    limit: np.ndarray,
+) -> list[Prediction]:
+    candidate = Candidate("judged", "baseline", model)
+    return free_run([candidate], windows, logs, step, limit)["judged"]
+
+
+def _moved(window: Window, offset: int) -> Window:
+    return Window(window.log + offset, window.start, window.stop, window.past, window.nu)
+
+
+def _chosen(
+    priors: Sequence[Prior],
+    run: FreeRun,
+    logs: Sequence[Prepared],
+    evaluation: EvaluationConfig,
+) -> PriorChoice:
+    blocks, labels = blocks_of(run)
+    scales, count = evaluation.scales.named(), len(blocks.weights)
+    parts = {p: shares(run, _key(p), logs, scales, labels, count) for p in priors}
+    lost = {p: sum(one.diverged for one in run.predictions[_key(p)]) for p in priors}
+    steady = [p for p in priors if lost[p] == min(lost.values())]
+    best = min(steady, key=lambda p: float(parts[p].sum()))
+    apart = {p: float((parts[p] - parts[best]).sum()) for p in priors}
+    spread = {p: blocks.standard_error(parts[p], parts[best]) for p in priors}
+    # they stand in the order of their strength; least squares must be better than all refits
+    taken = next(p for p in steady if apart[p] <= spread[p])
+    table = [
+        {
+            "prior": p,
+            "error": float(parts[p].sum()),
+            "difference": apart[p],
+            "standard_error": spread[p],
+            "diverged": lost[p],
+            "windows": len(run.windows),
+        }
+        for p in priors
+    ]
+    return PriorChoice(taken, table)

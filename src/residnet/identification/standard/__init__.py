@@ -1,0 +1,8 @@
+"""The standard recipe: a portfolio of models whose settings follow from logs and protocols."""
+
+from __future__ import annotations
+
+from residnet.identification.standard.facts import Facts
+from residnet.identification.standard.portfolio import PARTS, TIED, names_of, portfolio
+
+__all__ = ["PARTS", "TIED", "Facts", "names_of", "portfolio"]

@@ -1,0 +1,117 @@
+"""What the standard recipe looks at: channels, their excitation, sampling, length, protocol."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from residnet.core.names import VELOCITY
+from residnet.core.samples import Samples
+from residnet.data.prepare import Prepared
+from residnet.judge.config import EvaluationConfig
+from residnet.judge.protocol import Windows
+from residnet.physics.signals import FORCE_CHANNELS, WIND_CHANNELS
+
+_STILL = 1e-3
+"""Spread of a channel, as a share of its size, below which it tells nothing."""
+_ASTERN = 0.01
+"""Share of the samples from which a propeller that turns astern counts."""
+_USUAL = 60.0
+"""Length of a free run in s where no log says how long it is."""
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What the portfolio of a fit depends on.
+
+    Attributes:
+        names: channels that models see.
+        moving: inputs, forces and wind channels that vary in the training logs.
+        astern: inputs that take both signs there.
+        step: of the grid, s.
+        length: of the free runs that choose between models, s.
+        history: measured past that a free run may look back on, s.
+        samples: of the training logs.
+    """
+
+    names: tuple[str, ...]
+    moving: tuple[str, ...]
+    astern: tuple[str, ...]
+    step: float
+    length: float
+    history: float
+    samples: int
+
+    @classmethod
+    def supposed(cls, names: Sequence[str], step: float = 0.1) -> Facts:
+        """Return facts before any log is read: every channel moves, ahead only."""
+        return cls(tuple(names), _acting(names), (), step, _USUAL, 0.1 * _USUAL, 10_000)
+
+    @classmethod
+    def of(
+        cls,
+        samples: Samples,
+        logs: Sequence[Prepared],
+        evaluation: EvaluationConfig,
+        step: float,
+    ) -> Facts:
+        """Return what training logs and the protocol that chooses say.
+
+        Args:
+            samples: of the training logs.
+            logs: for training and validation.
+            evaluation: protocols.
+            step: of the grid, s.
+        """
+        z, names = samples.z, tuple(samples.names)
+        spread, size = z.std(0, correction=0), z.abs().amax(0)
+        moving = [
+            name
+            for name in _acting(names)
+            if spread[names.index(name)] > _STILL * size[names.index(name)]
+        ]
+        astern = [name for name in moving if _both_signs(z[:, names.index(name)])]
+        length, history = _free_run(logs, evaluation, step)
+        return cls(names, tuple(moving), tuple(astern), step, length, history, len(samples))
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Channels that drive the vessel and vary; forces where the model makes them."""
+        return tuple(name for name in self.moving if name not in WIND_CHANNELS)
+
+    @property
+    def wind(self) -> bool:
+        """Whether the true wind is known."""
+        return any(name in WIND_CHANNELS for name in self.moving)
+
+
+def _acting(names: Sequence[str]) -> tuple[str, ...]:
+    forces = "tau_x" in names
+    return tuple(
+        name
+        for name in names
+        if name not in VELOCITY and (not forces or name in FORCE_CHANNELS or name in WIND_CHANNELS)
+    )
+
+
+def _both_signs(values: torch.Tensor) -> bool:
+    ahead = float((values > 0).double().mean())
+    return min(ahead, float((values < 0).double().mean())) > _ASTERN
+
+
+def _free_run(
+    logs: Sequence[Prepared], evaluation: EvaluationConfig, step: float
+) -> tuple[float, float]:
+    """Return how long the free runs are that choose between models, and their measured past, s."""
+    protocol = evaluation.protocols[evaluation.selection]
+    if isinstance(protocol, Windows):
+        return protocol.length, protocol.history
+    found = [
+        window.stop - window.start
+        for number, log in enumerate(logs)
+        for window in protocol.windows(log, number, step)
+    ]
+    return (float(np.median(found)) * step if found else _USUAL), protocol.initial

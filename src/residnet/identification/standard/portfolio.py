@@ -1,0 +1,76 @@
+"""The models of the standard recipe, as a config of a fit would have them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from residnet.identification.standard.facts import Facts
+from residnet.identification.standard.schedule import (
+    calibration_settings,
+    hidden_size,
+    refit_settings,
+    training_settings,
+)
+from residnet.identification.standard.terms import hull_terms, linear_terms
+from residnet.physics.symmetry import mirrored_channels
+
+PARTS = ("baseline", "baselines", "refit", "heads", "base_of", "ensembles", "training")
+"""Keys of a fit that the recipe stands in place of."""
+TIED = "tied"
+"""Name of the mean of the models within one standard error of the best."""
+_FROZEN, _TOGETHER = "hull_network", "hull_network_calibrated"
+_RIDGE = 1e-4
+
+
+def portfolio(facts: Facts) -> dict[str, Any]:
+    """Return baselines, refits, heads and trainings by the names that the recipe gives them.
+
+    `baseline` is linear and `hull` nonlinear in velocities and inputs, both refitted. A network
+    stands on the hull, moves with it, stands on the linear model, and stands alone.
+
+    Args:
+        facts: of the logs; `Facts.supposed` before they are read.
+    """
+    network = _network(facts)
+    heads = {_FROZEN: network, _TOGETHER: network, "linear_network": network, "network": network}
+    training = training_settings(facts)
+    return {
+        "baseline": {"kind": "regressors", "ridge": 1e-6, "terms": linear_terms(facts)},
+        "baselines": {"hull": {"kind": "regressors", "ridge": _RIDGE, "terms": hull_terms(facts)}},
+        "refit": {"baseline": refit_settings(facts), "hull": refit_settings(facts)},
+        "heads": heads,
+        "base_of": {
+            _FROZEN: "hull",
+            _TOGETHER: "hull",
+            "linear_network": "baseline",
+            "network": "zero",
+        },
+        "ensembles": {},
+        "training": {
+            **dict.fromkeys(heads, training),
+            _TOGETHER: calibration_settings(facts, _FROZEN),
+        },
+    }
+
+
+def names_of(facts: Facts) -> tuple[str, ...]:
+    """Return the names of the recipe's models in the order that they are fitted in."""
+    plan = portfolio(facts)
+    return ("baseline", *plan["baselines"], *plan["heads"], TIED)
+
+
+def _regressors(terms: list[str]) -> dict[str, Any]:
+    return {"kind": "regressors", "ridge": _RIDGE, "dissipative": True, "terms": terms}
+
+
+def _network(facts: Facts) -> dict[str, Any]:
+    """Return a recurrent network whose memory an encoder of its own starts."""
+    size = hidden_size(facts)
+    return {
+        "kind": "lstm",
+        "hidden_size": size,
+        "readout": size,
+        "encoder": True,
+        "margin": 0.0,
+        "mirror": mirrored_channels(facts.names) is not None,
+    }
