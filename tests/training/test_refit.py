@@ -40,6 +40,7 @@ from residnet.training import refit as module
 from residnet.training.offsets import Offsets, OffsetsConfig
 from residnet.training.refit import refit
 from residnet.training.refit_config import RefitConfig
+from residnet.training.refit_problem import Problem
 from residnet.training.sensitivities import step_sensitivities
 
 
@@ -100,7 +101,7 @@ def test_windows_are_laid_every_so_often(smoothed: list[Prepared]) -> None:
     assert notes["horizon"] == 8.0
 
 
-def windy(integrator: Integrator = "rk4") -> tuple[HybridDynamics, module._Problem]:
+def windy(integrator: Integrator = "rk4") -> tuple[HybridDynamics, Problem]:
     """A model in true wind, whose heading matters to it, and windows with samples that do not
     count; everything moved off its start.
     """
@@ -126,14 +127,15 @@ def windy(integrator: Integrator = "rk4") -> tuple[HybridDynamics, module._Probl
     )
     usable = torch.from_numpy(random.random((batch, steps, 1)) < 0.8).double()
     half = torch.from_numpy(random.normal(size=(count, count)))
-    problem = module._Problem(
+    problem = Problem(
         x0=torch.from_numpy(random.normal(size=(batch, 6)) * [5, 5, 1, 0.5, 0.2, 0.2]),
         w=torch.cat((inputs(batch, steps, 6), wind), dim=-1),
         nu=torch.from_numpy(random.normal(size=(batch, steps, 3)) * 0.3),
         weight=torch.cat((usable, usable, torch.ones_like(usable)), dim=-1) / SCALES,
         precision=0.01 * half @ half.T,
         start=torch.from_numpy(random.normal(size=count) * 0.1),
-        pull=torch.from_numpy(random.uniform(0, 0.1, size=count)),
+        pull=torch.diag(torch.from_numpy(random.uniform(0, 0.1, size=count))),
+        still=torch.zeros(count, dtype=torch.bool),
         active=active,
         believed=torch.from_numpy(random.normal(size=count) * 0.1),
         belief=torch.from_numpy(random.uniform(0, 50, size=count)),
@@ -159,7 +161,7 @@ LEVEL = torch.tensor(0.3, dtype=torch.float64)
 
 def with_step(
     model: HybridDynamics,
-    problem: module._Problem,
+    problem: Problem,
     place: int,
     step: float,
     offsets: Offsets = NONE,
@@ -203,7 +205,7 @@ def test_sensitivities_are_those_of_the_rollout(integrator: Integrator) -> None:
 
 
 def normal_equations(
-    model: HybridDynamics, problem: module._Problem, offsets: module.Offsets
+    model: HybridDynamics, problem: Problem, offsets: module.Offsets
 ) -> module.Arrow:
     assert isinstance(model.baseline, RegressorBaseline)
     squares = module._level(model, problem, offsets)[1]
@@ -279,7 +281,7 @@ def test_hessian_is_half_that_of_the_cost_where_the_errors_vanish() -> None:
         "pull": 0 * problem.pull,
         "belief": 0 * problem.belief,
     }
-    perfect = module._Problem(**fields)
+    perfect = Problem(**fields)
     arrow = normal_equations(model, perfect, NONE)
     hessian, gradient = arrow.shared, arrow.gradient
     torch.testing.assert_close(gradient, torch.zeros_like(gradient), rtol=0, atol=1e-14)
