@@ -71,7 +71,7 @@ def _policy(name: str) -> tuple[str, ...]:
 
 
 def _recurrent(name: str) -> tuple[str, ...]:
-    short = ("epochs=1", "steps=1", "batch=16", "validation=16", "hold=0 s", "stretch=0")
+    short = ("epochs=1", "steps=1", "batch=16", "validation=16", "hold=0 s", "compiled=false")
     return tuple(f"recurrent.{name}.training.{key}" for key in short)
 
 

@@ -15,7 +15,7 @@ from tiny import call
 STATED = {"dt": "0.1 s", "duration": "6 s", "hold": "0 s", "delay": ["0 s", "0.3 s"]}
 TRAINING = {
     "epochs": 1, "steps": 1, "batch": 8, "dt": "0.1 s", "hold": "0 s", "validation": 8,
-    "stretch": 0,
+    "compiled": False,
 }  # fmt: skip
 SMALL: dict[str, Any] = {
     "task": "autopilot",

@@ -32,7 +32,7 @@ def trained(units: int, rate: float) -> tuple[ObservedPolicy, dict[str, object]]
         dt=0.1, trained_at=0.1, law=STEEP, units=units,
     ).build()  # fmt: skip
     settings = ConditionsTraining(
-        epochs=2, steps=4, batch=32, learning_rate=rate, dt=0.1, hold=0.0, validation=32, stretch=0
+        epochs=2, steps=4, batch=32, learning_rate=rate, dt=0.1, hold=0.0, validation=32
     )
     notes = train_under_conditions("policy", policy, VESSEL, settings, CONDITIONS, 3, None)
     return policy, notes

@@ -67,25 +67,7 @@ class Rollout(nn.Module):
             states [B, T+1, nx] from x0 on, inputs that acted [B, T, m], and the memory after the
             last step [B, n_state].
         """
-        states, inputs, s, _ = self.stretch(x0, w, s, self.source.initial(x0))
-        return states, inputs, s
-
-    def stretch(
-        self, x0: Tensor, w: Tensor, s: Tensor, memory: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Run on from a state with the memories that an earlier stretch left.
-
-        The source counts the steps from 0 in every stretch.
-
-        Args:
-            x0: states [B, nx] at its start.
-            w: given inputs [B, T, m].
-            s: memory of the model [B, n_state].
-            memory: memory of the source [B, k].
-
-        Returns:
-            what `forward` returns, and the source's memory after the last step.
-        """
+        memory = self.source.initial(x0)
         x = x0
         states = [x0]
         applied: list[Tensor] = []
@@ -104,4 +86,4 @@ class Rollout(nn.Module):
             states.append(x)
             applied.append(acting)
         inputs = torch.stack(applied, dim=1) if w.shape[1] > 0 else w
-        return torch.stack(states, dim=1), inputs, s, memory
+        return torch.stack(states, dim=1), inputs, s

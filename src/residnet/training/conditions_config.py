@@ -33,7 +33,8 @@ class ConditionsTraining(OneStage):
         guide: weight of the integral of the absolute error in deg s at the start.
         faded: share of the training after which that weight is zero.
         validation: number of flights that epochs are chosen on.
-        stretch: steps that are compiled together; 0 for none, where there is no C++ compiler.
+        compiled: whether flights and their gradient are compiled as C, which takes a C compiler;
+            without one the training says so and is some thirty times slower.
     """
 
     epochs: int = Field(default=18, ge=1, le=100_000)
@@ -50,7 +51,7 @@ class ConditionsTraining(OneStage):
     guide: float = Field(default=0.01, ge=0)
     faded: float = Field(default=0.6, gt=0, le=1)
     validation: int = Field(default=512, ge=2, le=1_000_000)
-    stretch: int = Field(default=5, ge=0, le=1_000)
+    compiled: bool = True
 
     def share(self, progress: float) -> float:
         """Return the share of the conditions that is drawn, at a progress of 0 to 1."""

@@ -10,15 +10,20 @@ from typing import Any, final
 import torch
 from torch import Tensor, nn
 
-from residnet.control.conditions.config import ConditionsConfig
+from residnet.control.conditions.config import ConditionsConfig, HeadingChanges
 from residnet.control.conditions.flights import ConditionedRun, fly_under
 from residnet.control.heading.steering import SteeredVessel
 from residnet.control.observed.policy import ObservedPolicy
+from residnet.core.errors import ExportError
 from residnet.core.progress import say
+from residnet.dynamics.rollout import Rollout
 from residnet.training.conditions_config import ConditionsTraining
 from residnet.training.epochs import EpochTraining, run_epochs
 
-Stretch = Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor, Tensor]]
+Flying = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
+"""Flights from states [B, nx], inputs [B, T, m] and memory [B, n]: states and what acted."""
+Compiler = Callable[[Rollout, Tensor, Tensor, Tensor], Flying]
+"""Makes the flights of a closed loop quick, given examples of what they are flown with."""
 
 
 @final
@@ -31,6 +36,7 @@ class ConditionsFit(EpochTraining):
         settings: of the training.
         conditions: of flights and their cost.
         seed: of batches and validation flights.
+        compiler: of the flights; None to fly them as they are.
     """
 
     def __init__(
@@ -40,6 +46,7 @@ class ConditionsFit(EpochTraining):
         settings: ConditionsTraining,
         conditions: ConditionsConfig,
         seed: int,
+        compiler: Compiler | None,
     ) -> None:
         super().__init__(settings, seed)
         self.policy, self.vessel, self.conditions = policy, vessel, conditions
@@ -48,10 +55,8 @@ class ConditionsFit(EpochTraining):
         self.drawn = conditions.model_copy(update=lengths)
         policy.at(settings.dt)
         self.loop = ConditionedRun(vessel, policy, settings.dt, settings.integrator, torch.float32)
-        self.rollout = self.loop.rollout(max(math.ceil(conditions.delay[1] / settings.dt), 1))
-        self.run: Stretch = (
-            _compiled(self.rollout.stretch) if settings.stretch else (self.rollout.stretch)
-        )
+        rollout = self.loop.rollout(max(math.ceil(conditions.delay[1] / settings.dt), 1))
+        self.fly = _flying(rollout, compiler, self.loop.given(self._batch(0.0, 2)))
         random = torch.Generator().manual_seed(seed + 1_000_003)
         self.unseen = conditions.draw(settings.validation, conditions.dt, random)
 
@@ -84,9 +89,8 @@ class ConditionsFit(EpochTraining):
             group["lr"] = settings.learning_rate * (
                 settings.final + (1.0 - settings.final) * cosine
             )
-        random = torch.Generator().manual_seed(int(torch.randint(2**62, (1,))))
-        changes = self.drawn.draw(settings.batch, settings.dt, random, settings.share(progress))
-        flown = self.loop.flights(changes, *self._fly(*self.loop.given(changes)))
+        changes = self._batch(settings.share(progress), settings.batch)
+        flown = self.loop.flights(changes, *self.fly(*self.loop.given(changes)))
         found = flown.measured(self.conditions)
         loss: Tensor = (
             found["cost"].mean() + math.degrees(settings.guiding(progress)) * found["iae"].mean()
@@ -94,21 +98,10 @@ class ConditionsFit(EpochTraining):
         self._losses.append(float(found["cost"].detach().mean()))
         return loss
 
-    def _fly(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return states and inputs of a rollout in compiled stretches, the rest as it is."""
-        # the first stretch is compiled for states with a gradient, as the others are
-        x = x.requires_grad_()
-        memory = self.rollout.source.initial(x)
-        step = self.settings.stretch or w.shape[1]
-        states, inputs = [x[:, None]], []
-        for first in range(0, w.shape[1], step):
-            part = w[:, first : first + step]
-            run = self.run if part.shape[1] == step else self.rollout.stretch
-            seen, acted, s, memory = run(x, part, s, memory)
-            x = seen[:, -1]
-            states.append(seen[:, 1:])
-            inputs.append(acted)
-        return torch.cat(states, dim=1), torch.cat(inputs, dim=1)
+    def _batch(self, share: float, rows: int) -> HeadingChanges:
+        """Return heading changes drawn anew, under a share of the conditions."""
+        random = torch.Generator().manual_seed(int(torch.randint(2**62, (1,))))
+        return self.drawn.draw(rows, self.settings.dt, random, share)
 
     def on_after_backward(self) -> None:
         """Reset the gradient of a batch where it is no number."""
@@ -124,28 +117,21 @@ class ConditionsFit(EpochTraining):
         return self.policy, float(flown.measured(self.conditions)["cost"].mean())
 
 
-def _compiled(stretch: Stretch) -> Stretch:
-    """Return a compiled function, or the same one where there is no working C++ compiler."""
-    fast: Stretch = torch.compile(stretch, dynamic=False)
-    chosen: list[Stretch] = []
-
-    def call(
-        x: Tensor, w: Tensor, s: Tensor, memory: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        if chosen:
-            return chosen[0](x, w, s, memory)
+def _flying(
+    rollout: Rollout, compiler: Compiler | None, given: tuple[Tensor, Tensor, Tensor]
+) -> Flying:
+    """Return the flights of a closed loop, compiled where a compiler is given and works."""
+    if compiler is not None:
         try:
-            found = fast(x, w, s, memory)
-        except Exception as error:  # whatever a compiler that is absent or broken may raise
-            reason = str(error).strip().splitlines() or [type(error).__name__]
-            say(f"  the steps are not compiled, training is slower: {reason[0][:120]}")
-            torch.compiler.reset()
-            chosen.append(stretch)
-            return stretch(x, w, s, memory)
-        chosen.append(fast)
-        return found
+            return compiler(rollout, *given)
+        except ExportError as error:
+            say(f"  the flights are not compiled, training is much slower: {error}")
 
-    return call
+    def fly(x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        states, inputs, _ = rollout(x, w, s)
+        return states, inputs
+
+    return fly
 
 
 def train_under_conditions(
@@ -156,10 +142,12 @@ def train_under_conditions(
     conditions: ConditionsConfig,
     seed: int,
     folder: Path | None,
+    compiler: Compiler | None = None,
 ) -> dict[str, Any]:
     """Train a policy and leave the weights of the epoch with the least cost in it.
 
-    `checkpoints/<name>/last.ckpt` in the folder is resumed where it exists.
+    `compiler` makes the flights of the training quick. `checkpoints/<name>/last.ckpt` in the folder
+    is resumed where it exists.
 
     Returns:
         What there is to say: the curve by epoch, the cost at the start and the best one.
@@ -167,7 +155,7 @@ def train_under_conditions(
     Raises:
         FitError: where no epoch gave a finite cost.
     """
-    fit = ConditionsFit(policy.float(), vessel, settings, conditions, seed)
+    fit = ConditionsFit(policy.float(), vessel, settings, conditions, seed, compiler)
     notes = run_epochs(name, fit, policy, policy, folder)
     policy.at(conditions.dt)
     return notes

@@ -15,6 +15,7 @@ from residnet.core.errors import ExportError
 from residnet.export.lowering.operations import FOLDS, LIKE, MAPS, MOVES
 from residnet.export.lowering.program import Cells, Fold, Instruction, Map, Pick, Product
 from residnet.export.lowering.program import Program as Program
+from residnet.export.lowering.scatters import Scatters
 from residnet.export.lowering.simplify import simplify
 from residnet.export.lowering.trace import recorded
 from residnet.export.lowering.values import (
@@ -54,7 +55,7 @@ def lowered(
     return _Builder(what).build(recorded(step, given, what), given, arguments, results)
 
 
-class _Builder:
+class _Builder(Scatters):
     def __init__(self, what: str) -> None:
         self.what = what
         self.program = Program()

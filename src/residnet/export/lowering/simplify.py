@@ -1,4 +1,4 @@
-"""Leaves out of a program what does nothing: products with one and sums with zero."""
+"""Leaves out of a program what does nothing: products with one, sums with zero, known choices."""
 
 from __future__ import annotations
 
@@ -38,6 +38,9 @@ def _grown(places: np.ndarray, size: int) -> np.ndarray:
 
 def _same(program: Program, op: str, operands: Sequence[int]) -> int | None:
     """Return the cell that an operation on these cells equals; None where it makes a new number."""
+    if op == "where":
+        condition = program.value(operands[0])
+        return None if condition is None else operands[2 if condition == 0.0 else 1]
     if op not in ("mul", "add", "sub"):
         return None
     a, b = (program.value(address) for address in operands)

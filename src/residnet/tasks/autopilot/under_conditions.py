@@ -17,6 +17,7 @@ from residnet.control.observed.policy import ObservedPolicy
 from residnet.control.observed.stored import ObservedPolicySpec
 from residnet.core.progress import report, say
 from residnet.dynamics.store import rebuilt
+from residnet.export.c.closed_loop import CompiledLoop
 from residnet.judge.conditions import QUIET_FLIGHTS, drawn, judged, quiet, swinging
 from residnet.physics.vessel import load_vessel
 from residnet.runs.folder import RunFolder
@@ -88,7 +89,14 @@ def trained_policy(
     if notes is None:
         say(f"  training {name}")
         notes = train_under_conditions(
-            name, policy, vessel, wanted.training, stated.stated, config.seed, folder.path
+            name,
+            policy,
+            vessel,
+            wanted.training,
+            stated.stated,
+            config.seed,
+            folder.path,
+            CompiledLoop if wanted.training.compiled else None,
         )
         notes |= {"seconds": round(time.time() - started, 1), "constants": policy.values()}
         store.keep_module(name, spec, policy, notes)
