@@ -139,6 +139,28 @@ def test_a_residual_of_noise_is_said_to_be_none(tmp_path: Path) -> None:
     assert better(rows(found)["believed"], "zero")[3]
     results = write_results(settings, found, RunFolder.create(tmp_path / "run", "", resume=False))
     assert "None of the 2 regressions is better" in " ".join(verdict(results))
+    advice = "Recommended: the believed model alone in surge, sway and yaw."
+    assert advice in verdict(results)
+
+
+def test_a_believed_model_that_is_worse_than_no_force_is_no_yardstick(tmp_path: Path) -> None:
+    """The forces are noise, the believed hull predicts others: regressions beat it, not zero."""
+    t, *_ = motion(0, 300.0)
+    random = np.random.default_rng(7)
+    names = [f"tau_{letter}_{kind}" for letter in "xyn" for kind in ("est", "cmd")]
+    log(tmp_path, "one", missing=0.0, **{n: random.normal(0.0, 5.0, len(t)) for n in names})
+    found = force_study(config(tmp_path))
+    ridge, believed = rows(found)["ridge"], rows(found)["believed"]
+    assert ridge["reference"] == ["zero"] * 3
+    assert better(ridge, "believed") == [True] * 4
+    assert not any(better(ridge, "reference"))
+    assert believed["minus_zero"]["ci95"][3][0] > 0
+    settings = config(tmp_path)
+    results = write_results(settings, found, RunFolder.create(tmp_path / "run", "", resume=False))
+    said = " ".join(verdict(results))
+    assert "worse than no force in surge, sway and yaw" in said
+    assert "None of the 1 regressions is better than the better of no force" in said
+    assert "Recommended: no force at all in surge, sway and yaw." in said
 
 
 def test_folds_are_stretches_of_one_log_with_a_gap_and_whole_logs_of_three(tmp_path: Path) -> None:

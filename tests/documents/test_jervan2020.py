@@ -16,6 +16,7 @@ from residnet.baselines.believed import BelievedConfig
 from residnet.control.motion.anticipation import Derivatives, Lag, course, needed_force
 from residnet.core.config import load_config
 from residnet.core.errors import ConfigError, FitError
+from residnet.documents.jervan2020.ferry.config import Half
 from residnet.documents.jervan2020.ferry.flights import MotionNoise
 from residnet.documents.jervan2020.ferry.identification import identify
 from residnet.documents.jervan2020.ferry.report import sections, verdict
@@ -24,8 +25,8 @@ from residnet.documents.jervan2020.ferry.study import Study, record_of, study
 from residnet.documents.jervan2020.ferry.task import FerryStudyConfig
 from residnet.documents.jervan2020.forward import forward_equations, missing_coefficients
 from residnet.documents.jervan2020.residual_model import constant_force
-from residnet.export.feed_forward import export_feed_forward
-from residnet.physics.force_model import FERRY_TERMS, ForceModel
+from residnet.export.feed_forward import RequiredForce, export_feed_forward
+from residnet.physics.force_model import FERRY_TERMS, Correction, ForceModel
 from residnet.physics.fossen import FossenVessel
 from residnet.physics.vessel import load_vessel
 from residnet.runs.folder import RunFolder
@@ -175,12 +176,55 @@ def test_feed_forward_alone_and_a_model_that_cannot_run_forward(tmp_path: Path) 
 
 def test_exported_feed_forward_is_the_model(short: Study, tmp_path: Path) -> None:
     model = short.models["lag_ridge"].model
-    export_feed_forward(model, None, [(-5.0, 5.0)] * 3 + [(-9.0, 9.0)] * 3, tmp_path / "f.pt")
+    force = RequiredForce(*model.parts(), mirrored=False)
+    export_feed_forward(force, None, [(-5.0, 5.0)] * 3 + [(-9.0, 9.0)] * 3, tmp_path / "f.pt")
     loaded = torch.jit.load(str(tmp_path / "f.pt"))
     with torch.no_grad():
         tau, outside = loaded(short.first.nu_dot, short.first.nu)
         torch.testing.assert_close(tau, model(short.first.nu_dot, short.first.nu))
     assert not outside.any()
+
+
+@pytest.mark.parametrize("half", ["first", "second"])
+def test_feed_forward_outside_its_range_keeps_to_the_believed_model(
+    short: Study, tmp_path: Path, half: Half
+) -> None:
+    """Far from what identified it, a wild correction commands no more than 1.2 times the hull."""
+    record = record_of(short.first, 20.0, MotionNoise(), half)
+    hull_force = ForceModel(hull("milliampere"))
+    wild = Correction(
+        FERRY_TERMS,
+        300.0 * torch.randn(30, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64),
+        torch.tensor([5.0, 20.0, 30.0], dtype=torch.float64),
+    )
+    motion = torch.cat((record.nu_dot, record.nu), dim=-1)[record.train]
+    low, high = motion.amin(0), motion.amax(0)
+    export_feed_forward(
+        RequiredForce(*hull_force.extended(wild).parts(), mirrored=True),
+        None,
+        list(zip(low.tolist(), high.tolist(), strict=True)),
+        tmp_path / "f.pt",
+    )
+    loaded = torch.jit.load(str(tmp_path / "f.pt"))
+    random = torch.Generator().manual_seed(3)
+    seen = low + (2.0 * torch.rand(2000, 6, generator=random, dtype=torch.float64) - 0.5) * (
+        high - low
+    )
+    tau, outside = loaded(seen[:, :3], seen[:, 3:])
+    with torch.no_grad():
+        believed = hull_force(seen[:, :3], seen[:, 3:])
+    assert 500 < int(outside.sum()) < 2000
+    assert (tau[outside].abs() <= 1.2 * believed[outside].abs() + 1e-9).all()
+    # the correction is there inside, and nothing jumps at the edge
+    assert ((tau - believed)[~outside].abs().amax(0) > 10.0).all()
+    path = torch.linspace(0.0, 1.5, 3001, dtype=torch.float64)[:, None]
+    along, _ = loaded(*(0.5 * (low + high) + path * (high - low)).split(3, dim=-1))
+    assert (along.diff(dim=0).abs().amax(0) < 0.01 * along.abs().amax(0)).all()
+    # straight ahead, at rest and straight astern there is neither sway force nor yaw moment
+    straight = torch.zeros(41, 6, dtype=torch.float64)
+    straight[:, 3], straight[:, 0] = torch.linspace(-1, 1, 41), torch.linspace(0.1, -0.1, 41)
+    tau, _ = loaded(straight[:, :3], straight[:, 3:])
+    assert tau[:, 1:].abs().max() < 1e-9
 
 
 def test_one_segment_nan_and_too_few_samples_are_clear_errors(short: Study) -> None:

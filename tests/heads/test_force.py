@@ -18,7 +18,7 @@ from residnet.dynamics.ensemble import mean_of
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.store import ModelSpec, load_model, save_model
-from residnet.export.feed_forward import RequiredForce
+from residnet.export.feed_forward import BelievedForce, RequiredForce, ResidualForce
 from residnet.heads import ForceHead, MlpConfig, PlsrConfig, RidgeConfig, SymbolicConfig
 from residnet.physics.fossen import FossenVessel
 from residnet.physics.signals import SignalsConfig
@@ -148,7 +148,8 @@ def test_a_free_run_is_the_true_ferrys(model: HybridDynamics) -> None:
 def test_the_feed_forward_undoes_the_motion(model: HybridDynamics) -> None:
     of = samples(count=50)
     assert isinstance(model.head, ForceHead)
-    force = RequiredForce(model.baseline, model.head).eval()
+    believed = BelievedForce(model.baseline, model.head.mass)
+    force = RequiredForce(believed, ResidualForce(model.head), mirrored=False).eval()
     with torch.no_grad():
         torch.testing.assert_close(force(of.target, of.z[:, :3]), of.z[:, 3:], rtol=0, atol=1e-2)
         # and exactly the model's own inverse

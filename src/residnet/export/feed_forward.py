@@ -23,41 +23,92 @@ from residnet.heads import ForceHead
 from residnet.physics.force_model import MOTION
 from residnet.physics.signals import FORCE_CHANNELS
 
+FADE = 0.25
+"""Share of the width of a training range, beyond its edge, over which a correction fades out."""
+EFFORT = 1.2
+"""Most force outside the training range, in forces of the believed model, axis by axis."""
+_EDGE = 0.05
+"""Share of the width of a training range, within its edge, over which that limit sets in."""
+
+
+@final
+class BelievedForce(nn.Module):
+    """The force [B, 3] that a baseline believes a motion needs: M (nu_dot - nu_dot_0), SI.
+
+    nu_dot_0 is its acceleration without forces.
+    """
+
+    def __init__(self, baseline: nn.Module, mass: Tensor) -> None:
+        super().__init__()
+        self.baseline = baseline
+        self.register_buffer("mass", mass.clone())
+        self.mass: Tensor
+
+    def forward(self, nu_dot: Tensor, nu: Tensor) -> Tensor:
+        """Return the force [B, 3] at nu_dot [B, 3] and nu [B, 3]."""
+        baseline: Tensor = self.baseline(torch.cat((nu, torch.zeros_like(nu)), dim=-1))
+        return (nu_dot - baseline) @ self.mass.to(nu.dtype).T
+
+
+@final
+class ResidualForce(nn.Module):
+    """The residual force [B, 3] of a head in force space, SI."""
+
+    def __init__(self, head: ForceHead) -> None:
+        super().__init__()
+        self.head = head
+
+    def forward(self, nu_dot: Tensor, nu: Tensor) -> Tensor:
+        """Return the force [B, 3] at nu_dot [B, 3] and nu [B, 3]."""
+        return self.head.force(nu_dot, torch.cat((nu, torch.zeros_like(nu)), dim=-1))
+
 
 @final
 class RequiredForce(nn.Module):
-    """The force tau [B, 3] = F(nu_dot [B, 3], nu [B, 3]) of a hybrid model in force space.
+    """The force tau [B, 3] = F(nu_dot [B, 3], nu [B, 3]) of a believed model and its correction.
 
-    It is M (nu_dot - nu_dot_0 without forces) + eps, float64, SI.
+    A vessel is the same to port and starboard, while a correction that was fitted to a log is not
+    quite: with `mirrored` it is the mean of itself and its mirror image, so that a straight course
+    needs neither sway force nor yaw moment.
     """
 
-    def __init__(self, baseline: nn.Module, head: ForceHead) -> None:
+    def __init__(self, believed: nn.Module, correction: nn.Module, *, mirrored: bool) -> None:
         super().__init__()
-        self.baseline, self.head = baseline, head
+        self.believed, self.correction, self.mirrored = believed, correction, mirrored
+        self.register_buffer("turned", torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
+        self.turned: Tensor
 
     def forward(self, nu_dot: Tensor, nu: Tensor) -> Tensor:
-        """Return the force tau [B, 3] in N, N, N m that the motion needs."""
-        z = torch.cat((nu, torch.zeros_like(nu)), dim=-1)
-        baseline: Tensor = self.baseline(z)
-        force: Tensor = (nu_dot - baseline) @ self.head.mass.to(nu.dtype).T + self.head.force(
-            nu_dot, z
-        )
-        return force
+        """Return the force [B, 3] at nu_dot [B, 3] and nu [B, 3]."""
+        believed, more = self.parts(nu_dot, nu)
+        return believed + more
+
+    def parts(self, nu_dot: Tensor, nu: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the believed force and the correction, [B, 3] each."""
+        believed: Tensor = self.believed(nu_dot, nu)
+        more: Tensor = self.correction(nu_dot, nu)
+        if self.mirrored:
+            other: Tensor = self.correction(nu_dot * self.turned, nu * self.turned)
+            more = 0.5 * (more + other * self.turned)
+        return believed, more
 
 
 @final
 class GuardedForce(nn.Module):
-    """A feed-forward whose answer is finite whatever it is given, with a flag.
+    """A feed-forward that knows where its correction was identified, with a flag.
 
-    Motions are treated as `residnet.export.guard` says: not a number becomes the middle of the
-    training range, what is farther off than the accepted range its nearest value.
+    Outside the training range the correction fades out over a quarter of the range's width, and no
+    axis commands more than 1.2 times the believed model's force; that limit sets in over the
+    outermost twentieth of the range, so that nothing jumps. The answer is finite whatever it is
+    given: motions are treated as `residnet.export.guard` says, not a number becomes the middle of
+    the training range, what is farther off than the accepted range its nearest value.
 
     Args:
-        model: tau [B, 3] from nu_dot and nu [B, 3].
+        model: the believed force and its correction.
         ranges: of nu_dot and nu in the training data, six.
     """
 
-    def __init__(self, model: nn.Module, ranges: Sequence[tuple[float, float]]) -> None:
+    def __init__(self, model: RequiredForce, ranges: Sequence[tuple[float, float]]) -> None:
         super().__init__()
         self.model = model
         low, high = torch.tensor(ranges, dtype=torch.float64).T
@@ -68,6 +119,7 @@ class GuardedForce(nn.Module):
             "least": low - reach,
             "most": high + reach,
             "middle": 0.5 * (low + high),
+            "width": (high - low).clamp(min=1e-9),
         }.items():
             self.register_buffer(name, value.clone())
         self.low: Tensor
@@ -75,7 +127,9 @@ class GuardedForce(nn.Module):
         self.least: Tensor
         self.most: Tensor
         self.middle: Tensor
+        self.width: Tensor
         self.dof = PLANAR.dof
+        self.fade, self.edge, self.effort = FADE, _EDGE, EFFORT
 
     def forward(self, nu_dot: Tensor, nu: Tensor) -> tuple[Tensor, Tensor]:
         """Return the force tau [B, 3] in N, N, N m and `outside` [B].
@@ -87,7 +141,14 @@ class GuardedForce(nn.Module):
         require_shape("nu", nu, [rows, self.dof])
         seen = torch.cat((nu_dot, nu), dim=-1).to(torch.float64)
         used = replaced(seen, self.low, self.high, self.least, self.most, self.middle)
-        force: Tensor = self.model(used[:, : self.dof], used[:, self.dof :])
+        believed, more = self.model.parts(used[:, : self.dof], used[:, self.dof :])
+        # how deep inside the range in widths, the least of all channels; negative outside
+        depth = torch.minimum((seen - self.low) / self.width, (self.high - seen) / self.width)
+        depth = torch.nan_to_num(depth, nan=-1.0).amin(dim=-1, keepdim=True)
+        force = believed + (1.0 + depth / self.fade).clamp(0.0, 1.0) * more
+        free = (depth / self.edge).clamp(0.0, 1.0)
+        most = self.effort * believed.abs() + free * (believed.abs() + more.abs())
+        force = torch.minimum(torch.maximum(force, -most), most)
         return force, ~within(seen, self.low, self.high).squeeze(-1)
 
 
@@ -111,6 +172,8 @@ def required_force(
             " this order, and no others"
         )
     model = model.to(torch.float64)
+    believed = BelievedForce(model.baseline, head.mass)
+    force = RequiredForce(believed, ResidualForce(head), mirrored=True)
     ranges = list(
         zip(
             (*head.lowest.tolist(), *spec.low[RANGE_VELOCITIES]),
@@ -118,11 +181,11 @@ def required_force(
             strict=True,
         )
     )
-    return RequiredForce(model.baseline, head).eval().requires_grad_(False), ranges
+    return force.eval().requires_grad_(False), ranges
 
 
 def export_feed_forward(
-    model: nn.Module,
+    model: RequiredForce,
     lag: dict[str, float] | None,
     ranges: Sequence[tuple[float, float]],
     file: Path,
@@ -130,9 +193,9 @@ def export_feed_forward(
     """Write (tau, outside) = F(nu_dot, nu) as TorchScript with its card.
 
     Args:
-        model: tau [B, 3] from nu_dot and nu [B, 3].
+        model: the believed force and its correction.
         lag: of the thrusters, for the card; None where it was not fitted.
-        ranges: of nu_dot and nu in the training data, six.
+        ranges: of nu_dot and nu in the data that identified the correction, six.
         file: where to write.
 
     Returns:
@@ -154,7 +217,7 @@ def export_feed_forward(
             200, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64
         ) * (high - low)
         with torch.no_grad():
-            eager = model(motion[:, : PLANAR.dof], motion[:, PLANAR.dof :])
+            eager, _ = guarded(motion[:, : PLANAR.dof], motion[:, PLANAR.dof :])
             scripted, _ = exported(motion[:, : PLANAR.dof], motion[:, PLANAR.dof :])
         share = float(((eager - scripted).abs().amax(0) / (eager.amax(0) - eager.amin(0))).max())
         if not share < 1e-9:
@@ -185,6 +248,16 @@ def export_feed_forward(
                     strict=True,
                 )
             },
+            "outside_the_training_range": (
+                f"the correction of the believed model fades out over {FADE:g} of the range's"
+                f" width; no axis commands more than {EFFORT:g} times the believed model's force"
+            ),
+            "mirror": (
+                "the correction is the mean of itself and its mirror image: a straight course needs"
+                " no sway force and no yaw moment beyond the believed model's"
+                if model.mirrored
+                else "the correction is as it was fitted, not the same to port and starboard"
+            ),
             "training_range": {
                 name: list(limits) for name, limits in zip(MOTION, ranges, strict=True)
             },

@@ -96,6 +96,35 @@ class Correction(nn.Module):
 
 
 @final
+class HullForce(nn.Module):
+    """The force [..., 3] that a believed hull says a motion needs."""
+
+    def __init__(self, hull: Fossen3) -> None:
+        super().__init__()
+        self.hull = hull
+
+    def forward(self, nu_dot: Tensor, nu: Tensor) -> Tensor:
+        """Return the force [..., 3] at nu_dot [..., 3] and nu [..., 3]."""
+        return self.hull.required(nu_dot, nu)
+
+
+@final
+class Corrections(nn.Module):
+    """The sum of corrections [..., 3] to a believed force."""
+
+    def __init__(self, corrections: Sequence[nn.Module] | nn.ModuleList) -> None:
+        super().__init__()
+        self.corrections = nn.ModuleList(corrections)
+
+    def forward(self, nu_dot: Tensor, nu: Tensor) -> Tensor:
+        """Return the force [..., 3] at nu_dot [..., 3] and nu [..., 3]."""
+        force = torch.zeros_like(nu)
+        for correction in self.corrections:
+            force = force + correction(nu_dot, nu)
+        return force
+
+
+@final
 class ForceModel(nn.Module):
     """A believed hull with a list of corrections: F_k = F_(k-1) + Theta phi, the chain of (3.26).
 
@@ -122,10 +151,14 @@ class ForceModel(nn.Module):
 
     def forward(self, nu_dot: Tensor, nu: Tensor) -> Tensor:
         """Return tau [..., 3] in N, N, N m that the motion needs in water at rest."""
-        tau = self.hull.required(nu_dot, nu)
+        tau: Tensor = self.hull.required(nu_dot, nu)
         for correction in self.corrections:
             tau = tau + correction(nu_dot, nu)
         return tau
+
+    def parts(self) -> tuple[HullForce, Corrections]:
+        """Return the believed hull and the sum of its corrections, as modules of their own."""
+        return HullForce(self.hull), Corrections(self.corrections)
 
     def at_heading(self, nu_dot: Tensor, nu: Tensor, psi: Tensor) -> Tensor:
         """Return tau [..., 3] that the thrusters have to give at heading psi [...] rad.
@@ -151,8 +184,6 @@ def accelerating(terms: Sequence[str], names: Sequence[str] = MOTION) -> dict[in
     """Return the numbers of the terms that are an acceleration, each with its axis.
 
     The other terms are free of accelerations.
-
-    The others are free of accelerations.
 
     Raises:
         ConfigError: where a term is not affine in nu_dot with a constant factor.

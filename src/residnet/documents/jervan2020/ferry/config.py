@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
@@ -17,6 +17,9 @@ from residnet.judge.still_fits import StillFitsConfig
 from residnet.runs.task import ComputingTask
 
 _Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
+
+Half = Literal["first", "second"]
+"""A half of the course."""
 
 
 class FerryModelConfig(ResidualModelConfig):
@@ -43,8 +46,8 @@ class FerrySettings(ComputingTask):
     Attributes:
         believed: vessel whose hull the controller believes in, by name or file.
         true: vessel that is simulated, by name or file.
-        course: waypoints and reference filter; the first half of the course identifies, the second
-            half tests.
+        course: waypoints and reference filter; one half of the course identifies, the other tests.
+        identify: which half identifies; the document's is the first.
         loop: controller and sampling.
         crossing: an operational crossing that is flown too; null for none.
         noise: noise on what is measured; null for none.
@@ -61,6 +64,7 @@ class FerrySettings(ComputingTask):
     believed: str = "milliampere"
     true: str = "milliampere_half"
     course: ReferenceFilterConfig
+    identify: Half = "first"
     loop: LoopConfig
     crossing: CrossingConfig | None = None
     noise: MotionNoise | None = None

@@ -20,7 +20,7 @@ from residnet.documents.jervan2020.forward import (
     missing_coefficients,
 )
 from residnet.documents.jervan2020.residual_pages import draw_model, fit_as_json
-from residnet.export.feed_forward import export_feed_forward
+from residnet.export.feed_forward import RequiredForce, export_feed_forward
 from residnet.report.figures.loop import draw_errors, draw_force_parts
 from residnet.runs.folder import RunFolder
 
@@ -53,11 +53,12 @@ def _keep_model(config: FerrySettings, found: Study, name: str, folder: RunFolde
     draw_model(
         name, model_config.fit, model_config.terms, model.fit, found.unmodelled, folder.figures
     )
-    motion = torch.cat((found.first.nu_dot, found.first.nu), dim=-1)
+    # the range of what identified the model, not of the whole course
+    motion = torch.cat((found.record.nu_dot, found.record.nu), dim=-1)[found.record.train]
     ranges = list(zip(motion.amin(0).tolist(), motion.amax(0).tolist(), strict=True))
-    export_feed_forward(
-        model.model, model.notes.get("lag"), ranges, folder.exports / f"{name}_feed_forward.pt"
-    )
+    force = RequiredForce(*model.model.parts(), mirrored=True)
+    file = folder.exports / f"{name}_feed_forward.pt"
+    export_feed_forward(force, model.notes.get("lag"), ranges, file)
     try:
         equations = forward_equations(config.believed, model.model, f"model {name}")
     except (ConfigError, FitError) as error:

@@ -8,7 +8,7 @@ import torch
 
 from residnet.control.motion.anticipation import Lag
 from residnet.core.layout import ACCELERATIONS, HEADING, POSE, VELOCITIES
-from residnet.documents.jervan2020.ferry.config import FerrySettings
+from residnet.documents.jervan2020.ferry.config import FerrySettings, Half
 from residnet.documents.jervan2020.ferry.flights import Flight, MotionNoise
 from residnet.documents.jervan2020.ferry.identification import FerryModel, identify
 from residnet.documents.jervan2020.residual_model import Record, remaining
@@ -39,6 +39,7 @@ class Study:
 
     Attributes:
         first: the course with the believed model, from which the models are identified.
+        record: its log, of which one half identifies the models and the other tests them.
         unmodelled: mean square of the believed model's residual on the test half, by axis in N^2,
             N^2, (N m)^2.
         models: fitted models by name.
@@ -49,6 +50,7 @@ class Study:
     """
 
     first: Flight
+    record: Record
     unmodelled: list[float]
     models: dict[str, FerryModel]
     courses: dict[str, Flight]
@@ -57,16 +59,18 @@ class Study:
     later: dict[str, Update]
 
 
-def record_of(flight: Flight, interval: float, noise: MotionNoise) -> Record:
-    """Return the log of a course with a fold for each segment; its first half identifies.
+def record_of(flight: Flight, interval: float, noise: MotionNoise, half: Half = "first") -> Record:
+    """Return the log of a course with a fold for each segment; one half identifies.
 
     Args:
         flight: the course as it was flown.
         interval: time from one waypoint to the next in s.
         noise: what is known of the sensors.
+        half: of the course, which identifies.
     """
     fold = torch.div(flight.t + 1e-9, interval, rounding_mode="floor").long()
     train = torch.arange(len(flight.t)) < len(flight.t) // 2
+    train = train if half == "first" else ~train
     return Record(
         flight.t,
         flight.measured[:, POSE],
@@ -89,7 +93,8 @@ def study(config: FerrySettings) -> Study:
     ferry = config.ferry()
     believed = ForceModel(ferry.believed.hull)
     first = ferry.fly_course(config.course, [(believed, None)])[0]
-    record = record_of(first, config.course.interval, config.noise or MotionNoise())
+    noise = config.noise or MotionNoise()
+    record = record_of(first, config.course.interval, noise, config.identify)
     residual = believed.residual(record.command, record.nu_dot, record.nu, record.pose[:, HEADING])
     models: dict[str, FerryModel] = {}
     for name, model_config in config.models.items():
@@ -127,7 +132,9 @@ def study(config: FerrySettings) -> Study:
             )
         )
     later = update(config, models, record, believed) if config.later is not None else {}
-    return Study(first, mse(residual[~record.train]), models, courses, crossings, alone, later)
+    return Study(
+        first, record, mse(residual[~record.train]), models, courses, crossings, alone, later
+    )
 
 
 def update(
@@ -148,7 +155,8 @@ def update(
     )
     out: dict[str, Update] = {}
     for (name, model), flight in zip(known.items(), flights, strict=True):
-        log = record_of(flight, config.course.interval, config.noise or MotionNoise())
+        noise = config.noise or MotionNoise()
+        log = record_of(flight, config.course.interval, noise, config.identify)
         before = remaining(model.model, model.lag, record)[~record.train]
         now = remaining(model.model, model.lag, log)
         verdict = still_fits(config.check_fit, before, now, log.command, log.fold)

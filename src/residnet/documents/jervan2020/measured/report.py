@@ -33,41 +33,66 @@ def verdict(results: Results) -> list[str]:
         believed = next(row for row in rows if row["model"] == "believed")
         sentences.append(
             f"{force.capitalize()} force: the believed model is better than no force"
-            f" {_where(better(believed, 'zero'))}."
+            f" {_where(better(believed, 'zero'))}{_worse_than_nothing(believed)}."
         )
-        sentences += _gains(fits)
+        sentences += [*_gains(fits), _advice(fits)]
     return sentences + _lags(results)
 
 
+def _worse_than_nothing(believed: Results) -> str:
+    """Return where the believed model is reliably worse than no force, for the same sentence."""
+    bounds = believed["minus_zero"]["ci95"][:3]
+    names = [axis for axis, limits in zip(AXES, bounds, strict=True) if limits[0] > 0]
+    return f", and worse than no force in {listed(names)}" if names else ""
+
+
 def _gains(fits: Sequence[Results]) -> list[str]:
-    """Return sentences on which regressions are better than the believed model alone."""
-    winners = [row for row in fits if better(row, "believed")[3]]
+    """Return sentences on which regressions are better than what needs none."""
+    best = "the better of no force and the believed model on each axis"
+    winners = [row for row in fits if better(row, "reference")[3]]
     if not winners:
         sentences = [
-            f"None of the {len(fits)} regressions is better than the believed model alone: every"
-            " interval of the mean over the axes reaches zero."
+            f"None of the {len(fits)} regressions is better than {best}: every interval of the mean"
+            " over the axes reaches zero."
         ]
     else:
-        gain = -100 * min(row["minus_believed"]["mean"][3] for row in winners)
+        gain = -100 * min(row["minus_reference"]["mean"][3] for row in winners)
         sentences = [
-            f"Of {len(fits)} regressions, these are better than the believed model alone in the"
-            f" mean over the axes: {listed([row['model'] for row in winners])}. The largest gain"
-            f" is {fixed(gain, 1)} % of the force's mean square."
+            f"Of {len(fits)} regressions, these are better than {best} in the mean over the axes:"
+            f" {listed([row['model'] for row in winners])}. The largest gain is {fixed(gain, 1)} %"
+            " of the force's mean square."
         ]
     single = [
         f"{row['model']} ({_where(flags)})"
         for row in fits
-        if any(flags := better(row, "believed")[:3])
+        if any(flags := better(row, "reference")[:3])
     ]
     if single:
         sentences.append(
             f"Better on single axes: {listed(single)}; of {3 * len(fits)} such comparisons, one in"
             " forty comes out so by chance."
         )
-    worse = [row["model"] for row in fits if row["minus_believed"]["ci95"][3][0] > 0]
+    worse = [row["model"] for row in fits if row["minus_reference"]["ci95"][3][0] > 0]
     if worse:
-        sentences.append(f"Worse than the believed model alone: {listed(worse)}.")
+        sentences.append(f"Worse than that: {listed(worse)}.")
     return sentences
+
+
+def _advice(fits: Sequence[Results]) -> str:
+    """Return the sentence that says what to use on each axis.
+
+    A regression is named where it is reliably better on that axis; of several, the one with the
+    least error. Otherwise it is the better of no force and the believed model.
+    """
+    names = {"zero": "no force at all", "believed": "the believed model alone"}
+    chosen: dict[str, list[str]] = {}
+    for axis, name in enumerate(AXES):
+        sure = [row for row in fits if better(row, "reference")[axis]]
+        best = min(sure, key=lambda row: float(row["mse"][axis]), default=None)
+        use = names[fits[0]["reference"][axis]] if best is None else str(best["model"])
+        chosen.setdefault(use, []).append(name)
+    parts = [f"{use} in {listed(axes)}" for use, axes in chosen.items()]
+    return f"Recommended: {', '.join(parts)}."
 
 
 def _where(flags: Sequence[bool]) -> str:
@@ -250,7 +275,7 @@ def _models(config: ForceSettings, results: Results, rows: Sequence[Results]) ->
             "model",
             *("surge N^2", "sway N^2", "yaw (N m)^2"),
             *("surge", "sway", "yaw") * 2,
-            *("mean", "95 % interval", "segments better %"),
+            *("mean", "95 % interval", "segments better %") * 2,
             "chosen by the estimator",
         ],
         caption="Published: the share that the document's model of that kind left of its believed"
@@ -260,6 +285,7 @@ def _models(config: ForceSettings, results: Results, rows: Sequence[Results]) ->
             ("% of zero", 3),
             ("% of the believed model's", 3),
             ("mean over axes less believed, % of zero", 3),
+            ("the same less the better of zero and believed on each axis", 3),
             ("", 1),
         ],
     )
@@ -274,6 +300,7 @@ def _models(config: ForceSettings, results: Results, rows: Sequence[Results]) ->
             cells.append(beside_published(100 * row["mse"][axis] / base[axis], left, 3))
         difference = row.get("minus_believed")
         cells += [Cell("")] * 3 if difference is None else _difference(difference)
+        cells += _difference(row["minus_reference"])
         notes = "" if model_config is None else notes_text(results["models"][row["model"]]["all"])
         table.add(row["model"], [*cells, Cell(notes, mark="text")])
     return table

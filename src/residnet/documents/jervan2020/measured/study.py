@@ -23,6 +23,9 @@ from residnet.documents.jervan2020.residual_model import Record, fit_model
 from residnet.judge.bootstrap import Blocks, intervals
 from residnet.physics.force_model import ForceModel
 
+_NULLS = ("zero", "believed")
+"""What needs no regression: no force at all, and the believed hull alone."""
+
 
 @dataclass(frozen=True)
 class Judged:
@@ -172,7 +175,9 @@ def table(
 ) -> list[dict[str, Any]]:
     """Return the rows of all models, grouped by the force that judges them.
 
-    Every group begins with `zero` (no force at all) and `believed` on the same samples.
+    Every group begins with `zero` (no force at all) and `believed` on the same samples. `reference`
+    is the better of the two on each axis: a believed model may be worse than no force, and what is
+    better than it is then no gain yet.
     """
     groups: dict[str, list[str]] = {}
     for name in judged:
@@ -188,6 +193,8 @@ def table(
             "zero": by_segment(measured.force(force)),
             "believed": by_segment(unmodelled(measured, believed, force)),
         }
+        choice = [min(_NULLS, key=lambda name: float(errors[name][:, a].mean())) for a in range(3)]
+        reference = np.stack([errors[name][:, a] for a, name in enumerate(choice)], axis=1)
         errors |= {name: by_segment(judged[name].error) for name in names}
         level = np.maximum(errors["zero"].mean(0), 1e-300)
         for name, error in errors.items():
@@ -198,11 +205,13 @@ def table(
                     "mse": error.mean(0).tolist(),
                     "of_zero": (error.mean(0) / level).tolist(),
                     "segments": len(segments),
+                    "reference": choice,
                     **{
                         f"minus_{other}": _difference((error - errors[other]) / level, parts)
-                        for other in ("zero", "believed")
+                        for other in _NULLS
                         if other != name
                     },
+                    "minus_reference": _difference((error - reference) / level, parts),
                 }
             )
     return rows
@@ -223,7 +232,7 @@ def better(row: Mapping[str, Any], than: str) -> list[bool]:
 
     Args:
         row: row of the model.
-        than: `zero` or `believed`.
+        than: `zero`, `believed`, or `reference`, the better of the two on each axis.
 
     Returns:
         One flag each for surge, sway, yaw and the mean over the axes.
