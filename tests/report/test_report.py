@@ -24,13 +24,18 @@ from residnet.report.run_reader import RunFiles
 from residnet.report.sections.fit.coefficients import term_unit
 
 
+def shown(run: Path) -> str:
+    """Return the text of the page, with spaces where numbers keep to their units."""
+    return write_fit_page(RunFiles(run)).read_text().replace("\u00a0", " ")
+
+
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
     return made_run(tmp_path / "made")
 
 
 def test_free_run_numbers_are_those_of_metrics(run: Path) -> None:
-    text = write_fit_page(RunFiles(run)).read_text()
+    text = shown(run)
     cells = Page(text).table("model", "plsr (selected)")
     # train and test of u, v, r, then nrmse with its interval, position, heading, diverged; the
     # protocol that selects comes first
@@ -53,15 +58,13 @@ def test_free_run_numbers_are_those_of_metrics(run: Path) -> None:
 
 
 def test_manoeuvres_stand_apart(run: Path) -> None:
-    cells = Page(write_fit_page(RunFiles(run)).read_text()).table(
-        "manoeuvre, model", "turning: baseline"
-    )
+    cells = Page(shown(run)).table("manoeuvre, model", "turning: baseline")
     assert cells["turning: baseline"][1] == "0.110"
     assert cells["zigzag: baseline"][1] == "0.120"
 
 
 def test_verdict(run: Path) -> None:
-    page = html.unescape(write_fit_page(RunFiles(run)).read_text()).replace("\u00a0", " ")
+    page = html.unescape(shown(run))
     verdict = re.search(r'<section class="verdict".*?</section>', page, re.DOTALL)
     assert verdict is not None
     assert "On test data model plsr is" in verdict[0]
@@ -94,7 +97,7 @@ def test_bad_news_is_told(run: Path) -> None:
             line["rmse"] = line["rmse"] | {"v": 0.06}
             line["nrmse"] = line["nrmse"] | {"mean": 0.3}
     write_json(run / "metrics.json", content)
-    page = html.unescape(write_fit_page(RunFiles(run)).read_text()).replace("\u00a0", " ")
+    page = html.unescape(shown(run))
     assert (
         "DIVERGED on test data, counted with the error of held velocities: plsr 2 of 6 (T30), plsr"
         " 2 of 6 (whole)." in page
@@ -105,7 +108,7 @@ def test_bad_news_is_told(run: Path) -> None:
 
 
 def test_parameters_heads_data_and_provenance(run: Path) -> None:
-    text = write_fit_page(RunFiles(run)).read_text()
+    text = shown(run)
     page = Page(text)
     terms = page.table("term", "u′: u")
     assert terms["u′: u"] == ["−0.914", "0.076", "12", "1/s"]
@@ -215,7 +218,7 @@ def compared(change: dict[str, float]) -> dict[str, Any]:
 def test_how_good_where_it_fails_and_what_limits_it(run: Path) -> None:
     write_json(run / "metrics.json", compared({"turning": 1.2}))
     write_json(run / "limits.json", limits_file())
-    text = write_fit_page(RunFiles(run)).read_text()
+    text = shown(run)
     cells = Page(text).table("windows of", "all")
     # plsr has 0.08, 0.8 times its reference, so that has 0.1
     assert cells["all"] == ["6", "0.0800", "0.100", "−20 %", "−0.0200", "−0.0300 to −0.0100"]
@@ -275,7 +278,7 @@ def test_no_repeats_no_reference_and_no_interval_are_said(run: Path) -> None:
         "logs": 0,
     }
     write_json(run / "limits.json", found)
-    text = html.unescape(write_fit_page(RunFiles(run)).read_text())
+    text = html.unescape(shown(run))
     assert "plsr: NRMSE 0.0800; too few logs for an interval." in text
     assert "hold no two stretches as long as a window" in text
     assert "worse by more than 5 %" not in text
@@ -283,10 +286,10 @@ def test_no_repeats_no_reference_and_no_interval_are_said(run: Path) -> None:
 
 def test_standard_errors_of_a_refitted_baseline_are_named(run: Path) -> None:
     note = "values and standard errors are those after the refit through rollouts"
-    assert note not in write_fit_page(RunFiles(run)).read_text()
+    assert note not in shown(run)
     path = run / "models" / "baseline" / "fit.json"
     write_json(path, json.loads(path.read_text()) | {"refit": {"iterations": 3}})
-    assert note in write_fit_page(RunFiles(run)).read_text()
+    assert note in shown(run)
 
 
 def test_accelerations_of_logs_stand_log_by_log(run: Path) -> None:
@@ -301,11 +304,11 @@ def test_accelerations_of_logs_stand_log_by_log(run: Path) -> None:
     offsets = [
         {"log": log, "axis": axis, "value": value} | own for (log, axis), value in values.items()
     ]
-    assert "Accelerations of each training log" not in write_fit_page(RunFiles(run)).read_text()
+    assert "Accelerations of each training log" not in shown(run)
     write_json(
         path, json.loads(path.read_text()) | {"refit": {"iterations": 3}, "offsets": offsets}
     )
-    text = write_fit_page(RunFiles(run)).read_text()
+    text = shown(run)
     cells = Page(text).table("log", "first")
     assert cells["first"] == ["−0.00055", "0.00010", "0.00015", "0.00010"]
     assert cells["second"] == ["0", "0.00010", "0.00030", "0.00010"]
@@ -353,7 +356,7 @@ def test_physical_sanity_is_shown_where_models_can_be_loaded(run: Path) -> None:
     # surge that feeds itself
     of_kind(model.baseline, RegressorBaseline).theta.data[0, 0] = 0.3
     save_model(run / "models" / "plsr", spec, model)
-    page = html.unescape(write_fit_page(RunFiles(run)).read_text())
+    page = html.unescape(shown(run))
     assert "Physical sanity" in page
     assert (
         "plsr, damping: not damped (wrong sign or none): u at rest, v at rest, r at rest, u at"
@@ -366,7 +369,7 @@ def test_a_folder_of_evaluate_has_other_splits_and_no_models(tmp_path: Path) -> 
     for path in (folder / "models").rglob("*.json"):
         path.unlink()
     write_json(folder / "metrics.json", metrics(("external",), ("zero", "baseline", "plsr")))
-    text = write_fit_page(RunFiles(folder)).read_text()
+    text = shown(folder)
     page = Page(text)
     assert page.table("model", "plsr (selected)")["plsr (selected)"][0] == "0.0400|−60 %"
     assert "that no fit has seen" in text
@@ -388,7 +391,7 @@ def test_metrics_alone_make_a_report(tmp_path: Path) -> None:
         if line["manoeuvre"] == "all"
     ]
     write_json(tmp_path / "metrics.json", content)
-    text = write_fit_page(RunFiles(tmp_path)).read_text()
+    text = shown(tmp_path)
     Page(text)
     assert "of the validation data (not unseen: read with care)" in text
     assert "Provenance" not in text
