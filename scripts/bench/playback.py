@@ -1,0 +1,274 @@
+"""Plays the recorded commands of a manoeuvre back through every export format of a model.
+
+    python scripts/bench/playback.py RUN[:MODEL] ... [--seconds 60] [--log NAME] [--no-aoti]
+    python scripts/bench/playback.py --fits
+
+A run is the folder of a finished fit; MODEL is one of its models, else the selected one. The inputs
+are those of a recorded zigzag of its free runs, or of the longest log where there is none. `--fits`
+makes short fits first: a learned WAM-V (PLSR, LSTM and their mean), its equation model, and where
+RESIDNET_DATA has the logs KVLCC2 (mmg) and a tanker's LSTM with wind.
+
+Prints, for each format, the largest difference of any state from the model itself as a share of
+that state's range: formats in single precision against the model in float32, C in double precision,
+CasADi and both kinds of FMU against the model in float64. The exit code is 1 where a difference is
+larger than 1e-5 (single) or 1e-12 (double).
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import sys
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+
+from residnet.core.errors import ResidnetError
+from residnet.core.names import STATE
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.learned import chosen_model
+from residnet.dynamics.rollout import Rollout
+from residnet.dynamics.store import ModelSpec, load_model
+from residnet.export import exporter
+from residnet.export.aoti import AotiModel
+from residnet.export.c.compiled import CompiledModel, compile_shared
+from residnet.export.c.source import identifier
+from residnet.export.casadi_function import CasadiModel
+from residnet.export.contract import DOUBLE, SINGLE, Stepped
+from residnet.export.onnx_file import OnnxModel
+
+ZIGZAG = ("zigzag", "zz", "_z_")
+"""Parts of the names of logs that are zigzags."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What is played back: the state that a log starts from, and its inputs.
+
+    Attributes:
+        name: of the log.
+        x0: state [6].
+        w: inputs [T, m].
+    """
+
+    name: str
+    x0: np.ndarray
+    w: np.ndarray
+
+
+def recording(run: Path, spec: ModelSpec, seconds: float, log: str) -> Recording:
+    """Return the recorded commands of a log of a run's free runs.
+
+    Raises:
+        ValueError: where the run's free runs hold no such log, or no inputs.
+    """
+    files = sorted(run.glob("rollouts/*/*.parquet"))
+    named = [file for file in files if file.stem == log] if log else files
+    zigzags = [f for f in named if any(word in f.stem.lower() for word in ZIGZAG)]
+    if not named:
+        raise ValueError(f"{run}: its free runs hold no log '{log}'")
+    best: Recording | None = None
+    columns = [f"input_{name}" for name in spec.signals.columns]
+    for file in zigzags or named:
+        table = pd.read_parquet(file)
+        missing = [name for name in columns if name not in table]
+        if missing:
+            raise ValueError(f"{file}: holds no {missing[0]}; run the fit again")
+        # windows follow each other; each sample of the log counts once
+        once = table.drop_duplicates("t").sort_values("t")
+        once = once[np.isfinite(once[[*STATE, *columns]]).all(axis=1)]
+        once = once[once["t"] <= once["t"].iloc[0] + seconds]
+        if best is None or len(once) > len(best.w) + 1:
+            x0 = once[list(STATE)].iloc[0].to_numpy(float)
+            best = Recording(file.stem, np.r_[0.0, 0.0, x0[2:]], once[columns].to_numpy(float))
+    assert best is not None
+    return best
+
+
+def eager(model: HybridDynamics, given: Recording, dtype: torch.dtype) -> np.ndarray:
+    """Return the states [T + 1, 6] of the model itself."""
+    model = copy.deepcopy(model).to(dtype).eval()
+    x0, w = (torch.tensor(part, dtype=dtype).unsqueeze(0) for part in (given.x0, given.w))
+    with torch.no_grad():
+        return np.asarray(Rollout(model)(x0, w, model.initial_state(1).to(dtype))[0][0].numpy())
+
+
+def played(stepped: Stepped, memory: int, given: Recording, kind: Any) -> np.ndarray:
+    """Return the states [T + 1, 6] of a file that has steps."""
+    x, s = given.x0.astype(kind), np.zeros(memory, kind)
+    path = [x]
+    for w in given.w.astype(kind):
+        x, s, _ = stepped.step(x, w, s)
+        path.append(x)
+    return np.stack(path)
+
+
+class Scripted:
+    """A TorchScript file with the steps of other formats."""
+
+    def __init__(self, file: Path) -> None:
+        self.module: Any = torch.jit.load(str(file))
+
+    def step(self, x: Any, w: Any, s: Any) -> tuple[Any, Any, bool]:
+        with torch.no_grad():
+            after, memory, outside = self.module.step(
+                *(torch.from_numpy(np.asarray(part, np.float32))[None] for part in (x, w, s))
+            )
+        return after[0].numpy(), memory[0].numpy(), bool(outside[0])
+
+    def warmup(self, y: Any, w: Any) -> Any:
+        """Not used: a playback starts without a past."""
+        raise NotImplementedError
+
+
+def unit_played(file: Path, spec: ModelSpec, given: Recording) -> np.ndarray:
+    """Return the states [T + 1, 6] of a co-simulation unit, stepped by FMPy."""
+    import fmpy
+
+    names = spec.signals.columns
+    t = spec.dt * np.arange(len(given.w) + 1)
+    signal = np.zeros(len(t), dtype=[("time", float), *((name, float) for name in names)])
+    signal["time"] = t
+    for column, name in enumerate(names):
+        signal[name] = np.r_[given.w[:, column], given.w[-1, column]]
+    start = {f"{name}_start": float(v) for name, v in zip(STATE, given.x0, strict=True)}
+    table = fmpy.simulate_fmu(
+        str(file), stop_time=float(t[-1]), step_size=spec.dt, output_interval=spec.dt,
+        start_values=start, input=signal, output=list(STATE),
+    )  # fmt: skip
+    return np.stack([table[name] for name in STATE], axis=1)
+
+
+def compiled(file: Path, folder: Path, spec: ModelSpec, memory: int, double: bool) -> CompiledModel:
+    prefix = identifier(spec.name)
+    flags = [f"-D{prefix.upper()}_DOUBLE"] if double else []
+    library = compile_shared([file], folder / f"{double}.so", flags)
+    return CompiledModel(library, prefix, memory, "double" if double else "single")
+
+
+def shares(spec: ModelSpec, model: HybridDynamics, given: Recording, aoti: bool) -> dict[str, Any]:
+    """Return the worst share of a state's range by format and precision, or why there is none."""
+    wanted = {dtype: eager(model, given, dtype) for dtype in (torch.float32, torch.float64)}
+    memory = model.n_state
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+
+        def written(kind: str) -> Path:
+            found = exporter(kind)
+            file = folder / kind / f"boat{found.suffix}"
+            found.export(spec, copy.deepcopy(model), file, [])
+            return file
+
+        def steps(of: Callable[[Path], Stepped], kind: str, number: Any) -> np.ndarray:
+            return played(of(written(kind)), memory, given, number)
+
+        ways: dict[str, tuple[torch.dtype, Callable[[], np.ndarray]]] = {
+            "torchscript": (torch.float32, lambda: steps(Scripted, "torchscript", np.float32)),
+            "onnx": (
+                torch.float32,
+                lambda: steps(lambda f: OnnxModel(f, spec, model), "onnx", np.float32),
+            ),
+            "c, single": (
+                torch.float32,
+                lambda: steps(lambda f: compiled(f, folder, spec, memory, False), "c", np.float32),
+            ),
+            "c, double": (
+                torch.float64,
+                lambda: steps(lambda f: compiled(f, folder, spec, memory, True), "c", np.float64),
+            ),
+            "casadi": (
+                torch.float64,
+                lambda: steps(lambda f: CasadiModel(f, spec, model), "casadi", np.float64),
+            ),
+            "fmu": (torch.float64, lambda: unit_played(written("fmu"), spec, given)),
+            "fmu2": (torch.float64, lambda: unit_played(written("fmu2"), spec, given)),
+        }
+        if aoti:
+            ways["aoti"] = (
+                torch.float32,
+                lambda: steps(lambda f: AotiModel(f, spec, model), "aoti", np.float32),
+            )
+        out: dict[str, Any] = {}
+        for way, (dtype, play) in ways.items():
+            try:
+                states = play()
+            except ResidnetError as error:
+                out[way] = str(error)
+                continue
+            span = np.maximum(np.ptp(wanted[dtype], axis=0), 1e-6)
+            apart = np.abs(states - wanted[dtype]).max(axis=0) / span
+            allowed = SINGLE if dtype == torch.float32 else DOUBLE
+            out[way] = (float(apart.max()), STATE[int(apart.argmax())], allowed)
+        return out
+
+
+def fits(folder: Path) -> list[str]:
+    """Make short fits of the five models; returns what is played back of them."""
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "ci"))
+    import short_configs
+    from short_configs import Short
+
+    mean = ("heads={plsr: {kind: plsr}, lstm: {kind: lstm, hidden_size: 8}}", "~training.mlp")
+    short_configs.SHORT["quickstart"] = Short(
+        (*short_configs.SHORT["quickstart"].overrides[:3], *short_configs._trained("lstm"), *mean,
+         "ensembles={mean: [plsr, lstm]}")
+    )  # fmt: skip
+    wanted = {
+        "quickstart": ("plsr", "lstm", "mean"),
+        "wam_v_equations": ("residual",),
+        "kvlcc2": ("mmg",),
+        "esso_osaka": ("lstm",),
+    }
+    runs = []
+    for name, models in wanted.items():
+        result = short_configs.carry_out(name, folder)
+        print(result.line(), file=sys.stderr, flush=True)
+        if result.state == "ok":
+            runs += [f"{folder / name}:{model}" for model in models]
+    return runs
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Print the table; return 1 where a format differs by more than it may."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("runs", nargs="*", metavar="RUN[:MODEL]")
+    parser.add_argument("--fits", action="store_true", help="make short fits first")
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--log", default="", help="name of the log; a zigzag where not given")
+    parser.add_argument("--no-aoti", action="store_true")
+    given = parser.parse_args(arguments)
+    torch.set_num_threads(1)
+    wrong = 0
+    with tempfile.TemporaryDirectory() as name:
+        runs = [*given.runs, *(fits(Path(name)) if given.fits else [])]
+        print(f"{'run: model':44}{'log':22}{'format':13}{'share of range':>15}  state")
+        for entry in runs:
+            place, _, model_name = entry.partition(":")
+            run = Path(place)
+            spec, model = load_model(run / "models" / chosen_model(run, model_name or "selected"))
+            log = recording(run, spec, given.seconds, given.log)
+            for way, found in shares(spec, model, log, not given.no_aoti).items():
+                head = f"{run.name + ': ' + spec.name:44}{log.name:22}{way:13}"
+                if isinstance(found, str):
+                    print(f"{head} refused: {found}", flush=True)
+                    continue
+                share, state, allowed = found
+                bad = not share <= allowed
+                wrong += bad
+                print(f"{head}{share:15.2e}  {state}{'  TOO MUCH' if bad else ''}", flush=True)
+    return int(wrong > 0)
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main(sys.argv[1:]))
+    except (ResidnetError, ValueError) as error:
+        sys.exit(f"playback.py: {error}")
