@@ -15,7 +15,8 @@ from residnet.core.config import validate
 from residnet.core.progress import Progress, listen
 from residnet.data.simulated.trials import SimulatedTrials
 from residnet.data.sources import read_logs
-from residnet.identification.fit import Identified, fit
+from residnet.identification.fit import fit
+from residnet.identification.identified import Identified
 from residnet.identification.models import FittedModel
 from residnet.identification.prepared import PreparedSplits, prepare_logs
 from residnet.identification.settings import FitSettings
@@ -113,7 +114,7 @@ def test_finished_heads_are_taken_from_the_store(
     heard: list[Progress] = []
     with listen(heard.append):
         again = fit(logs, settings, store=store)
-    assert again["lstm"] is identified["lstm"]
+    assert again["lstm"].model is identified["lstm"].model
     assert again["baseline"] is not identified["baseline"]
     assert not any(event.stage == "training lstm" for event in heard)
     assert any("validation free-run error" in event.message for event in heard)

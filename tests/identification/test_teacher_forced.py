@@ -12,8 +12,9 @@ from residnet.data.prepare import channels, samples
 from residnet.data.simulated.trials import SimulatedTrials
 from residnet.data.sources import read_logs
 from residnet.data.windows import WindowStore
-from residnet.identification.fit import Identified, fit
+from residnet.identification.fit import fit
 from residnet.identification.goodness import goodness_rows
+from residnet.identification.identified import Identified
 from residnet.identification.prepared import PreparedSplits, prepare_logs
 from residnet.identification.settings import FitSettings
 from residnet.identification.teacher_forced import residual_table, teacher_forced, term_table

@@ -172,7 +172,7 @@ def with_step(
     with torch.no_grad():
         other.baseline.theta.view(-1)[problem.active[place]] += step
     return float(
-        module._level(other, problem, offsets)[0]
+        module.level_of(other, problem, offsets)[0]
         + module._prior_cost(problem, other.baseline, problem.share(LEVEL), offsets)
     )
 
@@ -208,8 +208,8 @@ def normal_equations(
     model: HybridDynamics, problem: Problem, offsets: module.Offsets
 ) -> module.Arrow:
     assert isinstance(model.baseline, RegressorBaseline)
-    squares = module._level(model, problem, offsets)[1]
-    return module._normal_equations(model, problem, model.baseline, LEVEL, squares, offsets)
+    squares = module.level_of(model, problem, offsets)[1]
+    return module.normal_equations(model, problem, model.baseline, LEVEL, squares, offsets)
 
 
 def test_normal_equations_hold_half_the_gradient_of_the_cost() -> None:

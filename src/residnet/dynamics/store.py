@@ -22,6 +22,7 @@ from residnet.core.errors import UsageError
 from residnet.core.files import read_json, whole
 from residnet.core.names import VELOCITY, nearest
 from residnet.core.version import __version__
+from residnet.dynamics.band import BandTable
 from residnet.dynamics.base import Integrator
 from residnet.dynamics.ensemble import mean_of
 from residnet.dynamics.hybrid import HybridDynamics
@@ -65,6 +66,7 @@ class ModelSpec(Stored):
             ends.
         low: smallest u, v, r and inputs of the training data, SI, [3 + m].
         high: their largest.
+        band: how far free runs may be off; None where none was calibrated.
         members: of an ensemble, whose accelerations are averaged; its own baseline and head are
             then empty.
     """
@@ -81,6 +83,7 @@ class ModelSpec(Stored):
     hold: Literal["start", "mean"] = "start"
     low: tuple[float, ...]
     high: tuple[float, ...]
+    band: BandTable | None = None
     members: tuple[ModelSpec, ...] = ()
 
     def build(self) -> HybridDynamics:

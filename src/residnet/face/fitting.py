@@ -17,16 +17,20 @@ from residnet.face.models import Model
 from residnet.face.runs import FreeRuns, free_run
 from residnet.face.values import PartGiven, described, hearing, named_parts, part, plain
 from residnet.identification.currents import through_currents
-from residnet.identification.fit import Identified
 from residnet.identification.fit import fit as identify
+from residnet.identification.identified import Identified
 from residnet.identification.prepared import require_window
 from residnet.identification.settings import FitSettings
+from residnet.judge.bands.config import BandsConfig
 from residnet.judge.tables import metrics_table
 from residnet.judge.verdict.selection import Selection
 from residnet.judge.verdict.sentences import Evidence, verdict
 
 if TYPE_CHECKING:
     import pandas as pd
+
+
+_BANDS = BandsConfig()
 
 
 @final
@@ -128,6 +132,7 @@ def fit(
     training: Mapping[str, Any] | None = None,
     refit: Mapping[str, Any] | None = None,
     current: Mapping[str, Any] | None = None,
+    bands: Mapping[str, Any] | BandsConfig | None = _BANDS,
     integrator: str = "rk4",
     seed: int = 0,
     threads: int = 1,
@@ -149,6 +154,8 @@ def fit(
         training: of network heads by the name of the head; `epochs` and so on, as YAML has them.
         refit: baselines whose coefficients are moved through rollouts.
         current: the logs ran in constant currents that are estimated first.
+        bands: how far free runs may be off, calibrated over logs that were left out: `level`,
+            `folds` and so on, as YAML has them; None for none.
         integrator: of the models: rk4, heun, euler or semi_implicit_euler.
         seed: of weights and batches.
         threads: of PyTorch; one is fastest for these small products, and part of what makes a fit
@@ -181,6 +188,7 @@ def fit(
                 "ensembles": ensembles or {},
                 "training": training or {},
                 "evaluation": data.evaluation,
+                "bands": bands,
             }
         ),
         FitSettings,

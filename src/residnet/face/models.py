@@ -21,6 +21,8 @@ from residnet.dynamics.store import ModelSpec, load_model, save_model
 from residnet.export import exporter
 from residnet.face.values import PathGiven, described, path
 from residnet.identification.models import FittedModel
+from residnet.judge.bands.band import Band
+from residnet.judge.bands.file import read_bands
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -262,7 +264,13 @@ def load(folder: PathGiven, name: str | None = None) -> Model:
     elif not (place / "model.json").is_file() and (place / "models").is_dir():
         place = place / "models" / chosen_model(place, "selected")
     spec, module = load_model(place)
-    return Model(FittedModel(spec, module, _notes(place)))
+    return Model(FittedModel(spec, module, _notes(place), bands=_bands(place)))
+
+
+def _bands(folder: Path) -> dict[str, Band]:
+    """Return the bands that a run holds of a model in its folder; none outside of a run."""
+    file = folder.parent.parent / "bands.json"
+    return read_bands(read_json(file)).get(folder.name, {}) if file.is_file() else {}
 
 
 def _notes(folder: Path) -> dict[str, Any]:

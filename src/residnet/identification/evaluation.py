@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from residnet.data.sources import MeasuredLogs
 from residnet.dynamics.simulated import PlantDynamics
 from residnet.identification.models import FittedModel
 from residnet.identification.references import references
+from residnet.judge.bands.band import Bands
 from residnet.judge.config import EvaluationConfig
 from residnet.judge.freerun import Candidate, FreeRun, free_run
 from residnet.judge.limits import limits
@@ -35,6 +36,7 @@ class Evaluation:
         runs: free runs by protocol; protocols without a window are left out.
         rows: of metrics.json, without `selected`.
         limits: contents of limits.json by protocol.
+        bands: that the models were judged with, by model and protocol.
     """
 
     split: str
@@ -42,6 +44,7 @@ class Evaluation:
     runs: list[FreeRun]
     rows: list[dict[str, Any]]
     limits: dict[str, Any]
+    bands: Bands = field(default_factory=dict)
 
     @property
     def metrics(self) -> pd.DataFrame:
@@ -65,7 +68,8 @@ def evaluate(
         step: of the grid in s.
         limit: of |u, v, r| [3] beyond which a free run has diverged.
     """
-    out = Evaluation(logs[0].split, logs, [], [], {})
+    bands = {model.name: model.bands for model in models}
+    out = Evaluation(logs[0].split, logs, [], [], {}, bands)
     scales = config.scales.named()
     for name, protocol in config.protocols.items():
         windows = [
@@ -103,6 +107,7 @@ def candidates(
             entry.model,
             reference=compared_with.get(name),
             ranges=entry.spec.ranges,
+            bands=entry.bands,
         )
         for name, entry in models.items()
     ]

@@ -2,85 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
-
-import numpy as np
+from collections.abc import Mapping, Sequence
 
 from residnet.core.progress import say
 from residnet.data.prepare import Prepared
-from residnet.data.simulated.trials import SimulatedTrials
-from residnet.data.sources import MeasuredLogs
-from residnet.identification.evaluation import Evaluation, candidates, evaluate
+from residnet.identification.bands.calibrating import calibrate_bands
 from residnet.identification.fitter import Fitter
+from residnet.identification.identified import Identified
 from residnet.identification.models import FitStore, FittedModel, NoStore
-from residnet.identification.selecting import examine, select
 from residnet.identification.settings import FitSettings
 from residnet.identification.standard import TIED
-from residnet.judge.verdict.sanity import Finding
-from residnet.judge.verdict.selection import Selection
-
-
-@dataclass(frozen=True)
-class Identified(Mapping[str, FittedModel]):
-    """The fitted models by name: zero, baselines, heads and ensembles, in this order.
-
-    Attributes:
-        settings: of the fit.
-        models: by name.
-        limit: of |u, v, r| [3] beyond which a free run has diverged.
-        train: the logs that fitted them.
-    """
-
-    settings: FitSettings
-    models: dict[str, FittedModel]
-    limit: np.ndarray
-    train: Sequence[Prepared]
-
-    def evaluate(
-        self, logs: Sequence[Prepared], data: MeasuredLogs | SimulatedTrials | None = None
-    ) -> Evaluation:
-        """Free-run all models over the logs of one split.
-
-        Args:
-            logs: of one split, prepared as those of the fit.
-            data: where the logs came from; simulated trials add the plant as `truth`.
-        """
-        settings = self.settings
-        models = candidates(self.values(), data)
-        return evaluate(models, logs, settings.evaluation, settings.prepare.grid.step, self.limit)
-
-    @cached_property
-    def findings(self) -> dict[str, list[Finding]]:
-        """What the checks for physical sanity find, by model; `zero` is left out."""
-        return self.findings_of(list(self.values()))
-
-    def findings_of(self, fitted: Sequence[FittedModel]) -> dict[str, list[Finding]]:
-        """Return what the checks for physical sanity find of some models."""
-        step = self.settings.prepare.grid.step
-        return examine(fitted, self.train, self.settings.evaluation, step)
-
-    def select(self, judged: Mapping[str, Evaluation]) -> Selection:
-        """Choose a single model and an ensemble by their free runs.
-
-        Args:
-            judged: what `evaluate` returned, by split; `validation` is needed, and divergences on
-                `train` count where it is there.
-
-        Raises:
-            UsageError: where the validation logs have not been judged.
-        """
-        return select(self.values(), judged, self.findings, self.settings.evaluation)
-
-    def __getitem__(self, name: str) -> FittedModel:
-        return self.models[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.models)
-
-    def __len__(self) -> int:
-        return len(self.models)
 
 
 def fit(
@@ -115,6 +46,10 @@ def fit(
     identified = Identified(settings, models, fitter.limit, fitter.train)
     if settings.recipe is not None:
         _add_tied(identified, fitter, logs)
+    if settings.bands is not None:
+        identified.models.update(calibrate_bands(identified, logs["validation"], settings.bands))
+        for model in identified.values():
+            fitter.store.keep(model)
     return identified
 
 

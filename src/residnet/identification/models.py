@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -10,6 +11,7 @@ from torch import Tensor
 
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
+from residnet.judge.bands.band import Band
 
 
 @dataclass(frozen=True)
@@ -22,12 +24,14 @@ class FittedModel:
         notes: about the fit, as JSON takes them: coefficients, validation error, seconds, ...
         covariance: of the coefficients of a baseline that was refitted through rollouts, [P, P];
             None where there was no refit.
+        bands: of its free runs by protocol; empty where none were calibrated.
     """
 
     spec: ModelSpec
     model: HybridDynamics
     notes: dict[str, Any]
     covariance: Tensor | None = None
+    bands: Mapping[str, Band] = field(default_factory=dict)
 
     @property
     def name(self) -> str:

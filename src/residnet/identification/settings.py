@@ -25,6 +25,7 @@ from residnet.data.prepare import PrepareConfig
 from residnet.dynamics.base import Integrator
 from residnet.heads import HeadConfig
 from residnet.identification.standard import PARTS, TIED, Facts, portfolio
+from residnet.judge.bands.config import BandsConfig
 from residnet.judge.config import EvaluationConfig
 from residnet.physics.signals import SignalsConfig
 from residnet.training.config import TrainingConfig
@@ -72,6 +73,7 @@ class FitSettings(Parts):
         current: training and validation logs ran in constant currents that are estimated first;
             null for water at rest.
         evaluation: protocols and scales.
+        bands: how far free runs may be off, calibrated over logs that were left out; null for none.
         recipe: `standard` fits a portfolio in place of `baseline`, `baselines`, `refit`, `heads`,
             `base_of`, `ensembles` and `training`: a linear model and a hull, both refitted, a
             network on each, hull and network calibrated together, and a network alone; their terms,
@@ -85,6 +87,7 @@ class FitSettings(Parts):
     integrator: Integrator = "rk4"
     current: CurrentConfig | None = None
     evaluation: EvaluationConfig
+    bands: BandsConfig | None = BandsConfig()
     recipe: Literal["standard"] | None = None
 
     @model_validator(mode="after")

@@ -15,6 +15,7 @@ from residnet.data.prepare import Prepared
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
+from residnet.judge.bands.band import Band
 from residnet.judge.protocol import Window
 
 
@@ -35,6 +36,7 @@ class Candidate:
             none.
         ranges: smallest and largest training value of each velocity and input; empty where they
             are not known.
+        bands: of its free runs by protocol; empty where there are none.
     """
 
     name: str
@@ -45,6 +47,7 @@ class Candidate:
     idle: int = 0
     reference: str | None = None
     ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    bands: Mapping[str, Band] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ import numpy as np
 from residnet.core.layout import HEADING, SURGE, SWAY, YAW_RATE
 from residnet.core.names import VELOCITY
 from residnet.data.prepare import Prepared
+from residnet.judge.bands.coverage import count_bands
 from residnet.judge.bootstrap import Blocks, blocks, difference, intervals
 from residnet.judge.freerun import Candidate, FreeRun
 
@@ -56,7 +57,14 @@ def rows(
     Every model, over all windows, every kind of manoeuvre and every named group of kinds.
 
     `difference` compares a model with its reference (`Candidate.reference`) over the same windows;
-    None where it has none.
+    None where it has none. Models with a band have its coverage and interval score, too.
+
+    Args:
+        run: free runs of all models.
+        candidates: the models.
+        logs: that the windows belong to.
+        scales: what nrmse divides by.
+        groups: named sets of kinds of manoeuvre.
     """
     kinds = [logs[window.log].log.manoeuvre for window in run.windows]
     subsets = (
@@ -65,6 +73,7 @@ def rows(
         | {name: list(members) for name, members in groups.items()}
     )
     errors = {candidate.name: window_errors(run, candidate.name, logs) for candidate in candidates}
+    banded = count_bands(run, candidates, logs)
     out = []
     for candidate in candidates:
         diverged = np.array([prediction.diverged for prediction in run.predictions[candidate.name]])
@@ -83,7 +92,10 @@ def rows(
                     [window.log for window, taken in zip(run.windows, chosen, strict=True) if taken]
                 )
                 row |= _summary(part, int(diverged[chosen].sum()), scales, drawn)
-                out.append(row | {"difference": against(errors, candidate, scales, chosen, drawn)})
+                row["difference"] = against(errors, candidate, scales, chosen, drawn)
+                if candidate.name in banded:
+                    row |= banded[candidate.name].row(chosen)
+                out.append(row)
     return out
 
 

@@ -55,7 +55,15 @@ class Windows(Config):
 
     def windows(self, log: Prepared, number: int, step: float) -> list[Window]:
         """Return the windows of one log; none where it is too short."""
+        return self._laid(log, number, step, self.length)
+
+    def overlapping(self, log: Prepared, number: int, step: float, every: float) -> list[Window]:
+        """Return windows of the same length that start every so often, in s."""
+        return self._laid(log, number, step, min(every, self.length))
+
+    def _laid(self, log: Prepared, number: int, step: float, every: float) -> list[Window]:
         steps, start, out = round(self.length / step), round(self.first / step), []
+        apart = max(round(every / step), 1)
         _, end = stretch_bounds(log.piece)
         while start + steps < len(log):
             while start < len(log) and not log.usable[start]:
@@ -71,7 +79,7 @@ class Windows(Config):
             out.append(
                 Window(number, start, start + steps + 1, past, log.y[start, VELOCITIES].copy())
             )
-            start += steps
+            start += apart
         return out
 
 
@@ -116,6 +124,10 @@ class WholeManoeuvre(Config):
                 )
             begin = stop
         return out
+
+    def overlapping(self, log: Prepared, number: int, step: float, every: float) -> list[Window]:
+        """Return the windows themselves: a manoeuvre is one free run from its beginning."""
+        return self.windows(log, number, step)
 
 
 ProtocolConfig = Annotated[Windows | WholeManoeuvre, Field(discriminator="kind")]

@@ -10,7 +10,9 @@ import numpy as np
 from residnet.core.files import whole
 from residnet.core.names import STATE
 from residnet.data.prepare import Prepared
-from residnet.judge.freerun import FreeRun
+from residnet.judge.bands.band import Bands
+from residnet.judge.bands.coverage import limits
+from residnet.judge.freerun import FreeRun, Prediction
 
 INPUT = "input_"
 """Stands before the name of an input among the columns."""
@@ -19,19 +21,26 @@ _ORDER = ("u", "v", "r", "psi", "x", "y")
 
 
 def write_rollouts(
-    folder: Path, runs: Sequence[FreeRun], logs: Sequence[Prepared], inputs: Sequence[str]
+    folder: Path,
+    runs: Sequence[FreeRun],
+    logs: Sequence[Prepared],
+    inputs: Sequence[str],
+    bands: Bands | None = None,
 ) -> None:
     """Write one file per log of a split.
 
     Columns: protocol, model, window, t (s, the log's clock), usable, diverged, then u, v, r, psi,
     x, y as measured and with `_hat` as predicted (SI, rad), and the inputs that are held over the
-    step after each sample with `input_` before their names.
+    step after each sample with `input_` before their names. Where there are bands, `_low` and
+    `_high` are their pointwise limits; those of x and y are the box about the circle that holds the
+    position, and a model without a band has NaN.
 
     Args:
         folder: for the files.
         runs: protocols of a split.
         logs: of the split.
         inputs: names of the inputs, in the order of their columns.
+        bands: by model and protocol; None for none.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -44,6 +53,8 @@ def write_rollouts(
         measured: list[np.ndarray] = []
         predicted: list[np.ndarray] = []
         given: list[np.ndarray] = []
+        low: list[np.ndarray] = []
+        high: list[np.ndarray] = []
         for run in runs:
             of_log = [i for i, window in enumerate(run.windows) if window.log == number]
             for model, predictions in run.predictions.items():
@@ -63,14 +74,32 @@ def write_rollouts(
                     measured.append(log.y[rows])
                     given.append(log.w[rows])
                     predicted.append(predictions[i].states)
+                    least, most = _limits(predictions[i], model, run.protocol, bands or {})
+                    low.append(least)
+                    high.append(most)
         if not measured:
             continue
         columns = {name: np.concatenate(values) for name, values in parts.items()}
         y, y_hat = np.concatenate(measured), np.concatenate(predicted)
         columns |= {name: y[:, STATE.index(name)] for name in _ORDER}
         columns |= {f"{name}_hat": y_hat[:, STATE.index(name)] for name in _ORDER}
+        if any((bands or {}).values()):
+            for ending, parts_of in (("low", low), ("high", high)):
+                reached = np.concatenate(parts_of)
+                columns |= {f"{name}_{ending}": reached[:, STATE.index(name)] for name in _ORDER}
         w = np.concatenate(given)
         columns |= {f"{INPUT}{name}": w[:, place] for place, name in enumerate(inputs)}
         table = pa.table({name: pa.array(values) for name, values in columns.items()})
         with whole(folder / f"{log.log.name}.parquet") as file:
             pq.write_table(table, file, compression="zstd")
+
+
+def _limits(
+    prediction: Prediction, model: str, protocol: str, bands: Bands
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lower and upper limits [L, 6] of a prediction; NaN where it has no band."""
+    band = bands.get(model, {}).get(protocol)
+    if band is None:
+        unknown = np.full_like(prediction.states, np.nan)
+        return unknown, unknown
+    return limits(prediction.states, band.half_widths(prediction.states))

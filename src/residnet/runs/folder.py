@@ -44,6 +44,7 @@ class RunFolder:
         booklet: standard manoeuvres of the identified model.
         selection: which model was selected, and why.
         sanity: whether each model behaves like a vessel.
+        bands: how far free runs may be off.
     """
 
     def __init__(self, path: Path) -> None:
@@ -64,6 +65,7 @@ class RunFolder:
         self.booklet = path / "booklet.json"
         self.selection = path / "selection.json"
         self.sanity = path / "sanity.json"
+        self.bands = path / "bands.json"
 
     @classmethod
     def create(

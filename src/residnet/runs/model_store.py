@@ -8,8 +8,10 @@ from typing import Any
 
 from torch import nn
 
+from residnet.core.files import read_json
 from residnet.dynamics.store import Stored, load_model, model_names, read_weights, save_model
 from residnet.identification.models import FittedModel
+from residnet.judge.bands.file import read_bands
 from residnet.runs.folder import RunFolder
 
 
@@ -38,8 +40,11 @@ class FolderStore:
         Raises:
             UsageError: where there is none of that name.
         """
+        content = read_json(self.folder.bands) if self.folder.bands.is_file() else {}
         return FittedModel(
-            *load_model(self.folder.models / name), notes=self.folder.fit_notes(name)
+            *load_model(self.folder.models / name),
+            notes=self.folder.fit_notes(name),
+            bands=read_bands(content).get(name, {}),
         )
 
     def keep_module(

@@ -85,7 +85,7 @@ def refit(
     offsets = Offsets.begin(
         config.offsets, int(store.log.max()) + 1, scales / config.correlation, problem.speed
     )
-    level, _ = _level(model, problem, offsets)
+    level, _ = level_of(model, problem, offsets)
     first, count = level, 0
     if not torch.isfinite(first):
         raise FitError(
@@ -99,8 +99,8 @@ def refit(
         if not feeding:
             break
         problem = problem.at_rest(feeding)
-        _place(baseline, _values(baseline, problem), problem.active)
-    arrow = _normal_equations(model, problem, baseline, *_level(model, problem, offsets), offsets)
+        place(baseline, _values(baseline, problem), problem.active)
+    arrow = normal_equations(model, problem, baseline, *level_of(model, problem, offsets), offsets)
     share = problem.share(level)
     believing = arrow.believing(offsets, share)
     inverse = torch.linalg.pinv(believing.reduced()[0], hermitian=True)
@@ -138,9 +138,9 @@ def _minimised(
     iterations: int,
 ) -> tuple[Tensor, Offsets, int]:
     """Move parameters and offsets to the minimum; returns its level and the number of steps."""
-    level, squares = _level(model, problem, offsets)
+    level, squares = level_of(model, problem, offsets)
     damping, count = 1e-3, 0
-    arrow = _normal_equations(model, problem, baseline, level, squares, offsets)
+    arrow = normal_equations(model, problem, baseline, level, squares, offsets)
     for _ in range(iterations):
         offsets = with_spread(offsets, arrow, problem.share(level))
         step = _descend(model, problem, baseline, arrow, offsets, level, damping)
@@ -148,7 +148,7 @@ def _minimised(
             break
         level, squares, offsets, damping, gain = step
         count += 1
-        arrow = _normal_equations(model, problem, baseline, level, squares, offsets)
+        arrow = normal_equations(model, problem, baseline, level, squares, offsets)
         if gain < 2e-4:
             break
     return level, offsets, count
@@ -172,20 +172,20 @@ def _descend(
     kept = baseline.theta.detach().flatten()[problem.active].clone()
     for _attempt in range(8):
         step, offset_step = believing.damped(damping).solve()
-        _place(baseline, kept - step, problem.active)
+        place(baseline, kept - step, problem.active)
         moved = offsets.moved(offset_step)
-        reached, squares = _level(model, problem, moved)
+        reached, squares = level_of(model, problem, moved)
         trial = reached + _prior_cost(problem, baseline, share, moved)
         if torch.isfinite(trial) and trial < cost:
             gain = float(cost - trial) / float(cost)
             return reached, squares, moved, max(damping / 10, 1e-8), gain
         damping *= 10
-    _place(baseline, kept, problem.active)
+    place(baseline, kept, problem.active)
     return None
 
 
-def _place(baseline: ParametricBaseline, values: Tensor, active: Tensor) -> None:
-    """Set the free parameters."""
+def place(baseline: ParametricBaseline, values: Tensor, active: Tensor) -> None:
+    """Set the free parameters to values [P]; their places in theta are `active` [P]."""
     with torch.no_grad():
         flat = baseline.theta.detach().clone().flatten()
         flat[active] = values
@@ -220,8 +220,8 @@ def _ahead(model: HybridDynamics, x: Tensor, p: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def _level(model: HybridDynamics, problem: Problem, offsets: Offsets) -> tuple[Tensor, Tensor]:
-    """Mean error of the windows in units of the scales, and mean square error of each [B]."""
+def level_of(model: HybridDynamics, problem: Problem, offsets: Offsets) -> tuple[Tensor, Tensor]:
+    """Return the mean error of the windows in scales, and the mean square error of each [B]."""
     x, total = problem.x0, []
     shifted, _ = _shifted(model, problem, offsets)
     for k in range(problem.w.shape[1]):
@@ -233,7 +233,7 @@ def _level(model: HybridDynamics, problem: Problem, offsets: Offsets) -> tuple[T
 
 
 @torch.no_grad()
-def _normal_equations(
+def normal_equations(
     model: HybridDynamics,
     problem: Problem,
     baseline: ParametricBaseline,
@@ -241,11 +241,11 @@ def _normal_equations(
     squares: Tensor,
     offsets: Offsets,
 ) -> Arrow:
-    """Gauss-Newton Hessian and half the gradient of the robust cost, as yet without what is
-    believed of the offsets.
+    """Return the Gauss-Newton Hessian and half the gradient of the robust cost.
 
-    The windows' weights follow from their errors `squares`, which the search for this point has
-    computed; so one matrix product a step sums over all windows.
+    What is believed of the offsets is not in it yet. The windows' weights follow from their errors
+    `squares` [B], which the search for this point has computed; so one matrix product a step sums
+    over all windows.
     """
     batch, steps = problem.w.shape[:2]
     shared, logs = int(problem.active.numel()), len(offsets.value)

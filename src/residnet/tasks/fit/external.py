@@ -94,7 +94,12 @@ class ExternalLogs:
         )
         models = [c for c in candidates(fitted, config.data) if c.kind != "truth" or simulated]
         judged = evaluate(models, logs, config.evaluation, config.prepare.grid.step, limit)
-        write_rollouts(folder.rollouts / SPLIT, judged.runs, logs, config.signals.columns)
+        write_rollouts(
+            folder.rollouts / SPLIT, judged.runs, logs, config.signals.columns, judged.bands
+        )
+        if self.run.bands.is_file():
+            # the bands are the fit's own; the report of these logs draws them
+            folder.write(folder.bands, self.run.bands.read_text(encoding="utf-8"))
         write_data_quality(folder, {SPLIT: logs})
         chosen = self.run.read_metrics()
         write_metrics(

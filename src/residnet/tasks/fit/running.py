@@ -9,10 +9,12 @@ from residnet.core.errors import DataError
 from residnet.core.progress import say
 from residnet.identification.currents import through_currents
 from residnet.identification.evaluation import Evaluation
-from residnet.identification.fit import Identified, fit
+from residnet.identification.fit import fit
 from residnet.identification.goodness import goodness_rows
+from residnet.identification.identified import Identified
 from residnet.identification.prepared import PreparedSplits, prepare_logs
 from residnet.identification.teacher_forced import residual_table, term_table
+from residnet.judge.bands.file import bands_content
 from residnet.judge.goodness import content
 from residnet.judge.rollout_files import write_rollouts
 from residnet.judge.verdict.sanity_file import content as sanity_content
@@ -76,11 +78,18 @@ def _judged(
     """Run all models freely, and write everything that is found of them."""
     say("  free runs")
     fitted, step = list(identified.values()), config.prepare.grid.step
+    if config.bands is not None:
+        bands = {entry.name: entry.bands for entry in fitted}
+        folder.write_json(folder.bands, bands_content(config.name, bands))
     judged: dict[str, Evaluation] = {}
     for split in config.evaluation.splits:
         judged[split] = identified.evaluate(logs[split], config.data)
         write_rollouts(
-            folder.rollouts / split, judged[split].runs, judged[split].logs, config.signals.columns
+            folder.rollouts / split,
+            judged[split].runs,
+            judged[split].logs,
+            config.signals.columns,
+            judged[split].bands,
         )
     chosen = identified.select(judged)
     say(f"  selected: {chosen.selected}")

@@ -1,0 +1,165 @@
+"""Bands of the models of a fit, calibrated over logs that no model was fitted on."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from residnet.core.progress import say
+from residnet.data.prepare import Prepared
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.identification.bands.fold_models import FoldModels, fold_numbers
+from residnet.identification.identified import Identified
+from residnet.identification.models import FittedModel
+from residnet.identification.references import references
+from residnet.judge.bands.band import Band
+from residnet.judge.bands.calibrate import calibrate, few
+from residnet.judge.bands.channels import CHANNELS
+from residnet.judge.bands.config import BandsConfig
+from residnet.judge.bands.errors import RunErrors, run_errors
+from residnet.judge.bands.quantiles import corrected, independent, quantile, run_weights
+from residnet.judge.freerun import Candidate, free_run
+
+
+def calibrate_bands(
+    identified: Identified, validation: Sequence[Prepared], config: BandsConfig
+) -> dict[str, FittedModel]:
+    """Return the models of a fit with their bands under all protocols.
+
+    Training logs are predicted by models that leave them out, validation logs by the models
+    themselves. A model that is not fitted again without logs takes the form of its reference's
+    band, with the level that its own errors on the validation logs ask for.
+
+    Args:
+        identified: the fit.
+        validation: logs that chose between models.
+        config: level, folds and starts.
+    """
+    started = time.perf_counter()
+    fold = fold_numbers([log.log.manoeuvre for log in identified.train], config.folds, config.seed)
+    left_out = FoldModels(identified, fold)
+    refitted = left_out.models if int(fold.max()) > 0 else [{}]
+    out: dict[str, dict[str, Band]] = {}
+    for protocol in identified.settings.evaluation.protocols:
+        runs = _Calibration(identified, protocol, config)
+        for k, models in enumerate(refitted):
+            own = [log for log, number in zip(identified.train, fold, strict=True) if number == k]
+            runs.add(models, own, validation=False)
+        runs.add({name: entry.model for name, entry in identified.items()}, validation, True)
+        for name, band in runs.bands().items():
+            out.setdefault(name, {})[protocol] = band
+    say(f"  bands calibrated in {time.perf_counter() - started:.1f} s")
+    return {name: _banded(entry, out.get(name, {})) for name, entry in identified.items()}
+
+
+def _banded(entry: FittedModel, bands: Mapping[str, Band]) -> FittedModel:
+    """Return a model with its bands; its description takes the one that reaches furthest."""
+    if not bands:
+        return entry
+    furthest = max(bands.values(), key=lambda band: band.horizon)
+    spec = entry.spec.model_copy(update={"band": furthest.table()})
+    return replace(entry, spec=spec, bands=bands)
+
+
+class _Calibration:
+    """The free runs that calibrate the bands under one protocol."""
+
+    def __init__(self, identified: Identified, protocol: str, config: BandsConfig) -> None:
+        self.identified = identified
+        self.protocol = identified.settings.evaluation.protocols[protocol]
+        self.config = config
+        self.step = identified.settings.prepare.grid.step
+        self.crossed: dict[str, list[RunErrors]] = {}
+        self.validated: dict[str, list[RunErrors]] = {}
+
+    def add(
+        self, models: Mapping[str, HybridDynamics], logs: Sequence[Prepared], validation: bool
+    ) -> None:
+        """Run models over logs that they were not fitted on."""
+        windows = [
+            window
+            for number, log in enumerate(logs)
+            for window in self.protocol.overlapping(log, number, self.step, self.config.every)
+        ]
+        if not windows or not models:
+            return
+        candidates = [Candidate(name, "", model) for name, model in models.items()]
+        found = free_run(candidates, windows, logs, self.step, self.identified.limit)
+        for name, predictions in found.items():
+            runs = run_errors(windows, predictions, logs)
+            (self.validated if validation else self.crossed).setdefault(name, []).extend(runs)
+
+    def bands(self) -> dict[str, Band]:
+        """Return the band of each model; none where no log is long enough."""
+        zero = self.crossed.get("zero", []) + self.validated.get("zero", [])
+        if not zero:
+            return {}
+        errors = np.concatenate([run.error for run in zero])
+        unit = np.sqrt(np.nanmean(errors**2, axis=0))
+        # a channel that zero predicts without any error has no scale of its own
+        unit = np.where(unit > 0, unit, 1.0)
+        out: dict[str, Band] = {}
+        for name in self.crossed:
+            runs = self.crossed[name] + self.validated.get(name, [])
+            out[name] = calibrate(runs, self.config.level, self.step, unit)
+        compared = references(
+            {name: entry.spec.role for name, entry in self.identified.items()},
+            {name: entry.notes for name, entry in self.identified.items()},
+        )
+        for name, entry in self.identified.items():
+            if name not in out and self.validated.get(name):
+                out[name] = self._like(entry, out, compared.get(name, "baseline"), unit)
+        return {name: out[name] for name in self.identified if name in out}
+
+    def _like(
+        self, entry: FittedModel, known: Mapping[str, Band], reference: str, unit: np.ndarray
+    ) -> Band:
+        """Return the band of a model that was not fitted again without logs."""
+        runs = self.validated[entry.name]
+        logs = len({run.log for run in runs})
+        if reference not in known or not self.validated.get(reference):
+            band = calibrate(runs, self.config.level, self.step, unit)
+            return replace(band, cautions=(*_alone(logs), *few(logs)))
+        other = known[reference]
+        ratio = _level(runs, other, self.config.level) / _level(
+            self.validated[reference], other, self.config.level
+        )
+        ratio = np.where(np.isfinite(ratio), ratio, 1.0)
+        return replace(
+            other,
+            width=other.width * ratio,
+            plain=other.plain * ratio,
+            constant=other.constant * ratio,
+            logs=logs,
+            cautions=(*_scaled(reference, logs), *few(logs)),
+        )
+
+
+def _level(runs: Sequence[RunErrors], band: Band, level: float) -> np.ndarray:
+    """Return the quantile [5] of errors over the half widths of a band."""
+    names = [run.log for run in runs]
+    weight = run_weights(names)
+    ratios = [run.error / band.half_widths(run.states) for run in runs]
+    inside = np.array([np.nanmean(ratio <= 1.0) for ratio in ratios])
+    raised = corrected(level, independent(inside, weight, names, level))
+    joined = np.concatenate(ratios)
+    share = np.repeat(weight, [len(ratio) for ratio in ratios])
+    return np.array([quantile(joined[:, i], share, raised) for i in range(len(CHANNELS))])
+
+
+def _scaled(reference: str, logs: int) -> tuple[str, ...]:
+    return (
+        "This model was not fitted again without the logs that calibrate: its band has the form of"
+        f" that of {reference}, and its width from {logs} validation logs, which also chose"
+        " between models or stopped the training early.",
+    )
+
+
+def _alone(logs: int) -> tuple[str, ...]:
+    return (
+        f"Only {logs} validation logs calibrate this band: no model could be fitted without some of"
+        " the training logs. They also chose between models or stopped the training early.",
+    )

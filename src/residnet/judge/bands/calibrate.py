@@ -1,0 +1,169 @@
+"""Bands from the errors of free runs over logs that the model was not fitted on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from residnet.judge.bands.activity import MEASURES, Activity, mean_squares
+from residnet.judge.bands.band import Band, covered, factor, worst
+from residnet.judge.bands.channels import CHANNELS
+from residnet.judge.bands.errors import RunErrors
+from residnet.judge.bands.quantiles import corrected, independent, quantile, run_weights
+
+FEWEST_LOGS = 9
+"""Logs below which no band can promise 90 % whatever errors are distributed like."""
+_POINTS = 100
+"""Horizons that half widths are kept at."""
+_SMOOTHED = 0.11
+"""Share of the horizon over which widths are smoothed."""
+_RIDGE = 0.02
+"""Pull of the slopes to zero, against measures of unit variance."""
+_ROUNDS = 3
+_STEPS = 8
+
+
+@dataclass(frozen=True)
+class _Runs:
+    """Errors [W, G, 5] of W runs at G horizons, and measures [W, G, 6] of how lively they are."""
+
+    names: Sequence[str]
+    weight: np.ndarray
+    steps: np.ndarray
+    error: np.ndarray
+    measures: np.ndarray
+    activity: Activity
+
+
+def calibrate(runs: Sequence[RunErrors], level: float, step: float, unit: np.ndarray) -> Band:
+    """Return the band that holds a share `level` of the errors of runs to come.
+
+    Args:
+        runs: over logs that the model was not fitted on, under one protocol; at least one.
+        level: wanted.
+        step: of the runs in s.
+        unit: that scores are given in, [5].
+    """
+    given = _at_horizons(runs, step)
+    names, weight = given.names, given.weight
+    slope = np.zeros((len(MEASURES), len(CHANNELS)))
+    for _ in range(_ROUNDS):
+        shape = _shape(given, slope)
+        slope = _slopes(given, shape, slope)
+    shape = _shape(given, slope)
+    first = _quantiles(given, shape * factor(given.measures, slope), level)
+    inside = np.nanmean(
+        covered(given.error, first * shape * factor(given.measures, slope)), axis=(1, 2)
+    )
+    number = independent(inside, weight, names, level)
+    raised = corrected(level, number)
+    width = shape * _quantiles(given, shape * factor(given.measures, slope), raised)
+    same = _shape(given, np.zeros_like(slope))
+    plain = same * _quantiles(given, np.broadcast_to(same, given.error.shape), raised)
+    flat = given.error.reshape(-1, len(CHANNELS))
+    band = Band(
+        level,
+        step,
+        given.steps,
+        width,
+        plain,
+        np.ones(len(CHANNELS)),
+        quantile(flat, np.repeat(weight, given.error.shape[1]), raised),
+        unit,
+        given.activity,
+        slope,
+        len(set(names)),
+        number,
+    )
+    largest = worst([run.error for run in runs], [band.half_widths(run.states) for run in runs])
+    return replace(band, whole=quantile(largest, weight, raised), cautions=few(band.logs))
+
+
+def few(logs: int) -> tuple[str, ...]:
+    """Return what to say where logs are too few for a promise."""
+    if logs >= FEWEST_LOGS:
+        return ()
+    counted = f"{logs} logs calibrate" if logs > 1 else "One log calibrates"
+    return (
+        f"{counted} this band; below {FEWEST_LOGS} no method can promise 90 % for every"
+        " distribution of errors.",
+    )
+
+
+def _at_horizons(runs: Sequence[RunErrors], step: float) -> _Runs:
+    """Return the errors and measures of runs at the horizons that a band is kept at."""
+    longest = max(map(len, runs))
+    steps = np.unique(np.linspace(1, longest, min(_POINTS, longest)).round().astype(int))
+    names = [run.log for run in runs]
+    weight = run_weights(names)
+    squares = [mean_squares(run.states, step) for run in runs]
+    activity = Activity.of(squares, weight)
+    error = np.full((len(runs), len(steps), len(CHANNELS)), np.nan)
+    measures = np.zeros((len(runs), len(steps), len(MEASURES)))
+    for i, run in enumerate(runs):
+        reached = steps[steps <= len(run)] - 1
+        error[i, : len(reached)] = run.error[reached]
+        measures[i, : len(reached)] = activity.standard(squares[i][reached])
+    return _Runs(names, weight, steps, error, measures, activity)
+
+
+def _shape(given: _Runs, slope: np.ndarray) -> np.ndarray:
+    """Return the root mean square [G, 5] of errors over what liveliness explains, smoothed."""
+    scaled = (given.error / factor(given.measures, slope)) ** 2
+    weight = np.where(np.isfinite(scaled), given.weight[:, None, None], 0.0)
+    total = weight.sum(axis=0)
+    mean = np.where(total > 0, (weight * np.nan_to_num(scaled)).sum(axis=0), np.nan)
+    root = np.sqrt(_smooth(mean / np.where(total > 0, total, 1.0), given.steps))
+    return np.asarray(np.maximum(root, 1e-12 + 1e-6 * np.nanmax(root, axis=0)))
+
+
+def _quantiles(given: _Runs, scale: np.ndarray, level: float) -> np.ndarray:
+    """Return the quantile [G, 5] of errors over a scale [W, G, 5], smoothed over horizons."""
+    return _smooth(quantile(given.error / scale, given.weight, level), given.steps)
+
+
+def _smooth(values: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Return moving means [G, 5] over neighbouring horizons; gaps are filled from beside them."""
+    reach = 0.5 * _SMOOTHED * steps[-1]
+    # the first steps, where errors begin, are smoothed over what lies as near as the start itself
+    near = np.minimum(reach, steps - 1 + 0.5)
+    close = np.abs(steps[:, None] - steps[None, :]) <= near[:, None]
+    known = np.isfinite(values)
+    count = close @ known.astype(float)
+    mean = (close @ np.where(known, values, 0.0)) / np.maximum(count, 1.0)
+    for column in range(values.shape[1]):
+        good = count[:, column] > 0
+        if good.any():
+            mean[:, column] = np.interp(steps, steps[good], mean[good, column])
+        else:
+            mean[:, column] = np.nan
+    return np.asarray(mean)
+
+
+def _slopes(given: _Runs, shape: np.ndarray, slope: np.ndarray) -> np.ndarray:
+    """Return by how much liveliness raises the logarithm of the errors [6, 5].
+
+    Errors over the shape are taken for gamma distributed with a logarithmic link; Newton's method.
+    """
+    out = slope.copy()
+    weight = given.weight[:, None] / given.error.shape[1]
+    z = given.measures
+    pull = _RIDGE * np.eye(z.shape[2])
+    for channel in range(len(CHANNELS)):
+        ratio = given.error[:, :, channel] / shape[:, channel]
+        seen = np.isfinite(ratio)
+        y, w = np.where(seen, ratio, 0.0), np.where(seen, weight, 0.0)
+        if not seen.any():
+            continue
+        own = out[:, channel].copy()
+        for _ in range(_STEPS):
+            mean = np.exp(np.clip(z @ own, -20.0, 20.0))
+            mean *= (w * y).sum() / max((w * mean).sum(), 1e-300)
+            part = w * y / np.maximum(mean, 1e-300)
+            gradient = np.einsum("wg,wgf->f", part - w, z) - pull @ own
+            hessian = np.einsum("wg,wgf,wgh->fh", part, z, z) + pull
+            own = own + np.clip(np.linalg.solve(hessian, gradient), -1.0, 1.0)
+        out[:, channel] = own
+    return out

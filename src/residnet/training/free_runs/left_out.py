@@ -1,0 +1,143 @@
+"""Parameters of a refitted baseline without some of its logs, by one step of Gauss-Newton each.
+
+A refit for every group of logs that is left out would take as long as so many refits. At the
+minimum over all logs, the normal equations of a group say what it alone pulls the parameters to;
+taken away, the rest of the logs moves them by one step. All groups together cost as much as one
+iteration of the refit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from residnet.baselines import ParametricBaseline
+from residnet.core.samples import Samples
+from residnet.data.windows import WindowStore
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.training.offsets import Offsets
+from residnet.training.refit import level_of, normal_equations, place
+from residnet.training.refit_config import RefitConfig
+from residnet.training.refit_problem import Problem, problem_of
+
+_HALVINGS = 4
+
+
+def without_logs(
+    model: HybridDynamics,
+    samples: Samples,
+    store: WindowStore,
+    config: RefitConfig,
+    scales: Tensor,
+    fold: Tensor,
+    still: Sequence[int] = (),
+) -> list[Tensor]:
+    """Return theta of the model's baseline as each fold of logs, left out of the refit, leaves it.
+
+    Args:
+        model: a baseline without a head, after its refit; it is handed back as it was.
+        samples: of the refit.
+        store: training windows of the refit, float64.
+        config: of the refit.
+        scales: of the velocities, [3].
+        fold: number of the fold of each log [L], from 0 on.
+        still: numbers of the free parameters that the refit has left at zero.
+
+    Returns:
+        One theta for each fold; the refitted one where a fold holds no window, or where no part of
+        the step keeps the free runs of the other logs finite and no worse.
+    """
+    baseline = model.baseline
+    assert isinstance(baseline, ParametricBaseline)
+    problem = problem_of(model, baseline, samples, store, config, scales).at_rest(still)
+    offsets = Offsets.begin(
+        config.offsets, int(store.log.max()) + 1, scales / config.correlation, problem.speed
+    )
+    level, squares = level_of(model, problem, offsets)
+    fitted = baseline.theta.detach().clone()
+    parameters = fitted.flatten()[problem.active]
+    of_window = fold[problem.log]
+    folds = int(fold.max()) + 1
+    count = torch.bincount(of_window, minlength=folds).to(parameters.dtype)
+    parts = [
+        _part(model, _rows(problem, of_window == k), squares[of_window == k], level, offsets)
+        for k in range(folds)
+    ]
+    out = []
+    for k in range(folds):
+        left = float(count.sum() - count[k])
+        if count[k] == 0 or left == 0:
+            out.append(fitted.clone())
+            continue
+        hessian = (
+            problem.precision + problem.pull + torch.diag(problem.share(level) * problem.belief)
+        )
+        for j, (own, _) in enumerate(parts):
+            if j != k:
+                hessian = hessian + count[j] / left * own
+        step = torch.linalg.lstsq(
+            hessian, (count[k] / left * parts[k][1]).unsqueeze(1), driver="gelsd"
+        ).solution.squeeze(1)
+        step[problem.still] = 0.0
+        others = _rows(problem, of_window != k)
+        kept = _best_share(model, others, offsets, parameters, step)
+        place(baseline, kept, problem.active)
+        out.append(baseline.theta.detach().clone())
+        place(baseline, parameters, problem.active)
+    return out
+
+
+def _best_share(
+    model: HybridDynamics, others: Problem, offsets: Offsets, parameters: Tensor, step: Tensor
+) -> Tensor:
+    """Return the parameters after the largest share of the step that the other logs agree to."""
+    baseline = model.baseline
+    assert isinstance(baseline, ParametricBaseline)
+    before, _ = level_of(model, others, offsets)
+    for halving in range(_HALVINGS):
+        trial = parameters + 0.5**halving * step
+        place(baseline, trial, others.active)
+        after, _ = level_of(model, others, offsets)
+        place(baseline, parameters, others.active)
+        if torch.isfinite(after) and after <= before:
+            return trial
+    return parameters
+
+
+def _rows(problem: Problem, chosen: Tensor) -> Problem:
+    """Return the problem of some of its windows."""
+    return replace(
+        problem,
+        x0=problem.x0[chosen],
+        w=problem.w[chosen],
+        nu=problem.nu[chosen],
+        weight=problem.weight[chosen],
+        log=problem.log[chosen],
+    )
+
+
+def _part(
+    model: HybridDynamics, part: Problem, squares: Tensor, level: Tensor, offsets: Offsets
+) -> tuple[Tensor, Tensor]:
+    """Return Hessian [P, P] and half the gradient [P] of some windows' mean cost, without beliefs.
+
+    Offsets of the logs are eliminated.
+    """
+    size = int(part.active.numel())
+    if len(part.x0) == 0:
+        return torch.zeros(size, size, dtype=squares.dtype), torch.zeros(size, dtype=squares.dtype)
+    baseline = model.baseline
+    assert isinstance(baseline, ParametricBaseline)
+    theta = baseline.theta.detach().flatten()[part.active]
+    nothing = replace(
+        part,
+        precision=torch.zeros_like(part.precision),
+        pull=torch.zeros_like(part.pull),
+        belief=torch.zeros_like(part.belief),
+        start=theta,
+    )
+    arrow = normal_equations(model, nothing, baseline, level, squares, offsets)
+    return arrow.believing(offsets, part.share(level)).reduced()

@@ -1,0 +1,115 @@
+"""Bands of free runs: coverage where errors are known, few logs, horizons beyond, JSON."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from residnet.judge.bands.band import Band, covered, worst
+from residnet.judge.bands.calibrate import calibrate
+from residnet.judge.bands.errors import RunErrors
+from residnet.judge.bands.quantiles import corrected, independent, quantile, run_weights
+
+STEP = 0.5
+LENGTH = 60
+LIVELY = 4.0
+"""By how much errors of a run that reverses its rudder exceed those of one that does not."""
+
+
+def runs(logs: int, per_log: int, seed: int) -> list[RunErrors]:
+    """Runs whose errors grow with the root of time, and are larger where the run is lively."""
+    random = np.random.default_rng(seed)
+    t = np.arange(LENGTH + 1) * STEP
+    out = []
+    for number in range(logs):
+        # every fifth log zigzags, and is as short as such logs are
+        lively = number % 5 == 0
+        own = random.lognormal(0.0, 0.15)
+        for _ in range(max(per_log // 4, 1) if lively else per_log):
+            states = np.zeros((LENGTH + 1, 6))
+            rate = 0.02 * (10.0 if lively else 1.0) * random.lognormal(0.0, 0.1)
+            states[:, 3] = 1.0
+            states[:, 5] = rate * np.sin(0.5 * t + random.uniform(0, 6))
+            size = own * (LIVELY if lively else 1.0) * np.sqrt(t[1:, None])
+            error = np.abs(size * random.normal(size=(1, 5)) * [1, 2, 3, 4, 5])
+            kind = "zigzag" if lively else "turning"
+            out.append(RunErrors(f"log{number}", kind, error, states))
+    return out
+
+
+@pytest.fixture(scope="module")
+def band() -> Band:
+    """A band from 40 logs."""
+    return calibrate(runs(40, 12, 0), 0.9, STEP, np.ones(5))
+
+
+def coverage(band: Band, given: list[RunErrors]) -> tuple[float, float]:
+    """Shares of samples and of whole runs that a band holds."""
+    widths = [band.half_widths(run.states) for run in given]
+    held = [covered(run.error, width) for run, width in zip(given, widths, strict=True)]
+    largest = worst([run.error for run in given], widths)
+    return float(np.mean(held)), float((largest <= band.whole).mean())
+
+
+def test_new_runs_are_held_at_the_level_whatever_their_kind(band: Band) -> None:
+    fresh = runs(300, 8, 1)
+    samples, whole = coverage(band, fresh)
+    assert 0.87 < samples < 0.94
+    assert 0.87 < whole < 0.95
+    for kind in ("zigzag", "turning"):
+        assert 0.84 < coverage(band, [run for run in fresh if run.manoeuvre == kind])[0] < 0.96
+
+
+def test_a_lively_run_has_the_wider_band(band: Band) -> None:
+    of_kind = {run.manoeuvre: run for run in runs(5, 1, 2)}
+    lively, calm = (band.half_widths(of_kind[kind].states)[-1] for kind in ("zigzag", "turning"))
+    assert (lively > 2.0 * calm).all()
+
+
+def test_half_widths_grow_in_proportion_to_time_beyond_the_horizon(band: Band) -> None:
+    table = band.tabled(band.width, 3 * LENGTH)
+    np.testing.assert_allclose(table[-1], 3.0 * band.width[-1])
+
+
+def test_few_logs_are_told() -> None:
+    assert calibrate(runs(9, 4, 3), 0.9, STEP, np.ones(5)).cautions == ()
+    told = calibrate(runs(4, 4, 3), 0.9, STEP, np.ones(5)).cautions
+    assert "4 logs calibrate this band; below 9" in told[0]
+
+
+def test_unscored_samples_and_runs_of_other_lengths_are_left_out() -> None:
+    given = runs(12, 4, 4)
+    for run in given[::3]:
+        run.error[: LENGTH // 2, [0, 1, 4]] = np.nan
+    given = [
+        RunErrors(run.log, run.manoeuvre, run.error[:cut], run.states[: cut + 1])
+        for run, cut in zip(given, [LENGTH, 20, 35] * len(given), strict=False)
+    ]
+    found = calibrate(given, 0.9, STEP, np.ones(5))
+    assert np.isfinite(found.width).all()
+    assert (found.width > 0).all()
+    assert found.horizon == LENGTH * STEP
+
+
+def test_a_band_comes_back_from_json(band: Band) -> None:
+    again, run = Band.read(band.content()), runs(1, 1, 5)[0]
+    np.testing.assert_allclose(again.half_widths(run.states), band.half_widths(run.states))
+    np.testing.assert_allclose(again.whole, band.whole)
+
+
+def test_runs_of_a_log_count_as_one_where_they_agree() -> None:
+    names = [f"log{i // 10}" for i in range(100)]
+    weight = run_weights(names)
+    alike = np.array([float(i // 10 != 3) for i in range(100)])
+    apart = np.array([float(i % 10 != 3) for i in range(100)])
+    assert independent(alike, weight, names, 0.9) == pytest.approx(9.0, rel=0.2)
+    assert independent(apart, weight, names, 0.9) == 50.0
+    assert corrected(0.9, 9.0) == 1.0
+
+
+def test_a_weighted_quantile_is_the_smallest_score_that_suffices() -> None:
+    scores = np.array([3.0, np.nan, 1.0, 2.0])
+    weight = np.array([0.2, 0.4, 0.3, 0.1])
+    assert quantile(scores, weight, 0.5) == 1.0
+    assert quantile(scores, weight, 0.6) == 2.0
+    assert quantile(scores, weight, 1.0) == 3.0
