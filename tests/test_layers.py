@@ -32,6 +32,7 @@ LAYERS = [
     {"tasks"},
     {"crash"},
     {"door", "terminal"},
+    {"commands"},
     {"cli", "__main__", "face", "testing"},
 ]
 ALLOWED = {("__main__", "cli")}

@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated
 
 import typer
 
+from residnet.commands import (
+    ardupilot,
+    compare,
+    evaluate,
+    export,
+    limit_threads,
+    list_names,
+    report,
+    runs,
+    show,
+)
 from residnet.door import enter
 from residnet.terminal import drawn_progress
-
-if TYPE_CHECKING:
-    from residnet.runs.task import Finished
 
 app = typer.Typer(
     name="residnet",
@@ -57,7 +64,6 @@ Overrides = Annotated[
     ),
 ]
 _CONFIG = "YAML file of one run, or the name of a config that comes with residnet."
-RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a finished run.")]
 
 
 @app.command()
@@ -87,7 +93,7 @@ def run(
     """Carry out a run: fit, evaluate, report and export, or any other task."""
     from residnet.tasks.loading import config_file, load_task
 
-    _limit_threads()
+    limit_threads()
     task = load_task(config, overrides or [])
     told: list[str] = []
     with drawn_progress(quiet=quiet or as_json, kept=told):
@@ -104,7 +110,7 @@ def run(
         place = {"folder": str(finished.folder.path), "report": str(finished.folder.report)}
         print(json.dumps({**finished.folder.read_summary(), **place}, indent=1))
     else:
-        _show(finished)
+        show(finished)
 
 
 @app.command()
@@ -132,7 +138,7 @@ def new(
     from residnet.tasks.drafting.verb import new_config
     from residnet.terminal import asked
 
-    _limit_threads()
+    limit_threads()
     with drawn_progress():
         ask = asked() if not defaults else None
         lines = new_config(logs, out or Path("my_boat.yaml"), ask, overwrite=overwrite)
@@ -152,7 +158,7 @@ def demo(
     """Write realistic logs of a simulated boat to try things on, as csv and MCAP."""
     from residnet.tasks.demo import write_demo
 
-    _limit_threads()
+    limit_threads()
     with drawn_progress():
         lines = write_demo(folder, overwrite=overwrite)
     for line in lines:
@@ -200,7 +206,7 @@ def inspect(
     from residnet.core.files import require_file_place
     from residnet.tasks.inspection import inspect_logs
 
-    _limit_threads()
+    limit_threads()
     if file is not None:
         require_file_place(file)
     with drawn_progress():
@@ -212,172 +218,9 @@ def inspect(
         raise typer.Exit(1)
 
 
-@app.command()
-def evaluate(
-    folder: RunPath,
-    logs: Annotated[
-        list[Path],
-        typer.Option(
-            "--logs", metavar="PATH", help="Logs to predict: files or folders; may be repeated."
-        ),
-    ],
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out", metavar="DIR", help="Where results go; RUN/external-<time> where not given."
-        ),
-    ] = None,
-    more: Annotated[
-        list[Path] | None, typer.Argument(metavar="[PATH]...", help="Further logs.")
-    ] = None,
-) -> None:
-    """Evaluate the models of a finished run in free run on other logs."""
-    from residnet.tasks.verbs import evaluate_run
-
-    _limit_threads()
-    with drawn_progress():
-        finished = evaluate_run(folder, [*logs, *(more or [])], out)
-    _show(finished)
-
-
-@app.command()
-def export(
-    folder: RunPath,
-    model: Annotated[
-        str,
-        typer.Option(
-            "--model",
-            metavar="NAME",
-            help="Name of the model; 'selected' for the one chosen on validation data.",
-        ),
-    ],
-    file_format: Annotated[
-        str,
-        typer.Option("--format", metavar="FORMAT", help="One of `residnet list formats`."),
-    ] = "torchscript",
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out", metavar="FILE", help="File to write; RUN/exports/<model>.pt where not given."
-        ),
-    ] = None,
-) -> None:
-    """Export a model of a finished run for controllers, after a parity check."""
-    from residnet.tasks.verbs import export_run
-
-    _limit_threads()
-    print(export_run(folder, model, out, file_format))
-
-
-@app.command()
-def ardupilot(
-    source: Annotated[
-        str, typer.Argument(metavar="VESSEL|RUN", help="A vessel, or the folder of a finished fit.")
-    ],
-    model: Annotated[
-        str, typer.Option("--model", metavar="NAME", help="Name of the model of a run.")
-    ] = "selected",
-    servo: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--servo",
-            metavar="COMMAND=OUTPUT:LOW:HIGH",
-            help="Servo output of a command and its values at 1000 and 2000 us, SI.",
-        ),
-    ] = None,
-    port: Annotated[int, typer.Option("--port", help="UDP port that ArduPilot sends to.")] = 9002,
-) -> None:
-    """Simulate a vessel or a learned model for ArduPilot (sim_vehicle.py --model JSON)."""
-    from residnet.simulators.ardupilot import ArduPilotBackEnd, servos
-    from residnet.simulators.vehicle import vehicle
-
-    _limit_threads()
-    boat = vehicle(source, model=model, dt=0.0025)
-    end = ArduPilotBackEnd(boat, servos(boat, servo or ()), port)
-    print(f"{boat.name} listens at UDP port {end.port}; Ctrl-C ends it", flush=True)
-    for name, at in zip(boat.inputs, end.servos, strict=False):
-        print(f"  {name}: servo output {at.channel}, {at.low:g} to {at.high:g}", flush=True)
-    end.serve()
-
-
-@app.command()
-def report(folder: RunPath) -> None:
-    """Write the figures and the report of a finished run again."""
-    from residnet.tasks.verbs import report_run
-
-    _limit_threads()
-    print(report_run(folder))
-
-
-@app.command()
-def compare(
-    folders: Annotated[
-        list[Path], typer.Argument(metavar="RUN RUN...", help="Folders of finished fits.")
-    ],
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of the page.")] = Path(
-        "comparison"
-    ),
-) -> None:
-    """Set finished fits side by side: errors on common logs, paired intervals, configs."""
-    from residnet.tasks.compare.comparing import compare_runs
-
-    _limit_threads()
-    text, page = compare_runs(folders, out)
-    print(text)
-    print(f"page: {page}")
-
-
-@app.command()
-def runs(
-    folder: Annotated[Path, typer.Argument(metavar="[DIR]", help="Folder of runs.")] = Path("runs"),
-    as_json: Annotated[bool, typer.Option("--json", help="Print the list as JSON.")] = False,
-) -> None:
-    """List the runs below a folder with task, state, best figure and age."""
-    from residnet.tasks.run_list import runs_below, runs_text
-
-    entries = runs_below(folder)
-    print(json.dumps(entries, indent=1) if as_json else runs_text(folder, entries))
-
-
-@app.command(name="list")
-def list_names(
-    what: Annotated[
-        Literal[
-            "vessels",
-            "heads",
-            "manoeuvres",
-            "readers",
-            "tasks",
-            "baselines",
-            "formats",
-            "configs",
-        ],
-        typer.Argument(help="Kind of part to list."),
-    ],
-) -> None:
-    """List the parts that a config may name, with a line about each."""
-    from residnet.tasks.catalogue import catalogue
-
-    for name, about in catalogue(what):
-        print(f"{name:28s} {about}")
-
-
-def _show(finished: Finished) -> None:
-    """Print the verdict and table of a run, its exported files and its report."""
-    for sentence in finished.outcome.verdict:
-        print(sentence)
-    if finished.outcome.table:
-        print(finished.outcome.table)
-    for file in finished.exports:
-        print(f"exported: {file}")
-    if finished.folder.report.is_file():
-        print(f"report: {finished.folder.report}")
-
-
-def _limit_threads() -> None:
-    # small products are thirty times slower where several libraries fight for the cores
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ.setdefault(name, "1")
+for command in (evaluate, export, ardupilot, report, compare, runs):
+    app.command()(command)
+app.command(name="list")(list_names)
 
 
 def main() -> None:

@@ -141,7 +141,7 @@ def _read(file: Path, reader: LogReader | None, first: bool) -> Log:
         return reader.read(file)
     if Log.recognises(file) or format_of(file) is not None:
         return reader_for(file).read(file)
-    from residnet.data.doctor.draft import draft_map
+    from residnet.data.drafting.header_map import draft_map
 
     draft = draft_map(file)
     if first:

@@ -24,8 +24,8 @@ from residnet.data.doctor import (
     summary,
 )
 from residnet.data.doctor.dates import date_findings
-from residnet.data.doctor.draft import draft_map
 from residnet.data.doctor.excitation import conditioning
+from residnet.data.drafting.header_map import draft_map
 from residnet.data.masks import Mask
 from residnet.data.readers.base import LogReader
 from residnet.data.readers.composing.composed import RecordingConfig
