@@ -23,7 +23,7 @@ from flown_manoeuvres import (
 from kinds import of_kind
 
 from residnet.core.config import validate
-from residnet.core.errors import ConfigError
+from residnet.core.errors import ConfigError, UsageError
 from residnet.core.log import Log
 from residnet.data.simulated.trials import SimulatedTrials, simulate
 from residnet.dynamics.rollout import Rollout
@@ -37,6 +37,8 @@ from residnet.manoeuvres import (
     ThreeTwoOneOne,
     Zigzag,
 )
+from residnet.manoeuvres.base import ScheduleSource
+from residnet.manoeuvres.excitation import MultiSine
 from residnet.manoeuvres.indices import UNITS
 from residnet.physics.actuators import DifferentialThrust
 from residnet.physics.plant import Plant
@@ -286,3 +288,20 @@ def test_sensor_noise_is_on_the_velocities_alone() -> None:
     for name in ("x", "y", "psi", "n_port", "cmd_stbd"):
         for a, b in zip(noisy, clean, strict=True):
             np.testing.assert_array_equal(a[name], b[name])
+
+
+def test_multi_sines_excite_the_sway_force_where_commands_are_forces() -> None:
+    """Document 000 section 6.3: every force moves by itself; other vessels refuse it in words."""
+    t = torch.arange(0.0, 100.0, 0.1, dtype=torch.float64)
+    wave = MultiSine(
+        drive=0.2, steer_amplitude=0.1, sway_amplitude=0.3, band=(0.02, 0.1), start=5.0
+    )
+    plant = load_vessel("odin_forces").build()
+    source = MultiSine.source([wave], Helm.from_plant(plant), t)
+    assert isinstance(source, ScheduleSource)
+    sway, moment = source.commands[0, :, 1], source.commands[0, :, 2]
+    assert float(sway[:50].abs().max()) == 0.0
+    assert 0.15 * 25e3 < float(sway.abs().max()) <= 0.3 * 25e3
+    assert abs(float(torch.corrcoef(torch.stack((sway, moment)))[0, 1])) < 0.2
+    with pytest.raises(UsageError, match="no forces; leave it out"):
+        MultiSine.source([wave], Helm.from_plant(load_vessel("wam_v_cal").build()), t)

@@ -41,22 +41,28 @@ class Helm:
         inputs: names of the columns of its inputs, commands first.
         forces: turns forces tau [..., 3] in surge, sway and yaw into its commands; None for a
             vessel that cannot make all three.
+        side_force: largest commanded sway force in N; None for a vessel whose commands are no
+            forces.
     """
 
     demand: Demand
     state: tuple[str, ...]
     inputs: tuple[str, ...] = ()
     forces: Callable[[Tensor], Tensor] | None = None
+    side_force: float | None = None
 
     @classmethod
     def from_plant(cls, plant: Plant) -> Helm:
         """Return the helm of a plant."""
         forces: Callable[[Tensor], Tensor] | None = None
+        side_force: float | None = None
+        if isinstance(plant, HullPlant) and isinstance(plant.actuators, ForceCommands):
+            side_force = float(plant.actuators.limit[1])
         if plant.inputs[: plant.commands] == ForceCommands.commands:
             forces = torch.Tensor.clone
         elif isinstance(plant, HullPlant) and isinstance(plant.actuators, AzimuthThrusters):
             forces = plant.actuators.allocate
-        return cls(plant.demand, plant.state, plant.inputs, forces)
+        return cls(plant.demand, plant.state, plant.inputs, forces, side_force)
 
     def column(self, name: str) -> int:
         """Return the column of a state.

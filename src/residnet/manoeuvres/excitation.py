@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
 import numpy as np
@@ -12,7 +13,9 @@ from pydantic import AfterValidator, Field
 from torch import Tensor
 
 from residnet.core.config import Config, Hertz, Seconds
-from residnet.manoeuvres.base import Manoeuvre, Range, Scheduled
+from residnet.core.errors import UsageError
+from residnet.dynamics.rollout import Source
+from residnet.manoeuvres.base import Helm, Manoeuvre, Range, Scheduled, ScheduleSource
 
 
 def _ordered(band: tuple[float, float]) -> tuple[float, float]:
@@ -35,6 +38,8 @@ class Excitation(Scheduled, ABC):
         drive: mean drive.
         drive_amplitude: how far the drive goes to either side of it.
         steer_amplitude: how far the steer goes to either side of zero.
+        sway_amplitude: how far the sway force goes to either side of zero, in shares of the
+            largest; for vessels whose commands are forces.
         band: frequencies that the demands excite.
         seed: of everything random.
         start: when they begin; before, the drive is held and the steer is zero.
@@ -44,31 +49,56 @@ class Excitation(Scheduled, ABC):
     drive: float = Field(ge=-1, le=1)
     drive_amplitude: float = Field(default=0.0, ge=0, le=2)
     steer_amplitude: float = Field(default=0.0, ge=0, le=1)
+    sway_amplitude: float = Field(default=0.0, ge=0, le=1)
     band: Band
     seed: int = Field(default=0, ge=0)
     start: Seconds = Field(default=5.0, ge=0)
 
     @abstractmethod
     def _wave(self, t: Tensor, which: int) -> Tensor:
-        """Return the wave [T] within +-1 of the drive (0) or steer (1).
+        """Return the wave [T] within +-1 of the drive (0), the steer (1) or the sway force (2).
 
         Args:
             t: times [T] since the start in s.
-            which: 0 for the drive, 1 for the steer.
+            which: 0 for the drive, 1 for the steer, 2 for the sway force.
         """
 
     def demands(self, t: Tensor) -> tuple[Tensor, Tensor]:
         """Return drive and steer [T], clipped to +-1."""
-        active = t >= self.start - 1e-9
-        waves = [
-            torch.where(
-                active, self._wave((t - self.start).clamp(min=0.0), which), torch.zeros_like(t)
-            )
-            for which in (0, 1)
-        ]
-        return (self.drive + self.drive_amplitude * waves[0]).clamp(
+        drive, steer = (self._after_start(t, which) for which in (0, 1))
+        return (self.drive + self.drive_amplitude * drive).clamp(
             -1.0, 1.0
-        ), self.steer_amplitude * waves[1]
+        ), self.steer_amplitude * steer
+
+    def _after_start(self, t: Tensor, which: int) -> Tensor:
+        """Return a wave [T] that is zero before the start."""
+        wave = self._wave((t - self.start).clamp(min=0.0), which)
+        return torch.where(t >= self.start - 1e-9, wave, torch.zeros_like(t))
+
+    @classmethod
+    def source(cls, manoeuvres: Sequence[Manoeuvre], helm: Helm, t: Tensor) -> Source:
+        """Return the playback of the demands, with the sway forces where there are any.
+
+        Raises:
+            UsageError: where a sway force is asked of a vessel whose commands are no forces.
+        """
+        drawn = [manoeuvre for manoeuvre in manoeuvres if isinstance(manoeuvre, Excitation)]
+        sway = torch.stack([m.sway_amplitude * m._after_start(t, 2) for m in drawn])
+        if not bool(sway.any()):
+            return super().source(manoeuvres, helm, t)
+        limit, column = helm.side_force, "tau_y"
+        if limit is None or column not in helm.inputs:
+            raise UsageError(
+                "sway_amplitude: a manoeuvre asks for a sway force, but the vessel's commands are"
+                f" {', '.join(helm.inputs[:2])} and no forces; leave it out"
+            )
+        push = limit * sway.unsqueeze(-1) * torch.eye(3, dtype=t.dtype)[helm.inputs.index(column)]
+        pairs = [manoeuvre.demands(t) for manoeuvre in drawn]
+        return ScheduleSource(
+            torch.stack([drive for drive, _ in pairs]),
+            torch.stack([steer for _, steer in pairs]),
+            lambda drive, steer: helm.demand(drive, steer) + push,
+        )
 
 
 class RandomSteps(Excitation):
@@ -94,11 +124,8 @@ class RandomSteps(Excitation):
 class MultiSine(Excitation):
     """Sums of sines at frequencies spread evenly in their logarithm over the band.
 
-    Drive and steer have frequencies of their own. The phases are the ones with the flattest sum of
-    some random draws, so that the amplitude is well used.
-
-    The phases are the ones with the flattest sum of some random draws, so that the amplitude is
-    well used.
+    Each demand has frequencies of its own. The phases are the ones with the flattest sum of some
+    random draws, so that the amplitude is well used.
 
     Attributes:
         tones: frequencies of each of drive and steer.
@@ -109,7 +136,9 @@ class MultiSine(Excitation):
 
     def _wave(self, t: Tensor, which: int) -> Tensor:
         """Return the sum of sines [T], within +-1 over ten periods of the lowest; clipped."""
-        frequencies = np.geomspace(*self.band, 2 * self.tones)[which::2]
+        # every demand has frequencies of its own
+        demands = 3 if self.sway_amplitude else 2
+        frequencies = np.geomspace(*self.band, demands * self.tones)[which % demands :: demands]
         random = np.random.default_rng([self.seed, which])
         trial = np.arange(0.0, 10.0 / self.band[0], min(0.05 / self.band[1], 0.005 / self.band[0]))
         angle = 2.0 * math.pi * trial[:, None] * frequencies
@@ -133,6 +162,8 @@ class _Family(Config):
         drive: range of the mean drive.
         drive_amplitude: range of the drive's amplitude.
         steer_amplitude: range of the steer's amplitude.
+        sway_amplitude: range of the amplitude of the sway force, in shares of the largest; for
+            vessels whose commands are forces.
         band: lowest and highest frequency that the demands excite in Hz.
         start: when they begin in s.
     """
@@ -141,13 +172,14 @@ class _Family(Config):
     drive: Range = (0.3, 0.7)
     drive_amplitude: Range = (0.0, 0.3)
     steer_amplitude: Range = (0.2, 1.0)
+    sway_amplitude: Range = (0.0, 0.0)
     band: Band = (0.02, 0.2)
     start: Seconds = 5.0
 
     def _draw_common(
         self, random: np.random.Generator
     ) -> dict[str, float | int | tuple[float, float]]:
-        return {
+        common: dict[str, float | int | tuple[float, float]] = {
             "drive": float(random.uniform(*self.drive)),
             "drive_amplitude": float(random.uniform(*self.drive_amplitude)),
             "steer_amplitude": float(random.uniform(*self.steer_amplitude)),
@@ -155,6 +187,9 @@ class _Family(Config):
             "seed": int(random.integers(2**31)),
             "start": self.start,
         }
+        if self.sway_amplitude[1] > 0:
+            common["sway_amplitude"] = float(random.uniform(*self.sway_amplitude))
+        return common
 
 
 class RandomStepsFamily(_Family):
