@@ -8,6 +8,8 @@ Whatever the format, a stepped model keeps this contract, with batches of rows B
 - `step(x, w, s) -> (x, s, outside)`: state [B, 6], memory and flag [B] one step of `dt` later.
 - `rollout(x0, w, s) -> (x, s, outside)`: states [B, T+1, 6] from x0 on under inputs w [B, T, m],
   the memory after the last step, and the flag of each step [B, T].
+- `band(k) -> half widths [5]` of u, v, r, heading and position k steps after a measured state,
+  where a format has methods; the table that it reads stands in every card as `band`.
 
 `outside` is true where a velocity or an input lies beyond the training range, and where anything
 was no number or beyond what is accepted; states and memories that come out are finite always. What

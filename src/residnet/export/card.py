@@ -10,9 +10,21 @@ import torch
 
 from residnet.core.names import STATE
 from residnet.core.version import __version__
+from residnet.dynamics.band import BandTable
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
 from residnet.export.guard import GuardedDynamics
+
+_BAND = (
+    "half widths of the errors of a free run so many steps after a measured state, whatever the run"
+    " is like; between the steps they are interpolated, and beyond the last they grow in proportion"
+    " to time, without any promise; the position's is the radius about the predicted one"
+)
+
+
+def _band(band: BandTable, dt: float) -> dict[str, Any]:
+    """Return the table of half widths for formats that have no methods."""
+    return {"about": _BAND, "horizon": band.steps[-1] * dt, **band.model_dump(mode="json")}
 
 
 def make_card(
@@ -66,6 +78,7 @@ def make_card(
             member.model_dump(mode="json", include={"name", "baseline", "head"})
             for member in spec.members
         ],
+        "band": None if spec.band is None else _band(spec.band, spec.dt),
         "metrics": [dict(row) for row in metrics],
         "parity": dict(parity),
         "versions": {"residnet": __version__, "torch": torch.__version__},

@@ -50,7 +50,7 @@ _SETTINGS = {
     },
 }
 """What the card of this format says besides: the settings that make its first call quick."""
-_METHODS = ["initial_state", "warmup", "step", "rollout"]
+_METHODS = ["initial_state", "warmup", "step", "rollout", "band"]
 
 
 class ExportedModel(nn.Module):
@@ -67,6 +67,31 @@ class ExportedModel(nn.Module):
         self.inputs = len(spec.signals.columns)
         self.states = len(STATE)
         self.n_state = model.n_state
+        known = spec.band
+        self.register_buffer("band_steps", torch.tensor([1.0] if known is None else known.steps))
+        self.register_buffer(
+            "band_widths",
+            torch.full((1, 5), torch.inf) if known is None else torch.tensor(known.columns).T,
+        )
+        self.band_steps: Tensor
+        self.band_widths: Tensor
+
+    @torch.jit.export
+    def band(self, k: int) -> Tensor:
+        """Return the half widths [5] of u, v, r, heading and position k steps after a measurement.
+
+        They are zero at k = 0, grow in proportion to time beyond the calibrated horizon, and are
+        infinite where the model has no band.
+        """
+        steps, widths = self.band_steps.to(torch.float32), self.band_widths.to(torch.float32)
+        if k <= 0:
+            return torch.zeros_like(widths[0])
+        last = steps.shape[0] - 1
+        if k >= int(steps[last]):
+            return widths[last] * (float(k) / float(steps[last]))
+        after = int((steps <= k).sum())
+        share = (float(k) - float(steps[after - 1])) / float(steps[after] - steps[after - 1])
+        return widths[after - 1] + share * (widths[after] - widths[after - 1])
 
     @torch.jit.export
     def initial_state(self, batch: int) -> Tensor:

@@ -12,6 +12,7 @@ from residnet.report.interactive.free_runs import explorers
 from residnet.report.page import write_page
 from residnet.report.run_reader import RunFiles
 from residnet.report.sections.fit import (
+    bands,
     booklet,
     coefficients,
     data,
@@ -79,6 +80,7 @@ def fit_sections(run: RunFiles) -> list[Section]:
         doctor.section(run),
         _models(run),
         booklet.section(run),
+        bands.section(run),
         goodness.section(run),
         free_runs.section(run),
         figures_section(run.path / "figures"),

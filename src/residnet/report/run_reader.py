@@ -42,6 +42,8 @@ class StoredWindow:
         predicted: the same by model.
         diverged: by model.
         inputs: values [T] by name, SI and rad; empty where the run has stored none.
+        low: lower limits of the band [T, 6] by model; empty where no model has one.
+        high: upper limits likewise.
     """
 
     log: str
@@ -54,6 +56,8 @@ class StoredWindow:
     predicted: dict[str, np.ndarray]
     diverged: dict[str, bool]
     inputs: dict[str, np.ndarray] = field(default_factory=dict)
+    low: dict[str, np.ndarray] = field(default_factory=dict)
+    high: dict[str, np.ndarray] = field(default_factory=dict)
 
     def rmse(self, model: str) -> np.ndarray:
         """Return the root mean square errors [3] of u, v (usable samples) and r (all samples)."""
@@ -316,6 +320,18 @@ class RunFiles:
                             for name in table.columns
                             if name.startswith(INPUT)
                         },
+                        low=_limits(parts, "low"),
+                        high=_limits(parts, "high"),
                     )
                 )
         return out
+
+
+def _limits(parts: Mapping[str, Any], ending: str) -> dict[str, np.ndarray]:
+    """Return one limit of the bands [T, 6] of those models of a stored window that have any."""
+    names = [f"{name}_{ending}" for name in COLUMNS]
+    return {
+        model: part[names].to_numpy(float)
+        for model, part in parts.items()
+        if names[0] in part and bool(part[names[0]].notna().all())
+    }

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from residnet.report.blocks import Figure
+from residnet.report.figures import bands as figures_bands
 from residnet.report.figures import booklet as figures_booklet
 from residnet.report.figures import errors as figures_errors
 from residnet.report.figures import terms as figures_terms
@@ -46,6 +47,7 @@ def drawings(run: RunFiles) -> Iterator[Drawing]:
     """
     yield from _of_runs(run)
     yield from _of_errors(run)
+    yield from figures_bands.of_bands(run)
     yield from figures_booklet.of_booklet(run)
     yield from figures_terms.of_terms(run)
     yield from _of_training(run)

@@ -127,12 +127,12 @@ def tracks(run: RunFiles, windows: Sequence[StoredWindow]) -> Any:
 def history(run: RunFiles, window: StoredWindow) -> Any:
     """Draw velocities and heading against time, measured and predicted.
 
-    Masked samples are gaps on a grey ground.
+    Masked samples are gaps on a grey ground; the band of the leading model is shaded.
     """
     figure = new_figure(6.6)
     panels = figure.subplots(4, 1, sharex=True)
     time = window.t - window.t[0]
-    look = styles(run)
+    look, lead = styles(run), leading(run)
     handles: dict[str, Any] = {}
     offset = 2 * math.pi * math.floor((window.measured[0, 3] + math.pi) / (2 * math.pi))
     for i, (axes, (text, factor)) in enumerate(zip(panels, _PANELS, strict=True)):
@@ -140,6 +140,16 @@ def history(run: RunFiles, window: StoredWindow) -> Any:
         shade(axes, time, window.usable)
         measured = np.where(window.usable | (i >= 2), window.measured[:, i] - shift, np.nan)
         axes.plot(time, factor * measured, **MEASURED)
+        if lead in window.low:
+            axes.fill_between(
+                time,
+                factor * (window.low[lead][:, i] - shift),
+                factor * (window.high[lead][:, i] - shift),
+                color=look[lead]["color"],
+                alpha=0.15,
+                linewidth=0,
+                label=f"band of {lead}",
+            )
         for model in shown(run):
             if model in window.predicted:
                 axes.plot(time, factor * (window.predicted[model][:, i] - shift), **look[model])

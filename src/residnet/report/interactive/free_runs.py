@@ -27,6 +27,7 @@ _MOST_CASES = 24
 _MOST_SAMPLES = 500
 _MOST_POINTS = 700
 _MEASURED = "measured"
+_BAND = "band"
 _MOTION = (
     ("surge velocity u [m/s]", 1.0),
     ("sway velocity v [m/s]", 1.0),
@@ -90,10 +91,18 @@ def _free_runs(run: RunFiles, windows: Sequence[StoredWindow]) -> Explorer | Non
         " measured curves are masked samples. Of every kind of manoeuvre and protocol, the runs"
         f" with the least, the median and the largest error of {leading(run)} are here.",
         "Run",
-        {_MEASURED: Look(_MEASURED, INK, width=1.4), **_looks(run)},
+        {_MEASURED: Look(_MEASURED, INK, width=1.4), **_looks(run), **_band_look(run, chosen)},
         panels,
         [_run_case(run, window, rank, inputs) for window, rank in chosen],
     )
+
+
+def _band_look(run: RunFiles, chosen: Sequence[tuple[StoredWindow, str]]) -> dict[str, Look]:
+    """Return how the limits of the leading model's band look; nothing where it has none."""
+    lead = leading(run)
+    if not any(lead in window.low for window, _ in chosen):
+        return {}
+    return {_BAND: Look(f"band of {lead}", _looks(run)[lead].color, "dotted", 1.0)}
 
 
 def _input_title(run: RunFiles, name: str) -> str:
@@ -149,6 +158,12 @@ def _run_case(run: RunFiles, window: StoredWindow, rank: str, inputs: Sequence[s
         )
         for model, states in window.predicted.items():
             histories[column][model] = (time, factor * (states[rows, column] - shift))
+        if leading(run) in window.low:
+            lines = (window.low[leading(run)], window.high[leading(run)])
+            # both limits are one curve with a gap
+            limits = [np.append(factor * (line[rows, column] - shift), np.nan) for line in lines]
+            twice = np.append(time, np.nan)
+            histories[column][_BAND] = (np.tile(twice, 2), np.concatenate(limits))
     for model, states in window.predicted.items():
         tracks[model] = (states[rows, 5] - start[1], states[rows, 4] - start[0])
     given = [{_MEASURED: (time, run.unit(name)[1] * window.inputs[name][rows])} for name in inputs]

@@ -1,0 +1,53 @@
+"""The band of an exported model: a method in TorchScript, a table in the card."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from residnet.dynamics.band import BandTable
+from residnet.export import contract
+from residnet.export.torchscript import export_torchscript
+from residnet.testing.examples import example_model, example_spec
+
+TABLE = BandTable(
+    level=0.9,
+    steps=(1, 10, 30),
+    u=(0.1, 0.2, 0.4),
+    v=(0.1, 0.1, 0.1),
+    r=(0.01, 0.02, 0.02),
+    heading=(0.001, 0.1, 0.3),
+    position=(0.01, 1.0, 5.0),
+    logs=12,
+    cautions=("It is a test.",),
+)
+
+
+@pytest.mark.parametrize("table", [TABLE, None], ids=["band", "none"])
+def test_half_widths_are_those_of_the_table(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, table: BandTable | None
+) -> None:
+    monkeypatch.setattr(contract, "PARITY_STEPS", 5)
+    spec = example_spec(None).model_copy(update={"band": table})
+    card = export_torchscript(spec, example_model(spec), tmp_path / "model.pt", [])
+    loaded = torch.jit.load(str(tmp_path / "model.pt"))
+    assert loaded.band(0).tolist() == [0.0] * 5
+    if table is None:
+        assert card["band"] is None
+        assert torch.isinf(loaded.band(7)).all()
+        return
+    wanted = torch.tensor(table.columns).T
+    torch.testing.assert_close(loaded.band(1), wanted[0])
+    torch.testing.assert_close(loaded.band(10), wanted[1])
+    torch.testing.assert_close(loaded.band(20), 0.5 * (wanted[1] + wanted[2]))
+    torch.testing.assert_close(loaded.band(30), wanted[2])
+    torch.testing.assert_close(loaded.band(60), 2.0 * wanted[2])
+    assert card["band"]["horizon"] == pytest.approx(30 * spec.dt)
+    assert card["band"]["cautions"] == ["It is a test."]
+
+
+def test_a_column_of_another_length_is_refused() -> None:
+    with pytest.raises(ValueError, match="one half width for each of steps"):
+        BandTable.model_validate(TABLE.model_dump() | {"u": (0.1,)})
