@@ -94,6 +94,17 @@ def test_a_heading_that_is_not_wrapped_may_be_large_in_radians(
     assert (channels["psi"]["unit"], channels["r"]["unit"]) == ("rad", "rad/s")
 
 
+def test_letters_of_axes_are_told_by_their_units(logs: list[Log], tmp_path: Path) -> None:
+    """`N [m]` is no propeller, and `X [kN]` no place."""
+    log = logs[0]
+    columns = {"t [s]": log.t, "N [m]": log["x"], "E [m]": log["y"], "X [kN]": log["n"]}
+    columns |= {"HDG [deg]": np.degrees(log["psi"]) % 360.0, "left rpm": 60.0 * log["n"]}
+    pd.DataFrame(columns).to_csv(tmp_path / "turn.csv", index=False)
+    channels = draft_tables([tmp_path / "turn.csv"], Marks()).content["channels"]
+    found = {name: entry["column"] for name, entry in channels.items()}
+    assert found == {"x": "N [m]", "y": "E [m]", "psi": "HDG [deg]", "n_port": "left rpm"}
+
+
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "cp1252"])
 @pytest.mark.parametrize("language", ["German", "French", "Spanish", "Norwegian"])
 def test_the_encoding_of_a_header(language: str, encoding: str, tmp_path: Path) -> None:
@@ -129,6 +140,25 @@ def test_words_of_a_language(language: str) -> None:
         ("alloc_age", None),
         ("roll rate", "p"),
         ("Latitude", "latitude"),
+        ("Longitudinal velocity", "u"),
+        ("Velocidad longitudinal", "u"),
+        ("left_rpm", "n_port"),
+        ("thruster right", "thrust_stbd"),
+        ("TWS", "wind_speed"),
+        ("TWD", "wind_dir"),
+        ("AWA", None),
+        ("local_x", "x"),
+        ("Posición Y", "y"),
+        ("Taux de virage", "r"),
+        ("steering angle", "delta"),
+        ("Nordposition [m]", "x"),
+        ("Ostposition [m]", "y"),
+        ("Ost-Koordinate", "y"),
+        ("Rechtswert", "y"),
+        ("Istdrehzahl [U/min]", "n"),
+        ("Ruderlage soll", "cmd_delta"),
+        ("Rudersollwinkel", "cmd_delta"),
+        ("lateral acceleration", None),
     ],
 )
 def test_what_a_name_is_about(column: str, channel: str | None) -> None:

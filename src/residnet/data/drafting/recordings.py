@@ -16,7 +16,7 @@ from residnet.data.drafting.physics import FRAMES, Raw, along, follows, motion_o
 from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.sources import found_sources, step_of
 from residnet.data.drafting.tables import CHANNELS, READER
-from residnet.data.drafting.units import unit_by_size
+from residnet.data.drafting.units import is_pulse, unit_by_size
 from residnet.data.drafting.words import MOTION, input_channel, words_of
 from residnet.data.readers.composing.compose import Plan
 from residnet.data.readers.detect import AutoConfig, recording_for
@@ -172,10 +172,7 @@ def _numbered(same: Sequence[_Input]) -> list[_Input]:
 def _entry(found: _Input, marks: Marks) -> dict[str, Any]:
     key = (*CHANNELS, found.channel)
     entry: dict[str, Any] = {"topic": found.topic, "field": found.field}
-    known = found.values[np.isfinite(found.values)]
-    low, high = (float(level) for level in np.quantile(known, (0.01, 0.99)))
-    pulses = low >= 800.0 and high <= 2300.0 and high > 1200.0
-    if pulses and not found.channel.startswith(("n", "cmd_n")):
+    if is_pulse(found.channel, found.values):
         marks.guess(key, "pulses of a servo; 1500 us are taken as neutral, 500 us as all the way")
         return {**entry, "unit": "-", "offset": 1500, "scale": 0.002, "hold": True}
     unit, reason = unit_by_size(found.channel, found.values)

@@ -11,7 +11,7 @@ import numpy as np
 
 from residnet.core.errors import DataError, UsageError
 from residnet.core.names import CHANNEL_UNITS
-from residnet.core.units import si_unit, to_si
+from residnet.core.units import to_si
 from residnet.data.drafting.physics import (
     FRAMES,
     Fit,
@@ -26,7 +26,12 @@ from residnet.data.drafting.physics import (
 )
 from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.sheets import Clock, Sheet, clock_of, peek
-from residnet.data.drafting.units import unit_by_size, written_unit
+from residnet.data.drafting.units import (
+    is_pulse,
+    other_dimension,
+    unit_by_size,
+    written_unit,
+)
 from residnet.data.drafting.words import Words, input_channel, state_channel, words_of
 
 _LOOKED_AT = 24
@@ -118,6 +123,12 @@ def _named(columns: Sequence[str], marks: Marks) -> dict[str, str]:
     # shorter names first: `heading` before `heading of the second compass`
     for column in sorted(columns, key=lambda name: len(about[name].about)):
         channel = state_channel(about[column]) or input_channel(about[column])
+        other = _other_unit(column, channel)
+        if channel == "n" and other == "m":
+            channel = "x"
+        elif channel in _STATE and other:
+            marks.note(CHANNELS, f"'{column}' is called as {channel} is, but holds {other}")
+            continue
         if channel == "speed":
             speeds.append(column)
         elif channel is not None and channel not in names:
@@ -129,6 +140,12 @@ def _named(columns: Sequence[str], marks: Marks) -> dict[str, str]:
         marks.guess((*CHANNELS, "u"), f"'{speeds[0]}' is taken as the speed forward, not its size")
     order = [*_STATE, *(name for name in names if name not in _STATE)]
     return {name: names[name] for name in order if name in names}
+
+
+def _other_unit(column: str, channel: str | None) -> str | None:
+    """Return the unit in the brackets of a name where it cannot be that of a channel."""
+    expected = CHANNEL_UNITS.get(channel or "")
+    return None if expected is None else other_dimension(column, expected)
 
 
 def _raw(sheets: Sequence[Sheet], names: Mapping[str, str], left_out: dict[Path, str]) -> list[Raw]:
@@ -286,7 +303,8 @@ class _Channels:
             return entry | ({"frame": "enu"} if self._frame.from_east else {})
         if name in ("u", "v", "r") and {"x", "y", "psi"} <= set(self._names):
             return entry | self._rate(name)
-        if _is_pulse(name, self._values(name)) and written_unit(column, "rad") is None:
+        pulses = name not in _STATE and is_pulse(name, self._values(name))
+        if pulses and written_unit(column, "rad") is None:
             text = "pulses of a servo; 1500 us are taken as neutral, 500 us as all the way"
             self._marks.guess((*CHANNELS, name), text)
             return entry | {"unit": "-", "offset": 1500, "scale": 0.002}
@@ -325,22 +343,3 @@ class _Channels:
             return written
         text = f"the header says {written}, position and heading say {found} (factor {ratio:.3g})"
         return self._marks.ask(key, f"unit of '{self._names[name]}'", found, text, (found, written))
-
-
-def _is_pulse(name: str, values: np.ndarray) -> bool:
-    """Return whether values are pulses of a servo, in us."""
-    known = values[np.isfinite(values)]
-    if not known.size or name in _STATE or name.removeprefix("cmd_").startswith("n_"):
-        return False
-    low, high = np.quantile(known, (0.01, 0.99))
-    return bool(low >= 800.0 and high <= 2300.0 and high > 1200.0)
-
-
-def by_name(words: Words) -> str | None:
-    """Return the channel that a name stands for; None for none."""
-    return state_channel(words) or input_channel(words)
-
-
-def unit_of(entry: Mapping[str, Any]) -> str:
-    """Return the SI unit of a drafted channel."""
-    return si_unit(str(entry["unit"]))

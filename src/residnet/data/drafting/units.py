@@ -72,6 +72,15 @@ def unit_by_size(channel: str, values: np.ndarray) -> tuple[str, str]:
     return unit, f"the header has no unit; values up to {largest:.3g} would be {unit}"
 
 
+def is_pulse(channel: str, values: np.ndarray) -> bool:
+    """Return whether values are pulses of a servo, in us; revolutions may be as large."""
+    known = values[np.isfinite(values)]
+    if not known.size or re.match(r"(cmd_)?n(_|$)", channel):
+        return False
+    low, high = np.quantile(known, (0.01, 0.99))
+    return bool(low >= 800.0 and high <= 2300.0 and high > 1200.0)
+
+
 def _by_name(channel: str) -> str:
     """Return the SI unit of a channel that residnet does not know, by its name."""
     first = channel.removeprefix("cmd_")

@@ -16,32 +16,33 @@ from residnet.core.names import ACCELERATION, CHANNEL_UNITS
 _ABOUT: dict[str, str] = {
     "time": "zeit timestamp tiempo temps tijd tidspunkt 時刻 時間 | t time stamp tid sec secs"
     " seconds elapsed hora heure uhrzeit datum date datetime fecha utc dato",
-    "north": "north nord norte noord 北 | n northing",
-    "east": "east ost oste este oost 東 | e easting est",
-    "position": "posit 位置 | pos",
+    "north": "north nord norte noord hochwert 北 | n northing",
+    "east": "east ost oste este oost rechtswert 東 | e easting est",
+    "position": "posit posic posisj coordin koordinat coorden coordonn 位置 | pos local utm pose",
     "x": "| x",
     "y": "| y",
     "latitude": "latit breitengrad breedte bredde 緯度 | lat breite",
-    "longitude": "longit langengrad lengte lengde 経度 | lon lng laenge lange",
+    "longitude": "longitude longitud langengrad lengte lengde 経度 | lon lng laenge lange",
     "heading": "heading steuerkurs gierwinkel rumbo voorliggende heng kurswinkel 船首方位 方位"
     " 回頭角 lacet guinada | psi yaw hdg cap koers kurs kompass compass koersen kompassi"
     " peiling hdt",
     "ground": "ground grund fond grond grunn 対地 | cog sog smg cmg",
     "course": "course | cog cmg",
-    "rate": "rate geschwind vitesse velocidad snelheid hastighet 速度 角速度 | speed velo"
+    "rate": "rate taux geschwind vitesse velocidad snelheid hastighet 速度 角速度 | speed velo"
     " velocity rot",
-    "turn": "turn dreh gier wende drei giring 回頭 virage giro guin | rot angvelo yaw",
+    "turn": "turn dreh gier wende drei giring 回頭 virage girat giro guin | rot angvelo yaw",
     "turn_rate": "turnrate drehrate gierrate wenderate drehgeschwind giergeschwind"
     " wendegeschwind angvelo yawrate draaisnelheid giersnelheid svinghastighet dreiehastighet"
-    " 回頭角速度 | rot yawrate",
+    " bochtaanwijzer 回頭角速度 | rot yawrate wz gyroz",
     "angular": "angul winkelgeschwind hoeksnelheid vinkelhastighet 角速度 | gyro gyrz",
     "speed": "speed velo 風速 geschwind vitesse velocidad snelheid hastighet 速度 船速 fahrt"
-    " 速力 | velo sog stw fart vel spd log",
-    "surge": "surge langsgeschw laengsgeschw longitudinal avance avante voraus vooruit"
+    " vaart 速力 | velo sog stw fart vel spd log tws",
+    "surge": "surge langsgeschw laengsgeschw longitudin avance avante voraus vooruit voorwaart"
     " fremover 前後 langs | u forward ahead",
     "sway": "sway quergeschw seitlich lateral dwars tverr sideveis 左右 derive transvers"
     " querab sidewards sideways | v vm quer",
-    "rudder": "rudder ruder gouvernail timon roer rorv 舵 safran barre | delta rudder ror rsa",
+    "rudder": "rudder ruder gouvernail timon roer rorv 舵 safran barre | delta rudder ror rsa"
+    " steering helm",
     "propeller": "propel schraube helice schroef 推進 プロペラ propulseur | prop screw shaft"
     " welle eje arbre aksel 軸",
     "engine": "engine motor maschine maquina moteur hovedmaskin 主機 | main",
@@ -54,10 +55,10 @@ _ABOUT: dict[str, str] = {
     "azimuth": "azimu schottel pod | azi nozzle",
     "servo": "servo rcou",
     "force": "force kraft fuerza kracht 力 tau",
-    "wind": "wind vind vent viento 風",
-    "true": "true wahr vrai verdadero real ware sann 真",
+    "wind": "wind vind vent viento 風 | tws twd",
+    "true": "true wahr vrai verdadero real ware sann 真 | tws twd",
     "relative": "relativ apparent scheinb aparente schijnb tilsyn 相対 gemessen measured",
-    "direction": "direction richtung direccion richting retning angle winkel 方向 風向 | dir"
+    "direction": "direction richtung direccion richting retning angle winkel 方向 風向 | dir twd"
     " from angulo hoek vinkel",
     "angle": "angle winkel angulo hoek vinkel lage 角 | ang",
     "roll": "roll roulis balanceo krenging 横揺 kranken slagside | phi heel",
@@ -65,8 +66,10 @@ _ABOUT: dict[str, str] = {
     "acceleration": "accel beschleun versnell akselerasjon 加速 | udot vdot rdot dot acc",
     "command": "command order soll setpoint consigne befehl ordre gevraagd onsket 指令 demand"
     " reference desired | cmd set ref des",
-    "port": "backbord babord babor bakboord 左舷 portside | port bb ps",
-    "starboard": "starboard steuerbord tribord estribor stuurboord styrbord 右舷 | stbd sb stb",
+    "port": "backbord babord babor bakboord 左舷 portside | port bb ps"
+    " left links izquierda izquierdo gauche venstre",
+    "starboard": "starboard steuerbord tribord estribor stuurboord styrbord 右舷 | stbd sb stb"
+    " right rechts derecha derecho droite hoyre",
     "current": "current stromung courant corriente stroming 潮流",
     "depth": "depth tiefe profond profund diepte dybde 水深",
     "voltage": "volt spannung tension | amp ampere current_a",
@@ -76,7 +79,10 @@ _ABOUT: dict[str, str] = {
     "allocated": "alloc",
 }
 
-
+_WORDS = frozenset(
+    word for words in _ABOUT.values() for word in words.split() if len(word) > 2 and word.isascii()
+)
+"""All words that compounds are made of."""
 MOTION = ("x", "y", "psi", "u", "v", "r", "p", "phi", "wind_speed", "wind_dir")
 """Channels of the motion and of the wind."""
 
@@ -127,8 +133,19 @@ def words_of(name: str) -> Words:
     if number is None:
         tail = re.search(r"[a-z](\d+)$", tokens[-1]) if tokens else None
         number = int(tail.group(1)) if tail else None
+    bare += [piece for token in bare for piece in _pieces(token)]
     about = {thing for thing in _ABOUT if _fits(thing, text, bare)}
     return Words(text, frozenset(about), number)
+
+
+def _pieces(token: str) -> tuple[str, ...]:
+    """Return the two words that a compound is made of, `ost` and `position`; none for others."""
+    for cut in range(3, len(token) - 2):
+        first, second = token[:cut], token[cut:].removeprefix("s")
+        known = any(second.startswith(word) for word in _WORDS if len(word) > 3)
+        if first in _WORDS and (known or second in _WORDS):
+            return first, second
+    return ()
 
 
 def _fits(thing: str, text: str, tokens: list[str]) -> bool:
@@ -160,7 +177,7 @@ def state_channel(words: Words) -> str | None:
         return None
     if w.has("latitude"):
         return "latitude"
-    if w.has("longitude"):
+    if w.has("longitude") and w.lacks("surge"):
         return "longitude"
     if w.has("roll"):
         return "p" if w.has("rate") or w.has("angular") else "phi"

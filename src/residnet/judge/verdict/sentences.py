@@ -49,11 +49,19 @@ def verdict(evidence: Evidence) -> list[str]:
         lead(evidence),
         soundness(evidence),
         str(evidence.selection.get("reason", "")),
-        *trusted(evidence),
+        *([] if useless(evidence) else trusted(evidence)),
         outside(evidence),
         evidence.doctor,
     ]
     return [sentence for sentence in sentences if sentence]
+
+
+def useless(evidence: Evidence) -> bool:
+    """Return whether the selected model is `zero`, or no better: then no range is to be trusted."""
+    own, zero = evidence.rows.get(evidence.selected), evidence.rows.get(ZERO)
+    if evidence.selected == ZERO:
+        return True
+    return own is not None and zero is not None and _nrmse(own) >= _nrmse(zero)
 
 
 def lead(evidence: Evidence) -> str:
@@ -68,7 +76,7 @@ def lead(evidence: Evidence) -> str:
     if own is None:
         return f"The run holds no free runs of its selected model on {split} data."
     error = _nrmse(own)
-    if zero is not None and error >= _nrmse(zero):
+    if zero is not None and useless(evidence):
         return (
             f"WORSE THAN ZERO: on {split} data the selected model {name} has an NRMSE of"
             f" {error:.3g}{_lost(own)}, and zero, which only holds the velocities that a run starts"
