@@ -32,7 +32,7 @@ from residnet.data.drafting.units import (
     unit_by_size,
     written_unit,
 )
-from residnet.data.drafting.words import Words, input_channel, state_channel, words_of
+from residnet.data.drafting.words import input_channel, state_channel, words_of
 
 _LOOKED_AT = 24
 """Tables whose values are looked at; of the others only the header is."""
