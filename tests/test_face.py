@@ -237,3 +237,17 @@ def test_a_simulation_by_function_mapping_and_command_line_is_one(
     rows = result.read("indices.json")["rows"]
     overshoot = trials.indices["first_overshoot"].iloc[0]
     assert rows[0]["indices"]["first_overshoot"] == pytest.approx(overshoot, rel=1e-12)
+
+
+def test_logs_alone_are_fitted_by_the_recipe(logs: list[residnet.Log]) -> None:
+    models = residnet.fit([_coarse(log) for log in logs[:6]], effort=0.01)
+    assert models.settings.recipe == "standard"
+    assert models.settings.signals.inputs == ("n_port", "n_stbd")
+    assert {"zero", "baseline", "hull", "hull_network", "network"} <= set(models)
+    assert models.selected in models
+
+
+def _coarse(log: residnet.Log) -> residnet.Log:
+    """Every eighth sample of a log."""
+    channels = {name: values[::8] for name, values in log.channels.items()}
+    return log.replace(t=log.t[::8], channels=channels, masks={})

@@ -32,7 +32,7 @@ from residnet.identification.settings import FitSettings
 from residnet.judge.metrics import find
 
 INPUTS = {"boat": ["n", "delta"], "twin": ["n_port", "n_stbd"]}
-_LENGTH = 30.0
+_LENGTH = 20.0
 _FLIGHTS = 10
 
 
@@ -52,10 +52,10 @@ def settings_for(kind: str, splits: dict[str, list[Log]]) -> FitSettings:
         "integrator": "semi_implicit_euler",
         "evaluation": {
             "protocols": {
-                "T30": {**windows, "length": _LENGTH},
-                "T10": {**windows, "length": _LENGTH / 3},
+                "T20": {**windows, "length": _LENGTH},
+                "T5": {**windows, "length": _LENGTH / 4},
             },
-            "selection": "T30",
+            "selection": "T20",
             "scales": spread,
         },
     }

@@ -118,6 +118,16 @@ SHORT: dict[str, Short] = {
     "patrol_identified": Short(_trained("mlp")),
     "kvlcc2": Short(("refit.mmg.iterations=2", "booklet.draws=20"), data="kvlcc2"),
     "esso_osaka": Short(_TANKER, data="esso_osaka"),
+    "esso_osaka_standard": Short(
+        (
+            "data.split={root: '${RESIDNET_DATA}/esso_osaka', train: ['zigzag/*13_04_24.csv',"
+            " 'zigzag/*13_14_21.csv'], validation: ['zigzag/*13_29_19.csv'],"
+            " test: ['zigzag/*13_42_53.csv']}",
+            "evaluation.selection=T30",
+            "effort=0.01",
+        ),
+        data="esso_osaka",
+    ),
     "esso_osaka_no_wind": Short(_TANKER, data="esso_osaka"),
     "milliampere_raw": Short(data="milliampere"),
     "autopilot_nomoto": Short((*_policy("policy"), *_predictor("document"), *_STEP_TEST, *_PEERS)),

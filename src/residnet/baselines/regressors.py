@@ -14,11 +14,14 @@ from residnet.baselines.base import Baseline, IdentifiedConfig, ParametricBaseli
 from residnet.baselines.sets import Roles, SetName, expand, merged
 from residnet.core.names import ACCELERATION, VELOCITY
 from residnet.core.samples import Samples
+from residnet.physics.bounds import VelocityBound
 from residnet.physics.symmetry import dissipates, mirrored_terms, wrong_parity
 from residnet.physics.terms import TermLibrary
 from residnet.regression.least_squares import LeastSquares
 from residnet.regression.solutions import Coefficient, Solution
 
+_BEYOND = 0.5
+"""Share of a velocity's training range, on either side, in which a bounded model is as fitted."""
 RowTerms = dict[Literal["u", "v", "r"], tuple[str, ...]]
 Penalty = Annotated[float, Field(ge=0)]
 
@@ -36,9 +39,11 @@ class RegressorBaseline(ParametricBaseline):
         names: Sequence[str],
         held: Sequence[tuple[int, str]] = (),
         dissipative: bool = False,
+        bounded: bool = False,
     ) -> None:
         """From the terms of each axis; `held`: (axis, term) of coefficients that a refit through
-        rollouts must leave as they are; `dissipative`: no term may feed energy.
+        rollouts must leave as they are; `dissipative`: no term may feed energy;
+        `bounded`: velocities beyond their training range are taken at its edge and pulled back.
         """
         terms = list(dict.fromkeys(term for row in rows for term in row))
         super().__init__(torch.zeros(3, len(terms), dtype=torch.float64))
@@ -51,12 +56,16 @@ class RegressorBaseline(ParametricBaseline):
         self.held = tuple((axis, terms.index(term)) for axis, term in held)
         self.dissipative = dissipative
         self.names = tuple(names)
+        self.bound: VelocityBound | None = VelocityBound() if bounded else None
 
     def forward(self, z: Tensor) -> Tensor:
         """Return nu_dot [..., 3] at channels z [..., nz]."""
-        weights = self.theta * self.allowed
-        phi: Tensor = self.library(z)
-        return phi @ weights.to(z.dtype).T
+        weights = (self.theta * self.allowed).to(z.dtype)
+        if self.bound is not None:
+            phi: Tensor = self.library(self.bound.held(z))
+            return phi @ weights.T + self.bound(z)
+        known: Tensor = self.library(z)
+        return known @ weights.T
 
     def parameter_count(self) -> list[float]:
         """Return the number of coefficients of each axis that are not zero."""
@@ -86,7 +95,8 @@ class RegressorBaseline(ParametricBaseline):
         free = self.free_indices()
         axis, column = free // self.library.count, free % self.library.count
         out = torch.zeros(z.shape[0], 3, free.numel(), dtype=z.dtype)
-        out[:, axis, torch.arange(free.numel())] = self.library(z)[:, column]
+        seen = z if self.bound is None else self.bound.held(z)
+        out[:, axis, torch.arange(free.numel())] = self.library(seen)[:, column]
         return out
 
     def information(self, samples: Samples) -> Tensor:
@@ -196,6 +206,8 @@ class RegressorsConfig(IdentifiedConfig):
         manoeuvres: kinds of manoeuvre to fit on; empty for all.
         dissipative: terms along an axis' own velocity, such as u|u| in surge or v|r| in sway, whose
             sign would feed energy are left out, and the others fitted again; a refit does the same.
+        bounded: terms take velocities that are far outside their training range (by half its width)
+            at its edge, and such velocities are pulled back, so that the model cannot run away.
     """
 
     kind: Literal["regressors"] = "regressors"
@@ -206,6 +218,7 @@ class RegressorsConfig(IdentifiedConfig):
     ridge: Penalty | Annotated[tuple[Penalty, ...], Field(min_length=2)] = 0.0
     manoeuvres: tuple[str, ...] = ()
     dissipative: bool = False
+    bounded: bool = False
 
     @model_validator(mode="after")
     def _rows(self) -> RegressorsConfig:
@@ -234,7 +247,9 @@ class RegressorsConfig(IdentifiedConfig):
 
     def build(self, names: Sequence[str]) -> RegressorBaseline:
         """Return the module, coefficients zero, for channels `names`."""
-        return RegressorBaseline(self.rows(names), names, dissipative=self.dissipative)
+        return RegressorBaseline(
+            self.rows(names), names, dissipative=self.dissipative, bounded=self.bounded
+        )
 
     def require_samples(self, samples: Samples) -> None:
         """Check that there are manoeuvres to fit on.
@@ -273,7 +288,13 @@ class RegressorsConfig(IdentifiedConfig):
                 columns = [j for j in columns if terms[j] not in feeding]
                 found = fitted(axis, columns)
             fits.append(found)
-        return [baseline.solution(axes, axes[0].choice) for axes in zip(*fits, strict=True)]
+        found = [baseline.solution(axes, axes[0].choice) for axes in zip(*fits, strict=True)]
+        if not self.bounded:
+            return found
+        bound = VelocityBound(_BEYOND)
+        bound.calibrate(chosen)
+        state = {f"bound.{name}": value for name, value in bound.state_dict().items()}
+        return [replace(one, state={**one.state, **state}) for one in found]
 
     def _feeding(self, solutions: Sequence[Solution], axis: int, names: Sequence[str]) -> set[str]:
         """Return terms that feed energy in every solution and may not."""

@@ -13,7 +13,9 @@ from residnet.core.errors import UsageError
 from residnet.core.names import nearest
 from residnet.core.progress import ProgressCallback
 from residnet.face.data import Data
+from residnet.face.logs import LogsGiven
 from residnet.face.models import Model
+from residnet.face.preparing import prepared_alone
 from residnet.face.runs import FreeRuns, free_run
 from residnet.face.values import PartGiven, described, hearing, named_parts, part, plain
 from residnet.identification.currents import through_currents
@@ -122,10 +124,12 @@ class Models(Mapping[str, Model]):
 
 
 def fit(
-    data: Data,
-    baseline: PartGiven = "regressors",
+    data: Data | LogsGiven,
+    baseline: PartGiven | None = None,
     heads: PartGiven | Sequence[str] | Mapping[str, PartGiven] = (),
     *,
+    recipe: str | None = None,
+    effort: float = 1.0,
     baselines: Mapping[str, PartGiven] | None = None,
     base_of: Mapping[str, str] | None = None,
     ensembles: Mapping[str, Sequence[str]] | None = None,
@@ -133,21 +137,25 @@ def fit(
     refit: Mapping[str, Any] | None = None,
     current: Mapping[str, Any] | None = None,
     bands: Mapping[str, Any] | BandsConfig | None = _BANDS,
-    integrator: str = "rk4",
+    integrator: str | None = None,
     seed: int = 0,
     threads: int = 1,
     progress: ProgressCallback | None = None,
 ) -> Models:
     """Fit baselines, then heads on what each leaves, then ensembles.
 
-    The arguments are the keys of a config of the task `fit`, and give the same numbers.
+    The arguments are the keys of a config of the task `fit`, and give the same numbers. Without a
+    baseline, heads or other parts the standard recipe fits its portfolio of models.
 
     Args:
-        data: from `prepare`.
+        data: from `prepare`; or logs, whose inputs, split, step, protocols and scales then follow
+            from what they hold.
         baseline: the known part: its kind, a mapping or a config object. `regressors` alone is a
-            line in every channel.
+            line in every channel, and is taken where there are heads but no baseline.
         heads: what is learned on top: kinds such as `["plsr", "lstm"]`, or a mapping from names to
             kinds, mappings or config objects.
+        recipe: `standard`, in place of all parts.
+        effort: how long the recipe trains its networks, 1 for usual, less for a quick look.
         baselines: further baselines by name.
         base_of: the baseline that a head stands on, by the head's name.
         ensembles: models whose mean acceleration makes another model, by its name.
@@ -156,7 +164,8 @@ def fit(
         current: the logs ran in constant currents that are estimated first.
         bands: how far free runs may be off, calibrated over logs that were left out: `level`,
             `folds` and so on, as YAML has them; None for none.
-        integrator: of the models: rk4, heun, euler or semi_implicit_euler.
+        integrator: of the models: rk4, heun, euler or semi_implicit_euler; by default the last for
+            the recipe, else the first.
         seed: of weights and batches.
         threads: of PyTorch; one is fastest for these small products, and part of what makes a fit
             repeatable.
@@ -168,27 +177,39 @@ def fit(
         DataError: where a split holds no sample or no window.
 
     Example:
-        models = residnet.fit(data, heads=["plsr", "lstm"]); models.metrics
+        models = residnet.fit(logs); models.selected, models.metrics
     """
+    parts: dict[str, Any] = {
+        "baselines": {} if not baselines else named_parts(baselines, "baseline"),
+        "refit": refit or {},
+        "heads": {} if _empty(heads) else named_parts(heads, "head"),
+        "base_of": base_of or {},
+        "ensembles": ensembles or {},
+        "training": training or {},
+    }
+    given = {key: value for key, value in parts.items() if value}
+    if baseline is not None:
+        given["baseline"] = part(baseline, "baseline")
+    if recipe is None and not given:
+        recipe = "standard"
+    if recipe is None:
+        given.setdefault("baseline", part("regressors", "baseline"))
+    else:
+        given |= {"recipe": recipe, "effort": effort}
+    usual = "rk4" if recipe is None else "semi_implicit_euler"
     if not isinstance(data, Data):
-        raise UsageError(f"fit: expected data from residnet.prepare, given {described(data)}")
+        data = prepared_alone(data)
     settings: FitSettings = validate(
         plain(
             {
                 "seed": seed,
                 "prepare": data.prepare,
                 "signals": data.signals,
-                "integrator": integrator,
-                "baseline": part(baseline, "baseline"),
-                "baselines": {} if not baselines else named_parts(baselines, "baseline"),
+                "integrator": integrator or usual,
                 "current": current,
-                "refit": refit or {},
-                "heads": {} if _empty(heads) else named_parts(heads, "head"),
-                "base_of": base_of or {},
-                "ensembles": ensembles or {},
-                "training": training or {},
                 "evaluation": data.evaluation,
                 "bands": bands,
+                **given,
             }
         ),
         FitSettings,

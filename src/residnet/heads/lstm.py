@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from residnet.core.samples import Samples
 from residnet.heads.base import FeatureConfig, Features, ResidualHead, ResidualScale
 from residnet.heads.mirror import MirroredHead
+from residnet.physics.bounds import VelocityBound
 
 _FARTHEST = 1e3
 """Largest cell state that a memory may hold: a gain of at most one each step, the gates open."""
@@ -38,6 +39,8 @@ class LstmConfig(FeatureConfig):
             what a free run starts from; otherwise the same weights do both (Forgione and Piga 2021,
             Continuous-time system identification with neural networks, section 3; Weber and others
             2021, Non-linear RNN identification: diagnosis and simulation).
+        restoring: velocities that leave their training range are pulled back into it, so that a
+            network that stands alone cannot run away.
     """
 
     kind: Literal["lstm"] = "lstm"
@@ -50,6 +53,7 @@ class LstmConfig(FeatureConfig):
     axis_features: dict[Literal["u", "v", "r"], tuple[str, ...]] | None = None
     mirror: bool = False
     encoder: bool = False
+    restoring: bool = False
 
     @model_validator(mode="after")
     def _axes(self) -> LstmConfig:
@@ -239,9 +243,12 @@ class LstmHead(ResidualHead):
         self.width = 2 * config.hidden_size
         self.n_state = self.width * len(self.networks)
         self.scale = ResidualScale()
+        self.restoring: VelocityBound | None = VelocityBound() if config.restoring else None
 
     def calibrate(self, samples: Samples) -> None:
         """Take the scales of features and residual from the samples."""
+        if self.restoring is not None:
+            self.restoring.calibrate(samples)
         for network in self.networks:
             network.features.calibrate(samples)
         self.scale.calibrate(samples)
@@ -263,12 +270,17 @@ class LstmHead(ResidualHead):
             y, m = network(z, s[:, i * self.width : (i + 1) * self.width])
             out.append(y)
             memory.append(m)
-        return self.scale(torch.cat(out, dim=-1)), torch.cat(memory, dim=-1)
+        rho: Tensor = self.scale(torch.cat(out, dim=-1))
+        if self.restoring is not None:
+            rho = rho + self.restoring(z)
+        return rho, torch.cat(memory, dim=-1)
 
     def sequence(self, z: Tensor) -> Tensor:
         """Return residuals [B, T, 3] along measured channels [B, T, nz], from an empty memory."""
         scaled = torch.cat([network.sequence(z)[0] for network in self.networks], dim=-1)
         rho: Tensor = self.scale(scaled)
+        if self.restoring is not None:
+            rho = rho + self.restoring(z)
         return rho
 
     def warmup(self, z: Tensor) -> Tensor:

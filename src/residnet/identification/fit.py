@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 
+from residnet.core.errors import DataError, FitError
 from residnet.core.progress import say
 from residnet.data.prepare import Prepared
 from residnet.identification.bands.calibrating import calibrate_bands
@@ -32,14 +34,19 @@ def fit(
     settings = fitter.settings
     models = {"zero": fitter.zero()}
     for name in settings.all_baselines:
-        models[name] = fitter.baseline(name)
-        say(f"  {name}: {_said(models[name])}")
+        with _optional(settings, name):
+            models[name] = fitter.baseline(name)
+            say(f"  {name}: {_said(models[name])}")
     for name in settings.heads:
-        say(f"  fitting {name}")
         begin = settings.training[name].begin_with if name in settings.training else None
-        base = models[settings.baseline_name_of(name)]
-        models[name] = fitter.head(name, base, None if begin is None else models[begin])
-        say(f"  {name}: {_said(models[name])} after {models[name].notes['seconds']:.1f} s")
+        needed = [settings.baseline_name_of(name), *([] if begin is None else [begin])]
+        if any(other not in models for other in needed):
+            continue
+        say(f"  fitting {name}")
+        with _optional(settings, name):
+            start = None if begin is None else models[begin]
+            models[name] = fitter.head(name, models[needed[0]], start)
+            say(f"  {name}: {_said(models[name])} after {models[name].notes['seconds']:.1f} s")
     for name, members in settings.ensembles.items():
         models[name] = fitter.ensemble(name, [models[member] for member in members])
         say(f"  {name}: {_said(models[name])}")
@@ -51,6 +58,21 @@ def fit(
         for model in identified.values():
             fitter.store.keep(model)
     return identified
+
+
+@contextmanager
+def _optional(settings: FitSettings, name: str) -> Iterator[None]:
+    """Leave a model of the recipe out that the logs do not determine; others fail the fit.
+
+    Raises:
+        FitError: of a model that was asked for by name, or of the recipe's first.
+    """
+    try:
+        yield
+    except (DataError, FitError) as error:
+        if settings.recipe is None or name == "baseline":
+            raise
+        say(f"  {name} is left out: {error}")
 
 
 def _add_tied(

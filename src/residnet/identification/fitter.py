@@ -53,10 +53,14 @@ class Fitter:
         self.low, self.high = envelope(self.train)
         self.limit = velocity_limit(self.low, self.high, settings.evaluation.divergence)
         self.samples = samples(self.train, self.signals)
-        self.settings = settled(settings, self.samples, self.known)
+        self.settings = settled(settings, self.samples, self.train)
         self.scales = torch.from_numpy(settings.evaluation.scales.array())
         self.validate = ValidationScore(
-            logs["validation"], settings.evaluation, settings.prepare.grid.step, self.limit
+            logs["validation"],
+            settings.evaluation,
+            settings.prepare.grid.step,
+            self.limit,
+            dense=settings.recipe is not None,
         )
 
     def spec(self, name: str, role: str, baseline: BaselineConfig) -> ModelSpec:

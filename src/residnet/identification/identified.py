@@ -15,6 +15,8 @@ from residnet.identification.evaluation import Evaluation, candidates, evaluate
 from residnet.identification.models import FittedModel
 from residnet.identification.selecting import examine, select
 from residnet.identification.settings import FitSettings
+from residnet.judge.freerun import FreeRun, free_run
+from residnet.judge.protocol import all_windows, overlapping
 from residnet.judge.verdict.sanity import Finding
 from residnet.judge.verdict.selection import Selection
 
@@ -68,7 +70,26 @@ class Identified(Mapping[str, FittedModel]):
         Raises:
             UsageError: where the validation logs have not been judged.
         """
-        return select(self.values(), judged, self.findings, self.settings.evaluation)
+        return select(
+            self.values(),
+            judged,
+            self.findings,
+            self.settings.evaluation,
+            self._overlapping(judged.get("validation")),
+        )
+
+    def _overlapping(self, validation: Evaluation | None) -> FreeRun | None:
+        """Return free runs over overlapping windows, by which the recipe's models are chosen."""
+        settings = self.settings
+        if settings.recipe is None or validation is None:
+            return None
+        config, step, logs = settings.evaluation, settings.prepare.grid.step, validation.logs
+        name = f"{config.selection}, overlapping"
+        windows = all_windows(overlapping(config.protocols[config.selection]), logs, step, name)
+        models = candidates(self.values())
+        return FreeRun(
+            name, "validation", windows, free_run(models, windows, logs, step, self.limit)
+        )
 
     def __getitem__(self, name: str) -> FittedModel:
         return self.models[name]

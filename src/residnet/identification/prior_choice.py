@@ -20,7 +20,7 @@ from residnet.identification.folds import Fold, folds_of
 from residnet.identification.settings import FitSettings
 from residnet.judge.config import EvaluationConfig
 from residnet.judge.freerun import Candidate, FreeRun, Prediction, free_run
-from residnet.judge.protocol import Window, Windows
+from residnet.judge.protocol import Window, Windows, overlapping
 from residnet.judge.verdict.selection import blocks_of, shares
 from residnet.training.refit import refit
 from residnet.training.refit_config import RefitConfig
@@ -103,7 +103,7 @@ def _windows(
     """Return windows of the protocol that chooses, of the refit's horizon where none is there."""
     chosen = evaluation.protocols[evaluation.selection]
     shorter = Windows(length=config.horizon, first=0.0, history=0.0)
-    for protocol in (chosen, shorter):
+    for protocol in (overlapping(chosen), overlapping(shorter)):
         found = [w for number, log in enumerate(logs) for w in protocol.windows(log, number, step)]
         if found:
             return found

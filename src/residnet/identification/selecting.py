@@ -15,6 +15,7 @@ from residnet.heads import ClosedFormHead
 from residnet.identification.evaluation import Evaluation
 from residnet.identification.models import FittedModel
 from residnet.judge.config import EvaluationConfig
+from residnet.judge.freerun import FreeRun
 from residnet.judge.verdict.course_stability import SteadyRun, contradiction, steady_runs
 from residnet.judge.verdict.sanity import BOUNDED, DAMPING, STABILITY, Finding, check_model
 from residnet.judge.verdict.selection import Contender, Selection, blocks_of, choose, shares
@@ -74,6 +75,7 @@ def select(
     judged: Mapping[str, Evaluation],
     findings: Mapping[str, Sequence[Finding]],
     config: EvaluationConfig,
+    deciding: FreeRun | None = None,
 ) -> Selection:
     """Choose among the models of a fit by their free runs over the validation logs.
 
@@ -82,27 +84,30 @@ def select(
         judged: their free runs by split; `validation` is needed, `train` shows divergences too.
         findings: of the checks for physical sanity, by model.
         config: its `selection` protocol decides.
+        deciding: free runs over the validation logs that decide in its place.
 
     Raises:
         UsageError: where the validation logs have not been judged.
     """
     validation = judged.get("validation")
-    deciding = [] if validation is None else validation.runs
-    run = next((run for run in deciding if run.protocol == config.selection), None)
+    runs = [] if validation is None else validation.runs
+    run = deciding or next((run for run in runs if run.protocol == config.selection), None)
     if validation is None or run is None:
         raise UsageError(
             f"select: no free runs over validation logs by protocol '{config.selection}'; evaluate"
             " the validation split first"
         )
     blocks, labels = blocks_of(run)
+    counted = {split: judged[split].runs for split in _CHECKED if split in judged}
+    if deciding is not None:
+        counted["validation"] = [*counted["validation"], deciding]
     scales = config.scales.named()
     contenders = []
     for entry in fitted:
         lost = [
             (split, free.protocol, diverged, len(free.windows))
-            for split in _CHECKED
-            if split in judged
-            for free in judged[split].runs
+            for split, runs in counted.items()
+            for free in runs
             if (diverged := sum(p.diverged for p in free.predictions[entry.name]))
         ]
         faults = [

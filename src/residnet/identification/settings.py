@@ -79,6 +79,7 @@ class FitSettings(Parts):
             network on each, hull and network calibrated together, and a network alone; their terms,
             sizes and trainings follow from the logs. The mean of the models that validation data
             cannot tell from the best is named `tied`. Null for parts of your own.
+        effort: how long the recipe trains its networks: 1 for usual, less for a quick look.
     """
 
     seed: int = Field(default=0, ge=0)
@@ -89,6 +90,7 @@ class FitSettings(Parts):
     evaluation: EvaluationConfig
     bands: BandsConfig | None = BandsConfig()
     recipe: Literal["standard"] | None = None
+    effort: float = Field(default=1.0, gt=0, le=10)
 
     @model_validator(mode="after")
     def _of_recipe(self) -> FitSettings:
@@ -106,7 +108,7 @@ class FitSettings(Parts):
 
     def with_parts(self, facts: Facts) -> Self:
         """Return the settings with the parts of the recipe for what is known of the logs."""
-        parts = validate(portfolio(facts), Parts, "recipe")
+        parts = validate(portfolio(facts, self.effort), Parts, "recipe")
         return self.model_copy(update={key: getattr(parts, key) for key in PARTS})
 
     @model_serializer(mode="wrap")

@@ -18,7 +18,7 @@ def settled(settings: FitSettings, samples: Samples, logs: Sequence[Prepared]) -
     Args:
         settings: of the fit.
         samples: of the training logs.
-        logs: for training and validation.
+        logs: for training.
     """
     if settings.recipe is None:
         return settings

@@ -12,7 +12,7 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.judge.config import EvaluationConfig
 from residnet.judge.freerun import Candidate, FreeRun, free_run
 from residnet.judge.metrics import window_errors
-from residnet.judge.protocol import all_windows
+from residnet.judge.protocol import all_windows, overlapping
 from residnet.training.module import Score
 
 
@@ -24,19 +24,29 @@ class ValidationScore:
         config: its `selection` protocol and scales are used.
         step: of the grid in s.
         limit: of |u, v, r| [3] beyond which a free run has diverged.
+        dense: windows overlap, so that few logs tell more.
 
     Raises:
         DataError: where no log holds a window of the protocol.
     """
 
     def __init__(
-        self, logs: Sequence[Prepared], config: EvaluationConfig, step: float, limit: np.ndarray
+        self,
+        logs: Sequence[Prepared],
+        config: EvaluationConfig,
+        step: float,
+        limit: np.ndarray,
+        *,
+        dense: bool = False,
     ) -> None:
         self.logs = logs
         self.step = step
         self.limit = limit
         self.scales = config.scales.array()
-        self.windows = all_windows(config.protocols[config.selection], logs, step, config.selection)
+        protocol = config.protocols[config.selection]
+        self.windows = all_windows(
+            overlapping(protocol) if dense else protocol, logs, step, config.selection
+        )
 
     def __call__(self, model: HybridDynamics) -> Score:
         """Return the divergences and the mean nrmse of the validation windows, run in float32."""

@@ -15,6 +15,8 @@ from residnet.core.layout import VELOCITIES
 from residnet.core.stretches import stretch_bounds
 from residnet.data.prepare import Prepared
 
+_OVERLAP = 4
+
 
 @dataclass(frozen=True)
 class Window:
@@ -131,6 +133,23 @@ class WholeManoeuvre(Config):
 
 
 ProtocolConfig = Annotated[Windows | WholeManoeuvre, Field(discriminator="kind")]
+
+
+def overlapping(protocol: Windows | WholeManoeuvre) -> Windows | WholeManoeuvre:
+    """Return a protocol whose windows start four times as often, for choices among models.
+
+    Back-to-back windows of a few logs are few; what is left of a log behind the last one tells
+    nothing. Whole manoeuvres stay as they are.
+    """
+    return Overlapping(**protocol.model_dump()) if isinstance(protocol, Windows) else protocol
+
+
+class Overlapping(Windows):
+    """A protocol of windows that start every quarter of their length."""
+
+    def windows(self, log: Prepared, number: int, step: float) -> list[Window]:
+        """Return the windows of one log, by their start; none where it is too short."""
+        return self.overlapping(log, number, step, self.length / _OVERLAP)
 
 
 def all_windows(

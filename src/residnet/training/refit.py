@@ -43,7 +43,8 @@ class Refitted:
         covariance: of the free parameters, [P, P]; what offsets leave open is in it.
         notes: cost before and after, iterations, windows, horizon, independent errors; terms that
             were left out, since their sign would feed energy.
-        open: which free parameters the data leave open, so that their prior says what they are [P].
+        open: which free parameters neither accelerations nor free runs determine [P]; they stay
+            where least squares put them, which is near zero where these have a ridge.
         offsets: of each log in the store.
     """
 
@@ -116,11 +117,8 @@ def refit(
         "independent_errors": round(problem.count, 1),
         "at_rest": torch.nonzero(problem.still).squeeze(1).tolist(),
     }
-    known = problem.precision + problem.pull + torch.diag(share * problem.belief)
-    from_prior = (inverse @ known).diagonal()
-    return Refitted(
-        share * inverse, notes, replace(offsets, error=error), (from_prior > _OPEN) | problem.still
-    )
+    left_open = (inverse @ problem.own).diagonal() > _OPEN
+    return Refitted(share * inverse, notes, replace(offsets, error=error), left_open)
 
 
 def _values(baseline: ParametricBaseline, problem: Problem) -> Tensor:

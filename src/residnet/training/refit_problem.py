@@ -16,11 +16,17 @@ from residnet.data.windows import WindowStore
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.training.refit_config import RefitConfig
 
+_OWN = 1e-4
+"""Weight of a parameter's own start, as a share of the information that the samples would hold if
+all others were known; it says where a parameter stays that the data leave open.
+"""
+
 
 @dataclass(frozen=True)
 class Problem:
     """Windows x0 [B, 6], w [B, T, m], measured nu [B, T, 3], weights [B, T, 3] (0 or 1/scale);
-    numbers of the free parameters [P]; precision [P, P] about where least squares put them [P],
+    numbers of the free parameters [P]; precision [P, P] about where least squares put them, the
+    part of it that each parameter has for itself, whatever the data say, and that point [P];
     pull to the mirror symmetry [P, P]; beliefs, mean and precision [P]; which parameters stay at
     zero [P]; count of independent errors per channel; log of each window [B]; speed at which
     offsets are what they are said to be.
@@ -32,6 +38,7 @@ class Problem:
     weight: Tensor
     active: Tensor
     precision: Tensor
+    own: Tensor
     start: Tensor
     pull: Tensor
     believed: Tensor
@@ -101,13 +108,16 @@ def problem_of(
     active = baseline.free_indices()
     covered = (starts[:, None] + torch.arange(1, steps + 1)).unique().numel()
     believed, belief = baseline.prior()
+    information = baseline.information(samples)
+    own = torch.diag(_OWN * information.diagonal())
     return Problem(
         store.y[starts],
         take(store.w, starts, steps),
         nu,
         weight,
         active,
-        config.priors[0] * baseline.information(samples),
+        config.priors[0] * information + own,
+        own,
         baseline.theta.detach().flatten()[active].clone(),
         config.asymmetric * baseline.asymmetry(samples),
         believed,

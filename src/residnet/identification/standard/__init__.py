@@ -3,6 +3,6 @@
 from __future__ import annotations
 
 from residnet.identification.standard.facts import Facts
-from residnet.identification.standard.portfolio import PARTS, TIED, names_of, portfolio
+from residnet.identification.standard.portfolio import PARTS, TIED, portfolio
 
-__all__ = ["PARTS", "TIED", "Facts", "names_of", "portfolio"]
+__all__ = ["PARTS", "TIED", "Facts", "portfolio"]

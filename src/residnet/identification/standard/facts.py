@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -10,6 +11,7 @@ import torch
 
 from residnet.core.names import VELOCITY
 from residnet.core.samples import Samples
+from residnet.core.stretches import stretches
 from residnet.data.prepare import Prepared
 from residnet.judge.config import EvaluationConfig
 from residnet.judge.protocol import Windows
@@ -19,6 +21,8 @@ _STILL = 1e-3
 """Spread of a channel, as a share of its size, below which it tells nothing."""
 _ASTERN = 0.01
 """Share of the samples from which a propeller that turns astern counts."""
+_ROOM = 0.6
+"""Share of a usual stretch that a free run may take, so that it can start at several places."""
 _USUAL = 60.0
 """Length of a free run in s where no log says how long it is."""
 
@@ -34,6 +38,7 @@ class Facts:
         step: of the grid, s.
         length: of the free runs that choose between models, s.
         history: measured past that a free run may look back on, s.
+        stretch: half of the training samples lie in uninterrupted stretches at least so long, s.
         samples: of the training logs.
     """
 
@@ -43,12 +48,13 @@ class Facts:
     step: float
     length: float
     history: float
+    stretch: float
     samples: int
 
     @classmethod
     def supposed(cls, names: Sequence[str], step: float = 0.1) -> Facts:
         """Return facts before any log is read: every channel moves, ahead only."""
-        return cls(tuple(names), _acting(names), (), step, _USUAL, 0.1 * _USUAL, 10_000)
+        return cls(tuple(names), _acting(names), (), step, _USUAL, 0.1 * _USUAL, math.inf, 10_000)
 
     @classmethod
     def of(
@@ -62,7 +68,7 @@ class Facts:
 
         Args:
             samples: of the training logs.
-            logs: for training and validation.
+            logs: for training.
             evaluation: protocols.
             step: of the grid, s.
         """
@@ -75,7 +81,15 @@ class Facts:
         ]
         astern = [name for name in moving if _both_signs(z[:, names.index(name)])]
         length, history = _free_run(logs, evaluation, step)
-        return cls(names, tuple(moving), tuple(astern), step, length, history, len(samples))
+        stretch = _stretch(logs) * step
+        return cls(
+            names, tuple(moving), tuple(astern), step, length, history, stretch, len(samples)
+        )
+
+    @property
+    def longest(self) -> float:
+        """Length of the longest free runs that there is a use and enough room for, s."""
+        return min(self.length, _ROOM * self.stretch)
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -95,6 +109,15 @@ def _acting(names: Sequence[str]) -> tuple[str, ...]:
         for name in names
         if name not in VELOCITY and (not forces or name in FORCE_CHANNELS or name in WIND_CHANNELS)
     )
+
+
+def _stretch(logs: Sequence[Prepared]) -> float:
+    """Return the number of samples of stretches in which half of all samples lie, or longer."""
+    lengths = np.concatenate(
+        [np.diff(np.stack(stretches(log.piece)), axis=0).flatten() for log in logs]
+    )
+    falling = np.sort(lengths)[::-1]
+    return float(falling[np.searchsorted(np.cumsum(falling), 0.5 * falling.sum())])
 
 
 def _both_signs(values: torch.Tensor) -> bool:

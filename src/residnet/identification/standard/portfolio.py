@@ -22,7 +22,7 @@ _FROZEN, _TOGETHER = "hull_network", "hull_network_calibrated"
 _RIDGE = 1e-4
 
 
-def portfolio(facts: Facts) -> dict[str, Any]:
+def portfolio(facts: Facts, effort: float = 1.0) -> dict[str, Any]:
     """Return baselines, refits, heads and trainings by the names that the recipe gives them.
 
     `baseline` is linear and `hull` nonlinear in velocities and inputs, both refitted. A network
@@ -30,10 +30,11 @@ def portfolio(facts: Facts) -> dict[str, Any]:
 
     Args:
         facts: of the logs; `Facts.supposed` before they are read.
+        effort: how long networks are trained, 1 for usual.
     """
     network = _network(facts)
     heads = {_FROZEN: network, _TOGETHER: network, "linear_network": network, "network": network}
-    training = training_settings(facts)
+    training = training_settings(facts, effort)
     return {
         "baseline": {"kind": "regressors", "ridge": 1e-6, "terms": linear_terms(facts)},
         "baselines": {"hull": {"kind": "regressors", "ridge": _RIDGE, "terms": hull_terms(facts)}},
@@ -48,19 +49,14 @@ def portfolio(facts: Facts) -> dict[str, Any]:
         "ensembles": {},
         "training": {
             **dict.fromkeys(heads, training),
-            _TOGETHER: calibration_settings(facts, _FROZEN),
+            _TOGETHER: calibration_settings(facts, effort, _FROZEN),
         },
     }
 
 
-def names_of(facts: Facts) -> tuple[str, ...]:
-    """Return the names of the recipe's models in the order that they are fitted in."""
-    plan = portfolio(facts)
-    return ("baseline", *plan["baselines"], *plan["heads"], TIED)
-
-
 def _regressors(terms: list[str]) -> dict[str, Any]:
-    return {"kind": "regressors", "ridge": _RIDGE, "dissipative": True, "terms": terms}
+    sound = {"dissipative": True, "bounded": True}
+    return {"kind": "regressors", "ridge": _RIDGE, "terms": terms, **sound}
 
 
 def _network(facts: Facts) -> dict[str, Any]:
@@ -71,6 +67,7 @@ def _network(facts: Facts) -> dict[str, Any]:
         "hidden_size": size,
         "readout": size,
         "encoder": True,
+        "restoring": True,
         "margin": 0.0,
         "mirror": mirrored_channels(facts.names) is not None,
     }

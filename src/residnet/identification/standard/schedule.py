@@ -9,14 +9,13 @@ from residnet.identification.standard.facts import Facts
 _LONGEST = 300
 """Steps of the longest rollouts that a network is trained through."""
 _REFIT = 200
-"""Steps of the free runs of a refit, where they may be so many."""
+"""Steps of the free runs of a refit, where its share of the protocol's length is less."""
 _EPOCH = 25
 
 
 def refit_settings(facts: Facts) -> dict[str, Any]:
     """Return the refit of a baseline: several strengths of its prior, one chosen in free run."""
-    horizon = min(facts.length, max(0.2 * facts.length, min(_REFIT * facts.step, facts.length)))
-    horizon = min(horizon, max(_REFIT * facts.step, 20 * facts.step))
+    horizon = min(facts.longest, max(0.2 * facts.length, _REFIT * facts.step))
     return {
         "horizon": readable(horizon),
         "every": readable(0.5 * horizon),
@@ -30,9 +29,9 @@ def hidden_size(facts: Facts) -> int:
     return 16 if facts.samples < 8_000 else 24 if facts.samples < 20_000 else 32
 
 
-def training_settings(facts: Facts) -> dict[str, Any]:
+def training_settings(facts: Facts, effort: float) -> dict[str, Any]:
     """Return the training of a network in free run, over growing horizons."""
-    longest = min(facts.length, _LONGEST * facts.step)
+    longest = min(facts.longest, _LONGEST * facts.step)
     stages = [
         {"horizon": readable(share * longest), "epochs": epochs, "batch": _batch(facts), **rates}
         for share, epochs, rates in (
@@ -45,7 +44,7 @@ def training_settings(facts: Facts) -> dict[str, Any]:
         "history": readable(facts.history),
         "one_step": {"epochs": 0},
         "multi_step": stages,
-        "steps": _EPOCH,
+        "steps": max(1, round(_EPOCH * effort)),
         "average": 0.98,
         "start_noise": 0.03,
         "weight_decay": 0.001,
@@ -54,9 +53,9 @@ def training_settings(facts: Facts) -> dict[str, Any]:
     }
 
 
-def calibration_settings(facts: Facts, begin: str) -> dict[str, Any]:
+def calibration_settings(facts: Facts, effort: float, begin: str) -> dict[str, Any]:
     """Return the training that moves a network and its baseline together, from a trained one."""
-    longest = min(facts.length, _LONGEST * facts.step)
+    longest = min(facts.longest, _LONGEST * facts.step)
     stage = {
         "horizon": readable(longest),
         "epochs": 4,
@@ -65,7 +64,7 @@ def calibration_settings(facts: Facts, begin: str) -> dict[str, Any]:
         "final": 0.05,
     }
     return {
-        **training_settings(facts),
+        **training_settings(facts, effort),
         "multi_step": [stage],
         "from_baseline": False,
         "begin_with": begin,

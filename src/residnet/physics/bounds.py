@@ -1,0 +1,58 @@
+"""Velocities kept near their training range by models that know nothing beyond it."""
+
+from __future__ import annotations
+
+from typing import final
+
+import torch
+from torch import Tensor, nn
+
+from residnet.core.layout import PLANAR
+from residnet.core.samples import Samples
+
+_STRONG = 10.0
+"""Accelerations, in standard deviations, that are balanced half a range beyond the edge."""
+_SLOWEST, _FASTEST = 0.05, 2.0
+"""Limits of the rate in 1/s at which velocities are pulled back."""
+_LEAST = 1e-9
+
+
+@final
+class VelocityBound(nn.Module):
+    """An acceleration [..., 3] that pulls velocities back which left their range, else zero.
+
+    Beyond the range of the training data a fitted model knows nothing: with nothing to damp it,
+    what it last said would drive the vessel on for ever.
+
+    Args:
+        margin: share of the training range by which it is widened on either side.
+    """
+
+    def __init__(self, margin: float = 0.0) -> None:
+        super().__init__()
+        self.margin = margin
+        for name in ("low", "high", "rate"):
+            self.register_buffer(name, torch.zeros(PLANAR.dof, dtype=torch.float64))
+        self.low: Tensor
+        self.high: Tensor
+        self.rate: Tensor
+
+    def calibrate(self, samples: Samples) -> None:
+        """Take the range of u, v, r, the first channels, and the rate from the accelerations."""
+        nu = samples.z[:, : PLANAR.dof]
+        low, high = nu.amin(0), nu.amax(0)
+        wide = (high - low).clamp(min=_LEAST)
+        self.low.copy_(low - self.margin * wide)
+        self.high.copy_(high + self.margin * wide)
+        spread = samples.target.std(0, correction=0)
+        self.rate.copy_((_STRONG * spread / (0.5 * wide)).clamp(min=_SLOWEST, max=_FASTEST))
+
+    def held(self, z: Tensor) -> Tensor:
+        """Return channels z [..., nz], where u, v, r that left their range stand at its edge."""
+        low, high = self.low.to(z.dtype), self.high.to(z.dtype)
+        nu = torch.minimum(torch.maximum(z[..., :3], low), high)
+        return torch.cat((nu, z[..., 3:]), dim=-1)
+
+    def forward(self, z: Tensor) -> Tensor:
+        """Return the acceleration at channels z [..., nz]."""
+        return self.rate.to(z.dtype) * (self.held(z)[..., :3] - z[..., :3])

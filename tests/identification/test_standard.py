@@ -1,0 +1,204 @@
+"""The standard recipe: what it fits follows from logs, and what it chooses from folds of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from random_vessels import small_boat_logs
+
+from residnet.baselines import RegressorsConfig
+from residnet.core.config import validate
+from residnet.core.errors import ConfigError
+from residnet.core.log import Log
+from residnet.data.prepare import samples
+from residnet.identification.fit import Identified, fit
+from residnet.identification.folds import folds_of
+from residnet.identification.prepared import PreparedSplits, prepare_logs
+from residnet.identification.settings import FitSettings
+from residnet.identification.standard import PARTS, Facts, portfolio
+from residnet.physics.symmetry import dissipates
+
+NAMES = ("hull", "hull_network", "hull_network_calibrated", "linear_network", "network")
+
+
+def content(**changes: Any) -> dict[str, Any]:
+    windows = {"kind": "windows", "length": 8.0, "first": 1.0, "history": 1.0}
+    return {
+        "recipe": "standard",
+        "effort": 0.05,
+        "prepare": {
+            "grid": {"step": 0.2},
+            "derivative": {"kind": "savitzky_golay", "window": 1.4, "order": 2},
+        },
+        "signals": {"inputs": ["left", "right"], "pairs": [["left", "right"]]},
+        "integrator": "semi_implicit_euler",
+        "evaluation": {
+            "protocols": {"T8": windows},
+            "selection": "T8",
+            "scales": {"u": 0.2, "v": 0.05, "r": 0.1},
+        },
+        **changes,
+    }
+
+
+def settings(**changes: Any) -> FitSettings:
+    found: FitSettings = validate(content(**changes), FitSettings, "here")
+    return found
+
+
+def renamed(log: Log) -> Log:
+    """The log at 5 Hz, its propellers under names that say nothing of a side."""
+    new = {"n_port": "left", "n_stbd": "right"}
+    channels = {new.get(name, name): values[::2] for name, values in log.channels.items()}
+    return Log(log.name, 0.2 * np.arange(len(log.t[::2])), channels)
+
+
+@pytest.fixture(scope="module")
+def logs() -> PreparedSplits:
+    flown = [renamed(log) for log in small_boat_logs("twin", 4, 4, 40.0)]
+    splits = {"train": flown[:2], "validation": flown[2:3], "test": flown[3:]}
+    return prepare_logs(splits, settings())
+
+
+@pytest.fixture(scope="module")
+def identified(logs: PreparedSplits) -> Identified:
+    return fit(logs, settings())
+
+
+def test_a_portfolio_stands_in_place_of_the_parts(identified: Identified) -> None:
+    assert list(identified)[:2] == ["zero", "baseline"]
+    assert set(NAMES) <= set(identified)
+    for name in ("baseline", "hull"):
+        tried = identified[name].notes["prior_choice"]
+        assert [row["prior"] for row in tried] == [1.0, 1e-2, 1e-4, None]
+    assert all(np.isfinite(model.notes.get("validation", 0.0)) for model in identified.values())
+
+
+def test_networks_are_kept_only_where_they_gain(identified: Identified) -> None:
+    for name, base in (("hull_network", "hull"), ("hull_network_calibrated", "hull_network")):
+        gained, start = identified[name].notes, identified[base].notes
+        assert gained["validation"] <= start["validation"] + 1e-4
+
+
+def test_the_selected_model_and_the_tied_ones_are_sound(
+    identified: Identified, logs: PreparedSplits
+) -> None:
+    judged = {split: identified.evaluate(logs[split]) for split in ("train", "validation")}
+    chosen = identified.select(judged)
+    single = [e for e in chosen.contenders if e.family not in ("zero", "ensemble")]
+    assert next(e for e in single if e.name == chosen.selected).sound
+    best = min((e for e in single if e.sound), key=lambda e: e.error)
+    assert best.name in chosen.tied
+    if "tied" in identified:
+        assert identified["tied"].notes["members"] == list(chosen.tied)
+        assert chosen.selected_ensemble == "tied"
+
+
+def test_settings_say_the_recipe_and_nothing_of_its_parts() -> None:
+    own = settings()
+    written = own.model_dump(mode="json", by_alias=True)
+    assert written["recipe"] == "standard"
+    assert not set(PARTS) & set(written)
+    assert validate(written, FitSettings, "again") == own
+    assert own.model_names == ("baseline", *NAMES, "tied")
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"baseline": {"kind": "still"}}, "leave 'baseline' out"),
+        ({"heads": {"ridge": {"kind": "ridge"}}}, "leave 'heads' out"),
+        ({"recipe": "standart"}, "standard"),
+        ({"recipe": None}, "baseline"),
+        ({"signals": {"inputs": ["left"], "pairs": [["left", "rigth"]]}}, "rigth"),
+    ],
+)
+def test_what_does_not_go_with_the_recipe(changes: dict[str, Any], said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        settings(**changes)
+
+
+def test_terms_follow_from_what_moves() -> None:
+    whole = Facts.supposed(("u", "v", "r", "n", "delta", "wind_u", "wind_v", "wind_mag"))
+    hull = portfolio(whole)["baselines"]["hull"]["terms"]
+    assert {"u|u|", "n|n|", "|n| u", "n|n| delta", "wind_u wind_mag"} <= set(hull)
+    assert "n^2" not in hull
+    astern = replace(whole, astern=("n",), moving=("n", "delta"))
+    hull = portfolio(astern)["baselines"]["hull"]["terms"]
+    assert "n^2 delta" in hull
+    assert not [term for term in hull if "wind" in term]
+    still = replace(whole, moving=("delta",))
+    assert not [t for t in portfolio(still)["baselines"]["hull"]["terms"] if "n" in t.split()]
+
+
+def test_horizons_fit_into_the_logs() -> None:
+    facts = replace(Facts.supposed(("u", "v", "r", "n")), length=100.0, stretch=30.0)
+    plan = portfolio(facts)
+    horizons = [s["horizon"] for t in plan["training"].values() for s in t["multi_step"]]
+    assert max(*horizons, plan["refit"]["hull"]["horizon"]) <= 18.0
+
+
+@pytest.mark.parametrize("count", [2, 3, 5])
+def test_every_sample_is_left_out_once(logs: PreparedSplits, count: int) -> None:
+    known = [*logs["train"], *logs["validation"]]
+    folds = folds_of(known, count)
+    held = sum(int(log.good.sum()) for fold in folds for log in fold.held_out)
+    assert held == sum(int(log.good.sum()) for log in known)
+    for fold in folds:
+        for log in fold.fitted:
+            for other in fold.held_out:
+                same = log.log.name == other.log.name
+                assert not same or not (log.usable & other.usable).any()
+
+
+@pytest.mark.parametrize(
+    ("term", "axis", "known"),
+    [("u|u|", 0, True), ("v|r|", 1, True), ("|n| r", 2, True), ("u v", 1, False), ("u", 1, False)],
+)
+def test_terms_whose_power_has_one_sign(term: str, axis: int, known: bool) -> None:
+    assert dissipates(term, axis, ("u", "v", "r", "n")) == known
+
+
+def test_terms_that_would_feed_energy_are_left_out(logs: PreparedSplits) -> None:
+    config = RegressorsConfig(terms=("1", "u", "v", "r", "u|u|", "left"), dissipative=True)
+    known = samples(logs["train"], settings().signals.build())
+    # accelerations that grow with the speed, and fall with its square
+    speed = known.z[:, 0]
+    target = torch.stack((0.3 * speed - 0.2 * speed * speed.abs(), -known.z[:, 1], speed), dim=1)
+    baseline = config.build(known.names)
+    table = {(c.axis, c.term): c.value for c in config.fit(baseline, known.with_target(target))}
+    assert ("u_dot", "u") not in table
+    assert ("v_dot", "v") in table
+    assert not baseline.feeding()
+
+
+def test_a_bounded_model_comes_back_from_anywhere(logs: PreparedSplits) -> None:
+    known = samples(logs["train"], settings().signals.build())
+    config = RegressorsConfig(terms=("1", "u", "u|u|", "v", "r", "v|v|"), bounded=True)
+    baseline = config.build(known.names)
+    config.fit(baseline, known)
+    low, high = known.z[:, :3].amin(0), known.z[:, :3].amax(0)
+    far = torch.cat((high + 20.0 * (high - low), known.z[0, 3:]))
+    assert bool((baseline(far) < 0).all())
+    inside = RegressorsConfig(terms=("1", "u", "u|u|", "v", "r", "v|v|")).build(known.names)
+    inside.load_state_dict({"theta": baseline.theta})
+    torch.testing.assert_close(baseline(known.z), inside(known.z))
+
+
+def test_a_mirror_symmetric_model_has_no_asymmetry(logs: PreparedSplits) -> None:
+    names = settings().signals.build().names
+    known = samples(logs["train"], settings().signals.build())
+    baseline = RegressorsConfig(terms=("1", "u", "r", "left", "right")).build(names)
+    theta = torch.tensor(
+        [[0.1, -0.5, 0.0, 2.0, 2.0], [0.0, 0.0, 0.3, 0.1, -0.1], [0.0, 0.0, -1.0, 0.4, -0.4]],
+        dtype=torch.float64,
+    )
+    baseline.theta.data.copy_(theta)
+    pull = baseline.asymmetry(known)
+    assert float(theta.flatten() @ pull @ theta.flatten()) == pytest.approx(0.0, abs=1e-9)
+    theta[2, 4] = 0.4
+    assert float(theta.flatten() @ pull @ theta.flatten()) > 0.0
