@@ -239,6 +239,7 @@ def test_a_simulation_by_function_mapping_and_command_line_is_one(
     assert rows[0]["indices"]["first_overshoot"] == pytest.approx(overshoot, rel=1e-12)
 
 
+@pytest.mark.whole_runs
 def test_logs_alone_are_fitted_by_the_recipe(logs: list[residnet.Log]) -> None:
     models = residnet.fit([_coarse(log) for log in logs[:6]], effort=0.01)
     assert models.settings.recipe == "standard"
