@@ -11,6 +11,7 @@ from residnet.control.motion.reference_filter import ReferenceFilterConfig
 from residnet.core.errors import ConfigError
 from residnet.core.names import nearest
 from residnet.documents.jervan2020.ferry.flights import Disturbance, Ferry, LoopConfig, MotionNoise
+from residnet.documents.jervan2020.ferry.forward_runs import ForwardRunsConfig
 from residnet.documents.jervan2020.published import Published
 from residnet.documents.jervan2020.residual_model import ResidualModelConfig
 from residnet.judge.still_fits import StillFitsConfig
@@ -53,6 +54,8 @@ class FerrySettings(ComputingTask):
         noise: noise on what is measured; null for none.
         disturbance: force that is constant in earth axes.
         feed_forward_alone: fly the course without feedback too (Table 4.8).
+        forward: manoeuvres of the true ferry beside which the models run forward in time; one that
+            diverges there is refused, and its equations are not written.
         models: residual models by name; a model stands after the one that it builds on.
         published: figures that the document prints for the believed model.
         later: vessel that the true one has become later, by name or file; the models that fly are
@@ -70,6 +73,7 @@ class FerrySettings(ComputingTask):
     noise: MotionNoise | None = None
     disturbance: Disturbance = Disturbance()
     feed_forward_alone: bool = False
+    forward: ForwardRunsConfig = ForwardRunsConfig()
     models: dict[_Name, FerryModelConfig] = Field(min_length=1)
     published: Published = Published()
     later: str | None = None

@@ -90,6 +90,7 @@ def sections(config: FerrySettings, results: Results, run: Path) -> list[Section
         out.append(Section("Feed-forward without feedback", blocks))
     if results["later"]:
         out.append(Section("The vessel as it is later", [_later(results["later"])]))
+    out.append(Section("Forward in time", [_forward(results["forward"])]))
     if causes := [model["not_forward"] for model in models.values() if model["not_forward"]]:
         out.append(Section("Models that cannot run forward in time", [Bullets(causes)]))
     out.append(Section("Coefficients", [Text(ABOUT_COEFFICIENTS), *_coefficients(config, results)]))
@@ -203,6 +204,24 @@ def _alone(config: FerrySettings, flights: Mapping[str, Results]) -> Table:
     )
     for name, metrics in flights.items():
         table.add(name, _each(metrics["motion_mse"], _published(config, name).alone))
+    return table
+
+
+def _forward(rows: Mapping[str, Results]) -> Table:
+    """Return the table of free runs beside manoeuvres of the true ferry (3.22)."""
+    table = Table(
+        ["model", "u m/s", "v m/s", "r deg/s", "diverged"],
+        caption="Root mean square errors of free runs from the commanded forces, over the runs that"
+        " did not diverge. A model that explains the force may still be no model of motion.",
+    )
+    for name, row in rows.items():
+        factors = (1.0, 1.0, DEG)
+        errors = (
+            ["-"] * 3
+            if row["rmse"] is None
+            else [number(e * f) for e, f in zip(row["rmse"], factors, strict=True)]
+        )
+        table.add(name, [*errors, f"{row['diverged']} of {row['runs']}"])
     return table
 
 

@@ -8,11 +8,13 @@ from typing import Any
 
 import torch
 
+from residnet.baselines.believed import HullEquations
 from residnet.core.errors import ConfigError, FitError
 from residnet.core.frames import wrap
 from residnet.core.layout import HEADING, POSITION
 from residnet.documents.jervan2020.ferry.config import FerrySettings
 from residnet.documents.jervan2020.ferry.flights import Flight
+from residnet.documents.jervan2020.ferry.forward_runs import forward_runs, why_refused
 from residnet.documents.jervan2020.ferry.study import Study
 from residnet.documents.jervan2020.forward import (
     as_baseline_yaml,
@@ -34,8 +36,10 @@ def write_results(config: FerrySettings, found: Study, folder: RunFolder) -> dic
         The contents of ferry.json.
     """
     folder.figures.mkdir(exist_ok=True)
-    not_forward = {name: _keep_model(config, found, name, folder) for name in found.models}
-    results = _content(config, found, not_forward)
+    for name in found.models:
+        _keep_model(config, found, name, folder)
+    forward, not_forward = _run_forward(config, found, folder)
+    results = _content(config, found, not_forward) | {"forward": forward}
     folder.write_json(folder.path / FILE, results)
     for kind, flights in (
         ("course", found.courses),
@@ -47,8 +51,8 @@ def write_results(config: FerrySettings, found: Study, folder: RunFolder) -> dic
     return results
 
 
-def _keep_model(config: FerrySettings, found: Study, name: str, folder: RunFolder) -> str:
-    """Write a model's pictures, feed-forward and equations; return why it cannot run forward."""
+def _keep_model(config: FerrySettings, found: Study, name: str, folder: RunFolder) -> None:
+    """Write a model's pictures and its feed-forward."""
     model, model_config = found.models[name], config.models[name]
     draw_model(
         name, model_config.fit, model_config.terms, model.fit, found.unmodelled, folder.figures
@@ -59,15 +63,32 @@ def _keep_model(config: FerrySettings, found: Study, name: str, folder: RunFolde
     force = RequiredForce(*model.model.parts(), mirrored=True)
     file = folder.exports / f"{name}_feed_forward.pt"
     export_feed_forward(force, model.notes.get("lag"), ranges, file)
-    try:
-        equations = forward_equations(config.believed, model.model, f"model {name}")
-    except (ConfigError, FitError) as error:
-        return str(error)
-    folder.write(
-        folder.path / "models" / f"{name}_forward.yaml",
-        as_baseline_yaml(equations, f"run {config.name}, model {name}"),
-    )
-    return ""
+
+
+def _run_forward(
+    config: FerrySettings, found: Study, folder: RunFolder
+) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
+    """Run the models forward in time and write the equations of those that do not diverge.
+
+    Returns:
+        Their errors by model, and why a model cannot run forward, empty where it can.
+    """
+    equations: dict[str, HullEquations] = {}
+    refused = dict.fromkeys(found.models, "")
+    for name, model in found.models.items():
+        try:
+            equations[name] = forward_equations(config.believed, model.model, f"model {name}")
+        except (ConfigError, FitError) as error:
+            refused[name] = str(error)
+    rows = forward_runs(config.forward, config.true, config.believed, equations)
+    for name, model_equations in equations.items():
+        refused[name] = why_refused(name, rows[name])
+        if not refused[name]:
+            folder.write(
+                folder.path / "models" / f"{name}_forward.yaml",
+                as_baseline_yaml(model_equations, f"run {config.name}, model {name}"),
+            )
+    return rows, refused
 
 
 def _content(config: FerrySettings, found: Study, not_forward: Mapping[str, str]) -> dict[str, Any]:
