@@ -21,7 +21,11 @@ _SMOOTHED = 0.11
 """Share of the horizon over which widths are smoothed."""
 _RIDGE = 0.02
 """Pull of the slopes to zero, against measures of unit variance."""
-_ROUNDS = 3
+_ROUNDS = 2
+_FOLDS = 5
+"""Groups of logs whose errors are scaled by what the others say."""
+_THINNED = 3
+"""Of so many horizons one says how liveliness acts."""
 _STEPS = 8
 
 
@@ -36,6 +40,18 @@ class _Runs:
     measures: np.ndarray
     activity: Activity
 
+    def where(self, chosen: np.ndarray) -> _Runs:
+        """Return those runs that are chosen [W] bool."""
+        names = [name for name, wanted in zip(self.names, chosen, strict=True) if wanted]
+        weight = self.weight[chosen] / self.weight[chosen].sum()
+        return replace(
+            self,
+            names=names,
+            weight=weight,
+            error=self.error[chosen],
+            measures=self.measures[chosen],
+        )
+
 
 def calibrate(runs: Sequence[RunErrors], level: float, step: float, unit: np.ndarray) -> Band:
     """Return the band that holds a share `level` of the errors of runs to come.
@@ -48,18 +64,13 @@ def calibrate(runs: Sequence[RunErrors], level: float, step: float, unit: np.nda
     """
     given = _at_horizons(runs, step)
     names, weight = given.names, given.weight
-    slope = np.zeros((len(MEASURES), len(CHANNELS)))
-    for _ in range(_ROUNDS):
-        shape = _shape(given, slope)
-        slope = _slopes(given, shape, slope)
-    shape = _shape(given, slope)
-    first = _quantiles(given, shape * factor(given.measures, slope), level)
-    inside = np.nanmean(
-        covered(given.error, first * shape * factor(given.measures, slope)), axis=(1, 2)
-    )
+    shape, slope = _scale(given)
+    scale = _scales_of_others(given)
+    inside = np.nanmean(covered(given.error, _quantiles(given, scale, level) * scale), axis=(1, 2))
     number = independent(inside, weight, names, level)
     raised = corrected(level, number)
-    width = shape * _quantiles(given, shape * factor(given.measures, slope), raised)
+    quantiles = _quantiles(given, scale, raised)
+    width = shape * quantiles
     same = _shape(given, np.zeros_like(slope))
     plain = same * _quantiles(given, np.broadcast_to(same, given.error.shape), raised)
     flat = given.error.reshape(-1, len(CHANNELS))
@@ -78,7 +89,39 @@ def calibrate(runs: Sequence[RunErrors], level: float, step: float, unit: np.nda
         number,
     )
     largest = worst([run.error for run in runs], [band.half_widths(run.states) for run in runs])
+    # as far as the runs of other logs know the scale
+    seen = shape * factor(given.measures, slope)
+    largest *= _largest(given.error, scale * quantiles) / _largest(given.error, seen * quantiles)
     return replace(band, whole=quantile(largest, weight, raised), cautions=few(band.logs))
+
+
+def _largest(error: np.ndarray, width: np.ndarray) -> np.ndarray:
+    """Return the largest error in half widths of each run [W, 5], over horizons."""
+    return np.asarray(np.nanmax(np.where(np.isfinite(error), error / width, 1e-12), axis=1))
+
+
+def _scale(given: _Runs) -> tuple[np.ndarray, np.ndarray]:
+    """Return shape [G, 5] and slopes [6, 5] of the errors of runs."""
+    slope = np.zeros((len(MEASURES), len(CHANNELS)))
+    for _ in range(_ROUNDS):
+        slope = _slopes(given, _shape(given, slope), slope)
+    return _shape(given, slope), slope
+
+
+def _scales_of_others(given: _Runs) -> np.ndarray:
+    """Return the scale [W, G, 5] of every run's errors as the runs of other logs have it.
+
+    A scale that has seen a run would take its errors for smaller than those of runs to come.
+    """
+    _, place = np.unique(given.names, return_inverse=True)
+    fold = place % _FOLDS
+    out = np.empty_like(given.error)
+    for k in np.unique(fold):
+        own = fold == k
+        others = given.where(~own) if (~own).any() else given
+        shape, slope = _scale(others)
+        out[own] = shape * factor(given.measures[own], slope)
+    return out
 
 
 def few(logs: int) -> tuple[str, ...]:
@@ -148,11 +191,12 @@ def _slopes(given: _Runs, shape: np.ndarray, slope: np.ndarray) -> np.ndarray:
     Errors over the shape are taken for gamma distributed with a logarithmic link; Newton's method.
     """
     out = slope.copy()
-    weight = given.weight[:, None] / given.error.shape[1]
-    z = given.measures
+    rows = slice(None, None, _THINNED)
+    error, z, shape = given.error[:, rows], given.measures[:, rows], shape[rows]
+    weight = given.weight[:, None] / error.shape[1]
     pull = _RIDGE * np.eye(z.shape[2])
     for channel in range(len(CHANNELS)):
-        ratio = given.error[:, :, channel] / shape[:, channel]
+        ratio = error[:, :, channel] / shape[:, channel]
         seen = np.isfinite(ratio)
         y, w = np.where(seen, ratio, 0.0), np.where(seen, weight, 0.0)
         if not seen.any():

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 _PER_LOG = 5.0
-"""Independent scores that a log holds at most."""
+"""Independent scores that a log holds at most, as far as it has so many runs."""
 
 
 def run_weights(names: Sequence[str]) -> np.ndarray:
@@ -63,7 +63,8 @@ def independent(
     mean = float((share * own).sum())
     variance = float((share**2 * (own - mean) ** 2).sum()) * len(own) / (len(own) - 1)
     number = level * (1.0 - level) / max(variance, 1e-12)
-    return float(np.clip(number, 1.0, _PER_LOG * len(own)))
+    most = min(_PER_LOG * len(own), int(known.sum()))
+    return float(np.clip(number, 1.0, most))
 
 
 def corrected(level: float, number: float) -> float:

@@ -1,0 +1,149 @@
+"""What may change about a vessel or its data, and what each change does to short free runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import final
+
+import torch
+from torch import Tensor
+
+from residnet.core.layout import HEADING, SURGE, SWAY, VELOCITIES, YAW_RATE
+from residnet.dynamics.base import Dynamics
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.physics.signals import SignalsConfig
+
+_AXES = ("surge", "sway", "yaw")
+
+
+@dataclass(frozen=True)
+class Change:
+    """A small change of a vessel, of its commands, of its surroundings or of a sensor.
+
+    Attributes:
+        name: short, for tables.
+        words: what it is, completing "the logs look as if ...".
+        unit: of its size.
+        size: that its effect is computed with.
+        heavier: added to the inertia of all axes, as a share.
+        drag: added damping of surge, sway and yaw by velocity, 1/s.
+        push: acceleration to north and east, m/s^2.
+        gain: added to the gain of inputs, by their number.
+        offset: added to inputs, by their number.
+        sensor: what a sensor adds: `gyro_scale`, `gyro_offset`, `speed_scale`, `lag`, or
+            `current_north`, `current_east` for water that moves; empty for none.
+    """
+
+    name: str
+    words: str
+    unit: str
+    size: float
+    heavier: float = 0.0
+    drag: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    push: tuple[float, float] = (0.0, 0.0)
+    gain: Mapping[int, float] = field(default_factory=dict)
+    offset: Mapping[int, float] = field(default_factory=dict)
+    sensor: str = ""
+
+
+def causes(signals: SignalsConfig) -> list[Change]:
+    """Return the changes that a monitor looks for, given the inputs of a model."""
+    units = signals.units()
+    out = [Change("mass", "the vessel has become heavier", "share", 0.02, heavier=0.02)]
+    for axis, name in enumerate(_AXES):
+        drag = tuple(0.01 if axis == other else 0.0 for other in range(3))
+        words = f"the damping in {name} has grown"
+        out.append(Change(f"damping {name}", words, "1/s", 0.01, drag=(drag[0], drag[1], drag[2])))
+    for place, name in enumerate(signals.inputs):
+        words = f"{name} has grown stronger than it was"
+        out.append(Change(f"gain {name}", words, "share", 0.02, gain={place: 0.02}))
+        if units.get(name) == "rad":
+            words = f"{name} has an offset"
+            out.append(Change(f"offset {name}", words, "rad", 0.01, offset={place: 0.01}))
+    return [
+        *out,
+        Change("gyro scale", "the gyro shows too much", "share", 0.02, sensor="gyro_scale"),
+        Change("gyro offset", "the gyro has an offset", "rad/s", 0.001, sensor="gyro_offset"),
+        Change("speed scale", "u and v are shown too large", "share", 0.02, sensor="speed_scale"),
+        Change("lag", "u, v and r come late", "s", 0.1, sensor="lag"),
+    ]
+
+
+def surroundings() -> list[Change]:
+    """Return what wind and current do, which is no change of the vessel."""
+    return [
+        Change("current north", "", "m/s", 0.05, sensor="current_north"),
+        Change("current east", "", "m/s", 0.05, sensor="current_east"),
+        Change("push north", "", "m/s^2", 0.005, push=(0.005, 0.0)),
+        Change("push east", "", "m/s^2", 0.005, push=(0.0, 0.005)),
+    ]
+
+
+def shown(sensor: str, x: Tensor, rate: Tensor, size: float) -> Tensor:
+    """Return what a sensor adds to states [..., 6] whose velocities change by `rate` [..., 3]."""
+    out = torch.zeros_like(x)
+    if sensor == "gyro_scale":
+        out[..., YAW_RATE] = size * x[..., YAW_RATE]
+    elif sensor == "gyro_offset":
+        out[..., YAW_RATE] = size
+    elif sensor == "speed_scale":
+        out[..., SURGE : SWAY + 1] = size * x[..., SURGE : SWAY + 1]
+    elif sensor == "lag":
+        out[..., VELOCITIES] = -size * rate
+    elif sensor in ("current_north", "current_east"):
+        cos, sin = torch.cos(x[..., HEADING]), torch.sin(x[..., HEADING])
+        north = sensor == "current_north"
+        out[..., SURGE] = size * (cos if north else sin)
+        out[..., SWAY] = size * (-sin if north else cos)
+    return out
+
+
+@final
+class ChangedDynamics(Dynamics):
+    """A model with a change of its own for every block of rows.
+
+    Args:
+        model: as it was fitted.
+        changes: C of them; rows [C * B] are blocks of B.
+        rows: B.
+        inputs: number of the model's inputs.
+    """
+
+    def __init__(
+        self, model: HybridDynamics, changes: Sequence[Change], rows: int, inputs: int
+    ) -> None:
+        super().__init__(model.dt, model.integrator)
+        self.model = model
+        self.n_state = model.n_state
+
+        def each(values: Sequence[Sequence[float]]) -> Tensor:
+            table = torch.tensor(values, dtype=torch.float64)
+            return table.repeat_interleave(rows, dim=0)
+
+        span = range(inputs)
+        self.inertia = each([[1.0 + change.heavier] for change in changes])
+        self.drag = each([change.drag for change in changes])
+        self.push = each([change.push for change in changes])
+        self.gain = each([[1.0 + change.gain.get(i, 0.0) for i in span] for change in changes])
+        self.offset = each([[change.offset.get(i, 0.0) for i in span] for change in changes])
+
+    def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
+        """Return the rate of the unchanged model; the change acts on whole steps."""
+        return self.model.rate(x, p, rho)
+
+    def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Return state and memory one step later, with the changed acceleration."""
+        after, s = self.model.step(x, w * self.gain + self.offset, s)
+        nu = x[:, VELOCITIES]
+        cos, sin = torch.cos(x[:, HEADING]), torch.sin(x[:, HEADING])
+        north, east = self.push[:, 0], self.push[:, 1]
+        push = torch.stack(
+            (cos * north + sin * east, cos * east - sin * north, torch.zeros_like(north)), dim=1
+        )
+        moved = nu + (after[:, VELOCITIES] - nu) / self.inertia + self.dt * (push - self.drag * nu)
+        changed = after.clone()
+        changed[:, VELOCITIES] = moved
+        # the heading follows what the yaw rate has gained over the step
+        changed[:, HEADING] = after[:, HEADING] + 0.5 * self.dt * (moved[:, 2] - after[:, YAW_RATE])
+        return changed, s

@@ -1,0 +1,86 @@
+"""Short free runs from measured states: what they miss, and what each change would do to them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from residnet.core.layout import HEADING, VELOCITIES
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.rollout import Rollout
+from residnet.identification.monitoring.changes import Change, ChangedDynamics, shown
+
+SEEN = ("u", "v", "r", "heading")
+"""What innovations are taken of."""
+_SAMPLES = 5
+"""Samples of a window that count, the last of them its end."""
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A measured window of K steps.
+
+    Attributes:
+        y: states [K + 1, 6].
+        w: inputs held over each step [K, m].
+        past_y: states before it that warm a memory up [P, 6].
+        past_w: inputs before it [P, m].
+    """
+
+    y: np.ndarray
+    w: np.ndarray
+    past_y: np.ndarray
+    past_w: np.ndarray
+
+
+def innovations(
+    model: HybridDynamics, pieces: Sequence[Piece], changes: Sequence[Change]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return innovations [B, n] and what a unit of each change adds to them [B, C, n].
+
+    Args:
+        model: float64, in evaluation mode.
+        pieces: B windows of one length, with pasts of one length.
+        changes: C of them.
+    """
+    y = torch.from_numpy(np.stack([piece.y for piece in pieces]))
+    w = torch.from_numpy(np.stack([piece.w for piece in pieces]))
+    none = Change("none", "", "", 1.0)
+    all_changes = [none, *changes]
+    rows, steps, count = len(pieces), w.shape[1], len(all_changes)
+    places = np.linspace(0, steps, _SAMPLES + 1).round().astype(int)[1:]
+    with torch.no_grad():
+        memory = model.warmup(
+            torch.from_numpy(np.stack([piece.past_y for piece in pieces])),
+            torch.from_numpy(np.stack([piece.past_w for piece in pieces])),
+        )
+        begin = (y[:, 1] - y[:, 0])[:, VELOCITIES] / model.dt
+        x0 = torch.cat(
+            [y[:, 0] + shown(one.sensor, y[:, 0], begin, one.size) for one in all_changes]
+        )
+        changed = ChangedDynamics(model, all_changes, rows, w.shape[2])
+        path, _, _ = Rollout(changed)(x0, w.repeat(count, 1, 1), memory.repeat(count, 1))
+    path = path.reshape(count, rows, steps + 1, -1)[:, :, places]
+    measured = y[:, places]
+    rate = (y[:, places] - y[:, places - 1])[..., VELOCITIES] / model.dt
+    error = _seen(measured - path[0])
+    effects = [
+        _seen(
+            path[number + 1] - path[0]
+            if not change.sensor
+            else shown(change.sensor, measured, rate, change.size) - (path[number + 1] - path[0])
+        )
+        / change.size
+        for number, change in enumerate(changes)
+    ]
+    return error.numpy(), torch.stack(effects, dim=1).numpy()
+
+
+def _seen(states: Tensor) -> Tensor:
+    """Return differences of states [B, k, 6] as innovations [B, 4 k]."""
+    chosen = torch.cat((states[..., VELOCITIES], states[..., HEADING : HEADING + 1]), dim=-1)
+    return chosen.flatten(1)
