@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from residnet.core.errors import ExportError
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.rollout import Rollout, Source
-from residnet.export.c import closed_loop
+from residnet.export.c import loop_source
 from residnet.export.c.closed_loop import CompiledLoop
 
 DT = 0.1
@@ -84,9 +84,9 @@ def test_the_number_of_threads_changes_nothing() -> None:
 
 def test_a_loop_that_is_off_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     rollout, given = loop()
-    wrong = closed_loop._DRIVERS.replace("AT(gx, N_X, k)[i * width + l] +=", "(void)")
-    assert wrong != closed_loop._DRIVERS
-    monkeypatch.setattr(closed_loop, "_DRIVERS", wrong)
+    wrong = loop_source.BACK.replace("AT(gx, N_X, k)[i * width + l] +=", "(void)")
+    assert wrong != loop_source.BACK
+    monkeypatch.setattr(loop_source, "BACK", wrong)
     with pytest.raises(ExportError, match="is off by"):
         CompiledLoop(rollout, *given)
 

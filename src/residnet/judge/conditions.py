@@ -7,10 +7,8 @@ from typing import Any
 import pandas as pd
 import torch
 
-from residnet.control.base import Policy
 from residnet.control.conditions.config import ConditionsConfig, HeadingChanges
-from residnet.control.conditions.flights import fly_under
-from residnet.control.heading.steering import SteeredVessel
+from residnet.control.conditions.flights import ConditionedRun
 from residnet.judge.autopilots import distribution
 
 QUIET_FLIGHTS = 100
@@ -42,8 +40,7 @@ def judged(
     controller: str,
     kind: str,
     protocol: str,
-    vessel: SteeredVessel,
-    policy: Policy,
+    run: ConditionedRun,
     conditions: ConditionsConfig,
     changes: HeadingChanges,
 ) -> tuple[dict[str, Any], pd.DataFrame]:
@@ -52,7 +49,7 @@ def judged(
     A flight whose heading is no number counts as diverged, and with a heading error of 180 deg all
     the time in the means.
     """
-    flown = fly_under(vessel, policy, changes)
+    flown = run.fly(changes)
     finite = torch.isfinite(flown.psi).all(1) & torch.isfinite(flown.command).all(1)
     worst = conditions.duration + 0.5 * 180.0
     found = {
@@ -74,10 +71,10 @@ def judged(
 
 
 def swinging(
-    controller: str, kind: str, vessel: SteeredVessel, policy: Policy, changes: HeadingChanges
+    controller: str, kind: str, run: ConditionedRun, changes: HeadingChanges
 ) -> dict[str, Any]:
     """Return the row of metrics.json of flights without noise: what still swings at their end."""
-    flown = fly_under(vessel, policy, changes)
+    flown = run.fly(changes)
     heading, rudder = flown.swing(QUIET_AFTER)
     return {
         "model": controller,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, final
 
@@ -11,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from residnet.control.conditions.config import ConditionsConfig, HeadingChanges
-from residnet.control.conditions.flights import ConditionedRun, fly_under
+from residnet.control.conditions.flights import Compiler, ConditionedRun, Flying
 from residnet.control.heading.steering import SteeredVessel
 from residnet.control.observed.policy import ObservedPolicy
 from residnet.core.errors import ExportError
@@ -19,11 +18,6 @@ from residnet.core.progress import say
 from residnet.dynamics.rollout import Rollout
 from residnet.training.conditions_config import ConditionsTraining
 from residnet.training.epochs import EpochTraining, run_epochs
-
-Flying = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
-"""Flights from states [B, nx], inputs [B, T, m] and memory [B, n]: states and what acted."""
-Compiler = Callable[[Rollout, Tensor, Tensor, Tensor], Flying]
-"""Makes the flights of a closed loop quick, given examples of what they are flown with."""
 
 
 @final
@@ -49,7 +43,7 @@ class ConditionsFit(EpochTraining):
         compiler: Compiler | None,
     ) -> None:
         super().__init__(settings, seed)
-        self.policy, self.vessel, self.conditions = policy, vessel, conditions
+        self.policy, self.conditions = policy, conditions
         duration = conditions.duration if settings.duration is None else settings.duration
         lengths = {"hold": min(settings.hold, conditions.hold), "duration": duration}
         self.drawn = conditions.model_copy(update=lengths)
@@ -59,6 +53,9 @@ class ConditionsFit(EpochTraining):
         self.fly = _flying(rollout, compiler, self.loop.given(self._batch(0.0, 2)))
         random = torch.Generator().manual_seed(seed + 1_000_003)
         self.unseen = conditions.draw(settings.validation, conditions.dt, random)
+        self.test = ConditionedRun(
+            vessel, policy, conditions.dt, dtype=torch.float32, compiler=compiler
+        )
 
     def train_dataloader(self) -> range:
         """Return the numbers of batches; what is in them is drawn when they are used."""
@@ -112,7 +109,7 @@ class ConditionsFit(EpochTraining):
     def validated(self) -> tuple[nn.Module, float]:
         """Return the policy and its mean cost over the flights that epochs are chosen on."""
         self.policy.at(self.unseen.dt)
-        flown = fly_under(self.vessel, self.policy, self.unseen, dtype=torch.float32)
+        flown = self.test.fly(self.unseen)
         self.policy.at(self.settings.dt)
         return self.policy, float(flown.measured(self.conditions)["cost"].mean())
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol, final
 
 import numpy as np
 import torch
@@ -12,10 +13,11 @@ from pydantic import Field
 from torch import Tensor
 
 from residnet.control.conditions.config import ConditionsConfig, HeadingChanges
-from residnet.control.conditions.flights import fly_under
+from residnet.control.conditions.flights import ConditionedFlights, ConditionedRun
 from residnet.control.heading.controllers import Steering, TunableConfig
 from residnet.core.config import Config
-from residnet.core.errors import FitError
+from residnet.core.errors import ExportError, FitError
+from residnet.dynamics.rollout import Rollout
 
 _ROWS = 4096
 _LOST = 1e3
@@ -37,6 +39,31 @@ class EvolutionConfig(Config):
     tolerance: float = Field(default=1e-4, ge=0)
 
 
+class RowsFlying(Protocol):
+    """Flights of a closed loop whose rows have numbers of their own."""
+
+    def of(self, rollout: Rollout) -> RowsFlying:
+        """Return the flights of a closed loop that differs in its numbers alone."""
+
+    def __call__(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Return states and what acted."""
+
+
+class RowsCompiler(Protocol):
+    """Makes flights quick whose rows have numbers of their own; raises ExportError if it cannot."""
+
+    def __call__(
+        self,
+        rollout: Rollout,
+        x: Tensor,
+        w: Tensor,
+        s: Tensor,
+        *,
+        own: Sequence[str],
+    ) -> RowsFlying:
+        """Return the flights, given examples of what they are flown with."""
+
+
 @dataclass(frozen=True)
 class Evolved:
     """Tuned parameters, their mean cost [s] over the tuning flights, and the candidates tried."""
@@ -52,8 +79,11 @@ def evolve(
     conditions: ConditionsConfig,
     settings: EvolutionConfig,
     seed: int,
+    compiler: RowsCompiler | None = None,
 ) -> Evolved:
     """Return the missing parameters of least mean cost, by differential evolution.
+
+    `compiler` makes the flights of the search quick.
 
     Source: R. Storn and K. Price, 1997; scipy's implementation, over the logarithms.
 
@@ -69,6 +99,7 @@ def evolve(
     fixed = {name: value for name, value in given.items() if value is not None}
     names = [name for name, value in given.items() if value is None]
     steering = steering._replace(dt=conditions.dt)
+    trials = Trials(config, steering, conditions, changes, compiler)
 
     def costs(points: np.ndarray, /) -> Any:
         searched = torch.from_numpy(np.exp(points.reshape(len(names), -1).T))
@@ -77,11 +108,11 @@ def evolve(
             name: torch.full((len(searched),), value, dtype=torch.float64)
             for name, value in fixed.items()
         }
-        return mean_costs(config, steering, conditions, changes, candidates).numpy()
+        return trials.costs(candidates).numpy()
 
     if not names:
         alone = {name: torch.tensor([value]).double() for name, value in fixed.items()}
-        cost = float(mean_costs(config, steering, conditions, changes, alone)[0])
+        cost = float(trials.costs(alone)[0])
         return Evolved(fixed, cost, 1)
     axes = config.axes(steering.turning)
     bounds: Any = [(math.log(axes[name].low), math.log(axes[name].high)) for name in names]
@@ -107,32 +138,61 @@ def evolve(
     return Evolved(ordered, float(found.fun), int(found.nfev))
 
 
-def mean_costs(
-    config: TunableConfig,
-    steering: Steering,
-    conditions: ConditionsConfig,
-    changes: HeadingChanges,
-    candidates: dict[str, Tensor],
-) -> Tensor:
-    """Return the mean cost [C] in s of candidates, parameters [C] by name, over the same flights.
+@final
+class Trials:
+    """Flights of candidates for the parameters of a controller, all over the same changes.
 
-    One that diverges costs a thousand seconds.
+    Args:
+        config: of the controller.
+        steering: its task, at the step of the changes.
+        conditions: with the cost.
+        changes: what every candidate flies.
+        compiler: of the flights; None to fly them as they are.
     """
-    flights = len(changes.heading)
-    count = len(next(iter(candidates.values())))
-    at_once = max(_ROWS // flights, 1)
-    out = []
-    for first in range(0, count, at_once):
-        some = {name: values[first : first + at_once] for name, values in candidates.items()}
-        size = len(next(iter(some.values())))
-        rows = {name: values.repeat_interleave(flights).float() for name, values in some.items()}
-        flown = fly_under(
-            steering.vessel,
-            config.rows(rows, steering),
-            changes.repeated(size),
-            integrator="heun",
-            dtype=torch.float32,
-        )
-        cost = flown.measured(conditions)["cost"].reshape(size, flights)
-        out.append(cost.double().nan_to_num(_LOST, _LOST).clamp(max=_LOST).mean(1))
-    return torch.cat(out)
+
+    def __init__(
+        self,
+        config: TunableConfig,
+        steering: Steering,
+        conditions: ConditionsConfig,
+        changes: HeadingChanges,
+        compiler: RowsCompiler | None = None,
+    ) -> None:
+        self.config, self.steering, self.conditions = config, steering, conditions
+        self.changes, self.compiler = changes, compiler
+        self.loop: RowsFlying | None = None
+
+    def costs(self, candidates: dict[str, Tensor]) -> Tensor:
+        """Return the mean cost [C] in s of candidates, parameters [C] by name.
+
+        One that diverges costs a thousand seconds.
+        """
+        flights = len(self.changes.heading)
+        count = len(next(iter(candidates.values())))
+        at_once = max(_ROWS // flights, 1)
+        out = []
+        for first in range(0, count, at_once):
+            some = {name: values[first : first + at_once] for name, values in candidates.items()}
+            size = len(next(iter(some.values())))
+            rows = {name: values.repeat_interleave(flights) for name, values in some.items()}
+            flown = self._flown(rows, self.changes.repeated(size))
+            cost = flown.measured(self.conditions)["cost"].reshape(size, flights)
+            out.append(cost.double().nan_to_num(_LOST, _LOST).clamp(max=_LOST).mean(1))
+        return torch.cat(out)
+
+    def _flown(self, rows: dict[str, Tensor], changes: HeadingChanges) -> ConditionedFlights:
+        policy = self.config.rows(rows, self.steering).float().requires_grad_(False)
+        run = ConditionedRun(self.steering.vessel, policy, changes.dt, "heun", torch.float32)
+        if self.compiler is None:
+            return run.fly(changes)
+        rollout = run.rollout(max(int(changes.delay.max()), 1))
+        given = run.given(changes)
+        try:
+            if self.loop is None:
+                own = [f"source.policy.{name}" for name in self.config.own]
+                self.loop = self.compiler(rollout, *given, own=own)
+        except ExportError:
+            # what cannot be compiled is flown as it is
+            self.compiler = None
+            return run.fly(changes)
+        return run.flights(changes, *self.loop.of(rollout)(*given))

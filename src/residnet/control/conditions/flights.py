@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import final
 
@@ -11,6 +12,7 @@ from torch import Tensor
 from residnet.control.base import Policy
 from residnet.control.conditions.config import ConditionsConfig, HeadingChanges
 from residnet.control.heading.steering import SteeredVessel
+from residnet.core.errors import ExportError
 from residnet.core.frames import wrap
 from residnet.dynamics.rollout import Rollout, Source
 from residnet.dynamics.steering_variation import PushedSteering
@@ -23,6 +25,12 @@ QUANTITIES = {
     "iae": "rad s",
 }
 """Of a flight, with units: the cost, its three parts, and the integral of the absolute error."""
+
+Flying = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
+"""Flights from states [B, nx], inputs [B, T, m] and memory [B, n]: states and what acted."""
+Compiler = Callable[[Rollout, Tensor, Tensor, Tensor], Flying]
+"""Makes the flights of a closed loop quick, given examples of what they are flown with; it raises
+ExportError where it cannot."""
 
 
 @final
@@ -132,6 +140,9 @@ class ConditionedRun:
         dt: step in s.
         integrator: of the vessel.
         dtype: of the flights.
+        compiler: of flights without gradients; None to fly them as they are, as are those that it
+            cannot compile.
+        longest: delay in steps that there is room for; None for that of each call's changes.
     """
 
     def __init__(
@@ -141,10 +152,13 @@ class ConditionedRun:
         dt: float,
         integrator: str = "rk4",
         dtype: torch.dtype = torch.float64,
+        compiler: Compiler | None = None,
+        longest: int | None = None,
     ) -> None:
         self.vessel, self.dtype, self.dt = vessel, dtype, dt
         self.columns = vessel.column("psi"), vessel.column("r")
-        self.policy = policy
+        self.policy, self.compiler, self.longest = policy, compiler, longest
+        self._flying: dict[int, Flying] = {}
         self.model = PushedSteering(vessel.model(dt, integrator), len(vessel.inputs))
         self.model.to(dtype).requires_grad_(False)
 
@@ -181,10 +195,26 @@ class ConditionedRun:
 
     def fly(self, changes: HeadingChanges) -> ConditionedFlights:
         """Fly heading changes without gradients."""
-        longest = max(int(changes.delay.max()), 1)
+        longest = self.longest or max(int(changes.delay.max()), 1)
+        given = self.given(changes)
         with torch.no_grad():
-            states, inputs, _ = self.rollout(longest)(*self.given(changes))
-        return self.flights(changes, states, inputs)
+            if longest not in self._flying:
+                self._flying[longest] = self._quick(self.rollout(longest), *given)
+            return self.flights(changes, *self._flying[longest](*given))
+
+    def _quick(self, rollout: Rollout, x: Tensor, w: Tensor, s: Tensor) -> Flying:
+        """Return the flights of a closed loop, compiled where that can be."""
+        if self.compiler is not None:
+            try:
+                return self.compiler(rollout, x[:2], w[:2], s[:2])
+            except ExportError:
+                pass  # what cannot be compiled is flown as it is
+
+        def fly(x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+            states, inputs, _ = rollout(x, w, s)
+            return states, inputs
+
+        return fly
 
 
 def fly_under(

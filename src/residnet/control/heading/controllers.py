@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from typing import Literal, NamedTuple, final
+from typing import ClassVar, Literal, NamedTuple, final
 
 import torch
 from pydantic import Field
@@ -51,7 +51,11 @@ class LinearRows(Policy):
         super().__init__()
         self.psi, self.r = steering.vessel.column("psi"), steering.vessel.column("r")
         self.limit, self.dt = steering.limit, steering.dt
-        self.kp, self.kd, self.ki = (gain.unsqueeze(-1) for gain in gains)
+        for name, gain in zip(("kp", "kd", "ki"), gains, strict=True):
+            self.register_buffer(name, gain.unsqueeze(-1), persistent=False)
+        self.kp: Tensor
+        self.kd: Tensor
+        self.ki: Tensor
         self.n_state = 1
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
@@ -75,7 +79,12 @@ class ControllerConfig(Config, ABC):
 
 
 class TunableConfig(ControllerConfig, ABC):
-    """The config of a controller whose missing parameters are tuned."""
+    """The config of a controller whose missing parameters are tuned.
+
+    `own` names the numbers of what `rows` returns that every row has for itself.
+    """
+
+    own: ClassVar[tuple[str, ...]]
 
     @abstractmethod
     def parameters(self) -> dict[str, float | None]:
@@ -105,6 +114,8 @@ class TunableConfig(ControllerConfig, ABC):
 
 class TunedConfig(TunableConfig, ABC):
     """A linear law kp e - kd r + ki I whose missing parameters are tuned."""
+
+    own: ClassVar[tuple[str, ...]] = ("kp", "kd", "ki")
 
     @abstractmethod
     def gains(

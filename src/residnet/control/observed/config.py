@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 from torch import Tensor
@@ -47,6 +47,8 @@ class ObservedConfig(TunableConfig, ABC):
     yaw_rate_rate: Positive | None = None
     push_rate: Positive | None = None
     cross_rate: Positive | None = None
+
+    own: ClassVar[tuple[str, ...]] = ("constants",)
 
     @abstractmethod
     def law(self, limit: float, rate: float | None) -> HeadingLaw:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Sequence
 
 import numpy as np
+import torch
 
 from residnet.core.errors import ExportError
 from residnet.export.c.arrays import literal
@@ -25,7 +26,7 @@ _VECTOR = {
     "abs": "v_fabs({0})", "round": "v_rint({0})", "rsqrt": "(ONE / v_sqrt({0}))",
     "sigmoid": "(ONE / (ONE + v_exp(-{0})))",
     "and": "({0} & {1})", "or": "({0} | {1})", "not": "(~{0})",
-    "isnan": "({0} != {0})", "isinf": "(v_fabs({0}) > 3e38f)",
+    "isnan": "({0} != {0})", "isinf": "(v_fabs({0}) > BIG)",
 }  # fmt: skip
 """Operations whose vector form is not that of plain numbers."""
 _PLAIN = {
@@ -41,23 +42,40 @@ _TYPES: dict[Kind, tuple[str, str]] = {
 }  # fmt: skip
 _TWO = ("atan2", "hypot", "pow", "fmod", "copysign")
 
-PRELUDE = (
+_PRELUDE = (
     "#include <math.h>\n#include <string.h>\n"
-    "#define REAL float\n#define R(name) name##f\n#define ZERO 0.0f\n#define ONE 1.0f\n"
-    "typedef float V __attribute__((vector_size(4 * LANES)));\n"
-    "typedef float U __attribute__((vector_size(4 * LANES), aligned(4), may_alias));\n"
-    "typedef int I __attribute__((vector_size(4 * LANES)));\n"
+    "#define ZERO ((REAL)0)\n#define ONE ((REAL)1)\n"
+    "typedef REAL V __attribute__((vector_size(sizeof(REAL) * LANES)));\n"
+    "typedef REAL U __attribute__((vector_size(sizeof(REAL) * LANES), aligned(4), may_alias));\n"
+    "typedef INT I __attribute__((vector_size(sizeof(REAL) * LANES)));\n"
     "#define ALL(number) ((V){0} + (REAL)(number))\n"
     "#define EACH for (int l = 0; l < LANES; l++)\n"
     "static inline V pick(I c, V a, V b) { return (V)((c & (I)a) | (~c & (I)b)); }\n"
     + "".join(
         f"static __attribute__((noinline)) V v_{name}"
         + ("(V a, V b)" if name in _TWO else "(V a)")
-        + f" {{ V o; EACH o[l] = {name}f(a[l]{', b[l]' if name in _TWO else ''}); return o; }}\n"
+        + f" {{ V o; EACH o[l] = R({name})(a[l]{', b[l]' if name in _TWO else ''}); return o; }}\n"
         for name in FUNCTIONS
     )
 )
-"""What stands at the top of a file; `LANES` is defined before it, a power of two."""
+
+
+def prelude(dtype: torch.dtype) -> str:
+    """Return what stands at the top of a file in this precision."""
+    single = dtype == torch.float32
+    words = {
+        "LANES": lanes(dtype),
+        "REAL": "float" if single else "double",
+        "INT": "int" if single else "long long",
+        "R(name)": "name##f" if single else "name",
+        "BIG": "3e38f" if single else "1e308",
+    }
+    return "".join(f"#define {name} {text}\n" for name, text in words.items()) + _PRELUDE
+
+
+def lanes(dtype: torch.dtype) -> int:
+    """Return the number of rows of a block, which one vector of 64 bytes holds."""
+    return 64 // dtype.itemsize
 
 
 class LanesBody:

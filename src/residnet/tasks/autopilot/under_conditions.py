@@ -10,6 +10,7 @@ import torch
 
 from residnet.control.base import Policy
 from residnet.control.conditions.evolution import evolve
+from residnet.control.conditions.flights import ConditionedRun
 from residnet.control.heading.controllers import Steering, TunableConfig
 from residnet.control.heading.steering import SteeredPlant
 from residnet.control.observed.config import AnyController, ObservedConfig
@@ -46,7 +47,7 @@ def tuned_peer(
     started = time.time()
     steering = steering._replace(vessel=in_weather(config, stated))
     seed = config.seed + 11
-    found = evolve(peer, steering, stated.stated, stated.evolution, seed)
+    found = evolve(peer, steering, stated.stated, stated.evolution, seed, CompiledLoop)
     constants = ", ".join(f"{key} {value:.4g}" for key, value in found.parameters.items())
     say(f"  tuned {name}: {constants}, cost {found.cost:.3f} s")
     complete = peer.model_copy(update=found.parameters)
@@ -135,14 +136,18 @@ def judge_all(
         for name, conditions in tests.items()
     }
     still = drawn(quiet(stated.stated), min(QUIET_FLIGHTS, stated.flights), config.seed)
+    longest = max(1, *(int(changes.delay.max()) for _, changes in flown.values()))
     rows, tables = [], []
     for place, (name, (kind, policy)) in enumerate(controllers.items()):
         report("judging", place, len(controllers))
+        run = ConditionedRun(
+            vessel, policy.double(), stated.stated.dt, compiler=CompiledLoop, longest=longest
+        )
         for protocol, (conditions, changes) in flown.items():
-            row, table = judged(name, kind, protocol, vessel, policy, conditions, changes)
+            row, table = judged(name, kind, protocol, run, conditions, changes)
             rows.append(row)
             tables.append(table)
-        rows.append(swinging(name, kind, vessel, policy, still))
+        rows.append(swinging(name, kind, run, still))
     return rows, pd.concat(tables, ignore_index=True)
 
 
