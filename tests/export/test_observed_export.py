@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from residnet.control.observed.config import PtosConfig
 from residnet.control.observed.policy import FIXED, ObservedPolicy
 from residnet.control.observed.stored import ObservedPolicySpec
 from residnet.export.autopilot import export_autopilot
+from residnet.export.c.policy import export_autopilot_as_c
 
 DEG = math.pi / 180
 DT, GAIN, TIME, SPEED = 0.02, 3.47, 3.94, 3.2
@@ -82,6 +84,16 @@ def test_it_flags_a_gap_and_takes_up_the_course_after_it(module: Any) -> None:
     assert flags == gap
     assert all(math.isfinite(value) for value in commands)
     assert abs(headings[-1] - 30 * DEG) < 1.0 * DEG
+
+
+def test_it_is_written_as_c(tmp_path: Path) -> None:
+    """With its queue of pending commands and the memory of its network."""
+    card = {"dt": DT, "parity": {"steps": 1000}}
+    file = tmp_path / "pilot.c"
+    export_autopilot_as_c("pilot", policy(10 * DEG), file, safe="amidships", card=card)
+    stored = json.loads((tmp_path / "pilot.card.json").read_text())
+    assert stored["parity"]["share_of_limit"] <= 1e-4
+    assert "PILOT_SIZE_S" in (tmp_path / "pilot.h").read_text()
 
 
 def test_a_lost_estimate_begins_anew_and_keeps_the_push() -> None:

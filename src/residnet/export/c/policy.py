@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from residnet.control.heading.policy import HeadingPolicy
+from residnet.control.heading.keeper import HeadingKeeper
 from residnet.export.autopilot import MEASURED, check_parity, for_export
 from residnet.export.c.compiled import compile_shared
 from residnet.export.c.source import CFunction, c_file, h_file, identifier
@@ -138,7 +138,7 @@ def export_policy(
 
 def export_autopilot_as_c(
     name: str,
-    policy: HeadingPolicy,
+    policy: HeadingKeeper,
     file: Path,
     *,
     safe: Literal["hold", "amidships"],

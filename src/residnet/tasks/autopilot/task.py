@@ -85,12 +85,18 @@ class AutopilotConfig(AutopilotSettings):
         import torch
 
         from residnet.control.heading.stored import load_heading_policy
+        from residnet.control.observed.stored import load_observed_policy
         from residnet.export.c.policy import export_autopilot_as_c
 
         extra = {"card.json": ""}
         torch.jit.load(str(scripted), _extra_files=extra)
         card = json.loads(extra["card.json"])
-        policy = load_heading_policy(run.models / model)
-        policy.dt = card["dt"]
-        export_autopilot_as_c(model, policy, file, safe=self.safe, card=card)
+        if model in self.recurrent:
+            observed = load_observed_policy(run.models / model)
+            observed.at(card["dt"])
+            export_autopilot_as_c(model, observed, file, safe=self.safe, card=card)
+        else:
+            policy = load_heading_policy(run.models / model)
+            policy.dt = card["dt"]
+            export_autopilot_as_c(model, policy, file, safe=self.safe, card=card)
         return file
