@@ -215,6 +215,7 @@ def fits(folder: Path) -> list[str]:
     from short_configs import Short
 
     mean = ("heads={plsr: {kind: plsr}, lstm: {kind: lstm, hidden_size: 8}}", "~training.mlp")
+    short_configs.LIMIT = 1800
     short_configs.SHORT["quickstart"] = Short(
         (*short_configs.SHORT["quickstart"].overrides[:3], *short_configs._trained("lstm"), *mean,
          "ensembles={mean: [plsr, lstm]}")
