@@ -34,6 +34,8 @@ _RUDDERS = ("delta",)
 
 def anywhere(fault: Fault) -> Fault:
     """A fault of the shipped vessels, to be planted in other logs too where these can show it."""
+    if fault.name == "lag of r":
+        fault = dataclasses.replace(fault, plant=_one(_rate_late))
     needs = {"rudder in deg": ("boat", "tanker"), "stuck actuator": (), "no excitation": ()}
     hosts = needs.get(fault.name, ("boat", "twin", "tanker"))
     return dataclasses.replace(fault, hosts=hosts)
@@ -47,6 +49,14 @@ def propellers(log: Log) -> list[str]:
 def rudders(log: Log) -> list[str]:
     """The channels of a log that hold a rudder's angle."""
     return [name for name in _RUDDERS if name in log.channels]
+
+
+def _rate_late(ship: Ship, log: Log, random: np.random.Generator) -> Log:
+    """A late yaw rate; one that hardly changes hides its lag."""
+    late = _late(log, random.uniform(*ship.lag), "r")
+    if float(np.std(late["r"] - log["r"])) < 0.1 * float(np.std(log["r"])):
+        raise Undecidable
+    return late
 
 
 def _scaled(log: Log, names: list[str], factor: float) -> Log:

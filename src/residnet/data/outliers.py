@@ -17,6 +17,10 @@ SPIKE = "spike"
 _CHANGES = 12.0
 _DISTANCES = 30.0
 _LONGEST = 2
+# the least of both, in usual changes
+_GLANCE = 3.0
+# or leaves the range of the whole log by so many times that range
+_BEYOND = 0.9
 _FEWEST = 20
 _MOVED = ("x", "y", "psi", "phi", "u", "v", "r", "p")
 
@@ -122,19 +126,25 @@ def _spikes(values: np.ndarray, moved: bool) -> np.ndarray:
     change = np.abs(np.diff(known))
     # a glance: without one large change there is no spike
     largest = float(change.max())
-    if largest <= (3.0 * float(np.quantile(change, 0.99)) if moved else 0.5 * span) or not largest:
+    glance = 0.5 * span
+    if moved:
+        glance = min(_GLANCE * float(np.quantile(change, 0.99)), _BEYOND * span)
+    if largest <= glance or not largest:
         return out
     windows = np.lib.stride_tricks.sliding_window_view(np.pad(known, 3, mode="edge"), 7)
     distance = np.abs(known - np.median(windows, axis=1))
+    low, high = np.quantile(known, (0.005, 0.995))
+    beyond = np.maximum(low - known, known - high)
     if moved:
-        usual = min(
-            _CHANGES * float(np.quantile(change, 0.99)),
-            _DISTANCES * float(np.quantile(distance, 0.99)),
+        most = float(np.quantile(change, 0.99))
+        # the neighbours of a spike in a steady channel leave their median by a few changes
+        usual = max(
+            min(_CHANGES * most, _DISTANCES * float(np.quantile(distance, 0.99))), _GLANCE * most
         )
-        far = distance > max(usual, 1e-6 * span)
+        # what leaves the whole range of a noisy channel is a spike too
+        whole = (beyond > _BEYOND * span) & (distance > _BEYOND * span) & (span > 0.0)
+        far = (distance > max(usual, 1e-6 * span)) | whole
     else:
-        low, high = np.quantile(known, (0.005, 0.995))
-        beyond = np.maximum(low - known, known - high)
         far = (beyond > 0.5 * span) & (distance > 0.5 * span) if span > 0.0 else beyond < -1.0
     starts, stops = stretches(far)
     for start, stop in zip(starts, stops, strict=True):

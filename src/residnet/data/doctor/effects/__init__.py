@@ -28,6 +28,10 @@ _LEAST_PLACE = 0.06
 # a stretch is compared with so many others of its length, because every fit depends on its data
 _OTHERS = 6
 _ROWS_PER_COLUMN = 4
+_CERTAINLY = 20.0
+"""Standard errors from which on a size is certain."""
+_LEAST_MOVED = 0.1
+"""Share of its spread by which a velocity has to be wrong to count by itself."""
 
 
 class Effects:
@@ -54,7 +58,10 @@ class Effects:
         if finding.level != "will mislead" or finding.code in _CERTAIN:
             return finding
         if finding.repair is not None:
-            effect = self.of_repair(finding.repair(self._log))
+            repaired = finding.repair(self._log)
+            effect = self.of_repair(repaired)
+            if effect is not None and _certain(finding):
+                effect = max(effect, self._moved(repaired))
         elif finding.at is not None and finding.at.any():
             fitted = {*self._rows.moving, *self._inputs}
             learned = not finding.channels or not fitted.isdisjoint(finding.channels)
@@ -118,6 +125,21 @@ class Effects:
             return place
         return max(_harm(other.apart(self._fit, fitted, rows), other, fitted), place)
 
+    def _moved(self, repaired: Log) -> float:
+        """Return by how much of its spread a correction moves a velocity; 0 where that is little.
+
+        One-step predictions may stay as good while the coefficients that they give are wrong.
+        """
+        if len(repaired) != len(self._log):
+            return 0.0
+        shares = [
+            float(np.sqrt(np.nanmean((repaired[name] - self._log[name]) ** 2)))
+            / max(float(np.nanstd(self._log[name])), 1e-12)
+            for name in self._rows.moving
+        ]
+        most = max(shares, default=0.0)
+        return most if most >= _LEAST_MOVED else 0.0
+
     def _without(self, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return how far predictions [n] move, and what is left [n], without samples [T] bool."""
         rows = self._rows.apart_from(at)
@@ -136,6 +158,12 @@ def _harm(change: np.ndarray, rows: OneStep, fitted: np.ndarray) -> float:
     """
     kept = np.where(change > _CLEAR * rows.residual(fitted), change / rows.spread, 0.0)
     return float(kept.max(initial=0.0))
+
+
+def _certain(finding: Finding) -> bool:
+    """Return whether the size of what a finding would correct is known to a twentieth."""
+    figures = finding.figures
+    return abs(figures.get("size", 0.0)) > _CERTAINLY * figures.get("error", np.inf)
 
 
 def _size(values: Iterable[float] | np.ndarray) -> float:
