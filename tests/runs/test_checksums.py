@@ -7,9 +7,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from made_models import nomoto_model
 
 from residnet.core.errors import UsageError
 from residnet.runs.checksums import require_sealed, seal
+from residnet.runs.folder import RunFolder
+from residnet.runs.model_store import ModelStore
 
 
 def made(run: Path) -> Path:
@@ -54,6 +57,19 @@ def _edited(file: Path) -> None:
 
 def _cut(file: Path) -> None:
     file.write_text(file.read_text()[:-1])
+
+
+@pytest.mark.parametrize("file", ["fit.json", "model.json"])
+def test_a_resumed_run_takes_no_model_that_was_edited(file: str, tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path)
+    store = ModelStore(folder)
+    spec, model = nomoto_model(0.2, 5.0, 0.1)
+    store.keep_module("ridge", spec, model, {"validation": 0.2})
+    assert store.load("ridge").notes == {"validation": 0.2}
+    place = folder.models / "ridge" / file
+    place.write_text("{}")
+    with pytest.raises(UsageError, match=f"{file}: its SHA-256 is not the one"):
+        store.load("ridge")
 
 
 @pytest.mark.parametrize("damage", [_missing, _folder, _edited, _cut])

@@ -16,7 +16,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
 from residnet.core.config_yaml import KeyPath
-from residnet.core.names import nearest
+from residnet.core.names import nearest, shown
 from residnet.core.registry import Kinds
 
 _EXPECTED = {
@@ -37,7 +37,6 @@ _EXPECTED = {
     "model_type": "a mapping",
     "model_attributes_type": "a mapping",
 }
-_LONGEST_VALUE = 60
 
 
 @dataclass(frozen=True)
@@ -93,7 +92,7 @@ def _fault(details: ErrorDetails, model: Any) -> _Fault:
         case "union_tag_invalid":
             path += _discriminator(context)
             tag = str(context["tag"])
-            text = f"unknown value '{tag}'{nearest(tag, _quoted(context['expected_tags']))}"
+            text = f"unknown value '{shown(tag)}'{nearest(tag, _quoted(context['expected_tags']))}"
         case "union_tag_not_found":
             path += _discriminator(context)
             text = f"missing{nearest('', _tags(here, path[-1]))}"
@@ -101,7 +100,7 @@ def _fault(details: ErrorDetails, model: Any) -> _Fault:
             valid = _quoted(context["expected"])
             unknown = isinstance(value, str) and bool(valid)
             text = (
-                f"unknown value '{value}'{nearest(value, valid)}"
+                f"unknown value '{shown(value)}'{nearest(value, valid)}"
                 if unknown
                 else f"expected {context['expected']} {given(value)}"
             )
@@ -125,7 +124,7 @@ def given(value: Any) -> str:
     """Return `(given 'x')` for error messages: the value as YAML writes it, cut where long."""
     names = {None: "null", True: "true", False: "false"}
     text = names[value] if value is None or isinstance(value, bool) else repr(value)
-    return f"(given {text if len(text) <= _LONGEST_VALUE else text[: _LONGEST_VALUE - 4] + ' ...'})"
+    return f"(given {shown(text)})"
 
 
 def _quoted(text: str) -> list[str]:

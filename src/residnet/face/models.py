@@ -23,6 +23,7 @@ from residnet.face.values import PathGiven, described, path
 from residnet.identification.models import FittedModel
 from residnet.judge.bands.band import Band
 from residnet.judge.bands.file import read_bands
+from residnet.runs.checksums import require_sealed, seal
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -242,6 +243,7 @@ def save(model: Model, folder: PathGiven, *, overwrite: bool = False) -> Path:
     if place.exists() and not place.is_dir():
         raise UsageError(f"{place}: is a file, expected a folder")
     save_model(place, model.spec, model.module)
+    seal(place)
     return place
 
 
@@ -263,6 +265,7 @@ def load(folder: PathGiven, name: str | None = None) -> Model:
         place = place / "models" / chosen_model(place, name)
     elif not (place / "model.json").is_file() and (place / "models").is_dir():
         place = place / "models" / chosen_model(place, "selected")
+    require_sealed(place)
     spec, module = load_model(place)
     return Model(FittedModel(spec, module, _notes(place), bands=_bands(place)))
 

@@ -12,6 +12,7 @@ from residnet.core.files import read_json
 from residnet.dynamics.store import Stored, load_model, model_names, read_weights, save_model
 from residnet.identification.models import FittedModel
 from residnet.judge.bands.file import read_bands
+from residnet.runs.checksums import require_sealed, seal
 from residnet.runs.folder import RunFolder
 
 
@@ -38,8 +39,9 @@ class FolderStore:
         """Return a model with its notes.
 
         Raises:
-            UsageError: where there is none of that name.
+            UsageError: where there is none of that name, or a file of it has changed since.
         """
+        require_sealed(self.folder.models / name)
         content = read_json(self.folder.bands) if self.folder.bands.is_file() else {}
         return FittedModel(
             *load_model(self.folder.models / name),
@@ -54,6 +56,7 @@ class FolderStore:
         folder = self.folder.models / name
         self.folder.write_json(folder / "fit.json", dict(notes))
         save_model(folder, spec, module)
+        seal(folder)
 
     def finished_module(self, name: str, module: nn.Module) -> dict[str, Any] | None:
         """Fill a module with the weights that an interrupted run had trained, and freeze it.
@@ -62,11 +65,12 @@ class FolderStore:
             The notes of its training; None where it had not ended.
 
         Raises:
-            UsageError: where the weights are not as they were written.
+            UsageError: where the weights or the notes are not as they were written.
         """
         folder = self.folder.models / name
         if not (folder / "model.json").is_file():
             return None
+        require_sealed(folder)
         read_weights(folder, module)
         module.eval().requires_grad_(False)
         return self.folder.fit_notes(name)
