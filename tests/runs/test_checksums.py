@@ -12,7 +12,7 @@ from made_models import nomoto_model
 from residnet.core.errors import UsageError
 from residnet.runs.checksums import require_sealed, seal
 from residnet.runs.folder import RunFolder
-from residnet.runs.model_store import ModelStore
+from residnet.runs.model_store import FolderStore
 
 
 def made(run: Path) -> Path:
@@ -62,7 +62,7 @@ def _cut(file: Path) -> None:
 @pytest.mark.parametrize("file", ["fit.json", "model.json"])
 def test_a_resumed_run_takes_no_model_that_was_edited(file: str, tmp_path: Path) -> None:
     folder = RunFolder(tmp_path)
-    store = ModelStore(folder)
+    store = FolderStore(folder)
     spec, model = nomoto_model(0.2, 5.0, 0.1)
     store.keep_module("ridge", spec, model, {"validation": 0.2})
     assert store.load("ridge").notes == {"validation": 0.2}
