@@ -409,7 +409,11 @@ FAULTS = (
     Fault("copied part", ("copied_part",), _copied),
     Fault("spliced part", ("copied_part", "position_jump", "heading_jump", "jump"), _spliced),
     Fault("standing still", ("standing",), _one(_resting)),
-    Fault("no excitation", ("no_excitation",), _one(_steady)),
+    Fault(
+        "no excitation",
+        ("no_excitation",),
+        lambda s, logs, g: [_steady(s, log, g) for log in logs],
+    ),
 )
 
 

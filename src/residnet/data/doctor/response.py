@@ -50,19 +50,20 @@ def response_findings(log: Log, inputs: Sequence[str]) -> Iterator[Finding]:
         "lag": answer.lag,
         "better": answer.better,
     }
+    sure = answer.surest
     if (
-        answer.sure < -_SURE
+        sure < -_SURE
         and answer.worth > _WORTH
         and (answer.better < _BETTER or answer.best_sure < 0.0)
     ):
         text = (
             f"positive {name} turns the vessel to port (yaw acceleration {answer.effect:.3g} per"
-            f" unit, {-answer.sure:.0f} standard errors)"
+            f" unit, {-sure:.0f} standard errors)"
         )
         action = "turn it in the channel map (sign: -1), and check the sign of r and psi"
         yield Finding("will mislead", "rudder_sign", text, figures, action)
-    elif answer.sure > _SURE:
-        text = f"positive {name} turns the vessel to starboard ({answer.sure:.0f} standard errors)"
+    elif sure > _SURE:
+        text = f"positive {name} turns the vessel to starboard ({sure:.0f} standard errors)"
         yield Finding("note", "rudder_sign", text, figures)
 
 
@@ -87,6 +88,12 @@ class _Answer:
     better: float
     best_sure: float
     worth: float
+
+    @property
+    def surest(self) -> float:
+        """The effect in standard errors; with the shift where it is surer and of the same sign."""
+        same = self.sure * self.best_sure > 0.0 and abs(self.sure) > 0.5 * _SURE
+        return self.best_sure if same and abs(self.best_sure) > abs(self.sure) else self.sure
 
 
 def _opposite(log: Log, steer: np.ndarray) -> bool:
