@@ -13,16 +13,28 @@ from random_vessels import small_boat_logs
 from residnet.baselines import RegressorsConfig
 from residnet.core.config import validate
 from residnet.core.errors import ConfigError
+from residnet.core.frames import to_body
 from residnet.core.log import Log
 from residnet.data.prepare import samples
+from residnet.dynamics.disturbance import DisturbanceConfig
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.heads import LstmConfig, ZeroHead
 from residnet.identification.fit import Identified, fit
 from residnet.identification.folds import folds_of
 from residnet.identification.prepared import PreparedSplits, prepare_logs
 from residnet.identification.settings import FitSettings
 from residnet.identification.standard import PARTS, Facts, portfolio
+from residnet.physics.signals import SignalsConfig
 from residnet.physics.symmetry import dissipates
 
-NAMES = ("hull", "hull_network", "hull_network_calibrated", "linear_network", "network")
+NAMES = (
+    "hull",
+    "hull_network",
+    "hull_network_calibrated",
+    "linear_network",
+    "network",
+    "hull_force",
+)
 
 
 def content(**changes: Any) -> dict[str, Any]:
@@ -202,3 +214,49 @@ def test_a_mirror_symmetric_model_has_no_asymmetry(logs: PreparedSplits) -> None
     assert float(theta.flatten() @ pull @ theta.flatten()) == pytest.approx(0.0, abs=1e-9)
     theta[2, 4] = 0.4
     assert float(theta.flatten() @ pull @ theta.flatten()) > 0.0
+
+
+def test_an_unknown_force_is_told_from_the_past_and_held() -> None:
+    """A constant force over ground, which the model does not know, on a vessel that turns."""
+    signals = SignalsConfig(inputs=("n",)).build()
+    baseline = RegressorsConfig(terms=("u", "v", "r")).build(signals.names)
+    with torch.no_grad():
+        baseline.theta.copy_(torch.diag(torch.tensor([-0.1, -0.3, -0.5], dtype=torch.float64)))
+    known = HybridDynamics(signals, baseline, ZeroHead(), 0.1, "semi_implicit_euler")
+    observer = DisturbanceConfig(settle=5.0).build(0.1)
+    model = HybridDynamics(signals, baseline, ZeroHead(), 0.1, "semi_implicit_euler", observer)
+    w = torch.zeros(1, 1, dtype=torch.float64)
+
+    def blown(x: torch.Tensor) -> torch.Tensor:
+        ahead, across = to_body(torch.tensor([0.05]), torch.tensor([-0.02]), x[:, 2])
+        force = torch.stack((ahead, across, torch.tensor([0.02])), dim=-1)
+        return known.integrate(x, signals.prepare(w), force)
+
+    x, past = torch.tensor([[0.0, 0.0, 0.7, 0.3, 0.0, 0.05]], dtype=torch.float64), []
+    for _ in range(400):
+        past.append(x)
+        x = blown(x)
+    s = model.warmup(torch.stack(past, 1), w[:, None].expand(1, 400, 1))
+    np.testing.assert_allclose(s[0, 4:], [0.05, -0.02, 0.02], atol=3e-4)
+    truth = free = without = x
+    for _ in range(300):
+        truth, without = blown(truth), known.step(without, w, s[:, :0])[0]
+        free, s = model.step(free, w, s)
+    assert float((free - truth)[:, 3:].abs().max()) < 0.01
+    assert float((without - truth)[:, 3:].abs().max()) > 0.1
+    torch.jit.script(model)
+
+
+def test_an_encoder_starts_the_memory_with_weights_of_its_own() -> None:
+    names = ("u", "v", "r", "n")
+    head = LstmConfig(hidden_size=3, readout=2, encoder=True).build(names)
+    plain = LstmConfig(hidden_size=3, readout=2).build(names)
+    z = torch.randn(2, 7, 4, generator=torch.Generator().manual_seed(0))
+    assert head.warmup(z).shape == (2, 6)
+    assert not head.warmup(z[:, :0]).any(), "no past, no memory"
+    assert not head.warms_by_steps()
+    assert plain.warms_by_steps()
+    s = torch.zeros(2, 6)
+    for k in range(7):
+        s = head(z[:, k], s)[1]
+    assert not torch.allclose(s, head.warmup(z))

@@ -63,7 +63,8 @@ class RegressorBaseline(ParametricBaseline):
         weights = (self.theta * self.allowed).to(z.dtype)
         if self.bound is not None:
             phi: Tensor = self.library(self.bound.held(z))
-            return phi @ weights.T + self.bound(z)
+            back: Tensor = self.bound(z)
+            return phi @ weights.T + back
         known: Tensor = self.library(z)
         return known @ weights.T
 

@@ -67,6 +67,10 @@ class MeanHead(ResidualHead):
             total = total + member.sequence(z)  # type: ignore[operator]
         return total / len(self.members)
 
+    def warms_by_steps(self) -> bool:
+        """Return whether all members do."""
+        return all(member.warms_by_steps() for member in self.members)  # type: ignore[operator]
+
     def warmup(self, z: Tensor) -> Tensor:
         """Return the memory [B, n_state] that past channels [B, T, nz] leave."""
         memory: list[Tensor] = []

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from residnet.baselines.base import Baseline
 from residnet.dynamics.base import Dynamics, Integrator
+from residnet.dynamics.disturbance import SIZE, Disturbance, memory_range
 from residnet.heads.base import ResidualHead
 from residnet.physics.signals import Signals
 
@@ -30,12 +31,15 @@ class HybridDynamics(Dynamics):
         head: ResidualHead,
         dt: float,
         integrator: Integrator = "rk4",
+        disturbance: Disturbance | None = None,
     ) -> None:
         super().__init__(dt, integrator)
         self.signals = signals
         self.baseline = baseline
         self.head = head
-        self.n_state = head.n_state
+        self.disturbance = disturbance
+        self.width = head.n_state
+        self.n_state = head.n_state + (0 if disturbance is None else SIZE)
 
     def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
         """Return x_dot [B, 6] from what the step holds fixed.
@@ -58,8 +62,13 @@ class HybridDynamics(Dynamics):
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return the state and the memory one step of dt later."""
         p = self.signals.prepare(w)
-        rho, s = self.head(self.signals(x, p), s)
-        return self.integrate(x, p, rho), s
+        if self.disturbance is None:
+            rho, s = self.head(self.signals(x, p), s)
+            return self.integrate(x, p, rho), s
+        rho, own = self.head(self.signals(x, p), s[:, : self.width])
+        unknown, estimate = self.disturbance(x, s[:, self.width :])
+        after = self.integrate(x, p, rho + unknown)
+        return after, torch.cat((own, self.disturbance.remembered(after, estimate)), dim=-1)
 
     def one_step(self, z: Tensor) -> Tensor:
         """Return nu_dot [B, T, 3] along measured channels [B, T, nz] (teacher forcing).
@@ -76,4 +85,18 @@ class HybridDynamics(Dynamics):
             y_history: measured states [B, T, 6], oldest first; T may be 0.
             w_history: inputs held over the step that follows each of them [B, T, m].
         """
-        return self.head.warmup(self.channels(y_history, w_history))
+        if self.disturbance is None:
+            s: Tensor = self.head.warmup(self.channels(y_history, w_history))
+            return s
+        s = torch.zeros(y_history.shape[0], self.n_state, dtype=y_history.dtype)
+        for k in range(y_history.shape[1]):
+            s = self.step(y_history[:, k], w_history[:, k], s)[1]
+        return s
+
+    def memory_range(self) -> tuple[Tensor, Tensor]:
+        """Return the least and largest memory [n_state], of the head and of the observer."""
+        low, high = self.head.memory_range()
+        if self.disturbance is None:
+            return low, high
+        least, most = memory_range()
+        return torch.cat((low.double(), least)), torch.cat((high.double(), most))

@@ -24,6 +24,7 @@ from residnet.core.names import VELOCITY, nearest
 from residnet.core.version import __version__
 from residnet.dynamics.band import BandTable
 from residnet.dynamics.base import Integrator
+from residnet.dynamics.disturbance import DisturbanceConfig
 from residnet.dynamics.ensemble import mean_of
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.heads import HeadConfig, ZeroHead
@@ -67,6 +68,7 @@ class ModelSpec(Stored):
         low: smallest u, v, r and inputs of the training data, SI, [3 + m].
         high: their largest.
         band: how far free runs may be off; None where none was calibrated.
+        disturbance: unknown force that is estimated from the measured past; None for none.
         members: of an ensemble, whose accelerations are averaged; its own baseline and head are
             then empty.
     """
@@ -84,6 +86,7 @@ class ModelSpec(Stored):
     low: tuple[float, ...]
     high: tuple[float, ...]
     band: BandTable | None = None
+    disturbance: DisturbanceConfig | None = None
     members: tuple[ModelSpec, ...] = ()
 
     def build(self) -> HybridDynamics:
@@ -94,7 +97,8 @@ class ModelSpec(Stored):
         head = ZeroHead() if self.head is None else self.head.build(signals.names)
         known = self.baseline.build(signals.names)
         head.set_mass(known.mass())
-        return HybridDynamics(signals, known, head, self.dt, self.integrator)
+        unknown = None if self.disturbance is None else self.disturbance.build(self.dt)
+        return HybridDynamics(signals, known, head, self.dt, self.integrator, unknown)
 
     @property
     def ranges(self) -> dict[str, tuple[float, float]]:

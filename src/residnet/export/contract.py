@@ -132,6 +132,11 @@ def require_parity(
     Raises:
         ExportError: where a share is larger, or the model itself leaves what exports accept.
     """
+    if not model.head.warms_by_steps():
+        raise ExportError(
+            f"{what}: an encoder of its own starts the memory of {spec.name}, which this format has"
+            " no place for; export it as torchscript, or fit the network with `encoder: false`"
+        )
     tolerance = DOUBLE if dtype == torch.float64 else SINGLE
     y, w = drive(spec, dtype)
     with torch.no_grad():

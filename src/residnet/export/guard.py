@@ -70,7 +70,7 @@ class GuardedDynamics(Dynamics):
         )
         far = torch.full((len(PLANAR.pose),), _FARTHEST, dtype=torch.float64)
         far[POSITION.stop :] = _TURNS
-        first, last = model.head.memory_range()
+        first, last = model.memory_range()
         for name, value in {
             "low": torch.cat((-far, low)),
             "high": torch.cat((far, high)),

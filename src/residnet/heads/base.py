@@ -75,6 +75,10 @@ class ResidualHead(nn.Module, ABC):
         """
         return baseline
 
+    def warms_by_steps(self) -> bool:
+        """Return whether a past leaves the memory that steps along it do; an encoder does not."""
+        return True
+
     def warmup(self, z: Tensor) -> Tensor:
         """Return the memory [B, n_state] that past channels [B, T, nz], oldest first, leave."""
         return torch.zeros(z.shape[0], self.n_state, dtype=z.dtype, device=z.device)

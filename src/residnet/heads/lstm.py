@@ -283,6 +283,10 @@ class LstmHead(ResidualHead):
             rho = rho + self.restoring(z)
         return rho
 
+    def warms_by_steps(self) -> bool:
+        """Return whether there is no encoder."""
+        return all(network.encoder is None for network in self.networks)
+
     def warmup(self, z: Tensor) -> Tensor:
         """Return the memory [B, n_state] that past channels [B, T, nz] leave."""
         return torch.cat([network.memory_after(z) for network in self.networks], dim=-1)

@@ -94,6 +94,10 @@ class MirroredHead(ResidualHead):
         """Return residuals [B, T, 3] along measured channels [B, T, nz], from an empty memory."""
         return self.mean(self.inner.sequence(self.both(z)))
 
+    def warms_by_steps(self) -> bool:
+        """Return what the inner head says."""
+        return self.inner.warms_by_steps()
+
     def warmup(self, z: Tensor) -> Tensor:
         """Return the memory [B, n_state] that past channels [B, T, nz] leave."""
         s = self.inner.warmup(self.both(z))

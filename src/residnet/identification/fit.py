@@ -47,6 +47,10 @@ def fit(
             start = None if begin is None else models[begin]
             models[name] = fitter.head(name, models[needed[0]], start)
             say(f"  {name}: {_said(models[name])} after {models[name].notes['seconds']:.1f} s")
+    for name, force in settings.forces.items():
+        if force.of in models:
+            models[name] = fitter.with_force(name, models[force.of], force)
+            say(f"  {name}: {_said(models[name])}")
     for name, members in settings.ensembles.items():
         models[name] = fitter.ensemble(name, [models[member] for member in members])
         say(f"  {name}: {_said(models[name])}")
@@ -81,13 +85,15 @@ def _add_tied(
     """Add the mean of the models that validation data cannot tell from the best."""
     judged = {split: identified.evaluate(logs[split]) for split in ("train", "validation")}
     chosen = identified.select(judged)
-    if len(chosen.tied) < 2:
+    # a mean of accelerations has no place for a force that one member estimates for itself
+    tied = [n for n in chosen.tied if identified.models[n].spec.disturbance is None]
+    if len(tied) < 2:
         say("  tied: no model comes within one standard error of the best; there is no mean")
         return
-    model = fitter.ensemble(TIED, [identified.models[name] for name in chosen.tied])
+    model = fitter.ensemble(TIED, [identified.models[name] for name in tied])
     identified.models[TIED] = model
     identified.findings.update(identified.findings_of([model]))
-    say(f"  {TIED}: {_said(model)} (mean of {', '.join(chosen.tied)})")
+    say(f"  {TIED}: {_said(model)} (mean of {', '.join(tied)})")
 
 
 def _said(fitted: FittedModel) -> str:

@@ -23,7 +23,7 @@ from residnet.heads import ClosedFormHead
 from residnet.identification.models import FitStore, FittedModel
 from residnet.identification.prepared import velocity_limit
 from residnet.identification.prior_choice import choose_prior
-from residnet.identification.settings import FitSettings
+from residnet.identification.settings import FitSettings, ForceConfig
 from residnet.identification.settling import settled
 from residnet.identification.solution_choice import choose_solution
 from residnet.identification.validation import ValidationScore
@@ -185,6 +185,29 @@ class Fitter:
         }
         return self._kept(FittedModel(spec, model, notes))
 
+    def with_force(self, name: str, base: FittedModel, config: ForceConfig) -> FittedModel:
+        """Return a model with an unknown force, by the observer that validates best.
+
+        Args:
+            name: of the model.
+            base: fitted model that the force is added to.
+            config: time constants to choose from.
+        """
+        tried = []
+        for observer in config.candidates():
+            spec = base.spec.model_copy(update={"name": name, "disturbance": observer})
+            model = spec.build()
+            model.load_state_dict(base.model.state_dict())
+            tried.append((self.validate(model), spec, model))
+        _, spec, model = min(tried, key=lambda one: one[0])
+        notes: dict[str, Any] = {
+            **{key: base.notes[key] for key in ("refit", "baseline") if key in base.notes},
+            "of": base.name,
+            "force": spec.model_dump()["disturbance"],
+            **self._validated(model),
+        }
+        return self._kept(FittedModel(spec, model, notes))
+
     def ensemble(self, name: str, members: Sequence[FittedModel]) -> FittedModel:
         """Return the mean of fitted models as one model."""
         spec = self.spec(name, "ensemble", StillConfig()).model_copy(
@@ -248,7 +271,8 @@ def least_squares_covariance(baseline: nn.Module, known: Samples) -> Tensor | No
     if not isinstance(baseline, ParametricBaseline):
         return None
     information = len(known) / _ALIKE * baseline.information(known)
-    return torch.linalg.pinv(information, hermitian=True)
+    covariance: Tensor = torch.linalg.pinv(information, hermitian=True)
+    return covariance
 
 
 def residual_samples(model: HybridDynamics, known: Samples) -> Samples:

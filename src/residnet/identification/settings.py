@@ -18,11 +18,12 @@ from residnet.baselines import (
     RegressorBaseline,
     StillConfig,
 )
-from residnet.core.config import Config, validate
+from residnet.core.config import Config, Seconds, validate
 from residnet.core.errors import ConfigError
 from residnet.core.names import nearest
 from residnet.data.prepare import PrepareConfig
 from residnet.dynamics.base import Integrator
+from residnet.dynamics.disturbance import DisturbanceConfig
 from residnet.heads import HeadConfig
 from residnet.identification.standard import PARTS, TIED, Facts, portfolio
 from residnet.judge.bands.config import BandsConfig
@@ -33,6 +34,32 @@ from residnet.training.current import CurrentConfig
 from residnet.training.refit_config import RefitConfig
 
 _RESERVED = ("zero", "baseline", "truth")
+
+
+class ForceConfig(Config):
+    """A model that adds an unknown slowly varying force to another one.
+
+    The force is fixed to the earth, as wind and current are, and is estimated from the measured
+    past of each free run. Of several time constants those are taken whose free runs are best on the
+    validation data.
+
+    Attributes:
+        of: baseline or head that it is added to.
+        settle: time constants at which the estimate follows what the model does not explain.
+        decay: time constants at which it is forgotten during the prediction, beside holding it.
+    """
+
+    of: str
+    settle: tuple[Annotated[Seconds, Field(gt=0)], ...] = (5.0, 15.0, 45.0)
+    decay: tuple[Annotated[Seconds, Field(gt=0)], ...] = (60.0,)
+
+    def candidates(self) -> list[DisturbanceConfig]:
+        """Return the observers to choose from."""
+        return [
+            DisturbanceConfig(settle=settle, decay=decay)
+            for settle in self.settle
+            for decay in (None, *self.decay)
+        ]
 
 
 class Parts(Config):
@@ -47,6 +74,8 @@ class Parts(Config):
         heads: residual heads by name.
         base_of: the baseline that a head stands on, by the head's name; `baseline` where absent,
             `zero` for a head that is the whole model.
+        forces: models by name that add an unknown force, estimated from the measured past, to
+            another one.
         ensembles: models whose mean acceleration makes another model, by its name.
         training: of network heads by the name of the head; the defaults where absent.
     """
@@ -56,6 +85,7 @@ class Parts(Config):
     refit: dict[str, RefitConfig] = Field(default_factory=dict)
     heads: dict[str, HeadConfig] = Field(default_factory=dict)
     base_of: dict[str, str] = Field(default_factory=dict)
+    forces: dict[str, ForceConfig] = Field(default_factory=dict)
     ensembles: dict[str, Annotated[tuple[str, ...], Field(min_length=2)]] = Field(
         default_factory=dict
     )
@@ -123,8 +153,8 @@ class FitSettings(Parts):
     def _combination(self) -> FitSettings:
         baselines = self.all_baselines
         single = (*baselines, *self.heads)
-        models = (*single, *self.ensembles)
-        for name in (*self.baselines, *self.heads, *self.ensembles):
+        models = (*single, *self.forces, *self.ensembles)
+        for name in (*self.baselines, *self.heads, *self.forces, *self.ensembles):
             if (
                 name in _RESERVED
                 or models.count(name) > 1
@@ -139,6 +169,7 @@ class FitSettings(Parts):
         require_known("base_of", self.base_of.values(), ("zero", *baselines), "baseline")
         self._trainings_begin()
         require_known("refit", self.refit, baselines, "baseline")
+        require_known("forces", (force.of for force in self.forces.values()), single, "model")
         members = (name for names in self.ensembles.values() for name in names)
         require_known("ensembles", members, single, "model")
         self._parts_fit_together()
@@ -204,7 +235,7 @@ class FitSettings(Parts):
     def model_names(self) -> tuple[str, ...]:
         """Names of all models but `zero`: baselines, heads, ensembles."""
         tied = () if self.recipe is None else (TIED,)
-        return (*self.all_baselines, *self.heads, *self.ensembles, *tied)
+        return (*self.all_baselines, *self.heads, *self.forces, *self.ensembles, *tied)
 
     def baseline_name_of(self, head: str) -> str:
         """Return the name of the baseline that a head stands on."""

@@ -47,3 +47,9 @@ class Calibration(nn.Module):
         change = torch.zeros_like(self.start).flatten()
         moved = change.index_add(0, self.active, self.root @ self.moved)
         return self.start + moved.reshape(self.start.shape)
+
+    @torch.no_grad()
+    def place(self, model: HybridDynamics) -> None:
+        """Put the coefficients as they are now into a model."""
+        assert isinstance(model.baseline, ParametricBaseline)
+        model.baseline.theta.copy_(self())

@@ -172,8 +172,7 @@ class HeadTraining(EpochTraining):
     def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Put moved coefficients into the model, and move the averaged weights."""
         if self.calibration is not None:
-            with torch.no_grad():
-                self.model.baseline.theta.copy_(self.calibration())
+            self.calibration.place(self.model)
         if self.average is None:
             return
         # a short memory at first, or the average would remember the untrained start

@@ -12,9 +12,10 @@ from residnet.identification.standard.schedule import (
     training_settings,
 )
 from residnet.identification.standard.terms import hull_terms, linear_terms
+from residnet.physics.signals import WIND_CHANNELS
 from residnet.physics.symmetry import mirrored_channels
 
-PARTS = ("baseline", "baselines", "refit", "heads", "base_of", "ensembles", "training")
+PARTS = ("baseline", "baselines", "refit", "heads", "base_of", "forces", "ensembles", "training")
 """Keys of a fit that the recipe stands in place of."""
 TIED = "tied"
 """Name of the mean of the models within one standard error of the best."""
@@ -26,7 +27,8 @@ def portfolio(facts: Facts, effort: float = 1.0) -> dict[str, Any]:
     """Return baselines, refits, heads and trainings by the names that the recipe gives them.
 
     `baseline` is linear and `hull` nonlinear in velocities and inputs, both refitted. A network
-    stands on the hull, moves with it, stands on the linear model, and stands alone.
+    stands on the hull, moves with it, stands on the linear model, and stands alone. Where the wind
+    is not measured, an unknown force is estimated from the measured past and added to the hull.
 
     Args:
         facts: of the logs; `Facts.supposed` before they are read.
@@ -46,12 +48,18 @@ def portfolio(facts: Facts, effort: float = 1.0) -> dict[str, Any]:
             "linear_network": "baseline",
             "network": "zero",
         },
+        # where the wind is measured it is no unknown force
+        "forces": {} if _knows_wind(facts) else {"hull_force": {"of": "hull"}},
         "ensembles": {},
         "training": {
             **dict.fromkeys(heads, training),
             _TOGETHER: calibration_settings(facts, effort, _FROZEN),
         },
     }
+
+
+def _knows_wind(facts: Facts) -> bool:
+    return any(name in WIND_CHANNELS for name in facts.names)
 
 
 def _regressors(terms: list[str]) -> dict[str, Any]:

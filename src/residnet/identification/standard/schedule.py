@@ -50,6 +50,7 @@ def training_settings(facts: Facts, effort: float) -> dict[str, Any]:
         "weight_decay": 0.001,
         "robust": 0.05,
         "from_baseline": True,
+        "patience": 5,
     }
 
 
