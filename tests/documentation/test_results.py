@@ -1,0 +1,64 @@
+"""Figures in the pages name sources that exist, and are read from runs as they stand there."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(scope="module")
+def results() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("results", ROOT / "scripts" / "results.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["results"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_every_figure_names_a_source_that_exists(results: ModuleType) -> None:
+    found = [where for page in results.pages() for where, _ in results.marks(page)]
+    assert len(found) > 40
+    for where in found:
+        name, file, *rest = where.split()
+        assert name in results.SOURCES, where
+        assert file == "stdout" or file.endswith(".json"), where
+        assert len(rest) in (1, 2), where
+        assert rest[1:] in ([], ["x100"], ["deg"]), where
+    for source in results.SOURCES.values():
+        assert (ROOT / source.command[0]).is_file(), source.command
+
+
+def test_figures_are_read_from_runs_and_put_into_pages(results: ModuleType, tmp_path: Path) -> None:
+    run = tmp_path / "quickstart"
+    run.mkdir()
+    rows = [{"model": "a", "value": 1}, {"model": "b", "value": [0.123456, 2.0]}]
+    (run / "metrics.json").write_text(json.dumps({"rows": rows}))
+    (run / "stdout").write_text("right in 58 of 60 runs")
+    page = tmp_path / "page.md"
+    marks = ("metrics.json rows[model=b].value x100", r"stdout in\s(\d+\sof\s60)")
+    page.write_text("".join(f"<!--= quickstart {mark} -->old<!--/-->; " for mark in marks))
+    assert results.rewrite(page, tmp_path, ["quickstart"]) == 0
+    assert results.rewrite(page, tmp_path, []) == 2
+    assert [text for _, text in results.marks(page)] == ["12.3 / 200", "58 of 60"]
+    with pytest.raises(LookupError, match="no entry with model=c"):
+        results.figure("quickstart metrics.json rows[model=c].value", tmp_path)
+
+
+def test_what_cannot_be_run_is_said(
+    results: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("RESIDNET_DATA", str(tmp_path))
+    source = results.SOURCES["esso_osaka"]
+    assert "needs esso_osaka/" in results.why_not(source, 1000)
+    (tmp_path / "esso_osaka").mkdir()
+    assert results.why_not(source, 1000) == ""
+    assert results.why_not(source, 1).startswith("takes 45 minutes")
