@@ -11,7 +11,7 @@ import pytest
 
 from residnet.core.errors import UsageError
 from residnet.documents import study_sections
-from residnet.report.blocks import Cell, Figure, Table
+from residnet.report.blocks import Cell, Figure, Table, Text
 
 MODELS = (
     "zero",
@@ -82,7 +82,7 @@ def made(run: Path, models: tuple[str, ...] = MODELS) -> Path:
 
 def test_tables_hold_the_errors_of_the_records(tmp_path: Path) -> None:
     (section,) = study_sections("moreno2019", made(tmp_path))
-    errors, _, figure = section.blocks
+    errors, _, figure, _ = section.blocks
     content = json.loads((tmp_path / "study.json").read_text())
     assert {(row["model"], row["split"]) for row in content["rows"]} == {
         (m, s) for m in MODELS for s in ("train", "validation", "test")
@@ -110,5 +110,12 @@ def test_tables_hold_the_errors_of_the_records(tmp_path: Path) -> None:
 
 
 def test_a_run_without_a_model_of_the_study_says_which(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="'gptips' is absent"):
-        study_sections("moreno2019", made(tmp_path, MODELS[:-1]))
+    with pytest.raises(UsageError, match=f"'{MODELS[-2]}' is absent"):
+        study_sections("moreno2019", made(tmp_path, MODELS[:-2]))
+
+
+def test_a_run_without_the_optional_package_says_what_it_lacks(tmp_path: Path) -> None:
+    (section,) = study_sections("moreno2019", made(tmp_path, MODELS[:-1]))
+    said = section.blocks[0]
+    assert isinstance(said, Text)
+    assert "Not run: symbolic regression, GPTIPS settings" in str(said)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -135,3 +136,20 @@ def test_training_reports_every_epoch_and_writes_nothing(
     epochs = [event.done for event in heard if event.stage == "training lstm"]
     assert epochs == list(range(1, 8))
     assert not list(tmp_path.iterdir())
+
+
+def test_an_optional_head_is_left_out_where_its_package_is_absent(
+    logs: PreparedSplits, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "deap", None)
+    plain = {key: SETTINGS[key] for key in ("prepare", "signals", "baseline", "evaluation")}
+    bred = {"kind": "genetic", "evolution": {"population": 10, "generations": 1}}
+    said: list[str] = []
+
+    def hear(event: object) -> None:
+        said.append(str(event))
+
+    settings = validate(plain | {"heads": {"bred": bred | {"optional": True}}}, FitSettings, "here")
+    with listen(hear):
+        assert list(fit(logs, settings)) == ["zero", "baseline"]
+    assert "bred is left out" in " ".join(said)

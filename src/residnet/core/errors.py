@@ -33,6 +33,10 @@ class UsageError(ResidnetError):
     exit_code = 2
 
 
+class MissingPackageError(UsageError):
+    """The error of an optional package that is not installed (exit code 2)."""
+
+
 class ConfigError(UsageError):
     """The error of a wrong configuration key, value or combination (exit code 2)."""
 

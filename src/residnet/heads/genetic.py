@@ -26,9 +26,12 @@ class GeneticConfig(FeatureConfig, EquationSearchConfig):
 
     Attributes:
         kind: name of the head.
+        optional: leave the head out of a fit where the extra is not installed, and say so, instead
+            of stopping.
     """
 
     kind: Literal["genetic"] = "genetic"
+    optional: bool = False
 
     def build(self, names: Sequence[str]) -> GeneticHead:
         """Return the module for channels `names`."""

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
-from residnet.core.errors import DataError, FitError
+from residnet.core.errors import DataError, FitError, MissingPackageError
 from residnet.core.progress import say
 from residnet.data.prepare import Prepared
+from residnet.heads.genetic import GeneticConfig
 from residnet.identification.bands.calibrating import calibrate_bands
 from residnet.identification.fitter import Fitter
 from residnet.identification.identified import Identified
@@ -66,13 +67,22 @@ def fit(
 
 @contextmanager
 def _optional(settings: FitSettings, name: str) -> Iterator[None]:
-    """Leave a model of the recipe out that the logs do not determine; others fail the fit.
+    """Leave a model out that the recipe can do without, or whose optional package is not installed.
+
+    The recipe does without what the logs do not determine, except its first model. A head of kind
+    `genetic` can be `optional`.
 
     Raises:
         FitError: of a model that was asked for by name, or of the recipe's first.
+        MissingPackageError: of a head that is not optional.
     """
+    head = settings.heads.get(name)
     try:
         yield
+    except MissingPackageError as error:
+        if not (isinstance(head, GeneticConfig) and head.optional):
+            raise
+        say(f"  {name} is left out: {error}")
     except (DataError, FitError) as error:
         if settings.recipe is None or name == "baseline":
             raise

@@ -17,14 +17,16 @@ import numpy as np
 
 from residnet.core.errors import UsageError
 from residnet.core.files import whole
-from residnet.documents.moreno2019.published import RMSE
+from residnet.documents.moreno2019.published import EQUATIONS, OTHERS, RMSE
 from residnet.judge.residual_series import block_interval
-from residnet.report.blocks import Block, Cell, Figure, Section, Table
+from residnet.report.blocks import Block, Cell, Figure, Section, Table, Text
 from residnet.report.figures.style import MEASURED, RC, collect, legend_above, new_figure, save
 from residnet.report.format import DEG, fixed
 from residnet.report.run_reader import RunFiles, StoredWindow
 
 _PROTOCOL = "record"
+_OPTIONAL = "gptips"
+"""The model that a run without the extra gp lacks."""
 _SPLITS = ("train", "validation", "test")
 _PAIRS = {"rbf_joint": "rbf_each", "p1_joint": "p1_each", "p2_joint": "p2_each"}
 _NAMES = {
@@ -50,10 +52,12 @@ def sections(run: Path) -> list[Section]:
         UsageError: where the run lacks a model of the study or the free runs over whole records.
     """
     files = RunFiles(run)
-    missing = [model for model in _NAMES if model not in files.kinds]
+    names = {model: name for model, name in _NAMES.items() if model in files.kinds}
+    missing = [model for model in _NAMES if model not in (*names, _OPTIONAL)]
     if missing:
         raise UsageError(
-            f"{run}: study moreno2019 needs the models {', '.join(_NAMES)}; '{missing[0]}' is"
+            f"{run}: study moreno2019 needs the models"
+            f" {', '.join(model for model in _NAMES if model != _OPTIONAL)}; '{missing[0]}' is"
             " absent"
         )
     records = {
@@ -65,7 +69,7 @@ def sections(run: Path) -> list[Section]:
             f"{run}: study moreno2019 needs the protocol '{_PROTOCOL}' on the splits"
             f" {', '.join(_SPLITS)}"
         )
-    rows = [_row(model, split, records[split]) for model in _NAMES for split in _SPLITS]
+    rows = [_row(model, split, records[split]) for model in names for split in _SPLITS]
     pairs = [
         _pair(model, other, split, records[split])
         for model, other in _PAIRS.items()
@@ -74,7 +78,9 @@ def sections(run: Path) -> list[Section]:
     content = {"schema": "residnet.moreno2019/1", "rows": rows, "pairs": pairs}
     with whole(run / "study.json") as file:
         file.write_text(json.dumps(content, indent=1) + "\n")
-    blocks: list[Block] = [_errors(rows), _joint(pairs), _draw(records["test"], run)]
+    blocks: list[Block] = [_errors(rows), _joint(pairs), _draw(records["test"], run), _printed()]
+    if _OPTIONAL not in names:
+        blocks.insert(0, Text(f"Not run: {_NAMES[_OPTIONAL]}, which needs the extra gp."))
     return [Section("Document 001 (Moreno-Salinas et al. 2019)", blocks)]
 
 
@@ -148,7 +154,23 @@ def _errors(rows: Sequence[dict[str, Any]]) -> Table:
         ]
         diverged = f"{row['diverged']} of {row['records']}"
         table.add(_NAMES[row["model"]], [Cell(row["split"], mark="text"), *cells, diverged])
+    for model in OTHERS:
+        for split in _SPLITS[1:]:
+            values = [Cell("", f"published {fixed(v, 4)}") for v in RMSE[model, split][:2]]
+            rate = Cell("", f"published {fixed(DEG * RMSE[model, split][2], 3)}")
+            table.add(model, [Cell(split, mark="text"), *values, rate, ""])
     return table
+
+
+def _printed() -> Text:
+    """Return the published equations, which take the voltage of a motor that no public ship has."""
+    return Text(
+        [
+            "The equations that the document prints, in their likeliest reading; Delta is the"
+            " voltage of its motor, so that they cannot be evaluated on another ship:",
+            *EQUATIONS,
+        ]
+    )
 
 
 def _joint(pairs: Sequence[dict[str, Any]]) -> Table:

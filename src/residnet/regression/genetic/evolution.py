@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from residnet.core.errors import FitError, UsageError
+from residnet.core.errors import FitError, MissingPackageError
 from residnet.regression.expressions.algebra import (
     ONE,
     Algebra,
@@ -96,12 +96,12 @@ def require_deap() -> ModuleType:
     """Return DEAP's genetic programming.
 
     Raises:
-        UsageError: where it is not installed.
+        MissingPackageError: where it is not installed.
     """
     try:
         from deap import gp
     except ImportError as error:
-        raise UsageError(
+        raise MissingPackageError(
             "genetic programming needs the library DEAP, which is not installed; install it with:"
             " pip install 'residnet[gp]'"
         ) from error
