@@ -73,7 +73,7 @@ class ConditionsFit(EpochTraining):
             self.validate_start()
 
     def on_train_epoch_start(self) -> None:
-        """Seed the epoch."""
+        """Draw the epoch's flights anew, from a seed of its own."""
         self.seed_epoch()
         self.policy.at(self.settings.dt)
 

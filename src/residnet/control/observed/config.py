@@ -109,7 +109,7 @@ class ObservedLqrConfig(ObservedConfig):
     rate_weight: Positive | None = None
 
     def law(self, limit: float, rate: float | None) -> HeadingLaw:
-        """Return the regulator."""
+        """Return the linear regulator with this rudder limit in rad."""
         return RegulatorLaw(limit)
 
     def law_axes(self) -> dict[str, Axis]:

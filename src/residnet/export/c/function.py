@@ -64,12 +64,12 @@ class FunctionBody:
         ]
 
     def write(self) -> None:
-        """Write all instructions."""
+        """Write the program's instructions in their order."""
         for instruction in self.program.instructions:
             self.one(instruction)
 
     def one(self, instruction: Instruction) -> None:
-        """Write one instruction."""
+        """Write the C statements of one instruction."""
         writers: dict[type, Callable[..., None]] = {
             Map: self.map, Product: self.product, Fold: self.fold, Pick: self.pick,
         }  # fmt: skip

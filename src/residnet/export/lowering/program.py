@@ -183,7 +183,7 @@ class Program:
 
     @property
     def size(self) -> int:
-        """Number of cells."""
+        """Number of numbers that the program holds."""
         return self._size
 
     @property
