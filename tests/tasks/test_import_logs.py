@@ -13,6 +13,7 @@ import pytest
 import written_logs
 import yaml
 from tiny import call
+from tiny_tasks import imported
 
 from residnet.core.log import Log
 from residnet.data.readers import CanonicalConfig
@@ -85,3 +86,17 @@ def test_two_recordings_of_one_name(
         recorded(tmp_path / day, "rec_a", 2.0)
     assert call(monkeypatch, "check", config(tmp_path, logs=["*/rec_a"])) == 2
     assert "would both be the log 'rec_a'" in capsys.readouterr().err
+
+
+def test_a_check_reads_a_recording_as_the_run_will(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    content = imported(tmp_path)
+    content["reader"]["channels"]["u"]["column"] = "speed"
+    path = tmp_path / "import.yaml"
+    path.write_text(yaml.safe_dump(content))
+    assert call(monkeypatch, "check", path) == 2
+    assert "no column 'speed'" in capsys.readouterr().err
+    content["reader"]["channels"]["u"]["column"] = "u"
+    path.write_text(yaml.safe_dump(content))
+    assert call(monkeypatch, "check", path) == 0

@@ -21,6 +21,9 @@ from residnet.report.sections.import_logs import sections
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import MainFigure, Outcome, Task
 
+_READ_AT_ONCE = 50_000_000
+"""Bytes of the largest recording that a check reads."""
+
 
 class ImportConfig(Task):
     """Recordings of any format that become canonical logs, with what was noticed on the way in.
@@ -37,12 +40,23 @@ class ImportConfig(Task):
     logs: tuple[str, ...] = Field(min_length=1)
 
     def check(self) -> None:
-        """Check that every pattern matches.
+        """Check that every pattern matches, and that the reader understands the recordings.
+
+        The smallest recording of each kind of file is read, unless it is large.
 
         Raises:
-            ConfigError: where one does not, or two recordings would have one name.
+            ResidnetError: where a pattern matches nothing, two recordings would have one name, or a
+                recording cannot be read as the config says.
         """
-        self._paths()
+        reader = self.reader.build()
+        smallest: dict[str, tuple[int, Path]] = {}
+        for path in self._paths():
+            size = sum(file.stat().st_size for file in files_of(path))
+            kind = path.suffix.lower()
+            if size <= _READ_AT_ONCE and (kind not in smallest or size < smallest[kind][0]):
+                smallest[kind] = (size, path)
+        for _, path in smallest.values():
+            reader.read(path)
 
     def input_files(self) -> list[Path]:
         """Return the files of all recordings."""
