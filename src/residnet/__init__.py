@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from residnet.face.fitting import Models, fit, metrics, select
     from residnet.face.logs import inspect, read_logs
     from residnet.face.models import Model, export_model, load, save
+    from residnet.face.monitoring import Monitor
     from residnet.face.parts import available, baseline, head
     from residnet.face.runs import FreeRuns, free_run
     from residnet.face.simulation import Trials, manoeuvre, simulate, vessel
@@ -37,6 +38,7 @@ _HOME = {
     "Log": "core.log",
     "Model": "face.models",
     "Models": "face.fitting",
+    "Monitor": "face.monitoring",
     "Progress": "core.progress",
     "ResidnetError": "core.errors",
     "Result": "face.tasks",
@@ -68,6 +70,7 @@ __all__ = [
     "Log",
     "Model",
     "Models",
+    "Monitor",
     "Progress",
     "ResidnetError",
     "Result",

@@ -15,6 +15,7 @@ from residnet.commands import (
     export,
     limit_threads,
     list_names,
+    monitor,
     report,
     runs,
     show,
@@ -218,7 +219,7 @@ def inspect(
         raise typer.Exit(1)
 
 
-for command in (evaluate, export, ardupilot, report, compare, runs):
+for command in (evaluate, monitor, export, ardupilot, report, compare, runs):
     app.command()(command)
 app.command(name="list")(list_names)
 

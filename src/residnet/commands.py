@@ -44,6 +44,45 @@ def evaluate(
     show(finished)
 
 
+def monitor(
+    folder: RunPath,
+    logs: Annotated[
+        list[Path],
+        typer.Option(
+            "--logs", metavar="PATH", help="New logs in the order of time; may be repeated."
+        ),
+    ],
+    model: Annotated[str, typer.Option(help="Name of the model.")] = "selected",
+    window: Annotated[str, typer.Option(help="Length of the short free runs.")] = "10 s",
+    stretch: Annotated[str, typer.Option(help="Time that is looked back over.")] = "300 s",
+    false_alarm: Annotated[str, typer.Option(help="Mean time between false alarms.")] = "10 h",
+    file: Annotated[
+        Path | None,
+        typer.Option("--json", metavar="FILE", help="Write what was found to a file as JSON, too."),
+    ] = None,
+) -> None:
+    """Watch new logs with a model of a finished fit, and name what has changed.
+
+    The exit code is 1 where there is an alarm.
+    """
+    from residnet.core.files import require_file_place, whole
+    from residnet.tasks.verbs import monitor_run
+
+    limit_threads()
+    if file is not None:
+        require_file_place(file)
+    settings = {"window": window, "stretch": stretch, "false_alarm": false_alarm}
+    with drawn_progress():
+        found = monitor_run(folder, logs, model, settings)
+    for log in found:
+        print("\n".join(log.text()))
+    if file is not None:
+        with whole(file) as part:
+            part.write_text(json.dumps([log.content() for log in found], indent=1) + "\n")
+    if any(log.since is not None for log in found):
+        raise typer.Exit(1)
+
+
 def export(
     folder: RunPath,
     model: Annotated[

@@ -80,7 +80,7 @@ def rows(
         for name, members in subsets.items():
             chosen = np.array([kind in members for kind in kinds])
             if chosen.any():
-                row = {
+                row: dict[str, Any] = {
                     "model": candidate.name,
                     "kind": candidate.kind,
                     "split": run.split,

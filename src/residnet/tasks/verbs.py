@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from residnet.core.config import load_config, load_mapping
 from residnet.core.errors import UsageError
@@ -13,6 +14,8 @@ from residnet.core.registry import kinds
 from residnet.runs.checksums import seal
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import Finished, Task
+from residnet.tasks.fit.config import FitTaskSettings
+from residnet.tasks.fit.watching import WatchedLog, watch_logs
 from residnet.tasks.union import TaskConfig
 
 
@@ -52,6 +55,21 @@ def export_run(path: Path, model: str, out: Path | None, file_format: str) -> Pa
     run = RunFolder.open(path)
     require_file_place(out or run.exports / model)
     return _task(run, "export").export_model(run, model, out, file_format)
+
+
+def monitor_run(
+    path: Path, logs: Sequence[Path], model: str, settings: Mapping[str, Any]
+) -> list[WatchedLog]:
+    """Watch new logs with a model of a finished fit.
+
+    Raises:
+        UsageError: where the run is no fit, or there is no such model.
+        ResidnetError: where a log cannot be used.
+    """
+    run = RunFolder.open(path)
+    config = _task(run, "monitor")
+    assert isinstance(config, FitTaskSettings)
+    return watch_logs(config, run, logs, model, settings)
 
 
 def task_class(run: RunFolder) -> type[Task]:

@@ -161,9 +161,10 @@ class Watch:
         looks = self.config.false_alarm / self.config.stretch * _OVERLAP * len(self.causes)
         self.threshold = float(student.isf(0.5 / looks, len(groups) - 1))
 
-    def sums(self, pieces: Sequence[Piece]) -> _Sums:
-        """Return the scores of windows."""
-        return self._sums(*innovations(self.model, pieces, self.changes))
+    def sums(self, pieces: Sequence[Piece]) -> list[_Sums]:
+        """Return the scores of each of several windows."""
+        error, effects = innovations(self.model, pieces, self.changes)
+        return [self._sums(error[i : i + 1], effects[i : i + 1]) for i in range(len(pieces))]
 
     def _sums(self, error: np.ndarray, effects: np.ndarray) -> _Sums:
         e, a = error @ self.whiten.T, effects @ self.whiten.T
@@ -183,9 +184,11 @@ class Watch:
         information = np.diag(matrix[:count, :count] - matrix[:count, count:] @ own)
         return score, np.maximum(information, 1e-300)
 
-    def judge(self, sums: _Sums) -> Verdict:
-        """Return the verdict on the windows of a stretch."""
-        score, information = self._alone(sums)
+    def judge(self, groups: Sequence[_Sums]) -> Verdict:
+        """Return the verdict on groups of windows; wind and current are their own in each."""
+        parts = [self._alone(group) for group in groups]
+        score = np.sum([part[0] for part in parts], axis=0)
+        information = np.sum([part[1] for part in parts], axis=0)
         apart = score - self.bias * information
         variance = self.scatter * information * (1.0 + information / self.known)
         z = apart / np.sqrt(variance)
@@ -199,7 +202,9 @@ class Watch:
             for i, change in enumerate(self.causes)
         ]
         suspects.sort(key=lambda suspect: -suspect.score)
-        by_channel = (sums.squares / max(sums.count, 1)).reshape(-1, len(SEEN)).mean(axis=0)
+        count = sum(group.count for group in groups)
+        squares = np.sum([group.squares for group in groups], axis=0) / count
+        by_channel = squares.reshape(-1, len(SEEN)).mean(axis=0)
         innovation = dict(zip(SEEN, np.sqrt(by_channel).tolist(), strict=True))
         return Verdict(suspects[0].score > self.threshold, self.threshold, suspects, innovation)
 
@@ -216,8 +221,10 @@ class Watcher:
         self.watch = watch
         self.past = past
         self.steps = round(watch.config.window / watch.dt)
-        keep = max(round(watch.config.stretch / watch.config.window), 1)
-        self.recent: deque[_Sums] = deque(maxlen=keep)
+        self.size = max(round(watch.config.group / watch.config.window), 1)
+        self.windows = max(round(watch.config.stretch / watch.config.window), 1)
+        self.recent: deque[_Sums] = deque()
+        self.closed = True
         self.y: list[np.ndarray] = []
         self.w: list[np.ndarray] = []
 
@@ -229,27 +236,36 @@ class Watcher:
             the window that it lies in.
         """
         if not (np.isfinite(y).all() and np.isfinite(w).all()):
-            self.y, self.w = [], []
+            self.restart()
             return None
         self.y.append(np.asarray(y, dtype=float))
         self.w.append(np.asarray(w, dtype=float))
         if len(self.y) < self.past + self.steps + 1:
             return None
+        known, given = np.stack(self.y), np.stack(self.w)
         piece = Piece(
-            np.stack(self.y[self.past :]),
-            np.stack(self.w[self.past : -1]),
-            np.stack(self.y[: self.past]),
-            np.stack(self.w[: self.past]),
+            known[self.past :],
+            given[self.past : -1],
+            known[: self.past],
+            given[: self.past],
         )
         # the next window begins where this one ends
         keep = self.past + 1
         self.y, self.w = self.y[-keep:], self.w[-keep:]
-        return self.take(self.watch.sums([piece]))
+        return self.take(self.watch.sums([piece])[0])
+
+    def restart(self) -> None:
+        """Begin a new log, whose wind and current are its own."""
+        self.y, self.w = [], []
+        self.closed = True
 
     def take(self, sums: _Sums) -> Verdict:
         """Take the scores of a window, and return the verdict on the last stretch."""
-        self.recent.append(sums)
-        total = self.recent[0]
-        for part in list(self.recent)[1:]:
-            total = total + part
-        return self.watch.judge(total)
+        if self.closed or self.recent[-1].count >= self.size:
+            self.recent.append(sums)
+        else:
+            self.recent[-1] = self.recent[-1] + sums
+        self.closed = False
+        while sum(group.count for group in self.recent) - self.recent[0].count >= self.windows:
+            self.recent.popleft()
+        return self.watch.judge(self.recent)

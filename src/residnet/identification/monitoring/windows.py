@@ -10,12 +10,15 @@ import torch
 from torch import Tensor
 
 from residnet.core.layout import HEADING, VELOCITIES
+from residnet.data.prepare import Prepared
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.identification.monitoring.changes import Change, ChangedDynamics, shown
 
 SEEN = ("u", "v", "r", "heading")
 """What innovations are taken of."""
+_PAST = 5.0
+"""Time in s before a window that warms a memory up."""
 _SAMPLES = 5
 """Samples of a window that count, the last of them its end."""
 
@@ -84,3 +87,36 @@ def _seen(states: Tensor) -> Tensor:
     """Return differences of states [B, k, 6] as innovations [B, 4 k]."""
     chosen = torch.cat((states[..., VELOCITIES], states[..., HEADING : HEADING + 1]), dim=-1)
     return chosen.flatten(1)
+
+
+def pieces(log: Prepared, steps: int, past: int) -> list[Piece]:
+    """Return the windows of a log, back to back, whose samples can all be trusted.
+
+    Args:
+        log: prepared as those of the fit.
+        steps: length of a window.
+        past: samples before a window that warm a memory up; the first windows go without.
+    """
+    out, start = [], past
+    while start + steps < len(log):
+        rows = slice(start - past, start + steps + 1)
+        trusted = log.usable[rows] & (log.piece[rows] == log.piece[start]) & (log.piece[start] >= 0)
+        if not trusted.all():
+            # the next window begins behind the last sample that is not to be trusted
+            start = rows.start + int(np.flatnonzero(~trusted)[-1]) + 1 + past
+            continue
+        out.append(
+            Piece(
+                log.y[start : start + steps + 1],
+                log.w[start : start + steps],
+                log.y[start - past : start],
+                log.w[start - past : start],
+            )
+        )
+        start += steps
+    return out
+
+
+def past_of(model: HybridDynamics) -> int:
+    """Return the samples before a window that warm a model's memory up; 0 where it has none."""
+    return round(_PAST / model.dt) if model.n_state else 0

@@ -18,7 +18,7 @@ class FitConfig(FitTaskSettings):
 
     task: Literal["fit"]
 
-    verbs: ClassVar[tuple[str, ...]] = ("report", "evaluate", "export")
+    verbs: ClassVar[tuple[str, ...]] = ("report", "evaluate", "export", "monitor")
 
     def check(self) -> None:
         """Check that the logs hold what every part of the fit asks for, without fitting.

@@ -1,0 +1,208 @@
+"""Does the monitor find planted changes of simulated vessels, and leave clean logs alone?
+
+Each vessel is identified from clean trials. Then trials of the changed vessel, five minutes a
+seed, go through the monitor, and hours of clean ones.
+
+    python scripts/bench/monitor.py [--seeds 10] [--hours 2] [--seed 0] [VESSEL...]
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import yaml
+
+from residnet.core.config import validate
+from residnet.core.log import Log
+from residnet.core.resources import config_folder
+from residnet.data.prepare import Prepared, prepare
+from residnet.data.simulated.trials import SimulatedTrials, simulate
+from residnet.identification.fit import fit
+from residnet.identification.models import FittedModel
+from residnet.identification.monitoring.monitor import MonitorConfig, Watch, Watcher
+from residnet.identification.monitoring.windows import pieces
+from residnet.identification.prepared import prepare_logs
+from residnet.identification.settings import FitSettings
+
+STEP = 0.1
+PER_SEED = 5
+"""Trials of 60 s that each seed sees."""
+VESSELS: dict[str, dict[str, Any]] = {
+    "wam_v_cal": {"inputs": ["n_port", "n_stbd"], "forces": "wam_v_cal"},
+    "wam_v_vrx": {"inputs": ["n_port", "n_stbd"], "forces": "wam_v_vrx"},
+    "example_rudder_boat": {"inputs": ["n", "delta"]},
+}
+SEA: dict[str, dict[str, Any]] = {
+    "wam_v_cal": {"force_x": 10, "force_y": 10, "force_n": 10},
+    "wam_v_vrx": {"force_x": 10, "force_y": 10, "force_n": 10},
+    "example_rudder_boat": {"wind": {"speed": "3 m/s", "direction": "220 deg", "gust": 0.5}},
+}
+
+
+def trials(vessel: str, sea: dict[str, Any], seed: int, count: int) -> list[Log]:
+    """Return logs of so many trials, a mixture of manoeuvres in random order."""
+    third = max(count // 3, 3)
+    content: dict[str, Any] = {
+        "kind": "simulated",
+        "vessel": vessel,
+        "seed": seed,
+        "trials": [
+            {"kind": "zigzag", "count": count - 2 * third + 3, "heading": ["10 deg", "20 deg"]},
+            {"kind": "three_two_one_one", "count": third},
+            {"kind": "acceleration_deceleration", "count": third},
+        ],
+        "duration": 60.0,
+        "step": STEP,
+        "substeps": 2,
+        "noise": {"u": 0.02, "v": 0.02, "r": 0.003},
+        "disturbance": {"current_each": [0.0, 0.3], **sea},
+        "identification": {"zigzag": 2},
+        "validation": {"zigzag": 1},
+    }
+    config = validate(content, SimulatedTrials, "bench")
+    logs = simulate(config.draw(), config)
+    order = np.random.default_rng(seed).permutation(len(logs))[:count]
+    return [logs[i] for i in order]
+
+
+def identified(vessel: str, seed: int) -> tuple[FitSettings, FittedModel, list[Prepared]]:
+    """Return a model of the clean vessel, and the logs that fitted it."""
+    logs = trials(vessel, SEA[vessel], seed, 40)
+    settings = validate(
+        {
+            "prepare": {
+                "grid": {"step": STEP},
+                "derivative": {"kind": "savitzky_golay", "window": 1.1, "order": 2},
+            },
+            "signals": VESSELS[vessel],
+            "baseline": {"kind": "regressors", "sets": ["fossen"], "ridge": 1e-6},
+            "refit": {"baseline": {"horizon": 10.0, "every": 10.0, "iterations": 4}},
+            "bands": None,
+            "evaluation": {
+                "protocols": {"T20": {"kind": "windows", "length": 20.0}},
+                "selection": "T20",
+                "scales": {"u": 0.3, "v": 0.1, "r": 0.1},
+            },
+        },
+        FitSettings,
+        "bench",
+    )
+    prepared = prepare_logs({"train": logs[8:], "validation": logs[:8]}, settings)
+    found = fit(prepared, settings)
+    return settings, found["baseline"], [*prepared["train"], *prepared["validation"]]
+
+
+def changed_vessel(vessel: str, change: Callable[[dict[str, Any]], None], folder: Path) -> str:
+    """Write a vessel file with a change, and return its path."""
+    content = yaml.safe_load((config_folder() / "vessels" / f"{vessel}.yaml").read_text())
+    change(content)
+    file = folder / f"{vessel}_{change.__name__}.yaml"
+    file.write_text(yaml.safe_dump(content))
+    return str(file)
+
+
+def heavier(content: dict[str, Any]) -> None:
+    """Add 15 % to mass and inertia."""
+    for name in ("m", "I_z"):
+        content["rigid_body"][name]["value"] *= 1.15
+
+
+def yaw_damping(content: dict[str, Any]) -> None:
+    """Take 20 % off the damping in yaw."""
+    for term, entry in content["damping"]["N"].items():
+        if term in ("r", "r|r|", "|u|r"):
+            entry["value"] *= 0.8
+
+
+def scaled(name: str, factor: float, offset: float = 0.0) -> Callable[[Log], Log]:
+    """Return what changes one channel of a log."""
+
+    def change(log: Log) -> Log:
+        channels = dict(log.channels)
+        channels[name] = factor * channels[name] + offset
+        return log.replace(channels=channels)
+
+    return change
+
+
+def cases(vessel: str, folder: Path) -> dict[str, tuple[str, Callable[[Log], Log], str]]:
+    """Return the planted changes: vessel that is flown, what becomes of its logs, right cause."""
+    same = scaled("u", 1.0)
+    side = "n_stbd" if "n_stbd" in VESSELS[vessel]["inputs"] else "n"
+    out = {
+        "mass +15 %": (changed_vessel(vessel, heavier, folder), same, "mass"),
+        "thrust -10 %": (vessel, scaled(side, 0.9**-0.5), f"gain {side}"),
+        "yaw damping -20 %": (changed_vessel(vessel, yaw_damping, folder), same, "damping yaw"),
+        "gyro +5 %": (vessel, scaled("r", 1.05), "gyro scale"),
+    }
+    if "delta" in VESSELS[vessel]["inputs"]:
+        out["rudder 2 deg"] = (vessel, scaled("delta", 1.0, -np.deg2rad(2)), "offset delta")
+    return out
+
+
+def watched(
+    watch: Watch, settings: FitSettings, logs: Sequence[Log]
+) -> tuple[list[bool], list[str]]:
+    """Return, window by window, whether the monitor alarms and what it names first."""
+    watcher = Watcher(watch, 0)
+    alarms, names = [], []
+    for log in logs:
+        watcher.restart()
+        known = prepare(log, "external", settings.signals.columns, settings.prepare)
+        for sums in watch.sums(pieces(known, watcher.steps, 0)):
+            verdict = watcher.take(sums)
+            alarms.append(verdict.alarm)
+            names.append(verdict.suspects[0].change.name)
+    return alarms, names
+
+
+def main() -> None:
+    """Read the command line, and print a table for each vessel."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("vessels", nargs="*", default=list(VESSELS))
+    parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--hours", type=float, default=2.0)
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args()
+    torch.set_num_threads(1)
+    with tempfile.TemporaryDirectory() as folder:
+        for vessel in given.vessels:
+            settings, model, clean = identified(vessel, 100 + given.seed)
+            config = MonitorConfig()
+            steps = round(config.window / STEP)
+            watch = Watch(model.spec, model.model, [pieces(log, steps, 0) for log in clean], config)
+            print(f"{vessel}: threshold {watch.threshold:.2f}", flush=True)
+            for name, (flown, change, right) in cases(vessel, Path(folder)).items():
+                count = PER_SEED * given.seeds
+                logs = trials(flown, SEA[vessel], 7 + given.seed, count)
+                found, first, firsts = 0, 0, []
+                for k in range(given.seeds):
+                    part = [change(log) for log in logs[PER_SEED * k : PER_SEED * (k + 1)]]
+                    alarms, names = watched(watch, settings, part)
+                    found += any(alarms)
+                    named = names[-1]
+                    firsts.append(named)
+                    first += any(alarms) and named == right
+                print(
+                    f"  {name:18s} found {found}/{given.seeds}, right cause first"
+                    f" {first}/{given.seeds} ({', '.join(sorted(set(firsts)))})",
+                    flush=True,
+                )
+            logs = trials(vessel, SEA[vessel], 23 + given.seed, round(60 * given.hours))
+            alarms, _ = watched(watch, settings, logs)
+            raised = sum(
+                now and not before
+                for before, now in zip([False, *alarms[:-1]], alarms, strict=True)
+            )
+            hours = len(alarms) * config.window / 3600
+            print(f"  clean: {raised} alarms in {hours:.1f} h", flush=True)
+
+
+if __name__ == "__main__":
+    main()
