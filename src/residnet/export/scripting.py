@@ -80,6 +80,8 @@ def write_scripted(
         warnings.filterwarnings("ignore", category=FutureWarning)
         warnings.filterwarnings("ignore", message=".*torch.jit.*")
         scripted = torch.jit.freeze(torch.jit.script(module), preserved_attrs=list(methods))
+        for name in methods:
+            _compute_once(scripted, name)
         contents = card(check(scripted))
         # through memory: a disk that is full is then the system's error, not one of PyTorch
         written = io.BytesIO()
@@ -90,3 +92,20 @@ def write_scripted(
             partial.write_bytes(written.getvalue())
             check(torch.jit.load(str(partial)))
     return contents
+
+
+def _compute_once(scripted: Any, method: str) -> None:
+    """Let a method compute alike expressions once, in the graph that is saved.
+
+    The executor would do so while it runs, but its settings that make the first call quick leave
+    graphs as they are.
+    """
+    graph = scripted._c._get_method(method).graph
+    passes = torch._C
+    passes._jit_pass_inline(graph)
+    # what one round has joined lets the next one join more
+    for _ in range(3):
+        passes._jit_pass_constant_propagation(graph)
+        passes._jit_pass_peephole(graph)
+        passes._jit_pass_cse(graph)
+        passes._jit_pass_dce(graph)
