@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from residnet.baselines import ParametricBaseline
 from residnet.core.errors import DataError, ResidnetError
 from residnet.core.samples import Samples
 from residnet.data.prepare import Prepared, samples
@@ -25,6 +26,8 @@ from residnet.judge.verdict.selection import blocks_of, shares
 from residnet.training.refit import refit
 from residnet.training.refit_config import RefitConfig
 
+_ITERATIONS = 3
+"""Steps of Gauss-Newton for each strength, each search going on where the last one ended."""
 Prior = float | None
 """A strength of the prior; None for least squares as it is."""
 
@@ -126,16 +129,24 @@ def _fitted(
     except ResidnetError:
         return [(prior, None) for prior in priors]
     model.baseline.load_state_dict(first.state, strict=False)
-
-    def moved(prior: float) -> HybridDynamics | None:
+    # which strength is the better one shows long before the last digit
+    quick = config.model_copy(update={"every": config.horizon, "iterations": _ITERATIONS})
+    out: list[tuple[Prior, HybridDynamics | None]] = []
+    begin: torch.Tensor | None = None
+    for prior in priors:
+        if prior is None:
+            out.append((prior, model))
+            continue
         own = copy.deepcopy(model)
         try:
-            refit(own, known, store, config.with_prior(prior), scales)
+            refit(own, known, store, quick.with_prior(prior), scales, begin)
         except ResidnetError:
-            return None
-        return own
-
-    return [(prior, model if prior is None else moved(prior)) for prior in priors]
+            out.append((prior, None))
+            continue
+        assert isinstance(own.baseline, ParametricBaseline)
+        begin = own.baseline.theta.detach().clone()
+        out.append((prior, own))
+    return out
 
 
 def _predicted(

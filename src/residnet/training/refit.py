@@ -60,7 +60,12 @@ class Refitted:
 
 
 def refit(
-    model: HybridDynamics, samples: Samples, store: WindowStore, config: RefitConfig, scales: Tensor
+    model: HybridDynamics,
+    samples: Samples,
+    store: WindowStore,
+    config: RefitConfig,
+    scales: Tensor,
+    begin: Tensor | None = None,
 ) -> Refitted:
     """Move the parameters of `model.baseline` to the minimum; float64.
 
@@ -70,6 +75,8 @@ def refit(
         store: training windows, float64.
         config: settings.
         scales: of the velocities, [3].
+        begin: theta that the search begins at, where another refit has been near the minimum;
+            None for the least-squares solution, which stays the prior in any case.
 
     Raises:
         FitError: where the first free runs are not finite.
@@ -81,6 +88,9 @@ def refit(
             " 'mmg', 'nomoto' or 'nomoto_sideslip'"
         )
     problem = problem_of(model, baseline, samples, store, config, scales)
+    if begin is not None:
+        with torch.no_grad():
+            baseline.theta.copy_(begin)
     # spreads that are to be estimated start from what moves a velocity by its scale while errors
     # hang together
     offsets = Offsets.begin(
