@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from planted import FAULTS, SHIPS, Fault, Ship, clean
 from planted_channels import HARMLESS
+from written_logs import trial
 
 from residnet.core.log import Log
 from residnet.data.doctor import Finding, inspect, inspect_together
@@ -60,3 +61,17 @@ def test_planted_faults_are_named(fault: Fault, ship: Ship) -> None:
         assert any(finding.code in fault.codes for finding in said), [
             finding.text for finding in said
         ]
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("rare", [("x", "y"), ("u", "v"), ("psi",), ("x", "y", "u", "v", "r")])
+def test_rare_samples_are_looked_at_without_a_warning(rare: tuple[str, ...]) -> None:
+    """Positions come once a second where headings come ten times."""
+    log = trial()
+    channels = dict(log.channels)
+    for name in rare:
+        values = np.full(len(log), np.nan)
+        values[::10] = log[name][::10]
+        channels[name] = values
+    report = inspect(log.replace(channels=channels), ["cmd_port", "cmd_stbd"])
+    assert report.name == log.name

@@ -23,8 +23,12 @@ def course_findings(log: Log, motion: Rates) -> Iterator[Finding]:
     drift = np.angle(motion.measured["u"] + 1j * motion.measured["v"])
     away = np.exp(-1j * log["psi"])
     course = np.angle(motion.ground * away)
-    fast = np.abs(motion.ground) > 0.3 * np.nanquantile(np.abs(motion.ground), 0.9)
-    good = np.isfinite(course) & np.isfinite(drift) & fast & (np.abs(drift) < 1.2)
+    known = np.isfinite(course) & np.isfinite(drift)
+    if known.sum() < _FEWEST:
+        return
+    speed = np.abs(motion.ground)
+    fast = speed > 0.3 * np.quantile(speed[known], 0.9)
+    good = known & fast & (np.abs(drift) < 1.2)
     if good.sum() < _FEWEST:
         return
     spread = float(np.std(drift[good]))
