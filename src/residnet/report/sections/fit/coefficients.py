@@ -34,7 +34,7 @@ def section(run: RunFiles) -> Section | None:
             continue
         refitted = bool(run.fit(model).get("refit"))
         parts = [
-            Text(_after_refit(model), quiet=True) if refitted else None,
+            Text(_after_refit(run, model), quiet=True) if refitted else None,
             table,
             *_own(run, model),
         ]
@@ -46,7 +46,20 @@ def section(run: RunFiles) -> Section | None:
     return Section("Baseline parameters", blocks) if len(blocks) > 1 else None
 
 
-def _after_refit(model: str) -> str:
+def _after_refit(run: RunFiles, model: str) -> str:
+    notes = run.fit(model)
+    at_rest, left_open = (
+        ", ".join(f"{term} in {axis.replace('_dot', '')}′" for axis, term in notes.get(key) or [])
+        for key in ("feeding", "open")
+    )
+    said = f" Left out, for their sign would feed energy: {at_rest}." if at_rest else ""
+    if left_open:
+        said += f" The data leave open, and they stay near zero: {left_open}."
+    return said_of_refit(model) + said
+
+
+def said_of_refit(model: str) -> str:
+    """Return what holds of the table of every refitted baseline."""
     return (
         f"{model}: values and standard errors are those after the refit through rollouts. The"
         " ratios of value to error keep the error of the least-squares fit before it."
