@@ -72,6 +72,7 @@ SOURCES: dict[str, Source] = {
     "table_5_3": _study("halvorsen2019/table_5_3", 10, package="deap"),
     "table_5_3_small": _study("halvorsen2019/table_5_3_small", 2, package="deap"),
     "input_noise": _study("halvorsen2019/noise", 10, package="deap"),
+    "delay": _study("halvorsen2019/delay", 5, package="deap"),
     "force_equations": _study("halvorsen2019/force_equations", 2),
     "jet_equations": _study("halvorsen2019/jet_equations", 3),
     "standard_model": _study("halvorsen2019/standard_model", 5),

@@ -228,6 +228,9 @@ SHORT: dict[str, Short] = {
     "studies/halvorsen2019/table_5_3_small": Short(
         ("repeats=1", "rows.values=[0.2]", "columns.values=[0.2]", "~published")
     ),
+    "studies/halvorsen2019/delay": Short(
+        ("repeats=1", "rows.values=[none]", "columns.values=[0.0, 0.5]")
+    ),
     "studies/halvorsen2019/standard_model": Short(
         (
             "~trials.planing",

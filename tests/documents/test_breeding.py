@@ -118,3 +118,17 @@ TABLES = [file for file in sorted(STUDIES.glob("*.yaml")) if "task: breeding" in
 def test_published_studies_are_valid(file: Path) -> None:
     config = load_config(file, [], BreedingTaskConfig)
     assert config.repeats == 10
+
+
+def test_a_late_force_and_its_correction() -> None:
+    """The force that acts and the one that the record tells move by themselves."""
+    plain, late = RecordConfig(length=30.0), RecordConfig(length=30.0, delay=0.5)
+    told = RecordConfig(length=30.0, delay=0.5, corrected=0.5).record(10.0)
+    record = late.record(10.0)
+    np.testing.assert_array_equal(record["tau_x"], plain.record(10.0)["tau_x"])
+    np.testing.assert_array_equal(told["tau_x"][5:], record["tau_x"][:-5])
+    np.testing.assert_array_equal(told["u_dot"], record["u_dot"])
+    explained = -1.3 * told["u"] + 0.1 * told["tau_x"] - 0.5 * told["x"]
+    np.testing.assert_allclose(told["u_dot"], explained, atol=1e-15)
+    silent = NoiseConfig(on="none", factor=0.5).added(told, np.random.default_rng(0))
+    assert all((silent[name] == told[name]).all() for name in told)

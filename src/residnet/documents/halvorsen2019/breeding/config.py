@@ -29,6 +29,9 @@ class RecordConfig(Config):
         step: time between samples in s; the force is held over a step.
         period: period of the square wave in s; 6 pi s in the document.
         test_period: period in s of the square wave of the record that equations are scored on.
+        delay: how much later than recorded the force acts, in s (section 5.3.4).
+        corrected: how much later the record is told that the force acted, in s: the correction that
+            Listing 5.1 tries.
     """
 
     system: MassSpringDamperConfig = Field(default_factory=MassSpringDamperConfig)
@@ -36,6 +39,8 @@ class RecordConfig(Config):
     step: Seconds = Field(default=0.1, gt=0)
     period: Seconds = Field(default=float(6 * np.pi), gt=0)
     test_period: Seconds = Field(default=10.0, gt=0)
+    delay: Seconds = Field(default=0.0, ge=0)
+    corrected: Seconds = Field(default=0.0, ge=0)
 
     def record(self, period: float) -> Record:
         """Return a record without noise.
@@ -51,7 +56,8 @@ class RecordConfig(Config):
 
         m, d, k = (getattr(self.system, name).value for name in ("m", "d", "k"))
         t = self.step * np.arange(round(self.length / self.step))
-        force = self.system.tau_max * np.where(np.mod(t, period) < period / 2, 1.0, -1.0)
+        given = self.system.tau_max * np.where(np.mod(t, period) < period / 2, 1.0, -1.0)
+        force, told = (self._late(given, seconds) for seconds in (self.delay, self.corrected))
         block = np.zeros((3, 3))
         block[:2] = [[0.0, 1.0, 0.0], [-k / m, -d / m, 1.0 / m]]
         transition = expm(block * self.step)[:2]
@@ -59,7 +65,12 @@ class RecordConfig(Config):
         for i in range(1, len(t)):
             state[i] = transition @ [*state[i - 1], force[i - 1]]
         x, u = state.T
-        return {"x": x, "u": u, "tau_x": force, "u_dot": (force - d * u - k * x) / m}
+        return {"x": x, "u": u, "tau_x": told, "u_dot": (force - d * u - k * x) / m}
+
+    def _late(self, force: np.ndarray, seconds: float) -> np.ndarray:
+        """Return a force [N] some time later, its first value before."""
+        steps = round(seconds / self.step)
+        return np.concatenate((np.full(steps, force[0]), force))[: len(force)]
 
     def truth(self) -> dict[str, float]:
         """Return the true coefficients of u_dot (4.2) by term."""
@@ -71,16 +82,19 @@ class NoiseConfig(Config):
     """Uniform noise on the signals of a record, as a share of each signal's range (5.14).
 
     Attributes:
-        on: noisy signals: the acceleration (`output`), the terms' signals (`inputs`), or `all`.
+        on: noisy signals: the acceleration (`output`), the terms' signals (`inputs`), `all`, or
+            `none`.
         factor: amplitude of the noise over the range of the signal (largest minus smallest value).
     """
 
-    on: Literal["output", "inputs", "all"] = "all"
+    on: Literal["output", "inputs", "all", "none"] = "all"
     factor: float = Field(default=0.0, ge=0)
 
     def added(self, record: Record, random: np.random.Generator) -> Record:
         """Return the record with noise."""
-        noisy = {"output": ("u_dot",), "inputs": CHANNELS, "all": (*CHANNELS, "u_dot")}[self.on]
+        of_output = ("u_dot",)
+        signals = {"output": of_output, "inputs": CHANNELS, "all": (*CHANNELS, *of_output)}
+        noisy = signals.get(self.on, ())
         return {
             name: (
                 values + self.factor * np.ptp(values) * random.uniform(-1, 1, len(values))

@@ -41,7 +41,12 @@ class BreedingTaskConfig(BreedingSettings):
         Raises:
             ResidnetError: where DEAP is not installed or the data do not determine an equation.
         """
-        from residnet.documents.halvorsen2019.breeding.report import draw, main_figures, verdict
+        from residnet.documents.halvorsen2019.breeding.report import (
+            draw,
+            least,
+            main_figures,
+            verdict,
+        )
         from residnet.documents.halvorsen2019.breeding.search import search_table
 
         rows = search_table(self)
@@ -50,6 +55,7 @@ class BreedingTaskConfig(BreedingSettings):
             "run": self.name,
             "keys": (self.rows.key, self.columns.key),
             "rows": rows,
+            "least": {str(row["row"]): row["column"] for row in least(self, rows)},
         }
         folder.write_json(folder.path / FILE, content)
         folder.figures.mkdir(exist_ok=True)
