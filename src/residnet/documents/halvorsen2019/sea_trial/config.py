@@ -82,8 +82,9 @@ class PreparationConfig(Config):
         cutoff: cut-off frequency of the Butterworth filter as a share of the Nyquist frequency
             (correction H27).
         order: order of the filter, which is run forward and backward.
-        filter_inputs: filter commands and forces as the velocities; the document filters the
-            velocities alone.
+        filter_inputs: filter commands and forces as the velocities. The document filters the
+            velocities alone; its equations then learn the filter, too, and leave less of the
+            measured acceleration than the vessel's own equations.
         margin: time in s that is cut off at both ends of a log, where the filter has one side only.
         stretch: length in s of the stretches that train or validate as a whole.
         validate_every: number of stretches of which the last one validates.
@@ -93,7 +94,7 @@ class PreparationConfig(Config):
     step: Seconds = Field(default=0.05, gt=0)
     cutoff: float = Field(default=0.1, gt=0, lt=1)
     order: int = Field(default=2, ge=1, le=8)
-    filter_inputs: bool = False
+    filter_inputs: bool = True
     margin: Seconds = Field(default=2.0, ge=0)
     stretch: Seconds = Field(default=20.0, gt=0)
     validate_every: int = Field(default=4, ge=2)
