@@ -16,6 +16,7 @@ from residnet.commands import (
     limit_threads,
     list_names,
     monitor,
+    plan_trial,
     report,
     runs,
     show,
@@ -222,6 +223,7 @@ def inspect(
 for command in (evaluate, monitor, export, ardupilot, report, compare, runs):
     app.command()(command)
 app.command(name="list")(list_names)
+app.command(name="plan-trial")(plan_trial)
 
 
 def main() -> None:

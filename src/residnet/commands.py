@@ -83,6 +83,38 @@ def monitor(
         raise typer.Exit(1)
 
 
+def plan_trial(
+    folder: RunPath,
+    model: Annotated[
+        str, typer.Option(help="Refitted baseline; the booklet's or the first if not given.")
+    ] = "",
+    time: Annotated[str, typer.Option(help="How long each trial lasts.")] = "120 s",
+    area: Annotated[
+        str | None, typer.Option(help="Largest distance from the start, such as '200 m'.")
+    ] = None,
+    speed: Annotated[str | None, typer.Option(help="Largest speed, such as '3 m/s'.")] = None,
+    rudder: Annotated[float, typer.Option(help="Largest share of full steer.")] = 1.0,
+    count: Annotated[int, typer.Option(help="Number of trials to choose.")] = 3,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="DIR", help="Folder for next_trials.yaml and tracks."),
+    ] = None,
+) -> None:
+    """Say which manoeuvres to run next, and by how much they would narrow the predictions."""
+    from residnet.core.files import require_room
+    from residnet.tasks.verbs import plan_run
+
+    limit_threads()
+    if out is not None:
+        require_room(out)
+    limits = {"time": time, "area": area, "speed": speed, "rudder": rudder, "count": count}
+    with drawn_progress():
+        planned = plan_run(folder, model, limits)
+    print(planned.text())
+    for file in planned.write(out) if out is not None else []:
+        print(f"written: {file}")
+
+
 def export(
     folder: RunPath,
     model: Annotated[

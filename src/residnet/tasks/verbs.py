@@ -15,6 +15,7 @@ from residnet.runs.checksums import seal
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import Finished, Task
 from residnet.tasks.fit.config import FitTaskSettings
+from residnet.tasks.fit.planning import PlannedTrials, plan_trials
 from residnet.tasks.fit.watching import WatchedLog, watch_logs
 from residnet.tasks.union import TaskConfig
 
@@ -70,6 +71,19 @@ def monitor_run(
     config = _task(run, "monitor")
     assert isinstance(config, FitTaskSettings)
     return watch_logs(config, run, logs, model, settings)
+
+
+def plan_run(path: Path, model: str, limits: Mapping[str, Any]) -> PlannedTrials:
+    """Plan the next trials for a refitted baseline of a finished fit.
+
+    Raises:
+        UsageError: where the run is no fit, or has no such baseline.
+        DataError: where no candidate stays within the limits.
+    """
+    run = RunFolder.open(path)
+    config = _task(run, "plan-trial")
+    assert isinstance(config, FitTaskSettings)
+    return plan_trials(config, run, model, limits)
 
 
 def task_class(run: RunFolder) -> type[Task]:

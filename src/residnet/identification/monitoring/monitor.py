@@ -28,6 +28,8 @@ _SHRINK = 0.1
 """Share of the diagonal in the covariance of innovations."""
 _OVERLAP = 3.0
 """Independent looks that a sliding stretch gives while it slides by its own length."""
+_LEAST = 0.5
+"""Share of the threshold that a score must reach for its cause to be named before others."""
 _FEWEST = 5
 """Groups of clean windows below which nothing can be said about false alarms."""
 _CURRENT, _PUSH = 0.5, 0.05
@@ -201,12 +203,19 @@ class Watch:
             )
             for i, change in enumerate(self.causes)
         ]
-        suspects.sort(key=lambda suspect: -suspect.score)
+        # what explains most of the innovations is named first; what clean logs scatter in decides
+        # whether there is an alarm at all
+        explained = apart**2 / information
+        order = np.argsort(
+            -np.where(np.abs(z) > _LEAST * self.threshold, explained, 0.01 * np.abs(z))
+        )
+        alarm = bool(np.abs(z).max() > self.threshold)
+        suspects = [suspects[i] for i in order]
         count = sum(group.count for group in groups)
         squares = np.sum([group.squares for group in groups], axis=0) / count
         by_channel = squares.reshape(-1, len(SEEN)).mean(axis=0)
         innovation = dict(zip(SEEN, np.sqrt(by_channel).tolist(), strict=True))
-        return Verdict(suspects[0].score > self.threshold, self.threshold, suspects, innovation)
+        return Verdict(alarm, self.threshold, suspects, innovation)
 
 
 class Watcher:

@@ -18,7 +18,7 @@ class FitConfig(FitTaskSettings):
 
     task: Literal["fit"]
 
-    verbs: ClassVar[tuple[str, ...]] = ("report", "evaluate", "export", "monitor")
+    verbs: ClassVar[tuple[str, ...]] = ("report", "evaluate", "export", "monitor", "plan-trial")
 
     def check(self) -> None:
         """Check that the logs hold what every part of the fit asks for, without fitting.

@@ -1,0 +1,100 @@
+"""The next trial: what a refit has left open, what a run would tell, and the choice."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from made_system import LINEAR, SCALES, STEP, model_of, trials
+
+from residnet.baselines import RegressorsConfig
+from residnet.core.errors import DataError, UsageError
+from residnet.data.prepare import envelope, samples
+from residnet.data.windows import WindowStore
+from residnet.dynamics.gear import InputShare
+from residnet.dynamics.store import ModelSpec
+from residnet.identification.models import FittedModel
+from residnet.identification.planning.candidates import TrialLimits, shares_of
+from residnet.identification.planning.information import after, spread, volume_gain
+from residnet.identification.planning.plan import Plan, plan
+from residnet.physics.signals import SignalsConfig
+from residnet.training.free_runs.covariance import LeftOpen, left_open
+from residnet.training.refit import refit
+from residnet.training.refit_config import RefitConfig
+
+CONFIG = RefitConfig(horizon=4.0, every=4.0, iterations=3)
+SHARES = {"tau_x": InputShare(drive=1.0), "tau_n": InputShare(steer=0.3)}
+
+
+@pytest.fixture(scope="module")
+def known() -> tuple[FittedModel, LeftOpen, torch.Tensor]:
+    logs = trials()[:3]
+    model = model_of(LINEAR)
+    given, store = samples(logs, model.signals), WindowStore.gather(logs, torch.float64)
+    RegressorsConfig(terms=tuple(LINEAR)).fit(model.baseline, given)
+    refitted = refit(model, given, store, CONFIG, SCALES)
+    low, high = envelope(logs)
+    spec = ModelSpec(
+        name="baseline",
+        role="baseline",
+        signals=SignalsConfig(inputs=("tau_x", "tau_n")),
+        baseline=RegressorsConfig(terms=tuple(LINEAR)),
+        dt=STEP,
+        integrator=model.integrator,
+        low=tuple(low.tolist()),
+        high=tuple(high.tolist()),
+    )
+    open_ = left_open(model, given, store, CONFIG, SCALES, refitted.notes["at_rest"])
+    return FittedModel(spec, model, {}), open_, refitted.covariance
+
+
+def planned(known: tuple[FittedModel, LeftOpen, torch.Tensor], limits: TrialLimits) -> Plan:
+    fitted, open_, _ = known
+    return plan(fitted, open_, CONFIG, SCALES.numpy(), SHARES, np.full(3, 100.0), limits)
+
+
+def test_a_look_back_finds_the_covariance_of_the_refit(
+    known: tuple[FittedModel, LeftOpen, torch.Tensor],
+) -> None:
+    _, open_, covariance = known
+    # the prior, which knows how far least squares were off, is not quite what it was
+    errors, wanted = (part.diagonal().sqrt() for part in (open_.covariance, covariance))
+    torch.testing.assert_close(errors, wanted, rtol=0.25, atol=1e-9)
+
+
+def test_information_adds_to_what_is_known() -> None:
+    random = torch.Generator().manual_seed(0)
+    a, b = (torch.randn(4, 4, generator=random, dtype=torch.float64) for _ in range(2))
+    covariance, told = torch.linalg.inv(a @ a.T), b @ b.T
+    torch.testing.assert_close(after(covariance, told), torch.linalg.inv(a @ a.T + told))
+    wanted = 0.5 * (torch.logdet(a @ a.T + told) - torch.logdet(a @ a.T))
+    assert volume_gain(covariance, told) == pytest.approx(float(wanted))
+    assert spread(covariance, told) == pytest.approx(float((told @ covariance).trace().sqrt()))
+
+
+def test_trials_are_chosen_within_the_limits_and_narrow_the_intervals(
+    known: tuple[FittedModel, LeftOpen, torch.Tensor],
+) -> None:
+    found = planned(known, TrialLimits(time=8.0, count=2))
+    assert len(found.chosen) == 2
+    assert 0.0 < max(trial.shrinks for trial in found.chosen) < found.shrinks < 1.0
+    reach = float(np.median([trial.reach for trial in found.trials]))
+    near = planned(known, TrialLimits(time=8.0, area=reach, count=2))
+    assert all(trial.reach <= reach for trial in near.trials)
+    assert len(near.trials) < len(found.trials)
+    with pytest.raises(DataError, match="stays within the limits"):
+        planned(known, TrialLimits(time=8.0, area=1e-6))
+
+
+def test_inputs_that_steer_are_known_by_unit_or_side(
+    known: tuple[FittedModel, LeftOpen, torch.Tensor],
+) -> None:
+    spec = known[0].spec
+    assert shares_of(spec)["tau_n"].steer == max(map(abs, spec.ranges["tau_n"]))
+    twin = spec.model_copy(update={"signals": SignalsConfig(inputs=("n_port", "n_stbd"))})
+    shares = shares_of(twin)
+    assert float(shares["n_port"].steer) > 0 > float(shares["n_stbd"].steer)
+    short = {"low": spec.low[:4], "high": spec.high[:4]}
+    single = spec.model_copy(update={"signals": SignalsConfig(inputs=("n",)), **short})
+    with pytest.raises(UsageError, match="known to steer"):
+        shares_of(single)
