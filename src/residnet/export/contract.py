@@ -135,7 +135,7 @@ def require_parity(
     if not model.head.warms_by_steps():
         raise ExportError(
             f"{what}: an encoder of its own starts the memory of {spec.name}, which this format has"
-            " no place for; export it as torchscript, or fit the network with `encoder: false`"
+            " no place for; export it as torchscript, or export a model without an encoder"
         )
     tolerance = DOUBLE if dtype == torch.float64 else SINGLE
     y, w = drive(spec, dtype)

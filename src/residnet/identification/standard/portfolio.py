@@ -35,7 +35,10 @@ def portfolio(facts: Facts, effort: float = 1.0) -> dict[str, Any]:
         effort: how long networks are trained, 1 for usual.
     """
     network = _network(facts)
-    heads = {_FROZEN: network, _TOGETHER: network, "linear_network": network, "network": network}
+    # a residual needs its past less than a whole model does, and without an encoder every format
+    # of export has a place for it
+    alone = {**network, "encoder": True}
+    heads = {_FROZEN: network, _TOGETHER: network, "linear_network": network, "network": alone}
     training = training_settings(facts, effort)
     return {
         "baseline": {"kind": "regressors", "ridge": 1e-6, "terms": linear_terms(facts)},
@@ -68,13 +71,12 @@ def _regressors(terms: list[str]) -> dict[str, Any]:
 
 
 def _network(facts: Facts) -> dict[str, Any]:
-    """Return a recurrent network whose memory an encoder of its own starts."""
+    """Return a recurrent network that comes back from velocities that no log has."""
     size = hidden_size(facts)
     return {
         "kind": "lstm",
         "hidden_size": size,
         "readout": size,
-        "encoder": True,
         "restoring": True,
         "margin": 0.0,
         "mirror": mirrored_channels(facts.names) is not None,
