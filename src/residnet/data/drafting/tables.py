@@ -12,6 +12,7 @@ import numpy as np
 from residnet.core.errors import DataError, UsageError
 from residnet.core.names import CHANNEL_UNITS
 from residnet.core.units import to_si
+from residnet.data.drafting.fixes import as_fixes, from_fixes
 from residnet.data.drafting.physics import (
     FRAMES,
     Fit,
@@ -26,12 +27,7 @@ from residnet.data.drafting.physics import (
 )
 from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.sheets import Clock, Sheet, clock_of, peek
-from residnet.data.drafting.units import (
-    is_pulse,
-    other_dimension,
-    unit_by_size,
-    written_unit,
-)
+from residnet.data.drafting.units import is_pulse, other_dimension, unit_by_size, written_unit
 from residnet.data.drafting.words import input_channel, state_channel, words_of
 
 _LOOKED_AT = 24
@@ -83,7 +79,8 @@ def draft_tables(files: Sequence[Path], marks: Marks) -> TableDraft:
     numeric = [name for name in shared if name in first.numbers and name not in clock.columns]
     names = _named(numeric, marks)
     logs = _raw(sheets, names, left_out)
-    channels = _Channels(names, logs, marks).drafted()
+    names, logs, fixes = from_fixes(names, logs, marks)
+    channels = _Channels(names, logs, marks, fixes).drafted()
     about = {key: value for key, value in first.about.items() if key != "kind"}
     content = {"kind": first.about["kind"], **about, "time": clock.settings}
     if len({path.resolve().parent for path in files}) > 1:
@@ -144,8 +141,8 @@ def _named(columns: Sequence[str], marks: Marks) -> dict[str, str]:
 
 def _other_unit(column: str, channel: str | None) -> str | None:
     """Return the unit in the brackets of a name where it cannot be that of a channel."""
-    expected = CHANNEL_UNITS.get(channel or "")
-    return None if expected is None else other_dimension(column, expected)
+    si = CHANNEL_UNITS.get(channel or "")
+    return None if si is None else other_dimension(column, si)
 
 
 def _raw(sheets: Sequence[Sheet], names: Mapping[str, str], left_out: dict[Path, str]) -> list[Raw]:
@@ -181,7 +178,10 @@ def _unused(sheet: Sheet, names: Mapping[str, str], clock: Clock, marks: Marks) 
 class _Channels:
     """The entries of a channel map, from names, headers, values and physics."""
 
-    def __init__(self, names: Mapping[str, str], logs: Sequence[Raw], marks: Marks) -> None:
+    def __init__(
+        self, names: Mapping[str, str], logs: Sequence[Raw], marks: Marks, fixes: bool
+    ) -> None:
+        self._fixes = fixes
         self._names, self._logs, self._marks = dict(names), list(logs), marks
         self._frame = FRAMES[0]
         self._motions: list[Motion | None] = [None] * len(logs)
@@ -192,7 +192,8 @@ class _Channels:
         if {"x", "y", "psi"} <= set(self._names):
             self._settle_frame()
         self._settle_wind()
-        return {name: self._entry(name) for name in self._names}
+        entries = {name: self._entry(name) for name in self._names}
+        return as_fixes(entries) if self._fixes else entries
 
     def _values(self, name: str) -> np.ndarray:
         parts = [raw.columns[name] for raw in self._logs if name in raw.columns]
@@ -208,7 +209,7 @@ class _Channels:
         tried = [written] if written else [sized, other]
         best = (-np.inf, "rad", FRAMES[0])
         for unit in tried:
-            for frame in FRAMES:
+            for frame in (f for f in FRAMES if not (self._fixes and f.swapped)):
                 motions = [motion_of(raw, unit, frame) for raw in self._logs]
                 score = self._score(motions)
                 if score > best[0] + 0.02:
@@ -232,6 +233,7 @@ class _Channels:
         """Say which column is north, and mark what names and motion leave open."""
         x, y = words_of(self._names["x"]), words_of(self._names["y"])
         told = x.has("north") and y.has("east") and not (x.text == "x" or y.text == "y")
+        told = told or self._fixes
         if self._frame.swapped and not told:
             self._names["x"], self._names["y"] = self._names["y"], self._names["x"]
             text = "the vessel moves where it points only if the column called y is the north"
@@ -298,6 +300,8 @@ class _Channels:
     def _entry(self, name: str) -> dict[str, Any]:
         column = self._names[name]
         entry: dict[str, Any] = {"column": column}
+        if self._fixes and name in ("x", "y"):
+            return entry | {"unit": "deg"}
         if name == "psi":
             entry["unit"] = self._psi_unit
             return entry | ({"frame": "enu"} if self._frame.from_east else {})

@@ -127,6 +127,8 @@ def _plain_names(
     channels = read.reader.get("channels")
     state = ("x", "y", "psi", "u", "v", "r", "wind_speed", "wind_dir")
     if channels:
+        if "x" not in channels:
+            state = ("latitude", "longitude", *state)
         kept = {
             new.get(name, name): entry
             for name, entry in channels.items()

@@ -12,7 +12,10 @@ from residnet.data.drafting.questions import Marks
 from residnet.physics.environment.wind import WIND_INPUTS
 
 INPUTS = ("signals", "inputs")
-_PASSIVE = (*STATE, *ACCELERATION, "phi", "p", *WIND_INPUTS, "current_north", "current_east")
+_PASSIVE = (
+    *(*STATE, *ACCELERATION, "phi", "p", "latitude", "longitude"),
+    *(*WIND_INPUTS, "current_north", "current_east"),
+)
 _STILL = 2e-3
 """Spread of an input, as a share of its size, below which it stays where it is."""
 _SAME = 0.9995

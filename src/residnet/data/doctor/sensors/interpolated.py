@@ -60,7 +60,10 @@ def _straight(log: Log, name: str) -> np.ndarray:
     usual = float(np.median(known))
     rounding = 1e-9 * float(np.nanmax(np.abs(values))) / float(np.median(np.diff(log.t)))
     resolution = _resolution(values) / float(np.median(np.diff(log.t)))
-    coarse = 2.1 * resolution if 8.0 * resolution < usual else 0.0
+    if resolution > 0.0 and 8.0 * resolution >= usual:
+        # between few steps of its resolution a channel runs straight by itself
+        return out
+    coarse = 2.1 * resolution
     # a smooth channel bends little anyhow: only noise bends at every sample
     noisy = noise_of(values) * np.sqrt(6.0) > 0.5 * float(np.nanmedian(np.abs(np.diff(values, 2))))
     if usual <= 10.0 * rounding or not noisy:

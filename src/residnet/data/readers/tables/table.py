@@ -30,6 +30,7 @@ from residnet.data.readers.recording import remark
 from residnet.data.readers.spool import LARGE
 from residnet.data.readers.tables.channel_map import ChannelMap, factor
 from residnet.data.readers.tables.dates import DateClock, Order, zone_of
+from residnet.data.readers.tables.fixes import with_positions
 from residnet.data.readers.tables.pieces import Pieces, read_csv, read_excel, read_parquet
 from residnet.data.readers.tables.rows import Rows
 
@@ -91,7 +92,8 @@ class _TableConfig(Config, ABC):
     Attributes:
         time: column of the time.
         channels: canonical names (or names of your own) and the columns that they are taken from,
-            all of which must exist.
+            all of which must exist; `latitude` and `longitude` become x, y where these are not
+            there.
         manoeuvre: kind of manoeuvre of every file; `folder` takes the name of each file's folder,
             null says that it is not known.
     """
@@ -248,8 +250,9 @@ class TableReader(LogReader):
             else self._config.manoeuvre
         )
         units = {name: entry.si(name) for name, entry in maps.items()}
+        channels, units, placed = with_positions(path, channels, units)
         meta = provenance(path, read + cut, read + cut - t.size)
-        findings = [*(dates.remarks if dates else []), *rows.remarks()]
+        findings = [*(dates.remarks if dates else []), *rows.remarks(), *placed]
         if cut:
             findings.append(
                 remark("note", "cut_line", "the file ends within its last line, which is left out")

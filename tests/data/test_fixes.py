@@ -1,0 +1,82 @@
+"""Tables with latitude and longitude: positions in metres, and drafts that take them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+from tiny_tasks import boat
+
+from residnet.core.errors import DataError
+from residnet.data.readers.tables.table import CsvConfig
+from residnet.tasks.drafting.draft import drafted
+
+pytest.importorskip("pyproj")
+CHANNELS = {
+    "latitude": {"column": "Lat", "unit": "deg"},
+    "longitude": {"column": "Lon", "unit": "deg"},
+    "psi": {"column": "HDG (deg)", "unit": "deg"},
+}
+
+
+def table(seed: int, seconds: float = 60.0) -> pd.DataFrame:
+    """What a plotter records: fixes, speed and course over ground, heading, rate of turn."""
+    d = boat(seed, seconds)
+    north, east = np.degrees(d.x / 6.371e6), np.degrees(d.y / 6.371e6 / np.cos(np.radians(54.3)))
+    return pd.DataFrame(
+        {
+            "Date/Time": pd.Timestamp("2024-05-03 09:12") + pd.to_timedelta(d.t, unit="s"),
+            "Lat": (54.3 + north).round(8),
+            "Lon": (10.1 + east).round(8),
+            "SOG (kn)": (1.943844 * np.hypot(d.u, d.v)).round(3),
+            "HDG (deg)": (np.degrees(d.psi) % 360.0).round(2),
+            "ROT (deg/min)": (60.0 * np.degrees(d.r)).round(2),
+            "Rudder (deg)": np.degrees(d.delta).round(2),
+            "Engine RPM": (60.0 * d.n).round(),
+        }
+    )
+
+
+def test_fixes_become_metres_north_and_east_of_the_first(tmp_path: Path) -> None:
+    file = tmp_path / "log.csv"
+    made = table(3)
+    made.loc[20, ["Lat", "Lon"]] = 0.0
+    made.to_csv(file, index=False)
+    time = {"column": "Date/Time", "unit": "date"}
+    config = CsvConfig.model_validate({"time": time, "channels": CHANNELS})
+    log = config.build().read(file)
+    assert set(log.channels) == {"x", "y", "psi"}
+    truth = boat(3, 60.0)
+    assert np.isnan(log["x"][20])
+    good = np.isfinite(log["x"])
+    # the sphere of the sample and the ellipsoid differ by less than half a per cent
+    np.testing.assert_allclose(log["x"][good], truth.x[good], atol=0.005 * np.ptp(truth.x) + 0.01)
+    np.testing.assert_allclose(log["y"][good], truth.y[good], atol=0.005 * np.ptp(truth.y) + 0.01)
+    assert {finding["code"] for finding in log.meta["findings"]} >= {"origin", "no_fix"}
+
+
+def test_a_latitude_in_degrees_and_minutes_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "log.csv"
+    made = table(3)
+    made["Lat"] = 5418.123
+    made.to_csv(file, index=False)
+    config = CsvConfig.model_validate(
+        {"time": {"column": "Date/Time", "unit": "date"}, "channels": CHANNELS}
+    )
+    with pytest.raises(DataError, match="latitude reaches 5418 deg"):
+        config.build().read(file)
+
+
+def test_a_plotters_table_is_drafted_without_a_word(tmp_path: Path) -> None:
+    files = [tmp_path / f"trial{k}.csv" for k in range(3)]
+    for k, file in enumerate(files):
+        table(100 + k).to_csv(file, index=False)
+    content = yaml.safe_load(drafted(files, tmp_path, "boat").text)
+    channels = content["data"]["reader"]["channels"]
+    assert channels["latitude"] == {"column": "Lat", "unit": "deg"}
+    assert channels["longitude"] == {"column": "Lon", "unit": "deg"}
+    assert channels["psi"] == {"column": "HDG (deg)", "unit": "deg"}
+    assert content["signals"]["inputs"] == ["delta", "n"]
