@@ -176,3 +176,41 @@ def test_report_and_exports_are_there(run: Path) -> None:
     assert "10.57" in report
     for protocol in ("enter", "sides"):
         torch.jit.load(str(run / "exports" / f"policy_{protocol}.pt"))
+
+
+def test_a_recurrent_policy_flies_the_course_and_is_exported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stated = {"dt": "0.1 s", "duration": "6 s", "hold": "0 s"}
+    law = {
+        "kind": "ptos", "lag": "0.3 s", "steepness": 37.0, "share": 0.58, "damping": 0.84,
+        "heading_rate": 0.28, "yaw_rate_rate": 2.6, "push_rate": 4.2, "cross_rate": 0.08,
+    }  # fmt: skip
+    training = {
+        "epochs": 1, "steps": 1, "batch": 8, "dt": "0.1 s", "hold": "0 s", "validation": 4,
+        "compiled": False,
+    }  # fmt: skip
+    recurrent = {key: value for key, value in AUTOPILOT.items() if key not in ("policies", "floor")}
+    recurrent |= {
+        "conditions": {"stated": stated, "flights": 4},
+        "recurrent": {"learned": {"start": "ptos", "units": 3, "training": training}},
+        "peers": {"ptos": law},
+    }
+    dropped = ("line_of_sight", "others", "spread", "integral")
+    course = {key: value for key, value in COURSE.items() if key not in dropped}
+    course |= {"policy": "learned", "peers": ["ptos"], "protocols": ["sides"], "dt": "0.1 s"}
+    (tmp_path / "autopilot.yaml").write_text(yaml.safe_dump(recurrent))
+    (tmp_path / "course.yaml").write_text(yaml.safe_dump(course))
+    monkeypatch.chdir(tmp_path)
+    assert call(monkeypatch, "run", "course.yaml", "--out", "run") == 0
+    row = next(row for row in metrics(tmp_path / "run")["rows"] if row["model"] == "learned")
+    assert row["passed"] is True
+    assert row["course_time"] < 42.0
+    exported = torch.jit.load(str(tmp_path / "run" / "exports" / "learned_sides.pt"))
+    start = torch.tensor([[0.0, 0.0, 0.5, 3.2, 0.0, 0.0]])
+    command, memory, fault, arrived = exported.step(start, exported.initial_state(start))
+    assert not bool(fault) and not bool(arrived)
+    assert float(command.abs()) <= math.radians(5.001)
+    assert exported.step(start, memory)[2].tolist() == [False]
+    assert call(monkeypatch, "export", "run/autopilot", "--model", "learned", "--format", "c") == 0
+    assert (tmp_path / "run/autopilot/exports/learned.c").is_file()

@@ -35,6 +35,13 @@ class Policy(nn.Module, ABC):
             s: memory [B, n_state].
         """
 
+    def told(self, s: Tensor, rudder: Tensor) -> Tensor:
+        """Return the memory once the rudder angle [B, 1] is known that is really taken.
+
+        A controller without an estimate of the vessel does not care.
+        """
+        return s
+
 
 class Reference(nn.Module, ABC):
     """Guidance: what the controller shall follow."""

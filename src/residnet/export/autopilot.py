@@ -35,7 +35,7 @@ class Limits(NamedTuple):
     r: tuple[float, float]
 
 
-def memory_limits(policy: HeadingKeeper, turn: float) -> list[tuple[float, float]]:
+def memory_limits(policy: HeadingKeeper, turn: float, angle: float) -> list[tuple[float, float]]:
     """Return the ranges [low, high] of an exported policy's memory and last command.
 
     They hold what its own steps can lead to, with some room.
@@ -43,9 +43,10 @@ def memory_limits(policy: HeadingKeeper, turn: float) -> list[tuple[float, float
     Args:
         policy: see there.
         turn: fastest yaw rate [rad/s] that is accepted.
+        angle: largest rudder angle [rad] that the policy is told of.
     """
-    angle = 1.001 * policy.limit
-    return [*policy.memory_ranges(turn).values(), (-angle, angle)]
+    last = 1.001 * policy.limit
+    return [*policy.memory_ranges(turn, angle).values(), (-last, last)]
 
 
 class ExportedPolicy(nn.Module):
@@ -71,7 +72,7 @@ class ExportedPolicy(nn.Module):
         )
         self.low: Tensor
         self.high: Tensor
-        memory_ranges = memory_limits(policy, limits.r[1])
+        memory_ranges = memory_limits(policy, limits.r[1], policy.limit)
         self.register_buffer(
             "memory_low", torch.tensor([limit[0] for limit in memory_ranges], dtype=torch.float32)
         )
@@ -246,7 +247,7 @@ def _card(
         "policy": name,
         "measured": measured_entries(MEASURED, ("rad", "m/s", "rad/s"), module.low, module.high),
         "reference": [{"name": "heading", "unit": "rad"}],
-        "memory": [*module.policy.memory_ranges(1.0), "last_command"],
+        "memory": [*module.policy.memory_ranges(1.0, 1.0), "last_command"],
         "fault": (
             "measurement, reference or memory no number or out of range: command"
             f" {'held' if safe == 'hold' else 'amidships'}, flag set"

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from residnet.control.courses.course_plan import Course
 from residnet.control.guidance.course_guidance import CourseGuidance
 from residnet.control.heading.following import Following
-from residnet.control.heading.policy import HeadingPolicy
+from residnet.control.heading.keeper import HeadingKeeper
 from residnet.core.errors import ExportError
 from residnet.export.autopilot import measured_entries, memory_limits, policy_entries
 from residnet.export.scripting import require_shape, size, within, write_scripted
@@ -45,7 +45,7 @@ class ExportedCourse(nn.Module):
     """
 
     def __init__(
-        self, policy: HeadingPolicy, guidance: CourseGuidance, safe: Literal["hold", "amidships"]
+        self, policy: HeadingKeeper, guidance: CourseGuidance, safe: Literal["hold", "amidships"]
     ) -> None:
         super().__init__()
         policy = copy.deepcopy(policy).float().eval().requires_grad_(False)
@@ -67,15 +67,14 @@ class ExportedCourse(nn.Module):
         self.low: Tensor
         self.high: Tensor
         # relative to the course's motion: rudder and yaw rate may differ by twice their ranges
-        memory_ranges = memory_limits(policy, 2.0 * turn)
+        memory_ranges = memory_limits(policy, 2.0 * turn, 2.0 * policy.limit)
         angle = 1.001 * policy.limit
         drift = [(-1.01, 1.01)] * (guidance.n_state - 1)
         ranges = [
             (0.0, 1.001 * guidance.farthest),
             *drift,
             (-angle, angle),
-            (-2.0 * angle, 2.0 * angle),
-            *memory_ranges[1:],
+            *memory_ranges,
         ]
         self.register_buffer(
             "memory_low", torch.tensor([limit[0] for limit in ranges], dtype=torch.float32)
@@ -157,7 +156,7 @@ class ExportedCourse(nn.Module):
 
 def export_course(
     name: str,
-    policy: HeadingPolicy,
+    policy: HeadingKeeper,
     guidance: CourseGuidance,
     course: Course,
     file: Path,
@@ -250,7 +249,7 @@ def check_parity(name: str, module: ExportedCourse, exported: Any, course: Cours
 def _card(
     name: str,
     module: ExportedCourse,
-    policy: HeadingPolicy,
+    policy: HeadingKeeper,
     course: Course,
     safe: str,
     parity: float,

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from residnet.control.base import Policy
-from residnet.control.heading.policy import HeadingPolicy
 
 FOLLOWED = ("heading", "yaw_rate", "rudder")
 """Reference of a course at every step: heading, yaw rate and rudder in rad, rad/s, rad."""
@@ -49,7 +48,6 @@ class Following(Policy):
         self.law = law
         self.limit = limit
         self.travel = 2.0 * limit if rate is None else min(rate * dt, 2.0 * limit)
-        self.observes = isinstance(law, HeadingPolicy)
         self.n_state = 1 + law.n_state
         self.psi, self.r = state.index("psi"), state.index("r")
 
@@ -72,6 +70,5 @@ class Following(Policy):
         correction, memory = self.law(relative, torch.zeros_like(needed), s[:, 1:])
         command = (needed + correction).clamp(-self.limit, self.limit)
         rudder = s[:, 0:1] + (command - s[:, 0:1]).clamp(-self.travel, self.travel)
-        if self.observes:
-            memory = torch.cat((rudder - needed, memory[:, 1:]), dim=-1)
+        memory = self.law.told(memory, rudder - needed)
         return command, torch.cat((rudder, memory), dim=-1)

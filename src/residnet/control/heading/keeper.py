@@ -33,11 +33,17 @@ class HeadingKeeper(Policy, ABC):
     def read_from(self, state: Sequence[str]) -> None:
         """Take heading, speed and yaw rate from a state with these names."""
 
+    def at(self, dt: float) -> None:
+        """Take steps of dt seconds from now on."""
+        self.dt = dt
+
     @abstractmethod
-    def memory_ranges(self, turn: float) -> dict[str, tuple[float, float]]:
+    def memory_ranges(self, turn: float, angle: float) -> dict[str, tuple[float, float]]:
         """Return what the entries of the memory can be, [low, high] by name, with some room.
 
-        `turn` is the fastest yaw rate in rad/s that is measured.
+        Args:
+            turn: fastest yaw rate in rad/s that is measured.
+            angle: largest rudder angle in rad, relative to that of a course where one is followed.
         """
 
     @abstractmethod

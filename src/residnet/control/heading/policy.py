@@ -108,16 +108,20 @@ class HeadingPolicy(HeadingKeeper):
         """
         self.psi, self.u, self.r = state.index("psi"), state.index("u"), state.index("r")
 
-    def memory_ranges(self, turn: float) -> dict[str, tuple[float, float]]:
+    def told(self, s: Tensor, rudder: Tensor) -> Tensor:
+        """Return the memory once the rudder angle [B, 1] is known that is really taken."""
+        return torch.cat((rudder, s[:, 1:]), dim=-1)
+
+    def memory_ranges(self, turn: float, angle: float) -> dict[str, tuple[float, float]]:
         """Return what the entries of the memory can be, [low, high] by name, with some room."""
-        angle, variance = 1.001 * self.limit, 2.0 * self.prior
+        variance = 2.0 * self.prior
         # at a third of the speed the rudder that a turn stands for is three times as large
         share = 4.0 * turn / (self.gain * self.limit) + 2.0
         most = {
-            "rudder": angle,
+            "rudder": 1.001 * angle,
             "yaw_rate": 1.001 * turn,
             "turning": share,
-            "push": angle,
+            "push": 1.001 * self.limit,
             "effect": 3.0,
             "damping": 3.0,
             "effect_variance": variance,

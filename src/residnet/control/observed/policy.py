@@ -99,11 +99,19 @@ class ObservedPolicy(HeadingKeeper):
         found = torch.exp(self.constants.detach()).tolist()
         return dict(zip(self.names, found, strict=True))
 
-    def memory_ranges(self, turn: float) -> dict[str, tuple[float, float]]:
+    def told(self, s: Tensor, rudder: Tensor) -> Tensor:
+        """Return the memory once the rudder angle [B, 1] is known that is really taken."""
+        newest = 5 + self.observer.pending
+        parts = (s[:, :3], rudder, s[:, 4:newest])
+        if self.observer.pending > 0:
+            parts = (s[:, :3], rudder, torch.cat((s[:, 4 : newest - 1], rudder), dim=1))
+        return torch.cat((parts[0], parts[1], parts[2], s[:, newest:]), dim=1)
+
+    def memory_ranges(self, turn: float, angle: float) -> dict[str, tuple[float, float]]:
         """Return what the entries of the memory can be, [low, high] by name, with some room."""
-        angle, half = 1.001 * self.limit, 1.001 * math.pi
-        most = dict(zip(FIXED, (half, 3.0 * turn, angle, angle, angle), strict=True))
-        most |= {f"pending_{k}": angle for k in range(self.observer.pending)}
+        push, rudder, half = 1.001 * self.limit, 1.001 * angle, 1.001 * math.pi
+        most = dict(zip(FIXED, (half, 3.0 * turn, push, rudder, rudder), strict=True))
+        most |= {f"pending_{k}": rudder for k in range(self.observer.pending)}
         most |= {f"unit_{k}": 1.001 for k in range(self.units)}
         return {name: (-high, high) for name, high in most.items()}
 

@@ -84,19 +84,12 @@ class AutopilotConfig(AutopilotSettings):
         """Write a policy as C, at the step and with the card of its TorchScript file."""
         import torch
 
-        from residnet.control.heading.stored import load_heading_policy
-        from residnet.control.observed.stored import load_observed_policy
         from residnet.export.c.policy import export_autopilot_as_c
+        from residnet.tasks.autopilot.stored import stored_policy
 
         extra = {"card.json": ""}
         torch.jit.load(str(scripted), _extra_files=extra)
         card = json.loads(extra["card.json"])
-        if model in self.recurrent:
-            observed = load_observed_policy(run.models / model)
-            observed.at(card["dt"])
-            export_autopilot_as_c(model, observed, file, safe=self.safe, card=card)
-        else:
-            policy = load_heading_policy(run.models / model)
-            policy.dt = card["dt"]
-            export_autopilot_as_c(model, policy, file, safe=self.safe, card=card)
+        policy = stored_policy(self, run.models, model, card["dt"])
+        export_autopilot_as_c(model, policy, file, safe=self.safe, card=card)
         return file

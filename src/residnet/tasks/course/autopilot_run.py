@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from residnet.control.courses.config import smallest_turn
 from residnet.control.courses.turns import SteadyTurn
 from residnet.control.heading.controllers import Steering
-from residnet.control.heading.policy import HeadingPolicy
+from residnet.control.heading.keeper import HeadingKeeper
 from residnet.control.heading.steering import SteeredPlant
-from residnet.control.heading.stored import load_heading_policy
 from residnet.control.heading.turning import Turning
 from residnet.core.config import load_config
 from residnet.core.errors import ConfigError
@@ -18,6 +16,7 @@ from residnet.core.files import read_json
 from residnet.core.names import nearest
 from residnet.physics.vessel import load_vessel
 from residnet.runs.folder import RunFolder
+from residnet.tasks.autopilot.stored import stored_policy
 from residnet.tasks.autopilot.task import AutopilotConfig
 from residnet.tasks.course.config import CourseSettings
 
@@ -32,10 +31,10 @@ def autopilot_of(config: CourseSettings) -> AutopilotConfig:
     given = config.autopilot
     file = RunFolder.open(given).resolved if given.is_dir() else given
     autopilot = load_config(file, [], AutopilotConfig)
-    if config.policy not in autopilot.policies:
+    trained = {**autopilot.policies, **autopilot.recurrent}
+    if config.policy not in trained:
         raise ConfigError(
-            f"policy: '{config.policy}' is none of"
-            f" {given}{nearest(config.policy, autopilot.policies)}"
+            f"policy: '{config.policy}' is none of {given}{nearest(config.policy, trained)}"
         )
     for name in config.peers:
         if name not in (known := {**autopilot.peers, **autopilot.predictive}):
@@ -91,13 +90,13 @@ def ready(config: CourseSettings, folder: RunFolder) -> AutopilotRun:
     )
 
 
-def load_policy(run: Path, name: str, steering: Steering) -> HeadingPolicy:
-    """Return a trained policy from the run folder of an autopilot, at the step of `steering`.
+def load_policy(known: AutopilotRun, name: str) -> HeadingKeeper:
+    """Return a trained policy of the autopilot's run, at the step of the course.
 
     Raises:
         UsageError: where the run lacks it, or it is not as it was written.
     """
-    policy = load_heading_policy(run / "models" / name)
-    policy.dt = steering.dt
+    steering = known.steering
+    policy = stored_policy(known.autopilot, known.run.models, name, steering.dt)
     policy.read_from(steering.vessel.state)
     return policy

@@ -23,7 +23,7 @@ from residnet.control.guidance.waypoints import WaypointGuidance
 from residnet.control.guidance.wheel_over import WheelOver
 from residnet.control.heading.controllers import Steering
 from residnet.control.heading.following import Following
-from residnet.control.heading.policy import HeadingPolicy
+from residnet.control.heading.keeper import HeadingKeeper
 from residnet.core.progress import say
 from residnet.judge.courses import CourseFlight, row, spread_row
 from residnet.judge.metrics import SCHEMA
@@ -85,7 +85,7 @@ def run_course(config: CourseSettings, folder: RunFolder) -> Outcome:
                 f"buoy {circle['buoy']}: {circle['radius']:.4g} m cannot be followed; the smallest"
                 f" radius possible is {circle['smallest']:.2f} m"
             )
-    trained = load_policy(known.run.path, config.policy, steering)
+    trained = load_policy(known, config.policy)
     controllers = {config.policy: trained, **load_peers(config, known)}
     done = _Flown([], [], [])
     plans, exports = [], []
@@ -163,7 +163,7 @@ class _Export(NamedTuple):
     config: CourseSettings
     planned: PlannedCourse
     guidance: CourseGuidance
-    policy: HeadingPolicy
+    policy: HeadingKeeper
     autopilot: AutopilotSettings
 
     @property
