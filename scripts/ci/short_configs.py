@@ -134,6 +134,7 @@ SHORT: dict[str, Short] = {
     "autopilot_nomoto_rate": Short((*_policy("policy"), *_STEP_TEST, *_PEERS)),
     "autopilot_conditions": Short((*_CONDITIONS, *_predictor("document"))),
     "autopilot_conditions_rate": Short(_CONDITIONS),
+    "autopilot_ship": Short(_CONDITIONS),
     "autopilot_conditions_patrol": Short((*_CONDITIONS, "test.sea_time=10 s")),
     "autopilot_patrol": Short(
         (

@@ -209,7 +209,8 @@ def test_a_recurrent_policy_flies_the_course_and_is_exported(
     exported = torch.jit.load(str(tmp_path / "run" / "exports" / "learned_sides.pt"))
     start = torch.tensor([[0.0, 0.0, 0.5, 3.2, 0.0, 0.0]])
     command, memory, fault, arrived = exported.step(start, exported.initial_state(start))
-    assert not bool(fault) and not bool(arrived)
+    assert not bool(fault)
+    assert not bool(arrived)
     assert float(command.abs()) <= math.radians(5.001)
     assert exported.step(start, memory)[2].tolist() == [False]
     assert call(monkeypatch, "export", "run/autopilot", "--model", "learned", "--format", "c") == 0

@@ -14,8 +14,9 @@ class ConditionsTraining(OneStage):
     """Settings of a training through the whole closed loop, under the conditions of the run.
 
     The loss of a batch is the mean cost of its flights, with a share of the integral of the
-    absolute error that fades out. The departures from the nominal vessel in calm water grow from
-    none to all of the conditions, and every batch is drawn anew.
+    absolute error that fades out, and with the late rudder travel of flights without noise. The
+    departures from the nominal vessel in calm water grow from none to all of the conditions, and
+    every batch is drawn anew.
 
     Attributes:
         epochs: at most; each ends with a validation.
@@ -32,6 +33,9 @@ class ConditionsTraining(OneStage):
         spread: share of the training after which the conditions are drawn in full.
         guide: weight of the integral of the absolute error in deg s at the start.
         faded: share of the training after which that weight is zero.
+        quiet: share of the flights of a batch without noise and slow push, in which a loop that
+            swings by itself is seen.
+        calm: cost in s of a degree of rudder travel in the last third of those flights.
         validation: number of flights that epochs are chosen on.
         compiled: whether flights and their gradient are compiled as C, which takes a C compiler;
             without one the training says so and is some thirty times slower.
@@ -50,6 +54,8 @@ class ConditionsTraining(OneStage):
     spread: float = Field(default=0.15, ge=0, le=1)
     guide: float = Field(default=0.01, ge=0)
     faded: float = Field(default=0.6, gt=0, le=1)
+    quiet: float = Field(default=0.2, ge=0, le=1)
+    calm: float = Field(default=0.1, ge=0)
     validation: int = Field(default=512, ge=2, le=1_000_000)
     compiled: bool = True
 

@@ -19,6 +19,9 @@ from residnet.dynamics.rollout import Rollout
 from residnet.training.conditions_config import ConditionsTraining
 from residnet.training.epochs import EpochTraining, run_epochs
 
+_LATE = 1.0 / 3.0
+"""Share of a flight at whose end a quiet one should have come to rest."""
+
 
 @final
 class ConditionsFit(EpochTraining):
@@ -87,11 +90,16 @@ class ConditionsFit(EpochTraining):
                 settings.final + (1.0 - settings.final) * cosine
             )
         changes = self._batch(settings.share(progress), settings.batch)
+        quiet = round(settings.quiet * settings.batch)
+        changes.noise[:quiet], changes.push[:quiet] = 0.0, 0.0
         flown = self.loop.flights(changes, *self.fly(*self.loop.given(changes)))
         found = flown.measured(self.conditions)
         loss: Tensor = (
             found["cost"].mean() + math.degrees(settings.guiding(progress)) * found["iae"].mean()
         )
+        if quiet > 0:
+            late = flown.late_travel(_LATE)[:quiet].mean()
+            loss = loss + math.degrees(settings.calm) * late
         self._losses.append(float(found["cost"].detach().mean()))
         return loss
 

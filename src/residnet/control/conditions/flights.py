@@ -109,6 +109,13 @@ class ConditionedFlights:
 
         return between(self.psi), between(self.command)
 
+    def late_travel(self, share: float) -> Tensor:
+        """Return the rudder travel [B] in rad in the last share of what the cost counts."""
+        first = self.changes.start[:, None] + round((1.0 - share) * self.changes.count)
+        late = self.changes.counted() & (torch.arange(self.psi.shape[1]) >= first)
+        moved = torch.diff(self.command, dim=1, prepend=self.command[:, :1])
+        return (moved.abs() * late).sum(1)
+
     def measured(self, conditions: ConditionsConfig) -> dict[str, Tensor]:
         """Return each of `QUANTITIES` by flight, [B]; what is no number is left so."""
         dt, degrees = self.changes.dt, 180.0 / torch.pi

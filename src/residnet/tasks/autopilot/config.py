@@ -145,6 +145,9 @@ class AutopilotSettings(ComputingTask):
         vessel: name or file of the vessel.
         rudder: largest rudder angle in rad that controllers may use.
         turning_time: time in s until the turn at that angle is steady.
+        pace: multiple of all times in `test`, `conditions` and the trainings of `recurrent`,
+            delays aside; `vessel` for how many times as long as that of document 004 the vessel
+            takes for a heading change.
         spread: of vessels and disturbances, for training, tuning and comparison alike.
         test: the step of the heading reference that all controllers fly.
         policies: neural policies by name.
@@ -165,6 +168,7 @@ class AutopilotSettings(ComputingTask):
     vessel: VesselName
     rudder: Radians = Field(gt=0, lt=1.5)
     turning_time: Seconds = Field(default=100.0, gt=0)
+    pace: Literal["vessel"] | Annotated[float, Field(gt=0, le=1_000)] = 1.0
     spread: SpreadConfig = SpreadConfig()
     test: StepTestConfig
     policies: dict[_Name, PolicyConfig] = Field(default_factory=dict)
@@ -218,6 +222,15 @@ class AutopilotSettings(ComputingTask):
                         f"conditions.{name}: dt must be that of test, {self.test.dt:g} s, given"
                         f" {conditions.dt:g} s"
                     )
+        return self
+
+    @model_validator(mode="after")
+    def _at_a_pace(self) -> AutopilotSettings:
+        if self.pace != 1.0 and (self.policies or self.predictive or self.conditions is None):
+            raise ValueError(
+                "pace: only runs under 'conditions' with policies under 'recurrent' alone have a"
+                " pace; give the times of others as the vessel needs them"
+            )
         return self
 
     @model_validator(mode="after")

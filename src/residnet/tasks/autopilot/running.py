@@ -37,6 +37,7 @@ from residnet.runs.model_store import FolderStore
 from residnet.runs.task import MainFigure, Outcome
 from residnet.tasks.autopilot.comparison import compare
 from residnet.tasks.autopilot.config import AutopilotSettings, PolicyConfig
+from residnet.tasks.autopilot.pace import paced
 from residnet.tasks.autopilot.requirements import learned_vessel
 from residnet.tasks.autopilot.scores import CommandDifference, SettlingScore
 from residnet.tasks.autopilot.under_conditions import (
@@ -50,6 +51,7 @@ from residnet.training.autopilot import train_autopilot
 
 def run_autopilot(config: AutopilotSettings, folder: RunFolder) -> Outcome:
     """Tune, train and compare."""
+    config = paced(config)
     vessel = SteeredPlant(load_vessel(config.vessel).build())
     turning = vessel.turning(config.rudder, config.turning_time)
     say(
