@@ -92,6 +92,14 @@ def test_the_cost_is_what_it_says() -> None:
     )
 
 
+def test_late_travel_counts_the_last_share_alone() -> None:
+    changes = drawn(CALM)
+    flown = ConditionedRun(VESSEL, Ramp(), CALM.dt).fly(changes)
+    steps = round(changes.count / 3)
+    assert torch.allclose(flown.late_travel(1 / 3), torch.full((4,), steps * 0.01 * DEG).double())
+    assert torch.equal(flown.late_travel(0.0), torch.zeros(4).double())
+
+
 def test_disturbances_have_the_statistics_that_are_stated() -> None:
     config = ConditionsConfig(dt=0.05, duration=20.0)
     changes = drawn(config, 400)

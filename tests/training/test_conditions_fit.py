@@ -25,14 +25,23 @@ STEEP = PtosConfig(
 )  # fmt: skip
 
 
-def trained(units: int, rate: float) -> tuple[ObservedPolicy, dict[str, object]]:
+def trained(
+    units: int, rate: float, quiet: float = 0.0
+) -> tuple[ObservedPolicy, dict[str, object]]:
     torch.manual_seed(0)
     policy = ObservedPolicySpec(
         state=VESSEL.state, gain=3.47, time=3.94, speed=3.2, limit=math.radians(5), rate=None,
         dt=0.1, trained_at=0.1, law=STEEP, units=units,
     ).build()  # fmt: skip
     settings = ConditionsTraining(
-        epochs=2, steps=4, batch=32, learning_rate=rate, dt=0.1, hold=0.0, validation=32
+        epochs=2,
+        steps=4,
+        batch=32,
+        learning_rate=rate,
+        dt=0.1,
+        hold=0.0,
+        validation=32,
+        quiet=quiet,
     )
     notes = train_under_conditions("policy", policy, VESSEL, settings, CONDITIONS, 3, None)
     return policy, notes
