@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -12,33 +14,36 @@ from residnet.training.sensitivities import step_sensitivities
 
 @torch.no_grad()
 def moments(
-    model: HybridDynamics, states: Tensor, w: Tensor, horizon: int, scales: Tensor
+    model: HybridDynamics, runs: Sequence[tuple[Tensor, Tensor]], horizon: int, scales: Tensor
 ) -> Tensor:
-    """Return the sum over a run's samples of squared sensitivities of u, v, r in scales, [P, P].
+    """Return the sums over each run's samples of squared sensitivities of u, v, r, [R, P, P].
 
-    The run is cut into free runs of `horizon` steps, each from its own measured state, as a refit
-    takes it.
+    They are in scales. Each run is cut into free runs of `horizon` steps, each from its own
+    measured state, as a refit takes it; what is left at the end does not count.
 
     Args:
         model: a baseline without a head.
-        states: of the run [T + 1, 6].
-        w: inputs held over each step [T, m].
+        runs: states [T + 1, 6] and inputs held over each step [T, m] of R runs.
         horizon: steps of the free runs of a refit.
         scales: of the velocities [3].
     """
     baseline = model.baseline
     assert isinstance(baseline, ParametricBaseline)
-    count = max(len(w) // horizon, 1)
-    steps = min(horizon, len(w))
-    starts = torch.arange(count) * horizon
+    places = [
+        (run, k * horizon) for run, (_, w) in enumerate(runs) for k in range(len(w) // horizon)
+    ]
     size = int(baseline.free_indices().numel())
-    s = torch.zeros(count, 4, size, dtype=states.dtype)
-    out = torch.zeros(size, size, dtype=states.dtype)
-    for k in range(steps):
-        p = model.signals.prepare(w[starts + k])
-        s = step_sensitivities(model, baseline, states[starts + k], p, s)
-        seen = (s[:, 1:] / scales[:, None]).reshape(-1, size)
-        out.addmm_(seen.T, seen)
+    out = torch.zeros(len(runs), size, size, dtype=scales.dtype)
+    if not places:
+        return out
+    number = torch.tensor([run for run, _ in places])
+    x = torch.stack([runs[run][0][start : start + horizon] for run, start in places])
+    w = torch.stack([runs[run][1][start : start + horizon] for run, start in places])
+    s = torch.zeros(len(places), 4, size, dtype=scales.dtype)
+    for k in range(horizon):
+        s = step_sensitivities(model, baseline, x[:, k], model.signals.prepare(w[:, k]), s)
+        seen = s[:, 1:] / scales[:, None]
+        out.index_add_(0, number, seen.transpose(1, 2) @ seen)
     return out
 
 

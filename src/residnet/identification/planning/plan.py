@@ -100,9 +100,8 @@ def plan(
             f"none of {len(flown)} candidates stays within the limits; allow more area, speed or"
             " rudder, or less time"
         )
-    found = [
-        (flight, states, moments(model, states, w, horizon, divisor)) for flight, states, w in kept
-    ]
+    told = moments(model, [(states, w) for _, states, w in kept], horizon, divisor)
+    found = [(flight, states, own) for (flight, states, _), own in zip(kept, told, strict=True)]
     # so many samples hang together that they count as one
     each = spec.dt / refit.correlation / max(open_.square, 1e-12)
     goal = sum((own for _, _, own in found), torch.zeros_like(found[0][2]))
