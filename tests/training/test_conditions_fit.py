@@ -25,9 +25,7 @@ STEEP = PtosConfig(
 )  # fmt: skip
 
 
-def trained(
-    units: int, rate: float, quiet: float = 0.0
-) -> tuple[ObservedPolicy, dict[str, object]]:
+def trained(units: int, rate: float) -> tuple[ObservedPolicy, dict[str, object]]:
     torch.manual_seed(0)
     policy = ObservedPolicySpec(
         state=VESSEL.state, gain=3.47, time=3.94, speed=3.2, limit=math.radians(5), rate=None,
@@ -41,7 +39,7 @@ def trained(
         dt=0.1,
         hold=0.0,
         validation=32,
-        quiet=quiet,
+        quiet=0.0,
     )
     notes = train_under_conditions("policy", policy, VESSEL, settings, CONDITIONS, 3, None)
     return policy, notes

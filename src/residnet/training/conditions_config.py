@@ -54,7 +54,7 @@ class ConditionsTraining(OneStage):
     spread: float = Field(default=0.15, ge=0, le=1)
     guide: float = Field(default=0.01, ge=0)
     faded: float = Field(default=0.6, gt=0, le=1)
-    quiet: float = Field(default=0.2, ge=0, le=1)
+    quiet: float = Field(default=0.1, ge=0, le=1)
     calm: float = Field(default=0.1, ge=0)
     validation: int = Field(default=512, ge=2, le=1_000_000)
     compiled: bool = True
