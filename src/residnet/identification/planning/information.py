@@ -53,7 +53,8 @@ def after(covariance: Tensor, information: Tensor) -> Tensor:
     Parameters that have no covariance stay as they are.
     """
     eye = torch.eye(len(covariance), dtype=covariance.dtype)
-    return covariance @ torch.linalg.inv(eye + information @ covariance)
+    left: Tensor = covariance @ torch.linalg.inv(eye + information @ covariance)
+    return left
 
 
 def volume_gain(covariance: Tensor, information: Tensor) -> float:
