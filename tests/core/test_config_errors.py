@@ -136,7 +136,7 @@ def test_quantity_or_word(failure: Failure) -> None:
 
 def test_long_values_are_cut(failure: Failure) -> None:
     message = failure(f"epochs: {'x' * 500}\n")
-    assert message.endswith("xxx ...)")
+    assert message.endswith("xxx...)")
     assert len(message) < 150
 
 

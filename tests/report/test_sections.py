@@ -18,7 +18,7 @@ from made_task_runs import (
     made_simulate,
     made_study,
 )
-from read_page import Page
+from read_page import Page, plain
 
 from residnet.report.blocks import Section
 from residnet.report.fit import fit_sections
@@ -120,7 +120,7 @@ def test_controllers_are_compared_by_settling_time_and_effort(tmp_path: Path) ->
 
 
 def test_a_course_shows_what_was_missed(tmp_path: Path) -> None:
-    text = page_of("course", tmp_path / "run").read_text()
+    text = plain(page_of("course", tmp_path / "run"))
     page = Page(text)
     entered, spread, sides, _ = page.tables
     assert entered[1][:6] == ["net", "course", "61.50", "1.0250", "0.9500", "2 of 2"]
@@ -139,7 +139,7 @@ def test_indices_stand_flight_by_flight_or_by_kind(tmp_path: Path) -> None:
         ["initial turning distance", "m", "8.000", "8.000", "0", "2.00", "2.00", ""],
     ]
     run = RunFiles(made_simulate(tmp_path / "many", logs=13))
-    text = write_page(run.path, "many", "", [], simulate.sections(run)).read_text()
+    text = plain(write_page(run.path, "many", "", [], simulate.sections(run)))
     (table,) = Page(text).tables
     assert table[0] == ["log", "first overshoot [deg]", "initial turning distance [m]"]
     assert len(table) == 1 + 2 * 13
@@ -149,7 +149,7 @@ def test_indices_stand_flight_by_flight_or_by_kind(tmp_path: Path) -> None:
 
 
 def test_an_import_shows_gaps_channels_and_findings(tmp_path: Path) -> None:
-    text = page_of("import", tmp_path / "run").read_text()
+    text = plain(page_of("import", tmp_path / "run"))
     page = Page(text)
     cells = page.table("log", "first")
     assert cells["first"] == ["100", "0.1000", "9.900", "2", "9", "1", "1"]

@@ -3,8 +3,14 @@
 from __future__ import annotations
 
 from html.parser import HTMLParser
+from pathlib import Path
 
 _VOID = {"meta", "img", "br", "hr", "link", "wbr", "input"}
+
+
+def plain(page: Path) -> str:
+    """The text of a page; numbers and units that are kept together have a plain space between."""
+    return page.read_text().replace("\u00a0", " ")
 
 
 class Page(HTMLParser):

@@ -13,6 +13,7 @@ import pandas as pd
 import pytest
 import torch
 import yaml
+from read_page import plain
 from tiny import call
 
 TRAINING = {
@@ -351,6 +352,6 @@ def test_wind_and_sea_are_flown_by_vessels_that_feel_them(
     for name in ("policy", "pd"):
         assert 0 < found[(name, "sea")]["heel_rms"]["mean"] < math.radians(20)
         assert 0 < found[(name, "sea")]["rudder_rms"]["max"] <= math.radians(5)
-    text = (tmp_path / "run" / "report.html").read_text()
+    text = plain(tmp_path / "run" / "report.html")
     assert "(jonswap) and travel towards 165 deg" in text
     assert "10 m/s from eight directions" in text

@@ -14,6 +14,7 @@ import pandas as pd
 import pytest
 import torch
 import yaml
+from read_page import plain
 from tiny import TINY, call
 
 from residnet.dynamics.store import load_model
@@ -109,7 +110,7 @@ def test_report_and_figures_show_the_equations(run: Path) -> None:
     assert {f"Equation of {model}, term by term" for model in ("equation", "whole", "late")} <= set(
         titles
     )
-    text = (run / "report.html").read_text()
+    text = plain(run / "report.html")
     assert "Equations of equation" in text
     assert "candidate terms differ on these data (condition number" in text
     seconds = notes(run, "late")["delay"]["seconds"]

@@ -12,8 +12,8 @@ from residnet.control.heading.controllers import PdConfig, Steering
 from residnet.control.heading.policy import HeadingPolicy
 from residnet.control.heading.steering import SteeredPlant, fly
 from residnet.physics.vessel import load_vessel
-from residnet.training.autopilot import train_autopilot
-from residnet.training.autopilot_config import AutopilotTraining, SpreadConfig
+from residnet.training.policies.autopilot import train_autopilot
+from residnet.training.policies.autopilot_config import AutopilotTraining, SpreadConfig
 
 DEG = math.pi / 180
 VESSEL = SteeredPlant(load_vessel("nomoto_oceanos").build())

@@ -13,8 +13,8 @@ from residnet.control.observed.config import PtosConfig
 from residnet.control.observed.policy import ObservedPolicy
 from residnet.control.observed.stored import ObservedPolicySpec
 from residnet.physics.vessel import load_vessel
-from residnet.training.conditions_config import ConditionsTraining
-from residnet.training.conditions_fit import train_under_conditions
+from residnet.training.policies.conditions_config import ConditionsTraining
+from residnet.training.policies.conditions_fit import train_under_conditions
 
 VESSEL = SteeredPlant(load_vessel("nomoto_oceanos").build())
 CONDITIONS = ConditionsConfig(dt=0.1, duration=6.0, hold=0.0, delay=(0.0, 0.3))

@@ -24,6 +24,8 @@ def test_one_step_goes_where_a_refit_without_the_logs_goes(offsets: OffsetsConfi
     model = model_of(LINEAR)
     known, store = samples(logs, model.signals), WindowStore.gather(logs, torch.float64)
     RegressorsConfig(terms=tuple(LINEAR)).fit(model.baseline, known)
+    assert isinstance(model.baseline, ParametricBaseline)
+    first = model.baseline.theta.detach().clone()
     refit(model, known, store, config, SCALES)
     assert isinstance(model.baseline, ParametricBaseline)
     whole = model.baseline.theta.detach().clone()
@@ -35,12 +37,17 @@ def test_one_step_goes_where_a_refit_without_the_logs_goes(offsets: OffsetsConfi
     for k, theta in enumerate(found):
         kept = [log for i, log in enumerate(logs) if i % 2 != k]
         other = copy.deepcopy(model)
+        assert isinstance(other.baseline, ParametricBaseline)
+        # its prior stands where least squares put the parameters, as that of the whole refit does
+        with torch.no_grad():
+            other.baseline.theta.copy_(first)
         refit(
             other,
             samples(kept, model.signals),
             WindowStore.gather(kept, torch.float64),
             config,
             SCALES,
+            begin=whole,
         )
         assert isinstance(other.baseline, ParametricBaseline)
         wanted = other.baseline.theta.detach()

@@ -14,8 +14,8 @@ from residnet.control.heading.controllers import DocumentConfig, Steering
 from residnet.control.heading.document_autopilot import NetworkPredictor
 from residnet.control.heading.steering import SteeredPlant, fly
 from residnet.physics.vessel import load_vessel
-from residnet.training.predictor import simulate_answers, train_predictor
-from residnet.training.predictor_config import PredictorTraining
+from residnet.training.policies.predictor import simulate_answers, train_predictor
+from residnet.training.policies.predictor_config import PredictorTraining
 
 DEG = math.pi / 180
 LIMIT = 5 * DEG

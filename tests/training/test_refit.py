@@ -133,6 +133,7 @@ def windy(integrator: Integrator = "rk4") -> tuple[HybridDynamics, Problem]:
         nu=torch.from_numpy(random.normal(size=(batch, steps, 3)) * 0.3),
         weight=torch.cat((usable, usable, torch.ones_like(usable)), dim=-1) / SCALES,
         precision=0.01 * half @ half.T,
+        own=torch.zeros(count, count, dtype=torch.float64),
         start=torch.from_numpy(random.normal(size=count) * 0.1),
         pull=torch.diag(torch.from_numpy(random.uniform(0, 0.1, size=count))),
         still=torch.zeros(count, dtype=torch.bool),

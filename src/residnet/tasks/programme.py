@@ -12,7 +12,6 @@ from torch import Tensor
 from residnet.core.config import Config, ExistingPath, Metres, Quantity, Seconds
 from residnet.core.errors import ConfigError, UsageError
 from residnet.core.names import CHANNEL_UNITS, nearest
-from residnet.core.steps import check_steps
 from residnet.data.readers import ReaderConfig
 from residnet.data.readers.tables.canonical import CanonicalConfig
 from residnet.data.simulated.environment import Disturbance
@@ -22,6 +21,7 @@ from residnet.dynamics.actuated import ActuatedDynamics
 from residnet.dynamics.gear import GivenGear, InputShare, PlantGear
 from residnet.dynamics.learned import chosen_model
 from residnet.dynamics.simulated import TracedPlantDynamics
+from residnet.dynamics.steps import check_steps
 from residnet.dynamics.store import load_model
 from residnet.manoeuvres import FamilyConfig, Helm, Manoeuvre, ManoeuvreConfig, Replay
 from residnet.physics.vessel import load_vessel

@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 from torch import Tensor
 
 from residnet.core.config import Config, MetresPerSecond, Radians, RadiansPerSecond, Seconds
-from residnet.core.steps import check_steps
+from residnet.dynamics.steps import check_steps
 
 Range = Annotated[tuple[float, float], Field(description="low and high multiple")]
 _EXTRA = ("push", "reference", "noise_psi", "noise_r", "delay")

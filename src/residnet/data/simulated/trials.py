@@ -13,7 +13,6 @@ from residnet.core.config import Config, Seconds
 from residnet.core.errors import ConfigError
 from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS
-from residnet.core.steps import check_steps
 from residnet.data.simulated.environment import Disturbance
 from residnet.data.simulated.flying import (
     Craft,
@@ -26,6 +25,7 @@ from residnet.data.simulated.flying import (
 )
 from residnet.data.simulated.sensors import SensorNoise
 from residnet.dynamics.simulated import PlantDynamics
+from residnet.dynamics.steps import check_steps
 from residnet.manoeuvres import FamilyConfig, Helm, Manoeuvre
 from residnet.physics.vessel import VesselName, load_vessel
 

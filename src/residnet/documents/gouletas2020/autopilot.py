@@ -21,7 +21,7 @@ from residnet.documents.gouletas2020.config import PredictiveConfig
 from residnet.report.format import DEG
 from residnet.runs.folder import RunFolder
 from residnet.runs.model_store import FolderStore
-from residnet.training.predictor import train_predictor
+from residnet.training.policies.predictor import train_predictor
 
 
 def predictive(

@@ -7,7 +7,7 @@ from typing import Annotated
 from pydantic import Field
 
 from residnet.core.config import Config, Seconds
-from residnet.training.predictor_config import PredictorTraining
+from residnet.training.policies.predictor_config import PredictorTraining
 
 _Units = Annotated[int, Field(ge=1)]
 

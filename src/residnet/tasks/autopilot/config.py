@@ -14,14 +14,14 @@ from residnet.control.heading.controllers import BangBangConfig
 from residnet.control.observed.config import AnyController, ObservedConfig
 from residnet.core.config import Config, MetresPerSecond, Radians, Seconds
 from residnet.core.names import nearest
-from residnet.core.steps import check_steps
 from residnet.data.simulated.environment import Disturbance, WindField
 from residnet.documents.gouletas2020.config import PredictiveConfig
+from residnet.dynamics.steps import check_steps
 from residnet.physics.environment.waves import WavesConfig
 from residnet.physics.vessel import VesselName, load_vessel
 from residnet.runs.task import ComputingTask
-from residnet.training.autopilot_config import AutopilotTraining, SpreadConfig
-from residnet.training.conditions_config import ConditionsTraining
+from residnet.training.policies.autopilot_config import AutopilotTraining, SpreadConfig
+from residnet.training.policies.conditions_config import ConditionsTraining
 
 _Units = Annotated[int, Field(ge=1)]
 _Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]

@@ -46,7 +46,7 @@ from residnet.tasks.autopilot.under_conditions import (
     judge_all,
     trained_policy,
 )
-from residnet.training.autopilot import train_autopilot
+from residnet.training.policies.autopilot import train_autopilot
 
 
 def run_autopilot(config: AutopilotSettings, folder: RunFolder) -> Outcome:

@@ -24,7 +24,7 @@ from residnet.physics.vessel import load_vessel
 from residnet.runs.folder import RunFolder
 from residnet.runs.model_store import FolderStore
 from residnet.tasks.autopilot.config import AutopilotSettings, JudgedConditions, RecurrentConfig
-from residnet.training.conditions_fit import train_under_conditions
+from residnet.training.policies.conditions_fit import train_under_conditions
 
 Controllers = dict[str, tuple[str, Policy]]
 

@@ -125,10 +125,10 @@ def _plain_names(
             if name.startswith(f"{force}_"):
                 new[name] = force
     channels = read.reader.get("channels")
-    state = ("x", "y", "psi", "u", "v", "r", "wind_speed", "wind_dir")
+    state = ["x", "y", "psi", "u", "v", "r", "wind_speed", "wind_dir"]
     if channels:
         if "x" not in channels:
-            state = ("latitude", "longitude", *state)
+            state += ["latitude", "longitude"]
         kept = {
             new.get(name, name): entry
             for name, entry in channels.items()

@@ -66,6 +66,11 @@ def without_logs(
         _part(model, _rows(problem, of_window == k), squares[of_window == k], level, offsets)
         for k in range(folds)
     ]
+    # at the minimum all logs together pull as hard as the prior holds
+    together = sum(
+        (share * own for share, (_, own) in zip(count / count.sum(), parts, strict=True)),
+        torch.zeros_like(parameters),
+    )
     out = []
     for k in range(folds):
         left = float(count.sum() - count[k])
@@ -78,9 +83,8 @@ def without_logs(
         for j, (own, _) in enumerate(parts):
             if j != k:
                 hessian = hessian + count[j] / left * own
-        step = torch.linalg.lstsq(
-            hessian, (count[k] / left * parts[k][1]).unsqueeze(1), driver="gelsd"
-        ).solution.squeeze(1)
+        slope = count[k] / left * (parts[k][1] - together)
+        step = torch.linalg.lstsq(hessian, slope.unsqueeze(1), driver="gelsd").solution.squeeze(1)
         step[problem.still] = 0.0
         others = _rows(problem, of_window != k)
         kept = _best_share(model, others, offsets, parameters, step)

@@ -16,8 +16,8 @@ from residnet.control.observed.policy import ObservedPolicy
 from residnet.core.errors import ExportError
 from residnet.core.progress import say
 from residnet.dynamics.rollout import Rollout
-from residnet.training.conditions_config import ConditionsTraining
 from residnet.training.epochs import EpochTraining, run_epochs
+from residnet.training.policies.conditions_config import ConditionsTraining
 
 _LATE = 1.0 / 3.0
 """Share of a flight at whose end a quiet one should have come to rest."""

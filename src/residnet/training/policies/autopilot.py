@@ -18,8 +18,8 @@ from residnet.control.heading.policy import HeadingPolicy
 from residnet.control.heading.steering import Measured, SteeredVessel
 from residnet.core.frames import wrap
 from residnet.dynamics.rollout import Rollout
-from residnet.training.autopilot_config import AutopilotTraining, SpreadConfig
 from residnet.training.epochs import EpochTraining, run_epochs
+from residnet.training.policies.autopilot_config import AutopilotTraining, SpreadConfig
 
 Score = Callable[[HeadingPolicy], float]
 

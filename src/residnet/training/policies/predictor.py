@@ -16,7 +16,7 @@ from residnet.control.heading.document_autopilot import NetworkPredictor, Simula
 from residnet.control.heading.steering import SteeredVessel
 from residnet.dynamics.rollout import Rollout
 from residnet.training.epochs import EpochTraining, run_epochs
-from residnet.training.predictor_config import PredictorTraining
+from residnet.training.policies.predictor_config import PredictorTraining
 
 
 class Answers(NamedTuple):

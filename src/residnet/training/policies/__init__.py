@@ -1,0 +1,1 @@
+"""The training of heading policies through their closed loop."""
