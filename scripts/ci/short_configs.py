@@ -84,6 +84,7 @@ _TANKER = (
     "refit={}",
     "baselines.physics={kind: regressors, terms: [u, v, r, n]}",
     "evaluation.splits=[validation, test]",
+    "bands=null",
     *_trained("mlp", "lstm"),
 )
 _FERRY = ("course.interval=10 s",)
@@ -116,7 +117,7 @@ SHORT: dict[str, Short] = {
     "simulate_wam_v": Short(("~programme.families", "programme.step=0.1 s")),
     "rudder_boat_trials": Short(_TRIALS),
     "patrol_identified": Short(_trained("mlp")),
-    "kvlcc2": Short(("refit.mmg.iterations=2", "booklet.draws=20"), data="kvlcc2"),
+    "kvlcc2": Short(("refit.mmg.iterations=2", "booklet.draws=20", "bands=null"), data="kvlcc2"),
     "esso_osaka": Short(_TANKER, data="esso_osaka"),
     "esso_osaka_standard": Short(
         (
@@ -125,6 +126,7 @@ SHORT: dict[str, Short] = {
             " test: ['zigzag/*13_42_53.csv']}",
             "evaluation.selection=T30",
             "effort=0.01",
+            "bands=null",
         ),
         data="esso_osaka",
     ),
