@@ -89,7 +89,7 @@ CALLS: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
         "hiden_size: unknown key; did you mean 'hidden_size'",
     ),
     "a text for a number": (lambda m: residnet.head("lstm", hidden_size="3"), "a whole number"),
-    "logs instead of data": (lambda m: residnet.fit(3), "expected logs, or data from"),
+    "logs instead of data": (lambda m: residnet.fit(wrong(3)), "expected logs, or data from"),
     "an unknown model": (lambda m: m["models"]["rigde"], "no model 'rigde'; did you mean 'ridge'"),
     "a wide w": (
         lambda m: m["models"]["ridge"].step(X, np.zeros(3)),

@@ -148,7 +148,8 @@ def test_a_believed_model_that_is_worse_than_no_force_is_no_yardstick(tmp_path: 
     t, *_ = motion(0, 300.0)
     random = np.random.default_rng(7)
     names = [f"tau_{letter}_{kind}" for letter in "xyn" for kind in ("est", "cmd")]
-    log(tmp_path, "one", missing=0.0, **{n: random.normal(0.0, 5.0, len(t)) for n in names})
+    spoil: dict[str, Any] = {n: random.normal(0.0, 5.0, len(t)) for n in names}
+    log(tmp_path, "one", missing=0.0, **spoil)
     found = force_study(config(tmp_path))
     ridge, believed = rows(found)["ridge"], rows(found)["believed"]
     assert ridge["reference"] == ["zero"] * 3
