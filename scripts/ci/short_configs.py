@@ -121,9 +121,11 @@ SHORT: dict[str, Short] = {
     "esso_osaka": Short(_TANKER, data="esso_osaka"),
     "esso_osaka_standard": Short(
         (
-            "data.split={root: '${RESIDNET_DATA}/esso_osaka', train: ['zigzag/*13_04_24.csv',"
-            " 'zigzag/*13_14_21.csv'], validation: ['zigzag/*13_29_19.csv'],"
-            " test: ['zigzag/*13_42_53.csv']}",
+            "data.split={root: '${RESIDNET_DATA}/esso_osaka', train:"
+            " [{log: 'zigzag/*13_04_24.csv', from: 0 s, to: 150 s},"
+            " {log: 'zigzag/*13_14_21.csv', from: 0 s, to: 150 s}], validation:"
+            " [{log: 'zigzag/*13_29_19.csv', from: 0 s, to: 150 s}], test:"
+            " [{log: 'zigzag/*13_42_53.csv', from: 0 s, to: 150 s}]}",
             "evaluation.selection=T30",
             "effort=0.01",
             "bands=null",
