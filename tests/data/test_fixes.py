@@ -80,3 +80,13 @@ def test_a_plotters_table_is_drafted_without_a_word(tmp_path: Path) -> None:
     assert channels["longitude"] == {"column": "Lon", "unit": "deg"}
     assert channels["psi"] == {"column": "HDG (deg)", "unit": "deg"}
     assert content["signals"]["inputs"] == ["delta", "n"]
+
+
+def test_a_first_line_without_end_is_no_header(tmp_path: Path) -> None:
+    file = tmp_path / "log.csv"
+    file.write_text('"' + "0.5,1.0\n" * 40_000)
+    config = CsvConfig.model_validate(
+        {"time": {"column": "Date/Time", "unit": "date"}, "channels": CHANNELS}
+    )
+    with pytest.raises(DataError, match="line 1 is no header"):
+        config.build().read(file)

@@ -155,12 +155,20 @@ def _encoding(head: bytes) -> str:
     return "cp932" if japanese else "cp1252"
 
 
+def _cells(line: str, delimiter: str) -> list[str]:
+    """Return the cells of one line; a line that is no table's is one cell."""
+    try:
+        return next(csv.reader([line], delimiter=delimiter), [])
+    except csv.Error:
+        return [line]
+
+
 def _delimiter(lines: list[str]) -> str:
     """Return the sign that stands equally often in every line, and most often."""
     sample = [line for line in lines[:50] if line.strip()]
 
     def regular(sign: str) -> tuple[int, int]:
-        counts = [len(next(csv.reader([line], delimiter=sign))) for line in sample]
+        counts = [len(_cells(line, sign)) for line in sample]
         alike = sum(count == counts[0] for count in counts) if counts[0] > 1 else 0
         return alike, counts[0]
 
@@ -168,7 +176,7 @@ def _delimiter(lines: list[str]) -> str:
 
 
 def _decimal_comma(lines: list[str], delimiter: str) -> bool:
-    cells = [cell for line in lines[1:50] for cell in next(csv.reader([line], delimiter=delimiter))]
+    cells = [cell for line in lines[1:50] for cell in _cells(line, delimiter)]
     return sum(bool(_COMMA.fullmatch(cell)) for cell in cells) > sum(
         bool(_POINT.fullmatch(cell)) for cell in cells
     )

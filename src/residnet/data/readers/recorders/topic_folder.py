@@ -211,7 +211,7 @@ def _read(
                 column in (stamp or ()) or names_sender(column) or wanted.field(name, column)
             ),
         )
-    except (UnicodeDecodeError, pd.errors.ParserError) as error:
+    except (UnicodeDecodeError, csv.Error, pd.errors.ParserError) as error:
         return None, [
             remark(
                 "will mislead",

@@ -42,7 +42,13 @@ def _positions(
 def _header(path: Path, delimiter: str, encoding: str) -> tuple[list[str], str]:
     """Return the cells of a csv file's header, and a hint for errors about missing columns."""
     with path.open(newline="", encoding=encoding) as stream:
-        header = [cell.strip() for cell in next(csv.reader(stream, delimiter=delimiter), [])]
+        try:
+            header = [cell.strip() for cell in next(csv.reader(stream, delimiter=delimiter), [])]
+        except csv.Error as error:
+            raise DataError(
+                f"{path}: line 1 is no header with column names ({error}); a quotation mark may be"
+                " open, or lines are missing at the beginning"
+            ) from error
     if not any(header):
         raise DataError(
             f"{path}: the file is empty or its first line is blank; a header line with column"
