@@ -16,7 +16,7 @@ from residnet.data.windows import WindowStore
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.training.refit_config import RefitConfig
 
-_OWN = 1e-4
+_OWN = 1e-8
 """Weight of a parameter's own start, as a share of the information that the samples would hold if
 all others were known; it says where a parameter stays that the data leave open.
 """

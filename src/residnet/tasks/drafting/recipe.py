@@ -16,6 +16,8 @@ from residnet.tasks.drafting.inputs import roles
 
 _WINDOWS = (100.0, 60.0, 40.0, 30.0, 20.0, 10.0, 5.0, 2.0, 1.0)
 _HULL = ("u v", "u r", "v r", "u|u|", "v|v|", "r|r|", "v|r|", "r|v|")
+_SOUND = {"dissipative": True, "bounded": True}
+"""A model of logs that nobody has looked at neither feeds itself energy nor runs away."""
 _EFFORT = 12_000
 """Steps of rollouts that a network is trained through, in batches: about half a minute."""
 
@@ -124,11 +126,11 @@ def models(inputs: Sequence[str], wind: bool, time: Timing, length: float, sampl
     """
     acting = roles(inputs)
     extra = [name for name in inputs if name == "tau_y"]
-    linear: dict[str, Any] = {"kind": "regressors", "ridge": 1e-6, "sets": ["linear"]}
+    linear: dict[str, Any] = {"kind": "regressors", **_SOUND, "ridge": 1e-6, "sets": ["linear"]}
     linear["terms"] = [*extra, *(["wind_u", "wind_v"] if wind else [])]
     if not linear["terms"]:
         del linear["terms"]
-    physics: dict[str, Any] = {"kind": "regressors", "ridge": 1e-4}
+    physics: dict[str, Any] = {"kind": "regressors", **_SOUND, "ridge": 1e-4}
     if acting["drive"] and acting["steer"] and set(inputs) == {*acting["drive"], *acting["steer"]}:
         physics["sets"] = ["fossen", *(["wind"] if wind else [])]
         known = {"drive": ("n",), "steer": ("delta",)}
