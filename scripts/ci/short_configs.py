@@ -136,7 +136,14 @@ SHORT: dict[str, Short] = {
     "milliampere_raw": Short(data="milliampere"),
     "autopilot_nomoto": Short((*_policy("policy"), *_predictor("document"), *_STEP_TEST, *_PEERS)),
     "autopilot_nomoto_rate": Short((*_policy("policy"), *_STEP_TEST, *_PEERS)),
-    "autopilot_conditions": Short((*_CONDITIONS, *_predictor("document"))),
+    "autopilot_conditions": Short(
+        (
+            *_CONDITIONS,
+            *_recurrent("network"),
+            "recurrent.network.training.dt=0.1 s",
+            *_predictor("document"),
+        )
+    ),
     "autopilot_conditions_rate": Short(_CONDITIONS),
     "autopilot_ship": Short(_CONDITIONS),
     "autopilot_conditions_patrol": Short((*_CONDITIONS, "test.sea_time=10 s")),

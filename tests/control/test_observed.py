@@ -16,7 +16,7 @@ from residnet.control.heading.steering import SteeredPlant
 from residnet.control.heading.turning import Turning
 from residnet.control.observed.config import ObservedLqrConfig, PtosConfig
 from residnet.control.observed.policy import ObservedPolicy
-from residnet.control.observed.stored import ObservedPolicySpec
+from residnet.control.observed.stored import NetworkPolicySpec, ObservedPolicySpec
 from residnet.core.errors import ConfigError
 from residnet.physics.vessel import load_vessel
 
@@ -81,6 +81,26 @@ def test_port_and_starboard_are_alike(rate: float | None) -> None:
         other, t = made(mirrored, -reference, t)
     assert torch.allclose(one, -other, atol=1e-9)
     assert float(one.abs().max()) <= 5 * DEG
+
+
+def test_a_network_without_a_law_is_alike_on_both_sides_and_starts_amidships() -> None:
+    torch.manual_seed(2)
+    spec = NetworkPolicySpec(
+        state=STATE, gain=3.47, time=3.94, speed=3.2, limit=5 * DEG, rate=10 * DEG, dt=0.02,
+        trained_at=0.04, units=6,
+    )  # fmt: skip
+    made = spec.build().double().requires_grad_(False)
+    x, reference = measured(20)
+    mirrored = x * torch.tensor([-1.0, 1.0, -1.0])
+    s = made.initial_state(x)
+    assert float(made(x, reference, s)[0].abs().max()) == 0.0
+    made.network.out.weight.normal_(generator=torch.Generator().manual_seed(1))
+    t = s
+    for _ in range(10):
+        one, s = made(x, reference, s)
+        other, t = made(mirrored, -reference, t)
+    assert torch.allclose(one, -other, atol=1e-12)
+    assert 0.0 < float(one.abs().max()) <= 5 * DEG
 
 
 def test_an_untrained_network_and_one_set_to_zero_are_the_law_itself() -> None:

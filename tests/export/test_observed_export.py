@@ -12,7 +12,7 @@ import torch
 
 from residnet.control.observed.config import PtosConfig
 from residnet.control.observed.policy import FIXED, ObservedPolicy
-from residnet.control.observed.stored import ObservedPolicySpec
+from residnet.control.observed.stored import NetworkPolicySpec, ObservedPolicySpec
 from residnet.export.autopilot import export_autopilot
 from residnet.export.c.policy import export_autopilot_as_c
 
@@ -96,6 +96,19 @@ def test_it_is_written_as_c(tmp_path: Path) -> None:
     stored = json.loads((tmp_path / "pilot.card.json").read_text())
     assert stored["parity"]["share_of_limit"] <= 1e-4
     assert "PILOT_SIZE_S" in (tmp_path / "pilot.h").read_text()
+
+
+def test_a_network_without_a_law_is_written_as_c(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    made = NetworkPolicySpec(
+        state=("psi", "u", "r"), gain=GAIN, time=TIME, speed=SPEED, limit=5 * DEG, rate=10 * DEG,
+        dt=DT, trained_at=0.04, units=4,
+    ).build().requires_grad_(False)  # fmt: skip
+    made.network.out.weight.normal_(std=0.5)
+    card = {"dt": DT, "parity": {"steps": 1000}}
+    export_autopilot_as_c("pilot", made, tmp_path / "pilot.c", safe="amidships", card=card)
+    stored = json.loads((tmp_path / "pilot.card.json").read_text())
+    assert stored["parity"]["share_of_limit"] <= 1e-4
 
 
 def test_a_lost_estimate_begins_anew_and_keeps_the_push() -> None:

@@ -12,6 +12,10 @@ import torch
 import yaml
 from tiny import call
 
+from residnet.core.config import load_config
+from residnet.tasks.autopilot.stored import stored_policy
+from residnet.tasks.autopilot.task import AutopilotConfig
+
 STATED = {"dt": "0.1 s", "duration": "6 s", "hold": "0 s", "delay": ["0 s", "0.3 s"]}
 TRAINING = {
     "epochs": 1, "steps": 1, "batch": 8, "dt": "0.1 s", "hold": "0 s", "validation": 8,
@@ -33,6 +37,7 @@ SMALL: dict[str, Any] = {
     "recurrent": {
         "learned": {"start": "ptos", "units": 3, "training": TRAINING},
         "constants": {"start": "ptos", "units": 0, "training": TRAINING},
+        "network": {"start": None, "units": 3, "training": TRAINING},
     },
     "peers": {
         "pd": {"kind": "pd", "kp": 1.5, "damping_time": "1.3 s"},
@@ -64,6 +69,8 @@ def test_every_controller_and_every_companion_is_judged_on_the_same_flights(run:
         "learned untrained": "untrained",
         "learned network off": "network_off",
         "constants": "constants",
+        "network": "network",
+        "network untrained": "untrained",
         "pd": "classical",
         "ptos": "classical",
     }
@@ -105,12 +112,30 @@ def test_a_learned_policy_is_exported_with_its_card(run: Path) -> None:
     assert state.shape == (1, len(card["memory"]))
 
 
+def test_a_network_without_a_law_is_exported_and_read_back(run: Path) -> None:
+    extra = {"card.json": ""}
+    module = torch.jit.load(str(run / "exports" / "network.pt"), _extra_files=extra)
+    card = json.loads(extra["card.json"])
+    assert card["kind"] == "network"
+    assert "constants" not in card
+    config = load_config(run / "resolved.yaml", [], AutopilotConfig)
+    policy = stored_policy(config, run / "models", "network", 0.1)
+    policy.read_from(("psi", "u", "r"))
+    measured = torch.tensor([[0.1, 3.2, 0.02]])
+    memory, s = policy.initial_state(measured.double()), module.initial_state(measured)
+    for _ in range(5):
+        command, s, _ = module.step(measured, torch.tensor([[0.5]]), s)
+        wish, memory = policy(measured.double(), torch.tensor([[0.5]]).double(), memory)
+        assert float(command) == pytest.approx(float(wish), abs=1e-6)
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
         ({"conditions": None}, "give 'conditions' to train it under"),
         ({"peers": {"ptos": {"kind": "pd"}}}, "must name a peer of kind ptos"),
         ({"recurrent": {}, "policies": {}}, "give at least one policy"),
+        ({"recurrent": {"n": {"start": None, "units": 0}}}, "without a law needs a network"),
         ({"conditions": {"stated": {**STATED, "dt": "0.05 s"}}}, "dt must be that of test"),
         ({"conditions": {"stated": {**STATED, "current": 0.5}}}, "no input 'current_north'"),
         ({"conditions": {"stated": {**STATED, "delay": ["0.4 s", "0.1 s"]}}}, "in order"),

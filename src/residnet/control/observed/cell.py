@@ -21,14 +21,16 @@ class OddCell(nn.Module):
         features: number of features.
         units: number of units.
         dt: step of training in s.
+        hidden: units of an odd layer between memory and output; 0 for none.
     """
 
-    def __init__(self, features: int, units: int, dt: float) -> None:
+    def __init__(self, features: int, units: int, dt: float, hidden: int = 0) -> None:
         super().__init__()
         both = features + units
         self.gates = nn.Linear(both, 2 * units)
         self.candidate = nn.Linear(both, units, bias=False)
-        self.out = nn.Linear(both, 1, bias=False)
+        self.hidden = nn.Linear(both, hidden, bias=False) if hidden > 0 else None
+        self.out = nn.Linear(both + hidden, 1, bias=False)
         nn.init.normal_(self.gates.weight, std=1.0 / math.sqrt(both))
         nn.init.zeros_(self.gates.bias)
         nn.init.normal_(self.candidate.weight, std=1.0 / math.sqrt(both))
@@ -42,5 +44,8 @@ class OddCell(nn.Module):
         share = 1.0 - (1.0 - update).clamp(min=1e-6).pow(dt / self.trained_at)
         candidate = torch.tanh(self.candidate(torch.cat((features, reset * memory), dim=1)))
         memory = memory + share * (candidate - memory)
-        output: Tensor = self.out(torch.cat((features, memory), dim=1))
+        known = torch.cat((features, memory), dim=1)
+        if self.hidden is not None:
+            known = torch.cat((known, torch.tanh(self.hidden(known))), dim=1)
+        output: Tensor = self.out(known)
         return output, memory

@@ -14,6 +14,7 @@ CONDITIONS = "conditions.parquet"
 """What each flight under the stated conditions cost, by controller."""
 _KINDS = {
     "policy": "learned",
+    "network": "learned, no law inside",
     "constants": "law, constants trained",
     "untrained": "policy before training",
     "network_off": "policy, network set to zero",
@@ -42,15 +43,19 @@ def cost_verdict(rows: Sequence[Content]) -> list[str]:
     sentences = []
     for name, row in found.items():
         off = found.get(f"{name} network off")
-        if row["kind"] != "policy" or off is None:
+        if row["kind"] not in ("policy", "network"):
             continue
         cost, other = row["cost"]["mean"], best["cost"]["mean"]
         better = "below" if cost < other else "above"
+        without = (
+            "; it has no law inside"
+            if off is None
+            else f"; with its network set to zero it costs {off['cost']['mean']:.3f} s"
+        )
         sentences.append(
             f"Under the stated conditions '{name}' costs {cost:.3f} s a change,"
             f" {100 * abs(cost / other - 1):.1f} % {better} '{best['model']}', the best classical"
-            f" law, with {other:.3f} s; with its network set to zero it costs"
-            f" {off['cost']['mean']:.3f} s."
+            f" law, with {other:.3f} s{without}."
         )
     return sentences
 
@@ -103,7 +108,7 @@ def cost_table(rows: Sequence[Content]) -> Table:
                 fixed(_degrees(quiet, "rudder_swing", "max"), 2),
                 Cell(str(row["diverged"]), mark="bad" if row["diverged"] else ""),
             ],
-            selected=row["kind"] == "policy",
+            selected=row["kind"] in ("policy", "network"),
         )
     return table
 

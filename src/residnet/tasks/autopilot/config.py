@@ -12,6 +12,7 @@ from residnet.control.conditions.config import ConditionsConfig
 from residnet.control.conditions.evolution import EvolutionConfig
 from residnet.control.heading.controllers import BangBangConfig
 from residnet.control.observed.config import AnyController, ObservedConfig
+from residnet.control.observed.stored import NetworkPolicySpec, ObservedPolicySpec, RecurrentSpec
 from residnet.core.config import Config, MetresPerSecond, Radians, Seconds
 from residnet.core.names import nearest
 from residnet.data.simulated.environment import Disturbance, WindField
@@ -60,18 +61,37 @@ class PolicyConfig(Config):
 
 
 class RecurrentConfig(Config):
-    """A heading policy with observer and predictor, trained under the run's conditions.
+    """A recurrent heading policy, trained under the run's conditions.
 
     Attributes:
-        start: name of a peer with an observer, of kind `ptos` or `lqr_observer`; its constants as
-            tuned are where training begins, and they are trained too.
-        units: of the recurrent network beside the law; 0 trains the constants alone.
+        start: name of a peer with an observer, of kind `ptos` or `lqr_observer`: the network stands
+            beside its law, whose constants as tuned are where training begins, and they are trained
+            too. Null for a network alone, without law, observer or predictor.
+        units: of the recurrent network; 0 trains the constants of a law alone.
         training: how it is trained.
     """
 
-    start: _Name
+    start: _Name | None
     units: int = Field(default=16, ge=0, le=10_000)
     training: ConditionsTraining = ConditionsTraining()
+
+    @property
+    def spec(self) -> type[RecurrentSpec]:
+        """The kind of description that the policy is stored with."""
+        return NetworkPolicySpec if self.start is None else ObservedPolicySpec
+
+    @property
+    def kind(self) -> str:
+        """What the rows of metrics.json call it: policy, network, or constants."""
+        if self.start is None:
+            return "network"
+        return "policy" if self.units else "constants"
+
+    @model_validator(mode="after")
+    def _something(self) -> RecurrentConfig:
+        if self.start is None and self.units == 0:
+            raise ValueError("units: a policy without a law needs a network, at least one unit")
+        return self
 
 
 class JudgedConditions(Config):
@@ -154,8 +174,7 @@ class AutopilotSettings(ComputingTask):
         predictive: the document's own autopilots, by name.
         conditions: that all controllers are tuned, trained and judged under; null to tune linear
             peers for the step of `test` alone.
-        recurrent: policies with observer, predictor and recurrent network, by name, trained under
-            `conditions`.
+        recurrent: policies with a recurrent network, by name, trained under `conditions`.
         peers: by name; gains that are left out are tuned.
         floor: peer that knows the vessel exactly: the others are measured in multiples of its
             settling time.
@@ -202,6 +221,8 @@ class AutopilotSettings(ComputingTask):
         for name, wanted in self.recurrent.items():
             if self.conditions is None:
                 raise ValueError(f"recurrent.{name}: give 'conditions' to train it under")
+            if wanted.start is None:
+                continue
             if not isinstance(self.peers.get(wanted.start), ObservedConfig):
                 raise ValueError(
                     f"recurrent.{name}.start: '{wanted.start}' must name a peer of kind ptos or"

@@ -80,13 +80,13 @@ def run_autopilot(config: AutopilotSettings, folder: RunFolder) -> Outcome:
     judged = dict(controllers)
     if config.conditions is not None:
         for name, learner in config.recurrent.items():
-            start = complete[learner.start]
-            assert isinstance(start, ObservedConfig)
+            start = None if learner.start is None else complete[learner.start]
+            assert start is None or isinstance(start, ObservedConfig)
             spec, observed, found = trained_policy(
                 name, learner, start, steering, config, config.conditions, folder
             )
             notes[name] = {key: value for key, value in found.items() if key != "curve"}
-            learned = {name: ("policy" if learner.units else "constants", observed)}
+            learned = {name: (learner.kind, observed)}
             controllers = {**learned, **controllers}
             judged = {**learned, **companions(name, learner, spec, observed), **judged}
     folder.write_json(

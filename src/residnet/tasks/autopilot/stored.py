@@ -6,7 +6,7 @@ from pathlib import Path
 
 from residnet.control.heading.keeper import HeadingKeeper
 from residnet.control.heading.stored import load_heading_policy
-from residnet.control.observed.stored import load_observed_policy
+from residnet.control.observed.stored import load_recurrent
 from residnet.tasks.autopilot.config import AutopilotSettings
 
 
@@ -16,7 +16,10 @@ def stored_policy(config: AutopilotSettings, models: Path, name: str, dt: float)
     Raises:
         UsageError: where the run lacks it, or it is not as it was written.
     """
-    load = load_observed_policy if name in config.recurrent else load_heading_policy
-    policy: HeadingKeeper = load(models / name)
+    policy: HeadingKeeper
+    if name in config.recurrent:
+        policy = load_recurrent(models / name, config.recurrent[name].spec)
+    else:
+        policy = load_heading_policy(models / name)
     policy.at(dt)
     return policy

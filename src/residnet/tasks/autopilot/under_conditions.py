@@ -15,7 +15,7 @@ from residnet.control.heading.controllers import Steering, TunableConfig
 from residnet.control.heading.steering import SteeredPlant
 from residnet.control.observed.config import AnyController, ObservedConfig
 from residnet.control.observed.policy import ObservedPolicy
-from residnet.control.observed.stored import ObservedPolicySpec
+from residnet.control.observed.stored import RecurrentPolicy, RecurrentSpec
 from residnet.core.progress import report, say
 from residnet.dynamics.store import rebuilt
 from residnet.export.c.closed_loop import CompiledLoop
@@ -62,16 +62,19 @@ def tuned_peer(
 def trained_policy(
     name: str,
     wanted: RecurrentConfig,
-    start: ObservedConfig,
+    start: ObservedConfig | None,
     steering: Steering,
     config: AutopilotSettings,
     stated: JudgedConditions,
     folder: RunFolder,
-) -> tuple[ObservedPolicySpec, ObservedPolicy, dict[str, Any]]:
-    """Return a policy trained under the conditions, with its description and notes."""
+) -> tuple[RecurrentSpec, RecurrentPolicy, dict[str, Any]]:
+    """Return a policy trained under the conditions, with its description and notes.
+
+    `start` is the law that its network stands beside; None for none.
+    """
     torch.manual_seed(config.seed)
     vessel = in_weather(config, stated)
-    spec = ObservedPolicySpec.model_validate(
+    spec = wanted.spec.model_validate(
         {
             "state": steering.vessel.state,
             "gain": steering.turning.gain,
@@ -81,8 +84,8 @@ def trained_policy(
             "rate": steering.vessel.rate,
             "dt": steering.dt,
             "trained_at": wanted.training.dt,
-            "law": start.model_dump(),
             "units": wanted.units,
+            **({} if start is None else {"law": start.model_dump()}),
         }
     )
     policy, store = spec.build(), FolderStore(folder)
@@ -112,16 +115,19 @@ def trained_policy(
 
 
 def companions(
-    name: str, wanted: RecurrentConfig, spec: ObservedPolicySpec, policy: ObservedPolicy
+    name: str, wanted: RecurrentConfig, spec: RecurrentSpec, policy: RecurrentPolicy
 ) -> Controllers:
-    """Return what a trained policy is compared with: itself untrained, and without its network."""
+    """Return what a trained policy is compared with: itself untrained, and without its network.
+
+    A network alone gives nothing in both cases, and stands there once.
+    """
     if wanted.units == 0:
         return {}
     untrained = spec.build().eval().requires_grad_(False).double()
-    return {
-        f"{name} untrained": ("untrained", untrained),
-        f"{name} network off": ("network_off", policy.without_network()),
-    }
+    found: Controllers = {f"{name} untrained": ("untrained", untrained)}
+    if isinstance(policy, ObservedPolicy):
+        found[f"{name} network off"] = ("network_off", policy.without_network())
+    return found
 
 
 def judge_all(

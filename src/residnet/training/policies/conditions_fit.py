@@ -1,4 +1,4 @@
-"""Training of an observed policy under stated conditions, through the whole closed loop."""
+"""Training of a recurrent policy under stated conditions, through the whole closed loop."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from torch import Tensor, nn
 
 from residnet.control.conditions.config import ConditionsConfig, HeadingChanges
 from residnet.control.conditions.flights import Compiler, ConditionedRun, Flying
+from residnet.control.heading.keeper import HeadingKeeper
 from residnet.control.heading.steering import SteeredVessel
-from residnet.control.observed.policy import ObservedPolicy
 from residnet.core.errors import ExportError
 from residnet.core.progress import say
 from residnet.dynamics.rollout import Rollout
@@ -38,7 +38,7 @@ class ConditionsFit(EpochTraining):
 
     def __init__(
         self,
-        policy: ObservedPolicy,
+        policy: HeadingKeeper,
         vessel: SteeredVessel,
         settings: ConditionsTraining,
         conditions: ConditionsConfig,
@@ -141,7 +141,7 @@ def _flying(
 
 def train_under_conditions(
     name: str,
-    policy: ObservedPolicy,
+    policy: HeadingKeeper,
     vessel: SteeredVessel,
     settings: ConditionsTraining,
     conditions: ConditionsConfig,
