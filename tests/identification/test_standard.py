@@ -138,7 +138,8 @@ def test_what_does_not_go_with_the_recipe(changes: dict[str, Any], said: str) ->
 
 
 def test_terms_follow_from_what_moves() -> None:
-    whole = Facts.supposed(("u", "v", "r", "n", "delta", "wind_u", "wind_v", "wind_mag"))
+    names = ("u", "v", "r", "n", "delta", "wind_u", "wind_v", "wind_mag")
+    whole = replace(Facts.supposed(names), samples=20_000)
     hull = portfolio(whole)["baselines"]["hull"]["terms"]
     assert {"u|u|", "n|n|", "|n| u", "n|n| delta", "wind_u wind_mag"} <= set(hull)
     assert "n^2" not in hull
@@ -148,6 +149,26 @@ def test_terms_follow_from_what_moves() -> None:
     assert not [term for term in hull if "wind" in term]
     still = replace(whole, moving=("delta",))
     assert not [t for t in portfolio(still)["baselines"]["hull"]["terms"] if "n" in t.split()]
+
+
+def test_short_logs_give_each_axis_the_terms_that_a_symmetric_vessel_has() -> None:
+    names = ("u", "v", "r", "n", "delta")
+    rows = portfolio(Facts.supposed(names))["baselines"]["hull"]["terms"]
+    assert {"1", "u", "u|u|", "v r", "n", "n|n|", "|n| u"} == set(rows["u"])
+    assert {"u v", "v|r|", "u|u| delta", "n|n| delta", "n|n|", "1"} <= set(rows["v"])
+    assert not {"u", "u|u|", "|n| u", "v r"} & set(rows["r"])
+    paired = SignalsConfig(inputs=("left", "right"), pairs=(("left", "right"),)).build().names
+    rows = portfolio(Facts.supposed(paired))["baselines"]["hull"]["terms"]
+    assert {"left", "right|right|", "|left| u"} <= set(rows["r"])
+    assert "u|u|" not in rows["r"]
+    assert portfolio(Facts.supposed(paired))["heads"]["network"]["mirror"]
+
+
+def test_the_models_of_the_recipe_cannot_run_away() -> None:
+    plan = portfolio(Facts.supposed(("u", "v", "r", "n", "delta")))
+    for part in (plan["baseline"], *plan["baselines"].values()):
+        assert part["bounded"]
+        assert part["dissipative"]
 
 
 def test_horizons_fit_into_the_logs() -> None:

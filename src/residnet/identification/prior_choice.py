@@ -22,12 +22,14 @@ from residnet.identification.settings import FitSettings
 from residnet.judge.config import EvaluationConfig
 from residnet.judge.freerun import Candidate, FreeRun, Prediction, free_run
 from residnet.judge.protocol import Window, Windows, overlapping
-from residnet.judge.verdict.selection import blocks_of, shares
+from residnet.judge.verdict.selection import Blocks, blocks_of, shares
 from residnet.training.refit import refit
 from residnet.training.refit_config import RefitConfig
 
 _ITERATIONS = 3
 """Steps of Gauss-Newton for each strength, each search going on where the last one ended."""
+_ALIKE = 1.0 + 1e-9
+"""Standard errors by which divergences may differ; rounding apart."""
 Prior = float | None
 """A strength of the prior; None for least squares as it is."""
 
@@ -56,8 +58,8 @@ def choose_prior(
 ) -> PriorChoice:
     """Return the strongest prior that is within one paired standard error of the best.
 
-    Fewer divergences come before less error. A refit that fails in a fold counts there as if every
-    window had diverged.
+    Fewer divergences, by more than one standard error, come before less error. A refit that fails
+    in a fold counts there as if every window had diverged.
 
     Args:
         name: of the baseline.
@@ -164,6 +166,26 @@ def _moved(window: Window, offset: int) -> Window:
     return Window(window.log + offset, window.start, window.stop, window.past, window.nu)
 
 
+def _steady(
+    run: FreeRun, blocks: Blocks, labels: Sequence[np.ndarray], priors: Sequence[Prior]
+) -> list[Prior]:
+    """Return the priors that diverge no more often than the steadiest, by one standard error.
+
+    What happens in one part of the logs alone decides nothing.
+    """
+    lost = {p: np.zeros(len(blocks.weights)) for p in priors}
+    for p, parts in lost.items():
+        for label, prediction in zip(labels, run.predictions[_key(p)], strict=True):
+            parts[label[0]] += prediction.diverged
+    least = min(priors, key=lambda p: float(lost[p].sum()))
+    return [
+        p
+        for p in priors
+        if float((lost[p] - lost[least]).sum())
+        <= blocks.standard_error(lost[p], lost[least]) * _ALIKE
+    ]
+
+
 def _chosen(
     priors: Sequence[Prior],
     run: FreeRun,
@@ -174,7 +196,7 @@ def _chosen(
     scales, count = evaluation.scales.named(), len(blocks.weights)
     parts = {p: shares(run, _key(p), logs, scales, labels, count) for p in priors}
     lost = {p: sum(one.diverged for one in run.predictions[_key(p)]) for p in priors}
-    steady = [p for p in priors if lost[p] == min(lost.values())]
+    steady = _steady(run, blocks, labels, priors)
     best = min(steady, key=lambda p: float(parts[p].sum()))
     apart = {p: float((parts[p] - parts[best]).sum()) for p in priors}
     spread = {p: blocks.standard_error(parts[p], parts[best]) for p in priors}

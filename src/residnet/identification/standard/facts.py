@@ -52,9 +52,9 @@ class Facts:
     samples: int
 
     @classmethod
-    def supposed(cls, names: Sequence[str], step: float = 0.1) -> Facts:
+    def supposed(cls, names: tuple[str, ...], step: float = 0.1) -> Facts:
         """Return facts before any log is read: every channel moves, ahead only."""
-        return cls(tuple(names), _acting(names), (), step, _USUAL, 0.1 * _USUAL, math.inf, 10_000)
+        return cls(names, _acting(names), (), step, _USUAL, 0.1 * _USUAL, math.inf, 10_000)
 
     @classmethod
     def of(
@@ -72,7 +72,7 @@ class Facts:
             evaluation: protocols.
             step: of the grid, s.
         """
-        z, names = samples.z, tuple(samples.names)
+        z, names = samples.z, samples.names
         spread, size = z.std(0, correction=0), z.abs().amax(0)
         moving = [
             name

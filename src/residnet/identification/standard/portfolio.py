@@ -20,7 +20,6 @@ PARTS = ("baseline", "baselines", "refit", "heads", "base_of", "forces", "ensemb
 TIED = "tied"
 """Name of the mean of the models within one standard error of the best."""
 _FROZEN, _TOGETHER = "hull_network", "hull_network_calibrated"
-_RIDGE = 1e-4
 
 
 def portfolio(facts: Facts, effort: float = 1.0) -> dict[str, Any]:
@@ -41,8 +40,8 @@ def portfolio(facts: Facts, effort: float = 1.0) -> dict[str, Any]:
     heads = {_FROZEN: network, _TOGETHER: network, "linear_network": network, "network": alone}
     training = training_settings(facts, effort)
     return {
-        "baseline": {"kind": "regressors", "ridge": 1e-6, "terms": linear_terms(facts)},
-        "baselines": {"hull": {"kind": "regressors", "ridge": _RIDGE, "terms": hull_terms(facts)}},
+        "baseline": _regressors(1e-6, linear_terms(facts)),
+        "baselines": {"hull": _regressors(1e-4, hull_terms(facts))},
         "refit": {"baseline": refit_settings(facts), "hull": refit_settings(facts)},
         "heads": heads,
         "base_of": {
@@ -65,9 +64,10 @@ def _knows_wind(facts: Facts) -> bool:
     return any(name in WIND_CHANNELS for name in facts.names)
 
 
-def _regressors(terms: list[str]) -> dict[str, Any]:
+def _regressors(ridge: float, terms: list[str] | dict[str, list[str]]) -> dict[str, Any]:
+    """Return a model of regressors that neither feeds itself energy nor runs away."""
     sound = {"dissipative": True, "bounded": True}
-    return {"kind": "regressors", "ridge": _RIDGE, "terms": terms, **sound}
+    return {"kind": "regressors", "ridge": ridge, "terms": terms, **sound}
 
 
 def _network(facts: Facts) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from residnet.core.names import VELOCITY
 from residnet.identification.standard.facts import Facts
 from residnet.physics.signals import FORCE_CHANNELS
+from residnet.physics.symmetry import wrong_parity
 
 _HULL = ("u v", "u r", "v r", "u|u|", "v|v|", "r|r|", "v|r|", "r|v|")
 _WIND = (
@@ -32,18 +33,37 @@ def linear_terms(facts: Facts) -> list[str]:
     return ["1", *VELOCITY, *facts.inputs, *wind]
 
 
-def hull_terms(facts: Facts) -> list[str]:
+def hull_terms(facts: Facts) -> list[str] | dict[str, list[str]]:
     """Return the terms of a manoeuvring model: hull, propellers, rudders and wind.
 
     A rudder is known by its name. Every other input is taken for a propeller: a force that is
     linear and quadratic in it and falls with the inflow. Forces act as they are.
+
+    Short logs give each axis the terms that a mirror-symmetric vessel has there, and what a lone
+    propeller adds to them: half as many coefficients as all terms in all axes.
     """
+    terms = _terms(facts)
+    if _long(facts):
+        return terms
+    kept = ("1", *(f"{name}|{name}|" for name in facts.inputs))
+    return {
+        axis: [t for t in terms if t in kept or not wrong_parity(t, number, facts.names)]
+        for number, axis in enumerate(VELOCITY)
+    }
+
+
+def _long(facts: Facts) -> bool:
+    return facts.samples * facts.step >= _LONG
+
+
+def _terms(facts: Facts) -> list[str]:
+    """Return the terms of all axes together."""
     forces = [name for name in facts.inputs if name in FORCE_CHANNELS]
     acting = [name for name in facts.inputs if name not in forces]
     turning = [name for name in acting if _turns(name)]
     driving = [name for name in acting if name not in turning]
     more = list(_WIND) if facts.wind else []
-    if facts.samples * facts.step >= _LONG:
+    if _long(facts):
         more += ["wind_mag r", "wind_u r"] if facts.wind else []
         more += [*_FURTHER, *(term for n in driving for term in (f"{n} v", f"{n} r"))]
         more += [term for name in turning for term in _large_angles(name, driving)]
