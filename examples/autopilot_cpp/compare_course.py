@@ -23,6 +23,11 @@ import torch
 COLUMNS = ("x", "y", "psi", "r", "delta")
 
 
+def measured(x: float, y: float, psi: float, speed: float, r: float) -> torch.Tensor:
+    """What the controller sees [1, 6]."""
+    return torch.tensor([[x, y, psi, speed, 0.0, r]], dtype=torch.float64)
+
+
 def fly(module: Any, card: dict[str, Any], seconds: float) -> tuple[list[tuple[float, ...]], float]:
     """`COLUMNS` by step until the course ends, and the median time of a step in microseconds."""
     k, constant, speed, dt = (
@@ -35,9 +40,9 @@ def fly(module: Any, card: dict[str, Any], seconds: float) -> tuple[list[tuple[f
     decay, half = math.exp(-dt / constant), math.exp(-0.5 * dt / constant)
     track, taken = [], []
     with torch.inference_mode():
-        memory = module.initial_state(torch.tensor([[x, y, psi, speed, 0.0, r]]))
+        memory = module.initial_state(measured(x, y, psi, speed, r))
         for _ in range(round(seconds / dt)):
-            seen = torch.tensor([[x, y, psi, speed, 0.0, r]])
+            seen = measured(x, y, psi, speed, r)
             begin = time.perf_counter()
             command, memory, _, arrived = module.step(seen, memory)
             delta = float(command)
@@ -69,9 +74,7 @@ def eager(run: Path, card: dict[str, Any]) -> Any:
     config = load_config(folder.resolved, [], CourseTaskConfig)
     known = ready(config, folder)
     _, guidance = plan_for(config, known, card["protocol"])
-    return ExportedCourse(
-        load_policy(known.run.path, config.policy, known.steering), guidance, config.safe
-    ).eval()
+    return ExportedCourse(load_policy(known, config.policy), guidance, config.safe).eval()
 
 
 def main() -> None:

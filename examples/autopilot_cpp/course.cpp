@@ -32,11 +32,11 @@ int main(int argc, char** argv) {
 
     double x = std::atof(argv[7]), y = std::atof(argv[8]), psi = std::atof(argv[9]), r = 0.0;
     const double decay = std::exp(-dt / time);
-    auto seen = torch::zeros({1, 6});
-    float* measured = seen.data_ptr<float>();
+    auto seen = torch::zeros({1, 6}, torch::kFloat64);
+    double* measured = seen.data_ptr<double>();
     auto measure = [&] {
       const double values[] = {x, y, psi, speed, 0.0, r};
-      for (int i = 0; i < 6; ++i) measured[i] = static_cast<float>(values[i]);
+      for (int i = 0; i < 6; ++i) measured[i] = values[i];
     };
     measure();
     torch::Tensor memory = module.get_method("initial_state")({seen}).toTensor();
@@ -49,7 +49,7 @@ int main(int argc, char** argv) {
       times.begin();
       const auto answer = step({seen, memory});
       const auto& parts = answer.toTupleRef().elements();
-      const double delta = parts[0].toTensor().item<float>();
+      const double delta = parts[0].toTensor().item<double>();
       memory = parts[1].toTensor();
       const bool fault = parts[2].toTensor().item<bool>();
       arrived = parts[3].toTensor().item<bool>();

@@ -59,8 +59,8 @@ def made(
     )
     return (
         loaded,
-        Following(policy, MEASURED, limit=LIMIT, dt=0.02, rate=0.2),
-        guidance.float(),
+        Following(policy.double(), MEASURED, limit=LIMIT, dt=0.02, rate=0.2),
+        guidance.double(),
         card,
     )
 
@@ -69,7 +69,7 @@ def test_it_commands_what_guidance_and_policy_command(
     made: tuple[torch.jit.ScriptModule, Following, CourseGuidance, dict[str, Any]],
 ) -> None:
     loaded, follower, guidance, card = made
-    y = torch.tensor([[0.1, 0.3, 0.05, 3.2, 0.01, 0.02]])
+    y = torch.tensor([[0.1, 0.3, 0.05, 3.2, 0.01, 0.02]], dtype=torch.float64)
     s, place, memory, last = (
         loaded.initial_state(y),
         guidance.initial_state(y),
@@ -78,14 +78,15 @@ def test_it_commands_what_guidance_and_policy_command(
     )
     for k in range(200):
         y = torch.tensor(
-            [[0.064 * k, 0.3 + 0.001 * k, 0.002 * k, 3.2, 0.01, 0.1 * math.sin(0.1 * k)]]
+            [[0.064 * k, 0.3 + 0.001 * k, 0.002 * k, 3.2, 0.01, 0.1 * math.sin(0.1 * k)]],
+            dtype=torch.float64,
         )
         command, s, fault, arrived = loaded.step(y, s)
         reference, place = guidance(y, k, place)
         wish, memory = follower(y, reference, memory)
         # the rudder's rate is inside
         last += min(max(float(wish) - last, -0.2 * 0.02), 0.2 * 0.02)
-        assert float(command) == pytest.approx(last, abs=1e-6)
+        assert float(command) == pytest.approx(last, abs=1e-12)
         assert not bool(fault)
         assert not bool(arrived)
     assert len(card["memory"]) == s.shape[1]

@@ -34,7 +34,10 @@ _FAR = 1e3
 
 
 class ExportedCourse(nn.Module):
-    """What a controller calls once per step; float32, SI and radians.
+    """What a controller calls once per step; float64, SI and radians.
+
+    Single precision does not tell places along a course of some hundred metres well enough: two
+    programs that round differently would steer 1 mm apart.
 
     The memory s is that of the guidance (place along the course, and the drift where it is
     estimated), of the policy, and the last command. `fault` tells that a measurement or the memory
@@ -48,11 +51,11 @@ class ExportedCourse(nn.Module):
         self, policy: HeadingKeeper, guidance: CourseGuidance, safe: Literal["hold", "amidships"]
     ) -> None:
         super().__init__()
-        policy = copy.deepcopy(policy).float().eval().requires_grad_(False)
+        policy = copy.deepcopy(policy).double().eval().requires_grad_(False)
         policy.read_from(MEASURED)
         rate = None if math.isinf(policy.rate) else policy.rate
         self.follower = Following(policy, MEASURED, limit=policy.limit, dt=policy.dt, rate=rate)
-        self.guidance = copy.deepcopy(guidance).float()
+        self.guidance = copy.deepcopy(guidance).double()
         self.guidance.x, self.guidance.y, self.guidance.psi, self.guidance.u, self.guidance.v = (
             range(5)
         )
@@ -62,8 +65,8 @@ class ExportedCourse(nn.Module):
         circles = 2000.0 * math.pi
         low = [float(north.min()) - far, float(east.min()) - far, -circles, 0.0, -fast, -turn]
         high = [float(north.max()) + far, float(east.max()) + far, circles, fast, fast, turn]
-        self.register_buffer("low", torch.tensor(low, dtype=torch.float32))
-        self.register_buffer("high", torch.tensor(high, dtype=torch.float32))
+        self.register_buffer("low", torch.tensor(low, dtype=torch.float64))
+        self.register_buffer("high", torch.tensor(high, dtype=torch.float64))
         self.low: Tensor
         self.high: Tensor
         # relative to the course's motion: rudder and yaw rate may differ by twice their ranges
@@ -77,10 +80,10 @@ class ExportedCourse(nn.Module):
             *memory_ranges,
         ]
         self.register_buffer(
-            "memory_low", torch.tensor([limit[0] for limit in ranges], dtype=torch.float32)
+            "memory_low", torch.tensor([limit[0] for limit in ranges], dtype=torch.float64)
         )
         self.register_buffer(
-            "memory_high", torch.tensor([limit[1] for limit in ranges], dtype=torch.float32)
+            "memory_high", torch.tensor([limit[1] for limit in ranges], dtype=torch.float64)
         )
         self.memory_low: Tensor
         self.memory_high: Tensor
@@ -99,7 +102,7 @@ class ExportedCourse(nn.Module):
         It stands at the beginning of the course, rudder amidships.
         """
         require_shape("measured", y, [size(y, 2, 0), self.low.numel()])
-        return self._begun(y.to(torch.float32))
+        return self._begun(y.to(torch.float64))
 
     def _begun(self, y: Tensor) -> Tensor:
         y = torch.where(self._good(y).unsqueeze(-1), y, torch.zeros_like(y))
@@ -126,7 +129,7 @@ class ExportedCourse(nn.Module):
         rows = size(y, 2, 0)
         require_shape("measured", y, [rows, self.low.numel()])
         require_shape("s", s, [rows, self.memory_low.numel()])
-        y, s = y.to(torch.float32), s.to(torch.float32)
+        y, s = y.to(torch.float64), s.to(torch.float64)
         good = self._good(y).unsqueeze(-1)
         y = torch.where(good, y, torch.zeros_like(y))
         last = torch.nan_to_num(s[:, -1:]).clamp(-self.limit, self.limit)
@@ -205,11 +208,11 @@ def check_parity(name: str, module: ExportedCourse, exported: Any, course: Cours
     Raises:
         ExportError: where it exceeds 1e-4, a command is no number, or a wrong input raises no flag.
     """
-    steps = torch.arange(PARITY_STEPS, dtype=torch.float32)
+    steps = torch.arange(PARITY_STEPS, dtype=torch.float64)
     at = (steps * module.dt * module.speed / course.step).long().clamp(max=len(course.track) - 1)
     track, heading = (
-        torch.from_numpy(course.track).float()[at],
-        torch.from_numpy(course.heading).float()[at],
+        torch.from_numpy(course.track)[at],
+        torch.from_numpy(course.heading)[at],
     )
     aside = 0.1 * module.guidance.lookahead
     y = torch.stack(
@@ -281,6 +284,7 @@ def _card(
             f" {'held' if safe == 'hold' else 'amidships'}, flag set"
         ),
         **policy_entries(policy),
+        "dtype": "float64",
         **about,
         "metrics": [dict(row) for row in metrics],
         "parity": {"steps": PARITY_STEPS, "share_of_limit": parity},

@@ -26,25 +26,29 @@ class CompiledPolicy:
     """A policy's C file as a library, with the methods of the module that it came from.
 
     Args:
-        library: compiled in single precision.
+        library: compiled.
         prefix: of its names.
         programs: of its functions `initial_state` and `step`, for the sizes of their results.
+        double: whether it was compiled in double precision.
     """
 
-    def __init__(self, library: Path, prefix: str, programs: Mapping[str, Program]) -> None:
+    def __init__(
+        self, library: Path, prefix: str, programs: Mapping[str, Program], double: bool
+    ) -> None:
         self._loaded, self._prefix, self._programs = ctypes.CDLL(str(library)), prefix, programs
+        self._real: Any = np.float64 if double else np.float32
 
     def _call(self, name: str, given: Sequence[Tensor]) -> list[Tensor]:
         """Return the results of a function for one row, in their order."""
         program = self._programs[name]
-        arrays = [np.ascontiguousarray(part[0].numpy(), np.float32) for part in given]
+        arrays = [np.ascontiguousarray(part[0].numpy(), self._real) for part in given]
         out: dict[str, np.ndarray] = {}
         back = None
         for result, kind, cells in program.results:
             if kind == "flag" and back is None and cells.size == 1:
                 back = result
             else:
-                out[result] = np.zeros(cells.size, np.float32 if kind == "real" else np.int32)
+                out[result] = np.zeros(cells.size, self._real if kind == "real" else np.int32)
         function = getattr(self._loaded, f"{self._prefix}_{name}")
         pointers = [array.ctypes.data for array in (*arrays, *out.values())]
         function.argtypes = [ctypes.c_void_p] * len(pointers)
@@ -53,7 +57,7 @@ class CompiledPolicy:
         return [
             torch.tensor([bool(flag)])
             if result == back
-            else torch.from_numpy(out[result].astype(bool if kind == "flag" else np.float32))[None]
+            else torch.from_numpy(out[result].astype(bool if kind == "flag" else self._real))[None]
             for result, kind, _ in program.results
         ]
 
@@ -74,6 +78,8 @@ def export_policy(
     card: Mapping[str, Any],
     file: Path,
     check: Callable[[Any], float],
+    *,
+    double: bool = False,
 ) -> None:
     """Write a policy's source, header and card once the compiled file has been checked.
 
@@ -85,11 +91,14 @@ def export_policy(
         card: stands in the header too.
         file: the .c file.
         check: compares what behaves like the module with it; raises ExportError.
+        double: whether the file is in double precision alone, as the module is; otherwise it is in
+            single precision unless its user defines otherwise.
     """
     prefix, what = identifier(name), f"policy {name}"
     module = copy.deepcopy(module).eval()
     inner: Any = module
-    examples = [torch.zeros(1, size) for _, size in arguments]
+    dtype = torch.float64 if double else torch.float32
+    examples = [torch.zeros(1, size, dtype=dtype) for _, size in arguments]
     programs = {
         "initial_state": lowered(
             lambda y: inner.initial_state(y), arguments[:1], ["s"], what, examples[:1]
@@ -122,13 +131,14 @@ def export_policy(
         sizes,
         f"{name}: a policy, written by residnet. All arrays are the caller's.\n\n"
         + json.dumps(card, indent=1),
+        double_only=double,
     )
     with tempfile.TemporaryDirectory() as folder:
         source = Path(folder) / file.name
         source.write_text(source_text)
         (Path(folder) / header).write_text(header_text)
         library = compile_shared([source], Path(folder) / "policy.so")
-        parity = check(CompiledPolicy(library, prefix, programs))
+        parity = check(CompiledPolicy(library, prefix, programs, double))
     stored = {**card, "format": "c", "parity": {**card["parity"], "share_of_limit": parity}}
     file.parent.mkdir(parents=True, exist_ok=True)
     file.with_suffix(".h").write_text(header_text)

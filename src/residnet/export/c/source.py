@@ -71,8 +71,10 @@ def h_file(
     extra: Sequence[tuple[str, str]],
     sizes: Mapping[str, tuple[int | str, str]],
     about: str,
+    *,
+    double_only: bool = False,
 ) -> str:
-    """Return the header.
+    """Return the header file, with the comment that tells how to use it.
 
     Args:
         prefix: see `c_file`.
@@ -80,6 +82,7 @@ def h_file(
         extra: comment and prototype of further functions.
         sizes: value and comment of each constant, by name without prefix.
         about: comment at the top.
+        double_only: whether single precision is not offered.
     """
     guard = f"{prefix.upper()}_H"
     comment = "\n".join(f" * {line}".rstrip() for line in about.replace("*/", "* /").splitlines())
@@ -97,10 +100,23 @@ def h_file(
     return (
         f"/*\n{comment}\n */\n#ifndef {guard}\n#define {guard}\n\n#include <stddef.h>\n\n"
         f'#ifdef __cplusplus\nextern "C" {{\n#endif\n\n'
-        f"/* define {prefix.upper()}_DOUBLE for double precision, here and in the source file */\n"
-        f"#ifdef {prefix.upper()}_DOUBLE\ntypedef double {prefix}_real;\n"
-        f"#else\ntypedef float {prefix}_real;\n#endif\n\n{numbers}\n\n{prototypes}\n\n"
+        f"{_precision(prefix, double_only)}\n{numbers}\n\n{prototypes}\n\n"
         "#ifdef __cplusplus\n}\n#endif\n\n#endif\n"
+    )
+
+
+def _precision(prefix: str, double_only: bool) -> str:
+    """Return the lines that say what a real number is."""
+    macro = f"{prefix.upper()}_DOUBLE"
+    if double_only:
+        return (
+            f"/* in double precision alone: single would not follow it closely enough */\n"
+            f"#ifndef {macro}\n#define {macro}\n#endif\ntypedef double {prefix}_real;\n"
+        )
+    return (
+        f"/* define {macro} for double precision, here and in the source file */\n"
+        f"#ifdef {macro}\ntypedef double {prefix}_real;\n"
+        f"#else\ntypedef float {prefix}_real;\n#endif\n"
     )
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import pandas as pd
@@ -23,14 +22,12 @@ from residnet.control.guidance.waypoints import WaypointGuidance
 from residnet.control.guidance.wheel_over import WheelOver
 from residnet.control.heading.controllers import Steering
 from residnet.control.heading.following import Following
-from residnet.control.heading.keeper import HeadingKeeper
 from residnet.core.progress import say
 from residnet.judge.courses import CourseFlight, row, spread_row
 from residnet.judge.metrics import SCHEMA
 from residnet.report.sections.course import COURSES, SPREAD, TRACKS, text_of
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import MainFigure, Outcome
-from residnet.tasks.autopilot.config import AutopilotSettings
 from residnet.tasks.course.autopilot_run import (
     AutopilotRun,
     autopilot_of,
@@ -38,6 +35,7 @@ from residnet.tasks.course.autopilot_run import (
     ready,
 )
 from residnet.tasks.course.config import CourseSettings
+from residnet.tasks.course.exporting import CourseExport
 from residnet.tasks.course.flights import NOMINAL, Vessels, fly
 from residnet.tasks.course.peers import load_peers
 from residnet.tasks.course.tables import plan_table, spread_table, track_table
@@ -99,7 +97,9 @@ def run_course(config: CourseSettings, folder: RunFolder) -> Outcome:
         for name in controllers:
             for sight in (None, *(config.line_of_sight if protocol == "enter" else ())):
                 _fly(config, planned, steering, name, controllers[name], sight, done)
-        exports.append(_Export(folder.exports, config, planned, guidance, trained, known.autopilot))
+        exports.append(
+            CourseExport(folder.exports, config, planned, guidance, trained, known.autopilot)
+        )
     shown = {
         "schema": SCHEMA,
         "run": config.name,
@@ -154,48 +154,6 @@ def _main_figures(config: CourseSettings, rows: Sequence[dict[str, Any]]) -> dic
         figures[f"{protocol}_ratio"] = MainFigure(flight["ratio"])
         figures[f"{protocol}_cross_track_rms"] = MainFigure(flight["cross_track_rms"], "m")
     return figures
-
-
-class _Export(NamedTuple):
-    """A policy with the guidance along one plan, to be exported when the run ends."""
-
-    folder: Path
-    config: CourseSettings
-    planned: PlannedCourse
-    guidance: CourseGuidance
-    policy: HeadingKeeper
-    autopilot: AutopilotSettings
-
-    @property
-    def name(self) -> str:
-        """Name of the file without its ending."""
-        return f"{self.config.policy}_{self.planned.protocol}"
-
-    def write(self, rows: Sequence[dict[str, Any]]) -> Path:
-        """Export, with the policy's rows of metrics.json in the card; returns the file."""
-        from residnet.export.course import export_course
-
-        config, protocol = self.config, self.planned.protocol
-        file = self.folder / f"{self.name}.pt"
-        about = {
-            "vessel": self.autopilot.vessel,
-            "course": config.course.model_dump(mode="json"),
-            "protocol": protocol,
-        }
-        metrics = [
-            row for row in rows if row["protocol"] == protocol and row["model"] == config.policy
-        ]
-        export_course(
-            config.policy,
-            self.policy,
-            self.guidance,
-            self.planned.course,
-            file,
-            safe=config.safe,
-            about=about,
-            metrics=metrics,
-        )
-        return file
 
 
 class _Flown(NamedTuple):

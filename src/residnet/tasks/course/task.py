@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Sequence
-from typing import Literal, final
+from pathlib import Path
+from typing import ClassVar, Literal, final
 
+from residnet.core.errors import UsageError
+from residnet.core.names import nearest
 from residnet.report.blocks import Section
 from residnet.report.run_reader import RunFiles
 from residnet.runs.folder import RunFolder
@@ -16,6 +20,8 @@ from residnet.tasks.course.config import CourseSettings
 @final
 class CourseTaskConfig(CourseSettings):
     """A course past buoys, flown by a heading policy, its peers and laws of line of sight."""
+
+    verbs: ClassVar[tuple[str, ...]] = ("report", "export")
 
     task: Literal["course"]
 
@@ -50,3 +56,31 @@ class CourseTaskConfig(CourseSettings):
         files = RunFiles(run.path)
         draw(files)
         return sections(files)
+
+    def export_model(self, run: RunFolder, model: str, out: Path | None, file_format: str) -> Path:
+        """Return the file of a policy with the guidance of a course, named after both.
+
+        TorchScript was exported and checked when the run ended; C is written now.
+
+        Raises:
+            UsageError: where there is no such file, or another format is given.
+        """
+        names = {f"{self.policy}_{protocol}": protocol for protocol in self.protocols}
+        if model not in names:
+            raise UsageError(f"{run.path}: no export '{model}'{nearest(model, names)}")
+        if file_format not in ("torchscript", "c"):
+            raise UsageError(
+                f"{run.path}: courses are exported as torchscript or c, not as {file_format}"
+            )
+        file = run.exports / f"{model}.pt"
+        if not file.is_file():
+            raise UsageError(f"{file}: no such file; the run writes it at its end")
+        if file_format == "c":
+            from residnet.tasks.course.exporting import export_as_c
+
+            return export_as_c(self, run, names[model], file, out or file.with_suffix(".c"))
+        if out is None:
+            return file
+        out.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(file, out)
+        return out
