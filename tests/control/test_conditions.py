@@ -11,7 +11,7 @@ import torch
 from pydantic import ValidationError
 
 from residnet.control.base import Policy
-from residnet.control.conditions.config import ConditionsConfig, gauss_markov
+from residnet.control.conditions.config import ConditionsConfig, gauss_markov, wave_motion
 from residnet.control.conditions.evolution import EvolutionConfig, evolve
 from residnet.control.conditions.flights import (
     ConditionedFlights,
@@ -22,6 +22,7 @@ from residnet.control.conditions.flights import (
 from residnet.control.heading.controllers import PdConfig, Steering
 from residnet.control.heading.steering import SteeredPlant
 from residnet.control.heading.turning import Turning
+from residnet.judge.conditions import quiet
 from residnet.physics.vessel import load_vessel
 
 DEG = math.pi / 180
@@ -126,9 +127,36 @@ def test_the_slow_push_is_stationary_from_its_first_sample() -> None:
     assert torch.allclose(found.std(0), torch.ones(40), atol=0.06)
 
 
+def test_the_motion_in_waves_has_its_size_its_period_and_its_own_rate() -> None:
+    period = torch.full((300,), 7.0)
+    motion, rate = wave_motion(period, 1200, 0.05, torch.Generator().manual_seed(0)).unbind(2)
+    assert float(motion.std()) == pytest.approx(1.0, rel=0.03)
+    slope = (motion[:, 2:] - motion[:, :-2]) / 0.1
+    assert torch.allclose(slope, rate[:, 1:-1], atol=0.02)
+    power = torch.fft.rfft(motion).abs().square().mean(0)
+    assert float(power.argmax()) / (1200 * 0.05) == pytest.approx(1.0 / 7.0, rel=0.15)
+
+
+def test_waves_are_added_to_what_is_measured_and_change_nothing_else() -> None:
+    config = ConditionsConfig(dt=0.05, duration=10.0)
+    calm, rough = drawn(config, 60), drawn(config.model_copy(update={"waves": DEG}), 60)
+    assert torch.equal(calm.push, rough.push)
+    assert torch.equal(calm.variation, rough.variation)
+    added = (rough.noise - calm.noise)[:, :, 0].std(1)
+    assert float(added.min()) > 0.0
+    assert 0.4 * DEG < float(added.mean()) < 0.6 * DEG
+    assert float(quiet(config.model_copy(update={"waves": DEG})).waves) == 0.0
+
+
 @pytest.mark.parametrize(
     "wrong",
-    [{"effect": (1.2, 0.8)}, {"heading": (0.5, 4.0)}, {"delay": (-0.1, 0.2)}, {"wind": (9.0, 3.0)}],
+    [
+        {"effect": (1.2, 0.8)},
+        {"heading": (0.5, 4.0)},
+        {"delay": (-0.1, 0.2)},
+        {"wind": (9.0, 3.0)},
+        {"wave_period": (9.0, 4.0)},
+    ],
 )
 def test_ranges_are_in_order(wrong: dict[str, tuple[float, float]]) -> None:
     with pytest.raises(ValidationError, match="must be in order"):

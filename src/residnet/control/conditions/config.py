@@ -12,10 +12,13 @@ from torch import Tensor
 
 from residnet.core.config import Config, MetresPerSecond, Radians, RadiansPerSecond, Seconds
 from residnet.dynamics.steps import check_steps
+from residnet.physics.environment.waves import JonswapSpectrum
 
 Range = Annotated[tuple[float, float], Field(description="low and high multiple")]
 _EXTRA = ("push", "reference", "noise_psi", "noise_r", "delay")
 """Columns that stand behind the vessel's own inputs while flights are flown."""
+_SINES = 12
+"""That a motion with the waves is made of."""
 
 
 class ConditionsConfig(Config):
@@ -41,6 +44,10 @@ class ConditionsConfig(Config):
         duration: time in s from the change to the end of what is counted.
         wind: slowest and fastest wind in m/s from any direction; null for none.
         current: fastest current in m/s in any direction.
+        waves: largest standard deviation in rad of the heading's motion with the waves, evenly
+            drawn from zero on. Heading and yaw rate are measured with it; the error that is
+            counted is without it, since no rudder is quick enough against it.
+        wave_period: shortest and longest peak period in s of that motion, a JONSWAP spectrum.
         dt: step of vessel, sensors and controllers in s; with another one, as in training, the
             noise is scaled so that its spectrum stays the same.
         band: heading error in rad at which half of the cost of a large one is left.
@@ -61,6 +68,8 @@ class ConditionsConfig(Config):
     duration: Seconds = Field(default=14.0, gt=0)
     wind: tuple[MetresPerSecond, MetresPerSecond] | None = None
     current: MetresPerSecond = Field(default=0.0, ge=0)
+    waves: Radians = Field(default=0.0, ge=0, le=0.5)
+    wave_period: tuple[Seconds, Seconds] = (4.0, 9.0)
     dt: Seconds = Field(default=0.02, gt=0)
     band: Radians = Field(default=0.017453292519943295, gt=0)
     overshoot_weight: float = Field(default=0.5, ge=0)
@@ -73,6 +82,7 @@ class ConditionsConfig(Config):
             "time": (*self.time, 1e-6, 10.0),
             "delay": (*self.delay, 0.0, 60.0),
             "heading": (*self.heading, 1e-3, 3.1),
+            "wave_period": (*self.wave_period, 0.2, 60.0),
         }
         check_steps(self.hold + self.duration, self.dt)
         if self.wind is not None:
@@ -121,7 +131,7 @@ class ConditionsConfig(Config):
         sign = torch.where(torch.rand(rows, generator=random) < 0.5, -1.0, 1.0)
         effect, time = (1.0 + share * (even(*values) - 1.0) for values in (self.effect, self.time))
         bias = share * even(-self.bias, self.bias)
-        return HeadingChanges(
+        changes = HeadingChanges(
             heading=sign * even(*self.heading),
             start=torch.randint(0, hold + 1, (rows,), generator=random),
             variation=torch.stack((effect, time, bias), dim=1),
@@ -132,6 +142,11 @@ class ConditionsConfig(Config):
             dt=dt,
             count=steps - hold,
         )
+        if self.waves > 0:
+            # drawn last, so that all else is the same with waves and without
+            size, period = even(0.0, share * self.waves), even(*self.wave_period)
+            noise += size[:, None, None] * wave_motion(period, steps, dt, random)
+        return changes
 
     def _weather(self, rows: int, random: torch.Generator, share: float) -> dict[str, Tensor]:
         drawn = torch.rand(2, rows, generator=random)
@@ -146,6 +161,33 @@ class ConditionsConfig(Config):
             out["current_north"] = speed * torch.cos(around[1])
             out["current_east"] = speed * torch.sin(around[1])
         return out
+
+
+def wave_motion(period: Tensor, steps: int, dt: float, random: torch.Generator) -> Tensor:
+    """Return motions with the waves and their rates [B, T, 2], of unit variance before the rate.
+
+    Each is a sum of sines of random phase with a JONSWAP spectrum: the wave-frequency motion that
+    is added to the slow one (T. I. Fossen, Handbook of Marine Craft, 2011, section 8.2).
+
+    Args:
+        period: at the peak in s, [B].
+        steps: number T of steps.
+        dt: step in s.
+        random: source of phases and frequencies.
+    """
+    ratios = torch.linspace(0.7, 1.8, _SINES + 1)
+    # somewhere within its band each, so that the sum does not repeat itself
+    within = torch.rand(len(period), _SINES, generator=random)
+    ratio = ratios[:-1] + within * torch.diff(ratios)
+    form = JonswapSpectrum().density(ratio.numpy(), 1.0, 2.0 * math.pi)
+    power = torch.from_numpy(form).float()
+    amplitude = (2.0 * power / power.sum(1, keepdim=True)).sqrt()
+    omega = ratio * (2.0 * math.pi / period[:, None])
+    phase = 2.0 * math.pi * torch.rand(len(period), _SINES, generator=random)
+    angle = omega[:, None] * (dt * torch.arange(steps))[None, :, None] + phase[:, None]
+    motion = (amplitude[:, None] * torch.cos(angle)).sum(2)
+    rate = (-(amplitude * omega)[:, None] * torch.sin(angle)).sum(2)
+    return torch.stack((motion, rate), dim=2)
 
 
 def gauss_markov(rows: int, steps: int, step: float, random: torch.Generator) -> Tensor:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from residnet.judge.conditions import quiet_after
 from residnet.report.blocks import Block, Cell, Section, Table, Text
 from residnet.report.format import DEG, fixed, signed
 from residnet.report.run_reader import Content, RunFiles
@@ -165,14 +166,21 @@ def _texts(judged: Mapping[str, Any]) -> list[str]:
         f" {math.degrees(given['band']):.3g} deg) over {given['duration']:g} s from the change on,"
         f" plus {given['overshoot_weight']:g} s per deg of overshoot and"
         f" {given['travel_weight']:g} s per deg of rudder travel. Swing: largest movement, peak to"
-        " peak, from 20 s after a change on in flights without noise and slow push. Classical"
-        " controllers are tuned by the same cost, by differential evolution.",
+        f" peak, from {quiet_after(given['duration']):.3g} s after a change on in flights without"
+        " noise and slow push. Classical controllers are tuned by the same cost, by differential"
+        " evolution.",
     ]
     if given["wind"] or given["current"]:
         wind = f"wind of {given['wind'][0]:g} to {given['wind'][1]:g} m/s" if given["wind"] else ""
         current = f"current of up to {given['current']:g} m/s" if given["current"] else ""
         found = " and ".join(part for part in (wind, current) if part)
         texts.append(f"There is {found}, from all directions.")
+    if given.get("waves"):
+        texts.append(
+            "Heading and yaw rate are measured with the motion in waves, of up to"
+            f" {math.degrees(given['waves']):.3g} deg (standard deviation) and peak periods of"
+            f" {given['wave_period'][0]:g} to {given['wave_period'][1]:g} s."
+        )
     return texts
 
 

@@ -19,7 +19,7 @@ from residnet.control.observed.stored import RecurrentPolicy, RecurrentSpec
 from residnet.core.progress import report, say
 from residnet.dynamics.store import rebuilt
 from residnet.export.c.closed_loop import CompiledLoop
-from residnet.judge.conditions import QUIET_FLIGHTS, drawn, judged, quiet, swinging
+from residnet.judge.conditions import QUIET_FLIGHTS, drawn, judged, quiet, quiet_after, swinging
 from residnet.physics.vessel import load_vessel
 from residnet.runs.folder import RunFolder
 from residnet.runs.model_store import FolderStore
@@ -153,7 +153,7 @@ def judge_all(
             row, table = judged(name, kind, protocol, run, conditions, changes)
             rows.append(row)
             tables.append(table)
-        rows.append(swinging(name, kind, run, still))
+        rows.append(swinging(name, kind, run, still, quiet_after(stated.stated.duration)))
     return rows, pd.concat(tables, ignore_index=True)
 
 
