@@ -93,12 +93,26 @@ def test_the_cost_is_what_it_says() -> None:
     )
 
 
-def test_late_travel_counts_the_last_share_alone() -> None:
+def test_late_swing_is_the_variance_of_the_last_share_alone() -> None:
     changes = drawn(CALM)
     flown = ConditionedRun(VESSEL, Ramp(), CALM.dt).fly(changes)
     steps = round(changes.count / 3)
-    assert torch.allclose(flown.late_travel(1 / 3), torch.full((4,), steps * 0.01 * DEG).double())
-    assert torch.equal(flown.late_travel(0.0), torch.zeros(4).double())
+    # of evenly spaced values
+    expected = (0.01 * DEG) ** 2 * (steps**2 - 1) / 12
+    assert torch.allclose(flown.late_swing(1 / 3), torch.full((4,), expected).double())
+    assert torch.equal(flown.late_swing(0.0), torch.zeros(4).double())
+
+
+def test_the_first_flights_go_to_corners_of_the_spread() -> None:
+    config = ConditionsConfig(dt=0.05, duration=10.0)
+    changes = drawn(config, 60)
+    moved = config.at_corners(changes, 40, torch.Generator().manual_seed(0), 0.5)
+    assert torch.equal(moved.variation[40:], changes.variation[40:])
+    assert torch.equal(moved.delay[40:], changes.delay[40:])
+    assert torch.equal(moved.variation[:, 2], changes.variation[:, 2])
+    for column in (0, 1):
+        assert set(moved.variation[:40, column].mul(100).round().tolist()) == {90.0, 110.0}
+    assert set(moved.delay[:40].tolist()) == {0.0, 4.0}
 
 
 def test_disturbances_have_the_statistics_that_are_stated() -> None:

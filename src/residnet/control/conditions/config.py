@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import torch
@@ -147,6 +147,23 @@ class ConditionsConfig(Config):
             size, period = even(0.0, share * self.waves), even(*self.wave_period)
             noise += size[:, None, None] * wave_motion(period, steps, dt, random)
         return changes
+
+    def at_corners(
+        self, changes: HeadingChanges, rows: int, random: torch.Generator, share: float = 1.0
+    ) -> HeadingChanges:
+        """Return changes whose first rows have vessels and delays at corners of their ranges.
+
+        `share` is the part of all departures from the nominal vessel, as in `draw`.
+        """
+        variation, delay = changes.variation.clone(), changes.delay.clone()
+
+        def either(low: float, high: float) -> Tensor:
+            return torch.where(torch.rand(rows, generator=random) < 0.5, low, high)
+
+        variation[:rows, 0] = 1.0 + share * (either(*self.effect) - 1.0)
+        variation[:rows, 1] = 1.0 + share * (either(*self.time) - 1.0)
+        delay[:rows] = torch.round(share * either(*self.delay) / changes.dt)
+        return replace(changes, variation=variation, delay=delay)
 
     def _weather(self, rows: int, random: torch.Generator, share: float) -> dict[str, Tensor]:
         drawn = torch.rand(2, rows, generator=random)

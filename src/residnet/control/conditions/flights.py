@@ -109,12 +109,16 @@ class ConditionedFlights:
 
         return between(self.psi), between(self.command)
 
-    def late_travel(self, share: float) -> Tensor:
-        """Return the rudder travel [B] in rad in the last share of what the cost counts."""
+    def late_swing(self, share: float) -> Tensor:
+        """Return the variance of the rudder command [B] in rad^2 in the last share of what counts.
+
+        What counts is the time from the change on that the cost is of.
+        """
         first = self.changes.start[:, None] + round((1.0 - share) * self.changes.count)
         late = self.changes.counted() & (torch.arange(self.psi.shape[1]) >= first)
-        moved = torch.diff(self.command, dim=1, prepend=self.command[:, :1])
-        return (moved.abs() * late).sum(1)
+        number = late.sum(1, keepdim=True).clamp(min=1)
+        mean = (self.command * late).sum(1, keepdim=True) / number
+        return ((self.command - mean).square() * late).sum(1) / number[:, 0]
 
     def measured(self, conditions: ConditionsConfig) -> dict[str, Tensor]:
         """Return each of `QUANTITIES` by flight, [B]; what is no number is left so."""

@@ -14,7 +14,7 @@ class ConditionsTraining(OneStage):
     """Settings of a training through the whole closed loop, under the conditions of the run.
 
     The loss of a batch is the mean cost of its flights, with a share of the integral of the
-    absolute error that fades out, and with the late rudder travel of flights without noise. The
+    absolute error that fades out, and with the late rudder swing of flights without noise. The
     departures from the nominal vessel in calm water grow from none to all of the conditions, and
     every batch is drawn anew.
 
@@ -34,8 +34,9 @@ class ConditionsTraining(OneStage):
         guide: weight of the integral of the absolute error in deg s at the start.
         faded: share of the training after which that weight is zero.
         quiet: share of the flights of a batch without noise and slow push, in which a loop that
-            swings by itself is seen.
-        calm: cost in s of a degree of rudder travel in the last third of those flights.
+            swings by itself is seen; half of them are at corners of the spread.
+        calm: cost in s of a variance of one degree squared of the rudder command in the last third
+            of those flights.
         validation: number of flights that epochs are chosen on.
         compiled: whether flights and their gradient are compiled as C, which takes a C compiler;
             without one the training says so and is some thirty times slower.
@@ -55,7 +56,7 @@ class ConditionsTraining(OneStage):
     guide: float = Field(default=0.01, ge=0)
     faded: float = Field(default=0.6, gt=0, le=1)
     quiet: float = Field(default=0.1, ge=0, le=1)
-    calm: float = Field(default=0.1, ge=0)
+    calm: float = Field(default=1.0, ge=0)
     validation: int = Field(default=512, ge=2, le=1_000_000)
     compiled: bool = True
 

@@ -89,24 +89,29 @@ class ConditionsFit(EpochTraining):
             group["lr"] = settings.learning_rate * (
                 settings.final + (1.0 - settings.final) * cosine
             )
-        changes = self._batch(settings.share(progress), settings.batch)
         quiet = round(settings.quiet * settings.batch)
-        changes.noise[:quiet], changes.push[:quiet] = 0.0, 0.0
+        changes = self._batch(settings.share(progress), settings.batch, quiet)
         flown = self.loop.flights(changes, *self.fly(*self.loop.given(changes)))
         found = flown.measured(self.conditions)
         loss: Tensor = (
             found["cost"].mean() + math.degrees(settings.guiding(progress)) * found["iae"].mean()
         )
         if quiet > 0:
-            late = flown.late_travel(_LATE)[:quiet].mean()
-            loss = loss + math.degrees(settings.calm) * late
+            late = flown.late_swing(_LATE)[:quiet].mean()
+            loss = loss + math.degrees(math.degrees(settings.calm)) * late
         self._losses.append(float(found["cost"].detach().mean()))
         return loss
 
-    def _batch(self, share: float, rows: int) -> HeadingChanges:
-        """Return heading changes drawn anew, under a share of the conditions."""
+    def _batch(self, share: float, rows: int, quiet: int = 0) -> HeadingChanges:
+        """Return heading changes drawn anew, under a share of the conditions.
+
+        The first `quiet` of them are without noise and slow push, every second one of these at a
+        corner of the spread, where a loop swings first.
+        """
         random = torch.Generator().manual_seed(int(torch.randint(2**62, (1,))))
-        return self.drawn.draw(rows, self.settings.dt, random, share)
+        changes = self.drawn.draw(rows, self.settings.dt, random, share)
+        changes.noise[:quiet], changes.push[:quiet] = 0.0, 0.0
+        return self.drawn.at_corners(changes, quiet // 2, random, share)
 
     def on_after_backward(self) -> None:
         """Reset the gradient of a batch where it is no number."""
