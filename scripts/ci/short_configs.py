@@ -146,7 +146,9 @@ SHORT: dict[str, Short] = {
     ),
     "autopilot_conditions_rate": Short(_CONDITIONS),
     "autopilot_ship": Short(_CONDITIONS),
-    "autopilot_conditions_patrol": Short((*_CONDITIONS, "test.sea_time=10 s")),
+    "autopilot_conditions_patrol": Short(
+        (*_CONDITIONS, "conditions.stated.duration=12 s", "test.sea_time=10 s")
+    ),
     "autopilot_patrol": Short(
         (
             *_policy("policy"),

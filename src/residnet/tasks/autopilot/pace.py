@@ -16,8 +16,8 @@ _REFERENCE = Turning(3.47, 3.94, 3.2), math.radians(5.0)
 """K, T and rudder of the vessel of document 004, whose times configs state at a pace of one."""
 
 
-def least_time(turning: Turning, limit: float, rate: float | None) -> float:
-    """Return the least time in s of a heading change of 30 deg by T r_dot + r = K delta.
+def least_time(turning: Turning, limit: float, rate: float | None, change: float = _STEP) -> float:
+    """Return the least time in s of a change of heading [rad] by T r_dot + r = K delta.
 
     Full rudder is held until full counter-rudder stops the yaw rate on the new heading; each way of
     the rudder to one side takes its time beside that.
@@ -31,11 +31,11 @@ def least_time(turning: Turning, limit: float, rate: float | None) -> float:
         return angle, first + second
 
     low, high = 0.0, time
-    while turned(high)[0] < _STEP:
+    while turned(high)[0] < change:
         high *= 2.0
     for _ in range(60):
         middle = 0.5 * (low + high)
-        low, high = (low, middle) if turned(middle)[0] > _STEP else (middle, high)
+        low, high = (low, middle) if turned(middle)[0] > change else (middle, high)
     return turned(high)[1] + (0.0 if rate is None else 2.0 * limit / rate)
 
 

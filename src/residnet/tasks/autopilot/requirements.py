@@ -2,22 +2,31 @@
 
 from __future__ import annotations
 
+import math
+
+from residnet.control.conditions.config import ConditionsConfig
 from residnet.control.heading.steered_model import SteeredModel
 from residnet.control.heading.steering import SteeredPlant
+from residnet.control.heading.turning import Turning
 from residnet.core.errors import ConfigError, FitError
 from residnet.dynamics.learned import chosen_model
 from residnet.dynamics.store import load_model
 from residnet.physics.vessel import load_vessel
 from residnet.tasks.autopilot.config import AutopilotSettings, PolicyConfig
+from residnet.tasks.autopilot.pace import least_time, paced
+
+_PUSHED = 2.0
+"""Standard deviations of the slow push that the rudder must be able to hold."""
 
 
 def check_vessels(config: AutopilotSettings) -> None:
-    """Check that the vessel turns steadily, and so does every learned model of it.
+    """Check that the vessel turns steadily and can do what is asked, and so for learned models.
 
     Raises:
         UsageError: where a run or a model is missing.
         FitError: where a learned model does not turn towards the rudder and stay there.
-        ConfigError: where the vessel does not, or the inputs of a learned model are not its own.
+        ConfigError: where the vessel does not, has no time for its changes of heading or no rudder
+            left to hold its course, or where the inputs of a learned model are not its own.
     """
     vessel = SteeredPlant(load_vessel(config.vessel).build())
     learned = [
@@ -26,11 +35,45 @@ def check_vessels(config: AutopilotSettings) -> None:
         if wanted.learned is not None
     ]
     try:
-        vessel.turning(config.rudder, config.turning_time)
+        turning = vessel.turning(config.rudder, config.turning_time)
     except FitError as error:
         raise ConfigError(f"vessel '{config.vessel}' cannot be steered: {error}") from error
+    _check_flights(paced(config), turning, vessel.rate)
     for model, dt in learned:
         model.turning(config.rudder, config.turning_time, dt)
+
+
+def _check_flights(config: AutopilotSettings, turning: Turning, rate: float | None) -> None:
+    """Check that changes of heading can end in their time, and that the rudder can hold a course.
+
+    Raises:
+        ConfigError: with the key, what is needed and what is given.
+    """
+    asked = {"test": (config.test.heading, config.test.duration)}
+    if config.conditions is not None:
+        stated = config.conditions.stated
+        asked["conditions.stated"] = (stated.heading[0], stated.duration)
+        flown = {"stated": stated, **config.conditions.beyond}
+        for name, conditions in flown.items():
+            _check_rudder(f"conditions.{name}", conditions, config.rudder)
+    for key, (change, duration) in asked.items():
+        least = least_time(turning, config.rudder, rate, change)
+        if least > duration:
+            raise ConfigError(
+                f"{key}.duration: a change of heading of {math.degrees(change):.3g} deg takes this"
+                f" vessel {least:.3g} s at least, given {duration:.3g} s; give more time, or more"
+                " rudder"
+            )
+
+
+def _check_rudder(key: str, conditions: ConditionsConfig, limit: float) -> None:
+    held = conditions.bias + _PUSHED * conditions.push
+    if held >= limit:
+        raise ConfigError(
+            f"{key}: a bias of {math.degrees(conditions.bias):.3g} deg and a push of"
+            f" {math.degrees(conditions.push):.3g} deg leave nothing of a rudder of"
+            f" {math.degrees(limit):.3g} deg to steer with; give more rudder, or less of them"
+        )
 
 
 def learned_vessel(
