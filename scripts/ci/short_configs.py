@@ -87,6 +87,21 @@ _TANKER = (
     "bands=null",
     *_trained("mlp", "lstm"),
 )
+_SWEPT = (
+    "common=["
+    + ", ".join(
+        f"'{override}'"
+        for override in (
+            *_TRIALS,
+            "heads={mlp: {kind: mlp, hidden: [8]}}",
+            "~training.lstm",
+            *_trained("mlp"),
+            "bands=null",
+            "export.models=[]",
+        )
+    )
+    + "]",
+)
 _FERRY = ("course.interval=10 s",)
 _STEP_TEST = ("test.plants=2", "tuning_points=16")
 _PEERS = ("test.dt=0.1 s",)
@@ -114,6 +129,14 @@ SHORT: dict[str, Short] = {
     "wam_v_s3": Short((*_TRIALS, *_trained("mlp", "lstm"))),
     "wam_v_equations": Short(_TRIALS),
     "wam_v_trials": Short(_TRIALS),
+    "sweep_quickstart": Short(
+        (
+            *_SWEPT,
+            "space={heads.mlp.hidden: {choices: [[8], [16]]}}",
+            "search.trials=2",
+            "runner.workers=1",
+        )
+    ),
     "simulate_wam_v": Short(("~programme.families", "programme.step=0.1 s")),
     "rudder_boat_trials": Short(_TRIALS),
     "patrol_identified": Short(_trained("mlp")),

@@ -22,12 +22,15 @@ class Progress:
         done: how much of it is done, in any unit; None where the work cannot be counted.
         total: how much there is to do in the same unit; None where it is not known.
         message: a line for the log; empty where there is only a count.
+        score: of a training by then, its best validation error in free run; None where there is
+            none.
     """
 
     stage: str
     done: float | None = None
     total: float | None = None
     message: str = ""
+    score: float | None = None
 
 
 ProgressCallback = Callable[[Progress], None]
@@ -36,7 +39,11 @@ _callback: ContextVar[ProgressCallback | None] = ContextVar("residnet_progress",
 
 
 def report(
-    stage: str, done: float | None = None, total: float | None = None, message: str = ""
+    stage: str,
+    done: float | None = None,
+    total: float | None = None,
+    message: str = "",
+    score: float | None = None,
 ) -> None:
     """Tell the callback that listens, if there is one, how far a stage is.
 
@@ -45,10 +52,11 @@ def report(
         done: how much of it is done, in any unit; None where the work cannot be counted.
         total: how much there is to do in the same unit; None where it is not known.
         message: a line for the log.
+        score: best validation error in free run of a training by then.
     """
     callback = _callback.get()
     if callback is not None:
-        callback(Progress(stage, done, total, message))
+        callback(Progress(stage, done, total, message, score))
 
 
 def say(message: str) -> None:

@@ -4,11 +4,7 @@
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import active_children, get_context
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -16,7 +12,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from residnet.core.config import ExistingPath, load_config
-from residnet.core.errors import FitError, UsageError
+from residnet.core.errors import UsageError
 from residnet.core.files import read_json
 from residnet.core.names import nearest
 from residnet.core.progress import report
@@ -27,6 +23,7 @@ from residnet.report.sections.study import draw, sections, variants_table
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import MainFigure, Outcome, Task
 from residnet.tasks.fit import FitConfig
+from residnet.tasks.processes import processes
 
 _Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
 
@@ -211,31 +208,13 @@ def _main_figures(rows: Sequence[dict[str, Any]]) -> dict[str, MainFigure]:
 
 
 def _side_by_side(workers: int, jobs: Sequence[tuple[StudyConfig, str, int, Path]]) -> list[float]:
-    """Fit in processes side by side; an interruption ends them all at once.
+    """Fit in processes side by side.
 
     Raises:
         FitError: where the system ends a process.
     """
-    with ProcessPoolExecutor(
-        workers, mp_context=get_context("spawn"), initializer=_leave_interruptions
-    ) as pool:
-        try:
-            return list(pool.map(_fit, *zip(*jobs, strict=True)))
-        except BrokenProcessPool as error:
-            raise FitError(
-                "workers: the system has ended one of the processes; the memory may not be enough"
-                " for so many side by side, so give fewer and continue with --resume"
-            ) from error
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            for process in active_children():
-                process.terminate()
-            raise
-
-
-def _leave_interruptions() -> None:
-    """Leave Ctrl-C, which reaches every process of a terminal, to the one that began them."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with processes(workers) as pool:
+        return list(pool.map(_fit, *zip(*jobs, strict=True)))
 
 
 def _fit(study: StudyConfig, variant: str, seed: int, out: Path) -> float:

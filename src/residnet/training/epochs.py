@@ -222,7 +222,8 @@ class ReportProgress(L.Callback):
             f" {last.get('loss', math.nan):.4g}, best validation {pl_module.best_score:.4g}"
         )
         shown = done % max(self.epochs // 10, 1) == 0 or done == self.epochs
-        report(f"training {self.name}", done, self.epochs, line if shown else "")
+        score = pl_module.best_score if math.isfinite(pl_module.best_score) else None
+        report(f"training {self.name}", done, self.epochs, line if shown else "", score)
 
 
 def run_epochs(

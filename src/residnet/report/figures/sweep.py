@@ -1,0 +1,110 @@
+"""The figures of a sweep: trials over their keys, the best value so far, what each key matters."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from residnet.report.figures.files import Drawing
+from residnet.report.figures.style import SOLID, new_figure, styled
+
+
+@styled
+def parallel_coordinates(content: Mapping[str, Any]) -> Drawing:
+    """Draw each finished trial as a line over its keys to its value, the better the darker.
+
+    Args:
+        content: of sweep.json.
+    """
+    rows = [row for row in content["trials"] if row["value"] is not None]
+    values = np.array([row["value"] for row in rows])
+    rank = np.argsort(np.argsort(values if content["minimized"] else -values))
+    keys = list(content["keys"])
+    places, ticks = zip(*(_axis(rows, key, key in content["log"]) for key in keys), strict=True)
+    spread = np.ptp(values) or 1.0
+    heights = np.column_stack([*places, (values - values.min()) / spread])
+    figure = new_figure(3.6)
+    axes = figure.subplots()
+    # the best is drawn last, on top
+    for trial in np.argsort(-rank):
+        good = 1.0 - rank[trial] / max(len(rows) - 1, 1)
+        axes.plot(
+            heights[trial],
+            color=SOLID["color"],
+            alpha=0.12 + 0.88 * good**3,
+            linewidth=0.8 + 1.4 * (rank[trial] == 0),
+        )
+    named = [*ticks, [(0.0, f"{values.min():.4g}"), (1.0, f"{values.max():.4g}")]]
+    for column, marks in enumerate(named):
+        axes.axvline(column, color="0.4", linewidth=0.8)
+        for height, text in marks:
+            axes.annotate(text, (column, height), (3, 2), textcoords="offset points", fontsize=7)
+    axes.set_xticks(range(len(named)), [*map(_short, keys), _short(content["objective"])])
+    axes.set_yticks([])
+    axes.set_xlim(-0.1, len(named) - 0.6)
+    axes.grid(visible=False)
+    caption = (
+        "Every line is a finished trial: its values, and at the right what is sought. The better a"
+        " trial, the darker its line; the best is the thick one."
+    )
+    return Drawing("parallel_coordinates", "Trials over their keys", caption, figure)
+
+
+@styled
+def course_of_sweep(content: Mapping[str, Any]) -> Drawing:
+    """Draw the value of each trial, and the best one so far."""
+    rows = [row for row in content["trials"] if row["value"] is not None]
+    rows.sort(key=lambda row: int(row["number"]))
+    numbers = [row["number"] for row in rows]
+    values = np.array([row["value"] for row in rows])
+    so_far = np.minimum if content["minimized"] else np.maximum
+    figure = new_figure(2.6)
+    axes = figure.subplots()
+    axes.plot(numbers, values, "o", markersize=3.5, color="0.55", label="trial")
+    axes.step(numbers, so_far.accumulate(values), where="post", **SOLID, label="best so far")
+    axes.set_xlabel("trial [-]")
+    axes.set_ylabel(content["objective"])
+    axes.legend()
+    caption = "The value of each finished trial, and the best one by then."
+    return Drawing("course", "Course of the sweep", caption, figure)
+
+
+@styled
+def shares(content: Mapping[str, Any]) -> Drawing:
+    """Draw the share of each key in the variance of the values."""
+    found = sorted(content["importance"].items(), key=lambda pair: pair[1])
+    figure = new_figure(0.8 + 0.28 * len(found))
+    axes = figure.subplots()
+    axes.barh([key for key, _ in found], [share for _, share in found], color=SOLID["color"])
+    axes.set_xlim(0, 1)
+    axes.set_xlabel("share in the variance of the values [-]")
+    caption = (
+        "How much of the variance of the values each key explains (functional analysis of variance"
+        " over a forest fitted to the trials). With few trials these shares are rough."
+    )
+    return Drawing("importance", "What each key matters", caption, figure)
+
+
+def _axis(
+    rows: Sequence[Mapping[str, Any]], key: str, log: bool
+) -> tuple[np.ndarray, list[tuple[float, str]]]:
+    """Return the heights of the trials on the axis of a key [trials], and marks on that axis."""
+    found = [row["values"][key] for row in rows]
+    if all(isinstance(value, int | float) and not isinstance(value, bool) for value in found):
+        numbers = np.log(found) if log else np.array(found, dtype=float)
+        spread = np.ptp(numbers) or 1.0
+        ends = [(0.0, f"{min(found):.4g}"), (1.0, f"{max(found):.4g}")]
+        return (numbers - numbers.min()) / spread, ends[: len(set(found))]
+    texts = [json.dumps(value) for value in found]
+    kinds = sorted(set(texts))
+    step = 1.0 / max(len(kinds) - 1, 1)
+    marks = [(place * step, text) for place, text in enumerate(kinds)]
+    return np.array([kinds.index(text) * step for text in texts]), marks
+
+
+def _short(key: str) -> str:
+    """Return the last parts of a long key, which tell it apart."""
+    return key if len(key) <= 24 else "…" + key[-23:]
