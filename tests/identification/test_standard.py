@@ -142,6 +142,8 @@ def test_terms_follow_from_what_moves() -> None:
     whole = replace(Facts.supposed(names), samples=20_000)
     hull = portfolio(whole)["baselines"]["hull"]["terms"]
     assert {"u|u|", "n|n|", "|n| u", "n|n| delta", "wind_u wind_mag"} <= set(hull)
+    full = portfolio(whole)["baselines"]["full_hull"]["terms"]
+    assert set(hull) | {"u^2 v", "n r", "wind_mag r", "n|n| delta|delta|"} <= set(full)
     assert "n^2" not in hull
     astern = replace(whole, astern=("n",), moving=("n", "delta"))
     hull = portfolio(astern)["baselines"]["hull"]["terms"]

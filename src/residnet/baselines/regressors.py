@@ -62,8 +62,9 @@ class RegressorBaseline(ParametricBaseline):
         """Return nu_dot [..., 3] at channels z [..., nz]."""
         weights = (self.theta * self.allowed).to(z.dtype)
         if self.bound is not None:
-            phi: Tensor = self.library(self.bound.held(z))
-            back: Tensor = self.bound(z)
+            held: Tensor = self.bound.held(z)
+            phi: Tensor = self.library(held)
+            back: Tensor = self.bound.back(held, z)
             return phi @ weights.T + back
         known: Tensor = self.library(z)
         return known @ weights.T

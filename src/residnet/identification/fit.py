@@ -15,6 +15,7 @@ from residnet.identification.identified import Identified
 from residnet.identification.models import FitStore, FittedModel, NoStore
 from residnet.identification.settings import FitSettings
 from residnet.identification.standard import TIED
+from residnet.judge.verdict.selection import Selection
 
 
 def fit(
@@ -96,7 +97,7 @@ def _add_tied(
     judged = {split: identified.evaluate(logs[split]) for split in ("train", "validation")}
     chosen = identified.select(judged)
     # a mean of accelerations has no place for a force that one member estimates for itself
-    tied = [n for n in chosen.tied if identified.models[n].spec.disturbance is None]
+    tied = [n for n in _apart(chosen) if identified.models[n].spec.disturbance is None]
     if len(tied) < 2:
         say("  tied: no model comes within one standard error of the best; there is no mean")
         return
@@ -104,6 +105,16 @@ def _add_tied(
     identified.models[TIED] = model
     identified.findings.update(identified.findings_of([model]))
     say(f"  {TIED}: {_said(model)} (mean of {', '.join(tied)})")
+
+
+def _apart(chosen: Selection) -> list[str]:
+    """Return the tied models without those that err as another one does, to the last digit.
+
+    A training that gained nothing ends where it began, and would count twice in a mean.
+    """
+    errors = {e.name: e.shares.tobytes() for e in chosen.contenders}
+    first = {errors[name]: name for name in reversed(chosen.tied)}
+    return [name for name in chosen.tied if first[errors[name]] == name]
 
 
 def _said(fitted: FittedModel) -> str:

@@ -50,9 +50,15 @@ class VelocityBound(nn.Module):
     def held(self, z: Tensor) -> Tensor:
         """Return channels z [..., nz], where u, v, r that left their range stand at its edge."""
         low, high = self.low.to(z.dtype), self.high.to(z.dtype)
-        nu = torch.minimum(torch.maximum(z[..., :3], low), high)
+        nu = z[..., :3]
+        # a refit differentiates this, and derivatives of minimum and maximum are slow
+        nu = torch.where(nu > high, high, torch.where(nu < low, low, nu))
         return torch.cat((nu, z[..., 3:]), dim=-1)
+
+    def back(self, held: Tensor, z: Tensor) -> Tensor:
+        """Return the acceleration at channels z [..., nz] whose held ones are known."""
+        return self.rate.to(z.dtype) * (held[..., :3] - z[..., :3])
 
     def forward(self, z: Tensor) -> Tensor:
         """Return the acceleration at channels z [..., nz]."""
-        return self.rate.to(z.dtype) * (self.held(z)[..., :3] - z[..., :3])
+        return self.back(self.held(z), z)

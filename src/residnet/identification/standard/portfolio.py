@@ -11,7 +11,7 @@ from residnet.identification.standard.schedule import (
     refit_settings,
     training_settings,
 )
-from residnet.identification.standard.terms import hull_terms, linear_terms
+from residnet.identification.standard.terms import full_hull_terms, hull_terms, linear_terms, long
 from residnet.physics.signals import WIND_CHANNELS
 from residnet.physics.symmetry import mirrored_channels
 
@@ -19,14 +19,16 @@ PARTS = ("baseline", "baselines", "refit", "heads", "base_of", "forces", "ensemb
 """Keys of a fit that the recipe stands in place of."""
 TIED = "tied"
 """Name of the mean of the models within one standard error of the best."""
+_FULL = "full_hull"
 _FROZEN, _TOGETHER = "hull_network", "hull_network_calibrated"
 
 
 def portfolio(facts: Facts, effort: float = 1.0) -> dict[str, Any]:
     """Return baselines, refits, heads and trainings by the names that the recipe gives them.
 
-    `baseline` is linear and `hull` nonlinear in velocities and inputs, both refitted. A network
-    stands on the hull, moves with it, stands on the linear model, and stands alone. Where the wind
+    `baseline` is linear and `hull` nonlinear in velocities and inputs, both refitted; long logs
+    have a `full_hull` of more terms too, on which networks find little. A network stands on the
+    hull, moves with it, stands on the linear model, and stands alone. Where the wind
     is not measured, an unknown force is estimated from the measured past and added to the hull.
 
     Args:
@@ -39,10 +41,13 @@ def portfolio(facts: Facts, effort: float = 1.0) -> dict[str, Any]:
     alone = {**network, "encoder": True}
     heads = {_FROZEN: network, _TOGETHER: network, "linear_network": network, "network": alone}
     training = training_settings(facts, effort)
+    hulls = {"hull": _regressors(1e-4, hull_terms(facts))}
+    if long(facts):
+        hulls[_FULL] = _regressors(1e-4, full_hull_terms(facts))
     return {
         "baseline": _regressors(1e-6, linear_terms(facts)),
-        "baselines": {"hull": _regressors(1e-4, hull_terms(facts))},
-        "refit": {"baseline": refit_settings(facts), "hull": refit_settings(facts)},
+        "baselines": hulls,
+        "refit": dict.fromkeys(("baseline", *hulls), refit_settings(facts)),
         "heads": heads,
         "base_of": {
             _FROZEN: "hull",
@@ -51,7 +56,7 @@ def portfolio(facts: Facts, effort: float = 1.0) -> dict[str, Any]:
             "network": "zero",
         },
         # where the wind is measured it is no unknown force
-        "forces": {} if _knows_wind(facts) else {"hull_force": {"of": "hull"}},
+        "forces": {} if _knows_wind(facts) else {"hull_force": {"of": [*hulls][-1]}},
         "ensembles": {},
         "training": {
             **dict.fromkeys(heads, training),

@@ -43,7 +43,7 @@ def hull_terms(facts: Facts) -> list[str] | dict[str, list[str]]:
     propeller adds to them: half as many coefficients as all terms in all axes.
     """
     terms = _terms(facts)
-    if _long(facts):
+    if long(facts):
         return terms
     kept = ("1", *(f"{name}|{name}|" for name in facts.inputs))
     return {
@@ -52,26 +52,35 @@ def hull_terms(facts: Facts) -> list[str] | dict[str, list[str]]:
     }
 
 
-def _long(facts: Facts) -> bool:
+def full_hull_terms(facts: Facts) -> list[str]:
+    """Return the terms of a hull with all that long logs determine."""
+    _, turning, driving = _acting(facts)
+    more = ["wind_mag r", "wind_u r"] if facts.wind else []
+    more += [*_FURTHER, *(term for n in driving for term in (f"{n} v", f"{n} r"))]
+    return [*_terms(facts), *more, *(t for n in turning for t in _large_angles(n, driving))]
+
+
+def long(facts: Facts) -> bool:
+    """Return whether the training logs are long enough for a hull of many terms."""
     return facts.samples * facts.step >= _LONG
+
+
+def _acting(facts: Facts) -> tuple[list[str], list[str], list[str]]:
+    """Return the inputs that are forces, that turn the flow, and that drive."""
+    forces = [name for name in facts.inputs if name in FORCE_CHANNELS]
+    acting = [name for name in facts.inputs if name not in forces]
+    turning = [name for name in acting if _turns(name)]
+    return forces, turning, [name for name in acting if name not in turning]
 
 
 def _terms(facts: Facts) -> list[str]:
     """Return the terms of all axes together."""
-    forces = [name for name in facts.inputs if name in FORCE_CHANNELS]
-    acting = [name for name in facts.inputs if name not in forces]
-    turning = [name for name in acting if _turns(name)]
-    driving = [name for name in acting if name not in turning]
-    more = list(_WIND) if facts.wind else []
-    if _long(facts):
-        more += ["wind_mag r", "wind_u r"] if facts.wind else []
-        more += [*_FURTHER, *(term for n in driving for term in (f"{n} v", f"{n} r"))]
-        more += [term for name in turning for term in _large_angles(name, driving)]
+    forces, turning, driving = _acting(facts)
     return [
         *("1", *VELOCITY, *_HULL, *forces),
         *(term for name in driving for term in _propeller(name, name in facts.astern)),
         *(term for name in turning for term in _rudder(name, driving, facts.astern)),
-        *more,
+        *(_WIND if facts.wind else ()),
     ]
 
 
