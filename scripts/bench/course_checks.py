@@ -66,7 +66,8 @@ def faults(track: Array, course: Drawn, protocol: str, slack: float = 0.0) -> li
     """Return what is wrong with a track [N, 2]: order, side of closest approach, clearance.
 
     The closest approach on the whole track counts, and the one in the buoy's turn. A circle in
-    which the track begins counts from where it has been left. `slack` in m is allowed.
+    which the track begins counts from where the track, outside of it, comes nearer again. `slack`
+    in m is allowed.
     """
     found = []
     turn = passes(track, course.buoys)
@@ -78,8 +79,12 @@ def faults(track: Array, course: Drawn, protocol: str, slack: float = 0.0) -> li
             if distance[turn[i]] > radius + slack:
                 found.append(f"buoy {i + 1} missed by {distance[turn[i]] - radius:.3g} m")
             continue
-        outside = np.flatnonzero(distance >= radius)
-        left = int(outside[0]) if len(outside) else len(track) - 1
+        left = 0
+        if distance[0] < radius:
+            away = np.flatnonzero(distance >= radius)
+            left = int(away[0]) if len(away) else len(track) - 1
+            while left < len(track) - 1 and distance[left + 1] >= distance[left]:
+                left += 1
         if distance[left:].min() < radius - slack:
             found.append(f"buoy {i + 1} cleared by {distance[left:].min() - radius:.3g} m")
         whole = left + int(distance[left:].argmin())

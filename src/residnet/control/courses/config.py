@@ -134,7 +134,10 @@ def plan_course(
     make = TurnMaker(vessel, reached, config.planning_dt)
     turns = simulated_turns(make, rudder, steady.radius)
     course = plan(
-        _asked(config, protocol, buoys, circles, turns), step, 5.0 * config.lookahead, make
+        _asked(config, protocol, buoys, circles, turns, aside),
+        step,
+        5.0 * config.lookahead,
+        make,
     )
     reference = _reference(config, protocol, buoys, steady, turning.speed)
     return PlannedCourse(protocol, course, buoys, steady, reference)
@@ -176,6 +179,7 @@ def _asked(
     buoys: tuple[BuoyConfig, ...],
     circles: tuple[Circle, ...],
     turns: Turns,
+    aside: float = 0.0,
 ) -> CourseRequest:
     asked = tuple(
         Asked(
@@ -186,7 +190,7 @@ def _asked(
         )
         for buoy in buoys
     )
-    return CourseRequest(config.start, config.heading, circles, asked, protocol, turns)
+    return CourseRequest(config.start, config.heading, circles, asked, protocol, turns, aside)
 
 
 def _request(

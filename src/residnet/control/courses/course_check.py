@@ -40,7 +40,7 @@ class Passage(NamedTuple):
         at: sample of the closest approach in the buoy's turn.
         side: that the buoy lies on there.
         distance: there, in m.
-        least: smallest distance on the whole track after a circle in which it begins is left.
+        least: smallest distance on the whole track, from `left_behind` on.
         side_there: that the buoy lies on at that distance.
     """
 
@@ -51,6 +51,26 @@ class Passage(NamedTuple):
     side_there: str
 
 
+def left_behind(distance: Array, radius: float) -> int:
+    """Return the sample from which a buoy counts: 0, or where the circle is left that it begins in.
+
+    It is left once the track is outside and comes nearer again: going away is no approach. It is
+    the number of samples where the track never is.
+
+    Args:
+        distance: of the samples from the buoy [N] in m.
+        radius: of its circle in m.
+    """
+    if distance[0] >= radius:
+        return 0
+    outside = distance >= radius
+    if not outside.any():
+        return len(distance)
+    first = int(outside.argmax())
+    nearer = np.flatnonzero(np.diff(distance[first:]) < 0)
+    return first + int(nearer[0]) if len(nearer) else len(distance) - 1
+
+
 def passages(track: Array, buoys: Sequence[Asked]) -> list[Passage]:
     """Return how a track [N, 2] passes buoys in their order.
 
@@ -58,9 +78,8 @@ def passages(track: Array, buoys: Sequence[Asked]) -> list[Passage]:
     """
     distance = np.stack([np.hypot(*(track - (b.north, b.east)).T) for b in buoys])
     for row, buoy in zip(distance, buoys, strict=True):
-        outside = np.flatnonzero(row >= buoy.radius)
-        if row[0] < buoy.radius and len(outside):
-            row[: outside[0]] = np.inf
+        begin = left_behind(row, buoy.radius)
+        row[: begin if begin < len(row) else 0] = np.inf
     total, choices = distance[0], []
     number = np.arange(len(track))
     for row in distance[1:]:

@@ -82,6 +82,7 @@ class CourseRequest:
         buoys: what the finished course has to do at each, without margins.
         protocol: see there.
         turns: that the vessel makes.
+        aside: by how much in m the vessel may be displaced from the course.
     """
 
     start: tuple[float, float]
@@ -90,6 +91,7 @@ class CourseRequest:
     buoys: tuple[Asked, ...]
     protocol: Protocol
     turns: Turns
+    aside: float = 0.0
 
 
 def plan(
@@ -215,7 +217,7 @@ def _fitted(request: CourseRequest, sketch: Sketch) -> list[tuple[Fit, Fitted]]:
             request.turns,
         )
         at = route.place_of(sketch, np.array([circle.place for circle in request.circles]))
-        fit = Fit(route, request.circles, at, request.heading is None)
+        fit = Fit(route, request.circles, at, request.heading is None, request.aside)
         z = route.begin(sketch)
         best = fit.solve(z)
         found.append((fit, best))

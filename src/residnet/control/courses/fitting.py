@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import Bounds, minimize
 
+from residnet.control.courses.course_check import left_behind
 from residnet.control.courses.outline import Circle
 from residnet.control.courses.route import Drawn, Route
 from residnet.control.courses.turns import Array
@@ -62,12 +63,19 @@ class Fit:
         circles: in their order.
         at: points of the route [N] at which each is passed.
         free: whether the first heading is free.
+        aside: by how much in m the vessel may be displaced from the course; a buoy is farther off
+            by as much on the rest of the course than in its turn.
     """
 
     def __init__(
-        self, route: Route, circles: Sequence[Circle], at: NDArray[np.intp], free: bool
+        self,
+        route: Route,
+        circles: Sequence[Circle],
+        at: NDArray[np.intp],
+        free: bool,
+        aside: float = 0.0,
     ) -> None:
-        self.route, self.circles, self.free = route, circles, free
+        self.route, self.circles, self.free, self.aside = route, circles, free, aside
         self.unit = route.turns.radius
         middle = (at[1:] + at[:-1] + 1) // 2
         self.edges = np.concatenate(([0], middle, [-1]))
@@ -77,7 +85,8 @@ class Fit:
 
     def on(self, route: Route) -> Fit:
         """Return the same problem with other tables of turns."""
-        other = Fit(route, self.circles, np.zeros(len(self.circles), dtype=np.intp), self.free)
+        at = np.zeros(len(self.circles), dtype=np.intp)
+        other = Fit(route, self.circles, at, self.free, self.aside)
         other.edges = self.edges
         return other
 
@@ -105,11 +114,10 @@ class Fit:
                     self.others.append((j, i))
 
     def _left(self, points: np.ndarray, circle: Circle) -> int:
-        """Return the first point after a circle has been left in which the course begins."""
-        if abs(points[0] - circle.place) >= circle.radius or circle.side == 0:
+        """Return the point from which a circle counts: `course_check.left_behind`."""
+        if circle.side == 0:
             return 0
-        outside = np.abs(points - circle.place) >= circle.radius
-        return int(outside.argmax()) if outside.any() else len(points) - 2
+        return min(left_behind(np.abs(points - circle.place), circle.radius), len(points) - 2)
 
     def _nearest(self, drawn: Drawn, circle: Circle, part: slice) -> _Near:
         """Return the point of a part of the course that is nearest to a circle's middle."""
@@ -160,7 +168,7 @@ class Fit:
             part = slice(max(part.start, begin), part.stop)
             near = self._nearest(drawn, self.circles[j], part)
             # next to its own turn the course comes from there
-            apart = 0.0 if abs(i - j) <= 1 else _APART * self.unit
+            apart = 0.0 if abs(i - j) <= 1 else _APART * self.unit + self.aside
             values.append(near.distance - max(own[j][0], self.circles[j].radius) - apart)
             rows.append(near.change - (own[j][1] if own[j][0] > self.circles[j].radius else 0.0))
         even, level = [], []

@@ -56,7 +56,7 @@ class ConditionsTraining(OneStage):
     guide: float = Field(default=0.01, ge=0)
     faded: float = Field(default=0.6, gt=0, le=1)
     quiet: float = Field(default=0.1, ge=0, le=1)
-    calm: float = Field(default=1.0, ge=0)
+    calm: float = Field(default=0.5, ge=0)
     validation: int = Field(default=512, ge=2, le=1_000_000)
     compiled: bool = True
 

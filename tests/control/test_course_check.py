@@ -1,0 +1,49 @@
+"""The check of courses by their points: sides, clearance, and circles in which a course begins."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from residnet.control.courses.course_check import Asked, first_fault, left_behind, passages
+
+Array = NDArray[np.float64]
+
+
+def line(*corners: tuple[float, float]) -> Array:
+    """Points a quarter of a metre apart through corners."""
+    parts = []
+    for one, two in zip(corners, corners[1:], strict=False):
+        number = round(4 * float(np.hypot(two[0] - one[0], two[1] - one[1])))
+        parts.append(np.linspace(one, two, number, endpoint=False))
+    return np.concatenate(parts)
+
+
+def test_going_away_from_where_a_course_begins_is_no_approach() -> None:
+    """It begins within the circle, leaves it with the buoy on the wrong side, and comes back."""
+    track = line((0.0, 0.0), (0.0, 40.0), (12.0, 40.0), (12.0, -20.0))
+    buoy = Asked(north=1.0, east=1.0, radius=10.0, leave_to="port")
+    (passage,) = passages(track, [buoy])
+    assert passage.side == passage.side_there == "port"
+    assert passage.least == pytest.approx(11.0, abs=0.05)
+    assert first_fault(track, [buoy], "sides", 0.1) is None
+    other = buoy._replace(leave_to="starboard")
+    assert "not left to starboard" in str(first_fault(track, [other], "sides", 0.1))
+    distance = np.hypot(*(track - (1.0, 1.0)).T)
+    begin = left_behind(distance, 10.0)
+    assert distance[begin] == pytest.approx(
+        distance[: len(line((0.0, 0.0), (0.0, 40.0))) + 50].max()
+    )
+
+
+def test_a_circle_that_is_never_left_is_cut() -> None:
+    track = line((0.0, 0.0), (0.0, 5.0))
+    buoy = Asked(north=1.0, east=1.0, radius=10.0, leave_to="port")
+    assert left_behind(np.hypot(*(track - (1.0, 1.0)).T), 10.0) == len(track)
+    assert "is cut" in str(first_fault(track, [buoy], "sides", 0.1))
+
+
+def test_one_that_begins_outside_counts_from_the_start() -> None:
+    track = line((0.0, 0.0), (0.0, 30.0))
+    assert left_behind(np.hypot(*(track - (0.0, 20.0)).T), 5.0) == 0
