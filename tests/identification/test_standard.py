@@ -19,8 +19,8 @@ from residnet.data.prepare import samples
 from residnet.dynamics.disturbance import DisturbanceConfig
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.heads import LstmConfig, ZeroHead
+from residnet.identification.cross_fitting.folds import folds_of
 from residnet.identification.fit import Identified, fit
-from residnet.identification.folds import folds_of
 from residnet.identification.prepared import PreparedSplits, prepare_logs
 from residnet.identification.settings import FitSettings
 from residnet.identification.standard import PARTS, Facts, portfolio

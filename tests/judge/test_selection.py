@@ -127,3 +127,15 @@ def test_the_file_says_of_each_model_what_decided() -> None:
     assert rows["mlp"]["standard_error"] == pytest.approx(0.1 * JITTER.std(ddof=1) / np.sqrt(5))
     assert (rows["mlp"]["sound"], rows["mlp"]["diverged"]) == (False, 2)
     assert rows["zero"]["sound"] is True
+
+
+def test_blocks_of_other_data_add_to_the_variance() -> None:
+    """The blocks of folds and those of validation logs are independent of each other."""
+    random = np.random.default_rng(3)
+    one, other = random.random(5), random.random(4)
+    quarters = Blocks(np.full(4, 0.25), "stretches")
+    both = EVEN.beside(quarters)
+    apart = [EVEN.standard_error(one, np.zeros(5)), quarters.standard_error(other, np.zeros(4))]
+    found = both.standard_error(np.concatenate((one, other)), np.zeros(9))
+    assert found == pytest.approx(float(np.hypot(*apart)))
+    assert both.count == 9

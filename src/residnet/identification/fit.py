@@ -56,7 +56,7 @@ def fit(
     for name, members in settings.ensembles.items():
         models[name] = fitter.ensemble(name, [models[member] for member in members])
         say(f"  {name}: {_said(models[name])}")
-    identified = Identified(settings, models, fitter.limit, fitter.train)
+    identified = Identified(settings, models, fitter.limit, fitter.train, fitter.crossed)
     if settings.recipe is not None:
         _add_tied(identified, fitter, logs)
     if settings.bands is not None:

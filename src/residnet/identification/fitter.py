@@ -20,9 +20,10 @@ from residnet.dynamics.ensemble import mean_of
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec, rebuilt
 from residnet.heads import ClosedFormHead
+from residnet.identification.cross_fitting.crossed import Crossed
+from residnet.identification.cross_fitting.prior_choice import TAKEN, choose_prior
 from residnet.identification.models import FitStore, FittedModel
 from residnet.identification.prepared import velocity_limit
-from residnet.identification.prior_choice import choose_prior
 from residnet.identification.settings import FitSettings, ForceConfig
 from residnet.identification.settling import settled
 from residnet.identification.solution_choice import choose_solution
@@ -55,6 +56,7 @@ class Fitter:
         self.samples = samples(self.train, self.signals)
         self.settings = settled(settings, self.samples, self.train)
         self.scales = torch.from_numpy(settings.evaluation.scales.array())
+        self.crossed: Crossed | None = None
         self.validate = ValidationScore(
             logs["validation"],
             settings.evaluation,
@@ -125,6 +127,8 @@ class Fitter:
             spec = self.spec(name, "baseline", self.settings.all_baselines[name])
             choice = choose_prior(name, spec, config, self.settings, self.known, self.limit)
             notes["prior_choice"] = choice.table
+            own = choice.crossed.renamed({TAKEN: name, "zero": "zero"})
+            self.crossed = own if self.crossed is None else self.crossed.joined(own)
             if choice.prior is None:
                 return table, None
             config = config.with_prior(choice.prior)

@@ -11,6 +11,7 @@ import numpy as np
 from residnet.data.prepare import Prepared
 from residnet.data.simulated.trials import SimulatedTrials
 from residnet.data.sources import MeasuredLogs
+from residnet.identification.cross_fitting.crossed import Crossed
 from residnet.identification.evaluation import Evaluation, candidates, evaluate
 from residnet.identification.models import FittedModel
 from residnet.identification.selecting import examine, select
@@ -30,12 +31,14 @@ class Identified(Mapping[str, FittedModel]):
         models: by name.
         limit: of |u, v, r| [3] beyond which a free run has diverged.
         train: the logs that fitted them.
+        crossed: errors of the baselines over folds of the logs; None where none were needed.
     """
 
     settings: FitSettings
     models: dict[str, FittedModel]
     limit: np.ndarray
     train: Sequence[Prepared]
+    crossed: Crossed | None = None
 
     def evaluate(
         self, logs: Sequence[Prepared], data: MeasuredLogs | SimulatedTrials | None = None
@@ -76,6 +79,7 @@ class Identified(Mapping[str, FittedModel]):
             self.findings,
             self.settings.evaluation,
             self._overlapping(judged.get("validation")),
+            None if self.settings.recipe is None else self.crossed,
         )
 
     def _overlapping(self, validation: Evaluation | None) -> FreeRun | None:

@@ -12,6 +12,7 @@ from residnet.core.errors import UsageError
 from residnet.data.prepare import Prepared
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.heads import ClosedFormHead
+from residnet.identification.cross_fitting.crossed import Crossed, with_crossed
 from residnet.identification.evaluation import Evaluation
 from residnet.identification.models import FittedModel
 from residnet.judge.config import EvaluationConfig
@@ -76,6 +77,7 @@ def select(
     findings: Mapping[str, Sequence[Finding]],
     config: EvaluationConfig,
     deciding: FreeRun | None = None,
+    crossed: Crossed | None = None,
 ) -> Selection:
     """Choose among the models of a fit by their free runs over the validation logs.
 
@@ -85,6 +87,7 @@ def select(
         findings: of the checks for physical sanity, by model.
         config: its `selection` protocol decides.
         deciding: free runs over the validation logs that decide in its place.
+        crossed: errors of the baselines over folds of all logs, which then decide among them.
 
     Raises:
         UsageError: where the validation logs have not been judged.
@@ -102,8 +105,16 @@ def select(
     if deciding is not None:
         counted["validation"] = [*counted["validation"], deciding]
     scales = config.scales.named()
+    models = {entry.name: entry for entry in fitted}
+    parts = {
+        name: shares(run, name, validation.logs, scales, labels, len(blocks.weights))
+        for name in models
+    }
+    more = None if crossed is None else with_crossed(parts, blocks, crossed, models)
+    if more is not None:
+        parts, blocks = more
     contenders = []
-    for entry in fitted:
+    for entry in models.values():
         lost = [
             (split, free.protocol, diverged, len(free.windows))
             for split, runs in counted.items()
@@ -120,7 +131,7 @@ def select(
                 entry.name,
                 family(entry),
                 parameter_count(entry.model),
-                shares(run, entry.name, validation.logs, scales, labels, len(blocks.weights)),
+                parts[entry.name],
                 sum(diverged for _, _, diverged, _ in lost),
                 tuple(faults),
             )

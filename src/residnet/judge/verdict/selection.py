@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -64,22 +64,36 @@ class Blocks:
     Attributes:
         weights: share of each block in the mean over windows, [B]; their sum is 1.
         of: `logs` where a block is all windows of a log, else `stretches` of logs.
+        further: blocks of other data, over which a second part of the shares was taken.
     """
 
     weights: np.ndarray
     of: str
+    further: Blocks | None = None
+
+    @property
+    def count(self) -> int:
+        """Number of blocks, those of other data too."""
+        return len(self.weights) + (0 if self.further is None else self.further.count)
+
+    def beside(self, further: Blocks) -> Blocks:
+        """Return the blocks with those of other data behind them."""
+        return replace(self, further=further)
 
     def standard_error(self, one: np.ndarray, other: np.ndarray) -> float:
         """Return the standard error of the difference of two mean errors from their shares [B].
 
-        Zero where there is a single block, which tells nothing of the spread.
+        A single block adds nothing, since it does not tell of the spread.
         """
         count = len(self.weights)
+        beyond = (
+            0.0 if self.further is None else self.further.standard_error(one[count:], other[count:])
+        )
         if count < 2:
-            return 0.0
-        apart = one - other
+            return beyond
+        apart = one[:count] - other[:count]
         rest = apart - self.weights * apart.sum()
-        return math.sqrt(count / (count - 1) * float(rest @ rest))
+        return math.hypot(math.sqrt(count / (count - 1) * float(rest @ rest)), beyond)
 
 
 @dataclass(frozen=True)
@@ -120,7 +134,7 @@ class Selection:
             "selected": self.selected,
             "selected_ensemble": self.selected_ensemble,
             "reason": self.reason,
-            "blocks": {"of": self.blocks.of, "count": len(self.blocks.weights)},
+            "blocks": {"of": self.blocks.of, "count": self.blocks.count},
             "models": [
                 {
                     "model": entry.name,

@@ -17,17 +17,21 @@ from residnet.data.prepare import Prepared, samples
 from residnet.data.windows import WindowStore
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
-from residnet.identification.folds import Fold, folds_of
+from residnet.identification.cross_fitting.crossed import Crossed
+from residnet.identification.cross_fitting.folds import Fold, folds_of
 from residnet.identification.settings import FitSettings
 from residnet.judge.config import EvaluationConfig
 from residnet.judge.freerun import Candidate, FreeRun, Prediction, free_run
 from residnet.judge.protocol import Window, Windows, overlapping
-from residnet.judge.verdict.selection import Blocks, blocks_of, shares
+from residnet.judge.verdict.selection import Blocks, blocks_of
 from residnet.training.refit import refit
 from residnet.training.refit_config import RefitConfig
 
 _ITERATIONS = 3
 """Steps of Gauss-Newton for each strength, each search going on where the last one ended."""
+TAKEN = "taken"
+"""Name of the model with the chosen prior among the errors over the folds."""
+_ZERO = "zero"
 _ALIKE = 1.0 + 1e-9
 """Standard errors by which divergences may differ; rounding apart."""
 Prior = float | None
@@ -42,10 +46,12 @@ class PriorChoice:
         prior: None where least squares stay as they are.
         table: for fit.json: prior, free-run error over the held-out windows, the difference to the
             best with its standard error, windows that diverged.
+        crossed: errors over the folds by `taken` and `zero`.
     """
 
     prior: Prior
     table: list[dict[str, Any]]
+    crossed: Crossed
 
 
 def choose_prior(
@@ -77,13 +83,16 @@ def choose_prior(
     pool: list[Prepared] = []
     windows: list[Window] = []
     predicted: dict[str, list[Prediction]] = {_key(prior): [] for prior in priors}
+    predicted[_ZERO] = []
     for fold in folds_of(logs, config.folds):
         found = _windows(fold.held_out, settings.evaluation, config, step)
         if not found:
             continue
+        # beyond a limit of nothing every free run has diverged, and zero stands in its place
+        nothing = np.full(3, -1.0)
+        predicted[_ZERO] += _predicted(spec.build(), found, fold.held_out, step, nothing)
         for prior, model in _fitted(spec, config, fold, priors, scales):
-            # beyond a limit of nothing every free run has diverged
-            most = np.full(3, -1.0) if model is None else limit
+            most = nothing if model is None else limit
             predicted[_key(prior)] += _predicted(
                 model or spec.build(), found, fold.held_out, step, most
             )
@@ -192,9 +201,9 @@ def _chosen(
     logs: Sequence[Prepared],
     evaluation: EvaluationConfig,
 ) -> PriorChoice:
-    blocks, labels = blocks_of(run)
-    scales, count = evaluation.scales.named(), len(blocks.weights)
-    parts = {p: shares(run, _key(p), logs, scales, labels, count) for p in priors}
+    crossed = Crossed.of(run, logs, evaluation)
+    blocks, labels = crossed.blocks, blocks_of(run)[1]
+    parts = {p: crossed.shares[_key(p)] for p in priors}
     lost = {p: sum(one.diverged for one in run.predictions[_key(p)]) for p in priors}
     steady = _steady(run, blocks, labels, priors)
     best = min(steady, key=lambda p: float(parts[p].sum()))
@@ -213,4 +222,4 @@ def _chosen(
         }
         for p in priors
     ]
-    return PriorChoice(taken, table)
+    return PriorChoice(taken, table, crossed.renamed({_key(taken): TAKEN, _ZERO: _ZERO}))

@@ -1,0 +1,84 @@
+"""Errors over all folds of the logs, which tell models apart that a few validation logs do not."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from residnet.data.prepare import Prepared
+from residnet.identification.models import FittedModel
+from residnet.judge.config import EvaluationConfig
+from residnet.judge.freerun import FreeRun
+from residnet.judge.verdict.selection import Blocks, blocks_of, shares
+
+
+@dataclass(frozen=True)
+class Crossed:
+    """Errors of models over parts of the logs that each of them was fitted without.
+
+    Attributes:
+        blocks: of the training and validation logs together.
+        shares: what each block contributes to the mean NRMSE, [B], by model.
+        starts: log and first sample of each window, by which runs are known to be the same.
+    """
+
+    blocks: Blocks
+    shares: dict[str, np.ndarray]
+    starts: tuple[tuple[int, int], ...]
+
+    @classmethod
+    def of(cls, run: FreeRun, logs: Sequence[Prepared], config: EvaluationConfig) -> Crossed:
+        """Return the errors of free runs over logs that were left out."""
+        blocks, labels = blocks_of(run)
+        scales, count = config.scales.named(), len(blocks.weights)
+        found = {name: shares(run, name, logs, scales, labels, count) for name in run.predictions}
+        return cls(blocks, found, tuple((window.log, window.start) for window in run.windows))
+
+    def renamed(self, names: Mapping[str, str]) -> Crossed:
+        """Return the errors of some models, by names of their own."""
+        found = {new: self.shares[old] for old, new in names.items()}
+        return Crossed(self.blocks, found, self.starts)
+
+    def joined(self, other: Crossed | None) -> Crossed | None:
+        """Return both together; None where they are not over the same windows."""
+        if other is None or other.starts != self.starts:
+            return None
+        return Crossed(self.blocks, {**self.shares, **other.shares}, self.starts)
+
+
+def with_crossed(
+    own: Mapping[str, np.ndarray],
+    blocks: Blocks,
+    crossed: Crossed,
+    fitted: Mapping[str, FittedModel],
+) -> tuple[dict[str, np.ndarray], Blocks] | None:
+    """Return shares and blocks of all models over folds and validation logs; None where they lack.
+
+    A baseline is judged over all folds. What stands on it is too expensive to be fitted for each
+    fold: it is judged by its baseline's error over the folds, and by its difference to the
+    baseline on the validation logs. That difference spreads less than either of the two errors,
+    as both run over the same windows (a difference estimator, as in sampling from surveys).
+
+    Args:
+        own: shares over the validation logs, [B] by model.
+        blocks: of the validation logs.
+        crossed: errors over the folds, `zero` and all baselines among them.
+        fitted: the models.
+    """
+    out = {}
+    for name, entry in fitted.items():
+        roots = [_root(fitted[member], fitted) for member in entry.notes.get("members", (name,))]
+        if any(root not in crossed.shares for root in roots):
+            return None
+        over_folds = np.mean([crossed.shares[root] for root in roots], axis=0)
+        beside = np.mean([own[root] for root in roots], axis=0)
+        out[name] = np.concatenate((over_folds, own[name] - beside))
+    return out, crossed.blocks.beside(blocks)
+
+
+def _root(entry: FittedModel, fitted: Mapping[str, FittedModel]) -> str:
+    """Return the name of the baseline that a model is or stands on."""
+    below = entry.notes.get("of") or entry.notes.get("baseline")
+    return entry.name if below is None or below == entry.name else _root(fitted[below], fitted)

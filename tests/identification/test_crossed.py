@@ -1,0 +1,61 @@
+"""Errors over folds: a model on a baseline is judged by its difference to the baseline."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from residnet.identification.cross_fitting.crossed import Crossed, with_crossed
+from residnet.judge.verdict.selection import Blocks
+
+FOLDS = Blocks(np.full(3, 1.0 / 3.0), "stretches")
+LOGS = Blocks(np.full(2, 0.5), "stretches")
+CROSSED = Crossed(
+    FOLDS,
+    {"zero": np.full(3, 0.3), "hull": np.array([0.1, 0.2, 0.3])},
+    ((0, 5), (1, 5)),
+)
+
+
+def model(name: str, **notes: Any) -> Any:
+    return SimpleNamespace(name=name, notes=notes)
+
+
+def test_a_difference_is_added_to_the_baseline_s_error_over_the_folds() -> None:
+    own = {
+        "zero": np.array([0.5, 0.5]),
+        "hull": np.array([0.1, 0.1]),
+        "net": np.array([0.1, 0.05]),
+        "force": np.array([0.2, 0.1]),
+        "alone": np.array([0.3, 0.3]),
+        "mean": np.array([0.1, 0.2]),
+    }
+    fitted = {
+        "zero": model("zero"),
+        "hull": model("hull"),
+        "net": model("net", baseline="hull"),
+        "force": model("force", of="hull"),
+        "alone": model("alone", baseline="zero"),
+        "mean": model("mean", members=["net", "alone"]),
+    }
+    found = with_crossed(own, LOGS, CROSSED, fitted)
+    assert found is not None
+    shares, blocks = found
+    errors = {name: float(one.sum()) for name, one in shares.items()}
+    expected = {"zero": 0.9, "hull": 0.6, "net": 0.55, "force": 0.7, "alone": 0.5, "mean": 0.45}
+    np.testing.assert_allclose([errors[name] for name in expected], [*expected.values()])
+    # what is common to a model and its baseline over the folds does not blur their difference
+    spread = blocks.standard_error(shares["net"], shares["hull"])
+    assert spread == LOGS.standard_error(own["net"], own["hull"])
+    assert with_crossed(own, LOGS, CROSSED, {**fitted, "other": model("other")}) is None
+
+
+def test_errors_over_other_windows_are_not_joined() -> None:
+    other = replace(CROSSED, shares={"linear": np.full(3, 0.2)})
+    joined = CROSSED.joined(other)
+    assert joined is not None
+    assert set(joined.shares) == {"zero", "hull", "linear"}
+    assert CROSSED.joined(replace(other, starts=((0, 6), (1, 5)))) is None
