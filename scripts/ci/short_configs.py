@@ -291,6 +291,16 @@ SHORT: dict[str, Short] = {
         data="esso_osaka",
     ),
     "studies/moreno2019/polynomial_wind": Short(("refit={}",), data="esso_osaka"),
+    "studies/woo2018/outside_terms": Short(
+        (
+            "data.trials=[{kind: zigzag, count: 6, heading: [10 deg], steer: [0.15, 0.9],"
+            " drive: [1.0, 1.0]}]",
+            "data.identification={zigzag: 5}",
+            "data.validation={zigzag: 1}",
+            *_trained("mlp", "lstm"),
+        )
+    ),
+    "studies/woo2018/thrusters": Short(),
     "studies/woo2018/woo2018": Short((*_TRIALS, *_trained("lstm_printed", "lstm_rate", "lstm"))),
 }
 

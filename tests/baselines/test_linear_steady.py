@@ -123,6 +123,37 @@ def test_errors_of_the_fit_cover_the_truth() -> None:
         assert abs(entry.value - truth) < 5 * entry.error + 1e-9
 
 
+def test_steady_states_and_phi_stand_in_the_notes() -> None:
+    config = LinearSteadyConfig(settled=400.0)
+    (solution,) = config.solutions(config.build(NAMES), trials())
+    found = solution.notes["steady_constraints"]
+    for axis, state in enumerate("uvr"):
+        column = 0 if state == "u" else 1
+        assert found[state]["phi"] == pytest.approx(PHI[axis, column], rel=1e-4)
+        assert found[state]["bias"] == pytest.approx(BIAS[axis], rel=1e-4)
+    steady = solution.notes["steady_states"]
+    np.testing.assert_allclose(
+        steady["u"], PHI[0, 0] * np.array(steady["tau_x"]) + BIAS[0], rtol=1e-5
+    )
+
+
+@pytest.mark.parametrize("model", ["nomoto", "nomoto_sideslip"])
+def test_nomoto_keeps_the_steady_states_and_its_own_structure(model: str) -> None:
+    config = LinearSteadyConfig.model_validate({"settled": 400.0, "steering_model": model})
+    found = by_name(config.fit(config.build(NAMES), trials()))
+    # whatever the time constant, the yaw rate settles where the constant manoeuvres did
+    assert -found["r", "tau_n"] / found["r", "r"] == pytest.approx(PHI[2, 1], rel=1e-4)
+    assert -found["r", "1"] / found["r", "r"] == pytest.approx(BIAS[2], rel=1e-4)
+    assert ("r", "v") not in found
+    if model == "nomoto":
+        assert found["v", "v"] == found["r", "r"]
+        assert ("v", "tau_n") not in found
+    else:
+        slope = PHI[1, 1] / PHI[2, 1]
+        assert -found["v", "r"] / found["v", "v"] == pytest.approx(slope, rel=1e-4)
+        assert ("v", "tau_n") not in found
+
+
 def without(samples: Samples, kinds: tuple[str, ...]) -> Samples:
     keep = torch.tensor([kind not in kinds for kind in samples.kinds])
     return samples.where(keep[samples.group])

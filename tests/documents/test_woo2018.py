@@ -15,11 +15,26 @@ from matplotlib import pyplot as plt
 from residnet.core.errors import UsageError
 from residnet.documents import study_sections
 from residnet.documents.woo2018 import figures as woo2018
+from residnet.documents.woo2018 import panels
+from residnet.documents.woo2018.steady import steady_table
 from residnet.report.blocks import Figure, Table
-from residnet.report.run_reader import RunFiles
+from residnet.report.run_reader import RunFiles, StoredWindow
 
 KINDS = ("zigzag", "acceleration_deceleration", "three_two_one_one")
 MODELS = ("zero", "nomoto", "nomoto_side_slip", "baseline", "lstm_printed", "lstm_rate", "lstm")
+STEADY = {
+    "steady_states": {
+        "u": [0.5, 1.0, 1.5],
+        "v": [-0.1, 0.0, 0.1],
+        "r": [-0.2, 0.0, 0.2],
+        "tau_x": [100.0, 200.0, 300.0],
+        "tau_n": [-100.0, 0.0, 100.0],
+    },
+    "steady_constraints": {
+        state: {"of": force, "phi": phi, "phi_error": 1e-5, "bias": 0.0, "bias_error": 0.01}
+        for state, force, phi in (("u", "tau_x", 5e-3), ("v", "tau_n", 1e-3), ("r", "tau_n", 2e-3))
+    },
+}
 COLUMNS = ("u", "v", "r", "psi", "x", "y")
 
 
@@ -87,6 +102,8 @@ def made_study(
             {"schema": "residnet.metrics/1", "run": "made", "selected": "lstm", "rows": rows}
         )
     )
+    (run / "models" / "baseline").mkdir(parents=True)
+    (run / "models" / "baseline" / "fit.json").write_text(json.dumps(STEADY))
     for kind in kinds:
         for number, size in enumerate((3.0, 1.0, 2.0)):
             rollouts(run / "rollouts" / "test", f"{kind}_{number + 1:02d}", size)
@@ -103,9 +120,9 @@ def test_six_figures_that_show_something(study: Path) -> None:
     (section,) = study_sections("woo2018", study)
     paths = [block.path for block in section.blocks if isinstance(block, Figure)]
     assert [path.relative_to(study).as_posix() for path in paths] == [
-        f"figures/woo2018/{number}.png" for number in range(13, 19)
+        f"figures/woo2018/{number}.png" for number in (9, *range(13, 19))
     ]
-    (changes,) = (block for block in section.blocks if isinstance(block, Table))
+    _, changes = (block for block in section.blocks if isinstance(block, Table))
     # made up: the error of the linear model is 0.04, that of the best LSTM 0.01
     assert changes.rows[-1].cells[0].text == "−75.0"
     assert changes.rows[-1].cells[0].note == "published −76.9"
@@ -122,18 +139,45 @@ def test_six_figures_that_show_something(study: Path) -> None:
             for half in np.array_split(inked, 2, axis=0)
             for part in np.array_split(half, 2, axis=1)
         )
-    assert len({path.read_bytes() for path in paths}) == 6
+    assert len({path.read_bytes() for path in paths}) == 7
     assert dict(mpl.rcParams) == before, "the look of other figures is left alone"
 
 
+def typical(study: Path, kind: str) -> StoredWindow:
+    """The run that the figures show of a kind."""
+    files = RunFiles(study)
+    return woo2018._typical(files, files.windows("test"), kind)
+
+
+def test_the_steady_map_stands_beside_the_corrected_table(study: Path) -> None:
+    table = steady_table(RunFiles(study))
+    yaw = table.rows[-1].cells
+    # 2e-3 rad/s per N m is 0.1146 deg/s; Table 1 corrected has .0330 (W12) and 1.287 (W13)
+    assert (yaw[0].text, yaw[0].note) == ("0.115", "published 0.033")
+    assert yaw[2].note == "published 1.29"
+
+
+def test_error_panels_are_predicted_minus_measured(study: Path) -> None:
+    window = typical(study, "zigzag")
+    axes = plt.figure().add_subplot()
+    panels.plot_errors(axes, window, "r", ("lstm",))
+    panels.plot_ratios(axes.figure.add_subplot(), [window], "r", ("lstm",))
+    error = window.predicted["lstm"][:, 2] - window.measured[:, 2]
+    np.testing.assert_allclose(np.asarray(axes.get_lines()[0].get_ydata()), np.degrees(error))
+    ratio = axes.figure.axes[1].get_lines()[0].get_ydata()
+    expected = window.rmse("lstm")[2] / window.rmse("baseline")[2]
+    assert np.asarray(ratio) == pytest.approx([expected])
+    plt.close("all")
+
+
 def test_the_typical_run_is_that_of_the_median_error(study: Path) -> None:
-    assert woo2018._typical(RunFiles(study), "zigzag").log == "zigzag_03"
+    assert typical(study, "zigzag").log == "zigzag_03"
 
 
 def test_histories_show_the_stored_numbers(study: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    window = woo2018._typical(RunFiles(study), "zigzag")
+    window = typical(study, "zigzag")
     axes = plt.figure().add_subplot()
-    woo2018._plot_history(axes, window, "r", ("baseline", "lstm"))
+    panels.plot_history(axes, window, "r", ("baseline", "lstm"))
     stored = pd.read_parquet(study / "rollouts" / "test" / "zigzag_03.parquet")
     measured, *lines = [np.asarray(line.get_ydata()) for line in axes.get_lines()]
     for model, line in zip(("baseline", "lstm"), lines, strict=True):
@@ -145,15 +189,16 @@ def test_histories_show_the_stored_numbers(study: Path, monkeypatch: pytest.Monk
 
 
 def test_bars_are_the_rows_of_metrics(study: Path) -> None:
-    figure = woo2018._bars(RunFiles(study), ("v", "r"), "steering", ("nomoto", "lstm"))
-    for axes, channel, factor in zip(figure.axes, ("v", "r"), (1.0, 180 / np.pi), strict=True):
-        heights = [bar.get_height() for bar in axes.patches]
+    for channel, factor in (("v", 1.0), ("r", 180 / np.pi)):
+        axes = plt.figure().add_subplot()
+        panels.plot_rmse(axes, RunFiles(study), channel, "steering", ("nomoto", "lstm"))
         expected = [
             factor * row(model, split, "steering")["rmse"][channel]
             for split in ("train", "test")
             for model in ("nomoto", "lstm")
         ]
-        assert heights == pytest.approx(expected)
+        assert [bar.get_height() for bar in axes.patches] == pytest.approx(expected)
+    plt.close("all")
 
 
 @pytest.mark.parametrize("absent", [model for model in MODELS if model != "zero"])

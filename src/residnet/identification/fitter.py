@@ -106,6 +106,7 @@ class Fitter:
         notes: dict[str, Any] = {
             "samples": len(self.samples),
             **solution.choice,
+            **solution.notes,
             **tried,
             "least_squares": self.validate(model).error,
         }

@@ -10,3 +10,11 @@ CHANGE_OF_ERROR: MappingProxyType[str, float] = MappingProxyType(
 """Relative change of the prediction error from the linear model to the LSTM (section 4, Figures 16
 and 17), by velocity.
 """
+
+STEADY: MappingProxyType[str, tuple[float, float]] = MappingProxyType(
+    {"u": (0.0021, 0.5182), "v": (2.23e-4, -0.007), "r": (0.0330, 1.287)}
+)
+"""Phi and bias of the steady states (32), in m/s, m/s and deg/s per N, N m and N m.
+
+Table 1 as corrected (W12, W13): (34) needs .0330 and 1.287 where .341 and .657 are printed.
+"""
