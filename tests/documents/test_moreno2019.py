@@ -11,7 +11,9 @@ import pytest
 
 from residnet.core.errors import UsageError
 from residnet.documents import study_sections
+from residnet.documents.moreno2019 import curves
 from residnet.report.blocks import Cell, Figure, Table, Text
+from residnet.report.run_reader import RunFiles
 
 MODELS = (
     "zero",
@@ -107,6 +109,32 @@ def test_tables_hold_the_errors_of_the_records(tmp_path: Path) -> None:
     assert shown[1] == Cell("0.0700", "0.0700 to 0.0700; published 0.2249")
     assert isinstance(figure, Figure)
     assert figure.path.stat().st_size > 10_000
+
+
+def test_the_curves_are_what_the_search_tried(tmp_path: Path) -> None:
+    run = made(tmp_path)
+    tried = [
+        {"sigma": [width] * 3, "penalty": [penalty] * 3, "validation": width + penalty}
+        for width in (1.0, 10.0)
+        for penalty in (0.01, 0.1, 1.0)
+    ]
+    own_width = {"sigma": [1.0, 1.0, 10.0], "penalty": [0.1] * 3, "validation": 0.5}
+    none = {"penalty": [], "validation": 1.0}
+    choice = [entry | {"diverged": 0} for entry in (*tried, own_width, none)]
+    errors = np.arange(1.0, 19.0).reshape(2, 3, 3)
+    notes = {"free_run_choice": choice, "cross_validated_error": errors.tolist()}
+    (run / "models" / "rbf_joint").mkdir(parents=True)
+    (run / "models" / "rbf_joint" / "fit.json").write_text(json.dumps(notes))
+    grid = curves._grid(choice)
+    assert grid == {
+        (entry["penalty"][0], entry["sigma"][0]): entry["validation"] for entry in tried
+    }
+    one_step = curves._one_step(notes, grid)
+    assert one_step[0.01, 1.0] == 1.0
+    assert one_step[0.1, 10.0] == pytest.approx(np.mean([13 / 1, 14 / 2, 15 / 3]))
+    figures = curves.curves(RunFiles(run))
+    assert [figure.path.name for figure in figures] == ["5.png", "6.png"]
+    assert all(figure.path.stat().st_size > 5_000 for figure in figures)
 
 
 def test_a_run_without_a_model_of_the_study_says_which(tmp_path: Path) -> None:

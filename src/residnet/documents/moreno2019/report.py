@@ -17,6 +17,7 @@ import numpy as np
 
 from residnet.core.errors import UsageError
 from residnet.core.files import whole
+from residnet.documents.moreno2019.curves import curves
 from residnet.documents.moreno2019.published import EQUATIONS, OTHERS, RMSE
 from residnet.judge.residual_series import block_interval
 from residnet.report.blocks import Block, Cell, Figure, Section, Table, Text
@@ -46,7 +47,7 @@ _AXES = (("u", "m/s", 1.0), ("v", "m/s", 1.0), ("r", "deg/s", DEG))
 
 
 def sections(run: Path) -> list[Section]:
-    """Write study.json, draw Figure 8 and return the study's section of the report.
+    """Write study.json, draw Figures 5, 6 and 8 and return the study's section of the report.
 
     Raises:
         UsageError: where the run lacks a model of the study or the free runs over whole records.
@@ -78,7 +79,8 @@ def sections(run: Path) -> list[Section]:
     content = {"schema": "residnet.moreno2019/1", "rows": rows, "pairs": pairs}
     with whole(run / "study.json") as file:
         file.write_text(json.dumps(content, indent=1) + "\n")
-    blocks: list[Block] = [_errors(rows), _joint(pairs), _draw(records["test"], run), _printed()]
+    blocks: list[Block] = [_errors(rows), _joint(pairs), _draw(records["test"], run)]
+    blocks += [*curves(files), _printed()]
     if _OPTIONAL not in names:
         blocks.insert(0, Text(f"Not run: {_NAMES[_OPTIONAL]}, which needs the extra gp."))
     return [Section("Document 001 (Moreno-Salinas et al. 2019)", blocks)]

@@ -202,6 +202,8 @@ class SeaTrialSettings(ComputingTask):
         separate: also judge models that consist of one model for each phase.
         published: root mean square error (m/s^2, m/s^2, rad/s^2), C_p and adjusted R^2 that the
             document prints (Tables 7.3, 7.4), by set of samples, model and acceleration.
+        published_absolute: mean absolute residual (m/s^2, m/s^2, rad/s^2) and the ends of its 95 %
+            interval that the document prints (Table 7.5), likewise.
     """
 
     trials: dict[str, SeaTrialConfig] = Field(min_length=1)
@@ -209,24 +211,30 @@ class SeaTrialSettings(ComputingTask):
     equations: dict[str, EquationConfig] = Field(default_factory=dict)
     separate: bool = True
     published: dict[str, dict[str, Published]] = Field(default_factory=dict)
+    published_absolute: dict[str, dict[str, Published]] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _names(self) -> SeaTrialSettings:
         for name in self.equations:
             if name in (STANDARD, SEPARATE, PLANT):
                 raise ValueError(f"equations: the name '{name}' is taken")
-        for where, models in self.published.items():
-            if where not in SETS:
-                raise ValueError(f"published: no set '{where}'{nearest(where, SETS)}")
-            for model in models:
-                if model not in (STANDARD, *self.equations):
-                    raise ValueError(
-                        f"published.{where}: no model"
-                        f" '{model}'{nearest(model, (STANDARD, *self.equations))}"
-                    )
+        for key in ("published", "published_absolute"):
+            self._check_printed(key, getattr(self, key))
         for name, equation in self.equations.items():
             try:
                 equation.build()
             except ConfigError as error:
                 raise ValueError(f"equations.{name}: {error}") from None
         return self
+
+    def _check_printed(self, key: str, printed: dict[str, dict[str, Published]]) -> None:
+        """Check that printed figures belong to sets and models that there are."""
+        for where, models in printed.items():
+            if where not in SETS:
+                raise ValueError(f"{key}: no set '{where}'{nearest(where, SETS)}")
+            for model in models:
+                if model not in (STANDARD, *self.equations):
+                    raise ValueError(
+                        f"{key}.{where}: no model"
+                        f" '{model}'{nearest(model, (STANDARD, *self.equations))}"
+                    )

@@ -85,8 +85,9 @@ def sections(settings: SeaTrialSettings, results: Results, run: Path) -> list[Se
         run: run folder, which holds the figures.
     """
     first = next(iter(results["trials"]))
+    printed = (settings.published, settings.published_absolute)
     return [
-        _trial(settings, name, trial, run, settings.published if name == first else {})
+        _trial(settings, name, trial, run, printed if name == first else ({}, {}))
         for name, trial in results["trials"].items()
     ]
 
@@ -96,11 +97,11 @@ def _trial(
     name: str,
     trial: Results,
     run: Path,
-    published: Mapping[str, Mapping[str, Any]],
+    published: Sequence[Mapping[str, Mapping[str, Any]]],
 ) -> Section:
     blocks: list[Text | Section] = [Text(_about(trial))]
     for where, rows in trial["rows"].items():
-        table = _goodness(where, rows, published.get(where, {}))
+        table = _goodness(where, rows, *(of.get(where, {}) for of in published))
         blocks.append(
             Section(f"Validation, {SET_NAMES[where]}", [table, *pictures(run, f"{where}_{name}.")])
         )
@@ -137,8 +138,20 @@ def _about(trial: Results) -> str:
     )
 
 
-def _goodness(where: str, rows: Sequence[Results], published: Mapping[str, Any]) -> Table:
-    """Return the goodness of fit of all models on one set (Tables 7.3 to 7.5)."""
+def _goodness(
+    where: str,
+    rows: Sequence[Results],
+    published: Mapping[str, Any],
+    absolute: Mapping[str, Any],
+) -> Table:
+    """Return the goodness of fit of all models on one set (Tables 7.3 to 7.5).
+
+    Args:
+        where: set of samples.
+        rows: goodness of each model on each acceleration.
+        published: RMSE, C_p and adjusted R^2 that the document prints, by model and acceleration.
+        absolute: mean absolute residual and its interval, likewise.
+    """
     table = Table(
         [
             "model",
@@ -157,8 +170,9 @@ def _goodness(where: str, rows: Sequence[Results], published: Mapping[str, Any])
     )
     for row in rows:
         fitted_to = where if row["model"] == STANDARD else ALL
-        printed = (
-            published.get(row["model"], {}).get(row["axis"]) if row["on"] == fitted_to else None
+        printed, mean = (
+            of.get(row["model"], {}).get(row["axis"]) if row["on"] == fitted_to else None
+            for of in (published, absolute)
         )
         goodness = [
             beside_published(row[key], None if printed is None else printed[i], 3)
@@ -172,9 +186,12 @@ def _goodness(where: str, rows: Sequence[Results], published: Mapping[str, Any])
                 Cell(fitted_on, mark="text"),
                 f"{row['parameters']:.0f}",
                 *goodness,
-                number(row["mae"]),
+                beside_published(row["mae"], mean[0] if mean else None, 3),
                 interval(row["mae_ci95"]),
-                interval(row["mae_ci95_independent"]),
+                Cell(
+                    interval(row["mae_ci95_independent"]),
+                    f"published {interval(list(mean[1:]))}" if mean else "",
+                ),
             ],
         )
     return table
