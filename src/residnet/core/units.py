@@ -83,7 +83,8 @@ _WORDS: dict[str, str] = {
     "min": "minute minutes mins minuten minuto minutos minutt 分",
     "h": "hr hrs hour hours stunde stunden heure uur 時",
     "Hz": "hertz",
-    "kn": "kt kts knot knots knoten noeud noeuds nœud nœuds nudo nudos knoop knopen knop ノット",
+    "kn": "kt kts knot knots knoten nd nds noeud noeuds nœud nœuds nudo nudos knoop knopen knop"
+    " ノット",
     "rpm": "r.p.m. upm",
     "rps": "r.p.s.",
     "rad": "radian radians rads",
@@ -100,7 +101,20 @@ _WORDS: dict[str, str] = {
     "deg/s": "dps",
     "-": "none dimensionless",
 }
-_TURNS = ("rev", "revs", "revolutions", "r", "u", "tr", "omw", "omdr", "turns", "回転")
+_TURNS = (
+    "rev",
+    "revs",
+    "revolutions",
+    "r",
+    "u",
+    "tr",
+    "o",
+    "omw",
+    "omdr",
+    "turns",
+    "vueltas",
+    "回転",
+)
 # where one part of a quotient is written in another way than the table does
 _PARTS = ("m", "km", "cm", "rad", "deg", "kg", "rpm", "1")
 _POWERS = {"²": "^2", "³": "^3", "**": "^", "⁻": "^-", "¹": "1"}

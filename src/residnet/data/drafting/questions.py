@@ -67,6 +67,11 @@ class Marks:
         """Write down what the files show."""
         self.notes.append((key, text))
 
+    def move(self, old: Key, new: Key) -> None:
+        """Move the marks of one key to another."""
+        self.guesses = [(new if key == old else key, text) for key, text in self.guesses]
+        self.notes = [(new if key == old else key, text) for key, text in self.notes]
+
     def rename(self, below: Key, names: Mapping[str, str]) -> None:
         """Move what stands at keys below another one to new names; others there are forgotten."""
 

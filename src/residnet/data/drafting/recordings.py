@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,8 @@ import numpy as np
 
 from residnet.core.errors import ResidnetError
 from residnet.core.log import Log
+from residnet.core.names import CHANNEL_UNITS
+from residnet.data.drafting.fields import named_fields
 from residnet.data.drafting.physics import FRAMES, Raw, along, follows, motion_of
 from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.sources import found_sources, step_of
@@ -19,6 +21,7 @@ from residnet.data.drafting.tables import CHANNELS, READER
 from residnet.data.drafting.units import is_pulse, unit_by_size
 from residnet.data.drafting.words import MOTION, input_channel, words_of
 from residnet.data.readers.composing.compose import Plan
+from residnet.data.readers.composing.quantities import FieldMap
 from residnet.data.readers.detect import AutoConfig, recording_for
 from residnet.data.readers.messages.standard import standard_plan
 from residnet.data.readers.recording import Recording
@@ -54,7 +57,9 @@ def draft_recordings(paths: Sequence[Path], marks: Marks) -> dict[str, Any]:
         UsageError: where the first one cannot be read.
         DataError: where it holds nothing that can be used.
     """
-    recording = recording_for(paths[0])
+    # what stands still in one recording may move in another
+    some = [recording_for(path) for path in dict.fromkeys((paths[0], *paths[:: _every(paths)]))]
+    recording = some[0]
     content: dict[str, Any] = {"kind": "auto"}
     if len({path.resolve().parent for path in paths}) > 1:
         content["manoeuvre"] = "folder"
@@ -63,7 +68,11 @@ def draft_recordings(paths: Sequence[Path], marks: Marks) -> dict[str, Any]:
     plan = standard_plan(recording, Plan())
     taken = _taken(plan)
     step = _interval(log, plan, recording)
-    if log is None or not _sound(log, marks) or step > _SLOW:
+    fields = named_fields(some, marks)
+    if fields is not None:
+        content |= fields.content
+        taken, step = fields.taken, fields.step
+    elif log is None or not _sound(log, marks) or step > _SLOW:
         whole = log is not None and {"x", "y", "psi"} <= set(log.channels)
         found = found_sources(recording, marks, _COHERENT if whole else 0.0)
         if found is None and whole:
@@ -74,15 +83,55 @@ def draft_recordings(paths: Sequence[Path], marks: Marks) -> dict[str, Any]:
             taken, step = found.taken, found.step
     content["clock"] = {"kind": "uniform", "step": f"{float(f'{step:.2g}'):g} s"}
     marks.note((*READER, "clock"), "as often as the heading or the position comes")
+    standard = {} if "standard_messages" in content else dict(plan.channels)
     known = set(log.channels) if log is not None and "standard_messages" not in content else set()
     channels = dict(content.pop("channels", {}))
-    for found_input in _inputs(recording, taken):
+    channels |= _renamed(some, standard, known, marks)
+    for found_input in _inputs(some, taken):
         name = found_input.channel
         if name not in known and name not in channels:
             channels[name] = _entry(found_input, marks)
     if channels:
         content["channels"] = channels
     return content
+
+
+def _every(paths: Sequence[Path]) -> int:
+    """Return the stride through recordings of which three are looked at."""
+    return max(1, (len(paths) - 1) // 2)
+
+
+def _renamed(
+    recordings: Sequence[Recording],
+    standard: Mapping[str, FieldMap],
+    known: set[str],
+    marks: Marks,
+) -> dict[str, dict[str, Any]]:
+    """Return entries of plain numbers whose topic or joint is named as an actuator is.
+
+    A message that holds a bare number says neither what it measures nor its unit.
+    """
+    out: dict[str, dict[str, Any]] = {}
+    for name, field in standard.items():
+        topic = field.topic or ""
+        series = recordings[0].series.get(topic)
+        if name in CHANNEL_UNITS or series is None or field.unit not in ("-", "rad"):
+            continue
+        # the last part of a topic says more than the folders that it lies in
+        names = (topic.rsplit("/", 1)[-1], name) if field.field == "data" else (name,)
+        channels = [input_channel(words_of(one.removesuffix("_position"))) for one in names]
+        channel = next((one for one in channels if one), None)
+        if channel is None or channel in known or channel in out:
+            continue
+        values = _values(recordings, topic, field.field)
+        out[channel] = _entry(_Input(channel, topic, field.field, values), marks)
+    return out
+
+
+def _values(recordings: Sequence[Recording], topic: str, field: str) -> np.ndarray:
+    """Return the values of a field in all recordings that hold it."""
+    held = [r.series[topic] for r in recordings if topic in r.series]
+    return np.concatenate([series[field] for series in held if series.has(field)])
 
 
 def _read(path: Path) -> Log | None:
@@ -133,13 +182,13 @@ def _interval(log: Log | None, plan: Plan, recording: Recording) -> float:
     return float(np.median(np.diff(log.t))) if log is not None else 1.0
 
 
-def _inputs(recording: Recording, taken: set[tuple[str, str]]) -> list[_Input]:
+def _inputs(recordings: Sequence[Recording], taken: set[tuple[str, str]]) -> list[_Input]:
     """Return the fields whose topics and names are those of actuators."""
     found: dict[str, list[_Input]] = {}
-    for series in recording.series.values():
+    for series in recordings[0].series.values():
         for field in series.fields:
             channel = input_channel(words_of(f"{series.name} {field}"))
-            values = series[field]
+            values = _values(recordings, series.name, field)
             known = values[np.isfinite(values)]
             if channel is None or (series.name, field) in taken or known.size < _FEWEST:
                 continue

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 
@@ -77,10 +77,10 @@ def draft_tables(files: Sequence[Path], marks: Marks) -> TableDraft:
     if clock.guess:
         marks.guess((*READER, "time"), clock.guess)
     numeric = [name for name in shared if name in first.numbers and name not in clock.columns]
-    names = _named(numeric, marks)
+    names = named(numeric, marks)
     logs = _raw(sheets, names, left_out)
     names, logs, fixes = from_fixes(names, logs, marks)
-    channels = _Channels(names, logs, marks, fixes).drafted()
+    channels = Channels(names, logs, marks, fixes).drafted()
     about = {key: value for key, value in first.about.items() if key != "kind"}
     content = {"kind": first.about["kind"], **about, "time": clock.settings}
     if len({path.resolve().parent for path in files}) > 1:
@@ -112,8 +112,8 @@ def _sheets(files: Sequence[Path]) -> tuple[list[Sheet], dict[Path, str]]:
     return [sheets[best], *sheets[:best], *sheets[best + 1 :]], left_out
 
 
-def _named(columns: Sequence[str], marks: Marks) -> dict[str, str]:
-    """Return channel -> column."""
+def named(columns: Sequence[str], marks: Marks) -> dict[str, str]:
+    """Return channel -> column, by what the columns are called."""
     names: dict[str, str] = {}
     speeds: list[str] = []
     about = {column: words_of(column) for column in columns}
@@ -175,7 +175,8 @@ def _unused(sheet: Sheet, names: Mapping[str, str], clock: Clock, marks: Marks) 
         marks.note(CHANNELS, f"empty columns: {', '.join(sheet.empty[:12])}")
 
 
-class _Channels:
+@final
+class Channels:
     """The entries of a channel map, from names, headers, values and physics."""
 
     def __init__(

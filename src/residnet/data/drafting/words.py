@@ -38,7 +38,7 @@ _ABOUT: dict[str, str] = {
     "speed": "speed velo 風速 geschwind vitesse velocidad snelheid hastighet 速度 船速 fahrt"
     " vaart 速力 | velo sog stw fart vel spd log tws",
     "surge": "surge langsgeschw laengsgeschw longitudin avance avante voraus vooruit voorwaart"
-    " fremover 前後 langs | u forward ahead",
+    " fremover forover 前後 langs | u forward ahead",
     "sway": "sway quergeschw seitlich lateral dwars tverr sideveis 左右 derive transvers"
     " querab sidewards sideways | v vm quer",
     "rudder": "rudder ruder gouvernail timon roer rorv 舵 safran barre | delta rudder ror rsa"
@@ -52,7 +52,7 @@ _ABOUT: dict[str, str] = {
     "torque": "torque drehmoment couple koppel dreiemoment トルク",
     "power": "power leistung puissance potencia vermogen effekt 出力",
     "throttle": "throttle actuator gashebel lever hebel | gas pwm",
-    "azimuth": "azimu schottel pod | azi nozzle",
+    "azimuth": "azimu schottel pod | azi nozzle alpha",
     "servo": "servo rcou",
     "force": "force kraft fuerza kracht 力 tau",
     "wind": "wind vind vent viento 風 | tws twd",
@@ -73,6 +73,9 @@ _ABOUT: dict[str, str] = {
     "current": "current stromung courant corriente stroming 潮流",
     "depth": "depth tiefe profond profund diepte dybde 水深",
     "voltage": "volt spannung tension | amp ampere current_a",
+    "bow": "| bow bug proue proa boeg baug",
+    "stern": "| stern heck poupe popa hek akter aft",
+    "index": "| index idx id number nr no num count counter flag valid",
     "age": "| age alter",
     "estimate": "estimat filtered hat mean | est",
     "measured": "| meas measured actual ist",
@@ -218,9 +221,10 @@ def input_channel(words: Words) -> str | None:
     w, name = words, words.text.replace(" ", "_")
     if name in CHANNEL_UNITS and name not in (*MOTION, "t", *ACCELERATION):
         return name
-    if w.has("wind") or w.has("age") or w.has("power") or w.has("voltage"):
+    if not w.lacks("wind", "age", "index", "power", "voltage"):
         return None
-    side = "_port" if w.has("port") else "_stbd" if w.has("starboard") else ""
+    sides = {"port": "_port", "starboard": "_stbd", "bow": "_bow", "stern": "_stern"}
+    side = next((end for name, end in sides.items() if w.has(name)), "")
     side = side or (f"_{w.number}" if w.number is not None else "")
     if w.has("force") and (forced := _force(w)):
         return forced
@@ -232,6 +236,8 @@ def input_channel(words: Words) -> str | None:
         name = "delta" if w.lacks("rate") else "delta_rate"
         return f"cmd_{name}{side}" if w.has("command") else f"{name}{side}"
     turning = w.has("revolutions") or w.has("propeller") or (w.has("engine") and w.lacks("angle"))
+    if turning and w.has("throttle") and w.lacks("revolutions"):
+        return f"throttle{side}"
     if turning and w.lacks("thrust"):
         return f"cmd_n{side}" if w.has("command") else f"n{side}"
     if w.has("thrust"):

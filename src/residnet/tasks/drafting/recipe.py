@@ -137,7 +137,7 @@ def models(inputs: Sequence[str], wind: bool, time: Timing, length: float, sampl
         physics |= {key: list(names) for key, names in acting.items() if names != known[key]}
     else:
         physics["sets"] = ["linear", *(["wind"] if wind else [])]
-        physics["terms"] = [*_HULL, *extra, *(term for name in inputs for term in _acting(name))]
+        physics["terms"] = [*_HULL, *extra, *_driving(inputs)]
     horizon = _readable(_seconds(0.2 * length))
     plan: dict[str, Any] = {
         "baseline": linear,
@@ -156,13 +156,43 @@ def models(inputs: Sequence[str], wind: bool, time: Timing, length: float, sampl
     return plan
 
 
-def _acting(name: str) -> list[str]:
-    """Return the terms of an input of which only its kind is known."""
-    if name in ("tau_x", "tau_y", "tau_n"):
-        return []
-    if name.removeprefix("cmd_").startswith(("delta", "azimuth")):
-        return [f"u|u| {name}"]
-    return [f"{name}|{name}|", f"|{name}| u"]
+def _driving(inputs: Sequence[str]) -> list[str]:
+    """Return the terms of inputs of which only their kinds are known.
+
+    A thruster that turns pushes along its angle; a rudder turns by the flow past it.
+    """
+    angles = [name for name in inputs if _kind(name) in ("azimuth", "nozzle")]
+    thrusters = [name for name in inputs if _kind(name) in ("n", "thrust", "throttle")]
+    turned = {
+        name: next(
+            (angle for angle in angles if _end(angle) == _end(name)),
+            angles[0] if len(angles) == 1 else "",
+        )
+        for name in thrusters
+    }
+    out: list[str] = []
+    for name in inputs:
+        force = f"{name}|{name}|" if not name.startswith(("thrust", "cmd_thrust")) else name
+        if name in ("tau_x", "tau_y", "tau_n") or name in turned.values():
+            continue
+        if turned.get(name):
+            out += [f"{force} {function}({turned[name]})" for function in ("cos", "sin")]
+            out.append(f"|{name}| u")
+        elif _kind(name) in ("delta", "azimuth", "nozzle"):
+            out.append(f"u|u| {name}")
+        else:
+            out += [force, f"|{name}| u"]
+    return out
+
+
+def _kind(name: str) -> str:
+    """Return the first word of a channel's name, `n` of `cmd_n_bow`."""
+    return name.removeprefix("cmd_").split("_")[0]
+
+
+def _end(name: str) -> str:
+    """Return what follows the first word, which tells several actuators of a kind apart."""
+    return name.removeprefix("cmd_").removesuffix("_cmd").partition("_")[2]
 
 
 def _hidden(samples: int) -> list[int]:

@@ -38,5 +38,7 @@ def new_config(
     lines = [f"{key}: {why}" for key, why in draft.guesses[:_SHOWN]]
     if len(draft.guesses) > _SHOWN:
         lines.append(f"and {len(draft.guesses) - _SHOWN} more, marked in the file")
-    head = f"{len(draft.guesses)} values are guesses, each marked in the file:" if lines else ""
+    count = len(draft.guesses)
+    head = f"{count} values are guesses, each marked in the file:" if lines else ""
+    head = "one value is a guess, marked in the file:" if count == 1 else head
     return [*([head] if head else []), *lines, f"config: {file}", f"next: residnet run {file}"]

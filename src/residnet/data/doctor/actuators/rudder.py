@@ -85,7 +85,9 @@ def _yaw_fit(
     x, y = x[good], y[good]
     if y.size < 60 or float(np.nanstd(log[name])) < math.radians(1.0):
         return None
-    scale = np.maximum(np.linalg.norm(x, axis=0), 1e-300)
+    length = np.linalg.norm(x, axis=0)
+    # a column of zeros, of a channel that stands still, keeps its coefficient of zero
+    scale = np.where(length > 0.0, length, 1.0)
     x = x / scale
     inverse = np.linalg.pinv(x.T @ x, rcond=1e-10)
     values = inverse @ (x.T @ y)

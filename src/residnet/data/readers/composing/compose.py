@@ -223,7 +223,10 @@ def _meta(
     topics: dict[str, Any] = {}
     for series in recording.series.values():
         found = traffic(series)
-        remarks += [*series.remarks, *found]
+        named = sum(e.topic == series.name and e.sender is not None for e in plan.channels.values())
+        remarks += series.remarks
+        # senders that each have a channel are told apart already
+        remarks += [r for r in found if not (named > 1 and r["code"] == "several_publishers")]
         topics[series.name] = {
             "kind": series.kind,
             "rows": len(series),

@@ -87,7 +87,13 @@ def _joined(plan: Plan, offered: Plan) -> tuple[Plan, Sequence[str]]:
     )
     present |= {"u", "v"} if plan.velocity else set()
     present |= {"r"} if isinstance(plan.velocity, Derived) else set()
-    new = {name: entry for name, entry in offered.channels.items() if name not in present}
+    # a field that is taken under one name is not offered under another
+    declared = {(entry.topic, entry.field, entry.sender) for entry in plan.channels.values()}
+    new = {
+        name: entry
+        for name, entry in offered.channels.items()
+        if name not in present and (entry.topic, entry.field, entry.sender) not in declared
+    }
     position = offered.position if not {"x", "y"} & present else None
     heading = offered.heading if "psi" not in present else None
     velocity = offered.velocity if not {"u", "v"} & (present | set(new)) else None
