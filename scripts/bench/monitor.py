@@ -79,6 +79,7 @@ def identified(vessel: str, seed: int) -> tuple[FitSettings, FittedModel, list[P
             "prepare": {
                 "grid": {"step": STEP},
                 "derivative": {"kind": "savitzky_golay", "window": 1.1, "order": 2},
+                "hold": "mean",
             },
             "signals": VESSELS[vessel],
             "baseline": {"kind": "regressors", "sets": ["fossen"], "ridge": 1e-6},

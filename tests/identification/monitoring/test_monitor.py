@@ -67,7 +67,7 @@ def watch(known: tuple[ModelSpec, HybridDynamics]) -> Watch:
     [
         Change("mass", "", "", 0.15, heavier=0.15),
         Change("gain n_stbd", "", "", 0.1, gain={1: -0.1}),
-        Change("damping yaw", "", "", 0.1, drag=(0.0, 0.0, -0.15)),
+        Change("damping yaw", "", "", 0.1, damping=2, damped=-0.2),
         Change("gyro scale", "", "", 0.05, sensor="gyro_scale"),
     ],
     ids=lambda change: change.name,
@@ -86,7 +86,7 @@ def test_a_planted_change_is_found_and_named(
         assert verdict.alarm
         first = verdict.suspects[0]
         assert first.change.name == change.name
-        size = {"gain n_stbd": -0.1, "damping yaw": -0.15}.get(change.name, change.size)
+        size = {"gain n_stbd": -0.1, "damping yaw": -0.2}.get(change.name, change.size)
         assert first.size == pytest.approx(size, rel=0.3, abs=3 * first.error)
 
 

@@ -15,6 +15,8 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.physics.signals import SignalsConfig
 
 _AXES = ("surge", "sway", "yaw")
+_TAKEN = (0.1, 1.0, 1.0)
+"""Share of the velocity of surge, sway and yaw whose absence shows what damps it."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +29,8 @@ class Change:
         unit: of its size.
         size: that its effect is computed with.
         heavier: added to the inertia of all axes, as a share.
-        drag: added damping of surge, sway and yaw by velocity, 1/s.
+        damping: axis (0 surge, 1 sway, 2 yaw) whose damping changes; None for none.
+        damped: added to the damping of that axis, as a share of what the model has.
         push: acceleration to north and east, m/s^2.
         gain: added to the gain of inputs, by their number.
         offset: added to inputs, by their number.
@@ -40,7 +43,8 @@ class Change:
     unit: str
     size: float
     heavier: float = 0.0
-    drag: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    damping: int | None = None
+    damped: float = 0.0
     push: tuple[float, float] = (0.0, 0.0)
     gain: Mapping[int, float] = field(default_factory=dict)
     offset: Mapping[int, float] = field(default_factory=dict)
@@ -52,9 +56,8 @@ def causes(signals: SignalsConfig) -> list[Change]:
     units = signals.units()
     out = [Change("mass", "the vessel has become heavier", "share", 0.02, heavier=0.02)]
     for axis, name in enumerate(_AXES):
-        drag = tuple(0.01 if axis == other else 0.0 for other in range(3))
         words = f"the damping in {name} has grown"
-        out.append(Change(f"damping {name}", words, "1/s", 0.01, drag=(drag[0], drag[1], drag[2])))
+        out.append(Change(f"damping {name}", words, "share", 0.02, damping=axis, damped=0.02))
     for place, name in enumerate(signals.inputs):
         words = f"{name} has grown stronger than it was"
         out.append(Change(f"gain {name}", words, "share", 0.02, gain={place: 0.02}))
@@ -123,7 +126,17 @@ class ChangedDynamics(Dynamics):
 
         span = range(inputs)
         self.inertia = each([[1.0 + change.heavier] for change in changes])
-        self.drag = each([change.drag for change in changes])
+        damped = [k for k, change in enumerate(changes) if change.damping is not None]
+        self.damps = len(damped) > 0
+        self.damped_rows = torch.tensor(damped).repeat_interleave(rows) * rows + torch.arange(
+            rows
+        ).repeat(len(damped))
+        self.damping = torch.tensor(
+            [changes[k].damping or 0 for k in damped], dtype=torch.long
+        ).repeat_interleave(rows)
+        self.damped = torch.tensor(
+            [changes[k].damped for k in damped], dtype=torch.float64
+        ).repeat_interleave(rows)
         self.push = each([change.push for change in changes])
         self.gain = each([[1.0 + change.gain.get(i, 0.0) for i in span] for change in changes])
         self.offset = each([[change.offset.get(i, 0.0) for i in span] for change in changes])
@@ -134,16 +147,38 @@ class ChangedDynamics(Dynamics):
 
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return state and memory one step later, with the changed acceleration."""
-        after, s = self.model.step(x, w * self.gain + self.offset, s)
+        w = w * self.gain + self.offset
+        after, memory = self.model.step(x, w, s)
         nu = x[:, VELOCITIES]
+        gained = after[:, VELOCITIES] - nu
+        if self.damps:
+            gained = gained - self._slowed(x, w, s, gained)
         cos, sin = torch.cos(x[:, HEADING]), torch.sin(x[:, HEADING])
         north, east = self.push[:, 0], self.push[:, 1]
         push = torch.stack(
             (cos * north + sin * east, cos * east - sin * north, torch.zeros_like(north)), dim=1
         )
-        moved = nu + (after[:, VELOCITIES] - nu) / self.inertia + self.dt * (push - self.drag * nu)
+        moved = nu + gained / self.inertia + self.dt * push
         changed = after.clone()
         changed[:, VELOCITIES] = moved
         # the heading follows what the yaw rate has gained over the step
         changed[:, HEADING] = after[:, HEADING] + 0.5 * self.dt * (moved[:, 2] - after[:, YAW_RATE])
-        return changed, s
+        return changed, memory
+
+    def _slowed(self, x: Tensor, w: Tensor, s: Tensor, gained: Tensor) -> Tensor:
+        """Return what changed damping takes from the velocities gained over a step [B, 3].
+
+        What damps a velocity is what the step lacks without it; of surge only a part is taken away,
+        for models that hold near a service speed alone.
+        """
+        rows, axis = self.damped_rows, self.damping
+        taken = torch.tensor(_TAKEN, dtype=x.dtype)[axis]
+        share = torch.ones(len(rows), 3, dtype=x.dtype)
+        share[torch.arange(len(rows)), axis] = 1.0 - taken
+        still = x[rows].clone()
+        still[:, VELOCITIES] = still[:, VELOCITIES] * share
+        alone = self.model.step(still, w[rows], s[rows])[0][:, VELOCITIES] - still[:, VELOCITIES]
+        place = torch.arange(len(rows))
+        out = torch.zeros_like(gained)
+        out[rows, axis] = self.damped * (alone[place, axis] - gained[rows, axis]) / taken
+        return out

@@ -1,9 +1,10 @@
 """The monitor: score tests on the innovations of short free runs, against those of clean logs.
 
-Innovations of windows are whitened by their covariance over clean logs. For each cause the score
-test asks whether a small change of that kind explains the last minutes, once wind and current have
-taken what they can. How much clean logs scatter in the score sets its scale, so that what the model
-has always got wrong raises no alarm.
+Windows are free-run as a whole and in parts, each from its measured start. What the model has
+always got wrong is taken out of their innovations, which are then whitened by their covariance over
+clean logs. For each cause the score test asks whether a small change of that kind explains the last
+minutes, once wind and current have taken what they can. How much clean logs scatter in the score
+sets its scale. An alarm comes from single scores; all together say which cause is named first.
 """
 
 from __future__ import annotations
@@ -22,16 +23,17 @@ from residnet.core.errors import DataError
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
 from residnet.identification.monitoring.changes import Change, causes, surroundings
-from residnet.identification.monitoring.windows import SEEN, Piece, innovations
+from residnet.identification.monitoring.innovations import BELIEVED, always_wrong, whitening
+from residnet.identification.monitoring.windows import SEEN, Piece, innovations, parted
 
-_SHRINK = 0.1
-"""Share of the diagonal in the covariance of innovations."""
 _OVERLAP = 3.0
 """Independent looks that a sliding stretch gives while it slides by its own length."""
-_LEAST = 0.5
-"""Share of the threshold that a score must reach for its cause to be named before others."""
 _FEWEST = 5
 """Groups of clean windows below which nothing can be said about false alarms."""
+_PARTS = 5
+"""Parts that a window is also looked at in, each from its own measured start."""
+_LEAST_PART = 10
+"""Steps of a part below which windows are looked at as a whole only."""
 _CURRENT, _PUSH = 0.5, 0.05
 """Standard deviations of a current in m/s and of a push in m/s^2 that are thought possible."""
 
@@ -86,6 +88,9 @@ class Verdict:
     innovation: dict[str, float]
 
 
+_Innovations = tuple[np.ndarray, np.ndarray]
+
+
 @dataclass(frozen=True)
 class _Sums:
     """Scores [Q] and information [Q, Q] of a number of windows, and squares of innovations [n]."""
@@ -137,12 +142,17 @@ class Watch:
                 f"the clean logs hold {len(groups)} stretches of {config.group:g} s; a monitor"
                 f" needs at least {_FEWEST} to know how innovations scatter"
             )
-        found = [innovations(self.model, group, self.changes) for group in groups]
-        error = np.concatenate([part for part, _ in found])
-        second = error.T @ error / len(error)
-        covariance = (1.0 - _SHRINK) * second + _SHRINK * np.diag(np.diag(second))
-        self.whiten = np.linalg.inv(np.linalg.cholesky(covariance + 1e-18 * np.eye(len(second))))
-        self._scale([self._sums(e, effects) for e, effects in found])
+        self.parts = [1, _PARTS] if round(config.window / spec.dt) >= _LEAST_PART * _PARTS else [1]
+        found = [[self._innovations(group, parts) for parts in self.parts] for group in groups]
+        self.always: list[np.ndarray] = []
+        self.whiten: list[np.ndarray] = []
+        for i, parts in enumerate(self.parts):
+            error = np.concatenate([group[i][0] for group in found])
+            effects = np.concatenate([group[i][1] for group in found])
+            self.always.append(always_wrong(error, effects, self.causes))
+            rest = error - self._expected(effects, i)
+            self.whiten.append(whitening(rest, parts))
+        self._scale([self._sums(group) for group in found])
 
     @property
     def changes(self) -> list[Change]:
@@ -152,29 +162,60 @@ class Watch:
     def _scale(self, groups: Sequence[_Sums]) -> None:
         """Take bias and scatter of every cause's score from groups of clean windows."""
         parts = [self._alone(group) for group in groups]
-        score = np.array([part[0] for part in parts])
-        information = np.array([part[1] for part in parts])
-        self.known = information.sum(axis=0)
-        self.bias = score.sum(axis=0) / self.known
-        apart = score - self.bias * information
-        self.scatter = np.maximum(
-            (apart**2).sum(axis=0) / self.known * len(groups) / (len(groups) - 1), 1.0
-        )
+        matrix = np.sum([part[1] for part in parts], axis=0)
+        believed = np.diag([change.size**-2 / BELIEVED**2 for change in self.causes])
+        # two causes that are wrong alike, such as damping and gain, must not look like one of them
+        self.bias = np.linalg.solve(matrix + believed, np.sum([part[0] for part in parts], axis=0))
+        apart = np.array([score - own @ self.bias for score, own in parts])
+        self.known = matrix
+        count, size = len(groups), len(self.causes)
+        unit = apart / np.sqrt([np.diag(own) for _, own in parts])
+        scatter = unit.T @ unit / (count - 1)
+        # few groups say little about how scores scatter together
+        apart_alone = np.diag(np.maximum(np.diag(scatter), 1.0))
+        kept = count / (count + size)
+        self.scatter = kept * scatter + (1.0 - kept) * apart_alone
+        np.fill_diagonal(self.scatter, np.diag(apart_alone))
         looks = self.config.false_alarm / self.config.stretch * _OVERLAP * len(self.causes)
         self.threshold = float(student.isf(0.5 / looks, len(groups) - 1))
 
     def sums(self, pieces: Sequence[Piece]) -> list[_Sums]:
         """Return the scores of each of several windows."""
-        error, effects = innovations(self.model, pieces, self.changes)
-        return [self._sums(error[i : i + 1], effects[i : i + 1]) for i in range(len(pieces))]
+        found = [self._innovations(pieces, parts) for parts in self.parts]
+        return [
+            self._sums([(error[i : i + 1], effects[i : i + 1]) for error, effects in found])
+            for i in range(len(pieces))
+        ]
 
-    def _sums(self, error: np.ndarray, effects: np.ndarray) -> _Sums:
-        e, a = error @ self.whiten.T, effects @ self.whiten.T
+    def _innovations(self, pieces: Sequence[Piece], parts: int) -> _Innovations:
+        """Return innovations [B, parts n] and effects [B, C, parts n] of windows cut into parts."""
+        cut = [part for piece in pieces for part in parted(piece, parts)]
+        error, effects = innovations(self.model, cut, self.changes)
+        count = len(pieces)
+        by_change = effects.reshape(count, parts, len(self.changes), -1).swapaxes(1, 2)
+        return error.reshape(count, -1), by_change.reshape(count, len(self.changes), -1)
+
+    def _expected(self, effects: np.ndarray, i: int) -> np.ndarray:
+        """Return what innovations [B, n] are of clean logs, by their effects [B, C, n]."""
+        share = np.tile(self.always[i], effects.shape[2] // len(SEEN))
+        return np.asarray((effects[:, : len(self.causes)] * share).sum(axis=1))
+
+    def _sums(self, found: Sequence[_Innovations]) -> _Sums:
+        """Return the sums of the same windows as a whole and in parts."""
+        out = []
+        for i, (whiten, (error, effects)) in enumerate(zip(self.whiten, found, strict=True)):
+            size = len(whiten)
+            e = (error - self._expected(effects, i)).reshape(-1, size) @ whiten.T
+            count = len(self.changes)
+            a = effects.reshape(len(error), count, -1, size) @ whiten.T
+            a = a.swapaxes(1, 2).reshape(-1, count, size)
+            out.append((np.einsum("bqn,bn->q", a, e), np.einsum("bqn,bpn->qp", a, a), e))
+        whole = out[0][2]
         return _Sums(
-            np.einsum("bqn,bn->q", a, e),
-            np.einsum("bqn,bpn->qp", a, a),
-            (e**2).sum(axis=0),
-            len(e),
+            sum(score for score, _, _ in out),
+            sum(information for _, information, _ in out),
+            (whole**2).sum(axis=0),
+            len(whole),
         )
 
     def _alone(self, sums: _Sums) -> tuple[np.ndarray, np.ndarray]:
@@ -183,33 +224,32 @@ class Watch:
         matrix = sums.information
         own = np.linalg.solve(matrix[count:, count:] + self.belief, matrix[count:, :count])
         score = sums.score[:count] - own.T @ sums.score[count:]
-        information = np.diag(matrix[:count, :count] - matrix[:count, count:] @ own)
-        return score, np.maximum(information, 1e-300)
+        information = matrix[:count, :count] - matrix[:count, count:] @ own
+        return score, information + 1e-300 * np.eye(count)
 
     def judge(self, groups: Sequence[_Sums]) -> Verdict:
         """Return the verdict on groups of windows; wind and current are their own in each."""
         parts = [self._alone(group) for group in groups]
-        score = np.sum([part[0] for part in parts], axis=0)
-        information = np.sum([part[1] for part in parts], axis=0)
-        apart = score - self.bias * information
-        variance = self.scatter * information * (1.0 + information / self.known)
-        z = apart / np.sqrt(variance)
+        matrix = np.sum([part[1] for part in parts], axis=0)
+        apart = np.sum([part[0] for part in parts], axis=0) - matrix @ self.bias
+        information = np.diag(matrix)
+        covariance = np.zeros_like(matrix)
+        for _, own in parts:
+            root = np.sqrt(np.diag(own))
+            covariance += self.scatter * np.outer(root, root)
+        # what clean logs have told is not known exactly either
+        covariance *= 1.0 + float(np.mean(information / np.diag(self.known)))
+        error = np.sqrt(np.diag(covariance)) / information
+        size = apart / information
         suspects = [
-            Suspect(
-                change,
-                float(abs(z[i])),
-                float(apart[i] / information[i]),
-                float(np.sqrt(variance[i]) / information[i]),
-            )
+            Suspect(change, float(abs(size[i]) / error[i]), float(size[i]), float(error[i]))
             for i, change in enumerate(self.causes)
         ]
-        # what explains most of the innovations is named first; what clean logs scatter in decides
-        # whether there is an alarm at all
-        explained = apart**2 / information
-        order = np.argsort(
-            -np.where(np.abs(z) > _LEAST * self.threshold, explained, 0.01 * np.abs(z))
-        )
-        alarm = bool(np.abs(z).max() > self.threshold)
+        alarm = max(suspect.score for suspect in suspects) > self.threshold
+        # the scores of all causes together tell better than each alone which of them it is
+        weighed = np.linalg.solve(covariance, matrix)
+        told = np.einsum("pq,pq->q", matrix, weighed)
+        order = np.argsort(-np.abs(apart @ weighed) / np.sqrt(told))
         suspects = [suspects[i] for i in order]
         count = sum(group.count for group in groups)
         squares = np.sum([group.squares for group in groups], axis=0) / count

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -19,8 +20,8 @@ SEEN = ("u", "v", "r", "heading")
 """What innovations are taken of."""
 _PAST = 5.0
 """Time in s before a window that warms a memory up."""
-_SAMPLES = 5
-"""Samples of a window that count, the last of them its end."""
+_BLOCKS = 5
+"""Parts of a window whose means count."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,11 @@ def innovations(
     none = Change("none", "", "", 1.0)
     all_changes = [none, *changes]
     rows, steps, count = len(pieces), w.shape[1], len(all_changes)
-    places = np.linspace(0, steps, _SAMPLES + 1).round().astype(int)[1:]
+    blocks = min(_BLOCKS, steps)
+    mean = torch.zeros(blocks, steps, dtype=torch.float64)
+    edges = np.linspace(0, steps, blocks + 1).round().astype(int)
+    for block, (first, last) in enumerate(pairwise(edges.tolist())):
+        mean[block, first:last] = 1.0 / (last - first)
     with torch.no_grad():
         memory = model.warmup(
             torch.from_numpy(np.stack([piece.past_y for piece in pieces])),
@@ -67,20 +72,37 @@ def innovations(
         )
         changed = ChangedDynamics(model, all_changes, rows, w.shape[2])
         path, _, _ = Rollout(changed)(x0, w.repeat(count, 1, 1), memory.repeat(count, 1))
-    path = path.reshape(count, rows, steps + 1, -1)[:, :, places]
-    measured = y[:, places]
-    rate = (y[:, places] - y[:, places - 1])[..., VELOCITIES] / model.dt
-    error = _seen(measured - path[0])
+    path = path.reshape(count, rows, steps + 1, -1)
+    # what a sensor shows is taken of the prediction: noise of the measurement is in the error too
+    rate = mean @ path[0].diff(dim=1)[..., VELOCITIES] / model.dt
+    path = mean @ path[:, :, 1:]
+    error = _seen(mean @ y[:, 1:] - path[0])
     effects = [
         _seen(
             path[number + 1] - path[0]
             if not change.sensor
-            else shown(change.sensor, measured, rate, change.size) - (path[number + 1] - path[0])
+            else shown(change.sensor, path[0], rate, change.size) - (path[number + 1] - path[0])
         )
         / change.size
         for number, change in enumerate(changes)
     ]
     return error.numpy(), torch.stack(effects, dim=1).numpy()
+
+
+def parted(piece: Piece, parts: int) -> list[Piece]:
+    """Return the equal parts of a window, each with what went before it; a rest is left out."""
+    past, steps = len(piece.past_y), len(piece.w) // parts
+    y = np.concatenate((piece.past_y, piece.y))
+    w = np.concatenate((piece.past_w, piece.w))
+    return [
+        Piece(
+            y[past + k : past + k + steps + 1],
+            w[past + k : past + k + steps],
+            y[k : past + k],
+            w[k : past + k],
+        )
+        for k in range(0, parts * steps, steps)
+    ]
 
 
 def _seen(states: Tensor) -> Tensor:
