@@ -40,12 +40,13 @@ class Vessel:
         self.states = [entry["name"] for entry in self.card["states"]]
         self.inputs = [entry["name"] for entry in self.card["inputs"]]
         self.memory = int(self.card["memory"])
+        self.dtype = np.float64 if self.card["dtype"] == "float64" else np.float32
         accepted = self.card["bad_inputs"]["accepted"]
         self.least, self.most = np.array([accepted[n] for n in self.states + self.inputs]).T
 
     def initial_state(self, rows: int = 1) -> Array:
         """Return the memory [rows, memory] without a past."""
-        return np.zeros((rows, self.memory), np.float32)
+        return np.zeros((rows, self.memory), self.dtype)
 
     def step(
         self, x: Array, w: Array | Mapping[str, float], s: Array
@@ -59,13 +60,13 @@ class Vessel:
             if missing:
                 raise KeyError(f"inputs {missing} are missing; the model needs {self.inputs}")
             w = np.array([w[name] for name in self.inputs])
-        x = np.atleast_2d(np.asarray(x, np.float32))
-        w = np.broadcast_to(np.asarray(w, np.float32), (len(x), len(self.inputs)))
+        x = np.atleast_2d(np.asarray(x, self.dtype))
+        w = np.broadcast_to(np.asarray(w, self.dtype), (len(x), len(self.inputs)))
         feed = {"x": x, "w": np.ascontiguousarray(w)}
         if self.memory == 0:
             after, outside = self.session.run(["x_after", "outside"], feed)
             return after, s, outside
-        feed["s"] = np.asarray(s, np.float32)
+        feed["s"] = np.asarray(s, self.dtype)
         after, memory, outside = self.session.run(["x_after", "s_after", "outside"], feed)
         return after, memory, outside
 
@@ -85,7 +86,7 @@ class Vessel:
 
     def rollout(self, x: Array, w: Array, s: Array) -> tuple[Array, Array, Array]:
         """Return states [T + 1, 6] under inputs [T, m], the last memory, and flags [T]."""
-        path, flags = [np.asarray(x, np.float32).reshape(-1)], []
+        path, flags = [np.asarray(x, self.dtype).reshape(-1)], []
         for row in w:
             after, s, outside = self.step(path[-1], row, s)
             path.append(after[0])

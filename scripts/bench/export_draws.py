@@ -68,7 +68,7 @@ def judged(
             worst[found.way] = max(worst.get(found.way, 0.0), found.share)
             if found.bad:
                 wrong.append(
-                    f"{found.way}: {found.state} differs by {found.share:.2g} of its range"
+                    f"{found.way}: {found.state} differs by {found.share:.3g} of its range"
                 )
     return wrong
 

@@ -6,6 +6,7 @@ loaded back as a user would.
 
 from __future__ import annotations
 
+import copy
 import json
 import subprocess
 from collections.abc import Iterator
@@ -26,6 +27,7 @@ from residnet.export.autopilot import MEASURED
 from residnet.export.c.compiled import STRICT, CompiledModel, compile_shared, compiler
 from residnet.export.c.policy import export_autopilot_as_c
 from residnet.export.casadi_function import CasadiModel
+from residnet.export.contract import Stepped
 from residnet.export.lowering.build import lowered
 from residnet.export.onnx_file import OnnxModel
 from residnet.testing import check_bad_inputs
@@ -131,6 +133,26 @@ def test_coefficients_of_zero_are_left_out(left: int, tmp_path: Path) -> None:
         model.head.coefficients[left:] = 0.0  # type: ignore[index, operator]
     card = exporter("c").export(spec, model, tmp_path / "boat.c", [])
     assert max(card["parity"]["double"]["share_of_range"].values()) <= 1e-12
+
+
+@pytest.mark.parametrize("name", ["c", "onnx"])
+def test_what_single_precision_does_not_determine_is_written_in_double(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Large coefficients that cancel make a model round; here no difference at all is let pass."""
+    monkeypatch.setattr(contract, "SINGLE", -1.0)
+    spec, model = built("plsr")
+    file = tmp_path / f"boat.{name}"
+    card = exporter(name).export(spec, model, file, [])
+    assert card["dtype"] == "float64"
+    given = copy.deepcopy(model).double()
+    stepped: Stepped = (
+        OnnxModel(file, spec, model)
+        if name == "onnx"
+        else CompiledModel(compile_shared([file], tmp_path / "boat.so"), "mine", 0, "double")
+    )
+    shares = contract.require_parity(spec, given, stepped, "the file", torch.float64, 1e-6)
+    assert max(shares.values()) < 1e-6
 
 
 def test_an_operation_that_is_not_known_is_refused_by_name() -> None:

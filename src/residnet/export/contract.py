@@ -30,6 +30,10 @@ SINGLE, DOUBLE = 1e-5, 1e-12
 Numbers = npt.NDArray[np.floating[Any]]
 
 
+class Apart(ExportError):
+    """A file that rounds otherwise than the model, and ends elsewhere for that alone."""
+
+
 class Stepped(Protocol):
     """A file that was written, loaded back: one vessel, arrays without a batch."""
 
@@ -65,13 +69,14 @@ def checked(
     stepped: Stepped,
     what: str,
     dtype: torch.dtype = torch.float32,
+    tolerance: float | None = None,
 ) -> dict[str, Any]:
     """Return what a card says of the parity, once a file answers good and bad inputs as it must.
 
     Raises:
         ExportError: where it does not; see `require_parity` and `require_defined`.
     """
-    shares = require_parity(spec, model, stepped, what, dtype)
+    shares = require_parity(spec, model, stepped, what, dtype, tolerance)
     require_defined(spec, model, stepped, what, dtype)
     return {"steps": PARITY_STEPS, "share_of_range": shares}
 
@@ -119,6 +124,7 @@ def require_parity(
     stepped: Stepped,
     what: str,
     dtype: torch.dtype = torch.float32,
+    tolerance: float | None = None,
 ) -> dict[str, float]:
     """Return the largest difference of each state from the model's, as a share of its range.
 
@@ -128,16 +134,19 @@ def require_parity(
         stepped: what was written.
         what: was written, for messages.
         dtype: precision of both, float32 or float64.
+        tolerance: largest share; None for that of the precision.
 
     Raises:
-        ExportError: where a share is larger, or the model itself leaves what exports accept.
+        Apart: where a share is larger than allowed.
+        ExportError: where the model itself leaves what exports accept.
     """
     if not model.head.warms_by_steps():
         raise ExportError(
             f"{what}: an encoder of its own starts the memory of {spec.name}, which this format has"
             " no place for; export it as torchscript, or export a model without an encoder"
         )
-    tolerance = DOUBLE if dtype == torch.float64 else SINGLE
+    if tolerance is None:
+        tolerance = DOUBLE if dtype == torch.float64 else SINGLE
     y, w = drive(spec, dtype)
     with torch.no_grad():
         eager = Rollout(model)(y[:, -1], w[:, PAST:], model.warmup(y, w[:, :PAST]))[0]
@@ -152,7 +161,7 @@ def require_parity(
     worst = np.abs(np.stack(path) - states).max(axis=0) / span
     shares = dict(zip(STATE, worst.tolist(), strict=True))
     if not bool((worst <= tolerance).all()):
-        raise ExportError(
+        raise Apart(
             f"model {spec.name}: {what} differs from the model by {shares} of each channel's range"
             f" over {PARITY_STEPS} steps; allowed {tolerance:g}"
         )

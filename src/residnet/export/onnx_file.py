@@ -22,6 +22,8 @@ from residnet.dynamics.store import ModelSpec
 from residnet.export.base import Exporter
 from residnet.export.card import make_card
 from residnet.export.contract import (
+    SINGLE,
+    Apart,
     Numbers,
     accepted,
     checked,
@@ -44,6 +46,8 @@ class OnnxModel:
         self.session: Any = runtime.InferenceSession(
             str(file), options, providers=["CPUExecutionProvider"]
         )
+        double = self.session.get_inputs()[0].type == "tensor(double)"
+        self.dtype: Any = np.float64 if double else np.float32
         self.memory = model.n_state
         self.measured = accepted(spec, model)
 
@@ -54,18 +58,18 @@ class OnnxModel:
 
     def rows(self, x: Numbers, w: Numbers, s: Numbers) -> tuple[Numbers, Numbers, Numbers]:
         """Return states [B, 6], memories [B, n_state] and flags [B] one step later."""
-        given = {"x": np.asarray(x, np.float32), "w": np.asarray(w, np.float32)}
+        given = {"x": np.asarray(x, self.dtype), "w": np.asarray(w, self.dtype)}
         if self.memory == 0:
             after, outside = self.session.run(["x_after", "outside"], given)
-            return after, np.asarray(s, np.float32), outside
+            return after, np.asarray(s, self.dtype), outside
         after, memory, outside = self.session.run(
-            list(_OUTPUTS), given | {"s": np.asarray(s, np.float32)}
+            list(_OUTPUTS), given | {"s": np.asarray(s, self.dtype)}
         )
         return after, memory, outside
 
     def warmup(self, y: Numbers, w: Numbers) -> Numbers:
         """Return the memory that a measured past leaves."""
-        return warmed(self.measured, self.step, y, w, np.zeros(self.memory, np.float32))
+        return warmed(self.measured, self.step, y, w, np.zeros(self.memory, self.dtype))
 
 
 @final
@@ -83,21 +87,26 @@ class OnnxExporter(Exporter):
         file: Path,
         rows: Sequence[Mapping[str, Any]],
     ) -> Mapping[str, Any]:
-        """Write the model in float32, its card under the key `card` of the metadata."""
+        """Write the model, its card under the key `card` of the metadata.
+
+        It is in float64 where float32 does not determine the track.
+        """
         for package in ("onnx", "onnxscript", "onnxruntime"):
             require_package(package, "format onnx")
         require_numbers(spec, model)
-        model = copy.deepcopy(model).float().eval().requires_grad_(False)
+        model = copy.deepcopy(model).eval().requires_grad_(False)
+        card = make_card(spec, model, rows, {}) | {
+            "format": "onnx",
+            "safety": "The file holds numbers and operations; onnxruntime runs no code of it.",
+        }
         with tempfile.TemporaryDirectory() as name:
             partial = Path(name) / file.name
-            _write(spec, model, partial)
-            stepped = OnnxModel(partial, spec, model)
-            card = make_card(spec, model, rows, {}) | {
-                "format": "onnx",
-                "parity": checked(spec, model, stepped, "the ONNX file"),
-                "safety": "The file holds numbers and operations; onnxruntime runs no code of it.",
-            }
-            _require_rows(stepped, spec, model)
+            try:
+                parity = _checked(spec, copy.deepcopy(model).float(), partial, torch.float32)
+            except Apart as error:
+                parity = _in_double(spec, model, partial, error)
+                card |= {"dtype": "float64"}
+            card |= {"parity": parity}
             onnx = importlib.import_module("onnx")
             graph = onnx.load(str(partial))
             onnx.helper.set_model_props(graph, {"card": json.dumps(card)})
@@ -108,7 +117,40 @@ class OnnxExporter(Exporter):
         return card
 
 
-def _write(spec: ModelSpec, model: HybridDynamics, file: Path) -> None:
+def _checked(
+    spec: ModelSpec, model: HybridDynamics, file: Path, dtype: torch.dtype
+) -> dict[str, Any]:
+    """Write the graph in a precision and return what a card says of its parity.
+
+    Raises:
+        Apart: where the precision does not determine the track.
+        ExportError: where the graph is wrong otherwise.
+    """
+    _write(spec, model, file, dtype)
+    stepped = OnnxModel(file, spec, model)
+    # a graph in float64 is good to about eight digits
+    tolerance = SINGLE if dtype == torch.float64 else None
+    found = checked(spec, model, stepped, "the ONNX file", dtype, tolerance)
+    _require_rows(stepped, spec, model)
+    return found
+
+
+def _in_double(spec: ModelSpec, model: HybridDynamics, file: Path, single: Apart) -> dict[str, Any]:
+    """Write the graph in float64.
+
+    Raises:
+        ExportError: where onnxruntime lacks an operation in this precision: then the message is
+            that of single precision.
+    """
+    states = importlib.import_module("onnxruntime.capi.onnxruntime_pybind11_state")
+    try:
+        return _checked(spec, model.double(), file, torch.float64)
+    except (states.NotImplemented, states.InvalidGraph) as error:
+        lacks = str(error).strip().splitlines()[0]
+        raise ExportError(f"{single}; in double precision onnxruntime says: {lacks}") from None
+
+
+def _write(spec: ModelSpec, model: HybridDynamics, file: Path, dtype: torch.dtype) -> None:
     """Write the graph; a model without a memory has neither `s` nor `s_after`.
 
     Raises:
@@ -117,6 +159,7 @@ def _write(spec: ModelSpec, model: HybridDynamics, file: Path) -> None:
     kept = slice(None) if model.n_state else slice(0, 2)
     sizes = [len(STATE), len(spec.signals.columns), model.n_state][kept]
     step = Step(model, spec) if model.n_state else StepWithoutMemory(model, spec)
+    step = step.to(dtype)
     results = [name for name in _OUTPUTS if model.n_state or name != "s_after"]
     rows = {0: torch.export.Dim("rows", min=1)}
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
@@ -125,7 +168,7 @@ def _write(spec: ModelSpec, model: HybridDynamics, file: Path) -> None:
             warnings.simplefilter("ignore")
             program = torch.onnx.export(
                 step.eval(),
-                tuple(torch.zeros(2, size) for size in sizes),
+                tuple(torch.zeros(2, size, dtype=dtype) for size in sizes),
                 dynamo=True,
                 verbose=False,
                 input_names=list(_INPUTS[kept]),
@@ -151,7 +194,7 @@ def _require_rows(stepped: OnnxModel, spec: ModelSpec, model: HybridDynamics) ->
     low, high = torch.tensor(spec.low), torch.tensor(spec.high)
     seen = low + torch.rand(3, low.numel(), generator=generator) * (high - low)
     x = torch.cat((torch.zeros(3, 3), seen[:, :3]), dim=1).numpy()
-    w, s = seen[:, 3:].numpy(), np.zeros((3, model.n_state), np.float32)
+    w, s = seen[:, 3:].numpy(), np.zeros((3, model.n_state))
     together = stepped.rows(x, w, s)[0]
     alone = np.stack([stepped.step(*row)[0] for row in zip(x, w, s, strict=True)])
     if not np.allclose(together, alone, rtol=1e-5, atol=1e-5):

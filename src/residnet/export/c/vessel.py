@@ -43,7 +43,12 @@ class CSource(NamedTuple):
 
 
 def vessel_source(
-    spec: ModelSpec, model: HybridDynamics, card: Mapping[str, Any], header: str
+    spec: ModelSpec,
+    model: HybridDynamics,
+    card: Mapping[str, Any],
+    header: str,
+    *,
+    double_only: bool = False,
 ) -> CSource:
     """Return the source and header of a model.
 
@@ -52,6 +57,7 @@ def vessel_source(
         model: in float64.
         card: stands as a comment in the header.
         header: name of the header file.
+        double_only: whether single precision is not offered.
 
     Raises:
         ExportError: where the model has an operation that is not written in C.
@@ -117,7 +123,7 @@ def vessel_source(
     return CSource(
         prefix,
         c_file(prefix, functions, bodies, header),
-        h_file(prefix, functions, comments, sizes, about),
+        h_file(prefix, functions, comments, sizes, about, double_only=double_only),
     )
 
 
