@@ -13,9 +13,12 @@ from torch import Tensor
 from residnet.baselines import StillConfig
 from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.log import Log
+from residnet.dynamics.base import Integrator
 from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.simulated import PlantDynamics
 from residnet.heads import LstmConfig, ResidualHead, ZeroHead
+from residnet.judge import freerun
 from residnet.judge.freerun import Candidate, free_run, integrate
 from residnet.judge.protocol import Window
 from residnet.physics.signals import SignalsConfig
@@ -276,3 +279,45 @@ def test_a_vessel_that_rolls_starts_from_the_logs_roll_too() -> None:
     ):
         np.testing.assert_allclose(p.states[:, 3:], motion[w_.start : w_.stop, 3:], atol=1e-12)
     assert np.abs(log["phi"]).max() > 0.01
+
+
+def test_windows_run_together_as_they_run_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Long windows, short ones and little memory: batches differ, predictions do not."""
+    random = np.random.default_rng(4)
+    theta = np.concatenate((-np.eye(3), 0.1 * random.normal(size=(3, 3))), axis=1)
+    ready = [
+        made(random_states(300, np.random.default_rng(i)), STEP, name=str(i)) for i in range(2)
+    ]
+    lengths = (2, 3, 290, 40, 12, 11, 150, 60)
+    windows = [window(i % 2, i, i + length) for i, length in enumerate(lengths)]
+    model = hybrid(theta)
+    candidate = Candidate("m", "baseline", model)
+
+    def states(together: list[Window]) -> list[np.ndarray]:
+        found = free_run([candidate], together, ready, STEP, LIMIT)["m"]
+        return [prediction.states for prediction in found]
+
+    alone = [states([one])[0] for one in windows]
+    for largest in (30_000_000, 1_000):
+        monkeypatch.setattr(freerun, "_LARGEST", largest)
+        for one, other, length in zip(states(windows), alone, lengths, strict=True):
+            assert one.shape == (length, 6)
+            np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12)
+    assert model.positions, "the judged model itself is left as it is"
+
+
+@pytest.mark.parametrize("integrator", ["rk4", "semi_implicit_euler"])
+def test_velocities_and_heading_do_without_positions(integrator: Integrator) -> None:
+    random = np.random.default_rng(5)
+    model = hybrid(np.concatenate((-np.eye(3), 0.1 * random.normal(size=(3, 3))), axis=1))
+    model = HybridDynamics(model.signals, model.baseline, model.head, STEP, integrator)
+    x0, w = (
+        torch.from_numpy(random.normal(size=(4, 6))),
+        torch.from_numpy(random.normal(size=(4, 30, 2))),
+    )
+    with torch.no_grad():
+        whole = Rollout(model)(x0, w, x0[:, :0])[0]
+        model.positions = False
+        part = Rollout(model)(x0, w, x0[:, :0])[0]
+    assert torch.equal(part[..., 2:], whole[..., 2:])
+    assert torch.equal(part[..., :2], x0[:, None, :2].expand(-1, 31, -1))

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from residnet.data.prepare import Prepared
 from residnet.data.simulated.trials import SimulatedTrials
 from residnet.data.sources import MeasuredLogs
-from residnet.dynamics.simulated import PlantDynamics
+from residnet.dynamics.simulated import TracedPlantDynamics
 from residnet.identification.models import FittedModel
 from residnet.identification.references import references
 from residnet.judge.bands.band import Bands
@@ -68,22 +68,57 @@ def evaluate(
         step: of the grid in s.
         limit: of |u, v, r| [3] beyond which a free run has diverged.
     """
-    bands = {model.name: model.bands for model in models}
-    out = Evaluation(logs[0].split, logs, [], [], {}, bands)
-    scales = config.scales.named()
-    for name, protocol in config.protocols.items():
-        windows = [
+    return evaluate_splits(models, {logs[0].split: logs}, config, step, limit)[logs[0].split]
+
+
+def evaluate_splits(
+    models: Sequence[Candidate],
+    splits: Mapping[str, Sequence[Prepared]],
+    config: EvaluationConfig,
+    step: float,
+    limit: np.ndarray,
+) -> dict[str, Evaluation]:
+    """Free-run models over all protocols of several splits, all windows of a model side by side.
+
+    Args:
+        models: to be judged, see `candidates`.
+        splits: their logs, at least one each.
+        config: protocols, scales and groups.
+        step: of the grid in s.
+        limit: of |u, v, r| [3] beyond which a free run has diverged.
+    """
+    laid = {
+        (split, name): [
             window
             for number, log in enumerate(logs)
             for window in protocol.windows(log, number, step)
         ]
+        for split, logs in splits.items()
+        for name, protocol in config.protocols.items()
+    }
+    everywhere = [log for logs in splits.values() for log in logs]
+    before = dict(zip(splits, np.cumsum([0, *map(len, splits.values())]).tolist(), strict=False))
+    together = [
+        replace(window, log=window.log + before[split])
+        for (split, _), windows in laid.items()
+        for window in windows
+    ]
+    predictions = free_run(models, together, everywhere, step, limit)
+    bands = {model.name: model.bands for model in models}
+    scales = config.scales.named()
+    found = {split: Evaluation(split, logs, [], [], {}, bands) for split, logs in splits.items()}
+    begin = 0
+    for (split, name), windows in laid.items():
         if not windows:
             continue
-        run = FreeRun(name, out.split, windows, free_run(models, windows, logs, step, limit))
+        end = begin + len(windows)
+        own = {model: part[begin:end] for model, part in predictions.items()}
+        begin, out, logs = end, found[split], splits[split]
+        run = FreeRun(name, split, windows, own)
         out.runs.append(run)
         out.rows.extend(rows(run, models, logs, scales, config.groups))
         out.limits[name] = limits(run, models, logs, scales, step)
-    return out
+    return found
 
 
 def candidates(
@@ -122,6 +157,6 @@ def _truth(data: SimulatedTrials) -> Candidate | None:
         # no log shows what is under way in a delay line, so that the plant could not start from one
         return None
     commands = plant.inputs[: plant.commands]
-    model = PlantDynamics(plant, data.step, data.substeps)
+    model = TracedPlantDynamics(plant, data.step, data.substeps)
     unknown = len(plant.inputs) - len(commands)
     return Candidate("truth", "truth", model, plant.state, commands, unknown, "baseline")

@@ -94,7 +94,7 @@ def _add_tied(
     identified: Identified, fitter: Fitter, logs: Mapping[str, Sequence[Prepared]]
 ) -> None:
     """Add the mean of the models that validation data cannot tell from the best."""
-    judged = {split: identified.evaluate(logs[split]) for split in ("train", "validation")}
+    judged = identified.evaluate_splits({split: logs[split] for split in ("train", "validation")})
     chosen = identified.select(judged)
     # a mean of accelerations has no place for a force that one member estimates for itself
     tied = [n for n in _apart(chosen) if identified.models[n].spec.disturbance is None]

@@ -12,7 +12,7 @@ from residnet.data.prepare import Prepared
 from residnet.data.simulated.trials import SimulatedTrials
 from residnet.data.sources import MeasuredLogs
 from residnet.identification.cross_fitting.crossed import Crossed
-from residnet.identification.evaluation import Evaluation, candidates, evaluate
+from residnet.identification.evaluation import Evaluation, candidates, evaluate_splits
 from residnet.identification.models import FittedModel
 from residnet.identification.selecting import examine, select
 from residnet.identification.settings import FitSettings
@@ -49,9 +49,27 @@ class Identified(Mapping[str, FittedModel]):
             logs: of one split, prepared as those of the fit.
             data: where the logs came from; simulated trials add the plant as `truth`.
         """
+        return self.evaluate_splits({logs[0].split: logs}, data)[logs[0].split]
+
+    def evaluate_splits(
+        self,
+        splits: Mapping[str, Sequence[Prepared]],
+        data: MeasuredLogs | SimulatedTrials | None = None,
+    ) -> dict[str, Evaluation]:
+        """Free-run all models over the logs of several splits, side by side.
+
+        Args:
+            splits: logs by split, prepared as those of the fit.
+            data: where the logs came from; simulated trials add the plant as `truth`.
+        """
         settings = self.settings
-        models = candidates(self.values(), data)
-        return evaluate(models, logs, settings.evaluation, settings.prepare.grid.step, self.limit)
+        return evaluate_splits(
+            candidates(self.values(), data),
+            splits,
+            settings.evaluation,
+            settings.prepare.grid.step,
+            self.limit,
+        )
 
     @cached_property
     def findings(self) -> dict[str, list[Finding]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,6 +17,11 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.judge.bands.band import Band
 from residnet.judge.protocol import Window
+
+_LONGER = 4
+"""Times its own length that a window may be kept going beside longer ones."""
+_LARGEST = 30_000_000
+"""Numbers that the windows of a batch may hold."""
 
 
 @dataclass(frozen=True)
@@ -102,33 +107,86 @@ def _run(
     limit: np.ndarray,
     dtype: torch.dtype,
 ) -> list[Prediction]:
-    longest = max(window.stop - window.start for window in windows)
     tables = {n: _inputs(candidate, logs[n]) for n in {window.log for window in windows}}
-    x0 = np.stack([_initial(candidate, window, logs[window.log]) for window in windows])
+    # a copy: a validation in float32 must not round the model that it validates
+    model = copy.deepcopy(candidate.model).to(dtype).eval()
+    # the pose is integrated from the velocities below
+    model.positions = False
+    columns = [candidate.state.index(name) for name in VELOCITY]
+    out: dict[int, Prediction] = {}
+    width = len(candidate.state) + sum(table.shape[1] for table in list(tables.values())[:1])
+    for rows in _batches(windows, width):
+        members = [windows[row] for row in rows]
+        x0 = np.stack([_initial(candidate, window, logs[window.log]) for window in members])
+        nu = _simulated(model, members, x0, logs, tables, dtype)[:, :, columns].double().numpy()
+        for row, window, found in zip(rows, members, nu, strict=True):
+            out[row] = _prediction(window, found[: _length(window)], logs, step, limit)
+    return [out[row] for row in range(len(windows))]
+
+
+def _length(window: Window) -> int:
+    return window.stop - window.start
+
+
+def _batches(windows: Sequence[Window], width: int) -> Iterator[list[int]]:
+    """Yield the windows that are run together, by their numbers.
+
+    Steps cost much the same for one row or many, so that long and short windows run side by side,
+    as long as none is kept going for far more than its own length and memory suffices.
+
+    Args:
+        windows: of any lengths.
+        width: numbers that each row keeps for each step.
+    """
+    order = sorted(range(len(windows)), key=lambda row: -_length(windows[row]))
+    batch: list[int] = []
+    for row in order:
+        longest = _length(windows[batch[0]]) if batch else 0
+        if batch and (
+            _LONGER * _length(windows[row]) < longest
+            or (len(batch) + 1) * longest * width > _LARGEST
+        ):
+            yield batch
+            batch = []
+        batch.append(row)
+    if batch:
+        yield batch
+
+
+def _simulated(
+    model: Dynamics,
+    windows: Sequence[Window],
+    x0: np.ndarray,
+    logs: Sequence[Prepared],
+    tables: Mapping[int, np.ndarray],
+    dtype: torch.dtype,
+) -> torch.Tensor:
+    """Return the states [W, L, nx] of windows that run together, each from its row of x0."""
+    longest = max(map(_length, windows))
     ahead = np.stack(
         [
             tables[w.log][np.minimum(np.arange(w.start, w.start + longest - 1), w.stop - 1)]
             for w in windows
         ]
     )
-    # a copy: a validation in float32 must not round the model that it validates
-    model = copy.deepcopy(candidate.model).to(dtype).eval()
     with torch.no_grad():
         s = _memory(model, windows, logs, tables, dtype)
         states, _, _ = Rollout(model)(
             torch.from_numpy(x0).to(dtype), torch.from_numpy(ahead).to(dtype), s
         )
-    nu = states[:, :, [candidate.state.index(name) for name in VELOCITY]].double().numpy()
-    out = []
-    for i, window in enumerate(windows):
-        length = window.stop - window.start
-        nu_hat = nu[i, :length]
-        bad = not np.isfinite(nu_hat).all() or bool((np.abs(nu_hat) > limit).any())
-        if bad:
-            nu_hat = np.tile(window.nu, (length, 1))
-        pose = integrate(logs[window.log].y[window.start, POSE], nu_hat, step)
-        out.append(Prediction(np.concatenate((pose, nu_hat), axis=1), bad))
-    return out
+    found: torch.Tensor = states
+    return found
+
+
+def _prediction(
+    window: Window, nu: np.ndarray, logs: Sequence[Prepared], step: float, limit: np.ndarray
+) -> Prediction:
+    """Return velocities [L, 3] with their pose, or those of `zero` where they ran away."""
+    bad = not np.isfinite(nu).all() or bool((np.abs(nu) > limit).any())
+    if bad:
+        nu = np.tile(window.nu, (len(nu), 1))
+    pose = integrate(logs[window.log].y[window.start, POSE], nu, step)
+    return Prediction(np.concatenate((pose, nu), axis=1), bad)
 
 
 def _memory(

@@ -54,5 +54,12 @@ def train(
     if config.from_baseline:
         model.head.silence()
     scale = scales.to(torch.float32)
-    module = HeadTraining(model.to(torch.float32), store, config, scale, validate, seed, covariance)
-    return run_epochs(name, module, model, model.head, folder)
+    # losses and scores are those of velocities
+    model.positions = False
+    try:
+        module = HeadTraining(
+            model.to(torch.float32), store, config, scale, validate, seed, covariance
+        )
+        return run_epochs(name, module, model, model.head, folder)
+    finally:
+        model.positions = True

@@ -8,7 +8,6 @@ from functools import partial
 from residnet.core.errors import DataError
 from residnet.core.progress import say
 from residnet.identification.currents import through_currents
-from residnet.identification.evaluation import Evaluation
 from residnet.identification.fit import fit
 from residnet.identification.goodness import goodness_rows
 from residnet.identification.identified import Identified
@@ -81,15 +80,11 @@ def _judged(
     if config.bands is not None:
         bands = {entry.name: entry.bands for entry in fitted}
         folder.write_json(folder.bands, bands_content(config.name, bands))
-    judged: dict[str, Evaluation] = {}
-    for split in config.evaluation.splits:
-        judged[split] = identified.evaluate(logs[split], config.data)
+    splits = {split: logs[split] for split in config.evaluation.splits}
+    judged = identified.evaluate_splits(splits, config.data)
+    for split, part in judged.items():
         write_rollouts(
-            folder.rollouts / split,
-            judged[split].runs,
-            judged[split].logs,
-            config.signals.columns,
-            judged[split].bands,
+            folder.rollouts / split, part.runs, part.logs, config.signals.columns, part.bands
         )
     chosen = identified.select(judged)
     say(f"  selected: {chosen.selected}")
