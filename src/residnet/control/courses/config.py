@@ -28,6 +28,8 @@ from residnet.core.errors import ConfigError
 
 _STEP = math.log(1.12)
 """Between the radii of the turns that a plan uses, logarithmic."""
+_BESIDE = 0.05
+"""Of a buoy's radius by which a plan comes nearer than where it begins, at most."""
 
 
 class BuoyCourseConfig(Config):
@@ -210,7 +212,7 @@ def _request(
         return tuple(
             Circle(complex(buoy.north, buoy.east), depth, 0, 0) for buoy in buoys
         ), np.array([tightest])
-    radii = [(1.0 + margin) * buoy.radius + aside for buoy in buoys]
+    radii = [_kept(buoy, config.start, (1.0 + margin) * buoy.radius + aside) for buoy in buoys]
     # a few rudder angles do for circles of many sizes
     steps = [max(math.floor(math.log(radius / tightest) / _STEP), 0) for radius in radii]
     wide = sorted({0, *steps})
@@ -223,3 +225,14 @@ def _request(
         )
         for buoy, radius, step in zip(buoys, radii, steps, strict=True)
     ), tightest * np.exp(_STEP * np.array(wide))
+
+
+def _kept(buoy: BuoyConfig, start: tuple[float, float], radius: float) -> float:
+    """Return the radius in m that a plan keeps from a buoy: less where it begins nearer than that.
+
+    Where the course begins within the buoy's own circle, it is `radius`.
+    """
+    away = math.hypot(buoy.north - start[0], buoy.east - start[1])
+    if away < buoy.radius:
+        return radius
+    return max(min(radius, away - _BESIDE * buoy.radius), buoy.radius)

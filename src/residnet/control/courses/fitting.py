@@ -80,6 +80,7 @@ class Fit:
         middle = (at[1:] + at[:-1] + 1) // 2
         self.edges = np.concatenate(([0], middle, [-1]))
         self.others: list[tuple[int, int]] = []
+        self.apart = [self._apart(circle) for circle in circles]
         self.seen: Array | None = None
         self.last: _Results
 
@@ -89,6 +90,12 @@ class Fit:
         other = Fit(route, self.circles, at, self.free, self.aside)
         other.edges = self.edges
         return other
+
+    def _apart(self, circle: Circle) -> float:
+        """Return by how much farther a buoy is on the rest of the course, as its start allows."""
+        room = abs(circle.place - self.route.start) - circle.radius
+        apart = _APART * self.unit + self.aside
+        return apart if room < 0 else min(apart, 0.5 * room)
 
     def window(self, number: int, count: int) -> slice:
         """Return the points of a buoy's turn."""
@@ -168,7 +175,7 @@ class Fit:
             part = slice(max(part.start, begin), part.stop)
             near = self._nearest(drawn, self.circles[j], part)
             # next to its own turn the course comes from there
-            apart = 0.0 if abs(i - j) <= 1 else _APART * self.unit + self.aside
+            apart = 0.0 if abs(i - j) <= 1 else self.apart[j]
             values.append(near.distance - max(own[j][0], self.circles[j].radius) - apart)
             rows.append(near.change - (own[j][1] if own[j][0] > self.circles[j].radius else 0.0))
         even, level = [], []
