@@ -140,7 +140,16 @@ SHORT: dict[str, Short] = {
     "simulate_wam_v": Short(("~programme.families", "programme.step=0.1 s")),
     "rudder_boat_trials": Short(_TRIALS),
     "patrol_identified": Short(_trained("mlp")),
-    "kvlcc2": Short(("refit.mmg.iterations=2", "booklet.draws=20", "bands=null"), data="kvlcc2"),
+    "kvlcc2": Short(
+        (
+            "prepare.grid={step: 0.5 s, held: [n, delta]}",
+            "prepare.derivative={kind: savitzky_golay, window: 2.5 s, order: 2}",
+            "refit.mmg={horizon: 20 s, every: 40 s, prior: 0, robust: 0.3, iterations: 2}",
+            "booklet.draws=20",
+            "bands=null",
+        ),
+        data="kvlcc2",
+    ),
     "esso_osaka": Short(_TANKER, data="esso_osaka"),
     "esso_osaka_standard": Short(
         (
@@ -149,7 +158,10 @@ SHORT: dict[str, Short] = {
             " {log: 'zigzag/*13_14_21.csv', from: 0 s, to: 150 s}], validation:"
             " [{log: 'zigzag/*13_29_19.csv', from: 0 s, to: 150 s}], test:"
             " [{log: 'zigzag/*13_42_53.csv', from: 0 s, to: 150 s}]}",
-            "evaluation.selection=T30",
+            "evaluation.selection=T10",
+            "evaluation.protocols={T10: {kind: windows, length: 10 s}}",
+            "prepare.grid={step: 0.5 s, held: [n, delta]}",
+            "prepare.derivative={kind: savitzky_golay, window: 3.5 s, order: 2}",
             "effort=0.01",
             "bands=null",
         ),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -54,6 +55,12 @@ def _common(
     ] = False,
 ) -> None:
     """Options of all commands."""
+
+
+class Recipe(StrEnum):
+    """Recipes that a config may be drafted with."""
+
+    standard = "standard"
 
 
 Overrides = Annotated[
@@ -131,6 +138,12 @@ def new(
     defaults: Annotated[
         bool, typer.Option("--defaults", help="Ask nothing: take and mark every default.")
     ] = False,
+    recipe: Annotated[
+        Recipe | None,
+        typer.Option(
+            help="Fit the portfolio of the standard recipe: minutes more than a few models."
+        ),
+    ] = None,
 ) -> None:
     """Draft a complete config from logs: `residnet run` takes it as it is.
 
@@ -143,7 +156,9 @@ def new(
     limit_threads()
     with drawn_progress():
         ask = asked() if not defaults else None
-        lines = new_config(logs, out or Path("my_boat.yaml"), ask, overwrite=overwrite)
+        file = out or Path("my_boat.yaml")
+        standard = recipe is not None
+        lines = new_config(logs, file, ask, overwrite=overwrite, standard=standard)
     for line in lines:
         print(line)
 

@@ -71,6 +71,15 @@ def test_the_same_from_python(folder: Path) -> None:
     assert "data.split" in dict(draft.guesses)
 
 
+def test_the_standard_recipe_where_it_is_asked_for(folder: Path) -> None:
+    draft = residnet.draft(folder / "trials", name="boat", folder=folder, recipe="standard")
+    assert draft.config["recipe"] == "standard"
+    assert not {"baseline", "baselines", "heads", "training"} & set(draft.config)
+    load_task(draft.save(folder / "standard.yaml")).check()
+    with pytest.raises(UsageError, match="no recipe 'standart'; did you mean 'standard'"):
+        residnet.draft(folder / "trials", recipe="standart")
+
+
 def test_a_file_is_not_replaced_unasked(folder: Path) -> None:
     file = folder / "kept.yaml"
     file.write_text("mine")

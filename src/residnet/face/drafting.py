@@ -6,10 +6,14 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from residnet.core.errors import UsageError
+from residnet.core.names import nearest
 from residnet.core.progress import ProgressCallback
 from residnet.data.drafting.questions import Question
 from residnet.face.values import PathGiven, hearing, path
 from residnet.tasks.drafting.draft import Draft, drafted
+
+RECIPES = ("standard",)
+"""Recipes by name."""
 
 
 def draft(
@@ -18,6 +22,7 @@ def draft(
     name: str = "my_boat",
     folder: PathGiven = ".",
     answer: Callable[[Question], str] | None = None,
+    recipe: str | None = None,
     progress: ProgressCallback | None = None,
 ) -> Draft:
     """Draft a complete config of a fit from logs of any format.
@@ -31,6 +36,8 @@ def draft(
         folder: where the config will lie; its paths start from there.
         answer: is given each question that the logs leave open, and returns its answer; None takes
             the defaults.
+        recipe: `standard` proposes the standard recipe, which fits a portfolio of models and takes
+            minutes more than the few models that are proposed by default.
         progress: is told how far the reading is.
 
     Returns:
@@ -47,5 +54,8 @@ def draft(
     given = list(logs) if isinstance(logs, list | tuple) else [logs]
     if not given:
         raise UsageError("draft: no log is given; name files, folders or bags")
+    if recipe not in (None, *RECIPES):
+        raise UsageError(f"draft: no recipe '{recipe}'{nearest(str(recipe), RECIPES)}")
     with hearing(progress):
-        return drafted([path(one, "draft") for one in given], Path(folder), name, answer)
+        paths = [path(one, "draft") for one in given]
+        return drafted(paths, Path(folder), name, answer, standard=recipe is not None)

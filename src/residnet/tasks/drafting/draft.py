@@ -57,7 +57,14 @@ class Draft:
         return path
 
 
-def drafted(paths: Sequence[Path], folder: Path, name: str, answer: Answer | None = None) -> Draft:
+def drafted(
+    paths: Sequence[Path],
+    folder: Path,
+    name: str,
+    answer: Answer | None = None,
+    *,
+    standard: bool = False,
+) -> Draft:
     """Return a config for logs that the task `fit` runs as it is.
 
     Args:
@@ -65,6 +72,7 @@ def drafted(paths: Sequence[Path], folder: Path, name: str, answer: Answer | Non
         folder: where the config will lie; its paths start from there.
         name: of the run.
         answer: answers questions; None takes every default and marks it.
+        standard: propose the standard recipe in place of a few models that are fitted sooner.
 
     Raises:
         UsageError: where a path does not exist, or nothing drives the vessel in the logs.
@@ -83,7 +91,7 @@ def drafted(paths: Sequence[Path], folder: Path, name: str, answer: Answer | Non
         )
     read = _rudder_side(read, inputs, marks)
     renamed, inputs = _plain_names(read, inputs, marks)
-    return _assembled(renamed, inputs, folder, name, marks)
+    return _assembled(renamed, inputs, folder, name, marks, standard)
 
 
 def _rudder_side(read: ReadLogs, inputs: Sequence[str], marks: Marks) -> ReadLogs:
@@ -145,7 +153,12 @@ def _plain_names(
 
 
 def _assembled(
-    read: ReadLogs, inputs: tuple[str, ...], folder: Path, name: str, marks: Marks
+    read: ReadLogs,
+    inputs: tuple[str, ...],
+    folder: Path,
+    name: str,
+    marks: Marks,
+    standard: bool,
 ) -> Draft:
     whole = list(read.whole.values())
     time = recipe.timing(whole)
@@ -161,6 +174,9 @@ def _assembled(
     protocols = recipe.protocols(length)
     recipe.mark_timing(time, length, marks)
     plan = recipe.models(inputs, bool(wind), time, length, samples)
+    if standard and inputs:
+        plan = {"recipe": "standard"}
+        marks.note(("recipe",), "eight models or so, whose terms and sizes follow from the logs")
     scales = recipe.scales([*splits["train"], *splits["validation"]])
     marks.note(("evaluation", "scales"), "standard deviations over training and validation logs")
     config = {

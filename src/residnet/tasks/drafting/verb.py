@@ -14,7 +14,12 @@ _SHOWN = 12
 
 
 def new_config(
-    logs: Sequence[Path], out: Path, answer: Answer | None, *, overwrite: bool
+    logs: Sequence[Path],
+    out: Path,
+    answer: Answer | None,
+    *,
+    overwrite: bool,
+    standard: bool = False,
 ) -> list[str]:
     """Write a config for logs; returns what the terminal shows.
 
@@ -23,6 +28,7 @@ def new_config(
         out: file to write.
         answer: asks the user; None takes every default.
         overwrite: replace the file.
+        standard: propose the standard recipe.
 
     Raises:
         UsageError: where the file exists already, or a path does not.
@@ -33,7 +39,7 @@ def new_config(
     if out.exists() and not overwrite:
         raise UsageError(f"--out {out}: exists; give --overwrite, or another name")
     name = re.sub(r"[^A-Za-z0-9_.-]+", "_", out.stem).strip("_.-") or "my_boat"
-    draft = drafted(logs, out.parent, name, answer)
+    draft = drafted(logs, out.parent, name, answer, standard=standard)
     file = draft.save(out)
     lines = [f"{key}: {why}" for key, why in draft.guesses[:_SHOWN]]
     if len(draft.guesses) > _SHOWN:
