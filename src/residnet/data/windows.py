@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
@@ -76,6 +76,12 @@ class WindowStore:
             torch.from_numpy(np.repeat(np.arange(len(logs)), [len(p) for p in logs])),
         )
 
+    def to(self, device: torch.device) -> WindowStore:
+        """Return the same store on a device."""
+        return WindowStore(
+            **{part.name: getattr(self, part.name).to(device) for part in fields(self)}
+        )
+
     def starts(self, length: int, share: float = 0.5) -> Tensor:
         """Return the rows at which a window of `length` samples may start.
 
@@ -113,7 +119,7 @@ class WindowStore:
 
     def take(self, values: Tensor, starts: Tensor, length: int) -> Tensor:
         """Return the windows [B, length, ...] of one of the tensors, from rows `starts` [B] on."""
-        index = starts[:, None] + torch.arange(length)
+        index = starts[:, None] + torch.arange(length, device=starts.device)
         return values.index_select(0, index.reshape(-1)).reshape(
             starts.numel(), length, *values.shape[1:]
         )
@@ -123,7 +129,7 @@ class WindowStore:
 
         Where the stretch is shorter, its first sample is repeated.
         """
-        back = torch.arange(-length, 0)
+        back = torch.arange(-length, 0, device=starts.device)
         index = starts[:, None] + torch.maximum(back, -self.depth[starts][:, None])
         rows = index.reshape(-1)
         shape = (starts.numel(), length)

@@ -88,7 +88,7 @@ class HybridDynamics(Dynamics):
         if self.disturbance is None:
             s: Tensor = self.head.warmup(self.channels(y_history, w_history))
             return s
-        s = torch.zeros(y_history.shape[0], self.n_state, dtype=y_history.dtype)
+        s = y_history.new_zeros((y_history.shape[0], self.n_state))
         for k in range(y_history.shape[1]):
             s = self.step(y_history[:, k], w_history[:, k], s)[1]
         return s

@@ -236,7 +236,8 @@ class Fitter:
         from residnet.training.trainer import train
 
         settings = self.settings.training.get(name, TrainingConfig())
-        windows, folder = WindowStore.gather(self.train), self.store.training_folder
+        dtype = torch.float64 if settings.double else torch.float32
+        windows, folder = WindowStore.gather(self.train, dtype), self.store.training_folder
         spread = covariance
         if settings.refit_baseline and spread is None:
             spread = least_squares_covariance(model.baseline, self.samples)

@@ -109,7 +109,7 @@ def _run(
 ) -> list[Prediction]:
     tables = {n: _inputs(candidate, logs[n]) for n in {window.log for window in windows}}
     # a copy: a validation in float32 must not round the model that it validates
-    model = copy.deepcopy(candidate.model).to(dtype).eval()
+    model = copy.deepcopy(candidate.model).to("cpu", dtype).eval()
     # the pose is integrated from the velocities below
     model.positions = False
     columns = [candidate.state.index(name) for name in VELOCITY]

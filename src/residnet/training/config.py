@@ -5,6 +5,7 @@ from __future__ import annotations
 from pydantic import Field, model_validator
 
 from residnet.core.config import Config, Seconds
+from residnet.training.machine import MachineConfig
 
 
 class OneStep(Config):
@@ -72,7 +73,7 @@ class Beginnings(Config):
     initial: Seconds = Field(default=0.5, gt=0)
 
 
-class TrainingConfig(Config):
+class TrainingConfig(MachineConfig):
     """Settings of a training: one-step, then each of `multi_step` (a curriculum of horizons).
 
     Attributes:
@@ -130,6 +131,9 @@ class TrainingConfig(Config):
                 "beginnings need batches of at least 2 windows: some lie at the beginning of a"
                 " stretch, the others anywhere"
             )
+        least = min(self.one_step.batch, *(stage.batch for stage in self.multi_step), 1_024)
+        if self.processes > least:
+            raise ValueError(f"processes: {self.processes} cannot share batches of {least} windows")
         return self
 
     @property

@@ -8,6 +8,7 @@ import math
 import warnings
 from abc import ABC, abstractmethod
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Protocol
 
 import lightning as L
@@ -18,6 +19,7 @@ from torch import Tensor, nn
 from residnet.core.errors import FitError, UsageError
 from residnet.core.files import whole
 from residnet.core.progress import report
+from residnet.training.machine import MachineConfig
 
 
 class Epochs(Protocol):
@@ -179,7 +181,7 @@ class EpochTraining(L.LightningModule, ABC):
 
 
 def _copied(model: nn.Module) -> dict[str, Tensor]:
-    return {name: value.detach().clone() for name, value in model.state_dict().items()}
+    return {name: value.detach().to("cpu", copy=True) for name, value in model.state_dict().items()}
 
 
 class FinishEpoch(L.Callback):
@@ -201,7 +203,11 @@ class KeepCheckpoint(L.Callback):
         self.path = path
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Write beside the old one, then put it in place."""
+        """Write beside the old one, then put it in place; the first process alone writes."""
+        if not trainer.is_global_zero:
+            # the processes wait for each other there
+            trainer.save_checkpoint(self.path)
+            return
         with whole(self.path) as file:
             trainer.save_checkpoint(file)
 
@@ -227,7 +233,12 @@ class ReportProgress(L.Callback):
 
 
 def run_epochs(
-    name: str, module: EpochTraining, model: nn.Module, trained: nn.Module, folder: Path | None
+    name: str,
+    module: EpochTraining,
+    model: nn.Module,
+    trained: nn.Module,
+    folder: Path | None,
+    machine: MachineConfig | None = None,
 ) -> dict[str, Any]:
     """Train to the last epoch and leave the best state in the model.
 
@@ -240,6 +251,7 @@ def run_epochs(
         model: that is validated; it ends frozen, with the weights that scored best.
         trained: its part whose parameters are counted.
         folder: for checkpoints and the TensorBoard log; None for neither.
+        machine: that trains; None for one process on the CPU.
 
     Returns:
         Notes about the training: the curve by epoch, the best score, that of the start where it was
@@ -247,8 +259,13 @@ def run_epochs(
 
     Raises:
         FitError: where no epoch gave a finite validation.
-        UsageError: where the checkpoint is damaged or belongs to another training.
+        UsageError: where the checkpoint is damaged or belongs to another training, or the machine
+            lacks a device.
     """
+    machine = machine or MachineConfig()
+    if machine.processes > 1 and folder is None:
+        with TemporaryDirectory() as temporary:
+            return run_epochs(name, module, model, trained, Path(temporary), machine)
     logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
     settings: Epochs = module.settings
     callbacks: list[L.Callback] = [FinishEpoch(), ReportProgress(name, settings.epochs)]
@@ -260,12 +277,16 @@ def run_epochs(
         logger = TensorBoardLogger(folder / "tensorboard", name=name, version="")
     # a checkpoint that is there is taken up
     checkpoint = last if last is not None and last.is_file() else None
-    trainer = _trainer(settings, callbacks, logger)
+    trainer = _trainer(settings, callbacks, logger, machine)
     if checkpoint is not None:
         module.restore(_kept(checkpoint, module.made_of))
     # killed between the last epoch and the model's file: there is nothing left to train
     if not module.finished:
         _fit(trainer, module, checkpoint)
+        if machine.processes > 1 and last is not None:
+            # other processes have trained: what they found stands in the checkpoint
+            module.restore(_kept(last, module.made_of))
+    module.cpu()
     if not module.best_state:
         raise FitError(
             f"{name}: no epoch gave a finite free run on the validation data; lower the learning"
@@ -328,12 +349,14 @@ def _fit(trainer: L.Trainer, module: EpochTraining, checkpoint: Path | None) -> 
 
 
 def _trainer(
-    settings: Epochs, callbacks: list[L.Callback], logger: TensorBoardLogger | None
+    settings: Epochs,
+    callbacks: list[L.Callback],
+    logger: TensorBoardLogger | None,
+    machine: MachineConfig,
 ) -> L.Trainer:
-    """Return a trainer on the CPU that prints nothing and keeps no checkpoints of its own."""
+    """Return a trainer that prints nothing and keeps no checkpoints of its own."""
     return L.Trainer(
-        accelerator="cpu",
-        devices=1,
+        **machine.for_lightning(),
         max_epochs=settings.epochs,
         gradient_clip_val=settings.gradient_clip,
         logger=logger if logger is not None else False,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple, final
 
 import torch
@@ -72,6 +72,7 @@ class HeadTraining(EpochTraining):
         self.scales = scales
         self.validate = validate
         self.batches = stage_windows(config, store, model.dt)
+        self.rank, self.world = 0, 1
 
     def train_dataloader(self) -> EpochBatches:
         """Return window starts [batch], `steps` times an epoch."""
@@ -93,6 +94,9 @@ class HeadTraining(EpochTraining):
     def on_fit_start(self) -> None:
         """Reset the losses; a model that is trained further is a candidate as it is."""
         super().on_fit_start()
+        if torch.distributed.is_available() and torch.distributed.is_initialized():
+            self.rank, self.world = self.global_rank, torch.distributed.get_world_size()
+        self.store, self.scales = self.store.to(self.device), self.scales.to(self.device)
         begun = self.settings.from_baseline or self.settings.begin_with is not None
         if begun and self.epoch == 0:
             self.validate_start()
@@ -118,26 +122,51 @@ class HeadTraining(EpochTraining):
             if stage == 0
             else self._multi_step(starts, length, self.batches[stage])
         )
-        self._losses.append(float(loss.detach()))
+        self._losses.append(float(self.shared(loss.detach())))
         return loss
+
+    def shared(self, value: Tensor) -> Tensor:
+        """Return the mean of a value over the processes of the training."""
+        if self.world == 1:
+            return value
+        total = value.detach().clone()
+        torch.distributed.all_reduce(total)
+        return total / self.world
+
+    def mine(self, sources: Sequence[WindowBatches]) -> tuple[Tensor, list[int]]:
+        """Return the columns of a batch that this process takes, and how many of each source."""
+        begins = [sum(one.batch for one in sources[:i]) for i in range(len(sources))]
+        own = [
+            torch.arange(begin + self.rank, begin + source.batch, self.world, device="cpu")
+            for begin, source in zip(begins, sources, strict=True)
+        ]
+        return torch.cat(own), [len(part) for part in own]
 
     def _one_step(self, starts: Tensor, length: int) -> Tensor:
         take = self.store.take
         washout = torch.full_like(starts, round(self.settings.one_step.washout / self.model.dt))
         if self.settings.beginnings is not None:
             washout[self.store.depth[starts] == 0] = 0
-        counted = take(self.store.good, starts, length) & (torch.arange(length) >= washout[:, None])
+        samples = torch.arange(length, device=starts.device)
+        counted = take(self.store.good, starts, length) & (samples >= washout[:, None])
         y, w = take(self.store.smooth, starts, length), take(self.store.recorded, starts, length)
         spread = self.model.head.residual_std().to(y.dtype)
         return one_step_loss(
-            self.model, y, w, take(self.store.nu_dot, starts, length), counted, spread
+            self.model,
+            y,
+            w,
+            take(self.store.nu_dot, starts, length),
+            counted,
+            spread,
+            self.shared,
         )
 
     def _multi_step(self, starts: Tensor, length: int, sources: list[WindowBatches]) -> Tensor:
         take, dt = self.store.take, self.model.dt
         x0 = self.store.smooth[starts]
         beginnings = self.settings.beginnings
-        parts = starts.split([source.batch for source in sources])
+        columns, sizes = self.mine(sources)
+        parts = starts.split(sizes)
         memories = [
             self.model.warmup(*self.store.history(parts[0], round(self.settings.history / dt)))
         ]
@@ -147,11 +176,10 @@ class HeadTraining(EpochTraining):
             begun = torch.cat((x0[len(parts[0]) :, POSE], past[..., VELOCITIES].mean(1)), dim=1)
             x0 = torch.cat((x0[: len(parts[0])], begun))
         if self.settings.start_noise > 0:
-            noise = (
-                self.settings.start_noise
-                * self.scales
-                * torch.randn(len(starts), 3, dtype=x0.dtype)
-            )
+            # drawn for the whole batch on the CPU: the same on every device, by any processes
+            count = sum(source.batch for source in sources)
+            drawn = torch.randn(count, 3, dtype=x0.dtype, device="cpu")[columns].to(x0.device)
+            noise = self.settings.start_noise * self.scales * drawn
             x0 = torch.cat((x0[:, POSE], x0[:, VELOCITIES] + noise), dim=1)
         w, y = take(self.store.w, starts, length - 1), take(self.store.y, starts + 1, length - 1)
         usable = take(self.store.usable, starts + 1, length - 1)
@@ -166,7 +194,15 @@ class HeadTraining(EpochTraining):
                 return out
 
         return rollout_loss(
-            run, x0, w, torch.cat(memories), y, usable, self.scales, self.settings.robust
+            run,
+            x0,
+            w,
+            torch.cat(memories),
+            y,
+            usable,
+            self.scales,
+            self.settings.robust,
+            self.shared,
         )
 
     def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
@@ -199,5 +235,6 @@ class EpochBatches:
     def __iter__(self) -> Iterator[Tensor]:
         epoch = self.module.epoch
         stage, _ = self.module.settings.stage(epoch)
-        drawn = [source.epoch(self.module.seed, epoch) for source in self.module.batches[stage]]
-        return iter(torch.cat(drawn, dim=1))
+        sources = self.module.batches[stage]
+        drawn = [source.epoch(self.module.seed, epoch) for source in sources]
+        return iter(torch.cat(drawn, dim=1)[:, self.module.mine(sources)[0]])

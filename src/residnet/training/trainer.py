@@ -33,7 +33,7 @@ def train(
         name: of the head.
         model: with its baseline filled in.
         samples: training samples whose target is the residual; give the scales.
-        store: training windows.
+        store: training windows, float64 where the training's precision is.
         config: stages.
         scales: of the velocities, [3].
         validate: divergences and free-run error of a model on the validation data.
@@ -53,13 +53,13 @@ def train(
         model.head.calibrate(samples)
     if config.from_baseline:
         model.head.silence()
-    scale = scales.to(torch.float32)
+    dtype = torch.float64 if config.double else torch.float32
+    scale = scales.to(dtype)
     # losses and scores are those of velocities
     model.positions = False
     try:
-        module = HeadTraining(
-            model.to(torch.float32), store, config, scale, validate, seed, covariance
-        )
-        return run_epochs(name, module, model, model.head, folder)
+        module = HeadTraining(model.to(dtype), store, config, scale, validate, seed, covariance)
+        return run_epochs(name, module, model, model.head, folder, config)
     finally:
+        model.to(torch.float32)
         model.positions = True
