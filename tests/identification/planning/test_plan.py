@@ -16,7 +16,8 @@ from residnet.dynamics.store import ModelSpec
 from residnet.identification.models import FittedModel
 from residnet.identification.planning.candidates import TrialLimits, shares_of
 from residnet.identification.planning.information import after, spread, volume_gain
-from residnet.identification.planning.plan import Plan, plan
+from residnet.identification.planning.plan import Aim, Plan, plan
+from residnet.manoeuvres import ConstantInput
 from residnet.physics.signals import SignalsConfig
 from residnet.training.free_runs.covariance import LeftOpen, left_open
 from residnet.training.refit import refit
@@ -48,9 +49,11 @@ def known() -> tuple[FittedModel, LeftOpen, torch.Tensor]:
     return FittedModel(spec, model, {}), open_, refitted.covariance
 
 
-def planned(known: tuple[FittedModel, LeftOpen, torch.Tensor], limits: TrialLimits) -> Plan:
+def planned(
+    known: tuple[FittedModel, LeftOpen, torch.Tensor], limits: TrialLimits, aim: Aim | None = None
+) -> Plan:
     fitted, open_, _ = known
-    return plan(fitted, open_, CONFIG, SCALES.numpy(), SHARES, np.full(3, 100.0), limits)
+    return plan(fitted, open_, CONFIG, SCALES.numpy(), SHARES, np.full(3, 100.0), limits, aim)
 
 
 def test_a_look_back_finds_the_covariance_of_the_refit(
@@ -70,6 +73,23 @@ def test_information_adds_to_what_is_known() -> None:
     wanted = 0.5 * (torch.logdet(a @ a.T + told) - torch.logdet(a @ a.T))
     assert volume_gain(covariance, told) == pytest.approx(float(wanted))
     assert spread(covariance, told) == pytest.approx(float((told @ covariance).trace().sqrt()))
+
+
+def test_trials_are_chosen_for_what_is_to_be_predicted(
+    known: tuple[FittedModel, LeftOpen, torch.Tensor],
+) -> None:
+    straight = ConstantInput(name="straight", drive=1.0, steer=0.0, duration=8.0)
+    turning = ConstantInput(name="turning", drive=0.4, steer=1.0, duration=8.0)
+    limits = TrialLimits(time=8.0, count=1)
+    found = {
+        one.name: {
+            trial.flight.motion.name: trial.shrinks
+            for trial in planned(known, limits, Aim([one], 8.0, {"u": 0.5})).trials
+        }
+        for one in (straight, turning)
+    }
+    # changes of speed tell about straight runs, and little about turns
+    assert found["straight"]["speed_changes"] > 1.5 * found["turning"]["speed_changes"]
 
 
 def test_trials_are_chosen_within_the_limits_and_narrow_the_intervals(

@@ -21,9 +21,24 @@ from residnet.dynamics.gear import GivenGear, InputShare, commanded
 from residnet.identification.models import FittedModel
 from residnet.identification.planning.candidates import TrialLimits, candidates
 from residnet.identification.planning.information import after, moments, spread, volume_gain
-from residnet.manoeuvres import Helm
+from residnet.manoeuvres import Helm, Manoeuvre
 from residnet.training.free_runs.covariance import LeftOpen
 from residnet.training.refit_config import RefitConfig
+
+
+@dataclass(frozen=True)
+class Aim:
+    """Manoeuvres whose prediction is to become surer, such as those of a booklet.
+
+    Attributes:
+        manoeuvres: of them.
+        duration: of those that give none, in s.
+        initial: states by name that they start from.
+    """
+
+    manoeuvres: Sequence[Manoeuvre]
+    duration: float
+    initial: Mapping[str, float]
 
 
 @dataclass(frozen=True)
@@ -70,11 +85,12 @@ def plan(
     shares: Mapping[str, InputShare],
     limit: np.ndarray,
     limits: TrialLimits,
+    aim: Aim | None = None,
 ) -> Plan:
     """Return the trials that narrow the intervals of predictions most per minute.
 
-    Predictions are those of the velocities over all candidates alike. Trials are chosen one after
-    the other, each given those before it.
+    Predictions are those of the velocities over the manoeuvres of `aim`. Trials are chosen one
+    after the other, each given those before it.
 
     Args:
         fitted: a refitted baseline.
@@ -84,6 +100,7 @@ def plan(
         shares: of the inputs in drive and steer.
         limit: of |u, v, r| [3] beyond which a flight has diverged.
         limits: of the trials.
+        aim: what is to be predicted; None for all candidates alike.
 
     Raises:
         DataError: where no candidate stays within the limits.
@@ -92,7 +109,12 @@ def plan(
     horizon = round(refit.horizon / spec.dt)
     divisor = torch.from_numpy(scales)
     flown = [
-        (flight, _path(flight, spec.signals.columns)) for flight in _flights(fitted, shares, limits)
+        (flight, _path(flight, spec.signals.columns))
+        for flight in _flights(
+            fitted,
+            shares,
+            Aim(sorted(candidates(limits), key=lambda one: one.kind), limits.time, {}),
+        )
     ]
     kept = [(flight, states, w) for flight, (states, w) in flown if _allowed(states, limit, limits)]
     if not kept:
@@ -104,7 +126,10 @@ def plan(
     found = [(flight, states, own) for (flight, states, _), own in zip(kept, told, strict=True)]
     # so many samples hang together that they count as one
     each = spec.dt / refit.correlation / max(open_.square, 1e-12)
-    goal = sum((own for _, _, own in found), torch.zeros_like(found[0][2]))
+    goal = told.sum(dim=0)
+    if aim is not None:
+        paths = [_path(one, spec.signals.columns) for one in _flights(fitted, shares, aim)]
+        goal = moments(model, paths, horizon, divisor).sum(dim=0)
     before = spread(open_.covariance, goal)
     trials = []
     for flight, states, own in found:
@@ -142,21 +167,20 @@ def _greedy(trials: Sequence[Trial], covariance: Tensor, goal: Tensor, count: in
     return chosen
 
 
-def _flights(
-    fitted: FittedModel, shares: Mapping[str, InputShare], limits: TrialLimits
-) -> list[Flight]:
+def _flights(fitted: FittedModel, shares: Mapping[str, InputShare], aim: Aim) -> list[Flight]:
     spec, model = fitted.spec, fitted.model.double()
     gear = GivenGear(shares, spec.signals.exogenous, spec.dt)
     actuated = ActuatedDynamics(model, spec.signals.columns, spec.hold, gear)
     start = gear.approach(1)
     # trials begin at a speed in the middle of what the model knows
     start[:, SURGE] = 0.5 * (max(spec.low[0], 0.0) + spec.high[0])
+    for name, value in aim.initial.items():
+        start[:, actuated.state.index(name)] = float(value)
     craft = Craft(
         fitted.name, actuated, Helm(gear.demand, actuated.state, gear.inputs), gear.commands, start
     )
     sea = Sea(None, Disturbance(), SensorNoise(), 0)
-    manoeuvres = sorted(candidates(limits), key=lambda manoeuvre: manoeuvre.kind)
-    return fly(craft, manoeuvres, sea, limits.time, spec.dt)
+    return fly(craft, list(aim.manoeuvres), sea, aim.duration, spec.dt)
 
 
 def _path(flight: Flight, columns: Sequence[str]) -> tuple[Tensor, Tensor]:

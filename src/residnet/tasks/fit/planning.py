@@ -19,7 +19,7 @@ from residnet.data.prepare import samples
 from residnet.data.windows import WindowStore
 from residnet.identification.currents import through_currents
 from residnet.identification.planning.candidates import TrialLimits, shares_of
-from residnet.identification.planning.plan import Plan, Trial, plan
+from residnet.identification.planning.plan import Aim, Plan, Trial, plan
 from residnet.identification.prepared import prepare_logs, velocity_limit
 from residnet.runs.folder import RunFolder
 from residnet.runs.model_store import FolderStore
@@ -130,7 +130,14 @@ def plan_trials(
         torch.from_numpy(scales),
         fitted.notes["refit"].get("at_rest", ()),
     )
-    shares = config.booklet.inputs if config.booklet is not None else shares_of(fitted.spec)
+    booklet = config.booklet
+    shares = booklet.inputs if booklet is not None else shares_of(fitted.spec)
     low, high = np.array(fitted.spec.low), np.array(fitted.spec.high)
     limit = velocity_limit(low, high, config.evaluation.divergence)
-    return PlannedTrials(name, plan(fitted, open_, refit, scales, shares, limit, allowed))
+    aim = None
+    if booklet is not None:
+        initial = {key: float(value) for key, value in booklet.initial.items()}
+        # zigzags and turns of one kind fly together
+        manoeuvres = sorted(booklet.manoeuvres, key=lambda manoeuvre: manoeuvre.kind)
+        aim = Aim(manoeuvres, booklet.duration, initial)
+    return PlannedTrials(name, plan(fitted, open_, refit, scales, shares, limit, allowed, aim))

@@ -1,0 +1,227 @@
+"""Do the trials that `residnet plan-trial` picks narrow intervals more than trials at random?
+
+A simulated vessel with scattered parameters sails a few zigzags, and a model is refitted to them.
+Three trials are planned; they and all other candidates are then sailed by the vessel, with noise
+and random forces. The intervals are those of velocities over turning circles and zigzags of a
+booklet, by the covariance that a refit with the new trials ends with: after a whole refit for the
+planned trials, and at the first refit's parameters for three at random.
+
+    python scripts/bench/plan_trials.py [--draws 4] [--random 50] [--seed 0]
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from selection import scattered
+from torch import Tensor
+
+from residnet.core.config import validate
+from residnet.data.prepare import Prepared, samples
+from residnet.data.simulated.trials import SimulatedTrials, simulate
+from residnet.data.windows import WindowStore
+from residnet.dynamics.gear import InputShare
+from residnet.identification.fit import fit
+from residnet.identification.models import FittedModel
+from residnet.identification.planning.candidates import TrialLimits, candidates
+from residnet.identification.planning.information import moments, spread
+from residnet.identification.planning.plan import Aim, plan
+from residnet.identification.prepared import prepare_logs, velocity_limit
+from residnet.identification.settings import FitSettings
+from residnet.physics.vessel import load_vessel
+from residnet.training.free_runs.covariance import LeftOpen, left_open
+
+VESSELS: dict[str, dict[str, Any]] = {
+    "wam_v_cal": {
+        "signals": {"inputs": ["n_port", "n_stbd"], "forces": "wam_v_cal"},
+        "terms": ["u", "v", "r", "u|u|", "r|r|", "u v", "u r", "v r", "tau_x", "tau_n"],
+    },
+    "example_rudder_boat": {
+        "signals": {"inputs": ["n", "delta"]},
+        "terms": [
+            "u",
+            "v",
+            "r",
+            "u|u|",
+            "r|r|",
+            "u v",
+            "u r",
+            "v r",
+            "n|n|",
+            "|n| u",
+            "u|u| delta",
+        ],
+    },
+}
+STEP, SECONDS, PICKED = 0.1, 60.0, 3
+BOOKLET = (
+    "turn_starboard_drive_100",
+    "turn_port_drive_100",
+    "zigzag_10_steer_50_drive_100",
+    "zigzag_20_steer_100_drive_100",
+)
+"""Candidates that stand for the manoeuvres of a booklet."""
+
+
+def trials(vessel: str, seed: int) -> SimulatedTrials:
+    """Return the programme of the first zigzags; its sea and sensors are those of all trials."""
+    return validate(
+        {
+            "vessel": vessel,
+            "duration": SECONDS,
+            "step": STEP,
+            "substeps": 2,
+            "seed": seed,
+            "noise": {"u": 0.02, "v": 0.02, "r": 0.003},
+            "disturbance": {"force_x": 10, "force_y": 10, "force_n": 10},
+            "trials": [
+                {"kind": "zigzag", "count": 7, "heading": ["10 deg"], "drive": [0.3, 0.7]},
+            ],
+            "identification": {},
+            "validation": {},
+        },
+        SimulatedTrials,
+        "bench",
+    )
+
+
+def settings_of(vessel: str) -> FitSettings:
+    """Return the settings of a fit of one refitted baseline."""
+    known = VESSELS[vessel]
+    return validate(
+        {
+            "prepare": {
+                "grid": {"step": STEP},
+                "derivative": {"kind": "savitzky_golay", "window": 1.1, "order": 2},
+                "hold": "mean",
+            },
+            "signals": known["signals"],
+            "baseline": {"kind": "regressors", "terms": known["terms"]},
+            "refit": {"baseline": {"horizon": 10.0, "every": 10.0, "prior": 0.0}},
+            "bands": None,
+            "evaluation": {
+                "protocols": {"T20": {"kind": "windows", "length": 20.0}},
+                "selection": "T20",
+                "scales": {"u": 0.3, "v": 0.1, "r": 0.1},
+            },
+        },
+        FitSettings,
+        "bench",
+    )
+
+
+def shares_of(vessel: str, inputs: Sequence[str]) -> dict[str, InputShare]:
+    """Return how a vessel's commands follow drive and steer, as its booklet would say."""
+    plant = load_vessel(vessel).build()
+    one, none = torch.ones(1, dtype=torch.float64), torch.zeros(1, dtype=torch.float64)
+    drive, steer = plant.demand(one, none)[0], plant.demand(none, one)[0]
+    return {
+        name: InputShare(drive=float(d), steer=float(s), limit=max(abs(float(d)), abs(float(s))))
+        for name, d, s in zip(inputs, drive, steer, strict=True)
+    }
+
+
+def left(fitted: FittedModel, settings: FitSettings, logs: Sequence[Prepared]) -> LeftOpen:
+    """Return what a refit of this model with such logs leaves open."""
+    return left_open(
+        fitted.model.double(),
+        samples(logs, settings.signals.build()),
+        WindowStore.gather(logs, torch.float64),
+        settings.refit["baseline"],
+        torch.from_numpy(settings.evaluation.scales.array()),
+        fitted.notes["refit"].get("at_rest", ()),
+    )
+
+
+def drawn(vessel: str, seed: int, times: int) -> tuple[float, float, np.ndarray]:
+    """Return predicted and achieved shrinkage of the planned trials, and those of random ones."""
+    random = np.random.default_rng([seed, 5])
+    settings = settings_of(vessel)
+    scales = settings.evaluation.scales.array()
+    limits = TrialLimits(time=SECONDS, count=PICKED)
+    with tempfile.TemporaryDirectory() as folder:
+        programme = trials(str(scattered(vessel, random, Path(folder))), seed)
+        first = simulate(programme.draw(), programme)
+        others = sorted(candidates(limits), key=lambda one: one.kind)
+        later = simulate(others, programme.model_copy(update={"seed": seed + 1}))
+        shares = shares_of(programme.vessel, VESSELS[vessel]["signals"]["inputs"])
+    split = {"train": first[:6], "validation": first[6:], "later": later}
+    prepared = prepare_logs(split, settings)
+    fitted = fit(prepared, settings)["baseline"]
+    open_ = left(fitted, settings, prepared["train"])
+    low, high = np.array(fitted.spec.low), np.array(fitted.spec.high)
+    wide = velocity_limit(low, high, 10.0 * settings.evaluation.divergence)
+    refit = settings.refit["baseline"]
+    aim = Aim([one for one in others if one.name.startswith(BOOKLET)], SECONDS, {})
+    found = plan(fitted, open_, refit, scales, shares, wide, limits, aim)
+    goal = booklet(prepared["later"], others, fitted, refit.horizon, scales)
+    before = spread(open_.covariance, goal)
+
+    def shrinks(covariance: Tensor) -> float:
+        return 1.0 - spread(covariance, goal) / before
+
+    names = [one.name for one in others]
+    picked = [names.index(trial.flight.manoeuvre.name) for trial in found.chosen]
+    chosen = [*prepared["train"], *(prepared["later"][i] for i in picked)]
+    again = fit({**prepared, "train": chosen}, settings)["baseline"]
+    assert again.covariance is not None
+    total = sum((trial.moments for trial in found.chosen), torch.zeros_like(goal))
+    eye = torch.eye(len(goal), dtype=goal.dtype)
+    predicted = shrinks(open_.covariance @ torch.linalg.inv(eye + total @ open_.covariance))
+    at_random = []
+    for _ in range(times):
+        some = random.choice(len(others), PICKED, replace=False)
+        logs = [*prepared["train"], *(prepared["later"][i] for i in some)]
+        at_random.append(shrinks(left(fitted, settings, logs).covariance))
+    return predicted, shrinks(again.covariance), np.array(at_random)
+
+
+def booklet(
+    logs: Sequence[Prepared],
+    flown: Sequence[Any],
+    fitted: FittedModel,
+    horizon: float,
+    scales: np.ndarray,
+) -> Tensor:
+    """Return the squared sensitivities [P, P] of velocities over a booklet's manoeuvres."""
+    runs = [
+        (torch.from_numpy(log.y), torch.from_numpy(log.w[:-1]))
+        for log, one in zip(logs, flown, strict=True)
+        if one.name.startswith(BOOKLET)
+    ]
+    steps = round(horizon / STEP)
+    return moments(fitted.model.double(), runs, steps, torch.from_numpy(scales)).sum(dim=0)
+
+
+def main() -> None:
+    """Run the draws, and print a line for each."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("--draws", type=int, default=4)
+    parser.add_argument("--random", type=int, default=50)
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args()
+    torch.set_num_threads(1)
+    for number in range(given.draws):
+        started = time.process_time()
+        vessel = list(VESSELS)[number % len(VESSELS)]
+        predicted, achieved, at_random = drawn(vessel, 100 * given.seed + number, given.random)
+        middle = float(np.median(at_random))
+        print(
+            f"{vessel}: planned {achieved:.3f}, predicted {predicted:.3f}"
+            f" ({100 * (predicted / achieved - 1):+.0f} %), median of {given.random} at random"
+            f" {middle:.3f}, ratio {achieved / middle:.2f}; {time.process_time() - started:.0f} s",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()
