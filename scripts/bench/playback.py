@@ -212,7 +212,7 @@ def shares(
         found = exporter(kind)
         file = folder / kind / f"boat{found.suffix}"
         if kind not in cards:
-            file.parent.mkdir()
+            file.parent.mkdir(exist_ok=True)
             cards[kind] = found.export(spec, copy.deepcopy(model), file, [])
         return file
 

@@ -110,7 +110,13 @@ def test_c_compiles_without_warnings_and_keeps_nothing(tmp_path: Path) -> None:
         "mine_initial_state(s); outside = mine_step(x, w, s, x, s);"
         ' printf("%d %.9g", outside, x[3]); return 0; }\n'
     )
-    for flags in ((), ("-O3", "-Wconversion")):
+    (tmp_path / "empty.c").write_text("int main(void) { return 0; }\n")
+    narrow = ("-m32", "-msse2", "-mfpmath=sse")
+    tried = [compiler(), *narrow, "empty.c", "-o", "empty", "-lm"]
+    # where the compiler has the libraries of a 32-bit target
+    found = subprocess.run(tried, cwd=tmp_path, capture_output=True).returncode == 0
+    more = [narrow] if found else []
+    for flags in [(), ("-O3", "-Wconversion"), *more]:
         subprocess.run(
             [compiler(), *STRICT, *flags, "boat.c", "main.c", "-o", "main", "-lm"],
             cwd=tmp_path,

@@ -47,12 +47,12 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def zigzag(step: Any, dt: float) -> list[float]:
-    """Overshoots in degrees of a 20/20 zigzag steered by a moment of 150 N m."""
+def zigzag(step: Any, dt: float, drive: float, push: float) -> list[float]:
+    """Overshoots in degrees of a 20/20 zigzag driven by a force, steered by a moment."""
     psi, nu, side, farthest = 0.0, np.zeros(3), 1.0, 0.0
     overshoots: list[float] = []
     for _ in range(round(120.0 / dt)):
-        nu = step(nu, np.array([250.0, 0.0, 150.0 * side]))
+        nu = step(nu, np.array([drive, 0.0, push * side]))
         psi += dt * nu[2]
         # how far the heading goes on to the side that is being left
         farthest = max(farthest, -side * psi)
@@ -62,11 +62,13 @@ def zigzag(step: Any, dt: float) -> list[float]:
     return overshoots[1:]
 
 
-def test_a_zigzag_has_the_overshoots_of_the_baseline(written: Path) -> None:
-    _, model = believed()
-    dt = 0.01
-    boat = runpy.run_path(str(written / "hull_vehicle.py"))["Hull"]()
-    card = json.loads((written / "hull.parameters.json").read_text())
+def overshoots(
+    folder: Path, model: HybridDynamics, drive: float, push: float
+) -> tuple[list[float], list[float], list[float]]:
+    """Return those of the baseline, of PythonVehicleSimulator's vehicle, and of MSS' equations."""
+    dt = 0.02
+    boat = runpy.run_path(str(folder / "hull_vehicle.py"))["Hull"]()
+    card = json.loads((folder / "hull.parameters.json").read_text())
     mass, linear, quadratic = (np.array(card[name]) for name in ("M", "D", "D_n"))
 
     def simulator(nu: np.ndarray, tau: np.ndarray) -> np.ndarray:
@@ -85,19 +87,82 @@ def test_a_zigzag_has_the_overshoots_of_the_baseline(written: Path) -> None:
         rest = tau - c @ nu - linear @ nu - quadratic @ (np.abs(nu) * nu)
         return nu + dt * np.linalg.solve(mass, rest)
 
+    scripted = torch.jit.trace(model.baseline, torch.zeros(1, 6, dtype=torch.float64))
+
     def own(nu: np.ndarray, tau: np.ndarray) -> np.ndarray:
         z = torch.from_numpy(np.concatenate((nu, tau)))[None]
         with torch.no_grad():
-            return nu + dt * model.baseline(z)[0].numpy()
+            return nu + dt * np.asarray(scripted(z)[0].numpy())
 
-    wanted, first, second = (zigzag(step, dt) for step in (own, simulator, mss))
+    first, second, third = (zigzag(step, dt, drive, push) for step in (own, simulator, mss))
+    return first, second, third
+
+
+def test_a_zigzag_has_the_overshoots_of_the_baseline(written: Path) -> None:
+    wanted, first, second = overshoots(written, believed()[1], 250.0, 150.0)
     assert len(wanted) >= 2
     np.testing.assert_allclose(first, wanted, atol=0.5)
     np.testing.assert_allclose(second, wanted, atol=0.5)
+    card = json.loads((written / "hull.parameters.json").read_text())
     assert card["share_left_out"]["u"] < 1e-9
     assert 0.1 < card["share_left_out"]["v"] < 0.3
     # the only terms of this hull that the form has no place for
     assert card["terms_left_out"] == {"u_dot": [], "v_dot": ["|u|v"], "r_dot": ["|u|v"]}
+
+
+HULL_TERMS = (
+    "u", "v", "r", "u|u|", "v|v|", "r|r|", "v r", "r^2", "u r", "u v", "|u|v", *FORCES,
+)  # fmt: skip
+
+
+def drawn(seed: int, lift: float) -> tuple[ModelSpec, HybridDynamics]:
+    """A hull drawn at random as a sum of regressors; `lift` is a damping that forms do not have."""
+    random = np.random.default_rng(seed)
+    mass = 10.0 ** random.uniform(1.5, 3.5) * np.array([1.0, 1.5, 1.0])
+    length = (mass[0] / 40.0) ** (1 / 3) * 2.0
+    mass[2] *= (0.3 * length) ** 2
+    m = np.diag(mass)
+    m[1, 2] = m[2, 1] = 0.05 * length * mass[0]
+    slow = random.uniform(0.1, 0.5, 3) * mass
+    fast = random.uniform(0.05, 0.5, 3) * mass
+    rows = np.zeros((3, len(HULL_TERMS)))
+    at = {term: place for place, term in enumerate(HULL_TERMS)}
+    for i, name in enumerate("uvr"):
+        rows[i, at[name]], rows[i, at[f"{name}|{name}|"]] = -slow[i], -fast[i]
+        rows[i, at[FORCES[i]]] = 1.0
+    rows[1, at["|u|v"]] = -lift * mass[1]
+    rows[0, [at["v r"], at["r^2"]]] = m[1, 1], m[1, 2]
+    rows[1, at["u r"]] = -m[0, 0]
+    rows[2, [at["u v"], at["u r"]]] = m[0, 0] - m[1, 1], -m[1, 2]
+    content = believed()[0].model_dump(by_alias=True)
+    content["baseline"] = {"kind": "regressors", "terms": HULL_TERMS}
+    spec = ModelSpec.model_validate(content)
+    model = spec.build().double()
+    with torch.no_grad():
+        model.baseline.theta.copy_(torch.from_numpy(np.linalg.solve(m, rows)))  # type: ignore[union-attr, operator]
+    return spec, model
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_hulls_drawn_at_random_keep_their_overshoots(seed: int, tmp_path: Path) -> None:
+    spec, model = drawn(seed, 0.0)
+    (tmp_path / "hull.masses.yaml").write_text("mass: 20\ninertia: 10\n")
+    card = exporter("parameters").export(spec, model, tmp_path / "hull.parameters.json", [])
+    assert max(card["share_left_out"].values()) < 1e-9
+    drive, push = 0.4 * card["M"][0][0], 0.1 * card["M"][2][2]
+    wanted, first, second = overshoots(tmp_path, model, drive, push)
+    assert len(wanted) >= 2
+    np.testing.assert_allclose(first, wanted, atol=0.5)
+    np.testing.assert_allclose(second, wanted, atol=0.5)
+
+
+def test_what_a_drawn_hull_has_besides_is_listed_with_its_share(tmp_path: Path) -> None:
+    spec, model = drawn(3, 0.3)
+    (tmp_path / "hull.masses.yaml").write_text("mass: 20\ninertia: 10\n")
+    card = exporter("parameters").export(spec, model, tmp_path / "hull.parameters.json", [])
+    assert card["terms_left_out"]["v_dot"] == ["|u|v"]
+    assert card["share_left_out"]["v"] > 0.01
+    assert card["share_left_out"]["u"] < 1e-9
 
 
 def test_gazebo_gets_added_masses_and_resistances(written: Path) -> None:
