@@ -127,3 +127,16 @@ def test_a_table_for_the_terminal_has_its_columns_below_each_other() -> None:
 def test_a_row_of_another_length_is_refused() -> None:
     with pytest.raises(ValueError, match="row 'net': 1 cells for 2 columns"):
         Table(["model", "u", "v"], [["net", "1"]])
+
+
+def test_words_of_the_field_are_linked_once_a_section_to_what_they_mean(tmp_path: Path) -> None:
+    sections = [
+        Section("First", [Text("The NRMSE of free runs; the NRMSE again, and a heading.")]),
+        Section("Second", [Text("Two runs diverged."), Bullets(["Its NRMSE is low."])]),
+    ]
+    text = write_page(tmp_path, "words", "", [], sections).read_text()
+    assert text.count('href="#word-nrmse"') == 2
+    assert text.count('<dt id="word-nrmse">') == 1
+    assert '<a class="term" href="#word-free-run-rollout"' in text
+    assert ">free run</a>s; the NRMSE again" in text
+    assert 'id="word-head"' not in text

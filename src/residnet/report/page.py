@@ -13,6 +13,7 @@ from markupsafe import Markup, escape
 from residnet.core.config import load_mapping
 from residnet.core.files import read_json, whole
 from residnet.report.blocks import Block, Code, Facts, Section
+from residnet.report.glossary import Glossary
 from residnet.report.interactive.drawing import draw
 from residnet.report.interactive.explorer import Explorer
 
@@ -33,6 +34,7 @@ def write_page(
 
     The page stands alone: pictures, styles and scripts are inside, and nothing is loaded. Without
     JavaScript, and in print, pictures stand where interactive figures would.
+    Words of the glossary are linked to its end, where they are explained.
     Provenance and configuration are added at its end where the folder holds `provenance.json` and
     `resolved.yaml`.
 
@@ -60,7 +62,13 @@ def write_page(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"breakable": _breakable, "embedded": _embedded, "anchor": _anchor}
+    glossary = Glossary()
+    environment.filters |= {
+        "breakable": _breakable,
+        "embedded": _embedded,
+        "anchor": _anchor,
+        "linked": lambda text: glossary.linked(_breakable(str(text))),
+    }
     parts = [*sections, *_made_of(run, record)]
     text = environment.get_template("page.html.j2").render(
         title=title,
@@ -69,6 +77,7 @@ def write_page(
         date=str(record.get("started") or "")[:10],
         verdict=[sentence for sentence in verdict if sentence],
         sections=parts,
+        glossary=glossary,
         interactive=draw(_explorers(parts)),
     )
     path = run / "report.html"

@@ -148,8 +148,8 @@ def outside(evidence: Evidence) -> str:
     channels = sorted(found["channels"].items(), key=lambda pair: -pair[1])[:3]
     named = ", ".join(f"{name} {_percent(part)}" for name, part in channels)
     return (
-        f"{_percent(share)} of the {evidence.split} data lie outside the range of the training data"
-        f" ({named}); nothing is known of the model there but these runs."
+        f"Of the {evidence.split} data, {_percent(share)} lies outside the range of the training"
+        f" data ({named}); nothing is known of the model there but these runs."
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -173,7 +174,8 @@ def _run_case(run: RunFiles, window: StoredWindow, rank: str, inputs: Sequence[s
     note = f"{window.log}: {fixed(float(time[-1]), 1)} s under protocol {window.protocol}."
     if diverged:
         note += f" Diverged: {', '.join(diverged)}; the curves of zero stand in their place."
-    title = f"{kind}, {window.protocol}: {rank} ({window.log}{number})"
+    named = "" if kind == "unknown" else f"{kind}, "
+    title = f"{named}{window.protocol}: {rank} ({window.log}{number})"
     return Case(title, [tracks, *histories, *given], note)
 
 
@@ -231,7 +233,8 @@ def _residuals(run: RunFiles) -> Explorer | None:
         " head has learned a cloud along the line; it cannot reach a cloud upright on zero.",
         "Axis",
         {"equal": Look("target = prediction", INK, width=1.0)}
-        | {model: looks[model] for model in models},
+        # a figure without a cloud says nothing, whichever model was chosen
+        | {model: replace(looks[model], shown=True) for model in models},
         [Panel("predicted against target", "target", "cloud", 380)],
         cases,
     )
