@@ -11,6 +11,7 @@ import pytest
 import torch
 import yaml
 from pydantic import ValidationError
+from read_page import plain
 from scipy.signal import butter, filtfilt
 
 from residnet.core.errors import FitError
@@ -238,7 +239,7 @@ def test_a_short_trial_runs(tmp_path: Path) -> None:
         rows["standard", "displacement", "r_dot"]["rmse"]
         < 1.3 * rows["plant", "plant", "r_dot"]["rmse"]
     )
-    page = (tmp_path / "run" / "report.html").read_text()
+    page = plain(tmp_path / "run" / "report.html")
     assert all(f"Validation, {SET_NAMES[where]}" in page for where in found["rows"])
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["verdict"][0].startswith("Trial calm: on the validation stretches")

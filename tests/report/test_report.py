@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from kinds import of_kind
 from made_run import DEG, LEVEL, made_run, metrics, residuals, row, write_json
-from read_page import Page
+from read_page import Page, plain
 
 from residnet.baselines.regressors import RegressorBaseline
 from residnet.core.errors import DataError, UsageError
@@ -26,7 +26,7 @@ from residnet.report.sections.fit.coefficients import term_unit
 
 def shown(run: Path) -> str:
     """Return the text of the page, with spaces where numbers keep to their units."""
-    return write_fit_page(RunFiles(run)).read_text().replace("\u00a0", " ")
+    return plain(write_fit_page(RunFiles(run)))
 
 
 @pytest.fixture

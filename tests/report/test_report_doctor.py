@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from made_run import made_run
+from read_page import plain
 
 from residnet.core.log import Log
 from residnet.data.doctor import inspect, inspect_together, inspection
@@ -40,7 +41,7 @@ def test_findings_above_a_note_stand_in_a_table_and_notes_below(tmp_path: Path) 
     logs[1] = logs[1].replace(t=clock)
     reports = [inspect(log) for log in logs]
     (run / "doctor.json").write_text(json.dumps(inspection(reports, inspect_together(logs))))
-    text = write_fit_page(RunFiles(run)).read_text()
+    text = plain(write_fit_page(RunFiles(run)))
     loud = {
         finding.code for report in reports for finding in report.findings if finding.level != "note"
     }

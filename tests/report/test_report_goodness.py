@@ -39,17 +39,19 @@ def test_section_shows_what_the_file_says(tmp_path: Path) -> None:
         "sway v′ [m/s²], test data",
         "yaw r′ [deg/s²], test data",
     ]
-    table_block, _ = parts[2].shown
-    assert isinstance(table_block, Table)
-    yaw = {line.label: line.cells for line in table_block.rows}
+    fits, residuals, sentences = parts[2].shown
+    assert isinstance(fits, Table)
+    assert isinstance(residuals, Table)
+    assert isinstance(sentences, Text)
+    fitted = {line.label: line.cells for line in fits.rows}
+    yaw = {line.label: line.cells for line in residuals.rows}
     row = next(row for row in rows if row["model"] == "plsr" and row["axis"] == "r_dot")
-    texts = [cell.text for cell in yaw["plsr"]]
+    texts = [cell.text for cell in fitted["plsr"]]
     assert texts[:3] == ["9.00", number(DEG * row["rmse"]), number(row["r2"])]
-    assert texts[8] == f"{number(DEG * row['mae_ci95'][0])} to {number(DEG * row['mae_ci95'][1])}"
-    assert yaw["plsr"][-1].note == "baseline"
+    low, high = (number(DEG * end) for end in row["mae_ci95"])
+    assert yaw["plsr"][1].text == f"{low} to {high}"
+    assert yaw["plsr"][-1].note == "to baseline"
     assert yaw["plsr"][-1].mark == "best"
     assert yaw["baseline"][-1].text == "–"
-    sentences = parts[0].shown[1]
-    assert isinstance(sentences, Text)
     assert "times too narrow" in sentences.lines[0]
     assert 'id="goodness-of-fit"' in write_fit_page(RunFiles(run)).read_text()

@@ -59,7 +59,7 @@ def page_of(task: str, folder: Path) -> Path:
 @pytest.mark.parametrize("task", TASKS)
 def test_every_task_has_a_page_whose_sections_hold_something(task: str, tmp_path: Path) -> None:
     path = page_of(task, tmp_path / "run")
-    text = path.read_text()
+    text = plain(path)
     page = Page(text)
     assert len(page.sections) == len(set(page.sections)) >= 3
     assert page.tables
@@ -75,7 +75,7 @@ def test_every_task_has_a_page_whose_sections_hold_something(task: str, tmp_path
     reported = TASKS[task]
     run = RunFiles(path.parent)
     write_page(path.parent, run.title, "Made by hand.", ["Done."], reported.sections(run))
-    assert path.read_text() == text
+    assert plain(path) == text
 
 
 @pytest.mark.skipif(browser() is None, reason="no browser (chromium or chrome) is installed")
@@ -100,7 +100,7 @@ def test_the_browser_sees_what_is_too_wide_and_what_is_broken(tmp_path: Path) ->
 
 
 def test_controllers_are_compared_by_settling_time_and_effort(tmp_path: Path) -> None:
-    page = Page(page_of("autopilot", tmp_path / "run").read_text())
+    page = Page(plain(page_of("autopilot", tmp_path / "run")))
     cells = page.table("controller", "net")
     assert cells["pd"] == [
         "16.50",
@@ -132,7 +132,7 @@ def test_a_course_shows_what_was_missed(tmp_path: Path) -> None:
 
 
 def test_indices_stand_flight_by_flight_or_by_kind(tmp_path: Path) -> None:
-    few = Page(page_of("simulate", tmp_path / "few").read_text())
+    few = Page(plain(page_of("simulate", tmp_path / "few")))
     assert few.tables[0] == [
         ["index", "unit", "ship", "model", "difference", "ship [L]", "model [L]", "IMO limit"],
         ["first overshoot", "deg", "9.000", "11.00", "2.00", "", "", "10.00|exceeded"],
@@ -161,7 +161,7 @@ def test_an_import_shows_gaps_channels_and_findings(tmp_path: Path) -> None:
 
 
 def test_actuator_parameters_come_with_intervals(tmp_path: Path) -> None:
-    cells = Page(page_of("actuators", tmp_path / "run").read_text()).table(
+    cells = Page(plain(page_of("actuators", tmp_path / "run"))).table(
         "parameter", "largest revolutions"
     )
     assert cells["largest revolutions"] == ["2400", "2160 to 2640", "rpm"]
@@ -171,7 +171,7 @@ def test_actuator_parameters_come_with_intervals(tmp_path: Path) -> None:
 
 
 def test_variants_are_compared_with_the_reference(tmp_path: Path) -> None:
-    page = Page(page_of("study", tmp_path / "run").read_text())
+    page = Page(plain(page_of("study", tmp_path / "run")))
     cells = page.table("variant", "no_head")
     assert cells["no_head"][:4] == ["0.2500", "0.0100", "+0.0500", "+0.0250 to +0.0750"]
     assert cells["recipe"][2:4] == ["", ""]

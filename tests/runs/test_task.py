@@ -9,6 +9,7 @@ from typing import Literal
 
 import pytest
 import torch
+from read_page import plain
 
 from residnet.core.errors import DataError, ExportError, FitError, UsageError
 from residnet.report.blocks import Code, Section
@@ -65,7 +66,7 @@ def test_a_run_leaves_report_summary_and_mark(tmp_path: Path) -> None:
         "verdict": ["It works."],
         "figures": {"speed": {"value": 1.5, "unit": "m/s"}},
     }
-    page = folder.report.read_text()
+    page = plain(folder.report)
     assert "It works." in page
     assert "What was found" in page
     assert sorted(path.name for path in folder.path.iterdir()) == [
@@ -116,13 +117,13 @@ def test_an_export_that_fails_is_reported_and_the_run_complete(tmp_path: Path) -
         SampleTask(name="wild", fault="is not exported").run(out=tmp_path / "run")
     folder = RunFolder.open(tmp_path / "run")
     assert (folder.exports / "model.txt").is_file()
-    page = folder.report.read_text()
+    page = plain(folder.report)
     assert "Not exported: model wild: diverges." in page
     assert "exports/model.txt" in page.replace("<wbr>", "")
     assert folder.read_summary()["verdict"] == ["It works.", "Not exported: model wild: diverges."]
     # what an earlier run exported is not shown as this one's
     SampleTask(name="wild").run(out=tmp_path / "run", overwrite=True)
-    assert "wild: diverges" not in folder.report.read_text()
+    assert "wild: diverges" not in plain(folder.report)
 
 
 def test_without_a_report_a_run_ends_after_its_results(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -9,8 +10,12 @@ _VOID = {"meta", "img", "br", "hr", "link", "wbr", "input"}
 
 
 def plain(page: Path) -> str:
-    """The text of a page; numbers and units that are kept together have a plain space between."""
-    return page.read_text().replace("\u00a0", " ")
+    """The text of a page without links to the glossary.
+
+    Numbers and units that are kept together have a plain space between.
+    """
+    text = page.read_text().replace("\u00a0", " ")
+    return re.sub(r'<a class="term"[^>]*>([^<]*)</a>', r"\1", text)
 
 
 class Page(HTMLParser):

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import yaml
+from read_page import plain
 from tiny import call
 
 CONFIG = """
@@ -105,7 +106,7 @@ def test_measured_zigzags_are_repeated(run: Path) -> None:
 
 
 def test_the_report_shows_it(run: Path) -> None:
-    text = (run / "report.html").read_text()
+    text = plain(run / "report.html")
     assert "Manoeuvring booklet" in text
     assert "tactical diameter" in text
     assert len(list((run / "figures").glob("*booklet*.png"))) == 3

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from read_page import plain
 from tiny import call
 
 from residnet.core.errors import UsageError
@@ -71,7 +72,7 @@ def test_two_runs_side_by_side(tmp_path: Path) -> None:
     assert entry["ci95"] == pytest.approx([-0.05, -0.05])
     assert "second (linear) has the least error: -0.050 against first, beyond chance." in text
     assert "seed" in text
-    content = page.read_text()
+    content = plain(page)
     assert "Where the configs differ" in content
     assert "Error against horizon" in content
 

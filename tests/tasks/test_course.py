@@ -14,6 +14,7 @@ import pandas as pd
 import pytest
 import torch
 import yaml
+from read_page import plain
 from tiny import call
 
 pytestmark = pytest.mark.whole_runs
@@ -171,7 +172,7 @@ def test_the_tracks_say_what_the_rows_say(run: Path) -> None:
 
 
 def test_report_and_exports_are_there(run: Path) -> None:
-    report = (run / "report.html").read_text()
+    report = plain(run / "report.html")
     assert "enclosure" in report
     assert "10.57" in report
     for protocol in ("enter", "sides"):

@@ -42,7 +42,7 @@ def section(run: RunFiles) -> Section | None:
 
 
 def axes(run: RunFiles) -> list[Section]:
-    """Return a table and sentences for each axis, of the split that the report speaks of.
+    """Return tables and sentences for each axis, of the split that the report speaks of.
 
     Another split stands in where that one has no samples.
     """
@@ -54,28 +54,16 @@ def axes(run: RunFiles) -> list[Section]:
         of_axis = [row for row in rows if row["axis"] == axis]
         if of_axis:
             unit, factor = run.unit(axis.replace("_dot", ""))
-            blocks: list[Block] = [_table(of_axis, factor), Text(" ".join(_sentences(of_axis)))]
+            blocks: list[Block] = [_fits(of_axis, factor), _residuals(of_axis, factor)]
+            blocks.append(Text(" ".join(_sentences(of_axis))))
             unit = f"{unit}²" if unit.endswith("/s") else f"{unit}/s"
             out.append(Section(f"{title} [{unit}], {split} data", blocks, folded=bool(out)))
     return out
 
 
-def _table(rows: list[Content], factor: float) -> Table:
-    """Return measures and intervals of one axis, a row for each model."""
-    measures = ["parameters", "RMSE", "R²", "adjusted R²", "C_p", "AIC", "BIC"]
-    intervals = [
-        "mean |residual|",
-        "95 %, blocks",
-        "95 %, independent",
-        "block [s]",
-        "independent samples",
-        "correlation at lag 1",
-        "white, p",
-    ]
-    table = Table(
-        ["model", *measures, *intervals, "against"],
-        groups=[("fit", len(measures)), ("residuals", len(intervals)), ("difference", 1)],
-    )
+def _fits(rows: list[Content], factor: float) -> Table:
+    """Return how close each model fits on one axis, and what its parameters cost."""
+    table = Table(["model", "parameters", "RMSE", "R²", "adjusted R²", "C_p", "AIC", "BIC"])
     for row in rows:
         cells = [
             Cell(number(row["parameters"], 3)),
@@ -85,6 +73,26 @@ def _table(rows: list[Content], factor: float) -> Table:
             Cell(number(factor**2 * row["cp"])),
             Cell(number(row["aic"], 4)),
             Cell(number(row["bic"], 4)),
+        ]
+        table.add(row["model"], cells)
+    return table
+
+
+def _residuals(rows: list[Content], factor: float) -> Table:
+    """Return the size of the residuals of one axis with its intervals, and how alike they are."""
+    columns = [
+        "mean |residual|",
+        "95 %, blocks",
+        "95 %, independent",
+        "block [s]",
+        "independent samples",
+        "correlation at lag 1",
+        "white, p",
+        "difference",
+    ]
+    table = Table(["model", *columns])
+    for row in rows:
+        cells = [
             Cell(number(factor * row["mae"])),
             Cell(interval(row["mae_ci95"], factor)),
             Cell(interval(row["mae_ci95_independent"], factor), mark="weak"),
@@ -106,7 +114,7 @@ def _difference(pair: Content | None, factor: float) -> Cell:
         return Cell(DASH)
     return Cell(
         f"{number(factor * pair['mae'])} ({interval(pair['ci95'], factor)})",
-        note=str(pair["to"]),
+        note=f"to {pair['to']}",
         mark="best" if pair["excludes_zero"] else "",
     )
 
