@@ -1,6 +1,7 @@
 """How far `recipe: standard` is from the best of its models in hindsight, on boats drawn at random.
 
-    python scripts/bench/recipe.py [--count N] [--minutes M] [--seed S] [--records FILE]
+    python scripts/bench/recipe.py [--count N] [--minutes M] [--seed S] [--effort E]
+        [--records FILE]
 
 Each fit is of one small boat (one propeller and a rudder, or two propellers) that follows paths
 and does a few manoeuvres, with noise and gusts: M minutes for training and validation, as long for
@@ -36,7 +37,7 @@ _LENGTH = 20.0
 _FLIGHTS = 10
 
 
-def settings_for(kind: str, splits: dict[str, list[Log]]) -> FitSettings:
+def settings_for(kind: str, splits: dict[str, list[Log]], effort: float = 1.0) -> FitSettings:
     """The settings of a fit that says nothing but what the logs are."""
     test = splits["test"]
     step = float(np.median(np.diff(test[0].t)))
@@ -44,6 +45,9 @@ def settings_for(kind: str, splits: dict[str, list[Log]]) -> FitSettings:
     windows = {"kind": "windows", "first": 2.0, "history": 2.0}
     content = {
         "recipe": "standard",
+        "effort": effort,
+        # bands choose nothing
+        "bands": None,
         "prepare": {
             "grid": {"step": step},
             "derivative": {"kind": "savitzky_golay", "window": 11 * step, "order": 2},
@@ -69,11 +73,11 @@ def splits_of(kind: str, seed: int, minutes: float) -> dict[str, list[Log]]:
     return {"train": logs[:4], "validation": logs[4:5], "test": logs[5:]}
 
 
-def one(kind: str, seed: int, minutes: float) -> dict[str, Any]:
+def one(kind: str, seed: int, minutes: float, effort: float = 1.0) -> dict[str, Any]:
     """Fit the recipe to one boat and return what the comparison needs."""
     started = time.process_time()
     splits = splits_of(kind, seed, minutes)
-    settings = settings_for(kind, splits)
+    settings = settings_for(kind, splits, effort)
     return judged_fit(splits, settings) | {
         "kind": kind,
         "seed": seed,
@@ -150,12 +154,14 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=20, help="number of fits")
     parser.add_argument("--minutes", type=float, default=10.0, help="of training and validation")
     parser.add_argument("--seed", type=int, default=0, help="of the first boat")
+    parser.add_argument("--effort", type=float, default=1.0, help="of the networks' trainings")
     parser.add_argument("--records", type=Path, help="file for one line of JSON for each fit")
     given = parser.parse_args()
     torch.set_num_threads(1)
     records = []
     for number in range(given.count):
-        records.append(one(KINDS[number % 2], given.seed + number // 2, given.minutes))
+        seed = given.seed + number // 2
+        records.append(one(KINDS[number % 2], seed, given.minutes, given.effort))
         print(line(records[-1]), flush=True)
         if given.records is not None:
             with given.records.open("a", encoding="utf-8") as file:
