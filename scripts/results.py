@@ -10,7 +10,8 @@ A figure in a page stands between two comments, of which the first says where it
 are the name of a source (see `SOURCES`), a file in its run folder (or `stdout`), and a path through
 that JSON file, with `[key=value,...]` for the first entry of a list that has these values. For
 `stdout` the path is a regular expression in which a space is `\\s`. A fourth word scales it:
-`x100`, `deg` (from rad). Lists stand with slashes between their entries.
+`x100` by a factor, `deg` from rad; a fifth is the number of digits, 3 otherwise. Lists stand with
+slashes between their entries.
 
 A source that is finished under --runs is not run again unless `--again` is given. What needs absent
 data or an absent package, or takes longer than --minutes on two idle cores, is not run; its figures
@@ -67,7 +68,11 @@ def _study(name: str, minutes: float, *more: str, data: str = "", package: str =
 SOURCES: dict[str, Source] = {
     "quickstart": Source(("configs/quickstart.yaml",), 4),
     "kvlcc2": Source(("configs/kvlcc2.yaml",), 8, data="kvlcc2"),
-    "esso_osaka": Source(("configs/esso_osaka.yaml",), 45, data="esso_osaka"),
+    "tanker": Source(
+        ("configs/esso_osaka.yaml", "~heads", "~base_of", "~ensembles", "~training"),
+        9,
+        data="esso_osaka",
+    ),
     "table_5_2": _study("halvorsen2019/table_5_2", 10, package="deap"),
     "table_5_3": _study("halvorsen2019/table_5_3", 10, package="deap"),
     "table_5_3_small": _study("halvorsen2019/table_5_3_small", 2, package="deap"),
@@ -87,6 +92,9 @@ SOURCES: dict[str, Source] = {
     "zigzag": _study("jervan2020/zigzag", 2),
     "measured": _study("jervan2020/measured", 2, data="milliampere"),
     "woo2018": _study("woo2018/woo2018", 60),
+    "thrusters": _study("woo2018/thrusters", 1),
+    "outside_terms": _study("woo2018/outside_terms", 10),
+    "input_sets": Source(("scripts/bench/input_sets.py",), 3),
     "wam_v_equations": Source(("configs/wam_v_equations.yaml",), 3),
     "symbolic": Source(("scripts/bench/symbolic.py",), 6),
     "symbolic_random": Source(
@@ -158,8 +166,9 @@ def figure(where: str, runs: Path) -> str:
         if found is None:
             raise LookupError(f"{where}: the output has no such line")
         return found[1]
-    factor = {"": 1.0, "x100": 100.0, "deg": DEG}[scale[0] if scale else ""]
-    return shown(entry(json.loads(content), path), factor)
+    word, digits = scale[0] if scale else "x1", int(scale[1]) if len(scale) > 1 else DIGITS
+    factor = DEG if word == "deg" else float(word.removeprefix("x"))
+    return shown(entry(json.loads(content), path), factor, digits)
 
 
 def entry(content: Any, path: str) -> Any:
@@ -173,24 +182,24 @@ def entry(content: Any, path: str) -> Any:
             content = content[int(key) if isinstance(content, list) else key]
         if wanted:
             pairs = [pair.split("=") for pair in wanted.split(",")]
-            rows = [row for row in content if all(str(row[k]) == value for k, value in pairs)]
+            rows = [row for row in content if all(str(row.get(k)) == value for k, value in pairs)]
             if not rows:
                 raise LookupError(f"no entry with {wanted}")
             content = rows[0]
     return content
 
 
-def shown(value: Any, factor: float) -> str:
-    """Return a value, or a list of them, in three significant digits."""
+def shown(value: Any, factor: float, digits: int = DIGITS) -> str:
+    """Return a value, or a list of them, in a number of significant digits."""
     if isinstance(value, dict):
         value = list(value.values())
     if isinstance(value, list):
-        return " / ".join(shown(part, factor) for part in value)
+        return " / ".join(shown(part, factor, digits) for part in value)
     if isinstance(value, str) or value is None:
         return str(value)
     if isinstance(value, int):
         return str(value)
-    return f"{float(f'{factor * value:.{DIGITS}g}'):g}"
+    return f"{float(f'{factor * value:.{digits}g}'):.10g}"
 
 
 def rewrite(page: Path, runs: Path, missing: Sequence[str]) -> int:
