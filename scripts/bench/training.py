@@ -1,0 +1,172 @@
+"""Compare rollouts with their matrix products, and an epoch with the usual data loader and loop.
+
+- `rollout`: an LSTM on a linear baseline, 100 steps by RK4 at batch 1,024 in single precision,
+  against the matrix products of its network alone, which no implementation can do without.
+- `epoch`: 25 teacher-forced batches of 64 windows of 100 samples for an LSTM, with gradients and
+  optimiser, against a Dataset whose DataLoader collates windows and a cell that is called step by
+  step. Both have the same network, data and loss.
+
+Times are CPU seconds of this process, the least of `--repeats`, so that a busy machine matters
+little; one thread.
+
+    python scripts/bench/training.py [--parts rollout epoch] [--repeats 5]
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+import time
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.utils.data import DataLoader, Dataset
+
+from residnet.baselines.regressors import RegressorBaseline
+from residnet.data.windows import WindowBatches
+from residnet.dynamics.hybrid import HybridDynamics
+from residnet.dynamics.rollout import Rollout
+from residnet.heads import LstmConfig, ResidualHead
+from residnet.physics.signals import SignalsConfig
+
+_NAMES = ("u", "v", "r", "tau_x", "tau_n")
+_BATCH, _STEPS = 1_024, 100
+_WINDOW, _WINDOWS, _BATCHES = 100, 64, 25
+
+
+def least(work: Callable[[], object], repeats: int) -> float:
+    """Return the least CPU time of some work in s, after one call that warms up."""
+    work()
+    found = []
+    for _ in range(repeats):
+        begun = time.process_time()
+        work()
+        found.append(time.process_time() - begun)
+    return min(found)
+
+
+def model_of(hidden: int) -> HybridDynamics:
+    """Return an LSTM on a linear baseline."""
+    torch.manual_seed(0)
+    signals = SignalsConfig(inputs=("tau_x", "tau_n")).build()
+    baseline = RegressorBaseline([_NAMES] * 3, signals.names)
+    baseline.theta.data.copy_(-0.5 * torch.eye(3, 5))
+    head = LstmConfig(hidden_size=hidden).build(_NAMES)
+    return HybridDynamics(signals, baseline, head, 0.05).to(torch.float32).eval()
+
+
+def rollouts(repeats: int) -> None:
+    """Print the share of the matrix products in a rollout."""
+    x0, w = torch.zeros(_BATCH, 6), torch.randn(_BATCH, _STEPS, 2)
+    for hidden in (100, 24):
+        model = model_of(hidden)
+        model.positions = False
+        f, h = torch.randn(_BATCH, 5), torch.randn(_BATCH, hidden)
+        w_input, w_hidden = torch.randn(5, 4 * hidden), torch.randn(hidden, 4 * hidden)
+        out = torch.randn(hidden, 3)
+
+        def products(
+            f: Tensor = f, h: Tensor = h, a: Tensor = w_input, b: Tensor = w_hidden, o: Tensor = out
+        ) -> None:
+            for _ in range(_STEPS):
+                f @ a
+                h @ b
+                h @ o
+
+        with torch.no_grad():
+            whole = least(
+                lambda model=model: Rollout(model)(x0, w, model.initial_state(_BATCH)), repeats
+            )
+            bound = least(products, repeats)
+        print(
+            f"rollout, LSTM of {hidden}, batch {_BATCH}: {1e6 * whole / _STEPS:.0f} us a step,"
+            f" products alone {1e6 * bound / _STEPS:.0f} us: {100 * bound / whole:.0f} %"
+        )
+
+
+class Windows(Dataset[tuple[Tensor, Tensor]]):
+    """Windows as a Dataset returns them, one at a time."""
+
+    def __init__(self, z: np.ndarray, target: np.ndarray) -> None:
+        self.z, self.target = z, target
+
+    def __len__(self) -> int:
+        return len(self.z) - _WINDOW
+
+    def __getitem__(self, start: int) -> tuple[Tensor, Tensor]:
+        stop = start + _WINDOW
+        return torch.from_numpy(self.z[start:stop]), torch.from_numpy(self.target[start:stop])
+
+
+def epochs(repeats: int) -> None:
+    """Print how much faster an epoch is than by data loader and loop."""
+    random = np.random.default_rng(0)
+    z = random.normal(size=(50_000, 5)).astype(np.float32)
+    target = random.normal(size=(50_000, 3)).astype(np.float32)
+    for hidden in (24, 100):
+        head = LstmConfig(hidden_size=hidden).build(_NAMES).to(torch.float32).train()
+        ours = torch.optim.AdamW(head.parameters())
+        batches = WindowBatches(torch.arange(len(z) - _WINDOW), _WINDOWS, _BATCHES)
+
+        def epoch(
+            head: ResidualHead = head,
+            optimiser: torch.optim.Optimizer = ours,
+            batches: WindowBatches = batches,
+            data: tuple[Tensor, Tensor] = (torch.from_numpy(z), torch.from_numpy(target)),
+        ) -> None:
+            for starts in batches.epoch(0, 0):
+                rows = (starts[:, None] + torch.arange(_WINDOW)).reshape(-1)
+                seen, truth = (
+                    part.index_select(0, rows).unflatten(0, (_WINDOWS, _WINDOW)) for part in data
+                )
+                loss = (truth - head.sequence(seen)).square().mean()
+                optimiser.zero_grad()
+                loss.backward()
+                optimiser.step()
+
+        cell, out = nn.LSTMCell(5, hidden), nn.Linear(hidden, 3)
+        usual = torch.optim.AdamW([*cell.parameters(), *out.parameters()])
+        loader = DataLoader(Windows(z, target), batch_size=_WINDOWS, shuffle=True)
+
+        def usual_epoch(
+            cell: nn.LSTMCell = cell,
+            out: nn.Linear = out,
+            optimiser: torch.optim.Optimizer = usual,
+            loader: DataLoader[tuple[Tensor, Tensor]] = loader,
+        ) -> None:
+            for number, (seen, truth) in enumerate(loader):
+                if number == _BATCHES:
+                    break
+                state, found = None, []
+                for k in range(_WINDOW):
+                    state = cell(seen[:, k], state)
+                    found.append(out(state[0]))
+                loss = (truth - torch.stack(found, dim=1)).square().mean()
+                optimiser.zero_grad()
+                loss.backward()
+                optimiser.step()
+
+        own, other = least(epoch, repeats), least(usual_epoch, repeats)
+        print(
+            f"epoch of {_BATCHES} batches, LSTM of {hidden}: {own:.3f} s, by data loader and loop"
+            f" {other:.3f} s: {other / own:.1f} times"
+        )
+
+
+def main() -> None:
+    """Print the parts that were asked for."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--parts", nargs="+", default=["rollout", "epoch"])
+    parser.add_argument("--repeats", type=int, default=5)
+    given = parser.parse_args()
+    torch.set_num_threads(1)
+    print(f"torch {torch.__version__}, {platform.platform()}, load {os.getloadavg()[0]:.1f}")
+    for part in given.parts:
+        {"rollout": rollouts, "epoch": epochs}[part](given.repeats)
+
+
+if __name__ == "__main__":
+    main()
