@@ -24,6 +24,7 @@ from selection import scattered
 from torch import Tensor
 
 from residnet.core.config import validate
+from residnet.core.errors import ResidnetError
 from residnet.data.prepare import Prepared, samples
 from residnet.data.simulated.trials import SimulatedTrials, simulate
 from residnet.data.windows import WindowStore
@@ -213,7 +214,11 @@ def main() -> None:
     for number in range(given.draws):
         started = time.process_time()
         vessel = list(VESSELS)[number % len(VESSELS)]
-        predicted, achieved, at_random = drawn(vessel, 100 * given.seed + number, given.random)
+        try:
+            predicted, achieved, at_random = drawn(vessel, 100 * given.seed + number, given.random)
+        except ResidnetError as error:
+            print(f"not counted: {vessel}: {error}", flush=True)
+            continue
         middle = float(np.median(at_random))
         print(
             f"{vessel}: planned {achieved:.3f}, predicted {predicted:.3f}"

@@ -28,6 +28,8 @@ from residnet.identification.monitoring.windows import SEEN, Piece, innovations,
 
 _OVERLAP = 3.0
 """Independent looks that a sliding stretch gives while it slides by its own length."""
+_FOLDS = 5
+"""Parts of the clean windows whose scores are scaled by what the others say."""
 _FEWEST = 5
 """Groups of clean windows below which nothing can be said about false alarms."""
 _PARTS = 5
@@ -135,8 +137,8 @@ class Watch:
         self.causes = causes(spec.signals)
         self.others = surroundings()
         self.belief = np.diag([_CURRENT**-2] * 2 + [_PUSH**-2] * 2)
-        size = max(round(config.group / config.window), 1)
-        groups = [log[i : i + size] for log in clean for i in range(0, len(log), size)]
+        each = max(round(config.group / config.window), 1)
+        groups = [log[i : i + each] for log in clean for i in range(0, len(log), each)]
         if len(groups) < _FEWEST:
             raise DataError(
                 f"the clean logs hold {len(groups)} stretches of {config.group:g} s; a monitor"
@@ -144,40 +146,69 @@ class Watch:
             )
         self.parts = [1, _PARTS] if round(config.window / spec.dt) >= _LEAST_PART * _PARTS else [1]
         found = [[self._innovations(group, parts) for parts in self.parts] for group in groups]
-        self.always: list[np.ndarray] = []
-        self.whiten: list[np.ndarray] = []
-        for i, parts in enumerate(self.parts):
-            error = np.concatenate([group[i][0] for group in found])
-            effects = np.concatenate([group[i][1] for group in found])
-            self.always.append(always_wrong(error, effects, self.causes))
-            rest = error - self._expected(effects, i)
-            self.whiten.append(whitening(rest, parts))
-        self._scale([self._sums(group) for group in found])
+        self.always = self._wrong(found)
+        self.whiten = [
+            whitening(
+                np.concatenate([group[i][0] - self._expected(group[i][1], i) for group in found]),
+                parts,
+            )
+            for i, parts in enumerate(self.parts)
+        ]
+        known = self.always
+        fold = np.arange(len(found)) % _FOLDS
+        self.bias, self.known = self._bias([self._sums(group) for group in found])
+        count, size = len(found), len(self.causes)
+        apart, matrices = np.empty((count, size)), np.empty((count, size, size))
+        # scores scatter more where others say what is always wrong, as they do in service
+        for k in range(_FOLDS):
+            self.always = self._wrong(
+                [one for one, own in zip(found, fold, strict=True) if own != k]
+            )
+            others = [self._sums(one) for one in found]
+            bias, _ = self._bias([one for one, own in zip(others, fold, strict=True) if own != k])
+            for i in np.flatnonzero(fold == k):
+                score, matrices[i] = self._alone(others[i])
+                apart[i] = score - matrices[i] @ bias
+        self.always = known
+        self._scale(apart, matrices)
+
+    def _wrong(self, found: Sequence[Sequence[_Innovations]]) -> list[np.ndarray]:
+        """Return what the model has always got wrong, by innovations of groups of clean windows."""
+        return [
+            always_wrong(
+                np.concatenate([group[i][0] for group in found]),
+                np.concatenate([group[i][1] for group in found]),
+                self.causes,
+            )
+            for i in range(len(self.parts))
+        ]
+
+    def _bias(self, groups: Sequence[_Sums]) -> tuple[np.ndarray, np.ndarray]:
+        """Return the sizes [Q] of all causes together that clean logs have, and what is known."""
+        parts = [self._alone(group) for group in groups]
+        matrix = np.sum([part[1] for part in parts], axis=0)
+        believed = np.diag([change.size**-2 / BELIEVED**2 for change in self.causes])
+        # two causes that are wrong alike, such as damping and gain, must not look like one of them
+        score = np.sum([part[0] for part in parts], axis=0)
+        return np.linalg.solve(matrix + believed, score), matrix
 
     @property
     def changes(self) -> list[Change]:
         """The causes, then what surrounds the vessel."""
         return [*self.causes, *self.others]
 
-    def _scale(self, groups: Sequence[_Sums]) -> None:
-        """Take bias and scatter of every cause's score from groups of clean windows."""
-        parts = [self._alone(group) for group in groups]
-        matrix = np.sum([part[1] for part in parts], axis=0)
-        believed = np.diag([change.size**-2 / BELIEVED**2 for change in self.causes])
-        # two causes that are wrong alike, such as damping and gain, must not look like one of them
-        self.bias = np.linalg.solve(matrix + believed, np.sum([part[0] for part in parts], axis=0))
-        apart = np.array([score - own @ self.bias for score, own in parts])
-        self.known = matrix
-        count, size = len(groups), len(self.causes)
-        unit = apart / np.sqrt([np.diag(own) for _, own in parts])
+    def _scale(self, apart: np.ndarray, matrices: np.ndarray) -> None:
+        """Take the scatter of scores [G, Q] with information [G, Q, Q] from groups of windows."""
+        count, size = apart.shape
+        unit = apart / np.sqrt(np.diagonal(matrices, axis1=1, axis2=2))
         scatter = unit.T @ unit / (count - 1)
         # few groups say little about how scores scatter together
         apart_alone = np.diag(np.maximum(np.diag(scatter), 1.0))
         kept = count / (count + size)
         self.scatter = kept * scatter + (1.0 - kept) * apart_alone
         np.fill_diagonal(self.scatter, np.diag(apart_alone))
-        looks = self.config.false_alarm / self.config.stretch * _OVERLAP * len(self.causes)
-        self.threshold = float(student.isf(0.5 / looks, len(groups) - 1))
+        looks = self.config.false_alarm / self.config.stretch * _OVERLAP * size
+        self.threshold = float(student.isf(0.5 / looks, count - 1))
 
     def sums(self, pieces: Sequence[Piece]) -> list[_Sums]:
         """Return the scores of each of several windows."""
@@ -237,7 +268,6 @@ class Watch:
         for _, own in parts:
             root = np.sqrt(np.diag(own))
             covariance += self.scatter * np.outer(root, root)
-        # what clean logs have told is not known exactly either
         covariance *= 1.0 + float(np.mean(information / np.diag(self.known)))
         error = np.sqrt(np.diag(covariance)) / information
         size = apart / information
