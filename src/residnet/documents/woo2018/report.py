@@ -9,7 +9,7 @@ from residnet.documents.woo2018.figures import LEARNED, draw
 from residnet.documents.woo2018.panels import MODEL_NAMES, PROTOCOL
 from residnet.documents.woo2018.published import CHANGE_OF_ERROR
 from residnet.documents.woo2018.steady import steady_figure, steady_table
-from residnet.report.blocks import Section, Table, Text
+from residnet.report.blocks import Block, Section, Table, Text
 from residnet.report.run_reader import RunFiles
 
 _GROUPS = {"u": "speed", "v": "steering", "r": "steering"}
@@ -32,7 +32,7 @@ def sections(run: Path) -> list[Section]:
         " configs/studies/woo2018/outside_terms.yaml compares networks and closed forms on a plant"
         " whose terms none of them has."
     )
-    steady = [steady_table(files), steady_figure(files)]
+    steady: list[Block] = [steady_table(files), steady_figure(files)]
     blocks = [about, *steady, _changes(files), *figures]
     return [Section("Document 003 (Woo et al. 2018)", blocks)]
 
