@@ -9,6 +9,7 @@ from residnet.report.blocks import Block, Cell, Figure, Section, Table, Text
 from residnet.report.figures.courses import histories, spread, tracks
 from residnet.report.figures.files import Drawing, figures_section, write_drawings
 from residnet.report.format import DEG, fixed, number
+from residnet.report.interactive.courses import course_explorer
 from residnet.report.run_reader import Content, RunFiles
 
 TRACKS = "tracks.parquet"
@@ -32,13 +33,8 @@ def draw(run: RunFiles) -> list[Figure]:
 def _drawings(run: RunFiles) -> Iterator[Drawing]:
     course = run.resolved["course"]
     flown, plans, every = run.frame(TRACKS), run.frame(COURSES), run.frame(SPREAD)
-    smallest = run.metrics["smallest"]["radius"]
-    for protocol in run.resolved["protocols"]:
+    for protocol, radii in _radii(run).items():
         rule = RULES[protocol]
-        radii = [
-            course["acceptance"] if protocol == "enter" else max(buoy["radius"], smallest)
-            for buoy in course["buoys"]
-        ]
         flights = flown[flown["protocol"] == protocol]
         plan = plans[plans["protocol"] == protocol]
         name = f"{protocol}_tracks"
@@ -48,6 +44,18 @@ def _drawings(run: RunFiles) -> Iterator[Drawing]:
             yield spread(f"{protocol}_spread", every[every["protocol"] == protocol], rule)
 
 
+def _radii(run: RunFiles) -> dict[str, list[float]]:
+    """Return the radii in m of the buoys' circles by protocol."""
+    course, smallest = run.resolved["course"], run.metrics["smallest"]["radius"]
+    return {
+        protocol: [
+            course["acceptance"] if protocol == "enter" else max(buoy["radius"], smallest)
+            for buoy in course["buoys"]
+        ]
+        for protocol in run.resolved["protocols"]
+    }
+
+
 def sections(run: RunFiles) -> list[Section]:
     """Return times and margins by protocol, what the numbers mean, and the figures.
 
@@ -55,6 +63,11 @@ def sections(run: RunFiles) -> list[Section]:
         UsageError: where the folder holds no metrics.json.
     """
     out = [_protocol(run, protocol) for protocol in run.resolved["protocols"]]
+    flown, plans = run.frame(TRACKS), run.frame(COURSES)
+    if flown is not None and plans is not None:
+        buoys = run.resolved["course"]["buoys"]
+        explorer = course_explorer(flown, plans, _radii(run), buoys, RULES)
+        out.append(Section("Flights to look into", [explorer]))
     out.append(Section("What the numbers mean", [Text(_definition(run))]))
     figures = figures_section(run.path / "figures")
     return [*out, figures] if figures else out
