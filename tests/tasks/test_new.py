@@ -8,6 +8,7 @@ from pathlib import Path
 import foreign_tables
 import numpy as np
 import pytest
+import scipy.io
 import written_logs
 import written_recorders
 import yaml
@@ -150,3 +151,25 @@ def test_logs_of_a_simulated_boat_as_recorders_write_them(write: str, tmp_path: 
     assert ("can only predict how the vessel coasts" in guessed) == (write not in told)
     read = validate(draft.config["data"]["reader"], ReaderConfig, "here").build().read(path)
     np.testing.assert_allclose(read["u"][5:-5], log["u"][5:-5], atol=2e-3)
+
+
+def test_a_struct_is_read_by_the_names_of_its_fields(tmp_path: Path) -> None:
+    log = written_logs.trial(60.0)
+    way = (log["u"] + 1j * log["v"]) * np.exp(1j * log["psi"]) * 0.1
+    place = np.cumsum(way) - 0.5 * way
+    fields = {"time": log.t, "north": place.real, "east": place.imag}
+    fields["heading_deg"] = np.degrees(log["psi"]) % 360.0
+    fields |= {"surge_kn": log["u"] * 3600.0 / 1852.0, "sway": log["v"]}
+    fields |= {"yaw_rate_dps": np.degrees(log["r"]), "cmd_port": log["cmd_port"]}
+    paths = [tmp_path / "still.mat", tmp_path / "trial.mat"]
+    for path, moves in zip(paths, (0.0, 1.0), strict=True):
+        data = fields | {"cmd_stbd": 4.0 + moves * log["cmd_stbd"]}
+        scipy.io.savemat(path, {"trial": data})
+    draft = residnet.draft(tmp_path, folder=tmp_path)
+    channels = draft.config["data"]["reader"]["channels"]
+    assert {name: channels[name]["unit"] for name in "uvr"} == {"u": "kn", "v": "m/s", "r": "deg/s"}
+    assert draft.config["signals"]["inputs"] == ["cmd_port", "cmd_stbd"]
+    assert "data.reader.channels.v" in dict(draft.guesses)
+    read = validate(draft.config["data"]["reader"], ReaderConfig, "here").build().read(paths[1])
+    np.testing.assert_allclose(read["u"][5:-5], log["u"][5:-5], atol=2e-3)
+    np.testing.assert_allclose(read["r"][5:-5], log["r"][5:-5], atol=2e-3)
