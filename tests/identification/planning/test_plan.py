@@ -118,3 +118,11 @@ def test_inputs_that_steer_are_known_by_unit_or_side(
     single = spec.model_copy(update={"signals": SignalsConfig(inputs=("n",)), **short})
     with pytest.raises(UsageError, match="known to steer"):
         shares_of(single)
+
+
+def test_manoeuvres_too_short_to_tell_anything_are_refused(
+    known: tuple[FittedModel, LeftOpen, torch.Tensor],
+) -> None:
+    short = ConstantInput(name="short", drive=1.0, steer=0.0, duration=1.0)
+    with pytest.raises(DataError, match="cannot fly them"):
+        planned(known, TrialLimits(time=8.0, count=1), Aim([short], 1.0, {}))

@@ -103,7 +103,7 @@ def plan(
         aim: what is to be predicted; None for all candidates alike.
 
     Raises:
-        DataError: where no candidate stays within the limits.
+        DataError: where no candidate stays within the limits, or nothing is open.
     """
     spec, model = fitted.spec, fitted.model.double()
     horizon = round(refit.horizon / spec.dt)
@@ -131,6 +131,12 @@ def plan(
         paths = [_path(one, spec.signals.columns) for one in _flights(fitted, shares, aim)]
         goal = moments(model, paths, horizon, divisor).sum(dim=0)
     before = spread(open_.covariance, goal)
+    if not (np.isfinite(before) and before > 0.0):
+        raise DataError(
+            f"model {fitted.name}: its refit leaves nothing open about the manoeuvres to predict, or"
+            f" it cannot fly them for {refit.horizon:g} s; add logs that cover their speeds and"
+            " rudder angles, or shorten refit.horizon"
+        )
     trials = []
     for flight, states, own in found:
         minutes = (len(states) - 1) * spec.dt / 60.0
