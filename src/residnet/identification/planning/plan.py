@@ -133,7 +133,7 @@ def plan(
     before = spread(open_.covariance, goal)
     if not (np.isfinite(before) and before > 0.0):
         raise DataError(
-            f"model {fitted.name}: its refit leaves nothing open about the manoeuvres to predict, or"
+            f"model {fitted.name}: its refit leaves nothing open of the manoeuvres to predict, or"
             f" it cannot fly them for {refit.horizon:g} s; add logs that cover their speeds and"
             " rudder angles, or shorten refit.horizon"
         )
