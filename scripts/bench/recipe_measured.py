@@ -111,7 +111,9 @@ class Trained:
         self.step = data.prepare.grid.step
         self.past = max(round(_PAST / self.step), 1)
         joined = np.concatenate([self.rows(log) for log in data.logs("train")])
-        self.mean, self.spread = np.nanmean(joined, 0), np.nanstd(joined, 0) + 1e-9
+        self.mean = np.nanmean(joined, 0)
+        # an input that hardly moves in training may move in the test
+        self.spread = np.maximum(np.nanstd(joined, 0), 0.05 * np.abs(self.mean)) + 1e-9
         torch.manual_seed(0)
         self.net = Peer(joined.shape[1] - 3)
         found = windows(data, "train")
