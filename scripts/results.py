@@ -100,7 +100,7 @@ SOURCES: dict[str, Source] = {
     "symbolic_random": Source(
         (
             "scripts/bench/symbolic.py",
-            *("--parts", "random,late,ships", "--designs", "20", "--seed", "500"),
+            *("--parts", "random,late", "--designs", "20", "--seed", "918273"),
         ),
         5,
     ),
