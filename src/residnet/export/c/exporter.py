@@ -85,7 +85,7 @@ def _checked(
     )
     source.write_text(written.source)
     header.write_text(written.header)
-    parity = {}
+    parity: dict[str, Any] = {}
     for precision, dtype in precisions:
         flags = [f"-D{written.prefix.upper()}_DOUBLE"] if precision == "double" else []
         library = compile_shared([source], source.with_name(f"{precision}.so"), flags)

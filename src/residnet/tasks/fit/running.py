@@ -80,8 +80,8 @@ def _judged(
     if config.bands is not None:
         bands = {entry.name: entry.bands for entry in fitted}
         folder.write_json(folder.bands, bands_content(config.name, bands))
-    splits = {split: logs[split] for split in config.evaluation.splits}
-    judged = identified.evaluate_splits(splits, config.data)
+    held = {str(split): logs[split] for split in config.evaluation.splits}
+    judged = identified.evaluate_splits(held, config.data)
     for split, part in judged.items():
         write_rollouts(
             folder.rollouts / split, part.runs, part.logs, config.signals.columns, part.bands
