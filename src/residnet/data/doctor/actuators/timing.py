@@ -6,7 +6,7 @@ one vessel, though, the delay is the same.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +26,9 @@ _BETTER = 1.35
 _KNOWN = 0.3
 _SHARP = 1.1
 _SECTIONS = 10
+# minima that are looked at closely, and how many times the least counts as good a fit
+_MINIMA = 4
+_ALIKE = 1.15
 
 
 @dataclass(frozen=True)
@@ -37,13 +40,15 @@ class Delay:
         seconds: how late the answer comes; negative where it comes before the input.
         error: standard error of that, s.
         better: what a fit leaves without the shift, over what it leaves with it (sums of squares).
-        sharp: the same where the shift is wrong by the least lag that matters to either side.
+        late: what the best shift leaves that is no early answer, over the least that any leaves.
+        sharp: `better` where the shift is wrong by the least lag that matters to either side.
     """
 
     names: tuple[str, ...]
     seconds: float
     error: float
     better: float
+    late: float
     sharp: float
 
 
@@ -88,13 +93,14 @@ def delay_of(log: Log, names: tuple[str, ...], answer: str) -> Delay | None:
         x = np.concatenate((known, integrals(driven, log.t, first - shift, size)), axis=1)
         return _rest(x, y) ** 2
 
-    coarse = sorted({round(k * reach / _SHIFTS) for k in range(-_SHIFTS, _SHIFTS + 1)})
-    sums = {shift: left(shift) for shift in coarse}
-    best = min(sums, key=lambda shift: float(np.nansum(sums[shift])))
+    sums = {shift: left(shift) for shift in _around(0, reach, _SHIFTS)}
     gap = max(round(reach / _SHIFTS), 1)
-    fine = sorted({best + round(k * gap / 6) for k in range(-6, 7)})
-    sums |= {shift: left(shift) for shift in fine if abs(shift) <= reach}
-    best = min(sums, key=lambda shift: float(np.nansum(sums[shift])))
+    rough = {shift: float(np.nansum(rest)) for shift, rest in sums.items()}
+    for least in _lowest(rough)[:_MINIMA]:
+        near = (shift for shift in _around(least, gap, 6) if abs(shift) <= reach)
+        sums |= {shift: left(shift) for shift in near}
+    total = {shift: float(np.nansum(rest)) for shift, rest in sums.items()}
+    best = _likeliest(total, step)
     if abs(best) >= reach - gap:
         return None
     rest, plain = sums[best], sums[0]
@@ -112,7 +118,33 @@ def delay_of(log: Log, names: tuple[str, ...], answer: str) -> Delay | None:
     apart = max(round(_EARLY * 1.5 / step), 2)
     beside = [float(left(best + side)[good].sum()) for side in (-apart, apart)]
     sharp = min(beside) / max(float(rest[good].sum()), 1e-300)
-    return Delay(names, best * step, error, better, sharp)
+    late = min(value for shift, value in total.items() if -shift * step <= _EARLY)
+    late /= max(min(total.values()), 1e-300)
+    return Delay(names, best * step, error, better, late, sharp)
+
+
+def _around(centre: int, reach: int, count: int) -> list[int]:
+    """Return shifts from `centre` to `reach` samples on both sides, `count` a side."""
+    return sorted({centre + round(k * reach / count) for k in range(-count, count + 1)})
+
+
+def _lowest(sums: Mapping[int, float]) -> list[int]:
+    """Return the shifts of the minima of what fits leave, by shift, the lowest first."""
+    shifts = sorted(sums)
+    total = np.array([sums[shift] for shift in shifts])
+    fenced = np.concatenate(([np.inf], total, [np.inf]))
+    minima = np.flatnonzero((total <= fenced[:-2]) & (total <= fenced[2:]))
+    return [shifts[i] for i in minima[np.argsort(total[minima])]]
+
+
+def _likeliest(total: Mapping[int, float], step: float) -> int:
+    """Return the shift that fits best; of several alike the least that is no early answer.
+
+    An input that repeats itself, as that of a zigzag, fits as well half a period away.
+    """
+    least = min(total.values())
+    alike = [shift for shift in _lowest(total) if total[shift] <= _ALIKE * least]
+    return min(alike, key=lambda shift: (-shift * step > _EARLY, abs(shift)))
 
 
 def timing_findings(log: Log, inputs: Sequence[str]) -> Iterator[Finding]:
@@ -123,7 +155,8 @@ def timing_findings(log: Log, inputs: Sequence[str]) -> Iterator[Finding]:
         if delay is None:
             continue
         early = -delay.seconds
-        if early > max(_EARLY, 1.5 * step, _SURE * delay.error) and delay.better > _BETTER:
+        sure = delay.better > _BETTER and delay.late > _ALIKE
+        if early > max(_EARLY, 1.5 * step, _SURE * delay.error) and sure:
             channels = ", ".join(names)
             text = (
                 f"{answer} answers {channels} {early:.2f} +- {2.0 * delay.error:.2f} s before it is"
