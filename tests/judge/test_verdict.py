@@ -96,7 +96,7 @@ def test_trust_reaches_as_far_as_errors_are_smaller_than_those_of_zero(
 def test_data_outside_the_training_range_and_the_doctor_are_told() -> None:
     limits = {"outside": {"share": 0.123, "channels": {"u": 0.1, "delta": 0.03}}}
     said = verdict(evidence(limits=limits, doctor="Data doctor: nothing would mislead a fit."))
-    assert any(text.startswith("12 % of the test data lie outside") for text in said)
+    assert any(text.startswith("Of the test data, 12 % lies outside") for text in said)
     assert any("(u 10 %, delta 3 %)" in text for text in said)
     assert said[-1] == "Data doctor: nothing would mislead a fit."
 

@@ -69,3 +69,33 @@ def call(monkeypatch: pytest.MonkeyPatch, *words: object) -> int:
     except SystemExit as end:
         return int(end.code or 0)
     return 0
+
+
+SWEEP: dict[str, Any] = {
+    "task": "sweep",
+    "name": "tiny_sweep",
+    "base": "tiny.yaml",
+    "common": [
+        "data.duration=15",
+        "data.trials=[{kind: zigzag, count: 5, heading: [20 deg], start: 1},"
+        " {kind: three_two_one_one, count: 2, start: 1}]",
+        "data.identification={zigzag: 4, three_two_one_one: 1}",
+        "data.validation={zigzag: 1, three_two_one_one: 0}",
+        "baseline={kind: regressors, terms: [u, v, r, tau_x, tau_n]}",
+        "heads={ridge: {kind: ridge}}",
+        "training={}",
+        "ensembles={}",
+        "bands=null",
+        "export.models=[]",
+        "evaluation.splits=[validation]",
+        "~evaluation.protocols.T10",
+    ],
+    "space": {
+        "heads.ridge.degree": {"choices": [1, 2]},
+        "prepare.derivative.window": {"low": 0.7, "high": 1.9, "points": 2},
+    },
+    "search": {"kind": "grid"},
+    "objective": {"kind": "free_run", "model": "ridge"},
+    "runner": {"kind": "processes", "workers": 1},
+}
+"""A sweep over `TINY`, which lies beside it as tiny.yaml."""

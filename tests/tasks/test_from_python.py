@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 import written_logs
 import yaml
-from tiny import TINY, call
+from tiny import SWEEP, TINY, call
 
 import residnet
 from residnet.core.config import load_mapping
@@ -167,7 +167,13 @@ def sea_trial(folder: Path) -> dict[str, Any]:
     return content
 
 
+def sweep(folder: Path) -> dict[str, Any]:
+    (folder / "tiny.yaml").write_text(yaml.safe_dump(TINY, sort_keys=False))
+    return SWEEP
+
+
 TASKS: dict[str, Callable[[Path], dict[str, Any]]] = {
+    "sweep": sweep,
     "autopilot": autopilot,
     "course": course,
     "import": imported,
@@ -223,6 +229,8 @@ def test_python_and_command_line_are_one(
     monkeypatch.chdir(tmp_path)
     if task == "import":
         pytest.importorskip("rosbags")
+    if task == "sweep":
+        pytest.importorskip("optuna")
     config = TASKS[task](tmp_path)
     assert config["task"] == task
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(config, sort_keys=False))

@@ -13,47 +13,18 @@ from typing import Any
 
 import pytest
 import yaml
-from tiny import TINY, call
+from tiny import SWEEP, TINY, call
 
 pytest.importorskip("optuna")
 
-COMMON = [
-    "data.duration=15",
-    "data.trials=[{kind: zigzag, count: 5, heading: [20 deg], start: 1},"
-    " {kind: three_two_one_one, count: 2, start: 1}]",
-    "data.identification={zigzag: 4, three_two_one_one: 1}",
-    "data.validation={zigzag: 1, three_two_one_one: 0}",
-    "baseline={kind: regressors, terms: [u, v, r, tau_x, tau_n]}",
-    "heads={ridge: {kind: ridge}}",
-    "training={}",
-    "ensembles={}",
-    "bands=null",
-    "export.models=[]",
-    "evaluation.splits=[validation]",
-    "~evaluation.protocols.T10",
-]
 WINDOW = "prepare.derivative.window"
-SPACE: dict[str, Any] = {
-    "heads.ridge.degree": {"choices": [1, 2]},
-    WINDOW: {"low": 0.7, "high": 1.9, "points": 2},
-}
 
 
 @pytest.fixture
 def sweep(tmp_path: Path) -> Path:
     (tmp_path / "tiny.yaml").write_text(yaml.safe_dump(TINY, sort_keys=False))
-    content = {
-        "task": "sweep",
-        "name": "tiny_sweep",
-        "base": "tiny.yaml",
-        "common": COMMON,
-        "space": SPACE,
-        "search": {"kind": "grid"},
-        "objective": {"kind": "free_run", "model": "ridge"},
-        "runner": {"kind": "processes", "workers": 1},
-    }
     path = tmp_path / "sweep.yaml"
-    path.write_text(yaml.safe_dump(content, sort_keys=False))
+    path.write_text(yaml.safe_dump(SWEEP, sort_keys=False))
     return path
 
 
@@ -82,7 +53,8 @@ def test_a_grid_is_searched_whole_and_resumed(
 
     monkeypatch.setattr(running, "carry_out_trial", killed)
     words = ["run", sweep, "--out", out]
-    words += ["-s", f"space={json.dumps({**SPACE, WINDOW: {'choices': [0.9]}})}"]
+    space = {**SWEEP["space"], WINDOW: {"choices": [0.9]}}
+    words += ["-s", f"space={json.dumps(space)}"]
     assert call(monkeypatch, *words) == 130
     assert call(monkeypatch, *words, "--resume") == 0
     assert begun == [0, 1, 1], "the trial without an end goes on, the finished one is kept"

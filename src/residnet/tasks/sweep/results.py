@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from residnet.core.config import dump_config
@@ -53,7 +54,7 @@ def write_results(config: SweepConfig, study: optuna.Study, folder: RunFolder) -
     task = trial_task(config, _distributed(best["values"]), f"{config.name}.best")
     folder.write(folder.path / BEST, dump_config(task))
     return Outcome(
-        _verdict(config, folder, rows, best),
+        _verdict(config, rows, best),
         {"best": MainFigure(best["value"]), **figures},
         trials_table(content).text(),
     )
@@ -93,17 +94,15 @@ def _importance(study: optuna.Study, finished: int) -> dict[str, float]:
     return {key: float(share) for key, share in found.items()}
 
 
-def _verdict(
-    config: SweepConfig, folder: RunFolder, rows: list[dict[str, Any]], best: dict[str, Any]
-) -> list[str]:
+def _verdict(config: SweepConfig, rows: list[dict[str, Any]], best: dict[str, Any]) -> list[str]:
     drawn = ", ".join(f"{key} = {json.dumps(value)}" for key, value in best["values"].items())
     early = sum(row["state"] == "ended early" for row in rows)
     failed = [row for row in rows if row["state"] == "failed"]
     sentences = [
         f"Trial {best['number']} of {len(rows)} is the best: {config.objective.words}"
         f" {best['value']:.5g}, with {drawn}.",
-        f"Its run is {trial_folder(folder.path, best['number'])}, and {folder.path / BEST} repeats"
-        " it.",
+        f"Its run is {trial_folder(Path(), best['number'])} in the sweep's folder, and the config"
+        f" {BEST} there repeats it.",
     ]
     if early:
         sentences.append(f"{early} trials were ended early.")
