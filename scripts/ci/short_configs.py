@@ -87,6 +87,12 @@ _TANKER = (
     "bands=null",
     *_trained("mlp", "lstm"),
 )
+_COARSE = (
+    "prepare.grid={step: 0.5 s, held: [n, delta]}",
+    "prepare.derivative={kind: savitzky_golay, window: 2.5 s, order: 2}",
+    "evaluation.splits=[validation, test]",
+    "bands=null",
+)
 _SWEPT = (
     "common=["
     + ", ".join(
@@ -125,9 +131,9 @@ _CONDITIONS = (
 SHORT: dict[str, Short] = {
     "quickstart": Short((*_TRIALS, *_trained("mlp", "lstm"))),
     "wam_v_s1": Short((*_TRIALS, *_trained("mlp", "lstm"))),
-    "wam_v_s2": Short((*_TRIALS, *_trained("mlp", "lstm"))),
-    "wam_v_s3": Short((*_TRIALS, *_trained("mlp", "lstm"))),
-    "wam_v_equations": Short(_TRIALS),
+    "wam_v_s2": Short((*_TRIALS, *_trained("mlp", "lstm"), "bands=null")),
+    "wam_v_s3": Short((*_TRIALS, *_trained("mlp", "lstm"), "bands=null")),
+    "wam_v_equations": Short((*_TRIALS, "bands=null")),
     "wam_v_trials": Short(_TRIALS),
     "sweep_quickstart": Short(
         (
@@ -191,8 +197,8 @@ SHORT: dict[str, Short] = {
             *_STEP_TEST,
             "policies.policy.training.horizon=8 s",
             "test.dt=0.2 s",
-            "test.duration=20 s",
-            "test.bias_time=20 s",
+            "test.duration=26 s",
+            "test.bias_time=26 s",
             "test.sea_time=10 s",
         )
     ),
@@ -204,7 +210,7 @@ SHORT: dict[str, Short] = {
             "policies.on_model.training.horizon=8 s",
             "policies.on_model.learned.run={runs}/patrol_identified",
             "test.dt=0.2 s",
-            "test.duration=20 s",
+            "test.duration=26 s",
             *_STEP_TEST,
         ),
         after="patrol_identified",
@@ -299,10 +305,15 @@ SHORT: dict[str, Short] = {
     "studies/jervan2020/update": Short(_FERRY),
     "studies/jervan2020/zigzag": Short(),
     "studies/moreno2019/moreno2019": Short(
-        ("heads.gptips.evolution.population=30", "heads.gptips.evolution.generations=2"),
+        (
+            "heads.gptips.evolution.population=30",
+            "heads.gptips.evolution.generations=2",
+            *_COARSE[:2],
+            "bands=null",
+        ),
         data="esso_osaka",
     ),
-    "studies/moreno2019/polynomial_wind": Short(("refit={}",), data="esso_osaka"),
+    "studies/moreno2019/polynomial_wind": Short(("refit={}", *_COARSE), data="esso_osaka"),
     "studies/woo2018/outside_terms": Short(
         (
             "data.trials=[{kind: zigzag, count: 6, heading: [10 deg], steer: [0.15, 0.9],"
