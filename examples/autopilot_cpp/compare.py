@@ -76,11 +76,16 @@ def fly(
 def eager(folder: Path, card: dict[str, Any]) -> Any:
     """The policy without compilation: the same operations, called one by one from Python."""
     from residnet.control.heading.stored import load_heading_policy
-    from residnet.control.observed.stored import load_observed_policy
+    from residnet.control.observed.stored import (
+        NetworkPolicySpec,
+        ObservedPolicySpec,
+        load_recurrent,
+    )
     from residnet.export.autopilot import for_export
 
-    if card["kind"] == "observed":
-        policy = load_observed_policy(folder)
+    recurrent = {"observed": ObservedPolicySpec, "network": NetworkPolicySpec}
+    if card["kind"] in recurrent:
+        policy = load_recurrent(folder, recurrent[card["kind"]])
         policy.at(card["dt"])
     else:
         policy = load_heading_policy(folder)

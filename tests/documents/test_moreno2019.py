@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -113,7 +114,7 @@ def test_tables_hold_the_errors_of_the_records(tmp_path: Path) -> None:
 
 def test_the_curves_are_what_the_search_tried(tmp_path: Path) -> None:
     run = made(tmp_path)
-    tried = [
+    tried: list[dict[str, Any]] = [
         {"sigma": [width] * 3, "penalty": [penalty] * 3, "validation": width + penalty}
         for width in (1.0, 10.0)
         for penalty in (0.01, 0.1, 1.0)

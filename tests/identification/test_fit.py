@@ -78,7 +78,7 @@ def test_python_and_command_line_give_the_same_metrics(
     assert call(monkeypatch, "run", path, "--out", tmp_path / "run") == 0
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     splits = settings.evaluation.splits
-    judged = {str(split): identified.evaluate(logs[split], DATA) for split in splits}
+    judged = identified.evaluate_splits({str(split): logs[split] for split in splits}, DATA)
     rows: list[dict[str, Any]] = [row for part in judged.values() for row in part.rows]
     chosen = identified.select(judged)
     assert chosen.selected == metrics["selected"]

@@ -229,7 +229,10 @@ def test_measured_csv_end_to_end(
     theirs = {
         (r["model"], r["protocol"]): r["rmse"] for r in external["rows"] if r["manoeuvre"] == "all"
     }
-    assert theirs == mine
+    assert theirs.keys() == mine.keys()
+    for key, rmse in mine.items():
+        # free runs of several splits are one batch, in which sums may round otherwise
+        assert theirs[key] == pytest.approx(rmse, rel=1e-12)
     assert call(monkeypatch, "export", out, "--model", "ridge", "--format", "torchscript") == 0
     assert (out / "exports" / "ridge.pt").is_file()
     capsys.readouterr()
