@@ -11,8 +11,8 @@ from residnet.core.samples import Samples
 from residnet.data.windows import WindowStore
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.training.config import TrainingConfig
-from residnet.training.epochs import run_epochs
 from residnet.training.module import HeadTraining, Validate
+from residnet.training.running import run_epochs
 
 
 def train(

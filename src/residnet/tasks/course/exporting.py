@@ -16,6 +16,7 @@ from residnet.runs.folder import RunFolder
 from residnet.tasks.autopilot.config import AutopilotSettings
 from residnet.tasks.course.autopilot_run import load_policy, ready
 from residnet.tasks.course.config import CourseSettings
+from residnet.tasks.course.guided import plan_for
 
 _SAME = 1e-6
 """Largest difference of a course planned again from the one that was flown, as a share."""
@@ -91,7 +92,6 @@ def export_as_c(
     import torch
 
     from residnet.export.c.course import export_course_as_c
-    from residnet.tasks.course.running import plan_for
 
     extra = {"card.json": ""}
     torch.jit.load(str(scripted), _extra_files=extra)

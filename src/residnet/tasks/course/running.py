@@ -11,12 +11,8 @@ import pandas as pd
 from residnet.control.base import Policy, Reference
 from residnet.control.courses.config import (
     PlannedCourse,
-    plan_course,
     report_feasibility,
 )
-from residnet.control.courses.course_check import Protocol
-from residnet.control.guidance.course_guidance import CourseGuidance
-from residnet.control.guidance.drift import DriftEstimate
 from residnet.control.guidance.line_of_sight import AnyLineOfSight
 from residnet.control.guidance.waypoints import WaypointGuidance
 from residnet.control.guidance.wheel_over import WheelOver
@@ -29,7 +25,6 @@ from residnet.report.sections.course import COURSES, SPREAD, TRACKS, text_of
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import MainFigure, Outcome
 from residnet.tasks.course.autopilot_run import (
-    AutopilotRun,
     autopilot_of,
     load_policy,
     ready,
@@ -37,6 +32,7 @@ from residnet.tasks.course.autopilot_run import (
 from residnet.tasks.course.config import CourseSettings
 from residnet.tasks.course.exporting import CourseExport
 from residnet.tasks.course.flights import NOMINAL, Vessels, fly
+from residnet.tasks.course.guided import guidance_along, plan_for
 from residnet.tasks.course.peers import load_peers
 from residnet.tasks.course.tables import plan_table, spread_table, track_table
 
@@ -51,21 +47,6 @@ _UNITS = {
     "tightest_turn": "m",
     "travel": "rad",
 }
-
-
-def plan_for(
-    config: CourseSettings, known: AutopilotRun, protocol: Protocol
-) -> tuple[PlannedCourse, CourseGuidance]:
-    """Return the plan of a protocol, and the guidance along it.
-
-    Raises:
-        ConfigError: where no course fits the vessel's turns.
-    """
-    steering = known.steering
-    planned = plan_course(
-        config.course, protocol, steering.vessel, steering.turning, steering.limit, known.steady
-    )
-    return planned, _guidance(config, planned, steering)
 
 
 def run_course(config: CourseSettings, folder: RunFolder) -> Outcome:
@@ -199,15 +180,6 @@ def _fly(
         done.spread.append(spread_table(rows, vessels))
 
 
-def _guidance(config: CourseSettings, planned: PlannedCourse, steering: Steering) -> CourseGuidance:
-    """Return the guidance along the plan."""
-    lookahead = config.course.lookahead
-    drift = (
-        None if config.integral is None else DriftEstimate(lookahead, config.integral, steering.dt)
-    )
-    return CourseGuidance(planned.course, lookahead, steering.vessel.state, drift)
-
-
 def _steered(
     config: CourseSettings,
     planned: PlannedCourse,
@@ -220,7 +192,7 @@ def _steered(
     if sight is None:
         return Following(
             law, vessel.state, limit=steering.limit, dt=steering.dt, rate=vessel.rate
-        ), _guidance(config, planned, steering)
+        ), guidance_along(config, planned, steering)
     points, acceptance = (
         [(buoy.north, buoy.east) for buoy in planned.buoys],
         config.course.acceptance,

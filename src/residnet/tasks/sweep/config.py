@@ -119,7 +119,7 @@ class SweepConfig(Task):
 
     @property
     def trials(self) -> int:
-        """Number of trials."""
+        """Number of trials that the search asks for; of a grid, all its combinations."""
         if not isinstance(self.search, GridSearch):
             return self.search.trials
         count = 1

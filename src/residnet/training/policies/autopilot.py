@@ -18,8 +18,9 @@ from residnet.control.heading.policy import HeadingPolicy
 from residnet.control.heading.steering import Measured, SteeredVessel
 from residnet.core.frames import wrap
 from residnet.dynamics.rollout import Rollout
-from residnet.training.epochs import EpochTraining, run_epochs
+from residnet.training.epochs import EpochTraining
 from residnet.training.policies.autopilot_config import AutopilotTraining, SpreadConfig
+from residnet.training.running import run_epochs
 
 Score = Callable[[HeadingPolicy], float]
 

@@ -16,8 +16,9 @@ from residnet.control.heading.steering import SteeredVessel
 from residnet.core.errors import ExportError
 from residnet.core.progress import say
 from residnet.dynamics.rollout import Rollout
-from residnet.training.epochs import EpochTraining, run_epochs
+from residnet.training.epochs import EpochTraining
 from residnet.training.policies.conditions_config import ConditionsTraining
+from residnet.training.running import run_epochs
 
 _LATE = 1.0 / 3.0
 """Share of a flight at whose end a quiet one should have come to rest."""

@@ -15,8 +15,9 @@ from torch import Tensor, nn
 from residnet.control.heading.document_autopilot import NetworkPredictor, SimulatedPredictor
 from residnet.control.heading.steering import SteeredVessel
 from residnet.dynamics.rollout import Rollout
-from residnet.training.epochs import EpochTraining, run_epochs
+from residnet.training.epochs import EpochTraining
 from residnet.training.policies.predictor_config import PredictorTraining
+from residnet.training.running import run_epochs
 
 
 class Answers(NamedTuple):
