@@ -24,8 +24,8 @@ from residnet.report.interactive.explorer import (
 from residnet.report.run_reader import RunFiles, StoredWindow
 
 _DEG = math.degrees(1.0)
-_MOST_CASES = 24
-_MOST_SAMPLES = 500
+_MOST_CASES = 12
+_MOST_SAMPLES = 360
 _MOST_POINTS = 700
 _MEASURED = "measured"
 _BAND = "band"
