@@ -227,6 +227,24 @@ def test_a_bounded_model_comes_back_from_anywhere(logs: PreparedSplits) -> None:
     torch.testing.assert_close(baseline(known.z), inside(known.z))
 
 
+def test_a_bounded_model_holds_inputs_half_a_range_beyond_the_data(logs: PreparedSplits) -> None:
+    known = samples(logs["train"], settings().signals.build())
+    config = RegressorsConfig(terms=("1", "u", "v", "r", "left", "left|left|"), bounded=True)
+    baseline = config.build(known.names)
+    config.fit(baseline, known)
+    place = known.names.index("left")
+    low, high = known.z[:, place].amin(), known.z[:, place].amax()
+
+    def at(value: torch.Tensor) -> torch.Tensor:
+        z = known.z[:1].clone()
+        z[:, place] = value
+        return baseline(z)
+
+    edge = high + 0.5 * (high - low)
+    torch.testing.assert_close(at(high + 10.0 * (high - low)), at(edge))
+    assert not torch.allclose(at(edge), at(high))
+
+
 def test_a_mirror_symmetric_model_has_no_asymmetry(logs: PreparedSplits) -> None:
     names = settings().signals.build().names
     known = samples(logs["train"], settings().signals.build())

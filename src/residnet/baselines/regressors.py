@@ -21,7 +21,7 @@ from residnet.regression.least_squares import LeastSquares
 from residnet.regression.solutions import Coefficient, Solution
 
 _BEYOND = 0.5
-"""Share of a velocity's training range, on either side, in which a bounded model is as fitted."""
+"""Share of a channel's training range, on either side, in which a bounded model is as fitted."""
 RowTerms = dict[Literal["u", "v", "r"], tuple[str, ...]]
 Penalty = Annotated[float, Field(ge=0)]
 
@@ -43,7 +43,8 @@ class RegressorBaseline(ParametricBaseline):
     ) -> None:
         """From the terms of each axis; `held`: (axis, term) of coefficients that a refit through
         rollouts must leave as they are; `dissipative`: no term may feed energy;
-        `bounded`: velocities beyond their training range are taken at its edge and pulled back.
+        `bounded`: channels far beyond their training range are taken at its edge, and velocities
+        are pulled back.
         """
         terms = list(dict.fromkeys(term for row in rows for term in row))
         super().__init__(torch.zeros(3, len(terms), dtype=torch.float64))
@@ -56,7 +57,7 @@ class RegressorBaseline(ParametricBaseline):
         self.held = tuple((axis, terms.index(term)) for axis, term in held)
         self.dissipative = dissipative
         self.names = tuple(names)
-        self.bound: VelocityBound | None = VelocityBound() if bounded else None
+        self.bound: VelocityBound | None = VelocityBound(_BEYOND, len(names)) if bounded else None
 
     def forward(self, z: Tensor) -> Tensor:
         """Return nu_dot [..., 3] at channels z [..., nz]."""
@@ -208,8 +209,9 @@ class RegressorsConfig(IdentifiedConfig):
         manoeuvres: kinds of manoeuvre to fit on; empty for all.
         dissipative: terms along an axis' own velocity, such as u|u| in surge or v|r| in sway, whose
             sign would feed energy are left out, and the others fitted again; a refit does the same.
-        bounded: terms take velocities that are far outside their training range (by half its width)
-            at its edge, and such velocities are pulled back, so that the model cannot run away.
+        bounded: terms take velocities and inputs that are far outside their training range (by half
+            its width) at the edge of that, and such velocities are pulled back, so that the model
+            cannot run away.
     """
 
     kind: Literal["regressors"] = "regressors"
@@ -293,7 +295,7 @@ class RegressorsConfig(IdentifiedConfig):
         found = [baseline.solution(axes, axes[0].choice) for axes in zip(*fits, strict=True)]
         if not self.bounded:
             return found
-        bound = VelocityBound(_BEYOND)
+        bound = VelocityBound(_BEYOND, len(chosen.names))
         bound.calibrate(chosen)
         state = {f"bound.{name}": value for name, value in bound.state_dict().items()}
         return [replace(one, state={**one.state, **state}) for one in found]

@@ -26,34 +26,39 @@ class VelocityBound(nn.Module):
 
     Args:
         margin: share of the training range by which it is widened on either side.
+        channels: number of channels, the velocities first, that `held` keeps in their range: what
+            an input does far beyond it is as little known.
     """
 
-    def __init__(self, margin: float = 0.0) -> None:
+    def __init__(self, margin: float = 0.0, channels: int = PLANAR.dof) -> None:
         super().__init__()
         self.margin = margin
-        for name in ("low", "high", "rate"):
-            self.register_buffer(name, torch.zeros(PLANAR.dof, dtype=torch.float64))
+        self.channels = channels
+        for name, count in (("low", channels), ("high", channels), ("rate", PLANAR.dof)):
+            self.register_buffer(name, torch.zeros(count, dtype=torch.float64))
         self.low: Tensor
         self.high: Tensor
         self.rate: Tensor
 
     def calibrate(self, samples: Samples) -> None:
-        """Take the range of u, v, r, the first channels, and the rate from the accelerations."""
-        nu = samples.z[:, : PLANAR.dof]
-        low, high = nu.amin(0), nu.amax(0)
+        """Take the ranges of the channels, and the rate from the accelerations."""
+        seen = samples.z[:, : self.channels]
+        low, high = seen.amin(0), seen.amax(0)
         wide = (high - low).clamp(min=_LEAST)
         self.low.copy_(low - self.margin * wide)
         self.high.copy_(high + self.margin * wide)
         spread = samples.target.std(0, correction=0)
-        self.rate.copy_((_STRONG * spread / (0.5 * wide)).clamp(min=_SLOWEST, max=_FASTEST))
+        self.rate.copy_(
+            (_STRONG * spread / (0.5 * wide[: PLANAR.dof])).clamp(min=_SLOWEST, max=_FASTEST)
+        )
 
     def held(self, z: Tensor) -> Tensor:
-        """Return channels z [..., nz], where u, v, r that left their range stand at its edge."""
+        """Return channels z [..., nz], where those that left their range stand at its edge."""
         low, high = self.low.to(z.dtype), self.high.to(z.dtype)
-        nu = z[..., :3]
+        near = z[..., : self.channels]
         # a refit differentiates this, and derivatives of minimum and maximum are slow
-        nu = torch.where(nu > high, high, torch.where(nu < low, low, nu))
-        return torch.cat((nu, z[..., 3:]), dim=-1)
+        near = torch.where(near > high, high, torch.where(near < low, low, near))
+        return torch.cat((near, z[..., self.channels :]), dim=-1)
 
     def back(self, held: Tensor, z: Tensor) -> Tensor:
         """Return the acceleration at channels z [..., nz] whose held ones are known."""
