@@ -120,6 +120,24 @@ def test_what_the_believed_hull_lacks_stands_beside_what_was_found() -> None:
     assert set(truth) <= set(FERRY_TERMS)
 
 
+def test_azimuth_thrusters_get_the_controllers_force_and_push_late() -> None:
+    near = "course.waypoints=[[0, 0, 0], [2, 0, 0], [2, -1, 0], [2, -1, 20 deg]]"
+    flown = config("azimuth", near, "course.interval=5 s")
+    flight = flown.ferry().fly_course(flown.course, [(ForceModel(hull("milliampere")), None)])[0]
+    # the logged force is the controller's: feed-forward and feedback, not what the thrusters make
+    motion = course(flown.course, flown.loop.step)
+    needed = needed_force(ForceModel(hull("milliampere")), motion, None, flown.loop.step)
+    every = slice(None, None, flown.loop.every)
+    torch.testing.assert_close(
+        flight.command, needed[every, :3] + flight.feedback, rtol=1e-9, atol=1e-6
+    )
+    # and what they make is what moves the hull
+    moved = hull("milliampere_azimuth_half").required(flight.nu_dot, flight.nu)
+    torch.testing.assert_close(flight.acting, moved, rtol=1e-9, atol=1e-6)
+    late = (flight.acting[4:] - flight.command[:-4]).square().mean(0)
+    assert bool((late < (flight.acting - flight.command).square().mean(0)).all())
+
+
 @pytest.mark.whole_runs
 def test_feed_forward_alone_and_a_model_that_cannot_run_forward(tmp_path: Path) -> None:
     found = study(

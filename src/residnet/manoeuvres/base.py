@@ -21,7 +21,7 @@ from residnet.core.config import Config, Radians, Seconds
 from residnet.core.errors import UsageError
 from residnet.core.log import Log
 from residnet.dynamics.rollout import Source
-from residnet.physics.actuators import AzimuthThrusters, ForceCommands
+from residnet.physics.actuators import ForceActuators, ForceCommands
 from residnet.physics.plant import HullPlant, Plant
 
 Demand = Callable[[Tensor, Tensor], Tensor]
@@ -60,7 +60,7 @@ class Helm:
             side_force = float(plant.actuators.limit[1])
         if plant.inputs[: plant.commands] == ForceCommands.commands:
             forces = torch.Tensor.clone
-        elif isinstance(plant, HullPlant) and isinstance(plant.actuators, AzimuthThrusters):
+        elif isinstance(plant, HullPlant) and isinstance(plant.actuators, ForceActuators):
             forces = plant.actuators.allocate
         return cls(plant.demand, plant.state, plant.inputs, forces, side_force)
 

@@ -17,7 +17,7 @@ from residnet.control.base import Policy
 from residnet.core.config import Config
 from residnet.core.frames import to_body, wrap
 from residnet.core.layout import pose, velocities
-from residnet.physics.actuators import AzimuthThrusters
+from residnet.physics.actuators import ForceActuators
 from residnet.physics.fossen import Fossen3
 
 Gain = Annotated[float, Field(ge=0)]
@@ -116,12 +116,12 @@ class MotionPID(Policy):
 
 @final
 class Allocated(Policy):
-    """A controller of forces for a vessel with azimuth thrusters.
+    """A controller of forces for a vessel whose actuators can make them.
 
-    Its tau is allocated to their revolutions and angles.
+    Its tau is allocated to their commands, such as revolutions and angles of azimuth thrusters.
     """
 
-    def __init__(self, policy: Policy, thrusters: AzimuthThrusters) -> None:
+    def __init__(self, policy: Policy, thrusters: ForceActuators) -> None:
         super().__init__()
         self.policy = policy
         self.thrusters = thrusters
@@ -132,6 +132,6 @@ class Allocated(Policy):
         return self.policy.initial_state(x)
 
     def forward(self, x: Tensor, reference: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the commands [B, 2k] of the thrusters, and the controller's memory."""
+        """Return the commands [B, c] of the thrusters, and the controller's memory."""
         tau, s = self.policy(x, reference, s)
         return self.thrusters.allocate(tau), s

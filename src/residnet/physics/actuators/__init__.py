@@ -7,7 +7,7 @@ from typing import Annotated
 from pydantic import Field
 
 from residnet.physics.actuators.azimuth import AzimuthThrusters, AzimuthThrustersConfig
-from residnet.physics.actuators.base import ActuatorConfig, Actuators
+from residnet.physics.actuators.base import ActuatorConfig, Actuators, ForceActuators
 from residnet.physics.actuators.differential_thrust import (
     DifferentialThrust,
     DifferentialThrustConfig,
@@ -35,6 +35,7 @@ __all__ = [
     "AzimuthThrustersConfig",
     "DifferentialThrust",
     "DifferentialThrustConfig",
+    "ForceActuators",
     "ForceCommands",
     "ForceCommandsConfig",
     "RudderPropeller",

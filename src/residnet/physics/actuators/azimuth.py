@@ -13,9 +13,14 @@ from pydantic import Field, model_validator
 from torch import Tensor
 
 from residnet.core.config import Config, Metres, Radians, RadiansPerSecond, RevRate, RevsPerSecond
-from residnet.physics.actuators.base import ActuatorConfig, Actuators
+from residnet.physics.actuators.base import ActuatorConfig, ForceActuators
 from residnet.physics.actuators.servo import Servo, ServoConfig, Servos
 from residnet.physics.actuators.thrust_curve import CurveRange, require_range
+
+_TABLE = 401
+"""Points of the thrust curve from which its inverse starts; between them it is known to rise."""
+_NEWTON_STEPS = 4
+"""Steps of Newton's method; each doubles the digits that a line between two points has."""
 
 
 class PropellerShaftConfig(ServoConfig):
@@ -88,7 +93,7 @@ class AzimuthThrustersConfig(ActuatorConfig):
         if repeated := [name for name in names if names.count(name) > 1]:
             raise ValueError(f"two thrusters are named '{repeated[0]}'")
         require_range(self)
-        n = np.linspace(-self.n_max, self.n_max, 401)
+        n = np.linspace(-self.n_max, self.n_max, _TABLE)
         falling = n[np.polynomial.Polynomial(self.thrust).deriv()(n) <= 0]
         if len(falling):
             raise ValueError(
@@ -108,7 +113,7 @@ class AzimuthThrustersConfig(ActuatorConfig):
 
 
 @final
-class AzimuthThrusters(Actuators):
+class AzimuthThrusters(ForceActuators):
     """Revolutions and angles of k thrusters -> tau [..., 3]."""
 
     def __init__(self, config: AzimuthThrustersConfig) -> None:
@@ -139,6 +144,9 @@ class AzimuthThrusters(Actuators):
         self.map: Tensor
         self.register_buffer("share", torch.linalg.pinv(self.map), persistent=False)
         self.share: Tensor
+        grid = torch.linspace(-self.n_max, self.n_max, _TABLE, dtype=torch.float64)
+        self.register_buffer("table", torch.stack((grid, self.thrust(grid))), persistent=False)
+        self.table: Tensor
         self.strongest = float(self.thrust(torch.tensor(self.n_max, dtype=torch.float64)))
 
     def thrust(self, n: Tensor) -> Tensor:
@@ -156,12 +164,19 @@ class AzimuthThrusters(Actuators):
 
         Without gradient.
         """
-        low, high = torch.full_like(force, -self.n_max), torch.full_like(force, self.n_max)
-        for _ in range(52):
-            middle = 0.5 * (low + high)
-            short = self.thrust(middle) < force
-            low, high = torch.where(short, middle, low), torch.where(short, high, middle)
-        return 0.5 * (low + high)
+        # Newton's method from a table of the curve, which rises, within the table's interval
+        table = self.table.to(force.dtype)
+        after = torch.searchsorted(table[1].contiguous(), force.contiguous())
+        after = after.clamp(1, table.shape[1] - 1)
+        low, high = table[0][after - 1], table[0][after]
+        share = (force - table[1][after - 1]) / (table[1][after] - table[1][after - 1])
+        n = low + share.clamp(0.0, 1.0) * (high - low)
+        for _ in range(_NEWTON_STEPS):
+            slope = torch.full_like(n, (len(self.coefficients) - 1) * self.coefficients[-1])
+            for power in range(len(self.coefficients) - 2, 0, -1):
+                slope = power * self.coefficients[power] + n * slope
+            n = torch.minimum(torch.maximum(n - (self.thrust(n) - force) / slope, low), high)
+        return n
 
     def allocate(self, tau: Tensor) -> Tensor:
         """Return the commands [..., 2k] that make forces tau [..., 3] with the least thrust.
@@ -187,7 +202,14 @@ class AzimuthThrusters(Actuators):
 
     def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
         """Return tau [..., 3] in N, N, N m (5.2)."""
-        state = self.servos.value(a, command)
+        return self._together(self.servos.value(a, command))
+
+    def asked(self, command: Tensor) -> Tensor:
+        """Return the forces tau [..., 3] that revolutions and angles [..., 2k] ask for (5.2)."""
+        return self._together(command)
+
+    def _together(self, state: Tensor) -> Tensor:
+        """Return tau [..., 3] of revolutions and angles [..., 2k]."""
         thrust, angle = self.thrust(state[..., : self.count]), state[..., self.count :]
         parts = torch.cat((thrust * torch.cos(angle), thrust * torch.sin(angle)), dim=-1)
         return parts @ self.map.to(parts.dtype).T

@@ -53,6 +53,18 @@ class Actuators(nn.Module, ABC):
         return a
 
 
+class ForceActuators(Actuators, ABC):
+    """Actuators that push a hull in surge, sway and yaw, each as asked for, within their limits."""
+
+    @abstractmethod
+    def allocate(self, tau: Tensor) -> Tensor:
+        """Return the commands [..., c] that ask for forces tau [..., 3] in N, N, N m."""
+
+    @abstractmethod
+    def asked(self, command: Tensor) -> Tensor:
+        """Return the forces tau [..., 3] that commands [..., c] ask for, before any lag."""
+
+
 class ActuatorConfig(Config, ABC):
     """The part of a vessel file that all kinds of actuators share.
 

@@ -9,7 +9,7 @@ from pydantic import Field
 from torch import Tensor
 
 from residnet.core.config import NewtonMetres, Newtons
-from residnet.physics.actuators.base import ActuatorConfig, Actuators
+from residnet.physics.actuators.base import ActuatorConfig, ForceActuators
 from residnet.physics.actuators.servo import FirstOrderConfig, ImmediateConfig, SecondOrderConfig
 
 
@@ -37,7 +37,7 @@ class ForceCommandsConfig(ActuatorConfig):
 
 
 @final
-class ForceCommands(Actuators):
+class ForceCommands(ForceActuators):
     """The forces tau [..., 3], which follow the saturated commands [..., 3].
 
     With a lag the states are the forces, then what else the response needs.
@@ -66,6 +66,14 @@ class ForceCommands(Actuators):
         """Return tau [..., 3] for drive (surge force) and steer (yaw moment), each within +-1."""
         both = torch.stack((drive, torch.zeros_like(drive), steer), dim=-1)
         return both.clamp(-1.0, 1.0) * self.limit.to(drive.dtype)
+
+    def allocate(self, tau: Tensor) -> Tensor:
+        """Return the forces tau [..., 3] themselves."""
+        return tau
+
+    def asked(self, command: Tensor) -> Tensor:
+        """Return the commands [..., 3] themselves."""
+        return command
 
     def force(self, a: Tensor, command: Tensor, nu: Tensor) -> Tensor:
         """Return the forces tau [..., 3] in N, N, N m."""

@@ -16,7 +16,7 @@ from torch import Tensor
 from residnet.control.base import ClosedLoop, GivenReference, Reference
 from residnet.control.guidance.crossing import Crossing, CrossingConfig
 from residnet.control.motion.anticipation import Assisted, Lag, course, needed_force, reference_row
-from residnet.control.motion.pid import Gain, MotionPID, MotionPIDConfig, NoFeedForward
+from residnet.control.motion.pid import Allocated, Gain, MotionPID, MotionPIDConfig, NoFeedForward
 from residnet.control.motion.reference_filter import ReferenceFilterConfig
 from residnet.core.config import (
     Config,
@@ -29,10 +29,11 @@ from residnet.core.config import (
     quantity,
 )
 from residnet.core.errors import ConfigError, DataError
-from residnet.core.layout import ACTUATORS, MOTION, PLANAR, POSE, VELOCITIES
+from residnet.core.layout import ACTUATORS, MOTION, POSE, VELOCITIES
 from residnet.dynamics.rollout import Rollout, Source
 from residnet.dynamics.simulated import TracedPlantDynamics
 from residnet.judge.tracking import Tracking, tracking
+from residnet.physics.actuators import ForceActuators
 from residnet.physics.force_model import ForceModel
 from residnet.physics.fossen import FossenVessel, HullConfig
 from residnet.physics.vessel import load_vessel
@@ -166,6 +167,23 @@ class Flight:
     tracking: Tracking
 
 
+def force_hull(name: str) -> tuple[FossenVessel, ForceActuators]:
+    """Return a vessel by name or file, and its actuators, which make all three forces.
+
+    Raises:
+        ConfigError: where it is no hull, or its actuators do not push in surge, sway and yaw alike.
+    """
+    config = load_vessel(name)
+    if isinstance(config, HullConfig):
+        plant = config.build()
+        if isinstance(plant.actuators, ForceActuators):
+            return plant, plant.actuators
+    raise ConfigError(
+        f"vessel '{name}': this study needs a hull whose actuators push in surge, sway and yaw"
+        " alike (kind forces or azimuth_thrusters)"
+    )
+
+
 @dataclass(frozen=True)
 class Ferry:
     """The true plant, the believed hull and the control loop between them.
@@ -199,17 +217,9 @@ class Ferry:
         """Build both plants from vessels by name or file.
 
         Raises:
-            ConfigError: where a vessel is no hull with forces as commands.
+            ConfigError: where a vessel is no hull whose actuators make all three forces.
         """
-        plants = []
-        for name in (true, believed):
-            config = load_vessel(name)
-            if not isinstance(config, HullConfig) or config.actuators.kind != "forces":
-                raise ConfigError(
-                    f"vessel '{name}': this study needs a hull whose commands are forces (actuators"
-                    " of kind forces)"
-                )
-            plants.append(config.build())
+        plants = [force_hull(name)[0] for name in (true, believed)]
         if not plants[0].actuators.state:
             raise ConfigError(
                 f"vessel '{true}': its forces follow at once; the study is about thrusters that"
@@ -218,6 +228,13 @@ class Ferry:
         if disturbance == Disturbance():
             plants[0].in_calm_water()
         return cls(plants[0], plants[1], loop, disturbance, noise, seed)
+
+    @property
+    def thrusters(self) -> ForceActuators:
+        """What pushes the true ferry."""
+        actuators = self.true.actuators
+        assert isinstance(actuators, ForceActuators)
+        return actuators
 
     def without_feedback(self) -> Ferry:
         """Return the same ferry with the feed-forward alone."""
@@ -254,7 +271,7 @@ class Ferry:
             w[:, :, self.true.inputs.index("force_north")] = self.disturbance.north
             w[:, :, self.true.inputs.index("force_east")] = self.disturbance.east
         noise = (self.noise or MotionNoise()).draw((rows, steps), self.seed)
-        loop = ClosedLoop(Assisted(pid, lags, step), guidance)
+        loop = ClosedLoop(Allocated(Assisted(pid, lags, step), self.thrusters), guidance)
         source: Source = Sensed(loop, noise[..., MOTION]) if self.noise is not None else loop
         x0 = torch.zeros(rows, len(self.true.state), dtype=torch.float64)
         with torch.no_grad():
@@ -288,7 +305,8 @@ class Ferry:
     def _flight(
         self, x: Tensor, w: Tensor, reference: Tensor, noise: Tensor, pid: MotionPID
     ) -> Flight:
-        command = w[:, : PLANAR.dof]
+        given = w[:, : self.true.commands]
+        command = self.thrusters.asked(given)
         measured_state = torch.cat((x[:, MOTION] + noise[:, MOTION], x[:, ACTUATORS]), dim=-1)
         error = pid.error(measured_state, reference)
         feedback, _ = pid(
@@ -317,7 +335,7 @@ class Ferry:
             command[every],
             averaged[every],
             feedback[every],
-            x[every, ACTUATORS][:, : PLANAR.dof],
+            self.thrusters.force(x[:, ACTUATORS], given, x[:, VELOCITIES])[every],
             reference[every, POSE],
             metrics,
         )

@@ -16,11 +16,13 @@ from residnet.core.layout import VELOCITIES
 from residnet.core.log import Log
 from residnet.core.names import STATE
 from residnet.data.simulated.trials import SimulatedTrials, fly_trials
+from residnet.documents.jervan2020.ferry.flights import force_hull
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.heads.zero import ZeroHead
 from residnet.manoeuvres import FamilyConfig
 from residnet.manoeuvres.zigzag import ZigzagFamily
+from residnet.physics.actuators import ForceActuators
 from residnet.physics.signals import FORCE_CHANNELS, SignalsConfig
 
 _FARTHEST = 3.0
@@ -74,8 +76,10 @@ def forward_runs(
         seed=config.seed,
     )
     flown = [flight.motion for flight in fly_trials(trials.draw(), trials)]
+    thrusters = force_hull(true)[1]
     x, w = (
-        torch.stack(part) for part in zip(*(_columns(log) for log in _equal(flown)), strict=True)
+        torch.stack(part)
+        for part in zip(*(_columns(log, thrusters) for log in _equal(flown)), strict=True)
     )
     limit = _FARTHEST * x[..., VELOCITIES].abs().amax(dim=(0, 1))
     known = BelievedConfig(vessel=believed).equations()
@@ -110,13 +114,13 @@ def _equal(logs: list[Log]) -> list[Log]:
     return [log for log in logs if len(log) == longest]
 
 
-def _columns(log: Log) -> tuple[Tensor, Tensor]:
-    """Return states [T, 6] and commanded forces [T, 3]."""
-    states, forces = (
-        np.stack([log.channels[name] for name in names], axis=1)
-        for names in (STATE, FORCE_CHANNELS)
+def _columns(log: Log, thrusters: ForceActuators) -> tuple[Tensor, Tensor]:
+    """Return states [T, 6] and the forces [T, 3] that the commands ask for."""
+    states, commands = (
+        torch.from_numpy(np.stack([log.channels[name] for name in names], axis=1))
+        for names in (STATE, thrusters.commands)
     )
-    return torch.from_numpy(states), torch.from_numpy(forces)
+    return states, thrusters.asked(commands)
 
 
 def _run(equations: HullEquations, x0: Tensor, w: Tensor, step: float) -> Tensor:
