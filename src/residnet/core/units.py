@@ -34,6 +34,7 @@ _UNITS: dict[str, tuple[str, float]] = {
     "ns": ("s", 1e-9),
     "min": ("s", 60.0),
     "h": ("s", 3600.0),
+    "day": ("s", 86400.0),
     "Hz": ("1/s", 1.0),
     "1/s": ("1/s", 1.0),
     "1/min": ("1/s", 1.0 / 60.0),
@@ -82,6 +83,7 @@ _WORDS: dict[str, str] = {
     "ns": "nsec nanosecond nanoseconds",
     "min": "minute minutes mins minuten minuto minutos minutt 分",
     "h": "hr hrs hour hours stunde stunden heure uur 時",
+    "day": "days tag tage jour jours dag dagen",
     "Hz": "hertz",
     "kn": "kt kts knot knots knoten nd nds noeud noeuds nœud nœuds nudo nudos knoop knopen knop"
     " ノット",

@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from residnet.data.drafting.channels import CHANNELS, READER, Channels
 from residnet.data.drafting.fixes import from_fixes
 from residnet.data.drafting.physics import Raw
 from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.sources import Sources, step_of
-from residnet.data.drafting.tables import CHANNELS, READER, Channels, named
+from residnet.data.drafting.tables import named
 from residnet.data.drafting.words import state_channel, words_of
 from residnet.data.readers.recording import Recording, Series
 

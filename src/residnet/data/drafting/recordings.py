@@ -13,12 +13,12 @@ import numpy as np
 from residnet.core.errors import ResidnetError
 from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS
+from residnet.data.drafting.channels import CHANNELS, READER
 from residnet.data.drafting.fields import named_fields
 from residnet.data.drafting.physics import FRAMES, Raw, along, follows, motion_of
 from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.sources import found_sources, step_of
-from residnet.data.drafting.tables import CHANNELS, READER
-from residnet.data.drafting.units import is_pulse, unit_by_size
+from residnet.data.drafting.units import thrown, unit_by_size
 from residnet.data.drafting.words import MOTION, input_channel, words_of
 from residnet.data.readers.composing.compose import Plan
 from residnet.data.readers.composing.quantities import FieldMap
@@ -221,9 +221,9 @@ def _numbered(same: Sequence[_Input]) -> list[_Input]:
 def _entry(found: _Input, marks: Marks) -> dict[str, Any]:
     key = (*CHANNELS, found.channel)
     entry: dict[str, Any] = {"topic": found.topic, "field": found.field}
-    if is_pulse(found.channel, found.values):
-        marks.guess(key, "pulses of a servo; 1500 us are taken as neutral, 500 us as all the way")
-        return {**entry, "unit": "-", "offset": 1500, "scale": 0.002, "hold": True}
+    if throw := thrown(found.channel, found.field, found.values):
+        marks.guess(key, throw.reason)
+        return {**entry, **throw.settings, "hold": True}
     unit, reason = unit_by_size(found.channel, found.values)
     marks.guess(key, f"taken by its name; {reason}")
     return {**entry, "unit": unit, "hold": True}

@@ -2,41 +2,25 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, final
-
-import numpy as np
+from typing import Any
 
 from residnet.core.errors import DataError, UsageError
-from residnet.core.names import CHANNEL_UNITS
-from residnet.core.units import to_si
-from residnet.data.drafting.fixes import as_fixes, from_fixes
-from residnet.data.drafting.physics import (
-    FRAMES,
-    Fit,
-    Frame,
-    Motion,
-    Raw,
-    along,
-    explained_turn,
-    follows,
-    heading_of,
-    motion_of,
-)
+from residnet.core.names import CHANNEL_UNITS, shown
+from residnet.data.drafting.channels import CHANNELS, READER, STATE_NAMES, Channels
+from residnet.data.drafting.clocks import Clock, clock_of
+from residnet.data.drafting.fixes import from_fixes
+from residnet.data.drafting.physics import Raw
 from residnet.data.drafting.questions import Marks
-from residnet.data.drafting.sheets import Clock, Sheet, clock_of, peek
-from residnet.data.drafting.units import is_pulse, other_dimension, unit_by_size, written_unit
+from residnet.data.drafting.sheets import Sheet, peek
+from residnet.data.drafting.units import other_dimension
 from residnet.data.drafting.words import input_channel, state_channel, words_of
 
 _LOOKED_AT = 24
 """Tables whose values are looked at; of the others only the header is."""
-READER = ("data", "reader")
-CHANNELS = (*READER, "channels")
-_STATE = ("x", "y", "psi", "u", "v", "r", "phi", "p", "wind_speed", "wind_dir")
-_SURE = 0.9
-"""Correlation from which a measured factor overrules a header."""
 
 
 @dataclass(frozen=True)
@@ -78,17 +62,36 @@ def draft_tables(files: Sequence[Path], marks: Marks) -> TableDraft:
         marks.guess((*READER, "time"), clock.guess)
     numeric = [name for name in shared if name in first.numbers and name not in clock.columns]
     names = named(numeric, marks)
+    _refuse_written_positions(first, names)
     logs = _raw(sheets, names, left_out)
     names, logs, fixes = from_fixes(names, logs, marks)
     channels = Channels(names, logs, marks, fixes).drafted()
+    for entry in channels.values():
+        entry["column"] = first.column(entry["column"])
     about = {key: value for key, value in first.about.items() if key != "kind"}
-    content = {"kind": first.about["kind"], **about, "time": clock.settings}
+    time = {**clock.settings, "column": first.column(clock.settings["column"])}
+    content = {"kind": first.about["kind"], **about, "time": time}
     if len({path.resolve().parent for path in files}) > 1:
         content["manoeuvre"] = "folder"
         marks.guess((*READER, "manoeuvre"), "the kind of manoeuvre is taken from the folder's name")
     _unused(first, names, clock, marks)
     kept = tuple(path for path in files if path not in left_out)
     return TableDraft({**content, "channels": channels}, kept, left_out)
+
+
+def _refuse_written_positions(sheet: Sheet, names: Mapping[str, str]) -> None:
+    """Refuse positions of degrees and minutes where there are no others."""
+    found = [
+        name
+        for name in sheet.texts
+        if state_channel(words_of(name)) in ("latitude", "longitude") and "x" not in names
+    ]
+    if found and not {"latitude", "longitude"} <= set(names):
+        cell = sheet.texts[found[0]].dropna().iloc[0]
+        raise DataError(
+            f"{sheet.path}: column '{found[0]}' holds '{shown(str(cell))}', which is no number;"
+            " write latitude and longitude as degrees with decimals, for example 54.30125"
+        )
 
 
 def _sheets(files: Sequence[Path]) -> tuple[list[Sheet], dict[Path, str]]:
@@ -104,6 +107,12 @@ def _sheets(files: Sequence[Path]) -> tuple[list[Sheet], dict[Path, str]]:
     if not sheets:
         raise DataError(next(iter(left_out.values())))
     kinds = {tuple(sorted(sheet.about.items())) for sheet in sheets if len(sheet.numbers) > 1}
+    if not kinds:
+        path, names = sheets[0].path, ", ".join(sheets[0].header[:12])
+        raise DataError(
+            f"{path}: fewer than two of its columns hold numbers (columns: {names}); check how the"
+            " table was exported"
+        )
     if len({dict(kind)["kind"] for kind in kinds}) > 1:
         raise UsageError("the tables are of several formats; give those of one format at a time")
     # the form that most of them have: a table of whole numbers shows no decimal sign
@@ -123,7 +132,10 @@ def named(columns: Sequence[str], marks: Marks) -> dict[str, str]:
         other = _other_unit(column, channel)
         if channel == "n" and other == "m":
             channel = "x"
-        elif channel in _STATE and other:
+        elif channel and re.match(r"(cmd_)?n(_|$)", channel) and other in ("-", "%", "us"):
+            # no revolutions: the share of the throttle, or pulses to it
+            channel = re.sub(r"^(cmd_)?n", "throttle", channel)
+        elif channel in STATE_NAMES and other:
             marks.note(CHANNELS, f"'{column}' is called as {channel} is, but holds {other}")
             continue
         if channel == "speed":
@@ -135,7 +147,7 @@ def named(columns: Sequence[str], marks: Marks) -> dict[str, str]:
     if "u" not in names and "v" in names and speeds:
         names["u"] = speeds[0]
         marks.guess((*CHANNELS, "u"), f"'{speeds[0]}' is taken as the speed forward, not its size")
-    order = [*_STATE, *(name for name in names if name not in _STATE)]
+    order = [*STATE_NAMES, *(name for name in names if name not in STATE_NAMES)]
     return {name: names[name] for name in order if name in names}
 
 
@@ -173,178 +185,3 @@ def _unused(sheet: Sheet, names: Mapping[str, str], clock: Clock, marks: Marks) 
         marks.note(CHANNELS, f"columns of text: {', '.join(list(sheet.texts.keys() - used)[:12])}")
     if sheet.empty:
         marks.note(CHANNELS, f"empty columns: {', '.join(sheet.empty[:12])}")
-
-
-@final
-class Channels:
-    """The entries of a channel map, from names, headers, values and physics."""
-
-    def __init__(
-        self, names: Mapping[str, str], logs: Sequence[Raw], marks: Marks, fixes: bool
-    ) -> None:
-        self._fixes = fixes
-        self._names, self._logs, self._marks = dict(names), list(logs), marks
-        self._frame = FRAMES[0]
-        self._motions: list[Motion | None] = [None] * len(logs)
-        self._psi_unit = "rad"
-
-    def drafted(self) -> dict[str, dict[str, Any]]:
-        """Return channel -> entry."""
-        if {"x", "y", "psi"} <= set(self._names):
-            self._settle_frame()
-        self._settle_wind()
-        entries = {name: self._entry(name) for name in self._names}
-        return as_fixes(entries) if self._fixes else entries
-
-    def _values(self, name: str) -> np.ndarray:
-        parts = [raw.columns[name] for raw in self._logs if name in raw.columns]
-        return np.concatenate(parts) if parts else np.zeros(0)
-
-    def _settle_frame(self) -> None:
-        """Find the unit and frame of the heading under which the vessel moves where it points."""
-        written = written_unit(self._names["psi"], "rad")
-        sized, _ = unit_by_size("psi", self._values("psi"))
-        # a heading that is not wrapped is large in radians too: its size decides only where the
-        # motion does not
-        other = "rad" if sized == "deg" else "deg"
-        tried = [written] if written else [sized, other]
-        best = (-np.inf, "rad", FRAMES[0])
-        for unit in tried:
-            for frame in (f for f in FRAMES if not (self._fixes and f.swapped)):
-                motions = [motion_of(raw, unit, frame) for raw in self._logs]
-                score = self._score(motions)
-                if score > best[0] + 0.02:
-                    best = (score, unit, frame)
-                    self._motions = motions
-        score, self._psi_unit, self._frame = best
-        if written is None:
-            reason = f"position and heading fit together best in {self._psi_unit}"
-            self._marks.guess((*CHANNELS, "psi"), f"the header has no unit; {reason}")
-        self._name_axes(score)
-
-    def _score(self, motions: Sequence[Motion | None]) -> float:
-        """Return how well position, heading and velocities fit together, at most 1."""
-        fits = [follows(self._logs, motions, name) for name in ("u", "v") if name in self._names]
-        if len(fits) == 2:
-            # only the forward component tells how the heading lies; both count
-            return sum(fit.correlation * (fit.factor > 0 or i) for i, fit in enumerate(fits)) / 2
-        return along(motions)
-
-    def _name_axes(self, score: float) -> None:
-        """Say which column is north, and mark what names and motion leave open."""
-        x, y = words_of(self._names["x"]), words_of(self._names["y"])
-        told = x.has("north") and y.has("east") and not (x.text == "x" or y.text == "y")
-        told = told or self._fixes
-        if self._frame.swapped and not told:
-            self._names["x"], self._names["y"] = self._names["y"], self._names["x"]
-            text = "the vessel moves where it points only if the column called y is the north"
-            self._marks.guess((*CHANNELS, "x"), text)
-        elif self._frame.swapped:
-            # named north and east, yet turned about: the heading counts from east
-            self._frame = Frame(False, True)
-            self._motions = [motion_of(raw, self._psi_unit, self._frame) for raw in self._logs]
-        elif not told and not self._frame.from_east:
-            text = f"x is taken as north and y as east: with them the heading fits ({score:.2f})"
-            self._marks.guess((*CHANNELS, "x"), text)
-        if self._frame.from_east:
-            text = "the vessel moves where it points only if the heading counts from east"
-            self._marks.guess((*CHANNELS, "psi"), text)
-        if score < 0.5:
-            text = f"position, heading and velocities fit together badly ({score:.2f} of 1)"
-            self._marks.guess((*CHANNELS, "psi"), f"{text}: check units and axes")
-        self._frame = Frame(False, self._frame.from_east)
-
-    def _settle_wind(self) -> None:
-        """Leave out a wind that turns with the vessel, and a wind without its other half."""
-        pair = {"wind_speed", "wind_dir"} & set(self._names)
-        if not pair:
-            return
-        if len(pair) == 1:
-            column = self._names.pop(pair.pop())
-            self._marks.note(CHANNELS, f"'{column}' alone is no wind; left out")
-            return
-        words = words_of(self._names["wind_dir"])
-        if not words.has("true") and self._turns_with_vessel():
-            columns = [self._names.pop(name) for name in ("wind_speed", "wind_dir")]
-            text = "turns against the heading, as a relative wind does; a model needs the true wind"
-            self._marks.note(CHANNELS, f"'{columns[1]}' {text}: {', '.join(columns)} left out")
-            return
-        text = "the direction is taken as that which the true wind comes from, clockwise from north"
-        self._marks.guess((*CHANNELS, "wind_dir"), text)
-
-    def _turns_with_vessel(self) -> bool:
-        if "psi" not in self._names:
-            return False
-        unit = self._unit("wind_dir", mark=False)
-        shares = [
-            explained_turn(
-                raw,
-                raw.columns["wind_dir"] * to_si(unit, "rad"),
-                heading_of(raw, self._psi_unit, self._frame),
-            )
-            for raw in self._logs
-            if {"wind_dir", "psi"} <= set(raw.columns)
-        ]
-        return bool(shares) and float(np.mean(shares)) > 0.1
-
-    def _unit(self, name: str, *, mark: bool = True) -> str:
-        """Return the unit of a channel from its header or its size."""
-        column = self._names[name]
-        written = written_unit(column, CHANNEL_UNITS.get(name))
-        if written is not None:
-            return written
-        unit, reason = unit_by_size(name, self._values(name))
-        if mark:
-            self._marks.guess((*CHANNELS, name), reason)
-        return unit
-
-    def _entry(self, name: str) -> dict[str, Any]:
-        column = self._names[name]
-        entry: dict[str, Any] = {"column": column}
-        if self._fixes and name in ("x", "y"):
-            return entry | {"unit": "deg"}
-        if name == "psi":
-            entry["unit"] = self._psi_unit
-            return entry | ({"frame": "enu"} if self._frame.from_east else {})
-        if name in ("u", "v", "r") and {"x", "y", "psi"} <= set(self._names):
-            return entry | self._rate(name)
-        pulses = name not in _STATE and is_pulse(name, self._values(name))
-        if pulses and written_unit(column, "rad") is None:
-            text = "pulses of a servo; 1500 us are taken as neutral, 500 us as all the way"
-            self._marks.guess((*CHANNELS, name), text)
-            return entry | {"unit": "-", "offset": 1500, "scale": 0.002}
-        return entry | {"unit": self._unit(name)}
-
-    def _rate(self, name: str) -> dict[str, Any]:
-        """Return unit and sign of a velocity, checked against position and heading."""
-        key, column = (*CHANNELS, name), self._names[name]
-        si = CHANNEL_UNITS[name]
-        fit = follows(self._logs, self._motions, name)
-        written = written_unit(column, si)
-        unit = self._measured_unit(name, written, fit)
-        entry: dict[str, Any] = {"unit": unit}
-        if fit.telling and fit.factor < 0.0:
-            entry["sign"] = -1
-            what = {"u": "astern", "v": "port", "r": "port"}[name]
-            text = f"position and heading say that it is positive to {what} (correlation"
-            self._marks.guess(key, f"{text} {fit.correlation:.2f})")
-        if not fit.telling and written is None:
-            self._marks.guess(key, f"position and heading do not tell whether {unit} is right")
-        return entry
-
-    def _measured_unit(self, name: str, written: str | None, fit: Fit) -> str:
-        key, si = (*CHANNELS, name), CHANNEL_UNITS[name]
-        found = fit.unit(si) if fit.telling else None
-        if written is None and found is not None:
-            text = f"the header has no unit; position and heading say {found}"
-            self._marks.guess(key, f"{text} (correlation {fit.correlation:.2f})")
-            return found
-        if written is None:
-            return self._unit(name)
-        if found is None or to_si(found) == to_si(written, si) or fit.correlation < _SURE:
-            return written
-        ratio = abs(fit.factor) / to_si(written, si)
-        if 0.6 < ratio < 1.6:
-            return written
-        text = f"the header says {written}, position and heading say {found} (factor {ratio:.3g})"
-        return self._marks.ask(key, f"unit of '{self._names[name]}'", found, text, (found, written))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -11,6 +12,8 @@ from residnet.core.names import CHANNEL_UNITS
 from residnet.core.units import known_unit
 
 _IN_BRACKETS = re.compile(r"[\[({]([^\])}]*)[\])}]")
+_FULL = 35.0
+"""Angle in deg of a rudder that is hard over, as most are built."""
 _GERMAN = {"grad": "deg", "grad/s": "deg/s", "grad/min": "deg/min"}
 
 
@@ -70,6 +73,50 @@ def unit_by_size(channel: str, values: np.ndarray) -> tuple[str, str]:
     else:
         unit = expected
     return unit, f"the header has no unit; values up to {largest:.3g} would be {unit}"
+
+
+class Throw(NamedTuple):
+    """How numbers that say how far an actuator is thrown become the values of its channel.
+
+    Attributes:
+        settings: unit, offset and scale of a channel map.
+        reason: why these are guessed.
+    """
+
+    settings: dict[str, Any]
+    reason: str
+
+
+def thrown(channel: str, column: str, values: np.ndarray) -> Throw | None:
+    """Return how pulses, per cent or shares become a channel; None where its unit is a plain one.
+
+    Args:
+        channel: of an actuator.
+        column: its name.
+        values: of the column [T], of all logs together.
+    """
+    rudder = channel.removeprefix("cmd_").startswith("delta")
+    if rudder and written_unit(column, "rad") is not None:
+        return None
+    unit, all_the_way, told = ("deg", _FULL, f", {_FULL:g} deg") if rudder else ("-", 1.0, "")
+    if is_pulse(channel, values):
+        settings = {"unit": unit, "offset": 1500, "scale": all_the_way / 500.0}
+        reason = "pulses of a servo; 1500 us are taken as neutral, 500 us as all the way"
+        return Throw(settings, reason + told)
+    if not rudder or not (whole := _whole(column, values)):
+        return None
+    reason = f"{whole:g} is taken as all the way{told}"
+    return Throw({"unit": unit, "scale": all_the_way / whole}, reason)
+
+
+def _whole(column: str, values: np.ndarray) -> float:
+    """Return the number that stands for a rudder that is hard over; 0 where it is an angle."""
+    written = written_unit(column, "-")
+    if written is not None:
+        return 100.0 if written == "%" else 1.0
+    largest = float(np.abs(values[np.isfinite(values)]).max(initial=0.0))
+    # numbers that end at a round one are rather shares than angles
+    return next((whole for whole in (1.0, 100.0) if 0.995 * whole <= largest <= whole), 0.0)
 
 
 def is_pulse(channel: str, values: np.ndarray) -> bool:

@@ -14,65 +14,71 @@ from residnet.core.names import ACCELERATION, CHANNEL_UNITS
 
 # what a name may be about -> parts of words, and whole words behind a bar
 _ABOUT: dict[str, str] = {
-    "time": "zeit timestamp tiempo temps tijd tidspunkt 時刻 時間 | t time stamp tid sec secs"
-    " seconds elapsed hora heure uhrzeit datum date datetime fecha utc dato",
+    "time": "zeit timestamp tiempo temps tijd tidspunkt klockslag klokkeslett horodatage 時刻"
+    " 時間 日時 | t time stamp tid sec secs seconds elapsed hora heure uhrzeit datum date"
+    " datetime fecha utc dato",
     "north": "north nord norte noord hochwert 北 | n northing",
     "east": "east ost oste este oost rechtswert 東 | e easting est",
     "position": "posit posic posisj coordin koordinat coorden coordonn 位置 | pos local utm pose",
     "x": "| x",
     "y": "| y",
-    "latitude": "latit breitengrad breedte bredde 緯度 | lat breite",
-    "longitude": "longitude longitud langengrad lengte lengde 経度 | lon lng laenge lange",
+    "latitude": "latit breitengrad breedte bredde breddegrad 緯度 | lat breite",
+    "longitude": "longitude longitud longitudine langengrad lengte lengde 経度 | lon lng long"
+    " laenge lange",
     "heading": "heading steuerkurs gierwinkel rumbo voorliggende heng kurswinkel 船首方位 方位"
-    " 回頭角 lacet guinada | psi yaw hdg cap koers kurs kompass compass koersen kompassi"
-    " peiling hdt",
+    " 回頭角 船首角 方位角 針路 lacet guinada giringsvinkel girvinkel gierhoek kompaskoers"
+    " kompasskurs | kompas psi yaw hdg cap koers kurs kompass compass koersen kompassi peiling"
+    " hdt proa prua rotta stavriktning",
     "ground": "ground grund fond grond grunn 対地 | cog sog smg cmg",
     "course": "course | cog cmg",
-    "rate": "rate taux geschwind vitesse velocidad snelheid hastighet 速度 角速度 | speed velo"
-    " velocity rot",
-    "turn": "turn dreh gier wende drei giring 回頭 virage girat giro guin | rot angvelo yaw",
+    "rate": "rate taux geschwind vitesse velocidad velocita snelheid hastighet 速度 角速度"
+    " 回頭率 | speed velo velocity rot",
+    "turn": "turn dreh gier wende drei giring 回頭 旋回 virage girat giro guin accostat sving"
+    " svang | rot angvelo yaw lacet girhastighet",
     "turn_rate": "turnrate drehrate gierrate wenderate drehgeschwind giergeschwind"
     " wendegeschwind angvelo yawrate draaisnelheid giersnelheid svinghastighet dreiehastighet"
-    " bochtaanwijzer 回頭角速度 | rot yawrate wz gyroz",
+    " bochtaanwijzer girhastighet 回頭角速度 回頭率 旋回角速度 | rot yawrate wz gyroz",
     "angular": "angul winkelgeschwind hoeksnelheid vinkelhastighet 角速度 | gyro gyrz",
-    "speed": "speed velo 風速 geschwind vitesse velocidad snelheid hastighet 速度 船速 fahrt"
-    " vaart 速力 | velo sog stw fart vel spd log tws",
-    "surge": "surge langsgeschw laengsgeschw longitudin avance avante voraus vooruit voorwaart"
-    " fremover forover 前後 langs | u forward ahead",
+    "speed": "speed velo 風速 geschwind vitesse velocidad velocita snelheid hastighet 速度 船速"
+    " fahrt vaart 速力 | velo sog stw fart vel spd log tws",
+    "surge": "surge langsgeschw laengsgeschw longitudinal avance avante voraus vooruit voorwaart"
+    " fremover forover 前後 langs avanzamento | u forward ahead corredera",
     "sway": "sway quergeschw seitlich lateral dwars tverr sideveis 左右 derive transvers"
-    " querab sidewards sideways | v vm quer",
-    "rudder": "rudder ruder gouvernail timon roer rorv 舵 safran barre | delta rudder ror rsa"
-    " steering helm",
+    " verlijering scarroccio avdrift abatimiento querdrift 横流 querab sidewards sideways | v vm"
+    " quer",
+    "rudder": "rudder ruder gouvernail timon roer rorv roder rorutslag 舵 safran barre | delta"
+    " rudder ror rsa steering helm pala",
     "propeller": "propel schraube helice schroef 推進 プロペラ propulseur | prop screw shaft"
     " welle eje arbre aksel 軸",
     "engine": "engine motor maschine maquina moteur hovedmaskin 主機 | main",
-    "revolutions": "drehzahl revolution umdreh tours toerental omdreining turtall 回転 revoluc"
-    " | rpm rps rev revs n",
+    "revolutions": "drehzahl revolution umdreh tours toerental omdreining turtall varvtal regime"
+    " tours giri 回転 revoluc | rpm rps rev revs n",
     "thrust": "thrust schub poussee empuje stuwkracht skyv 推力",
     "torque": "torque drehmoment couple koppel dreiemoment トルク",
     "power": "power leistung puissance potencia vermogen effekt 出力",
-    "throttle": "throttle actuator gashebel lever hebel | gas pwm",
+    "throttle": "throttle actuator gashebel gashendel gasspak gasreglage acelerador accelerateur"
+    " manetta スロットル lever hebel | gas pwm gaz",
     "azimuth": "azimu schottel pod | azi nozzle alpha",
     "servo": "servo rcou",
     "force": "force kraft fuerza kracht 力 tau",
     "wind": "wind vind vent viento 風 | tws twd",
-    "true": "true wahr vrai verdadero real ware sann 真 | tws twd",
+    "true": "true wahr vrai verdadero real reel ware sann 真 | tws twd",
     "relative": "relativ apparent scheinb aparente schijnb tilsyn 相対 gemessen measured",
-    "direction": "direction richtung direccion richting retning angle winkel 方向 風向 | dir twd"
-    " from angulo hoek vinkel",
+    "direction": "direction direzion richtung riktning direccion richting retning angle winkel"
+    " 方向 風向 | dir twd from angulo hoek vinkel",
     "angle": "angle winkel angulo hoek vinkel lage 角 | ang",
     "roll": "roll roulis balanceo krenging 横揺 kranken slagside | phi heel",
     "pitch": "pitch tangage cabeceo stampf | theta trim",
     "acceleration": "accel beschleun versnell akselerasjon 加速 | udot vdot rdot dot acc",
-    "command": "command order soll setpoint consigne befehl ordre gevraagd onsket 指令 demand"
-    " reference desired | cmd set ref des",
-    "port": "backbord babord babor bakboord 左舷 portside | port bb ps"
-    " left links izquierda izquierdo gauche venstre",
+    "command": "command soll setpoint consigne befehl gevraagd onsket 指令 demand reference"
+    " desired | cmd set ref des order ordre ordered",
+    "port": "backbord babord babor bakboord 左舷 portside | port bb ps left links izquierda"
+    " izquierdo gauche venstre",
     "starboard": "starboard steuerbord tribord estribor stuurboord styrbord 右舷 | stbd sb stb"
     " right rechts derecha derecho droite hoyre",
     "current": "current stromung courant corriente stroming 潮流",
     "depth": "depth tiefe profond profund diepte dybde 水深",
-    "voltage": "volt spannung tension | amp ampere current_a",
+    "voltage": "volt spannung tension battery batterie bateria batteri | amp ampere current_a",
     "bow": "| bow bug proue proa boeg baug",
     "stern": "| stern heck poupe popa hek akter aft",
     "index": "| index idx id number nr no num count counter flag valid",
@@ -131,6 +137,9 @@ def words_of(name: str) -> Words:
     """Return what a column's name is about."""
     text = plain(name)
     tokens = text.split()
+    if len(tokens) > 1 and re.search(r"[\s_][VAW]$", _IN_BRACKETS.sub(" ", name).strip()):
+        # volts, amperes and watts are no names of channels
+        tokens, text = tokens[:-1], text[:-2]
     number = next((int(token) for token in reversed(tokens) if token.isdigit()), None)
     bare = [re.sub(r"\d+$", "", token) for token in tokens if not token.isdigit()]
     if number is None:
@@ -176,11 +185,12 @@ def state_channel(words: Words) -> str | None:
         return "wind_dir" if w.has("direction") else None
     if not w.lacks("command", "acceleration", "rudder", "propeller", "current", "depth", "age"):
         return None
-    if not w.lacks("engine", "revolutions", "throttle", "azimuth", "servo", "thrust", "torque"):
+    driven = ("engine", "revolutions", "throttle", "azimuth", "servo", "thrust", "torque")
+    if not w.lacks(*driven) and not (w.has("position") and w.has("north")):
         return None
     if w.has("latitude"):
         return "latitude"
-    if w.has("longitude") and w.lacks("surge"):
+    if w.has("longitude") and w.lacks("surge", "speed"):
         return "longitude"
     if w.has("roll"):
         return "p" if w.has("rate") or w.has("angular") else "phi"
@@ -209,7 +219,7 @@ def _velocity(w: Words) -> str | None:
         return None
     if w.has("sway"):
         return "v"
-    if w.has("surge"):
+    if w.has("surge") or w.has("longitude"):
         return "u"
     if w.has("speed") and not w.lacks("port", "starboard"):
         return "v"

@@ -14,12 +14,12 @@ from residnet.core.log import Log
 from residnet.core.progress import say
 from residnet.data.division import divided, without_copies
 from residnet.data.doctor import inspect
+from residnet.data.drafting.channels import CHANNELS
 from residnet.data.drafting.physics import Raw, turns_to
 from residnet.data.drafting.questions import Answer, Marks
-from residnet.data.drafting.tables import CHANNELS
 from residnet.data.prepare import PrepareConfig, prepare
 from residnet.tasks.drafting import recipe
-from residnet.tasks.drafting.inputs import INPUTS, driving
+from residnet.tasks.drafting.inputs import INPUTS, driving, lacks
 from residnet.tasks.drafting.logs import ReadLogs, found_logs, read_all
 from residnet.tasks.drafting.yaml_text import commented
 from residnet.tasks.fit.task import FitConfig
@@ -88,6 +88,12 @@ def drafted(
             "no channel of the logs is a rudder, a propeller or another command (they hold"
             f" {held}): a model without them can only predict how the vessel coasts; name the"
             " columns that drive it",
+        )
+    elif lacking := lacks(inputs):
+        marks.guess(
+            INPUTS,
+            f"nothing among the inputs {lacking} the vessel; where a column that no channel takes"
+            " does, name it under data.reader.channels",
         )
     read = _rudder_side(read, inputs, marks)
     renamed, inputs = _plain_names(read, inputs, marks)

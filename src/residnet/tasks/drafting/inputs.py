@@ -154,3 +154,18 @@ def roles(names: Sequence[str]) -> Mapping[str, tuple[str, ...]]:
         name for name in names if name.removeprefix("cmd_") in ("n", "thrust", "throttle")
     )
     return {"drive": drive, "steer": steer}
+
+
+def lacks(names: Sequence[str]) -> str:
+    """Return what no input does, `drives` or `steers`; empty where both are done.
+
+    Forces, thrusters that turn, and several thrusters do both.
+    """
+    acting = roles(names)
+    rest = [name for name in names if name not in (*acting["drive"], *acting["steer"])]
+    pushing = [name for name in rest if not name.removeprefix("cmd_").startswith("delta")]
+    if len(pushing) > 1 or any(name.startswith(("tau", "azimuth", "nozzle")) for name in rest):
+        return ""
+    if not acting["steer"]:
+        return "steers"
+    return "" if acting["drive"] or pushing else "drives"

@@ -20,6 +20,8 @@ from residnet.data.parts import logs_below
 from residnet.data.readers import ReaderConfig
 from residnet.data.readers.detect import format_of
 
+_UNTOLD = ("columns that no channel takes", "columns of text", "fields that no channel takes")
+
 
 @dataclass(frozen=True)
 class ReadLogs:
@@ -101,7 +103,7 @@ def read_all(paths: Sequence[Path], marks: Marks) -> ReadLogs:
     report("reading logs", len(paths), len(paths))
     if not logs:
         raise DataError(next(iter(left_out.values())))
-    return _completed(content, logs, left_out)
+    return _completed(content, logs, left_out, marks)
 
 
 def _kind(path: Path) -> str:
@@ -117,7 +119,7 @@ def _kind(path: Path) -> str:
 
 
 def _completed(
-    content: dict[str, Any], logs: dict[Path, Log], left_out: dict[Path, str]
+    content: dict[str, Any], logs: dict[Path, Log], left_out: dict[Path, str], marks: Marks
 ) -> ReadLogs:
     whole: dict[Path, Log] = {}
     for path, log in logs.items():
@@ -126,5 +128,8 @@ def _completed(
         except ResidnetError as error:
             left_out[path] = str(error)
     if not whole:
-        raise DataError(next(iter(left_out.values())))
+        # what the names of columns did not tell may be what is missing
+        untold = "; ".join(text for _, text in marks.notes if text.startswith(_UNTOLD))
+        reason = next(iter(left_out.values()))
+        raise DataError(f"{reason} ({untold})" if untold else reason)
     return ReadLogs(content, {path: logs[path] for path in whole}, whole, left_out)

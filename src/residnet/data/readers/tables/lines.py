@@ -10,20 +10,29 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from residnet.core.errors import DataError
+from residnet.data.readers.tables.header import BLANKS
 
 _BLOCK = 1 << 18
 _TAIL = 1 << 16
 _NEWLINE, _RETURN, _QUOTE = 0x0A, b"\r", b'"'
 
 
-def check_lines(path: Path, delimiter: str, wide: int) -> bool:
-    """Look at every line below the header, `wide` cells each; blank lines do not count.
+def check_lines(path: Path, delimiter: str, header: Sequence[str], above: int = 1) -> bool:
+    """Look at every line of values, as many cells each as the header; blank lines do not count.
+
+    A delimiter more or less at the end of every line makes no cell.
+
+    Args:
+        path: of the file.
+        delimiter: between cells.
+        header: names of the columns.
+        above: number of lines above the values.
 
     Returns:
         Whether the last line must be left out because the file was cut within it: it has no end,
@@ -32,7 +41,10 @@ def check_lines(path: Path, delimiter: str, wide: int) -> bool:
     Raises:
         DataError: where a line has more or fewer cells than the header, or a byte is zero.
     """
-    cut, line = _cut_short(path, delimiter, wide), 0
+    wide = len(header)
+    # names that are missing at the end are those of cells that are not there
+    named = max((i for i, name in enumerate(header, start=1) if name), default=wide)
+    cut, line = _cut_short(path, delimiter, named), 0
     for block, last in _blocks(path):
         if b"\x00" in block:
             at = line + block[: block.index(b"\x00")].count(b"\n") + 1
@@ -40,11 +52,13 @@ def check_lines(path: Path, delimiter: str, wide: int) -> bool:
                 f"{path}: line {at} holds a zero byte, which no text has; the file is damaged or"
                 " not UTF-8, write it again"
             )
-        cells, blank = (
-            _quoted(block, delimiter) if _QUOTE in block else _counted(block, delimiter, wide)
-        )
+        cells, blank = _cells(block, delimiter, wide)
         odd = (cells != wide) & ~blank
-        odd[: max(1 - line, 0)] = False
+        odd[: max(above - line, 0)] = False
+        if odd.any():
+            # rarely so: an empty cell more at the end of lines, or without names
+            ended = _ended(block, delimiter, cells.size)
+            odd &= ~((cells >= named) & (cells < wide)) & ~((cells == wide + 1) & ended)
         if last and cut:
             odd[-1:] = False
         if odd.any():
@@ -81,6 +95,25 @@ def _blocks(path: Path) -> Iterator[tuple[bytes, bool]]:
             if end:
                 yield text[:end], False
             rest = text[end:] + tail
+
+
+def _cells(block: bytes, delimiter: str, wide: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the cells of each line, and whether it is blank."""
+    if delimiter == BLANKS:
+        counts = np.array([len(line.split()) for line in _lines(block)], dtype=np.int64)
+        return counts, counts == 0
+    return _quoted(block, delimiter) if _QUOTE in block else _counted(block, delimiter, wide)
+
+
+def _lines(block: bytes) -> list[bytes]:
+    lines = block.split(b"\n")
+    return lines if lines[-1] else lines[:-1]
+
+
+def _ended(block: bytes, delimiter: str, count: int) -> np.ndarray:
+    """Return for each line whether it ends with a delimiter; all not where they cannot be told."""
+    ended = np.array([line.rstrip(b" ").endswith(delimiter.encode()) for line in _lines(block)])
+    return ended if ended.size == count else np.zeros(count, dtype=bool)
 
 
 def _counted(block: bytes, delimiter: str, wide: int) -> tuple[np.ndarray, np.ndarray]:
@@ -136,10 +169,8 @@ def _cut_short(path: Path, delimiter: str, wide: int) -> bool:
     if not tail or tail.endswith((b"\n", b"\r")):
         return False
     lines = [line for line in tail.replace(_RETURN, b"\n").split(b"\n") if line.strip()]
-    last, before = (
-        lines[-1].split(delimiter.encode()),
-        [line.split(delimiter.encode()) for line in lines[-51:-1]],
-    )
+    mark = None if delimiter == BLANKS else delimiter.encode()
+    last, before = lines[-1].split(mark), [line.split(mark) for line in lines[-51:-1]]
     # the first of several lines may itself be cut, by the tail, or be the header
     known = [
         len(cells[-1].strip()) for cells in before[1:] if len(cells) == wide and cells[-1].strip()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,6 +11,7 @@ import numpy as np
 from residnet.core.errors import DataError, UsageError
 from residnet.core.names import nearest, shown
 from residnet.data.readers.files import missing_package
+from residnet.data.readers.tables.header import BLANKS, found_header, header_with
 from residnet.data.readers.tables.lines import check_lines
 
 if TYPE_CHECKING:
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 # pieces of this many rows stay in the cache while they are parsed
 _PIECE = 20_000
+_SEARCHED = 60
+"""Rows of a sheet among which names are looked for."""
 Pieces = Iterator["tuple[pd.DataFrame, float]"]
 
 
@@ -37,29 +39,6 @@ def _positions(
                 " so that one is meant"
             )
     return [list(header).index(column) for column in columns]
-
-
-def _header(path: Path, delimiter: str, encoding: str) -> tuple[list[str], str]:
-    """Return the cells of a csv file's header, and a hint for errors about missing columns."""
-    with path.open(newline="", encoding=encoding) as stream:
-        try:
-            header = [cell.strip() for cell in next(csv.reader(stream, delimiter=delimiter), [])]
-        except csv.Error as error:
-            raise DataError(
-                f"{path}: line 1 is no header with column names ({error}); a quotation mark may be"
-                " open, or lines are missing at the beginning"
-            ) from error
-    if not any(header):
-        raise DataError(
-            f"{path}: the file is empty or its first line is blank; a header line with column"
-            " names was expected"
-        )
-    hint = (
-        f" (only one column found; is the delimiter really '{delimiter}'?)"
-        if len(header) == 1
-        else ""
-    )
-    return header, hint
 
 
 def read_csv(
@@ -83,19 +62,21 @@ def read_csv(
     # a byte order mark is no part of the first name
     coded = "utf-8-sig" if encoding == "utf-8" else encoding
     try:
-        header, hint = _header(path, delimiter, coded)
-        where = _positions(path, header, columns, hint)
+        head = header_with(path, delimiter, coded, columns)
+        one = f" (only one column found; is the delimiter really '{delimiter}'?)"
+        header = head.names
+        where = _positions(path, header, columns, one if len(header) == 1 else "")
         # one column more than the header: cells beyond it would shift or vanish silently (a decimal
         # comma in a comma table does that)
         wide, size = len(header), max(1, path.stat().st_size)
-        cut = check_lines(path, delimiter, wide)
+        cut = check_lines(path, delimiter, header, head.above)
         with path.open("rb") as stream_of_bytes:
             pieces = pd.read_csv(
                 stream_of_bytes,
-                sep=delimiter,
+                sep=r"\s+" if delimiter == BLANKS else delimiter,
                 decimal=decimal,
                 header=None,
-                skiprows=1,
+                skiprows=head.above,
                 names=list(range(wide + 1)),
                 index_col=False,
                 skip_blank_lines=False,
@@ -107,12 +88,13 @@ def read_csv(
             for table, last in _with_last(pieces):
                 beyond = np.flatnonzero(table[wide].notna().to_numpy())
                 if beyond.size:
+                    line = int(table.index[beyond[0]]) + head.above + 1
                     raise DataError(
-                        f"{path}: line {int(table.index[beyond[0]]) + 2} has more cells than the"
-                        f" {wide} columns of the header ({beyond.size} such lines); check"
-                        " `delimiter` and `decimal`"
+                        f"{path}: line {line} has more cells than the {wide} columns of"
+                        f" the header ({beyond.size} such lines); check `delimiter` and `decimal`"
                     )
                 wanted = table[where]
+                wanted.attrs["above"] = head.above - 1
                 if last and cut:
                     wanted = wanted.iloc[:-1]
                     wanted.attrs["cut"] = True
@@ -195,11 +177,16 @@ def read_excel(path: Path, columns: Sequence[str], sheet: str | None) -> Pieces:
     """
     table = excel_sheet(path, sheet)
     where = _positions(path, [str(name) for name in table.columns], columns)
-    yield table.iloc[:, where], 1.0
+    wanted = table.iloc[:, where]
+    wanted.attrs["above"] = table.attrs["above"] - 1
+    yield wanted, 1.0
 
 
 def excel_sheet(path: Path, sheet: str | None, rows: int | None = None) -> pd.DataFrame:
-    """Return a sheet as its cells are, with the first line as names.
+    """Return a sheet as its cells are, with the line above its values that holds names as names.
+
+    Its `attrs` hold `above`, the number of lines above the values, and `between`, the cells of the
+    lines between names and values.
 
     Args:
         path: the file.
@@ -220,7 +207,9 @@ def excel_sheet(path: Path, sheet: str | None, rows: int | None = None) -> pd.Da
         names = openpyxl.load_workbook(path, read_only=True).sheetnames
         if sheet is not None and sheet not in names:
             raise UsageError(f"{path}: no sheet '{sheet}'{nearest(sheet, names)}")
-        table = pd.read_excel(path, sheet_name=sheet or 0, nrows=rows, engine="openpyxl")
+        cells = pd.read_excel(
+            path, sheet_name=sheet or 0, nrows=rows, engine="openpyxl", header=None
+        )
     except UsageError:
         raise
     # a damaged archive fails in every layer of the library
@@ -229,5 +218,33 @@ def excel_sheet(path: Path, sheet: str | None, rows: int | None = None) -> pd.Da
             f"{path}: damaged or not an Excel file ({type(error).__name__}:"
             f" {shown(' '.join(str(error).split()), 200)})"
         ) from error
-    table.columns = [str(name).strip() for name in table.columns]
-    return table.dropna(how="all")
+    return _below_names(cells)
+
+
+def _below_names(cells: pd.DataFrame) -> pd.DataFrame:
+    """Return the values of a sheet under the names of its columns."""
+    import pandas as pd
+
+    first = [
+        ["" if pd.isna(cell) else str(cell).strip() for cell in row]
+        for row in cells.head(_SEARCHED).itertuples(index=False)
+    ]
+    at, values = found_header(first) or (0, 1)
+    table = cells.iloc[values:].infer_objects()
+    table.columns = pd.Index(numbered(first[at] if first else []))
+    # with the names among them, all columns were of objects
+    table = table.dropna(how="all")
+    table.attrs |= {"above": values, "between": first[at + 1 : values]}
+    return table
+
+
+def numbered(names: Sequence[str]) -> list[str]:
+    """Return names of which each stands once, those of nameless columns made up."""
+    out: list[str] = []
+    for place, name in enumerate(names):
+        unique, copy = name or f"Unnamed: {place}", 0
+        while unique in out:
+            copy += 1
+            unique = f"{name}.{copy}"
+        out.append(unique)
+    return out

@@ -116,10 +116,12 @@ class _TableConfig(Config, ABC):
 
 @final
 class CsvConfig(_TableConfig):
-    """Text tables with one header line.
+    """Text tables with a line of column names; lines above it, and units beneath it, are skipped.
+
+    The names' line is the first one that holds the time's and all channels' columns.
 
     Attributes:
-        delimiter: between cells.
+        delimiter: between cells; a blank stands for any number of blanks and tabulators.
         decimal: sign of the decimals, `.` or `,`.
         encoding: of the text, for example `cp1252` for a file that an older Windows wrote.
     """
@@ -150,7 +152,7 @@ class CsvConfig(_TableConfig):
 
 @final
 class ExcelConfig(_TableConfig):
-    """Sheets of Excel files (.xlsx) with one line of column names.
+    """Sheets of Excel files (.xlsx); lines above the column names, and units beneath, are skipped.
 
     Attributes:
         sheet: name of the sheet; null takes the first.
@@ -230,17 +232,18 @@ class TableReader(LogReader):
         with progress(path.name, size, 1.0) as advance:
             for piece, share in self._load(path, columns):
                 cut |= bool(piece.attrs.get("cut"))
-                first = len(time.columns)
+                # rows are called by their lines in the file
+                row, first = read + int(piece.attrs.get("above", 0)), len(time.columns)
                 clock = (
                     self._dated(path, piece.iloc[:, :first], dates)
                     if dates
-                    else self._numbers(path, piece.iloc[:, 0], time.column, read)
+                    else self._numbers(path, piece.iloc[:, 0], time.column, row)
                 )
                 measured = [
-                    self._numbers(path, piece.iloc[:, i], columns[i], read)
+                    self._numbers(path, piece.iloc[:, i], columns[i], row)
                     for i in range(first, len(columns))
                 ]
-                rows.add([clock, *measured], read)
+                rows.add([clock, *measured], row)
                 read += len(piece)
                 advance(share)
         t, channels = rows.finish()

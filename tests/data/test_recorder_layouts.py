@@ -1,0 +1,184 @@
+"""Tables as recorders write them: lines above the names, units beneath, pulses, odd ends."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from residnet.core.config import validate
+from residnet.core.errors import DataError
+from residnet.core.log import Log
+from residnet.data.drafting.questions import Marks
+from residnet.data.drafting.tables import draft_tables
+from residnet.data.readers import ReaderConfig
+
+T = np.arange(0.0, 60.0, 0.2)
+PSI = 0.4 * np.sin(0.2 * T)
+NORTH, EAST = np.cumsum(0.4 * np.cos(PSI)), np.cumsum(0.4 * np.sin(PSI))
+RUDDER = np.radians(20.0) * np.sign(np.cos(0.2 * T))
+COLUMNS = {
+    "Zeit": T,
+    "Nord": NORTH,
+    "Ost": EAST,
+    "Kurs": np.degrees(PSI) % 360.0,
+    "Ruder": np.degrees(RUDDER),
+    "Drehzahl": 600.0 + T,
+}
+UNITS = ("s", "m", "m", "°", "°", "1/min")
+
+
+def text(columns: dict[str, Any], delimiter: str = ";", units: tuple[str, ...] = ()) -> list[str]:
+    """The lines of a table, with decimal points."""
+    lines = [delimiter.join(columns)]
+    lines += [delimiter.join(units)] if units else []
+    rows = zip(*columns.values(), strict=True)
+    return lines + [delimiter.join(f"{cell:.6f}" for cell in row) for row in rows]
+
+
+def drafted(path: Path) -> tuple[Log, dict[str, Any], Marks]:
+    """What the drafted reader reads, its settings, and what is marked."""
+    marks = Marks()
+    content = draft_tables([path], marks).content
+    return validate(content, ReaderConfig, "here").build().read(path), content, marks
+
+
+def compare(log: Log) -> None:
+    np.testing.assert_allclose(log["x"], NORTH, atol=1e-5)
+    np.testing.assert_allclose(log["psi"], PSI, atol=1e-6)
+    np.testing.assert_allclose(log["delta"], RUDDER, atol=1e-6)
+    np.testing.assert_allclose(log["n"], (600.0 + T) / 60.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("delimiter", [";", "\t", "|", ","])
+@pytest.mark.parametrize(
+    "above",
+    [
+        [],
+        ["# recorder 4.2, vessel No. 7", "# started 2025-06-17"],
+        ["Data logger XY-7", "Serial: 12345", ""],
+        ['"Sea trial";"17.06.2025"'],
+    ],
+)
+def test_lines_above_the_names_and_units_beneath(
+    above: list[str], delimiter: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join([*above, *text(COLUMNS, delimiter, UNITS)]) + "\n")
+    log, content, marks = drafted(path)
+    compare(log)
+    assert content["time"]["unit"] == "s"
+    assert content["channels"]["n"]["column"] == "Drehzahl"
+    assert not [text for _, text in marks.guesses if "no unit" in text]
+
+
+def test_an_empty_cell_at_the_end_of_lines(tmp_path: Path) -> None:
+    names, *rows = text(COLUMNS, ";", UNITS)
+    for lines in (
+        [names, *(row + ";" for row in rows)],
+        [names + ";;", *rows],
+        [names + ";", *(row + ";" for row in rows)],
+    ):
+        path = tmp_path / "log.csv"
+        path.write_text("\r\n".join(lines) + "\r\n", encoding="utf-8-sig")
+        compare(drafted(path)[0])
+
+
+def test_columns_between_blanks(tmp_path: Path) -> None:
+    path = tmp_path / "log.dat"
+    path.write_text("\n".join(line.replace(";", "   ") for line in text(COLUMNS, ";", UNITS)))
+    log, content, _ = drafted(path)
+    assert content["delimiter"] == " "
+    compare(log)
+
+
+def test_a_line_is_called_by_its_number_in_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    lines = ["recorder", "", *text(COLUMNS, ";", UNITS)]
+    path.write_text("\n".join(lines) + "\n")
+    _, content, _ = drafted(path)
+    cells = lines[30].split(";")
+    lines[30] = ";".join([*cells[:3], "bad", *cells[4:]])
+    path.write_text("\n".join(lines) + "\n")
+    with pytest.raises(DataError, match=r"line 31, column 'Kurs': 'bad'"):
+        validate(content, ReaderConfig, "here").build().read(path)
+    lines[30] = ";".join(cells[:3])
+    path.write_text("\n".join(lines) + "\n")
+    with pytest.raises(DataError, match="line 31 has 3 cells, the header 6"):
+        validate(content, ReaderConfig, "here").build().read(path)
+
+
+def test_a_sheet_with_a_title_and_units(tmp_path: Path) -> None:
+    pytest.importorskip("openpyxl")
+    rows: list[list[Any]] = [["Sea trial", *[None] * 5], [None] * 6, list(COLUMNS), list(UNITS)]
+    rows += [list(row) for row in zip(*COLUMNS.values(), strict=True)]
+    path = tmp_path / "log.xlsx"
+    pd.DataFrame(rows).to_excel(path, index=False, header=False)
+    compare(drafted(path)[0])
+
+
+@pytest.mark.parametrize(
+    ("column", "values", "factor"),
+    [
+        ("Ruder [us]", 1500.0 + 400.0 * np.sign(RUDDER), 28.0 / 20.0),
+        ("Ruder", 1500.0 + 400.0 * np.sign(RUDDER), 28.0 / 20.0),
+        ("Ruder [%]", 50.0 * np.sign(RUDDER), 17.5 / 20.0),
+        ("Ruder", 100.0 * np.sign(RUDDER), 35.0 / 20.0),
+        ("Ruder", np.sign(RUDDER), 35.0 / 20.0),
+    ],
+)
+def test_a_rudder_that_is_no_angle_becomes_one_by_a_guess(
+    column: str, values: np.ndarray, factor: float, tmp_path: Path
+) -> None:
+    """Hard over is taken as 35 deg, and said to be."""
+    columns = {name: cells for name, cells in COLUMNS.items() if name != "Ruder"}
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join(text(columns | {column: values})) + "\n")
+    log, _, marks = drafted(path)
+    np.testing.assert_allclose(log["delta"], factor * RUDDER, atol=1e-6)
+    told = [text for key, text in marks.guesses if key[-1] == "delta"]
+    assert any("35 deg" in text for text in told)
+
+
+def test_revolutions_in_per_cent_are_a_throttle(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    columns = {name: cells for name, cells in COLUMNS.items() if name != "Drehzahl"}
+    path.write_text("\n".join(text(columns | {"Motor [%]": 60.0 + 0.1 * T})) + "\n")
+    log, content, _ = drafted(path)
+    assert content["channels"]["throttle"]["unit"] == "%"
+    np.testing.assert_allclose(log["throttle"], 0.6 + 0.001 * T, atol=1e-6)
+
+
+def test_days_as_excel_counts_them(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    days = 45825.5 + T / 86400.0
+    rows = zip(days, NORTH, EAST, np.degrees(PSI), np.degrees(RUDDER), strict=True)
+    lines = ["time,north [m],east [m],heading [deg],rudder [deg]"]
+    lines += [",".join(f"{cell:.10f}" for cell in row) for row in rows]
+    path.write_text("\n".join(lines) + "\n")
+    log, content, _ = drafted(path)
+    assert content["time"]["unit"] == "day"
+    np.testing.assert_allclose(log.t - log.t[0], T, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"1,2,3\n4,5,6\n7,8,9\n", "no line holds names of columns"),
+        ("a;b\n1;2\n".encode("utf-16"), "UTF-16"),
+        (b"name,vessel\na,b\nc,d\n", "names of columns|hold numbers"),
+        (
+            b"time,Latitude,Longitude\n0,54 18.1N,10 2.3E\n1,54 18.2N,10 2.4E\n",
+            "54 18.1N.*degrees with decimals|fewer than two",
+        ),
+    ],
+)
+def test_what_is_no_table_is_refused_in_one_line(content: bytes, said: str, tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=said) as refused:
+        draft_tables([path], Marks())
+    assert "\n" not in str(refused.value)
