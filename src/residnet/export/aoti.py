@@ -35,7 +35,10 @@ class AotiModel:
 
     def step(self, x: Numbers, w: Numbers, s: Numbers) -> tuple[Numbers, Numbers, bool]:
         """Return state, memory and flag one step later."""
-        given = [torch.from_numpy(np.asarray(part)).to(self.dtype)[None] for part in (x, w, s)]
+        # the package takes numbers as they lie in memory, whatever a tensor's strides say
+        given = [
+            torch.from_numpy(np.ascontiguousarray(part)).to(self.dtype)[None] for part in (x, w, s)
+        ]
         after, memory, outside = self.package(*given)
         return after[0].numpy(), memory[0].numpy(), bool(outside[0])
 
@@ -68,6 +71,7 @@ class AotiExporter(Exporter):
         model = copy.deepcopy(model).eval().requires_grad_(False)
         card = make_card(spec, model, rows, {}) | {
             "format": "aoti",
+            "layout": "Give contiguous tensors: the package does not look at strides.",
             "safety": "The package holds machine code that runs when loaded: load only what"
             " you trust. It is for the kind of machine that it was made on.",
         }

@@ -22,7 +22,6 @@ from residnet.dynamics.store import ModelSpec
 from residnet.export.base import Exporter
 from residnet.export.card import make_card
 from residnet.export.contract import (
-    SINGLE,
     Apart,
     Numbers,
     accepted,
@@ -34,6 +33,8 @@ from residnet.export.packages import require_package
 from residnet.export.stepping import Step, StepWithoutMemory
 
 _INPUTS, _OUTPUTS = ("x", "w", "s"), ("x_after", "s_after", "outside")
+# onnxruntime computes sines of doubles to thirteen digits
+_DOUBLE = 1e-7
 
 
 class OnnxModel:
@@ -128,8 +129,7 @@ def _checked(
     """
     _write(spec, model, file, dtype)
     stepped = OnnxModel(file, spec, model)
-    # a graph in float64 is good to about eight digits
-    tolerance = SINGLE if dtype == torch.float64 else None
+    tolerance = _DOUBLE if dtype == torch.float64 else None
     found = checked(spec, model, stepped, "the ONNX file", dtype, tolerance)
     _require_rows(stepped, spec, model)
     return found
@@ -174,6 +174,7 @@ def _write(spec: ModelSpec, model: HybridDynamics, file: Path, dtype: torch.dtyp
                 input_names=list(_INPUTS[kept]),
                 output_names=results,
                 dynamic_shapes=tuple(rows for _ in sizes),
+                custom_translation_table={torch.ops.aten.scalar_tensor.default: _scalar},
             )
     except torch.onnx.OnnxExporterError as error:
         first = str(error).strip().splitlines()[0]
@@ -182,6 +183,15 @@ def _write(spec: ModelSpec, model: HybridDynamics, file: Path, dtype: torch.dtyp
         ) from None
     assert program is not None
     program.save(str(file))
+
+
+def _scalar(
+    s: float, dtype: int = 1, layout: str = "", device: str = "", pin_memory: bool = False
+) -> Any:
+    """Return a number of a model as a constant; torch's own translation rounds it to float32."""
+    ir = importlib.import_module("onnx_ir")
+    kind = ir.DataType(dtype if dtype > 0 else ir.DataType.FLOAT)
+    return importlib.import_module("onnxscript").opset18.Constant(value=ir.tensor(s, dtype=kind))
 
 
 def _require_rows(stepped: OnnxModel, spec: ModelSpec, model: HybridDynamics) -> None:
