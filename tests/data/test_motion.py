@@ -82,6 +82,24 @@ def test_what_is_measured_at_every_sample_stays() -> None:
     assert complete_motion(TRUTH, MotionConfig()) is TRUTH
 
 
+@pytest.mark.parametrize("every", [2, 10])
+def test_values_that_a_receiver_repeats_are_made_anew(every: int) -> None:
+    slow = ("x", "y", "u", "v")
+    last = np.arange(len(TRUTH)) // every * every
+    held = TRUTH.replace(
+        channels={n: v[last] if n in slow else v for n, v in TRUTH.channels.items()}
+    )
+    out = complete_motion(held, MotionConfig())
+    assert set(out.meta["smoothed"]) == set(slow)
+    assert all(error(out, name) < 0.2 * error(held, name) for name in slow)
+    assert all(np.array_equal(out[name], TRUTH[name]) for name in ("psi", "r", "delta"))
+
+
+def test_coarse_values_are_not_taken_for_repeated_ones() -> None:
+    coarse = TRUTH.replace(channels={n: np.round(v, 2) for n, v in TRUTH.channels.items()})
+    assert complete_motion(coarse, MotionConfig()) is coarse
+
+
 def test_a_long_gap_stays_a_gap() -> None:
     log = measured(every=10)
     lost = (log.t > 50.0) & (log.t < 60.0)

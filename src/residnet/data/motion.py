@@ -14,6 +14,7 @@ from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
 from residnet.core.names import CHANNEL_UNITS, POSE, STATE
 from residnet.data.doctor.signals import noise_of, spikes
+from residnet.data.held import without_held
 from residnet.data.readers.base import unwrap
 from residnet.data.readers.recording import remark
 from residnet.data.sparse_smoother import Track, smooth_track
@@ -41,8 +42,9 @@ class MotionConfig(Config):
 
     A channel of the motion that is measured at every sample stays as it is measured. One that the
     log lacks, or that has values at some samples only (a position at 1 Hz beside a heading at 10
-    Hz), is made by a smoother from all others. Stretches without a position or heading for longer
-    than three of their usual intervals stay gaps.
+    Hz, the samples between empty or the last value repeated), is made by a smoother from all
+    others. Stretches without a position or heading for longer than three of their usual intervals
+    stay gaps.
 
     Attributes:
         antenna: where the antenna stands; null where x and y are those of the vessel's centre.
@@ -69,7 +71,8 @@ def complete_motion(log: Log, config: MotionConfig) -> Log:
         UsageError: where the log lacks position or heading.
         DataError: where these hold hardly a value.
     """
-    sparse = [name for name in STATE if name in log.channels and not _dense(log[name])]
+    told = without_held(log)
+    sparse = [name for name in STATE if name in told.channels and not _dense(told[name])]
     lacking = [name for name in STATE if name not in log.channels]
     if not (sparse or lacking or config.moves):
         return log
@@ -78,14 +81,14 @@ def complete_motion(log: Log, config: MotionConfig) -> Log:
             f"log {log.name}: no channel {', '.join(missing)}; position and heading are needed,"
             " and give the velocities where these were not measured: name their columns"
         )
-    made = _smoothed(log, config)
+    made = _smoothed(told, config)
     kept = set(STATE) - set(sparse) - set(lacking) - (set(POSE) if config.moves else set())
     if config.always:
         kept = set()
     new = {name: log[name] if name in kept else made[name] for name in STATE}
     names = [name for name in STATE if name not in kept]
     text = f"{', '.join(names)} come from a smoother of the measured motion: " + ", ".join(
-        f"{name} {_told(log, name)}" for name in names
+        f"{name} {_told(told, name)}" for name in names
     )
     meta = {
         **log.meta,

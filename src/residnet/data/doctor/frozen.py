@@ -11,6 +11,7 @@ from residnet.core.log import Log
 from residnet.core.stretches import stretches
 from residnet.data.doctor.findings import Finding, Level
 from residnet.data.doctor.signals import noise_of
+from residnet.data.held import usual_interval
 
 # shortest run of equal values that counts as frozen, in steps
 _LEAST_RUN = 5
@@ -39,17 +40,13 @@ def frozen_findings(log: Log, measured: Sequence[str]) -> Iterator[Finding]:
 
 def sample_and_hold(log: Log, name: str) -> Iterator[Finding]:
     """Return a slow sensor whose last value is repeated until the next."""
-    changes = np.flatnonzero(np.diff(log[name]) != 0.0)
-    every = np.diff(changes)
-    if every.size < 20 or float(np.median(every)) < 2.0:
-        return
-    usual = float(np.median(every))
-    if float((np.abs(every - usual) <= 0.25 * usual).mean()) < 0.9:
+    usual = usual_interval(log[name])
+    if usual < 2.0:
         return
     text = f"{name} changes in every {usual:.0f}th sample only, its last value is held in between"
     action = (
         "leave the cells between two measurements empty: held values are late by half an interval"
-        " and their derivative is spikes"
+        " and their derivative is spikes; a fit takes them out of the motion and smooths it"
     )
     yield Finding("will mislead", "held", text, {"every": usual}, action)
 
