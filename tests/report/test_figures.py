@@ -16,6 +16,7 @@ from residnet.report.figures.errors import bar_group, growth, r_squared
 from residnet.report.figures.files import read_figures
 from residnet.report.figures.fit import write_figures
 from residnet.report.figures.style import styles
+from residnet.report.figures.terms import of_breeding
 from residnet.report.figures.tracks import representative, shown
 from residnet.report.run_reader import RunFiles
 
@@ -164,3 +165,16 @@ def test_damaged_pictures_are_passed_over(tmp_path: Path) -> None:
     (folder / "folder.png").mkdir()
     (folder / "foreign.png").write_text("no picture")
     assert read_figures(folder) == []
+
+
+def test_a_bred_equation_shows_its_generations(tmp_path: Path) -> None:
+    folder = made_run(tmp_path / "made")
+    model = RunFiles(folder).heads[0]
+    history = [{"train": 1 / k, "validation": 1.2 / k, "terms": k} for k in range(1, 6)]
+    row = {"history": history, "generation": 4}
+    write_json(folder / "models" / model / "fit.json", {"equations": {"u_dot": row, "r_dot": row}})
+    (drawing,) = of_breeding(RunFiles(folder))
+    first, second = drawing.figure.axes
+    assert [axes.get_title(loc="left") for axes in (first, second)] == ["surge", "yaw"]
+    np.testing.assert_allclose(first.lines[1].get_ydata(), [1.2 / k for k in range(1, 6)])
+    assert list(first.lines[2].get_xdata()) == [4]

@@ -6,7 +6,7 @@ One config class per kind says which estimator of `residnet.regression` finds th
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal, final
 
 import torch
@@ -18,6 +18,7 @@ from residnet.core.errors import FitError
 from residnet.regression.elastic_net import ElasticNet
 from residnet.regression.estimator import Estimator, require_data
 from residnet.regression.least_squares import CentredLeastSquares
+from residnet.regression.pls_path import pls_path
 from residnet.regression.plsr import PLSR
 from residnet.regression.ridge import Ridge
 from residnet.regression.surface import Surface
@@ -66,6 +67,19 @@ class Regression:
 
 
 @dataclass(frozen=True)
+class OrderErrors:
+    """Mean square errors of a PLSR over its order: forces [A, 3] in N^2, N^2, (N m)^2.
+
+    Attributes:
+        left_out: over samples whose fold was left out; NaN without folds.
+        test: over the test half; NaN without one.
+    """
+
+    left_out: Tensor
+    test: Tensor
+
+
+@dataclass(frozen=True)
 class Fit:
     """Coefficients of y = intercept + x coefficients.
 
@@ -76,6 +90,7 @@ class Fit:
         notes: what was chosen.
         surface: errors of all models that the choice was made from, where a surface analysis made
             it.
+        orders: errors over the order of a PLSR.
     """
 
     coefficients: Tensor
@@ -83,6 +98,7 @@ class Fit:
     pre: Tensor
     notes: dict[str, Any] = field(default_factory=dict)
     surface: Surface | None = None
+    orders: OrderErrors | None = None
 
     @classmethod
     def from_pre(cls, data: Regression, pre: Tensor, notes: dict[str, Any]) -> Fit:
@@ -132,7 +148,12 @@ class _ScaledRegression(RegressionKind):
         e, f, *_ = data.standardised
         groups = None if self.fixed() else data.fold
         first = self.estimator().fit(e, f, groups, names=data.terms, outputs=_FORCES)[0]
-        return Fit.from_pre(data, first.coefficients, self.chosen(first.choice, first.notes))
+        out = Fit.from_pre(data, first.coefficients, self.chosen(first.choice, first.notes))
+        return replace(out, orders=self.over_orders(data))
+
+    def over_orders(self, data: Regression) -> OrderErrors | None:
+        """Return the errors over all orders; None for an estimator without an order."""
+        return None
 
 
 @final
@@ -165,6 +186,35 @@ class PlsrRegression(_ScaledRegression):
         if choice["order"] == 0:
             raise FitError("PLSR: nothing in the residual varies with the basis functions")
         return choice
+
+    def over_orders(self, data: Regression) -> OrderErrors:
+        """Return the errors over all orders (document 002 Figures 4.4, 4.22, 4.42, 5.7)."""
+        e, f, mean_x, mean_y, std_y = data.standardised
+        folds = data.fold.unique()
+        orders, left_out = e.shape[1], torch.full_like(f, torch.nan).repeat(e.shape[1], 1, 1)
+        if len(folds) > 1:
+            for fold in folds:
+                out = data.fold == fold
+                left_out[:, out] = _error_by_order(e[~out], f[~out], e[out], f[out], orders)
+        test = torch.full((orders, 3), torch.nan, dtype=f.dtype)
+        if data.test is not None and len(data.test[0]):
+            x, y = data.test
+            scaled = (x - mean_x) / data.scale, (y - mean_y) / std_y
+            test = _error_by_order(e, f, *scaled, orders).square().mean(1)
+        square = std_y.square()
+        return OrderErrors(left_out.square().mean(1) * square, test * square)
+
+
+def _error_by_order(e: Tensor, f: Tensor, x: Tensor, y: Tensor, orders: int) -> Tensor:
+    """Return the errors [A, N, 3] at x of a PLSR of f on e, for each order up to `orders`."""
+    mean_e, mean_f = e.mean(0), f.mean(0)
+    centred = e - mean_e
+    path = pls_path(centred.T @ centred, centred.T @ (f - mean_f), orders)
+    if len(path) < orders:
+        # what is left explains nothing: higher orders change no more
+        last = path[-1:] if len(path) else torch.zeros(1, e.shape[1], f.shape[1], dtype=e.dtype)
+        path = torch.cat((path, last.expand(orders - len(path), -1, -1)))
+    return y - mean_f - (x - mean_e) @ path
 
 
 @final

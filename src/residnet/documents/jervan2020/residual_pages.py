@@ -10,7 +10,7 @@ from residnet.documents.cells import notes_text
 from residnet.documents.jervan2020.regressions import Fit, RegressionConfig, SurfaceRegression
 from residnet.documents.jervan2020.residual_model import AXES
 from residnet.report.blocks import Section, Table, Text
-from residnet.report.figures.force import draw_surface, draw_weights
+from residnet.report.figures.force import draw_orders, draw_surface, draw_weights
 from residnet.report.format import number
 
 ABOUT_COEFFICIENTS = (
@@ -18,6 +18,9 @@ ABOUT_COEFFICIENTS = (
     " function, in SI units. A weight is the magnitude of the coefficient of scaled variables: it"
     " says how much a basis function matters."
 )
+
+MODEL_PICTURES = ("orders_", "surface_", "weights_")
+"""What the names of the pictures of `draw_model` begin with."""
 
 
 def fit_as_json(terms: Sequence[str], fit: Fit) -> dict[str, Any]:
@@ -78,7 +81,7 @@ def draw_model(
     unmodelled: Sequence[float],
     figures: Path,
 ) -> None:
-    """Draw the weights of a model, and its surface of errors where it was chosen from one.
+    """Draw the weights of a model, and the errors that its order or surface was chosen from.
 
     Args:
         name: name of the model.
@@ -90,6 +93,10 @@ def draw_model(
     """
     title = f"Weights of the basis functions in {name}"
     draw_weights(terms, fit.pre, title, figures / f"weights_{name}.png")
+    if fit.orders is not None:
+        curves = {"left-out segments": fit.orders.left_out, "test half": fit.orders.test}
+        order = int(fit.notes["order"])
+        draw_orders(curves, unmodelled, order, figures / f"orders_{name}.png")
     if isinstance(config, SurfaceRegression) and fit.surface is not None:
         choices = {
             "chosen": list(zip(fit.notes["order"], fit.notes["terms"], strict=True)),

@@ -50,6 +50,7 @@ def drawings(run: RunFiles) -> Iterator[Drawing]:
     yield from figures_bands.of_bands(run)
     yield from figures_booklet.of_booklet(run)
     yield from figures_terms.of_terms(run)
+    yield from figures_terms.of_breeding(run)
     yield from _of_training(run)
 
 

@@ -1,4 +1,4 @@
-"""Figures of force-space models (document 002 Figures 4.6, 4.20, 4.25)."""
+"""Figures of force-space models (document 002 Figures 4.6, 4.20, 4.22, 4.25)."""
 
 from __future__ import annotations
 
@@ -65,6 +65,42 @@ def draw_surface(
             "Surface analysis",
             "Share of the unmodelled residual's mean square that is left, by model order and"
             " number of basis functions. Marks show what each rule chose.",
+        )
+
+
+def draw_orders(
+    curves: Mapping[str, Tensor], unmodelled: Sequence[float], chosen: int, path: Path
+) -> None:
+    """Write a figure of the error that is left over the order of a PLSR.
+
+    Args:
+        curves: mean square error by order and axis [A, 3], by the samples that it is of.
+        unmodelled: mean square of the residual of each axis.
+        chosen: order of the model.
+        path: PNG file.
+    """
+    from matplotlib import rc_context
+
+    with rc_context(RC):
+        figure = new_figure(2.6)
+        panels = figure.subplots(1, 3, sharey=True)
+        for axis, axes in enumerate(panels):
+            for (name, error), colour in zip(curves.items(), ("#0072B2", "#D55E00"), strict=False):
+                share = error[:, axis].numpy() / unmodelled[axis]
+                if np.isfinite(share).any():
+                    axes.plot(np.arange(len(share)) + 1, share, color=colour, label=name)
+            axes.axvline(chosen, color="0.5", linestyle="--", linewidth=1.0, label="this model")
+            axes.set_yscale("log")
+            axes.set_title(_AXES[axis], loc="left")
+            axes.set_xlabel("model order")
+        panels[0].set_ylabel("share of the MSE that is left")
+        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=3)
+        save(
+            figure,
+            path,
+            "Error over the order of the PLSR",
+            "Share of the unmodelled residual's mean square that is left, by model order: on"
+            " segments that were left out of the fit one by one, and on the test half.",
         )
 
 

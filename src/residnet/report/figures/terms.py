@@ -1,9 +1,9 @@
-"""Equations part by part: what each term adds along a log (document 000 section 6.4.2)."""
+"""Equations term by term along a log (document 000 section 6.4.2), and how they were bred."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -41,6 +41,53 @@ def of_terms(run: RunFiles) -> Iterator[Drawing]:
             ),
             parts(rows),
         )
+
+
+def of_breeding(run: RunFiles) -> Iterator[Drawing]:
+    """Draw the best error of each generation, of every model that was bred (Figures 6.2, 6.3)."""
+    for model in run.heads:
+        equations = run.fit(model).get("equations", {})
+        histories = {axis: row["history"] for axis, row in equations.items() if "history" in row}
+        if histories:
+            yield Drawing(
+                f"breeding_{model}",
+                f"Search of {model}, generation by generation",
+                (
+                    "Mean square error of the best individual over the target's mean square, on"
+                    " the samples that breed and on those that validate. A ring marks the"
+                    " generation whose equation was kept, the least validation error. A curve that"
+                    " still falls at its end asks for more generations."
+                ),
+                breeding(histories, {axis: row["generation"] for axis, row in equations.items()}),
+            )
+
+
+@styled
+def breeding(histories: Mapping[str, Sequence[Mapping[str, Any]]], kept: Mapping[str, int]) -> Any:
+    """Draw the error over the generations, a panel for each axis.
+
+    Args:
+        histories: `train` and `validation` of each generation, by axis.
+        kept: generation of the equation that was kept, by axis.
+    """
+    from matplotlib.ticker import MaxNLocator
+
+    figure = new_figure(2.6)
+    panels = figure.subplots(1, len(histories), squeeze=False)[0]
+    names = {axis: text.split(" ")[0] for axis, text, _ in _AXES}
+    for axes, (axis, history) in zip(panels, histories.items(), strict=True):
+        for part, colour in (("train", _COLOURS[0]), ("validation", _COLOURS[1])):
+            axes.plot([row[part] for row in history], color=colour, label=part)
+        best = kept[axis]
+        ring = {"color": "black", "markerfacecolor": "none", "markersize": 7, "label": "kept"}
+        axes.plot(best, history[best]["validation"], "o", **ring)
+        axes.set_yscale("log")
+        axes.set_title(names.get(axis, axis), loc="left")
+        axes.set_xlabel("generation")
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    panels[0].set_ylabel("share of the mean square [-]")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=3)
+    return figure
 
 
 @styled

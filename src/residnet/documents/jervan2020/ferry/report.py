@@ -10,7 +10,11 @@ from residnet.documents.cells import beside_published, joined, notes_text, pictu
 from residnet.documents.jervan2020.ferry.config import FerrySettings
 from residnet.documents.jervan2020.published import Published
 from residnet.documents.jervan2020.residual_model import AXES
-from residnet.documents.jervan2020.residual_pages import ABOUT_COEFFICIENTS, coefficients_section
+from residnet.documents.jervan2020.residual_pages import (
+    ABOUT_COEFFICIENTS,
+    MODEL_PICTURES,
+    coefficients_section,
+)
 from residnet.report.blocks import Block, Bullets, Cell, Section, Table, Text
 from residnet.report.format import DEG, number
 
@@ -94,7 +98,7 @@ def sections(config: FerrySettings, results: Results, run: Path) -> list[Section
     if causes := [model["not_forward"] for model in models.values() if model["not_forward"]]:
         out.append(Section("Models that cannot run forward in time", [Bullets(causes)]))
     out.append(Section("Coefficients", [Text(ABOUT_COEFFICIENTS), *_coefficients(config, results)]))
-    return [*out, Section("Weights and surfaces", pictures(run, "surface_", "weights_"), True)]
+    return [*out, Section("Orders, weights and surfaces", pictures(run, *MODEL_PICTURES), True)]
 
 
 def _coefficients(config: FerrySettings, results: Results) -> list[Section]:

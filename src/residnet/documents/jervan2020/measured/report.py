@@ -10,7 +10,11 @@ from residnet.documents.cells import beside_published, listed, notes_text, pictu
 from residnet.documents.jervan2020.measured.config import ForceSettings
 from residnet.documents.jervan2020.measured.study import better
 from residnet.documents.jervan2020.residual_model import AXES
-from residnet.documents.jervan2020.residual_pages import ABOUT_COEFFICIENTS, coefficients_section
+from residnet.documents.jervan2020.residual_pages import (
+    ABOUT_COEFFICIENTS,
+    MODEL_PICTURES,
+    coefficients_section,
+)
 from residnet.report.blocks import Bullets, Cell, Section, Table, Text
 from residnet.report.format import fixed, interval, number, plural, signed
 
@@ -166,7 +170,7 @@ def sections(config: ForceSettings, results: Results, run: Path) -> list[Section
         for name, model in results["models"].items()
     ]
     out.append(Section("Coefficients of models fitted to all samples", [_ABOUT, *coefficients]))
-    return [*out, Section("Weights and surfaces", pictures(run, "surface_", "weights_"), True)]
+    return [*out, Section("Orders, weights and surfaces", pictures(run, *MODEL_PICTURES), True)]
 
 
 def _data(config: ForceSettings, results: Results) -> Section:
