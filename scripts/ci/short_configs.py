@@ -122,6 +122,7 @@ _CONDITIONS = (
     *_recurrent("learned"),
     *_recurrent("constants"),
     "recurrent.learned.training.dt=0.1 s",
+    "recurrent.learned.training.steady={flights: 2}",
     "recurrent.constants.training.dt=0.1 s",
     "test.dt=0.1 s",
     "test.plants=2",
@@ -182,6 +183,7 @@ SHORT: dict[str, Short] = {
             *_CONDITIONS,
             *_recurrent("network"),
             "recurrent.network.training.dt=0.1 s",
+            "recurrent.network.training.steady={flights: 2}",
             *_predictor("document"),
         )
     ),

@@ -19,10 +19,10 @@ from residnet.control.conditions.flights import (
     ConditionedRun,
     fly_under,
 )
+from residnet.control.conditions.quiet import quiet
 from residnet.control.heading.controllers import PdConfig, Steering
 from residnet.control.heading.steering import SteeredPlant
 from residnet.control.heading.turning import Turning
-from residnet.judge.conditions import quiet
 from residnet.physics.vessel import load_vessel
 
 DEG = math.pi / 180

@@ -13,14 +13,16 @@ import yaml
 from read_page import plain
 from tiny import call
 
+from residnet.control.observed.config import PtosConfig
 from residnet.core.config import load_config
 from residnet.tasks.autopilot.stored import stored_policy
 from residnet.tasks.autopilot.task import AutopilotConfig
+from residnet.tasks.autopilot.tuned import tuned_before
 
 STATED = {"dt": "0.1 s", "duration": "6 s", "hold": "0 s", "delay": ["0 s", "0.3 s"]}
 TRAINING = {
     "epochs": 1, "steps": 1, "batch": 8, "dt": "0.1 s", "hold": "0 s", "validation": 8,
-    "compiled": False,
+    "compiled": False, "steady": {"flights": 2},
 }  # fmt: skip
 SMALL: dict[str, Any] = {
     "task": "autopilot",
@@ -130,6 +132,25 @@ def test_a_network_without_a_law_is_exported_and_read_back(run: Path) -> None:
         assert float(command) == pytest.approx(float(wish), abs=1e-6)
 
 
+def test_a_run_takes_the_constants_that_another_tuned(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = {**SMALL, "seed": 5, "conditions": {**SMALL["conditions"], "tuned_in": str(run)}}
+    config = AutopilotConfig.model_validate(settings)
+    found = tuned_before("ptos", config.peers["ptos"], config)  # type: ignore[arg-type]
+    assert found is not None
+    kept = json.loads((run / "controllers.json").read_text())["controllers"]["ptos"]
+    assert found[0].model_dump(mode="json") == kept["config"]
+    assert None not in found[0].parameters().values()
+    other = PtosConfig(lag=0.1)
+    assert tuned_before("ptos", other, config) is None
+    file = tmp_path / "other.yaml"
+    settings["conditions"]["stated"] = {**STATED, "bias": "0.5 deg"}
+    file.write_text(yaml.safe_dump(settings))
+    assert call(monkeypatch, "check", file) == 2
+    assert "tuned its peers for another 'conditions.stated'" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -143,6 +164,7 @@ def test_a_network_without_a_law_is_exported_and_read_back(run: Path) -> None:
         ({"vessel": "wam_v_cal", "rudder": "0.5 deg"}, "cmd_delta"),
         ({"conditions": {"stated": {**STATED, "current": 0.5}}}, "no input 'current_north'"),
         ({"conditions": {"stated": {**STATED, "delay": ["0.4 s", "0.1 s"]}}}, "in order"),
+        ({"conditions": {"tuned_in": "nowhere"}}, "nowhere is not the folder of a finished"),
     ],
 )
 def test_wrong_configs_are_said_in_a_line(

@@ -189,7 +189,7 @@ def test_a_recurrent_policy_flies_the_course_and_is_exported(
     }  # fmt: skip
     training = {
         "epochs": 1, "steps": 1, "batch": 8, "dt": "0.1 s", "hold": "0 s", "validation": 4,
-        "compiled": False,
+        "compiled": False, "steady": None,
     }  # fmt: skip
     recurrent = {key: value for key, value in AUTOPILOT.items() if key not in ("policies", "floor")}
     recurrent |= {

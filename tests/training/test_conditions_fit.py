@@ -40,6 +40,7 @@ def trained(units: int, rate: float) -> tuple[ObservedPolicy, dict[str, object]]
         hold=0.0,
         validation=32,
         quiet=0.0,
+        steady=None,
     )
     notes = train_under_conditions("policy", policy, VESSEL, settings, CONDITIONS, 3, None)
     return policy, notes

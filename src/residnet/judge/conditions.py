@@ -12,32 +12,6 @@ from residnet.control.conditions.flights import ConditionedRun
 from residnet.judge.autopilots import distribution
 
 QUIET_FLIGHTS = 100
-_QUIET_AFTER, _QUIET_FOR = 10.0 / 7.0, 5.0 / 7.0
-"""Multiples of what the cost counts: after that time a flight without noise is looked at for
-swinging, for that long (with 14 s from 20 s on, for 10 s).
-"""
-
-
-def quiet(conditions: ConditionsConfig) -> ConditionsConfig:
-    """Return the conditions without noise, waves and slow push, with time enough to settle."""
-    return conditions.model_copy(
-        update={
-            "noise_psi": 0.0,
-            "noise_r": 0.0,
-            "push": 0.0,
-            "waves": 0.0,
-            "hold": 0.0,
-            "duration": quiet_after(conditions.duration) + _QUIET_FOR * conditions.duration,
-        }
-    )
-
-
-def quiet_after(duration: float) -> float:
-    """Return the time in s after a change from which nothing should swing.
-
-    `duration` is the time in s that the cost counts.
-    """
-    return _QUIET_AFTER * duration
 
 
 def drawn(conditions: ConditionsConfig, flights: int, seed: int) -> HeadingChanges:

@@ -46,8 +46,8 @@ class EpochTraining(L.LightningModule, ABC):
     the undisturbed one.
 
     Attributes:
-        diverged: number of free runs that diverged in the last validation; weights with fewer of
-            them are better, whatever the scores.
+        diverged: number of runs of the last validation that are unusable, free runs that diverge
+            or flights that swing; weights with fewer of them are better, whatever the scores.
     """
 
     def __init__(self, settings: Epochs, seed: int) -> None:

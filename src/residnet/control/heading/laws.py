@@ -109,6 +109,8 @@ class StoppingLaw(HeadingLaw):
         steep, share, stiff = constants[0], constants[1], constants[2]
         ahead, left = error, r
         if self.swing > 0.0:
-            ahead, left = centred(error, r, acting, force, decay, self.swing)
+            # the rudder answers its own angle with a gain above one, within its rate: a gradient
+            # through that would grow from step to step and say nothing of the flight
+            ahead, left = centred(error, r, acting.detach(), force, decay, self.swing)
         stopping = braking(left, share * force, decay, steep * force, stiff, self.swing)
         return steep * (ahead - stopping)

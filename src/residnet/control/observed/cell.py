@@ -41,9 +41,11 @@ class OddCell(nn.Module):
         """Return the output [B, 1] and the memory [B, units] after a step of dt seconds."""
         sizes = torch.cat((features, memory), dim=1).abs()
         update, reset = torch.sigmoid(self.gates(sizes)).chunk(2, dim=1)
-        share = 1.0 - (1.0 - update).clamp(min=1e-6).pow(dt / self.trained_at)
+        kept = (1.0 - update).clamp(min=1e-6)
+        if dt != self.trained_at:
+            kept = kept.pow(dt / self.trained_at)
         candidate = torch.tanh(self.candidate(torch.cat((features, reset * memory), dim=1)))
-        memory = memory + share * (candidate - memory)
+        memory = candidate + kept * (memory - candidate)
         known = torch.cat((features, memory), dim=1)
         if self.hidden is not None:
             known = torch.cat((known, torch.tanh(self.hidden(known))), dim=1)

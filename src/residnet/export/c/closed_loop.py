@@ -8,11 +8,9 @@ from __future__ import annotations
 
 import copy
 import ctypes
-import subprocess
-import tempfile
+import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import Any, final
 
 import torch
@@ -20,11 +18,10 @@ from torch import Tensor
 
 from residnet.core.errors import ExportError
 from residnet.dynamics.rollout import Rollout
-from residnet.export.c.compiled import compiler
+from residnet.export.c.kept import compiled_library
 from residnet.export.c.lanes import lanes
 from residnet.export.c.loop_source import loop_source
 
-_FLAGS = ("-O2", "-ftree-vectorize", "-ffast-math", "-march=native", "-fPIC", "-shared", "-w")
 _CHECKED, _SAME = 40, 5e-3
 """Steps of the flight that the compiled loop is checked by, and how far it may be off."""
 
@@ -42,6 +39,9 @@ class CompiledLoop:
             flights are flown in.
         own: names of parameters and buffers [B, ...] that every row has for itself; there is no
             gradient for them.
+        most: how much of what is asked of a row reaches its gradient, as a multiple of the median
+            over rows. A loop that is at the edge of swinging has flights whose gradients are
+            millions of times as large as those of others.
 
     Raises:
         ExportError: where a step cannot be recorded or written, or no C compiler does its work.
@@ -55,14 +55,15 @@ class CompiledLoop:
         s: Tensor,
         *,
         own: Sequence[str] = (),
+        most: float = math.inf,
     ) -> None:
         self.rollout, self.dtype, self.own = rollout, x.dtype, tuple(own)
-        self.shared = [
-            name
-            for name, p in rollout.named_parameters()
-            if p.requires_grad and name not in self.own
-        ]
-        self.gradient = torch.is_grad_enabled() and bool(self.shared)
+        self.most = math.inf
+        weights = {name: p for name, p in rollout.named_parameters() if name not in self.own}
+        trained = [name for name, p in weights.items() if p.requires_grad]
+        self.gradient = torch.is_grad_enabled() and bool(trained)
+        # loops that differ in their weights alone are one library, which is compiled once
+        self.shared = trained if self.gradient else list(weights)
         alone = copy.deepcopy(rollout).double()
         held = _numbers(alone)
         shared = {name: held[name].detach() for name in self.shared}
@@ -79,11 +80,12 @@ class CompiledLoop:
             for name, part in zip(("x", "w", "s", "q", "theta", "own"), given, strict=True)
         }
         self.sizes = sizes | {"a": acting.shape[1]}
-        self.library = _library(
+        self.library = compiled_library(
             loop_source(alone, given, shared, rows, self.sizes, x.dtype, self.gradient)
         )
         self.pool = ThreadPoolExecutor(max(torch.get_num_threads(), 1))
         self._check(x, w[:, :_CHECKED], s)
+        self.most = most
 
     def of(self, rollout: Rollout) -> CompiledLoop:
         """Return the flights of a closed loop that differs in its numbers alone."""
@@ -183,10 +185,30 @@ class _Flight(torch.autograd.Function):
             whole[:, :, : ctx.rows] = grad.permute(1, 2, 0)
             given.append(whole)
         block = lanes(loop.dtype)
-        # each block adds up for itself, so that the sum does not depend on the number of threads
+        # each row adds up for itself, so that the sum does not depend on the number of threads
         total = torch.zeros(width // block, loop.sizes["theta"], block, dtype=loop.dtype)
         loop.run("back", width // block, *known, *given, total, steps, width)
-        return (total.sum((0, 2)), *[None] * 6)
+        by_row = total.transpose(1, 2).reshape(width, -1)[: ctx.rows]
+        asked = sum(grad.flatten(1).square().sum(1) for grad in grads)
+        return (_held(by_row, torch.as_tensor(asked).sqrt(), loop.most).sum(0), *[None] * 6)
+
+
+def _held(gradients: Tensor, asked: Tensor, most: float) -> Tensor:
+    """Return gradients [B, n] of rows, none larger than a multiple of what the median row has.
+
+    Args:
+        gradients: of each row.
+        asked: size [B] of the gradient that each row was given.
+        most: the multiple; infinity leaves all as they are.
+    """
+    if math.isinf(most):
+        return gradients
+    size = gradients.norm(dim=1)
+    share = size / asked.clamp(min=1e-30)
+    usual = share[asked > 0].nanmedian() if bool((asked > 0).any()) else share.new_zeros(())
+    kept = (most * usual * asked / size.clamp(min=1e-30)).clamp(max=1.0)
+    # what is no number says nothing
+    return torch.where(torch.isfinite(size)[:, None], gradients * kept[:, None], 0.0)
 
 
 def _numbers(rollout: Rollout) -> dict[str, Tensor]:
@@ -196,20 +218,3 @@ def _numbers(rollout: Rollout) -> dict[str, Tensor]:
 
 def _flat(parts: dict[str, Tensor]) -> Tensor:
     return torch.cat([torch.zeros(0), *(part.reshape(-1) for part in parts.values())])
-
-
-def _library(source: str) -> ctypes.CDLL:
-    """Compile a source file for this machine and load it.
-
-    Raises:
-        ExportError: where there is no compiler, or it fails.
-    """
-    with tempfile.TemporaryDirectory() as folder:
-        file, out = Path(folder) / "closed_loop.c", Path(folder) / "closed_loop.so"
-        file.write_text(source)
-        call = [compiler(), "-std=gnu99", *_FLAGS, str(file), "-o", str(out), "-lm"]
-        done = subprocess.run(call, capture_output=True, text=True)
-        if done.returncode:
-            said = done.stderr.strip().splitlines() or ["no message"]
-            raise ExportError(f"the closed loop does not compile ({said[0]})")
-        return ctypes.CDLL(str(out))

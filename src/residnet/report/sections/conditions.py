@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from residnet.judge.conditions import quiet_after
+from residnet.control.conditions.quiet import quiet_after
 from residnet.report.blocks import Block, Cell, Section, Table, Text
 from residnet.report.format import DEG, fixed, signed
 from residnet.report.run_reader import Content, RunFiles

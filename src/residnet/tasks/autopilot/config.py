@@ -103,12 +103,16 @@ class JudgedConditions(Config):
         beyond: further conditions by name, outside of those of tuning and training, that
             controllers are judged under only.
         evolution: the search for the constants of peers.
+        tuned_in: folder of a finished run of the same vessel, rudder, conditions and search, whose
+            constants peers of the same name and kind take, so that runs with several seeds are
+            compared with the same laws; null to tune them here.
     """
 
     stated: ConditionsConfig = ConditionsConfig()
     flights: int = Field(default=1500, ge=2, le=1_000_000)
     beyond: dict[_Name, ConditionsConfig] = Field(default_factory=dict)
     evolution: EvolutionConfig = EvolutionConfig()
+    tuned_in: Path | None = None
 
 
 class StepTestConfig(Config):

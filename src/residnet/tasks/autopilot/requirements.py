@@ -14,6 +14,7 @@ from residnet.dynamics.store import load_model
 from residnet.physics.vessel import load_vessel
 from residnet.tasks.autopilot.config import AutopilotSettings, PolicyConfig
 from residnet.tasks.autopilot.pace import least_time, paced
+from residnet.tasks.autopilot.tuned import check_tuned
 
 _PUSHED = 2.0
 """Standard deviations of the slow push that the rudder must be able to hold."""
@@ -23,7 +24,7 @@ def check_vessels(config: AutopilotSettings) -> None:
     """Check that the vessel turns steadily and can do what is asked, and so for learned models.
 
     Raises:
-        UsageError: where a run or a model is missing.
+        UsageError: where a run or a model is missing, that of `tuned_in` too.
         FitError: where a learned model does not turn towards the rudder and stay there.
         ConfigError: where the vessel does not, has no time for its changes of heading or no rudder
             left to hold its course, or where the inputs of a learned model are not its own.
@@ -39,6 +40,7 @@ def check_vessels(config: AutopilotSettings) -> None:
     except FitError as error:
         raise ConfigError(f"vessel '{config.vessel}' cannot be steered: {error}") from error
     _check_flights(paced(config), turning, vessel.rate)
+    check_tuned(config)
     for model, dt in learned:
         model.turning(config.rudder, config.turning_time, dt)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from functools import partial
 from typing import Any
 
 import pandas as pd
@@ -11,6 +12,7 @@ import torch
 from residnet.control.base import Policy
 from residnet.control.conditions.evolution import evolve
 from residnet.control.conditions.flights import ConditionedRun
+from residnet.control.conditions.quiet import quiet, quiet_after
 from residnet.control.heading.controllers import Steering, TunableConfig
 from residnet.control.heading.steering import SteeredPlant
 from residnet.control.observed.config import AnyController, ObservedConfig
@@ -19,11 +21,12 @@ from residnet.control.observed.stored import RecurrentPolicy, RecurrentSpec
 from residnet.core.progress import report, say
 from residnet.dynamics.store import rebuilt
 from residnet.export.c.closed_loop import CompiledLoop
-from residnet.judge.conditions import QUIET_FLIGHTS, drawn, judged, quiet, quiet_after, swinging
+from residnet.judge.conditions import QUIET_FLIGHTS, drawn, judged, swinging
 from residnet.physics.vessel import load_vessel
 from residnet.runs.folder import RunFolder
 from residnet.runs.model_store import FolderStore
 from residnet.tasks.autopilot.config import AutopilotSettings, JudgedConditions, RecurrentConfig
+from residnet.tasks.autopilot.tuned import tuned_before
 from residnet.training.policies.conditions_fit import train_under_conditions
 
 Controllers = dict[str, tuple[str, Policy]]
@@ -100,7 +103,9 @@ def trained_policy(
             stated.stated,
             config.seed,
             folder.path,
-            CompiledLoop if wanted.training.compiled else None,
+            partial(CompiledLoop, most=wanted.training.outlying)
+            if wanted.training.compiled
+            else None,
         )
         notes |= {"seconds": round(time.time() - started, 1), "constants": policy.values()}
         store.keep_module(name, spec, policy, notes)
@@ -167,5 +172,6 @@ def completed(
     """Return a peer ready to fly, tuned where it lacks constants, and notes on it."""
     if not isinstance(peer, TunableConfig) or None not in peer.parameters().values():
         return peer, {"config": peer.model_dump(mode="json")}
-    found, notes = tuned_peer(name, peer, steering, config, stated)
+    before = tuned_before(name, peer, config)
+    found, notes = before or tuned_peer(name, peer, steering, config, stated)
     return type(peer).model_validate(found.model_dump()), notes

@@ -6,6 +6,7 @@ from typing import Annotated
 
 from pydantic import Field
 
+from residnet.control.conditions.quiet import SteadyConfig
 from residnet.core.config import Seconds
 from residnet.training.one_stage import OneStage
 
@@ -14,9 +15,9 @@ class ConditionsTraining(OneStage):
     """Settings of a training through the whole closed loop, under the conditions of the run.
 
     The loss of a batch is the mean cost of its flights, with a share of the integral of the
-    absolute error that fades out, and with the late rudder swing of flights without noise. The
-    departures from the nominal vessel in calm water grow from none to all of the conditions, and
-    every batch is drawn anew.
+    absolute error that fades out, and with the late rudder swing and the nominal overshoot of
+    flights without noise. The departures from the nominal vessel in calm water grow from none to
+    all of the conditions, and every batch is drawn anew.
 
     Attributes:
         epochs: at most; each ends with a validation.
@@ -33,10 +34,20 @@ class ConditionsTraining(OneStage):
         spread: share of the training after which the conditions are drawn in full.
         guide: weight of the integral of the absolute error in deg s at the start.
         faded: share of the training after which that weight is zero.
+        outlying: how much of the loss reaches the gradient of one flight, as a multiple of what the
+            median flight of a batch has: a loop at the edge of swinging has flights whose gradients
+            are millions of times as large as those of others. Only compiled flights are held so.
         quiet: share of the flights of a batch without noise and slow push, in which a loop that
-            swings by itself is seen; half of them are at corners of the spread.
+            swings by itself is seen; half of them are at corners of the spread, a quarter flies the
+            nominal vessel without delay.
         calm: cost in s of a variance of one degree squared of the rudder command in the last third
-            of those flights.
+            of those flights, mean over the quarter of them that swings most; a movement of half of
+            what `steady` allows is free.
+        exact: cost in s of one degree of overshoot of the flights of the nominal vessel; half of
+            what `steady` allows is free.
+        stricter: factor on `calm` and `exact` after every epoch that `steady` refuses.
+        steady: what a policy must keep to without noise; of epochs that do not, those with fewer
+            flights beyond come before those that cost less. Null to choose by the cost alone.
         validation: number of flights that epochs are chosen on.
         compiled: whether flights and their gradient are compiled as C, which takes a C compiler;
             without one the training says so and is some thirty times slower.
@@ -55,8 +66,12 @@ class ConditionsTraining(OneStage):
     spread: float = Field(default=0.15, ge=0, le=1)
     guide: float = Field(default=0.01, ge=0)
     faded: float = Field(default=0.6, gt=0, le=1)
+    outlying: float = Field(default=4.0, ge=1)
     quiet: float = Field(default=0.1, ge=0, le=1)
     calm: float = Field(default=0.5, ge=0)
+    exact: float = Field(default=1.0, ge=0)
+    stricter: float = Field(default=1.1, ge=1, le=10)
+    steady: SteadyConfig | None = SteadyConfig()
     validation: int = Field(default=512, ge=2, le=1_000_000)
     compiled: bool = True
 

@@ -10,7 +10,13 @@ import torch
 from torch import Tensor, nn
 
 from residnet.control.conditions.config import ConditionsConfig, HeadingChanges
-from residnet.control.conditions.flights import Compiler, ConditionedRun, Flying
+from residnet.control.conditions.flights import (
+    Compiler,
+    ConditionedFlights,
+    ConditionedRun,
+    Flying,
+)
+from residnet.control.conditions.quiet import SteadyTest, nominal
 from residnet.control.heading.keeper import HeadingKeeper
 from residnet.control.heading.steering import SteeredVessel
 from residnet.core.errors import ExportError
@@ -22,6 +28,9 @@ from residnet.training.running import run_epochs
 
 _LATE = 1.0 / 3.0
 """Share of a flight at whose end a quiet one should have come to rest."""
+_ALL = 1_000_000
+_FREE = 0.5
+"""Share of what a policy may swing and overshoot that costs nothing in training."""
 
 
 @final
@@ -57,8 +66,16 @@ class ConditionsFit(EpochTraining):
         self.fly = _flying(rollout, compiler, self.loop.given(self._batch(0.0, 2)))
         random = torch.Generator().manual_seed(seed + 1_000_003)
         self.unseen = conditions.draw(settings.validation, conditions.dt, random)
+        self.steady = None
+        if settings.steady is not None:
+            self.steady = SteadyTest(settings.steady, conditions, seed + 1_500_007)
         self.test = ConditionedRun(
-            vessel, policy, conditions.dt, dtype=torch.float32, compiler=compiler
+            vessel,
+            policy,
+            conditions.dt,
+            dtype=torch.float32,
+            compiler=compiler,
+            longest=max(math.ceil(conditions.delay[1] / conditions.dt), 1),
         )
 
     def train_dataloader(self) -> range:
@@ -75,6 +92,7 @@ class ConditionsFit(EpochTraining):
         super().on_fit_start()
         if not self.history:
             self.validate_start()
+            self.best_diverged = self.diverged
 
     def on_train_epoch_start(self) -> None:
         """Draw the epoch's flights anew, from a seed of its own."""
@@ -98,20 +116,39 @@ class ConditionsFit(EpochTraining):
             found["cost"].mean() + math.degrees(settings.guiding(progress)) * found["iae"].mean()
         )
         if quiet > 0:
-            late = flown.late_swing(_LATE)[:quiet].mean()
-            loss = loss + math.degrees(math.degrees(settings.calm)) * late
+            loss = loss + self._strict() * self._unsteady(flown, found["overshoot"], quiet)
         self._losses.append(float(found["cost"].detach().mean()))
         return loss
+
+    def _unsteady(self, flown: ConditionedFlights, overshoot: Tensor, quiet: int) -> Tensor:
+        """Return what the quiet flights of a batch cost in s beyond what is free."""
+        settings, steady = self.settings, self.settings.steady
+        # the standard deviation of a sine is its movement peak to peak over two roots of two
+        free = 0.0 if steady is None else (_FREE * steady.rudder_swing) ** 2 / 8.0
+        swing = (flown.late_swing(_LATE)[:quiet] - free).clamp(min=0.0)
+        worst = swing.topk(math.ceil(quiet / 4)).values.mean()
+        cost: Tensor = math.degrees(math.degrees(settings.calm)) * worst
+        if quiet >= 4:
+            over = overshoot[quiet // 2 : quiet // 2 + quiet // 4]
+            over = (over - (0.0 if steady is None else _FREE * steady.overshoot)).clamp(min=0.0)
+            cost = cost + math.degrees(settings.exact) * over.mean()
+        return cost
+
+    def _strict(self) -> float:
+        """Return the factor on what swing and nominal overshoot cost in this epoch."""
+        refused = sum(entry.get("diverged", 0.0) > 0 for entry in self.history)
+        return float(self.settings.stricter**refused)
 
     def _batch(self, share: float, rows: int, quiet: int = 0) -> HeadingChanges:
         """Return heading changes drawn anew, under a share of the conditions.
 
-        The first `quiet` of them are without noise and slow push, every second one of these at a
-        corner of the spread, where a loop swings first.
+        The first `quiet` of them are without noise and slow push: first half of these at a corner
+        of the spread, where a loop swings first, then a quarter that flies the nominal vessel.
         """
         random = torch.Generator().manual_seed(int(torch.randint(2**62, (1,))))
         changes = self.drawn.draw(rows, self.settings.dt, random, share)
         changes.noise[:quiet], changes.push[:quiet] = 0.0, 0.0
+        changes = nominal(changes, quiet // 2, quiet // 4)
         return self.drawn.at_corners(changes, quiet // 2, random, share)
 
     def on_after_backward(self) -> None:
@@ -121,11 +158,19 @@ class ConditionsFit(EpochTraining):
             self.trainer.optimizers[0].zero_grad()
 
     def validated(self) -> tuple[nn.Module, float]:
-        """Return the policy and its mean cost over the flights that epochs are chosen on."""
+        """Return the policy and its mean cost over the flights that epochs are chosen on.
+
+        Flights that swing are counted. An epoch that costs more than the start counts as if more
+        of them swung than there are, so that it never takes the start's place.
+        """
         self.policy.at(self.unseen.dt)
         flown = self.test.fly(self.unseen)
+        score = float(flown.measured(self.conditions)["cost"].mean())
+        if self.steady is not None:
+            worse = self.start_score is not None and score > self.start_score
+            self.diverged = _ALL if worse else self.steady.refused(self.test)
         self.policy.at(self.settings.dt)
-        return self.policy, float(flown.measured(self.conditions)["cost"].mean())
+        return self.policy, score
 
 
 def _flying(
@@ -161,12 +206,14 @@ def train_under_conditions(
     is resumed where it exists.
 
     Returns:
-        What there is to say: the curve by epoch, the cost at the start and the best one.
+        What there is to say: the curve by epoch, the cost at the start and the best one, and how
+        many flights are beyond `settings.steady`.
 
     Raises:
         FitError: where no epoch gave a finite cost.
     """
     fit = ConditionsFit(policy.float(), vessel, settings, conditions, seed, compiler)
     notes = run_epochs(name, fit, policy, policy, folder)
+    notes |= {"unsteady": fit.best_diverged}
     policy.at(conditions.dt)
     return notes
