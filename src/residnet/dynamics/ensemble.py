@@ -60,6 +60,26 @@ class MeanHead(ResidualHead):
             begin += self.widths[i]
         return total / len(self.members), torch.cat(memory, dim=-1)
 
+    def told_apart(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return mean and standard deviation of the members' residuals [B, 3], and the memory."""
+        told: list[Tensor] = []
+        memory: list[Tensor] = []
+        begin = 0
+        for i, member in enumerate(self.members):
+            rho, after = member(z, s[..., begin : begin + self.widths[i]])
+            told.append(rho)
+            memory.append(after)
+            begin += self.widths[i]
+        mean, deviation = _agreement(torch.stack(told))
+        return mean, deviation, torch.cat(memory, dim=-1)
+
+    def sequence_told_apart(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Return mean and standard deviation of the members' residuals [B, T, 3] along z."""
+        told: list[Tensor] = []
+        for member in self.members:
+            told.append(member.sequence(z))  # type: ignore[operator]
+        return _agreement(torch.stack(told))
+
     def sequence(self, z: Tensor) -> Tensor:
         """Return residuals [B, T, 3] along channels [B, T, nz], from an empty memory."""
         total = zero_acceleration(z)
@@ -86,6 +106,13 @@ class MeanHead(ResidualHead):
     def parameter_count(self) -> list[float]:
         """Return the parameters of each axis, those of all members together."""
         return _summed([member.parameter_count() for member in self.members])  # type: ignore[operator]
+
+
+def _agreement(told: Tensor) -> tuple[Tensor, Tensor]:
+    """Return mean and standard deviation [..., 3] of what members tell [K, ..., 3]."""
+    mean = told.mean(dim=0)
+    # the root has no slope at zero
+    return mean, torch.sqrt((told - mean).square().mean(dim=0) + 1e-18)
 
 
 def _summed(counts: Sequence[Sequence[float]]) -> list[float]:

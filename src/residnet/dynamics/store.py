@@ -26,6 +26,7 @@ from residnet.dynamics.band import BandTable
 from residnet.dynamics.base import Integrator
 from residnet.dynamics.disturbance import DisturbanceConfig
 from residnet.dynamics.ensemble import mean_of
+from residnet.dynamics.gate import GatedHead
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.heads import HeadConfig, ZeroHead
 from residnet.physics.signals import SignalsConfig
@@ -71,6 +72,7 @@ class ModelSpec(Stored):
         disturbance: unknown force that is estimated from the measured past; None for none.
         members: of an ensemble, whose accelerations are averaged; its own baseline and head are
             then empty.
+        gated: the residual fades outside the training range.
     """
 
     schema_name: Literal["residnet.model/1"] = Field(default="residnet.model/1", alias="schema")
@@ -88,9 +90,16 @@ class ModelSpec(Stored):
     band: BandTable | None = None
     disturbance: DisturbanceConfig | None = None
     members: tuple[ModelSpec, ...] = ()
+    gated: bool = False
 
     def build(self) -> HybridDynamics:
         """Return the model with its numbers not yet filled in."""
+        model = self._ungated()
+        if self.gated:
+            model.head = GatedHead(model.head, model.signals.count)
+        return model
+
+    def _ungated(self) -> HybridDynamics:
         if self.members:
             return mean_of([member.build() for member in self.members])
         signals = self.signals.build()

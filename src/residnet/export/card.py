@@ -78,6 +78,7 @@ def make_card(
             member.model_dump(mode="json", include={"name", "baseline", "head"})
             for member in spec.members
         ],
+        "gated": spec.gated,
         "band": None if spec.band is None else _band(spec.band, spec.dt),
         "metrics": [dict(row) for row in metrics],
         "parity": dict(parity),

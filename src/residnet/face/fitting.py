@@ -133,6 +133,7 @@ def fit(
     baselines: Mapping[str, PartGiven] | None = None,
     base_of: Mapping[str, str] | None = None,
     ensembles: Mapping[str, Sequence[str]] | None = None,
+    gates: Mapping[str, Any] | None = None,
     training: Mapping[str, Any] | None = None,
     refit: Mapping[str, Any] | None = None,
     current: Mapping[str, Any] | None = None,
@@ -159,6 +160,7 @@ def fit(
         baselines: further baselines by name.
         base_of: the baseline that a head stands on, by the head's name.
         ensembles: models whose mean acceleration makes another model, by its name.
+        gates: models that fade the residual `of` another one to its baseline outside the data.
         training: of network heads by the name of the head; `epochs` and so on, as YAML has them.
         refit: baselines whose coefficients are moved through rollouts.
         current: the logs ran in constant currents that are estimated first.
@@ -185,6 +187,7 @@ def fit(
         "heads": {} if _empty(heads) else named_parts(heads, "head"),
         "base_of": base_of or {},
         "ensembles": ensembles or {},
+        "gates": gates or {},
         "training": training or {},
     }
     given = {key: value for key, value in parts.items() if value}

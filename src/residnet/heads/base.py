@@ -48,6 +48,19 @@ class ResidualHead(nn.Module, ABC):
         """
         return self.forward(z, z[..., :0])[0]
 
+    def told_apart(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return residual [B, 3], how far members of this head disagree [B, 3], and the memory.
+
+        A head without members agrees with itself.
+        """
+        rho, s = self.forward(z, s)
+        return rho, torch.zeros_like(rho), s
+
+    def sequence_told_apart(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Return what `sequence` does [B, T, 3], and how far members disagree [B, T, 3]."""
+        rho = self.sequence(z)
+        return rho, torch.zeros_like(rho)
+
     def accelerations(self, known: Tensor, rho: Tensor) -> Tensor:
         """Return nu_dot [..., 3] from the baseline's `known` and this head's residual, [..., 3]."""
         return known + rho

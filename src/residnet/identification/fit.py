@@ -56,6 +56,10 @@ def fit(
     for name, members in settings.ensembles.items():
         models[name] = fitter.ensemble(name, [models[member] for member in members])
         say(f"  {name}: {_said(models[name])}")
+    for name, gate in settings.gates.items():
+        if gate.of in models:
+            models[name] = fitter.gated(name, models[gate.of], gate)
+            say(f"  {name}: {_said(models[name])}")
     identified = Identified(settings, models, fitter.limit, fitter.train, fitter.crossed)
     if settings.recipe is not None:
         _add_tied(identified, fitter, logs)

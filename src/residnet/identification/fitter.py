@@ -17,6 +17,7 @@ from residnet.core.samples import Samples
 from residnet.data.prepare import Prepared, envelope, samples
 from residnet.data.windows import WindowStore
 from residnet.dynamics.ensemble import mean_of
+from residnet.dynamics.gate import GatedHead
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec, rebuilt
 from residnet.heads import ClosedFormHead
@@ -24,7 +25,7 @@ from residnet.identification.cross_fitting.crossed import Crossed
 from residnet.identification.cross_fitting.prior_choice import TAKEN, choose_prior
 from residnet.identification.models import FitStore, FittedModel
 from residnet.identification.prepared import velocity_limit
-from residnet.identification.settings import FitSettings, ForceConfig
+from residnet.identification.settings import FitSettings, ForceConfig, GateConfig
 from residnet.identification.settling import settled
 from residnet.identification.solution_choice import choose_solution
 from residnet.identification.validation import ValidationScore
@@ -54,6 +55,7 @@ class Fitter:
         self.low, self.high = envelope(self.train)
         self.limit = velocity_limit(self.low, self.high, settings.evaluation.divergence)
         self.samples = samples(self.train, self.signals)
+        self.held_back = samples(logs["validation"], self.signals)
         self.settings = settled(settings, self.samples, self.train)
         self.scales = torch.from_numpy(settings.evaluation.scales.array())
         self.crossed: Crossed | None = None
@@ -221,6 +223,35 @@ class Fitter:
         model = mean_of([copy.deepcopy(member.model).to(torch.float64) for member in members])
         notes: dict[str, Any] = {
             "members": [member.name for member in members],
+            **self._validated(model),
+        }
+        return self._kept(FittedModel(spec, model, notes))
+
+    def gated(self, name: str, base: FittedModel, config: GateConfig) -> FittedModel:
+        """Return a model whose residual fades to its baseline outside the training range.
+
+        Args:
+            name: of the model.
+            base: fitted model with the residual.
+            config: fades to choose from.
+        """
+        spec = base.spec.model_copy(update={"name": name, "gated": True})
+        inner = copy.deepcopy(base.model).to(torch.float64)
+        model = HybridDynamics(
+            inner.signals,
+            inner.baseline,
+            GatedHead(inner.head, inner.signals.count),
+            inner.dt,
+            inner.integrator,
+        )
+        assert isinstance(model.head, GatedHead)
+        model.head.calibrate(self.samples)
+        left = model.head.learn_fade(residual_samples(model, self.held_back), config.fades)
+        notes: dict[str, Any] = {
+            **{key: base.notes[key] for key in ("baseline", "members") if key in base.notes},
+            "of": base.name,
+            "fade": model.head.fade.tolist(),
+            "fades_tried": left,
             **self._validated(model),
         }
         return self._kept(FittedModel(spec, model, notes))

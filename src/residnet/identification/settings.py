@@ -24,7 +24,7 @@ from residnet.core.names import nearest
 from residnet.data.prepare import PrepareConfig
 from residnet.dynamics.base import Integrator
 from residnet.dynamics.disturbance import DisturbanceConfig
-from residnet.heads import HeadConfig
+from residnet.heads import ForceHead, HeadConfig
 from residnet.identification.standard import PARTS, TIED, Facts, portfolio
 from residnet.judge.bands.config import BandsConfig
 from residnet.judge.config import EvaluationConfig
@@ -62,6 +62,25 @@ class ForceConfig(Config):
         ]
 
 
+class GateConfig(Config):
+    """A model that falls back to physics where its network knows nothing.
+
+    Outside the training range the residual of another model fades to the baseline, and where the
+    members of an ensemble disagree. How quickly it fades is chosen on the validation logs: what
+    lies outside inner boxes of the range stands for what nobody has seen.
+
+    Attributes:
+        of: head or ensemble whose residual fades.
+        fades: distances from the training range, in its half widths, at which half of the residual
+            is left, to choose from for each axis.
+    """
+
+    of: str
+    fades: tuple[Annotated[float, Field(gt=0, le=1e6)], ...] = Field(
+        default=(0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 100.0), min_length=1
+    )
+
+
 class Parts(Config):
     """The models of a fit.
 
@@ -77,6 +96,8 @@ class Parts(Config):
         forces: models by name that add an unknown force, estimated from the measured past, to
             another one.
         ensembles: models whose mean acceleration makes another model, by its name.
+        gates: models by name that fade the residual of a head or an ensemble to its baseline, where
+            the training data say nothing.
         training: of network heads by the name of the head; the defaults where absent.
     """
 
@@ -89,6 +110,7 @@ class Parts(Config):
     ensembles: dict[str, Annotated[tuple[str, ...], Field(min_length=2)]] = Field(
         default_factory=dict
     )
+    gates: dict[str, GateConfig] = Field(default_factory=dict)
     training: dict[str, TrainingConfig] = Field(default_factory=dict)
 
 
@@ -153,8 +175,8 @@ class FitSettings(Parts):
     def _combination(self) -> FitSettings:
         baselines = self.all_baselines
         single = (*baselines, *self.heads)
-        models = (*single, *self.forces, *self.ensembles)
-        for name in (*self.baselines, *self.heads, *self.forces, *self.ensembles):
+        models = (*single, *self.forces, *self.ensembles, *self.gates)
+        for name in (*self.baselines, *self.heads, *self.forces, *self.ensembles, *self.gates):
             if (
                 name in _RESERVED
                 or models.count(name) > 1
@@ -172,6 +194,8 @@ class FitSettings(Parts):
         require_known("forces", (force.of for force in self.forces.values()), single, "model")
         members = (name for names in self.ensembles.values() for name in names)
         require_known("ensembles", members, single, "model")
+        residuals = (*self.heads, *self.ensembles)
+        require_known("gates", (gate.of for gate in self.gates.values()), residuals, "residual")
         self._parts_fit_together()
         return self
 
@@ -211,6 +235,13 @@ class FitSettings(Parts):
                     f"training.{name}.refit_baseline: the baseline of '{name}' has no coefficients"
                     " that may move; leave it out"
                 )
+        for name, gate in self.gates.items():
+            built = self.heads[gate.of].build(names) if gate.of in self.heads else None
+            if isinstance(built, ForceHead):
+                raise ValueError(
+                    f"gates.{name}.of: '{gate.of}' is in force space and changes the mass, which"
+                    " cannot fade; name a head in acceleration space"
+                )
         for name in self.refit:
             if not isinstance(self.all_baselines[name].build(names), ParametricBaseline):
                 raise ValueError(
@@ -235,7 +266,14 @@ class FitSettings(Parts):
     def model_names(self) -> tuple[str, ...]:
         """Names of all models but `zero`: baselines, heads, ensembles."""
         tied = () if self.recipe is None else (TIED,)
-        return (*self.all_baselines, *self.heads, *self.forces, *self.ensembles, *tied)
+        return (
+            *self.all_baselines,
+            *self.heads,
+            *self.forces,
+            *self.ensembles,
+            *self.gates,
+            *tied,
+        )
 
     def baseline_name_of(self, head: str) -> str:
         """Return the name of the baseline that a head stands on."""
