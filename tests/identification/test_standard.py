@@ -24,6 +24,7 @@ from residnet.identification.fit import Identified, fit
 from residnet.identification.prepared import PreparedSplits, prepare_logs
 from residnet.identification.settings import FitSettings
 from residnet.identification.standard import PARTS, Facts, portfolio
+from residnet.judge.verdict.selection import least
 from residnet.physics.signals import SignalsConfig
 from residnet.physics.symmetry import dissipates
 
@@ -106,7 +107,8 @@ def test_the_selected_model_and_the_tied_ones_are_sound(
     chosen = identified.select(judged)
     single = [e for e in chosen.contenders if e.family not in ("zero", "ensemble")]
     assert next(e for e in single if e.name == chosen.selected).sound
-    best = min((e for e in single if e.sound), key=lambda e: e.error)
+    best = least((e for e in single if e.sound), chosen.blocks)
+    assert best is not None
     assert best.name in chosen.tied
     if "tied" in identified:
         assert identified["tied"].notes["members"] == list(chosen.tied)

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from residnet.judge.verdict.selection import Blocks, Contender, Selection, choose
+from residnet.judge.verdict.selection import Blocks, Contender, Selection, choose, difference
 
 EVEN = Blocks(np.full(5, 0.2), "logs")
 JITTER = np.array([1.0, -1.0, 2.0, -2.0, 0.0])
@@ -141,3 +141,36 @@ def test_blocks_of_other_data_add_to_the_variance() -> None:
     found = both.standard_error(np.concatenate((one, other)), np.zeros(9))
     assert found == pytest.approx(math.hypot(*apart))
     assert both.count == 9
+
+
+def test_the_more_precise_of_two_comparisons_counts() -> None:
+    """A network alone is judged by way of `zero` over folds, which differs much between logs."""
+    both = EVEN.beside(EVEN)
+
+    def judged(name: str, folds: float, spread: float, alone: float, family: str) -> Contender:
+        direct = (alone + 0.001 * JITTER) / 5
+        over_folds = (folds + spread * JITTER) / 5
+        rest = np.zeros(5) if family == "refitted baseline" else direct - over_folds[::-1]
+        return Contender(name, family, 10, np.concatenate((over_folds, rest)), direct=direct)
+
+    hull = judged("hull", 0.2, 0.01, 0.2, "refitted baseline")
+    network = judged("network", 0.8, 0.3, 0.25, "network")
+    assert difference(network, hull, both)[0] == pytest.approx(0.05)
+    assert difference(network, hull, both)[1] < 0.01
+    found = choose((ZERO_OF_FOLDS, hull, network), both)
+    assert (found.selected, found.tied) == ("hull", ("hull",))
+    # the other way round neither a simpler hull nor zero stands in a good network's way
+    good = judged("network", 0.8, 0.3, 0.1, "network")
+    assert choose((ZERO_OF_FOLDS, hull, good), both).selected == "network"
+    # two baselines are compared over the folds, which are more logs
+    linear = judged("linear", 0.3, 0.02, 0.1, "refitted baseline")
+    assert difference(linear, hull, both)[0] == pytest.approx(0.1)
+
+
+ZERO_OF_FOLDS = Contender(
+    "zero",
+    "zero",
+    0,
+    np.concatenate(((0.8 + 0.3 * JITTER) / 5, np.zeros(5))),
+    direct=np.full(5, 0.16),
+)

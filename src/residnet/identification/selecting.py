@@ -110,6 +110,7 @@ def select(
         name: shares(run, name, validation.logs, scales, labels, len(blocks.weights))
         for name in models
     }
+    own = parts
     more = None if crossed is None else with_crossed(parts, blocks, crossed, models)
     if more is not None:
         parts, blocks = more
@@ -134,6 +135,7 @@ def select(
                 parts[entry.name],
                 sum(diverged for _, _, diverged, _ in lost),
                 tuple(faults),
+                None if more is None else own[entry.name],
             )
         )
     return choose(contenders, blocks)

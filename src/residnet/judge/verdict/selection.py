@@ -32,6 +32,7 @@ class Contender:
         shares: what each block of the validation data contributes to its mean NRMSE, [B].
         diverged: number of its validation windows that diverged, over all protocols.
         faults: sentences on what makes it unsound, divergences among them; empty for a sound model.
+        direct: shares over the validation logs alone, where `shares` are of folds too; else None.
     """
 
     name: str
@@ -40,6 +41,7 @@ class Contender:
     shares: np.ndarray
     diverged: int = 0
     faults: tuple[str, ...] = ()
+    direct: np.ndarray | None = None
 
     @property
     def error(self) -> float:
@@ -96,6 +98,33 @@ class Blocks:
         return math.hypot(math.sqrt(count / (count - 1) * float(rest @ rest)), beyond)
 
 
+def difference(one: Contender, other: Contender, blocks: Blocks) -> tuple[float, float]:
+    """Return by how much one model errs more than another, and the standard error of that.
+
+    Over folds a network is judged by way of its baseline. Where two networks stand on baselines
+    that differ much from log to log, this tells less than the validation logs alone, and where it
+    does, these speak.
+    """
+    told = one.error - other.error, blocks.standard_error(one.shares, other.shares)
+    if blocks.further is None or one.direct is None or other.direct is None:
+        return told
+    count = len(blocks.weights)
+    if np.array_equal(one.shares[count:], other.shares[count:]):
+        return told
+    alone = float((one.direct - other.direct).sum())
+    spread = blocks.further.standard_error(one.direct, other.direct)
+    return (alone, spread) if 0.0 < spread < told[1] else told
+
+
+def least(entries: Iterable[Contender], blocks: Blocks) -> Contender | None:
+    """Return the model that errs least, each compared with the best so far; None of none."""
+    best: Contender | None = None
+    for entry in sorted(entries, key=lambda entry: entry.error):
+        if best is None or difference(entry, best, blocks)[0] < 0.0:
+            best = entry
+    return best
+
+
 @dataclass(frozen=True)
 class Selection:
     """The chosen models, and why.
@@ -118,13 +147,14 @@ class Selection:
     def tied(self) -> tuple[str, ...]:
         """Names of the sound single models within one standard error of the best, `zero` aside."""
         single = [e for e in self.contenders if e.family not in ("ensemble", "zero") and e.sound]
-        best = min(single, key=lambda entry: entry.error, default=None)
+        best = least(single, self.blocks)
         return tuple(
-            entry.name
-            for entry in single
-            if best is not None
-            and entry.error - best.error <= self.blocks.standard_error(entry.shares, best.shares)
+            entry.name for entry in single if best is not None and self._within(entry, best)
         )
+
+    def _within(self, entry: Contender, best: Contender) -> bool:
+        apart, spread = difference(entry, best, self.blocks)
+        return apart <= spread
 
     def content(self) -> dict[str, Any]:
         """Return the contents of selection.json."""
@@ -141,8 +171,8 @@ class Selection:
                     "family": entry.family,
                     "parameters": entry.parameters,
                     "nrmse_mean": entry.error,
-                    "difference": entry.error - lead.error,
-                    "standard_error": self.blocks.standard_error(entry.shares, lead.shares),
+                    "difference": difference(entry, lead, self.blocks)[0],
+                    "standard_error": difference(entry, lead, self.blocks)[1],
                     "diverged": entry.diverged,
                     "sound": entry.sound,
                     "faults": list(entry.faults),
@@ -183,20 +213,24 @@ def _simplest(
     sound: Sequence[Contender], unsound: Sequence[Contender], blocks: Blocks
 ) -> tuple[Contender, str]:
     """Return the simplest sound model within one standard error of the best, and why."""
-    best = min(sound, key=lambda entry: entry.error)
+    best = least(sound, blocks)
+    assert best is not None
     for chosen in sorted(sound, key=lambda entry: (*entry.simplicity, entry.error)):
-        apart = chosen.error - best.error
-        if apart <= blocks.standard_error(chosen.shares, best.shares):
+        apart, within = difference(chosen, best, blocks)
+        if apart <= within:
             break
     if chosen is best:
-        reason = (
-            f"{chosen.name} has the least validation error of the sound models ({chosen.error:.3g})"
+        # folds may say less where baselines differ; then the validation logs have decided
+        what = (
+            "errs least of the sound models over the same validation logs"
+            if any(entry.error < best.error for entry in sound)
+            else "has the least validation error of the sound models"
         )
+        reason = f"{chosen.name} {what} ({chosen.error:.3g})"
         simpler = [e for e in sound if e.simplicity < best.simplicity]
         if simpler:
             reason += ", and no simpler one comes within one standard error of it"
     else:
-        within = blocks.standard_error(chosen.shares, best.shares)
         reason = (
             f"{chosen.name} is the simplest sound model whose validation error ({chosen.error:.3g})"
             f" is within one standard error ({within:.2g}) of the least, that of {best.name}"
