@@ -13,9 +13,10 @@ that JSON file, with `[key=value,...]` for the first entry of a list that has th
 `x100` by a factor, `deg` from rad; a fifth is the number of digits, 3 otherwise. Lists stand with
 slashes between their entries.
 
-A source that is finished under --runs is not run again unless `--again` is given. What needs absent
-data or an absent package, or takes longer than --minutes on two idle cores, is not run; its figures
-stay as they are, and the last lines name them.
+A source that is finished under --runs, with the package and the configs as they are now, is not run
+again unless `--again` is given, so that all figures of a call are of one state; it must be
+committed. What needs absent data or an absent package, or takes longer than --minutes on two idle
+cores, is not run; its figures stay as they are, and the last lines name them.
 """
 
 from __future__ import annotations
@@ -143,11 +144,29 @@ def why_not(source: Source, minutes: float) -> str:
     return ""
 
 
-def make(name: str, source: Source, runs: Path, *, again: bool) -> str:
+def git(*words: str) -> str:
+    """Return what git says."""
+    said = subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=True)
+    return said.stdout.strip()
+
+
+def state() -> str:
+    """Return what the figures depend on: package, configs and scripts as they are committed.
+
+    Raises:
+        SystemExit: where something of them is not committed.
+    """
+    parts = ("src", "configs", "scripts/bench", "tests/support")
+    if changed := git("status", "--porcelain", "--", *parts):
+        raise SystemExit(f"commit first, so that figures belong to a commit:\n{changed}")
+    return git("rev-parse", *(f"HEAD:{part}" for part in parts))
+
+
+def make(name: str, source: Source, runs: Path, now: str, *, again: bool) -> str:
     """Run a source unless it is finished; return why its figures are not there, or nothing."""
     folder = runs / name
-    done = folder / ("summary.json" if source.is_config else "stdout")
-    if done.is_file() and not again:
+    stamp = folder / "state"
+    if stamp.is_file() and stamp.read_text(encoding="utf-8") == now and not again:
         return ""
     print(f"running {name}: {' '.join(source.command)}", flush=True)
     if source.is_config:
@@ -163,6 +182,7 @@ def make(name: str, source: Source, runs: Path, *, again: bool) -> str:
         return f"failed: {(ran.stderr.strip() or 'without a word').splitlines()[-1]}"
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "stdout").write_text(ran.stdout, encoding="utf-8")
+    stamp.write_text(now, encoding="utf-8")
     return ""
 
 
@@ -182,6 +202,18 @@ def figure(where: str, runs: Path) -> str:
     word, digits = scale[0] if scale else "x1", int(scale[1]) if len(scale) > 1 else DIGITS
     factor = DEG if word == "deg" else float(word.removeprefix("x"))
     return shown(entry(json.loads(content), path), factor, digits)
+
+
+def lacking(name: str, runs: Path) -> str:
+    """Return the first figure of the pages that the run of a source does not have, or nothing."""
+    for page in pages():
+        for where, _ in marks(page):
+            if where.split()[0] == name:
+                try:
+                    figure(where, runs)
+                except (LookupError, OSError) as error:
+                    return f"ran, but has no figure {where}: {error}"
+    return ""
 
 
 def entry(content: Any, path: str) -> Any:
@@ -257,14 +289,16 @@ def main() -> None:
     wanted = set(options.only.split(",")) if options.only else used
     if unknown := wanted - set(SOURCES):
         parser.error(f"no source '{min(unknown)}'; valid: {', '.join(SOURCES)}")
+    now = state()
     reasons = dict.fromkeys(used - wanted, "not asked for")
     for name in sorted(used & wanted, key=lambda name: SOURCES[name].minutes):
         reason = why_not(SOURCES[name], options.minutes)
-        reason = reason or make(name, SOURCES[name], options.runs, again=options.again)
-        if reason:
+        reason = reason or make(name, SOURCES[name], options.runs, now, again=options.again)
+        if reason := reason or lacking(name, options.runs):
             reasons[name] = reason
     changed = sum(rewrite(page, options.runs, list(reasons)) for page in pages())
-    print(f"{changed} figures changed.")
+    commit = git("rev-parse", "--short", "HEAD")
+    print(f"{changed} figures changed; those that were run are of commit {commit}.")
     for name, reason in sorted(reasons.items()):
         print(f"not run: {name}: {reason}")
 

@@ -54,6 +54,23 @@ def test_figures_are_read_from_runs_and_put_into_pages(results: ModuleType, tmp_
         results.figure("quickstart metrics.json rows[model=c].value", tmp_path)
 
 
+def test_only_runs_of_this_state_count_and_a_lacking_figure_is_named(
+    results: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("<!--= made stdout took\\s(\\d+) -->old<!--/-->")
+    monkeypatch.setattr(results, "pages", lambda: [page])
+    script = tmp_path / "bench.py"
+    script.write_text("print('took 7')")
+    source = results.Source((str(script),), 1)
+    assert results.make("made", source, tmp_path, "first", again=False) == ""
+    script.write_text("print('took long')")
+    assert results.make("made", source, tmp_path, "first", again=False) == ""
+    assert results.lacking("made", tmp_path) == ""
+    assert results.make("made", source, tmp_path, "second", again=False) == ""
+    assert "has no figure made stdout" in results.lacking("made", tmp_path)
+
+
 def test_what_cannot_be_run_is_said(
     results: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
