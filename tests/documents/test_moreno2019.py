@@ -10,11 +10,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from residnet.core.errors import UsageError
+from residnet.core.config import load_config
+from residnet.core.errors import ConfigError, UsageError
 from residnet.documents import study_sections
 from residnet.documents.moreno2019 import curves
 from residnet.report.blocks import Cell, Figure, Table, Text
 from residnet.report.run_reader import RunFiles
+from residnet.tasks.fit.task import FitConfig
 
 MODELS = (
     "zero",
@@ -141,6 +143,21 @@ def test_the_curves_are_what_the_search_tried(tmp_path: Path) -> None:
 def test_a_run_without_a_model_of_the_study_says_which(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=f"'{MODELS[-2]}' is absent"):
         study_sections("moreno2019", made(tmp_path, MODELS[:-2]))
+
+
+@pytest.mark.parametrize(
+    ("config", "absent"), [("moreno2019/moreno2019", "p2_each"), ("woo2018/woo2018", "lstm_rate")]
+)
+def test_a_study_without_one_of_its_models_is_refused_before_any_work(
+    config: str, absent: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("RESIDNET_DATA", str(tmp_path))
+    path = Path(__file__).resolve().parents[2] / "configs" / "studies" / f"{config}.yaml"
+    over = [f"~heads.{absent}"]
+    over.append(f"~base_of.{absent}" if config.startswith("moreno") else f"~training.{absent}")
+    with pytest.raises(ConfigError, match=f"'{absent}' is absent; give it, or leave the study out"):
+        load_config(path, over, FitConfig)
+    assert load_config(path, [*over, "study=null"], FitConfig).study is None
 
 
 def test_a_run_without_the_optional_package_says_what_it_lacks(tmp_path: Path) -> None:

@@ -10,9 +10,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
+from residnet.documents.moreno2019.published import MODELS as MORENO2019
+from residnet.documents.woo2018.published import MODELS as WOO2018
 from residnet.report.blocks import Section
 
 StudyName = Literal["moreno2019", "woo2018"]
+
+STUDY_MODELS: dict[StudyName, tuple[str, ...]] = {"moreno2019": MORENO2019, "woo2018": WOO2018}
+"""Models that a fit must have for a document's study."""
 
 
 def study_sections(name: StudyName, run: Path) -> list[Section]:

@@ -4,6 +4,12 @@ from __future__ import annotations
 
 from types import MappingProxyType
 
+MODELS = (
+    *("baseline", "rbf_joint", "rbf_each", "p1_joint", "p1_each", "p2_joint", "p2_each"),
+    "symbolic",
+)
+"""Models that the study shows; genetic programming (`gptips`) may stand beside them."""
+
 RMSE: MappingProxyType[tuple[str, str], tuple[float, float, float]] = MappingProxyType(
     {
         ("rbf_joint", "train"): (0.0777, 0.0739, 0.0137),

@@ -18,7 +18,7 @@ import numpy as np
 from residnet.core.errors import UsageError
 from residnet.core.files import whole
 from residnet.documents.moreno2019.curves import curves
-from residnet.documents.moreno2019.published import EQUATIONS, OTHERS, RMSE
+from residnet.documents.moreno2019.published import EQUATIONS, MODELS, OTHERS, RMSE
 from residnet.judge.residual_series import block_interval
 from residnet.report.blocks import Block, Cell, Figure, Section, Table, Text
 from residnet.report.figures.style import MEASURED, RC, collect, legend_above, new_figure, save
@@ -54,11 +54,10 @@ def sections(run: Path) -> list[Section]:
     """
     files = RunFiles(run)
     names = {model: name for model, name in _NAMES.items() if model in files.kinds}
-    missing = [model for model in _NAMES if model not in (*names, _OPTIONAL)]
+    missing = [model for model in MODELS if model not in names]
     if missing:
         raise UsageError(
-            f"{run}: study moreno2019 needs the models"
-            f" {', '.join(model for model in _NAMES if model != _OPTIONAL)}; '{missing[0]}' is"
+            f"{run}: study moreno2019 needs the models {', '.join(MODELS)}; '{missing[0]}' is"
             " absent"
         )
     records = {

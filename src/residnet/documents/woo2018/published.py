@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from types import MappingProxyType
 
+MODELS = ("baseline", "nomoto", "nomoto_side_slip", "lstm_printed", "lstm_rate", "lstm")
+"""Models that the study shows."""
+
 CHANGE_OF_ERROR: MappingProxyType[str, float] = MappingProxyType(
     {"u": -0.769, "v": -0.279, "r": -0.607}
 )

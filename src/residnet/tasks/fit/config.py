@@ -9,7 +9,7 @@ from pydantic import model_validator
 from residnet.core.config import Config
 from residnet.data.simulated.trials import SimulatedTrials
 from residnet.data.sources import DataConfig, input_files
-from residnet.documents import StudyName
+from residnet.documents import STUDY_MODELS, StudyName
 from residnet.identification.settings import FitSettings, require_known
 from residnet.judge.booklet import BookletConfig
 from residnet.runs.task import ComputingTask
@@ -46,6 +46,13 @@ class FitTaskSettings(FitSettings, ComputingTask):
         if self.booklet is not None:
             require_known("booklet.model", (self.booklet.model,), self.refit, "refitted baseline")
             self.booklet.rudder()
+        if self.study is not None:
+            absent = [m for m in STUDY_MODELS[self.study] if m not in self.model_names]
+            if absent:
+                raise ValueError(
+                    f"study: {self.study} shows the models {', '.join(STUDY_MODELS[self.study])};"
+                    f" '{absent[0]}' is absent; give it, or leave the study out (study=null)"
+                )
         require_known("export.models", self.export.models, ("selected", *self.model_names), "model")
         if isinstance(self.data, SimulatedTrials):
             self.data.splits(self.data.draw())
