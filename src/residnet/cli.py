@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from residnet.commands import (
+    Quiet,
     ardupilot,
     compare,
     evaluate,
@@ -89,9 +90,7 @@ def run(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace an earlier run in its folder.")
     ] = False,
-    quiet: Annotated[
-        bool, typer.Option("--quiet", help="Show no progress, the result only.")
-    ] = False,
+    quiet: Quiet = False,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print summary.json and the run's folder, for machines.")
     ] = False,
@@ -144,6 +143,7 @@ def new(
             help="Fit the portfolio of the standard recipe: minutes more than a few models."
         ),
     ] = None,
+    quiet: Quiet = False,
 ) -> None:
     """Draft a complete config from logs: `residnet run` takes it as it is.
 
@@ -154,7 +154,7 @@ def new(
     from residnet.terminal import asked
 
     limit_threads()
-    with drawn_progress():
+    with drawn_progress(quiet=quiet):
         ask = asked() if not defaults else None
         file = out or Path("my_boat.yaml")
         standard = recipe is not None
@@ -171,12 +171,13 @@ def demo(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace the logs of an earlier demo.")
     ] = False,
+    quiet: Quiet = False,
 ) -> None:
     """Write realistic logs of a simulated boat to try things on, as csv and MCAP."""
     from residnet.tasks.demo import write_demo
 
     limit_threads()
-    with drawn_progress():
+    with drawn_progress(quiet=quiet):
         lines = write_demo(folder, overwrite=overwrite)
     for line in lines:
         print(line)
@@ -186,12 +187,15 @@ def demo(
 def check(
     config: Annotated[Path, typer.Argument(metavar="CONFIG", help=_CONFIG)],
     overrides: Overrides = None,
+    quiet: Quiet = False,
 ) -> None:
     """Validate a config and everything that it names, without running it."""
     from residnet.tasks.loading import load_task
 
-    task = load_task(config, overrides or [])
-    task.check()
+    limit_threads()
+    with drawn_progress(quiet=quiet):
+        task = load_task(config, overrides or [])
+        task.check()
     print(f"{config}: the config is valid (task {task.task}, run {task.name})")
 
 
@@ -214,6 +218,7 @@ def inspect(
         Path | None,
         typer.Option("--json", metavar="FILE", help="Write the findings to a file as JSON, too."),
     ] = None,
+    quiet: Quiet = False,
 ) -> None:
     """Check logs for faults that would mislead a fit.
 
@@ -226,7 +231,7 @@ def inspect(
     limit_threads()
     if file is not None:
         require_file_place(file)
-    with drawn_progress():
+    with drawn_progress(quiet=quiet):
         findings = inspect_logs(logs, config)
     print(findings.text)
     if file is not None:

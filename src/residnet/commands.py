@@ -14,6 +14,7 @@ from residnet.terminal import drawn_progress
 if TYPE_CHECKING:
     from residnet.runs.task import Finished
 
+Quiet = Annotated[bool, typer.Option("--quiet", help="Show no progress, the result only.")]
 RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a finished run.")]
 
 
@@ -34,12 +35,13 @@ def evaluate(
     more: Annotated[
         list[Path] | None, typer.Argument(metavar="[PATH]...", help="Further logs.")
     ] = None,
+    quiet: Quiet = False,
 ) -> None:
     """Evaluate the models of a finished run in free run on other logs."""
     from residnet.tasks.verbs import evaluate_run
 
     limit_threads()
-    with drawn_progress():
+    with drawn_progress(quiet=quiet):
         finished = evaluate_run(folder, [*logs, *(more or [])], out)
     show(finished)
 
@@ -60,6 +62,7 @@ def monitor(
         Path | None,
         typer.Option("--json", metavar="FILE", help="Write what was found to a file as JSON, too."),
     ] = None,
+    quiet: Quiet = False,
 ) -> None:
     """Watch new logs with a model of a finished fit, and name what has changed.
 
@@ -72,7 +75,7 @@ def monitor(
     if file is not None:
         require_file_place(file)
     settings = {"window": window, "stretch": stretch, "false_alarm": false_alarm}
-    with drawn_progress():
+    with drawn_progress(quiet=quiet):
         found = monitor_run(folder, logs, model, settings)
     for log in found:
         print("\n".join(log.text()))
@@ -99,6 +102,7 @@ def plan_trial(
         Path | None,
         typer.Option("--out", metavar="DIR", help="Folder for next_trials.yaml and tracks."),
     ] = None,
+    quiet: Quiet = False,
 ) -> None:
     """Say which manoeuvres to run next, and by how much they would narrow the predictions."""
     from residnet.core.files import require_room
@@ -108,7 +112,7 @@ def plan_trial(
     if out is not None:
         require_room(out)
     limits = {"time": time, "area": area, "speed": speed, "rudder": rudder, "count": count}
-    with drawn_progress():
+    with drawn_progress(quiet=quiet):
         planned = plan_run(folder, model, limits)
     print(planned.text())
     for file in planned.write(out) if out is not None else []:
@@ -135,12 +139,15 @@ def export(
             "--out", metavar="FILE", help="File to write; RUN/exports/<model>.pt where not given."
         ),
     ] = None,
+    quiet: Quiet = False,
 ) -> None:
     """Export a model of a finished run for controllers, after a parity check."""
     from residnet.tasks.verbs import export_run
 
     limit_threads()
-    print(export_run(folder, model, out, file_format))
+    with drawn_progress(quiet=quiet):
+        written = export_run(folder, model, out, file_format)
+    print(written)
 
 
 def ardupilot(
@@ -173,12 +180,14 @@ def ardupilot(
     end.serve()
 
 
-def report(folder: RunPath) -> None:
+def report(folder: RunPath, quiet: Quiet = False) -> None:
     """Write the figures and the report of a finished run again."""
     from residnet.tasks.verbs import report_run
 
     limit_threads()
-    print(report_run(folder))
+    with drawn_progress(quiet=quiet):
+        page = report_run(folder)
+    print(page)
 
 
 def compare(
@@ -188,12 +197,14 @@ def compare(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of the page.")] = Path(
         "comparison"
     ),
+    quiet: Quiet = False,
 ) -> None:
     """Set finished fits side by side: errors on common logs, paired intervals, configs."""
     from residnet.tasks.compare.comparing import compare_runs
 
     limit_threads()
-    text, page = compare_runs(folders, out)
+    with drawn_progress(quiet=quiet):
+        text, page = compare_runs(folders, out)
     print(text)
     print(f"page: {page}")
 

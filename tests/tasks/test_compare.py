@@ -73,7 +73,7 @@ def test_two_runs_side_by_side(tmp_path: Path) -> None:
     assert "second (linear) has the least error: -0.050 against first, beyond chance." in text
     assert "seed" in text
     content = plain(page)
-    assert "Where the configs differ" in content
+    assert "Where the runs differ" in content
     assert "Error against horizon" in content
 
 

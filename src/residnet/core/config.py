@@ -19,7 +19,7 @@ from yaml.nodes import Node
 
 from residnet.core.config_errors import describe
 from residnet.core.config_overrides import Override, apply_override
-from residnet.core.config_paths import ConfigPath, ExistingPath
+from residnet.core.config_paths import BaseConfig, ConfigPath, ExistingPath
 from residnet.core.config_yaml import KeyPath, dump, line_of, parse
 from residnet.core.errors import ConfigError
 from residnet.core.quantities import (
@@ -39,6 +39,7 @@ from residnet.core.quantities import (
 )
 
 __all__ = [
+    "BaseConfig",
     "Config",
     "ConfigPath",
     "ExistingPath",

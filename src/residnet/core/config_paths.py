@@ -12,11 +12,14 @@ from pydantic import GetCoreSchemaHandler, ValidationInfo
 from pydantic_core import CoreSchema, core_schema
 
 from residnet.core.config_errors import given
+from residnet.core.names import nearest
+from residnet.core.resources import shipped_configs
 
 
 @dataclass(frozen=True)
 class _PathRule:
     must_exist: bool
+    shipped: bool = False
 
     def __get_pydantic_core_schema__(
         self, source: Any, handler: GetCoreSchemaHandler
@@ -34,10 +37,12 @@ class _PathRule:
         places = [place / path for place in (folder, Path.cwd()) if place is not None]
         found = next((place for place in places if _exists(place)), None)
         if found is None and self.must_exist:
-            raise ValueError(
-                "no such file or folder:"
-                f" {' or '.join(str(place) for place in dict.fromkeys(places))}"
-            )
+            own = shipped_configs() if self.shipped and not path.suffix else {}
+            if path.as_posix() in own:
+                return own[path.as_posix()].absolute()
+            looked = " or ".join(str(place) for place in dict.fromkeys(places))
+            hint = f"; residnet has no config '{path}' either{nearest(str(path), own)}"
+            raise ValueError(f"no such file or folder: {looked}{hint if own else ''}")
         return (found or places[-1]).absolute()
 
 
@@ -71,3 +76,6 @@ exists there, else from the current folder.
 
 ExistingPath = Annotated[Path, _PathRule(must_exist=True)]
 """As `ConfigPath`, and the file or folder exists."""
+
+BaseConfig = Annotated[Path, _PathRule(must_exist=True, shipped=True)]
+"""As `ExistingPath`; without an ending it may name a config that comes with residnet."""

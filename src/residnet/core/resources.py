@@ -15,3 +15,13 @@ def config_folder() -> Path:
     package = Path(residnet.__file__).parent
     inside = package / "configs"
     return inside if inside.is_dir() else package.parents[1] / "configs"
+
+
+def shipped_configs() -> dict[str, Path]:
+    """Return the configs that come with residnet by name; studies are named by their path too."""
+    folder = config_folder()
+    files = [file for file in sorted(folder.rglob("*.yaml")) if file.parent.name != "vessels"]
+    by_path = {file.relative_to(folder).with_suffix("").as_posix(): file for file in files}
+    stems = [file.stem for file in files]
+    # a stem that two studies share names neither
+    return {file.stem: file for file in files if stems.count(file.stem) == 1} | by_path

@@ -9,7 +9,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import ClassVar, Literal, Protocol, TypeAlias
+from typing import TYPE_CHECKING, ClassVar, Literal, Protocol, TypeAlias
+
+if TYPE_CHECKING:
+    from residnet.report.interactive.explorer import Explorer
 
 Mark: TypeAlias = Literal["", "bad", "best", "weak", "text"]
 
@@ -92,12 +95,14 @@ class Figure:
         path: of a PNG file.
         title: a few words.
         caption: whole sentences that say what to look for.
+        explorer: the interactive figure that shows the same; None where there is none.
     """
 
     kind: ClassVar[str] = "figure"
     path: Path
     title: str
     caption: str
+    explorer: Explorer | None = None
 
 
 @dataclass(frozen=True)

@@ -83,7 +83,7 @@ def fit_sections(run: RunFiles) -> list[Section]:
         bands.section(run),
         goodness.section(run),
         free_runs.section(run),
-        figures_section(run.path / "figures"),
+        figures_section(run.path / "figures", "tracks|history_.*|horizon_.*|residuals.*"),
         sanity.section(run, findings),
     ]
     return [section for section in found if section is not None]

@@ -12,7 +12,7 @@ from markupsafe import Markup, escape
 
 from residnet.core.config import load_mapping
 from residnet.core.files import read_json, whole
-from residnet.report.blocks import Block, Code, Facts, Section
+from residnet.report.blocks import Block, Code, Facts, Figure, Section
 from residnet.report.glossary import Glossary
 from residnet.report.interactive.drawing import draw
 from residnet.report.interactive.explorer import Explorer
@@ -23,6 +23,8 @@ _FACTS = ("residnet", "git", "seed", "python", "machine", "started")
 
 _UNIT = re.compile(r"(?<=\d) (?=(?:%|m|s|deg|m/s|deg/s|1/s|N|kN)(?![\w/]))")
 """The space between a number and its unit."""
+_MOST_PANELS = 60
+"""Most panels of interactive figures of one page, which a browser has to draw."""
 _LONG = 20
 """Least number of characters of a name that may break in the middle."""
 
@@ -78,7 +80,7 @@ def write_page(
         verdict=[sentence for sentence in verdict if sentence],
         sections=parts,
         glossary=glossary,
-        interactive=draw(_explorers(parts)),
+        interactive=draw(_afforded(_explorers(parts))),
     )
     path = run / "report.html"
     with whole(path) as file:
@@ -99,9 +101,22 @@ def _explorers(blocks: Sequence[Block]) -> list[Explorer]:
     for block in blocks:
         if isinstance(block, Explorer):
             found.append(block)
+        elif isinstance(block, Figure) and block.explorer is not None:
+            found.append(block.explorer)
         elif isinstance(block, Section):
             found += _explorers(block.shown)
     return found
+
+
+def _afforded(explorers: Sequence[Explorer]) -> list[Explorer]:
+    """Return the interactive figures that a page has room for; others stay pictures."""
+    out: list[Explorer] = []
+    panels = 0
+    for explorer in explorers:
+        panels += len(explorer.panels)
+        if panels <= _MOST_PANELS or not out:
+            out.append(explorer)
+    return out
 
 
 def _record(run: Path) -> Mapping[str, Any]:

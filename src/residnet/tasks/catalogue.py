@@ -8,12 +8,12 @@ from residnet.baselines import BaselineConfig
 from residnet.core.config import load_mapping
 from residnet.core.errors import ResidnetError
 from residnet.core.registry import ThirdParty, broken_kinds, kinds
+from residnet.core.resources import shipped_configs
 from residnet.data.readers import ReaderConfig
 from residnet.export import exporters
 from residnet.heads import HeadConfig
 from residnet.manoeuvres import ManoeuvreConfig
 from residnet.physics.vessel import broken_vessels, load_vessel, vessel_files
-from residnet.tasks.loading import shipped_configs
 from residnet.tasks.union import TaskConfig
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from residnet.core.config import load_config
 from residnet.core.errors import ConfigError
 from residnet.core.names import nearest
-from residnet.core.resources import config_folder
+from residnet.core.resources import shipped_configs
 from residnet.runs.task import Task
 from residnet.tasks.union import TaskConfig
 
@@ -46,13 +46,3 @@ def config_file(path: Path) -> Path:
             f"{nearest(name, shipped)}; residnet list configs shows them"
         )
     return shipped[name]
-
-
-def shipped_configs() -> dict[str, Path]:
-    """Return the configs that come with residnet by name; studies are named by their path too."""
-    folder = config_folder()
-    files = [file for file in sorted(folder.rglob("*.yaml")) if file.parent.name != "vessels"]
-    by_path = {file.relative_to(folder).with_suffix("").as_posix(): file for file in files}
-    stems = [file.stem for file in files]
-    # a stem that two studies share names neither
-    return {file.stem: file for file in files if stems.count(file.stem) == 1} | by_path

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from residnet.core.config import ExistingPath, load_config
+from residnet.core.config import BaseConfig, load_config
 from residnet.core.errors import UsageError
 from residnet.core.files import read_json
 from residnet.core.names import nearest
@@ -32,7 +32,8 @@ class StudyConfig(Task):
     """Variants of one fit, each over several seeds, compared window by window.
 
     Attributes:
-        base: config of a fit; paths in it are taken from its own folder.
+        base: config of a fit, by its path or by the name of one that comes with residnet; paths in
+            it are taken from its own folder.
         common: overrides of the base for all variants.
         variants: overrides by the variant's name; the files differ in nothing else.
         reference: the variant that the others are compared with.
@@ -44,7 +45,7 @@ class StudyConfig(Task):
     """
 
     task: Literal["study"]
-    base: ExistingPath
+    base: BaseConfig
     common: tuple[str, ...] = ()
     variants: dict[_Name, tuple[str, ...]] = Field(min_length=2)
     reference: str

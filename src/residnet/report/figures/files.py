@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from residnet.report.blocks import Figure, Section
-from residnet.report.figures.style import save
+from residnet.report.figures.style import CURVES, save
+from residnet.report.interactive.pictures import picture_explorer
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -70,11 +72,34 @@ def read_figures(folder: Path) -> list[Figure]:
             # damaged: it is drawn again, or is not one of residnet
             continue
         if "Title" in words and "Description" in words:
-            out.append(Figure(path, str(words["Title"]), str(words["Description"])))
+            out.append(_figure(path, words))
     return out
 
 
-def figures_section(folder: Path) -> Section | None:
-    """Return a section with all figures of a folder, None where there are none."""
+def _figure(path: Path, words: Mapping[str, Any]) -> Figure:
+    title, caption = str(words["Title"]), str(words["Description"])
+    if CURVES not in words:
+        return Figure(path, title, caption)
+    name = "figure-" + re.sub(r"[^a-z0-9]+", "-", path.stem.lower())
+    return Figure(path, title, caption, picture_explorer(name, title, caption, str(words[CURVES])))
+
+
+def figures_section(folder: Path, covered: str = "") -> Section | None:
+    """Return a section with all figures of a folder, None where there are none.
+
+    Args:
+        folder: with the pictures.
+        covered: regular expression of the names of those that other interactive figures of the
+            page show already; they are drawn as pictures, for print.
+    """
     figures = read_figures(folder)
-    return Section("Figures", figures, pictures=True) if figures else None
+    name = re.compile(rf"(\d+_)?({covered})")
+    hidden = [figure for figure in figures if name.fullmatch(figure.path.stem)]
+    shown = [figure for figure in figures if figure not in hidden]
+    still = [replace(figure, explorer=None) for figure in hidden]
+    if not figures:
+        return None
+    if not shown:
+        return Section("Figures", still, pictures=True)
+    pictures = Section("Pictures of the interactive figures", still, pictures=True)
+    return Section("Figures", [*shown, pictures if still else None])

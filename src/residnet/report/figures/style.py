@@ -10,12 +10,15 @@ from typing import Any, ParamSpec, TypeVar
 import numpy as np
 
 from residnet.core.files import whole
+from residnet.report.interactive.pictures import curves_text
 from residnet.report.run_reader import RunFiles
 
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
 
 DPI = 140
+CURVES = "Curves"
+"""Name of the text in a picture's file that holds the curves that it shows."""
 WIDTH = 7.0
 """Width of every figure in inches: the text block of an A4 page, so that 9 pt stay 9 pt in print.
 """
@@ -123,6 +126,9 @@ def save(figure: Any, path: Path, title: str, caption: str) -> None:
     words = PngInfo()
     words.add_itxt("Title", title)
     words.add_itxt("Description", caption)
+    # so that a page can show the curves themselves, whenever it is written
+    if curves := curves_text(figure):
+        words.add_itxt(CURVES, curves, zip=True)
     with whole(path) as file:
         picture.save(file, format="PNG", optimize=True, dpi=(DPI, DPI), pnginfo=words)
 

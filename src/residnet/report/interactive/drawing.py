@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import base64
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from residnet.report.interactive.explorer import INK, Case, Explorer, Panel
+from residnet.report.interactive.packing import packed
 
 if TYPE_CHECKING:
     from bokeh.models import ColumnDataSource
     from bokeh.plotting import figure as Canvas
 
-_LEVELS = 65_000
-"""Steps into which the range of a curve is divided: finer than any screen."""
-_GAP = 65_535
 _FONT = "12px"
 _RANDOM = re.compile(
     r"\b[0-9a-f]{8}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{12}\b|(?<=\")p\d{4,}(?=\")"
@@ -88,38 +85,50 @@ def _numbered(texts: Sequence[str]) -> list[str]:
 
 def _panels(explorer: Explorer) -> list[Canvas]:
     """Return the panels; those of curves share their horizontal axis and a cursor."""
-    from bokeh.models import ColumnDataSource, CrosshairTool, DataRange1d
+    from bokeh.models import ColumnDataSource, CrosshairTool
     from bokeh.models.annotations import Span
 
-    time_axis: Any = DataRange1d(only_visible=True)
+    groups: dict[str, Any] = {}
     cursor = Span(dimension="height", line_dash="dotted", line_width=1)
     out = []
     for number, panel in enumerate(explorer.panels):
-        columns: dict[str, Any] = dict(_columns(explorer, explorer.cases[0], number))
-        source = ColumnDataSource(columns)
-        canvas = _canvas(explorer, panel, number, time_axis, source)
+        # the page's own script fills in the first case: its values are there once
+        columns: dict[str, Any] = {
+            name: [] for name in _columns(explorer, explorer.cases[0], number)
+        }
+        shared = groups.setdefault(panel.group, _range(panel.x_limits))
+        canvas = _canvas(explorer, panel, number, shared, ColumnDataSource(columns))
         if panel.kind == "curves":
             canvas.add_tools(CrosshairTool(dimensions="height", overlay=cursor))
         out.append(canvas)
     return out
 
 
+def _range(limits: Sequence[float]) -> Any:
+    """Return what an axis shows: given limits, else all curves that are switched on."""
+    from bokeh.models import DataRange1d, Range1d
+
+    return Range1d(*limits) if limits else DataRange1d(only_visible=True)
+
+
 def _canvas(
     explorer: Explorer, panel: Panel, number: int, time_axis: Any, source: ColumnDataSource
 ) -> Canvas:
-    from bokeh.models import BasicTicker, BoxZoomTool, DataRange1d, HoverTool
+    from bokeh.models import BasicTicker, BoxZoomTool, DataRange1d, FixedTicker, HoverTool
     from bokeh.models.annotations import Title
     from bokeh.plotting import figure
 
     # what is switched off does not widen the axes
     options: dict[str, Any] = {
         "x_range": time_axis if panel.kind == "curves" else DataRange1d(only_visible=True),
-        "y_range": DataRange1d(only_visible=True),
+        "y_range": _range(panel.y_limits),
     }
     if panel.kind == "map":
         options["match_aspect"] = True
     if panel.logarithmic:
         options["y_axis_type"] = "log"
+    if panel.x_logarithmic:
+        options["x_axis_type"] = "log"
     canvas = figure(
         name=f"{explorer.name}-{number}",
         title=Title(text=panel.title, text_font_size=_FONT),
@@ -149,9 +158,16 @@ def _canvas(
         axis.major_label_text_font_size = _FONT
         axis.axis_label_text_font_size = _FONT
         axis.axis_label_text_font_style = "normal"
-    if not panel.logarithmic:
-        canvas.yaxis.ticker = BasicTicker(desired_num_ticks=4)
-    canvas.xaxis.ticker = BasicTicker(desired_num_ticks=5)
+    ticks = (canvas.yaxis, panel.y_names, panel.logarithmic, 4)
+    for axis, names, logarithmic, count in (
+        ticks,
+        (canvas.xaxis, panel.x_names, panel.x_logarithmic, 5),
+    ):
+        if names:
+            axis.ticker = FixedTicker(ticks=[float(place) for place in names])
+            axis.major_label_overrides = {float(place): text for place, text in names.items()}
+        elif not logarithmic:
+            axis.ticker = BasicTicker(desired_num_ticks=count)
     return canvas
 
 
@@ -163,7 +179,7 @@ def _curve(explorer: Explorer, panel: Panel, name: str, source: ColumnDataSource
     look = explorer.looks[name]
     color = "#808080" if look.color == INK else look.color
     x = f"x of {name}"
-    if panel.kind == "cloud":
+    if panel.kind == "cloud" or look.points:
         glyph: Any = Scatter(x=x, y=name, size=4, fill_color=color, line_color=None, fill_alpha=0.6)
     else:
         glyph = Line(x=x, y=name, line_color=color, line_dash=look.dash, line_width=look.width)
@@ -196,7 +212,7 @@ def _cases(explorer: Explorer) -> str:
                 "title": case.title,
                 "note": case.note,
                 "panels": [
-                    _packed(_columns(explorer, case, number))
+                    packed(_columns(explorer, case, number))
                     for number in range(len(explorer.panels))
                 ],
             }
@@ -204,23 +220,3 @@ def _cases(explorer: Explorer) -> str:
         ],
     }
     return json.dumps(content, separators=(",", ":"), ensure_ascii=True).replace("<", "\\u003c")
-
-
-def _packed(columns: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """Return columns as 16-bit numbers with offset and step; equal columns are stored once."""
-    out: dict[str, Any] = {}
-    stored: dict[bytes, str] = {}
-    for name, values in columns.items():
-        key = values.tobytes()
-        if key in stored:
-            out[name] = stored[key]
-            continue
-        stored[key] = name
-        finite = np.isfinite(values)
-        low = float(values[finite].min()) if finite.any() else 0.0
-        span = float(values[finite].max()) - low if finite.any() else 0.0
-        step = span / _LEVELS if span > 0 else 1.0
-        levels = np.full(len(values), _GAP, dtype="<u2")
-        levels[finite] = np.round((values[finite] - low) / step)
-        out[name] = [low, step, base64.b64encode(levels.tobytes()).decode("ascii")]
-    return out

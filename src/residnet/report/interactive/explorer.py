@@ -24,6 +24,7 @@ class Look:
         dash: of its line as Bokeh has it: `solid`, `dashed`, `dotted`, `dashdot`, `dotdash`.
         width: of its line in pixels.
         shown: whether it is switched on at first.
+        points: it is drawn as points, not as a line.
     """
 
     label: str
@@ -31,6 +32,7 @@ class Look:
     dash: str = "solid"
     width: float = 1.8
     shown: bool = True
+    points: bool = False
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,13 @@ class Panel:
             points.
         height: in pixels.
         logarithmic: whether the vertical axis is.
+        x_logarithmic: whether the horizontal axis is.
+        group: panels of curves of one group share their horizontal axis.
+        x_names: what stands at the horizontal axis in place of numbers, by their places as text.
+        y_names: the same for the vertical axis.
+        beside: it may stand beside others where the page is wide enough.
+        x_limits: where the horizontal axis begins and ends at first; empty for all of the curves.
+        y_limits: the same for the vertical axis.
     """
 
     title: str
@@ -51,6 +60,13 @@ class Panel:
     kind: PanelKind = "curves"
     height: int = 170
     logarithmic: bool = False
+    x_logarithmic: bool = False
+    group: str = ""
+    x_names: Mapping[str, str] = field(default_factory=dict)
+    y_names: Mapping[str, str] = field(default_factory=dict)
+    beside: bool = False
+    x_limits: Sequence[float] = ()
+    y_limits: Sequence[float] = ()
 
 
 Curve: TypeAlias = tuple[np.ndarray, np.ndarray]
@@ -99,6 +115,18 @@ class Explorer:
         """Return the names of the curves that a panel shows in any case, in order."""
         present = {name for case in self.cases for name in case.curves[panel]}
         return [name for name in self.looks if name in present]
+
+
+def joined(curves: Sequence[Curve]) -> Curve:
+    """Return several curves as one with gaps between them."""
+    if not curves:
+        return np.empty(0), np.empty(0)
+    gap = np.array([np.nan])
+    x, y = (
+        np.concatenate([part for curve in curves for part in (curve[axis], gap)])[:-1]
+        for axis in (0, 1)
+    )
+    return x, y
 
 
 def thinned(length: int, most: int) -> np.ndarray:

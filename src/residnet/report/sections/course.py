@@ -69,7 +69,7 @@ def sections(run: RunFiles) -> list[Section]:
         explorer = course_explorer(flown, plans, _radii(run), buoys, RULES)
         out.append(Section("Flights to look into", [explorer]))
     out.append(Section("What the numbers mean", [Text(_definition(run))]))
-    figures = figures_section(run.path / "figures")
+    figures = figures_section(run.path / "figures", ".*_(tracks|time)")
     return [*out, figures] if figures else out
 
 

@@ -26,7 +26,7 @@ def sections(run: RunFiles) -> list[Section]:
     explorer = flight_explorer(flown)
     if explorer is not None:
         out.append(Section("Runs to look into", [explorer]))
-    figures = figures_section(run.path / "figures")
+    figures = figures_section(run.path / "figures", "tracks.*|history_.*")
     return [*out, figures] if figures else out
 
 

@@ -32,6 +32,7 @@
     for (var i = 0; i < this.data.panels; i++) { this.plots.push(plotOf(root.id + "-" + i)); }
     this.wire();
     this.paint();
+    this.show(0);
   }
 
   Explorer.prototype.wire = function () {
@@ -121,9 +122,9 @@
         }
       });
       plot.renderers.forEach(function (curve) {
-        if (looks[curve.name].color === "ink" && curve.glyph.line_color !== undefined) {
-          curve.glyph.line_color = { value: ink };
-        }
+        if (looks[curve.name].color !== "ink") { return; }
+        var part = curve.glyph.type === "Scatter" ? "fill_color" : "line_color";
+        curve.glyph[part] = { value: ink };
       });
     });
   };

@@ -10,11 +10,13 @@ import numpy as np
 
 from residnet.core.config import load_mapping
 from residnet.core.errors import UsageError
-from residnet.report.blocks import Block, Cell, Figure, Section, Table
+from residnet.report.blocks import Block, Cell, Section, Table
+from residnet.report.figures.files import read_figures
 from residnet.report.page import write_page
 from residnet.tasks.compare.errors import JudgedRun, common_windows, judged_runs, paired
 
 _MOST = 60
+_ABSENT = object()
 
 
 def compare_runs(paths: Sequence[Path], out: Path) -> tuple[str, Path]:
@@ -37,7 +39,7 @@ def compare_runs(paths: Sequence[Path], out: Path) -> tuple[str, Path]:
         sections = [
             Section("On common logs", [paired_rows, *blocks]),
             Section("Every model of every run", [metrics]),
-            Section("Where the configs differ", [configs]),
+            Section("Where the runs differ", [configs]),
         ]
         names = " against ".join(run.name for run in runs)
         page = write_page(out, "Runs compared", names, verdict, sections)
@@ -100,32 +102,57 @@ def paired_table(runs: Sequence[JudgedRun], pairs: Mapping[str, Mapping[str, Any
 
 
 def config_table(runs: Sequence[JudgedRun]) -> Table:
-    """Return the keys of the configs that differ."""
-    flat = [dict(_flat(load_mapping(run.folder.resolved), "")) for run in runs]
-    keys = [
-        key
-        for key in dict.fromkeys(key for one in flat for key in one)
-        if len({one.get(key, "(absent)") for one in flat}) > 1 and key != "name"
-    ]
-    more = f" The first {_MOST} of {len(keys)} keys." if len(keys) > _MOST else ""
+    """Return the settings in which the runs differ.
+
+    A part that only some runs have, such as a head, stands in one line.
+    """
+    contents = [dict(load_mapping(run.folder.resolved)) for run in runs]
+    found = [pair for pair in _differing(contents, "") if pair[0] not in ("name", "description")]
+    more = f" The first {_MOST} of {len(found)} stand here." if len(found) > _MOST else ""
     table = Table(
-        ["key", *(run.name for run in runs)],
-        caption=f"{len(keys) or 'No'} keys of the configs differ.{more}",
+        ["setting", *(run.name for run in runs)],
+        caption=(
+            f"What the runs were asked to do differently; what is alike is left out.{more}"
+            if found
+            else "The runs were asked to do the same."
+        ),
     )
-    for key in keys[:_MOST]:
-        table.add(key, [Cell(one.get(key, "(absent)"), mark="text") for one in flat])
+    for key, texts in found[:_MOST]:
+        table.add(key, [Cell(text, mark="text") for text in texts])
     return table
 
 
-def _flat(value: Any, path: str) -> list[tuple[str, str]]:
-    if isinstance(value, Mapping) and value:
-        return [
-            pair
-            for key, inner in value.items()
-            for pair in _flat(inner, f"{path}.{key}" if path else str(key))
-        ]
-    text = str(value)
-    return [(path, text if len(text) <= 80 else f"{text[:77]}...")]
+def _differing(values: Sequence[Any], path: str) -> list[tuple[str, list[str]]]:
+    """Return the paths below which values differ, with what each says there."""
+    if all(value == values[0] for value in values):
+        return []
+    if not all(isinstance(value, Mapping) for value in values):
+        return [(path, [_short(value) for value in values])]
+    keys = dict.fromkeys(key for value in values for key in value)
+    return [
+        pair
+        for key in keys
+        for pair in _differing(
+            [value.get(key, _ABSENT) for value in values], f"{path}.{key}" if path else str(key)
+        )
+    ]
+
+
+def _short(value: Any) -> str:
+    """Return a value in a few words; of a part with many settings its kind or its first ones."""
+    if value is _ABSENT:
+        return "not there"
+    if value is None:
+        return "none"
+    if isinstance(value, Mapping):
+        kind = value.get("kind")
+        parts = [f"{key} {_short(part)}" for key, part in value.items() if key != "kind"]
+        rest = "" if kind else f" {', '.join(parts[:2])}{' ...' if len(parts) > 2 else ''}"
+        return f"there{f' (kind {kind})' if kind else rest and f' ({rest.strip()})'}"
+    if isinstance(value, (list, tuple)) and not value:
+        return "none"
+    text = ", ".join(map(str, value)) if isinstance(value, (list, tuple)) else f"{value}"
+    return text if len(text) <= 80 else f"{text[:77]}..."
 
 
 def _sentence(runs: Sequence[JudgedRun], pairs: Mapping[str, Mapping[str, Any]]) -> str:
@@ -166,4 +193,4 @@ def _curves(runs: Sequence[JudgedRun], out: Path) -> Block:
     (out / "figures").mkdir(exist_ok=True)
     path = out / "figures" / "horizon.png"
     save(figure, path, title, caption)
-    return Figure(path, title, caption)
+    return read_figures(path.parent)[0]

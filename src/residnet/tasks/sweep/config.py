@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from residnet.core.config import Config, ExistingPath
+from residnet.core.config import BaseConfig, Config
 from residnet.runs.task import Task
 from residnet.tasks.sweep.objective import FreeRunObjective, ObjectiveConfig
 from residnet.tasks.sweep.runners import ProcessesConfig, RunnerConfig
@@ -82,7 +82,8 @@ class SweepConfig(Task):
     """Keys of a config varied over a search space; every trial is a run of its own.
 
     Attributes:
-        base: config of any task but a sweep; paths in it are taken from its own folder.
+        base: config of any task but a sweep, by its path or by the name of one that comes with
+            residnet, such as `quickstart`; paths in it are taken from its own folder.
         common: overrides of the base for all trials.
         space: values by the key of the base that they are for, such as `heads.mlp.hidden`.
         search: how the space is searched.
@@ -92,7 +93,7 @@ class SweepConfig(Task):
     """
 
     task: Literal["sweep"]
-    base: ExistingPath
+    base: BaseConfig
     common: tuple[str, ...] = ()
     space: dict[str, Values] = Field(min_length=1)
     search: SearchConfig

@@ -1,0 +1,93 @@
+"""Interactive figures of pictures: a picture's file carries what it shows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from browser import browser, layout
+
+from residnet.report.blocks import Section
+from residnet.report.figures.files import figures_section, read_figures
+from residnet.report.figures.style import new_figure, save
+from residnet.report.interactive.explorer import INK
+from residnet.report.page import write_page
+
+T = np.linspace(0.0, 10.0, 200)
+
+
+def drawn(folder: Path) -> Path:
+    """A picture with lines, a shade, points, a line across, names at an axis and columns."""
+    figure = new_figure(4.0)
+    (first, second), (third, fourth) = figure.subplots(2, 2)
+    first.plot(T, np.sin(T), color="#0072B2", label="model")
+    first.plot(T, np.cos(T), color="black", linestyle="--", label="measured")
+    first.fill_between(T, np.sin(T) - 0.1, np.sin(T) + 0.1, color="#0072B2", alpha=0.2)
+    first.axhline(0.5, color="0.4", linestyle=":")
+    first.set(ylabel="heading\n[deg]", xlabel="time [s]", ylim=(-2.0, 2.0))
+    second.semilogy(T, np.exp(-T), color="#0072B2")
+    second.set_title("error")
+    third.scatter(T[::20], T[::20], color="#D55E00", label="trials")
+    fourth.plot([0.0, 1.0], [2.0, 3.0], "o", color="#0072B2", label="model")
+    fourth.set_xticks([0, 1], ["u", "v"])
+    handles, labels = first.get_legend_handles_labels()
+    figure.legend(handles, labels)
+    path = folder / "figures" / "01_curves.png"
+    path.parent.mkdir(parents=True)
+    save(figure, path, "Curves", "Look at them.")
+    return path
+
+
+def test_a_picture_becomes_an_interactive_figure(tmp_path: Path) -> None:
+    drawn(tmp_path)
+    (figure,) = read_figures(tmp_path / "figures")
+    explorer = figure.explorer
+    assert explorer is not None
+    heading, error, trials, names = explorer.panels
+    assert (heading.title, heading.x_label) == ("heading [deg]", "time [s]")
+    assert tuple(heading.y_limits) == (-2.0, 2.0)
+    assert (error.title, error.logarithmic, tuple(error.y_limits)) == ("error", True, ())
+    assert names.x_names == {"0": "u", "1": "v"}
+    assert all(panel.beside for panel in explorer.panels)
+    assert trials.group != heading.group
+    looks = explorer.looks
+    assert looks["measured"].color == INK
+    assert looks["measured"].dash == "dashed"
+    assert looks["trials (points)"].points
+    curves = explorer.cases[0].curves
+    np.testing.assert_allclose(curves[0]["model"][1], np.sin(T), atol=1e-4)
+    np.testing.assert_allclose(curves[1]["model"][1], np.exp(-T), atol=1e-4)
+    assert float(np.nanmax(curves[0]["model, shade"][1])) == pytest.approx(1.1, abs=0.01)
+    assert np.ptp(curves[0]["other lines"][0]) >= 10.0
+    assert curves[3]["model (points)"][1].tolist() == pytest.approx([2.0, 3.0], abs=1e-4)
+
+
+def test_what_curves_cannot_show_stays_a_picture(tmp_path: Path) -> None:
+    figure = new_figure(2.0)
+    figure.subplots().imshow(np.eye(3))
+    save(figure, tmp_path / "map.png", "Map", "Look.")
+    (read,) = read_figures(tmp_path)
+    assert read.explorer is None
+
+
+def test_figures_that_others_cover_are_for_print(tmp_path: Path) -> None:
+    drawn(tmp_path)
+    whole = figures_section(tmp_path / "figures")
+    assert whole is not None
+    assert not whole.pictures
+    covered = figures_section(tmp_path / "figures", "curves|tracks")
+    assert covered is not None
+    assert covered.pictures
+
+
+@pytest.mark.skipif(browser() is None, reason="no browser (chromium or chrome) is installed")
+def test_a_browser_draws_the_curves_of_a_picture(tmp_path: Path) -> None:
+    drawn(tmp_path)
+    figures = figures_section(tmp_path / "figures")
+    page = write_page(tmp_path, "Run", "", ["Done."], [Section("All", [figures])])
+    found = layout(page, 390, tmp_path)
+    assert (found.overflow, found.broken) == (0, [])
+    assert found.panels == [True] * 4
+    assert found.used["zoomed"] == pytest.approx(0.5, abs=0.01)
+    assert found.used["reset"] == pytest.approx(1.0, abs=0.01)
