@@ -47,6 +47,8 @@ const use = async (page, pause) => {
   box.click();
   const hidden = plot.renderers.find(curve => curve.name === box.value).visible === false;
   const list = root.querySelector("select"), note = () => root.querySelector(".note").textContent;
+  if (list === null) return {focused: focused, zoomed: near / begin, reset: again / begin,
+                             hidden: hidden};
   const first = note();
   list.value = String(list.length - 1);
   list.dispatchEvent(new Event("change"));

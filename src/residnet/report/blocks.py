@@ -6,8 +6,10 @@ The same objects serve the page (`residnet.report.page.write_page`) and the term
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from itertools import accumulate
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal, Protocol, TypeAlias
 
@@ -15,6 +17,10 @@ if TYPE_CHECKING:
     from residnet.report.interactive.explorer import Explorer
 
 Mark: TypeAlias = Literal["", "bad", "best", "weak", "text"]
+
+
+_SHEET, _LETTER, _PADDING = 700.0, 6.3, 6.0
+"""Pixels of a sheet of A4 between its margins, of a bold letter of a table, and beside a cell."""
 
 
 class Block(Protocol):
@@ -193,6 +199,43 @@ class Table:
             left.append(bool(marks) and all(mark == "text" for mark in marks))
         return left
 
+    @property
+    def pieces(self) -> list[Table]:
+        """Return the table in pieces that each fit a sheet of A4, itself where it fits whole.
+
+        Each piece has the labels of the rows; columns of one group stay together where they fit.
+        """
+        widths = [_narrowest(texts) for texts in self._texts()]
+        spans = [count for _, count in self.groups] or [1] * (len(self.columns) - 1)
+        stretches: list[list[int]] = [[0, 0]]
+        for start, count in zip(accumulate([0, *spans]), spans, strict=False):
+            first = stretches[-1][0]
+            if first < start and sum(widths[1 + first : 1 + start + count]) + widths[0] > _SHEET:
+                stretches.append([start, start])
+            stretches[-1][1] = start + count
+        if len(stretches) == 1:
+            return [self]
+        return [self._piece(first, last) for first, last in stretches]
+
+    def _texts(self) -> list[list[str]]:
+        """Return for each column all texts in it, its title first."""
+        found = [[self.columns[0], *(row.label for row in self.rows)]]
+        for column, title in enumerate(self.columns[1:]):
+            cells = [row.cells[column] for row in self.rows]
+            found.append([title, *(cell.text for cell in cells), *(cell.note for cell in cells)])
+        return found
+
+    def _piece(self, first: int, last: int) -> Table:
+        """Return the columns from one to before another, the labels' column aside."""
+        groups, at = [], 0
+        for title, count in self.groups:
+            groups += [(title, count)] if first <= at < last else []
+            at += count
+        rows = [Row(row.label, row.cells[first:last], row.rule, row.selected) for row in self.rows]
+        caption = "" if first else self.caption
+        columns = [self.columns[0], *self.columns[1 + first : 1 + last]]
+        return Table(columns, rows, caption, groups)
+
     def text(self) -> str:
         """Return the table for a terminal: columns aligned, notes in brackets, groups above."""
         lines = [self.columns]
@@ -219,6 +262,13 @@ class Table:
             ]
             out.append("  ".join(parts))
         return "\n".join(line.rstrip() for line in out)
+
+
+def _narrowest(texts: Iterable[str]) -> float:
+    """Return the width in pixels that the longest word of a column takes in print."""
+    # names break after underscores and slashes
+    words = [word for text in texts for word in re.split(r"[\s_/]", text)]
+    return _PADDING + _LETTER * max(map(len, words), default=0)
 
 
 def _plain(cell: Cell) -> str:
