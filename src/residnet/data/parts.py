@@ -40,7 +40,9 @@ class LogPart(Config):
     @model_validator(mode="after")
     def _order(self) -> LogPart:
         if self.start is not None and self.stop is not None and self.stop <= self.start:
-            raise ValueError(f"a stretch from {self.start:g} s to {self.stop:g} s holds nothing")
+            raise ValueError(
+                f"a stretch from {self.start:.10g} s to {self.stop:.10g} s holds nothing"
+            )
         return self
 
 
@@ -92,11 +94,12 @@ def stretch_of(log: Log, start: float | None, stop: float | None) -> Log:
     inside = (log.t >= _or(start, -np.inf) - 1e-9) & (log.t < _or(stop, np.inf) - 1e-9)
     if inside.sum() < 2:
         raise DataError(
-            f"log {log.name}: {int(inside.sum())} samples from {_or(start, log.t[0]):g} s to"
-            f" {_or(stop, log.t[-1]):g} s; the log runs from {log.t[0]:g} s to {log.t[-1]:g} s"
+            f"log {log.name}: {int(inside.sum())} samples from {_or(start, log.t[0]):.10g} s to"
+            f" {_or(stop, log.t[-1]):.10g} s; the log runs from {log.t[0]:.10g} s to"
+            f" {log.t[-1]:.10g} s"
         )
     ends = [_or(start, float(log.t[0])), _or(stop, float(log.t[-1]))]
-    name = "_".join([log.name, *(f"{end:g}s".replace(".", "p") for end in ends)])
+    name = "_".join([log.name, *(f"{end:.13g}s".replace(".", "p") for end in ends)])
     return log.replace(
         name=name,
         t=log.t[inside],

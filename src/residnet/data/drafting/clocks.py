@@ -52,16 +52,17 @@ def clock_of(sheet: Sheet) -> Clock:
         for name, values in sheet.numbers.items()
         if values.size > 1 and bool((np.diff(values[np.isfinite(values)]) > 0.0).all())
     ]
-    chosen = next((name for name in rising if name in named), next(iter(rising), None))
+    called = [name for name in named if name in sheet.numbers]
+    # one that is called time and does not increase is refused where it is read; a counter is none
+    others = [name for name in rising if words_of(name).lacks("index")] if not called else []
+    chosen = next((name for name in rising if name in named), next(iter([*called, *others]), None))
     if chosen is None:
         if not named:
             raise DataError(
                 f"{sheet.path}: no column is called time or increases as time does; name it in a"
                 " channel map (--config)"
             )
-        chosen = next((name for name in named if name in sheet.numbers), named[0])
-        if chosen not in sheet.numbers:
-            raise DataError(f"{sheet.path}: column '{chosen}' holds no times that can be read")
+        raise DataError(f"{sheet.path}: column '{named[0]}' holds no times that can be read")
     values = sheet.numbers[chosen]
     unit = written_unit(chosen, "s")
     guess = ""

@@ -290,8 +290,8 @@ def _split(
             if ends:
                 source = usable[path]
                 entry = {"log": entry}
-                entry |= {"from": f"{ends[0]:g} s"} if ends[0] > source.t[0] else {}
-                entry |= {"to": f"{ends[1]:g} s"} if ends[1] < source.t[-1] else {}
+                entry |= {"from": f"{ends[0]:.13g} s"} if ends[0] > source.t[0] else {}
+                entry |= {"to": f"{ends[1]:.13g} s"} if ends[1] < source.t[-1] else {}
             entries[split].append(entry)
     cut = any(isinstance(entry, dict) for found in entries.values() for entry in found)
     why = (
