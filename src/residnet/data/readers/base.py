@@ -122,8 +122,8 @@ def require_increasing(path: Path, t: np.ndarray, row: Callable[[int], str]) -> 
         )
         raise DataError(
             f"{path}: time {what} from {row(i)} ({t[i]:.13g} s) to {row(i + 1)}"
-            f" ({t[i + 1]:.13g} s), {bad.size} such steps in all; delete the repeated rows, or split"
-            " the file where its clock restarts"
+            f" ({t[i + 1]:.13g} s), {bad.size} such steps in all; delete the repeated rows, or"
+            " split the file where its clock restarts"
         )
 
 
