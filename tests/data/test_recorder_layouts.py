@@ -14,7 +14,10 @@ from residnet.core.errors import DataError
 from residnet.core.log import Log
 from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.tables import draft_tables
+from residnet.data.drafting.words import input_channel, state_channel, words_of
+from residnet.data.parts import stretch_of
 from residnet.data.readers import ReaderConfig
+from residnet.tasks.drafting.inputs import driving
 
 T = np.arange(0.0, 60.0, 0.2)
 PSI = 0.4 * np.sin(0.2 * T)
@@ -182,3 +185,53 @@ def test_what_is_no_table_is_refused_in_one_line(content: bytes, said: str, tmp_
     with pytest.raises(DataError, match=said) as refused:
         draft_tables([path], Marks())
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("column", "channel"),
+    [
+        ("Battery_V", None),
+        ("Motordrehzahl [1/min]", "n"),
+        ("engine temperature [°C]", None),
+        ("engine load", None),
+        ("oil pressure main engine", None),
+        ("speed through water", "speed"),
+        ("pos_n", "x"),
+        ("Longitudine", "longitude"),
+        ("Long. speed", "u"),
+        ("Stävriktning", "psi"),
+        ("船首角", "psi"),
+        ("旋回角速度", "r"),
+        ("Gashendel", "throttle"),
+    ],
+)
+def test_what_recorders_call_columns(column: str, channel: str | None) -> None:
+    words = words_of(column)
+    assert (state_channel(words) or input_channel(words)) == channel
+
+
+def test_a_second_compass_is_no_input() -> None:
+    t = np.arange(0.0, 30.0, 0.1)
+    names = ("x", "y", "psi", "u", "v", "r", "delta", "backup_compass_heading", "bucket")
+    units = dict.fromkeys(names, "-") | {"delta": "rad"}
+    channels = {name: np.sin((1.0 + i) * t) for i, name in enumerate(names)}
+    marks = Marks()
+    inputs = driving([Log("log", t, channels, units)], marks)
+    assert inputs == ("delta", "bucket")
+    assert any("backup_compass" in text for _, text in marks.notes)
+    assert any(text.startswith("bucket is taken") for _, text in marks.guesses)
+
+
+def test_times_of_unix_keep_their_digits(tmp_path: Path) -> None:
+    log = Log("log", 1.75e9 + T, {"x": NORTH}, {"x": "m"})
+    first = stretch_of(log, None, 1.75e9 + 20.0)
+    second = stretch_of(log, 1.75e9 + 20.0, None)
+    assert first.name != second.name
+    assert len(first) + len(second) == len(log)
+    path = tmp_path / "log.csv"
+    lines = text({"No.": np.arange(T.size), **COLUMNS, "Zeit": np.floor(T)}, ";")
+    path.write_text("\n".join(lines) + "\n")
+    content = draft_tables([path], Marks()).content
+    assert content["time"]["column"] == "Zeit", "a counter is no time"
+    with pytest.raises(DataError, match="time repeats"):
+        validate(content, ReaderConfig, "here").build().read(path)

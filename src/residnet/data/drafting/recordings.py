@@ -167,6 +167,9 @@ def _sound(log: Log, marks: Marks) -> bool:
             scores.append(along(motion))
     if scores[0] < _COHERENT and max(scores) > scores[0] + 0.1:
         return False
+    if scores[0] < 0.3 and along([motion_of(raw, "rad", FRAMES[0])]) > _COHERENT:
+        # the pose is right, and the velocities are not those of the body
+        return False
     if scores[0] < 0.3:
         text = f"position, heading and velocities fit together badly ({scores[0]:.2f} of 1)"
         marks.guess(READER, f"{text}: check the frames")

@@ -83,6 +83,8 @@ _ABOUT: dict[str, str] = {
     "stern": "| stern heck poupe popa hek akter aft",
     "index": "| index idx id number nr no num count counter flag valid",
     "age": "| age alter",
+    "machinery": "temperat pressure presion pression fuel kraftstoff carburant oil coolant load"
+    " consumption verbrauch hours stunden alarm druck | temp last water",
     "estimate": "estimat filtered hat mean | est",
     "measured": "| meas measured actual ist",
     "allocated": "alloc",
@@ -177,6 +179,8 @@ def state_channel(words: Words) -> str | None:
     w, name = words, words.text.replace(" ", "_")
     if name in MOTION:
         return name
+    if w.has("machinery") and w.lacks("speed", "surge"):
+        return None
     if w.has("wind"):
         if w.has("relative") and not w.has("true"):
             return None
@@ -231,7 +235,7 @@ def input_channel(words: Words) -> str | None:
     w, name = words, words.text.replace(" ", "_")
     if name in CHANNEL_UNITS and name not in (*MOTION, "t", *ACCELERATION):
         return name
-    if not w.lacks("wind", "age", "index", "power", "voltage"):
+    if not w.lacks("wind", "age", "index", "power", "voltage", "machinery"):
         return None
     sides = {"port": "_port", "starboard": "_stbd", "bow": "_bow", "stern": "_stern"}
     side = next((end for name, end in sides.items() if w.has(name)), "")

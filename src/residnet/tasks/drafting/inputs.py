@@ -9,6 +9,7 @@ import numpy as np
 from residnet.core.log import Log
 from residnet.core.names import ACCELERATION, STATE
 from residnet.data.drafting.questions import Marks
+from residnet.data.drafting.words import input_channel, state_channel, words_of
 from residnet.physics.environment.wind import WIND_INPUTS
 
 INPUTS = ("signals", "inputs")
@@ -32,6 +33,7 @@ def driving(logs: Sequence[Log], marks: Marks) -> tuple[str, ...]:
     """
     names = [name for name in logs[0].channels if name not in _PASSIVE]
     names = [name for name in names if all(name in log.channels for log in logs)]
+    names = _acting(names, marks)
     names = _moving(logs, names, marks)
     names = _forces(logs, names, marks)
     names = _measured(names, marks)
@@ -43,6 +45,23 @@ def driving(logs: Sequence[Log], marks: Marks) -> tuple[str, ...]:
 
 def _joined(logs: Sequence[Log], name: str) -> np.ndarray:
     return np.concatenate([log[name] for log in logs])
+
+
+def _acting(names: Sequence[str], marks: Marks) -> list[str]:
+    """Return the channels whose names do not say that they measure something else."""
+    out = []
+    for name in names:
+        words = words_of(name)
+        if input_channel(words) is not None:
+            out.append(name)
+        elif state_channel(words) is not None or not words.lacks(
+            "voltage", "age", "depth", "index", "machinery"
+        ):
+            marks.note(INPUTS, f"{name} is left out: by its name it drives nothing")
+        else:
+            marks.guess(INPUTS, f"{name} is taken, though its name does not say what it drives")
+            out.append(name)
+    return out
 
 
 def _moving(logs: Sequence[Log], names: Sequence[str], marks: Marks) -> list[str]:
