@@ -69,7 +69,7 @@ def test_quantity_is_si(kind: Any, value: object, expected: float) -> None:
     [
         (Radians, "20 s", ["unit 's' does not measure [rad]", "rad, deg", "given '20 s'"]),
         (Radians, "20 dge", ["unknown unit 'dge'; did you mean 'deg'?"]),
-        (Seconds, "1 fortnight", ["unknown unit 'fortnight'; valid: h, min, ms, ns, s, us"]),
+        (Seconds, "1 fortnight", ["unknown unit 'fortnight'; valid: day, h, min, ms, ns, s, us"]),
         (Seconds, "soon", ["expected a number in s or text such as '1.5 ms' (given 'soon')"]),
         (Seconds, "", ["expected a number"]),
         (Seconds, True, ["expected a number", "given true"]),
