@@ -1,9 +1,10 @@
 """Does the monitor find planted changes of simulated vessels, and leave clean logs alone?
 
-Each vessel is identified from clean trials. Then trials of the changed vessel, five minutes a
-seed, go through the monitor, and hours of clean ones.
+Each vessel is identified from clean trials in currents that the fit estimates. Then trials of the
+changed vessel, five minutes a seed, go through the monitor, and hours of clean ones. With
+--scatter the parameters of the vessels are scattered by about a fifth first.
 
-    python scripts/bench/monitor.py [--seeds 10] [--hours 2] [--seed 0] [VESSEL...]
+    python scripts/bench/monitor.py [--seeds 10] [--hours 2] [--seed 0] [--scatter] [VESSEL...]
 """
 
 from __future__ import annotations
@@ -17,12 +18,14 @@ from typing import Any
 import numpy as np
 import torch
 import yaml
+from selection import scattered
 
 from residnet.core.config import validate
 from residnet.core.log import Log
 from residnet.core.resources import config_folder
 from residnet.data.prepare import Prepared, prepare
 from residnet.data.simulated.trials import SimulatedTrials, simulate
+from residnet.identification.currents import through_currents
 from residnet.identification.fit import fit
 from residnet.identification.models import FittedModel
 from residnet.identification.monitoring.monitor import MonitorConfig, Watch, Watcher
@@ -71,9 +74,11 @@ def trials(vessel: str, sea: dict[str, Any], seed: int, count: int) -> list[Log]
     return [logs[i] for i in order]
 
 
-def identified(vessel: str, seed: int) -> tuple[FitSettings, FittedModel, list[Prepared]]:
-    """Return a model of the clean vessel, and the logs that fitted it."""
-    logs = trials(vessel, SEA[vessel], seed, 40)
+def identified(
+    vessel: str, flown: str, seed: int
+) -> tuple[FitSettings, FittedModel, list[Prepared]]:
+    """Return a model of the clean vessel, and the logs that fitted it, over ground."""
+    logs = trials(flown, SEA[vessel], seed, 40)
     settings = validate(
         {
             "prepare": {
@@ -84,6 +89,7 @@ def identified(vessel: str, seed: int) -> tuple[FitSettings, FittedModel, list[P
             "signals": VESSELS[vessel],
             "baseline": {"kind": "regressors", "sets": ["fossen"], "ridge": 1e-6},
             "refit": {"baseline": {"horizon": 10.0, "every": 10.0, "iterations": 4}},
+            "current": {"spread": 0.3},
             "bands": None,
             "evaluation": {
                 "protocols": {"T20": {"kind": "windows", "length": 20.0}},
@@ -95,15 +101,21 @@ def identified(vessel: str, seed: int) -> tuple[FitSettings, FittedModel, list[P
         "bench",
     )
     prepared = prepare_logs({"train": logs[8:], "validation": logs[:8]}, settings)
-    found = fit(prepared, settings)
+    found = fit(through_currents(prepared, settings)[0], settings)
     return settings, found["baseline"], [*prepared["train"], *prepared["validation"]]
 
 
-def changed_vessel(vessel: str, change: Callable[[dict[str, Any]], None], folder: Path) -> str:
+def vessel_file(vessel: str) -> Path:
+    """Return the file of a vessel of residnet, or of one given by its path."""
+    shipped = config_folder() / "vessels" / f"{vessel}.yaml"
+    return shipped if shipped.is_file() else Path(vessel)
+
+
+def changed_vessel(flown: str, change: Callable[[dict[str, Any]], None], folder: Path) -> str:
     """Write a vessel file with a change, and return its path."""
-    content = yaml.safe_load((config_folder() / "vessels" / f"{vessel}.yaml").read_text())
+    content = yaml.safe_load(vessel_file(flown).read_text())
     change(content)
-    file = folder / f"{vessel}_{change.__name__}.yaml"
+    file = folder / f"{Path(flown).stem}_{change.__name__}.yaml"
     file.write_text(yaml.safe_dump(content))
     return str(file)
 
@@ -132,18 +144,20 @@ def scaled(name: str, factor: float, offset: float = 0.0) -> Callable[[Log], Log
     return change
 
 
-def cases(vessel: str, folder: Path) -> dict[str, tuple[str, Callable[[Log], Log], str]]:
+def cases(
+    vessel: str, flown: str, folder: Path
+) -> dict[str, tuple[str, Callable[[Log], Log], str]]:
     """Return the planted changes: vessel that is flown, what becomes of its logs, right cause."""
     same = scaled("u", 1.0)
     side = "n_stbd" if "n_stbd" in VESSELS[vessel]["inputs"] else "n"
     out = {
-        "mass +15 %": (changed_vessel(vessel, heavier, folder), same, "mass"),
-        "thrust -10 %": (vessel, scaled(side, 0.9**-0.5), f"gain {side}"),
-        "yaw damping -20 %": (changed_vessel(vessel, yaw_damping, folder), same, "damping yaw"),
-        "gyro +5 %": (vessel, scaled("r", 1.05), "gyro scale"),
+        "mass +15 %": (changed_vessel(flown, heavier, folder), same, "mass"),
+        "thrust -10 %": (flown, scaled(side, 0.9**-0.5), f"gain {side}"),
+        "yaw damping -20 %": (changed_vessel(flown, yaw_damping, folder), same, "damping yaw"),
+        "gyro +5 %": (flown, scaled("r", 1.05), "gyro scale"),
     }
     if "delta" in VESSELS[vessel]["inputs"]:
-        out["rudder 2 deg"] = (vessel, scaled("delta", 1.0, -np.deg2rad(2)), "offset delta")
+        out["rudder 2 deg"] = (flown, scaled("delta", 1.0, -np.deg2rad(2)), "offset delta")
     return out
 
 
@@ -170,16 +184,19 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--hours", type=float, default=2.0)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--scatter", action="store_true")
     given = parser.parse_args()
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as folder:
         for vessel in given.vessels:
-            settings, model, clean = identified(vessel, 100 + given.seed)
+            random = np.random.default_rng(given.seed)
+            sailed = str(scattered(vessel, random, Path(folder))) if given.scatter else vessel
+            settings, model, clean = identified(vessel, sailed, 100 + given.seed)
             config = MonitorConfig()
             steps = round(config.window / STEP)
             watch = Watch(model.spec, model.model, [pieces(log, steps, 0) for log in clean], config)
             print(f"{vessel}: threshold {watch.threshold:.2f}", flush=True)
-            for name, (flown, change, right) in cases(vessel, Path(folder)).items():
+            for name, (flown, change, right) in cases(vessel, sailed, Path(folder)).items():
                 count = PER_SEED * given.seeds
                 logs = trials(flown, SEA[vessel], 7 + given.seed, count)
                 found, first, firsts = 0, 0, []
@@ -195,7 +212,7 @@ def main() -> None:
                     f" {first}/{given.seeds} ({', '.join(sorted(set(firsts)))})",
                     flush=True,
                 )
-            logs = trials(vessel, SEA[vessel], 23 + given.seed, round(60 * given.hours))
+            logs = trials(sailed, SEA[vessel], 23 + given.seed, round(60 * given.hours))
             alarms, _ = watched(watch, settings, logs)
             raised = sum(
                 now and not before

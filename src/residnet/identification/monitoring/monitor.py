@@ -3,8 +3,9 @@
 Windows are free-run as a whole and in parts, each from its measured start. What the model has
 always got wrong is taken out of their innovations, which are then whitened by their covariance over
 clean logs. For each cause the score test asks whether a small change of that kind explains the last
-minutes, once wind and current have taken what they can. How much clean logs scatter in the score
-sets its scale. An alarm comes from single scores; all together say which cause is named first.
+minutes, once wind and current have taken what they can. How much clean logs differ in the sizes
+that they ask for sets its scale. An alarm comes from single causes; the scores of all together say
+which is named first.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
 from residnet.identification.monitoring.changes import Change, causes, surroundings
 from residnet.identification.monitoring.innovations import BELIEVED, always_wrong, whitening
+from residnet.identification.monitoring.scatter import Group, scattered
 from residnet.identification.monitoring.windows import SEEN, Piece, innovations, parted
 
 _OVERLAP = 3.0
@@ -138,7 +140,10 @@ class Watch:
         self.others = surroundings()
         self.belief = np.diag([_CURRENT**-2] * 2 + [_PUSH**-2] * 2)
         each = max(round(config.group / config.window), 1)
-        groups = [log[i : i + each] for log in clean for i in range(0, len(log), each)]
+        cut = [
+            (k, log[i : i + each]) for k, log in enumerate(clean) for i in range(0, len(log), each)
+        ]
+        groups, of = [group for _, group in cut], np.array([log for log, _ in cut])
         if len(groups) < _FEWEST:
             raise DataError(
                 f"the clean logs hold {len(groups)} stretches of {config.group:g} s; a monitor"
@@ -155,22 +160,23 @@ class Watch:
             for i, parts in enumerate(self.parts)
         ]
         known = self.always
-        fold = np.arange(len(found)) % _FOLDS
-        self.bias, self.known = self._bias([self._sums(group) for group in found])
-        count, size = len(found), len(self.causes)
-        apart, matrices = np.empty((count, size)), np.empty((count, size, size))
+        # groups of one log are alike
+        fold = (of if len(set(of)) >= _FOLDS else np.arange(len(found))) % _FOLDS
+        self.bias = self._bias([self._sums(group) for group in found])
+        apart: list[Group] = []
         # scores scatter more where others say what is always wrong, as they do in service
         for k in range(_FOLDS):
             self.always = self._wrong(
                 [one for one, own in zip(found, fold, strict=True) if own != k]
             )
             others = [self._sums(one) for one in found]
-            bias, _ = self._bias([one for one, own in zip(others, fold, strict=True) if own != k])
+            bias = self._bias([one for one, own in zip(others, fold, strict=True) if own != k])
             for i in np.flatnonzero(fold == k):
-                score, matrices[i] = self._alone(others[i])
-                apart[i] = score - matrices[i] @ bias
+                apart.append(self._group(int(of[i]), others[i], bias))
         self.always = known
-        self._scale(apart, matrices)
+        self.scatter = scattered(apart)
+        looks = config.false_alarm / config.stretch * _OVERLAP * len(self.causes)
+        self.threshold = float(student.isf(0.5 / looks, len(apart) - 1))
 
     def _wrong(self, found: Sequence[Sequence[_Innovations]]) -> list[np.ndarray]:
         """Return what the model has always got wrong, by innovations of groups of clean windows."""
@@ -183,32 +189,19 @@ class Watch:
             for i in range(len(self.parts))
         ]
 
-    def _bias(self, groups: Sequence[_Sums]) -> tuple[np.ndarray, np.ndarray]:
-        """Return the sizes [Q] of all causes together that clean logs have, and what is known."""
+    def _bias(self, groups: Sequence[_Sums]) -> np.ndarray:
+        """Return the sizes [Q] of all causes together that clean logs ask for."""
         parts = [self._alone(group) for group in groups]
         matrix = np.sum([part[1] for part in parts], axis=0)
         believed = np.diag([change.size**-2 / BELIEVED**2 for change in self.causes])
         # two causes that are wrong alike, such as damping and gain, must not look like one of them
         score = np.sum([part[0] for part in parts], axis=0)
-        return np.linalg.solve(matrix + believed, score), matrix
+        return np.asarray(np.linalg.solve(matrix + believed, score))
 
     @property
     def changes(self) -> list[Change]:
         """The causes, then what surrounds the vessel."""
         return [*self.causes, *self.others]
-
-    def _scale(self, apart: np.ndarray, matrices: np.ndarray) -> None:
-        """Take the scatter of scores [G, Q] with information [G, Q, Q] from groups of windows."""
-        count, size = apart.shape
-        unit = apart / np.sqrt(np.diagonal(matrices, axis1=1, axis2=2))
-        scatter = unit.T @ unit / (count - 1)
-        # few groups say little about how scores scatter together
-        apart_alone = np.diag(np.maximum(np.diag(scatter), 1.0))
-        kept = count / (count + size)
-        self.scatter = kept * scatter + (1.0 - kept) * apart_alone
-        np.fill_diagonal(self.scatter, np.diag(apart_alone))
-        looks = self.config.false_alarm / self.config.stretch * _OVERLAP * size
-        self.threshold = float(student.isf(0.5 / looks, count - 1))
 
     def sums(self, pieces: Sequence[Piece]) -> list[_Sums]:
         """Return the scores of each of several windows."""
@@ -258,31 +251,28 @@ class Watch:
         information = matrix[:count, :count] - matrix[:count, count:] @ own
         return score, information + 1e-300 * np.eye(count)
 
-    def judge(self, groups: Sequence[_Sums]) -> Verdict:
-        """Return the verdict on groups of windows; wind and current are their own in each."""
-        parts = [self._alone(group) for group in groups]
-        matrix = np.sum([part[1] for part in parts], axis=0)
-        apart = np.sum([part[0] for part in parts], axis=0) - matrix @ self.bias
-        information = np.diag(matrix)
-        covariance = np.zeros_like(matrix)
-        for _, own in parts:
-            root = np.sqrt(np.diag(own))
-            covariance += self.scatter * np.outer(root, root)
-        covariance *= 1.0 + float(np.mean(information / np.diag(self.known)))
-        error = np.sqrt(np.diag(covariance)) / information
-        size = apart / information
+    def _group(self, log: int, sums: _Sums, bias: np.ndarray) -> Group:
+        """Return scores and information of a group, what clean logs always ask for taken out."""
+        score, information = self._alone(sums)
+        return Group(log, score - information @ bias, information)
+
+    def judge(self, logs: Sequence[int], sums: Sequence[_Sums]) -> Verdict:
+        """Return the verdict on groups of windows; wind and current are their own in each.
+
+        Args:
+            logs: number of the log that each group is of.
+            sums: of the groups.
+        """
+        groups = [self._group(log, one, self.bias) for log, one in zip(logs, sums, strict=True)]
+        size, error = self.scatter.sizes(groups)
         suspects = [
             Suspect(change, float(abs(size[i]) / error[i]), float(size[i]), float(error[i]))
             for i, change in enumerate(self.causes)
         ]
         alarm = max(suspect.score for suspect in suspects) > self.threshold
-        # the scores of all causes together tell better than each alone which of them it is
-        weighed = np.linalg.solve(covariance, matrix)
-        told = np.einsum("pq,pq->q", matrix, weighed)
-        order = np.argsort(-np.abs(apart @ weighed) / np.sqrt(told))
-        suspects = [suspects[i] for i in order]
-        count = sum(group.count for group in groups)
-        squares = np.sum([group.squares for group in groups], axis=0) / count
+        suspects = [suspects[i] for i in np.argsort(-self.scatter.together(groups))]
+        count = sum(one.count for one in sums)
+        squares = np.sum([one.squares for one in sums], axis=0) / count
         by_channel = squares.reshape(-1, len(SEEN)).mean(axis=0)
         innovation = dict(zip(SEEN, np.sqrt(by_channel).tolist(), strict=True))
         return Verdict(alarm, self.threshold, suspects, innovation)
@@ -302,7 +292,8 @@ class Watcher:
         self.steps = round(watch.config.window / watch.dt)
         self.size = max(round(watch.config.group / watch.config.window), 1)
         self.windows = max(round(watch.config.stretch / watch.config.window), 1)
-        self.recent: deque[_Sums] = deque()
+        self.recent: deque[tuple[int, _Sums]] = deque()
+        self.log = 0
         self.closed = True
         self.y: list[np.ndarray] = []
         self.w: list[np.ndarray] = []
@@ -336,15 +327,18 @@ class Watcher:
     def restart(self) -> None:
         """Begin a new log, whose wind and current are its own."""
         self.y, self.w = [], []
+        self.log += 1
         self.closed = True
 
     def take(self, sums: _Sums) -> Verdict:
         """Take the scores of a window, and return the verdict on the last stretch."""
-        if self.closed or self.recent[-1].count >= self.size:
-            self.recent.append(sums)
+        if self.closed or self.recent[-1][1].count >= self.size:
+            self.recent.append((self.log, sums))
         else:
-            self.recent[-1] = self.recent[-1] + sums
+            self.recent[-1] = (self.log, self.recent[-1][1] + sums)
         self.closed = False
-        while sum(group.count for group in self.recent) - self.recent[0].count >= self.windows:
+        counts = [group.count for _, group in self.recent]
+        while sum(counts) - counts[0] >= self.windows:
             self.recent.popleft()
-        return self.watch.judge(self.recent)
+            counts.pop(0)
+        return self.watch.judge([log for log, _ in self.recent], [one for _, one in self.recent])

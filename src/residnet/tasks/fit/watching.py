@@ -13,7 +13,6 @@ from residnet.core.config import validate
 from residnet.core.errors import DataError, UsageError
 from residnet.core.names import nearest
 from residnet.data.prepare import Prepared, prepare
-from residnet.identification.currents import through_currents
 from residnet.identification.monitoring.monitor import MonitorConfig, Verdict, Watch, Watcher
 from residnet.identification.monitoring.windows import past_of, pieces
 from residnet.identification.prepared import prepare_logs
@@ -123,8 +122,8 @@ def watch_logs(
 
 def _clean(config: FitTaskSettings) -> list[Prepared]:
     """Return the logs of the fit that are known to be of the unchanged vessel."""
+    # over ground, as new logs are: a current is taken out of either in the same way
     logs = prepare_logs(take_logs(config), config)
-    logs, _ = through_currents(logs, config)
     return [*logs["train"], *logs["validation"]]
 
 

@@ -1,0 +1,149 @@
+"""How scores of clean logs scatter, and what groups of windows say of each cause by that measure.
+
+A group of windows has a score a and an information I for each cause; a / I is the size that it asks
+for. Noise gives a the variance s I. No model is right everywhere, so each clean log also asks for a
+size of its own, which adds t I^2, part of it shared by the groups of one log (a model of random
+effects: R. DerSimonian and N. Laird, 1986). Without t a log with much information, such as a hard
+turn, would raise alarms for what the model has always got wrong in hard turns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+_NOISE = np.geomspace(1.0, 30.0, 25)
+"""Variances of the noise, in those of white innovations, that are tried."""
+_APART = np.concatenate(([0.0], np.geomspace(1e-4, 1e3, 40)))
+"""Variances of sizes, in what a group of middling information tells, that are tried."""
+_NOTHING = 1e-12
+
+
+@dataclass(frozen=True)
+class Group:
+    """Scores of a group of windows, what surrounds the vessel taken out.
+
+    Attributes:
+        log: number of the log that they are of.
+        score: of each cause [Q].
+        information: about them [Q, Q].
+    """
+
+    log: int
+    score: np.ndarray
+    information: np.ndarray
+
+    @property
+    def own(self) -> np.ndarray:
+        """Information about each cause alone [Q], never zero."""
+        return np.diag(self.information) + _NOTHING
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """What clean groups say about the scatter of scores.
+
+    Attributes:
+        noise: variance of each score in units of its information [Q].
+        apart: variance of the sizes that groups ask for [Q].
+        shared: part of it that is common to the groups of one log [Q].
+        known: variance of the mean size of all clean logs [Q].
+        correlation: of the scores of different causes [Q, Q].
+    """
+
+    noise: np.ndarray
+    apart: np.ndarray
+    shared: np.ndarray
+    known: np.ndarray
+    correlation: np.ndarray
+
+    def variance(self, own: np.ndarray) -> np.ndarray:
+        """Return the variance of scores [..., Q] whose information is `own` [..., Q]."""
+        return np.asarray(self.noise * own + self.apart * own**2)
+
+    def sizes(self, groups: Sequence[Group]) -> tuple[np.ndarray, np.ndarray]:
+        """Return the size of each cause [Q] by groups of windows, and its standard error."""
+        told, weight = _told(groups, self)
+        return told / weight, np.sqrt(1.0 / weight + self.known)
+
+    def together(self, groups: Sequence[Group]) -> np.ndarray:
+        """Return how well each cause alone [Q] explains the scores of all causes together.
+
+        In standard deviations: the scores of all tell better than each for itself which it is.
+        """
+        told, weight = 0.0, 0.0
+        for group in groups:
+            deviation = np.sqrt(self.variance(group.own))
+            covariance = self.correlation * np.outer(deviation, deviation)
+            weighed = np.linalg.solve(covariance, group.information)
+            told = told + weighed.T @ group.score
+            weight = weight + np.einsum("pq,pq->q", group.information, weighed)
+        return np.asarray(np.abs(told) / np.sqrt(weight + _NOTHING))
+
+
+def scattered(groups: Sequence[Group]) -> Scatter:
+    """Return how the scores of groups of clean windows scatter about zero."""
+    score = np.stack([group.score for group in groups])
+    own = np.stack([group.own for group in groups])
+    count, size = score.shape
+    noise, apart = np.empty(size), np.empty(size)
+    for cause in range(size):
+        noise[cause], apart[cause] = _likeliest(score[:, cause], own[:, cause])
+    alone = Scatter(noise, apart, 0.0 * apart, 0.0 * apart, np.eye(size))
+    deviation = np.sqrt(alone.variance(own))
+    unit = score / deviation
+    second = unit.T @ unit / count
+    root = np.sqrt(np.diag(second)) + _NOTHING
+    # few groups say little about how scores scatter together
+    kept = count / (count + size)
+    correlation = kept * second / np.outer(root, root) + (1.0 - kept) * np.eye(size)
+    np.fill_diagonal(correlation, 1.0)
+    shared = _shared(groups, alone)
+    whole = Scatter(noise, apart, shared, 0.0 * apart, correlation)
+    return Scatter(noise, apart, shared, 1.0 / _told(groups, whole)[1], correlation)
+
+
+def _told(groups: Sequence[Group], scatter: Scatter) -> tuple[np.ndarray, np.ndarray]:
+    """Return the weighed sum of sizes [Q] and the sum of weights, the inverse variance."""
+    told, weight = np.zeros(len(scatter.noise)), np.full(len(scatter.noise), _NOTHING)
+    for log in dict.fromkeys(group.log for group in groups):
+        part, sure = 0.0, 0.0
+        for group in groups:
+            if group.log == log:
+                alone = scatter.variance(group.own) - scatter.shared * group.own**2
+                part = part + group.own * group.score / alone
+                sure = sure + group.own**2 / alone
+        told += part / (1.0 + scatter.shared * sure)
+        weight += sure / (1.0 + scatter.shared * sure)
+    return told, weight
+
+
+def _likeliest(score: np.ndarray, own: np.ndarray) -> tuple[float, float]:
+    """Return the variances of noise and sizes under which scores [G] are likeliest."""
+    apart = _APART / np.median(own)
+    variance = (
+        _NOISE[:, None, None] * own[None, None, :] + apart[None, :, None] * own[None, None, :] ** 2
+    )
+    unlikely = (np.log(variance) + score**2 / variance).sum(axis=2)
+    i, j = np.unravel_index(int(unlikely.argmin()), unlikely.shape)
+    return float(_NOISE[i]), float(apart[j])
+
+
+def _shared(groups: Sequence[Group], scatter: Scatter) -> np.ndarray:
+    """Return the variance of sizes [Q] that the groups of one log share.
+
+    Where no clean log holds two groups nothing tells, and all is taken to be shared.
+    """
+    told, weight = np.zeros(len(scatter.noise)), np.zeros(len(scatter.noise))
+    for i, one in enumerate(groups):
+        for other in groups[:i]:
+            if other.log == one.log:
+                variance = scatter.variance(one.own) * scatter.variance(other.own)
+                product = one.own * other.own
+                told += product * one.score * other.score / variance
+                weight += product**2 / variance
+    if not weight.any():
+        return scatter.apart
+    return np.clip(told / np.maximum(weight, 1e-300), 0.0, scatter.apart)

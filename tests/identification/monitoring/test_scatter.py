@@ -1,0 +1,73 @@
+"""The scatter of clean scores: what logs differ in is no alarm, and the right cause comes first."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from residnet.identification.monitoring.scatter import Group, scattered
+
+CAUSES = 3
+ALIKE = np.array([[1.0, 0.8, 0.0], [0.8, 1.0, 0.0], [0.0, 0.0, 1.0]])
+"""Information about causes of which two look much the same."""
+
+
+def groups(
+    random: np.random.Generator,
+    logs: int,
+    each: int,
+    change: np.ndarray,
+    apart: float,
+    shared: float = 0.0,
+) -> list[Group]:
+    """Groups whose information varies a hundredfold, logs and groups of sizes of their own."""
+    out = []
+    for log in range(logs):
+        common = shared * random.normal(size=CAUSES)
+        for _ in range(each):
+            information = ALIKE * 10.0 ** random.uniform(0, 2)
+            size = change + common + apart * random.normal(size=CAUSES)
+            noise = np.linalg.cholesky(information) @ random.normal(size=CAUSES)
+            out.append(Group(log, information @ size + noise, information))
+    return out
+
+
+def test_much_information_about_a_wrong_model_is_no_alarm() -> None:
+    random = np.random.default_rng(0)
+    scatter = scattered(groups(random, 60, 1, np.zeros(CAUSES), 0.5))
+    scores = []
+    for _ in range(400):
+        size, error = scatter.sizes(groups(random, 5, 1, np.zeros(CAUSES), 0.5))
+        scores.append(size / error)
+    assert 0.8 < np.std(scores) < 1.2
+    # without what logs differ in, five vigorous logs would seem to know better
+    assert (scatter.apart > 0.05).all()
+
+
+def test_groups_of_one_log_share_what_is_their_own() -> None:
+    random = np.random.default_rng(1)
+    scatter = scattered(groups(random, 40, 5, np.zeros(CAUSES), 0.1, shared=0.5))
+    assert (scatter.shared > 0.5 * scatter.apart).all()
+    scores = []
+    for _ in range(300):
+        size, error = scatter.sizes(groups(random, 1, 5, np.zeros(CAUSES), 0.1, shared=0.5))
+        scores.append(size / error)
+    assert 0.8 < np.std(scores) < 1.25
+    free = scattered(groups(random, 40, 5, np.zeros(CAUSES), 0.5))
+    assert (free.shared < 0.3 * free.apart).all()
+    # where no clean log tells, a single log counts once
+    alone = scattered(groups(random, 40, 1, np.zeros(CAUSES), 0.5))
+    np.testing.assert_array_equal(alone.shared, alone.apart)
+
+
+def test_all_scores_together_name_the_cause() -> None:
+    random = np.random.default_rng(2)
+    scatter = scattered(groups(random, 60, 1, np.zeros(CAUSES), 0.1))
+    for cause in range(CAUSES):
+        right = 0
+        for _ in range(50):
+            change = np.where(np.arange(CAUSES) == cause, 1.5, 0.0)
+            found = groups(random, 5, 1, change, 0.1)
+            right += int(scatter.together(found).argmax()) == cause
+            size, error = scatter.sizes(found)
+            assert abs(size[cause] - 1.5) < 5 * error[cause]
+        assert right >= 45
