@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import ctypes
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from residnet.dynamics.band import BandTable
-from residnet.export import contract
-from residnet.export.torchscript import export_torchscript
+from residnet.export import contract, exporter
+from residnet.export.c.compiled import compile_shared
+from residnet.export.torchscript import ExportedModel, export_torchscript
 from residnet.testing.examples import example_model, example_spec
 
 TABLE = BandTable(
@@ -46,6 +49,28 @@ def test_half_widths_are_those_of_the_table(
     torch.testing.assert_close(loaded.band(60), 2.0 * wanted[2])
     assert card["band"]["horizon"] == pytest.approx(30 * spec.dt)
     assert card["band"]["cautions"] == ["It is a test."]
+
+
+@pytest.mark.parametrize("table", [TABLE, None], ids=["band", "none"])
+def test_c_has_the_same_half_widths(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, table: BandTable | None
+) -> None:
+    monkeypatch.setattr(contract, "PARITY_STEPS", 5)
+    spec = example_spec(None).model_copy(update={"band": table})
+    model = example_model(spec)
+    exporter("c").export(spec, model, tmp_path / "boat.c", [])
+    library = ctypes.CDLL(
+        str(compile_shared([tmp_path / "boat.c"], tmp_path / "boat.so", ["-DEXAMPLE_DOUBLE"]))
+    )
+    half = np.zeros(5)
+
+    def band(k: int) -> list[float]:
+        library.example_band(k, half.ctypes.data_as(ctypes.c_void_p))
+        return half.tolist()
+
+    exported = ExportedModel(model.float(), spec)
+    for k in (-3, 0, 1, 7, 10, 20, 29, 30, 60):
+        assert band(k) == pytest.approx(exported.band(k).tolist(), rel=1e-6)
 
 
 def test_a_column_of_another_length_is_refused() -> None:

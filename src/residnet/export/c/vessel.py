@@ -12,6 +12,7 @@ from torch import Tensor
 from residnet.core.names import STATE
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
+from residnet.export.c.band import ABOUT, band_body, band_prototype
 from residnet.export.c.source import CFunction, c_file, h_file, identifier
 from residnet.export.guard import GuardedDynamics
 from residnet.export.lowering.build import lowered
@@ -100,6 +101,7 @@ def vessel_source(
     bodies = [
         (begin, empty.format(P=upper)),
         (history, _warmup_body(model.n_state).format(p=prefix, P=upper)),
+        (band_prototype(prefix), band_body(spec.band)),
     ]
     comments = [
         ("memory without a past", begin),
@@ -107,6 +109,7 @@ def vessel_source(
             "memory that a measured past leaves: count states and inputs, oldest first",
             history,
         ),
+        (ABOUT, band_prototype(prefix)),
     ]
     sizes: dict[str, tuple[int | str, str]] = {
         "STATES": (len(STATE), ", ".join(f"{e['name']} {e['unit']}" for e in card["states"])),
