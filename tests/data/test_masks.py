@@ -54,6 +54,14 @@ def test_frozen_without_aftermath_marks_the_equal_samples_only() -> None:
     assert not Frozen(samples=3).apply(log_of(x=x, y=np.arange(10))).any()
 
 
+def test_a_slow_receiver_is_frozen_where_it_repeats_itself_for_several_of_its_own_steps() -> None:
+    last = np.arange(600) // 10 * 10.0
+    assert not Frozen().apply(log_of(x=last, y=last)).any()
+    last[300:370] = 300.0
+    found = np.flatnonzero(Frozen(after=0.0).apply(log_of(x=last, y=last)))
+    assert (found[0], found[-1]) == (300, 369)
+
+
 def test_gap_marks_the_sample_after_it_and_splits_there() -> None:
     log = apply_masks(
         log_of(np.array([0.0, 0.1, 0.2, 0.9, 1.0, 1.1]), u=np.ones(6)), [Gap(longest=0.2)]

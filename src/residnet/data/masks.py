@@ -20,6 +20,7 @@ from pydantic import Field
 from residnet.core.config import Config, Seconds
 from residnet.core.log import Log
 from residnet.core.stretches import stretch_numbers, stretches
+from residnet.data.held import usual_interval
 from residnet.data.outliers import far_from_median, spike_cells, steps_above
 from residnet.data.readers.base import unwrap
 
@@ -55,6 +56,8 @@ class Mask(Config, ABC):
 class Frozen(Mask):
     """A receiver that holds its last fix: all `channels` bit-identical over several steps.
 
+    Where a slow receiver repeats each value until its next one, a step is the time between these.
+
     From the first of the equal samples until `after` seconds past the last of them: the filters
     behind the receiver need that long to recover.
 
@@ -71,8 +74,9 @@ class Frozen(Mask):
 
     def apply(self, log: Log) -> np.ndarray:
         """Return [T] bool; see `Mask.apply`."""
-        starts, stops = stretches((np.diff(log.stack(self.channels), axis=0) == 0.0).all(axis=1))
-        long = stops - starts >= self.samples
+        values = log.stack(self.channels)
+        starts, stops = stretches((np.diff(values, axis=0) == 0.0).all(axis=1))
+        long = stops - starts >= self.samples * usual_interval(values)
         starts, last = starts[long], stops[long]
         # half a step of margin keeps `after` a whole number of samples in spite of rounding in t
         ends = np.searchsorted(log.t, log.t[last] + self.after - 0.5 * _step(log.t))

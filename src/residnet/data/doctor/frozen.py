@@ -90,9 +90,12 @@ def _frozen(log: Log, name: str, held: np.ndarray) -> Finding:
 def _held(log: Log, names: Sequence[str]) -> np.ndarray:
     """Return [T] bool: runs of equal values that neither chance nor rest explains."""
     out = np.zeros(len(log), dtype=bool)
-    same = (np.diff(log.stack(tuple(names)), axis=0) == 0.0).all(axis=1)
+    values = log.stack(tuple(names))
+    same = (np.diff(values, axis=0) == 0.0).all(axis=1)
     starts, stops = stretches(same)
-    long = stops - starts >= _LEAST_RUN
+    # a slow sensor that repeats each value has steps of its own
+    shortest = _LEAST_RUN * usual_interval(values)
+    long = stops - starts >= shortest
     outside = same.size - int((stops - starts)[long].sum())
     if outside < 0.02 * same.size:
         return out
@@ -100,9 +103,9 @@ def _held(log: Log, names: Sequence[str]) -> np.ndarray:
     chance = min(float((stops - starts)[~long].sum()) / outside, 0.99)
     # two channels that hold together are never chance
     least = (
-        _LEAST_RUN
+        shortest
         if chance <= 0.0 or len(names) > 1
-        else max(_LEAST_RUN, int(np.ceil(np.log(1e-4 / same.size) / np.log(chance))))
+        else max(shortest, int(np.ceil(np.log(1e-4 / same.size) / np.log(chance))))
     )
     limit = 0.15 if len(names) > 1 else 1e-3
     for start, stop in zip(starts, stops, strict=True):
