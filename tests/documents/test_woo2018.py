@@ -127,6 +127,8 @@ def test_six_figures_that_show_something(study: Path) -> None:
     # made up: the error of the linear model is 0.04, that of the best LSTM 0.01
     assert changes.rows[-1].cells[0].text == "−75.0"
     assert changes.rows[-1].cells[0].note == "published −76.9"
+    written = json.loads((study / "study.json").read_text())["changes"]
+    assert written["lstm"]["u"] == pytest.approx(-0.75)
     for path in paths:
         image = plt.imread(path)[..., :3]
         assert min(image.shape[:2]) > 200

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
 from pathlib import Path
 
+from residnet.core.files import whole
 from residnet.documents.cells import beside_published
 from residnet.documents.woo2018.figures import LEARNED, draw
 from residnet.documents.woo2018.panels import MODEL_NAMES, PROTOCOL
@@ -17,7 +20,7 @@ _GROUPS = {"u": "speed", "v": "steering", "r": "steering"}
 
 
 def sections(run: Path) -> list[Section]:
-    """Draw the figures of document 003 and return the study's section of the report.
+    """Write study.json, draw the figures of document 003 and return the section of the report.
 
     Raises:
         UsageError: where the run lacks a kind of manoeuvre or a model of the study.
@@ -33,27 +36,42 @@ def sections(run: Path) -> list[Section]:
         " whose terms none of them has."
     )
     steady: list[Block] = [steady_table(files), steady_figure(files)]
-    blocks = [about, *steady, _changes(files), *figures]
+    changes = {model: changes_of_error(files, model) for model in LEARNED}
+    with whole(run / "study.json") as file:
+        content = {"schema": "residnet.woo2018/1", "changes": changes}
+        file.write_text(json.dumps(content, indent=1) + "\n")
+    blocks = [about, *steady, _table(changes), *figures]
     return [Section("Document 003 (Woo et al. 2018)", blocks)]
 
 
-def _changes(files: RunFiles) -> Table:
-    """Return how much each LSTM changes the error of the linear model on unseen manoeuvres."""
+def changes_of_error(files: RunFiles, model: str) -> dict[str, float | None]:
+    """Return how a model changes the error of the linear one on unseen manoeuvres, by velocity.
+
+    A change is the ratio of root mean square errors less one; None where a row is absent.
+    """
+    changes: dict[str, float | None] = {}
+    for channel, group in _GROUPS.items():
+        rows = [files.row(name, "test", PROTOCOL, group) for name in ("baseline", model)]
+        errors = [None if row is None else row["rmse"][channel] for row in rows]
+        changes[channel] = (
+            None if errors[0] is None or errors[1] is None else errors[1] / errors[0] - 1
+        )
+    return changes
+
+
+def _table(changes: Mapping[str, Mapping[str, float | None]]) -> Table:
+    """Return the table of how much each LSTM changes the error of the linear model."""
     table = Table(
         ["model", "u %", "v %", "r %"],
         caption="Change of the root mean square error on unseen manoeuvres from the linear model to"
         " the LSTM. The document prints one figure for each velocity.",
     )
-    for model in LEARNED:
-        cells = []
-        for channel, group in _GROUPS.items():
-            rows = [files.row(name, "test", PROTOCOL, group) for name in ("baseline", model)]
-            errors = [None if row is None else float(row["rmse"][channel]) for row in rows]
-            change = (
-                None
-                if errors[0] is None or errors[1] is None
-                else 100 * (errors[1] / errors[0] - 1)
+    for model, by_channel in changes.items():
+        cells = [
+            beside_published(
+                None if change is None else 100 * change, 100 * CHANGE_OF_ERROR[channel], 3
             )
-            cells.append(beside_published(change, 100 * CHANGE_OF_ERROR[channel], 3))
+            for channel, change in by_channel.items()
+        ]
         table.add(MODEL_NAMES[model], cells)
     return table
