@@ -298,7 +298,7 @@ SHORT: dict[str, Short] = {
             ),
         )
     ),
-    "studies/jervan2020/azimuth": Short((*_FERRY, "~models.surface")),
+    "studies/jervan2020/azimuth": Short(_FERRY),
     "studies/jervan2020/case": Short(_FERRY),
     "studies/jervan2020/disturbance": Short(_FERRY),
     "studies/jervan2020/force_residual": Short(_FERRY),
