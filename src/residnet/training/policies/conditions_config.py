@@ -43,8 +43,7 @@ class ConditionsTraining(OneStage):
         calm: cost in s of a variance of one degree squared of the rudder command in the last third
             of those flights, mean over the quarter of them that swings most; a movement of half of
             what `steady` allows is free.
-        exact: cost in s of one degree of overshoot of the flights of the nominal vessel; half of
-            what `steady` allows is free.
+        exact: cost in s of one degree of overshoot of the flights of the nominal vessel.
         stricter: factor on `calm` and `exact` after every epoch that `steady` refuses.
         steady: what a policy must keep to without noise; of epochs that do not, those with fewer
             flights beyond come before those that cost less. Null to choose by the cost alone.

@@ -30,7 +30,7 @@ _LATE = 1.0 / 3.0
 """Share of a flight at whose end a quiet one should have come to rest."""
 _ALL = 1_000_000
 _FREE = 0.5
-"""Share of what a policy may swing and overshoot that costs nothing in training."""
+"""Share of what the rudder may swing that costs nothing in training."""
 
 
 @final
@@ -121,7 +121,7 @@ class ConditionsFit(EpochTraining):
         return loss
 
     def _unsteady(self, flown: ConditionedFlights, overshoot: Tensor, quiet: int) -> Tensor:
-        """Return what the quiet flights of a batch cost in s beyond what is free."""
+        """Return what the quiet flights of a batch cost in s for swing and overshoot."""
         settings, steady = self.settings, self.settings.steady
         # the standard deviation of a sine is its movement peak to peak over two roots of two
         free = 0.0 if steady is None else (_FREE * steady.rudder_swing) ** 2 / 8.0
@@ -129,9 +129,8 @@ class ConditionsFit(EpochTraining):
         worst = swing.topk(math.ceil(quiet / 4)).values.mean()
         cost: Tensor = math.degrees(math.degrees(settings.calm)) * worst
         if quiet >= 4:
-            over = overshoot[quiet // 2 : quiet // 2 + quiet // 4]
-            over = (over - (0.0 if steady is None else _FREE * steady.overshoot)).clamp(min=0.0)
-            cost = cost + math.degrees(settings.exact) * over.mean()
+            over = overshoot[quiet // 2 : quiet // 2 + quiet // 4].mean()
+            cost = cost + math.degrees(settings.exact) * over
         return cost
 
     def _strict(self) -> float:
