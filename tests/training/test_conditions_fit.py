@@ -8,13 +8,15 @@ import pytest
 import torch
 
 from residnet.control.conditions.config import ConditionsConfig
+from residnet.control.conditions.flights import ConditionedFlights
+from residnet.control.conditions.quiet import SteadyConfig
 from residnet.control.heading.steering import SteeredPlant
 from residnet.control.observed.config import PtosConfig
 from residnet.control.observed.policy import ObservedPolicy
 from residnet.control.observed.stored import ObservedPolicySpec
 from residnet.physics.vessel import load_vessel
 from residnet.training.policies.conditions_config import ConditionsTraining
-from residnet.training.policies.conditions_fit import train_under_conditions
+from residnet.training.policies.conditions_fit import ConditionsFit, train_under_conditions
 
 VESSEL = SteeredPlant(load_vessel("nomoto_oceanos").build())
 CONDITIONS = ConditionsConfig(dt=0.1, duration=6.0, hold=0.0, delay=(0.0, 0.3))
@@ -61,6 +63,50 @@ def test_a_start_that_training_only_spoils_is_kept() -> None:
     policy, notes = trained(4, 30.0)
     assert notes["best_validation"] == notes["start_validation"]
     assert float(policy.network.out.weight.abs().max()) == 0.0
+
+
+def fitted(settings: ConditionsTraining) -> ConditionsFit:
+    policy = ObservedPolicySpec(
+        state=VESSEL.state, gain=3.47, time=3.94, speed=3.2, limit=math.radians(5), rate=None,
+        dt=0.1, trained_at=0.1, law=STEEP, units=2,
+    ).build()  # fmt: skip
+    return ConditionsFit(policy, VESSEL, settings, CONDITIONS, 0, None)
+
+
+def test_epochs_that_swing_come_after_those_that_do_not() -> None:
+    settings = ConditionsTraining(dt=0.1, hold=0.0, validation=4, steady=SteadyConfig(flights=4))
+    fit = fitted(settings)
+    # five of twenty flights are beyond the limits: they count twice
+    fit.best_state, fit.best_score, fit.best_diverged = {"any": torch.zeros(1)}, 6.0, 5
+    for refused, cost, better in ((0, 9.0, True), (5, 5.9, True), (0, math.nan, False),
+                                  (10, 5.1, False), (10, 4.9, True), (1, 7.1, True)):  # fmt: skip
+        fit.diverged = refused
+        assert fit._gains(cost) is better
+    fit.best_diverged = 0
+    fit.diverged = 1
+    assert not fit._gains(0.1)
+
+
+def test_swing_and_nominal_overshoot_cost_beyond_what_is_free() -> None:
+    fit = fitted(ConditionsTraining(dt=0.1, hold=0.0, validation=4, calm=0.5, exact=2.0))
+    changes = CONDITIONS.draw(16, 0.1, torch.Generator().manual_seed(0))
+    time = 0.1 * torch.arange(changes.push.shape[1])
+    wave = torch.sin(2.0 * math.pi * time)
+    over = torch.full((16,), math.radians(0.1))
+
+    def cost(amplitude: float, swinging: int) -> float:
+        command = torch.zeros(16, len(time))
+        command[:swinging] = math.radians(amplitude) * wave
+        flown = ConditionedFlights(changes, torch.zeros_like(command), command, command)
+        return float(fit._unsteady(flown, over, 8))
+
+    # 0.2 s are the overshoot; half a degree from peak to peak is free; of eight quiet flights the
+    # two that swing most count
+    assert cost(0.0, 0) == pytest.approx(0.2, rel=1e-5)
+    assert cost(0.24, 8) == pytest.approx(0.2, rel=1e-5)
+    assert cost(1.0, 8) == pytest.approx(0.2 + 0.5 * (0.5 - 0.25**2 / 2.0), rel=0.02)
+    assert cost(1.0, 2) == pytest.approx(cost(1.0, 8))
+    assert cost(1.0, 1) == pytest.approx(0.2 + 0.5 * (cost(1.0, 8) - 0.2), rel=1e-4)
 
 
 def test_the_conditions_and_the_guide_follow_the_progress() -> None:

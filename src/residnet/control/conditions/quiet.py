@@ -68,6 +68,9 @@ class SteadyTest:
         limits: of swing and overshoot.
         conditions: with noise, those of the training.
         seed: of the flights.
+
+    Attributes:
+        flights: number of all, those of the nominal vessel included.
     """
 
     def __init__(self, limits: SteadyConfig, conditions: ConditionsConfig, seed: int) -> None:
@@ -79,6 +82,7 @@ class SteadyTest:
         sides = torch.tensor([1.0, -1.0]).repeat(_NOMINAL // 2)
         heading[limits.flights :] = sides * torch.linspace(*conditions.heading, _NOMINAL)
         self.changes = nominal(replace(drawn, heading=heading), limits.flights, _NOMINAL)
+        self.flights = limits.flights + _NOMINAL
 
     def refused(self, run: ConditionedRun) -> int:
         """Return how many flights swing, or overshoot on the nominal vessel."""

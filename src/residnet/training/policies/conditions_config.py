@@ -45,8 +45,8 @@ class ConditionsTraining(OneStage):
             what `steady` allows is free.
         exact: cost in s of one degree of overshoot of the flights of the nominal vessel.
         stricter: factor on `calm` and `exact` after every epoch that `steady` refuses.
-        steady: what a policy must keep to without noise; of epochs that do not, those with fewer
-            flights beyond come before those that cost less. Null to choose by the cost alone.
+        steady: what a policy must keep to without noise. Epochs that do come first; of those that
+            do not, a flight beyond counts twice. Null to choose by the cost alone.
         validation: number of flights that epochs are chosen on.
         compiled: whether flights and their gradient are compiled as C, which takes a C compiler;
             without one the training says so and is some thirty times slower.

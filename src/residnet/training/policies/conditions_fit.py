@@ -156,6 +156,19 @@ class ConditionsFit(EpochTraining):
         if not all(bool(torch.isfinite(grad).all()) for grad in given):
             self.trainer.optimizers[0].zero_grad()
 
+    def _gains(self, score: float) -> bool:
+        if not self.best_state or not math.isfinite(score):
+            return math.isfinite(score)
+        return self._rank(self.diverged, score) < self._rank(self.best_diverged, self.best_score)
+
+    def _rank(self, refused: int, cost: float) -> tuple[bool, float]:
+        """Return the order of epochs: those without refused flights, then by what flights cost.
+
+        A refused flight counts twice.
+        """
+        share = 0.0 if self.steady is None else refused / self.steady.flights
+        return refused > 0, cost * (1.0 + share)
+
     def validated(self) -> tuple[nn.Module, float]:
         """Return the policy and its mean cost over the flights that epochs are chosen on.
 
