@@ -28,7 +28,8 @@ from residnet.data.simulated.trials import SimulatedTrials, simulate
 from residnet.identification.currents import through_currents
 from residnet.identification.fit import fit
 from residnet.identification.models import FittedModel
-from residnet.identification.monitoring.monitor import MonitorConfig, Watch, Watcher
+from residnet.identification.monitoring.monitor import MonitorConfig, Watch
+from residnet.identification.monitoring.watcher import Watcher
 from residnet.identification.monitoring.windows import pieces
 from residnet.identification.prepared import prepare_logs
 from residnet.identification.settings import FitSettings

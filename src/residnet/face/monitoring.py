@@ -13,7 +13,8 @@ from residnet.core.errors import UsageError
 from residnet.face.data import Data
 from residnet.face.models import Model, require_model
 from residnet.face.values import described
-from residnet.identification.monitoring.monitor import MonitorConfig, Verdict, Watch, Watcher
+from residnet.identification.monitoring.monitor import MonitorConfig, Verdict, Watch
+from residnet.identification.monitoring.watcher import Watcher
 from residnet.identification.monitoring.windows import past_of, pieces
 
 

@@ -11,7 +11,8 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.store import ModelSpec
 from residnet.identification.monitoring.changes import Change, ChangedDynamics
-from residnet.identification.monitoring.monitor import MonitorConfig, Watch, Watcher
+from residnet.identification.monitoring.monitor import MonitorConfig, Watch
+from residnet.identification.monitoring.watcher import Watcher
 from residnet.identification.monitoring.windows import Piece
 from residnet.testing.examples import STEP, example_model, example_spec
 
@@ -117,3 +118,17 @@ def test_too_few_clean_logs_are_refused(known: tuple[ModelSpec, HybridDynamics])
     spec, model = known
     with pytest.raises(DataError, match="needs at least 5"):
         Watch(spec, model, [windows(log) for log in logs(model, NONE, 2, 0)], MonitorConfig())
+
+
+def test_windows_that_run_away_tell_nothing(
+    known: tuple[ModelSpec, HybridDynamics], watch: Watch
+) -> None:
+    """A start that no vessel has ends a free run far off; the verdict stays that of the others."""
+    y, w = logs(known[1], NONE, 1, 7)[0]
+    wild = y.copy()
+    wild[:, 5] = 1e9
+    alone = watch.sums(windows((wild, w)))
+    assert all(np.isfinite(one.score).all() and not one.score.any() for one in alone)
+    assert not np.isnan(
+        watch.judge([0], [alone[0] + watch.sums(windows((y, w)))[0]]).suspects[0].score
+    )

@@ -37,8 +37,28 @@ def always_wrong(error: np.ndarray, effects: np.ndarray, causes: Sequence[Change
     return out
 
 
+def run_away(
+    error: np.ndarray, effects: np.ndarray, causes: Sequence[Change], limit: np.ndarray
+) -> np.ndarray:
+    """Return which windows [B] tell nothing, because the free run or a changed one ran away.
+
+    Args:
+        error: innovations [B, n].
+        effects: of a unit of each change [B, C, n].
+        causes: the C changes.
+        limit: largest innovation of each channel [4] that a vessel can have.
+    """
+    most = np.tile(limit, error.shape[1] // len(limit))
+    size = np.array([change.size for change in causes])[:, None]
+    # comparisons with what is no number are false
+    sound = (np.abs(error) <= most).all(axis=1)
+    return ~(sound & (np.abs(effects * size) <= most).all(axis=(1, 2)))
+
+
 def whitening(error: np.ndarray, parts: int) -> np.ndarray:
     """Return the matrix [n, n] that makes innovations [B, parts n] of clean logs uncorrelated."""
+    # windows that ran away were made nothing of
+    error = error[(error != 0.0).any(axis=1)]
     error = error.reshape(len(error) * parts, -1)
     second = error.T @ error / len(error)
     covariance = (1.0 - _SHRINK) * second + _SHRINK * np.diag(np.diag(second))

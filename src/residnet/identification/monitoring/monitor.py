@@ -10,7 +10,6 @@ which is named first.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -21,10 +20,16 @@ from scipy.stats import t as student
 
 from residnet.core.config import Config, Seconds
 from residnet.core.errors import DataError
+from residnet.core.layout import VELOCITIES
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec
 from residnet.identification.monitoring.changes import Change, causes, surroundings
-from residnet.identification.monitoring.innovations import BELIEVED, always_wrong, whitening
+from residnet.identification.monitoring.innovations import (
+    BELIEVED,
+    always_wrong,
+    run_away,
+    whitening,
+)
 from residnet.identification.monitoring.scatter import Group, scattered
 from residnet.identification.monitoring.windows import SEEN, Piece, innovations, parted
 
@@ -38,6 +43,10 @@ _PARTS = 5
 """Parts that a window is also looked at in, each from its own measured start."""
 _LEAST_PART = 10
 """Steps of a part below which windows are looked at as a whole only."""
+_FAR, _TURN = 3.0, 2.0 * np.pi
+"""Innovation beyond which a free run ran away: in largest clean velocities; turns of heading."""
+_MOST_LOST = 0.5
+"""Share of clean windows that may run away."""
 _CURRENT, _PUSH = 0.5, 0.05
 """Standard deviations of a current in m/s and of a push in m/s^2 that are thought possible."""
 
@@ -96,7 +105,7 @@ _Innovations = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
-class _Sums:
+class Sums:
     """Scores [Q] and information [Q, Q] of a number of windows, and squares of innovations [n]."""
 
     score: np.ndarray
@@ -104,8 +113,8 @@ class _Sums:
     squares: np.ndarray
     count: int
 
-    def __add__(self, other: _Sums) -> _Sums:
-        return _Sums(
+    def __add__(self, other: Sums) -> Sums:
+        return Sums(
             self.score + other.score,
             self.information + other.information,
             self.squares + other.squares,
@@ -149,8 +158,18 @@ class Watch:
                 f"the clean logs hold {len(groups)} stretches of {config.group:g} s; a monitor"
                 f" needs at least {_FEWEST} to know how innovations scatter"
             )
+        fastest = np.max(
+            [np.abs(p.y[:, VELOCITIES]).max(axis=0) for log in clean for p in log], axis=0
+        )
+        self.limit = _FAR * np.append(fastest, _TURN)
         self.parts = [1, _PARTS] if round(config.window / spec.dt) >= _LEAST_PART * _PARTS else [1]
         found = [[self._innovations(group, parts) for parts in self.parts] for group in groups]
+        lost = np.concatenate([(group[0][0] == 0.0).all(axis=1) for group in found])
+        if lost.mean() > _MOST_LOST:
+            raise DataError(
+                f"model {spec.name}: free runs of {config.window:g} s run away in {lost.sum()} of"
+                f" {len(lost)} clean windows; watch with another model, or with a shorter window"
+            )
         self.always = self._wrong(found)
         self.whiten = [
             whitening(
@@ -189,7 +208,7 @@ class Watch:
             for i in range(len(self.parts))
         ]
 
-    def _bias(self, groups: Sequence[_Sums]) -> np.ndarray:
+    def _bias(self, groups: Sequence[Sums]) -> np.ndarray:
         """Return the sizes [Q] of all causes together that clean logs ask for."""
         parts = [self._alone(group) for group in groups]
         matrix = np.sum([part[1] for part in parts], axis=0)
@@ -203,7 +222,7 @@ class Watch:
         """The causes, then what surrounds the vessel."""
         return [*self.causes, *self.others]
 
-    def sums(self, pieces: Sequence[Piece]) -> list[_Sums]:
+    def sums(self, pieces: Sequence[Piece]) -> list[Sums]:
         """Return the scores of each of several windows."""
         found = [self._innovations(pieces, parts) for parts in self.parts]
         return [
@@ -217,14 +236,17 @@ class Watch:
         error, effects = innovations(self.model, cut, self.changes)
         count = len(pieces)
         by_change = effects.reshape(count, parts, len(self.changes), -1).swapaxes(1, 2)
-        return error.reshape(count, -1), by_change.reshape(count, len(self.changes), -1)
+        error, effects = error.reshape(count, -1), by_change.reshape(count, len(self.changes), -1)
+        lost = run_away(error, effects, self.changes, self.limit)
+        error[lost], effects[lost] = 0.0, 0.0
+        return error, effects
 
     def _expected(self, effects: np.ndarray, i: int) -> np.ndarray:
         """Return what innovations [B, n] are of clean logs, by their effects [B, C, n]."""
         share = np.tile(self.always[i], effects.shape[2] // len(SEEN))
         return np.asarray((effects[:, : len(self.causes)] * share).sum(axis=1))
 
-    def _sums(self, found: Sequence[_Innovations]) -> _Sums:
+    def _sums(self, found: Sequence[_Innovations]) -> Sums:
         """Return the sums of the same windows as a whole and in parts."""
         out = []
         for i, (whiten, (error, effects)) in enumerate(zip(self.whiten, found, strict=True)):
@@ -235,14 +257,14 @@ class Watch:
             a = a.swapaxes(1, 2).reshape(-1, count, size)
             out.append((np.einsum("bqn,bn->q", a, e), np.einsum("bqn,bpn->qp", a, a), e))
         whole = out[0][2]
-        return _Sums(
+        return Sums(
             sum(score for score, _, _ in out),
             sum(information for _, information, _ in out),
             (whole**2).sum(axis=0),
             len(whole),
         )
 
-    def _alone(self, sums: _Sums) -> tuple[np.ndarray, np.ndarray]:
+    def _alone(self, sums: Sums) -> tuple[np.ndarray, np.ndarray]:
         """Return scores and information of the causes once the surroundings have had their part."""
         count = len(self.causes)
         matrix = sums.information
@@ -251,12 +273,12 @@ class Watch:
         information = matrix[:count, :count] - matrix[:count, count:] @ own
         return score, information + 1e-300 * np.eye(count)
 
-    def _group(self, log: int, sums: _Sums, bias: np.ndarray) -> Group:
+    def _group(self, log: int, sums: Sums, bias: np.ndarray) -> Group:
         """Return scores and information of a group, what clean logs always ask for taken out."""
         score, information = self._alone(sums)
         return Group(log, score - information @ bias, information)
 
-    def judge(self, logs: Sequence[int], sums: Sequence[_Sums]) -> Verdict:
+    def judge(self, logs: Sequence[int], sums: Sequence[Sums]) -> Verdict:
         """Return the verdict on groups of windows; wind and current are their own in each.
 
         Args:
@@ -276,69 +298,3 @@ class Watch:
         by_channel = squares.reshape(-1, len(SEEN)).mean(axis=0)
         innovation = dict(zip(SEEN, np.sqrt(by_channel).tolist(), strict=True))
         return Verdict(alarm, self.threshold, suspects, innovation)
-
-
-class Watcher:
-    """A watch that goes along with measurements, sample by sample.
-
-    Args:
-        watch: over a model.
-        past: samples before a window that warm a memory up.
-    """
-
-    def __init__(self, watch: Watch, past: int) -> None:
-        self.watch = watch
-        self.past = past
-        self.steps = round(watch.config.window / watch.dt)
-        self.size = max(round(watch.config.group / watch.config.window), 1)
-        self.windows = max(round(watch.config.stretch / watch.config.window), 1)
-        self.recent: deque[tuple[int, _Sums]] = deque()
-        self.log = 0
-        self.closed = True
-        self.y: list[np.ndarray] = []
-        self.w: list[np.ndarray] = []
-
-    def step(self, y: np.ndarray, w: np.ndarray) -> Verdict | None:
-        """Take one sample: measured state [6], and the inputs [m] held over the step after it.
-
-        Returns:
-            The verdict where a window is complete, else None. A sample that is no measurement ends
-            the window that it lies in.
-        """
-        if not (np.isfinite(y).all() and np.isfinite(w).all()):
-            self.restart()
-            return None
-        self.y.append(np.asarray(y, dtype=float))
-        self.w.append(np.asarray(w, dtype=float))
-        if len(self.y) < self.past + self.steps + 1:
-            return None
-        known, given = np.stack(self.y), np.stack(self.w)
-        piece = Piece(
-            known[self.past :],
-            given[self.past : -1],
-            known[: self.past],
-            given[: self.past],
-        )
-        # the next window begins where this one ends
-        keep = self.past + 1
-        self.y, self.w = self.y[-keep:], self.w[-keep:]
-        return self.take(self.watch.sums([piece])[0])
-
-    def restart(self) -> None:
-        """Begin a new log, whose wind and current are its own."""
-        self.y, self.w = [], []
-        self.log += 1
-        self.closed = True
-
-    def take(self, sums: _Sums) -> Verdict:
-        """Take the scores of a window, and return the verdict on the last stretch."""
-        if self.closed or self.recent[-1][1].count >= self.size:
-            self.recent.append((self.log, sums))
-        else:
-            self.recent[-1] = (self.log, self.recent[-1][1] + sums)
-        self.closed = False
-        counts = [group.count for _, group in self.recent]
-        while sum(counts) - counts[0] >= self.windows:
-            self.recent.popleft()
-            counts.pop(0)
-        return self.watch.judge([log for log, _ in self.recent], [one for _, one in self.recent])

@@ -13,7 +13,8 @@ from residnet.core.config import validate
 from residnet.core.errors import DataError, UsageError
 from residnet.core.names import nearest
 from residnet.data.prepare import Prepared, prepare
-from residnet.identification.monitoring.monitor import MonitorConfig, Verdict, Watch, Watcher
+from residnet.identification.monitoring.monitor import MonitorConfig, Verdict, Watch
+from residnet.identification.monitoring.watcher import Watcher
 from residnet.identification.monitoring.windows import past_of, pieces
 from residnet.identification.prepared import prepare_logs
 from residnet.runs.folder import RunFolder
