@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -72,18 +72,7 @@ def read_csv(
         cut = check_lines(path, delimiter, header, head.above)
         with path.open("rb") as stream_of_bytes:
             pieces = pd.read_csv(
-                stream_of_bytes,
-                sep=r"\s+" if delimiter == BLANKS else delimiter,
-                decimal=decimal,
-                header=None,
-                skiprows=head.above,
-                names=list(range(wide + 1)),
-                index_col=False,
-                skip_blank_lines=False,
-                skipinitialspace=True,
-                low_memory=False,
-                encoding=coded,
-                chunksize=_PIECE,
+                stream_of_bytes, encoding=coded, **_form(delimiter, decimal, head.above, wide)
             )
             for table, last in _with_last(pieces):
                 beyond = np.flatnonzero(table[wide].notna().to_numpy())
@@ -112,6 +101,22 @@ def read_csv(
             f"{path}: not a regular table, its header has {len(header)} columns ({reason}); check"
             " `delimiter` and `decimal`"
         ) from error
+
+
+def _form(delimiter: str, decimal: str, above: int, wide: int) -> dict[str, Any]:
+    """Return how pandas reads the values of a table, one column beyond the header's included."""
+    return {
+        "sep": r"\s+" if delimiter == BLANKS else delimiter,
+        "decimal": decimal,
+        "header": None,
+        "skiprows": above,
+        "names": list(range(wide + 1)),
+        "index_col": False,
+        "skip_blank_lines": False,
+        "skipinitialspace": True,
+        "low_memory": False,
+        "chunksize": _PIECE,
+    }
 
 
 def _with_last(pieces: Iterable[pd.DataFrame]) -> Iterator[tuple[pd.DataFrame, bool]]:
