@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 Mark: TypeAlias = Literal["", "bad", "best", "weak", "text"]
 
 
-_SHEET, _LETTER, _PADDING = 700.0, 6.3, 6.0
+_SHEET, _LETTER, _PADDING = 700.0, 5.8, 6.0
 """Pixels of a sheet of A4 between its margins, of a bold letter of a table, and beside a cell."""
 
 
@@ -108,7 +108,7 @@ class Figure:
     path: Path
     title: str
     caption: str
-    explorer: Explorer | None = None
+    explorer: Explorer | None = field(default=None, compare=False, repr=False)
 
 
 @dataclass(frozen=True)

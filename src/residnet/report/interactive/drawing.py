@@ -108,7 +108,9 @@ def _range(limits: Sequence[float]) -> Any:
     """Return what an axis shows: given limits, else all curves that are switched on."""
     from bokeh.models import DataRange1d, Range1d
 
-    return Range1d(*limits) if limits else DataRange1d(only_visible=True)
+    if not limits:
+        return DataRange1d(only_visible=True)
+    return Range1d(start=limits[0], end=limits[1])
 
 
 def _canvas(

@@ -256,7 +256,7 @@ def _drawn(axes: Axes, labels: Mapping[tuple[str, str], str]) -> list[tuple[str,
                 parts.append((look, (offsets[:, 0], offsets[:, 1])))
             continue
         stroke = isinstance(part, LineCollection)
-        shades = part.get_color() if stroke else part.get_facecolor()
+        shades = part.get_edgecolor() if stroke else part.get_facecolor()
         if len(shades):
             outlines = [path.vertices for path in part.get_paths()]
             look = _look(part, shades[0], labels, False)

@@ -1,0 +1,293 @@
+"""Random layouts of recorders' tables: is what `residnet new` drafts right, marked, or refused?
+
+    python scripts/bench/layouts.py [--count 20] [--seed 0] [--keep FOLDER]
+
+Logs of a simulated boat are written as tables whose language, units, times, positions, delimiter,
+decimals, encoding, lines above the names and kinds of rudder and throttle are drawn at random. Each
+layout is drafted and read, and every channel is compared with the truth. A value that is wrong and
+not marked as a guess makes the script fail; so does an error that is not one line.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import math
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from residnet.core.config import validate
+from residnet.core.errors import ResidnetError
+from residnet.core.log import Log
+from residnet.data.drafting.questions import Marks
+from residnet.data.drafting.tables import draft_tables
+from residnet.data.readers import ReaderConfig
+from residnet.data.simulated.trials import SimulatedTrials, simulate
+from residnet.tasks.demo import TRIALS
+
+DEG, KN = 180.0 / math.pi, 3600.0 / 1852.0
+KEYS = ["t", "x", "y", "lat", "lon", "psi", "u", "v", "r", "delta", "n", "throttle"]
+LANGUAGES = {
+    "English": "Log time|Northing|Easting|GPS_Lat|Lng|True heading|speed through water"
+    "|lateral velocity|Rate of turn|helm angle|shaft speed|Throttle",
+    "German": "Zeitstempel|Hochwert|Rechtswert|Breite|geogr. Länge|Kurs rechtweisend"
+    "|Vorausgeschwindigkeit|Querdrift|Gierrate|Ruderlage|Motordrehzahl|Gashebel",
+    "French": "Horodatage|Position nord|Position est|Latitude|Longitude|Cap vrai|Vitesse surface"
+    "|Dérive|Vitesse de lacet|Angle de barre|Régime hélice|Gaz",
+    "Spanish": "Marca de tiempo|Pos norte|Pos este|Latitud|Longitud|Rumbo verdadero"
+    "|Velocidad de avance|Abatimiento|Velocidad de giro|Ángulo de pala|Revoluciones hélice"
+    "|Acelerador",
+    "Dutch": "Tijdstip|Noordpositie|Oostpositie|Breedte|Lengte|Kompaskoers|Vaart door het water"
+    "|Verlijering|Bochtaanwijzer|Roerstand|Schroeftoerental|Gashendel",
+    "Norwegian": "Klokkeslett|Nordposisjon|Østposisjon|Breddegrad|Lengdegrad|Styrt kurs"
+    "|Fart gjennom vannet|Tverrskips fart|Svingrate|Rorutslag|Akselturtall|Gasspak",
+    "Japanese": "日時|北方向位置|東方向位置|緯度|経度|船首角|対水速力|横流れ速度|回頭率|操舵角"
+    "|軸回転数|スロットル",
+    "Italian": "Ora|Nord|Est|Latitudine|Longitudine|Prua|Velocità avanzamento|Scarroccio"
+    "|Velocità di accostata|Angolo timone|Giri elica|Manetta",
+    "Swedish": "Klockslag|Nord|Ost|Latitud|Longitud|Stävriktning|Fart genom vattnet|Avdrift"
+    "|Girhastighet|Rodervinkel|Propellervarvtal|Gasreglage",
+}
+UNITS: dict[str, Sequence[tuple[str, float]]] = {
+    "psi": (("deg", DEG), ("°", DEG), ("degrees", DEG), ("rad", 1.0)),
+    "u": (("kn", KN), ("m/s", 1.0), ("knots", KN), ("km/h", 3.6)),
+    "v": (("kn", KN), ("m/s", 1.0), ("cm/s", 100.0)),
+    "r": (("deg/min", 60.0 * DEG), ("°/min", 60.0 * DEG), ("°/s", DEG), ("rad/s", 1.0)),
+    "delta": (("deg", DEG), ("°", DEG), ("rad", 1.0)),
+    "n": (("rpm", 60.0), ("1/min", 60.0), ("Hz", 1.0), ("U/min", 60.0)),
+}
+ABOVE: dict[str, Sequence[str]] = {
+    "nothing": (),
+    "comments": ("# recorder 4.2, vessel MV Example", "# started 2025-06-17"),
+    "words": ("Data logger XY-7 export", "Vessel: MV Example", "Serial: 12345", ""),
+    "quotes": ('"Sea trial";"17.06.2025"', ""),
+}
+CLOCKS: dict[str, Callable[[pd.Timestamp], str]] = {
+    "iso": lambda at: f"{at.isoformat(timespec='milliseconds')}Z",
+    "zone": lambda at: f"{at:%Y-%m-%d %H:%M:%S}.{at.microsecond // 1000:03d}+02:00",
+    "half days": lambda at: f"{at:%m/%d/%Y %I:%M:%S}.{at.microsecond // 1000:03d} {at:%p}",
+    "local": lambda at: f"{at:%d.%m.%Y %H:%M:%S}.{at.microsecond // 1000:03d}",
+    "clock": lambda at: f"{at:%H:%M:%S}.{at.microsecond // 1000:03d}",
+    "unix": lambda at: f"{at.timestamp():.3f}",
+    "unix ms": lambda at: f"{at.timestamp() * 1000:.0f}",
+    "days": lambda at: f"{(at - pd.Timestamp('1899-12-30')) / pd.Timedelta(days=1):.10f}",
+}
+Column = tuple[str, str, list[Any]]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How tables are written: each field is a name from the lists above or as it says."""
+
+    language: str
+    delimiter: str
+    decimal: str
+    encoding: str
+    above: str
+    units: str
+    clock: str
+    place: str
+    slow: bool
+    motion: bool
+    wrapped: bool
+    rudder: str
+    drive: str
+    ended: bool
+    form: str
+
+
+def drawn(rng: np.random.Generator) -> Layout:
+    """A layout at random."""
+
+    def one(*options: str) -> str:
+        return str(rng.choice(options))
+
+    language = one(*LANGUAGES)
+    delimiter = one(",", ";", "\t", "|")
+    comma = delimiter != "," and language != "English" and rng.random() < 0.8
+    western = language != "Japanese"
+    return Layout(
+        language,
+        delimiter,
+        "," if comma else ".",
+        one("utf-8", "utf-8-sig", "cp1252" if western else "cp932"),
+        one(*ABOVE),
+        one("[]", "()", "second line", "none"),
+        one("s", "ms", *CLOCKS),
+        one("metres", "degrees", "utm"),
+        bool(rng.random() < 0.3),
+        bool(rng.random() < 0.6),
+        bool(rng.random() < 0.7),
+        one("angle", "to port", "pulses", "per cent", "shares"),
+        one("revolutions", "pulses", "per cent"),
+        bool(rng.random() < 0.3),
+        one("csv", "csv", "csv", "xlsx"),
+    )
+
+
+def columns_of(log: Log, layout: Layout, rng: np.random.Generator) -> list[Column]:
+    """Names, units and cells of a log as a layout has them."""
+    names = dict(zip(KEYS, LANGUAGES[layout.language].split("|"), strict=True))
+    t = log.t - log.t[0]
+    start = pd.Timestamp("2025-06-17 11:58:20")
+    out: list[Column] = []
+    if layout.clock in ("s", "ms"):
+        out.append((names["t"], layout.clock, list(t * (1000.0 if layout.clock == "ms" else 1.0))))
+    else:
+        write = CLOCKS[layout.clock]
+        out.append((names["t"], "", [write(start + pd.Timedelta(seconds=s)) for s in t]))
+    x, y = log["x"], log["y"]
+    if layout.slow:
+        held = (np.arange(t.size) // 5) * 5
+        x, y = x[held], y[held]
+    if layout.place == "degrees":
+        latitude = 54.3 + x / 111_320.0
+        longitude = 10.15 + y / (111_320.0 * math.cos(math.radians(54.3)))
+        out += [(names["lat"], "deg", list(latitude)), (names["lon"], "deg", list(longitude))]
+    else:
+        far = (6_800_123.0, 431_222.0) if layout.place == "utm" else (0.0, 0.0)
+        out += [(names["x"], "m", list(x + far[0])), (names["y"], "m", list(y + far[1]))]
+    for key in ("psi", *(("u", "v", "r") if layout.motion else ())):
+        values = (
+            np.remainder(log[key], 2 * math.pi) if key == "psi" and layout.wrapped else log[key]
+        )
+        unit, factor = UNITS[key][rng.integers(len(UNITS[key]))]
+        out.append((names[key], unit, list(values * factor)))
+    share = log["delta"] / math.radians(35.0)
+    unit, factor = UNITS["delta"][rng.integers(len(UNITS["delta"]))]
+    kinds = {
+        "angle": (unit, log["delta"] * factor),
+        "to port": (unit, -log["delta"] * factor),
+        "pulses": ("us", np.round(1500.0 + 500.0 * share)),
+        "per cent": ("%", 100.0 * share),
+        "shares": ("", share),
+    }
+    out.append((names["delta"], *_cells(kinds[layout.rudder])))
+    unit, factor = UNITS["n"][rng.integers(len(UNITS["n"]))]
+    most = float(np.abs(log["n"]).max())
+    drives = {
+        "revolutions": ("n", unit, log["n"] * factor),
+        "pulses": ("throttle", "us", np.round(1500.0 + 500.0 * log["n"] / most)),
+        "per cent": ("throttle", "%", 100.0 * log["n"] / most),
+    }
+    key, unit, values = drives[layout.drive]
+    return [*out, (names[key], unit, list(values))]
+
+
+def _cells(kind: tuple[str, np.ndarray]) -> tuple[str, list[Any]]:
+    return kind[0], list(kind[1])
+
+
+def write(log: Log, layout: Layout, rng: np.random.Generator, path: Path) -> None:
+    """Write a log as a layout has it."""
+    columns = columns_of(log, layout, rng)
+    bracketed = layout.units in ("[]", "()")
+    heads = [
+        f"{name} {layout.units[0]}{unit}{layout.units[1]}" if unit and bracketed else name
+        for name, unit, _ in columns
+    ]
+    rows: list[list[Any]] = [heads]
+    rows += [[unit for _, unit, _ in columns]] if layout.units == "second line" else []
+    rows += [list(row) for row in zip(*(cells for _, _, cells in columns), strict=True)]
+    if layout.form == "xlsx":
+        blank = [None] * len(heads)
+        title = [["Sea trial", *blank[1:]], blank] if ABOVE[layout.above] else []
+        pd.DataFrame([*title, *rows]).to_excel(path, index=False, header=False)
+        return
+
+    def text(cell: Any) -> str:
+        written = f"{cell:.9f}" if isinstance(cell, float) else str(cell)
+        return written.replace(".", layout.decimal) if isinstance(cell, float) else written
+
+    with path.open("w", encoding=layout.encoding, newline="") as stream:
+        stream.writelines(f"{line}\n" for line in ABOVE[layout.above])
+        writer = csv.writer(stream, delimiter=layout.delimiter)
+        for row in rows:
+            writer.writerow([*map(text, row), *([""] if layout.ended else [])])
+
+
+def wrong(read: Log, truth: Log) -> list[str]:
+    """The channels of a log that are not what they were."""
+    t, out = read.t - read.t[0], []
+    if not math.isclose(float(t[-1]), float(truth.t[-1] - truth.t[0]), rel_tol=0.02):
+        return ["time"]
+    for name in ("x", "y", "psi", "u", "v", "r", "delta", "n"):
+        if name not in read.channels:
+            continue
+        known = np.isfinite(read[name])
+        was = np.interp(t[known], truth.t - truth.t[0], truth[name])
+        there = read[name][known]
+        if name in ("x", "y"):
+            away = float(np.abs((there - there[0]) - (was - was[0])).max()) > 10.0
+        elif name == "psi":
+            away = float(np.median(np.abs(np.angle(np.exp(1j * (there - was)))))) > 0.1
+        else:
+            away = not 0.7 < float(there @ was) / float(was @ was + 1e-12) < 1.4
+        out += [name] if away else []
+    return out
+
+
+def judged(files: Sequence[Path], logs: Sequence[Log], layout: Layout) -> tuple[str, str]:
+    """What became of a layout, and what is to be said of it."""
+    marks = Marks()
+    try:
+        content = draft_tables(files, marks).content
+        reader = validate(content, ReaderConfig, "bench").build()
+        faults = {
+            fault
+            for f, log in zip(files, logs, strict=True)
+            for fault in wrong(reader.read(f), log)
+        }
+    except ResidnetError as error:
+        return ("refused", str(error)) if "\n" not in str(error) else ("FAILED", str(error))
+    lacking = {"psi", "delta"} - set(content["channels"])
+    told = {key[-1] for key, _ in marks.guesses}
+    # to which side a rudder turns the vessel is found later, from the logs themselves
+    faults -= {"delta"} if layout.rudder == "to port" else set()
+    unmarked = sorted(faults - told)
+    if unmarked or lacking:
+        return "FAILED", f"wrong and not marked: {unmarked}; not found: {sorted(lacking)}"
+    return ("marked", f"wrong, and marked: {sorted(faults)}") if faults else ("right", "")
+
+
+def main() -> int:
+    """Draw layouts; return 1 where one is wrong without a mark."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--count", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--keep", type=Path, help="folder for the tables; a temporary one otherwise"
+    )
+    given = parser.parse_args()
+    sensors = {**TRIALS["noise"]["sensors"], "delta": {"noise": "0.1 deg"}}
+    settings = {**TRIALS, "step": "0.2 s", "noise": {**TRIALS["noise"], "sensors": sensors}}
+    config = validate(settings, SimulatedTrials, "bench")
+    logs = simulate(config.draw(), config)[::5]
+    counts: Counter[str] = Counter()
+    with tempfile.TemporaryDirectory() as temporary:
+        for seed in range(given.seed, given.seed + given.count):
+            layout = drawn(np.random.default_rng(seed))
+            folder = (given.keep or Path(temporary)) / str(seed)
+            folder.mkdir(parents=True, exist_ok=True)
+            files = [folder / f"log_{i}.{layout.form}" for i in range(len(logs))]
+            for file, log in zip(files, logs, strict=True):
+                write(log, layout, np.random.default_rng(seed), file)
+            state, words = judged(files, logs, layout)
+            counts[state] += 1
+            print(f"{seed} {state} {words}", flush=True)
+            if state == "FAILED":
+                print(f"  {layout}", flush=True)
+    print(", ".join(f"{count} {state}" for state, count in counts.items()))
+    return int(counts["FAILED"] > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
