@@ -53,6 +53,16 @@ def test_a_difference_is_added_to_the_baseline_s_error_over_the_folds() -> None:
     assert with_crossed(own, LOGS, CROSSED, {**fitted, "other": model("other")}) is None
 
 
+def test_a_model_that_was_judged_over_the_folds_itself_needs_no_baseline() -> None:
+    force = np.array([0.3, 0.1, 0.1])
+    crossed = replace(CROSSED, shares={**CROSSED.shares, "force": force})
+    own = {name: np.array([0.2, 0.1]) for name in ("hull", "force")}
+    fitted = {"hull": model("hull"), "force": model("force", of="hull")}
+    found = with_crossed(own, LOGS, crossed, fitted)
+    assert found is not None
+    np.testing.assert_allclose(found[0]["force"], [*force, 0.0, 0.0])
+
+
 def test_errors_over_other_windows_are_not_joined() -> None:
     other = replace(CROSSED, shares={"linear": np.full(3, 0.2)})
     joined = CROSSED.joined(other)

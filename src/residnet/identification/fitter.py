@@ -22,7 +22,12 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.store import ModelSpec, rebuilt
 from residnet.heads import ClosedFormHead
 from residnet.identification.cross_fitting.crossed import Crossed
-from residnet.identification.cross_fitting.prior_choice import TAKEN, choose_prior
+from residnet.identification.cross_fitting.prior_choice import (
+    TAKEN,
+    JudgedFold,
+    choose_prior,
+    judged_over,
+)
 from residnet.identification.models import FitStore, FittedModel
 from residnet.identification.prepared import velocity_limit
 from residnet.identification.settings import FitSettings, ForceConfig, GateConfig
@@ -59,6 +64,7 @@ class Fitter:
         self.settings = settled(settings, self.samples, self.train)
         self.scales = torch.from_numpy(settings.evaluation.scales.array())
         self.crossed: Crossed | None = None
+        self.folds: dict[str, tuple[JudgedFold, ...]] = {}
         self.validate = ValidationScore(
             logs["validation"],
             settings.evaluation,
@@ -132,6 +138,7 @@ class Fitter:
             notes["prior_choice"] = choice.table
             own = choice.crossed.renamed({TAKEN: name, "zero": "zero"})
             self.crossed = own if self.crossed is None else self.crossed.joined(own)
+            self.folds[name] = choice.folds
             if choice.prior is None:
                 return table, None
             config = config.with_prior(choice.prior)
@@ -207,6 +214,10 @@ class Fitter:
             model.load_state_dict(base.model.state_dict())
             tried.append((self.validate(model), spec, model))
         _, spec, model = min(tried, key=lambda one: one[0])
+        if base.name in self.folds and self.crossed is not None:
+            # the few validation logs have chosen the time constants; all logs judge the model
+            over_folds = judged_over(name, self.folds[base.name], spec, self.settings, self.limit)
+            self.crossed = self.crossed.joined(over_folds) or self.crossed
         notes: dict[str, Any] = {
             **{key: base.notes[key] for key in ("refit", "baseline") if key in base.notes},
             "of": base.name,

@@ -56,10 +56,11 @@ def with_crossed(
 ) -> tuple[dict[str, np.ndarray], Blocks] | None:
     """Return shares and blocks of all models over folds and validation logs; None where they lack.
 
-    A baseline is judged over all folds. What stands on it is too expensive to be fitted for each
-    fold: it is judged by its baseline's error over the folds, and by its difference to the
-    baseline on the validation logs. That difference spreads less than either of the two errors,
-    as both run over the same windows (a difference estimator, as in sampling from surveys).
+    A baseline is judged over all folds, and so is one with an unknown force. What else stands on
+    it is too expensive to be fitted for each fold: it is judged by its baseline's error over the
+    folds, and by its difference to the baseline on the validation logs. That difference spreads
+    less than either of the two errors, as both run over the same windows (a difference estimator,
+    as in sampling from surveys).
 
     Args:
         own: shares over the validation logs, [B] by model.
@@ -69,7 +70,9 @@ def with_crossed(
     """
     out = {}
     for name, entry in fitted.items():
-        roots = [_root(fitted[member], fitted) for member in entry.notes.get("members", (name,))]
+        roots = [
+            _root(fitted[member], fitted, crossed) for member in entry.notes.get("members", (name,))
+        ]
         if any(root not in crossed.shares for root in roots):
             return None
         over_folds = np.mean([crossed.shares[root] for root in roots], axis=0)
@@ -78,7 +81,9 @@ def with_crossed(
     return out, crossed.blocks.beside(blocks)
 
 
-def _root(entry: FittedModel, fitted: Mapping[str, FittedModel]) -> str:
-    """Return the name of the baseline that a model is or stands on."""
+def _root(entry: FittedModel, fitted: Mapping[str, FittedModel], crossed: Crossed) -> str:
+    """Return the name of the model over folds that a model is or stands on."""
     below = entry.notes.get("of") or entry.notes.get("baseline")
-    return entry.name if below is None or below == entry.name else _root(fitted[below], fitted)
+    if entry.name in crossed.shares or below is None or below == entry.name:
+        return entry.name
+    return _root(fitted[below], fitted, crossed)

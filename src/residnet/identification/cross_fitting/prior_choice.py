@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -39,6 +39,21 @@ Prior = float | None
 
 
 @dataclass(frozen=True)
+class JudgedFold:
+    """A part of the logs, and the model that was fitted without it.
+
+    Attributes:
+        windows: of the part.
+        logs: that these belong to.
+        model: with the chosen prior; None where its fit failed.
+    """
+
+    windows: list[Window]
+    logs: list[Prepared]
+    model: HybridDynamics | None
+
+
+@dataclass(frozen=True)
 class PriorChoice:
     """The strength that is taken, and what it was compared with.
 
@@ -47,11 +62,13 @@ class PriorChoice:
         table: for fit.json: prior, free-run error over the held-out windows, the difference to the
             best with its standard error, windows that diverged.
         crossed: errors over the folds by `taken` and `zero`.
+        folds: with the models of the chosen prior.
     """
 
     prior: Prior
     table: list[dict[str, Any]]
     crossed: Crossed
+    folds: tuple[JudgedFold, ...] = ()
 
 
 def choose_prior(
@@ -84,18 +101,16 @@ def choose_prior(
     windows: list[Window] = []
     predicted: dict[str, list[Prediction]] = {_key(prior): [] for prior in priors}
     predicted[_ZERO] = []
+    fitted: list[tuple[list[Window], Fold, dict[Prior, HybridDynamics | None]]] = []
     for fold in folds_of(logs, config.folds):
         found = _windows(fold.held_out, settings.evaluation, config, step)
         if not found:
             continue
-        # beyond a limit of nothing every free run has diverged, and zero stands in its place
-        nothing = np.full(3, -1.0)
-        predicted[_ZERO] += _predicted(spec.build(), found, fold.held_out, step, nothing)
-        for prior, model in _fitted(spec, config, fold, priors, scales):
-            most = nothing if model is None else limit
-            predicted[_key(prior)] += _predicted(
-                model or spec.build(), found, fold.held_out, step, most
-            )
+        predicted[_ZERO] += _predicted(None, spec, found, fold.held_out, step, limit)
+        models = dict(_fitted(spec, config, fold, priors, scales))
+        for prior, model in models.items():
+            predicted[_key(prior)] += _predicted(model, spec, found, fold.held_out, step, limit)
+        fitted.append((found, fold, models))
         offset = len(pool)
         windows += [_moved(window, offset) for window in found]
         pool += fold.held_out
@@ -104,7 +119,44 @@ def choose_prior(
             f"refit.{name}: no part of the training and validation logs holds a free run of"
             f" {config.horizon:g} s to choose the prior by; give one prior, or longer logs"
         )
-    return _chosen(priors, FreeRun("", "", windows, predicted), pool, settings.evaluation)
+    choice = _chosen(priors, FreeRun("", "", windows, predicted), pool, settings.evaluation)
+    return replace(
+        choice,
+        folds=tuple(
+            JudgedFold(found, fold.held_out, models[choice.prior]) for found, fold, models in fitted
+        ),
+    )
+
+
+def judged_over(
+    name: str,
+    folds: Sequence[JudgedFold],
+    spec: ModelSpec,
+    settings: FitSettings,
+    limit: np.ndarray,
+) -> Crossed:
+    """Return the errors over folds of a model that adds to the baselines fitted there.
+
+    Args:
+        name: that the errors get.
+        folds: of the baseline's choice of a prior.
+        spec: of the model, whose weights are the baseline's.
+        settings: of the fit.
+        limit: of |u, v, r| [3] beyond which a free run has diverged.
+    """
+    pool: list[Prepared] = []
+    windows: list[Window] = []
+    predicted: list[Prediction] = []
+    for fold in folds:
+        model = None
+        if fold.model is not None:
+            model = spec.build()
+            model.load_state_dict(fold.model.state_dict())
+        step = settings.prepare.grid.step
+        predicted += _predicted(model, spec, fold.windows, fold.logs, step, limit)
+        windows += [_moved(window, len(pool)) for window in fold.windows]
+        pool += fold.logs
+    return Crossed.of(FreeRun("", "", windows, {name: predicted}), pool, settings.evaluation)
 
 
 def _key(prior: Prior) -> str:
@@ -161,12 +213,17 @@ def _fitted(
 
 
 def _predicted(
-    model: HybridDynamics,
+    model: HybridDynamics | None,
+    spec: ModelSpec,
     windows: Sequence[Window],
     logs: Sequence[Prepared],
     step: float,
     limit: np.ndarray,
 ) -> list[Prediction]:
+    """Return the free runs of a model; those of `zero`, as diverged, where there is none."""
+    if model is None:
+        # beyond a limit of nothing every free run has diverged, and zero stands in its place
+        model, limit = spec.build(), np.full(3, -1.0)
     candidate = Candidate("judged", "baseline", model)
     return free_run([candidate], windows, logs, step, limit)["judged"]
 
