@@ -37,6 +37,8 @@ _MORE = ((1.0, 1.5, 2), (1.0, 1.0, 2), (0.0, 1.0, 2), (0.5, 2.0, 2), (1.0, 3.0, 
 """What outlines are looked for with: share of the room before and behind turns, multiple of their
 radius, and how many distances buoys may be passed at.
 """
+_EFFORT = 500
+"""Times that a route is drawn for fits, beyond which no other outline is fitted."""
 _RINGS = (0.0, 0.25)
 _TOLERANCE = 2e-3
 """Of distances, as a share of the vessel's turning radius."""
@@ -113,17 +115,28 @@ def plan(
     """
     reasons: list[tuple[float, str]] = []
     known: set[tuple[object, ...]] = set()
+    effort = 0
     for number, tries in enumerate((_TRIES, *((one,) for one in _MORE))):
         report("planning", number, 1 + len(_MORE))
         found: list[tuple[Fit, Fitted]] = []
         for room, wide, rings in tries:
+            if effort > _EFFORT:
+                break
             sketch = _outline(request, room, wide, _RINGS[:rings])
             for outline in () if sketch is None else _simplified(request, sketch):
                 if (shape := _shape(outline)) in known:
                     continue
                 known.add(shape)
-                every = _fitted(request, outline)
-                found += [one for one in every if _right(request, *one, step, reasons)]
+                fits = _fitted(request, outline)
+                right = [one for one in fits if _right(request, *one, step, reasons)]
+                close = [one for one in fits if one[1].missed <= _TOLERANCE * request.turns.radius]
+                if close and not right:
+                    # what is passed out of its turn may be on the wrong side there
+                    fit, fitted = min(close, key=lambda one: one[1].time)
+                    fitted = fit.alone(fitted.z)
+                    right = [(fit, fitted)] if _right(request, fit, fitted, step, reasons) else []
+                found += right
+                effort += sum(fit.effort for fit, _ in fits)
                 if found:
                     break
         for fit, fitted in sorted(found, key=lambda one: one[1].time):

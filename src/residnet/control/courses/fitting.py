@@ -1,35 +1,38 @@
 """The lengths of a route's legs and turns that make it quickest and keep it right.
 
-Sequential quadratic programming with exact derivatives.
+What is asked of it, with exact derivatives; `descent` solves it.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
-from typing import Any, NamedTuple, final
+from typing import NamedTuple, final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import Bounds, minimize
 
 from residnet.control.courses.course_check import left_behind
+from residnet.control.courses.descent import Linear, descend
 from residnet.control.courses.outline import Circle
-from residnet.control.courses.route import Drawn, Route
+from residnet.control.courses.route import LEG, Drawn, Route
+from residnet.control.courses.turn_table import POINTS
 from residnet.control.courses.turns import Array
 
-_ROUNDS = 40
-_QUICKER = 3
-"""Searches for a quicker course, each from what the one before has found."""
-_WEIGHT = 0.3
-_SETTLED = 1e-3
-_BOX = 2.0
-"""By which legs and holds may change in a search, in turning radii and the time for one."""
-_ASIDE = 1.0
-"""By which the first heading may be changed, in rad."""
+_DEAR = 40.0
+"""Turning radii that a course may be longer by to miss what is asked by one less."""
+_PRICE = 4.0
+"""The same where a buoy's own turn is not to be the only one that comes as near."""
 _APART = 0.03
 """Turning radii by which a buoy is farther off on the rest of the course than in its turn."""
-_NEAR = 3.0
-"""Turning radii from a circle within which a part of the course is kept an eye on."""
+_ABEAM = 0.3
+"""Sine of the angle from ahead or astern below which a buoy is not yet on a side."""
+_NEAR, _BESIDE = 2.0, 0.7
+"""Turning radii from a circle within which other parts of the course, and the buoy's own turn, are
+kept an eye on.
+"""
+_SHARES = 4
+"""Pieces of a turn that keep to circles each for itself."""
 FARTHEST = 0.3
 """How much farther off than its circle a buoy may be passed, in turning radii."""
 
@@ -47,11 +50,20 @@ class Fitted(NamedTuple):
 
 
 class _Near(NamedTuple):
-    """The point of a part of a route that is nearest to a buoy: distance, sign, derivatives."""
+    """The nearest points of M parts of a route to a buoy each.
 
-    distance: float
-    sign: float
+    Attributes:
+        distance: [M] in m.
+        change: derivatives [M, nz] of the distances.
+        abeam: [M] the same, positive to starboard and negative to port. It goes through zero
+            where the buoy comes to lie ahead or astern of the end of a part.
+        swing: derivatives [M, nz] of that.
+    """
+
+    distance: Array
     change: Array
+    abeam: Array
+    swing: Array
 
 
 @final
@@ -76,11 +88,14 @@ class Fit:
         aside: float = 0.0,
     ) -> None:
         self.route, self.circles, self.free, self.aside = route, circles, free, aside
+        self.places = np.array([circle.place for circle in circles])
+        self.sides = np.array([circle.side for circle in circles])
         self.unit = route.turns.radius
         middle = (at[1:] + at[:-1] + 1) // 2
         self.edges = np.concatenate(([0], middle, [-1]))
-        self.others: list[tuple[int, int]] = []
+        self.others: list[tuple[int, int, slice]] = []
         self.apart = [self._apart(circle) for circle in circles]
+        self.hard, self.price, self.effort = 0, _PRICE, 0
         self.seen: Array | None = None
         self.last: _Results
 
@@ -104,86 +119,127 @@ class Fit:
         return slice(min(low, count - 2), max(high, min(low, count - 2) + 2))
 
     def watch(self, z: Array) -> None:
-        """Choose which parts of the course must keep clear of buoys that are passed elsewhere."""
-        points = self.route(z).points
-        self.others = []
+        """Choose which pieces of the course must keep clear of which buoys."""
+        drawn = self.route(z)
+        points, self.others = drawn.points, []
+        pieces = self._pieces(len(points))
+        right = self.sides * self._nearest(drawn, self._parts(points)).abeam > 0
         for j, circle in enumerate(self.circles):
             if circle.side == 0:
                 continue
-            begin = self._left(points, circle)
-            for i in range(len(self.circles)):
-                part = self.window(i, len(points))
-                part = slice(max(part.start, begin), part.stop)
-                if i == j or part.stop - part.start < 2:
-                    continue
-                nearest = np.abs(points[part] - circle.place).min()
-                if nearest < circle.radius + _NEAR * self.unit:
-                    self.others.append((j, i))
+            begin, distance = self._left(points, circle), np.abs(points - circle.place)
+            self.others += [
+                (j, i, part)
+                for i, part in pieces
+                # from the wrong side the way to the right one leads through the circle
+                if (i != j or right[j])
+                and part.stop - max(part.start, begin) > 1
+                and distance[max(part.start, begin) : part.stop].min()
+                < circle.radius + (_BESIDE if i == j else _NEAR) * self.unit
+            ]
+
+    def _pieces(self, count: int) -> list[tuple[int, slice]]:
+        """Return pieces of the route and in which buoy's turn each is; turns are several.
+
+        Of a whole turn about a buoy, the nearest point jumps from its beginning to its end.
+        """
+        cuts = {0, count - 1, *range(LEG, count, LEG + POINTS)}
+        for k in range(_SHARES):
+            cuts |= set(range(LEG + k * POINTS // _SHARES, count, LEG + POINTS))
+        turns = [self.window(number, count) for number in range(len(self.circles))]
+        found = []
+        for i, turn in enumerate(turns):
+            inside = sorted({turn.start, turn.stop - 1, *cuts} & set(range(turn.start, turn.stop)))
+            found += [(i, slice(one, two + 1)) for one, two in itertools.pairwise(inside)]
+        return found
 
     def _left(self, points: np.ndarray, circle: Circle) -> int:
         """Return the point from which a circle counts: `course_check.left_behind`."""
-        if circle.side == 0:
+        if circle.side == 0 or abs(circle.place - points[0]) >= circle.radius:
             return 0
         return min(left_behind(np.abs(points - circle.place), circle.radius), len(points) - 2)
 
-    def _nearest(self, drawn: Drawn, circle: Circle, part: slice) -> _Near:
-        """Return the point of a part of the course that is nearest to a circle's middle."""
-        points = drawn.points[part]
-        begin, piece = points[:-1], np.diff(points)
-        away = circle.place - begin
-        share = np.clip(
-            (away * piece.conj()).real / np.maximum(np.abs(piece) ** 2, 1e-12), 0.0, 1.0
-        )
+    def _parts(self, points: np.ndarray) -> list[tuple[int, slice]]:
+        """Return the circles and the parts of the course that keep to them: own turns first."""
+        count, last = len(points), len(self.circles) - 1
+        left = [self._left(points, circle) for circle in self.circles]
+        found: list[tuple[int, slice]] = []
+        for j, circle in enumerate(self.circles):
+            part = self.window(j, count)
+            found.append((j, slice(count - 2, count) if j == last and circle.side == 0 else part))
+        found += [(j, part) for j, _, part in self.others]
+        return [
+            (j, slice(max(part.start, min(left[j], part.stop - 2)), part.stop)) for j, part in found
+        ]
+
+    def _nearest(self, drawn: Drawn, parts: Sequence[tuple[int, slice]]) -> _Near:
+        """Return the points of parts of the course that are nearest to the middle of circles."""
+        piece = np.diff(drawn.points)
+        away = self.places[:, None] - drawn.points[:-1]
+        share = (away * piece.conj()).real / np.maximum(np.abs(piece) ** 2, 1e-12)
+        share = np.clip(share, 0.0, 1.0)
         offset = away - share * piece
-        near = int(np.abs(offset).argmin())
-        distance = float(np.abs(offset[near]))
-        moved = drawn.moved[part][near : near + 2]
-        shift = (1.0 - share[near]) * moved[0] + share[near] * moved[1]
-        outward = offset[near] / max(distance, 1e-9)
-        change = -(shift * outward.conjugate()).real
-        sign = 1.0 if (piece[near].conjugate() * offset[near]).imag >= 0 else -1.0
-        return _Near(distance, sign, change)
+        distances = np.abs(offset)
+        which = np.array([j for j, _ in parts])
+        at = np.array(
+            [part.start + distances[j, part.start : part.stop - 1].argmin() for j, part in parts]
+        )
+        near, distance, offset = share[which, at][:, None], distances[which, at], offset[which, at]
+        begin, end = drawn.moved(at), drawn.moved(at + 1)
+        shift = (1.0 - near) * begin + near * end
+        outward = offset / np.maximum(distance, 1e-9)
+        change = -(shift * outward.conj()[:, None]).real
+        size = np.maximum(np.abs(piece[at]), 1e-9)
+        back = (piece[at] / size).conj()
+        across = (back * offset).imag / _ABEAM
+        rotated = (back[:, None] * (end - begin)).imag / size[:, None]
+        swing = -((back[:, None] * shift).imag + (back * offset).real[:, None] * rotated) / _ABEAM
+        ahead = np.abs(across) < distance
+        sign = np.where(across >= 0, 1.0, -1.0)
+        return _Near(
+            distance,
+            change,
+            np.where(ahead, across, sign * distance),
+            np.where(ahead[:, None], swing, sign[:, None] * change),
+        )
 
     def results(self, z: Array) -> _Results:
         """Return the time, what must not be negative, what must vanish, and their derivatives."""
         if self.seen is not None and np.array_equal(self.seen, z):
             return self.last
         drawn = self.route(z)
-        count, goal = len(drawn.points), self.circles[-1]
+        self.effort += 1
+        goal, number = self.circles[-1], len(self.circles)
         far, values, rows = FARTHEST * self.unit, [], []
-        own: list[tuple[float, Array]] = []
+        near = self._nearest(drawn, self._parts(drawn.points))
+        # on the wrong side, distances are negative
+        entered, side = self.sides == 0, self.sides[:, None]
+        own = np.where(entered, near.distance[:number], self.sides * near.abeam[:number])
+        change = np.where(side == 0, near.change[:number], side * near.swing[:number])
         for j, circle in enumerate(self.circles):
-            part = self.window(j, count)
-            if circle.side == 0 and j == len(self.circles) - 1:
-                part = slice(count - 2, count)
-            if circle.side != 0:
-                begin = min(self._left(drawn.points, circle), part.stop - 2)
-                part = slice(max(part.start, begin), part.stop)
-            near = self._nearest(drawn, circle, part)
             if circle.side == 0:
-                values.append(circle.radius - near.distance)
-                rows.append(-near.change)
-                own.append((near.distance, near.change))
+                values.append(circle.radius - own[j])
+                rows.append(-change[j])
             else:
-                sign = near.sign * circle.side
-                own.append((sign * near.distance, sign * near.change))
-                values += [own[-1][0] - circle.radius, circle.radius + far - own[-1][0]]
-                rows += [own[-1][1], -own[-1][1]]
-        for j, i in self.others:
-            part = self.window(i, count)
-            begin = min(self._left(drawn.points, self.circles[j]), part.stop - 2)
-            part = slice(max(part.start, begin), part.stop)
-            near = self._nearest(drawn, self.circles[j], part)
-            # next to its own turn the course comes from there
-            apart = 0.0 if abs(i - j) <= 1 else self.apart[j]
-            values.append(near.distance - max(own[j][0], self.circles[j].radius) - apart)
-            rows.append(near.change - (own[j][1] if own[j][0] > self.circles[j].radius else 0.0))
+                values += [own[j] - circle.radius, circle.radius + far - own[j]]
+                rows += [change[j], -change[j]]
+        for k, (j, _, _) in enumerate(self.others, start=number):
+            values.append(near.distance[k] - self.circles[j].radius)
+            rows.append(near.change[k])
+        self.hard = len(values)
+        for k, (j, i, _) in enumerate(self.others, start=number):
+            if i != j:
+                # where it lies on its side too, a buoy may be as near
+                apart = self.apart[j] if near.abeam[k] * self.circles[j].side < 0 else 0.0
+                values.append(near.distance[k] - own[j] - apart)
+                rows.append(near.change[k] - change[j])
         even, level = [], []
         if goal.side != 0:
             along = np.exp(1j * drawn.heading)
             left = (goal.place - drawn.points[-1]) * along.conjugate()
+            moved = drawn.moved(np.array([len(drawn.points) - 1]))[0]
             even.append(left.real)
-            level.append(-(drawn.moved[-1] * along.conjugate()).real + left.imag * drawn.turned)
+            level.append(-(moved * along.conjugate()).real + left.imag * drawn.turned)
         unit, time = self.unit, self.unit / self.route.turns.speed
         size = len(z)
         self.last = (
@@ -198,84 +254,48 @@ class Fit:
         self.seen = z.copy()
         return self.last
 
+    def least(self) -> Array:
+        """Return the smallest z."""
+        return self.route.least()
+
+    def most(self) -> Array:
+        """Return the largest z."""
+        return self.route.most()
+
+    def linear(self, z: Array) -> Linear:
+        """Return the problem as it is linear at z."""
+        time, slower, values, rows, even, level, _ = self.results(z)
+        price = np.full(len(values), self.price)
+        price[: self.hard] = _DEAR
+        fixed = np.zeros(len(z), dtype=bool)
+        fixed[0] = not self.free
+        return Linear(time, slower, values, rows, price, even, level, _DEAR, fixed)
+
+    def look(self, z: Array) -> None:
+        """Look anew which parts of the course come near which buoys."""
+        self.seen = None
+        self.watch(z)
+
     def missed(self, z: Array) -> tuple[float, int]:
         """Return by how much a route misses what is asked of it, in m, and at which buoy."""
         _, _, values, _, even, _, _ = self.results(z)
         numbers = [
             *(j for j, circle in enumerate(self.circles) for _ in range(1 + abs(circle.side))),
-            *(j for j, _ in self.others),
+            *(j for j, _, _ in self.others),
         ]
-        short = np.maximum(-values, 0.0)
+        short = np.maximum(-values[: self.hard], 0.0)
         worst = int(short.argmax())
         if len(even) and abs(even[0]) > short[worst]:
             return self.unit * float(abs(even[0])), len(self.circles) - 1
         return self.unit * float(short[worst]), numbers[worst]
 
-    def solve(self, z: Array) -> Fitted:
-        """Return the route that is found from a start: the nearest right one, then the quickest.
+    def alone(self, z: Array) -> Fitted:
+        """Return the route that is found where buoys are hardly approached out of their turns."""
+        self.price = _DEAR
+        return self.solve(z)
 
-        Each search keeps near where it begins, since the course shall keep its shape.
-        """
-        z = self._search(z, 0.0)
-        if self.missed(z)[0] <= self.unit:
-            for _ in range(_QUICKER):
-                before = self.results(z)[0]
-                z = self._search(z, _WEIGHT)
-                if self.results(z)[0] > (1.0 - _SETTLED) * before:
-                    break
+    def solve(self, z: Array) -> Fitted:
+        """Return the route that is found from a start."""
+        z = descend(self, np.clip(z, self.route.least(), self.route.most()))
         missed, worst = self.missed(z)
         return Fitted(z, self.results(z)[0] * self.unit / self.route.turns.speed, missed, worst)
-
-    def _search(self, begin: Array, weight: float) -> Array:
-        """Return the z that is found within a box; `weight` 0 for the nearest right one."""
-        self.seen = None
-        self.watch(begin)
-        least = np.maximum(begin - _BOX, self.route.least())
-        most = np.minimum(begin + _BOX, self.route.most())
-        aside = _ASIDE if self.free else 0.0
-        least[0], most[0] = begin[0] - aside, begin[0] + aside
-        begin = np.clip(begin, least, most)
-
-        def aim(z: Array) -> float:
-            if weight > 0:
-                return weight * self.results(z)[0]
-            return 0.5 * float(((z - begin) ** 2).sum())
-
-        def slope(z: Array) -> Array:
-            return weight * self.results(z)[1] if weight > 0 else z - begin
-
-        constraints = [
-            {
-                "type": "ineq",
-                "fun": lambda z: self.results(z)[2],
-                "jac": lambda z: self.results(z)[3],
-            }
-        ]
-        if self.circles[-1].side != 0:
-            constraints.append(
-                {
-                    "type": "eq",
-                    "fun": lambda z: self.results(z)[4],
-                    "jac": lambda z: self.results(z)[5],
-                }
-            )
-        # its types know no constraints with Jacobians
-        solve: Any = minimize
-        result = solve(
-            aim,
-            begin,
-            jac=slope,
-            method="SLSQP",
-            bounds=Bounds(least, most),
-            constraints=constraints,
-            options={"maxiter": _ROUNDS, "ftol": 1e-5 * (weight or 1.0)},
-        )
-        z: Array = np.clip(result.x, least, most)
-        if (
-            not np.isfinite(z).all()
-            or self.missed(begin)[0] <= self.missed(z)[0] - 1e-3 * self.unit
-        ):
-            z = begin
-        self.seen = None
-        self.watch(z)
-        return z

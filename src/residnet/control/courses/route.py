@@ -5,7 +5,7 @@ from __future__ import annotations
 import cmath
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple, final
+from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,24 +99,54 @@ class Sketch:
         return Sketch(self.heading, legs, (*self.bends[:k], bend, *self.bends[k + 2 :]), passed)
 
 
-class Drawn(NamedTuple):
-    """A route's points [S] complex in m, its length of time in s, end heading, and derivatives.
+@dataclass(frozen=True)
+class Drawn:
+    """A route's points, its length of time, and what they change by.
+
+    A point moves with a length of its own part of the route, and with those of all parts before
+    it: these shift it and turn it about where they end.
 
     Attributes:
-        points: from the start on.
+        points: [S] complex in m, from the start on.
         time: in s.
         heading: of the last leg in rad.
-        moved: derivatives [S, nz] of the points.
         slower: derivatives [nz] of the time.
         turned: derivatives [nz] of the last heading.
+        inner: derivatives [S] of the points by the length of their own part.
+        own: number in z of that length [S].
+        after: first point [nz] behind the part of each length.
+        shift, turn, pivot: what each length does to the points behind its part [nz].
+        units: of z [nz].
     """
 
     points: np.ndarray
     time: float
     heading: float
-    moved: np.ndarray
     slower: Array
     turned: Array
+    inner: np.ndarray
+    own: NDArray[np.intp]
+    after: NDArray[np.intp]
+    shift: np.ndarray
+    turn: Array
+    pivot: np.ndarray
+    units: Array
+
+    def moved(self, at: NDArray[np.intp]) -> np.ndarray:
+        """Return the derivatives [P, nz] of points with the numbers [P]."""
+        away = self.points[at][:, None] - self.pivot
+        rows = np.where(at[:, None] >= self.after, self.shift + 1j * self.turn * away, 0.0)
+        own = self.own[at]
+        inside = np.flatnonzero(own > 0)
+        rows[inside, own[inside]] = self.inner[at[inside]]
+        result: np.ndarray = rows * self.units
+        return result
+
+
+def _mirrored(points: np.ndarray, sides: Array) -> np.ndarray:
+    """Return turns [n, K] to starboard as turns to their sides [n]: to port they are mirrored."""
+    result: np.ndarray = points.real + 1j * sides[:, None] * points.imag
+    return result
 
 
 @final
@@ -198,55 +228,57 @@ class Route:
     def __call__(self, z: Array) -> Drawn:
         """Return the points of z, the time, and what they change by."""
         z = z * self.units
-        size, speed = len(z), self.turns.speed
-        level, at = float(z[0]), self.start
+        size, number, speed = len(z), len(self.sides), self.turns.speed
+        sides, begin, first = np.array(self.sides, dtype=float), float(z[0]), float(z[1])
         shares = np.linspace(0.0, 1.0, LEG + 1)[1:]
-        points = [np.array([at])]
-        pivots: list[tuple[complex, complex, float, int]] = []
-        legs: list[tuple[complex, float, int]] = []
-        total = 1 + LEG + len(self.sides) * (POINTS + LEG)
-        moved = np.zeros((total, size), dtype=complex)
-        slower, turned = np.zeros(size), np.zeros(size)
-        turned[0], slower[1::2], time = 1.0, 1.0 / speed, float(z[1::2].sum()) / speed
-        along, place = cmath.exp(1j * level), 1
-        points.append(at + float(z[1]) * along * shares)
-        moved[place : place + LEG, 1], at = shares * along, at + float(z[1]) * along
-        place += LEG
-        moved[place:, 1] = along
-        for k, (side, number) in enumerate(zip(self.sides, self.numbers, strict=True)):
-            hold, leg, column = float(z[2 + 2 * k]), float(z[3 + 2 * k]), 2 + 2 * k
-            track, heading, lasted = self.turns.tables[number](hold)
-            track_, heading_, lasted_ = self.turns.tables[number].change(hold)
-            if side < 0:
-                track, track_ = track.conj(), track_.conj()
-            points.append(at + along * track)
-            moved[place : place + POINTS, column] = along * track_
-            end = at + along * complex(track[-1])
-            pivots.append((end, along * complex(track_[-1]), side * float(heading_[-1]), place))
-            level += side * float(heading[-1])
-            turned[column], slower[column] = side * float(heading_[-1]), lasted_
-            time += lasted
-            along, place = cmath.exp(1j * level), place + POINTS
-            behind, course, onward, bent = self.turns.tables[number].along(leg * shares)
-            if side < 0:
-                behind, onward = behind.conj(), onward.conj()
-            points.append(end + along * behind)
-            moved[place : place + LEG, column + 1] = shares * along * onward
-            at, place = complex(points[-1][-1]), place + LEG
-            moved[place:, column + 1] = along * onward[-1]
-            level += side * float(course[-1])
-            along = cmath.exp(1j * level)
-            turned[column + 1] = side * float(bent[-1])
-            legs.append((at, turned[column + 1], place))
-        track = np.concatenate(points)
-        moved[:, 0] = 1j * (track - self.start)
-        for k, (end, turn, begin) in enumerate(legs):
-            moved[begin:, 3 + 2 * k] += 1j * turn * (track[begin:] - end)
-        for k, (end, shift, turn, begin) in enumerate(pivots):
-            later = slice(begin + POINTS, None)
-            moved[later, 2 + 2 * k] = shift + 1j * turn * (track[later] - end)
+        made, change = self.turns.at(self.numbers, z[2::2])
+        behind, onward = self.turns.legs(self.numbers, z[3::2, None] * shares)
+        made, change, behind, onward = (
+            part._replace(points=_mirrored(part.points, sides))
+            for part in (made, change, behind, onward)
+        )
+        bent, swung = sides * made.headings, sides * behind.headings
+        levels = begin + np.concatenate(([0.0], np.cumsum(bent + swung)))
+        along, beyond = np.exp(1j * levels), np.exp(1j * (levels[:-1] + bent))
+        track = along[:-1, None] * made.points
+        leg = beyond[:, None] * behind.points
+        at = self.start + first * along[0]
+        ends = at + np.cumsum(track[:, -1:] + leg[:, -1:])
+        corners = np.concatenate(([at], ends))[:-1] + track[:, -1]
+        starts = np.concatenate(([at], ends))[:-1]
+        parts = np.concatenate((starts[:, None] + track, corners[:, None] + leg), axis=1)
+        points = np.concatenate(
+            ([self.start], self.start + first * along[0] * shares, parts.ravel())
+        )
+        inner = np.concatenate(
+            (
+                along[:-1, None] * change.points,
+                shares * beyond[:, None] * onward.points,
+            ),
+            axis=1,
+        )
+        shift, turn, pivot = np.zeros(size, complex), np.zeros(size), np.full(size, self.start)
+        turn[0], shift[1], pivot[1] = 1.0, along[0], at
+        turn[2::2], turn[3::2] = sides * change.headings, sides * onward.headings
+        shift[2::2] = along[:-1] * change.points[:, -1]
+        shift[3::2] = beyond * onward.points[:, -1]
+        pivot[2::2], pivot[3::2] = corners, ends
+        lengths = np.array([1, LEG, *(POINTS, LEG) * number])
+        slower = np.zeros(size)
+        slower[1::2], slower[2::2] = 1.0 / speed, change.times
         return Drawn(
-            track, time, level, moved * self.units, slower * self.units, turned * self.units
+            points,
+            float(z[1::2].sum()) / speed + float(made.times.sum()),
+            float(levels[-1]),
+            slower * self.units,
+            turn * self.units,
+            np.concatenate(([0.0], along[0] * shares, inner.ravel())),
+            np.repeat(np.arange(size), lengths),
+            np.concatenate(([0], np.cumsum(lengths)[1:])),
+            shift,
+            turn,
+            pivot,
+            self.units,
         )
 
     def sailed(self, z: Array) -> list[tuple[np.ndarray, Array, float]]:
@@ -273,9 +305,9 @@ class Route:
             parts.append((points[over:], level + heading[over:], -side * table.rudder))
             level += float(heading[-1])
             along, at = cmath.exp(1j * level), complex(points[-1])
-            behind, course, _, _ = table.along(leg * np.linspace(0.0, 1.0, 100) ** 2)
-            behind, course = (behind, course) if side > 0 else (behind.conj(), -course)
-            parts.append((at + along * behind, level + course, 0.0))
-            level += float(course[-1])
+            behind, _ = table.along(leg * np.linspace(0.0, 1.0, 100)[:, None] ** 2)
+            places = behind.points[:, 0] if side > 0 else behind.points[:, 0].conj()
+            parts.append((at + along * places, level + side * behind.headings, 0.0))
+            level += side * float(behind.headings[-1])
             along, at = cmath.exp(1j * level), complex(parts[-1][0][-1])
         return parts

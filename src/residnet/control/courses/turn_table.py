@@ -9,9 +9,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import final
+from typing import NamedTuple, final
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from residnet.control.courses.turns import Array, Turn, TurnMaker
@@ -26,6 +27,17 @@ _NOTHING = 2e-3
 """Below it what a turn leaves does not count: shares of speed and radius, and rad."""
 _SETTLED = 4.0
 """Time constants after which the vessel runs straight behind a turn."""
+
+
+class Part(NamedTuple):
+    """Turns, or the legs behind them: points [n, K] complex, last headings [n], and times [n].
+
+    Also their derivatives.
+    """
+
+    points: np.ndarray
+    headings: Array
+    times: Array
 
 
 @final
@@ -64,23 +76,20 @@ class TurnTable:
         row = self.spline(hold)
         return row[:POINTS] + 1j * row[POINTS : 2 * POINTS], row[2 * POINTS : -1], float(row[-1])
 
-    def change(self, hold: float) -> tuple[np.ndarray, Array, float]:
-        """Return the derivatives of the same by the time that the rudder is held."""
-        row = self.slope(hold)
-        return row[:POINTS] + 1j * row[POINTS : 2 * POINTS], row[2 * POINTS : -1], float(row[-1])
-
-    def along(self, lengths: Array) -> tuple[np.ndarray, Array, np.ndarray, Array]:
-        """Return places and headings [M] of the leg at lengths [M] in m, and their derivatives."""
+    def along(self, lengths: Array) -> tuple[Part, Part]:
+        """Return the leg behind at lengths [..., K] in m, and what it changes by with each."""
+        none = np.zeros(lengths.shape[:-1])
         if self.leg is None or self.bent is None:
-            none = np.zeros(len(lengths))
-            return lengths.astype(complex), none, np.ones(len(lengths), dtype=complex), none
+            straight = lengths.astype(complex)
+            return Part(straight, none, none), Part(np.ones_like(straight), none, none)
         known = np.minimum(lengths, self.leg.x[-1])
         rows, bent = self.leg(known), self.bent(known)
-        onward = np.exp(1j * rows[:, 2])
+        onward = np.exp(1j * rows[..., 2])
         inside = lengths <= self.leg.x[-1]
-        places = rows[:, 0] + 1j * rows[:, 1] + (lengths - known) * onward
-        moved = np.where(inside, bent[:, 0] + 1j * bent[:, 1], onward)
-        return places, rows[:, 2], moved, np.where(inside, bent[:, 2], 0.0)
+        places = rows[..., 0] + 1j * rows[..., 1] + (lengths - known) * onward
+        moved = np.where(inside, bent[..., 0] + 1j * bent[..., 1], onward)
+        turned = np.where(inside, bent[..., 2], 0.0)
+        return Part(places, rows[..., -1, 2], none), Part(moved, turned[..., -1], none)
 
     def hold(self, angle: float) -> float:
         """Return the time in s that a turn of an angle in rad is held for."""
@@ -118,6 +127,37 @@ class Turns:
     speed: float
     radius: float
     settled: bool = True
+
+    def at(self, numbers: Sequence[int], holds: Array) -> tuple[Part, Part]:
+        """Return turns of tables [n] held for [n] in s, to starboard, and their derivatives."""
+        rows, slopes = np.zeros((2, len(holds), 3 * POINTS + 1))
+        for number, which in _groups(numbers):
+            rows[which] = self.tables[number].spline(holds[which])
+            slopes[which] = self.tables[number].slope(holds[which])
+        made, change = (
+            Part(part[:, :POINTS] + 1j * part[:, POINTS : 2 * POINTS], part[:, -2], part[:, -1])
+            for part in (rows, slopes)
+        )
+        return made, change
+
+    def legs(self, numbers: Sequence[int], lengths: Array) -> tuple[Part, Part]:
+        """Return the legs behind such turns at lengths [n, K] in m, and their derivatives."""
+        count = len(lengths)
+        both = [
+            Part(np.zeros(lengths.shape, complex), np.zeros(count), np.zeros(count))
+            for _ in range(2)
+        ]
+        for number, which in _groups(numbers):
+            for whole, found in zip(both, self.tables[number].along(lengths[which]), strict=True):
+                for into, values in zip(whole, found, strict=True):
+                    into[which] = values
+        return both[0], both[1]
+
+
+def _groups(numbers: Sequence[int]) -> list[tuple[int, NDArray[np.intp]]]:
+    """Return each table's number and the turns that are of it."""
+    every = np.array(numbers, dtype=np.intp)
+    return [(int(number), np.flatnonzero(every == number)) for number in np.unique(every)]
 
 
 def arcs(radii: Array, speed: float) -> Turns:
