@@ -29,6 +29,8 @@ from residnet.training.running import run_epochs
 _LATE = 1.0 / 3.0
 """Share of a flight at whose end a quiet one should have come to rest."""
 _ALL = 1_000_000
+_LITTLE = 0.3
+"""Share of the range of changes of heading that flights without noise are drawn from."""
 _FREE = 0.5
 """Share of what the rudder may swing that costs nothing in training."""
 
@@ -126,11 +128,13 @@ class ConditionsFit(EpochTraining):
         # the standard deviation of a sine is its movement peak to peak over two roots of two
         free = 0.0 if steady is None else (_FREE * steady.rudder_swing) ** 2 / 8.0
         swing = (flown.late_swing(_LATE)[:quiet] - free).clamp(min=0.0)
+        first, last = quiet // 2, quiet // 2 + quiet // 4
+        # large changes of the nominal vessel may still be under way
+        swing = torch.cat((swing[:first], swing[last:]))
         worst = swing.topk(math.ceil(quiet / 4)).values.mean()
         cost: Tensor = math.degrees(math.degrees(settings.calm)) * worst
-        if quiet >= 4:
-            over = overshoot[quiet // 2 : quiet // 2 + quiet // 4].mean()
-            cost = cost + math.degrees(settings.exact) * over
+        if last > first:
+            cost = cost + math.degrees(settings.exact) * overshoot[first:last].mean()
         return cost
 
     def _strict(self) -> float:
@@ -142,13 +146,20 @@ class ConditionsFit(EpochTraining):
         """Return heading changes drawn anew, under a share of the conditions.
 
         The first `quiet` of them are without noise and slow push: first half of these at a corner
-        of the spread, where a loop swings first, then a quarter that flies the nominal vessel.
+        of the spread, where a loop swings first, then a quarter that flies the nominal vessel. All
+        but the latter change their heading little, so that the change is over when they are looked
+        at for swinging.
         """
         random = torch.Generator().manual_seed(int(torch.randint(2**62, (1,))))
         changes = self.drawn.draw(rows, self.settings.dt, random, share)
         changes.noise[:quiet], changes.push[:quiet] = 0.0, 0.0
-        changes = nominal(changes, quiet // 2, quiet // 4)
-        return self.drawn.at_corners(changes, quiet // 2, random, share)
+        first, number = quiet // 2, quiet // 4
+        least = self.drawn.heading[0] * changes.heading.sign()
+        small = least + _LITTLE * (changes.heading - least)
+        for some in (slice(0, first), slice(first + number, quiet)):
+            changes.heading[some] = small[some]
+        changes = nominal(changes, first, number)
+        return self.drawn.at_corners(changes, first, random, share)
 
     def on_after_backward(self) -> None:
         """Reset the gradient of a batch where it is no number."""
