@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from browser import browser, layout
+from PIL import Image
 
 from residnet.report.blocks import Section
-from residnet.report.figures.files import figures_section, read_figures
+from residnet.report.figures.files import figures_section, picture_alone, read_figures
 from residnet.report.figures.style import new_figure, save
 from residnet.report.interactive.explorer import INK
 from residnet.report.page import write_page
@@ -61,6 +62,17 @@ def test_a_picture_becomes_an_interactive_figure(tmp_path: Path) -> None:
     assert float(np.nanmax(curves[0]["model, shade"][1])) == pytest.approx(1.1, abs=0.01)
     assert np.ptp(curves[0]["other lines"][0]) >= 10.0
     assert curves[3]["model (points)"][1].tolist() == pytest.approx([2.0, 3.0], abs=1e-4)
+
+
+def test_a_page_holds_the_picture_without_its_curves(tmp_path: Path) -> None:
+    path = drawn(tmp_path)
+    alone = tmp_path / "alone.png"
+    alone.write_bytes(picture_alone(path))
+    assert alone.stat().st_size < path.stat().st_size
+    with Image.open(alone) as picture, Image.open(path) as whole:
+        assert "Curves" not in picture.info
+        assert picture.info["Title"] == "Curves"
+        assert picture.tobytes() == whole.tobytes()
 
 
 def test_what_curves_cannot_show_stays_a_picture(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from markupsafe import Markup, escape
 from residnet.core.config import load_mapping
 from residnet.core.files import read_json, whole
 from residnet.report.blocks import Block, Code, Facts, Figure, Section
+from residnet.report.figures.files import picture_alone
 from residnet.report.glossary import Glossary
 from residnet.report.interactive.drawing import draw
 from residnet.report.interactive.explorer import Explorer
@@ -179,4 +180,4 @@ def _breakable(text: str) -> Markup:
 
 
 def _embedded(path: Path) -> str:
-    return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode("ascii")
+    return "data:image/png;base64," + base64.b64encode(picture_alone(path)).decode("ascii")

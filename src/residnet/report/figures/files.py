@@ -84,6 +84,18 @@ def _figure(path: Path, words: Mapping[str, Any]) -> Figure:
     return Figure(path, title, caption, picture_explorer(name, title, caption, str(words[CURVES])))
 
 
+def picture_alone(path: Path) -> bytes:
+    """Return a picture's file without its curves, which a page holds in a form of its own."""
+    data = path.read_bytes()
+    out, at = [data[:8]], 8
+    while at < len(data):
+        end = at + 12 + int.from_bytes(data[at : at + 4], "big")
+        if data[at + 4 : at + 9 + len(CURVES)] != b"iTXt" + CURVES.encode() + b"\0":
+            out.append(data[at:end])
+        at = end
+    return b"".join(out)
+
+
 def figures_section(folder: Path, covered: str = "") -> Section | None:
     """Return a section with all figures of a folder, None where there are none.
 

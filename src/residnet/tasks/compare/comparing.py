@@ -37,7 +37,7 @@ def compare_runs(paths: Sequence[Path], out: Path) -> tuple[str, Path]:
         out.mkdir(parents=True, exist_ok=True)
         blocks: list[Block] = [_curves(runs, out)] if pairs else []
         sections = [
-            Section("On common logs", [paired_rows, *blocks]),
+            *([Section("On common logs", [paired_rows, *blocks])] if pairs else []),
             Section("Every model of every run", [metrics]),
             Section("Where the runs differ", [configs]),
         ]
@@ -45,7 +45,8 @@ def compare_runs(paths: Sequence[Path], out: Path) -> tuple[str, Path]:
         page = write_page(out, "Runs compared", names, verdict, sections)
     except OSError as error:
         raise UsageError(f"{out}: cannot be written ({error.strerror})") from error
-    text = "\n\n".join([metrics.text(), paired_rows.text(), configs.text(), verdict[0]])
+    tables = [metrics, *([paired_rows] if pairs else []), configs]
+    text = "\n\n".join([*(table.text() for table in tables), verdict[0]])
     return text, page
 
 
@@ -144,6 +145,10 @@ def _short(value: Any) -> str:
         return "not there"
     if value is None:
         return "none"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.4g}"
     if isinstance(value, Mapping):
         kind = value.get("kind")
         parts = [f"{key} {_short(part)}" for key, part in value.items() if key != "kind"]
@@ -151,7 +156,7 @@ def _short(value: Any) -> str:
         return f"there{f' (kind {kind})' if kind else rest and f' ({rest.strip()})'}"
     if isinstance(value, (list, tuple)) and not value:
         return "none"
-    text = ", ".join(map(str, value)) if isinstance(value, (list, tuple)) else f"{value}"
+    text = ", ".join(map(_short, value)) if isinstance(value, (list, tuple)) else f"{value}"
     return text if len(text) <= 80 else f"{text[:77]}..."
 
 
