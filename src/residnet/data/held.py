@@ -31,7 +31,7 @@ def without_held(log: Log) -> Log:
     Such values are late by up to an interval, and their derivative is spikes; left out, they are
     made from the other sensors like those of any channel that is measured at some samples only.
     """
-    new = {}
+    new: dict[str, np.ndarray] = {}
     for group in _TOGETHER:
         names = [name for name in group if name in log.channels]
         if not names:
