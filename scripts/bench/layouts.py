@@ -159,10 +159,10 @@ def columns_of(log: Log, layout: Layout, rng: np.random.Generator) -> list[Colum
         values = (
             np.remainder(log[key], 2 * math.pi) if key == "psi" and layout.wrapped else log[key]
         )
-        unit, factor = UNITS[key][rng.integers(len(UNITS[key]))]
+        unit, factor = UNITS[key][int(rng.integers(len(UNITS[key])))]
         out.append((names[key], unit, list(values * factor)))
     share = log["delta"] / math.radians(35.0)
-    unit, factor = UNITS["delta"][rng.integers(len(UNITS["delta"]))]
+    unit, factor = UNITS["delta"][int(rng.integers(len(UNITS["delta"])))]
     kinds = {
         "angle": (unit, log["delta"] * factor),
         "to port": (unit, -log["delta"] * factor),
@@ -171,7 +171,7 @@ def columns_of(log: Log, layout: Layout, rng: np.random.Generator) -> list[Colum
         "shares": ("", share),
     }
     out.append((names["delta"], *_cells(kinds[layout.rudder])))
-    unit, factor = UNITS["n"][rng.integers(len(UNITS["n"]))]
+    unit, factor = UNITS["n"][int(rng.integers(len(UNITS["n"])))]
     most = float(np.abs(log["n"]).max())
     drives = {
         "revolutions": ("n", unit, log["n"] * factor),
@@ -216,7 +216,8 @@ def write(log: Log, layout: Layout, rng: np.random.Generator, path: Path) -> Non
 
 def wrong(read: Log, truth: Log) -> list[str]:
     """The channels of a log that are not what they were."""
-    t, out = read.t - read.t[0], []
+    t = read.t - read.t[0]
+    out: list[str] = []
     if not math.isclose(float(t[-1]), float(truth.t[-1] - truth.t[0]), rel_tol=0.02):
         return ["time"]
     for name in ("x", "y", "psi", "u", "v", "r", "delta", "n"):

@@ -67,7 +67,7 @@ def read_figures(folder: Path) -> list[Figure]:
     for path in sorted(folder.glob("*.png")):
         try:
             with Image.open(path) as picture:
-                words = dict(picture.info)
+                words = {str(name): text for name, text in picture.info.items()}
         except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
             # damaged: it is drawn again, or is not one of residnet
             continue
