@@ -14,6 +14,7 @@ from made_configs import Failure, Fit, Lstm, Mlp, Sensor, Space, Task
 from pydantic import Field, TypeAdapter, ValidationError
 
 from residnet.core.config import (
+    BaseConfig,
     Config,
     Hertz,
     Metres,
@@ -283,3 +284,24 @@ def test_numbers_that_no_vessel_has_are_refused(tmp_path: Path, number: str) -> 
 def test_a_file_without_end_is_refused() -> None:
     with pytest.raises(ConfigError, match="/dev/zero: is longer than 2 MB"):
         load_config(Path("/dev/zero"), [], Fit)
+
+
+class Swept(Config):
+    """A config with a base.
+
+    Attributes:
+        base: file, or the name of a shipped config.
+    """
+
+    base: BaseConfig
+
+
+def test_a_base_is_a_file_or_a_shipped_config(tmp_path: Path) -> None:
+    own = tmp_path / "own.yaml"
+    own.write_text("task: fit\n")
+    assert Swept.model_validate({"base": str(own)}).base == own
+    assert Swept.model_validate({"base": "quickstart"}).base.name == "quickstart.yaml"
+    with pytest.raises(ValidationError, match=r"no config 'quickstrat' either.*quickstart"):
+        Swept.model_validate({"base": "quickstrat"})
+    with pytest.raises(ValidationError, match="no such file or folder"):
+        Swept.model_validate({"base": "absent.yaml"})

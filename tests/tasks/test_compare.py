@@ -77,6 +77,20 @@ def test_two_runs_side_by_side(tmp_path: Path) -> None:
     assert "Error against horizon" in content
 
 
+def test_a_part_that_one_run_lacks_stands_in_one_line(tmp_path: Path) -> None:
+    first, second = made_run(tmp_path / "first", 0.3), made_run(tmp_path / "second", 0.15)
+    for folder, more in (
+        (first, "heads: {mlp: {kind: mlp, hidden: [16], dropout: 0.1}}"),
+        (second, "heads: {}"),
+    ):
+        with (folder / "resolved.yaml").open("a") as file:
+            file.write(f"{more}\n")
+    text, _ = compare_runs([first, second], tmp_path / "out")
+    (line,) = [line for line in text.splitlines() if line.startswith("heads")]
+    assert line.split() == ["heads.mlp", "there", "(kind", "mlp)", "not", "there"]
+    assert "same" not in text
+
+
 def test_runs_without_a_common_log(tmp_path: Path) -> None:
     first, second = made_run(tmp_path / "first", 0.3), made_run(tmp_path / "second", 0.15)
     shutil.rmtree(second / "rollouts" / "test")
