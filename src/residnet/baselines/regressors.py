@@ -18,6 +18,7 @@ from residnet.physics.bounds import VelocityBound
 from residnet.physics.symmetry import dissipates, mirrored_terms, wrong_parity
 from residnet.physics.terms import TermLibrary
 from residnet.regression.least_squares import LeastSquares
+from residnet.regression.pieces import chosen, regressors
 from residnet.regression.solutions import Coefficient, Solution
 
 _BEYOND = 0.5
@@ -270,16 +271,16 @@ class RegressorsConfig(IdentifiedConfig):
             FitError: where the data do not determine a coefficient.
         """
         assert isinstance(baseline, RegressorBaseline)
-        chosen = of_manoeuvres(samples, self.manoeuvres)
+        picked = of_manoeuvres(samples, self.manoeuvres)
         estimator = LeastSquares(self.ridge if isinstance(self.ridge, tuple) else (self.ridge,))
-        phi = baseline.library(chosen.z)
         terms = baseline.library.terms
+        phi = regressors(baseline.library, picked.z, range(len(terms)))
 
         def fitted(axis: int, columns: list[int]) -> list[Solution]:
             return estimator.fit(
-                phi[:, columns],
-                chosen.target[:, [axis]],
-                chosen.group,
+                chosen(phi, columns),
+                picked.target[:, [axis]],
+                picked.group,
                 names=[terms[j] for j in columns],
                 outputs=(ACCELERATION[axis],),
             )
@@ -288,15 +289,15 @@ class RegressorsConfig(IdentifiedConfig):
         for axis in range(len(ACCELERATION)):
             columns = baseline.columns(axis)
             found = fitted(axis, columns)
-            while feeding := self._feeding(found, axis, chosen.names):
+            while feeding := self._feeding(found, axis, picked.names):
                 columns = [j for j in columns if terms[j] not in feeding]
                 found = fitted(axis, columns)
             fits.append(found)
         found = [baseline.solution(axes, axes[0].choice) for axes in zip(*fits, strict=True)]
         if not self.bounded:
             return found
-        bound = VelocityBound(_BEYOND, len(chosen.names))
-        bound.calibrate(chosen)
+        bound = VelocityBound(_BEYOND, len(picked.names))
+        bound.calibrate(picked)
         state = {f"bound.{name}": value for name, value in bound.state_dict().items()}
         return [replace(one, state={**one.state, **state}) for one in found]
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from residnet.core.arrays import paged
 from residnet.core.errors import DataError, UsageError
 from residnet.core.files import whole
 from residnet.core.names import CHANNEL_UNITS, nearest
@@ -96,6 +97,24 @@ class Log:
     def replace(self, **changes: Any) -> Log:
         """Return a copy with some attributes changed."""
         return dataclasses.replace(self, **changes)
+
+    def rows(self, part: slice | np.ndarray) -> Log:
+        """Return the log at some of its samples, given as a slice or as a mask [T]."""
+        return self.replace(
+            t=self.t[part],
+            channels={name: values[part] for name, values in self.channels.items()},
+            masks={reason: mask[part] for reason, mask in self.masks.items()},
+        )
+
+    def on_disk(self) -> Log:
+        """Return the same log with its arrays in a temporary file, out of memory."""
+        moved = self.replace(
+            t=paged.on_disk(self.t),
+            channels={name: paged.on_disk(values) for name, values in self.channels.items()},
+            masks={reason: paged.on_disk(mask) for reason, mask in self.masks.items()},
+        )
+        paged.forget()
+        return moved
 
     def save(self, path: Path) -> None:
         """Write the log as a canonical Parquet file.

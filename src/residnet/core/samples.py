@@ -8,6 +8,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from residnet.core.arrays.paged import forget, row_pieces
+from residnet.core.arrays.tally import Tally
+
 
 @dataclass(frozen=True)
 class Samples:
@@ -49,6 +52,15 @@ class Samples:
     def with_target(self, target: Tensor) -> Samples:
         """Return the same samples with another target [N, 3]."""
         return Samples(self.z, target, self.group, self.t, self.kinds, self.names)
+
+    def tally(self) -> tuple[Tally, Tally]:
+        """Return what the channels are like, and the target."""
+        channels, target = Tally(self.z.shape[1]), Tally(self.target.shape[1])
+        for rows in row_pieces(len(self)):
+            channels.add(self.z[rows])
+            target.add(self.target[rows])
+            forget()
+        return channels, target
 
     def column(self, name: str) -> Tensor:
         """Return one channel [N] by its name."""

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field, model_validator
 
+from residnet.core.arrays.paged import lies_on_disk
 from residnet.core.config import Config, Seconds
 from residnet.core.errors import ConfigError, DataError
 from residnet.core.log import Log
@@ -100,13 +101,8 @@ def stretch_of(log: Log, start: float | None, stop: float | None) -> Log:
         )
     ends = [_or(start, float(log.t[0])), _or(stop, float(log.t[-1]))]
     name = "_".join([log.name, *(f"{end:.13g}s".replace(".", "p") for end in ends)])
-    return log.replace(
-        name=name,
-        t=log.t[inside],
-        channels={key: values[inside] for key, values in log.channels.items()},
-        masks={key: mask[inside] for key, mask in log.masks.items()},
-        meta={**log.meta, "stretch": ends},
-    )
+    part = log.rows(inside).replace(name=name, meta={**log.meta, "stretch": ends})
+    return part.on_disk() if lies_on_disk(log.t) else part
 
 
 def _or(value: float | None, other: float) -> float:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, fields, replace
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from pydantic import Field
 
+from residnet.core.arrays import paged
 from residnet.core.config import Config, Seconds
 from residnet.core.errors import DataError
 from residnet.core.layout import POSE, RANGE_VELOCITIES, VELOCITIES
@@ -87,6 +88,15 @@ class Prepared:
     def __len__(self) -> int:
         return len(self.log)
 
+    def on_disk(self) -> Prepared:
+        """Return the same with its arrays in a temporary file, out of memory."""
+        moved: dict[str, Any] = {
+            part.name: paged.on_disk(getattr(self, part.name))
+            for part in fields(self)
+            if part.name not in ("log", "split")
+        }
+        return replace(self, log=self.log.on_disk(), **moved)
+
 
 def prepare(log: Log, split: str, columns: Sequence[str], config: PrepareConfig) -> Prepared:
     """Align, mask, smooth and differentiate one log.
@@ -104,6 +114,7 @@ def prepare(log: Log, split: str, columns: Sequence[str], config: PrepareConfig)
         UsageError: where a channel is missing.
         DataError: where no sample remains, or a value is none that a vessel can have.
     """
+    large = paged.lies_on_disk(log.t)
     log = without_spikes(_plausible(log, columns))
     log = align(_masked(log, columns, config), config.grid)
     y, w = log.stack(STATE), log.stack(tuple(columns))
@@ -126,7 +137,9 @@ def prepare(log: Log, split: str, columns: Sequence[str], config: PrepareConfig)
     )
     trimmed = (log.t >= log.t[0] + config.trim - 1e-9) & (log.t <= log.t[-1] - config.trim + 1e-9)
     held = _means(w, piece) if config.hold == "mean" else w
-    return Prepared(log, split, y, smooth, nu_dot, held, w, piece, usable, usable & valid & trimmed)
+    good = usable & valid & trimmed
+    prepared = Prepared(log, split, y, smooth, nu_dot, held, w, piece, usable, good)
+    return prepared.on_disk() if large else prepared
 
 
 def _plausible(log: Log, columns: Sequence[str]) -> Log:
@@ -197,20 +210,21 @@ def samples(logs: Sequence[Prepared], signals: Signals) -> Samples:
             f"none of {len(logs)} training logs has a sample to learn from; are the logs shorter"
             " than the derivative's window?"
         )
-    z, target, group, time = [], [], [], []
-    for number, p in enumerate(logs):
-        z.append(channels(p, signals, p.good))
-        target.append(torch.from_numpy(p.nu_dot[p.good]))
-        group.append(torch.full((int(p.good.sum()),), number))
-        time.append(torch.from_numpy(p.log.t[p.good] - p.log.t[0]))
-    return Samples(
-        torch.cat(z),
-        torch.cat(target),
-        torch.cat(group),
-        torch.cat(time),
-        tuple(p.log.manoeuvre for p in logs),
-        signals.names,
-    )
+    counts = [int(p.good.sum()) for p in logs]
+    total = sum(counts)
+    z, target, time = paged.rows(total, len(signals.names)), paged.rows(total, 3), paged.rows(total)
+    group = paged.rows(total, dtype=torch.int64)
+    begin = 0
+    for number, (p, count) in enumerate(zip(logs, counts, strict=True)):
+        rows = slice(begin, begin + count)
+        z[rows] = channels(p, signals, p.good)
+        target[rows] = torch.from_numpy(p.nu_dot[p.good])
+        group[rows] = number
+        time[rows] = torch.from_numpy(p.log.t[p.good] - p.log.t[0])
+        begin += count
+        paged.forget()
+    kinds = tuple(p.log.manoeuvre for p in logs)
+    return Samples(z, target, group, time, kinds, signals.names)
 
 
 def envelope(logs: Sequence[Prepared]) -> tuple[np.ndarray, np.ndarray]:

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from residnet.core.arrays import paged
 from residnet.core.config import Config
 from residnet.core.errors import DataError
 from residnet.core.log import Log
@@ -66,12 +67,15 @@ def read_logs(config: MeasuredLogs | SimulatedTrials) -> Splits:
 
 
 def _all_logs(config: MeasuredLogs) -> dict[Path, Log]:
-    """Return every log of the splits, each read once."""
+    """Return every log of the splits, each read once; after a million samples they lie on disk."""
     reader, files = config.reader.build(), config.split.files()
-    out = {}
+    out: dict[Path, Log] = {}
+    samples = 0
     for number, path in enumerate(files):
         report("reading logs", number, len(files))
-        out[path] = reader.read(path)
+        log = reader.read(path)
+        samples += len(log)
+        out[path] = log if samples <= paged.LARGE else log.on_disk()
     report("reading logs", len(files), len(files))
     return out
 

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from residnet.core.arrays import paged
 from residnet.core.errors import DataError
 from residnet.core.stretches import stretch_bounds
 from residnet.data.prepare import Prepared
@@ -49,31 +50,41 @@ class WindowStore:
 
         Positions are counted from each log's start so that float32 keeps them exact enough.
         """
-        y = np.concatenate([p.y - p.y[0] * [1, 1, 0, 0, 0, 0] for p in logs])
-        smooth = np.concatenate([p.smooth - p.y[0] * [1, 1, 0, 0, 0, 0] for p in logs])
-        labels = np.concatenate(
-            [np.where(p.piece >= 0, p.piece + 1_000_000 * i, -1) for i, p in enumerate(logs)]
-        )
+        lengths = [len(p) for p in logs]
+        total, inputs = sum(lengths), logs[0].w.shape[1]
+        labels = np.empty(total, dtype=np.int64)
+        y, smooth, nu_dot = (paged.rows(total, width, dtype=dtype) for width in (6, 6, 3))
+        w, recorded = (paged.rows(total, inputs, dtype=dtype) for _ in range(2))
+        usable, good = (paged.rows(total, dtype=torch.bool) for _ in range(2))
+        begin = 0
+        for number, (p, length) in enumerate(zip(logs, lengths, strict=True)):
+            rows = slice(begin, begin + length)
+            start = p.y[0] * [1, 1, 0, 0, 0, 0]
+            for whole, part in (
+                (y, p.y - start),
+                (smooth, p.smooth - start),
+                (nu_dot, p.nu_dot),
+                (w, p.w),
+                (recorded, p.recorded),
+            ):
+                whole[rows] = torch.from_numpy(np.nan_to_num(part)).to(dtype)
+            usable[rows], good[rows] = torch.from_numpy(p.usable), torch.from_numpy(p.good)
+            labels[rows] = np.where(p.piece >= 0, p.piece + 1_000_000 * number, -1)
+            begin += length
+            paged.forget()
         begins, ends = stretch_bounds(labels)
-        depth, reach = np.arange(labels.size) - begins, ends - np.arange(labels.size)
-
-        def tensor(array: np.ndarray) -> Tensor:
-            return torch.from_numpy(np.nan_to_num(array)).to(dtype)
-
-        def flags(parts: list[np.ndarray]) -> Tensor:
-            return torch.from_numpy(np.concatenate(parts))
-
+        depth, reach = np.arange(total) - begins, ends - np.arange(total)
         return cls(
-            tensor(y),
-            tensor(smooth),
-            tensor(np.concatenate([p.nu_dot for p in logs])),
-            tensor(np.concatenate([p.w for p in logs])),
-            tensor(np.concatenate([p.recorded for p in logs])),
-            flags([p.usable for p in logs]),
-            flags([p.good for p in logs]),
+            y,
+            smooth,
+            nu_dot,
+            w,
+            recorded,
+            usable,
+            good,
             torch.from_numpy(reach),
             torch.from_numpy(depth),
-            torch.from_numpy(np.repeat(np.arange(len(logs)), [len(p) for p in logs])),
+            torch.from_numpy(np.repeat(np.arange(len(logs)), lengths)),
         )
 
     def to(self, device: torch.device) -> WindowStore:

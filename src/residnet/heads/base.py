@@ -11,6 +11,7 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
+from residnet.core.arrays import paged
 from residnet.core.config import Config
 from residnet.core.errors import ConfigError
 from residnet.core.names import ACCELERATION, nearest
@@ -70,7 +71,10 @@ class ResidualHead(nn.Module, ABC):
 
         The baseline's accelerations are `known` [N, 3].
         """
-        return samples.with_target(samples.target - known)
+        left = paged.rows(len(samples), 3)
+        for rows in paged.row_pieces(len(samples)):
+            torch.sub(samples.target[rows], known[rows], out=left[rows])
+        return samples.with_target(left)
 
     def set_mass(self, mass: Tensor | None) -> None:
         """Take the inertia [3, 3] of the baseline, None where it knows no forces.
@@ -256,11 +260,10 @@ class Features(nn.Module):
 
         A constant feature is left unscaled.
         """
-        z = samples.z.index_select(1, self.index)
-        low, high = z.amin(0), z.amax(0)
+        tally, _ = samples.tally()
+        low, high, std = (part[self.index] for part in (tally.low, tally.high, tally.std()))
         reach = self.margin * (high - low)
-        std = z.std(0, correction=0)
-        self.mean.copy_(z.mean(0))
+        self.mean.copy_(tally.mean[self.index])
         self.std.copy_(
             torch.where(std > CONSTANT * (1 + self.mean.abs()), std, torch.ones_like(std))
         )
@@ -295,7 +298,7 @@ class ResidualScale(nn.Module):
 
     def calibrate(self, samples: Samples) -> None:
         """Take the standard deviation of each axis from the samples' target."""
-        self.spread.copy_(samples.target.std(0, correction=0).clamp(min=_LEAST_STD))
+        self.spread.copy_(samples.tally()[1].std().clamp(min=_LEAST_STD))
 
     def forward(self, out: Tensor) -> Tensor:
         """Return residual accelerations [..., 3] for outputs [..., 3] near one."""

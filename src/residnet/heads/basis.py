@@ -13,11 +13,13 @@ import torch
 from pydantic import Field, model_validator
 from torch import Tensor
 
+from residnet.core.arrays.paged import row_pieces
 from residnet.core.names import ACCELERATION
 from residnet.core.samples import Samples
 from residnet.heads.base import ClosedFormHead, FeatureConfig, Features
 from residnet.physics.terms import TermLibrary, polynomial_terms
 from residnet.regression.estimator import Estimator, fold_numbers, require_finite, usual_folds
+from residnet.regression.pieces import regressors
 from residnet.regression.solutions import Solution
 
 
@@ -109,11 +111,13 @@ class BasisHead(ClosedFormHead):
 
     def solutions(self, samples: Samples) -> list[Solution]:
         """Return the solutions of the estimator; see `ClosedFormHead.solutions`."""
-        chosen = samples.z[:, [samples.names.index(name) for name in self.features.names]]
-        require_finite(chosen, self.features.names, "channel")
+        columns = [samples.names.index(name) for name in self.features.names]
+        for rows in row_pieces(len(samples)):
+            chosen = samples.z[rows][:, columns]
+            require_finite(chosen, self.features.names, "channel", rows.start)
         folds = self.folds or usual_folds(samples.group)
         return self.estimator(folds).fit(
-            self.basis(samples.z),
+            regressors(self.basis, samples.z, range(self.library.count)),
             samples.target,
             samples.group,
             names=self.library.terms,

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from residnet.baselines import BaselineConfig, Coefficient, ParametricBaseline, StillConfig
+from residnet.core.arrays import paged
 from residnet.core.errors import FitError
 from residnet.core.samples import Samples
 from residnet.data.prepare import Prepared, envelope, samples
@@ -334,7 +335,11 @@ def residual_samples(model: HybridDynamics, known: Samples) -> Samples:
         known: samples whose target is the measured acceleration.
     """
     with torch.no_grad():
-        return model.head.residual_target(known, model.baseline(known.z))
+        explained = paged.rows(len(known), 3)
+        for rows in paged.row_pieces(len(known)):
+            explained[rows] = model.baseline(known.z[rows])
+            paged.forget()
+        return model.head.residual_target(known, explained)
 
 
 def _coefficient_row(entry: Coefficient) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from residnet.core.arrays import paged
 from residnet.core.stretches import stretches
 from residnet.data.prepare import Prepared
 from residnet.dynamics.hybrid import HybridDynamics
@@ -23,6 +24,8 @@ def goodness_rows(
 ) -> dict[str, list[dict[str, Any]]]:
     """Return statistics of what each model leaves of the measured accelerations, by split.
 
+    Of very many logs as many are taken, evenly spread, as have a million samples.
+
     Args:
         fitted: models of one fit.
         logs: by split; training and test logs are used.
@@ -35,19 +38,26 @@ def goodness_rows(
     )
     splits = {}
     for split in SPLITS:
-        measured = [piece for log in logs[split] for piece in measured_stretches(log)]
+        taken = _some(logs[split])
+        measured = [piece for log in taken for piece in measured_stretches(log)]
         predictions = [
             OneStep(
                 name,
                 entry.spec.role,
                 _parameter_counts(entry.model),
-                [part for log in logs[split] for part in _residuals(entry.model, log)],
+                [part for log in taken for part in _residuals(entry.model, log)],
                 compared_with.get(name),
             )
             for name, entry in models.items()
         ]
         splits[split] = table(predictions, measured, step) if measured else []
     return splits
+
+
+def _some(logs: Sequence[Prepared]) -> Sequence[Prepared]:
+    """Return the logs, or evenly spread ones of a million samples where there are more."""
+    every = -(-sum(len(log) for log in logs) // paged.LARGE)
+    return logs[:: max(every, 1)]
 
 
 def measured_stretches(log: Prepared) -> list[np.ndarray]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 
 import numpy as np
 
@@ -13,6 +14,8 @@ from residnet.core.progress import say
 from residnet.data.prepare import Prepared, prepare
 from residnet.identification.settings import FitSettings
 
+_LONGEST = 500_000
+"""Samples of a log that are prepared at once."""
 PreparedSplits = dict[str, list[Prepared]]
 
 
@@ -27,7 +30,11 @@ def prepare_logs(splits: Mapping[str, Sequence[Log]], settings: FitSettings) -> 
         DataError: where a log has nothing to learn from or to predict.
     """
     prepared = {
-        split: [prepare(log, split, settings.signals.columns, settings.prepare) for log in logs]
+        split: [
+            prepare(part, split, settings.signals.columns, settings.prepare)
+            for log in logs
+            for part in shortened(log)
+        ]
         for split, logs in splits.items()
     }
     for logs in prepared.values():
@@ -36,6 +43,18 @@ def prepare_logs(splits: Mapping[str, Sequence[Log]], settings: FitSettings) -> 
     _tell_smoothed([log for logs in prepared.values() for log in logs])
     _tell_spikes([log for logs in prepared.values() for log in logs])
     return prepared
+
+
+def shortened(log: Log) -> list[Log]:
+    """Return a log as it is, or its parts one after the other where it is very long."""
+    if len(log) <= _LONGEST:
+        return [log]
+    count = -(-len(log) // _LONGEST)
+    bounds = np.linspace(0, len(log), count + 1).astype(int)
+    return [
+        log.rows(slice(begin, end)).replace(name=f"{log.name}_{number + 1}_of_{count}")
+        for number, (begin, end) in enumerate(pairwise(bounds))
+    ]
 
 
 def _tell_spikes(logs: Sequence[Prepared]) -> None:

@@ -42,12 +42,12 @@ class VelocityBound(nn.Module):
 
     def calibrate(self, samples: Samples) -> None:
         """Take the ranges of the channels, and the rate from the accelerations."""
-        seen = samples.z[:, : self.channels]
-        low, high = seen.amin(0), seen.amax(0)
+        seen, target = samples.tally()
+        low, high = seen.low[: self.channels], seen.high[: self.channels]
         wide = (high - low).clamp(min=_LEAST)
         self.low.copy_(low - self.margin * wide)
         self.high.copy_(high + self.margin * wide)
-        spread = samples.target.std(0, correction=0)
+        spread = target.std()
         self.rate.copy_(
             (_STRONG * spread / (0.5 * wide[: PLANAR.dof])).clamp(min=_SLOWEST, max=_FASTEST)
         )

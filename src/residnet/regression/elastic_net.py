@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from residnet.regression.estimator import Estimator, column_names, fold_numbers, require_data
+from residnet.regression.pieces import Regressors, whole
 from residnet.regression.solutions import Solution
 
 _PENALTIES = 40
@@ -37,7 +38,7 @@ class ElasticNet(Estimator):
 
     def fit(
         self,
-        x: Tensor,
+        x: Regressors,
         y: Tensor,
         groups: Tensor | None = None,
         *,
@@ -49,6 +50,7 @@ class ElasticNet(Estimator):
         from sklearn.exceptions import ConvergenceWarning
         from sklearn.linear_model import ElasticNetCV
 
+        x = whole(x)
         require_data(x, y, column_names(x, names, "x"), column_names(y, outputs, "y"))
         fold = fold_numbers(groups, self.folds)
         parts = [

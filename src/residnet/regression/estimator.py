@@ -8,7 +8,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from residnet.core.arrays.paged import row_pieces
 from residnet.core.errors import FitError
+from residnet.regression.pieces import Regressors, pieces
 from residnet.regression.solutions import Solution
 
 
@@ -18,7 +20,7 @@ class Estimator(ABC):
     @abstractmethod
     def fit(
         self,
-        x: Tensor,
+        x: Regressors,
         y: Tensor,
         groups: Tensor | None = None,
         *,
@@ -31,7 +33,7 @@ class Estimator(ABC):
         criterion that the estimator does not know, such as the error of free runs.
 
         Args:
-            x: inputs [N, J], float64.
+            x: inputs [N, J], float64; pieces of them where there are many samples.
             y: outputs [N, n], float64.
             groups: number of the group of each sample [N]. Samples of one group, such as a
                 manoeuvre, belong together: cross-validation never splits them. None where nothing
@@ -44,13 +46,13 @@ class Estimator(ABC):
         """
 
 
-def column_names(values: Tensor, names: Sequence[str], letter: str) -> tuple[str, ...]:
+def column_names(values: Regressors, names: Sequence[str], letter: str) -> tuple[str, ...]:
     """Return the names of columns, numbered ones where none are given."""
     return tuple(names) or tuple(f"{letter}{j}" for j in range(values.shape[1]))
 
 
-def require_finite(values: Tensor, names: Sequence[str], what: str) -> None:
-    """Check that all values [N, J] are finite.
+def require_finite(values: Tensor, names: Sequence[str], what: str, first: int = 0) -> None:
+    """Check that all values [N, J] are finite; `first` is the number of the first sample.
 
     Raises:
         FitError: naming the column and the first sample that is not.
@@ -59,22 +61,25 @@ def require_finite(values: Tensor, names: Sequence[str], what: str) -> None:
     if bool(bad.any()):
         row, column = (int(part[0]) for part in bad.nonzero(as_tuple=True))
         raise FitError(
-            f"{what} '{names[column]}' is not finite at sample {row}; mask or repair the log"
+            f"{what} '{names[column]}' is not finite at sample {first + row}; mask or repair the"
+            " log"
         )
 
 
-def require_data(x: Tensor, y: Tensor, names: Sequence[str], outputs: Sequence[str]) -> None:
+def require_data(x: Regressors, y: Tensor, names: Sequence[str], outputs: Sequence[str]) -> None:
     """Check that inputs [N, J] and outputs [N, n] are finite and that there are any.
 
     Raises:
         FitError: where they are not, or where their numbers of samples differ.
     """
     require_pairs(x, y)
-    require_finite(x, names, "basis function")
-    require_finite(y, outputs, "output")
+    for rows, part in pieces(x):
+        require_finite(part, names, "basis function", rows.start)
+    for rows in row_pieces(len(y)):
+        require_finite(y[rows], outputs, "output", rows.start)
 
 
-def require_pairs(x: Tensor, y: Tensor) -> None:
+def require_pairs(x: Regressors, y: Tensor) -> None:
     """Check that there are inputs [N, J], and as many outputs [N, n].
 
     Raises:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import final
 
 import torch
@@ -10,6 +10,7 @@ from torch import Tensor
 
 from residnet.core.errors import FitError
 from residnet.regression.estimator import Estimator, column_names, require_data
+from residnet.regression.pieces import Regressors, pieces, whole
 from residnet.regression.solutions import Coefficient, Solution
 
 _COLLINEAR = 1e-9
@@ -41,7 +42,7 @@ class LeastSquares(Estimator):
 
     def fit(
         self,
-        x: Tensor,
+        x: Regressors,
         y: Tensor,
         groups: Tensor | None = None,
         *,
@@ -64,24 +65,21 @@ class LeastSquares(Estimator):
                 f"{n} samples do not determine {j} coefficients ({', '.join(names)}); give longer"
                 " or more logs"
             )
-        scale = x.square().mean(0).sqrt()
+        scale = _sum(x, lambda _, part: part.square().sum(0)).div(n).sqrt()
         if bool((scale <= 0).any()):
             dead = [name for name, s in zip(names, scale.tolist(), strict=True) if s <= 0]
             raise FitError(
                 f"regressor '{dead[0]}' is zero in all {n} samples; the data do not excite it:"
                 " leave it out or log it"
             )
-        a = x / scale
-        gram, cross = a.T @ a / n, a.T @ y / n
+        gram = _sum(x, lambda _, part: (part / scale).T @ (part / scale)) / n
+        cross = _sum(x, lambda rows, part: (part / scale).T @ y[rows]) / n
         condition = _condition(gram, min(self.penalties), names)
         solutions = []
         for penalty in self.penalties:
-            inverse = torch.linalg.inv(gram + penalty * torch.eye(j, dtype=x.dtype))
+            inverse = torch.linalg.inv(gram + penalty * torch.eye(j, dtype=y.dtype))
             coefficients = inverse @ cross
-            residual = y - a @ coefficients
-            score = torch.stack(
-                [_score_spread(a, residual[:, [k]], gram, groups) for k in range(y.shape[1])]
-            )
+            score = _score_spreads(x, y, scale, coefficients, gram, groups)
             covariance = inverse @ score @ inverse / n**2 / torch.outer(scale, scale)
             solutions.append(
                 linear_solution(
@@ -105,7 +103,7 @@ class CentredLeastSquares(Estimator):
 
     def fit(
         self,
-        x: Tensor,
+        x: Regressors,
         y: Tensor,
         groups: Tensor | None = None,
         *,
@@ -120,6 +118,7 @@ class CentredLeastSquares(Estimator):
             FitError: with no more samples than regressors, or where some are collinear, naming
                 them.
         """
+        x = whole(x)
         names, outputs = column_names(x, names, "x"), column_names(y, outputs, "y")
         require_data(x, y, names, outputs)
         if len(x) <= x.shape[1]:
@@ -179,16 +178,41 @@ def _condition(gram: Tensor, ridge: float, names: Sequence[str]) -> float:
     return condition
 
 
-def _score_spread(a: Tensor, residual: Tensor, gram: Tensor, groups: Tensor | None) -> Tensor:
-    """Return the spread of the score a'e [J, J], for residuals [N, 1].
+def _score_spreads(
+    x: Regressors,
+    y: Tensor,
+    scale: Tensor,
+    coefficients: Tensor,
+    gram: Tensor,
+    groups: Tensor | None,
+) -> Tensor:
+    """Return the spread of the score a'e of each output [n, J, J], for columns a = x / scale.
 
     It is taken over groups where there are at least two, else as of independent residuals.
     """
-    n, j = a.shape
-    if groups is not None:
-        present, index = torch.unique(groups, return_inverse=True)
-        count = int(present.numel())
-        if count > 1:
-            total = torch.zeros(count, j, dtype=a.dtype).index_add_(0, index, a * residual)
-            return total.T @ total * count / (count - 1)
-    return gram * residual.square().sum() / (n - j) * n
+    samples, j = x.shape
+    outputs = y.shape[1]
+    present, index = (
+        torch.unique(groups, return_inverse=True) if groups is not None else (y[:0, 0], None)
+    )
+    count = int(present.numel())
+    if index is None or count < 2:
+        left = _sum(x, lambda rows, part: (y[rows] - part / scale @ coefficients).square().sum(0))
+        return gram * (left / (samples - j) * samples)[:, None, None]
+    total = torch.zeros(outputs, count, j, dtype=y.dtype)
+    for rows, part in pieces(x):
+        a = part / scale
+        residual = y[rows] - a @ coefficients
+        for k in range(outputs):
+            total[k].index_add_(0, index[rows], a * residual[:, [k]])
+    return total.transpose(1, 2) @ total * count / (count - 1)
+
+
+def _sum(x: Regressors, of: Callable[[slice, Tensor], Tensor]) -> Tensor:
+    """Return the sum of what each piece of regressors gives."""
+    parts = iter(pieces(x))
+    rows, part = next(parts)
+    total = of(rows, part)
+    for rows, part in parts:
+        total = total + of(rows, part)
+    return total

@@ -8,8 +8,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from residnet.core.arrays.tally import Tally
 from residnet.core.errors import FitError
 from residnet.regression.estimator import column_names, fold_numbers, require_data
+from residnet.regression.pieces import Regressors, pieces
 
 CONSTANT = 1e-9
 """Standard deviation below which, in units of its largest value, a column counts as constant."""
@@ -67,17 +69,26 @@ class FoldMoments:
         self.regressors = shift_x.numel()
 
     @classmethod
-    def gather(cls, x: Tensor, y: Tensor, fold: Tensor, folds: int) -> FoldMoments:
-        """Return the moments of x [N, J] and y [N, n], with the fold of each sample [N]."""
-        shift_x, shift_y = x.mean(0), y.mean(0)
-        joined = torch.cat((torch.ones_like(y[:, :1]), x - shift_x, y - shift_y), dim=1)
-        sums = torch.stack([joined[fold == f].T @ joined[fold == f] for f in range(folds)])
+    def gather(cls, x: Regressors, y: Tensor, fold: Tensor, folds: int) -> FoldMoments:
+        """Return the moments of x [N, J] and y [N, n], with the fold of each sample [N].
+
+        A column that varies by rounding alone counts as zero.
+        """
+        shift_x, constant = _means(x)
+        shift_y = y.mean(0)
+        width = 1 + shift_x.numel() + shift_y.numel()
+        sums = torch.zeros(folds, width, width, dtype=y.dtype)
+        for rows, part in pieces(x):
+            there, of = y[rows], fold[rows]
+            part = part.masked_fill(constant, 0.0)
+            joined = torch.cat((torch.ones_like(there[:, :1]), part - shift_x, there - shift_y), 1)
+            sums += torch.stack([joined[of == f].T @ joined[of == f] for f in range(folds)])
         return cls(sums, shift_x, shift_y)
 
     @classmethod
     def checked(
         cls,
-        x: Tensor,
+        x: Regressors,
         y: Tensor,
         groups: Tensor | None,
         folds: int | None,
@@ -94,14 +105,13 @@ class FoldMoments:
                 columns.
         """
         require_data(x, y, column_names(x, names, "x"), column_names(y, outputs, "y"))
-        fold = fold_numbers(groups, folds) if groups is not None else x.new_zeros(len(x))
+        fold = fold_numbers(groups, folds) if groups is not None else y.new_zeros(len(x))
         if len(x) <= x.shape[1]:
             raise FitError(
                 f"{len(x)} samples do not determine {x.shape[1]} basis functions; give more data or"
                 " fewer terms"
             )
-        constant = x.std(0) <= CONSTANT * x.abs().amax(0)
-        return cls.gather(x.masked_fill(constant, 0.0), y, fold, int(fold.max()) + 1)
+        return cls.gather(x, y, fold, int(fold.max()) + 1)
 
     def centred(self, total: Tensor) -> Centred:
         """Return the moments about the means, from summed moments."""
@@ -143,3 +153,15 @@ class FoldMoments:
         """Return the variance of each output over all samples [n]."""
         j, total = self.regressors, self.sums.sum(0)
         return total[j + 1 :, j + 1 :].diagonal() / total[0, 0]
+
+
+def _means(x: Regressors) -> tuple[Tensor, Tensor]:
+    """Return the mean of each column [J], zero for those that vary by rounding alone, and which
+    these are [J].
+    """
+    tally = Tally(x.shape[1])
+    for _, part in pieces(x):
+        tally.add(part)
+    largest = torch.maximum(tally.low.abs(), tally.high.abs())
+    constant = tally.std(correction=1) <= CONSTANT * largest
+    return tally.mean.masked_fill(constant, 0.0), constant

@@ -12,6 +12,7 @@ from residnet.core.errors import FitError
 from residnet.regression.estimator import Estimator
 from residnet.regression.moments import CONSTANT, Candidates, Centred, FoldMoments
 from residnet.regression.nipals import nipals
+from residnet.regression.pieces import Regressors, whole
 from residnet.regression.pls_path import pls_path
 from residnet.regression.solutions import Solution
 
@@ -53,7 +54,7 @@ class PLSR(Estimator):
 
     def fit(
         self,
-        x: Tensor,
+        x: Regressors,
         y: Tensor,
         groups: Tensor | None = None,
         *,
@@ -81,7 +82,7 @@ class PLSR(Estimator):
             raise FitError("the order is not given, and without groups nothing can choose it")
         model = self._path(moments.all(), highest)
         if self.algorithm == "nipals":
-            model = model._replace(coefficients=self._nipals(x, y, min(order, highest)))
+            model = model._replace(coefficients=self._nipals(whole(x), y, min(order, highest)))
         found = model.coefficients
         if len(found) == 0:
             return [_zero(x, y, notes)]
@@ -136,7 +137,7 @@ def _ladder(highest: int) -> list[int]:
     return orders
 
 
-def _zero(x: Tensor, y: Tensor, notes: dict[str, Any]) -> Solution:
+def _zero(x: Regressors, y: Tensor, notes: dict[str, Any]) -> Solution:
     """Return the solution that is zero everywhere: it leaves the known part as it is."""
     state = {
         "coefficients": y.new_zeros(x.shape[1], y.shape[1]),

@@ -11,6 +11,7 @@ from torch import Tensor
 from residnet.core.errors import FitError
 from residnet.regression.estimator import Estimator
 from residnet.regression.moments import Candidates, Centred, FoldMoments
+from residnet.regression.pieces import Regressors
 from residnet.regression.solutions import Solution
 
 
@@ -46,7 +47,7 @@ class Ridge(Estimator):
 
     def fit(
         self,
-        x: Tensor,
+        x: Regressors,
         y: Tensor,
         groups: Tensor | None = None,
         *,

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from residnet.regression.estimator import Estimator, column_names, require_pairs
+from residnet.regression.pieces import Regressors, whole
 from residnet.regression.solutions import Coefficient, Solution
 from residnet.regression.sparse import NOTHING, Equation, SearchConfig, find
 from residnet.regression.sparse_reduction import Reduced, reduce
@@ -48,7 +49,7 @@ class SparseRegression(Estimator):
 
     def fit(
         self,
-        x: Tensor,
+        x: Regressors,
         y: Tensor,
         groups: Tensor | None = None,
         *,
@@ -62,6 +63,7 @@ class SparseRegression(Estimator):
         Raises:
             FitError: where the samples do not tell the candidates apart.
         """
+        x = whole(x)
         names, outputs = column_names(x, names, "x"), column_names(y, outputs, "y")
         require_pairs(x, y)
         reduced = self._reduced(x.numpy(), y.numpy(), names)

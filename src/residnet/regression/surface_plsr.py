@@ -10,6 +10,7 @@ from torch import Tensor
 
 from residnet.regression.estimator import Estimator, fold_numbers
 from residnet.regression.moments import CONSTANT, FoldMoments
+from residnet.regression.pieces import Regressors, whole
 from residnet.regression.pls_path import pls_path
 from residnet.regression.solutions import Solution
 from residnet.regression.surface import Surface, surface
@@ -33,7 +34,7 @@ class SurfacePLSR(Estimator):
 
     def fit(
         self,
-        x: Tensor,
+        x: Regressors,
         y: Tensor,
         groups: Tensor | None = None,
         *,
@@ -47,6 +48,7 @@ class SurfacePLSR(Estimator):
         Raises:
             FitError: with fewer than two groups or basis functions, or one that is constant.
         """
+        x = whole(x)
         found = self.surface(x, y, groups, names=names, outputs=outputs)
         return [self.chosen(found, x, y, groups)]
 

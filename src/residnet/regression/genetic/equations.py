@@ -17,6 +17,7 @@ from residnet.regression.expressions.notation import LATEX, PLAIN, SYMPY, latex_
 from residnet.regression.expressions.text import c_function, term, total
 from residnet.regression.genetic.config import BLOCKS, EquationSearchConfig, limits_of
 from residnet.regression.genetic.evolution import Found, evolve
+from residnet.regression.pieces import Regressors, whole
 from residnet.regression.solutions import Coefficient, Solution
 from residnet.regression.sparse import Equation, find
 from residnet.regression.sparse_reduction import Reduced, reduce
@@ -45,7 +46,7 @@ class GeneticEquations(Estimator):
 
     def fit(
         self,
-        x: Tensor,
+        x: Regressors,
         y: Tensor,
         groups: Tensor | None = None,
         *,
@@ -58,6 +59,7 @@ class GeneticEquations(Estimator):
             FitError: where the data do not determine an equation.
             UsageError: where DEAP is not installed.
         """
+        x = whole(x)
         names, outputs = column_names(x, names, "x"), column_names(y, outputs, "y")
         require_data(x, y, names, outputs)
         config, n = self.config, y.shape[1]

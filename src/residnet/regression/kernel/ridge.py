@@ -12,6 +12,7 @@ from residnet.core.errors import FitError
 from residnet.regression.estimator import Estimator, column_names, fold_numbers, require_data
 from residnet.regression.kernel.functions import Kernel
 from residnet.regression.kernel.path import Path
+from residnet.regression.pieces import Regressors, whole
 from residnet.regression.solutions import Solution
 
 Scoring = Callable[[Sequence[Path]], Tensor]
@@ -60,7 +61,7 @@ class KernelRidge(Estimator):
 
     def fit(
         self,
-        x: Tensor,
+        x: Regressors,
         y: Tensor,
         groups: Tensor | None = None,
         *,
@@ -74,6 +75,7 @@ class KernelRidge(Estimator):
         Raises:
             FitError: with fewer groups than folds.
         """
+        x = whole(x)
         require_data(x, y, column_names(x, names, "x"), column_names(y, outputs, "y"))
         fold = fold_numbers(groups, self.folds)
         folds, count = int(fold.max()) + 1, len(self.penalties)

@@ -1,0 +1,173 @@
+"""Memory and time of fits on many samples: logs of a simulated boat, fitted by heads of each kind.
+
+    python scripts/bench/large_data.py [--samples 1000000 10000000] [--logs 1000] [--folder DIR]
+
+The logs (10 Hz, twin propellers, random steps of both, sensor noise) are written as canonical
+Parquet files; four logs of 10,000 samples for validation and test stand beside them. Each head is
+fitted by a run of its own, in a process of its own: PLSR, ridge, and an MLP for 100 steps of
+training. Printed are the largest resident memory of the process (VmHWM), its time from start to
+end, and the samples a second, each for every number of samples.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+import yaml
+
+import residnet
+from residnet.core.log import Log
+
+STEP = 0.1
+HEADS = {
+    "plsr": ({"kind": "plsr", "choose": "one_step"}, {}),
+    "ridge": ({"kind": "ridge", "choose": "one_step"}, {}),
+    "mlp": (
+        {"kind": "mlp", "hidden": [32, 32]},
+        {"steps": 100, "one_step": {"epochs": 1, "window": "2 s"}, "multi_step": []},
+    ),
+}
+
+
+def simulate(count: int, length: int, seed: int) -> list[Log]:
+    """Return logs of a small boat with quadratic damping, all flown side by side."""
+    generator = np.random.default_rng(seed)
+    hold = 60
+    drives = generator.uniform(-20.0, 100.0, (length // hold + 1, count, 2))
+    n = np.repeat(drives, hold, axis=0)[:length]
+    x = np.zeros((count, 6))
+    path = np.empty((length, count, 6))
+    for k in range(length):
+        path[k] = x
+        u, v, r = x[:, 3:].T
+        port, stbd = (n[k] * np.abs(n[k]) * 1e-4).T
+        rates = np.stack(
+            (
+                0.8 * (port + stbd) + v * r - 0.4 * u - 0.3 * u * np.abs(u),
+                -0.7 * u * r - 1.1 * v - 0.9 * v * np.abs(v),
+                1.2 * (port - stbd) - 1.3 * r - 0.5 * r * np.abs(r) - 0.2 * u * v,
+            ),
+            axis=1,
+        )
+        nu = x[:, 3:] + STEP * rates
+        c, s = np.cos(x[:, 2]), np.sin(x[:, 2])
+        pose = np.stack((nu[:, 0] * c - nu[:, 1] * s, nu[:, 0] * s + nu[:, 1] * c, nu[:, 2]), 1)
+        x = np.concatenate((x[:, :3] + STEP * pose, nu), axis=1)
+    path[..., 3:] += generator.normal(0.0, 0.01, path[..., 3:].shape)
+    t = STEP * np.arange(length)
+    names = ("x", "y", "psi", "u", "v", "r")
+    return [
+        Log(
+            f"random_{seed}_{i:04d}",
+            t,
+            {name: path[:, i, j].copy() for j, name in enumerate(names)}
+            | {"n_port": n[:, i, 0].copy(), "n_stbd": n[:, i, 1].copy()},
+            manoeuvre="random_steps",
+        )
+        for i in range(count)
+    ]
+
+
+def write_logs(folder: Path, samples: int, count: int) -> None:
+    """Write so many training logs, and two each for validation and test."""
+    for split, logs, length, seed in (
+        ("train", count, samples // count, 1),
+        ("validation", 2, 10_000, 2),
+        ("test", 2, 10_000, 3),
+    ):
+        (folder / split).mkdir(parents=True)
+        for first in range(0, logs, 100):
+            for log in simulate(min(100, logs - first), length, 1000 * seed + first):
+                log.save(folder / split / f"{log.name}.parquet")
+
+
+def config(folder: Path, head: str) -> Path:
+    """Write the config of a fit of one head and return its file."""
+    settings, training = HEADS[head]
+    content = {
+        "task": "fit",
+        "name": f"large_{head}",
+        "data": {
+            "kind": "measured",
+            "reader": {"kind": "canonical"},
+            "split": {
+                "root": str(folder),
+                **{s: [f"{s}/*.parquet"] for s in ("train", "validation", "test")},
+            },
+        },
+        "prepare": {
+            "grid": {"step": f"{STEP} s", "held": ["n_port", "n_stbd"]},
+            "derivative": {"kind": "savitzky_golay", "window": "1.1 s", "order": 2},
+        },
+        "signals": {"inputs": ["n_port", "n_stbd"]},
+        "baseline": {"kind": "regressors", "sets": ["linear"], "drive": ["n_port"],
+                     "steer": ["n_stbd"]},
+        "heads": {head: settings},
+        "evaluation": {
+            "splits": ["validation", "test"],
+            "protocols": {"T30": {"kind": "windows", "length": "30 s"}},
+            "selection": "T30",
+            "scales": {"u": 0.5, "v": 0.1, "r": 0.3},
+        },
+    }  # fmt: skip
+    if training:
+        content["training"] = {head: training}
+    file = folder / f"{head}.yaml"
+    file.write_text(yaml.safe_dump(content))
+    return file
+
+
+def carried_out(file: Path, out: Path) -> tuple[float, float]:
+    """Run a config; return the seconds and the largest resident memory in bytes.
+
+    Raises:
+        RuntimeError: where the run fails, with the end of what it said.
+    """
+    started = time.perf_counter()
+    argument = [sys.executable, "-m", "residnet", "run", str(file), "--out", str(out)]
+    said = out.with_suffix(".log")
+    with said.open("w") as stream:
+        process = subprocess.Popen(argument, stdout=stream, stderr=subprocess.STDOUT)
+        _, status, usage = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode != 0:
+        raise RuntimeError("\n".join(said.read_text().splitlines()[-12:]))
+    return time.perf_counter() - started, usage.ru_maxrss * 1024.0
+
+
+def main() -> int:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--samples", type=int, nargs="+", default=[1_000_000, 10_000_000])
+    parser.add_argument("--logs", type=int, default=1000)
+    parser.add_argument("--heads", nargs="+", default=list(HEADS), choices=list(HEADS))
+    parser.add_argument("--folder", type=Path, help="keeps the logs; a temporary one otherwise")
+    given = parser.parse_args()
+    print(f"residnet {residnet.__version__}, torch {torch.__version__}, {platform.machine()}")
+    print(f"{'samples':>11}{'head':>8}{'peak GB':>9}{'seconds':>9}{'samples/s':>11}")
+    for samples in given.samples:
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(given.folder or name) / str(samples)
+            if not folder.is_dir():
+                write_logs(folder, samples, given.logs)
+            for head in given.heads:
+                out = Path(name) / f"run_{head}"
+                seconds, peak = carried_out(config(folder, head), out)
+                rate = samples / seconds
+                print(
+                    f"{samples:11}{head:>8}{peak / 1e9:9.2f}{seconds:9.1f}{rate:11.0f}", flush=True
+                )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

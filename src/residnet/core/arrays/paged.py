@@ -1,0 +1,102 @@
+"""Arrays of large data sets in files, whose pages the system may drop from memory."""
+
+from __future__ import annotations
+
+import math
+import mmap
+import tempfile
+import weakref
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from residnet.core.errors import DataError
+
+LARGE = 1_000_000
+"""Samples of all logs together from which further ones are kept on disk."""
+PIECE = 200_000
+"""Rows that are worked on at a time."""
+_CHUNK = 1 << 28
+"""Bytes of a file that many arrays share: each file holds a descriptor open."""
+_ALIGNED = 64
+
+_files: weakref.WeakSet[mmap.mmap] = weakref.WeakSet()
+
+
+class _Arena:
+    """The file that arrays are being put into."""
+
+    def __init__(self) -> None:
+        self.file: mmap.mmap | None = None
+        self.end = 0
+
+    def place(self, count: int) -> tuple[mmap.mmap, int]:
+        """Return a file with room for so many bytes, and where they go."""
+        if self.file is None or self.end + count > len(self.file):
+            with tempfile.TemporaryFile(prefix="residnet-") as file:
+                try:
+                    file.truncate(max(count, _CHUNK))
+                    self.file = mmap.mmap(file.fileno(), 0)
+                except OSError as error:
+                    raise DataError(
+                        f"{tempfile.gettempdir()}: no room for the samples of large logs"
+                        f" ({error.strerror}); set TMPDIR to a larger disk"
+                    ) from error
+            _files.add(self.file)
+            self.end = 0
+        start = self.end
+        self.end += math.ceil(count / _ALIGNED) * _ALIGNED
+        return self.file, start
+
+
+_arena = _Arena()
+
+
+def empty(shape: tuple[int, ...], dtype: Any = np.float64) -> np.ndarray:
+    """Return an array of zeros in a file that vanishes with the arrays in it.
+
+    Raises:
+        DataError: where the disk is full.
+    """
+    kind = np.dtype(dtype)
+    file, start = _arena.place(max(math.prod(shape) * kind.itemsize, 1))
+    return np.ndarray(shape, kind, buffer=file, offset=start)
+
+
+def on_disk(values: np.ndarray) -> np.ndarray:
+    """Return a copy of an array in a file."""
+    out = empty(values.shape, values.dtype)
+    out[...] = values
+    return out
+
+
+def lies_on_disk(values: np.ndarray) -> bool:
+    """Return whether an array is one of those in files."""
+    owner: Any = values
+    while isinstance(owner, np.ndarray):
+        owner = owner.base
+    return isinstance(owner, mmap.mmap)
+
+
+def rows(count: int, *shape: int, dtype: torch.dtype = torch.float64) -> Tensor:
+    """Return a tensor [count, *shape] to be filled: in memory, or in a file where it is large."""
+    if count <= LARGE:
+        return torch.zeros(count, *shape, dtype=dtype)
+    kind = torch.zeros(0, dtype=dtype).numpy().dtype
+    return torch.from_numpy(empty((count, *shape), kind))
+
+
+def row_pieces(count: int) -> Iterator[slice]:
+    """Yield the rows of data: all at once, or in pieces where there are many."""
+    step = PIECE if count > LARGE else max(count, 1)
+    for start in range(0, count, step):
+        yield slice(start, min(start + step, count))
+
+
+def forget() -> None:
+    """Give back the memory of all arrays in files; they are read again when they are next used."""
+    for file in list(_files):
+        file.madvise(mmap.MADV_DONTNEED)

@@ -1,0 +1,101 @@
+"""Fits of many samples, kept on disk and worked on piece by piece, against those in memory."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from tiny import TINY
+
+from residnet.core.arrays import paged
+from residnet.core.config import validate
+from residnet.core.log import Log
+from residnet.data.simulated.trials import SimulatedTrials
+from residnet.data.sources import read_logs
+from residnet.data.windows import WindowStore
+from residnet.identification.fit import fit
+from residnet.identification.prepared import prepare_logs, shortened
+from residnet.identification.settings import FitSettings
+from residnet.regression.estimator import Estimator
+from residnet.regression.least_squares import LeastSquares
+from residnet.regression.pieces import Pieces
+from residnet.regression.plsr import PLSR
+from residnet.regression.ridge import Ridge
+
+
+@pytest.fixture
+def few(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Take hundreds of samples for many."""
+    monkeypatch.setattr(paged, "LARGE", 500)
+    monkeypatch.setattr(paged, "PIECE", 130)
+
+
+def test_a_fit_from_disk_is_the_fit_from_memory(few: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    wanted: dict[str, Any] = {
+        key: TINY[key] for key in ("prepare", "signals", "baseline", "evaluation")
+    }
+    heads = {"plsr": {"kind": "plsr"}, "ridge": {"kind": "ridge"}}
+    settings = validate(wanted | {"heads": heads}, FitSettings, "here")
+    read = read_logs(validate(TINY["data"], SimulatedTrials, "here"))
+    on_disk = {split: [log.on_disk() for log in logs] for split, logs in read.items()}
+    prepared = prepare_logs(on_disk, settings)
+    assert all(paged.lies_on_disk(log.y) for logs in prepared.values() for log in logs)
+    small = fit(prepared, settings)
+    store = WindowStore.gather(prepared["train"])
+    monkeypatch.undo()
+    held = prepare_logs(read, settings)
+    assert not any(paged.lies_on_disk(log.y) for logs in held.values() for log in logs)
+    for name, entry in fit(held, settings).items():
+        for key, value in entry.model.state_dict().items():
+            torch.testing.assert_close(
+                small[name].model.state_dict()[key], value, rtol=1e-7, atol=1e-10
+            )
+    other = WindowStore.gather(held["train"])
+    for part in dataclasses.fields(store):
+        assert torch.equal(getattr(store, part.name), getattr(other, part.name))
+
+
+@pytest.mark.parametrize(
+    "estimator", [LeastSquares((0.0, 1e-3)), Ridge((1e-6, 1e-2)), PLSR()], ids=lambda e: type(e)
+)
+def test_pieces_give_what_the_whole_does(few: None, estimator: Estimator) -> None:
+    generator = torch.Generator().manual_seed(5)
+    z = torch.randn(900, 3, generator=generator, dtype=torch.float64)
+
+    def basis(z: torch.Tensor) -> torch.Tensor:
+        return torch.cat((z, z.square(), torch.full_like(z[:, :1], 0.3)), dim=1)
+
+    columns = [5, 0, 1, 2, 4]
+    y = basis(z)[:, [0, 4]] + 0.1 * torch.randn(900, 2, generator=generator, dtype=torch.float64)
+    groups = torch.arange(900) // 150
+    in_pieces = estimator.fit(Pieces(basis, z, columns), y, groups)
+    at_once = estimator.fit(basis(z)[:, columns], y, groups)
+    assert len(in_pieces) == len(at_once)
+    for found, wanted in zip(in_pieces, at_once, strict=True):
+        assert found.choice == wanted.choice
+        for name, value in wanted.state.items():
+            torch.testing.assert_close(found.state[name], value, rtol=1e-9, atol=1e-12)
+        assert [c.error for c in found.table] == pytest.approx(
+            [c.error for c in wanted.table], rel=1e-9
+        )
+
+
+def test_a_very_long_log_is_prepared_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("residnet.identification.prepared._LONGEST", 400)
+    log = Log("trip", np.arange(1000.0), {"u": np.arange(1000.0)})
+    parts = shortened(log)
+    assert [part.name for part in parts] == ["trip_1_of_3", "trip_2_of_3", "trip_3_of_3"]
+    np.testing.assert_array_equal(np.concatenate([part["u"] for part in parts]), log["u"])
+    assert shortened(parts[0]) == [parts[0]]
+
+
+def test_arrays_on_disk_keep_their_values_when_memory_is_given_back() -> None:
+    values = np.random.default_rng(0).normal(size=(1000, 3))
+    kept = paged.on_disk(values)
+    paged.forget()
+    np.testing.assert_array_equal(kept, values)
+    assert paged.lies_on_disk(kept[5:, 0])
+    assert not paged.lies_on_disk(values)
