@@ -90,7 +90,7 @@ class ExportedPolicy(nn.Module):
     def initial_state(self, y: Tensor) -> Tensor:
         """Return the memory s [B, n] at the first measurement y [B, 3], rudder amidships."""
         require_shape("measured", y, [size(y, 2, 0), self.low.numel()])
-        y = y.to(torch.float32)
+        y = y.to(self.low.dtype)
         good = self._good(y).unsqueeze(-1)
         return torch.cat(
             (
@@ -116,7 +116,8 @@ class ExportedPolicy(nn.Module):
         require_shape("measured", y, [rows, self.low.numel()])
         require_shape("reference", reference, [rows, 1])
         require_shape("s", s, [rows, self.memory_low.numel()])
-        y, reference, s = y.to(torch.float32), reference.to(torch.float32), s.to(torch.float32)
+        kind = self.low.dtype
+        y, reference, s = y.to(kind), reference.to(kind), s.to(kind)
         good = (
             self._good(y)
             & torch.isfinite(reference[:, 0])
@@ -206,7 +207,7 @@ def check_parity(name: str, module: ExportedPolicy, exported: Any) -> float:
     Raises:
         ExportError: where it exceeds 1e-4, a command is no number, or a wrong input raises no flag.
     """
-    steps = torch.arange(PARITY_STEPS, dtype=torch.float32)
+    steps = torch.arange(PARITY_STEPS, dtype=module.low.dtype)
     turn = float(module.high[2]) / 5.0
     psi, r = 0.8 * torch.sin(0.01 * steps), turn * torch.cos(0.013 * steps)
     y = torch.stack((psi, torch.full_like(psi, module.policy.speed), r), dim=-1).unsqueeze(1)

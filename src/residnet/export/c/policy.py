@@ -15,7 +15,8 @@ import torch
 from torch import Tensor, nn
 
 from residnet.control.heading.keeper import HeadingKeeper
-from residnet.export.autopilot import MEASURED, check_parity, for_export
+from residnet.core.errors import ExportError
+from residnet.export.autopilot import MEASURED, ExportedPolicy, check_parity, for_export
 from residnet.export.c.compiled import compile_shared
 from residnet.export.c.source import CFunction, c_file, h_file, identifier
 from residnet.export.lowering.build import lowered
@@ -156,6 +157,8 @@ def export_autopilot_as_c(
 ) -> None:
     """Write a heading policy as C with the checks of its inputs inside.
 
+    The file is in double precision alone where single precision does not reproduce the policy.
+
     Args:
         name: of the policy.
         policy: at the step that it shall run with.
@@ -166,7 +169,18 @@ def export_autopilot_as_c(
     Raises:
         ExportError: where the C file does not reproduce the policy.
     """
-    module = for_export(policy, safe)
+    single, double = for_export(policy, safe), for_export(policy, safe).double()
+    try:
+        _export_heading(name, single, card, file, double=False)
+    except ExportError:
+        # some laws with a rudder rate answer a rounding in the seventh digit by one in the third
+        _export_heading(name, double, {**card, "dtype": "float64"}, file, double=True)
+
+
+def _export_heading(
+    name: str, module: ExportedPolicy, card: Mapping[str, Any], file: Path, *, double: bool
+) -> None:
+    """Write a heading policy as C in one precision."""
     export_policy(
         name,
         module,
@@ -175,4 +189,5 @@ def export_autopilot_as_c(
         card,
         file,
         lambda exported: check_parity(name, module, exported),
+        double=double,
     )
