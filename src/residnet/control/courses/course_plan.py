@@ -37,7 +37,7 @@ _MORE = ((1.0, 1.5, 2), (1.0, 1.0, 2), (0.0, 1.0, 2), (0.5, 2.0, 2), (1.0, 3.0, 
 """What outlines are looked for with: share of the room before and behind turns, multiple of their
 radius, and how many distances buoys may be passed at.
 """
-_EFFORT = 500
+_EFFORT = 400
 """Times that a route is drawn for fits, beyond which no other outline is fitted."""
 _RINGS = (0.0, 0.25)
 _TOLERANCE = 2e-3
@@ -234,7 +234,7 @@ def _fitted(request: CourseRequest, sketch: Sketch) -> list[tuple[Fit, Fitted]]:
         z = route.begin(sketch)
         best = fit.solve(z)
         found.append((fit, best))
-        if best.missed > 0.5 * radius:
+        if best.missed > 0.1 * radius:
             break
         after = _drawn(request, route, best.z, fit, sketch).simplified(_SHORT * radius, _SMALL)
         if len(after.bends) == len(sketch.bends) or attempt == 2:
