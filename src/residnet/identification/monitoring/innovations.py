@@ -52,7 +52,7 @@ def run_away(
     size = np.array([change.size for change in causes])[:, None]
     # comparisons with what is no number are false
     sound = (np.abs(error) <= most).all(axis=1)
-    return ~(sound & (np.abs(effects * size) <= most).all(axis=(1, 2)))
+    return np.asarray(~(sound & (np.abs(effects * size) <= most).all(axis=(1, 2))))
 
 
 def whitening(error: np.ndarray, parts: int) -> np.ndarray:
