@@ -4,8 +4,8 @@ Windows are free-run as a whole and in parts, each from its measured start. What
 always got wrong is taken out of their innovations, which are then whitened by their covariance over
 clean logs. For each cause the score test asks whether a small change of that kind explains the last
 minutes, once wind and current have taken what they can. How much clean logs differ in the sizes
-that they ask for sets its scale. An alarm comes from single causes; the scores of all together say
-which is named first.
+that they ask for sets its scale. The scores of all causes together say how well each alone explains
+them.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class Suspect:
 
     Attributes:
         change: the cause.
-        score: of its test, in standard deviations of clean logs.
+        score: of its test by the scores of all causes, in standard deviations of clean logs.
         size: of the change, in its unit.
         error: standard error of the size.
     """
@@ -286,13 +286,13 @@ class Watch:
             sums: of the groups.
         """
         groups = [self._group(log, one, self.bias) for log, one in zip(logs, sums, strict=True)]
-        size, error = self.scatter.sizes(groups)
+        size, error = self.scatter.together(groups)
         suspects = [
             Suspect(change, float(abs(size[i]) / error[i]), float(size[i]), float(error[i]))
             for i, change in enumerate(self.causes)
         ]
         alarm = max(suspect.score for suspect in suspects) > self.threshold
-        suspects = [suspects[i] for i in np.argsort(-self.scatter.together(groups))]
+        suspects.sort(key=lambda suspect: -suspect.score)
         count = sum(one.count for one in sums)
         squares = np.sum([one.squares for one in sums], axis=0) / count
         by_channel = squares.reshape(-1, len(SEEN)).mean(axis=0)

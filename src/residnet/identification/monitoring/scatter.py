@@ -51,6 +51,7 @@ class Scatter:
         shared: part of it that is common to the groups of one log [Q].
         known: variance of the mean size of all clean logs [Q].
         correlation: of the scores of different causes [Q, Q].
+        count: of the groups that told all this.
     """
 
     noise: np.ndarray
@@ -58,29 +59,45 @@ class Scatter:
     shared: np.ndarray
     known: np.ndarray
     correlation: np.ndarray
+    count: int = 10**9
 
     def variance(self, own: np.ndarray) -> np.ndarray:
         """Return the variance of scores [..., Q] whose information is `own` [..., Q]."""
         return np.asarray(self.noise * own + self.apart * own**2)
 
-    def sizes(self, groups: Sequence[Group]) -> tuple[np.ndarray, np.ndarray]:
-        """Return the size of each cause [Q] by groups of windows, and its standard error."""
-        told, weight = _told(groups, self)
-        return told / weight, np.sqrt(1.0 / weight + self.known)
+    @property
+    def inflation(self) -> float:
+        """How much larger variances are than they seem, their matrix being an estimate itself.
 
-    def together(self, groups: Sequence[Group]) -> np.ndarray:
-        """Return how well each cause alone [Q] explains the scores of all causes together.
-
-        In standard deviations: the scores of all tell better than each for itself which it is.
+        Weights from few groups are not the best ones, and flatter what they weigh (R. N. Kackar and
+        D. A. Harville, 1984, for the effect; the factors are those of Wishart matrices).
         """
-        told, weight = 0.0, 0.0
-        for group in groups:
-            deviation = np.sqrt(self.variance(group.own))
-            covariance = self.correlation * np.outer(deviation, deviation)
-            weighed = np.linalg.solve(covariance, group.information)
-            told = told + weighed.T @ group.score
-            weight = weight + np.einsum("pq,pq->q", group.information, weighed)
-        return np.asarray(np.abs(told) / np.sqrt(weight + _NOTHING))
+        size = len(self.noise)
+        left = max(self.count - size - 1, 1)
+        return max((self.count - 1) / left, 1.0) * self.count / (left + 1)
+
+    def together(self, groups: Sequence[Group]) -> tuple[np.ndarray, np.ndarray]:
+        """Return the size of each cause alone [Q] by the scores of all causes, and its error.
+
+        The scores of all tell better than each for itself which cause it is, and that there is one.
+        """
+        told, weight = np.zeros(len(self.noise)), np.full(len(self.noise), _NOTHING)
+        for log in dict.fromkeys(group.log for group in groups):
+            part, sure, alike = 0.0, 0.0, []
+            for group in groups:
+                if group.log == log:
+                    variance = self.variance(group.own)
+                    deviation = np.sqrt(variance)
+                    covariance = self.correlation * np.outer(deviation, deviation)
+                    weighed = np.linalg.solve(covariance, group.information)
+                    part = part + weighed.T @ group.score
+                    sure = sure + np.einsum("pq,pq->q", group.information, weighed)
+                    alike.append(self.shared * group.own**2 / variance)
+            # groups of one log say in part the same
+            again = 1.0 + (len(alike) - 1) * np.mean(alike, axis=0)
+            told += part / again
+            weight += sure / again
+        return told / weight, np.sqrt((1.0 / weight + self.known) * self.inflation)
 
 
 def scattered(groups: Sequence[Group]) -> Scatter:
@@ -102,7 +119,7 @@ def scattered(groups: Sequence[Group]) -> Scatter:
     np.fill_diagonal(correlation, 1.0)
     shared = _shared(groups, alone)
     whole = Scatter(noise, apart, shared, 0.0 * apart, correlation)
-    return Scatter(noise, apart, shared, 1.0 / _told(groups, whole)[1], correlation)
+    return Scatter(noise, apart, shared, 1.0 / _told(groups, whole)[1], correlation, count)
 
 
 def _told(groups: Sequence[Group], scatter: Scatter) -> tuple[np.ndarray, np.ndarray]:
