@@ -83,7 +83,8 @@ class Scatter:
         """
         told, weight = np.zeros(len(self.noise)), np.full(len(self.noise), _NOTHING)
         for log in dict.fromkeys(group.log for group in groups):
-            part, sure, alike = 0.0, 0.0, []
+            part, sure = 0.0, 0.0
+            alike: list[np.ndarray] = []
             for group in groups:
                 if group.log == log:
                     variance = self.variance(group.own)
