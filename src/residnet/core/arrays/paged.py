@@ -15,9 +15,9 @@ from torch import Tensor
 
 from residnet.core.errors import DataError
 
-LARGE = 1_000_000
+LARGE = 200_000
 """Samples of all logs together from which further ones are kept on disk."""
-PIECE = 200_000
+PIECE = 50_000
 """Rows that are worked on at a time."""
 _CHUNK = 1 << 28
 """Bytes of a file that many arrays share: each file holds a descriptor open."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,6 +19,9 @@ from residnet.data.split import row_hashes
 _COPIED = 20
 _EPOCH = 1e8
 _OUTSIDE = 0.25
+_STATES = ("x", "y", "u", "v", "r")
+_FAR = 30.0
+"""Usual changes by which the states may differ across a pause."""
 
 
 def comparison_findings(
@@ -31,8 +35,9 @@ def comparison_findings(
     """
     given = splits or {}
     found = list(_copies(logs, given))
-    for a, b in itertools.permutations(logs, 2):
-        found += _continued(a, b, given)
+    ends = [_Ends.of(log) for log in logs]
+    for i, j in _near(ends):
+        found += _continued(logs[i], logs[j], ends[i], ends[j], given)
     for a, b in itertools.combinations(logs, 2):
         found += [*_overlapping(a, b), *_same_commands(a, b, given)]
     return [*found, *_ranges(logs, given)]
@@ -114,29 +119,78 @@ def _copy(
     return Finding(level, "copied_part", text, figures, "leave it out, or keep both in one split")
 
 
-def _continued(a: Log, b: Log, splits: Mapping[str, str]) -> Iterator[Finding]:
+@dataclass(frozen=True)
+class _Ends:
+    """Where a log begins and ends, and how much is usual from sample to sample.
+
+    Attributes:
+        step: median time between samples in s.
+        first: mean of the first three samples by state.
+        last: mean of the last three.
+        change: median change between samples.
+        noise: standard deviation of white noise.
+    """
+
+    step: float
+    first: dict[str, float]
+    last: dict[str, float]
+    change: dict[str, float]
+    noise: dict[str, float]
+
+    @classmethod
+    def of(cls, log: Log) -> _Ends:
+        """Return the ends of a log."""
+        states = [name for name in _STATES if name in log.channels]
+        changes = {name: np.abs(np.diff(log[name])) for name in states}
+        known = {name: change[np.isfinite(change)] for name, change in changes.items()}
+        return cls(
+            float(np.median(np.diff(log.t))) if len(log) > 1 else 0.0,
+            {name: float(log[name][:3].mean()) for name in states},
+            {name: float(log[name][-3:].mean()) for name in states},
+            {name: float(np.median(part)) for name, part in known.items() if part.size},
+            {name: noise_of(log[name]) for name in states},
+        )
+
+    def usual(self, other: _Ends, name: str) -> float:
+        """Return how far apart the states of two logs are that go on from each other."""
+        change = self.change.get(name)
+        return 0.0 if change is None else change + self.noise[name] + other.noise[name]
+
+
+def _near(ends: Sequence[_Ends]) -> list[tuple[int, int]]:
+    """Return the pairs of which the second may begin where the first ends, in order.
+
+    Of thousands of logs few are left to look at.
+    """
+    near = ~np.eye(len(ends), dtype=bool)
+    for name in _STATES:
+        has = np.array([name in end.first for end in ends])
+        first, last, change, noise = (
+            np.array([getattr(end, part).get(name, 0.0) for end in ends])
+            for part in ("first", "last", "change", "noise")
+        )
+        usual = change[:, None] + noise[:, None] + noise[None, :]
+        apart = np.abs(first[None, :] - last[:, None])
+        near &= ~(has[:, None] & has[None, :]) | (apart <= _FAR * np.maximum(usual, 1e-12))
+    return [(int(i), int(j)) for i, j in np.argwhere(near)]
+
+
+def _continued(
+    a: Log, b: Log, ends_a: _Ends, ends_b: _Ends, splits: Mapping[str, str]
+) -> Iterator[Finding]:
     """Return a log that goes on where another ended: one run, cut into files."""
-    states = [
-        name for name in ("x", "y", "u", "v", "r") if name in a.channels and name in b.channels
-    ]
+    states = [name for name in _STATES if name in ends_a.first and name in ends_b.first]
     if len(states) < 4 or len(a) < 20 or len(b) < 20:
         return
-    step = float(np.median(np.diff(a.t)))
+    step = ends_a.step
     pause = float(b.t[0] - a.t[-1])
     on_time = abs(a.t[-1]) > 2.0 * step and 0.0 < pause < 3.0 * step and abs(b.t[0]) > 2.0 * step
     if not on_time and abs(b.t[0] - a.t[0]) > 1e-9 and b.t[0] > 2.0 * step:
         return
     for name in states:
-        ends = np.array([a[name][-3:].mean(), b[name][:3].mean()])
-        change = np.abs(np.diff(a[name]))
-        usual = (
-            float(np.median(change[np.isfinite(change)])) + noise_of(a[name]) + noise_of(b[name])
-            if np.isfinite(change).any()
-            else 0.0
-        )
-        if not np.isfinite(ends).all() or abs(ends[1] - ends[0]) > (30.0 if on_time else 8.0) * max(
-            float(usual), 1e-12
-        ):
+        apart = abs(ends_b.first[name] - ends_a.last[name])
+        allowed = (_FAR if on_time else 8.0) * max(ends_a.usual(ends_b, name), 1e-12)
+        if not apart <= allowed:
             return
     if not on_time and float(np.hypot(a["u"][-1], a["v"][-1])) < 0.2 * float(
         np.nanquantile(np.hypot(a["u"], a["v"]), 0.9)
@@ -174,8 +228,16 @@ def _same_commands(a: Log, b: Log, splits: Mapping[str, str]) -> Iterator[Findin
         if name in b.channels and name not in MEASURED and not name.startswith(("wind", "current"))
     ]
     size = min(len(a), len(b))
+    if size < 50:
+        return
+    # a few samples tell most pairs apart
+    for at in (0, size // 3, 2 * size // 3, size - 1):
+        for name in names:
+            same = np.isclose(a[name][at], b[name][at], rtol=1e-6, atol=1e-9, equal_nan=True)
+            if not same and float(np.nanstd(a[name][:size])) > 1e-9:
+                return
     moving = [name for name in names if float(np.nanstd(a[name][:size])) > 1e-9]
-    if not moving or size < 50:
+    if not moving:
         return
     if all(
         np.allclose(a[name][:size], b[name][:size], rtol=1e-6, atol=1e-9, equal_nan=True)

@@ -22,6 +22,10 @@ from residnet.judge.bands.config import BandsConfig
 from residnet.judge.bands.errors import RunErrors, run_errors
 from residnet.judge.bands.quantiles import corrected, independent, quantile, run_weights
 from residnet.judge.freerun import Candidate, free_run
+from residnet.judge.protocol import Window
+
+_MOST = 1_000_000
+"""Samples of all windows together that calibrate; of more windows, every second or so is taken."""
 
 
 def calibrate_bands(
@@ -72,6 +76,12 @@ class _Calibration:
         self.protocol = identified.settings.evaluation.protocols[protocol]
         self.config = config
         self.step = identified.settings.prepare.grid.step
+        laid = sum(len(log) for log in identified.train) * self.step / config.every
+        length = max(
+            (w.stop - w.start for log in identified.train[:1] for w in self._windows([log])),
+            default=1,
+        )
+        self.every = max(1, round(laid * length / _MOST))
         self.crossed: dict[str, list[RunErrors]] = {}
         self.validated: dict[str, list[RunErrors]] = {}
 
@@ -79,11 +89,7 @@ class _Calibration:
         self, models: Mapping[str, HybridDynamics], logs: Sequence[Prepared], validation: bool
     ) -> None:
         """Run models over logs that they were not fitted on."""
-        windows = [
-            window
-            for number, log in enumerate(logs)
-            for window in self.protocol.overlapping(log, number, self.step, self.config.every)
-        ]
+        windows = self._windows(logs)[:: 1 if validation else self.every]
         if not windows or not models:
             return
         candidates = [Candidate(name, "", model) for name, model in models.items()]
@@ -91,6 +97,13 @@ class _Calibration:
         for name, predictions in found.items():
             runs = run_errors(windows, predictions, logs)
             (self.validated if validation else self.crossed).setdefault(name, []).extend(runs)
+
+    def _windows(self, logs: Sequence[Prepared]) -> list[Window]:
+        return [
+            window
+            for number, log in enumerate(logs)
+            for window in self.protocol.overlapping(log, number, self.step, self.config.every)
+        ]
 
     def bands(self) -> dict[str, Band]:
         """Return the band of each model; none where no log is long enough."""
