@@ -45,6 +45,9 @@ def quiet_after(duration: float) -> float:
 class SteadyConfig(Config):
     """What a policy must keep to without noise and slow push, for an epoch of training to be taken.
 
+    The defaults are a fifth below 0.2 deg of heading, 1 deg of rudder and 0.15 deg of overshoot,
+    since other flights judge the policy than those that choose the epoch.
+
     Attributes:
         heading_swing: largest movement of the heading in rad, peak to peak, once a change is long
             over: from ten sevenths of the conditions' duration on, 20 s with 14 s.
@@ -54,9 +57,9 @@ class SteadyConfig(Config):
         flights: under the conditions that are looked at for swinging.
     """
 
-    heading_swing: Radians = Field(default=0.0034906585039886592, gt=0)
-    rudder_swing: Radians = Field(default=0.017453292519943295, gt=0)
-    overshoot: Radians = Field(default=0.002617993877991494, gt=0)
+    heading_swing: Radians = Field(default=0.002792526803190927, gt=0)
+    rudder_swing: Radians = Field(default=0.013962634015954637, gt=0)
+    overshoot: Radians = Field(default=0.0020943951023931953, gt=0)
     flights: int = Field(default=256, ge=2, le=1_000_000)
 
 
