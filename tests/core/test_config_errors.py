@@ -102,7 +102,7 @@ from residnet.core.errors import ConfigError
             "pair: [1 m, {}]\n",
             (
                 "run.yaml:2: pair.0: unit 'm' does not measure [s]; units that do: s, ms, us, ns,"
-                " min, h (given '1 m')"
+                " min, h, day (given '1 m')"
             ),
         ),
         # missing
@@ -217,7 +217,7 @@ def test_overrides_set_values(load: Callable[..., Fit]) -> None:
             ["dt=3 deg"],
             (
                 "override 'dt=3 deg': dt: unit 'deg' does not measure [s]; units that do: s, ms,"
-                " us, ns, min, h (given '3 deg')"
+                " us, ns, min, h, day (given '3 deg')"
             ),
         ),
         (

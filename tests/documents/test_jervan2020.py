@@ -315,7 +315,7 @@ def test_needed_force_and_its_derivatives_along_the_course() -> None:
 
 def test_refused_configs() -> None:
     for override, message in (
-        ("true=wam_v_cal", "commands are forces"),
+        ("true=wam_v_cal", "actuators push in surge, sway and yaw"),
         ("models.lag_ridge.on=nothing", "no model before it"),
         ("models.lag_ridge.terms=[u_dott]", "u_dott"),
         ("course.interval=0.05", "whole number of steps"),

@@ -164,7 +164,10 @@ def test_a_run_takes_the_constants_that_another_tuned(
         ({"vessel": "wam_v_cal", "rudder": "0.5 deg"}, "cmd_delta"),
         ({"conditions": {"stated": {**STATED, "current": 0.5}}}, "no input 'current_north'"),
         ({"conditions": {"stated": {**STATED, "delay": ["0.4 s", "0.1 s"]}}}, "in order"),
-        ({"conditions": {"tuned_in": "nowhere"}}, "nowhere is not the folder of a finished"),
+        (
+            {"conditions": {"stated": STATED, "tuned_in": "nowhere"}},
+            "nowhere is not the folder of a finished",
+        ),
     ],
 )
 def test_wrong_configs_are_said_in_a_line(

@@ -250,6 +250,8 @@ def _near(unit: str, expected: str | None) -> str | None:
         for spelling in difflib.get_close_matches(text, wanted, n=6, cutoff=0.6)
         if sorted(spelling) == sorted(text) or _one_word_differs(spelling, text)
     ]
+    # swapped letters are likelier than another word
+    close = [spelling for spelling in close if sorted(spelling) == sorted(text)] or close
     factors = {_UNITS[name][1] for spelling in close for name in exact[spelling]}
     return exact[close[0]][0] if len(factors) == 1 else None
 
