@@ -12,6 +12,7 @@ from known_logs import wavy
 from residnet.core.config import validate
 from residnet.core.errors import ConfigError, DataError
 from residnet.core.log import Log
+from residnet.data.doctor.compare import comparison_findings
 from residnet.data.split import SplitConfig, check_leaks
 
 
@@ -198,3 +199,16 @@ def test_missing_values_compare_equal_and_one_split_cannot_leak() -> None:
         check_leaks({"train": [log], "test": [copied(log, 100, 900)]})
     check_leaks({"train": [log, log]})
     check_leaks({})
+
+
+def test_copies_are_found_by_a_sample_of_very_many_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    log = wavy()
+    logs = {"train": [log], "test": [copied(log, 700, 1200)]}
+    with pytest.raises(DataError) as exact:
+        check_leaks(logs)
+    monkeypatch.setattr("residnet.data.split.LARGE", 600)
+    with pytest.raises(DataError) as sampled:
+        check_leaks(logs)
+    assert str(sampled.value) == str(exact.value)
+    found = comparison_findings([log, copied(log, 700, 1200)])
+    assert [finding.code for finding in found if finding.code == "copied_part"]

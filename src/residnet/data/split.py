@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field, model_validator
 
+from residnet.core.arrays.paged import LARGE, forget
 from residnet.core.config import Config, ConfigPath, load_mapping, validate
 from residnet.core.errors import ConfigError, DataError
 from residnet.core.log import Log
@@ -184,20 +185,42 @@ def check_leaks(logs: Mapping[str, Sequence[Log]], rows: int = 100) -> None:
     common = sorted(set.intersection(*(set(log.channels) for _, log in flat)))
     if not common:
         return
-    hashes = [np.unique(row_hashes(log, common)) for _, log in flat]
+    one_of = sampling([log for _, log in flat])
+    hashes = [np.unique(sampled_hashes(log, common, one_of)) for _, log in flat]
     owner = np.repeat(np.arange(len(flat)), [h.size for h in hashes])
     _, row = np.unique(np.concatenate(hashes), return_inverse=True)
     holds = coo_array((np.ones(row.size), (row, owner))).tocsr()
     split_of = np.unique([split for split, _ in flat], return_inverse=True)[1]
     shared = np.where(split_of[:, None] != split_of[None, :], (holds.T @ holds).toarray(), 0.0)
     first, second = np.unravel_index(int(np.argmax(shared)), shared.shape)
-    if shared[first, second] > rows:
-        (split_a, a), (split_b, b) = flat[first], flat[second]
+    (split_a, a), (split_b, b) = flat[first], flat[second]
+    if shared[first, second] == 0.0:
+        return
+    same = np.intersect1d(row_hashes(a, common), row_hashes(b, common)).size
+    if same > rows:
         raise DataError(
-            f"logs {a.name} ({split_a}) and {b.name} ({split_b}) share {int(shared[first, second])}"
-            f" identical rows, at most {rows} are allowed; one is a copy of part of the other:"
-            " leave one out, or put both into one split"
+            f"logs {a.name} ({split_a}) and {b.name} ({split_b}) share {same} identical rows, at"
+            f" most {rows} are allowed; one is a copy of part of the other: leave one out, or put"
+            " both into one split"
         )
+
+
+def sampling(logs: Sequence[Log]) -> int:
+    """Return of how many rows one is compared between logs: more than one of very many."""
+    return -(-sum(len(log) for log in logs) // LARGE)
+
+
+def sampled_hashes(log: Log, channels: Sequence[str], one_of: int) -> np.ndarray:
+    """Return the hashes of a log's rows that are compared: of equal rows all are, or none.
+
+    Args:
+        log: whose rows.
+        channels: that count.
+        one_of: of how many hashes one is kept, by its own number.
+    """
+    hashes = row_hashes(log, channels)
+    forget()
+    return hashes[hashes % np.uint64(one_of) == 0]
 
 
 def row_hashes(log: Log, channels: Sequence[str]) -> np.ndarray:

@@ -13,7 +13,7 @@ from residnet.core.names import VELOCITY
 from residnet.core.stretches import stretches
 from residnet.data.doctor.findings import Finding, Level, share_of, show
 from residnet.data.doctor.signals import MEASURED, noise_of
-from residnet.data.split import row_hashes
+from residnet.data.split import row_hashes, sampled_hashes, sampling
 
 # so many rows in a row that two logs share are no chance
 _COPIED = 20
@@ -51,6 +51,11 @@ def _copies(logs: Sequence[Log], splits: Mapping[str, str]) -> Iterator[Finding]
     )
     if not names:
         return
+    one_of = sampling(logs)
+    if one_of > 1:
+        logs = _alike(logs, names, one_of)
+        if not logs:
+            return
     hashes = [row_hashes(log, names) for log in logs]
     owner = np.repeat(np.arange(len(logs)), [part.size for part in hashes])
     row = np.concatenate([np.arange(part.size) for part in hashes])
@@ -78,6 +83,15 @@ def _copies(logs: Sequence[Log], splits: Mapping[str, str]) -> Iterator[Finding]
             yield _copy(
                 logs[i], logs[j], int(starts[np.argmax(stops - starts)]), offset, longest, splits
             )
+
+
+def _alike(logs: Sequence[Log], names: Sequence[str], one_of: int) -> list[Log]:
+    """Return the logs of which some rows stand in another one, by a sample of all rows."""
+    kept = [sampled_hashes(log, names, one_of) for log in logs]
+    found, count = np.unique(np.concatenate(kept), return_counts=True)
+    twice = found[(count > 1) & (count <= 2 * len(logs))]
+    alike = [int(np.isin(part, twice).sum()) for part in kept]
+    return [log for log, same in zip(logs, alike, strict=True) if same * one_of >= _COPIED]
 
 
 def _copy(
