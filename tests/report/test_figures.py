@@ -176,5 +176,6 @@ def test_a_bred_equation_shows_its_generations(tmp_path: Path) -> None:
     (drawing,) = of_breeding(RunFiles(folder))
     first, second = drawing.figure.axes
     assert [axes.get_title(loc="left") for axes in (first, second)] == ["surge", "yaw"]
-    np.testing.assert_allclose(first.lines[1].get_ydata(), [1.2 / k for k in range(1, 6)])
-    assert list(first.lines[2].get_xdata()) == [4]
+    errors = np.asarray(first.lines[1].get_ydata(), dtype=float)
+    np.testing.assert_allclose(errors, [1.2 / k for k in range(1, 6)])
+    assert np.asarray(first.lines[2].get_xdata()).tolist() == [4]

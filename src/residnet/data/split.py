@@ -220,7 +220,7 @@ def sampled_hashes(log: Log, channels: Sequence[str], one_of: int) -> np.ndarray
     """
     hashes = row_hashes(log, channels)
     forget()
-    return hashes[hashes % np.uint64(one_of) == 0]
+    return np.asarray(hashes[hashes % np.uint64(one_of) == 0])
 
 
 def row_hashes(log: Log, channels: Sequence[str]) -> np.ndarray:
