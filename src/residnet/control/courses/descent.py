@@ -58,7 +58,7 @@ class Linear(NamedTuple):
 
 
 class Problem(Protocol):
-    """What `descend` solves."""
+    """A smooth cost over z [nz] with bounds, equations, and values that must not be negative."""
 
     def least(self) -> Array:
         """Return the smallest z [nz]."""
