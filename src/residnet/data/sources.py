@@ -67,7 +67,7 @@ def read_logs(config: MeasuredLogs | SimulatedTrials) -> Splits:
 
 
 def _all_logs(config: MeasuredLogs) -> dict[Path, Log]:
-    """Return every log of the splits, each read once; after a million samples they lie on disk."""
+    """Return every log of the splits, each read once; after 200,000 samples they lie on disk."""
     reader, files = config.reader.build(), config.split.files()
     out: dict[Path, Log] = {}
     samples = 0

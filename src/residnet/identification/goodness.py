@@ -24,7 +24,7 @@ def goodness_rows(
 ) -> dict[str, list[dict[str, Any]]]:
     """Return statistics of what each model leaves of the measured accelerations, by split.
 
-    Of very many logs as many are taken, evenly spread, as have a million samples.
+    Of very many logs as many are taken, evenly spread, as have 200,000 samples.
 
     Args:
         fitted: models of one fit.
@@ -55,7 +55,7 @@ def goodness_rows(
 
 
 def _some(logs: Sequence[Prepared]) -> Sequence[Prepared]:
-    """Return the logs, or evenly spread ones of a million samples where there are more."""
+    """Return the logs, or evenly spread ones of 200,000 samples where there are more."""
     every = -(-sum(len(log) for log in logs) // paged.LARGE)
     return logs[:: max(every, 1)]
 
