@@ -15,6 +15,7 @@ from tiny import call
 
 from residnet.control.observed.config import PtosConfig
 from residnet.core.config import load_config
+from residnet.report.sections.conditions import cost_verdict
 from residnet.tasks.autopilot.stored import stored_policy
 from residnet.tasks.autopilot.task import AutopilotConfig
 from residnet.tasks.autopilot.tuned import tuned_before
@@ -181,3 +182,14 @@ def test_wrong_configs_are_said_in_a_line(
     path.write_text(yaml.safe_dump({**SMALL, **change}))
     assert call(monkeypatch, "check", path) == 2
     assert words in capsys.readouterr().err
+
+
+def test_the_verdict_begins_with_the_cheapest_policy() -> None:
+    costs = {"a": ("network", 6.3), "b": ("policy", 6.1), "law": ("classical", 6.4)}
+    rows = [
+        {"protocol": "conditions", "model": name, "kind": kind, "cost": {"mean": cost}}
+        for name, (kind, cost) in costs.items()
+    ]
+    first, second = cost_verdict(rows)
+    assert first.startswith("Under the stated conditions 'b' costs 6.100 s a change, 4.7 % below")
+    assert "'a' costs 6.300 s" in second

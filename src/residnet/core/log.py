@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import mmap
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,18 +17,6 @@ from residnet.core.names import CHANNEL_UNITS, nearest
 
 SCHEMA = "residnet.log/1"
 _PIECE = 500_000
-
-
-def forget_pages(values: np.ndarray) -> None:
-    """Give back the memory of a read-only array that lies in a file.
-
-    The array is read again when it is next used; other arrays stay as they are.
-    """
-    owner: Any = values
-    while isinstance(owner, np.ndarray):
-        owner = owner.base
-    if isinstance(owner, mmap.mmap) and not values.flags.writeable:
-        owner.madvise(mmap.MADV_DONTNEED)
 
 
 @dataclass(frozen=True)
@@ -150,7 +137,7 @@ class Log:
                     )
                 )
                 for values in columns.values():
-                    forget_pages(values)
+                    paged.forget_pages(values)
 
     @staticmethod
     def recognises(path: Path) -> bool:

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import final
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -119,7 +120,7 @@ class GatedHead(ResidualHead):
                     for z in _by_manoeuvre(samples.z, samples.group)
                 ]
             )
-        agreed = spread.quantile(_AGREED, dim=0).to(torch.float64)
+        (agreed,) = _quantiles(spread, (_AGREED,))
         self.agreed.copy_(torch.where(agreed > _LEAST, agreed, torch.ones_like(agreed)))
 
     def learn_fade(self, samples: Samples, candidates: Sequence[float]) -> dict[str, list[float]]:
@@ -142,7 +143,7 @@ class GatedHead(ResidualHead):
         whole = torch.zeros(3, dtype=torch.float64)
         fades = torch.tensor(candidates, dtype=torch.float64)[:, None, None]
         for quantile in _BOXES:
-            low, high = samples.z.quantile(quantile, dim=0), samples.z.quantile(1 - quantile, dim=0)
+            low, high = _quantiles(samples.z, (quantile, 1.0 - quantile))
             reach = (0.5 * (high - low)).clamp(min=_LEAST)
             held = torch.minimum(torch.maximum(samples.z, low), high)
             beyond = samples.z - held
@@ -164,6 +165,11 @@ class GatedHead(ResidualHead):
         last = torch.where(worth, torch.arange(len(candidates))[:, None], 0).amax(dim=0)
         self.fade.copy_(fades.flatten()[farther][last])
         return {f"{fade:g}": left[i].tolist() for i, fade in enumerate(candidates)}
+
+
+def _quantiles(values: Tensor, shares: Sequence[float]) -> Tensor:
+    """Return quantiles [Q, n] of columns [N, n]; torch's own take 16 million numbers at most."""
+    return torch.from_numpy(np.quantile(values.double().numpy(), shares, axis=0))
 
 
 def _by_manoeuvre(z: Tensor, group: Tensor) -> list[Tensor]:

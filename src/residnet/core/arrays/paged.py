@@ -67,18 +67,24 @@ def empty(shape: tuple[int, ...], dtype: Any = np.float64) -> np.ndarray:
 
 
 def on_disk(values: np.ndarray) -> np.ndarray:
-    """Return a copy of an array in a file."""
+    """Return a copy of an array in a file; the array itself where it lies in one."""
+    if lies_on_disk(values):
+        return values
     out = empty(values.shape, values.dtype)
     out[...] = values
     return out
 
 
 def lies_on_disk(values: np.ndarray) -> bool:
-    """Return whether an array is one of those in files."""
+    """Return whether an array is a view of a file, one of these or another."""
+    return _file_of(values) is not None
+
+
+def _file_of(values: np.ndarray) -> mmap.mmap | None:
     owner: Any = values
     while isinstance(owner, np.ndarray):
         owner = owner.base
-    return isinstance(owner, mmap.mmap)
+    return owner if isinstance(owner, mmap.mmap) else None
 
 
 def rows(count: int, *shape: int, dtype: torch.dtype = torch.float64) -> Tensor:
@@ -99,4 +105,14 @@ def row_pieces(count: int) -> Iterator[slice]:
 def forget() -> None:
     """Give back the memory of all arrays in files; they are read again when they are next used."""
     for file in list(_files):
+        file.madvise(mmap.MADV_DONTNEED)
+
+
+def forget_pages(values: np.ndarray) -> None:
+    """Give back the memory of one array that lies in a file; others stay as they are.
+
+    So does a file of another's that may be written to: its changes might live in memory alone.
+    """
+    file = _file_of(values)
+    if file is not None and (file in _files or not values.flags.writeable):
         file.madvise(mmap.MADV_DONTNEED)

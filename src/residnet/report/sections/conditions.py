@@ -33,7 +33,7 @@ def best_classical(rows: Sequence[Content]) -> Content:
 
 
 def cost_verdict(rows: Sequence[Content]) -> list[str]:
-    """Return a sentence for each learned policy: its cost beside the best classical one.
+    """Return a sentence for each learned policy, the cheapest first: its cost and the best law's.
 
     Without stated conditions there is none.
     """
@@ -42,7 +42,7 @@ def cost_verdict(rows: Sequence[Content]) -> list[str]:
         return []
     best = best_classical(rows)
     sentences = []
-    for name, row in found.items():
+    for name, row in sorted(found.items(), key=lambda entry: float(entry[1]["cost"]["mean"])):
         off = found.get(f"{name} network off")
         if row["kind"] not in ("policy", "network"):
             continue
