@@ -20,7 +20,7 @@ from residnet.core.samples import Samples
 from residnet.core.stretches import stretch_numbers
 from residnet.data.align import GridConfig, align
 from residnet.data.derivatives import DerivativeConfig, SavitzkyGolay
-from residnet.data.masks import MaskConfig, apply_masks, scored, segments
+from residnet.data.masks import HARD, MaskConfig, apply_masks, scored, segments
 from residnet.data.motion import MotionConfig, complete_motion, fill_sparse
 from residnet.data.outliers import without_spikes
 from residnet.data.plausible import beyond_belief
@@ -122,7 +122,11 @@ def prepare(log: Log, split: str, columns: Sequence[str], config: PrepareConfig)
     usable = scored(log) & (piece >= 0)
     if not usable.any():
         reasons = (
-            ", ".join(f"{reason} {mask.mean():.0%}" for reason, mask in log.masks.items())
+            ", ".join(
+                f"{reason.removeprefix(HARD)} {mask.mean():.0%}"
+                for reason, mask in log.masks.items()
+                if mask.any()
+            )
             or "NaN in a channel that the model needs"
         )
         raise DataError(

@@ -252,6 +252,8 @@ def _yaw(log: Log, motion: Rates) -> Iterator[Finding]:
 
 def _drift(log: Log, causes: dict[str, Cause]) -> Iterator[Finding]:
     """Return the bias, lag and gain of r against psi."""
+    if min(int(np.isfinite(log[name]).sum()) for name in ("psi", "r")) < 2:
+        return
     psi, r = (
         np.interp(log.t, log.t[np.isfinite(values)], values[np.isfinite(values)])
         for values in (log["psi"], log["r"])

@@ -35,12 +35,13 @@ class Rates:
 
 def average_rates(log: Log, moving: list[str]) -> Rates:
     """Return the rates over windows in which the pose moves by several times its noise."""
+    moving = [name for name in moving if np.isfinite(log[name]).any()]
     step, span = float(np.median(np.diff(log.t))), float(log.t[-1] - log.t[0])
-    speed = (
-        float(np.sqrt(np.nanmean(log["u"] ** 2 + log["v"] ** 2)))
-        if "u" in moving and "v" in moving
-        else 0.0
-    )
+    speed = 0.0
+    if "u" in moving and "v" in moving:
+        squares = log["u"] ** 2 + log["v"] ** 2
+        # either may be known where the other is not
+        speed = float(np.sqrt(np.nanmean(squares))) if np.isfinite(squares).any() else 0.0
     turning = float(np.nanstd(log["r"])) if "r" in moving else 0.0
 
     def half(noise: float, rate: float) -> int:

@@ -98,12 +98,14 @@ def _steered(log: Log, names: Sequence[str]) -> float:
 
 def _signs(log: Log, names: Sequence[str]) -> Iterator[Finding]:
     moving = np.abs(log["u"]) > 0.3 * float(np.nanquantile(np.abs(log["u"]), 0.9))
+    if not moving.any():
+        return
     action = "turn it in the channel map (sign: -1)"
     against = [
         name
         for name in names
-        if float(np.mean((log[name] * log["u"])[moving & (log[name] != 0.0)] < 0.0)) > _AGAINST
-        and float(np.mean((log[name] != 0.0)[moving])) > 0.5
+        if float(np.mean((log[name] != 0.0)[moving])) > 0.5
+        and float(np.mean((log[name] * log["u"])[moving & (log[name] != 0.0)] < 0.0)) > _AGAINST
     ]
     if len(against) < len(names) and _turns_one_way(log, moving):
         # a propeller that runs astern beside one that runs ahead is how such a vessel turns

@@ -46,11 +46,12 @@ def neutral_angle(log: Log, name: str) -> Neutral | None:
         return None
     values, spread = found
     effect, effect_error = float(values[1]), float(np.sqrt(spread[1, 1]))
-    if abs(effect) < 4.0 * effect_error:
+    # of a vessel that never moved both are zero
+    if not abs(effect) > 4.0 * effect_error:
         return None
     angle = -float(values[0]) / effect
     gradient = np.array([-1.0 / effect, float(values[0]) / effect**2])
-    error = float(np.sqrt(gradient @ spread[:2, :2] @ gradient))
+    error = float(np.sqrt(max(gradient @ spread[:2, :2] @ gradient, 0.0)))
     return Neutral(angle, error, effect, effect_error)
 
 

@@ -107,9 +107,11 @@ def _block(log: Log, moving: Sequence[str], step: float) -> int:
         size = factor * least
         if size > len(log) // 20:
             break
+        changes = {name: log[name][size:] - log[name][:-size] for name in moving}
         least_change = [
-            float(np.nanstd(log[name][size:] - log[name][:-size])) / max(noise_of(log[name]), 1e-12)
-            for name in moving
+            float(np.nanstd(change)) / max(noise_of(log[name]), 1e-12)
+            for name, change in changes.items()
+            if np.isfinite(change).any()
         ]
         if min(least_change, default=_OVER_NOISE) >= _OVER_NOISE:
             return size

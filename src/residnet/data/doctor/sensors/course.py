@@ -18,7 +18,7 @@ _FEWEST = 100
 
 def course_findings(log: Log, motion: Rates) -> Iterator[Finding]:
     """Return a heading that follows the course over ground where velocities tell of drift."""
-    if any(name not in log.channels for name in ("u", "v")):
+    if any(name not in motion.measured for name in ("u", "v")):
         return
     drift = np.angle(motion.measured["u"] + 1j * motion.measured["v"])
     away = np.exp(-1j * log["psi"])
