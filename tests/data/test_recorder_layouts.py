@@ -170,7 +170,7 @@ def test_days_as_excel_counts_them(tmp_path: Path) -> None:
     ("content", "said"),
     [
         (b"1,2,3\n4,5,6\n7,8,9\n", "no line holds names of columns"),
-        ("a;b\n1;2\n".encode("utf-16"), "UTF-16"),
+        (b"\xff\xfea\x00\x00\xd8;\x00b\x00\n\x001\x00", "not UTF-16 text"),
         (b"name,vessel\na,b\nc,d\n", "names of columns|hold numbers"),
         (
             b"time,Latitude,Longitude\n0,54 18.1N,10 2.3E\n1,54 18.2N,10 2.4E\n",

@@ -12,6 +12,7 @@ from pydantic import Field, field_validator, model_validator
 from residnet.core.config import Config, ExistingPath
 from residnet.core.errors import DataError, UsageError
 from residnet.core.names import nearest, to_si
+from residnet.data.readers.encoding import as_utf8
 from residnet.physics.actuators.identify import (
     fit_step,
     fit_throttle,
@@ -261,7 +262,8 @@ def _read(path: Path, *columns: Column) -> tuple[np.ndarray, ...]:
     import pandas as pd
 
     try:
-        table = pd.read_csv(path, skipinitialspace=True)
+        with as_utf8(path) as file:
+            table = pd.read_csv(file, skipinitialspace=True, encoding="utf-8-sig")
     except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
         raise DataError(
             f"{path}: not a readable csv table ({' '.join(str(error).split())})"

@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from residnet.core.errors import DataError
 from residnet.core.log import Log
 from residnet.data.doctor.findings import Finding
+from residnet.data.readers.encoding import as_utf8
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -69,14 +71,16 @@ def _dated_columns(path: Path) -> pd.DataFrame | None:
             return pd.read_parquet(path, columns=names).head(_ROWS) if names else None
         if path.suffix.lower() not in (".csv", ".txt", ".tsv"):
             return None
-        return pd.read_csv(
-            path,
-            sep=None,
-            engine="python",
-            nrows=_ROWS,
-            usecols=lambda name: bool(_NAMED.search(str(name))),
-        )
-    except (OSError, ValueError, LookupError):
+        with as_utf8(path) as file:
+            return pd.read_csv(
+                file,
+                sep=None,
+                engine="python",
+                nrows=_ROWS,
+                usecols=lambda name: bool(_NAMED.search(str(name))),
+                encoding="utf-8-sig",
+            )
+    except (DataError, OSError, ValueError, LookupError):
         # a file that cannot be read again has no date to tell
         return None
 

@@ -5,7 +5,6 @@ It is guessed from names, units in the header and values.
 
 from __future__ import annotations
 
-import csv
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ import numpy as np
 from residnet.core.config import validate
 from residnet.core.errors import DataError, UsageError
 from residnet.core.names import CHANNEL_UNITS, to_si, units
+from residnet.data.drafting.text_tables import text_table
 from residnet.data.readers.base import LogReader, require_file
 from residnet.data.readers.tables.table import CsvConfig, ParquetConfig
 
@@ -115,8 +115,6 @@ def draft_map(path: Path) -> Draft:
 
 
 def _peek(path: Path) -> tuple[pd.DataFrame, dict[str, Any]]:
-    import pandas as pd
-
     if path.suffix == ".parquet":
         import pyarrow as pa
         import pyarrow.parquet as pq
@@ -129,44 +127,9 @@ def _peek(path: Path) -> tuple[pd.DataFrame, dict[str, Any]]:
                 f"{path}: not a readable Parquet table"
                 f" ({str(error).splitlines()[0] if str(error) else 'no rows'})"
             ) from error
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            head = stream.readline()
-        if not head.strip() or "\x00" in head:
-            raise DataError(
-                f"{path}: the file is empty or no text; a table with a header line was expected"
-            )
-        delimiter = max((",", ";", "\t"), key=head.count)
-        decimal = "," if delimiter != "," and _comma_decimals(path, delimiter) else "."
-        table = pd.read_csv(
-            path,
-            sep=delimiter,
-            decimal=decimal,
-            nrows=_ROWS,
-            encoding="utf-8-sig",
-            skipinitialspace=True,
-            low_memory=False,
-        )
-    except UnicodeDecodeError as error:
-        raise DataError(
-            f"{path}: not UTF-8 text (byte {error.start}); save the file as UTF-8"
-        ) from error
-    except (ValueError, csv.Error) as error:
-        raise DataError(f"{path}: not a regular table ({str(error).splitlines()[0]})") from error
-    about: dict[str, Any] = {
-        "kind": "csv",
-        **({"delimiter": delimiter} if delimiter != "," else {}),
-        **({"decimal": ","} if decimal == "," else {}),
-    }
+    table, about = text_table(path, _ROWS)
     table.columns = [str(name).strip() for name in table.columns]
     return table, about
-
-
-def _comma_decimals(path: Path, delimiter: str) -> bool:
-    with path.open(encoding="utf-8-sig") as stream:
-        stream.readline()
-        cells = stream.readline().split(delimiter)
-    return any(re.fullmatch(r"\s*-?\d+,\d+\s*", cell) for cell in cells)
 
 
 def _numeric(table: pd.DataFrame) -> tuple[dict[str, np.ndarray], list[dict[str, Any]]]:

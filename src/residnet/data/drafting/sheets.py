@@ -31,7 +31,7 @@ class Sheet:
 
     Attributes:
         path: of the file.
-        about: settings of its reader beside time and channels: kind, delimiter, decimal, encoding.
+        about: settings of its reader beside time and channels: kind, delimiter, decimal.
         header: names of all columns.
         numbers: values [T] of the columns that hold numbers.
         texts: columns that hold text, dates among them.

@@ -1,8 +1,7 @@
-"""The first rows of a text table whose form nobody described: delimiter, decimals, encoding."""
+"""The first rows of a text table whose form nobody described: names, delimiter, decimals."""
 
 from __future__ import annotations
 
-import codecs
 import csv
 import re
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from residnet.core.errors import DataError
 from residnet.core.names import shown
+from residnet.data.readers.encoding import as_utf8
 from residnet.data.readers.tables.header import BLANKS, cells_of, found_header
 from residnet.data.readers.tables.pieces import numbered
 
@@ -20,8 +20,6 @@ _HEAD = 1 << 16
 _SEARCHED = 60
 """Lines among which names of columns are looked for."""
 _BEYOND = "beyond the last column"
-_JAPANESE = re.compile(r"[\u3040-\u30ff\u4e00-\u9fff]")
-_LATIN = re.compile(r"[\x00-\x7fÀ-ÿ°º²³µ·±´×–’]*")
 _COMMA = re.compile(r"\s*-?\d+,\d+(?:[eE][-+]?\d+)?\s*")
 _POINT = re.compile(r"\s*-?\d+\.\d+(?:[eE][-+]?\d+)?\s*")
 
@@ -34,14 +32,17 @@ def text_table(path: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]]:
     Raises:
         DataError: where it is empty or no table.
     """
+    with as_utf8(path) as file:
+        return _first_rows(path, file, rows)
+
+
+def _first_rows(path: Path, file: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]]:
+    """Return the first rows of a table whose text stands in `file` as UTF-8."""
     import pandas as pd
 
-    with path.open("rb") as stream:
+    with file.open("rb") as stream:
         head = stream.read(_HEAD)
-    if head[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
-        raise DataError(f"{path}: is UTF-16 text; save it as UTF-8 (in Excel: CSV UTF-8)")
-    encoding = _encoding(head)
-    lines = head.decode(encoding, errors="replace").removeprefix("\ufeff").splitlines()
+    lines = head.decode("utf-8-sig", errors="replace").splitlines()
     lines = lines[:-1] if len(head) == _HEAD else lines
     if not any(line.strip() for line in lines) or b"\x00" in head:
         raise DataError(
@@ -52,14 +53,14 @@ def text_table(path: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]]:
     names = numbered(form.names)
     try:
         table = pd.read_csv(
-            path,
+            file,
             sep=r"\s+" if form.delimiter == BLANKS else form.delimiter,
             decimal=decimal,
             header=None,
             names=[*names, _BEYOND],
             skiprows=form.above,
             nrows=rows,
-            encoding="utf-8-sig" if encoding == "utf-8" else encoding,
+            encoding="utf-8-sig",
             skipinitialspace=True,
             index_col=False,
             low_memory=False,
@@ -71,7 +72,6 @@ def text_table(path: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]]:
     about: dict[str, Any] = {"kind": "csv"}
     about |= {"delimiter": form.delimiter} if form.delimiter != "," else {}
     about |= {"decimal": ","} if decimal == "," else {}
-    about |= {"encoding": encoding} if encoding != "utf-8" else {}
     return table, about
 
 
@@ -118,23 +118,6 @@ def _form(path: Path, lines: list[str]) -> _Form:
             f" between them that stands between numbers (its first line: '{shown(lines[0], 60)}')"
         )
     return max(found, key=lambda entry: entry[:2])[2]
-
-
-def _encoding(head: bytes) -> str:
-    """Return the encoding of a text from its first bytes."""
-    whole = head[: head.rfind(b"\n") + 1] or head
-    try:
-        whole.decode("utf-8")
-        return "utf-8"
-    except UnicodeDecodeError:
-        # a Latin letter and the next one may look like one Japanese sign, but not the other way
-        if _LATIN.fullmatch(whole.decode("cp1252", errors="replace")):
-            return "cp1252"
-    try:
-        japanese = _JAPANESE.search(whole.decode("cp932"))
-    except UnicodeDecodeError:
-        japanese = None
-    return "cp932" if japanese else "cp1252"
 
 
 def _as_wide(row: list[str], names: list[str]) -> bool:

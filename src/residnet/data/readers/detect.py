@@ -14,6 +14,7 @@ from residnet.data.readers.base import LogReader, require_file
 from residnet.data.readers.composing.clocks import align_clocks
 from residnet.data.readers.composing.composed import RecordingConfig
 from residnet.data.readers.composing.wanted import EVERYTHING, Wanted
+from residnet.data.readers.encoding import encoding_of_head
 from residnet.data.readers.recorders.ardupilot import ArduPilotConfig
 from residnet.data.readers.recorders.hdf5 import Hdf5Config, is_hdf5
 from residnet.data.readers.recorders.mat import MatConfig
@@ -31,6 +32,11 @@ _ULOG = b"ULog\x01\x12\x35"
 _DATAFLASH = b"\xa3\x95\x80"
 # a sentence with its checksum at the start of a line, or behind a time
 _NMEA = re.compile(rb"(?m)^[^$!\n]{0,40}[$!][A-Z]{2}[A-Z]{3},[\x20-\x7e]*\*[0-9A-Fa-f]{2}\s*$")
+
+
+def _text(head: bytes) -> bytes:
+    """Return the first bytes of a text as UTF-8."""
+    return head.decode(encoding_of_head(head), errors="replace").encode("utf-8")
 
 
 @dataclass(frozen=True)
@@ -59,7 +65,7 @@ FORMATS: tuple[Format, ...] = (
     ),
     Format("PX4 ULog", lambda path, head: head.startswith(_ULOG), UlogConfig),
     Format("ArduPilot log", lambda path, head: head.startswith(_DATAFLASH), ArduPilotConfig),
-    Format("NMEA 0183", lambda path, head: _NMEA.search(head) is not None, NmeaConfig),
+    Format("NMEA 0183", lambda path, head: _NMEA.search(_text(head)) is not None, NmeaConfig),
     Format(
         "MATLAB",
         lambda path, head: head.startswith(_MAT5) or path.suffix.lower() == ".mat",

@@ -5,8 +5,10 @@ from __future__ import annotations
 import datetime
 import re
 from array import array
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal, final
+from typing import Any, BinaryIO, Literal, final
 
 import numpy as np
 
@@ -15,6 +17,7 @@ from residnet.core.stretches import stretch_bounds
 from residnet.data.readers.base import require_file
 from residnet.data.readers.composing.composed import RecordingConfig
 from residnet.data.readers.composing.wanted import EVERYTHING, Wanted
+from residnet.data.readers.encoding import as_utf8, encoding_of_head
 from residnet.data.readers.files import missing_package, progress
 from residnet.data.readers.recording import Recording, Remark, Series, remark
 from residnet.data.readers.stamps import parse_texts
@@ -23,6 +26,7 @@ _SENTENCE = re.compile(rb"^(?P<before>[^$!]*)(?P<sentence>[$!][A-Z]{2}[A-Z0-9]{2
 _PER_MINUTE = {"rate_of_turn": 1.0 / 60.0}
 _DAY = 86_400 * 10**9
 _REPORT_EVERY = 5000
+_HEAD = 1024
 
 
 @final
@@ -59,11 +63,11 @@ def load_nmea(path: Path, wanted: Wanted = EVERYTHING) -> Recording:
         raise missing_package("nmea", "pynmea2", "a file of NMEA 0183 sentences") from error
     lines = _Lines()
     size, done, bad = path.stat().st_size, 0, 0
-    with path.open("rb") as stream, progress(path.name, size, size) as advance:
+    with _sentences(path) as stream, progress(path.name, size, size) as advance:
         for count, line in enumerate(stream):
             done += len(line)
             if count % _REPORT_EVERY == 0:
-                advance(done)
+                advance(min(done, size))
             match = _SENTENCE.match(line)
             if match is None:
                 bad += bool(line.strip())
@@ -82,6 +86,15 @@ def load_nmea(path: Path, wanted: Wanted = EVERYTHING) -> Recording:
             f"{path}: holds no NMEA 0183 sentence ({bad} lines are none, or fail their checksum)"
         )
     return lines.recording(path, bad)
+
+
+@contextmanager
+def _sentences(path: Path) -> Iterator[BinaryIO]:
+    """Yield the lines of a file; a shell of Windows may have written them as UTF-16."""
+    with path.open("rb") as stream:
+        encoding = encoding_of_head(stream.read(_HEAD))
+    with as_utf8(path, encoding) as file, file.open("rb") as stream:
+        yield stream
 
 
 @final

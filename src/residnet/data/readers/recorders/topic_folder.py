@@ -15,6 +15,7 @@ from residnet.data.drafting.words import state_channel, words_of
 from residnet.data.readers.base import require_file
 from residnet.data.readers.composing.composed import RecordingConfig
 from residnet.data.readers.composing.wanted import EVERYTHING, Wanted
+from residnet.data.readers.encoding import as_utf8, encoding_of_head
 from residnet.data.readers.files import progress, total_size
 from residnet.data.readers.recording import Recording, Remark, Series, key_of, remark
 from residnet.data.readers.spool import LARGE
@@ -83,7 +84,8 @@ def load_folder(
             if not take(name):
                 listed.append(name)
                 continue
-            table, said = _read(file, name, time, delimiter, take)
+            with as_utf8(file) as text:
+                table, said = _read(text, name, time, delimiter, take)
             remarks += said
             done += file.stat().st_size
             advance(done)
@@ -123,7 +125,9 @@ def is_topic_folder(path: Path) -> bool:
         file for file in path.rglob("*") if file.suffix.lower() in _ENDINGS and file.is_file()
     )[:200]:
         with file.open("rb") as stream:
-            heads.append(stream.readline(10_000).decode("utf-8", errors="replace").strip())
+            head = stream.read(10_000)
+        lines = head.decode(encoding_of_head(head), errors="replace").splitlines()
+        heads.append(lines[0].removeprefix("\ufeff").strip() if lines else "")
     full = [head for head in heads if head]
     stamped = any(_stamp_columns(head.split(",")) is not None for head in full)
     timed = [head for head in full if set(head.split(",")) & set(_ARRIVAL)]

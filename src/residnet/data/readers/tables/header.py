@@ -55,13 +55,19 @@ def measures(cell: str) -> bool:
     return bool(_NUMBER.fullmatch(cell) or _TIME.match(cell))
 
 
-def header_with(path: Path, delimiter: str, encoding: str, columns: Sequence[str]) -> Header:
+def header_with(path: Path, delimiter: str, file: Path, columns: Sequence[str]) -> Header:
     """Return the first line of a text table that holds all the names; else its first line.
+
+    Args:
+        path: of the table, for messages.
+        delimiter: between cells.
+        file: that holds its text as UTF-8.
+        columns: names that are looked for.
 
     Raises:
         DataError: where the first line is blank or no line of cells.
     """
-    with path.open(newline="", encoding=encoding) as stream:
+    with file.open(newline="", encoding="utf-8-sig") as stream:
         rows: list[tuple[int, list[str]]] = []
         try:
             if delimiter == BLANKS:

@@ -23,16 +23,19 @@ _TAIL = 1 << 16
 _NEWLINE, _RETURN, _QUOTE = 0x0A, b"\r", b'"'
 
 
-def check_lines(path: Path, delimiter: str, header: Sequence[str], above: int = 1) -> bool:
+def check_lines(
+    path: Path, delimiter: str, header: Sequence[str], above: int = 1, file: Path | None = None
+) -> bool:
     """Look at every line of values, as many cells each as the header; blank lines do not count.
 
     A delimiter more or less at the end of every line makes no cell.
 
     Args:
-        path: of the file.
+        path: of the table.
         delimiter: between cells.
         header: names of the columns.
         above: number of lines above the values.
+        file: that holds its text as UTF-8; None for `path` itself.
 
     Returns:
         Whether the last line must be left out because the file was cut within it: it has no end,
@@ -41,11 +44,11 @@ def check_lines(path: Path, delimiter: str, header: Sequence[str], above: int = 
     Raises:
         DataError: where a line has more or fewer cells than the header, or a byte is zero.
     """
-    wide = len(header)
+    wide, file = len(header), file or path
     # names that are missing at the end are those of cells that are not there
     named = max((i for i, name in enumerate(header, start=1) if name), default=wide)
-    cut, line = _cut_short(path, delimiter, named), 0
-    for block, last in _blocks(path):
+    cut, line = _cut_short(file, delimiter, named), 0
+    for block, last in _blocks(file):
         if b"\x00" in block:
             at = line + block[: block.index(b"\x00")].count(b"\n") + 1
             raise DataError(

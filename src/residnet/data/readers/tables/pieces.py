@@ -10,6 +10,7 @@ import numpy as np
 
 from residnet.core.errors import DataError, UsageError
 from residnet.core.names import nearest, shown
+from residnet.data.readers.encoding import as_utf8
 from residnet.data.readers.files import missing_package
 from residnet.data.readers.tables.header import BLANKS, found_header, header_with
 from residnet.data.readers.tables.lines import check_lines
@@ -42,7 +43,11 @@ def _positions(
 
 
 def read_csv(
-    path: Path, columns: Sequence[str], delimiter: str, decimal: str, encoding: str = "utf-8"
+    path: Path,
+    columns: Sequence[str],
+    delimiter: str,
+    decimal: str,
+    encoding: str | None = None,
 ) -> Pieces:
     """Yield the wanted columns of a text table piece by piece, with the share of the file read.
 
@@ -51,29 +56,33 @@ def read_csv(
         columns: names of the wanted columns, in order.
         delimiter: between cells.
         decimal: sign of the decimals.
-        encoding: of the text.
+        encoding: of the text; None finds it.
 
     Raises:
         UsageError: where a column is missing.
         DataError: where the file is empty, not text of this encoding or not a regular table.
     """
+    with as_utf8(path, encoding) as file:
+        yield from _csv_pieces(path, file, columns, delimiter, decimal)
+
+
+def _csv_pieces(
+    path: Path, file: Path, columns: Sequence[str], delimiter: str, decimal: str
+) -> Pieces:
+    """Yield the wanted columns of a table whose text stands in `file` as UTF-8."""
     import pandas as pd
 
-    # a byte order mark is no part of the first name
-    coded = "utf-8-sig" if encoding == "utf-8" else encoding
     try:
-        head = header_with(path, delimiter, coded, columns)
+        head = header_with(path, delimiter, file, columns)
         one = f" (only one column found; is the delimiter really '{delimiter}'?)"
         header = head.names
         where = _positions(path, header, columns, one if len(header) == 1 else "")
         # one column more than the header: cells beyond it would shift or vanish silently (a decimal
         # comma in a comma table does that)
-        wide, size = len(header), max(1, path.stat().st_size)
-        cut = check_lines(path, delimiter, header, head.above)
-        with path.open("rb") as stream_of_bytes:
-            pieces = pd.read_csv(
-                stream_of_bytes, encoding=coded, **_form(delimiter, decimal, head.above, wide)
-            )
+        wide, size = len(header), max(1, file.stat().st_size)
+        cut = check_lines(path, delimiter, header, head.above, file)
+        with file.open("rb") as stream_of_bytes:
+            pieces = pd.read_csv(stream_of_bytes, **_form(delimiter, decimal, head.above, wide))
             for table, last in _with_last(pieces):
                 beyond = np.flatnonzero(table[wide].notna().to_numpy())
                 if beyond.size:
@@ -90,8 +99,8 @@ def read_csv(
                 yield wanted, min(1.0, stream_of_bytes.tell() / size)
     except UnicodeDecodeError as error:
         raise DataError(
-            f"{path}: not {encoding.upper()} text (byte {error.start}); save the file as UTF-8, or"
-            " give its `encoding`"
+            f"{path}: not UTF-8 text (byte {error.start}); save the file as UTF-8, or give its"
+            " `encoding`"
         ) from error
     except pd.errors.EmptyDataError:
         return
@@ -106,6 +115,8 @@ def read_csv(
 def _form(delimiter: str, decimal: str, above: int, wide: int) -> dict[str, Any]:
     """Return how pandas reads the values of a table, one column beyond the header's included."""
     return {
+        # a byte order mark is no part of the first name
+        "encoding": "utf-8-sig",
         "sep": r"\s+" if delimiter == BLANKS else delimiter,
         "decimal": decimal,
         "header": None,

@@ -123,22 +123,25 @@ class CsvConfig(_TableConfig):
     Attributes:
         delimiter: between cells; a blank stands for any number of blanks and tabulators.
         decimal: sign of the decimals, `.` or `,`.
-        encoding: of the text, for example `cp1252` for a file that an older Windows wrote.
+        encoding: of the text, for example `cp1252` for a file that an older Windows wrote; null
+            finds it by the bytes themselves, UTF-16 and Japanese (cp932) included.
     """
 
     kind: Literal["csv"] = "csv"
     delimiter: str = Field(default=",", min_length=1, max_length=1)
     decimal: Literal[".", ","] = "."
-    encoding: str = "utf-8"
+    encoding: str | None = None
 
     @field_validator("encoding")
     @classmethod
-    def _known_encoding(cls, encoding: str) -> str:
+    def _known_encoding(cls, encoding: str | None) -> str | None:
+        if encoding is None:
+            return None
         try:
             return codecs.lookup(encoding).name
         except LookupError as error:
             raise ValueError(
-                f"no encoding is called '{encoding}'; usual are utf-8, cp1252 and cp932"
+                f"no encoding is called '{encoding}'; usual are utf-8, utf-16, cp1252 and cp932"
             ) from error
 
     def build(self) -> TableReader:

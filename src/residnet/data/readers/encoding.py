@@ -1,0 +1,134 @@
+"""Text files of any encoding, read as UTF-8: the encoding is found by the bytes themselves."""
+
+from __future__ import annotations
+
+import codecs
+import re
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from residnet.core.errors import DataError
+
+_BLOCK = 1 << 20
+_HEAD = 1 << 16
+# the longer marks first: one of UTF-32 begins as one of UTF-16 does
+_MARKS = {
+    codecs.BOM_UTF8: "utf-8",
+    codecs.BOM_UTF32_LE: "utf-32",
+    codecs.BOM_UTF32_BE: "utf-32",
+    codecs.BOM_UTF16_LE: "utf-16",
+    codecs.BOM_UTF16_BE: "utf-16",
+}
+_JAPANESE = re.compile(r"[\u3040-\u30ff\u4e00-\u9fff]")
+_LATIN = re.compile(r"[\x00-\x7fÀ-ÿ°º²³µ·±´×–’]*")
+_ASCII = bytes(range(128))
+
+
+def encoding_of(path: Path) -> str:
+    """Return the encoding of a text file: by its byte order mark, else by what its bytes can be.
+
+    Text without a mark is UTF-8 where all of it can be, else UTF-16, Japanese (cp932) or Western
+    European (cp1252).
+    """
+    with path.open("rb") as stream:
+        head = stream.read(_HEAD)
+        marked = next((name for mark, name in _MARKS.items() if head.startswith(mark)), None)
+        if marked is not None:
+            return marked
+        wide = _without_mark(head)
+        if wide is not None:
+            return wide
+        stream.seek(0)
+        return _of_bytes(_first_beyond_utf8(stream))
+
+
+def encoding_of_head(head: bytes) -> str:
+    """Return the encoding of a text from its first bytes alone."""
+    marked = next((name for mark, name in _MARKS.items() if head.startswith(mark)), None)
+    return marked or _without_mark(head) or "utf-8"
+
+
+@contextmanager
+def as_utf8(path: Path, encoding: str | None = None) -> Iterator[Path]:
+    """Yield a file that holds the text of `path` in UTF-8, perhaps behind a byte order mark.
+
+    It is `path` itself where that is UTF-8, or else a temporary one, gone after the context.
+
+    Args:
+        path: of the text.
+        encoding: its name; None finds it.
+
+    Raises:
+        DataError: where the text is not of this encoding.
+    """
+    name = codecs.lookup(encoding or encoding_of(path)).name
+    if name in ("utf-8", "utf-8-sig", "ascii"):
+        yield path
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder) / path.name
+        _copy(path, copy, name)
+        yield copy
+
+
+def _copy(path: Path, copy: Path, encoding: str) -> None:
+    """Write the text of `path` as UTF-8; half a sign at the end of a file that was cut is left."""
+    decoder = codecs.getincrementaldecoder(encoding)()
+    done = 0
+    with path.open("rb") as stream, copy.open("wb") as out:
+        while block := stream.read(_BLOCK):
+            try:
+                out.write(decoder.decode(block).encode("utf-8"))
+            except UnicodeError as error:
+                at = done + getattr(error, "start", 0)
+                raise DataError(
+                    f"{path}: not {encoding.upper()} text (near byte {at}); save the file as UTF-8,"
+                    " or give its `encoding`"
+                ) from error
+            done += len(block)
+
+
+def _without_mark(head: bytes) -> str | None:
+    """Return UTF-16 in one of its orders where every other byte is zero; None for other text."""
+    if len(head) < 4 or b"\x00" not in head:
+        return None
+    values = np.frombuffer(head[: len(head) // 2 * 2], dtype=np.uint8).reshape(-1, 2)
+    first, second = (values == 0).mean(axis=0)
+    if second > 0.5 and first < 0.01:
+        return "utf-16-le"
+    return "utf-16-be" if first > 0.5 and second < 0.01 else None
+
+
+def _first_beyond_utf8(stream: BinaryIO) -> bytes:
+    """Return the first block that is no UTF-8, whole lines of it; empty where all of it is."""
+    decoder = codecs.getincrementaldecoder("utf-8")()
+    while block := stream.read(_BLOCK):
+        try:
+            if not (block.isascii() and decoder.getstate()[0] == b""):
+                decoder.decode(block)
+        except UnicodeDecodeError:
+            return block[: block.rfind(b"\n") + 1] or block
+    return b""
+
+
+def _of_bytes(block: bytes) -> str:
+    """Return the encoding of bytes that are no UTF-8; UTF-8 for none."""
+    if not block:
+        return "utf-8"
+    beyond = block.translate(None, _ASCII)
+    # a Latin letter and the next one may look like one Japanese sign, but not the other way
+    if _LATIN.fullmatch(beyond.decode("cp1252", errors="replace")):
+        return "cp1252"
+    for name, likely in (("cp932", _JAPANESE), ("cp1252", re.compile(""))):
+        try:
+            if likely.search(block.decode(name)):
+                return name
+        except UnicodeDecodeError:
+            continue
+    # it gives every byte a sign: numbers can be read, and names stay names
+    return "latin-1"
