@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,13 @@ import pytest
 import yaml
 from tiny_tasks import boat
 
+from residnet.core.config import validate
 from residnet.core.errors import DataError
+from residnet.core.log import Log
+from residnet.data.drafting.questions import Marks
+from residnet.data.drafting.tables import draft_tables
+from residnet.data.readers import ReaderConfig
+from residnet.data.readers.tables.angles import degrees_of
 from residnet.data.readers.tables.table import CsvConfig
 from residnet.tasks.drafting.draft import drafted
 
@@ -90,3 +97,85 @@ def test_a_first_line_without_end_is_no_header(tmp_path: Path) -> None:
     )
     with pytest.raises(DataError, match="line 1 is no header"):
         config.build().read(file)
+
+
+@pytest.mark.parametrize(
+    "cell",
+    [
+        "59°54.321'N", "5954.321,N", "59 54 19.26 N", "59° 54′ 19.26″ n", "N 59° 54.321'",
+        "59-54.321N", "59:54:19.26", "59.90535 N", "59°54,321'N", "59deg 54min 19.26sec N",
+        "59d54m19.26N", "59°54'19.26''N", "+59 54.321", "59º54.321´N", "59.90535°",
+    ],
+)  # fmt: skip
+def test_ways_to_write_a_latitude(cell: str) -> None:
+    form = "ddmm" if "5954" in cell else "number"
+    np.testing.assert_allclose(degrees_of(pd.Series([cell, None]), "latitude", form)[0], 59.90535)
+    if cell.startswith("N") or cell[-1] in "Nn":
+        south = cell.replace("N", "S") if "N" in cell else f"{cell[:-1]}s"
+        np.testing.assert_allclose(degrees_of(pd.Series([south]), "latitude", form), -59.90535)
+
+
+@pytest.mark.parametrize(
+    ("cell", "said"),
+    [
+        ("59°64.321'N", "is no latitude"),
+        ("59.5 54 N", "is no latitude"),
+        ("N59S", "is no latitude"),
+        ("-59N", "is no latitude"),
+        ("59E", "no hemisphere of latitude"),
+        ("10 30 O", "O is east to some"),
+        ("noon", "is no latitude"),
+    ],
+)
+def test_what_is_no_latitude(cell: str, said: str) -> None:
+    with pytest.raises(DataError, match=said):
+        degrees_of(pd.Series(["59N", cell]), "latitude")
+
+
+def minutes(value: float, side: str) -> str:
+    return f"{int(value)}°{value % 1 * 60:.7f}'{side}"
+
+
+def seconds(value: float, side: str) -> str:
+    return f"{int(value)} {int(value % 1 * 60)} {value % 1 * 60 % 1 * 60:.5f} {side}"
+
+
+def packed(value: float, side: str) -> str:
+    return f"{100 * int(value) + value % 1 * 60:.7f},{side}"
+
+
+@pytest.mark.parametrize("write", [minutes, seconds, packed])
+def test_written_positions_are_drafted_and_read(
+    write: Callable[[float, str], str], tmp_path: Path
+) -> None:
+    """South-west of the origin, so that both signs turn."""
+    made, file = table(3), tmp_path / "log.csv"
+    plain = made.assign(Lat=-made["Lat"], Lon=-made["Lon"])
+    plain.to_csv(tmp_path / "plain.csv", index=False)
+    written = made.assign(
+        Lat=[write(value, "S") for value in made["Lat"]],
+        Lon=[write(value, "W") for value in made["Lon"]],
+    )
+    written.to_csv(file, index=False)
+    read = [_read(path)[0] for path in (file, tmp_path / "plain.csv")]
+    for name in ("x", "y"):
+        np.testing.assert_allclose(read[0][name], read[1][name], atol=2e-3)
+
+
+def test_numbers_with_minutes_and_letters_beside_them(tmp_path: Path) -> None:
+    made, file = table(3), tmp_path / "log.csv"
+    made.to_csv(tmp_path / "plain.csv", index=False)
+    numbers = {
+        name: [100 * int(value) + value % 1 * 60 for value in made[name]] for name in ("Lat", "Lon")
+    }
+    made.assign(**numbers, NS="N", EW="E").to_csv(file, index=False)
+    log, marks = _read(file)
+    for name in ("x", "y"):
+        np.testing.assert_allclose(log[name], _read(tmp_path / "plain.csv")[0][name], atol=2e-3)
+    assert any("degrees and minutes in one" in text for _, text in marks.guesses)
+
+
+def _read(file: Path) -> tuple[Log, Marks]:
+    marks = Marks()
+    content = draft_tables([file], marks).content
+    return validate(content, ReaderConfig, "here").build().read(file), marks

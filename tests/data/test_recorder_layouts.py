@@ -173,8 +173,8 @@ def test_days_as_excel_counts_them(tmp_path: Path) -> None:
         (b"\xff\xfea\x00\x00\xd8;\x00b\x00\n\x001\x00", "not UTF-16 text"),
         (b"name,vessel\na,b\nc,d\n", "names of columns|hold numbers"),
         (
-            b"time,Latitude,Longitude\n0,54 18.1N,10 2.3E\n1,54 18.2N,10 2.4E\n",
-            "54 18.1N.*degrees with decimals|fewer than two",
+            b"time,speed,Latitude,Longitude\n0,1,54 68.1N,10 2.3E\n1,2,54 18.2N,10 2.4E\n",
+            "54 68.1N.*forms that are read",
         ),
     ],
 )

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from residnet.core.errors import DataError, UsageError
-from residnet.core.names import CHANNEL_UNITS, shown
+from residnet.core.names import CHANNEL_UNITS
 from residnet.data.drafting.channels import CHANNELS, READER, STATE_NAMES, Channels
 from residnet.data.drafting.clocks import Clock, clock_of
 from residnet.data.drafting.fixes import from_fixes
@@ -18,6 +18,7 @@ from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.sheets import Sheet, peek
 from residnet.data.drafting.units import other_dimension
 from residnet.data.drafting.words import input_channel, state_channel, words_of
+from residnet.data.drafting.written import refuse_written_positions, with_degrees
 
 _LOOKED_AT = 24
 """Tables whose values are looked at; of the others only the header is."""
@@ -50,7 +51,8 @@ def draft_tables(files: Sequence[Path], marks: Marks) -> TableDraft:
         DataError: where none can be read, or none has a time.
     """
     sheets, left_out = _sheets(files)
-    first = sheets[0]
+    first, written = with_degrees(sheets[0], marks)
+    sheets = [first, *(with_degrees(sheet, Marks())[0] for sheet in sheets[1:])]
     shared = [name for name in first.header if all(name in sheet.header for sheet in sheets)]
     lost = sorted({name for sheet in sheets for name in sheet.header} - set(shared))
     if lost:
@@ -62,12 +64,13 @@ def draft_tables(files: Sequence[Path], marks: Marks) -> TableDraft:
         marks.guess((*READER, "time"), clock.guess)
     numeric = [name for name in shared if name in first.numbers and name not in clock.columns]
     names = named(numeric, marks)
-    _refuse_written_positions(first, names)
+    refuse_written_positions(first, names)
     logs = _raw(sheets, names, left_out)
     names, logs, fixes = from_fixes(names, logs, marks)
     channels = Channels(names, logs, marks, fixes).drafted()
     for entry in channels.values():
-        entry["column"] = first.column(entry["column"])
+        settings = written.get(entry["column"], {})
+        entry |= {"column": first.column(entry["column"]), **settings}
     about = {key: value for key, value in first.about.items() if key != "kind"}
     time = {**clock.settings, "column": first.column(clock.settings["column"])}
     content = {"kind": first.about["kind"], **about, "time": time}
@@ -77,21 +80,6 @@ def draft_tables(files: Sequence[Path], marks: Marks) -> TableDraft:
     _unused(first, names, clock, marks)
     kept = tuple(path for path in files if path not in left_out)
     return TableDraft({**content, "channels": channels}, kept, left_out)
-
-
-def _refuse_written_positions(sheet: Sheet, names: Mapping[str, str]) -> None:
-    """Refuse positions of degrees and minutes where there are no others."""
-    found = [
-        name
-        for name in sheet.texts
-        if state_channel(words_of(name)) in ("latitude", "longitude") and "x" not in names
-    ]
-    if found and not {"latitude", "longitude"} <= set(names):
-        cell = sheet.texts[found[0]].dropna().iloc[0]
-        raise DataError(
-            f"{sheet.path}: column '{found[0]}' holds '{shown(str(cell))}', which is no number;"
-            " write latitude and longitude as degrees with decimals, for example 54.30125"
-        )
 
 
 def _sheets(files: Sequence[Path]) -> tuple[list[Sheet], dict[Path, str]]:

@@ -12,6 +12,7 @@ from residnet.core.errors import UsageError
 from residnet.core.names import CHANNEL_UNITS
 from residnet.core.units import known_unit, si_unit, to_si
 from residnet.data.readers.base import unwrap
+from residnet.data.readers.tables.angles import Form
 
 Frame = Literal["as_measured", "ned", "enu", "body_fsd", "body_fpu"]
 
@@ -103,9 +104,33 @@ class ChannelMap(Conversion):
 
     Attributes:
         column: name of the column, as the file's header has it.
+        form: of numbers that are angles: `number`, or `ddmm` for degrees and minutes in one, as
+            receivers write 5954.321 for 59 degrees and 54.321 minutes. Latitudes and longitudes
+            such as `59°54.321'N` or `59 54 19.3 N` are read in either case.
+        hemisphere: column with the letters N and S or E and W that belong to the numbers; null
+            where there is none.
     """
 
     column: str
+    form: Form = "number"
+    hemisphere: str | None = None
+
+    @property
+    def is_angle(self) -> bool:
+        """Whether its cells may be degrees with minutes or letters."""
+        return self.form != "number" or self.hemisphere is not None
+
+    def require_fit(self, name: str) -> None:
+        """Stop where this cannot be the channel `name`; see `Conversion.require_fit`.
+
+        Raises:
+            ValueError: also where degrees with minutes are in another unit.
+        """
+        super().require_fit(name)
+        if self.is_angle and known_unit(self.unit) != "deg":
+            raise ValueError(
+                f"channel {name}: `form` and `hemisphere` are for degrees; set unit: deg"
+            )
 
 
 def factor(unit: str, expected: str | None) -> float:

@@ -43,7 +43,7 @@ def with_positions(
     if units[LATITUDE] != "rad" or most > np.pi / 2:
         raise DataError(
             f"{path}: latitude reaches {np.degrees(most):.4g} deg, which none does; give the unit"
-            " of its column (deg), and degrees with decimals"
+            " of its column (deg), and `form: ddmm` for degrees and minutes in one number"
         )
     first = int(np.argmax(known))
     origin = float(latitude[first]), float(longitude[first])

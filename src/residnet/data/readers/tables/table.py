@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import codecs
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, final
 
@@ -28,9 +28,10 @@ from residnet.data.readers.base import (
 from residnet.data.readers.files import progress
 from residnet.data.readers.recording import remark
 from residnet.data.readers.spool import LARGE
+from residnet.data.readers.tables.angles import degrees_of, side_signs
 from residnet.data.readers.tables.channel_map import ChannelMap, factor
 from residnet.data.readers.tables.dates import DateClock, Order, zone_of
-from residnet.data.readers.tables.fixes import with_positions
+from residnet.data.readers.tables.fixes import LATITUDE, LONGITUDE, with_positions
 from residnet.data.readers.tables.pieces import Pieces, read_csv, read_excel, read_parquet
 from residnet.data.readers.tables.rows import Rows
 
@@ -184,6 +185,13 @@ class ParquetConfig(_TableConfig):
         return TableReader(self, read_parquet, lambda i: f"row {i + 1}")
 
 
+def _is_text_position(name: str, cells: pd.Series) -> bool:
+    """Return whether a column holds positions that are no numbers."""
+    import pandas as pd
+
+    return name in (LATITUDE, LONGITUDE) and not pd.api.types.is_numeric_dtype(cells)
+
+
 @final
 class TableReader(LogReader):
     """Reads a table by its channel map, piece by piece.
@@ -223,6 +231,8 @@ class TableReader(LogReader):
         if time.unit == DATE:
             dates = DateClock(time.zone, time.order)
         columns = [*time.columns, *(entry.column for entry in maps.values())]
+        sides = [entry.hemisphere for entry in maps.values() if entry.hemisphere]
+        place = {column: i for i, column in enumerate([*columns, *sides])}
         size = path.stat().st_size
         rows = Rows(
             path,
@@ -233,7 +243,7 @@ class TableReader(LogReader):
         )
         read, cut = 0, False
         with progress(path.name, size, 1.0) as advance:
-            for piece, share in self._load(path, columns):
+            for piece, share in self._load(path, [*columns, *sides]):
                 cut |= bool(piece.attrs.get("cut"))
                 # rows are called by their lines in the file
                 row, first = read + int(piece.attrs.get("above", 0)), len(time.columns)
@@ -243,8 +253,10 @@ class TableReader(LogReader):
                     else self._numbers(path, piece.iloc[:, 0], time.column, row)
                 )
                 measured = [
-                    self._numbers(path, piece.iloc[:, i], columns[i], row)
-                    for i in range(first, len(columns))
+                    self._angles(path, piece, name, place)
+                    if entry.is_angle or _is_text_position(name, piece.iloc[:, i])
+                    else self._numbers(path, piece.iloc[:, i], entry.column, row)
+                    for i, (name, entry) in enumerate(maps.items(), start=first)
                 ]
                 rows.add([clock, *measured], row)
                 read += len(piece)
@@ -276,6 +288,23 @@ class TableReader(LogReader):
             return dates.seconds(cells.iloc[:, 0], cells.iloc[:, 1] if cells.shape[1] > 1 else None)
         except DataError as error:
             raise DataError(f"{path}: column '{cells.columns[0]}': {error}") from None
+
+    def _angles(
+        self, path: Path, piece: pd.DataFrame, name: str, place: Mapping[str, int]
+    ) -> np.ndarray:
+        """Return the angles [T] in degrees of one column, with the side that another tells."""
+        entry = self._config.channels[name]
+        column = entry.column
+        if known_unit(entry.unit) != "deg":
+            raise DataError(f"{path}: column '{column}' is written in degrees; set unit: deg")
+        try:
+            angles = degrees_of(piece.iloc[:, place[column]], name, entry.form)
+            if entry.hemisphere is not None:
+                column = entry.hemisphere
+                angles = angles * side_signs(piece.iloc[:, place[column]], name)
+        except DataError as error:
+            raise DataError(f"{path}: column '{column}': {error}") from None
+        return angles
 
     def _numbers(self, path: Path, column: pd.Series, name: str, first: int) -> np.ndarray:
         """Return the cells of one column as float64 [T], NaN where empty.
