@@ -30,7 +30,7 @@ LAYERS = [
     {"runs"},
     {"documents"},
     {"tasks"},
-    {"crash"},
+    {"crash", "run_log"},
     {"door", "terminal"},
     {"commands"},
     {"cli", "__main__", "face", "testing"},

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import ExitStack
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -99,21 +100,25 @@ def run(
     ] = False,
 ) -> None:
     """Carry out a run: fit, evaluate, report and export, or any other task."""
+    from residnet.run_log import RunLog
     from residnet.tasks.loading import config_file, load_task
 
     limit_threads()
     task = load_task(config, overrides or [])
-    told: list[str] = []
-    with drawn_progress(quiet=quiet or as_json, kept=told):
+    log = RunLog(task.place(out)) if verbose else None
+    with ExitStack() as stack:
+        if log is not None:
+            stack.enter_context(log.until_the_end())
+        kept = None if log is None else log.line
+        stack.enter_context(drawn_progress(quiet=quiet or as_json, kept=kept))
         finished = task.run(
             source=config_file(config),
             overrides=overrides or [],
             out=out,
             resume=resume,
             overwrite=overwrite,
+            opened=None if log is None else log.open,
         )
-    if verbose:
-        finished.folder.write(finished.folder.path / "log.txt", "".join(told))
     if as_json:
         place = {"folder": str(finished.folder.path), "report": str(finished.folder.report)}
         print(json.dumps({**finished.folder.read_summary(), **place}, indent=1))

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import sys
-import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
@@ -16,13 +15,17 @@ if TYPE_CHECKING:
     from rich.progress import TaskID
 
 
+Keep = Callable[[str], None]
+"""Is given one line after the other."""
+
+
 @contextmanager
-def drawn_progress(*, quiet: bool = False, kept: list[str] | None = None) -> Iterator[None]:
+def drawn_progress(*, quiet: bool = False, kept: Keep | None = None) -> Iterator[None]:
     """Draw the progress of everything within the context on standard error.
 
     Args:
         quiet: draw nothing.
-        kept: is given every line, with the time of day, whatever is drawn.
+        kept: is given every line, whatever is drawn.
     """
     if quiet or not sys.stderr.isatty():
         with listen(_Kept(kept, None if quiet else _Lines())):
@@ -46,14 +49,14 @@ def drawn_progress(*, quiet: bool = False, kept: list[str] | None = None) -> Ite
 class _Kept:
     """Keeps the lines that are told, and hands everything on."""
 
-    def __init__(self, kept: list[str] | None, then: ProgressCallback | None) -> None:
+    def __init__(self, kept: Keep | None, then: ProgressCallback | None) -> None:
         self._kept, self._then = kept, then
 
     def __call__(self, progress: Progress) -> None:
         if self._kept is not None and (progress.message or progress.done == progress.total):
             text = progress.message or f"{progress.stage}: done"
             if progress.message or progress.done is not None:
-                self._kept.append(f"{time.strftime('%H:%M:%S')} {text.strip()}\n")
+                self._kept(text)
         if self._then is not None:
             self._then(progress)
 

@@ -18,7 +18,15 @@ if TYPE_CHECKING:
 SUMMARY = "residnet.summary/1"
 """Schema of summary.json."""
 
-_BEFORE_RESULTS = {"resolved.yaml", "provenance.json", "doctor.json", "data_quality.json"}
+LOG = "log.txt"
+"""File that holds the progress of a run, where that is kept."""
+_BEFORE_RESULTS = {
+    "resolved.yaml",
+    "provenance.json",
+    "doctor.json",
+    "data_quality.json",
+    LOG,
+}
 """Files that a run writes before its first result; a folder of these alone may be used again."""
 
 

@@ -157,6 +157,7 @@ class Task(Config):
         resume: bool = False,
         overwrite: bool = False,
         report: bool = True,
+        opened: Callable[[Path], None] | None = None,
     ) -> Finished:
         """Carry the task out, from an empty folder to the finished mark.
 
@@ -167,11 +168,12 @@ class Task(Config):
             resume: continue an interrupted run in its folder.
             overwrite: replace an earlier run in its folder.
             report: draw the report and export; without them a run ends after its results.
+            opened: is told the run folder as soon as it stands; None for nobody.
 
         Raises:
             ResidnetError: where the input does not allow it, or a result fails a check.
         """
-        place, resolved = out or Path("runs") / self.name, dump_config(self)
+        place, resolved = self.place(out), dump_config(self)
         # before the check, which may read much
         RunFolder(place).require(resolved, resume=resume, overwrite=overwrite)
         self.check()
@@ -181,7 +183,14 @@ class Task(Config):
         if resume:
             made_from.require_same_inputs(RunFolder(place))
         folder = RunFolder.create(place, resolved, resume=resume, overwrite=overwrite)
+        if opened is not None:
+            opened(folder.path)
         return self.conduct(folder, made_from, self.carry_out, report=report)
+
+    @final
+    def place(self, out: Path | None) -> Path:
+        """Return the run folder: the one that was asked for, else runs/<name>."""
+        return out or Path("runs") / self.name
 
     @final
     def conduct(
