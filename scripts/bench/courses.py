@@ -88,7 +88,6 @@ class Ship:
             buoys=buoys,
             acceptance=float(course.radii[0]),
             lookahead=self.lookahead,
-            planning_dt=self.dt,
             turning_time=25.0 * self.turning.time,
             **extra,
         )
@@ -207,6 +206,7 @@ def main() -> None:
     steady = smallest_turn(
         ship.config(draw(np.random.default_rng(0), (2, 2), (9, 9), None, 1.0), 0.0),
         ship.vessel,
+        ship.turning,
         ship.limit,
     )
     print(f"{args.vessel}: R {steady.radius:.4g} m, K {ship.turning.gain:.4g}/s", end="")

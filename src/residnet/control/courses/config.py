@@ -20,7 +20,7 @@ from residnet.control.courses.course_plan import Course, CourseRequest, plan
 from residnet.control.courses.dubins import dubins_length
 from residnet.control.courses.outline import Circle
 from residnet.control.courses.turn_table import Turns, arcs, simulated_turns
-from residnet.control.courses.turns import SteadyTurn, TurnMaker, steady_turn
+from residnet.control.courses.turns import SteadyTurn, TurnMaker, steady_turn, turning_step
 from residnet.control.heading.steering import SteeredVessel
 from residnet.control.heading.turning import Turning
 from residnet.core.config import Config, Metres, MetresPerSecond, Radians, Seconds
@@ -46,7 +46,8 @@ class BuoyCourseConfig(Config):
         current: strongest that the plan leaves room for; the vessel is displaced by it until the
             guidance has corrected.
         lookahead: of the line-of-sight guidance.
-        planning_dt: step of the simulated turns.
+        planning_dt: step of the simulated turns; null for the longest that simulates them as half
+            of it does, to 0.001 turning radii.
         turning_time: until a held rudder's turn is steady.
     """
 
@@ -59,7 +60,7 @@ class BuoyCourseConfig(Config):
     margin: float = Field(default=0.01, ge=0, lt=1)
     current: MetresPerSecond = Field(default=0.0, ge=0)
     lookahead: Metres = Field(gt=0)
-    planning_dt: Seconds = Field(default=0.05, gt=0)
+    planning_dt: Seconds | None = Field(default=None, gt=0)
     turning_time: Seconds = Field(default=100.0, gt=0)
 
 
@@ -84,9 +85,12 @@ class PlannedCourse:
     reference: float
 
 
-def smallest_turn(config: BuoyCourseConfig, vessel: SteeredVessel, limit: float) -> SteadyTurn:
+def smallest_turn(
+    config: BuoyCourseConfig, vessel: SteeredVessel, turning: Turning, limit: float
+) -> SteadyTurn:
     """Return the smallest turn of the nominal vessel, at the rudder's limit in rad."""
-    return steady_turn(vessel, limit, config.turning_time, config.planning_dt)
+    step = config.planning_dt or turning_step(vessel, turning, limit)
+    return steady_turn(vessel, limit, config.turning_time, step)
 
 
 def report_feasibility(
@@ -133,7 +137,7 @@ def plan_course(
     rudder = limit * steady.radius / radii
     # what a turn takes is seen from the yaw rate that it reaches, which K overstates in hard turns
     reached = replace(turning, gain=steady.yaw_rate / limit)
-    make = TurnMaker(vessel, reached, config.planning_dt)
+    make = TurnMaker(vessel, reached, steady.step)
     turns = simulated_turns(make, rudder, steady.radius)
     course = plan(
         _asked(config, protocol, buoys, circles, turns, aside),

@@ -46,6 +46,7 @@ _NARROW = (0.1, 0.04, 0.02)
 """Turned angles in rad between the turns that are made anew, round for round."""
 _UNCHANGED = 1e-3
 """Largest change of z with which turns made anew fit each other."""
+_FAR = 0.1
 _SMALL = math.radians(1.5)
 _SHORT = 0.3
 """Turning radii of a leg between two turns to one side that are tried as one."""
@@ -234,7 +235,7 @@ def _fitted(request: CourseRequest, sketch: Sketch) -> list[tuple[Fit, Fitted]]:
         z = route.begin(sketch)
         best = fit.solve(z)
         found.append((fit, best))
-        if best.missed > 0.1 * radius:
+        if best.missed > _FAR * radius:
             break
         after = _drawn(request, route, best.z, fit, sketch).simplified(_SHORT * radius, _SMALL)
         if len(after.bends) == len(sketch.bends) or attempt == 2:

@@ -237,8 +237,8 @@ def following_turns(
         points, headings, times = _sampled(group)
         middle = group[len(group) // 2]
         track, course = middle.along(np.linspace(0.0, tail, 80))
-        places = (track @ (1.0, 1j) - complex(*middle.track[-1])) * np.exp(-1j * middle.heading[-1])
-        leg = np.stack((places.real, places.imag, course - middle.heading[-1]), axis=-1)
+        places = (track - track[0]) @ (1.0, 1j) * np.exp(-1j * course[0])
+        leg = np.stack((places.real, places.imag, course - course[0]), axis=-1)
         if angle < 0:
             points, headings = points.conj(), -headings
             leg[:, 1:] *= -1.0
@@ -264,10 +264,9 @@ def _sampled(group: Sequence[Turn]) -> tuple[np.ndarray, Array, Array]:
     share = np.linspace(0.0, 1.0, POINTS + 1)[1:]
     points, headings = np.zeros((len(group), POINTS), dtype=complex), np.zeros((len(group), POINTS))
     for k, turn in enumerate(group):
-        at = share * turn.times[-1]
-        north, east = (np.interp(at, turn.times, turn.track[:, i]) for i in range(2))
-        points[k], headings[k] = north + 1j * east, np.interp(at, turn.times, turn.heading)
-    return points, headings, np.array([turn.times[-1] for turn in group])
+        track, headings[k] = turn.at(share * turn.lasts)
+        points[k] = track @ (1.0, 1j)
+    return points, headings, np.array([turn.lasts for turn in group])
 
 
 def _holds(share: Array, rudder: float, turning: Turning) -> Array:

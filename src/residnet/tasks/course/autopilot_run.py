@@ -85,7 +85,7 @@ def ready(config: CourseSettings, folder: RunFolder) -> AutopilotRun:
         autopilot,
         run,
         steering,
-        smallest_turn(config.course, steering.vessel, steering.limit),
+        smallest_turn(config.course, steering.vessel, steering.turning, steering.limit),
         notes["controllers"],
     )
 

@@ -17,8 +17,8 @@ def check_plans(config: CourseSettings, autopilot: AutopilotSettings) -> None:
         ConfigError: where there is no course, with the buoy and what can be done.
     """
     vessel = SteeredPlant(load_vessel(autopilot.vessel).build())
-    turning = vessel.turning(autopilot.rudder, autopilot.turning_time, config.course.planning_dt)
-    steady = smallest_turn(config.course, vessel, autopilot.rudder)
+    turning = vessel.turning(autopilot.rudder, autopilot.turning_time)
+    steady = smallest_turn(config.course, vessel, turning, autopilot.rudder)
     for protocol in config.protocols:
         try:
             plan_course(config.course, protocol, vessel, turning, autopilot.rudder, steady)
