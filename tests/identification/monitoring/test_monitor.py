@@ -12,6 +12,7 @@ from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.store import ModelSpec
 from residnet.identification.monitoring.changes import Change, ChangedDynamics
 from residnet.identification.monitoring.monitor import MonitorConfig, Watch
+from residnet.identification.monitoring.refitting import recursive_refit
 from residnet.identification.monitoring.watcher import Watcher
 from residnet.identification.monitoring.windows import Piece
 from residnet.testing.examples import STEP, example_model, example_spec
@@ -112,6 +113,43 @@ def test_sample_by_sample_it_says_what_windows_say(
     # a lost sample begins anew
     assert single.step(np.full(6, np.nan), w[0]) is None
     assert all(single.step(y[k], given[k]) is None for k in range(WINDOW))
+
+
+def test_a_refit_finds_the_size_of_a_planted_change_and_leaves_the_old_model_alone(
+    known: tuple[ModelSpec, HybridDynamics], watch: Watch
+) -> None:
+    weaker = Change("gain n_stbd", "", "", 0.1, gain={1: -0.1})
+    fresh = logs(known[1], weaker, 3, 50)
+    before = known[1].baseline.theta.clone()
+    found = recursive_refit(watch, [windows(log) for log in fresh])
+    assert torch.equal(known[1].baseline.theta, before)
+    (moved,) = found.moved
+    assert moved.change.name == "gain n_stbd"
+    assert moved.size == pytest.approx(-0.1, abs=0.01 + 2 * moved.error)
+    assert len(moved.after) == len(fresh)
+    assert found.before.alarm
+    assert not found.verdict.alarm
+    # on a log that the refit has not seen, the new model runs as the changed vessel does
+    (y, w), *_ = logs(known[1], weaker, 1, 91)
+    start, inputs = torch.from_numpy(y[:1]), torch.from_numpy(w[None])
+    errors = [
+        float(
+            np.abs(Rollout(model)(start, inputs, torch.zeros(1, 0))[0][0].numpy() - y)[:, 3].max()
+        )
+        for model in (known[1], found.model)
+    ]
+    assert errors[1] < 0.5 * errors[0]
+
+
+def test_a_refit_leaves_errors_of_sensors_and_unchanged_vessels_alone(
+    known: tuple[ModelSpec, HybridDynamics], watch: Watch
+) -> None:
+    gyro = Change("gyro scale", "", "", 0.05, sensor="gyro_scale")
+    for change, words in ((gyro, "mend the sensor"), (NONE, "no cause exceeds")):
+        found = recursive_refit(watch, [windows(log) for log in logs(known[1], change, 3, 50)])
+        assert not found.moved
+        assert found.model is watch.model
+        assert words in found.ended
 
 
 def test_too_few_clean_logs_are_refused(known: tuple[ModelSpec, HybridDynamics]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import final
 
 import torch
@@ -49,6 +49,19 @@ class Change:
     gain: Mapping[int, float] = field(default_factory=dict)
     offset: Mapping[int, float] = field(default_factory=dict)
     sensor: str = ""
+
+    def of_size(self, size: float) -> Change:
+        """Return the same change of another size, in its unit."""
+        k = size / self.size
+        return replace(
+            self,
+            size=size,
+            heavier=k * self.heavier,
+            damped=k * self.damped,
+            push=(k * self.push[0], k * self.push[1]),
+            gain={place: k * value for place, value in self.gain.items()},
+            offset={place: k * value for place, value in self.offset.items()},
+        )
 
 
 def causes(signals: SignalsConfig) -> list[Change]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,6 +14,75 @@ _SHRINK = 0.1
 """Share of the diagonal in the covariance of innovations."""
 BELIEVED = 15.0
 """Standard deviation of what a model has always got wrong, in the causes' own small sizes."""
+
+
+@dataclass(frozen=True)
+class Sums:
+    """Scores [Q] and information [Q, Q] of a number of windows, and squares of innovations [n]."""
+
+    score: np.ndarray
+    information: np.ndarray
+    squares: np.ndarray
+    count: int
+
+    def __add__(self, other: Sums) -> Sums:
+        return Sums(
+            self.score + other.score,
+            self.information + other.information,
+            self.squares + other.squares,
+            self.count + other.count,
+        )
+
+
+def weighed(
+    found: Sequence[tuple[np.ndarray, np.ndarray]],
+    whiten: Sequence[np.ndarray],
+    belief: np.ndarray,
+) -> Sums:
+    """Return the sums over windows that were looked at as a whole, then in parts.
+
+    A window that no change of a size thought possible explains tells of a manoeuvre that the model
+    does not know. It counts by the inverse of what it leaves unexplained.
+
+    Args:
+        found: innovations [B, parts n] and effects [B, C, parts n] for each look.
+        whiten: matrix [n, n] of each look.
+        belief: precision of the sizes of the changes [C, C].
+    """
+    looks, number = [], 0
+    for (error, effects), matrix in zip(found, whiten, strict=True):
+        size, (windows, count, values) = len(matrix), effects.shape
+        e = (error.reshape(windows, -1, size) @ matrix.T).reshape(windows, values)
+        a = (effects.reshape(windows, count, -1, size) @ matrix.T).reshape(effects.shape)
+        looks.append((np.einsum("bqn,bn->bq", a, e), a @ a.swapaxes(1, 2), e**2))
+        number += values
+    score = np.sum([one for one, _, _ in looks], axis=0)
+    information = np.sum([one for _, one, _ in looks], axis=0)
+    squares = np.sum([one.sum(axis=1) for _, _, one in looks], axis=0)
+    own = np.linalg.solve(information + belief, score[..., None])[..., 0]
+    left = (squares - (score * own).sum(axis=1)) / number
+    weight = 1.0 / np.maximum(left, 1.0)
+    return Sums(
+        weight @ score,
+        np.tensordot(weight, information, 1),
+        looks[0][2].sum(axis=0),
+        len(looks[0][2]),
+    )
+
+
+def apart_from(sums: Sums, count: int, belief: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return scores [Q] and information [Q, Q] once what follows has taken what it can explain.
+
+    Args:
+        sums: of Q changes, then of what surrounds the vessel.
+        count: Q.
+        belief: precision of the sizes of what surrounds the vessel.
+    """
+    matrix = sums.information
+    own = np.linalg.solve(matrix[count:, count:] + belief, matrix[count:, :count])
+    score = sums.score[:count] - own.T @ sums.score[count:]
+    information = matrix[:count, :count] - matrix[:count, count:] @ own
+    return score, information + 1e-300 * np.eye(count)
 
 
 def always_wrong(error: np.ndarray, effects: np.ndarray, causes: Sequence[Change]) -> np.ndarray:

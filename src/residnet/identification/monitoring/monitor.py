@@ -10,6 +10,7 @@ them.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -26,8 +27,11 @@ from residnet.dynamics.store import ModelSpec
 from residnet.identification.monitoring.changes import Change, causes, surroundings
 from residnet.identification.monitoring.innovations import (
     BELIEVED,
+    Sums,
     always_wrong,
+    apart_from,
     run_away,
+    weighed,
     whitening,
 )
 from residnet.identification.monitoring.scatter import Group, scattered
@@ -104,24 +108,6 @@ class Verdict:
 _Innovations = tuple[np.ndarray, np.ndarray]
 
 
-@dataclass(frozen=True)
-class Sums:
-    """Scores [Q] and information [Q, Q] of a number of windows, and squares of innovations [n]."""
-
-    score: np.ndarray
-    information: np.ndarray
-    squares: np.ndarray
-    count: int
-
-    def __add__(self, other: Sums) -> Sums:
-        return Sums(
-            self.score + other.score,
-            self.information + other.information,
-            self.squares + other.squares,
-            self.count + other.count,
-        )
-
-
 class Watch:
     """What is known of clean logs, and the tests against it.
 
@@ -147,11 +133,10 @@ class Watch:
         self.dt = spec.dt
         self.causes = causes(spec.signals)
         self.others = surroundings()
-        self.belief = np.diag([_CURRENT**-2] * 2 + [_PUSH**-2] * 2)
-        each = max(round(config.group / config.window), 1)
-        cut = [
-            (k, log[i : i + each]) for k, log in enumerate(clean) for i in range(0, len(log), each)
-        ]
+        outside = [_CURRENT**-2] * 2 + [_PUSH**-2] * 2
+        self.belief = np.diag(outside)
+        self.possible = np.diag([*((BELIEVED * one.size) ** -2 for one in self.causes), *outside])
+        cut = [(k, part) for k, log in enumerate(clean) for part in self.groups(log)]
         groups, of = [group for _, group in cut], np.array([log for log, _ in cut])
         if len(groups) < _FEWEST:
             raise DataError(
@@ -163,7 +148,7 @@ class Watch:
         )
         self.limit = _FAR * np.append(fastest, _TURN)
         self.parts = [1, _PARTS] if round(config.window / spec.dt) >= _LEAST_PART * _PARTS else [1]
-        found = [[self._innovations(group, parts) for parts in self.parts] for group in groups]
+        found = [[self.innovations(group, parts) for parts in self.parts] for group in groups]
         lost = np.concatenate([(group[0][0] == 0.0).all(axis=1) for group in found])
         if lost.mean() > _MOST_LOST:
             raise DataError(
@@ -173,7 +158,7 @@ class Watch:
         self.always = self._wrong(found)
         self.whiten = [
             whitening(
-                np.concatenate([group[i][0] - self._expected(group[i][1], i) for group in found]),
+                np.concatenate([group[i][0] - self.expected(group[i][1], i) for group in found]),
                 parts,
             )
             for i, parts in enumerate(self.parts)
@@ -183,6 +168,7 @@ class Watch:
         fold = (of if len(set(of)) >= _FOLDS else np.arange(len(found))) % _FOLDS
         self.bias = self._bias([self._sums(group) for group in found])
         apart: list[Group] = []
+        self.by_fold: list[tuple[list[np.ndarray], np.ndarray]] = []
         # scores scatter more where others say what is always wrong, as they do in service
         for k in range(_FOLDS):
             self.always = self._wrong(
@@ -190,6 +176,7 @@ class Watch:
             )
             others = [self._sums(one) for one in found]
             bias = self._bias([one for one, own in zip(others, fold, strict=True) if own != k])
+            self.by_fold.append((self.always, bias))
             for i in np.flatnonzero(fold == k):
                 apart.append(self._group(int(of[i]), others[i], bias))
         self.always = known
@@ -222,15 +209,26 @@ class Watch:
         """The causes, then what surrounds the vessel."""
         return [*self.causes, *self.others]
 
+    def groups(self, log: Sequence[Piece]) -> list[Sequence[Piece]]:
+        """Return the windows of a log in groups whose wind and current are taken to be constant."""
+        each = max(round(self.config.group / self.config.window), 1)
+        return [log[i : i + each] for i in range(0, len(log), each)]
+
+    def over(self, model: HybridDynamics) -> Watch:
+        """Return the same watch over another model, judged by what clean logs were of this one."""
+        out = copy.copy(self)
+        out.model = model
+        return out
+
     def sums(self, pieces: Sequence[Piece]) -> list[Sums]:
         """Return the scores of each of several windows."""
-        found = [self._innovations(pieces, parts) for parts in self.parts]
+        found = [self.innovations(pieces, parts) for parts in self.parts]
         return [
             self._sums([(error[i : i + 1], effects[i : i + 1]) for error, effects in found])
             for i in range(len(pieces))
         ]
 
-    def _innovations(self, pieces: Sequence[Piece], parts: int) -> _Innovations:
+    def innovations(self, pieces: Sequence[Piece], parts: int) -> _Innovations:
         """Return innovations [B, parts n] and effects [B, C, parts n] of windows cut into parts."""
         cut = [part for piece in pieces for part in parted(piece, parts)]
         error, effects = innovations(self.model, cut, self.changes)
@@ -241,37 +239,28 @@ class Watch:
         error[lost], effects[lost] = 0.0, 0.0
         return error, effects
 
-    def _expected(self, effects: np.ndarray, i: int) -> np.ndarray:
-        """Return what innovations [B, n] are of clean logs, by their effects [B, C, n]."""
-        share = np.tile(self.always[i], effects.shape[2] // len(SEEN))
+    def expected(self, effects: np.ndarray, i: int, always: np.ndarray | None = None) -> np.ndarray:
+        """Return what innovations [B, n] are of clean logs, by their effects [B, C, n].
+
+        Args:
+            effects: of a unit of each change.
+            i: number of the look: whole windows, or their parts.
+            always: what the model has always got wrong [Q, 4]; by all clean logs where None.
+        """
+        wrong = self.always[i] if always is None else always
+        share = np.tile(wrong, effects.shape[2] // len(SEEN))
         return np.asarray((effects[:, : len(self.causes)] * share).sum(axis=1))
 
     def _sums(self, found: Sequence[_Innovations]) -> Sums:
         """Return the sums of the same windows as a whole and in parts."""
-        out = []
-        for i, (whiten, (error, effects)) in enumerate(zip(self.whiten, found, strict=True)):
-            size = len(whiten)
-            e = (error - self._expected(effects, i)).reshape(-1, size) @ whiten.T
-            count = len(self.changes)
-            a = effects.reshape(len(error), count, -1, size) @ whiten.T
-            a = a.swapaxes(1, 2).reshape(-1, count, size)
-            out.append((np.einsum("bqn,bn->q", a, e), np.einsum("bqn,bpn->qp", a, a), e))
-        whole = out[0][2]
-        return Sums(
-            sum(score for score, _, _ in out),
-            sum(information for _, information, _ in out),
-            (whole**2).sum(axis=0),
-            len(whole),
-        )
+        left = [
+            (error - self.expected(effects, i), effects) for i, (error, effects) in enumerate(found)
+        ]
+        return weighed(left, self.whiten, self.possible)
 
     def _alone(self, sums: Sums) -> tuple[np.ndarray, np.ndarray]:
         """Return scores and information of the causes once the surroundings have had their part."""
-        count = len(self.causes)
-        matrix = sums.information
-        own = np.linalg.solve(matrix[count:, count:] + self.belief, matrix[count:, :count])
-        score = sums.score[:count] - own.T @ sums.score[count:]
-        information = matrix[:count, :count] - matrix[:count, count:] @ own
-        return score, information + 1e-300 * np.eye(count)
+        return apart_from(sums, len(self.causes), self.belief)
 
     def _group(self, log: int, sums: Sums, bias: np.ndarray) -> Group:
         """Return scores and information of a group, what clean logs always ask for taken out."""

@@ -6,7 +6,8 @@ from collections import deque
 
 import numpy as np
 
-from residnet.identification.monitoring.monitor import Sums, Verdict, Watch
+from residnet.identification.monitoring.innovations import Sums
+from residnet.identification.monitoring.monitor import Verdict, Watch
 from residnet.identification.monitoring.windows import Piece
 
 

@@ -86,6 +86,8 @@ def innovations(
         / change.size
         for number, change in enumerate(changes)
     ]
+    if not effects:
+        return error.numpy(), np.zeros((len(error), 0, error.shape[1]))
     return error.numpy(), torch.stack(effects, dim=1).numpy()
 
 
