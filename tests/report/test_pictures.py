@@ -12,7 +12,8 @@ from PIL import Image
 from residnet.report.blocks import Section
 from residnet.report.figures.files import figures_section, picture_alone, read_figures
 from residnet.report.figures.style import new_figure, save
-from residnet.report.interactive.explorer import INK
+from residnet.report.interactive.drawing import draw
+from residnet.report.interactive.explorer import FILL, INK
 from residnet.report.page import write_page
 
 T = np.linspace(0.0, 10.0, 200)
@@ -56,12 +57,35 @@ def test_a_picture_becomes_an_interactive_figure(tmp_path: Path) -> None:
     assert looks["measured"].color == INK
     assert looks["measured"].dash == "dashed"
     assert looks["trials (points)"].points
+    assert looks["model, shade"].dash == FILL
     curves = explorer.cases[0].curves
     np.testing.assert_allclose(curves[0]["model"][1], np.sin(T), atol=1e-4)
     np.testing.assert_allclose(curves[1]["model"][1], np.exp(-T), atol=1e-4)
     assert float(np.nanmax(curves[0]["model, shade"][1])) == pytest.approx(1.1, abs=0.01)
     assert np.ptp(curves[0]["other lines"][0]) >= 10.0
     assert curves[3]["model (points)"][1].tolist() == pytest.approx([2.0, 3.0], abs=1e-4)
+
+
+def test_steps_single_points_and_counts(tmp_path: Path) -> None:
+    figure = new_figure(4.0)
+    steps, alone = figure.subplots(1, 2)
+    steps.step([0, 1, 2], [3.0, 1.0, 2.0], where="post", color="#0072B2", label="best so far")
+    alone.plot([0.5], [2.0], "o-", color="#D55E00", label="one run")
+    steps.legend()
+    alone.legend()
+    path = tmp_path / "figures" / "01_counts.png"
+    path.parent.mkdir(parents=True)
+    save(figure, path, "Counts", "Look at them.")
+    (drawn_one,) = read_figures(path.parent)
+    explorer = drawn_one.explorer
+    assert explorer is not None
+    x, y = explorer.cases[0].curves[0]["best so far"]
+    np.testing.assert_allclose(x, [0, 1, 1, 2, 2], atol=1e-4)
+    np.testing.assert_allclose(y, [3, 3, 1, 1, 2], atol=1e-4)
+    assert explorer.looks["one run (points)"].points
+    parts = draw([explorer])
+    assert parts is not None
+    assert '"min_interval":1.0' in parts.script
 
 
 def test_a_page_holds_the_picture_without_its_curves(tmp_path: Path) -> None:

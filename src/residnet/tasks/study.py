@@ -180,7 +180,8 @@ def _verdict(rows: Sequence[dict[str, Any]], reference: str) -> list[str]:
         best = min(found, key=lambda row: (int(row["diverged"]) > 0, float(row["nrmse_mean"])))
         steady = " of the steady ones" if any(row["diverged"] for row in found) else ""
         sentence = (
-            f"{protocol}: '{best['variant']}' has the least error{steady}, {best['nrmse_mean']:.4f}"
+            f"{protocol}: '{best['variant']}' has the least free-run NRMSE{steady},"
+            f" {best['nrmse_mean']:.4f}"
         )
         if best["diverged"]:
             sentence = (

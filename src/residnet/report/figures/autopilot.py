@@ -76,6 +76,7 @@ def responses(
     for sign in (-1.0, 1.0):
         for axis, middle in ((axes[0], heading), (axes[1], 0.0)):
             axis.axhline(DEG * (middle + sign * band), **_BAND)
+    axes[0].lines[-1].set_label("band of settling")
     axes[1].set(ylim=(-2.5 * DEG * band, 2.5 * DEG * band))
     axes[-1].set(xlabel="time [s]")
     figure.align_ylabels(axes)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -10,6 +11,9 @@ import numpy as np
 
 from residnet.report.figures.files import Drawing
 from residnet.report.figures.style import SOLID, new_figure, styled
+
+_LONGEST = 20
+"""Most letters of a line beneath an axis."""
 
 
 @styled
@@ -42,7 +46,7 @@ def parallel_coordinates(content: Mapping[str, Any]) -> Drawing:
         axes.axvline(column, color="0.4", linewidth=0.8)
         for height, text in marks:
             axes.annotate(text, (column, height), (3, 2), textcoords="offset points", fontsize=7)
-    axes.set_xticks(range(len(named)), [*map(_short, keys), _short(content["objective"])])
+    axes.set_xticks(range(len(named)), [*map(_lines, keys), _lines(_words(content))])
     axes.set_yticks([])
     axes.set_xlim(-0.1, len(named) - 0.6)
     axes.grid(visible=False)
@@ -66,7 +70,8 @@ def course_of_sweep(content: Mapping[str, Any]) -> Drawing:
     axes.plot(numbers, values, "o", markersize=3.5, color="0.55", label="trial")
     axes.step(numbers, so_far.accumulate(values), where="post", **SOLID, label="best so far")
     axes.set_xlabel("trial [-]")
-    axes.set_ylabel(content["objective"])
+    axes.set_ylabel(_words(content))
+    axes.xaxis.get_major_locator().set_params(integer=True)
     axes.legend()
     caption = "The value of each finished trial, and the best one by then."
     return Drawing("course", "Course of the sweep", caption, figure)
@@ -105,6 +110,16 @@ def _axis(
     return np.array([kinds.index(text) * step for text in texts]), marks
 
 
-def _short(key: str) -> str:
-    """Return the last parts of a long key, which tell it apart."""
-    return key if len(key) <= 24 else "…" + key[-23:]
+def _words(content: Mapping[str, Any]) -> str:
+    """Return what is sought, without the sign of a number that has no unit."""
+    return str(content["objective"]).removesuffix(" [-]")
+
+
+def _lines(key: str) -> str:
+    """Return a long key in lines that end with its parts."""
+    lines = [""]
+    for part in re.findall(r"[^. ]+[. ]?", key):
+        if lines[-1] and len(lines[-1]) + len(part) > _LONGEST:
+            lines.append("")
+        lines[-1] += part
+    return "\n".join(line.strip() for line in lines)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from residnet.report.interactive.explorer import INK, Case, Explorer, Panel
+from residnet.report.interactive.explorer import FILL, INK, Case, Explorer, Panel
 from residnet.report.interactive.packing import packed
 
 if TYPE_CHECKING:
@@ -148,7 +148,7 @@ def _canvas(
     over = [_curve(explorer, panel, name, source) for name in explorer.names(number)]
     canvas.renderers.extend(over)
     hover = HoverTool(
-        renderers=over,
+        renderers=[curve for curve in over if explorer.looks[curve.name].dash != FILL],
         mode="mouse" if panel.kind != "curves" else "vline",
         tooltips=[("$name", "@$name{0.000 a}")] if panel.kind == "curves" else [("", "$name")],
         point_policy="follow_mouse",
@@ -170,12 +170,14 @@ def _canvas(
             axis.major_label_overrides = {float(place): text for place, text in names.items()}
         elif not logarithmic:
             axis.ticker = BasicTicker(desired_num_ticks=count)
+    if not panel.x_names and not panel.x_logarithmic and _counts(explorer, number):
+        canvas.xaxis.ticker = BasicTicker(desired_num_ticks=5, min_interval=1.0)
     return canvas
 
 
 def _curve(explorer: Explorer, panel: Panel, name: str, source: ColumnDataSource) -> Any:
     """Return the renderer of a curve, added to nothing yet."""
-    from bokeh.models import Line, Scatter
+    from bokeh.models import Line, Patch, Scatter
     from bokeh.models.renderers import GlyphRenderer
 
     look = explorer.looks[name]
@@ -183,9 +185,21 @@ def _curve(explorer: Explorer, panel: Panel, name: str, source: ColumnDataSource
     x = f"x of {name}"
     if panel.kind == "cloud" or look.points:
         glyph: Any = Scatter(x=x, y=name, size=4, fill_color=color, line_color=None, fill_alpha=0.6)
+    elif look.dash == FILL:
+        glyph = Patch(x=x, y=name, fill_color=color, line_color=None)
     else:
         glyph = Line(x=x, y=name, line_color=color, line_dash=look.dash, line_width=look.width)
     return GlyphRenderer(data_source=source, glyph=glyph, name=name, visible=look.shown)
+
+
+def _counts(explorer: Explorer, panel: int) -> bool:
+    """Return whether the horizontal values of a panel are whole, those of a count."""
+    curves = [x for case in explorer.cases for x, _ in case.curves[panel].values()]
+    known = [x[np.isfinite(x)] for x in curves]
+    # values on a page are packed in 16 bits
+    fine = 2e-5 * max((float(np.ptp(x)) for x in known if x.size), default=0.0)
+    whole = [bool((np.abs(x - np.rint(x)) <= fine).all()) for x in known]
+    return any(x.size for x in known) and all(whole)
 
 
 def _columns(explorer: Explorer, case: Case, panel: int) -> dict[str, np.ndarray]:

@@ -11,6 +11,9 @@ import numpy as np
 INK = "ink"
 """The colour of text, for what was measured: black on paper, light on a dark screen."""
 
+FILL = "fill"
+"""Stands for the dash of a curve whose inside is filled, without a line."""
+
 PanelKind: TypeAlias = Literal["curves", "map", "cloud"]
 
 
@@ -21,7 +24,8 @@ class Look:
     Attributes:
         label: beside its switch.
         color: as CSS has it, or `INK`.
-        dash: of its line as Bokeh has it: `solid`, `dashed`, `dotted`, `dashdot`, `dotdash`.
+        dash: of its line as Bokeh has it: `solid`, `dashed`, `dotted`, `dashdot`, `dotdash`; or
+            `FILL`.
         width: of its line in pixels.
         shown: whether it is switched on at first.
         points: it is drawn as points, not as a line.

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from residnet.report.interactive.explorer import (
+    FILL,
     INK,
     Case,
     Curve,
@@ -243,8 +244,10 @@ def _drawn(axes: Axes, labels: Mapping[tuple[str, str], str]) -> list[tuple[str,
 
     parts: list[tuple[Look, Curve]] = []
     for line in axes.get_lines():
-        points = _dash_of(line) == "none"
-        if points and line.get_marker() in ("None", "", None):
+        marked = line.get_marker() not in ("None", "", None)
+        # a line needs two points to be seen
+        points = _dash_of(line) == "none" or (marked and np.size(line.get_xdata()) < 2)
+        if points and not marked:
             continue
         parts.append((_look(line, line.get_color(), labels, points), _line(axes, line)))
     for part in axes.collections:
@@ -260,7 +263,7 @@ def _drawn(axes: Axes, labels: Mapping[tuple[str, str], str]) -> list[tuple[str,
         if len(shades):
             outlines = [path.vertices for path in part.get_paths()]
             look = _look(part, shades[0], labels, False)
-            look = look if stroke else _edge(look)
+            look = look if stroke else _filled(look)
             parts.append((look, _outline(outlines)))
     for patch in axes.patches:
         path = patch.get_path().transformed(patch.get_patch_transform())
@@ -271,10 +274,10 @@ def _drawn(axes: Axes, labels: Mapping[tuple[str, str], str]) -> list[tuple[str,
     return [(look.label + (" (points)" if look.points else ""), look, c) for look, c in found]
 
 
-def _edge(look: Look) -> Look:
-    """Return how the edge of a shade looks."""
+def _filled(look: Look) -> Look:
+    """Return how a shade looks."""
     label = look.label if look.label == _OTHERS else f"{look.label}, shade"
-    return replace(look, label=label, dash="dotted", width=1.0)
+    return replace(look, label=label, dash=FILL)
 
 
 def _line(axes: Axes, line: Any) -> Curve:
@@ -287,6 +290,15 @@ def _line(axes: Axes, line: Any) -> Curve:
     elif transform == axes.get_xaxis_transform(which="grid"):
         low, high = axes.get_ylim()
         y = low + (high - low) * y
+    return _stepped(x, y, line.get_drawstyle())
+
+
+def _stepped(x: np.ndarray, y: np.ndarray, style: str) -> Curve:
+    """Return a curve with the corners of its steps."""
+    if style == "steps-post":
+        return np.repeat(x, 2)[1:], np.repeat(y, 2)[:-1]
+    if style in ("steps", "steps-pre"):
+        return np.repeat(x, 2)[:-1], np.repeat(y, 2)[1:]
     return x, y
 
 

@@ -30,7 +30,7 @@ def sections(run: RunFiles) -> list[Section]:
     content = run.json("sweep.json")
     about = [
         f"Each trial is a run of its own below trials/; sought is the"
-        f" {'least' if content['minimized'] else 'greatest'} {content['objective']}.",
+        f" {'least' if content['minimized'] else 'greatest'} {objective(content)}.",
         "best.yaml holds the config of the best trial with all its keys.",
     ]
     out = [Section("The best trials", [trials_table(content), Text(about, quiet=True)])]
@@ -56,7 +56,7 @@ def trials_table(content: Content) -> Table:
 
 def _table(content: Content, rows: Sequence[Content]) -> Table:
     keys = content["keys"]
-    table = Table(["trial", content["objective"], *keys, "run [s]", "state"])
+    table = Table(["trial", objective(content), *keys, "run [s]", "state"])
     for row in rows:
         cells = [
             Cell(number(row["value"], 5) if row["value"] is not None else ""),
@@ -66,6 +66,11 @@ def _table(content: Content, rows: Sequence[Content]) -> Table:
         ]
         table.add(str(row["number"]), cells, selected=row["number"] == content["best"])
     return table
+
+
+def objective(content: Content) -> str:
+    """Return what is sought, without the sign of a number that has no unit."""
+    return str(content["objective"]).removesuffix(" [-]")
 
 
 def _shown(value: object) -> str:

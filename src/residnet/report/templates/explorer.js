@@ -123,7 +123,7 @@
       });
       plot.renderers.forEach(function (curve) {
         if (looks[curve.name].color !== "ink") { return; }
-        var part = curve.glyph.type === "Scatter" ? "fill_color" : "line_color";
+        var part = curve.glyph.type === "Line" ? "line_color" : "fill_color";
         curve.glyph[part] = { value: ink };
       });
     });
@@ -137,6 +137,12 @@
       if (!ready) { return; }
       clearInterval(wait);
       var explorers = roots.map(function (root) { return new Explorer(root); });
+      // frames were laid out before the labels beside them were known
+      setTimeout(function () {
+        explorers.forEach(function (one) {
+          one.plots.forEach(function (plot) { plot.min_border_right = plot.min_border_right - 1; });
+        });
+      }, 0);
       document.documentElement.classList.add("drawn");
       var dark = window.matchMedia("(prefers-color-scheme: dark)");
       dark.addEventListener("change", function () { explorers.forEach(function (one) { one.paint(); }); });

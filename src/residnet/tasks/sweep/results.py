@@ -96,10 +96,11 @@ def _importance(study: optuna.Study, finished: int) -> dict[str, float]:
 
 def _verdict(config: SweepConfig, rows: list[dict[str, Any]], best: dict[str, Any]) -> list[str]:
     drawn = ", ".join(f"{key} = {json.dumps(value)}" for key, value in best["values"].items())
+    sought = config.objective.words.removesuffix(" [-]")
     early = sum(row["state"] == "ended early" for row in rows)
     failed = [row for row in rows if row["state"] == "failed"]
     sentences = [
-        f"Trial {best['number']} of {len(rows)} is the best: {config.objective.words}"
+        f"Trial {best['number']} of {len(rows)} is the best: {sought}"
         f" {best['value']:.5g}, with {drawn}.",
         f"Its run is {trial_folder(Path(), best['number'])} in the sweep's folder, and the config"
         f" {BEST} there repeats it.",
