@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -58,6 +58,14 @@ def monitor(
     window: Annotated[str, typer.Option(help="Length of the short free runs.")] = "10 s",
     stretch: Annotated[str, typer.Option(help="Time that is looked back over.")] = "300 s",
     false_alarm: Annotated[str, typer.Option(help="Mean time between false alarms.")] = "10 h",
+    refit: Annotated[
+        Path | None,
+        typer.Option(
+            "--refit",
+            metavar="DIR",
+            help="Put the changes that are named into a copy of the model, in a new run folder.",
+        ),
+    ] = None,
     file: Annotated[
         Path | None,
         typer.Option("--json", metavar="FILE", help="Write what was found to a file as JSON, too."),
@@ -66,7 +74,7 @@ def monitor(
 ) -> None:
     """Watch new logs with a model of a finished fit, and name what has changed.
 
-    The exit code is 1 where there is an alarm.
+    The exit code is 1 where there is an alarm. A refit leaves the run as it is.
     """
     from residnet.core.files import require_file_place, whole
     from residnet.tasks.verbs import monitor_run
@@ -76,12 +84,16 @@ def monitor(
         require_file_place(file)
     settings = {"window": window, "stretch": stretch, "false_alarm": false_alarm}
     with drawn_progress(quiet=quiet):
-        found = monitor_run(folder, logs, model, settings)
+        found, refitted = monitor_run(folder, logs, model, settings, refit)
     for log in found:
         print("\n".join(log.text()))
+    content: list[dict[str, Any]] = [log.content() for log in found]
+    if refitted is not None:
+        print("\n".join(refitted.text()))
+        content.append({"refit": refitted.content()})
     if file is not None:
         with whole(file) as part:
-            part.write_text(json.dumps([log.content() for log in found], indent=1) + "\n")
+            part.write_text(json.dumps(content, indent=1) + "\n")
     if any(log.since is not None for log in found):
         raise typer.Exit(1)
 

@@ -9,11 +9,12 @@ from typing import Any, final
 import numpy as np
 
 from residnet.core.config import validate
-from residnet.core.errors import UsageError
+from residnet.core.errors import DataError, UsageError
 from residnet.face.data import Data
 from residnet.face.models import Model, require_model
 from residnet.face.values import described
 from residnet.identification.monitoring.monitor import MonitorConfig, Verdict, Watch
+from residnet.identification.monitoring.refitting import Refit, recursive_refit, refitted
 from residnet.identification.monitoring.watcher import Watcher
 from residnet.identification.monitoring.windows import past_of, pieces
 
@@ -51,6 +52,7 @@ class Monitor:
         steps = round(config.window / model.dt)
         logs = [log for split in ("train", "validation") for log in clean.splits.get(split, ())]
         watch = Watch(model.spec, module, [pieces(log, steps, past) for log in logs], config)
+        self._model, self._past = model, past
         self._watcher = Watcher(watch, past)
         self.verdict: Verdict | None = None
 
@@ -69,6 +71,40 @@ class Monitor:
         found = self._watcher.step(np.asarray(y, dtype=float), np.asarray(w, dtype=float))
         self.verdict = found or self.verdict
         return found
+
+    def refit(self, new: Data) -> tuple[Model, Refit]:
+        """Put the changes that the monitor names into a copy of the model, log by log.
+
+        The old model stays as it is. Judge both on logs that were not given here, for example by
+        `residnet.free_run`, before the new one goes into service.
+
+        Args:
+            new: logs of the changed vessel in the order of time, as
+                `residnet.prepare(logs, like=data)` gives them.
+
+        Returns:
+            The new model, named `<name>_refit`, and what was found: `moved` holds each change with
+            size and standard error, `ended` says why no further one was taken. Where `moved` is
+            empty the model is as it was.
+
+        Raises:
+            UsageError: where the data are of another kind, or the model has no parameters to move.
+            DataError: where a log holds no window.
+        """
+        if not isinstance(new, Data):
+            raise UsageError(
+                f"Monitor.refit: expected data from residnet.prepare, given {described(new)}"
+            )
+        logs = [log for members in new.splits.values() for log in members]
+        windows = [pieces(log, self._watcher.steps, self._past) for log in logs]
+        for log, found in zip(logs, windows, strict=True):
+            if not found:
+                raise DataError(
+                    f"log {log.log.name}: holds no window of"
+                    f" {self._watcher.watch.config.window:g} s without a break; leave it out"
+                )
+        refit = recursive_refit(self._watcher.watch, windows)
+        return Model(refitted(self._model.fitted, refit)), refit
 
     def restart(self) -> None:
         """Say that the next sample does not follow the last one."""

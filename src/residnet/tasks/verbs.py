@@ -16,7 +16,8 @@ from residnet.runs.folder import RunFolder
 from residnet.runs.task import Finished, Task
 from residnet.tasks.fit.config import FitTaskSettings
 from residnet.tasks.fit.planning import PlannedTrials, plan_trials
-from residnet.tasks.fit.watching import WatchedLog, watch_logs
+from residnet.tasks.fit.refitting import RefitRun, refit_run, require_refit
+from residnet.tasks.fit.watching import WatchedLog, in_service, watch_logs
 from residnet.tasks.union import TaskConfig
 
 
@@ -59,9 +60,20 @@ def export_run(path: Path, model: str, out: Path | None, file_format: str) -> Pa
 
 
 def monitor_run(
-    path: Path, logs: Sequence[Path], model: str, settings: Mapping[str, Any]
-) -> list[WatchedLog]:
-    """Watch new logs with a model of a finished fit.
+    path: Path,
+    logs: Sequence[Path],
+    model: str,
+    settings: Mapping[str, Any],
+    refit: Path | None = None,
+) -> tuple[list[WatchedLog], RefitRun | None]:
+    """Watch new logs with a model of a finished fit, and refit it to them where that is asked.
+
+    Args:
+        path: of the run.
+        logs: new logs, in the order of time.
+        model: name of the model.
+        settings: of the monitor.
+        refit: folder of a run for the refitted model; None for no refit.
 
     Raises:
         UsageError: where the run is no fit, or there is no such model.
@@ -70,7 +82,11 @@ def monitor_run(
     run = RunFolder.open(path)
     config = _task(run, "monitor")
     assert isinstance(config, FitTaskSettings)
-    return watch_logs(config, run, logs, model, settings)
+    if refit is not None:
+        require_refit(run, refit, config)
+    service = in_service(config, run, logs, model, settings)
+    watched = watch_logs(service)
+    return watched, None if refit is None else refit_run(config, run, service, refit)
 
 
 def plan_run(path: Path, model: str, limits: Mapping[str, Any]) -> PlannedTrials:

@@ -23,6 +23,7 @@ from residnet.baselines import ParametricBaseline
 from residnet.core.errors import UsageError
 from residnet.core.layout import VELOCITIES
 from residnet.dynamics.hybrid import HybridDynamics
+from residnet.identification.models import FittedModel
 from residnet.identification.monitoring.changes import Change, ChangedDynamics
 from residnet.identification.monitoring.innovations import BELIEVED, apart_from, weighed
 from residnet.identification.monitoring.monitor import Verdict, Watch
@@ -110,6 +111,30 @@ def recursive_refit(watch: Watch, logs: Sequence[Sequence[Piece]], most: int = _
         moved = filtered.through(groups)
         model = filtered.model
         verdict = _judged(watch.over(model), groups)
+
+
+def refitted(fitted: FittedModel, found: Refit) -> FittedModel:
+    """Return the refitted model under a name of its own, with notes on what was put into it.
+
+    Bands that were calibrated for the old model are left out.
+    """
+    baseline = found.model.baseline
+    assert isinstance(baseline, ParametricBaseline)
+    values = baseline.theta.detach().flatten()[baseline.free_indices()].tolist()
+    known = dict(zip(baseline.free_names(), values, strict=True))
+    notes = dict(fitted.notes)
+    notes["coefficients"] = [
+        {**row, "value": known[row["axis"], row["term"]]}
+        for row in fitted.notes.get("coefficients", ())
+        if (row["axis"], row["term"]) in known
+    ]
+    notes["refit_of"] = fitted.name
+    notes["refit_changes"] = [
+        {"cause": one.change.name, "size": one.size, "standard_error": one.error}
+        for one in found.moved
+    ]
+    spec = fitted.spec.model_copy(update={"name": f"{fitted.name}_refit", "band": None})
+    return FittedModel(spec, copy.deepcopy(found.model), notes)
 
 
 def _judged(watch: Watch, groups: Sequence[tuple[int, Sequence[Piece]]]) -> Verdict:

@@ -13,9 +13,10 @@ from residnet.core.config import validate
 from residnet.core.errors import DataError, UsageError
 from residnet.core.names import nearest
 from residnet.data.prepare import Prepared, prepare
+from residnet.identification.models import FittedModel
 from residnet.identification.monitoring.monitor import MonitorConfig, Verdict, Watch
 from residnet.identification.monitoring.watcher import Watcher
-from residnet.identification.monitoring.windows import past_of, pieces
+from residnet.identification.monitoring.windows import Piece, past_of, pieces
 from residnet.identification.prepared import prepare_logs
 from residnet.runs.folder import RunFolder
 from residnet.runs.model_store import FolderStore
@@ -78,14 +79,46 @@ class WatchedLog:
         return out
 
 
-def watch_logs(
+@dataclass(frozen=True)
+class Service:
+    """A model in service, the watch over it, and the logs that are new.
+
+    Attributes:
+        fitted: the model with its notes.
+        watch: over it.
+        files: of the new logs, in the order of time.
+        logs: the new logs, prepared as those of the fit.
+    """
+
+    fitted: FittedModel
+    watch: Watch
+    files: Sequence[Path]
+    logs: Sequence[Prepared]
+
+    def windows(self, log: Prepared) -> list[Piece]:
+        """Return the windows of a new log.
+
+        Raises:
+            DataError: where it holds none.
+        """
+        steps = round(self.watch.config.window / self.fitted.spec.dt)
+        found = pieces(log, steps, past_of(self.watch.model))
+        if not found:
+            raise DataError(
+                f"log {log.log.name}: holds no window of {self.watch.config.window:g} s without a"
+                " break; shorten --window or leave it out"
+            )
+        return found
+
+
+def in_service(
     config: FitTaskSettings,
     run: RunFolder,
     paths: Sequence[Path],
     model: str,
     settings: Mapping[str, Any],
-) -> list[WatchedLog]:
-    """Watch logs one after the other; the stretch that is looked back over goes on between them.
+) -> Service:
+    """Set up the watch over a model of a finished fit, and read the new logs.
 
     Args:
         config: of the finished fit.
@@ -96,7 +129,7 @@ def watch_logs(
 
     Raises:
         UsageError: where there is no such model or path.
-        DataError: where a log holds no window, or clean logs are too few.
+        DataError: where a log cannot be used, or clean logs are too few.
     """
     chosen = validate(dict(settings), MonitorConfig, "monitor")
     store = FolderStore(run)
@@ -105,20 +138,24 @@ def watch_logs(
         known = ["selected", *store.names()]
         raise UsageError(f"{run.path}: no model '{name}'{nearest(name, known)}")
     fitted = store.load(name)
+    files = log_files(paths)
     new = [
         prepare(read_external(path, config), SPLIT, config.signals.columns, config.prepare)
-        for path in log_files(paths)
+        for path in files
     ]
-    past = past_of(fitted.model)
-    steps = round(chosen.window / fitted.spec.dt)
-    watch = Watch(
-        fitted.spec,
-        fitted.model,
-        [pieces(log, steps, past) for log in _clean(config)],
-        chosen,
-    )
-    watcher = Watcher(watch, past)
-    return [_watched(watcher, log) for log in new]
+    past, steps = past_of(fitted.model), round(chosen.window / fitted.spec.dt)
+    clean = [pieces(log, steps, past) for log in _clean(config)]
+    return Service(fitted, Watch(fitted.spec, fitted.model, clean, chosen), files, new)
+
+
+def watch_logs(service: Service) -> list[WatchedLog]:
+    """Watch logs one after the other; the stretch that is looked back over goes on between them.
+
+    Raises:
+        DataError: where a log holds no window.
+    """
+    watcher = Watcher(service.watch, past_of(service.watch.model))
+    return [_watched(watcher, log, service.windows(log)) for log in service.logs]
 
 
 def _clean(config: FitTaskSettings) -> list[Prepared]:
@@ -128,13 +165,7 @@ def _clean(config: FitTaskSettings) -> list[Prepared]:
     return [*logs["train"], *logs["validation"]]
 
 
-def _watched(watcher: Watcher, log: Prepared) -> WatchedLog:
-    found = pieces(log, watcher.steps, watcher.past)
-    if not found:
-        raise DataError(
-            f"log {log.log.name}: holds no window of {watcher.watch.config.window:g} s without a"
-            " break; shorten --window or leave it out"
-        )
+def _watched(watcher: Watcher, log: Prepared, found: Sequence[Piece]) -> WatchedLog:
     watcher.restart()
     verdicts = [watcher.take(sums) for sums in watcher.watch.sums(found)]
     alarms = np.flatnonzero([verdict.alarm for verdict in verdicts])

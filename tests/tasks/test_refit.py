@@ -1,0 +1,108 @@
+"""`residnet monitor --refit`: a new run beside the old one, judged on logs that were held out."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from tiny import TINY, call
+
+from residnet.core.config import validate
+from residnet.data.simulated.trials import SimulatedTrials, simulate
+from residnet.runs.checksums import require_sealed
+
+DATA: dict[str, Any] = {
+    **TINY["data"],
+    "duration": 20,
+    "noise": {"u": 0.01, "v": 0.01, "r": 0.002},
+    "trials": [
+        {"kind": "zigzag", "count": 7, "heading": ["20 deg"], "start": 3},
+        {"kind": "acceleration_deceleration", "count": 4},
+        {"kind": "three_two_one_one", "count": 4, "start": 3},
+    ],
+    "identification": {"zigzag": 6, "acceleration_deceleration": 3, "three_two_one_one": 3},
+}
+CONFIG: dict[str, Any] = {
+    **{key: TINY[key] for key in ("task", "prepare", "signals")},
+    "name": "watched",
+    "data": DATA,
+    "baseline": {"kind": "regressors", "sets": ["fossen"], "ridge": 1e-6},
+    "bands": None,
+    "evaluation": {
+        "protocols": {"manoeuvre": {"kind": "manoeuvre"}},
+        "selection": "manoeuvre",
+        "scales": TINY["evaluation"]["scales"],
+    },
+}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("watched")
+    config = folder / "config.yaml"
+    config.write_text(yaml.safe_dump(CONFIG, sort_keys=False))
+    with pytest.MonkeyPatch.context() as patch:
+        assert call(patch, "run", config, "--out", folder / "run") == 0
+    return folder / "run"
+
+
+def new_logs(folder: Path, weaker: float) -> list[Any]:
+    """Write logs of a vessel whose starboard propeller pushes by a share less."""
+    data = validate({**DATA, "seed": 7}, SimulatedTrials, "test")
+    folder.mkdir()
+    words: list[Any] = []
+    for number, log in enumerate(simulate(data.draw(), data)[:4]):
+        # the log tells more revolutions than those that push, as the thrust grows with the square
+        told = log.channels["n_stbd"] / (1.0 - weaker) ** 0.5
+        log.replace(channels={**log.channels, "n_stbd": told}).save(folder / f"{number}.parquet")
+        words += ["--logs", folder / f"{number}.parquet"]
+    return words
+
+
+@pytest.mark.whole_runs
+def test_a_refit_leaves_the_old_run_alone_and_can_be_exported_and_evaluated(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = {file: file.read_bytes() for file in run.rglob("*") if file.is_file()}
+    logs, out = new_logs(tmp_path / "logs", 0.2), tmp_path / "refit"
+    given = [*logs, "--model", "baseline", "--window", "5 s", "--refit", out]
+    assert call(monkeypatch, "monitor", run, *given, "--json", tmp_path / "found.json") == 1
+    said = capsys.readouterr().out
+    assert {file: file.read_bytes() for file in run.rglob("*") if file.is_file()} == before
+    require_sealed(run)
+    found = json.loads((tmp_path / "found.json").read_text())[-1]["refit"]
+    (change,) = found["changes"]
+    assert change["cause"] == "gain n_stbd"
+    assert found["worth_taking"]
+    assert "IS worth taking" in said
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["selected"] == "baseline_refit"
+    assert {row["model"] for row in metrics["rows"]} == {"zero", "baseline", "baseline_refit"}
+    errors = {
+        row["model"]: row["nrmse"]["mean"]
+        for row in metrics["rows"]
+        if row["protocol"] == "manoeuvre" and row["manoeuvre"] == "all"
+    }
+    assert errors["baseline_refit"] == found["nrmse_new"] < 0.8 * errors["baseline"]
+    assert errors["baseline"] == found["nrmse_old"]
+    assert (out / "report.html").is_file()
+    assert call(monkeypatch, "export", out, "--model", "baseline_refit") == 0
+    # a folder that is there, or the run itself, is not written to
+    capsys.readouterr()
+    assert call(monkeypatch, "monitor", run, *given) == 2
+    assert call(monkeypatch, "monitor", run, *logs, "--refit", run / "refit") == 2
+    assert "give another folder for --refit" in capsys.readouterr().err
+
+
+@pytest.mark.whole_runs
+def test_clean_logs_are_not_refitted(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    logs, out = new_logs(tmp_path / "logs", 0.0), tmp_path / "refit"
+    given = [*logs, "--model", "baseline", "--window", "5 s", "--refit", out]
+    assert call(monkeypatch, "monitor", run, *given) == 0
+    assert "no model was written" in capsys.readouterr().out
+    assert not out.exists()
