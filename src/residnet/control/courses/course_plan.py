@@ -47,6 +47,10 @@ _NARROW = (0.1, 0.04, 0.02)
 _UNCHANGED = 1e-3
 """Largest change of z with which turns made anew fit each other."""
 _FAR = 0.1
+_JOINED = 3
+"""Courses whose turns are made anew, at most."""
+_SLOWER = 1.1
+"""Multiple of the quickest course's time from which on another is not made anew."""
 _SMALL = math.radians(1.5)
 _SHORT = 0.3
 """Turning radii of a leg between two turns to one side that are tried as one."""
@@ -140,12 +144,24 @@ def plan(
                 effort += sum(fit.effort for fit, _ in fits)
                 if found:
                     break
-        for fit, fitted in sorted(found, key=lambda one: one[1].time):
-            if make is not None and not request.turns.settled:
-                fit, fitted = _joined(request, fit, fitted, make)
+        found.sort(key=lambda one: one[1].time)
+        if make is not None and not request.turns.settled:
+            # what turns leave to those behind them changes which course is quickest
+            made = [_joined(request, *one, make) for one in _distinct(found)]
+            found = sorted(made, key=lambda one: one[1].time)
+        for fit, fitted in found:
             if _right(request, fit, fitted, step, reasons):
                 return _sampled(fit.route, fitted.z, step, beyond)
     raise ConfigError(_refusal(request, reasons))
+
+
+def _distinct(found: Sequence[tuple[Fit, Fitted]]) -> list[tuple[Fit, Fitted]]:
+    """Return the quickest courses that differ in their turns, a few at most."""
+    kept: dict[tuple[int, ...], tuple[Fit, Fitted]] = {}
+    for one in found:
+        if one[1].time < _SLOWER * found[0][1].time:
+            kept.setdefault(one[0].route.sides, one)
+    return list(kept.values())[:_JOINED]
 
 
 def _simplified(request: CourseRequest, sketch: Sketch) -> list[Sketch]:
@@ -166,7 +182,8 @@ def _right(
         reasons.append((fitted.missed, f"buoy {fitted.worst + 1}"))
         return False
     course = _sampled(fit.route, fitted.z, step, step)
-    track = course.track[: math.floor(course.length / step) + 1]
+    # to the end, between samples
+    track = course.track[: math.ceil(course.length / step) + 1]
     wrong = first_fault(track, request.buoys, request.protocol, 0.5 * step)
     if wrong is not None:
         reasons.append((0.0, wrong))

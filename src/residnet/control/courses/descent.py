@@ -11,19 +11,22 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.optimize import linprog
+from scipy.optimize import linprog, minimize
 
 from residnet.control.courses.turns import Array
 
 _ROUNDS = 45
 _LOOKED = 8
 """Steps after which the problem looks anew what it has to keep to."""
-_SETTLED = 5e-3
+_SETTLED = 2e-2
 """Gain that a step promises below which none is made."""
 _REACH = (5e-4, 0.3, 1.0)
 """Least, first and largest reach of a step."""
 _HELD = (0.05, 0.3, 0.7)
 """Shares of the promised gain: from which a step is made, shortened below, lengthened above."""
+
+_BENT = (0.5, 25)
+"""Largest reach of all steps of quadratic programs, and how many there are at most."""
 
 
 class Linear(NamedTuple):
@@ -113,6 +116,47 @@ def descend(problem: Problem, z: Array) -> Array:
             break
     problem.look(z)
     return z
+
+
+def polished(problem: Problem, z: Array) -> Array:
+    """Return the z of least cost near an end of `descend`, or that end where none is found.
+
+    Linear programs creep where less is asked than z has parts, because the cost bends there.
+    Quadratic ones (SLSQP) see the bend. What is far from being missed is left out.
+    """
+    first = problem.linear(z)
+    low = np.maximum(problem.least(), z - _BENT[0])
+    high = np.minimum(problem.most(), z + _BENT[0])
+    low[first.fixed] = high[first.fixed] = z[first.fixed]
+    kept = first.values < np.abs(first.rows).max(axis=1, initial=0.0) * _BENT[0]
+    conditions: list[Any] = [
+        {
+            "type": "ineq",
+            "fun": lambda x: problem.linear(x).values[kept],
+            "jac": lambda x: problem.linear(x).rows[kept],
+        }
+    ]
+    if len(first.even):
+        conditions.append(
+            {
+                "type": "eq",
+                "fun": lambda x: problem.linear(x).even,
+                "jac": lambda x: problem.linear(x).level,
+            }
+        )
+    found = minimize(
+        lambda x: (problem.linear(x).cost, problem.linear(x).slope),
+        z,
+        jac=True,
+        method="SLSQP",
+        bounds=np.stack((low, high), axis=-1),
+        constraints=conditions,
+        options={"maxiter": _BENT[1], "ftol": 1e-4},
+    )
+    after = np.clip(found.x, low, high)
+    better = problem.linear(after).merit() < first.merit()
+    problem.look(after if better else z)
+    return after if better else z
 
 
 def _tried(problem: Problem, here: Linear, z: Array, step: Array) -> tuple[Array, Linear, float]:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from residnet.control.courses.course_check import left_behind
-from residnet.control.courses.descent import Linear, descend
+from residnet.control.courses.descent import Linear, descend, polished
 from residnet.control.courses.outline import Circle
 from residnet.control.courses.route import LEG, Drawn, Route
 from residnet.control.courses.turn_table import POINTS
@@ -33,6 +33,8 @@ kept an eye on.
 """
 _SHARES = 4
 """Pieces of a turn that keep to circles each for itself."""
+_CLOSE = 0.02
+"""Turning radii that a route may miss by to be improved further."""
 FARTHEST = 0.3
 """How much farther off than its circle a buoy may be passed, in turning radii."""
 
@@ -297,5 +299,7 @@ class Fit:
     def solve(self, z: Array) -> Fitted:
         """Return the route that is found from a start."""
         z = descend(self, np.clip(z, self.route.least(), self.route.most()))
+        if self.missed(z)[0] <= _CLOSE * self.unit:
+            z = polished(self, z)
         missed, worst = self.missed(z)
         return Fitted(z, self.results(z)[0] * self.unit / self.route.turns.speed, missed, worst)

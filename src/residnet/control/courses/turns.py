@@ -118,7 +118,7 @@ class TurnMaker:
                 float(rudder[row]),
                 float(hold),
                 float(hold + stop),
-                _of_row(held, row),
+                _of_row(held, int(row)),
                 _of_row(countered, number),
                 _of_row(behind, number),
                 self.columns,
@@ -179,7 +179,8 @@ class TurnMaker:
 def _of_rows(states: CubicSpline, times: Array, rows: NDArray[np.intp]) -> Array:
     """Return the states [M, nx] of rows [M] at times [M]."""
     interval = np.clip(np.searchsorted(states.x, times, side="right") - 1, 0, len(states.x) - 2)
-    found: Array = np.polyval(states.c[:, interval, rows], (times - states.x[interval])[:, None])
+    passed = (times - states.x[interval])[:, None]
+    found: Array = np.asarray(np.polyval(states.c[:, interval, rows], passed), dtype=np.float64)
     return found
 
 
