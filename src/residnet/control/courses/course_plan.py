@@ -19,13 +19,12 @@ from numpy.typing import NDArray
 
 from residnet.control.courses.course_check import Asked, Protocol, first_fault
 from residnet.control.courses.fitting import Fit, Fitted
+from residnet.control.courses.joining import joined
 from residnet.control.courses.outline import Circle, Outlines
 from residnet.control.courses.route import LEG, Bend, Route, Sketch
 from residnet.control.courses.turn_table import (
     POINTS,
     Turns,
-    following_turns,
-    state_behind,
 )
 from residnet.control.courses.turns import Array, TurnMaker
 from residnet.control.courses.words import Room
@@ -42,15 +41,7 @@ _EFFORT = 400
 _RINGS = (0.0, 0.25)
 _TOLERANCE = 2e-3
 """Of distances, as a share of the vessel's turning radius."""
-_NARROW = (0.1, 0.04, 0.02)
-"""Turned angles in rad between the turns that are made anew, round for round."""
-_UNCHANGED = 1e-3
-"""Largest change of z with which turns made anew fit each other."""
 _FAR = 0.1
-_JOINED = 3
-"""Courses whose turns are made anew, at most."""
-_SLOWER = 1.1
-"""Multiple of the quickest course's time from which on another is not made anew."""
 _SMALL = math.radians(1.5)
 _SHORT = 0.3
 """Turning radii of a leg between two turns to one side that are tried as one."""
@@ -145,23 +136,10 @@ def plan(
                 if found:
                     break
         found.sort(key=lambda one: one[1].time)
-        if make is not None and not request.turns.settled:
-            # what turns leave to those behind them changes which course is quickest
-            made = [_joined(request, *one, make) for one in _distinct(found)]
-            found = sorted(made, key=lambda one: one[1].time)
-        for fit, fitted in found:
+        for fit, fitted in found if make is None else joined(request.turns, found, make):
             if _right(request, fit, fitted, step, reasons):
                 return _sampled(fit.route, fitted.z, step, beyond)
     raise ConfigError(_refusal(request, reasons))
-
-
-def _distinct(found: Sequence[tuple[Fit, Fitted]]) -> list[tuple[Fit, Fitted]]:
-    """Return the quickest courses that differ in their turns, a few at most."""
-    kept: dict[tuple[int, ...], tuple[Fit, Fitted]] = {}
-    for one in found:
-        if one[1].time < _SLOWER * found[0][1].time:
-            kept.setdefault(one[0].route.sides, one)
-    return list(kept.values())[:_JOINED]
 
 
 def _simplified(request: CourseRequest, sketch: Sketch) -> list[Sketch]:
@@ -259,35 +237,6 @@ def _fitted(request: CourseRequest, sketch: Sketch) -> list[tuple[Fit, Fitted]]:
             break
         sketch = after
     return found
-
-
-def _joined(
-    request: CourseRequest, fit: Fit, fitted: Fitted, make: TurnMaker
-) -> tuple[Fit, Fitted]:
-    """Return a course whose turns begin with the motion that the turns before them leave."""
-    route, z = fit.route, fitted.z
-    sides = np.array(route.sides)
-    if len(sides) == 0:
-        return fit, fitted
-    rudder = sides * [request.turns.tables[number].rudder for number in route.numbers]
-    begin = [make.straight] * len(sides)
-    for width in _NARROW:
-        values = z * route.units
-        spacing = width / (make.turning.gain * np.abs(rudder))
-        middle = np.maximum(values[2::2], 2.0 * spacing + 0.1 * make.dt)
-        holds = middle[:, None] + spacing[:, None] * np.arange(-2, 3)
-        turns, made = following_turns(make, holds, rudder, begin, route.turns.radius)
-        begin = [make.straight]
-        for turn, leg in zip(made[:-1], values[3:-1:2], strict=True):
-            begin.append(state_behind(turn, float(leg)))
-        joined = Route(route.start, route.sides, tuple(range(len(sides))), turns)
-        fit = fit.on(joined)
-        before, z = z, np.clip(z, joined.least(), joined.most())
-        fitted = fit.solve(z)
-        z = fitted.z
-        if np.abs(z - before).max() < _UNCHANGED:
-            break
-    return fit, fitted
 
 
 def _drawn(request: CourseRequest, route: Route, z: Array, fit: Fit, sketch: Sketch) -> Sketch:

@@ -99,6 +99,7 @@ class Fit:
         self.apart = [self._apart(circle) for circle in circles]
         self.hard, self.price, self.effort = 0, _PRICE, 0
         self.seen: Array | None = None
+        self.near: tuple[Array, float] | None = None
         self.last: _Results
 
     def on(self, route: Route) -> Fit:
@@ -258,11 +259,13 @@ class Fit:
 
     def least(self) -> Array:
         """Return the smallest z."""
-        return self.route.least()
+        least = self.route.least()
+        return least if self.near is None else np.maximum(least, self.near[0] - self.near[1])
 
     def most(self) -> Array:
         """Return the largest z."""
-        return self.route.most()
+        most = self.route.most()
+        return most if self.near is None else np.minimum(most, self.near[0] + self.near[1])
 
     def linear(self, z: Array) -> Linear:
         """Return the problem as it is linear at z."""
@@ -296,9 +299,10 @@ class Fit:
         self.price = _DEAR
         return self.solve(z)
 
-    def solve(self, z: Array) -> Fitted:
-        """Return the route that is found from a start."""
-        z = descend(self, np.clip(z, self.route.least(), self.route.most()))
+    def solve(self, z: Array, reach: float | None = None) -> Fitted:
+        """Return the route that is found from a start, not farther from it than a reach of z."""
+        self.near = None if reach is None else (z, reach)
+        z = descend(self, np.clip(z, self.least(), self.most()))
         if self.missed(z)[0] <= _CLOSE * self.unit:
             z = polished(self, z)
         missed, worst = self.missed(z)
