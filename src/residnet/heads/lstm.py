@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from residnet.core.samples import Samples
 from residnet.heads.base import FeatureConfig, Features, ResidualHead, ResidualScale
 from residnet.heads.mirror import MirroredHead
+from residnet.heads.quick_tanh import Tanh, quick_tanh
 from residnet.physics.bounds import VelocityBound
 
 _FARTHEST = 1e3
@@ -112,16 +113,12 @@ class LstmCore(nn.Module):
     def forward(self, f: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return output h [B, H] and memory [B, 2H] after one step of features [B, F]."""
         gates = f @ self.w_input.T + s[:, : self.hidden] @ self.w_hidden.T + self.bias
-        i, forget, g, o = gates.chunk(4, dim=-1)
-        if self.softsign:
-            block = nn.functional.softsign(g)
-        else:
-            block = torch.tanh(g)
-        c = torch.sigmoid(forget) * s[:, self.hidden :] + torch.sigmoid(i) * block
-        if self.softsign:
-            h = torch.sigmoid(o) * nn.functional.softsign(c)
-        else:
-            h = torch.sigmoid(o) * torch.tanh(c)
+        # one operation over all numbers is quicker than three over parts that lie apart
+        i, forget, _, o = torch.sigmoid(gates).chunk(4, dim=-1)
+        g = gates[:, 2 * self.hidden : 3 * self.hidden]
+        block = nn.functional.softsign(g) if self.softsign else quick_tanh(g)
+        c = forget * s[:, self.hidden :] + i * block
+        h = o * (nn.functional.softsign(c) if self.softsign else quick_tanh(c))
         return h, torch.cat((h, c), dim=-1)
 
     def memory_range(self) -> tuple[Tensor, Tensor]:
@@ -186,7 +183,7 @@ class LstmNetwork(nn.Module):
             out.bias.zero_()
         mixer = (
             nn.Sequential(
-                nn.Linear(config.hidden_size + self.features.count, config.readout), nn.Tanh()
+                nn.Linear(config.hidden_size + self.features.count, config.readout), Tanh()
             )
             if self.skip
             else nn.Sequential()

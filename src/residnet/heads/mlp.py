@@ -12,9 +12,10 @@ from torch import Tensor, nn
 from residnet.core.samples import Samples
 from residnet.heads.base import FeatureConfig, Features, ResidualHead, ResidualScale
 from residnet.heads.mirror import MirroredHead
+from residnet.heads.quick_tanh import Tanh
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {
-    "tanh": nn.Tanh,
+    "tanh": Tanh,
     "silu": nn.SiLU,
     "relu": nn.ReLU,
     "softsign": nn.Softsign,
