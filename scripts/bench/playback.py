@@ -310,13 +310,13 @@ def main(arguments: Sequence[str]) -> int:
     wrong = 0
     with tempfile.TemporaryDirectory() as name:
         runs = [*given.runs, *(fits(Path(name)) if given.fits else [])]
-        print(f"{'run: model':44}{'log':22}{'format':13}{'share of range':>15}  state")
+        print(f"{'run: model':44}{'log':38} {'format':13}{'share of range':>15}  state")
         for entry in runs:
             place, _, model_name = entry.partition(":")
             run = Path(place)
             spec, model = load_model(run / "models" / chosen_model(run, model_name or "selected"))
             log = recording(run, spec, given.seconds, given.log)
-            head = f"{run.name + ': ' + spec.name:44}{log.name:22}"
+            head = f"{run.name + ': ' + spec.name:44}{log.name:38} "
             with tempfile.TemporaryDirectory() as written:
                 for found in shares(spec, model, log, not given.no_aoti, Path(written)):
                     wrong += found.bad

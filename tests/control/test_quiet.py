@@ -8,7 +8,7 @@ import torch
 
 from residnet.control.conditions.config import ConditionsConfig
 from residnet.control.conditions.flights import ConditionedRun
-from residnet.control.conditions.quiet import SteadyConfig, SteadyTest, nominal
+from residnet.control.conditions.quiet import SteadyConfig, SteadyTest, nominal, too_many
 from residnet.control.heading.controllers import PdConfig, Steering
 from residnet.control.heading.steering import SteeredPlant
 from residnet.control.observed.config import PtosConfig
@@ -51,3 +51,14 @@ def test_nominal_rows_have_no_delay_bias_or_weather() -> None:
     for rows in (slice(0, 2), slice(5, 6)):
         assert torch.equal(changed.variation[rows], drawn.variation[rows])
         assert torch.equal(changed.delay[rows], drawn.delay[rows])
+
+
+def test_one_flight_in_twenty_may_overshoot_by_more() -> None:
+    overshoot = torch.zeros(60)
+    overshoot[:3] = 1.0
+    assert too_many(overshoot, 0.5) == 0
+    overshoot[3:5] = 0.6
+    assert too_many(overshoot, 0.5) == 2
+    assert too_many(overshoot, 2.0) == 0
+    overshoot[5] = math.nan
+    assert too_many(overshoot, 0.5) == 3

@@ -76,10 +76,10 @@ def fitted(settings: ConditionsTraining) -> ConditionsFit:
 def test_epochs_that_swing_come_after_those_that_do_not() -> None:
     settings = ConditionsTraining(dt=0.1, hold=0.0, validation=4, steady=SteadyConfig(flights=4))
     fit = fitted(settings)
-    # five of twenty flights are beyond the limits: they count twice
+    # five of twenty-four flights are beyond the limits: they count twice
     fit.best_state, fit.best_score, fit.best_diverged = {"any": torch.zeros(1)}, 6.0, 5
     for refused, cost, better in ((0, 9.0, True), (5, 5.9, True), (0, math.nan, False),
-                                  (10, 5.1, False), (10, 4.9, True), (1, 7.1, True)):  # fmt: skip
+                                  (10, 5.2, False), (10, 4.9, True), (1, 6.9, True)):  # fmt: skip
         fit.diverged = refused
         assert fit._gains(cost) is better
     fit.best_diverged = 0
@@ -107,6 +107,14 @@ def test_swing_and_nominal_overshoot_cost_beyond_what_is_free() -> None:
     assert cost(1.0, 8) == pytest.approx(0.2 + 0.5 * (0.5 - 0.2**2 / 2.0), rel=0.02)
     assert cost(1.0, 2) == pytest.approx(cost(1.0, 8))
     assert cost(1.0, 1) == pytest.approx(0.2 + 0.5 * (cost(1.0, 8) - 0.2), rel=1e-4)
+
+
+def test_overshoot_beyond_the_limit_of_one_in_twenty_costs() -> None:
+    limits = SteadyConfig(flights=4, overshoot_p95=math.radians(0.5))
+    settings = ConditionsTraining(dt=0.1, hold=0.0, validation=4, excess=2.0, steady=limits)
+    overshoot = torch.deg2rad(torch.tensor([0.0, 0.4, 0.7, 1.5]))
+    assert float(fitted(settings)._beyond(overshoot)) == pytest.approx(2.0 * (0.2 + 1.0) / 4.0)
+    assert fitted(settings.model_copy(update={"steady": None}))._beyond(overshoot) == 0.0
 
 
 def test_the_conditions_and_the_guide_follow_the_progress() -> None:

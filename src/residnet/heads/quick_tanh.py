@@ -16,8 +16,8 @@ def quick_tanh(x: Tensor, many: int = 8_192) -> Tensor:
     fewer than `many` numbers, for which three operations take longer than one.
     """
     traced = False
-    if not torch.jit.is_scripting():
-        traced = torch.compiler.is_compiling() or torch.jit.is_tracing()
+    if not torch.jit.is_scripting():  # type: ignore[attr-defined]
+        traced = torch.compiler.is_compiling()
     if traced or torch.is_grad_enabled() or x.device.type != "cpu" or x.numel() < many:
         return torch.tanh(x)
     return 2.0 * torch.sigmoid(2.0 * x) - 1.0

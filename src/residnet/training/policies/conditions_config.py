@@ -44,6 +44,8 @@ class ConditionsTraining(OneStage):
             of those flights, mean over the quarter of them that swings most; a movement of half of
             what `steady` allows is free.
         exact: cost in s of one degree of overshoot of the flights of the nominal vessel.
+        excess: cost in s of one degree of overshoot beyond `steady.overshoot_p95`, in all flights,
+            besides what the conditions count for it.
         stricter: factor on `calm` and `exact` after every epoch that `steady` refuses.
         steady: what a policy must keep to without noise. Epochs that do come first; of those that
             do not, a flight beyond counts twice. Null to choose by the cost alone.
@@ -67,9 +69,10 @@ class ConditionsTraining(OneStage):
     faded: float = Field(default=0.6, gt=0, le=1)
     outlying: float = Field(default=4.0, ge=1)
     quiet: float = Field(default=0.1, ge=0, le=1)
-    calm: float = Field(default=0.5, ge=0)
+    calm: float = Field(default=1.0, ge=0)
     exact: float = Field(default=1.0, ge=0)
-    stricter: float = Field(default=1.1, ge=1, le=10)
+    excess: float = Field(default=1.0, ge=0)
+    stricter: float = Field(default=1.2, ge=1, le=10)
     steady: SteadyConfig | None = SteadyConfig()
     validation: int = Field(default=512, ge=2, le=1_000_000)
     compiled: bool = True

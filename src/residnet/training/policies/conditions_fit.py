@@ -16,7 +16,7 @@ from residnet.control.conditions.flights import (
     ConditionedRun,
     Flying,
 )
-from residnet.control.conditions.quiet import SteadyTest, nominal
+from residnet.control.conditions.quiet import SteadyTest, nominal, too_many
 from residnet.control.heading.keeper import HeadingKeeper
 from residnet.control.heading.steering import SteeredVessel
 from residnet.core.errors import ExportError
@@ -119,6 +119,7 @@ class ConditionsFit(EpochTraining):
         )
         if quiet > 0:
             loss = loss + self._strict() * self._unsteady(flown, found["overshoot"], quiet)
+        loss = loss + self._beyond(found["overshoot"])
         self._losses.append(float(found["cost"].detach().mean()))
         return loss
 
@@ -136,6 +137,13 @@ class ConditionsFit(EpochTraining):
         if last > first:
             cost = cost + math.degrees(settings.exact) * overshoot[first:last].mean()
         return cost
+
+    def _beyond(self, overshoot: Tensor) -> Tensor:
+        """Return what overshoots beyond the limit of one flight in twenty cost in s."""
+        steady = self.settings.steady
+        limit = math.inf if steady is None else steady.overshoot_p95
+        beyond: Tensor = (overshoot - limit).clamp(min=0.0).mean()
+        return math.degrees(self.settings.excess) * beyond
 
     def _strict(self) -> float:
         """Return the factor on what swing and nominal overshoot cost in this epoch."""
@@ -177,21 +185,24 @@ class ConditionsFit(EpochTraining):
 
         A refused flight counts twice.
         """
-        share = 0.0 if self.steady is None else refused / self.steady.flights
+        flights = 0 if self.steady is None else self.steady.flights + self.settings.validation
+        share = refused / max(flights, 1)
         return refused > 0, cost * (1.0 + share)
 
     def validated(self) -> tuple[nn.Module, float]:
         """Return the policy and its mean cost over the flights that epochs are chosen on.
 
-        Flights that swing are counted. An epoch that costs more than the start counts as if more
-        of them swung than there are, so that it never takes the start's place.
+        Flights that swing are counted, and those beyond one in twenty that overshoot too far. An
+        epoch that costs more than the start counts as if more of them swung than there are, so
+        that it never takes the start's place.
         """
         self.policy.at(self.unseen.dt)
-        flown = self.test.fly(self.unseen)
-        score = float(flown.measured(self.conditions)["cost"].mean())
+        found = self.test.fly(self.unseen).measured(self.conditions)
+        score = float(found["cost"].mean())
         if self.steady is not None:
             worse = self.start_score is not None and score > self.start_score
-            self.diverged = _ALL if worse else self.steady.refused(self.test)
+            often = too_many(found["overshoot"], self.steady.limits.overshoot_p95)
+            self.diverged = _ALL if worse else self.steady.refused(self.test) + often
         self.policy.at(self.settings.dt)
         return self.policy, score
 
