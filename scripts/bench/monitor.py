@@ -191,7 +191,9 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         for vessel in given.vessels:
             random = np.random.default_rng(given.seed)
-            sailed = str(scattered(vessel, random, Path(folder))) if given.scatter else vessel
+            sailed = vessel
+            if given.scatter:
+                sailed = str(scattered(vessel, random, Path(folder), ("added_mass", "damping")))
             settings, model, clean = identified(vessel, sailed, 100 + given.seed)
             config = MonitorConfig()
             steps = round(config.window / STEP)

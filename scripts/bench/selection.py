@@ -16,7 +16,7 @@ import json
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -70,8 +70,10 @@ VESSELS: dict[str, dict[str, Any]] = {
 are scattered, and the standard deviations of its largest random forces."""
 
 
-def scattered(name: str, random: np.random.Generator, folder: Path) -> Path:
-    """Write a vessel's file with parameters scattered by about a fifth."""
+def scattered(
+    name: str, random: np.random.Generator, folder: Path, sections: Sequence[str] = ()
+) -> Path:
+    """Write a vessel's file with parameters of some sections scattered by about a fifth."""
     vessels = Path(__file__).resolve().parents[2] / "configs" / "vessels"
     content = yaml.safe_load((vessels / f"{name}.yaml").read_text(encoding="utf-8"))
 
@@ -80,7 +82,7 @@ def scattered(name: str, random: np.random.Generator, folder: Path) -> Path:
             return {key: value if key in _WORDS else moved(value) for key, value in part.items()}
         return float(part * np.exp(0.2 * random.standard_normal()))
 
-    for section in VESSELS[name]["scattered"]:
+    for section in sections or VESSELS[name]["scattered"]:
         content[section] = moved(content[section])
     content["name"] = "scattered"
     path = folder / "scattered.yaml"

@@ -71,3 +71,21 @@ def test_all_scores_together_name_the_cause() -> None:
             right += int(np.abs(size / error).argmax()) == cause
             assert abs(size[cause] - 1.5) < 5 * error[cause]
         assert right >= 45
+
+
+def test_one_log_at_odds_with_the_others_does_not_speak_for_all() -> None:
+    random = np.random.default_rng(5)
+    scatter = scattered(groups(random, 60, 1, np.zeros(CAUSES), 0.1))
+    changed, strange = [], []
+    for _ in range(50):
+        known = groups(random, 5, 1, np.zeros(CAUSES), 0.1)
+        odd = known[-1]
+        # a manoeuvre that no clean log held asks for ten standard deviations alone
+        pushed = odd.score + 10.0 * np.sqrt(scatter.variance(odd.own))
+        size, error = scatter.together([*known[:-1], Group(odd.log, pushed, odd.information)])
+        strange.append(np.abs(size / error).max())
+        size, error = scatter.together(groups(random, 5, 1, np.array([0.0, 0.0, 2.0]), 0.1))
+        changed.append(size[2] / error[2])
+        assert abs(size[2] - 2.0) < 5 * error[2]
+    assert np.median(strange) < 4.0
+    assert np.median(changed) > 6.0

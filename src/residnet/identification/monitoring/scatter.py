@@ -19,6 +19,13 @@ _NOISE = np.geomspace(1.0, 30.0, 25)
 _APART = np.concatenate(([0.0], np.geomspace(1e-4, 1e3, 40)))
 """Variances of sizes, in what a group of middling information tells, that are tried."""
 _NOTHING = 1e-12
+_AT_ODDS = 1.345
+"""Standard deviations by which a log may differ from the others before it counts for less.
+
+It is the usual constant: where errors are normal, 95 % of what they say is kept.
+"""
+_ROUNDS = 8
+"""Of reweighting."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +88,7 @@ class Scatter:
 
         The scores of all tell better than each for itself which cause it is, and that there is one.
         """
-        told, weight = np.zeros(len(self.noise)), np.full(len(self.noise), _NOTHING)
+        told, weight = [], []
         for log in dict.fromkeys(group.log for group in groups):
             part, sure = 0.0, 0.0
             alike: list[np.ndarray] = []
@@ -96,9 +103,30 @@ class Scatter:
                     alike.append(self.shared * group.own**2 / variance)
             # groups of one log say in part the same
             again = 1.0 + (len(alike) - 1) * np.mean(alike, axis=0)
-            told += part / again
-            weight += sure / again
-        return told / weight, np.sqrt((1.0 / weight + self.known) * self.inflation)
+            told.append(part / again)
+            weight.append(sure / again + _NOTHING)
+        size, agreed = _agreed(np.stack(told), np.stack(weight))
+        return size, np.sqrt((1.0 / agreed + self.known) * self.inflation)
+
+
+def _agreed(told: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the size [Q] on which logs agree, and the weight behind it (P. J. Huber, 1964).
+
+    A vessel that has changed shows it in all logs. One that is at odds with the others, as a rare
+    manoeuvre may be, counts by how far it is and not by the square of that.
+
+    Args:
+        told: sizes times weights of the logs [K, Q].
+        weight: inverse variances of the sizes [K, Q].
+    """
+    each, root = told / weight, np.sqrt(weight)
+    trusted = np.ones_like(weight)
+    size = told.sum(axis=0) / weight.sum(axis=0)
+    for _ in range(_ROUNDS):
+        apart = np.abs(each - size) * root
+        trusted = np.minimum(1.0, _AT_ODDS / np.maximum(apart, 1e-9))
+        size = (trusted * told).sum(axis=0) / (trusted * weight).sum(axis=0)
+    return size, (trusted * weight).sum(axis=0)
 
 
 def scattered(groups: Sequence[Group]) -> Scatter:
