@@ -231,3 +231,21 @@ def test_everything_that_a_bag_holds(tmp_path: Path) -> None:
     assert recording["odometry"].kind == "nav_msgs/msg/Odometry"
     assert recording["odometry"].sender is not None
     assert len(recording["cmd_port"]) == 21
+
+
+def test_vectors_beside_a_struct_with_the_time(tmp_path: Path) -> None:
+    """One struct has the time, its neighbours do not; two times that differ leave it open."""
+    from scipy.io import savemat
+
+    t = np.arange(0.0, 30.0, 0.1)
+    nav = {"t": t, "pos": {"N": 2.0 * t}}
+    act = {"rudder": np.sin(t), "gains": np.ones(3)}
+    savemat(tmp_path / "one.mat", {"data": {"nav": nav, "act": act}})
+    recording = recording_for(tmp_path / "one.mat")
+    fields = recording.series["data/nav"].fields
+    assert set(fields) == {"pos.N", "act.rudder"}
+    np.testing.assert_array_equal(fields["act.rudder"], np.sin(t))
+    assert {note["code"] for note in recording.remarks} == {"no_time", "time_of_others"}
+    savemat(tmp_path / "two.mat", {"nav": nav, "imu": {"t": t + 0.05, "r": t}, "act": act})
+    series = recording_for(tmp_path / "two.mat").series
+    assert {name for one in series.values() for name in one.fields} == {"pos.N", "r"}

@@ -234,3 +234,35 @@ def test_times_of_unix_keep_their_digits(tmp_path: Path) -> None:
     assert content["time"]["column"] == "Zeit", "a counter is no time"
     with pytest.raises(DataError, match="time repeats"):
         validate(content, ReaderConfig, "here").build().read(path)
+
+
+@pytest.mark.parametrize("ending", ["", "\n"])
+@pytest.mark.parametrize("sign", ["#", "%", "//", "  #"])
+def test_comments_among_the_values(sign: str, ending: str, tmp_path: Path) -> None:
+    """A recorder says at the end how many rows it wrote; somebody notes what happened."""
+    lines = text(COLUMNS)
+    note = f"{sign} wind rises, sea 2; 300 rows, by JS"
+    path, plain = tmp_path / "log.csv", tmp_path / "plain.csv"
+    plain.write_text("\n".join(lines) + "\n")
+    path.write_text("\n".join([*lines[:100], note, *lines[100:], note]) + ending)
+    log, _, _ = drafted(path)
+    truth, _, _ = drafted(plain)
+    np.testing.assert_array_equal(log.t, truth.t)
+    for name, values in truth.channels.items():
+        np.testing.assert_array_equal(log[name], values)
+
+
+def test_a_name_that_stands_twice(tmp_path: Path) -> None:
+    """The first is taken, and said to be; either can be told by its number."""
+    path = tmp_path / "log.csv"
+    rows = zip(T, NORTH, EAST, np.degrees(PSI), np.degrees(PSI) + 2.0, strict=True)
+    lines = ["t [s],north [m],east [m],heading [deg],heading [deg]"]
+    path.write_text("\n".join([*lines, *(",".join(map(str, row)) for row in rows)]) + "\n")
+    log, content, marks = drafted(path)
+    np.testing.assert_allclose(log["psi"], PSI, atol=1e-9)
+    assert any("more than once" in said for _, said in marks.guesses)
+    entry = content["channels"]["psi"]
+    assert entry["column"] == "heading [deg].0"
+    entry["column"] = "heading [deg].1"
+    other = validate(content, ReaderConfig, "here").build().read(path)
+    np.testing.assert_allclose(other["psi"] - log["psi"], np.radians(2.0), atol=1e-9)

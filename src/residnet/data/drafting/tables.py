@@ -130,6 +130,9 @@ def named(columns: Sequence[str], marks: Marks) -> dict[str, str]:
             speeds.append(column)
         elif channel is not None and channel not in names:
             names[channel] = column
+        elif channel is not None and _copy(column) == _copy(names[channel]):
+            text = f"the header names it more than once; '{names[channel]}' is the first of them"
+            marks.guess((*CHANNELS, channel), text)
         elif channel is not None:
             marks.note(CHANNELS, f"'{column}' may be {channel} as well as '{names[channel]}' is")
     if "u" not in names and "v" in names and speeds:
@@ -137,6 +140,11 @@ def named(columns: Sequence[str], marks: Marks) -> dict[str, str]:
         marks.guess((*CHANNELS, "u"), f"'{speeds[0]}' is taken as the speed forward, not its size")
     order = [*STATE_NAMES, *(name for name in names if name not in STATE_NAMES)]
     return {name: names[name] for name in order if name in names}
+
+
+def _copy(column: str) -> str:
+    """Return the name that stands more than once in a header."""
+    return re.sub(r"\.\d+$", "", column)
 
 
 def _other_unit(column: str, channel: str | None) -> str | None:

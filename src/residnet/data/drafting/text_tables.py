@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from residnet.core.errors import DataError
 from residnet.core.names import shown
 from residnet.data.readers.encoding import as_utf8
-from residnet.data.readers.tables.header import BLANKS, cells_of, found_header
-from residnet.data.readers.tables.pieces import numbered
+from residnet.data.readers.tables.header import BLANKS, cells_of, found_header, numbered
+from residnet.data.readers.tables.lines import comment_lines
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -58,7 +58,7 @@ def _first_rows(path: Path, file: Path, rows: int) -> tuple[pd.DataFrame, dict[s
             decimal=decimal,
             header=None,
             names=[*names, _BEYOND],
-            skiprows=form.above,
+            skiprows=[*range(form.above), *comment_lines(file, form.above)],
             nrows=rows,
             encoding="utf-8-sig",
             skipinitialspace=True,

@@ -43,7 +43,7 @@ _ABOUT: dict[str, str] = {
     " fahrt vaart 速力 | velo sog stw fart vel spd log tws",
     "surge": "surge langsgeschw laengsgeschw longitudinal avance avante voraus vooruit voorwaart"
     " fremover forover 前後 langs avanzamento | u forward ahead corredera",
-    "sway": "sway quergeschw seitlich lateral dwars tverr sideveis 左右 derive transvers"
+    "sway": "sway quergeschw seitlich lateral dwars tverr sideveis 左右 derive deriva transvers"
     " verlijering scarroccio avdrift abatimiento querdrift 横流 querab sidewards sideways | v vm"
     " quer",
     "rudder": "rudder ruder gouvernail timon roer rorv roder rorutslag 舵 safran barre | delta"

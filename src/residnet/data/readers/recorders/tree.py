@@ -36,6 +36,8 @@ TIME_NAMES = (
 # MATLAB's day 719529 is 1 January 1970
 _DATENUM_1970, _DAY = 719_529.0, 86_400.0
 _MOST_COLUMNS = 64
+_FEWEST = 20
+"""Fewest samples of a vector that is timed by another group's time."""
 
 
 class Vector(Protocol):
@@ -98,7 +100,8 @@ def tree_recording(
 ) -> Recording:
     """Return the recording of vectors by their path (`trial/u`).
 
-    Each vector belongs to the nearest group above it whose time has its length.
+    Each vector belongs to the nearest group above it whose time has its length, else to the only
+    time of the file that has it.
 
     Args:
         path: the file.
@@ -114,23 +117,31 @@ def tree_recording(
     clocks = _required_clocks(path, leaves, time)
     fields: dict[str, dict[str, np.ndarray]] = {group: {} for group in clocks}
     remarks: list[Remark] = []
-    left = []
+    left, adopted = [], []
     for name, values in leaves.items():
         group = _home(name, values, clocks)
         if group is None:
             left.append(f"{name} {list(values.shape)}")
         elif (
             name != clocks[group][0]
-            and wanted.field(group or "/", path_in := name[len(group) :].lstrip("/"))
+            and wanted.field(group or "/", path_in := _path_in(group, name))
             and wanted(group or "/")
         ):
             fields[group].update(_columns(path_in, values, len(clocks[group][1])))
+            if not name.startswith(f"{group}/" if group else ""):
+                adopted.append(f"{name} by {clocks[group][0]}")
     if left:
         text = (
             f"{len(left)} arrays belong to no time"
             f" ({', '.join(left[:6])}{', ...' if len(left) > 6 else ''}); left out"
         )
         remarks.append(remark("note", "no_time", text, arrays=len(left)))
+    if adopted:
+        text = (
+            f"{len(adopted)} arrays without a time beside them are timed by the only one of their"
+            f" length ({', '.join(adopted[:6])}{', ...' if len(adopted) > 6 else ''})"
+        )
+        remarks.append(remark("note", "time_of_others", text, arrays=len(adopted)))
     chosen = {
         group: clock for group, clock in clocks.items() if wanted(group or "/") and fields[group]
     }
@@ -201,13 +212,31 @@ def _clocks(
 
 
 def _home(path: str, values: Vector, clocks: Mapping[str, tuple[str, np.ndarray]]) -> str | None:
-    """Return the nearest group above whose time has the length of `values`."""
+    """Return the nearest group above whose time has the length of `values`.
+
+    Where there is none, and all times of this length in the file are the same, the first of their
+    groups.
+    """
     group = path
     while group:
         group = group.rpartition("/")[0]
         if group in clocks and _rows(values, clocks[group][1].size) is not None:
             return group
-    return None
+    if max(values.shape, default=0) < _FEWEST:
+        return None
+    alike = [name for name, (_, t) in clocks.items() if max(values.shape) == t.size]
+    same = all(np.array_equal(clocks[name][1], clocks[alike[0]][1]) for name in alike)
+    return alike[0] if alike and same and _rows(values, max(values.shape)) is not None else None
+
+
+def _path_in(group: str, name: str) -> str:
+    """Return the path of a vector below what it has in common with the group of its time."""
+    shared = 0
+    for mine, other in zip(name.split("/")[:-1], group.split("/") if group else [], strict=False):
+        if mine != other:
+            break
+        shared += 1
+    return "/".join(name.split("/")[shared:])
 
 
 def _rows(values: Vector, length: int) -> int | None:

@@ -50,6 +50,19 @@ def cells_of(lines: Iterable[str], delimiter: str) -> Iterator[list[str]]:
         yield [cell.strip() for cell in row]
 
 
+def numbered(names: Sequence[str]) -> list[str]:
+    """Return names of which each stands once: copies are counted, nameless columns too."""
+    out: list[str] = []
+    for place, name in enumerate(names):
+        several = name and list(names).count(name) > 1
+        copy = f"{name}.{list(names[:place]).count(name)}"
+        unique = copy if several else name or f"Unnamed: {place}"
+        while unique in out:
+            unique += "_"
+        out.append(unique)
+    return out
+
+
 def measures(cell: str) -> bool:
     """Return whether a cell holds a number, a date or a time of day."""
     return bool(_NUMBER.fullmatch(cell) or _TIME.match(cell))
@@ -90,13 +103,16 @@ def header_with(path: Path, delimiter: str, file: Path, columns: Sequence[str]) 
         )
     at = found[0] if found else 0
     line, names = rows[at]
-    where = [names.index(column) for column in columns if column in names]
+    called = numbered(names)
+    where = [called.index(column) for column in columns if column in called]
     below = _without_values([cells for _, cells in rows[at + 1 :]], where) if found else 0
     return Header(tuple(names), line, rows[at + below][0])
 
 
 def _holding(rows: Sequence[tuple[int, list[str]]], columns: Sequence[str]) -> list[int]:
-    return [i for i, (_, cells) in enumerate(rows) if set(columns) <= set(cells)][:1]
+    """Return which row holds all the names, at most one."""
+    wanted = set(columns)
+    return [i for i, (_, row) in enumerate(rows) if wanted <= {*row, *numbered(row)}][:1]
 
 
 def _without_values(rows: Sequence[Sequence[str]], where: Sequence[int]) -> int:

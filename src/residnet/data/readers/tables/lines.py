@@ -12,20 +12,36 @@ import csv
 import io
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from residnet.core.errors import DataError
 from residnet.data.readers.tables.header import BLANKS
 
+
+class Lines(NamedTuple):
+    """What the lines of a table are, beside values.
+
+    Attributes:
+        cut: whether the last line must be left out because the file was cut within it: it has no
+            end, and too few cells or a last cell shorter than any in that column shortly before.
+        comments: numbers of the lines below the header that are comments, from 0.
+    """
+
+    cut: bool
+    comments: tuple[int, ...]
+
+
 _BLOCK = 1 << 18
+_COMMENT = (b"#", b"%", b"//")
 _TAIL = 1 << 16
 _NEWLINE, _RETURN, _QUOTE = 0x0A, b"\r", b'"'
 
 
 def check_lines(
     path: Path, delimiter: str, header: Sequence[str], above: int = 1, file: Path | None = None
-) -> bool:
+) -> Lines:
     """Look at every line of values, as many cells each as the header; blank lines do not count.
 
     A delimiter more or less at the end of every line makes no cell.
@@ -38,8 +54,8 @@ def check_lines(
         file: that holds its text as UTF-8; None for `path` itself.
 
     Returns:
-        Whether the last line must be left out because the file was cut within it: it has no end,
-        and too few cells or a last cell shorter than any in that column shortly before.
+        Whether the last line is left out, and which lines are comments: those that begin with `#`,
+        `%` or `//`.
 
     Raises:
         DataError: where a line has more or fewer cells than the header, or a byte is zero.
@@ -48,6 +64,7 @@ def check_lines(
     # names that are missing at the end are those of cells that are not there
     named = max((i for i, name in enumerate(header, start=1) if name), default=wide)
     cut, line = _cut_short(file, delimiter, named), 0
+    comments: list[int] = []
     for block, last in _blocks(file):
         if b"\x00" in block:
             at = line + block[: block.index(b"\x00")].count(b"\n") + 1
@@ -58,6 +75,9 @@ def check_lines(
         cells, blank = _cells(block, delimiter, wide)
         odd = (cells != wide) & ~blank
         odd[: max(above - line, 0)] = False
+        said = [i for i in _comments(block) if line + i >= above]
+        comments += [line + i for i in said]
+        odd[[i for i in said if i < odd.size]] = False
         if odd.any():
             # rarely so: an empty cell more at the end of lines, or without names
             ended = _ended(block, delimiter, cells.size)
@@ -72,7 +92,23 @@ def check_lines(
                 " the damaged lines"
             )
         line += cells.size
-    return cut
+    return Lines(cut and line - 1 not in comments[-1:], tuple(comments))
+
+
+def comment_lines(file: Path, above: int) -> list[int]:
+    """Return the numbers, from 0, of the lines of a table below its header that are comments."""
+    found, line = [], 0
+    for block, _ in _blocks(file):
+        found += [line + i for i in _comments(block) if line + i >= above]
+        line += len(_lines(block))
+    return found
+
+
+def _comments(block: bytes) -> list[int]:
+    """Return which lines of a block are comments."""
+    if not any(sign in block for sign in _COMMENT):
+        return []
+    return [i for i, line in enumerate(_lines(block)) if line.lstrip().startswith(_COMMENT)]
 
 
 def _blocks(path: Path) -> Iterator[tuple[bytes, bool]]:

@@ -12,7 +12,7 @@ from residnet.core.errors import DataError, UsageError
 from residnet.core.names import nearest, shown
 from residnet.data.readers.encoding import as_utf8
 from residnet.data.readers.files import missing_package
-from residnet.data.readers.tables.header import BLANKS, found_header, header_with
+from residnet.data.readers.tables.header import BLANKS, found_header, header_with, numbered
 from residnet.data.readers.tables.lines import check_lines
 
 if TYPE_CHECKING:
@@ -30,16 +30,18 @@ def _positions(
     path: Path, header: Sequence[str], columns: Sequence[str], hint: str = ""
 ) -> list[int]:
     """Return where the wanted columns stand in the header."""
+    names = numbered(header)
     for column in columns:
+        if column in names:
+            continue
         count = list(header).count(column)
-        if count == 0:
-            raise UsageError(f"{path}: no column '{column}'{nearest(column, header)}{hint}")
         if count > 1:
             raise DataError(
-                f"{path}: column '{column}' stands {count} times in the header; rename the copies"
-                " so that one is meant"
+                f"{path}: column '{column}' stands {count} times in the header; write"
+                f" '{column}.0' for the first, '{column}.1' for the second"
             )
-    return [list(header).index(column) for column in columns]
+        raise UsageError(f"{path}: no column '{column}'{nearest(column, names)}{hint}")
+    return [names.index(column) for column in columns]
 
 
 def read_csv(
@@ -80,9 +82,10 @@ def _csv_pieces(
         # one column more than the header: cells beyond it would shift or vanish silently (a decimal
         # comma in a comma table does that)
         wide, size = len(header), max(1, file.stat().st_size)
-        cut = check_lines(path, delimiter, header, head.above, file)
+        cut, comments = check_lines(path, delimiter, header, head.above, file)
         with file.open("rb") as stream_of_bytes:
-            pieces = pd.read_csv(stream_of_bytes, **_form(delimiter, decimal, head.above, wide))
+            form = _form(delimiter, decimal, (head.above, *comments), wide)
+            pieces = pd.read_csv(stream_of_bytes, **form)
             for table, last in _with_last(pieces):
                 beyond = np.flatnonzero(table[wide].notna().to_numpy())
                 if beyond.size:
@@ -112,15 +115,18 @@ def _csv_pieces(
         ) from error
 
 
-def _form(delimiter: str, decimal: str, above: int, wide: int) -> dict[str, Any]:
-    """Return how pandas reads the values of a table, one column beyond the header's included."""
+def _form(delimiter: str, decimal: str, skipped: Sequence[int], wide: int) -> dict[str, Any]:
+    """Return how pandas reads the values of a table, one column beyond the header's included.
+
+    `skipped` are the number of lines above the values, and the numbers of lines of comments.
+    """
     return {
         # a byte order mark is no part of the first name
         "encoding": "utf-8-sig",
         "sep": r"\s+" if delimiter == BLANKS else delimiter,
         "decimal": decimal,
         "header": None,
-        "skiprows": above,
+        "skiprows": [*range(skipped[0]), *skipped[1:]],
         "names": list(range(wide + 1)),
         "index_col": False,
         "skip_blank_lines": False,
@@ -252,15 +258,3 @@ def _below_names(cells: pd.DataFrame) -> pd.DataFrame:
     table = table.dropna(how="all")
     table.attrs |= {"above": values, "between": first[at + 1 : values]}
     return table
-
-
-def numbered(names: Sequence[str]) -> list[str]:
-    """Return names of which each stands once, those of nameless columns made up."""
-    out: list[str] = []
-    for place, name in enumerate(names):
-        unique, copy = name or f"Unnamed: {place}", 0
-        while unique in out:
-            copy += 1
-            unique = f"{name}.{copy}"
-        out.append(unique)
-    return out
