@@ -148,7 +148,7 @@ def test_missing_file_names_the_nearest(tmp_path: Path) -> None:
 def test_text_that_is_not_utf8(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_bytes("t,u,v °\n0,1,2\n".encode("latin-1"))
     with pytest.raises(DataError, match="not UTF-8"):
-        build({**SIMPLE, "encoding": "utf-8"}).read(tmp_path / "a.csv")
+        build(SIMPLE, encoding="utf-8").read(tmp_path / "a.csv")
 
 
 @pytest.mark.parametrize(
