@@ -29,7 +29,7 @@ from residnet.core.errors import ConfigError
 _STEP = math.log(1.12)
 """Between the radii of the turns that a plan uses, logarithmic."""
 _BESIDE = 0.05
-"""Of a buoy's radius by which a plan comes nearer than where it begins, at most."""
+"""Of a buoy's radius by which a plan comes nearer than where it begins, unless room lacks."""
 
 
 class BuoyCourseConfig(Config):
@@ -216,7 +216,7 @@ def _request(
         return tuple(
             Circle(complex(buoy.north, buoy.east), depth, 0, 0) for buoy in buoys
         ), np.array([tightest])
-    radii = [_kept(buoy, config.start, (1.0 + margin) * buoy.radius + aside) for buoy in buoys]
+    radii = [_kept(buoy, config.start, margin, aside) for buoy in buoys]
     # a few rudder angles do for circles of many sizes
     steps = [max(math.floor(math.log(radius / tightest) / _STEP), 0) for radius in radii]
     wide = sorted({0, *steps})
@@ -231,12 +231,16 @@ def _request(
     ), tightest * np.exp(_STEP * np.array(wide))
 
 
-def _kept(buoy: BuoyConfig, start: tuple[float, float], radius: float) -> float:
+def _kept(buoy: BuoyConfig, start: tuple[float, float], margin: float, aside: float) -> float:
     """Return the radius in m that a plan keeps from a buoy: less where it begins nearer than that.
 
-    Where the course begins within the buoy's own circle, it is `radius`.
+    The start may lie on the wrong side: then the course passes nearer than it begins, by as much as
+    it may be displaced, or half way between its start and the circle. Where it begins within the
+    buoy's own circle, it leaves that first.
     """
-    away = math.hypot(buoy.north - start[0], buoy.east - start[1])
-    if away < buoy.radius:
+    radius = (1.0 + margin) * buoy.radius + aside
+    room = math.hypot(buoy.north - start[0], buoy.east - start[1]) - buoy.radius
+    if room < 0:
         return radius
-    return max(min(radius, away - _BESIDE * buoy.radius), buoy.radius)
+    nearer = min(max(aside, _BESIDE * buoy.radius), 0.5 * room)
+    return min(radius, buoy.radius + room - nearer)

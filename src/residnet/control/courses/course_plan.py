@@ -42,6 +42,8 @@ _RINGS = (0.0, 0.25)
 _TOLERANCE = 2e-3
 """Of distances, as a share of the vessel's turning radius."""
 _FAR = 0.1
+_MENDED = 0.1
+"""Change of z within which a course is mended whose turns fit each other."""
 _SMALL = math.radians(1.5)
 _SHORT = 0.3
 """Turning radii of a leg between two turns to one side that are tried as one."""
@@ -139,6 +141,10 @@ def plan(
         for fit, fitted in found if make is None else joined(request.turns, found, make):
             if _right(request, fit, fitted, step, reasons):
                 return _sampled(fit.route, fitted.z, step, beyond)
+            if fitted.missed <= _TOLERANCE * request.turns.radius:
+                fitted = fit.alone(fitted.z, _MENDED)
+                if _right(request, fit, fitted, step, reasons):
+                    return _sampled(fit.route, fitted.z, step, beyond)
     raise ConfigError(_refusal(request, reasons))
 
 

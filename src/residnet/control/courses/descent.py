@@ -144,7 +144,9 @@ def polished(problem: Problem, z: Array) -> Array:
                 "jac": lambda x: problem.linear(x).level,
             }
         )
-    found = minimize(
+    # its types know no conditions with derivatives
+    solve: Any = minimize
+    found = solve(
         lambda x: (problem.linear(x).cost, problem.linear(x).slope),
         z,
         jac=True,

@@ -106,7 +106,7 @@ class Fit:
         """Return the same problem with other tables of turns."""
         at = np.zeros(len(self.circles), dtype=np.intp)
         other = Fit(route, self.circles, at, self.free, self.aside)
-        other.edges = self.edges
+        other.edges, other.price = self.edges, self.price
         return other
 
     def _apart(self, circle: Circle) -> float:
@@ -294,10 +294,10 @@ class Fit:
             return self.unit * float(abs(even[0])), len(self.circles) - 1
         return self.unit * float(short[worst]), numbers[worst]
 
-    def alone(self, z: Array) -> Fitted:
+    def alone(self, z: Array, reach: float | None = None) -> Fitted:
         """Return the route that is found where buoys are hardly approached out of their turns."""
         self.price = _DEAR
-        return self.solve(z)
+        return self.solve(z, reach)
 
     def solve(self, z: Array, reach: float | None = None) -> Fitted:
         """Return the route that is found from a start, not farther from it than a reach of z."""

@@ -52,11 +52,11 @@ def joined(
         if one[1].time < _SLOWER * found[0][1].time:
             distinct.setdefault(one[0].route.sides, one)
     begun = [_Joining(turns, make, *one) for one in list(distinct.values())[:_MOST]]
-    for one in begun:
-        one.advance(0, _COMPARED)
-    for one in sorted(begun, key=lambda one: one.fitted.time):
-        one.advance(_COMPARED, len(_ROUNDS))
-        yield one.fit, one.fitted
+    for course in begun:
+        course.advance(0, _COMPARED)
+    for course in sorted(begun, key=lambda course: course.fitted.time):
+        course.advance(_COMPARED, len(_ROUNDS))
+        yield course.fit, course.fitted
 
 
 @final
