@@ -18,6 +18,11 @@ _NOISE = np.geomspace(1.0, 30.0, 25)
 """Variances of the noise, in those of white innovations, that are tried."""
 _APART = np.concatenate(([0.0], np.geomspace(1e-4, 1e3, 40)))
 """Variances of sizes, in what a group of middling information tells, that are tried."""
+_LEFT_OPEN = 1.0
+"""Twice the logarithm of the likelihood by which a larger scatter may fall short of the likeliest.
+
+That is one standard error: clean logs have fitted the model too, and look better than others.
+"""
 _NOTHING = 1e-12
 _AT_ODDS = 1.345
 """Standard deviations by which a log may differ from the others before it counts for less.
@@ -167,13 +172,16 @@ def _told(groups: Sequence[Group], scatter: Scatter) -> tuple[np.ndarray, np.nda
 
 
 def _likeliest(score: np.ndarray, own: np.ndarray) -> tuple[float, float]:
-    """Return the variances of noise and sizes under which scores [G] are likeliest."""
+    """Return the variances of noise and sizes that scores [G] ask for, one standard error above."""
     apart = _APART / np.median(own)
     variance = (
         _NOISE[:, None, None] * own[None, None, :] + apart[None, :, None] * own[None, None, :] ** 2
     )
-    unlikely = (np.log(variance) + score**2 / variance).sum(axis=2)
-    i, j = np.unravel_index(int(unlikely.argmin()), unlikely.shape)
+    scatter = np.log(variance).sum(axis=2)
+    unlikely = scatter + (score**2 / variance).sum(axis=2)
+    # few logs leave open how much others scatter
+    possible = unlikely <= unlikely.min() + _LEFT_OPEN
+    i, j = np.unravel_index(int(np.where(possible, scatter, -np.inf).argmax()), unlikely.shape)
     return float(_NOISE[i]), float(apart[j])
 
 
