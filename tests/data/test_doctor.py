@@ -358,29 +358,3 @@ def test_a_jump_behind_a_gap_is_told_at_its_samples() -> None:
     finding = one(inspect(gap), "position_jump")
     assert finding.at is not None
     assert finding.at.shape == gap.t.shape
-
-
-@pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("way", ["zero", "constant", "half unknown"])
-def test_channels_without_content_are_told_and_stop_nothing(way: str) -> None:
-    log = wavy()
-    for name, values in log.channels.items():
-        sick = values.copy()
-        if way == "zero":
-            sick[:] = 0.0
-        elif way == "constant":
-            sick[:] = sick[20]
-        else:
-            sick[len(sick) // 2 :] = np.nan
-        # reports may say what they like: to end with one is what counts
-        assert inspect(changed(log, **{name: sick}), inputs=["delta"]).lines(), name
-
-
-@pytest.mark.filterwarnings("error")
-def test_a_moored_vessel_is_inspected() -> None:
-    log = wavy()
-    still = {name: np.full(len(log), 0.1) for name in ("x", "y", "psi")}
-    report = inspect(
-        changed(log, **still, **{name: np.zeros(len(log)) for name in "uvr"}), inputs=["delta"]
-    )
-    assert report.lines()

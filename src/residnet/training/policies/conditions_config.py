@@ -25,7 +25,9 @@ class ConditionsTraining(OneStage):
         final: share of it at the end.
         steps: batches of an epoch.
         batch: flights of a batch.
-        dt: step in s of vessel and controller in training.
+        dt: step in s of vessel and controller in training, but for its end.
+        fine: share of the training, at its end, that takes the step of the conditions: a loop that
+            hardly swings at long steps may swing at short ones.
         integrator: of the vessel in training.
         hold: longest time in s before the change of heading in training.
         duration: time in s from the change to the end of a training flight; null for that of the
@@ -60,6 +62,7 @@ class ConditionsTraining(OneStage):
     steps: int = Field(default=100, ge=1, le=100_000)
     batch: int = Field(default=384, ge=2, le=1_000_000)
     dt: Seconds = Field(default=0.04, gt=0)
+    fine: float = Field(default=0.3, ge=0, le=1)
     integrator: Annotated[str, Field(pattern="^(rk4|heun)$")] = "heun"
     hold: Seconds = Field(default=2.0, ge=0)
     duration: Seconds | None = Field(default=None, gt=0)
@@ -69,7 +72,7 @@ class ConditionsTraining(OneStage):
     faded: float = Field(default=0.6, gt=0, le=1)
     outlying: float = Field(default=4.0, ge=1)
     quiet: float = Field(default=0.1, ge=0, le=1)
-    calm: float = Field(default=1.0, ge=0)
+    calm: float = Field(default=2.0, ge=0)
     exact: float = Field(default=1.0, ge=0)
     excess: float = Field(default=1.0, ge=0)
     stricter: float = Field(default=1.2, ge=1, le=10)

@@ -62,10 +62,9 @@ class ConditionsFit(EpochTraining):
         duration = conditions.duration if settings.duration is None else settings.duration
         lengths = {"hold": min(settings.hold, conditions.hold), "duration": duration}
         self.drawn = conditions.model_copy(update=lengths)
-        policy.at(settings.dt)
-        self.loop = ConditionedRun(vessel, policy, settings.dt, settings.integrator, torch.float32)
-        rollout = self.loop.rollout(max(math.ceil(conditions.delay[1] / settings.dt), 1))
-        self.fly = _flying(rollout, compiler, self.loop.given(self._batch(0.0, 2)))
+        self.vessel, self.compiler = vessel, compiler
+        self._loops: dict[float, tuple[ConditionedRun, Flying]] = {}
+        self._at(settings.dt)
         random = torch.Generator().manual_seed(seed + 1_000_003)
         self.unseen = conditions.draw(settings.validation, conditions.dt, random)
         self.steady = None
@@ -79,6 +78,23 @@ class ConditionsFit(EpochTraining):
             compiler=compiler,
             longest=max(math.ceil(conditions.delay[1] / conditions.dt), 1),
         )
+
+    def _step(self) -> float:
+        """Return the step in s of the present epoch."""
+        coarse = self.epoch < round(self.settings.epochs * (1.0 - self.settings.fine))
+        return self.settings.dt if coarse else self.conditions.dt
+
+    def _at(self, dt: float) -> None:
+        """Fly at a step of dt seconds from now on."""
+        self.step_size = dt
+        self.policy.at(dt)
+        if dt in self._loops:
+            return
+        settings = self.settings
+        loop = ConditionedRun(self.vessel, self.policy, dt, settings.integrator, torch.float32)
+        rollout = loop.rollout(max(math.ceil(self.conditions.delay[1] / dt), 1))
+        fly = _flying(rollout, self.compiler, loop.given(self._batch(0.0, 2)))
+        self._loops[dt] = loop, fly
 
     def train_dataloader(self) -> range:
         """Return the numbers of batches; what is in them is drawn when they are used."""
@@ -97,9 +113,9 @@ class ConditionsFit(EpochTraining):
             self.best_diverged = self.diverged
 
     def on_train_epoch_start(self) -> None:
-        """Draw the epoch's flights anew, from a seed of its own."""
+        """Draw the epoch's flights anew, from a seed of its own, at the epoch's step."""
+        self._at(self._step())
         self.seed_epoch()
-        self.policy.at(self.settings.dt)
 
     def training_step(self, number: int, batch_index: int) -> Tensor:
         """Return the loss of one batch of heading changes."""
@@ -112,7 +128,8 @@ class ConditionsFit(EpochTraining):
             )
         quiet = round(settings.quiet * settings.batch)
         changes = self._batch(settings.share(progress), settings.batch, quiet)
-        flown = self.loop.flights(changes, *self.fly(*self.loop.given(changes)))
+        loop, fly = self._loops[self.step_size]
+        flown = loop.flights(changes, *fly(*loop.given(changes)))
         found = flown.measured(self.conditions)
         loss: Tensor = (
             found["cost"].mean() + math.degrees(settings.guiding(progress)) * found["iae"].mean()
@@ -159,7 +176,7 @@ class ConditionsFit(EpochTraining):
         at for swinging.
         """
         random = torch.Generator().manual_seed(int(torch.randint(2**62, (1,))))
-        changes = self.drawn.draw(rows, self.settings.dt, random, share)
+        changes = self.drawn.draw(rows, self.step_size, random, share)
         changes.noise[:quiet], changes.push[:quiet] = 0.0, 0.0
         first, number = quiet // 2, quiet // 4
         least = self.drawn.heading[0] * changes.heading.sign()
@@ -203,7 +220,7 @@ class ConditionsFit(EpochTraining):
             worse = self.start_score is not None and score > self.start_score
             often = too_many(found["overshoot"], self.steady.limits.overshoot_p95)
             self.diverged = _ALL if worse else self.steady.refused(self.test) + often
-        self.policy.at(self.settings.dt)
+        self.policy.at(self.step_size)
         return self.policy, score
 
 
