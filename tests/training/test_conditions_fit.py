@@ -73,6 +73,18 @@ def fitted(settings: ConditionsTraining) -> ConditionsFit:
     return ConditionsFit(policy, VESSEL, settings, CONDITIONS, 0, None)
 
 
+def test_the_last_epochs_take_the_step_of_the_conditions() -> None:
+    fit = fitted(ConditionsTraining(dt=0.2, hold=0.0, validation=4, epochs=10, fine=0.3))
+    steps = []
+    for epoch in range(10):
+        fit.history = [{}] * epoch
+        fit.on_train_epoch_start()
+        steps.append(fit.policy.dt)
+    assert steps == [0.2] * 7 + [0.1] * 3
+    # the vessel and its loops are not trained: they have no place in a checkpoint
+    assert all(name.startswith("policy.") for name in fit.state_dict())
+
+
 def test_epochs_that_swing_come_after_those_that_do_not() -> None:
     settings = ConditionsTraining(dt=0.1, hold=0.0, validation=4, steady=SteadyConfig(flights=4))
     fit = fitted(settings)
