@@ -48,7 +48,8 @@ class ConditionsTraining(OneStage):
         exact: cost in s of one degree of overshoot of the flights of the nominal vessel.
         excess: cost in s of one degree of overshoot beyond `steady.overshoot_p95`, in all flights,
             besides what the conditions count for it.
-        stricter: factor on `calm` and `exact` after every epoch that `steady` refuses.
+        stricter: factor on `calm` and `exact` after every epoch that `steady` refuses though it
+            costs less than the start.
         steady: what a policy must keep to without noise. Epochs that do come first; of those that
             do not, a flight beyond counts twice. Null to choose by the cost alone.
         validation: number of flights that epochs are chosen on.
@@ -72,7 +73,7 @@ class ConditionsTraining(OneStage):
     faded: float = Field(default=0.6, gt=0, le=1)
     outlying: float = Field(default=4.0, ge=1)
     quiet: float = Field(default=0.1, ge=0, le=1)
-    calm: float = Field(default=2.0, ge=0)
+    calm: float = Field(default=0.5, ge=0)
     exact: float = Field(default=1.0, ge=0)
     excess: float = Field(default=1.0, ge=0)
     stricter: float = Field(default=1.2, ge=1, le=10)

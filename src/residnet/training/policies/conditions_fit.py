@@ -163,8 +163,11 @@ class ConditionsFit(EpochTraining):
         return math.degrees(self.settings.excess) * beyond
 
     def _strict(self) -> float:
-        """Return the factor on what swing and nominal overshoot cost in this epoch."""
-        refused = sum(entry.get("diverged", 0.0) > 0 for entry in self.history)
+        """Return the factor on what swing and nominal overshoot cost in this epoch.
+
+        Epochs that cost more than the start do not count: a heavier charge would not cure them.
+        """
+        refused = sum(0 < entry.get("diverged", 0.0) < _ALL for entry in self.history)
         return float(self.settings.stricter**refused)
 
     def _batch(self, share: float, rows: int, quiet: int = 0) -> HeadingChanges:
