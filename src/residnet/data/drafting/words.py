@@ -52,7 +52,7 @@ _ABOUT: dict[str, str] = {
     " welle eje arbre aksel 軸",
     "engine": "engine motor maschine maquina moteur hovedmaskin 主機 | main",
     "revolutions": "drehzahl revolution umdreh tours toerental omdreining turtall varvtal regime"
-    " tours giri 回転 revoluc | rpm rps rev revs n",
+    " tours giri 回転 revoluc | rpm erpm rps rev revs n",
     "thrust": "thrust schub poussee empuje stuwkracht skyv 推力",
     "torque": "torque drehmoment couple koppel dreiemoment トルク",
     "power": "power leistung puissance potencia vermogen effekt 出力",
@@ -202,12 +202,19 @@ def state_channel(words: Words) -> str | None:
         return "r"
     if (w.has("turn") and w.has("rate")) or (w.has("angular") and w.text.endswith((" z", " r"))):
         return "r"
+    twist = _TWIST.search(w.text)
+    if twist:
+        return "u" if "x" in twist.groups() else "v"
     return _place(w) or _velocity(w)
+
+
+_TWIST = re.compile(r"\b(?:twist|velocity) linear ([xy])$|\blinear velocity ([xy])$")
+_COMPASS = ("gyro", "compass", "gyro compass", "gyrocompass")
 
 
 def _place(w: Words) -> str | None:
     """Return x, y or psi."""
-    if w.has("heading") and w.lacks("ground"):
+    if (w.has("heading") and w.lacks("ground")) or w.text in _COMPASS:
         return "psi"
     if w.lacks("speed", "angle", "force"):
         if w.has("north") or (w.has("x") and (w.has("position") or w.text in ("x", "x m"))):
