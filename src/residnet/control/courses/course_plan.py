@@ -36,7 +36,7 @@ _MORE = ((1.0, 1.5, 2), (1.0, 1.0, 2), (0.0, 1.0, 2), (0.5, 2.0, 2), (1.0, 3.0, 
 """What outlines are looked for with: share of the room before and behind turns, multiple of their
 radius, and how many distances buoys may be passed at.
 """
-_EFFORT = 400
+_EFFORT = 600
 """Times that a route is drawn for fits, beyond which no other outline is fitted."""
 _RINGS = (0.0, 0.25)
 _TOLERANCE = 2e-3

@@ -31,6 +31,8 @@ _LATE = 1.0 / 3.0
 _ALL = 1_000_000
 _LITTLE = 0.3
 """Share of the range of changes of heading that flights without noise are drawn from."""
+_SLOWER = 0.5
+"""Factor on the learning rate after every epoch that costs more than the start."""
 _FREE = 0.5
 """Share of what the rudder may swing that costs nothing in training."""
 
@@ -115,17 +117,33 @@ class ConditionsFit(EpochTraining):
     def on_train_epoch_start(self) -> None:
         """Draw the epoch's flights anew, from a seed of its own, at the epoch's step."""
         self._at(self._step())
+        if self._spoilt(self.history[-1:]):
+            # far from any good policy the gradient leads nowhere; Adam's memory is of that place
+            self.policy.load_state_dict(self.best_state)
+            self.trainer.optimizers[0].state.clear()
         self.seed_epoch()
+
+    def _spoilt(self, epochs: list[dict[str, float]]) -> int:
+        """Return how many of some finished epochs cost more than the start in full conditions."""
+        settings, start = self.settings, self.start_score
+        if start is None or not self.best_state:
+            return 0
+        first = math.ceil(settings.spread * settings.epochs)
+        costs = [
+            entry["validation"]
+            for entry in epochs
+            if "validation" in entry and entry["epoch"] >= first
+        ]
+        return sum(not cost <= start for cost in costs)
 
     def training_step(self, number: int, batch_index: int) -> Tensor:
         """Return the loss of one batch of heading changes."""
         settings = self.settings
         progress = (self.epoch + number / settings.steps) / settings.epochs
         cosine = 0.5 * (1.0 + math.cos(math.pi * progress))
+        rate = settings.learning_rate * _SLOWER ** self._spoilt(self.history)
         for group in self.trainer.optimizers[0].param_groups:
-            group["lr"] = settings.learning_rate * (
-                settings.final + (1.0 - settings.final) * cosine
-            )
+            group["lr"] = rate * (settings.final + (1.0 - settings.final) * cosine)
         quiet = round(settings.quiet * settings.batch)
         changes = self._batch(settings.share(progress), settings.batch, quiet)
         loop, fly = self._loops[self.step_size]
