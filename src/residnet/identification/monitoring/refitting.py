@@ -35,6 +35,8 @@ _RIDGE = 1e-6
 """Of the least squares that find a direction, as a share of each parameter's information."""
 _EXPRESSED = 0.7
 """Share of a change's accelerations that the parameters must be able to follow."""
+_BRIEF = 1e-4
+"""Share of a step over which the accelerations of a change are found."""
 _SAMPLES = 4_000
 """Samples that a direction is found from, at most."""
 
@@ -177,10 +179,13 @@ def _direction(
     every = max(len(x) // _SAMPLES, 1)
     x, w = x[::every], w[::every]
     memory = x.new_zeros(len(x), model.n_state)
+    # over a whole step the vessel answers to the change already, which would hide a part of it
+    brief = copy.deepcopy(model)
+    brief.dt = _BRIEF * model.dt
     with torch.no_grad():
-        changed = ChangedDynamics(model, [change], len(x), w.shape[1])
-        gained = changed.step(x, w, memory)[0] - model.step(x, w, memory)[0]
-        wanted = gained[:, VELOCITIES].flatten() / (model.dt * change.size)
+        changed = ChangedDynamics(brief, [change], len(x), w.shape[1])
+        gained = changed.step(x, w, memory)[0] - brief.step(x, w, memory)[0]
+        wanted = gained[:, VELOCITIES].flatten() / (brief.dt * change.size)
         slopes = baseline.sensitivity(model.channels(x, w)).flatten(0, 1)
         # axes count alike, though an acceleration in yaw is no acceleration in surge
         weight = gained[:, VELOCITIES].square().mean(0)
