@@ -85,6 +85,20 @@ def test_the_last_epochs_take_the_step_of_the_conditions() -> None:
     assert all(name.startswith("policy.") for name in fit.state_dict())
 
 
+def test_epochs_far_from_the_start_ease_the_charge() -> None:
+    fit = fitted(ConditionsTraining(dt=0.1, hold=0.0, validation=4, epochs=10, stricter=1.5))
+    fit.start_score, fit.best_state = 6.0, {"any": torch.zeros(1)}
+    # the first two epochs fly less than the full conditions; the third swings only
+    costs = [(9.0, 1_000_000), (9.0, 1_000_000), (5.9, 3), (7.0, 1_000_000), (6.1, 1_000_000)]
+    fit.history = [
+        {"epoch": float(k), "validation": cost, "diverged": float(refused)}
+        for k, (cost, refused) in enumerate(costs)
+    ]
+    assert fit._spoilt(fit.history) == 1
+    assert fit._strict() == pytest.approx(1.5 * 0.2)
+    assert fit._spoilt([{"epoch": 9.0}, {"epoch": 9.0, "validation": math.nan}]) == 1
+
+
 def test_epochs_that_swing_come_after_those_that_do_not() -> None:
     settings = ConditionsTraining(dt=0.1, hold=0.0, validation=4, steady=SteadyConfig(flights=4))
     fit = fitted(settings)

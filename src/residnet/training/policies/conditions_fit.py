@@ -31,8 +31,10 @@ _LATE = 1.0 / 3.0
 _ALL = 1_000_000
 _LITTLE = 0.3
 """Share of the range of changes of heading that flights without noise are drawn from."""
-_SLOWER = 0.5
-"""Factor on the learning rate after every epoch that costs more than the start."""
+_FAR = 1.15
+"""Multiple of the start's cost from which an epoch has left the good policies."""
+_SLOWER, _LESS = 0.5, 0.2
+"""Factors on the learning rate and on the charge for swinging after every such epoch."""
 _FREE = 0.5
 """Share of what the rudder may swing that costs nothing in training."""
 
@@ -124,7 +126,7 @@ class ConditionsFit(EpochTraining):
         self.seed_epoch()
 
     def _spoilt(self, epochs: list[dict[str, float]]) -> int:
-        """Return how many of some finished epochs cost more than the start in full conditions."""
+        """Return how many of some epochs cost far more than the start in full conditions."""
         settings, start = self.settings, self.start_score
         if start is None or not self.best_state:
             return 0
@@ -134,7 +136,7 @@ class ConditionsFit(EpochTraining):
             for entry in epochs
             if "validation" in entry and entry["epoch"] >= first
         ]
-        return sum(not cost <= start for cost in costs)
+        return sum(not cost <= _FAR * start for cost in costs)
 
     def training_step(self, number: int, batch_index: int) -> Tensor:
         """Return the loss of one batch of heading changes."""
@@ -186,7 +188,7 @@ class ConditionsFit(EpochTraining):
         Epochs that cost more than the start do not count: a heavier charge would not cure them.
         """
         refused = sum(0 < entry.get("diverged", 0.0) < _ALL for entry in self.history)
-        return float(self.settings.stricter**refused)
+        return float(self.settings.stricter**refused * _LESS ** self._spoilt(self.history))
 
     def _batch(self, share: float, rows: int, quiet: int = 0) -> HeadingChanges:
         """Return heading changes drawn anew, under a share of the conditions.
