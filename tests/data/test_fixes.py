@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pandas as pd
@@ -108,7 +109,7 @@ def test_a_first_line_without_end_is_no_header(tmp_path: Path) -> None:
     ],
 )  # fmt: skip
 def test_ways_to_write_a_latitude(cell: str) -> None:
-    form = "ddmm" if "5954" in cell else "number"
+    form: Literal["number", "ddmm"] = "ddmm" if "5954" in cell else "number"
     np.testing.assert_allclose(degrees_of(pd.Series([cell, None]), "latitude", form)[0], 59.90535)
     if cell.startswith("N") or cell[-1] in "Nn":
         south = cell.replace("N", "S") if "N" in cell else f"{cell[:-1]}s"

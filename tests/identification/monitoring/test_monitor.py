@@ -120,9 +120,9 @@ def test_a_refit_finds_the_size_of_a_planted_change_and_leaves_the_old_model_alo
 ) -> None:
     weaker = Change("gain n_stbd", "", "", 0.1, gain={1: -0.1})
     fresh = logs(known[1], weaker, 3, 50)
-    before = known[1].baseline.theta.clone()
+    before = known[1].baseline.state_dict()["theta"].clone()
     found = recursive_refit(watch, [windows(log) for log in fresh])
-    assert torch.equal(known[1].baseline.theta, before)
+    assert torch.equal(known[1].baseline.state_dict()["theta"], before)
     (moved,) = found.moved
     assert moved.change.name == "gain n_stbd"
     assert moved.size == pytest.approx(-0.1, abs=2 * moved.error)
