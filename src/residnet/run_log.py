@@ -26,7 +26,7 @@ class RunLog:
         self._file: Path | None = None
 
     def line(self, text: str) -> None:
-        """Keep one line."""
+        """Add one line with the time of day."""
         self._add(f"{time.strftime('%H:%M:%S')} {text.strip()}\n")
 
     def open(self, folder: Path) -> None:

@@ -36,21 +36,16 @@ def encoding_of(path: Path) -> str:
     European (cp1252).
     """
     with path.open("rb") as stream:
-        head = stream.read(_HEAD)
-        marked = next((name for mark, name in _MARKS.items() if head.startswith(mark)), None)
-        if marked is not None:
-            return marked
-        wide = _without_mark(head)
-        if wide is not None:
-            return wide
+        told = _told(stream.read(_HEAD))
+        if told is not None:
+            return told
         stream.seek(0)
         return _of_bytes(_first_beyond_utf8(stream))
 
 
 def encoding_of_head(head: bytes) -> str:
     """Return the encoding of a text from its first bytes alone."""
-    marked = next((name for mark, name in _MARKS.items() if head.startswith(mark)), None)
-    return marked or _without_mark(head) or "utf-8"
+    return _told(head) or "utf-8"
 
 
 @contextmanager
@@ -91,6 +86,12 @@ def _copy(path: Path, copy: Path, encoding: str) -> None:
                     " or give its `encoding`"
                 ) from error
             done += len(block)
+
+
+def _told(head: bytes) -> str | None:
+    """Return the encoding that a mark or the zeros of wide signs tell; None for neither."""
+    marked = next((name for mark, name in _MARKS.items() if head.startswith(mark)), None)
+    return marked or _without_mark(head)
 
 
 def _without_mark(head: bytes) -> str | None:
