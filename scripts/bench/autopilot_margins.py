@@ -37,6 +37,8 @@ COLUMNS = (
 
 def margins(run: Path, name: str) -> list[float]:
     """The figures of one run in the order of `COLUMNS`; those that a run lacks are no numbers."""
+    if not (run / "metrics.json").is_file():
+        raise SystemExit(f"{run} holds no metrics.json: name the folder of a finished run")
     rows: list[dict[str, Any]] = json.loads((run / "metrics.json").read_text())["rows"]
     find = {(row["model"], row["protocol"]): row for row in rows}
     own = find[(name, "conditions")]

@@ -42,10 +42,12 @@ from residnet.training.free_runs.covariance import LeftOpen, left_open
 VESSELS: dict[str, dict[str, Any]] = {
     "wam_v_cal": {
         "signals": {"inputs": ["n_port", "n_stbd"], "forces": "wam_v_cal"},
+        "commands": {"n_port": "cmd_port", "n_stbd": "cmd_stbd"},
         "terms": ["u", "v", "r", "u|u|", "r|r|", "u v", "u r", "v r", "tau_x", "tau_n"],
     },
     "example_rudder_boat": {
         "signals": {"inputs": ["n", "delta"]},
+        "commands": {"n": "cmd_n", "delta": "cmd_delta"},
         "terms": [
             "u",
             "v",
@@ -118,15 +120,18 @@ def settings_of(vessel: str) -> FitSettings:
     )
 
 
-def shares_of(vessel: str, inputs: Sequence[str]) -> dict[str, InputShare]:
+def shares_of(vessel: str, flown: str) -> dict[str, InputShare]:
     """Return how a vessel's commands follow drive and steer, as its booklet would say."""
-    plant = load_vessel(vessel).build()
+    plant = load_vessel(flown).build()
     one, none = torch.ones(1, dtype=torch.float64), torch.zeros(1, dtype=torch.float64)
-    drive, steer = plant.demand(one, none)[0], plant.demand(none, one)[0]
-    return {
-        name: InputShare(drive=float(d), steer=float(s), limit=max(abs(float(d)), abs(float(s))))
-        for name, d, s in zip(inputs, drive, steer, strict=True)
-    }
+    drive, steer = plant.demand(one, none)[0].tolist(), plant.demand(none, one)[0].tolist()
+    # a plant has an order of its own, such as the rudder before the propeller
+    found = dict(zip(plant.inputs, zip(drive, steer, strict=True), strict=False))
+    out = {}
+    for name, command in VESSELS[vessel]["commands"].items():
+        d, s = found[command]
+        out[name] = InputShare(drive=d, steer=s, limit=max(abs(d), abs(s)))
+    return out
 
 
 def left(fitted: FittedModel, settings: FitSettings, logs: Sequence[Prepared]) -> LeftOpen:
@@ -152,7 +157,7 @@ def drawn(vessel: str, seed: int, times: int) -> tuple[float, float, np.ndarray]
         first = simulate(programme.draw(), programme)
         others = sorted(candidates(limits), key=lambda one: one.kind)
         later = simulate(others, programme.model_copy(update={"seed": seed + 1}))
-        shares = shares_of(programme.vessel, VESSELS[vessel]["signals"]["inputs"])
+        shares = shares_of(vessel, programme.vessel)
     split = {"train": first[:6], "validation": first[6:], "later": later}
     prepared = prepare_logs(split, settings)
     fitted = fit(prepared, settings)["baseline"]

@@ -7,7 +7,7 @@
   step. Both have the same network, data and loss.
 
 Times are CPU seconds of this process, the least of `--repeats`, so that a busy machine matters
-little; one thread.
+little; one thread, with the memory settings of a run (`keep_freed_memory`).
 
     python scripts/bench/training.py [--parts rollout epoch] [--repeats 5]
 """
@@ -26,6 +26,7 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset
 
 from residnet.baselines.regressors import RegressorBaseline
+from residnet.core.arrays.heap import keep_freed_memory
 from residnet.data.windows import WindowBatches
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
@@ -163,6 +164,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5)
     given = parser.parse_args()
     torch.set_num_threads(1)
+    keep_freed_memory()
     print(f"torch {torch.__version__}, {platform.platform()}, load {os.getloadavg()[0]:.1f}")
     for part in given.parts:
         {"rollout": rollouts, "epoch": epochs}[part](given.repeats)

@@ -190,7 +190,13 @@ SHORT: dict[str, Short] = {
     "autopilot_conditions_rate": Short(_CONDITIONS),
     "autopilot_ship": Short(_CONDITIONS),
     "autopilot_conditions_patrol": Short(
-        (*_CONDITIONS, "conditions.stated.duration=12 s", "test.sea_time=10 s")
+        (
+            *_CONDITIONS,
+            "conditions.stated.duration=12 s",
+            "recurrent.learned.training.duration=12 s",
+            "recurrent.constants.training.duration=12 s",
+            "test.sea_time=10 s",
+        )
     ),
     "autopilot_patrol": Short(
         (

@@ -159,6 +159,11 @@ def test_words_of_a_language(language: str) -> None:
         ("Ruderlage soll", "cmd_delta"),
         ("Rudersollwinkel", "cmd_delta"),
         ("lateral acceleration", None),
+        ("servo3_raw", "servo_3"),
+        ("vx", "u"),
+        ("Vy [m/s]", "v"),
+        ("velocity_x_mps", "u"),
+        ("wind speed x", "wind_speed"),
     ],
 )
 def test_what_a_name_is_about(column: str, channel: str | None) -> None:

@@ -82,6 +82,13 @@ def test_numbers_among_zero_bytes_are_no_utf_16(tmp_path: Path) -> None:
         read(path)
 
 
+@pytest.mark.parametrize("filled", [1, 200_000])
+def test_a_file_that_its_recorder_filled_with_zeros(filled: int, tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_bytes(GERMAN.encode("utf-8") + b"\x00" * filled)
+    assert len(read(path)) == T.size
+
+
 def test_sentences_that_a_shell_of_windows_wrote(tmp_path: Path) -> None:
     path = tmp_path / "log.txt"
     path.write_bytes(_with_checksums().encode("utf-16"))

@@ -306,3 +306,21 @@ def test_an_encoder_starts_the_memory_with_weights_of_its_own() -> None:
     for k in range(7):
         s = head(z[:, k], s)[1]
     assert not torch.allclose(s, head.warmup(z))
+
+
+def test_a_term_that_turns_the_damping_about_is_left_out(logs: PreparedSplits) -> None:
+    known = samples(logs["train"], settings().signals.build())
+    speed, sway, rate = (known.z[:, i] for i in range(3))
+    # fed by u r, and damped by |u| r where nobody has been
+    target = torch.stack((-speed, -sway, 0.4 * speed * rate - 0.1 * rate), dim=1)
+    terms = ("1", "u", "v", "r", "u r", "left")
+    for dissipative in (False, True):
+        baseline = RegressorsConfig(terms=terms, dissipative=dissipative).build(known.names)
+        config = RegressorsConfig(terms=terms, dissipative=dissipative)
+        table = {(c.axis, c.term) for c in config.fit(baseline, known.with_target(target))}
+        assert (("r_dot", "u r") in table) != dissipative
+        assert ("v_dot", "u r") in table
+        z = known.z[::20].clone().requires_grad_()
+        slope = torch.autograd.grad(baseline(z)[:, 2].sum(), z)[0][:, 2]
+        assert (slope.median() > 0.0) != dissipative
+    assert not baseline.undamped(known)

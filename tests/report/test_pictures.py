@@ -12,8 +12,10 @@ from PIL import Image
 from residnet.report.blocks import Section
 from residnet.report.figures.files import figures_section, picture_alone, read_figures
 from residnet.report.figures.style import new_figure, save
+from residnet.report.figures.sweep import parallel_coordinates
 from residnet.report.interactive.drawing import draw
 from residnet.report.interactive.explorer import FILL, INK
+from residnet.report.interactive.pictures import curves_text, picture_explorer
 from residnet.report.page import write_page
 
 T = np.linspace(0.0, 10.0, 200)
@@ -127,3 +129,33 @@ def test_a_browser_draws_the_curves_of_a_picture(tmp_path: Path) -> None:
     assert found.panels == [True] * 4
     assert found.used["zoomed"] == pytest.approx(0.5, abs=0.01)
     assert found.used["reset"] == pytest.approx(1.0, abs=0.01)
+
+
+def test_trials_of_a_sweep_over_their_keys() -> None:
+    trials = [
+        {"number": i, "value": 0.1 * i, "values": {"heads.size": i, "kind": "ab"[i % 2]}}
+        for i in range(20)
+    ]
+    content = {
+        "trials": [*trials, {"number": 20, "value": None, "values": {}}],
+        "keys": ["heads.size", "kind"],
+        "log": [],
+        "minimized": False,
+        "objective": "score [-]",
+    }
+    drawing = parallel_coordinates(content)
+    text = curves_text(drawing.figure)
+    explorer = picture_explorer("keys", drawing.title, drawing.caption, text)
+    assert explorer is not None
+    (panel,), (case,) = explorer.panels, explorer.cases
+    assert panel.unnumbered
+    assert panel.x_names == {
+        "0": "heads.size\n0 to 19",
+        "1": 'kind\n"a" to "b"',
+        "2": "score\n0 to 1.9",
+    }
+    x, y = case.curves[0]["best"]
+    np.testing.assert_allclose(x[:3], (0.0, 1.0, 2.0), atol=1e-3)
+    np.testing.assert_allclose(y[:3], (1.0, 1.0, 1.0), atol=1e-3)
+    counts = {name: int(np.isfinite(curve[0]).sum()) // 3 for name, curve in case.curves[0].items()}
+    assert counts["best tenth"] + counts["better half"] + counts["worse half"] == len(trials)

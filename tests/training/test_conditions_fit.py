@@ -86,7 +86,8 @@ def test_the_last_epochs_take_the_step_of_the_conditions() -> None:
 
 
 def test_epochs_far_from_the_start_ease_the_charge() -> None:
-    fit = fitted(ConditionsTraining(dt=0.1, hold=0.0, validation=4, epochs=10, stricter=1.5))
+    settings = ConditionsTraining(dt=0.1, hold=0.0, validation=4, nominal=0.05, spread=0.15)
+    fit = fitted(settings.model_copy(update={"epochs": 10, "stricter": 1.5}))
     fit.start_score, fit.best_state = 6.0, {"any": torch.zeros(1)}
     # the first two epochs fly less than the full conditions; the third swings only
     costs = [(9.0, 1_000_000), (9.0, 1_000_000), (5.9, 3), (7.0, 1_000_000), (6.1, 1_000_000)]
@@ -144,7 +145,10 @@ def test_overshoot_beyond_the_limit_of_one_in_twenty_costs() -> None:
 
 
 def test_the_conditions_and_the_guide_follow_the_progress() -> None:
-    settings = ConditionsTraining()
+    assert ConditionsTraining().share(0.0) == 1.0
+    with pytest.raises(ValueError, match=r"nominal \(0.1\) must not be larger than spread \(0\)"):
+        ConditionsTraining(nominal=0.1)
+    settings = ConditionsTraining(nominal=0.05, spread=0.15)
     assert [settings.share(p) for p in (0.0, 0.05, 0.15, 1.0)] == [0.0, 0.0, 1.0, 1.0]
     assert settings.share(0.1) == pytest.approx(0.5)
     assert settings.guiding(0.0) == settings.guide

@@ -353,6 +353,22 @@ def test_errors(smoothed: list[Prepared]) -> None:
     )
 
 
+def test_a_start_that_diverges_is_brought_near_over_shorter_free_runs(
+    smoothed: list[Prepared],
+) -> None:
+    model, known, store = fitted(LINEAR, smoothed)
+    config = RefitConfig(horizon=4.0, every=4.0, prior=0.0)
+    wanted = refit(model, known, store, config, SCALES).notes
+    again, _, _ = fitted(LINEAR, smoothed)
+    with torch.no_grad():
+        # a yaw rate that grows beyond all numbers within the horizon
+        theta_of(again)[2, LINEAR.index("r")] = 300.0
+    notes = refit(again, known, store, config, SCALES).notes
+    assert wanted["begun_over"] == pytest.approx(4.0)
+    assert notes["begun_over"] < 4.0
+    assert notes["cost_after"] == pytest.approx(wanted["cost_after"], rel=1e-2)
+
+
 def test_nothing_moves_from_the_truth_without_noise() -> None:
     """Exact data, exact start: the cost is that of the refit's Euler scheme alone, and the free run
     stays where it was.

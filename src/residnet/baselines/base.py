@@ -94,6 +94,13 @@ class ParametricBaseline(Baseline, ABC):
         """
         return []
 
+    def undamped(self, samples: Samples) -> list[int]:
+        """Return the free parameters that feed an axis where most of the samples are not damped.
+
+        They are counted among the free ones, at most one of each axis; empty as for `feeding`.
+        """
+        return []
+
     @abstractmethod
     def updated_table(self, table: Sequence[Coefficient], errors: Tensor) -> list[Coefficient]:
         """Return the table of coefficients as theta is now.

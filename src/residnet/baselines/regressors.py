@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 from torch import Tensor
 
 from residnet.baselines.base import Baseline, IdentifiedConfig, ParametricBaseline, of_manoeuvres
+from residnet.baselines.damping import own_slopes, undamped, undamped_terms
 from residnet.baselines.sets import Roles, SetName, expand, merged
 from residnet.core.names import ACCELERATION, VELOCITY
 from residnet.core.samples import Samples
@@ -156,6 +157,15 @@ class RegressorBaseline(ParametricBaseline):
             and dissipates(self.library.terms[place % count], place // count, self.names)
         ]
 
+    def undamped(self, samples: Samples) -> list[int]:
+        """Return the free coefficients, by their number, that feed an axis most where it is fed."""
+        if not self.dissipative:
+            return []
+        free = self.free_indices().tolist()
+        found = undamped_terms(self.theta.detach(), own_slopes(self.library, samples))
+        places = [axis * self.library.count + term for axis, term in found]
+        return [free.index(place) for place in places if place in free]
+
     def updated_table(self, table: Sequence[Coefficient], errors: Tensor) -> list[Coefficient]:
         """Return coefficients and ratios as theta is now; a ratio keeps its error."""
         terms = self.library.terms
@@ -190,6 +200,17 @@ class RegressorBaseline(ParametricBaseline):
         return Solution(choice, {"theta": theta}, tuple(c for fit in fits for c in fit.table))
 
 
+def _turning(solutions: Sequence[Solution], terms: Sequence[str], slopes: Tensor) -> set[str]:
+    """Return the term, if any, that turns an axis' damping about in every solution."""
+    found = []
+    for one in solutions:
+        values = {c.term: c.value for c in one.table}
+        theta = torch.tensor([values.get(term, 0.0) for term in terms], dtype=slopes.dtype)
+        term = undamped(theta, slopes)
+        found.append(set() if term is None else {terms[term]})
+    return set.intersection(*found)
+
+
 class RegressorsConfig(IdentifiedConfig):
     """Least squares (or ridge) of accelerations on named regressors.
 
@@ -209,7 +230,9 @@ class RegressorsConfig(IdentifiedConfig):
             several the one whose free run is best on validation data.
         manoeuvres: kinds of manoeuvre to fit on; empty for all.
         dissipative: terms along an axis' own velocity, such as u|u| in surge or v|r| in sway, whose
-            sign would feed energy are left out, and the others fitted again; a refit does the same.
+            sign would feed energy are left out, and the others fitted again; so is, where an axis
+            is not damped at most of the samples, the term that feeds it most, such as u r in yaw.
+            A refit does the same.
         bounded: terms take velocities and inputs that are far outside their training range (by half
             its width) at the edge of that, and such velocities are pulled back, so that the model
             cannot run away.
@@ -286,12 +309,20 @@ class RegressorsConfig(IdentifiedConfig):
             )
 
         fits = []
+        slopes = own_slopes(baseline.library, picked) if self.dissipative else None
         for axis in range(len(ACCELERATION)):
-            columns = baseline.columns(axis)
-            found = fitted(axis, columns)
-            while feeding := self._feeding(found, axis, picked.names):
-                columns = [j for j in columns if terms[j] not in feeding]
+            feeding: set[str] = set()
+            turning: set[str] = set()
+            while True:
+                columns = [j for j in baseline.columns(axis) if terms[j] not in feeding | turning]
                 found = fitted(axis, columns)
+                if fed := self._feeding(found, axis, picked.names):
+                    feeding |= fed
+                elif slopes is not None and (turned := _turning(found, terms, slopes[axis])):
+                    # what fed energy beside this term may not without it
+                    feeding, turning = set(), turning | turned
+                else:
+                    break
             fits.append(found)
         found = [baseline.solution(axes, axes[0].choice) for axes in zip(*fits, strict=True)]
         if not self.bounded:

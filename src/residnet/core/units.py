@@ -53,6 +53,7 @@ _UNITS: dict[str, tuple[str, float]] = {
     "g": ("m/s^2", 9.80665),
     "rad": ("rad", 1.0),
     "deg": ("rad", math.pi / 180.0),
+    "cdeg": ("rad", math.pi / 18000.0),
     "rad/s": ("rad/s", 1.0),
     "rad/min": ("rad/s", 1.0 / 60.0),
     "deg/s": ("rad/s", math.pi / 180.0),

@@ -43,6 +43,7 @@ from residnet.dynamics.store import ModelSpec
 
 REACH = 2.0
 """How far beyond the training range a value is accepted, in largest magnitudes of that range."""
+_LARGEST = float(torch.finfo(torch.float32).max)
 _FARTHEST = 1e5
 """Largest north and east in m."""
 _TURNS = 2000.0 * math.pi
@@ -64,6 +65,7 @@ class GuardedDynamics(Dynamics):
     def __init__(self, model: HybridDynamics, spec: ModelSpec) -> None:
         super().__init__(model.dt, model.integrator)
         self.model = model
+        self.largest = _LARGEST
         self.n_state = model.n_state
         low, high, reach = (
             torch.tensor(part, dtype=torch.float64) for part in (spec.low, spec.high, _reach(spec))
@@ -77,8 +79,9 @@ class GuardedDynamics(Dynamics):
             "least": torch.cat((-far, low - reach)),
             "most": torch.cat((far, high + reach)),
             "middle": torch.cat((0.0 * far, 0.5 * (low + high))),
-            "memory_low": first - 1e-3 * first.abs(),
-            "memory_high": last + 1e-3 * last.abs(),
+            # finite, so that comparisons alone tell what is no number
+            "memory_low": (first - 1e-3 * first.abs()).clamp(min=-_LARGEST),
+            "memory_high": (last + 1e-3 * last.abs()).clamp(max=_LARGEST),
         }.items():
             self.register_buffer(name, value.to(torch.float32))
         self.low: Tensor
@@ -126,8 +129,7 @@ class GuardedDynamics(Dynamics):
 
     def remembers(self, s: Tensor) -> Tensor:
         """Return which rows [B] of a memory [B, n_state] the head can have come to."""
-        possible = (s >= self.memory_low) & (s <= self.memory_high) & torch.isfinite(s)
-        return possible.all(dim=-1)
+        return ((s >= self.memory_low) & (s <= self.memory_high)).all(dim=-1)
 
     def settle(self, x: Tensor, after: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return state and memory after a step as they are given out, and the flag [B].
@@ -145,7 +147,7 @@ class GuardedDynamics(Dynamics):
         coasting = torch.minimum(torch.maximum(coasting, least), most)
         if self.n_state == 0:
             return torch.where(kept, after, coasting), s, ~kept.squeeze(-1)
-        known = torch.isfinite(s).all(dim=-1, keepdim=True)
+        known = (s.abs() <= self.largest).all(dim=-1, keepdim=True)
         # a head of another package may leave what it says of its memory
         s = torch.minimum(torch.maximum(s, self.memory_low), self.memory_high)
         s = torch.where(known, s, torch.zeros_like(s))

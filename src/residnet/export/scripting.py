@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
+from torch.jit._fuser import optimized_execution
 
 from residnet.core.files import whole
 
@@ -73,7 +74,8 @@ def write_scripted(
     Raises:
         ExportError: from `check`.
     """
-    with warnings.catch_warnings():
+    # freezing loses the methods where a program has switched the executor's optimisation off
+    with warnings.catch_warnings(), optimized_execution(True):
         # TorchScript still works in torch 2.13 but announces its end; every export depends on it
         # here alone
         warnings.filterwarnings("ignore", category=DeprecationWarning)

@@ -267,10 +267,11 @@ class LstmHead(ResidualHead):
             y, m = network(z, s[:, i * self.width : (i + 1) * self.width])
             out.append(y)
             memory.append(m)
-        rho: Tensor = self.scale(torch.cat(out, dim=-1))
+        rho: Tensor = self.scale(out[0] if len(out) == 1 else torch.cat(out, dim=-1))
         if self.restoring is not None:
             rho = rho + self.restoring(z)
-        return rho, torch.cat(memory, dim=-1)
+        # joining a single part would copy it
+        return rho, memory[0] if len(memory) == 1 else torch.cat(memory, dim=-1)
 
     def sequence(self, z: Tensor) -> Tensor:
         """Return residuals [B, T, 3] along measured channels [B, T, nz], from an empty memory."""

@@ -13,6 +13,7 @@ from typing import Any, ClassVar, NamedTuple, final
 
 from pydantic import Field
 
+from residnet.core.arrays.heap import keep_freed_memory
 from residnet.core.config import Config, dump_config, load_mapping
 from residnet.core.errors import DataError, ExportError, UsageError
 from residnet.report.blocks import Section
@@ -278,9 +279,10 @@ class ComputingTask(Task):
 
     @contextmanager
     def resources(self) -> Iterator[None]:
-        """Set the number of threads, and put it back in the end."""
+        """Set the number of threads, put back in the end, and keep freed memory for tensors."""
         import torch
 
+        keep_freed_memory()
         before = torch.get_num_threads()
         torch.set_num_threads(self.threads)
         try:

@@ -29,10 +29,12 @@ from residnet.training.sensitivities import OffsetBaseline, step_sensitivities
 
 __all__ = ["Refitted", "free_run_starts", "refit"]
 
-_ROUNDS = 4
+_ROUNDS = 8
 """Times that terms which feed energy are looked for."""
 _OPEN = 0.5
 """Share of a parameter's information that is the prior's, from which on the data leave it open."""
+_ASTRAY = 1e3
+"""Error in scales beyond which free runs do not tell which way to go."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,8 @@ class Refitted:
 
     Attributes:
         covariance: of the free parameters, [P, P]; what offsets leave open is in it.
-        notes: cost before and after, iterations, windows, horizon, independent errors; terms that
+        notes: cost before and after, iterations, windows, horizon, the part of it in s that the
+            search began with (all unless free runs diverged), independent errors; terms that
             were left out, since their sign would feed energy.
         open: which free parameters neither accelerations nor free runs determine [P]; they stay
             where least squares put them, which is near zero where these have a ridge.
@@ -79,7 +82,8 @@ def refit(
             None for the least-squares solution, which stays the prior in any case.
 
     Raises:
-        FitError: where the first free runs are not finite.
+        FitError: where free runs diverge from the first step on, or from a later one whatever the
+            minimum of those before it is.
     """
     baseline = model.baseline
     if not isinstance(baseline, ParametricBaseline):
@@ -97,19 +101,23 @@ def refit(
         config.offsets, int(store.log.max()) + 1, scales / config.correlation, problem.speed
     )
     level, _ = level_of(model, problem, offsets)
-    first, count = level, 0
-    if not torch.isfinite(first):
-        raise FitError(
-            "the least-squares baseline diverges within the refit's horizon; shorten `horizon` or"
-            " raise the baseline's ridge"
-        )
+    count, begun = 0, problem.w.shape[1]
+    turning: list[int] = []
+    if not torch.isfinite(level):
+        offsets, begun, count = _brought_near(model, problem, baseline, offsets, config.iterations)
+        level, _ = level_of(model, problem, offsets)
+    first = level
     for _round in range(_ROUNDS):
         level, offsets, steps = _minimised(model, problem, baseline, offsets, config.iterations)
         count += steps
-        feeding = baseline.feeding()
-        if not feeding:
+        if feeding := baseline.feeding():
+            problem = problem.at_rest(feeding)
+        elif turned := baseline.undamped(samples):
+            # what fed energy beside these may not without them
+            turning += turned
+            problem = problem.with_only(turning)
+        else:
             break
-        problem = problem.at_rest(feeding)
         place(baseline, _values(baseline, problem), problem.active)
     arrow = normal_equations(model, problem, baseline, *level_of(model, problem, offsets), offsets)
     share = problem.share(level)
@@ -124,11 +132,51 @@ def refit(
         "iterations": count,
         "windows": len(problem.x0),
         "horizon": config.horizon,
+        "begun_over": begun * model.dt,
         "independent_errors": round(problem.count, 1),
         "at_rest": torch.nonzero(problem.still).squeeze(1).tolist(),
     }
     left_open = (inverse @ problem.own).diagonal() > _OPEN
     return Refitted(share * inverse, notes, replace(offsets, error=error), left_open)
+
+
+def _brought_near(
+    model: HybridDynamics,
+    problem: Problem,
+    baseline: ParametricBaseline,
+    offsets: Offsets,
+    iterations: int,
+) -> tuple[Offsets, int, int]:
+    """Move the parameters to where free runs are finite over the whole horizon.
+
+    The minimum over a part of the horizon that no free run leaves carries over a longer part.
+
+    Returns:
+        The offsets, the steps of the first part, and the steps of the search.
+    """
+
+    def diverges(part: int) -> bool:
+        level = float(level_of(model, problem.over(part), offsets)[0])
+        # a single step is nearly linear, and tells the way from anywhere
+        return not (level < _ASTRAY or (part == 1 and level < torch.inf))
+
+    whole = problem.w.shape[1]
+    known, begun, count = 0, 0, 0
+    while known < whole:
+        part = min(2 * known, whole) if known else whole
+        while part > known and diverges(part):
+            part = known + (part - known) // 2
+        if part == known:
+            raise FitError(
+                "the least-squares baseline diverges within the refit's horizon; shorten `horizon`"
+                " or raise the baseline's ridge"
+            )
+        known, begun = part, begun or part
+        if known < whole:
+            shorter = problem.over(known)
+            _, offsets, steps = _minimised(model, shorter, baseline, offsets, iterations)
+            count += steps
+    return offsets, begun, count
 
 
 def _values(baseline: ParametricBaseline, problem: Problem) -> Tensor:

@@ -55,6 +55,16 @@ class Problem:
         still[list(numbers)] = True
         return replace(self, still=still)
 
+    def with_only(self, numbers: Sequence[int]) -> Problem:
+        """Return the problem in which these free parameters stay at zero, and no others."""
+        return replace(self, still=torch.zeros_like(self.still)).at_rest(numbers)
+
+    def over(self, steps: int) -> Problem:
+        """Return the problem whose free runs are so many steps long."""
+        return replace(
+            self, w=self.w[:, :steps], nu=self.nu[:, :steps], weight=self.weight[:, :steps]
+        )
+
     def share(self, level: Tensor) -> Tensor:
         """Return half of what one unit of minus the logarithm of a probability costs.
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from residnet.identification.monitoring.scatter import Group, scattered
@@ -36,7 +38,7 @@ def test_much_information_about_a_wrong_model_is_no_alarm() -> None:
     scatter = scattered(groups(random, 60, 1, np.zeros(CAUSES), 0.5))
     scores = []
     for _ in range(400):
-        size, error = scatter.together(groups(random, 5, 1, np.zeros(CAUSES), 0.5))
+        size, error, _ = scatter.together(groups(random, 5, 1, np.zeros(CAUSES), 0.5))
         scores.append(size / error)
     assert 0.75 < np.std(scores) < 1.2
     # without what logs differ in, five vigorous logs would seem to know better
@@ -49,7 +51,7 @@ def test_groups_of_one_log_share_what_is_their_own() -> None:
     assert (scatter.shared > 0.5 * scatter.apart).all()
     scores = []
     for _ in range(300):
-        size, error = scatter.together(groups(random, 1, 5, np.zeros(CAUSES), 0.1, shared=0.5))
+        size, error, _ = scatter.together(groups(random, 1, 5, np.zeros(CAUSES), 0.1, shared=0.5))
         scores.append(size / error)
     assert 0.8 < np.std(scores) < 1.25
     free = scattered(groups(random, 40, 5, np.zeros(CAUSES), 0.5))
@@ -67,7 +69,7 @@ def test_all_scores_together_name_the_cause() -> None:
         for _ in range(50):
             change = np.where(np.arange(CAUSES) == cause, 1.5, 0.0)
             found = groups(random, 5, 1, change, 0.1)
-            size, error = scatter.together(found)
+            size, error, _ = scatter.together(found)
             right += int(np.abs(size / error).argmax()) == cause
             assert abs(size[cause] - 1.5) < 5 * error[cause]
         assert right >= 45
@@ -82,10 +84,24 @@ def test_one_log_at_odds_with_the_others_does_not_speak_for_all() -> None:
         odd = known[-1]
         # a manoeuvre that no clean log held asks for ten standard deviations alone
         pushed = odd.score + 10.0 * np.sqrt(scatter.variance(odd.own))
-        size, error = scatter.together([*known[:-1], Group(odd.log, pushed, odd.information)])
+        size, error, _ = scatter.together([*known[:-1], Group(odd.log, pushed, odd.information)])
         strange.append(np.abs(size / error).max())
-        size, error = scatter.together(groups(random, 5, 1, np.array([0.0, 0.0, 2.0]), 0.1))
+        size, error, _ = scatter.together(groups(random, 5, 1, np.array([0.0, 0.0, 2.0]), 0.1))
         changed.append(size[2] / error[2])
         assert abs(size[2] - 2.0) < 5 * error[2]
     assert np.median(strange) < 4.0
     assert np.median(changed) > 6.0
+
+
+def test_a_cause_is_no_likelier_because_clean_logs_were_surer_of_it() -> None:
+    random = np.random.default_rng(4)
+    scatter = scattered(groups(random, 60, 1, np.zeros(CAUSES), 0.3))
+    # clean logs leave open what the mean size of the right cause is, and so its score is smaller
+    vague = replace(scatter, known=np.array([1.0, 0.0, 0.0]))
+    first = 0
+    for _ in range(50):
+        found = groups(random, 5, 1, np.array([1.5, 0.0, 0.0]), 0.3)
+        size, error, explains = vague.together(found)
+        assert abs(size[0]) / error[0] < abs(size[1]) / error[1]
+        first += int(np.argmax(explains) == 0)
+    assert first > 40

@@ -57,7 +57,8 @@ class SteadyConfig(Config):
             changes of heading of all sizes.
         overshoot_p95: overshoot in rad that one flight in twenty may exceed under the conditions,
             noise and slow push included.
-        flights: under the conditions that are looked at for swinging.
+        flights: under the conditions that are looked at for swinging; half of them at corners of
+            the spread.
     """
 
     heading_swing: Radians = Field(default=0.002792526803190927, gt=0)
@@ -85,6 +86,8 @@ class SteadyTest:
         self.conditions = quiet(conditions)
         random = torch.Generator().manual_seed(seed)
         drawn = self.conditions.draw(limits.flights + _NOMINAL, conditions.dt, random)
+        # a loop swings first where delay, K and T are at their bounds, which few draws come near
+        drawn = self.conditions.at_corners(drawn, limits.flights // 2, random)
         heading = drawn.heading.clone()
         sides = torch.tensor([1.0, -1.0]).repeat(_NOMINAL // 2)
         heading[limits.flights :] = sides * torch.linspace(*conditions.heading, _NOMINAL)

@@ -24,7 +24,7 @@ from residnet.data.drafting.physics import (
 )
 from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.units import thrown, unit_by_size, written_unit
-from residnet.data.drafting.words import words_of
+from residnet.data.drafting.words import axis_velocity, words_of
 
 READER = ("data", "reader")
 CHANNELS = (*READER, "channels")
@@ -38,9 +38,10 @@ class Channels:
     """The entries of a channel map, from names, headers, values and physics."""
 
     def __init__(
-        self, names: Mapping[str, str], logs: Sequence[Raw], marks: Marks, fixes: bool
+        self, names: Mapping[str, str], logs: Sequence[Raw], marks: Marks, fixes: float
     ) -> None:
-        self._fixes = fixes
+        """From channel -> column, logs, and degrees in one count of x and y, 0 for metres."""
+        self._fixes = float(fixes)
         self._names, self._logs, self._marks = dict(names), list(logs), marks
         self._frame = FRAMES[0]
         self._motions: list[Motion | None] = [None] * len(logs)
@@ -49,6 +50,7 @@ class Channels:
     def drafted(self) -> dict[str, dict[str, Any]]:
         """Return channel -> entry."""
         if {"x", "y", "psi"} <= set(self._names):
+            self._settle_axes()
             self._settle_frame()
         self._settle_wind()
         entries = {name: self._entry(name) for name in self._names}
@@ -66,6 +68,8 @@ class Channels:
         # motion does not
         other = "rad" if sized == "deg" else "deg"
         tried = [written] if written else [sized, other]
+        if not written and np.nanmax(np.abs(self._values("psi")), initial=0.0) > 720.0:
+            tried.append("cdeg")
         best = (-np.inf, "rad", FRAMES[0])
         for unit in tried:
             for frame in (f for f in FRAMES if not (self._fixes and f.swapped)):
@@ -80,6 +84,45 @@ class Channels:
             self._marks.guess((*CHANNELS, "psi"), f"the header has no unit; {reason}")
         self._name_axes(score)
 
+    def _settle_axes(self) -> None:
+        """Leave out velocities along x and y that count along north and east, not along the hull.
+
+        Names such as vx and vy do not say which; position and heading do, without them.
+        """
+        called = [n for n in ("u", "v") if n in self._names and self._along_axis(n)]
+        if not called:
+            return
+        if self._over_ground(called):
+            columns = ", ".join(self._names.pop(name) for name in called)
+            text = f"{columns} follow the motion along north and east, and not along the vessel's"
+            self._marks.note(CHANNELS, f"{text} axes; left out, for u and v follow from positions")
+            return
+        for name in called:
+            text = "taken along the vessel's own axes, which position and heading do not contradict"
+            self._marks.guess((*CHANNELS, name), text)
+
+    def _along_axis(self, name: str) -> bool:
+        return axis_velocity(words_of(self._names[name])) is not None
+
+    def _over_ground(self, called: Sequence[str]) -> bool:
+        """Return whether velocities along x and y fit those along north and east better."""
+        rest = {name: column for name, column in self._names.items() if name not in called}
+        alone = Channels(rest, self._logs, Marks(), self._fixes)
+        alone._settle_frame()
+        still = [Raw(raw.t, {**raw.columns, "psi": np.zeros(raw.t.size)}) for raw in self._logs]
+        ground = [motion_of(raw, "rad", FRAMES[0]) for raw in still]
+
+        def fit(motions: Sequence[Motion | None], along: Mapping[str, str]) -> float:
+            moved = [
+                Raw(raw.t, {along[n]: raw.columns[n] for n in called if n in raw.columns})
+                for raw in self._logs
+            ]
+            return float(np.mean([follows(moved, motions, along[n]).correlation for n in called]))
+
+        same, turned = {"u": "u", "v": "v"}, {"u": "v", "v": "u"}
+        best = max(fit(ground, same), fit(ground, turned))
+        return best > _SURE and best > fit(alone._motions, same) + 0.05
+
     def _score(self, motions: Sequence[Motion | None]) -> float:
         """Return how well position, heading and velocities fit together, at most 1."""
         fits = [follows(self._logs, motions, name) for name in ("u", "v") if name in self._names]
@@ -92,7 +135,7 @@ class Channels:
         """Say which column is north, and mark what names and motion leave open."""
         x, y = words_of(self._names["x"]), words_of(self._names["y"])
         told = x.has("north") and y.has("east") and not (x.text == "x" or y.text == "y")
-        told = told or self._fixes
+        told = told or self._fixes > 0.0
         if self._frame.swapped and not told:
             self._names["x"], self._names["y"] = self._names["y"], self._names["x"]
             text = "the vessel moves where it points only if the column called y is the north"
@@ -160,7 +203,7 @@ class Channels:
         column = self._names[name]
         entry: dict[str, Any] = {"column": column}
         if self._fixes and name in ("x", "y"):
-            return entry | {"unit": "deg"}
+            return entry | {"unit": "deg"} | ({"scale": self._fixes} if self._fixes < 1.0 else {})
         if name == "psi":
             entry["unit"] = self._psi_unit
             return entry | ({"frame": "enu"} if self._frame.from_east else {})

@@ -13,7 +13,7 @@ from residnet.core.errors import DataError, UsageError
 from residnet.core.units import known_unit
 from residnet.data.drafting.text_tables import text_table
 from residnet.data.readers.base import require_file
-from residnet.data.readers.tables.pieces import excel_sheet
+from residnet.data.readers.tables.pieces import excel_sheet, sheet_names
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -65,7 +65,7 @@ def peek(path: Path, rows: int = _ROWS) -> Sheet:
     if path.suffix.lower() == ".parquet":
         table, about = _parquet(path, rows), {"kind": "parquet"}
     elif path.suffix.lower() == ".xlsx":
-        table, about = excel_sheet(path, None, rows), {"kind": "excel"}
+        table, about = _excel(path, rows)
     else:
         table, about = text_table(path, rows)
     columns = _described(table)
@@ -111,6 +111,16 @@ def _unit_in(cell: str) -> str:
     except UsageError:
         return ""
     return unit
+
+
+def _excel(path: Path, rows: int) -> tuple[pd.DataFrame, dict[str, Any]]:
+    """Return the first sheet with two columns of numbers, else the first, and its settings."""
+    names = sheet_names(path)
+    tables = ((name, excel_sheet(path, name, rows)) for name in names)
+    for number, (name, table) in enumerate(tables):
+        if len(table.select_dtypes("number").columns) > 1:
+            return table, {"kind": "excel", **({"sheet": name} if number else {})}
+    return excel_sheet(path, None, rows), {"kind": "excel"}
 
 
 def _parquet(path: Path, rows: int) -> pd.DataFrame:

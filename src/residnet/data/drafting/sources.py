@@ -113,6 +113,14 @@ def _positions(recording: Recording) -> Iterator[PositionConfig]:
         if series.has("latitude") and series.has("longitude"):
             yield Geodetic(topic=series.name)
             continue
+        called = {state_channel(words_of(field)): field for field in reversed(series.fields)}
+        if {"latitude", "longitude"} <= set(called):
+            fixes = called["latitude"], called["longitude"]
+            if all(
+                0.0 < float(np.nanmax(np.abs(series[name]), initial=0.0)) <= 180.0 for name in fixes
+            ):
+                yield Geodetic(topic=series.name, latitude=fixes[0], longitude=fixes[1])
+                continue
         for prefix in ("pose.pose.position.", "pose.position.", "position.", ""):
             pair = next(
                 (

@@ -145,8 +145,9 @@ def words_of(name: str) -> Words:
     number = next((int(token) for token in reversed(tokens) if token.isdigit()), None)
     bare = [re.sub(r"\d+$", "", token) for token in tokens if not token.isdigit()]
     if number is None:
-        tail = re.search(r"[a-z](\d+)$", tokens[-1]) if tokens else None
-        number = int(tail.group(1)) if tail else None
+        # `servo3_raw` counts as `servo_raw_3` does
+        tails = (re.search(r"[a-z](\d+)$", token) for token in reversed(tokens))
+        number = next((int(tail.group(1)) for tail in tails if tail), None)
     bare += [piece for token in bare for piece in _pieces(token)]
     about = {thing for thing in _ABOUT if _fits(thing, text, bare)}
     return Words(text, frozenset(about), number)
@@ -202,13 +203,23 @@ def state_channel(words: Words) -> str | None:
         return "r"
     if (w.has("turn") and w.has("rate")) or (w.has("angular") and w.text.endswith((" z", " r"))):
         return "r"
-    twist = _TWIST.search(w.text)
-    if twist:
-        return "u" if "x" in twist.groups() else "v"
+    if axis := axis_velocity(w):
+        return axis
     return _place(w) or _velocity(w)
 
 
-_TWIST = re.compile(r"\b(?:twist|velocity) linear ([xy])$|\blinear velocity ([xy])$")
+_TWIST = re.compile(
+    r"\b(?:(?:twist|velocity) linear|linear velocity|v|vel|velo|velocity|speed|lin|linear)"
+    r" ?(?P<axis>[xy])(?: (?:m s|mps|ms))?$"
+)
+
+
+def axis_velocity(words: Words) -> str | None:
+    """Return u or v of a velocity along an axis x or y, of whatever frame; None for others."""
+    twist = _TWIST.search(words.text)
+    return None if twist is None else "u" if twist["axis"] == "x" else "v"
+
+
 _COMPASS = ("gyro", "compass", "gyro compass", "gyrocompass")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -13,15 +14,16 @@ from residnet.core.names import shown
 from residnet.data.drafting.channels import CHANNELS
 from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.sheets import Sheet
-from residnet.data.drafting.words import state_channel, words_of
-from residnet.data.readers.tables.angles import Form, degrees_of, side_signs
+from residnet.data.drafting.words import plain, state_channel, words_of
+from residnet.data.readers.tables.angles import Form, LetterO, degrees_of, side_signs
 
 if TYPE_CHECKING:
     import pandas as pd
 
 _FORMS: tuple[Form, ...] = ("number", "ddmm")
 _LARGEST = {"latitude": 90.0, "longitude": 180.0}
-_SIDES = {"latitude": {"N", "S"}, "longitude": {"E", "W"}}
+_SIDES = {"latitude": {"N", "S"}, "longitude": {"E", "W", "O"}}
+_GERMANIC = re.compile(r"breite|l(?:ae|a)nge|breedte|lengte|zeit|tijd|kurs|koers|ruder|roer")
 Settings = Mapping[str, Mapping[str, Any]]
 """Column -> what its entry in a channel map says beside column and unit."""
 
@@ -36,10 +38,12 @@ def with_degrees(sheet: Sheet, marks: Marks) -> tuple[Sheet, Settings]:
         return sheet, {}
     numbers: dict[str, np.ndarray] = {}
     settings: dict[str, dict[str, Any]] = {}
+    letter_o, why = _letter_o(sheet, columns["longitude"])
     for form in _FORMS:
         try:
             numbers = {
-                column: _degrees(sheet, name, column, form) for name, column in columns.items()
+                column: _degrees(sheet, name, column, form, letter_o)
+                for name, column in columns.items()
             }
         except DataError:
             continue
@@ -55,7 +59,10 @@ def with_degrees(sheet: Sheet, marks: Marks) -> tuple[Sheet, Settings]:
         side = _side(sheet, name)
         if side is not None:
             settings[column]["hemisphere"] = sheet.column(side)
-            numbers[column] = numbers[column] * side_signs(sheet.texts[side], name)
+            numbers[column] = numbers[column] * side_signs(sheet.texts[side], name, letter_o)
+    if letter_o is not None:
+        settings[columns["longitude"]]["letter_o"] = letter_o
+        marks.guess((*CHANNELS, "longitude"), why)
     used = {entry["hemisphere"] for entry in settings.values() if "hemisphere" in entry}
     texts = {name: cells for name, cells in sheet.texts.items() if name not in {*numbers, *used}}
     read = {**sheet.numbers, **numbers}
@@ -73,7 +80,30 @@ def _columns(sheet: Sheet) -> dict[str, str]:
     return out
 
 
-def _degrees(sheet: Sheet, name: str, column: str, form: Form) -> np.ndarray:
+def _letter_o(sheet: Sheet, longitude: str) -> tuple[LetterO | None, str]:
+    """Return what O means as a hemisphere, and why; None where no longitude has it.
+
+    Beside W it is the east, and beside E the west. Alone it is as the names of columns have it:
+    the east in German and Dutch, the west in Spanish, French, Italian and Portuguese.
+    """
+    side = _side(sheet, "longitude")
+    cells = sheet.texts.get(side or longitude)
+    if cells is None:
+        return None, ""
+    ends = cells.dropna().astype("string").str.upper().str.extract(r"^\s*([EOW])?.*?([EOW])?\s*$")
+    found = {str(letter) for end in ends for letter in ends[end].dropna().unique()}
+    if "O" not in found:
+        return None, ""
+    if len(found) > 1:
+        return ("east" if "W" in found else "west"), f"O stands beside {min(found - {'O'})}"
+    german = any(_GERMANIC.search(plain(name)) for name in sheet.header)
+    means: LetterO = "east" if german else "west"
+    return means, f"the letter O is taken as {means}, by the language of the columns' names"
+
+
+def _degrees(
+    sheet: Sheet, name: str, column: str, form: Form, letter_o: LetterO | None
+) -> np.ndarray:
     """Return the values [T] of the column of a channel in degrees.
 
     Raises:
@@ -83,7 +113,7 @@ def _degrees(sheet: Sheet, name: str, column: str, form: Form) -> np.ndarray:
 
     values = sheet.numbers.get(column)
     cells = sheet.texts[column] if values is None else pd.Series(values)
-    return degrees_of(cells, name, form)
+    return degrees_of(cells, name, form, letter_o)
 
 
 def _largest(values: np.ndarray) -> float:

@@ -52,7 +52,8 @@ def encoding_of_head(head: bytes) -> str:
 def as_utf8(path: Path, encoding: str | None = None) -> Iterator[Path]:
     """Yield a file that holds the text of `path` in UTF-8, perhaps behind a byte order mark.
 
-    It is `path` itself where that is UTF-8, or else a temporary one, gone after the context.
+    It is `path` itself where that is UTF-8, or else a temporary one, gone after the context. Zero
+    bytes at its end, with which recorders fill what they have not written, are left out.
 
     Args:
         path: of the text.
@@ -62,21 +63,22 @@ def as_utf8(path: Path, encoding: str | None = None) -> Iterator[Path]:
         DataError: where the text is not of this encoding.
     """
     name = codecs.lookup(encoding or encoding_of(path)).name
-    if name in ("utf-8", "utf-8-sig", "ascii"):
+    filled = 0 if name.startswith(("utf-16", "utf-32")) else _zeros_at_end(path)
+    if name in ("utf-8", "utf-8-sig", "ascii") and not filled:
         yield path
         return
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / path.name
-        _copy(path, copy, name)
+        _copy(path, copy, name, path.stat().st_size - filled)
         yield copy
 
 
-def _copy(path: Path, copy: Path, encoding: str) -> None:
-    """Write the text of `path` as UTF-8; half a sign at the end of a file that was cut is left."""
+def _copy(path: Path, copy: Path, encoding: str, size: int) -> None:
+    """Write the first `size` bytes of `path` as UTF-8; half a sign at their end is left."""
     decoder = codecs.getincrementaldecoder(encoding)()
     done = 0
     with path.open("rb") as stream, copy.open("wb") as out:
-        while block := stream.read(_BLOCK):
+        while block := stream.read(min(_BLOCK, size - done)):
             try:
                 out.write(decoder.decode(block).encode("utf-8"))
             except UnicodeError as error:
@@ -86,6 +88,20 @@ def _copy(path: Path, copy: Path, encoding: str) -> None:
                     " or give its `encoding`"
                 ) from error
             done += len(block)
+
+
+def _zeros_at_end(path: Path) -> int:
+    """Return how many bytes at the end of a file are zero."""
+    count, size = 0, path.stat().st_size
+    with path.open("rb") as stream:
+        while count < size:
+            stream.seek(max(0, size - count - _HEAD))
+            block = stream.read(min(_HEAD, size - count))
+            zeros = len(block) - len(block.rstrip(b"\0"))
+            count += zeros
+            if zeros < len(block):
+                break
+    return count
 
 
 def _told(head: bytes) -> str | None:

@@ -80,12 +80,14 @@ class Suspect:
         score: of its test by the scores of all causes, in standard deviations of clean logs.
         size: of the change, in its unit.
         error: standard error of the size.
+        explains: square that it alone takes off the scores of all causes.
     """
 
     change: Change
     score: float
     size: float
     error: float
+    explains: float
 
 
 @dataclass(frozen=True)
@@ -95,7 +97,7 @@ class Verdict:
     Attributes:
         alarm: whether the largest score exceeds the threshold.
         threshold: of the scores.
-        suspects: causes, the likeliest first.
+        suspects: causes, the one that explains most first.
         innovation: root mean square of the whitened innovations of each channel; 1 on clean logs.
     """
 
@@ -103,6 +105,11 @@ class Verdict:
     threshold: float
     suspects: Sequence[Suspect]
     innovation: dict[str, float]
+
+    @property
+    def largest(self) -> float:
+        """The largest score of any cause."""
+        return max(suspect.score for suspect in self.suspects)
 
 
 _Innovations = tuple[np.ndarray, np.ndarray]
@@ -275,13 +282,13 @@ class Watch:
             sums: of the groups.
         """
         groups = [self._group(log, one, self.bias) for log, one in zip(logs, sums, strict=True)]
-        size, error = self.scatter.together(groups)
+        size, error, explains = self.scatter.together(groups)
         suspects = [
-            Suspect(change, float(abs(size[i]) / error[i]), float(size[i]), float(error[i]))
-            for i, change in enumerate(self.causes)
+            Suspect(change, float(abs(a) / b), float(a), float(b), float(c))
+            for change, a, b, c in zip(self.causes, size, error, explains, strict=True)
         ]
         alarm = max(suspect.score for suspect in suspects) > self.threshold
-        suspects.sort(key=lambda suspect: -suspect.score)
+        suspects.sort(key=lambda suspect: -suspect.explains)
         count = sum(one.count for one in sums)
         squares = np.sum([one.squares for one in sums], axis=0) / count
         by_channel = squares.reshape(-1, len(SEEN)).mean(axis=0)

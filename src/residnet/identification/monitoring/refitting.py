@@ -149,7 +149,7 @@ def _ended(verdict: Verdict, taken: Sequence[Change], most: int) -> str:
     first = verdict.suspects[0]
     if not verdict.alarm:
         return (
-            f"no cause exceeds the threshold (largest score {first.score:.1f} of"
+            f"no cause exceeds the threshold (largest score {verdict.largest:.1f} of"
             f" {verdict.threshold:.1f})"
         )
     if first.change.sensor:

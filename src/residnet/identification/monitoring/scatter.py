@@ -88,10 +88,13 @@ class Scatter:
         left = max(self.count - size - 1, 1)
         return max((self.count - 1) / left, 1.0) * self.count / (left + 1)
 
-    def together(self, groups: Sequence[Group]) -> tuple[np.ndarray, np.ndarray]:
-        """Return the size of each cause alone [Q] by the scores of all causes, and its error.
+    def together(self, groups: Sequence[Group]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the size of each cause alone [Q], its error, and how much it explains.
 
-        The scores of all tell better than each for itself which cause it is, and that there is one.
+        The scores of all causes tell better than each for itself which it is, and that there is
+        one. What a cause explains is the square that it takes off all scores. All causes are
+        compared on the same scores: neither how well logs agree on the size of one, nor how surely
+        clean logs asked for none of it, says that another one is more likely.
         """
         told, weight = [], []
         for log in dict.fromkeys(group.log for group in groups):
@@ -111,7 +114,8 @@ class Scatter:
             told.append(part / again)
             weight.append(sure / again + _NOTHING)
         size, agreed = _agreed(np.stack(told), np.stack(weight))
-        return size, np.sqrt((1.0 / agreed + self.known) * self.inflation)
+        explained = np.sum(told, axis=0) ** 2 / np.sum(weight, axis=0) / self.inflation
+        return size, np.sqrt((1.0 / agreed + self.known) * self.inflation), explained
 
 
 def _agreed(told: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

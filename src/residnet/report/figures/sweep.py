@@ -10,15 +10,26 @@ from typing import Any
 import numpy as np
 
 from residnet.report.figures.files import Drawing
-from residnet.report.figures.style import SOLID, new_figure, styled
+from residnet.report.figures.style import DASHED, SOLID, new_figure, styled
 
 _LONGEST = 20
 """Most letters of a line beneath an axis."""
 
 
+_SIDE_BY_SIDE = 5
+"""Most axes whose names have room beside each other."""
+_GROUPS: tuple[tuple[str, float, float, dict[str, Any]], ...] = (
+    ("worse half", 0.5, 1.0, {"color": "0.72", "linewidth": 0.8}),
+    ("better half", 0.1, 0.5, {**SOLID, "alpha": 0.45, "linewidth": 1.0}),
+    ("best tenth", 0.0, 0.1, {**SOLID, "linewidth": 1.2}),
+    ("best", 0.0, 1e-9, {**DASHED, "linestyle": "-", "linewidth": 2.4}),
+)
+"""Groups of trials by their rank: from which share of them, to which, and how they are drawn."""
+
+
 @styled
 def parallel_coordinates(content: Mapping[str, Any]) -> Drawing:
-    """Draw each finished trial as a line over its keys to its value, the better the darker.
+    """Draw each finished trial as a line over its keys to its value, the best on top.
 
     Args:
         content: of sweep.json.
@@ -30,29 +41,30 @@ def parallel_coordinates(content: Mapping[str, Any]) -> Drawing:
     places, ticks = zip(*(_axis(rows, key, key in content["log"]) for key in keys), strict=True)
     spread = np.ptp(values) or 1.0
     heights = np.column_stack([*places, (values - values.min()) / spread])
-    figure = new_figure(3.6)
-    axes = figure.subplots()
-    # the best is drawn last, on top
-    for trial in np.argsort(-rank):
-        good = 1.0 - rank[trial] / max(len(rows) - 1, 1)
-        axes.plot(
-            heights[trial],
-            color=SOLID["color"],
-            alpha=0.12 + 0.88 * good**3,
-            linewidth=0.8 + 1.4 * (rank[trial] == 0),
-        )
     named = [*ticks, [(0.0, f"{values.min():.4g}"), (1.0, f"{values.max():.4g}")]]
+    crowded = len(named) > _SIDE_BY_SIDE
+    figure = new_figure(4.8 if crowded else 3.6)
+    axes = figure.subplots()
+    for column in range(len(named)):
+        axes.axvline(column, color="0.6", linewidth=0.8, label="axes")
+    handles = []
+    for label, low, high, look in _GROUPS:
+        found = heights[(rank >= low * len(rows)) & (rank < high * len(rows))]
+        handles += [axes.plot(trial, label=label, **look)[0] for trial in found][:1]
     for column, marks in enumerate(named):
-        axes.axvline(column, color="0.4", linewidth=0.8)
         for height, text in marks:
             axes.annotate(text, (column, height), (3, 2), textcoords="offset points", fontsize=7)
-    axes.set_xticks(range(len(named)), [*map(_lines, keys), _lines(_words(content))])
+    names = [*map(_lines, keys), _lines(_words(content))]
+    labels = [_ranged(*one) for one in zip(names, named, strict=True)]
+    axes.set_xticks(range(len(named)), labels, rotation=90 if crowded else 0)
     axes.set_yticks([])
     axes.set_xlim(-0.1, len(named) - 0.6)
     axes.grid(visible=False)
+    place = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "ncols": len(_GROUPS)}
+    axes.legend(handles=handles, **place)
     caption = (
-        "Every line is a finished trial: its values, and at the right what is sought. The better a"
-        " trial, the darker its line; the best is the thick one."
+        "Every line is a finished trial: its values, and at the right what is sought. Beneath"
+        " each axis stands what it reaches from and to. The best trial is the thick line."
     )
     return Drawing("parallel_coordinates", "Trials over their keys", caption, figure)
 
@@ -113,6 +125,12 @@ def _axis(
 def _words(content: Mapping[str, Any]) -> str:
     """Return what is sought, without the sign of a number that has no unit."""
     return str(content["objective"]).removesuffix(" [-]")
+
+
+def _ranged(name: str, marks: Sequence[tuple[float, str]]) -> str:
+    """Return the name of an axis above what it reaches from and to."""
+    ends = [text for height, text in marks if height in (0.0, 1.0)]
+    return f"{name}\n{' to '.join(ends)}"
 
 
 def _lines(key: str) -> str:

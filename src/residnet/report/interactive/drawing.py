@@ -116,7 +116,14 @@ def _range(limits: Sequence[float]) -> Any:
 def _canvas(
     explorer: Explorer, panel: Panel, number: int, time_axis: Any, source: ColumnDataSource
 ) -> Canvas:
-    from bokeh.models import BasicTicker, BoxZoomTool, DataRange1d, FixedTicker, HoverTool
+    from bokeh.models import (
+        BasicTicker,
+        BoxZoomTool,
+        DataRange1d,
+        FixedTicker,
+        HoverTool,
+        NoOverlap,
+    )
     from bokeh.models.annotations import Title
     from bokeh.plotting import figure
 
@@ -147,10 +154,12 @@ def _canvas(
     canvas.stylesheets = [":host .bk-events { touch-action: pan-y pinch-zoom; }"]
     over = [_curve(explorer, panel, name, source) for name in explorer.names(number)]
     canvas.renderers.extend(over)
+    # where a height stands for no number, the name alone says what a curve is
+    told = panel.kind == "curves" and not panel.unnumbered
     hover = HoverTool(
         renderers=[curve for curve in over if explorer.looks[curve.name].dash != FILL],
-        mode="mouse" if panel.kind != "curves" else "vline",
-        tooltips=[("$name", "@$name{0.000 a}")] if panel.kind == "curves" else [("", "$name")],
+        mode="vline" if told else "mouse",
+        tooltips=[("$name", "@$name{0.000 a}")] if told else [("", "$name")],
         point_policy="follow_mouse",
     )
     canvas.add_tools(hover, BoxZoomTool(match_aspect=panel.kind == "map"))
@@ -170,6 +179,12 @@ def _canvas(
             axis.major_label_overrides = {float(place): text for place, text in names.items()}
         elif not logarithmic:
             axis.ticker = BasicTicker(desired_num_ticks=count)
+    if panel.unnumbered:
+        canvas.yaxis.visible = False
+        canvas.ygrid.visible = False
+        # long names of many axes stand upright, and on a phone those that have room
+        canvas.xaxis.major_label_orientation = "vertical"
+        canvas.xaxis.major_label_policy = NoOverlap(min_distance=2)
     if not panel.x_names and not panel.x_logarithmic and _counts(explorer, number):
         canvas.xaxis.ticker = BasicTicker(desired_num_ticks=5, min_interval=1.0)
     return canvas

@@ -57,6 +57,7 @@ class Panel:
         beside: it may stand beside others where the page is wide enough.
         x_limits: where the horizontal axis begins and ends at first; empty for all of the curves.
         y_limits: the same for the vertical axis.
+        unnumbered: the vertical axis has no numbers, for several axes stand side by side.
     """
 
     title: str
@@ -71,6 +72,7 @@ class Panel:
     beside: bool = False
     x_limits: Sequence[float] = ()
     y_limits: Sequence[float] = ()
+    unnumbered: bool = False
 
 
 Curve: TypeAlias = tuple[np.ndarray, np.ndarray]

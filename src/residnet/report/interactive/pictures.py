@@ -140,6 +140,7 @@ def _panel(axes: Axes, all_axes: list[Axes]) -> dict[str, Any]:
         # the first panel of a row tells what all show
         row = [one for one in all_axes if one.get_shared_y_axes().joined(one, axes)]
         title = _words(next((one.get_ylabel() for one in row if one.get_ylabel()), ""))
+    upright = len(axes.get_yticks()) == 0
     equal = axes.get_aspect() in ("equal", 1.0)
     first = next(
         i
@@ -150,13 +151,14 @@ def _panel(axes: Axes, all_axes: list[Axes]) -> dict[str, Any]:
         "title": title,
         "x_label": _words(axes.get_xlabel()),
         "kind": "map" if equal else "curves",
-        "height": 380 if equal else 210,
+        "height": 380 if equal or upright else 210,
         "logarithmic": axes.get_yscale() == "log",
         "x_logarithmic": axes.get_xscale() == "log",
         "group": f"x{first}",
         "x_names": _tick_names(axes.xaxis),
         "y_names": _tick_names(axes.yaxis),
         "beside": _beside(axes),
+        "unnumbered": upright,
         "x_limits": [] if axes.get_autoscalex_on() else list(map(float, axes.get_xlim())),
         "y_limits": [] if axes.get_autoscaley_on() else list(map(float, axes.get_ylim())),
     }
@@ -176,7 +178,10 @@ def _tick_names(axis: Any) -> dict[str, str]:
     if not isinstance(locator, FixedLocator) or isinstance(formatter, ScalarFormatter):
         return {}
     places = np.asarray(locator(), dtype=float).tolist()
-    texts = [_words(formatter(place, number)) for number, place in enumerate(places)]
+    texts = [
+        "\n".join(map(_words, str(formatter(place, number)).split("\n")))
+        for number, place in enumerate(places)
+    ]
     return {f"{place:g}": text for place, text in zip(places, texts, strict=True) if text}
 
 

@@ -179,7 +179,8 @@ def _assembled(
     samples = int(sum(log.t[-1] - log.t[0] for log in splits["train"]) / time.step)
     protocols = recipe.protocols(length)
     recipe.mark_timing(time, length, marks)
-    plan = recipe.models(inputs, bool(wind), time, length, samples)
+    thrown = [name for name, entry in read.reader.get("channels", {}).items() if "scale" in entry]
+    plan = recipe.models(inputs, bool(wind), time, length, samples, thrown)
     if standard and inputs:
         plan = {"recipe": "standard"}
         marks.note(("recipe",), "eight models or so, whose terms and sizes follow from the logs")

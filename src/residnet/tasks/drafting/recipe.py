@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -44,7 +44,7 @@ def timing(logs: Sequence[Log]) -> Timing:
     interval = float(np.median([np.median(np.diff(log.t)) for log in logs]))
     memories = [_memory(log) for log in logs]
     memory = float(np.median([m for m in memories if np.isfinite(m)] or [20.0 * interval]))
-    step = _readable(interval * max(1, int(memory / 40.0 / interval)))
+    step = float(f"{interval * max(1, int(memory / 40.0 / interval)):.4g}")
     samples = max(7, 2 * round(0.5 * memory / 5.0 / step) + 1)
     return Timing(interval, memory, step, _readable(min(samples, 41) * step))
 
@@ -114,7 +114,14 @@ def held(logs: Sequence[Log], inputs: Sequence[str]) -> tuple[str, ...]:
     return tuple(out)
 
 
-def models(inputs: Sequence[str], wind: bool, time: Timing, length: float, samples: int) -> Any:
+def models(
+    inputs: Sequence[str],
+    wind: bool,
+    time: Timing,
+    length: float,
+    samples: int,
+    thrown: Collection[str] = (),
+) -> Any:
     """Return baselines, refit, heads, base_of and training of a config.
 
     Args:
@@ -123,6 +130,8 @@ def models(inputs: Sequence[str], wind: bool, time: Timing, length: float, sampl
         time: of the logs.
         length: of the free runs that models are chosen by, s.
         samples: for training, on the grid.
+        thrown: inputs in pulses, per cent or shares; of these one that steers may do so by
+            thrust, without a flow past a rudder.
     """
     acting = roles(inputs)
     extra = [name for name in inputs if name == "tau_y"]
@@ -135,9 +144,12 @@ def models(inputs: Sequence[str], wind: bool, time: Timing, length: float, sampl
         physics["sets"] = ["fossen", *(["wind"] if wind else [])]
         known = {"drive": ("n",), "steer": ("delta",)}
         physics |= {key: list(names) for key, names in acting.items() if names != known[key]}
+        direct = [name for name in acting["steer"] if name in thrown]
+        if direct:
+            physics["terms"] = [t for name in direct for t in (name, f"{name}|{name}|")]
     else:
         physics["sets"] = ["linear", *(["wind"] if wind else [])]
-        physics["terms"] = [*_HULL, *extra, *_driving(inputs)]
+        physics["terms"] = [*_HULL, *extra, *_driving(inputs, thrown)]
     horizon = _readable(_seconds(0.2 * length))
     plan: dict[str, Any] = {
         "baseline": linear,
@@ -156,10 +168,11 @@ def models(inputs: Sequence[str], wind: bool, time: Timing, length: float, sampl
     return plan
 
 
-def _driving(inputs: Sequence[str]) -> list[str]:
+def _driving(inputs: Sequence[str], thrown: Collection[str]) -> list[str]:
     """Return the terms of inputs of which only their kinds are known.
 
-    A thruster that turns pushes along its angle; a rudder turns by the flow past it.
+    A thrust is a force already, unless it is told in pulses or per cent (`thrown`). A thruster
+    that turns pushes along its angle; a rudder turns by the flow past it.
     """
     angles = [name for name in inputs if _kind(name) in ("azimuth", "nozzle")]
     thrusters = [name for name in inputs if _kind(name) in ("n", "thrust", "throttle")]
@@ -172,7 +185,8 @@ def _driving(inputs: Sequence[str]) -> list[str]:
     }
     out: list[str] = []
     for name in inputs:
-        force = f"{name}|{name}|" if not name.startswith(("thrust", "cmd_thrust")) else name
+        told = name.startswith(("thrust", "cmd_thrust")) and name not in thrown
+        force = name if told else f"{name}|{name}|"
         if name in ("tau_x", "tau_y", "tau_n") or name in turned.values():
             continue
         if turned.get(name):

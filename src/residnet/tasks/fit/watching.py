@@ -60,6 +60,7 @@ class WatchedLog:
                     "size": suspect.size,
                     "standard_error": suspect.error,
                     "unit": suspect.change.unit,
+                    "explains": suspect.explains,
                 }
                 for suspect in self.last.suspects
             ],

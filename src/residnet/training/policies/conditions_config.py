@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from residnet.control.conditions.quiet import SteadyConfig
 from residnet.core.config import Seconds
@@ -16,8 +16,8 @@ class ConditionsTraining(OneStage):
 
     The loss of a batch is the mean cost of its flights, with a share of the integral of the
     absolute error that fades out, and with the late rudder swing and the nominal overshoot of
-    flights without noise. The departures from the nominal vessel in calm water grow from none to
-    all of the conditions, and every batch is drawn anew.
+    flights without noise. Every batch is drawn anew, under the conditions in full. A policy without
+    a law inside may begin with the nominal vessel in calm water instead (`nominal`, `spread`).
 
     Attributes:
         epochs: at most; each ends with a validation.
@@ -33,9 +33,12 @@ class ConditionsTraining(OneStage):
         integrator: of the vessel in training.
         hold: longest time in s before the change of heading in training.
         duration: time in s from the change to the end of a training flight; null for that of the
-            conditions.
-        nominal: share of the training that flies the nominal vessel in calm water.
-        spread: share of the training after which the conditions are drawn in full.
+            conditions. It should be longer where large changes do not end within that: a policy
+            creeps through what lies behind the end of its training.
+        nominal: share of the training, at its beginning, that flies the nominal vessel in calm
+            water. A policy that starts from a tuned law would leave what the law does well.
+        spread: share of the training after which the conditions are drawn in full, at least
+            `nominal`.
         guide: weight of the integral of the absolute error in deg s at the start.
         faded: share of the training after which that weight is zero.
         outlying: how much of the loss reaches the gradient of one flight, as a multiple of what the
@@ -69,8 +72,8 @@ class ConditionsTraining(OneStage):
     integrator: Annotated[str, Field(pattern="^(rk4|heun)$")] = "heun"
     hold: Seconds = Field(default=2.0, ge=0)
     duration: Seconds | None = Field(default=None, gt=0)
-    nominal: float = Field(default=0.05, ge=0, le=1)
-    spread: float = Field(default=0.15, ge=0, le=1)
+    nominal: float = Field(default=0.0, ge=0, le=1)
+    spread: float = Field(default=0.0, ge=0, le=1)
     guide: float = Field(default=0.01, ge=0)
     faded: float = Field(default=0.6, gt=0, le=1)
     outlying: float = Field(default=4.0, ge=1)
@@ -82,6 +85,15 @@ class ConditionsTraining(OneStage):
     steady: SteadyConfig | None = SteadyConfig()
     validation: int = Field(default=512, ge=2, le=1_000_000)
     compiled: bool = True
+
+    @model_validator(mode="after")
+    def _ramp(self) -> ConditionsTraining:
+        if self.nominal > self.spread:
+            raise ValueError(
+                f"nominal ({self.nominal:g}) must not be larger than spread ({self.spread:g}):"
+                " the conditions grow from the end of the one to the end of the other"
+            )
+        return self
 
     def share(self, progress: float) -> float:
         """Return the share of the conditions that is drawn, at a progress of 0 to 1."""

@@ -29,7 +29,7 @@ from residnet.training.running import run_epochs
 _LATE = 1.0 / 3.0
 """Share of a flight at whose end a quiet one should have come to rest."""
 _ALL = 1_000_000
-_LITTLE = 0.3
+_LITTLE = 0.6
 """Share of the range of changes of heading that flights without noise are drawn from."""
 _FAR = 1.15
 """Multiple of the start's cost from which an epoch has left the good policies."""
@@ -195,8 +195,9 @@ class ConditionsFit(EpochTraining):
 
         The first `quiet` of them are without noise and slow push: first half of these at a corner
         of the spread, where a loop swings first, then a quarter that flies the nominal vessel. All
-        but the latter change their heading little, so that the change is over when they are looked
-        at for swinging.
+        but the latter leave out the largest changes of heading, so that the change is over when
+        they are looked at for swinging. A policy's memory may keep a loop swinging behind large
+        changes that does not swing behind small ones.
         """
         random = torch.Generator().manual_seed(int(torch.randint(2**62, (1,))))
         changes = self.drawn.draw(rows, self.step_size, random, share)

@@ -32,6 +32,13 @@ TIME_NAMES = (
     "t_s",
     "utc",
     "datenum",
+    "Zeit",
+    "zeit",
+    "tiempo",
+    "temps",
+    "tijd",
+    "tempo",
+    "tid",
 )
 # MATLAB's day 719529 is 1 January 1970
 _DATENUM_1970, _DAY = 719_529.0, 86_400.0

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 Form = Literal["number", "ddmm"]
 """How a number stands for an angle: as degrees, or as degrees and minutes in one."""
+LetterO = Literal["east", "west"]
+"""What O stands for: Ost and Oost, or Oeste, Ouest and Ovest."""
 _NUMBER = r"\d+(?:[.,]\d+)?"
 _FORM = (
     r"^\s*(?P<lead>[NSEWOnsewo])?\s*(?P<sign>[-+−])?\s*"
@@ -26,7 +28,9 @@ _SIDES = {"n": 1.0, "e": 1.0, "s": -1.0, "w": -1.0}
 _OF = {"latitude": "ns", "longitude": "ew"}
 
 
-def degrees_of(cells: pd.Series, name: str, form: Form = "number") -> np.ndarray:
+def degrees_of(
+    cells: pd.Series, name: str, form: Form = "number", letter_o: LetterO | None = None
+) -> np.ndarray:
     """Return angles [T] in degrees from cells such as `59°54.321'N`, `59 54 19.3 N` or `-59.9`.
 
     NaN stands for empty cells.
@@ -35,6 +39,7 @@ def degrees_of(cells: pd.Series, name: str, form: Form = "number") -> np.ndarray
         cells: of one column.
         name: of the channel: a latitude has no east.
         form: of a number that stands alone.
+        letter_o: what O stands for; None refuses it.
 
     Raises:
         DataError: naming the first cell that is no such angle.
@@ -63,7 +68,7 @@ def degrees_of(cells: pd.Series, name: str, form: Form = "number") -> np.ndarray
     lead, tail = (parts[part].str.lower() for part in ("lead", "tail"))
     side = lead.fillna(tail)
     turned = parts["sign"].fillna("+").isin(["-", "−"]).to_numpy()
-    signs = side_signs(side, name)
+    signs = side_signs(side, name, letter_o)
     wrong |= (lead.notna() & tail.notna()).to_numpy() | (turned & (signs > 0) & side.notna())
     _require(column[known], wrong, name)
     out = np.full(len(cells), np.nan)
@@ -84,7 +89,7 @@ def from_form(values: np.ndarray, form: Form) -> np.ndarray:
     return out
 
 
-def side_signs(sides: pd.Series, name: str) -> np.ndarray:
+def side_signs(sides: pd.Series, name: str, letter_o: LetterO | None = None) -> np.ndarray:
     """Return 1 or -1 [T] for the letters of hemispheres; 1 where there is none.
 
     Raises:
@@ -92,11 +97,15 @@ def side_signs(sides: pd.Series, name: str) -> np.ndarray:
     """
     letters = sides.astype("string").str.strip().str.lower()
     letters = letters.mask(letters == "")
+    if letter_o is not None and name == "longitude":
+        letters = letters.replace("o", letter_o[0])
     allowed = _OF.get(name, "nsew")
     wrong = (letters.notna() & ~letters.isin([*allowed])).to_numpy(dtype=bool)
     if wrong.any():
         first = shown(str(sides.iloc[int(np.argmax(wrong))]), 20)
-        either = "; O is east to some and west to others" if first.lower() == "o" else ""
+        either = (
+            "; O is east to some and west to others: set letter_o" if first.upper() == "O" else ""
+        )
         raise DataError(
             f"'{first}' is no hemisphere of {name}; {' or '.join(allowed.upper())} was"
             f" expected{either}"

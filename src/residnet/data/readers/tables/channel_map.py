@@ -12,7 +12,7 @@ from residnet.core.errors import UsageError
 from residnet.core.names import CHANNEL_UNITS
 from residnet.core.units import known_unit, si_unit, to_si
 from residnet.data.readers.base import unwrap
-from residnet.data.readers.tables.angles import Form
+from residnet.data.readers.tables.angles import Form, LetterO
 
 Frame = Literal["as_measured", "ned", "enu", "body_fsd", "body_fpu"]
 
@@ -109,11 +109,14 @@ class ChannelMap(Conversion):
             such as `59°54.321'N` or `59 54 19.3 N` are read in either case.
         hemisphere: column with the letters N and S or E and W that belong to the numbers; null
             where there is none.
+        letter_o: what the letter O means in longitudes, `east` (Ost, Oost) or `west` (Oeste, Ouest,
+            Ovest); null refuses it.
     """
 
     column: str
     form: Form = "number"
     hemisphere: str | None = None
+    letter_o: LetterO | None = None
 
     @property
     def is_angle(self) -> bool:

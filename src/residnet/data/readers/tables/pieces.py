@@ -221,26 +221,41 @@ def excel_sheet(path: Path, sheet: str | None, rows: int | None = None) -> pd.Da
     """
     import pandas as pd
 
+    names = sheet_names(path)
+    if sheet is not None and sheet not in names:
+        raise UsageError(f"{path}: no sheet '{sheet}'{nearest(sheet, names)}")
+    try:
+        cells = pd.read_excel(
+            path, sheet_name=sheet or 0, nrows=rows, engine="openpyxl", header=None
+        )
+    # a damaged archive fails in every layer of the library
+    except Exception as error:
+        raise _damaged(path, error) from error
+    return _below_names(cells)
+
+
+def sheet_names(path: Path) -> list[str]:
+    """Return the names of the sheets of an Excel file, in order.
+
+    Raises:
+        UsageError: where openpyxl is not installed.
+        DataError: where the file cannot be read.
+    """
     try:
         import openpyxl
     except ImportError as error:
         raise missing_package("excel", "openpyxl", "an Excel sheet") from error
     try:
-        names = openpyxl.load_workbook(path, read_only=True).sheetnames
-        if sheet is not None and sheet not in names:
-            raise UsageError(f"{path}: no sheet '{sheet}'{nearest(sheet, names)}")
-        cells = pd.read_excel(
-            path, sheet_name=sheet or 0, nrows=rows, engine="openpyxl", header=None
-        )
-    except UsageError:
-        raise
-    # a damaged archive fails in every layer of the library
+        return [str(name) for name in openpyxl.load_workbook(path, read_only=True).sheetnames]
     except Exception as error:
-        raise DataError(
-            f"{path}: damaged or not an Excel file ({type(error).__name__}:"
-            f" {shown(' '.join(str(error).split()), 200)})"
-        ) from error
-    return _below_names(cells)
+        raise _damaged(path, error) from error
+
+
+def _damaged(path: Path, error: Exception) -> DataError:
+    return DataError(
+        f"{path}: damaged or not an Excel file ({type(error).__name__}:"
+        f" {shown(' '.join(str(error).split()), 200)})"
+    )
 
 
 def _below_names(cells: pd.DataFrame) -> pd.DataFrame:

@@ -298,10 +298,10 @@ class TableReader(LogReader):
         if known_unit(entry.unit) != "deg":
             raise DataError(f"{path}: column '{column}' is written in degrees; set unit: deg")
         try:
-            angles = degrees_of(piece.iloc[:, place[column]], name, entry.form)
+            angles = degrees_of(piece.iloc[:, place[column]], name, entry.form, entry.letter_o)
             if entry.hemisphere is not None:
                 column = entry.hemisphere
-                angles = angles * side_signs(piece.iloc[:, place[column]], name)
+                angles = angles * side_signs(piece.iloc[:, place[column]], name, entry.letter_o)
         except DataError as error:
             raise DataError(f"{path}: column '{column}': {error}") from None
         return angles

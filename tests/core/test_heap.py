@@ -1,0 +1,32 @@
+"""Freed memory stays with the process, so that large arrays do not fault its pages in again."""
+
+from __future__ import annotations
+
+import platform
+import subprocess
+import sys
+
+import pytest
+
+_FAULTS = """
+import resource, sys
+from residnet.core.arrays.heap import keep_freed_memory
+if sys.argv[1] == "keep":
+    keep_freed_memory()
+def fill():
+    number = 48 << 20
+    b"1" * number
+fill()
+before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+for _ in range(4):
+    fill()
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only the GNU C library is set")
+def test_arrays_find_the_memory_of_freed_ones_again() -> None:
+    kept, usual = (
+        int(subprocess.check_output([sys.executable, "-c", _FAULTS, word])) for word in ("keep", "")
+    )
+    assert kept < usual / 10

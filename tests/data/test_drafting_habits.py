@@ -1,0 +1,115 @@
+"""Drafts of what autopilots, simulators and spreadsheets write by habit."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import residnet
+from residnet.core.config import validate
+from residnet.core.log import Log
+from residnet.data.drafting.questions import Marks
+from residnet.data.drafting.tables import draft_tables
+from residnet.data.readers import ReaderConfig
+
+
+@pytest.fixture(scope="module")
+def log() -> Log:
+    """Turns of a boat with a rudder."""
+    trial = {"kind": "zigzag", "drive": 0.8, "steer": 0.6, "heading": "70 deg", "start": 3}
+    flown = residnet.simulate("example_rudder_boat", [trial], duration=90.0, step=0.2, seed=4)
+    return next(iter(flown.logs))
+
+
+def _drafted(frame: pd.DataFrame, file: Path, **to_csv: Any) -> tuple[Log, Marks]:
+    """Return the log that a table's draft reads, and what was marked."""
+    frame.to_csv(file, index=False, **to_csv)
+    marks = Marks()
+    content = draft_tables([file], marks).content
+    return validate(content, ReaderConfig, "test").build().read(file), marks
+
+
+def _guessed(marks: Marks, name: str) -> bool:
+    return any(key[-1] == name for key, _ in marks.guesses)
+
+
+def _fixes(log: Log) -> tuple[np.ndarray, np.ndarray]:
+    north, east = log["x"] / 111_132.0, log["y"] / (111_320.0 * math.cos(math.radians(54.3)))
+    return 54.3 + north, 10.15 + east
+
+
+def _at(read: Log, log: Log) -> None:
+    """Check positions from the first fix on; the sphere here is no ellipsoid."""
+    for name in ("x", "y"):
+        moved = log[name] - log[name][0]
+        np.testing.assert_allclose(read[name] - read[name][0], moved, atol=0.01 * np.ptp(moved))
+
+
+def _frame(log: Log, **columns: np.ndarray) -> pd.DataFrame:
+    rudder = {"rudder [deg]": np.degrees(log["delta"]), "rpm": 60.0 * log["n"]}
+    return pd.DataFrame({"time [s]": log.t, **columns, **rudder})
+
+
+@pytest.mark.parametrize("ground", [False, True])
+def test_velocities_along_x_and_y(ground: bool, log: Log, tmp_path: Path) -> None:
+    u, v, psi = log["u"], log["v"], log["psi"]
+    if ground:
+        u, v = np.cos(psi) * u - np.sin(psi) * v, np.sin(psi) * u + np.cos(psi) * v
+    frame = _frame(log, x=log["x"], y=log["y"], yaw=psi, vx=u, vy=v)
+    read, marks = _drafted(frame, tmp_path / "log.csv")
+    assert ({"u", "v"} <= set(read.channels)) != ground
+    assert _guessed(marks, "u") != ground
+    assert any("along north and east" in text for _, text in marks.notes) == ground
+    np.testing.assert_allclose(read["psi"] - read["psi"][0], psi - psi[0], atol=1e-6)
+
+
+def test_whole_numbers_of_an_autopilot(log: Log, tmp_path: Path) -> None:
+    latitude, longitude = _fixes(log)
+    heading = np.round(np.degrees(log["psi"]) % 360.0 * 100.0)
+    frame = _frame(log, lat=np.round(latitude * 1e7), lon=np.round(longitude * 1e7), hdg=heading)
+    read, marks = _drafted(frame.astype({"lat": int, "lon": int}), tmp_path / "log.csv")
+    _at(read, log)
+    assert np.cos(read["psi"] - log["psi"]).min() > 0.9999
+    assert all(_guessed(marks, name) for name in ("latitude", "longitude", "psi"))
+
+
+@pytest.mark.parametrize(
+    ("names", "sign"), [(("Breite", "Länge", "Kurs [°]"), 1), (("Lat", "Long", "Cap [°]"), -1)]
+)
+@pytest.mark.parametrize("apart", [False, True])
+def test_o_as_a_hemisphere(
+    names: tuple[str, str, str], sign: int, apart: bool, log: Log, tmp_path: Path
+) -> None:
+    latitude, longitude = _fixes(log)
+    longitude = longitude if sign > 0 else longitude - 20.0
+    size = np.abs(longitude)
+
+    def minutes(angle: float, side: str) -> str:
+        return f"{int(angle)}°{angle % 1 * 60:.5f}'{side}"
+
+    north = np.array([minutes(angle, "N") for angle in latitude])
+    east = np.array([minutes(angle, "" if apart else "O") for angle in size])
+    given = {names[0]: north, names[1]: east, names[2]: np.degrees(log["psi"]) % 360.0}
+    given |= {"Seite": np.full(len(log.t), "O")} if apart else {}
+    read, marks = _drafted(_frame(log, **given), tmp_path / "log.csv", sep=";")
+    _at(read, log)
+    assert _guessed(marks, "longitude")
+
+
+def test_a_workbook_that_begins_with_words(log: Log, tmp_path: Path) -> None:
+    file = tmp_path / "log.xlsx"
+    frame = _frame(log, x=log["x"], y=log["y"], heading=log["psi"])
+    with pd.ExcelWriter(file) as book:
+        pd.DataFrame({"Protokoll": ["Probefahrt", "gutes Wetter"]}).to_excel(
+            book, sheet_name="Info"
+        )
+        frame.to_excel(book, sheet_name="Daten", index=False)
+    content = draft_tables([file], Marks()).content
+    assert content["sheet"] == "Daten"
+    read = validate(content, ReaderConfig, "test").build().read(file)
+    np.testing.assert_allclose(read["x"], log["x"], atol=1e-9)
