@@ -23,7 +23,6 @@ from residnet.export import contract
 from residnet.export.base import Exporter
 from residnet.export.card import make_card
 from residnet.export.contract import (
-    SINGLE,
     Apart,
     Numbers,
     accepted,
@@ -134,7 +133,7 @@ def _checked(
     """
     _write(spec, model, file, dtype)
     stepped = OnnxModel(file, spec, model)
-    tolerance = _DOUBLE if dtype == torch.float64 else SINGLE
+    tolerance = _DOUBLE if dtype == torch.float64 else contract.SINGLE
     found = checked(spec, model, stepped, "the ONNX file", dtype, tolerance)
     _require_rows(stepped, spec, model)
     _require_tracks(stepped, spec, model, dtype, tolerance)
