@@ -4,9 +4,10 @@
 
 Half of the segments of the course, drawn at random, identify PLSR and ridge regression of the
 residual force (document 002); every other draw also turns the order of the waypoints at random.
-Each model is exported with the range of its half. At 5,000 motions up to three times that range,
-the largest ratio of the commanded to the believed force outside the range is printed, which may
-be 1.2, and the largest sway force and yaw moment on straight courses ahead and astern.
+Each model is exported with the range of its half. At 20,000 motions, 5,000 each up to 1.2, 3, 10
+and 100 times that range, the largest ratio of the commanded to the believed force outside the range
+is printed, which may be 1.2, and the largest sway force and yaw moment on straight courses ahead
+and astern.
 """
 
 from __future__ import annotations
@@ -35,6 +36,10 @@ FITS = {
     "plsr_5": {"kind": "plsr", "order": 5},
     "ridge": {"kind": "ridge"},
 }
+REACHES = (1.2, 3.0, 10.0, 100.0)
+"""How far off the drawn motions are, in half widths of the range; beyond about 3 they are replaced
+by the nearest value.
+"""
 
 
 def believed() -> ForceModel:
@@ -79,7 +84,8 @@ def judge(found: Study, interval: float, random: torch.Generator) -> list[str]:
             force = RequiredForce(*model.model.parts(), mirrored=True)
             export_feed_forward(force, model.notes.get("lag"), ranges, file)
             exported = torch.jit.load(str(file))
-        away = 3.0 * (2 * torch.rand(5000, 6, generator=random, dtype=torch.float64) - 1)
+        far = torch.tensor(REACHES, dtype=torch.float64).repeat_interleave(5000).unsqueeze(-1)
+        away = far * (2 * torch.rand(len(far), 6, generator=random, dtype=torch.float64) - 1)
         x = middle + width * away
         tau, outside = exported(x[:, :3], x[:, 3:])
         with torch.no_grad():
@@ -90,7 +96,7 @@ def judge(found: Study, interval: float, random: torch.Generator) -> list[str]:
         across, _ = exported(straight[:, :3], straight[:, 3:])
         text = " / ".join(f"{float(value):.3f}" for value in ratio)
         lines.append(
-            f"{name:7s} {int(outside.sum())} of 5000 outside; largest ratio {text};"
+            f"{name:7s} {int(outside.sum())} of {len(x)} outside; largest ratio {text};"
             f" straight {float(across[:, 1:].abs().max()):.1e} N, N m"
         )
     return lines

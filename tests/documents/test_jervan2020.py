@@ -233,6 +233,18 @@ def test_feed_forward_outside_its_range_keeps_to_the_believed_model(
         believed = hull_force(seen[:, :3], seen[:, 3:])
     assert 500 < int(outside.sum()) < 2000
     assert (tau[outside].abs() <= 1.2 * believed[outside].abs() + 1e-9).all()
+    # nor does it where a motion is so far off that its nearest value stands for it
+    far = 0.5 * (low + high) + 40.0 * (seen - 0.5 * (low + high))
+    asked, flags = loaded(far[:, :3], far[:, 3:])
+    with torch.no_grad():
+        needed = hull_force(far[:, :3], far[:, 3:])
+    assert flags.all()
+    assert (asked.abs() <= 1.2 * needed.abs() + 1e-9).all()
+    spoiled = seen.clone()
+    spoiled[::3, 1], spoiled[1::3, 4], spoiled[2::3] = torch.nan, torch.inf, 1e200
+    answered, flags = loaded(spoiled[:, :3], spoiled[:, 3:])
+    assert answered.isfinite().all()
+    assert flags.all()
     # the correction is there inside, and nothing jumps at the edge
     assert ((tau - believed)[~outside].abs().amax(0) > 10.0).all()
     path = torch.linspace(0.0, 1.5, 3001, dtype=torch.float64)[:, None]

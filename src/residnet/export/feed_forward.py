@@ -101,7 +101,8 @@ class GuardedForce(nn.Module):
     axis commands more than 1.2 times the believed model's force; that limit sets in over the
     outermost twentieth of the range, so that nothing jumps. The answer is finite whatever it is
     given: motions are treated as `residnet.export.guard` says, not a number becomes the middle of
-    the training range, what is farther off than the accepted range its nearest value.
+    the training range, what is farther off than the accepted range its nearest value. Such a motion
+    commands no more than 1.2 times the believed force of itself either, where that is a number.
 
     Args:
         model: the believed force and its correction.
@@ -147,7 +148,12 @@ class GuardedForce(nn.Module):
         depth = torch.nan_to_num(depth, nan=-1.0).amin(dim=-1, keepdim=True)
         force = believed + (1.0 + depth / self.fade).clamp(0.0, 1.0) * more
         free = (depth / self.edge).clamp(0.0, 1.0)
-        most = self.effort * believed.abs() + free * (believed.abs() + more.abs())
+        # a motion that was replaced may itself need less than what stands in its place
+        itself: Tensor = self.model.believed(seen[:, : self.dof], seen[:, self.dof :])
+        unknown = float("inf")
+        least = torch.nan_to_num(itself.abs(), nan=unknown, posinf=unknown)
+        most = self.effort * torch.minimum(believed.abs(), least)
+        most = most + free * (believed.abs() + more.abs())
         force = torch.minimum(torch.maximum(force, -most), most)
         return force, ~within(seen, self.low, self.high).squeeze(-1)
 
@@ -250,7 +256,8 @@ def export_feed_forward(
             },
             "outside_the_training_range": (
                 f"the correction of the believed model fades out over {FADE:g} of the range's"
-                f" width; no axis commands more than {EFFORT:g} times the believed model's force"
+                f" width; no axis commands more than {EFFORT:g} times the believed model's force,"
+                " beyond `accepted` neither that of the motion nor that of its nearest value"
             ),
             "mirror": (
                 "the correction is the mean of itself and its mirror image: a straight course needs"
