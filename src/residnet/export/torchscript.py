@@ -7,6 +7,7 @@ archive. TorchScript is code: load only files that you trust.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, final
 
@@ -179,7 +180,7 @@ def export_torchscript(
         file,
         ExportedModel(model, spec).eval(),
         _METHODS,
-        lambda exported: check_parity(spec, model, exported),
+        partial(check_parity, spec, model, driven=_driven(spec, model)),
         lambda parity: (
             make_card(
                 spec, model, metrics, {"steps": contract.PARITY_STEPS, "share_of_range": parity}
@@ -189,7 +190,26 @@ def export_torchscript(
     )
 
 
-def check_parity(spec: ModelSpec, model: HybridDynamics, exported: Any) -> dict[str, float]:
+def _driven(spec: ModelSpec, model: HybridDynamics) -> tuple[Tensor, Tensor, Tensor]:
+    """Return past states [1, P, 6], inputs [1, P + T, m] and the model's own track [1, T + 1, 6].
+
+    Raises:
+        ExportError: where the model itself leaves what exports accept.
+    """
+    y, w = drive(spec, torch.float32)
+    with torch.no_grad():
+        s = model.warmup(y, w[:, :PAST])
+        eager, _, _ = Rollout(model)(y[:, -1].clone(), w[:, PAST:], s)
+        require_sound(spec, model, eager)
+    return y, w, eager
+
+
+def check_parity(
+    spec: ModelSpec,
+    model: HybridDynamics,
+    exported: Any,
+    driven: tuple[Tensor, Tensor, Tensor] | None = None,
+) -> dict[str, float]:
     """Return the largest difference of each state between model and exported module.
 
     It is a share of the state's range, over 2,000 steps from a warmed-up memory.
@@ -197,12 +217,9 @@ def check_parity(spec: ModelSpec, model: HybridDynamics, exported: Any) -> dict[
     Raises:
         ExportError: where a share exceeds 1e-5, or the model itself leaves what exports accept.
     """
-    y, w = drive(spec, torch.float32)
+    y, w, eager = _driven(spec, model) if driven is None else driven
     x = y[:, -1].clone()
     with torch.no_grad():
-        s = model.warmup(y, w[:, :PAST])
-        eager, _, _ = Rollout(model)(x, w[:, PAST:], s)
-        require_sound(spec, model, eager)
         scripted = [x]
         memory = exported.warmup(y, w[:, :PAST])
         for k in range(PAST, w.shape[1]):

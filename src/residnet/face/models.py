@@ -17,6 +17,7 @@ from residnet.core.names import STATE
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.learned import chosen_model
 from residnet.dynamics.rollout import Rollout
+from residnet.dynamics.scripted import scripted
 from residnet.dynamics.store import ModelSpec, load_model, save_model
 from residnet.export import exporter
 from residnet.face.values import PathGiven, described, path
@@ -143,7 +144,7 @@ class Model:
         self._same_rows(states, inputs)
         memory = self._memory(s, len(states))
         with torch.no_grad():
-            found, _, _ = Rollout(self._double())(states, inputs, memory)
+            found, _, _ = scripted(Rollout(self._double()), inputs.shape[1])(states, inputs, memory)
         return _back(found, single)
 
     def warmup(self, y_history: Any, w_history: Any) -> np.ndarray:

@@ -15,6 +15,7 @@ from residnet.data.prepare import Prepared
 from residnet.dynamics.base import Dynamics
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
+from residnet.dynamics.scripted import scripted
 from residnet.judge.bands.band import Band
 from residnet.judge.protocol import Window
 
@@ -171,7 +172,7 @@ def _simulated(
     )
     with torch.no_grad():
         s = _memory(model, windows, logs, tables, dtype)
-        states, _, _ = Rollout(model)(
+        states, _, _ = scripted(Rollout(model), longest)(
             torch.from_numpy(x0).to(dtype), torch.from_numpy(ahead).to(dtype), s
         )
     found: torch.Tensor = states

@@ -15,7 +15,7 @@ from residnet.core.files import read_json, whole
 from residnet.report.blocks import Block, Code, Facts, Figure, Section
 from residnet.report.figures.files import picture_alone
 from residnet.report.glossary import Glossary
-from residnet.report.interactive.drawing import draw
+from residnet.report.interactive.drawing import Drawn, draw
 from residnet.report.interactive.explorer import Explorer
 
 _FACT_TITLES = {"git": "git revision", "python": "Python", "started": "started (UTC)"}
@@ -30,8 +30,21 @@ _LONG = 20
 """Least number of characters of a name that may break in the middle."""
 
 
+def draw_sections(sections: Sequence[Section]) -> Drawn | None:
+    """Return the interactive figures of a page's sections; None where there are none.
+
+    Drawing them takes most of the time of a page: one that is written twice needs them once.
+    """
+    return draw(_afforded(_explorers(sections)))
+
+
 def write_page(
-    run: Path, title: str, description: str, verdict: Sequence[str], sections: Sequence[Section]
+    run: Path,
+    title: str,
+    description: str,
+    verdict: Sequence[str],
+    sections: Sequence[Section],
+    drawn: Drawn | None = None,
 ) -> Path:
     """Write `report.html` of a run folder, whole or not at all.
 
@@ -47,6 +60,7 @@ def write_page(
         description: what the run was made for, empty where nothing is to be said.
         verdict: sentences that stand first, the first of them in bold.
         sections: from top to bottom.
+        drawn: what `draw_sections` returned for the sections; None to draw them now.
 
     Returns:
         Path of the page.
@@ -81,7 +95,7 @@ def write_page(
         verdict=[sentence for sentence in verdict if sentence],
         sections=parts,
         glossary=glossary,
-        interactive=draw(_afforded(_explorers(parts))),
+        interactive=drawn or draw_sections(sections),
     )
     path = run / "report.html"
     with whole(path) as file:

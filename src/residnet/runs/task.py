@@ -17,7 +17,8 @@ from residnet.core.arrays.heap import keep_freed_memory
 from residnet.core.config import Config, dump_config, load_mapping
 from residnet.core.errors import DataError, ExportError, UsageError
 from residnet.report.blocks import Section
-from residnet.report.page import title_and_description, write_page
+from residnet.report.interactive.drawing import Drawn
+from residnet.report.page import draw_sections, title_and_description, write_page
 from residnet.report.sections.exports import EXPORTS, exports_section
 from residnet.runs.checksums import seal
 from residnet.runs.exports import Exported, Exports, write_exports
@@ -222,12 +223,13 @@ class Task(Config):
             verdict, exported = list(outcome.verdict), Exported()
             if report:
                 sections = self.report_sections(folder)
-                self._write_page(folder, sections)
+                drawn = draw_sections(sections)
+                self._write_page(folder, sections, drawn)
                 if outcome.exports:
                     exported = write_exports(folder, outcome.exports)
                     verdict += [f"Not exported: {fault}." for fault in exported.faults]
                     folder.write_summary(self.task, verdict, figures, finished=False)
-                    self._write_page(folder, sections)
+                    self._write_page(folder, sections, drawn)
         seal(folder.path)
         folder.write_summary(self.task, verdict, figures, finished=True)
         if outcome.failure:
@@ -242,7 +244,9 @@ class Task(Config):
         return cls._write_page(run, cls.report_sections(run))
 
     @classmethod
-    def _write_page(cls, run: RunFolder, sections: Sequence[Section]) -> Path:
+    def _write_page(
+        cls, run: RunFolder, sections: Sequence[Section], drawn: Drawn | None = None
+    ) -> Path:
         title, description = title_and_description(run.path)
         exports = exports_section(run.path)
         return write_page(
@@ -251,6 +255,7 @@ class Task(Config):
             description,
             run.read_summary()["verdict"],
             [*sections, *([] if exports is None else [exports])],
+            drawn,
         )
 
     @contextmanager

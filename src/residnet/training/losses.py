@@ -9,9 +9,7 @@ from torch import Tensor
 
 from residnet.core.layout import velocities
 from residnet.dynamics.hybrid import HybridDynamics
-
-FreeRun = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
-"""Initial states, inputs and memory to states, inputs and memory, as `Rollout` has it."""
+from residnet.dynamics.scripted import FreeRun
 
 Shared = Callable[[Tensor], Tensor]
 """A sum over this process's windows to the mean of the sums of all processes."""

@@ -15,10 +15,11 @@ from residnet.core.layout import POSE, VELOCITIES
 from residnet.data.windows import WindowBatches, WindowStore
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
+from residnet.dynamics.scripted import MANY, FreeRun, scripted
 from residnet.training.calibration import PACE, Calibration
 from residnet.training.config import TrainingConfig
 from residnet.training.epochs import EpochTraining
-from residnet.training.losses import FreeRun, one_step_loss, rollout_loss
+from residnet.training.losses import one_step_loss, rollout_loss
 from residnet.training.stage_windows import stage_windows, stages
 
 _BACK = 1e-3
@@ -68,6 +69,7 @@ class HeadTraining(EpochTraining):
         )
         self.average = copy.deepcopy(model).requires_grad_(False) if config.average > 0 else None
         self.rollout = Rollout(model)
+        self._compiled: FreeRun | None = None
         self.store = store
         self.scales = scales
         self.validate = validate
@@ -183,18 +185,8 @@ class HeadTraining(EpochTraining):
             x0 = torch.cat((x0[:, POSE], x0[:, VELOCITIES] + noise), dim=1)
         w, y = take(self.store.w, starts, length - 1), take(self.store.y, starts + 1, length - 1)
         usable = take(self.store.usable, starts + 1, length - 1)
-        run: FreeRun = self.rollout
-        if self.calibration is not None:
-            moved = {"model.baseline.theta": self.calibration()}
-
-            def run(x0: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-                out: tuple[Tensor, Tensor, Tensor] = functional_call(
-                    self.rollout, moved, (x0, w, s)
-                )
-                return out
-
         return rollout_loss(
-            run,
+            self._free_run(),
             x0,
             w,
             torch.cat(memories),
@@ -204,6 +196,21 @@ class HeadTraining(EpochTraining):
             self.settings.robust,
             self.shared,
         )
+
+    def _free_run(self) -> FreeRun:
+        """Return the free run of the model as the training has it now."""
+        if self.calibration is None:
+            if self._compiled is None:
+                # not before: by now the model is on its device and in training
+                self._compiled = scripted(self.rollout, MANY)
+            return self._compiled
+        moved = {"model.baseline.theta": self.calibration()}
+
+        def run(x0: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+            out: tuple[Tensor, Tensor, Tensor] = functional_call(self.rollout, moved, (x0, w, s))
+            return out
+
+        return run
 
     def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Put moved coefficients into the model, and move the averaged weights."""

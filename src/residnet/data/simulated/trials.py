@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -24,7 +25,7 @@ from residnet.data.simulated.flying import (
     source_of,
 )
 from residnet.data.simulated.sensors import SensorNoise
-from residnet.dynamics.simulated import PlantDynamics
+from residnet.dynamics.simulated import PlantDynamics, TracedPlantDynamics
 from residnet.dynamics.steps import check_steps
 from residnet.manoeuvres import FamilyConfig, Helm, Manoeuvre
 from residnet.physics.vessel import VesselName, load_vessel
@@ -122,7 +123,8 @@ def fly_trials(manoeuvres: Sequence[Manoeuvre], config: SimulatedTrials) -> list
     and the true wind where there is any. Float64.
     """
     plant = load_vessel(config.vessel).build()
-    craft = trials_craft(config)
+    traced = TracedPlantDynamics(plant, config.step, config.substeps)
+    craft = replace(trials_craft(config), dynamics=traced)
     sea = Sea(plant, config.disturbance, config.noise, config.seed)
     return fly(craft, manoeuvres, sea, config.duration, config.step, {"vessel": config.vessel})
 

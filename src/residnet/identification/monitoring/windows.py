@@ -14,6 +14,7 @@ from residnet.core.layout import HEADING, VELOCITIES
 from residnet.data.prepare import Prepared
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
+from residnet.dynamics.scripted import scripted
 from residnet.identification.monitoring.changes import Change, ChangedDynamics, shown
 
 SEEN = ("u", "v", "r", "heading")
@@ -71,7 +72,9 @@ def innovations(
             [y[:, 0] + shown(one.sensor, y[:, 0], begin, one.size) for one in all_changes]
         )
         changed = ChangedDynamics(model, all_changes, rows, w.shape[2])
-        path, _, _ = Rollout(changed)(x0, w.repeat(count, 1, 1), memory.repeat(count, 1))
+        path, _, _ = scripted(Rollout(changed), steps)(
+            x0, w.repeat(count, 1, 1), memory.repeat(count, 1)
+        )
     path = path.reshape(count, rows, steps + 1, -1)
     # what a sensor shows is taken of the prediction: noise of the measurement is in the error too
     rate = mean @ path[0].diff(dim=1)[..., VELOCITIES] / model.dt

@@ -1,0 +1,79 @@
+"""Compiled rollouts give the numbers and the gradients of those that are not."""
+
+from __future__ import annotations
+
+from typing import final
+
+import torch
+from torch import Tensor, nn
+
+from residnet.dynamics.base import Dynamics
+from residnet.dynamics.rollout import Rollout, Source
+from residnet.dynamics.scripted import MANY, scripted
+
+DT = 0.1
+
+
+@final
+class Pendulum(Dynamics):
+    """A damped pendulum whose damping is a parameter."""
+
+    def __init__(self) -> None:
+        super().__init__(DT, "rk4")
+        self.damping = nn.Parameter(torch.tensor([0.3], dtype=torch.float64))
+
+    def rate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
+        return torch.stack(
+            (x[:, 1], p[:, 0] - torch.sin(x[:, 0]) - (self.damping * x[:, 1:])[:, 0]), dim=-1
+        )
+
+    def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        return self.integrate(x, w, s), s
+
+
+@final
+class Printed(Source):
+    """A source that TorchScript cannot express."""
+
+    def forward(self, x: Tensor, w: Tensor, k: int, memory: Tensor) -> tuple[Tensor, Tensor]:
+        return dict.fromkeys(sorted(["w"], key=lambda name: -len(name)), w)["w"], memory
+
+
+def case() -> tuple[Tensor, Tensor, Tensor]:
+    random = torch.Generator().manual_seed(41)
+    x0 = torch.randn(3, 2, generator=random, dtype=torch.float64)
+    return x0, torch.randn(3, 300, 1, generator=random, dtype=torch.float64), x0[:, :0]
+
+
+def test_numbers_and_gradients_are_the_same() -> None:
+    rollout = Rollout(Pendulum())
+    run = scripted(rollout, 300)
+    assert run is not rollout
+    found = []
+    for free in (rollout, run, run, run):
+        rollout.zero_grad()
+        states = free(*case())[0]
+        states[:, -1].square().sum().backward()
+        gradient = rollout.model.damping.grad
+        assert isinstance(gradient, Tensor)
+        found.append((states.detach(), gradient.clone()))
+    for states, gradient in found[1:]:
+        assert torch.equal(states, found[0][0])
+        assert torch.equal(gradient, found[0][1])
+
+
+def test_a_step_of_the_optimiser_is_seen() -> None:
+    rollout = Rollout(Pendulum())
+    run = scripted(rollout, MANY)
+    before = run(*case())[0]
+    with torch.no_grad():
+        rollout.model.damping.add_(0.2)  # type: ignore[operator]
+    assert not torch.equal(run(*case())[0], before)
+    assert torch.equal(run(*case())[0], rollout(*case())[0])
+
+
+def test_what_cannot_be_compiled_or_is_short_runs_as_it_is() -> None:
+    odd = Rollout(Pendulum(), Printed())
+    assert scripted(odd, MANY) is odd
+    short = Rollout(Pendulum())
+    assert scripted(short, 10) is short
