@@ -159,3 +159,68 @@ def test_trials_of_a_sweep_over_their_keys() -> None:
     np.testing.assert_allclose(y[:3], (1.0, 1.0, 1.0), atol=1e-3)
     counts = {name: int(np.isfinite(curve[0]).sum()) // 3 for name, curve in case.curves[0].items()}
     assert counts["best tenth"] + counts["better half"] + counts["worse half"] == len(trials)
+
+
+def test_what_no_legend_names_keeps_its_colour_and_its_group(tmp_path: Path) -> None:
+    figure = new_figure(2.0)
+    axes = figure.subplots()
+    axes.plot(T, np.sin(T), color="#0072B2", label="law")
+    axes.plot(T, np.cos(T), color="#0072B2", linestyle="--", label="learned")
+    axes.fill_between(T, np.cos(T), 2.0, color="#0072B2", alpha=0.3, gid="learned")
+    axes.fill_between(T, -2.0, -1.0, color="#0072B2", alpha=0.3)
+    figure.legend(*axes.get_legend_handles_labels())
+    save(figure, tmp_path / "01_shades.png", "Shades", "Look.")
+    (read,) = read_figures(tmp_path)
+    assert read.explorer is not None
+    looks = read.explorer.looks
+    assert set(looks) == {"law", "learned", "learned, shade", "shades"}
+    assert looks["shades"].color == looks["learned, shade"].color == "#0072b24c"
+
+
+def surfaces(folder: Path) -> Path:
+    """A picture of two surfaces over the same axes, with a bar of colours and a mark."""
+    from matplotlib.colors import LogNorm
+
+    figure = new_figure(3.0)
+    panels = figure.subplots(1, 2)
+    for number, axes in enumerate(panels):
+        heights = np.outer([1.0, 2.0, 5.0], [3.0, 7.0, 11.0, 13.0]) * 10.0**number
+        heights[2, 0] = np.nan
+        image = axes.imshow(
+            heights, origin="lower", extent=(0.5, 4.5, -0.5, 2.5), norm=LogNorm(1.0, 900.0)
+        )
+        axes.plot(2 + number, 1, "x", color="#D55E00", label="chosen")
+        axes.set(title=("surge", "sway")[number], xlabel="functions")
+    panels[0].set_ylabel("order")
+    figure.colorbar(image, ax=panels).set_label("share [%]")
+    path = folder / "figures" / "surface.png"
+    path.parent.mkdir(parents=True)
+    save(figure, path, "Surface", "Look at it.")
+    return path
+
+
+def test_a_surface_becomes_cells_and_sections(tmp_path: Path) -> None:
+    (figure,) = read_figures(surfaces(tmp_path).parent)
+    explorer = figure.explorer
+    assert explorer is not None
+    assert explorer.surface is not None
+    assert (explorer.surface.x_label, explorer.surface.y_label) == ("functions", "order")
+    assert explorer.surface.height == "share [%]"
+    assert explorer.surface.limits == (1.0, 900.0)
+    surge, sway = explorer.cases
+    assert (surge.title, surge.chosen, sway.chosen) == ("surge", (2.0, 1.0), (3.0, 1.0))
+    x, y = surge.curves[0]["surface"]
+    assert len(surge.heights) == 11, "a cell without a height is none"
+    np.testing.assert_allclose(surge.heights[(x > 3.9) & (y > 1.9)], 65.0, rtol=1e-3)
+    np.testing.assert_allclose(sway.heights[(x < 1.1) & (y < 0.1)], 30.0, rtol=1e-3)
+
+
+@pytest.mark.skipif(browser() is None, reason="no browser (chromium or chrome) is installed")
+def test_a_browser_cuts_a_surface(tmp_path: Path) -> None:
+    section = figures_section(surfaces(tmp_path).parent)
+    page = write_page(tmp_path, "Run", "", ["Done."], [Section("All", [section])])
+    found = layout(page, 390, tmp_path)
+    assert (found.overflow, found.broken) == (0, [])
+    assert found.panels == [True] * 3
+    assert found.used["cut"] == [["2", "1"], ["3", "1"]], "a slider chooses the next section"
+    assert found.used["section"] == pytest.approx([11.0, 22.0, 55.0], rel=1e-3)

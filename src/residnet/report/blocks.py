@@ -166,6 +166,10 @@ class Table:
         self.columns = list(columns)
         self.caption = caption
         self.groups = list(groups)
+        spanned = sum(count for _, count in self.groups)
+        if self.groups and spanned < len(self.columns) - 1:
+            # the line of groups is as long as that of columns
+            self.groups.append(("", len(self.columns) - 1 - spanned))
         self.rows: list[Row] = []
         for row in rows:
             if isinstance(row, Row):

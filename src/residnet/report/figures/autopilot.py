@@ -70,8 +70,8 @@ def responses(
             axis.plot(wide.index, wide[(1.0, 1.0)], **look)
             if kinds[controller] == "policy" and quantity in ("psi", "error"):
                 low, high = wide.min(axis=1), wide.max(axis=1)
-                color = look["color"]
-                axis.fill_between(wide.index, low, high, color=color, alpha=0.25, linewidth=0)
+                shade = {"color": look["color"], "gid": str(look["label"])}
+                axis.fill_between(wide.index, low, high, alpha=0.25, linewidth=0, **shade)
             axis.set(ylabel=text)
     for sign in (-1.0, 1.0):
         for axis, middle in ((axes[0], heading), (axes[1], 0.0)):

@@ -72,7 +72,8 @@ def learning(fits: Mapping[str, Content], name: str) -> Drawing:
         epochs = [0.0, *(point["epoch"] + 1.0 for point in curve)]
         scores = [fit["start_validation"], *(point["validation"] for point in curve)]
         axis.plot(epochs, scores, marker=".", **look[policy])
-        axis.axhline(fit["start_validation"], color="0.6", linewidth=0.8, linestyle=":")
+        start = {"color": "0.6", "linewidth": 0.8, "linestyle": ":", "gid": "start"}
+        axis.axhline(fit["start_validation"], **start)
     axis.set(xlabel="epoch", ylabel="mean cost [s]")
     axis.legend(loc="best")
     caption = (

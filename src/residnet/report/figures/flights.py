@@ -177,6 +177,7 @@ def _history(crafts: Sequence[str], group: Sequence[Flight]) -> Any:
                     color="0.6",
                     linewidth=0.8,
                     linestyle=":",
+                    gid="heading of reversals",
                 )
         for i, flight in enumerate(group):
             if name in flight.motion.channels:

@@ -11,6 +11,9 @@ from torch import Tensor
 from residnet.report.figures.style import RC, new_figure, save
 
 _AXES = ("surge", "sway", "yaw")
+_COLOURS_SPAN = (6.3, 316.0)
+"""Shares in % of the first and the last colour of a surface."""
+_MARKS = (("x", "#D55E00"), ("o", "#CC79A7"), ("s", "#E69F00"))
 
 
 def draw_surface(
@@ -28,25 +31,25 @@ def draw_surface(
         path: PNG file.
     """
     from matplotlib import rc_context
+    from matplotlib.colors import LogNorm
 
     with rc_context(RC):
         figure = new_figure(2.9)
         panels = figure.subplots(1, 3, sharey=True)
         for axis, axes in enumerate(panels):
-            share = error[axis].numpy() / unmodelled[axis]
+            share = 100.0 * error[axis].numpy() / unmodelled[axis]
             image = axes.imshow(
-                np.log10(share),
+                share,
                 origin="lower",
                 aspect="auto",
                 cmap="viridis",
-                vmin=-1.2,
-                vmax=0.5,
+                norm=LogNorm(*_COLOURS_SPAN),
                 extent=_extent(share),
             )
-            for (name, picks), mark in zip(chosen.items(), ("x", "o", "s"), strict=False):
+            for (name, picks), (mark, colour) in zip(chosen.items(), _MARKS, strict=False):
                 order, count = picks[axis]
                 axes.plot(
-                    count, order, mark, color="#D55E00", fillstyle="none", label=name, markersize=7
+                    count, order, mark, color=colour, fillstyle="none", label=name, markersize=7
                 )
             # room for marks at the edge
             axes.set_xlim(0.5, share.shape[1] + 0.5)
@@ -56,9 +59,9 @@ def draw_surface(
             axes.grid(visible=False)
         panels[0].set_ylabel("model order")
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=3)
-        bar = figure.colorbar(image, ax=panels, ticks=[-1, -0.5, 0, 0.5])
-        bar.ax.set_yticklabels(["10 %", "32 %", "100 %", "316 %"])
-        bar.set_label("share of the MSE that is left")
+        bar = figure.colorbar(image, ax=panels)
+        bar.set_ticks([10, 30, 100, 300], labels=["10", "30", "100", "300"])
+        bar.set_label("share of the MSE that is left [%]")
         save(
             figure,
             path,

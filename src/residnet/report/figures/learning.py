@@ -31,7 +31,13 @@ def learning_curves(run: RunFiles, models: Sequence[str]) -> Any:
             np.array([_number(point.get(key)) for point in curve]) for key in ("loss", "validation")
         )
         top, bottom = panels[:, column]
-        line = {"color": look[model]["color"], "linewidth": 1.4, "marker": ".", "markersize": 4}
+        line = {
+            "gid": short_label(run, model),
+            "color": look[model]["color"],
+            "linewidth": 1.4,
+            "marker": ".",
+            "markersize": 4,
+        }
         for number in np.unique(stage):
             top.plot(epoch[stage == number], loss[stage == number], **line)
         _validation(bottom, epoch, validation, line)
@@ -81,8 +87,8 @@ def _stages(
     for number in np.unique(stage):
         begin = float(epoch[stage == number][0]) - 0.5
         if begin > epoch[0]:
-            top.axvline(begin, color="0.5", linewidth=0.8)
-            bottom.axvline(begin, color="0.5", linewidth=0.8)
+            for axes in (top, bottom):
+                axes.axvline(begin, color="0.5", linewidth=0.8, gid="next stage")
         index = int(number) - 1
         text = (
             "one-step"

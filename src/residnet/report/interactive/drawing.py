@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from residnet.report.interactive.explorer import FILL, INK, Case, Explorer, Panel
+from residnet.report.interactive.explorer import CELLS, FILL, INK, Case, Explorer, Panel, Surface
 from residnet.report.interactive.packing import packed
 
 if TYPE_CHECKING:
@@ -22,6 +22,8 @@ _RANDOM = re.compile(
     r"\b[0-9a-f]{8}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{12}\b|(?<=\")p\d{4,}(?=\")"
 )
 """Names that Bokeh gives to the parts of a page and to its models."""
+HEIGHT = "height of a cell"
+"""Name of the column of a surface's heights; of their logarithms on a page where they are so."""
 _MARGIN = 68
 """Pixels left of every panel, so that time axes stand under each other."""
 
@@ -154,12 +156,15 @@ def _canvas(
     canvas.stylesheets = [":host .bk-events { touch-action: pan-y pinch-zoom; }"]
     over = [_curve(explorer, panel, name, source) for name in explorer.names(number)]
     canvas.renderers.extend(over)
+    if panel.kind == "surface" and explorer.surface is not None:
+        canvas.add_layout(_colours_told(explorer.surface, over), "right")
+        canvas.yaxis.axis_label = explorer.surface.y_label or None
     # where a height stands for no number, the name alone says what a curve is
     told = panel.kind == "curves" and not panel.unnumbered
     hover = HoverTool(
         renderers=[curve for curve in over if explorer.looks[curve.name].dash != FILL],
         mode="vline" if told else "mouse",
-        tooltips=[("$name", "@$name{0.000 a}")] if told else [("", "$name")],
+        tooltips=_tips(explorer, panel, told),
         point_policy="follow_mouse",
     )
     canvas.add_tools(hover, BoxZoomTool(match_aspect=panel.kind == "map"))
@@ -190,6 +195,45 @@ def _canvas(
     return canvas
 
 
+def _tips(explorer: Explorer, panel: Panel, told: bool) -> Any:
+    """Return what stands beside the pointer over a panel."""
+    surface = explorer.surface
+    if panel.kind == "surface" and surface is not None:
+        height = f"@{{{HEIGHT}}}{{0.000 a}}"
+        return [(surface.x_label, "$x{0}"), (surface.y_label, "$y{0}"), (surface.height, height)]
+    return [("$name", "@$name{0.000 a}")] if told else [("", "$name")]
+
+
+def _colours_told(surface: Surface, over: Sequence[Any]) -> Any:
+    """Return the bar that tells what the colours of a surface mean."""
+    from bokeh.models import BasicTicker, LogTicker
+    from bokeh.models.annotations import ColorBar
+
+    (cells,) = [one for one in over if one.name == surface.name]
+    return ColorBar(
+        color_mapper=cells.glyph.fill_color.transform,
+        ticker=LogTicker(mantissas=[1, 3]) if surface.logarithmic else BasicTicker(),
+        width=12,
+        padding=4,
+        background_fill_color=None,
+        major_label_text_font_size=_FONT,
+    )
+
+
+def _cells(surface: Surface, name: str) -> Any:
+    """Return the glyph of a surface's cells."""
+    from bokeh.models import LinearColorMapper, LogColorMapper, Rect
+    from bokeh.palettes import Viridis256
+
+    mapper = LogColorMapper if surface.logarithmic else LinearColorMapper
+    low, high = surface.limits
+    shade: Any = {"field": HEIGHT, "transform": mapper(palette=Viridis256, low=low, high=high)}
+    width, height = surface.size
+    return Rect(
+        x=f"x of {name}", y=name, width=width, height=height, fill_color=shade, line_color=None
+    )
+
+
 def _curve(explorer: Explorer, panel: Panel, name: str, source: ColumnDataSource) -> Any:
     """Return the renderer of a curve, added to nothing yet."""
     from bokeh.models import Line, Patch, Scatter
@@ -198,8 +242,13 @@ def _curve(explorer: Explorer, panel: Panel, name: str, source: ColumnDataSource
     look = explorer.looks[name]
     color = "#808080" if look.color == INK else look.color
     x = f"x of {name}"
-    if panel.kind == "cloud" or look.points:
-        glyph: Any = Scatter(x=x, y=name, size=4, fill_color=color, line_color=None, fill_alpha=0.6)
+    if look.dash == CELLS and explorer.surface is not None:
+        glyph: Any = _cells(explorer.surface, name)
+    elif panel.kind == "surface" and look.points:
+        # a mark stands out from cells of any colour
+        glyph = Scatter(x=x, y=name, size=10, fill_color=color, line_color="white", line_width=2)
+    elif panel.kind == "cloud" or look.points:
+        glyph = Scatter(x=x, y=name, size=4, fill_color=color, line_color=None, fill_alpha=0.6)
     elif look.dash == FILL:
         glyph = Patch(x=x, y=name, fill_color=color, line_color=None)
     else:
@@ -227,6 +276,10 @@ def _columns(explorer: Explorer, case: Case, panel: int) -> dict[str, np.ndarray
         for column, values in ((f"x of {name}", x), (name, y)):
             out[column] = np.full(longest, np.nan)
             out[column][: len(values)] = values
+    if explorer.panels[panel].kind == "surface" and explorer.surface is not None:
+        heights = np.log10(case.heights) if explorer.surface.logarithmic else case.heights
+        out[HEIGHT] = np.full(longest, np.nan)
+        out[HEIGHT][: len(heights)] = heights
     return out
 
 
@@ -238,10 +291,20 @@ def _cases(explorer: Explorer) -> str:
             for name, look in explorer.looks.items()
         },
         "panels": len(explorer.panels),
+        "surface": None
+        if explorer.surface is None
+        else {
+            "name": explorer.surface.name,
+            "section": explorer.surface.section,
+            "heights": HEIGHT,
+            "size": explorer.surface.size,
+            "logarithmic": explorer.surface.logarithmic,
+        },
         "cases": [
             {
                 "title": case.title,
                 "note": case.note,
+                "chosen": case.chosen,
                 "panels": [
                     packed(_columns(explorer, case, number))
                     for number in range(len(explorer.panels))

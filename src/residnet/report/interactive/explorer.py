@@ -14,7 +14,10 @@ INK = "ink"
 FILL = "fill"
 """Stands for the dash of a curve whose inside is filled, without a line."""
 
-PanelKind: TypeAlias = Literal["curves", "map", "cloud"]
+CELLS = "cells"
+"""Stands for the dash of what is drawn as the coloured cells of a surface, one at each point."""
+
+PanelKind: TypeAlias = Literal["curves", "map", "cloud", "surface"]
 
 
 @dataclass(frozen=True)
@@ -47,7 +50,7 @@ class Panel:
         title: above it, in words and with its unit.
         x_label: of the horizontal axis with its unit, empty where a panel beneath names it.
         kind: `curves` share their horizontal axis, a `map` has equal scales, a `cloud` is of
-            points.
+            points, a `surface` of coloured cells.
         height: in pixels.
         logarithmic: whether the vertical axis is.
         x_logarithmic: whether the horizontal axis is.
@@ -80,6 +83,34 @@ Curve: TypeAlias = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
+class Surface:
+    """What the first panel of an interactive figure shows as the coloured cells of a grid.
+
+    Its second panel shows the section along the horizontal axis and its third one that along the
+    vertical axis, each through a cell that the reader chooses.
+
+    Attributes:
+        name: of the cells among the looks.
+        section: of the sections and of the chosen cell among the looks.
+        x_label: what stands on the horizontal axis.
+        y_label: what stands on the vertical axis.
+        height: what the colours tell, with its unit.
+        limits: heights of the first and the last colour.
+        size: width and height of a cell in the units of the axes.
+        logarithmic: whether colours and sections are.
+    """
+
+    name: str
+    section: str
+    x_label: str
+    y_label: str
+    height: str
+    limits: tuple[float, float]
+    size: tuple[float, float]
+    logarithmic: bool = False
+
+
+@dataclass(frozen=True)
 class Case:
     """What all panels show at a time.
 
@@ -87,11 +118,15 @@ class Case:
         title: in the list to choose from.
         curves: for each panel, curves by name.
         note: a sentence on the case, empty where nothing is to be said.
+        heights: of the surface's cells [T], in the order of their curve; empty without one.
+        chosen: cell whose sections are shown first, horizontal and vertical value.
     """
 
     title: str
     curves: Sequence[Mapping[str, Curve]]
     note: str = ""
+    heights: np.ndarray = field(default_factory=lambda: np.empty(0))
+    chosen: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -106,6 +141,7 @@ class Explorer:
         looks: of the curves by name, in the order of the switches.
         panels: from top to bottom.
         cases: at least one.
+        surface: what the first panel shows; None where all panels are of curves.
     """
 
     kind: ClassVar[str] = "explorer"
@@ -116,6 +152,7 @@ class Explorer:
     looks: Mapping[str, Look]
     panels: Sequence[Panel]
     cases: Sequence[Case] = field(default_factory=tuple)
+    surface: Surface | None = None
 
     def names(self, panel: int) -> list[str]:
         """Return the names of the curves that a panel shows in any case, in order."""

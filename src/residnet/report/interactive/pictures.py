@@ -25,6 +25,7 @@ from residnet.report.interactive.explorer import (
     thinned,
 )
 from residnet.report.interactive.packing import packed, unpacked
+from residnet.report.interactive.surfaces import surface_content, surface_explorer
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -37,6 +38,7 @@ _MOST_PANELS = 24
 _MOST_TEXT = 900_000
 """Most characters that a PNG file may carry in one text and still be read."""
 _OTHERS = "other lines"
+_SHADES = "shades"
 _SCALES = ("linear", "log")
 
 
@@ -49,11 +51,17 @@ class _Found:
 
 
 def curves_text(figure: Figure) -> str:
-    """Return what a drawn figure shows as text; empty where it is more than curves and points."""
+    """Return what a drawn figure shows as text.
+
+    It is empty where that is more than curves and points, or surfaces with a bar of their colours.
+    """
+    labels = _labels(figure)
+    surfaces = surface_content(figure, lambda one: _drawn(one, labels), _words)
+    if surfaces is not None:
+        return _stored({"surface": surfaces})
     axes = [one for one in figure.axes if one.get_visible() and one.has_data()]
     if not axes or len(axes) > _MOST_PANELS or not all(map(_plain, axes)):
         return ""
-    labels = _labels(figure)
     found: dict[str, _Found] = {}
     for number, one in enumerate(axes):
         for name, look, curve in _drawn(one, labels):
@@ -70,6 +78,11 @@ def curves_text(figure: Figure) -> str:
         },
         "curves": [_of_panel(found, number) for number in range(len(axes))],
     }
+    return _stored(content)
+
+
+def _stored(content: Mapping[str, Any]) -> str:
+    """Return what a figure shows as text; empty where a file cannot carry that much."""
     text = json.dumps(content, separators=(",", ":"))
     return text if len(text) <= _MOST_TEXT else ""
 
@@ -85,6 +98,8 @@ def picture_explorer(name: str, title: str, caption: str, text: str) -> Explorer
     """
     try:
         content = json.loads(text)
+        if "surface" in content:
+            return surface_explorer(name, title, caption, content["surface"])
         panels = [Panel(**panel) for panel in content["panels"]]
         looks = {
             label: Look(label, color, dash, float(width), points=bool(points))
@@ -219,18 +234,35 @@ def _dash_of(artist: Any) -> str:
     return names.get(style, "solid") if isinstance(style, str) else "solid"
 
 
-def _look(artist: Any, color: Any, labels: Mapping[tuple[str, str], str], points: bool) -> Look:
+def _shade(color: Any, artist: Any) -> str:
+    """Return a colour as a page has it; what is faint on paper stays to be seen on a screen."""
+    from matplotlib.colors import to_hex, to_rgba
+
+    red, green, blue, alpha = to_rgba(color, artist.get_alpha())
+    return to_hex((red, green, blue, max(alpha, 0.25)), keep_alpha=alpha < 1.0)
+
+
+def _look(
+    artist: Any,
+    color: Any,
+    labels: Mapping[tuple[str, str], str],
+    points: bool,
+    filled: bool = False,
+) -> Look:
     """Return how an artist looks, under its own label or that of its likes in a legend."""
     from matplotlib.colors import to_hex, to_rgba
 
     dash = _dash_of(artist)
-    own = str(artist.get_label() or "")
+    # what no legend has room for is named by its group
+    own = str(artist.get_gid() or artist.get_label() or "")
     likes = [text for (shade, _), text in labels.items() if shade == to_hex(color)]
-    label = own if own and not own.startswith("_") else labels.get(_key(color, dash), "")
+    # a shade has no kind of line
+    alike = "" if filled else labels.get(_key(color, dash), "")
+    label = own if own and not own.startswith("_") else alike
     label = label or (likes[0] if len(likes) == 1 else _OTHERS)
     red, green, blue, alpha = to_rgba(color, artist.get_alpha())
     grey = max(red, green, blue) - min(red, green, blue) < 0.05
-    shade = to_hex((red, green, blue, max(alpha, 0.25)), keep_alpha=alpha < 1.0)
+    shade = _shade(color, artist)
     ink = grey and red < 0.5 and alpha > 0.5
     width = getattr(artist, "get_linewidth", lambda: 1.0)()
     width = float(np.ravel(width)[0]) if np.size(width) else 1.0
@@ -267,8 +299,8 @@ def _drawn(axes: Axes, labels: Mapping[tuple[str, str], str]) -> list[tuple[str,
         shades = part.get_edgecolor() if stroke else part.get_facecolor()
         if len(shades):
             outlines = [path.vertices for path in part.get_paths()]
-            look = _look(part, shades[0], labels, False)
-            look = look if stroke else _filled(look)
+            look = _look(part, shades[0], labels, False, filled=not stroke)
+            look = look if stroke else _filled(look, _shade(shades[0], part))
             parts.append((look, _outline(outlines)))
     for patch in axes.patches:
         path = patch.get_path().transformed(patch.get_patch_transform())
@@ -279,10 +311,10 @@ def _drawn(axes: Axes, labels: Mapping[tuple[str, str], str]) -> list[tuple[str,
     return [(look.label + (" (points)" if look.points else ""), look, c) for look, c in found]
 
 
-def _filled(look: Look) -> Look:
-    """Return how a shade looks."""
-    label = look.label if look.label == _OTHERS else f"{look.label}, shade"
-    return replace(look, label=label, dash=FILL)
+def _filled(look: Look, color: str) -> Look:
+    """Return how a shade of that colour looks."""
+    label = _SHADES if look.label == _OTHERS else f"{look.label}, shade"
+    return replace(look, label=label, color=color, dash=FILL)
 
 
 def _line(axes: Axes, line: Any) -> Curve:
