@@ -15,6 +15,47 @@ ROWS = [
     if line.startswith("| ") and not line.startswith(("| item", "| ---"))
 ]
 COMMANDS = sorted({command for row in ROWS for command in re.findall(r"`([^`]+)`", row[3])})
+CAPTIONS = {
+    "000": {
+        "Figure": "1.1 3.1-3.3 4.1 5.1-5.11 6.1-6.9 7.1-7.14 8.1",
+        "Table": "5.1-5.3 6.1-6.2 7.1-7.5",
+        "Listing": "5.1 9.1",
+    },
+    "001": {"Figure": "1-8", "Table": "1-3"},
+    "002": {"Figure": "1.1 2.1-2.3 3.1-3.5 4.1-4.47 5.1-5.19", "Table": "4.1-4.16 5.1-5.6 A.1"},
+    "003": {"Figure": "1-18", "Table": "1"},
+    "004": {
+        "Figure": "2.1-2.12 3.1-3.9 4.1-4.2 5.1-5.4 6.1-6.22",
+        "Table": "3.1 5.1-5.3 6.1-6.8",
+        "Listing": "A.1",
+    },
+}
+"""What each document has a caption for: first and last number of each chapter."""
+
+
+def numbers(spans: str) -> set[str]:
+    """Return all numbers of spans such as `5.1-5.3 8.1`."""
+    found = set()
+    for span in spans.split():
+        first, _, last = span.partition("-")
+        chapter, dot, low = first.rpartition(".")
+        high = int((last or first).rpartition(".")[2])
+        found |= {f"{chapter}{dot}{n}" for n in range(int(low), high + 1)}
+    return found
+
+
+@pytest.mark.parametrize("document", CAPTIONS)
+def test_every_figure_table_and_listing_has_a_row(document: str) -> None:
+    text = PAGE.read_text(encoding="utf-8").partition(f"## Document {document}")[2]
+    lines = text.partition("\n## ")[0].splitlines()
+    items = "\n".join(line.split(" | ")[0] for line in lines if line.startswith("| "))
+    for kind, spans in CAPTIONS[document].items():
+        # "Figure 8 (a), 11 (a)" and "Figure 7, (21), (22)": numbers of equations are in brackets
+        named = re.findall(rf"{kind} (\S+(?: \(a\), \d+)?)", items)
+        named += re.findall(rf", {kind} (\S+)", items)
+        have = {n.strip(",") for text in named for n in re.findall(r"(?<!\()[A-Z0-9.]+", text)}
+        missing = sorted(numbers(spans) - {n.strip(".") for n in have})
+        assert not missing, f"document {document}: no row for {kind} {', '.join(missing)}"
 
 
 def test_every_row_is_whole() -> None:

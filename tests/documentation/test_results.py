@@ -80,3 +80,44 @@ def test_what_cannot_be_run_is_said(
     (tmp_path / "esso_osaka").mkdir()
     assert results.why_not(source, 1000) == ""
     assert results.why_not(source, 1).startswith("takes 9 minutes")
+
+
+def test_what_ran_stands_in_the_pages_and_what_did_not_is_named(
+    results: ModuleType,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+) -> None:
+    page = tmp_path / "page.md"
+    names = ("good", "bad", "long", "other")
+    page.write_text(
+        "\n".join(f"<!--= {name} stdout took\\s(\\d+) -->old<!--/-->" for name in names)
+    )
+    (tmp_path / "good.py").write_text("import sys; print('took', sys.argv[1])")
+    (tmp_path / "bad.py").write_text("raise SystemExit('no such luck')")
+    minutes = {"good": 1, "bad": 2, "long": 99, "other": 1}
+    made = {
+        name: results.Source((str(tmp_path / f"{name}.py"), "7"), minutes[name]) for name in names
+    }
+    for name, value in {
+        "pages": lambda: [page],
+        "SOURCES": made,
+        "state": lambda: "now",
+        "git": lambda *words: "abc",
+    }.items():
+        monkeypatch.setattr(results, name, value)
+    call = ["results.py", "--runs", str(tmp_path / "runs"), "--only", "good,bad,long"]
+    monkeypatch.setattr(sys, "argv", call)
+    results.main()
+    assert [text for _, text in results.marks(page)] == ["7", "old", "old", "old"]
+    said = capsys.readouterr().out
+    assert "1 figures changed; those that were run are of commit abc." in said
+    assert "not run: bad: failed: no such luck" in said
+    assert "not run: long: takes 99 minutes" in said
+    assert "not run: other: not asked for" in said
+    # what is finished is not run again, unless its command is another one
+    results.main()
+    assert "running good" not in capsys.readouterr().out
+    made["good"] = results.Source((str(tmp_path / "good.py"), "8"), 1)
+    results.main()
+    assert next(text for _, text in results.marks(page)) == "8"
