@@ -8,6 +8,7 @@ falls by rho^2 / (rho^2 + e): members that agree in its sign keep most of it.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from typing import final
 
@@ -123,8 +124,37 @@ class GatedHead(ResidualHead):
         (agreed,) = _quantiles(spread, (_AGREED,))
         self.agreed.copy_(torch.where(agreed > _LEAST, agreed, torch.ones_like(agreed)))
 
+    def inner_box(self, z: Tensor, quantile: float) -> tuple[Tensor, Tensor]:
+        """Return the low and high quantile [nz] of channels z [N, nz]."""
+        low, high = _quantiles(z, (quantile, 1.0 - quantile))
+        return low, high
+
+    def within(self, low: Tensor, high: Tensor, fade: Tensor) -> GatedHead:
+        """Return this gate as if the residual were known within a box only.
+
+        Beyond it the residual is held at the edge, as heads hold theirs, and faded.
+
+        Args:
+            low: lower edges of the box [nz].
+            high: upper edges [nz].
+            fade: distance at which half is left of each axis [3], in half widths of the box.
+        """
+        out = GatedHead(_HeldHead(self.inner, low, high), len(low))
+        out.agreed.copy_(self.agreed)
+        out.low.copy_(low)
+        out.high.copy_(high)
+        out.reach.copy_(self._reach(low, high))
+        out.fade.copy_(fade)
+        return out
+
+    def _reach(self, low: Tensor, high: Tensor) -> Tensor:
+        """Return the half widths of a box [nz], in which distances from it are measured."""
+        half = (0.5 * (high - low)).clamp(min=_LEAST)
+        # a channel that hardly varies within the box would make all distances large
+        return torch.maximum(half, 0.1 * self.reach)
+
     def learn_fade(self, samples: Samples, candidates: Sequence[float]) -> dict[str, list[float]]:
-        """Choose each axis' fade from what holding the residual would have told further in.
+        """Choose each axis' fade from what holding the residual would have told of accelerations.
 
         Inner boxes of the training range play its part: beyond one, the residual is held at its
         edge, and faded by each candidate. That which reaches farthest is taken, of those that gain
@@ -143,12 +173,9 @@ class GatedHead(ResidualHead):
         whole = torch.zeros(3, dtype=torch.float64)
         fades = torch.tensor(candidates, dtype=torch.float64)[:, None, None]
         for quantile in _BOXES:
-            low, high = _quantiles(samples.z, (quantile, 1.0 - quantile))
-            reach = (0.5 * (high - low)).clamp(min=_LEAST)
+            low, high = self.inner_box(samples.z, quantile)
             held = torch.minimum(torch.maximum(samples.z, low), high)
-            beyond = samples.z - held
-            # a channel that hardly varies within the box would make all distances large
-            far = (beyond / torch.maximum(reach, 0.1 * self.reach)).square().sum(dim=1)
+            far = ((samples.z - held) / self._reach(low, high)).square().sum(dim=1)
             out = far > 0
             with torch.no_grad():
                 rho = torch.cat(
@@ -165,6 +192,46 @@ class GatedHead(ResidualHead):
         last = torch.where(worth, torch.arange(len(candidates))[:, None], 0).amax(dim=0)
         self.fade.copy_(fades.flatten()[farther][last])
         return {f"{fade:g}": left[i].tolist() for i, fade in enumerate(candidates)}
+
+
+@final
+class _HeldHead(ResidualHead):
+    """A head whose channels are held at the edges of a box.
+
+    Args:
+        inner: the head.
+        low: lower edges [nz].
+        high: upper edges [nz].
+    """
+
+    def __init__(self, inner: ResidualHead, low: Tensor, high: Tensor) -> None:
+        super().__init__()
+        self.inner = copy.deepcopy(inner)
+        self.n_state = inner.n_state
+        self.register_buffer("low", low.clone())
+        self.register_buffer("high", high.clone())
+        self.low: Tensor
+        self.high: Tensor
+
+    def held(self, z: Tensor) -> Tensor:
+        """Return channels z [..., nz] held at the edges."""
+        return torch.minimum(torch.maximum(z, self.low.to(z.dtype)), self.high.to(z.dtype))
+
+    def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the inner head's residual [B, 3] at the held channels, and its memory."""
+        return self.inner(self.held(z), s)
+
+    def told_apart(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return what the inner head does at the held channels."""
+        return self.inner.told_apart(self.held(z), s)
+
+    def warms_by_steps(self) -> bool:
+        """Return what the inner head says."""
+        return self.inner.warms_by_steps()
+
+    def warmup(self, z: Tensor) -> Tensor:
+        """Return the memory [B, n_state] that past channels [B, T, nz], held, leave."""
+        return self.inner.warmup(self.held(z))
 
 
 def _quantiles(values: Tensor, shares: Sequence[float]) -> Tensor:

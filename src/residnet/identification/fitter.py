@@ -29,6 +29,7 @@ from residnet.identification.cross_fitting.prior_choice import (
     choose_prior,
     judged_over,
 )
+from residnet.identification.fading import reach_in_free_runs
 from residnet.identification.models import FitStore, FittedModel
 from residnet.identification.prepared import velocity_limit
 from residnet.identification.settings import FitSettings, ForceConfig, GateConfig
@@ -259,11 +260,13 @@ class Fitter:
         assert isinstance(model.head, GatedHead)
         model.head.calibrate(self.samples)
         left = model.head.learn_fade(residual_samples(model, self.held_back), config.fades)
+        reached = reach_in_free_runs(model, self.held_back, config.fades, self.validate)
         notes: dict[str, Any] = {
             **{key: base.notes[key] for key in ("baseline", "members") if key in base.notes},
             "of": base.name,
             "fade": model.head.fade.tolist(),
             "fades_tried": left,
+            "reaches_tried": reached,
             **self._validated(model),
         }
         return self._kept(FittedModel(spec, model, notes))
