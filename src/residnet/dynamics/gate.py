@@ -219,7 +219,8 @@ class _HeldHead(ResidualHead):
 
     def forward(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return the inner head's residual [B, 3] at the held channels, and its memory."""
-        return self.inner(self.held(z), s)
+        rho, _, s = self.told_apart(z, s)
+        return rho, s
 
     def told_apart(self, z: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return what the inner head does at the held channels."""
