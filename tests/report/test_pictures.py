@@ -177,6 +177,21 @@ def test_what_no_legend_names_keeps_its_colour_and_its_group(tmp_path: Path) -> 
     assert looks["shades"].color == looks["learned, shade"].color == "#0072b24c"
 
 
+def test_shades_across_the_axes_end_at_their_limits(tmp_path: Path) -> None:
+    figure = new_figure(2.0)
+    axes = figure.subplots()
+    axes.plot(T, 0.01 * np.sin(T), color="#0072B2", label="measured")
+    axes.axvspan(2.0, 3.0, color="0.88", label="masked")
+    axes.legend()
+    save(figure, tmp_path / "01_masked.png", "Masked", "Look.")
+    (read,) = read_figures(tmp_path)
+    assert read.explorer is not None
+    assert read.explorer.looks["masked, shade"].dash == FILL
+    x, y = read.explorer.cases[0].curves[0]["masked, shade"]
+    assert (x.min(), x.max()) == pytest.approx((2.0, 3.0), abs=1e-3)
+    assert abs(y).max() == pytest.approx(max(map(abs, axes.get_ylim())), rel=1e-3)
+
+
 def surfaces(folder: Path) -> Path:
     """A picture of two surfaces over the same axes, with a bar of colours and a mark."""
     from matplotlib.colors import LogNorm

@@ -83,6 +83,7 @@ def write_page(
     environment.filters |= {
         "breakable": _breakable,
         "embedded": _embedded,
+        "pixels": _pixels,
         "anchor": _anchor,
         "linked": lambda text: glossary.linked(_breakable(str(text))),
     }
@@ -191,6 +192,15 @@ def _breakable(text: str) -> Markup:
 
     together = _UNIT.sub("\u00a0", str(escape(text)))
     return Markup(re.sub(rf"\S{{{_LONG},}}", broken, together))
+
+
+def _pixels(path: Path) -> Markup:
+    """Return width and height of a picture, so that its place is kept until it is drawn."""
+    from PIL import Image
+
+    with Image.open(path) as picture:
+        width, height = picture.size
+    return Markup(f' width="{width}" height="{height}"')
 
 
 def _embedded(path: Path) -> str:

@@ -302,10 +302,15 @@ def _drawn(axes: Axes, labels: Mapping[tuple[str, str], str]) -> list[tuple[str,
             look = _look(part, shades[0], labels, False, filled=not stroke)
             look = look if stroke else _filled(look, _shade(shades[0], part))
             parts.append((look, _outline(outlines)))
+    # a shade across all of the axes ends at their limits
+    to_data = axes.transData.inverted()
     for patch in axes.patches:
-        path = patch.get_path().transformed(patch.get_patch_transform())
-        outline = _outline([path.to_polygons()[0]] if path.to_polygons() else [])
-        parts.append((_look(patch, patch.get_facecolor(), labels, False), outline))
+        polygons = patch.get_path().transformed(patch.get_transform() + to_data).to_polygons()
+        face, edge = patch.get_facecolor(), patch.get_edgecolor()
+        filled = face[3] > 0
+        look = _look(patch, face if filled else edge, labels, False, filled=filled)
+        look = _filled(look, _shade(face, patch)) if filled else look
+        parts.append((look, _outline(polygons[:1])))
     # what stands at other places than numbers tell is left out: frames and arrows
     found = [(look, curve) for look, curve in parts if np.isfinite(curve[0]).any()]
     return [(look.label + (" (points)" if look.points else ""), look, c) for look, c in found]

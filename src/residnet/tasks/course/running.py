@@ -120,10 +120,11 @@ def _verdict(config: CourseSettings, rows: Sequence[dict[str, Any]]) -> list[str
                 f"{protocol}: '{config.policy}' did not come to the end of the course."
             )
             continue
+        passes = "and passes all" if flight["passed"] else "but does NOT pass all"
         sentences.append(
             f"{protocol}: '{config.policy}' needs {flight['course_time']:.1f} s,"
-            f" {flight['ratio']:.3f} times the time of the reference, and passes"
-            f" {flight['passed']} of {len(config.course.buoys)} buoys as the protocol asks."
+            f" {flight['ratio']:.3f} times the time of the reference, {passes}"
+            f" {len(config.course.buoys)} buoys as the protocol asks."
         )
     return sentences
 
