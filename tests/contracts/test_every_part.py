@@ -120,6 +120,7 @@ def test_manoeuvre(kind: str, tmp_path: Path) -> None:
 READERS: dict[str, tuple[Callable[[Log, Path], Path], str]] = {
     "csv": (written_logs.csv, ""),
     "parquet": (written_logs.parquet, ""),
+    "json_lines": (written_logs.json_lines, ""),
     "excel": (written_logs.excel, "openpyxl"),
     "csv_topics": (written_logs.topics, "rosbags"),
     "rosbag": (written_logs.bag2_mcap, "rosbags"),
@@ -140,7 +141,7 @@ def test_reader(kind: str, tmp_path: Path) -> None:
         pytest.importorskip(needs)
     log = written_logs.trial(20.0)
     settings: dict[str, Any] = {}
-    if kind in ("csv", "parquet", "excel"):
+    if kind in ("csv", "parquet", "excel", "json_lines"):
         channels = {name: {"column": name, "unit": CHANNEL_UNITS[name]} for name in log.channels}
         settings = {"time": {"column": "t"}, "channels": channels}
     read = check_reader(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import pytest
 
 import residnet
 from residnet.core.config import validate
+from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
 from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.tables import draft_tables
@@ -113,3 +115,86 @@ def test_a_workbook_that_begins_with_words(log: Log, tmp_path: Path) -> None:
     assert content["sheet"] == "Daten"
     read = validate(content, ReaderConfig, "test").build().read(file)
     np.testing.assert_allclose(read["x"], log["x"], atol=1e-9)
+
+
+def _attitude(log: Log, names: list[str], anticlockwise: bool) -> dict[str, np.ndarray]:
+    """Return the columns of a quaternion x, y, z, w that changes its sign and has some roll."""
+    yaw = math.pi / 2 - log["psi"] if anticlockwise else log["psi"]
+    roll = 0.05 * np.sin(log.t)
+    parts = (
+        np.cos(yaw / 2) * np.sin(roll / 2),
+        np.sin(yaw / 2) * np.sin(roll / 2),
+        np.sin(yaw / 2) * np.cos(roll / 2),
+        np.cos(yaw / 2) * np.cos(roll / 2),
+    )
+    sign = np.where(np.sin(log.t) < 0, -1.0, 1.0)
+    return {name: sign * part for name, part in zip(names, parts, strict=True)}
+
+
+@pytest.mark.parametrize(
+    ("names", "anticlockwise"),
+    [
+        (["qx", "qy", "qz", "qw"], True),
+        (
+            [
+                "pose.orientation.x",
+                "pose.orientation.y",
+                "pose.orientation.z",
+                "pose.orientation.w",
+            ],
+            False,
+        ),
+        (["quat_x [-]", "quat_y [-]", "quat_z [-]", "quat_w [-]"], True),
+        (["q[1]", "q[2]", "q[3]", "q[0]"], False),
+    ],
+)
+def test_attitudes_as_quaternions(
+    log: Log, tmp_path: Path, names: list[str], anticlockwise: bool
+) -> None:
+    frame = pd.DataFrame(
+        {
+            **{"time [s]": log.t, "north [m]": log["x"], "east [m]": log["y"]},
+            **_attitude(log, names, anticlockwise),
+            "rudder [deg]": np.degrees(log["cmd_delta"]),
+        }
+    )
+    read, marks = _drafted(frame, tmp_path / "log.csv")
+    turns = (read["psi"] - log["psi"]) / (2 * math.pi)
+    np.testing.assert_allclose(turns - round(turns[0]), 0.0, atol=1e-9)
+    assert _guessed(marks, "qw")
+    assert not {"qx", "qy", "qz", "qw"} & set(read.channels)
+
+
+def test_part_of_a_quaternion_is_refused() -> None:
+    entry = {"column": "a", "unit": "-"}
+    settings = {"kind": "csv", "time": {"column": "t"}, "channels": {"qx": entry, "qw": entry}}
+    with pytest.raises(UsageError, match="add qy, qz"):
+        validate(settings, ReaderConfig, "test")
+
+
+def test_json_lines(log: Log, tmp_path: Path) -> None:
+    lines = [
+        {
+            "stamp": t,
+            "nav": {"north": x, "east": y, "heading_deg": math.degrees(psi)},
+            "act": {"rudder_deg": [math.degrees(delta)]},
+            "scan": list(range(40)),
+        }
+        for t, x, y, psi, delta in zip(
+            log.t, log["x"], log["y"], log["psi"], log["cmd_delta"], strict=True
+        )
+    ]
+    file = tmp_path / "log.jsonl"
+    whole = "\n".join(map(json.dumps, lines))
+    file.write_text(whole + '\n\n{"stamp": 9')
+    marks = Marks()
+    content = draft_tables([file], marks).content
+    read = validate(content, ReaderConfig, "test").build().read(file)
+    assert content["kind"] == "json_lines"
+    assert any(finding["code"] == "cut_line" for finding in read.meta["findings"])
+    for name in ("x", "y", "psi"):
+        np.testing.assert_allclose(read[name], log[name], atol=1e-9)
+    np.testing.assert_allclose(read["delta"], log["cmd_delta"], atol=1e-9)
+    file.write_text(whole.replace("}\n{", "}\n[1]\n{", 1))
+    with pytest.raises(DataError, match=r"line 2, '\[1\]', is no JSON object"):
+        draft_tables([file], marks)

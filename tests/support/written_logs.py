@@ -55,6 +55,15 @@ def parquet(log: Log, folder: Path) -> Path:
     return path
 
 
+def json_lines(log: Log, folder: Path) -> Path:
+    """An object a line."""
+    path = folder / "trial.jsonl"
+    pd.DataFrame({"t": log.t, **log.channels}).to_json(
+        path, orient="records", lines=True, double_precision=15
+    )
+    return path
+
+
 def excel(log: Log, folder: Path) -> Path:
     """The first sheet of an Excel file."""
     path = folder / "trial.xlsx"

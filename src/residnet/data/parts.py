@@ -17,7 +17,19 @@ from residnet.core.names import nearest
 from residnet.data.readers.detect import format_of
 from residnet.data.readers.files import files_of
 
-_TABLES = (".csv", ".tsv", ".txt", ".dat", ".xlsx", ".parquet", ".mat", ".h5", ".hdf5")
+_TABLES = (
+    ".csv",
+    ".tsv",
+    ".txt",
+    ".dat",
+    ".xlsx",
+    ".parquet",
+    ".mat",
+    ".h5",
+    ".hdf5",
+    ".jsonl",
+    ".ndjson",
+)
 _RECORDERS = (".mcap", ".db3", ".bag", ".ulg", ".bin", ".nmea", ".log")
 LOG_ENDINGS = (*_TABLES, *_RECORDERS)
 """Endings of files that may be logs."""

@@ -13,12 +13,13 @@ from residnet.core.errors import DataError, UsageError
 from residnet.core.units import known_unit
 from residnet.data.drafting.text_tables import text_table
 from residnet.data.readers.base import require_file
+from residnet.data.readers.tables.json_lines import json_table
 from residnet.data.readers.tables.pieces import excel_sheet, sheet_names
 
 if TYPE_CHECKING:
     import pandas as pd
 
-ENDINGS = (".csv", ".tsv", ".txt", ".dat", ".xlsx", ".parquet")
+ENDINGS = (".csv", ".tsv", ".txt", ".dat", ".xlsx", ".parquet", ".jsonl", ".ndjson")
 """Endings of tables."""
 
 _ROWS = 20_000
@@ -66,6 +67,8 @@ def peek(path: Path, rows: int = _ROWS) -> Sheet:
         table, about = _parquet(path, rows), {"kind": "parquet"}
     elif path.suffix.lower() == ".xlsx":
         table, about = _excel(path, rows)
+    elif path.suffix.lower() in (".jsonl", ".ndjson"):
+        table, about = json_table(path, rows), {"kind": "json_lines"}
     else:
         table, about = text_table(path, rows)
     columns = _described(table)

@@ -10,6 +10,12 @@ from typing import Any
 
 from residnet.core.errors import DataError, UsageError
 from residnet.core.names import CHANNEL_UNITS
+from residnet.data.drafting.attitudes import (
+    as_quaternion,
+    from_quaternion,
+    is_unit,
+    quaternions,
+)
 from residnet.data.drafting.channels import CHANNELS, READER, STATE_NAMES, Channels
 from residnet.data.drafting.clocks import Clock, clock_of
 from residnet.data.drafting.fixes import from_fixes
@@ -63,11 +69,20 @@ def draft_tables(files: Sequence[Path], marks: Marks) -> TableDraft:
     if clock.guess:
         marks.guess((*READER, "time"), clock.guess)
     numeric = [name for name in shared if name in first.numbers and name not in clock.columns]
-    names = named(numeric, marks)
+    attitudes = quaternions(numeric)
+    parts = {column for attitude in attitudes for column in attitude.values()}
+    names = named([name for name in numeric if name not in parts], marks)
     refuse_written_positions(first, names)
-    logs = _raw(sheets, names, left_out)
+    attitude = attitudes[0] if attitudes and "psi" not in names else {}
+    logs = _raw(sheets, {**names, **attitude}, left_out)
+    attitude = attitude if is_unit(logs) else {}
     names, logs, fixes = from_fixes(names, logs, marks)
+    if attitude:
+        names, logs = from_quaternion(names, attitude, logs)
     channels = Channels(names, logs, marks, fixes).drafted()
+    if attitude:
+        channels = as_quaternion(channels, attitude, marks, {"x", "y"} <= set(names))
+        names = {**{name: names[name] for name in names if name != "psi"}, **attitude}
     for entry in channels.values():
         settings = written.get(entry["column"], {})
         entry |= {"column": first.column(entry["column"]), **settings}

@@ -19,6 +19,7 @@ from residnet.data.readers.tables.channel_map import ChannelMap
 from residnet.data.readers.tables.table import (
     CsvConfig,
     ExcelConfig,
+    JsonLinesConfig,
     ParquetConfig,
     TableReader,
     TimeColumn,
@@ -28,6 +29,7 @@ ReaderConfig = Annotated[
     CsvConfig
     | ParquetConfig
     | ExcelConfig
+    | JsonLinesConfig
     | CanonicalConfig
     | TopicFolderConfig
     | RosbagConfig
@@ -50,6 +52,7 @@ __all__ = [
     "CsvConfig",
     "ExcelConfig",
     "Hdf5Config",
+    "JsonLinesConfig",
     "LogReader",
     "MatConfig",
     "NmeaConfig",

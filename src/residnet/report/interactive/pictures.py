@@ -278,6 +278,7 @@ def _look(
 def _drawn(axes: Axes, labels: Mapping[tuple[str, str], str]) -> list[tuple[str, Look, Curve]]:
     """Return name, look and values of all that is drawn in some axes."""
     from matplotlib.collections import LineCollection, PathCollection
+    from matplotlib.colors import to_rgba
 
     parts: list[tuple[Look, Curve]] = []
     for line in axes.get_lines():
@@ -307,7 +308,7 @@ def _drawn(axes: Axes, labels: Mapping[tuple[str, str], str]) -> list[tuple[str,
     for patch in axes.patches:
         polygons = patch.get_path().transformed(patch.get_transform() + to_data).to_polygons()
         face, edge = patch.get_facecolor(), patch.get_edgecolor()
-        filled = face[3] > 0
+        filled = to_rgba(face)[3] > 0
         look = _look(patch, face if filled else edge, labels, False, filled=filled)
         look = _filled(look, _shade(face, patch)) if filled else look
         parts.append((look, _outline(polygons[:1])))

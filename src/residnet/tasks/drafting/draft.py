@@ -18,6 +18,7 @@ from residnet.data.drafting.channels import CHANNELS
 from residnet.data.drafting.physics import Raw, turns_to
 from residnet.data.drafting.questions import Answer, Marks
 from residnet.data.prepare import PrepareConfig, prepare
+from residnet.data.readers.tables.channel_map import QUATERNION
 from residnet.tasks.drafting import recipe
 from residnet.tasks.drafting.inputs import INPUTS, driving, lacks
 from residnet.tasks.drafting.logs import ReadLogs, found_logs, read_all
@@ -143,6 +144,8 @@ def _plain_names(
     if channels:
         if "x" not in channels:
             state += ["latitude", "longitude"]
+        if "psi" not in channels:
+            state += QUATERNION
         kept = {
             new.get(name, name): entry
             for name, entry in channels.items()

@@ -10,11 +10,12 @@ from residnet.core.log import Log
 from residnet.core.names import ACCELERATION, STATE
 from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.words import input_channel, state_channel, words_of
+from residnet.data.readers.tables.channel_map import QUATERNION
 from residnet.physics.environment.wind import WIND_INPUTS
 
 INPUTS = ("signals", "inputs")
 _PASSIVE = (
-    *(*STATE, *ACCELERATION, "phi", "p", "latitude", "longitude"),
+    *(*STATE, *ACCELERATION, "phi", "p", "latitude", "longitude", *QUATERNION),
     *(*WIND_INPUTS, "current_north", "current_east"),
 )
 _STILL = 2e-3

@@ -24,22 +24,35 @@ def field_values(recording: Recording, series: Series, path: str) -> np.ndarray:
     return values
 
 
+def unit_quaternion(
+    x: np.ndarray, y: np.ndarray, z: np.ndarray, w: np.ndarray
+) -> tuple[np.ndarray, ...]:
+    """Return quaternions [T] of length one, x, y, z, w; NaN where they are empty."""
+    norm = np.sqrt(x * x + y * y + z * z + w * w)
+    known = np.isfinite(norm) & (norm > 0.5)
+    length = np.where(known, norm, 1.0)
+    return tuple(np.where(known, part / length, np.nan) for part in (x, y, z, w))
+
+
+def yaw_of(x: np.ndarray, y: np.ndarray, z: np.ndarray, w: np.ndarray) -> np.ndarray:
+    """Return the rotation [T] about the vertical axis in rad of quaternions of length one."""
+    yaw: np.ndarray = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    return yaw
+
+
 def from_quaternion(
     recording: Recording, series: Series, config: Quaternion
 ) -> tuple[np.ndarray, dict[str, np.ndarray], tuple[Remark, ...]]:
     """Return heading, roll where it is wanted, and remarks from the quaternions of a topic."""
     x, y, z, w = (field_values(recording, series, f"{config.field}.{axis}") for axis in "xyzw")
-    norm = np.sqrt(x * x + y * y + z * z + w * w)
-    known = np.isfinite(norm) & (norm > 0.5)
+    x, y, z, w = unit_quaternion(x, y, z, w)
+    known = np.isfinite(w)
     if not known.any():
         raise DataError(
             f"{recording.path}: topic {series.name}: '{config.field}' holds no orientation, all"
             " quaternions are empty"
         )
-    x, y, z, w = (
-        np.where(known, part / np.where(known, norm, 1.0), np.nan) for part in (x, y, z, w)
-    )
-    yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    yaw = yaw_of(x, y, z, w)
     remarks = []
     flips = int(((x[1:] * x[:-1] + y[1:] * y[:-1] + z[1:] * z[:-1] + w[1:] * w[:-1]) < 0.0).sum())
     if flips:

@@ -29,9 +29,11 @@ from residnet.data.readers.files import progress
 from residnet.data.readers.recording import remark
 from residnet.data.readers.spool import LARGE
 from residnet.data.readers.tables.angles import degrees_of, side_signs
-from residnet.data.readers.tables.channel_map import ChannelMap, factor
+from residnet.data.readers.tables.attitudes import with_heading
+from residnet.data.readers.tables.channel_map import QUATERNION, ChannelMap, factor
 from residnet.data.readers.tables.dates import DateClock, Order, zone_of
 from residnet.data.readers.tables.fixes import LATITUDE, LONGITUDE, with_positions
+from residnet.data.readers.tables.json_lines import read_json_lines
 from residnet.data.readers.tables.pieces import Pieces, read_csv, read_excel, read_parquet
 from residnet.data.readers.tables.rows import Rows
 
@@ -94,7 +96,7 @@ class _TableConfig(Config, ABC):
         time: column of the time.
         channels: canonical names (or names of your own) and the columns that they are taken from,
             all of which must exist; `latitude` and `longitude` become x, y where these are not
-            there.
+            there, and `qx`, `qy`, `qz`, `qw` become the heading psi where there is none.
         manoeuvre: kind of manoeuvre of every file; `folder` takes the name of each file's folder,
             null says that it is not known.
     """
@@ -108,6 +110,10 @@ class _TableConfig(Config, ABC):
     def _fits_names(cls, channels: dict[str, ChannelMap]) -> dict[str, ChannelMap]:
         for name, entry in channels.items():
             entry.require_fit(name)
+        parts = [name for name in QUATERNION if name in channels]
+        if parts and len(parts) < len(QUATERNION):
+            lost = ", ".join(name for name in QUATERNION if name not in channels)
+            raise ValueError(f"an attitude needs all of {', '.join(QUATERNION)}; add {lost}")
         return channels
 
     @abstractmethod
@@ -183,6 +189,20 @@ class ParquetConfig(_TableConfig):
     def build(self) -> TableReader:
         """Build the reader of Parquet files."""
         return TableReader(self, read_parquet, lambda i: f"row {i + 1}")
+
+
+@final
+class JsonLinesConfig(_TableConfig):
+    """Files with a JSON object a line (.jsonl, .ndjson); a column is a key, `nav.lat` one within.
+
+    Entries of lists are counted from zero: `imu.q[0]`.
+    """
+
+    kind: Literal["json_lines"] = "json_lines"
+
+    def build(self) -> TableReader:
+        """Build the reader of JSON lines."""
+        return TableReader(self, read_json_lines, lambda i: f"object {i + 1}")
 
 
 def _is_text_position(name: str, cells: pd.Series) -> bool:
@@ -269,6 +289,7 @@ class TableReader(LogReader):
         )
         units = {name: entry.si(name) for name, entry in maps.items()}
         channels, units, placed = with_positions(path, channels, units)
+        channels, units = with_heading(path, channels, units, maps)
         meta = provenance(path, read + cut, read + cut - t.size)
         findings = [*(dates.remarks if dates else []), *rows.remarks(), *placed]
         if cut:

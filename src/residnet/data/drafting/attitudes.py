@@ -1,0 +1,101 @@
+"""Tables that hold the attitude as a quaternion in place of a heading."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from residnet.data.drafting.channels import CHANNELS
+from residnet.data.drafting.physics import Raw
+from residnet.data.drafting.questions import Marks
+from residnet.data.readers.composing.orientation import unit_quaternion, yaw_of
+from residnet.data.readers.tables.channel_map import QUATERNION
+
+_COLUMN = re.compile(
+    r"(?P<stem>(?:.*[\W_])?(?:q|quat|quaternions?|orient|orientation|att|attitude|rot|rotation))"
+    r"[\W_]*(?P<part>[xyzwijk0-3])\W*",
+    re.IGNORECASE,
+)
+_PARTS = {**dict(zip("xyzw", QUATERNION, strict=True)), "i": "qx", "j": "qy", "k": "qz"}
+_SCALAR_FIRST = dict(zip("0123", ("qw", "qx", "qy", "qz"), strict=True))
+_HEADING = "heading of the quaternion [rad]"
+
+
+def quaternions(columns: Sequence[str]) -> list[dict[str, str]]:
+    """Return for each quaternion channel -> column, by what the columns are called.
+
+    The parts are called x, y, z, w, or 0 to 3 with the scalar part first.
+    """
+    found: dict[str, dict[str, str]] = {}
+    for column in columns:
+        # units in brackets do not belong to the name
+        match = _COLUMN.fullmatch(re.sub(r"\s*\[\D*\]$|\s*\(\D*\)$", "", column.strip()))
+        if match is not None:
+            part = match["part"].lower()
+            channel = _PARTS.get(part) or _SCALAR_FIRST[part]
+            kind = "counted" if part in _SCALAR_FIRST else "named"
+            found.setdefault(f"{match['stem']} {kind}", {}).setdefault(channel, column)
+    return [parts for parts in found.values() if set(parts) == set(QUATERNION)]
+
+
+def from_quaternion(
+    names: Mapping[str, str], parts: Mapping[str, str], logs: Sequence[Raw]
+) -> tuple[dict[str, str], list[Raw]]:
+    """Return channel -> column and the logs, with a heading in rad from qx, qy, qz, qw.
+
+    Args:
+        names: channel -> column, without the heading.
+        parts: channel -> column of the quaternion.
+        logs: their columns by channel, those of the quaternion among them.
+    """
+    turned = []
+    for raw in logs:
+        if set(QUATERNION) <= set(raw.columns):
+            yaw = yaw_of(*unit_quaternion(*(raw.columns[name] for name in QUATERNION)))
+            others = {name: raw.columns[name] for name in raw.columns if name not in QUATERNION}
+            raw = Raw(raw.t, {**others, "psi": yaw})
+        turned.append(raw)
+    rest = {name: column for name, column in names.items() if name not in parts}
+    return {**rest, "psi": _HEADING}, turned
+
+
+def is_unit(logs: Sequence[Raw]) -> bool:
+    """Return whether four columns are a quaternion: their squares add up to one."""
+    norms = [
+        np.sqrt(sum(raw.columns[name] ** 2 for name in QUATERNION))
+        for raw in logs
+        if set(QUATERNION) <= set(raw.columns)
+    ]
+    known = np.concatenate([norm[np.isfinite(norm) & (norm > 0)] for norm in norms] or [np.ones(0)])
+    return known.size > 0 and bool(abs(float(np.median(known)) - 1.0) < 0.02)
+
+
+def as_quaternion(
+    entries: Mapping[str, dict[str, Any]], parts: Mapping[str, str], marks: Marks, placed: bool
+) -> dict[str, dict[str, Any]]:
+    """Return the entries of a channel map with the quaternion's in place of psi.
+
+    Args:
+        entries: channel -> entry.
+        parts: channel -> column of the quaternion.
+        marks: is told what is not sure.
+        placed: there is a position, which tells the frame.
+    """
+    out = {name: entry for name, entry in entries.items() if name != "psi"}
+    frame = {"frame": entries["psi"]["frame"]} if "frame" in entries["psi"] else {}
+    out |= {name: {"column": parts[name], "unit": "-"} for name in QUATERNION}
+    out["qw"] |= frame
+    marks.move((*CHANNELS, "psi"), (*CHANNELS, "qw"))
+    turned = "anticlockwise from east" if frame else "clockwise from north"
+    if placed:
+        text = f"position and heading fit together best where the heading counts {turned}"
+    else:
+        text = f"no position tells the frame; the heading is taken to count {turned}"
+    marks.guess((*CHANNELS, "qw"), text)
+    if re.search(r"\d\W*$", parts["qw"]):
+        text = "the part that is counted first is taken as the scalar one"
+        marks.guess((*CHANNELS, "qw"), text)
+    return out
