@@ -86,7 +86,7 @@ SOURCES: dict[str, Source] = {
     # genetic programming and bands, which change no other model, take most of an hour
     "moreno2019": _study(
         "moreno2019/moreno2019",
-        12,
+        5,
         *("~heads.gptips", "~base_of.gptips", "bands=null"),
         data="esso_osaka",
     ),
@@ -113,7 +113,9 @@ SOURCES: dict[str, Source] = {
     "zigzag": _study("jervan2020/zigzag", 2),
     "measured": _study("jervan2020/measured", 2, data="milliampere"),
     "woo2018": _study("woo2018/woo2018", 60),
-    "woo2018_linear": _study("woo2018/woo2018", 3, "~heads", "~training", "study=null"),
+    "woo2018_linear": _study(
+        "woo2018/woo2018", 2, "~heads", "~training", "study=null", "bands=null"
+    ),
     "thrusters": _study("woo2018/thrusters", 1),
     "outside_terms": _study("woo2018/outside_terms", 10),
     "input_sets": Source(("scripts/bench/input_sets.py",), 3),
