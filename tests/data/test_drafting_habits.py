@@ -146,6 +146,7 @@ def _attitude(log: Log, names: list[str], anticlockwise: bool) -> dict[str, np.n
         ),
         (["quat_x [-]", "quat_y [-]", "quat_z [-]", "quat_w [-]"], True),
         (["q[1]", "q[2]", "q[3]", "q[0]"], False),
+        (["q0", "q1", "q2", "q3"], True),
     ],
 )
 def test_attitudes_as_quaternions(
@@ -198,3 +199,17 @@ def test_json_lines(log: Log, tmp_path: Path) -> None:
     file.write_text(whole.replace("}\n{", "}\n[1]\n{", 1))
     with pytest.raises(DataError, match=r"line 2, '\[1\]', is no JSON object"):
         draft_tables([file], marks)
+
+
+def test_n_beside_e_is_north(log: Log, tmp_path: Path) -> None:
+    frame = pd.DataFrame(
+        {
+            **{"time [s]": log.t, "N [m]": log["x"], "E [m]": log["y"]},
+            **{"heading [deg]": np.degrees(log["psi"]), "rpm": 60.0 * log["cmd_n"]},
+        }
+    )
+    read, marks = _drafted(frame, tmp_path / "log.csv")
+    for name in ("x", "y", "psi"):
+        np.testing.assert_allclose(read[name], log[name], atol=1e-9)
+    np.testing.assert_allclose(read["n"], log["cmd_n"], atol=1e-9)
+    assert _guessed(marks, "x")

@@ -20,14 +20,15 @@ _COLUMN = re.compile(
     re.IGNORECASE,
 )
 _PARTS = {**dict(zip("xyzw", QUATERNION, strict=True)), "i": "qx", "j": "qy", "k": "qz"}
-_SCALAR_FIRST = dict(zip("0123", ("qw", "qx", "qy", "qz"), strict=True))
+_COUNTED = (("qw", "qx", "qy", "qz"), QUATERNION)
+"""What counted parts may be: most write the scalar part first, some last."""
 _HEADING = "heading of the quaternion [rad]"
 
 
 def quaternions(columns: Sequence[str]) -> list[dict[str, str]]:
     """Return for each quaternion channel -> column, by what the columns are called.
 
-    The parts are called x, y, z, w, or 0 to 3 with the scalar part first.
+    Parts that are counted 0 to 3 stand twice, with the scalar part first and last.
     """
     found: dict[str, dict[str, str]] = {}
     for column in columns:
@@ -35,9 +36,10 @@ def quaternions(columns: Sequence[str]) -> list[dict[str, str]]:
         match = _COLUMN.fullmatch(re.sub(r"\s*\[\D*\]$|\s*\(\D*\)$", "", column.strip()))
         if match is not None:
             part = match["part"].lower()
-            channel = _PARTS.get(part) or _SCALAR_FIRST[part]
-            kind = "counted" if part in _SCALAR_FIRST else "named"
-            found.setdefault(f"{match['stem']} {kind}", {}).setdefault(channel, column)
+            channels = [_PARTS[part]] if part in _PARTS else [row[int(part)] for row in _COUNTED]
+            for number, channel in enumerate(channels):
+                kind = f"{match['stem']} {number if part.isdigit() else 'named'}"
+                found.setdefault(kind, {}).setdefault(channel, column)
     return [parts for parts in found.values() if set(parts) == set(QUATERNION)]
 
 
@@ -60,6 +62,27 @@ def from_quaternion(
         turned.append(raw)
     rest = {name: column for name, column in names.items() if name not in parts}
     return {**rest, "psi": _HEADING}, turned
+
+
+def levelled(
+    attitudes: Sequence[dict[str, str]], columns: Sequence[Mapping[str, np.ndarray]]
+) -> dict[str, str]:
+    """Return the first of quaternions, in the order of its parts that leaves a vessel level.
+
+    Args:
+        attitudes: channel -> column of each, as `quaternions` gave them.
+        columns: column -> values of each table.
+    """
+    if not attitudes:
+        return {}
+    alike = [parts for parts in attitudes if set(parts.values()) == set(attitudes[0].values())]
+
+    def tilt(parts: Mapping[str, str]) -> float:
+        whole = [table for table in columns if set(parts.values()) <= set(table)]
+        tilts = [table[parts[name]] for table in whole for name in ("qx", "qy")]
+        return float(np.nanmean(np.concatenate(tilts) ** 2)) if tilts else 0.0
+
+    return min(alike, key=tilt)
 
 
 def is_unit(logs: Sequence[Raw]) -> bool:
@@ -96,6 +119,6 @@ def as_quaternion(
         text = f"no position tells the frame; the heading is taken to count {turned}"
     marks.guess((*CHANNELS, "qw"), text)
     if re.search(r"\d\W*$", parts["qw"]):
-        text = "the part that is counted first is taken as the scalar one"
+        text = f"'{parts['qw']}' is taken as the scalar part, which leaves the vessel level"
         marks.guess((*CHANNELS, "qw"), text)
     return out

@@ -67,6 +67,11 @@ class Marks:
         """Write down what the files show."""
         self.notes.append((key, text))
 
+    def extend(self, other: Marks) -> None:
+        """Add the marks of another draft."""
+        self.guesses += other.guesses
+        self.notes += other.notes
+
     def move(self, old: Key, new: Key) -> None:
         """Move the marks of one key to another."""
         self.guesses = [(new if key == old else key, text) for key, text in self.guesses]

@@ -14,6 +14,7 @@ from residnet.data.drafting.attitudes import (
     as_quaternion,
     from_quaternion,
     is_unit,
+    levelled,
     quaternions,
 )
 from residnet.data.drafting.channels import CHANNELS, READER, STATE_NAMES, Channels
@@ -73,7 +74,7 @@ def draft_tables(files: Sequence[Path], marks: Marks) -> TableDraft:
     parts = {column for attitude in attitudes for column in attitude.values()}
     names = named([name for name in numeric if name not in parts], marks)
     refuse_written_positions(first, names)
-    attitude = attitudes[0] if attitudes and "psi" not in names else {}
+    attitude = levelled(attitudes, [one.numbers for one in sheets]) if "psi" not in names else {}
     logs = _raw(sheets, {**names, **attitude}, left_out)
     attitude = attitude if is_unit(logs) else {}
     names, logs, fixes = from_fixes(names, logs, marks)
@@ -126,6 +127,15 @@ def _sheets(files: Sequence[Path]) -> tuple[list[Sheet], dict[Path, str]]:
 
 def named(columns: Sequence[str], marks: Marks) -> dict[str, str]:
     """Return channel -> column, by what the columns are called."""
+    if pair := _letters(columns):
+        rest = Marks()
+        others = named([name for name in columns if name not in pair.values()], rest)
+        if not {"x", "y", "latitude", "longitude"} & set(others):
+            # beside E, N counts no revolutions
+            marks.extend(rest)
+            text = f"'{pair['x']}' and '{pair['y']}' side by side are taken as north and east"
+            marks.guess((*CHANNELS, "x"), text)
+            return {**pair, **others}
     names: dict[str, str] = {}
     speeds: list[str] = []
     about = {column: words_of(column) for column in columns}
@@ -155,6 +165,12 @@ def named(columns: Sequence[str], marks: Marks) -> dict[str, str]:
         marks.guess((*CHANNELS, "u"), f"'{speeds[0]}' is taken as the speed forward, not its size")
     order = [*STATE_NAMES, *(name for name in names if name not in STATE_NAMES)]
     return {name: names[name] for name in order if name in names}
+
+
+def _letters(columns: Sequence[str]) -> dict[str, str]:
+    """Return x and y -> columns that are called N and E and no more, none without both."""
+    alone = {re.sub(r"\W*[\[(].*", "", column).strip().lower(): column for column in columns}
+    return {"x": alone["n"], "y": alone["e"]} if {"n", "e"} <= set(alone) else {}
 
 
 def _copy(column: str) -> str:
