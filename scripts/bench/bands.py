@@ -2,10 +2,11 @@
 
 Of a finished run, or of what `residnet evaluate` wrote, the selected model's bands are judged on
 the stored free runs. With `--cross`, all logs of a config are divided into folds instead: each is
-judged with bands of a fit that has seen none of it.
+judged with bands of a fit that has seen none of it. With `--alone`, models that the judged one
+does not stand on are left out of these fits: networks take most of the time.
 
     python scripts/bench/bands.py RUN [--split test]
-    python scripts/bench/bands.py --cross CONFIG [--model physics] [--folds 5] [-s KEY=VALUE]
+    python scripts/bench/bands.py --cross CONFIG [--model physics] [--alone] [--folds 5] [-s K=V]
 """
 
 from __future__ import annotations
@@ -53,6 +54,27 @@ def stored(run: Path, split: str, model: str, bands: dict[str, Band]) -> dict[st
             error[np.ix_(~part["usable"].to_numpy(bool)[1:], [0, 1, 4])] = np.nan
             given = RunErrors(file.stem, manoeuvres[file.stem], error, states)
             out.setdefault(str(protocol), []).append((given, bands[str(protocol)]))
+    return out
+
+
+def alone(config: FitTaskSettings, model: str) -> list[str]:
+    """Return overrides that leave out all models of a config that one does not stand on.
+
+    Args:
+        config: of a fit.
+        model: one of its baselines or heads.
+
+    Raises:
+        ValueError: where the model is neither.
+    """
+    if model not in ("baseline", *config.baselines, *config.heads):
+        raise ValueError(f"{model} is no baseline or head of the config")
+    needed = {model, config.baseline_name_of(model) if model in config.heads else model}
+    out = [f"~{key}" for key in ("ensembles", "gates", "forces") if getattr(config, key)]
+    for key in ("heads", "base_of", "training", "baselines", "refit"):
+        given = getattr(config, key)
+        unused = [name for name in given if name not in needed]
+        out += [f"~{key}"] if len(unused) == len(given) > 0 else [f"~{key}.{n}" for n in unused]
     return out
 
 
@@ -131,6 +153,7 @@ def main() -> None:
     parser.add_argument("--split", default="test")
     parser.add_argument("--cross", type=Path)
     parser.add_argument("--model")
+    parser.add_argument("--alone", action="store_true")
     parser.add_argument("--folds", type=int, default=5)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("-s", dest="overrides", action="append", default=[])
@@ -139,6 +162,10 @@ def main() -> None:
     if given.cross is not None:
         config = load_task(given.cross, given.overrides)
         assert isinstance(config, FitTaskSettings)
+        if given.alone:
+            left_out = alone(config, given.model or "baseline")
+            config = load_task(given.cross, [*given.overrides, *left_out])
+            assert isinstance(config, FitTaskSettings)
         found = crossed(config, given.model or "baseline", given.folds, given.seed)
     else:
         metrics = json.loads((given.run / "metrics.json").read_text())
