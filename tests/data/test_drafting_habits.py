@@ -17,6 +17,7 @@ from residnet.core.errors import DataError, UsageError
 from residnet.core.log import Log
 from residnet.data.drafting.questions import Marks
 from residnet.data.drafting.tables import draft_tables
+from residnet.data.drafting.words import state_channel, words_of
 from residnet.data.readers import ReaderConfig
 
 
@@ -213,3 +214,10 @@ def test_n_beside_e_is_north(log: Log, tmp_path: Path) -> None:
         np.testing.assert_allclose(read[name], log[name], atol=1e-9)
     np.testing.assert_allclose(read["n"], log["cmd_n"], atol=1e-9)
     assert _guessed(marks, "x")
+
+
+@pytest.mark.parametrize(
+    ("column", "channel"), [("Nordwert [m]", "x"), ("Ostwert [m]", "y"), ("Ostkoordinate", "y")]
+)
+def test_german_compounds_of_north_and_east(column: str, channel: str) -> None:
+    assert state_channel(words_of(column)) == channel

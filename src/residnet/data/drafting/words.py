@@ -18,7 +18,7 @@ _ABOUT: dict[str, str] = {
     " 時間 日時 | t time stamp tid sec secs seconds elapsed hora heure uhrzeit datum date"
     " datetime fecha utc dato",
     "north": "north nord norte noord hochwert 北 | n northing",
-    "east": "east ost oste este oost rechtswert 東 | e easting est",
+    "east": "east ost oste este oost rechtswert ostwert ostkoord ostricht 東 | e easting est",
     "position": "posit posic posisj coordin koordinat coorden coordonn 位置 | pos local utm pose",
     "x": "| x",
     "y": "| y",
