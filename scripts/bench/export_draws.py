@@ -31,7 +31,7 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 from drawn_models import Draw, Model, recording
-from playback import Recording, shares
+from playback import DOUBLE_ALONE, Recording, shares
 
 from residnet.core.errors import ResidnetError
 from residnet.dynamics.store import ModelSpec
@@ -61,7 +61,8 @@ def judged(
                 print(f"  {found.way} refuses: {found.refused}", flush=True)
                 if "\n" in found.refused:
                     wrong.append(f"{found.way}: refuses in several lines: {found.refused!r}")
-                if left := left_behind(folder / kind):
+                left = left_behind(folder / kind)
+                if left and found.refused != DOUBLE_ALONE:
                     wrong.append(f"{found.way}: refuses and leaves {left}")
                 continue
             said[f"{found.way}: held"] += 1

@@ -46,6 +46,8 @@ from residnet.export.onnx_file import OnnxModel
 
 ZIGZAG = ("zigzag", "zz", "_z_")
 """Parts of the names of logs that are zigzags."""
+DOUBLE_ALONE = "in double precision alone"
+"""Said of single precision where the C file has only double."""
 
 
 @dataclass(frozen=True)
@@ -223,7 +225,7 @@ def shares(
     def in_c(double: bool) -> np.ndarray:
         file = written("c")
         if not double and precision("c") is np.float64:
-            raise ExportError("in double precision alone")
+            raise ExportError(DOUBLE_ALONE)
         stepped = compiled(file, folder, spec, model.n_state, double)
         return played(stepped, given, np.float64 if double else np.float32)
 

@@ -28,17 +28,15 @@ from residnet.export.contract import (
     accepted,
     checked,
     require_numbers,
+    require_tracks,
     warmed,
 )
-from residnet.export.guard import GuardedDynamics
 from residnet.export.packages import require_package
 from residnet.export.stepping import Step, StepWithoutMemory
 
 _INPUTS, _OUTPUTS = ("x", "w", "s"), ("x_after", "s_after", "outside")
 # onnxruntime computes sines of doubles to thirteen digits
 _DOUBLE = 1e-7
-_TRACKS, _HELD = 16, 20
-"""Tracks whose inputs jump, and steps between the jumps."""
 
 
 class OnnxModel:
@@ -136,7 +134,8 @@ def _checked(
     tolerance = _DOUBLE if dtype == torch.float64 else contract.SINGLE
     found = checked(spec, model, stepped, "the ONNX file", dtype, tolerance)
     _require_rows(stepped, spec, model)
-    _require_tracks(stepped, spec, model, dtype, tolerance)
+    # onnxruntime adds up in another order than torch, which shows in double precision too
+    require_tracks(spec, model, stepped.rows, "the ONNX file", dtype, tolerance, tracks=16)
     return found
 
 
@@ -216,45 +215,4 @@ def _require_rows(stepped: OnnxModel, spec: ModelSpec, model: HybridDynamics) ->
         raise ExportError(
             f"model {spec.name}: the ONNX file gives other states for several rows at once than"
             " for each alone"
-        )
-
-
-def _require_tracks(
-    stepped: OnnxModel,
-    spec: ModelSpec,
-    model: HybridDynamics,
-    dtype: torch.dtype,
-    tolerance: float,
-) -> None:
-    """Refuse a precision whose rounding grows, on tracks whose inputs jump within the range.
-
-    onnxruntime adds up in another order than torch. Where a model hardly damps, what that rounds
-    otherwise differs much from track to track, so there are many, each from a state of its own.
-
-    Raises:
-        Apart: where a state of a track differs by more than `tolerance` of its range.
-    """
-    generator = torch.Generator().manual_seed(1)
-    guard = GuardedDynamics(model, spec).to(dtype).eval()
-    low, high = (torch.tensor(bound, dtype=dtype) for bound in (spec.low, spec.high))
-    places = (_TRACKS, contract.PARITY_STEPS // _HELD + 1, low.numel())
-    seen = low + torch.rand(places, generator=generator).to(dtype) * (high - low)
-    wanted = torch.cat((torch.zeros(_TRACKS, 3, dtype=dtype), seen[:, 0, :3]), dim=1)
-    memory = model.initial_state(_TRACKS).to(dtype)
-    x, s = wanted.numpy(), memory.numpy()
-    path, found = [wanted.numpy()], [x]
-    for k in range(contract.PARITY_STEPS):
-        w = seen[:, k // _HELD, 3:]
-        with torch.no_grad():
-            wanted, memory, _ = guard.flagged_step(wanted, w, memory)
-        x, s, _ = stepped.rows(x, w.numpy(), s)
-        path.append(wanted.numpy())
-        found.append(x)
-    states = np.stack(path)
-    span = np.maximum(np.ptp(states, axis=0), 1e-6)
-    worst = float((np.abs(np.stack(found) - states).max(axis=0) / span).max())
-    if not worst <= tolerance:
-        raise Apart(
-            f"model {spec.name}: the ONNX file differs from the model by {worst:.2g} of a state's"
-            f" range over {contract.PARITY_STEPS} steps; allowed {tolerance:g}"
         )
