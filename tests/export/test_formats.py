@@ -11,6 +11,7 @@ import json
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import casadi
 import numpy as np
@@ -29,6 +30,7 @@ from residnet.export.c.compiled import STRICT, CompiledModel, compile_shared, co
 from residnet.export.c.policy import export_autopilot_as_c
 from residnet.export.casadi_function import CasadiModel
 from residnet.export.contract import Stepped
+from residnet.export.guard import GuardedDynamics
 from residnet.export.lowering.build import lowered
 from residnet.export.onnx_file import OnnxModel
 from residnet.testing import check_bad_inputs
@@ -200,3 +202,25 @@ def test_a_policy_is_written_as_c(tmp_path: Path) -> None:
     stored = json.loads((tmp_path / "pilot.card.json").read_text())
     assert stored["parity"]["share_of_limit"] <= 1e-4
     assert "int pilot_step(const pilot_real *y" in (tmp_path / "pilot.h").read_text()
+
+
+def test_tracks_whose_inputs_jump_find_rounding_that_grows(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """What rounds states to four decimals is refused; the model itself is not."""
+    monkeypatch.setattr(contract, "PARITY_STEPS", 200)
+    spec, model = built("plsr")
+    guard = GuardedDynamics(model.float(), spec).eval()
+
+    def exact(x: Any, w: Any, s: Any) -> Any:
+        with torch.no_grad():
+            found = guard.flagged_step(*map(torch.from_numpy, (x, w, s)))
+        return tuple(part.numpy() for part in found)
+
+    def rounding(x: Any, w: Any, s: Any) -> Any:
+        after, memory, outside = exact(x, w, s)
+        return after.round(4), memory, outside
+
+    contract.require_tracks(spec, model, exact, "the file", torch.float32, 1e-5)
+    with pytest.raises(contract.Apart, match="the file differs from the model"):
+        contract.require_tracks(spec, model, rounding, "the file", torch.float32, 1e-5)

@@ -33,8 +33,8 @@ Numbers = npt.NDArray[np.floating[Any]]
 
 Rows = Callable[[Numbers, Numbers, Numbers], tuple[Numbers, Numbers, Any]]
 """States [B, 6], inputs [B, m] and memories [B, n_state] to those one step later, and flags [B]."""
-_HELD = 20
-"""Steps between the jumps of inputs."""
+_TRACKS, _HELD = 16, 20
+"""Tracks whose inputs jump, and steps between the jumps: eight may all miss what grows."""
 
 
 class Apart(ExportError):
@@ -85,7 +85,7 @@ def checked(
     """
     shares = require_parity(spec, model, stepped, what, dtype, tolerance)
     if dtype == torch.float32:
-        require_tracks(spec, model, _one_by_one(stepped), what, dtype, SINGLE, tracks=8)
+        require_tracks(spec, model, _one_by_one(stepped), what, dtype, SINGLE)
     require_defined(spec, model, stepped, what, dtype)
     return {"steps": PARITY_STEPS, "share_of_range": shares}
 
@@ -195,7 +195,6 @@ def require_tracks(
     what: str,
     dtype: torch.dtype,
     tolerance: float,
-    tracks: int,
 ) -> None:
     """Refuse a precision whose rounding grows, on tracks whose inputs jump within the range.
 
@@ -209,7 +208,6 @@ def require_tracks(
         what: was written, for messages.
         dtype: precision of both, float32 or float64.
         tolerance: largest difference as a share of a state's range.
-        tracks: how many.
 
     Raises:
         Apart: where a state of a track differs by more.
@@ -217,12 +215,12 @@ def require_tracks(
     generator = torch.Generator().manual_seed(1)
     guard = GuardedDynamics(model, spec).to(dtype).eval()
     low, high = (torch.tensor(bound, dtype=dtype) for bound in (spec.low, spec.high))
-    places = (tracks, PARITY_STEPS // _HELD + 1, low.numel())
+    places = (_TRACKS, PARITY_STEPS // _HELD + 1, low.numel())
     seen = low + torch.rand(places, generator=generator).to(dtype) * (high - low)
     w = seen[:, :, 3:].repeat_interleave(_HELD, dim=1)[:, :PARITY_STEPS]
     # the last column is the guard's flag
-    x0 = torch.cat((torch.zeros(tracks, 3), seen[:, 0, :3], torch.zeros(tracks, 1)), dim=1)
-    x0, s0 = x0.to(dtype), model.initial_state(tracks).to(dtype)
+    x0 = torch.cat((torch.zeros(_TRACKS, 3), seen[:, 0, :3], torch.zeros(_TRACKS, 1)), dim=1)
+    x0, s0 = x0.to(dtype), model.initial_state(_TRACKS).to(dtype)
     with torch.no_grad():
         wanted = scripted(Rollout(guard), PARITY_STEPS)(x0, w, s0)[0][..., : len(STATE)].numpy()
     x, s = x0[:, : len(STATE)].numpy(), s0.numpy()

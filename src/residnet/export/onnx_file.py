@@ -135,7 +135,7 @@ def _checked(
     found = checked(spec, model, stepped, "the ONNX file", dtype, tolerance)
     _require_rows(stepped, spec, model)
     # onnxruntime adds up in another order than torch, which shows in double precision too
-    require_tracks(spec, model, stepped.rows, "the ONNX file", dtype, tolerance, tracks=16)
+    require_tracks(spec, model, stepped.rows, "the ONNX file", dtype, tolerance)
     return found
 
 
