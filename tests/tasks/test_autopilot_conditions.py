@@ -20,6 +20,8 @@ from residnet.tasks.autopilot.stored import stored_policy
 from residnet.tasks.autopilot.task import AutopilotConfig
 from residnet.tasks.autopilot.tuned import tuned_before
 
+pytestmark = pytest.mark.whole_runs
+
 STATED = {"dt": "0.1 s", "duration": "6 s", "hold": "0 s", "delay": ["0 s", "0.3 s"]}
 TRAINING = {
     "epochs": 1, "steps": 1, "batch": 8, "dt": "0.1 s", "hold": "0 s", "validation": 8,

@@ -13,6 +13,8 @@ import yaml
 from read_page import plain
 from tiny import call
 
+pytestmark = pytest.mark.whole_runs
+
 CONFIG = """
 task: fit
 name: booklet

@@ -20,6 +20,8 @@ from tiny import TINY, call
 from residnet.dynamics.store import load_model
 from residnet.report.figures.files import read_figures
 
+pytestmark = pytest.mark.whole_runs
+
 FEATURES = ["u", "v", "r", "tau_x", "tau_n"]
 
 

@@ -17,6 +17,8 @@ from residnet.core.config import load_config
 from residnet.data.simulated.trials import SimulatedTrials, simulate
 from residnet.tasks.fit import FitConfig
 
+pytestmark = pytest.mark.whole_runs
+
 FERRY: dict[str, Any] = {
     "task": "fit",
     "name": "ferry",
