@@ -91,6 +91,15 @@ def run(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace an earlier run in its folder.")
     ] = False,
+    workers: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            max=1024,
+            metavar="N",
+            help="Models of a fit that are fitted side by side; one a core where not given.",
+        ),
+    ] = None,
     quiet: Quiet = False,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print summary.json and the run's folder, for machines.")
@@ -100,6 +109,7 @@ def run(
     ] = False,
 ) -> None:
     """Carry out a run: fit, evaluate, report and export, or any other task."""
+    from residnet.core.processes import spread
     from residnet.run_log import RunLog
     from residnet.tasks.loading import config_file, load_task
 
@@ -111,6 +121,7 @@ def run(
             stack.enter_context(log.until_the_end())
         kept = None if log is None else log.line
         stack.enter_context(drawn_progress(quiet=quiet or as_json, kept=kept))
+        stack.enter_context(spread(workers))
         finished = task.run(
             source=config_file(config),
             overrides=overrides or [],

@@ -59,6 +59,11 @@ def report(
         callback(Progress(stage, done, total, message, score))
 
 
+def listener() -> ProgressCallback | None:
+    """Return the callback that listens, for threads, which do not inherit it; None for none."""
+    return _callback.get()
+
+
 def say(message: str) -> None:
     """Tell the callback that listens, if there is one, a line about the work."""
     report("", message=message)

@@ -152,10 +152,21 @@ def rebuilt(spec: Stored, module: ModuleT) -> ModuleT:
         spec: what the module was built from.
         module: whose numbers are taken over.
     """
-    again = spec.build()
+    again = restored(spec, module.state_dict())
     assert isinstance(again, type(module))
-    _fill(again, module.state_dict())
-    return again.eval().requires_grad_(False)
+    return again
+
+
+def restored(spec: Stored, state: dict[str, Tensor]) -> nn.Module:
+    """Return the module of a description with its numbers filled in; in evaluation mode.
+
+    Args:
+        spec: what the module is built from.
+        state: its `state_dict()`.
+    """
+    module = spec.build()
+    _fill(module, state)
+    return module.eval().requires_grad_(False)
 
 
 def load_model(folder: Path) -> tuple[ModelSpec, HybridDynamics]:

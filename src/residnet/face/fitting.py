@@ -11,6 +11,7 @@ import torch
 from residnet.core.config import validate
 from residnet.core.errors import UsageError
 from residnet.core.names import nearest
+from residnet.core.processes import spread
 from residnet.core.progress import ProgressCallback
 from residnet.face.data import Data
 from residnet.face.logs import LogsGiven
@@ -141,6 +142,7 @@ def fit(
     integrator: str | None = None,
     seed: int = 0,
     threads: int = 1,
+    workers: int = 1,
     progress: ProgressCallback | None = None,
 ) -> Models:
     """Fit baselines, then heads on what each leaves, then ensembles.
@@ -171,6 +173,9 @@ def fit(
         seed: of weights and batches.
         threads: of PyTorch; one is fastest for these small products, and part of what makes a fit
             repeatable.
+        workers: models that may be fitted side by side, each in a process of its own, where they
+            take long; the numbers stay the same. With more than one, a script has to keep its calls
+            under `if __name__ == "__main__":`, since each process imports it again.
         progress: is told what is being fitted, and how far it is.
 
     Raises:
@@ -221,7 +226,7 @@ def fit(
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
-        with hearing(progress):
+        with hearing(progress), spread(workers):
             for split in ("validation", "test"):
                 for log in data.logs(split):
                     require_window(log, settings)

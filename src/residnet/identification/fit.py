@@ -12,7 +12,8 @@ from residnet.heads.genetic import GeneticConfig
 from residnet.identification.bands.calibrating import calibrate_bands
 from residnet.identification.fitter import Fitter
 from residnet.identification.identified import Identified
-from residnet.identification.models import FitStore, FittedModel, NoStore
+from residnet.identification.models import FitStore, NoStore
+from residnet.identification.parts import fit_parts, said
 from residnet.identification.settings import FitSettings
 from residnet.identification.standard import TIED
 from residnet.judge.verdict.selection import Selection
@@ -32,34 +33,21 @@ def fit(
         FitError: where the data do not determine a part, or a training never ran freely.
         DataError: where a split holds no sample or no window.
     """
-    fitter = Fitter(logs, settings, store or NoStore())
+    given, fitter = settings, Fitter(logs, settings, store or NoStore())
     settings = fitter.settings
     models = {"zero": fitter.zero()}
-    for name in settings.all_baselines:
-        with _optional(settings, name):
-            models[name] = fitter.baseline(name)
-            say(f"  {name}: {_said(models[name])}")
-    for name in settings.heads:
-        begin = settings.training[name].begin_with if name in settings.training else None
-        needed = [settings.baseline_name_of(name), *([] if begin is None else [begin])]
-        if any(other not in models for other in needed):
-            continue
-        say(f"  fitting {name}")
-        with _optional(settings, name):
-            start = None if begin is None else models[begin]
-            models[name] = fitter.head(name, models[needed[0]], start)
-            say(f"  {name}: {_said(models[name])} after {models[name].notes['seconds']:.1f} s")
+    fit_parts(fitter, logs, given, models, _optional)
     for name, force in settings.forces.items():
         if force.of in models:
             models[name] = fitter.with_force(name, models[force.of], force)
-            say(f"  {name}: {_said(models[name])}")
+            say(f"  {name}: {said(models[name])}")
     for name, members in settings.ensembles.items():
         models[name] = fitter.ensemble(name, [models[member] for member in members])
-        say(f"  {name}: {_said(models[name])}")
+        say(f"  {name}: {said(models[name])}")
     for name, gate in settings.gates.items():
         if gate.of in models:
             models[name] = fitter.gated(name, models[gate.of], gate)
-            say(f"  {name}: {_said(models[name])}")
+            say(f"  {name}: {said(models[name])}")
     identified = Identified(settings, models, fitter.limit, fitter.train, fitter.crossed)
     if settings.recipe is not None:
         _add_tied(identified, fitter, logs)
@@ -108,7 +96,7 @@ def _add_tied(
     model = fitter.ensemble(TIED, [identified.models[name] for name in tied])
     identified.models[TIED] = model
     identified.findings.update(identified.findings_of([model]))
-    say(f"  {TIED}: {_said(model)} (mean of {', '.join(tied)})")
+    say(f"  {TIED}: {said(model)} (mean of {', '.join(tied)})")
 
 
 def _apart(chosen: Selection) -> list[str]:
@@ -119,10 +107,3 @@ def _apart(chosen: Selection) -> list[str]:
     errors = {e.name: e.shares.tobytes() for e in chosen.contenders}
     first = {errors[name]: name for name in reversed(chosen.tied)}
     return [name for name in chosen.tied if first[errors[name]] == name]
-
-
-def _said(fitted: FittedModel) -> str:
-    """The validation error of a model in words, its divergences beside it."""
-    diverged = fitted.notes.get("validation_diverged", 0)
-    lost = f" ({diverged} windows DIVERGED)" if diverged else ""
-    return f"validation free-run error {fitted.notes['validation']:.4f}{lost}"

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import copy
-import dataclasses
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from residnet.baselines import BaselineConfig, Coefficient, ParametricBaseline, StillConfig
-from residnet.core.arrays import paged
 from residnet.core.errors import FitError
 from residnet.core.samples import Samples
 from residnet.data.prepare import Prepared, envelope, samples
@@ -26,12 +25,14 @@ from residnet.identification.cross_fitting.crossed import Crossed
 from residnet.identification.cross_fitting.prior_choice import (
     TAKEN,
     JudgedFold,
+    PriorChoice,
     choose_prior,
     judged_over,
 )
 from residnet.identification.fading import reach_in_free_runs
 from residnet.identification.models import FitStore, FittedModel
 from residnet.identification.prepared import velocity_limit
+from residnet.identification.residuals import least_squares_covariance, residual_samples
 from residnet.identification.settings import FitSettings, ForceConfig, GateConfig
 from residnet.identification.settling import settled
 from residnet.identification.solution_choice import choose_solution
@@ -39,8 +40,20 @@ from residnet.identification.validation import ValidationScore
 from residnet.training.config import TrainingConfig
 from residnet.training.refit import refit
 
-_ALIKE = 20
-"""Samples in a row whose errors hang together, where nothing else is known."""
+
+@dataclass(frozen=True)
+class FittedPart:
+    """A baseline or a head, with what folds of the logs say of it.
+
+    Attributes:
+        model: as it was kept.
+        crossed: its errors over parts of the logs that it was fitted without; None for none.
+        folds: these parts; empty for none.
+    """
+
+    model: FittedModel
+    crossed: Crossed | None = None
+    folds: tuple[JudgedFold, ...] = ()
 
 
 class Fitter:
@@ -105,7 +118,7 @@ class Fitter:
         spec = self.spec("zero", "zero", StillConfig())
         return self._kept(FittedModel(spec, spec.build(), {}))
 
-    def baseline(self, name: str = "baseline") -> FittedModel:
+    def baseline(self, name: str = "baseline") -> FittedPart:
         """Identify a baseline; refit it through rollouts where the settings ask for it."""
         spec = self.spec(name, "baseline", self.settings.all_baselines[name])
         model = spec.build()
@@ -120,29 +133,39 @@ class Fitter:
             **tried,
             "least_squares": self.validate(model).error,
         }
+        choice = None
         if name in self.settings.refit:
-            table, covariance = self._refit(name, model, table, notes)
+            table, covariance, choice = self._refit(name, model, table, notes)
         notes["coefficients"] = [_coefficient_row(entry) for entry in table]
         notes |= self._validated(model)
         notes["seconds"] = round(time.perf_counter() - started, 1)
-        return self._kept(FittedModel(spec, model, notes, covariance))
+        kept = self._kept(FittedModel(spec, model, notes, covariance))
+        if choice is None:
+            return FittedPart(kept)
+        own = choice.crossed.renamed({TAKEN: name, "zero": "zero"})
+        return FittedPart(kept, own, choice.folds)
+
+    def adopt(self, part: FittedPart) -> None:
+        """Take up what folds of the logs say of a baseline."""
+        if part.crossed is not None:
+            own = part.crossed
+            self.crossed = own if self.crossed is None else self.crossed.joined(own)
+            self.folds[part.model.name] = part.folds
 
     def _refit(
         self, name: str, model: HybridDynamics, table: list[Coefficient], notes: dict[str, Any]
-    ) -> tuple[list[Coefficient], torch.Tensor | None]:
-        """Move a baseline's coefficients through rollouts; returns their new table and covariance
-        and adds to the notes.
+    ) -> tuple[list[Coefficient], torch.Tensor | None, PriorChoice | None]:
+        """Move a baseline's coefficients through rollouts.
+
+        Returns their new table, their covariance and the choice of a prior, and adds to the notes.
         """
-        config = self.settings.refit[name]
+        config, choice = self.settings.refit[name], None
         if len(config.priors) > 1:
             spec = self.spec(name, "baseline", self.settings.all_baselines[name])
             choice = choose_prior(name, spec, config, self.settings, self.known, self.limit)
             notes["prior_choice"] = choice.table
-            own = choice.crossed.renamed({TAKEN: name, "zero": "zero"})
-            self.crossed = own if self.crossed is None else self.crossed.joined(own)
-            self.folds[name] = choice.folds
             if choice.prior is None:
-                return table, None
+                return table, None, choice
             config = config.with_prior(choice.prior)
         store = WindowStore.gather(self.train, torch.float64)
         refitted = refit(model, self.samples, store, config, self.scales)
@@ -156,7 +179,8 @@ class Fitter:
         notes["refit"] = refitted.notes
         if refitted.offsets.axes:
             notes["offsets"] = refitted.offsets.table([log.log.name for log in self.train])
-        return model.baseline.updated_table(table, refitted.errors), refitted.covariance
+        table = model.baseline.updated_table(table, refitted.errors)
+        return table, refitted.covariance, choice
 
     def head(
         self, name: str, baseline: FittedModel, begin: FittedModel | None = None
@@ -310,39 +334,9 @@ class Fitter:
 
         What is judged is then bit for bit what is stored, and a resumed fit judges the same.
         """
-        kept = dataclasses.replace(fitted, model=rebuilt(fitted.spec, fitted.model))
+        kept = replace(fitted, model=rebuilt(fitted.spec, fitted.model))
         self.store.keep(kept)
         return kept
-
-
-def least_squares_covariance(baseline: nn.Module, known: Samples) -> Tensor | None:
-    """Return the covariance [P, P] of a baseline's coefficients from accelerations alone.
-
-    None where it has no coefficients that may move.
-    """
-    if not isinstance(baseline, ParametricBaseline):
-        return None
-    information = len(known) / _ALIKE * baseline.information(known)
-    covariance: Tensor = torch.linalg.pinv(information, hermitian=True)
-    return covariance
-
-
-def residual_samples(model: HybridDynamics, known: Samples) -> Samples:
-    """Return samples whose target is what the model's baseline leaves.
-
-    That is an acceleration (document 003 (19)) or a force (document 002 (3.20)), as the model's
-    head wants it.
-
-    Args:
-        model: with its baseline filled in.
-        known: samples whose target is the measured acceleration.
-    """
-    with torch.no_grad():
-        explained = paged.rows(len(known), 3)
-        for rows in paged.row_pieces(len(known)):
-            explained[rows] = model.baseline(known.z[rows])
-            paged.forget()
-        return model.head.residual_target(known, explained)
 
 
 def _coefficient_row(entry: Coefficient) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from residnet.core.config import BaseConfig, load_config
 from residnet.core.errors import UsageError
 from residnet.core.files import read_json
 from residnet.core.names import nearest
+from residnet.core.processes import processes
 from residnet.core.progress import report
 from residnet.report.blocks import Section
 from residnet.report.comparison import Variant, table, window_nrmse
@@ -23,7 +24,6 @@ from residnet.report.sections.study import draw, sections, variants_table
 from residnet.runs.folder import RunFolder
 from residnet.runs.task import MainFigure, Outcome, Task
 from residnet.tasks.fit import FitConfig
-from residnet.tasks.processes import processes
 
 _Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")]
 

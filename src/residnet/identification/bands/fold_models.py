@@ -18,9 +18,9 @@ from residnet.data.windows import WindowStore
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.heads import ClosedFormHead
 from residnet.heads.base import EquationHead
-from residnet.identification.fitter import residual_samples
 from residnet.identification.identified import Identified
 from residnet.identification.models import FittedModel
+from residnet.identification.residuals import residual_samples
 from residnet.regression.solutions import Solution
 from residnet.training.free_runs.left_out import without_logs
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -40,17 +40,17 @@ Prior = float | None
 
 @dataclass(frozen=True)
 class JudgedFold:
-    """A part of the logs, and the model that was fitted without it.
+    """A part of the logs, and the numbers of the model that was fitted without it.
 
     Attributes:
         windows: of the part.
         logs: that these belong to.
-        model: with the chosen prior; None where its fit failed.
+        state: numbers of the model with the chosen prior; None where its fit failed.
     """
 
     windows: list[Window]
     logs: list[Prepared]
-    model: HybridDynamics | None
+    state: Mapping[str, torch.Tensor] | None
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,8 @@ def choose_prior(
     return replace(
         choice,
         folds=tuple(
-            JudgedFold(found, fold.held_out, models[choice.prior]) for found, fold, models in fitted
+            JudgedFold(found, fold.held_out, _state(models[choice.prior]))
+            for found, fold, models in fitted
         ),
     )
 
@@ -149,14 +150,18 @@ def judged_over(
     predicted: list[Prediction] = []
     for fold in folds:
         model = None
-        if fold.model is not None:
+        if fold.state is not None:
             model = spec.build()
-            model.load_state_dict(fold.model.state_dict())
+            model.load_state_dict(dict(fold.state))
         step = settings.prepare.grid.step
         predicted += _predicted(model, spec, fold.windows, fold.logs, step, limit)
         windows += [_moved(window, len(pool)) for window in fold.windows]
         pool += fold.logs
     return Crossed.of(FreeRun("", "", windows, {name: predicted}), pool, settings.evaluation)
+
+
+def _state(model: HybridDynamics | None) -> dict[str, torch.Tensor] | None:
+    return None if model is None else model.state_dict()
 
 
 def _key(prior: Prior) -> str:

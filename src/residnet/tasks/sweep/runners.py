@@ -12,7 +12,7 @@ from pydantic import Field
 
 from residnet.core.config import Config
 from residnet.core.errors import FitError, MissingPackageError
-from residnet.tasks.processes import ThisProcess, processes
+from residnet.core.processes import ThisProcess, processes, spread
 
 
 class ProcessesConfig(Config):
@@ -47,7 +47,8 @@ class ProcessesConfig(Config):
             FitError: where the system ends one of them.
         """
         if self.side_by_side == 1:
-            yield ThisProcess()
+            with spread(1):
+                yield ThisProcess()
             return
         with processes(self.side_by_side) as pool:
             yield pool

@@ -8,25 +8,62 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from contextvars import ContextVar
 from multiprocessing import active_children, connection, get_context, parent_process
 from threading import Thread
 from typing import Any
 
 from residnet.core.errors import FitError
 
+_cores: ContextVar[int] = ContextVar("residnet_cores", default=1)
+
+
+def free_cores() -> int:
+    """Return how many cores work may spread over, where nobody names a number of processes.
+
+    One, unless `spread` says otherwise: a new process imports the program that it belongs to again,
+    and a program of the user's own need not be made for that.
+    """
+    return _cores.get()
+
 
 @contextmanager
-def processes(workers: int) -> Iterator[Executor]:
+def spread(cores: int | None = None) -> Iterator[None]:
+    """Let the work within the context spread over several cores.
+
+    Args:
+        cores: number of them; None for all that this process may use.
+    """
+    if cores is None:
+        from joblib import cpu_count
+
+        cores = int(cpu_count())
+    token = _cores.set(cores)
+    try:
+        yield
+    finally:
+        _cores.reset(token)
+
+
+@contextmanager
+def processes(
+    workers: int, begin: Callable[..., None] | None = None, given: tuple[Any, ...] = ()
+) -> Iterator[Executor]:
     """Hold processes for work side by side; an interruption ends them all at once.
 
     Args:
         workers: number of processes; each is started when it is first needed.
+        begin: is called once in each process, before its first work.
+        given: to `begin`.
 
     Raises:
         FitError: where the system ends one of the processes.
     """
     with ProcessPoolExecutor(
-        workers, mp_context=get_context("spawn"), initializer=begin_worker
+        workers,
+        mp_context=get_context("spawn"),
+        initializer=begin_worker,
+        initargs=(begin, given),
     ) as pool:
         try:
             yield pool
@@ -46,21 +83,30 @@ class ThisProcess(Executor):
     """An executor that does its work at once, in the process that hands it over."""
 
     def submit(self, work: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Do the work; returns a future that is done."""
+        """Do the work; returns a future that is done, with what the work raised where it failed."""
         future: Future[Any] = Future()
-        future.set_result(work(*args, **kwargs))
+        try:
+            future.set_result(work(*args, **kwargs))
+        except Exception as error:
+            future.set_exception(error)
         return future
 
 
-def begin_worker() -> None:
+def begin_worker(begin: Callable[..., None] | None = None, given: tuple[Any, ...] = ()) -> None:
     """Leave Ctrl-C to the process that began this one, and end with it, however it ends.
 
     Ctrl-C reaches every process of a terminal; a process that is killed cannot tell its children.
+
+    Args:
+        begin: is called then.
+        given: to it.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = parent_process()
     if parent is not None:
         Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
+    if begin is not None:
+        begin(*given)
 
 
 def _end_with(sentinel: int) -> None:
