@@ -42,7 +42,9 @@ const use = async (page, pause) => {
   const root = page.querySelector(".explorer");
   if (root === null) return {};
   const plots = page.defaultView.Bokeh.documents[0];
-  const plot = plots.get_model_by_name(root.id + "-1"), range = plot.x_range;
+  const plot = plots.get_model_by_name(root.id + "-1") ||
+    plots.get_model_by_name(root.id + "-0");
+  const range = plot.x_range;
   const width = () => range.end - range.start, begin = width();
   const press = async text => {
     const button = [...root.querySelectorAll("button")].find(b => b.textContent === text);
