@@ -13,6 +13,7 @@ from residnet.core.config import validate
 from residnet.core.errors import ConfigError, DataError
 from residnet.core.log import Log
 from residnet.data.doctor.compare import comparison_findings
+from residnet.data.parts import log_names
 from residnet.data.split import SplitConfig, check_leaks
 
 
@@ -141,11 +142,28 @@ def test_other_faults(root: Path) -> None:
         resolve(file=root / "none.yaml")
     with pytest.raises(ConfigError, match="is not a folder"):
         resolve(root=root / "none", train=["a"], validation=["b"], test=["c"])
-    (root / "zigzag/a.csv").write_text("t\n")
-    with pytest.raises(ConfigError, match="would both be the log 'a'"):
-        resolve(
-            root=root, train=["zigzag/a.csv"], validation=["zigzag/d.csv"], test=["turning/a.csv"]
-        )
+
+
+def test_logs_of_one_name_are_told_apart_by_their_folders(root: Path) -> None:
+    for name in ("zigzag/a.csv", "day_1/run_1/log.csv", "day_2/run_1/log.csv", "day_2/log.csv"):
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_text("t\n")
+    (root / "day_2/log.txt").write_text("t\n")
+    paths = [path for path in sorted(root.rglob("*.*")) if path.suffix != ".yaml"]
+    names = log_names([*paths, paths[0]])
+    assert len(set(names.values())) == len(names) == len(paths)
+    told = {path.relative_to(root).as_posix(): name for path, name in names.items()}
+    assert told["zigzag/a.csv"] == "zigzag_a"
+    assert told["turning/a.csv"] == "turning_a"
+    assert told["day_1/run_1/log.csv"] == "day_1_run_1_log"
+    assert told["day_2/run_1/log.csv"] == "day_2_run_1_log"
+    assert (told["day_2/log.csv"], told["day_2/log.txt"]) == ("log_csv", "log_txt")
+    # a name that only one log has stays as it is
+    assert told["zigzag/d.csv"] == "d"
+    found = resolve(
+        root=root, train=["zigzag/a.csv"], validation=["zigzag/d.csv"], test=["turning/a.csv"]
+    )
+    assert [len(paths) for paths in found.values()] == [1, 1, 1]
 
 
 def copied(log: Log, start: int, stop: int, turns: int = 0) -> Log:

@@ -84,8 +84,10 @@ def test_two_recordings_of_one_name(
     for day in ("monday", "tuesday"):
         (tmp_path / day).mkdir()
         recorded(tmp_path / day, "rec_a", 2.0)
-    assert call(monkeypatch, "check", config(tmp_path, logs=["*/rec_a"])) == 2
-    assert "would both be the log 'rec_a'" in capsys.readouterr().err
+    run = tmp_path / "run"
+    assert call(monkeypatch, "run", config(tmp_path, logs=["*/rec_a"]), "--out", run) == 0
+    assert set(json.loads((run / "findings.json").read_text())) == {"monday_rec_a", "tuesday_rec_a"}
+    assert len({path.name for path in run.rglob("*_rec_a.*")}) >= 2
 
 
 def test_a_check_reads_a_recording_as_the_run_will(

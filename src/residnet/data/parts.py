@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -155,6 +156,42 @@ def _holds_recordings(folder: Path) -> bool:
     below = [path for path in folder.iterdir() if path.is_dir()]
     names = [frozenset(f.relative_to(path) for f in files_of(path)) for path in below]
     return any(names.count(held) > 1 and len(held) > 1 for held in names)
+
+
+def log_names(paths: Iterable[Path]) -> dict[Path, str]:
+    """Return the name of each log: that of its file without the ending, or of its folder.
+
+    Where several files or folders have one name, as with a folder for each trial, the folders above
+    come before it as far as they are needed to tell the logs apart; of files in one folder the
+    ending comes behind it.
+
+    Args:
+        paths: files and recordings; one that is given twice is one log.
+    """
+    given = list(dict.fromkeys(paths))
+    real = {path: path.resolve() for path in given}
+    above = dict.fromkeys(given, 0)
+    beside = Counter((own.parent, path.stem) for own, path in {real[p]: p for p in given}.items())
+    while True:
+        names = {path: _name(path, real[path], above[path], beside) for path in given}
+        owners: dict[str, set[Path]] = {}
+        for path, name in names.items():
+            owners.setdefault(name, set()).add(real[path])
+        again = [
+            path
+            for path, name in names.items()
+            if len(owners[name]) > 1 and above[path] < len(real[path].parents) - 1
+        ]
+        if not again:
+            return names
+        for path in again:
+            above[path] += 1
+
+
+def _name(path: Path, real: Path, above: int, beside: Mapping[tuple[Path, str], int]) -> str:
+    alone = path.is_dir() or beside[real.parent, path.stem] == 1
+    own = (path.name if path.is_dir() else path.stem) if alone else path.name.replace(".", "_")
+    return "_".join([*(parent.name for parent in reversed(real.parents[:above])), own])
 
 
 def data_files(paths: Iterable[Path]) -> list[Path]:

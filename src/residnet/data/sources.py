@@ -13,7 +13,7 @@ from residnet.core.errors import DataError
 from residnet.core.log import Log
 from residnet.core.progress import report
 from residnet.data.division import divided
-from residnet.data.parts import data_files
+from residnet.data.parts import data_files, log_names
 from residnet.data.readers import ReaderConfig
 from residnet.data.simulated.trials import SimulatedTrials, simulate
 from residnet.data.split import SplitConfig, check_leaks
@@ -69,11 +69,12 @@ def read_logs(config: MeasuredLogs | SimulatedTrials) -> Splits:
 def _all_logs(config: MeasuredLogs) -> dict[Path, Log]:
     """Return every log of the splits, each read once; after 200,000 samples they lie on disk."""
     reader, files = config.reader.build(), config.split.files()
+    names = log_names(files)
     out: dict[Path, Log] = {}
     samples = 0
     for number, path in enumerate(files):
         report("reading logs", number, len(files))
-        log = reader.read(path)
+        log = reader.read(path).replace(name=names[path])
         samples += len(log)
         out[path] = log if samples <= paged.LARGE else log.on_disk()
     report("reading logs", len(files), len(files))

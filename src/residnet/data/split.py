@@ -70,8 +70,8 @@ class SplitConfig(Config):
         The matches of a pattern are sorted.
 
         Raises:
-            ConfigError: where a split is empty, a pattern matches nothing, or a stretch or the name
-                of a log occurs in two places.
+            ConfigError: where a split is empty, a pattern matches nothing, or a stretch stands in
+                two splits.
         """
         if self.auto:
             return {}
@@ -141,9 +141,8 @@ def _from_file(file: Path) -> dict[str, tuple[str | LogPart, ...]]:
 
 
 def _require_distinct(parts: Mapping[str, Sequence[Part]], where: str) -> None:
-    """Stop where two splits name the same stretch, or two files would be one log."""
+    """Stop where two splits name the same stretch."""
     seen: list[tuple[Path, str, Part]] = []
-    names: dict[str, Path] = {}
     for split, members in parts.items():
         for part in members:
             real = part.path.resolve()
@@ -154,12 +153,6 @@ def _require_distinct(parts: Mapping[str, Sequence[Part]], where: str) -> None:
                         f"{where}: {what}{part.path} stands in {owner} and in {split}; a"
                         f" {'file' if part.whole else 'stretch'} belongs to one split"
                     )
-            name = part.path.name if part.path.is_dir() else part.path.stem
-            if names.setdefault(name, real) != real:
-                raise ConfigError(
-                    f"{where}: {names[name]} and {part.path} would both be the log"
-                    f" '{name}'; rename one of the files"
-                )
             seen.append((real, split, part))
 
 

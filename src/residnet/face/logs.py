@@ -11,6 +11,7 @@ from residnet.core.config import validate
 from residnet.core.errors import UsageError
 from residnet.core.log import Log
 from residnet.core.progress import ProgressCallback, report, say
+from residnet.data.parts import log_names
 from residnet.data.readers import LogReader, ReaderConfig
 from residnet.data.readers.detect import format_of, reader_for
 from residnet.face.values import PartGiven, PathGiven, described, hearing, part, path, plain
@@ -64,10 +65,10 @@ def read_logs(
     with hearing(progress):
         files = _files(given)
         chosen = _reader(files[0], channels, time, manoeuvre, reader)
-        logs = []
+        logs, names = [], log_names(files)
         for number, file in enumerate(files):
             report("reading logs", number, len(files))
-            logs.append(_read(file, chosen, number == 0))
+            logs.append(_read(file, chosen, number == 0).replace(name=names[file]))
         report("reading logs", len(files), len(files))
     return logs
 

@@ -13,6 +13,7 @@ from residnet.core.errors import ConfigError
 from residnet.core.log import Log
 from residnet.core.names import nearest
 from residnet.core.progress import report
+from residnet.data.parts import log_names
 from residnet.data.readers import ReaderConfig
 from residnet.data.readers.files import files_of
 from residnet.report.blocks import Section
@@ -45,8 +46,8 @@ class ImportConfig(Task):
         The smallest recording of each kind of file is read, unless it is large.
 
         Raises:
-            ResidnetError: where a pattern matches nothing, two recordings would have one name, or a
-                recording cannot be read as the config says.
+            ResidnetError: where a pattern matches nothing, or a recording cannot be read as the
+                config says.
         """
         reader = self.reader.build()
         smallest: dict[str, tuple[int, Path]] = {}
@@ -70,12 +71,12 @@ class ImportConfig(Task):
             DataError: where a recording cannot be used; those before it have been written.
         """
         paths = self._paths()
-        reader = self.reader.build()
+        reader, names = self.reader.build(), log_names(paths)
         findings: dict[str, Any] = {}
         lines: list[str] = []
         for number, path in enumerate(paths):
             report("reading recordings", number, len(paths))
-            log = reader.read(path)
+            log = reader.read(path).replace(name=names[path])
             _write(log, folder)
             findings[log.name] = log.meta.get("findings", [])
             lines += _lines(log)
@@ -100,7 +101,7 @@ class ImportConfig(Task):
 
     def _paths(self) -> list[Path]:
         root = self.root or Path.cwd()
-        found: dict[str, Path] = {}
+        found: dict[Path, None] = {}
         for pattern in self.logs:
             matches = [root / pattern] if (root / pattern).exists() else _globbed(root, pattern)
             if not matches:
@@ -110,14 +111,8 @@ class ImportConfig(Task):
                     else f"; there is no folder {root}"
                 )
                 raise ConfigError(f"logs: '{pattern}' matches nothing in {root}{near}")
-            for path in matches:
-                name = path.name if path.is_dir() else path.stem
-                if found.setdefault(name, path) != path:
-                    raise ConfigError(
-                        f"logs: {found[name]} and {path} would both be the log '{name}'; rename one"
-                        " of them"
-                    )
-        return list(found.values())
+            found.update(dict.fromkeys(matches))
+        return list(found)
 
 
 def _globbed(root: Path, pattern: str) -> list[Path]:

@@ -27,6 +27,7 @@ from residnet.data.doctor.dates import date_findings
 from residnet.data.doctor.excitation import conditioning
 from residnet.data.drafting.header_map import draft_map
 from residnet.data.masks import Mask
+from residnet.data.parts import log_names
 from residnet.data.readers.base import LogReader
 from residnet.data.readers.composing.composed import RecordingConfig
 from residnet.data.readers.detect import format_of, reader_for
@@ -93,6 +94,7 @@ def inspect_logs(paths: Sequence[Path], config: Path | None) -> Inspection:
     """
     setup = Reading() if config is None else reading(config)
     files = log_files(paths, setup.folders or config is None)
+    names = log_names(files)
     logs: list[Log] = []
     reports: list[Report] = []
     drafts: dict[str, list[str]] = {}
@@ -101,12 +103,13 @@ def inspect_logs(paths: Sequence[Path], config: Path | None) -> Inspection:
         progress.report("inspecting logs", number, len(files))
         try:
             log, draft = _read(path, setup)
+            log = log.replace(name=names[path])
             report = inspect(log, setup.inputs, setup.masks).joined(date_findings(log, path))
         except DataError as error:
             if len(files) == 1:
                 raise
             reports.append(
-                Report(path.stem, (Finding("fatal", "unreadable", str(error)),), str(path))
+                Report(names[path], (Finding("fatal", "unreadable", str(error)),), str(path))
             )
         else:
             logs.append(log)
@@ -149,7 +152,7 @@ def reading(config: Path) -> Reading:
     except ConfigError:
         # the split's own files need not be here to look at others
         splits = {}
-    named = {path.stem: split for path, split in splits.items()}
+    named = {name: splits[path] for path, name in log_names(splits).items()}
     reader = task.data.reader
     return Reading(
         reader.build(),

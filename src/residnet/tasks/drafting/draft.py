@@ -285,11 +285,9 @@ def _split(
         entries[split] = []
         for log in logs:
             ends = log.meta.get("stretch")
-            path = next(
-                path
-                for name, path in paths.items()
-                if (ends and log.name.startswith(name)) or name == log.name
-            )
+            # the name of a stretch begins with that of its log, and may with a shorter one
+            own = [n for n in paths if n == log.name or (ends and log.name.startswith(n))]
+            path = paths[max(own, key=len)]
             entry: Any = path.resolve().relative_to(common).as_posix()
             if ends:
                 source = usable[path]

@@ -16,7 +16,7 @@ from residnet.data.drafting.recordings import draft_recordings
 from residnet.data.drafting.sheets import ENDINGS
 from residnet.data.drafting.tables import draft_tables
 from residnet.data.motion import MotionConfig, complete_motion
-from residnet.data.parts import logs_below
+from residnet.data.parts import log_names, logs_below
 from residnet.data.readers import ReaderConfig
 from residnet.data.readers.detect import format_of
 
@@ -87,17 +87,12 @@ def read_all(paths: Sequence[Path], marks: Marks) -> ReadLogs:
         content = draft_recordings(paths, marks)
     reader = validate(content, ReaderConfig, "draft").build()
     logs: dict[Path, Log] = {}
-    names: dict[str, Path] = {}
+    names = log_names(paths)
     for number, path in enumerate(paths):
         report("reading logs", number, len(paths))
         try:
             if path not in left_out:
-                log = reader.read(path)
-                if log.name in names:
-                    left_out[path] = f"{names[log.name]} has the same name; rename one of them"
-                    continue
-                names[log.name] = path
-                logs[path] = log
+                logs[path] = reader.read(path).replace(name=names[path])
         except ResidnetError as error:
             left_out[path] = str(error)
     report("reading logs", len(paths), len(paths))

@@ -9,11 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from residnet.core.config import dump_config
-from residnet.core.errors import DataError
 from residnet.core.log import Log
 from residnet.core.progress import say
+from residnet.data.parts import log_names
 from residnet.data.prepare import prepare
 from residnet.data.readers import CanonicalConfig
+from residnet.data.readers.composing.composed import RecordingConfig
 from residnet.data.simulated.trials import SimulatedTrials
 from residnet.identification.evaluation import candidates, evaluate
 from residnet.identification.prepared import require_window, velocity_limit
@@ -52,20 +53,16 @@ class ExternalLogs:
             paths: files and folders.
 
         Raises:
-            DataError: where a log cannot be used or is too short, or two have one name.
+            DataError: where a log cannot be used or is too short.
             UsageError: where a path or a channel is missing.
         """
         self.config, self.run = config, run
-        files = log_files(paths)
+        files = log_files(paths, takes_folders(config))
         self.provenance = Provenance(run.resolved, (), config.seed, files, time.time())
-        self.read = [read_external(path, config) for path in files]
+        self.read = read_external(files, config)
         self.logs = [
             prepare(log, SPLIT, config.signals.columns, config.prepare) for log in self.read
         ]
-        names = [log.log.name for log in self.logs]
-        for name in names:
-            if names.count(name) > 1:
-                raise DataError(f"two logs are named '{name}'; rename one file")
         for log in self.logs:
             require_window(log, config)
 
@@ -112,12 +109,21 @@ class ExternalLogs:
         return fit_outcome(folder, SPLIT)
 
 
-def read_external(path: Path, config: FitTaskSettings) -> Log:
-    """Read a log as the run read its own; canonical files are recognised by their own mark.
+def takes_folders(config: FitTaskSettings) -> bool:
+    """Return whether a folder may be one log for the run's reader, as a ROS 2 bag is."""
+    data = config.data
+    return not isinstance(data, SimulatedTrials) and isinstance(data.reader, RecordingConfig)
+
+
+def read_external(paths: Sequence[Path], config: FitTaskSettings) -> list[Log]:
+    """Read logs as the run read its own; canonical files are recognised by their own mark.
 
     Raises:
-        ResidnetError: where the file cannot be read.
+        ResidnetError: where a file cannot be read.
     """
-    if isinstance(config.data, SimulatedTrials) or Log.recognises(path):
-        return CanonicalConfig().build().read(path)
-    return config.data.reader.build().read(path)
+    data = config.data
+    own = CanonicalConfig() if isinstance(data, SimulatedTrials) else data.reader
+    return [
+        (CanonicalConfig() if Log.recognises(path) else own).build().read(path).replace(name=name)
+        for path, name in log_names(paths).items()
+    ]

@@ -21,7 +21,7 @@ from residnet.identification.prepared import prepare_logs
 from residnet.runs.folder import RunFolder
 from residnet.runs.model_store import FolderStore
 from residnet.tasks.fit.config import FitTaskSettings
-from residnet.tasks.fit.external import SPLIT, read_external
+from residnet.tasks.fit.external import SPLIT, read_external, takes_folders
 from residnet.tasks.fit.inputs import take_logs
 from residnet.tasks.log_files import log_files
 
@@ -139,10 +139,10 @@ def in_service(
         known = ["selected", *store.names()]
         raise UsageError(f"{run.path}: no model '{name}'{nearest(name, known)}")
     fitted = store.load(name)
-    files = log_files(paths)
+    files = log_files(paths, takes_folders(config))
     new = [
-        prepare(read_external(path, config), SPLIT, config.signals.columns, config.prepare)
-        for path in files
+        prepare(log, SPLIT, config.signals.columns, config.prepare)
+        for log in read_external(files, config)
     ]
     past, steps = past_of(fitted.model), round(chosen.window / fitted.spec.dt)
     clean = [pieces(log, steps, past) for log in _clean(config)]

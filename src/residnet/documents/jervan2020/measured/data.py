@@ -12,6 +12,7 @@ from torch import Tensor
 
 from residnet.core.errors import DataError, FitError
 from residnet.core.layout import ACCELERATIONS, PLANAR, POSE, VELOCITIES
+from residnet.data.parts import log_names
 from residnet.data.prepare import Prepared, prepare
 from residnet.data.split import check_leaks
 from residnet.documents.jervan2020.measured.config import FoldsConfig, ForceSettings
@@ -179,7 +180,8 @@ def _read(config: ForceSettings) -> list[Prepared]:
         DataError: where two logs have rows in common, or a log holds no usable samples.
     """
     reader = config.data.reader.build()
-    recorded = [reader.read(path) for path in config.data.files()]
+    names = log_names(config.data.files())
+    recorded = [reader.read(path).replace(name=name) for path, name in names.items()]
     # a model would be fitted to the very samples that judge it
     check_leaks({log.name: [log] for log in recorded})
     logs = [prepare(log, "all", config.channels.columns(), config.prepare) for log in recorded]
