@@ -11,7 +11,7 @@ import numpy as np
 from residnet.core.config import dump_config
 from residnet.core.log import Log
 from residnet.core.progress import say
-from residnet.data.parts import log_names
+from residnet.data.parts import data_files, log_names
 from residnet.data.prepare import prepare
 from residnet.data.readers import CanonicalConfig
 from residnet.data.readers.composing.composed import RecordingConfig
@@ -58,7 +58,7 @@ class ExternalLogs:
         """
         self.config, self.run = config, run
         files = log_files(paths, takes_folders(config))
-        self.provenance = Provenance(run.resolved, (), config.seed, files, time.time())
+        self.provenance = Provenance(run.resolved, (), config.seed, data_files(files), time.time())
         self.read = read_external(files, config)
         self.logs = [
             prepare(log, SPLIT, config.signals.columns, config.prepare) for log in self.read

@@ -12,6 +12,7 @@ import numpy as np
 from residnet.core.config import validate
 from residnet.core.errors import DataError, UsageError
 from residnet.core.names import nearest
+from residnet.data.parts import data_files
 from residnet.data.prepare import Prepared, prepare
 from residnet.identification.models import FittedModel
 from residnet.identification.monitoring.monitor import MonitorConfig, Verdict, Watch
@@ -146,7 +147,8 @@ def in_service(
     ]
     past, steps = past_of(fitted.model), round(chosen.window / fitted.spec.dt)
     clean = [pieces(log, steps, past) for log in _clean(config)]
-    return Service(fitted, Watch(fitted.spec, fitted.model, clean, chosen), files, new)
+    watch = Watch(fitted.spec, fitted.model, clean, chosen)
+    return Service(fitted, watch, data_files(files), new)
 
 
 def watch_logs(service: Service) -> list[WatchedLog]:
