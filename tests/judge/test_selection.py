@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -165,6 +166,26 @@ def test_the_more_precise_of_two_comparisons_counts() -> None:
     # two baselines are compared over the folds, which are more logs
     linear = judged("linear", 0.3, 0.02, 0.1, "refitted baseline")
     assert difference(linear, hull, both)[0] == pytest.approx(0.1)
+
+
+def test_stretches_of_one_validation_log_do_not_overrule_folds() -> None:
+    """A patrol vessel with five minutes of logs: a line in each channel stood before the hull."""
+    both = EVEN.beside(replace(EVEN, of="stretches"))
+
+    def judged(name: str, folds: float, alone: float, family: str, gain: float) -> Contender:
+        over_folds, direct = (folds + 0.02 * JITTER) / 5, (alone + 0.001 * JITTER) / 5
+        return Contender(
+            name, family, 10, np.concatenate((over_folds, np.full(5, gain / 5))), direct=direct
+        )
+
+    linear = judged("baseline", 0.53, 0.38, "refitted baseline", 0.0)
+    hull = judged("hull", 0.32, 0.47, "refitted baseline", 0.0)
+    network = judged("hull_network", 0.32, 0.46, "network", -0.01)
+    assert difference(network, linear, both)[0] == pytest.approx(-0.22)
+    found = choose((ZERO_OF_FOLDS, linear, hull, network), both)
+    assert found.selected == "hull_network"
+    # five whole logs or more may
+    assert difference(network, linear, EVEN.beside(EVEN))[0] == pytest.approx(0.08)
 
 
 ZERO_OF_FOLDS = Contender(

@@ -103,16 +103,18 @@ def difference(one: Contender, other: Contender, blocks: Blocks) -> tuple[float,
 
     Over folds a network is judged by way of its baseline. Where two networks stand on baselines
     that differ much from log to log, this tells less than the validation logs alone, and where it
-    does, these speak.
+    does, these speak. Stretches of fewer than five logs do not: they resemble each other, and tell
+    nothing of how logs differ.
     """
     told = one.error - other.error, blocks.standard_error(one.shares, other.shares)
-    if blocks.further is None or one.direct is None or other.direct is None:
+    further = blocks.further
+    if further is None or further.of != "logs" or one.direct is None or other.direct is None:
         return told
     count = len(blocks.weights)
     if np.array_equal(one.shares[count:], other.shares[count:]):
         return told
     alone = float((one.direct - other.direct).sum())
-    spread = blocks.further.standard_error(one.direct, other.direct)
+    spread = further.standard_error(one.direct, other.direct)
     return (alone, spread) if 0.0 < spread < told[1] else told
 
 
