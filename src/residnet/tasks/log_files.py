@@ -8,14 +8,16 @@ from pathlib import Path
 from residnet.core.errors import UsageError
 from residnet.data.parts import logs_below
 
+_TABLES = (".csv", ".parquet")
+
 
 def log_files(paths: Sequence[Path], folders: bool = False) -> list[Path]:
     """Return the files, and the logs below folders, in order.
 
     Args:
         paths: files and folders.
-        folders: a folder may itself be a log, as a ROS 2 bag is, and logs below folders are of any
-            format; else they are csv and Parquet files.
+        folders: a folder may itself be a log, as a ROS 2 bag is, and where a folder holds neither
+            such nor tables, logs of any other format are taken.
 
     Raises:
         UsageError: where a path does not exist or a folder holds no log.
@@ -23,14 +25,14 @@ def log_files(paths: Sequence[Path], folders: bool = False) -> list[Path]:
     files: list[Path] = []
     for path in paths:
         if path.is_dir():
-            found = (
-                logs_below(path)
-                if folders
-                else sorted(p for p in path.rglob("*") if p.suffix in {".csv", ".parquet"})
-            )
+            below = logs_below(path) if folders else sorted(path.rglob("*"))
+            # notes and settings often lie beside tables
+            found = [p for p in below if (folders and p.is_dir()) or p.suffix in _TABLES]
+            if not found and folders:
+                found = below
             if not found:
-                known = "log of a format that is known" if folders else "csv or Parquet file"
-                raise UsageError(f"{path}: holds no {known}")
+                more = ", and no log of another format" if folders else ""
+                raise UsageError(f"{path}: holds no csv or Parquet file{more}")
             files += found
         elif path.is_file():
             files.append(path)
