@@ -51,6 +51,8 @@ def test_a_repeated_run_is_found_and_its_difference_measured() -> None:
     second[late, 3:] += np.array([0.02, 0.01, 0.004])
     logs = [first, made(second, STEP, w=shifted, name="second", kind="turning")]
     (pair,) = find_pairs(PROTOCOL, logs, 2, np.array([0.1, 0.05, 0.02]), STEP)
+    # without commands nothing says that two runs were to be the same
+    assert not list(find_pairs(PROTOCOL, logs, 0, np.array([0.1, 0.05, 0.02]), STEP))
     assert (pair.first.log, pair.first.start, pair.log, pair.start) == (0, 50, 1, 90)
     assert pair.mismatch == pytest.approx(0, abs=1e-6)
     found = repeatability(PROTOCOL, logs, 2, SCALES, STEP)

@@ -100,6 +100,13 @@ def test_a_vessel_that_behaves_passes(
     assert "not applicable: acceleration-space model" in found[MASS].text
 
 
+def test_a_vessel_without_inputs_is_checked_from_rest() -> None:
+    coasting = {name: row for name, row in RUDDER.items() if name in "uvr"}
+    found = check_model(*made(coasting, (), low=(0.0, -0.4, -0.2), high=(2.0, 0.4, 0.2)))
+    assert all(finding.ok for finding in found if finding.check == BOUNDED)
+    assert any("1 run of" in finding.text for finding in found if finding.check == BOUNDED)
+
+
 def test_wrong_sign_of_damping_is_flagged() -> None:
     found = findings(*made(RUDDER | {"u": (0.1, 0, 0)}))
     assert found[DAMPING].ok is False

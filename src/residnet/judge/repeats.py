@@ -91,8 +91,11 @@ def find_pairs(
 ) -> Iterator[Pair]:
     """Return pairs of repeated runs; scales [3] are of u, v, r.
 
-    Each window of the protocol with at most one stretch of each log from its own on.
+    Each window of the protocol with at most one stretch of each log from its own on. Without
+    commands nothing says that two runs were to be the same, and there are none.
     """
+    if commands == 0:
+        return
     every = max(round(_SEARCH / step), 1)
     known = [log.recorded[log.piece >= 0, :commands] for log in logs]
     spread = np.concatenate(known).max(0) - np.concatenate(known).min(0)

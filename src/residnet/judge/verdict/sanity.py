@@ -293,19 +293,26 @@ def check_bounded(spec: ModelSpec, model: HybridDynamics, divergence: float) -> 
             f" {divergence:g} times the largest training velocity)"
         )
         return Finding(spec.name, BOUNDED, False, text)
+    many = len(corners) > 1
     text = (
-        f"{len(corners)} runs of {_LONG_RUN:.0f} s from rest with inputs held at their extremes"
-        f" stay bounded; the farthest ({inputs}) reaches {reached} of the largest training values"
+        f"{len(corners)} run{'s' if many else ''} of {_LONG_RUN:.0f} s from rest with"
+        f" inputs held at their extremes stay{'' if many else 's'} bounded; the farthest"
+        f" ({inputs or 'no inputs'}) reaches {reached} of the largest training values"
     )
     return Finding(spec.name, BOUNDED, True, text)
 
 
 def _corners(spec: ModelSpec, most: int = 64) -> Tensor:
-    """Inputs [K, m] at the edges of their ranges, every combination or `most` drawn ones."""
+    """Inputs [K, m] at the edges of their ranges, every combination or `most` drawn ones.
+
+    A model without inputs has a single run, from rest.
+    """
     low, high = (
         torch.tensor(spec.low[RANGE_INPUTS], dtype=torch.float64),
         torch.tensor(spec.high[RANGE_INPUTS], dtype=torch.float64),
     )
+    if low.numel() == 0:
+        return low.reshape(1, 0)
     pick = (
         torch.cartesian_prod(
             *[torch.tensor([0.0, 1.0], dtype=torch.float64)] * low.numel()
