@@ -78,7 +78,7 @@ SOURCES: dict[str, Source] = {
     "table_5_2": _study("halvorsen2019/table_5_2", 10, package="deap"),
     "table_5_3": _study("halvorsen2019/table_5_3", 10, package="deap"),
     "table_5_3_small": _study("halvorsen2019/table_5_3_small", 2, package="deap"),
-    "input_noise": _study("halvorsen2019/noise", 10, package="deap"),
+    "input_noise": _study("halvorsen2019/noise", 2, package="deap"),
     "delay": _study("halvorsen2019/delay", 5, package="deap"),
     "force_equations": _study("halvorsen2019/force_equations", 2),
     "jet_equations": _study("halvorsen2019/jet_equations", 3),
@@ -93,7 +93,7 @@ SOURCES: dict[str, Source] = {
     # the document's 500 generations, all of them, without the other models of Tables 2 and 3
     "gptips": _study(
         "moreno2019/moreno2019",
-        15,
+        40,
         "heads.gptips.evolution.patience=500",
         *(f"~heads.{k}" for k in ("rbf_joint", "rbf_each", "p1_joint", "p1_each", "p2_joint")),
         *("~heads.p2_each", "~heads.symbolic", "base_of={gptips: nothing}"),

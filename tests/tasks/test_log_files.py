@@ -22,6 +22,8 @@ def test_folders_hold_tables_recordings_or_other_logs(tmp_path: Path) -> None:
     # what lies beside tables is no log
     (tables / "README.txt").write_text("Trials of a boat.\n")
     assert log_files([tables], folders=True) == log_files([tables]) == [table]
+    # a file that is named twice is one log
+    assert log_files([table, tables, tables / ".." / "tables" / table.name]) == [table]
     bag_files = [written_logs.bag2(log, bags / name) for name in ("one", "two")]
     assert log_files([bags], folders=True) == bag_files
     assert log_files([bag_files[0]], folders=True) == bag_files[:1]

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
-from threading import Thread
+from threading import Event, Thread
 from typing import Any, Protocol
 
 import torch
@@ -146,11 +146,11 @@ def _bench(
         yield _Here(fitter)
         return
     with (
-        _heard() as tell,
+        _heard() as wire,
         processes(
             places,
             _begin,
-            (dict(logs), settings, fitter.store.training_folder, torch.get_num_threads(), tell),
+            (dict(logs), settings, fitter.store.training_folder, torch.get_num_threads(), wire),
         ) as pool,
     ):
         yield _There(pool, places, fitter.store)
@@ -199,11 +199,11 @@ class _Here:
         self._fitter = fitter
 
     def submit(self, part: Part, models: Mapping[str, FittedModel]) -> Future[Any]:
-        """Fit a part."""
+        """Fit a part at once."""
         return ThisProcess().submit(part.fitted_by, self._fitter, models)
 
     def received(self, future: Future[Any]) -> FittedPart:
-        """Return the part."""
+        """Return the part, or raise what its fit raised."""
         result: FittedPart = future.result()
         return result
 
@@ -267,7 +267,7 @@ _tell: Callable[[Progress], None]
 
 
 def _begin(
-    logs: Logs, settings: FitSettings, folder: Path | None, threads: int, queue: Any
+    logs: Logs, settings: FitSettings, folder: Path | None, threads: int, wire: _Wire
 ) -> None:
     """Prepare a process for parts of a fit."""
     global _fitter, _tell
@@ -280,7 +280,7 @@ def _begin(
             made.append(Fitter(logs, settings, _Trainings(folder)))
         return made[0]
 
-    _fitter, _tell = fitter, queue.put
+    _fitter, _tell = fitter, wire
 
 
 def _fit_there(part: Part, needed: Mapping[str, _Sent]) -> _Sent:
@@ -290,20 +290,37 @@ def _fit_there(part: Part, needed: Mapping[str, _Sent]) -> _Sent:
         return _Sent.of(part.fitted_by(_fitter(), models))
 
 
+@dataclass(frozen=True)
+class _Wire:
+    """The way of progress out of the processes; they write one at a time."""
+
+    sender: Any
+    lock: Any
+
+    def __call__(self, progress: Progress) -> None:
+        """Send a report."""
+        with self.lock:
+            self.sender.send(progress)
+
+
 @contextmanager
-def _heard() -> Iterator[Any]:
-    """Hold a queue whose reports of progress reach who listens to this process."""
-    queue, callback = get_context("spawn").SimpleQueue(), listener()
+def _heard() -> Iterator[_Wire]:
+    """Hold a wire whose reports of progress reach who listens to this process."""
+    context, callback, over = get_context("spawn"), listener(), Event()
+    receiver, sender = context.Pipe(duplex=False)
 
     def hand_on() -> None:
         with listen(callback):
-            while (one := queue.get()) is not None:
-                report(one.stage, one.done, one.total, one.message, one.score)
+            while receiver.poll(0.0 if over.is_set() else 0.1) or not over.is_set():
+                if receiver.poll():
+                    one = receiver.recv()
+                    report(one.stage, one.done, one.total, one.message, one.score)
 
     thread = Thread(target=hand_on, daemon=True)
     thread.start()
     try:
-        yield queue
+        yield _Wire(sender, context.Lock())
     finally:
-        queue.put(None)
+        # the lock is left alone: a process that was ended may have held it
+        over.set()
         thread.join(1.0)

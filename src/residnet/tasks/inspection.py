@@ -49,7 +49,7 @@ class Reading:
     folders: bool = False
     inputs: tuple[str, ...] | None = None
     masks: tuple[Mask, ...] = ()
-    splits: Mapping[str, str] | None = None
+    splits: Mapping[Path, str] | None = None
     task: Any = None
 
 
@@ -116,9 +116,11 @@ def inspect_logs(paths: Sequence[Path], config: Path | None) -> Inspection:
             reports.append(report)
             drafts |= {"\n".join(draft): draft} if draft else {}
         lines += reports[-1].lines()
-    together = (
-        inspect_together(logs, setup.inputs, setup.splits) if logs else Report("together", ())
-    )
+    known = setup.splits or {}
+    splits = {
+        name: known[real] for path, name in names.items() if (real := path.resolve()) in known
+    }
+    together = inspect_together(logs, setup.inputs, splits) if logs else Report("together", ())
     if setup.task is not None and logs:
         together = Report("together", (*together.findings, *_regressors(logs, setup.task)))
     progress.report("inspecting logs", len(files), len(files))
@@ -152,14 +154,13 @@ def reading(config: Path) -> Reading:
     except ConfigError:
         # the split's own files need not be here to look at others
         splits = {}
-    named = {name: splits[path] for path, name in log_names(splits).items()}
     reader = task.data.reader
     return Reading(
         reader.build(),
         isinstance(reader, RecordingConfig),
         task.signals.columns,
         task.prepare.masks,
-        named,
+        splits,
         task,
     )
 

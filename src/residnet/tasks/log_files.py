@@ -12,7 +12,7 @@ _TABLES = (".csv", ".parquet")
 
 
 def log_files(paths: Sequence[Path], folders: bool = False) -> list[Path]:
-    """Return the files, and the logs below folders, in order.
+    """Return the files, and the logs below folders, in order; each once.
 
     Args:
         paths: files and folders.
@@ -38,4 +38,7 @@ def log_files(paths: Sequence[Path], folders: bool = False) -> list[Path]:
             files.append(path)
         else:
             raise UsageError(f"{path}: no such file or folder")
-    return files
+    once: dict[Path, Path] = {}
+    for file in files:
+        once.setdefault(file.resolve(), file)
+    return list(once.values())
