@@ -167,6 +167,40 @@ def test_attitudes_as_quaternions(
     assert not {"qx", "qy", "qz", "qw"} & set(read.channels)
 
 
+@pytest.mark.parametrize("stem", ["pose.", ".pose.pose.", "field.pose.pose.", ""])
+@pytest.mark.parametrize("ned", [False, True])
+def test_poses_of_ros(log: Log, tmp_path: Path, stem: str, ned: bool) -> None:
+    names = [f"{stem}orientation.{part}" for part in "xyzw"]
+    east_first = {f"{stem}position.x": log["y"], f"{stem}position.y": log["x"]}
+    north_first = {f"{stem}position.x": log["x"], f"{stem}position.y": log["y"]}
+    frame = pd.DataFrame(
+        {
+            **{"time": log.t, "header.frame_id": np.full(len(log.t), "map_ned" if ned else "map")},
+            **(north_first if ned else east_first),
+            **_attitude(log, names, not ned),
+            "twist.linear.x": log["u"],
+            "twist.linear.y": log["v"] if ned else -log["v"],
+            "twist.angular.z": log["r"] if ned else -log["r"],
+            "rudder [deg]": np.degrees(log["cmd_delta"]),
+        }
+    )
+    read, marks = _drafted(frame, tmp_path / "log.csv")
+    for name in ("x", "y", "u", "v", "r"):
+        np.testing.assert_allclose(read[name], log[name], atol=1e-9)
+    assert np.cos(read["psi"] - log["psi"]).min() > 1.0 - 1e-9
+    assert _guessed(marks, "qw")
+    assert _guessed(marks, "x")
+
+
+def test_rates_beside_a_heading_of_ros_alone(log: Log, tmp_path: Path) -> None:
+    names = [f"imu.orientation.{part}" for part in "xyzw"]
+    frame = _frame(log, **_attitude(log, names, True), **{"twist.angular.z": -log["r"]})
+    read, marks = _drafted(frame, tmp_path / "log.csv")
+    np.testing.assert_allclose(read["r"], log["r"], atol=1e-9)
+    assert np.cos(read["psi"] - log["psi"]).min() > 1.0 - 1e-9
+    assert _guessed(marks, "r")
+
+
 def test_part_of_a_quaternion_is_refused() -> None:
     entry = {"column": "a", "unit": "-"}
     settings = {"kind": "csv", "time": {"column": "t"}, "channels": {"qx": entry, "qw": entry}}

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from residnet.data.drafting.channels import CHANNELS
-from residnet.data.drafting.physics import Raw
+from residnet.data.drafting.physics import FRAMES, POSE_FRAMES, Frame, Raw
 from residnet.data.drafting.questions import Marks
 from residnet.data.readers.composing.orientation import unit_quaternion, yaw_of
 from residnet.data.readers.tables.channel_map import QUATERNION
@@ -22,6 +22,9 @@ _COLUMN = re.compile(
 _PARTS = {**dict(zip("xyzw", QUATERNION, strict=True)), "i": "qx", "j": "qy", "k": "qz"}
 _COUNTED = (("qw", "qx", "qy", "qz"), QUATERNION)
 """What counted parts may be: most write the scalar part first, some last."""
+_POSE = {"x": r"position\W*x", "y": r"position\W*y", "qw": r"orientation\W*w"}
+"""How the columns of a message geometry_msgs/Pose end."""
+_NED = re.compile(r"(?:^|[\W_])(?:ned|frd)(?:$|[\W_])", re.IGNORECASE)
 _HEADING = "heading of the quaternion [rad]"
 
 
@@ -62,6 +65,29 @@ def from_quaternion(
         turned.append(raw)
     rest = {name: column for name, column in names.items() if name not in parts}
     return {**rest, "psi": _HEADING}, turned
+
+
+def frames_of(
+    names: Mapping[str, str], parts: Mapping[str, str], texts: Iterable[str]
+) -> tuple[Frame, ...]:
+    """Return the frames that a position and a quaternion may have, by what they are called.
+
+    A pose of ROS counts from east, as REP 103 asks, unless something is called NED.
+
+    Args:
+        names: channel -> column.
+        parts: channel -> column of the quaternion.
+        texts: names of columns and the texts of the tables, those of frames among them.
+    """
+    held = {**names, **parts}
+    posed = all(
+        re.search(rf"(?:^|[\W_]){ending}$", held[name].strip(), re.IGNORECASE)
+        for name, ending in _POSE.items()
+        if name in held
+    )
+    if "qw" not in held or not posed or any(_NED.search(text) for text in texts):
+        return FRAMES
+    return POSE_FRAMES
 
 
 def levelled(

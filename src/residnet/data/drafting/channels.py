@@ -12,6 +12,7 @@ from residnet.core.units import to_si
 from residnet.data.drafting.fixes import as_fixes
 from residnet.data.drafting.physics import (
     FRAMES,
+    POSE_FRAMES,
     Fit,
     Frame,
     Motion,
@@ -38,12 +39,20 @@ class Channels:
     """The entries of a channel map, from names, headers, values and physics."""
 
     def __init__(
-        self, names: Mapping[str, str], logs: Sequence[Raw], marks: Marks, fixes: float
+        self,
+        names: Mapping[str, str],
+        logs: Sequence[Raw],
+        marks: Marks,
+        fixes: float,
+        frames: Sequence[Frame] = FRAMES,
     ) -> None:
-        """From channel -> column, logs, and degrees in one count of x and y, 0 for metres."""
-        self._fixes = float(fixes)
+        """From channel -> column, logs, and degrees in one count of x and y, 0 for metres.
+
+        The frames are those that are tried, the likeliest first.
+        """
+        self._fixes, self._frames = float(fixes), tuple(frames)
         self._names, self._logs, self._marks = dict(names), list(logs), marks
-        self._frame = FRAMES[0]
+        self._frame = self._frames[0]
         self._motions: list[Motion | None] = [None] * len(logs)
         self._psi_unit = "rad"
 
@@ -55,6 +64,11 @@ class Channels:
         self._settle_wind()
         entries = {name: self._entry(name) for name in self._names}
         return as_fixes(entries) if self._fixes else entries
+
+    @property
+    def _posed(self) -> bool:
+        """Whether position and heading are called as those of a pose of ROS."""
+        return self._frames == POSE_FRAMES
 
     def _values(self, name: str) -> np.ndarray:
         parts = [raw.columns[name] for raw in self._logs if name in raw.columns]
@@ -70,9 +84,9 @@ class Channels:
         tried = [written] if written else [sized, other]
         if not written and np.nanmax(np.abs(self._values("psi")), initial=0.0) > 720.0:
             tried.append("cdeg")
-        best = (-np.inf, "rad", FRAMES[0])
+        best = (-np.inf, "rad", self._frames[0])
         for unit in tried:
-            for frame in (f for f in FRAMES if not (self._fixes and f.swapped)):
+            for frame in (f for f in self._frames if not (self._fixes and f.swapped)):
                 motions = [motion_of(raw, unit, frame) for raw in self._logs]
                 score = self._score(motions)
                 if score > best[0] + 0.02:
@@ -107,7 +121,7 @@ class Channels:
     def _over_ground(self, called: Sequence[str]) -> bool:
         """Return whether velocities along x and y fit those along north and east better."""
         rest = {name: column for name, column in self._names.items() if name not in called}
-        alone = Channels(rest, self._logs, Marks(), self._fixes)
+        alone = Channels(rest, self._logs, Marks(), self._fixes, self._frames)
         alone._settle_frame()
         still = [Raw(raw.t, {**raw.columns, "psi": np.zeros(raw.t.size)}) for raw in self._logs]
         ground = [motion_of(raw, "rad", FRAMES[0]) for raw in still]
@@ -139,6 +153,8 @@ class Channels:
         if self._frame.swapped and not told:
             self._names["x"], self._names["y"] = self._names["y"], self._names["x"]
             text = "the vessel moves where it points only if the column called y is the north"
+            if self._posed and self._frame.from_east:
+                text = "x is taken as east and y as north, as in a pose of ROS (REP 103)"
             self._marks.guess((*CHANNELS, "x"), text)
         elif self._frame.swapped:
             # named north and east, yet turned about: the heading counts from east
@@ -149,6 +165,8 @@ class Channels:
             self._marks.guess((*CHANNELS, "x"), text)
         if self._frame.from_east:
             text = "the vessel moves where it points only if the heading counts from east"
+            if self._posed:
+                text = "the heading is taken to count from east, as in a pose of ROS (REP 103)"
             self._marks.guess((*CHANNELS, "psi"), text)
         if score < 0.5:
             text = f"position, heading and velocities fit together badly ({score:.2f} of 1)"
@@ -212,7 +230,16 @@ class Channels:
         if name not in STATE_NAMES and (throw := thrown(name, column, self._values(name))):
             self._marks.guess((*CHANNELS, name), throw.reason)
             return entry | throw.settings
-        return entry | {"unit": self._unit(name)}
+        sign = self._sign_by_habit(name)
+        return entry | {"unit": self._unit(name)} | ({"sign": sign} if sign < 0 else {})
+
+    def _sign_by_habit(self, name: str) -> int:
+        """Return -1 for v and r beside a pose of ROS, which count to port by REP 103, else 1."""
+        if not self._posed or name not in ("v", "r"):
+            return 1
+        text = "taken as positive to port, as beside a pose of ROS (REP 103)"
+        self._marks.guess((*CHANNELS, name), text)
+        return -1
 
     def _rate(self, name: str) -> dict[str, Any]:
         """Return unit and sign of a velocity, checked against position and heading."""
@@ -227,6 +254,8 @@ class Channels:
             what = {"u": "astern", "v": "port", "r": "port"}[name]
             text = f"position and heading say that it is positive to {what} (correlation"
             self._marks.guess(key, f"{text} {fit.correlation:.2f})")
+        elif not fit.telling and self._sign_by_habit(name) < 0:
+            entry["sign"] = -1
         if not fit.telling and written is None:
             self._marks.guess(key, f"position and heading do not tell whether {unit} is right")
         return entry

@@ -36,6 +36,8 @@ class Frame(NamedTuple):
 
 FRAMES = (Frame(False, False), Frame(True, False), Frame(False, True))
 """Frames that can be told apart; both changes together are a mirror image that fits as well."""
+POSE_FRAMES = (Frame(True, True), Frame(True, False))
+"""Frames of a pose of ROS, by REP 103 first: x east, y north, headings from east."""
 
 
 @dataclass(frozen=True)

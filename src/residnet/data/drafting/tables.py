@@ -12,6 +12,7 @@ from residnet.core.errors import DataError, UsageError
 from residnet.core.names import CHANNEL_UNITS
 from residnet.data.drafting.attitudes import (
     as_quaternion,
+    frames_of,
     from_quaternion,
     is_unit,
     levelled,
@@ -80,7 +81,8 @@ def draft_tables(files: Sequence[Path], marks: Marks) -> TableDraft:
     names, logs, fixes = from_fixes(names, logs, marks)
     if attitude:
         names, logs = from_quaternion(names, attitude, logs)
-    channels = Channels(names, logs, marks, fixes).drafted()
+    frames = frames_of(names, attitude, _words(first))
+    channels = Channels(names, logs, marks, fixes, frames).drafted()
     if attitude:
         channels = as_quaternion(channels, attitude, marks, {"x", "y"} <= set(names))
         names = {**{name: names[name] for name in names if name != "psi"}, **attitude}
@@ -182,6 +184,12 @@ def _other_unit(column: str, channel: str | None) -> str | None:
     """Return the unit in the brackets of a name where it cannot be that of a channel."""
     si = CHANNEL_UNITS.get(channel or "")
     return None if si is None else other_dimension(column, si)
+
+
+def _words(sheet: Sheet) -> list[str]:
+    """Return the names of a table's columns, and the texts in its first rows."""
+    texts = (str(text) for cells in sheet.texts.values() for text in cells.unique()[:20])
+    return [*sheet.header, *texts]
 
 
 def _raw(sheets: Sequence[Sheet], names: Mapping[str, str], left_out: dict[Path, str]) -> list[Raw]:
