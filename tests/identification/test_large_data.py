@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import mmap
+import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -99,3 +102,19 @@ def test_arrays_on_disk_keep_their_values_when_memory_is_given_back() -> None:
     np.testing.assert_array_equal(kept, values)
     assert paged.lies_on_disk(kept[5:, 0])
     assert not paged.lies_on_disk(values)
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="pages are counted on Linux only")
+def test_pages_are_given_back_while_others_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    def pages() -> int:
+        return int(Path("/proc/self/statm").read_text().split()[2]) * mmap.PAGESIZE
+
+    monkeypatch.setattr(paged, "_RESIDENT", 1 << 24)
+    before = pages()
+    values = paged.empty((1 << 23,))
+    values[...] = np.arange(values.size)
+    until = time.monotonic() + 20.0
+    while pages() - before > 1 << 25 and time.monotonic() < until:
+        time.sleep(0.05)
+    assert pages() - before <= 1 << 25
+    np.testing.assert_array_equal(values[:: 1 << 18], np.arange(0, values.size, 1 << 18))

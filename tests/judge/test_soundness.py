@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -82,6 +83,25 @@ def test_a_model_that_behaves_is_sound() -> None:
     assert wrong_damping(model, points) == ""
     assert runaway(spec, model, points, 3.0) == ""
     assert contradiction(model, steady_runs([log()], STEP)) == ""
+
+
+def test_points_of_several_logs_are_recorded_ones_with_the_extreme_inputs() -> None:
+    logs = [replace(log(), usable=np.arange(400) % 3 > 0), log(150.0, settles=False), log(300.0)]
+    logs[2].w[77, 1], logs[0].w[1, 0] = -0.9, 55.0
+    points = training_points(logs)
+    recorded = {
+        (*state[3:], *inputs)
+        for one in logs
+        for state, inputs in zip(one.smooth[one.usable], one.w[one.usable], strict=True)
+    }
+    found = list(map(tuple, np.hstack((points.x[:, 3:], points.w)).tolist()))
+    assert set(found) <= recorded
+    assert 90 <= len(found) <= 94
+    assert points.w[:, 1].min() == -0.9
+    assert points.w[:, 0].max() == 55.0
+    speeds = [np.hypot(state[0], state[1]) for state in recorded]
+    assert np.hypot(*points.x[:, 3:5].numpy().T).max() == max(speeds)
+    assert points.longest == 299.5
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from pydantic import Field
 from residnet.core.arrays import paged
 from residnet.core.config import Config, Seconds
 from residnet.core.errors import DataError
-from residnet.core.layout import POSE, RANGE_VELOCITIES, VELOCITIES
+from residnet.core.layout import POSE, VELOCITIES
 from residnet.core.log import Log
 from residnet.core.names import STATE
 from residnet.core.samples import Samples
@@ -237,12 +237,15 @@ def envelope(logs: Sequence[Prepared]) -> tuple[np.ndarray, np.ndarray]:
     Only usable samples count, and velocities no further beyond the quantiles of 0.5 % and 99.5 %
     than these lie apart.
     """
-    joined = np.concatenate(
-        [np.concatenate((p.y[p.usable, VELOCITIES], p.w[p.usable]), axis=1) for p in logs]
-    )
-    low, high = joined.min(0), joined.max(0)
-    # a few bad samples must not widen the range in which a free run counts as sound
-    few, most = np.quantile(joined[:, RANGE_VELOCITIES], (_FEW, 1.0 - _FEW), axis=0)
-    low[RANGE_VELOCITIES] = np.maximum(low[RANGE_VELOCITIES], few - (most - few))
-    high[RANGE_VELOCITIES] = np.minimum(high[RANGE_VELOCITIES], most + (most - few))
-    return low, high
+    bounds = []
+    # one column at a time: of large data all of them would fill the memory
+    for column in range(VELOCITIES.start, VELOCITIES.stop):
+        values = np.concatenate([p.y[p.usable, column] for p in logs])
+        low, high = values.min(), values.max()
+        # a few bad samples must not widen the range in which a free run counts as sound
+        few, most = np.quantile(values, (_FEW, 1.0 - _FEW), overwrite_input=True)
+        bounds.append((max(low, few - (most - few)), min(high, most + (most - few))))
+    least = np.min([p.w[p.usable].min(0) for p in logs if p.usable.any()], axis=0)
+    largest = np.max([p.w[p.usable].max(0) for p in logs if p.usable.any()], axis=0)
+    low, high = np.array(bounds).T
+    return np.concatenate((low, least)), np.concatenate((high, largest))

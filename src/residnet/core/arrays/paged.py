@@ -7,6 +7,8 @@ import mmap
 import tempfile
 import weakref
 from collections.abc import Iterator
+from pathlib import Path
+from threading import Event, Lock, Thread
 from typing import Any
 
 import numpy as np
@@ -23,7 +25,12 @@ _CHUNK = 1 << 28
 """Bytes of a file that many arrays share: each file holds a descriptor open."""
 _ALIGNED = 64
 
+_RESIDENT = 1 << 28
+"""Bytes of pages of files beyond which those of arrays are given back."""
+_LOOKED_EVERY = 0.1
+
 _files: weakref.WeakSet[mmap.mmap] = weakref.WeakSet()
+_lock = Lock()
 
 
 class _Arena:
@@ -45,14 +52,48 @@ class _Arena:
                         f"{tempfile.gettempdir()}: no room for the samples of large logs"
                         f" ({error.strerror}); set TMPDIR to a larger disk"
                     ) from error
-            _files.add(self.file)
+            with _lock:
+                _files.add(self.file)
+            _keeper.begin()
             self.end = 0
         start = self.end
         self.end += math.ceil(count / _ALIGNED) * _ALIGNED
         return self.file, start
 
 
-_arena = _Arena()
+class _Keeper:
+    """Gives back pages while others work with the arrays, who need not know where these lie.
+
+    The system drops them only where another process lacks memory, and until then they count as
+    this one's. Where there is no /proc/self/statm they stay.
+    """
+
+    def __init__(self) -> None:
+        self._begun = False
+
+    def begin(self) -> None:
+        """Look after the pages from now on; further calls change nothing."""
+        statm = Path("/proc/self/statm")
+        if self._begun or not statm.exists():
+            return
+        self._begun = True
+        at_first = _file_pages(statm)
+
+        def look() -> None:
+            pause = Event()
+            while not pause.wait(_LOOKED_EVERY):
+                if (_file_pages(statm) - at_first) * mmap.PAGESIZE > _RESIDENT:
+                    forget()
+
+        Thread(target=look, name="pages of arrays in files", daemon=True).start()
+
+
+def _file_pages(statm: Path) -> int:
+    """Return how many pages of files this process holds in memory."""
+    return int(statm.read_text().split()[2])
+
+
+_arena, _keeper = _Arena(), _Keeper()
 
 
 def empty(shape: tuple[int, ...], dtype: Any = np.float64) -> np.ndarray:
@@ -104,7 +145,9 @@ def row_pieces(count: int) -> Iterator[slice]:
 
 def forget() -> None:
     """Give back the memory of all arrays in files; they are read again when they are next used."""
-    for file in list(_files):
+    with _lock:
+        files = list(_files)
+    for file in files:
         file.madvise(mmap.MADV_DONTNEED)
 
 

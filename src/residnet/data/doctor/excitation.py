@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from residnet.core.arrays.paged import LARGE
 from residnet.core.log import Log
 from residnet.core.names import VELOCITY
 from residnet.core.stretches import stretches
@@ -207,7 +208,9 @@ def set_findings(logs: Sequence[Log], inputs: Sequence[str] | None) -> Iterator[
         )
     moving = [name for name in (*awake, *driving) if name not in held]
     if len(moving) > 1:
-        columns = np.concatenate([log.stack(tuple(moving)) for log in logs])
+        # of very many samples evenly spread ones tell the same
+        every = -(-sum(len(log) for log in logs) // LARGE)
+        columns = np.concatenate([log.stack(tuple(moving))[::every] for log in logs])
         columns = columns[np.isfinite(columns).all(axis=1)]
         if columns.shape[0] >= 10 * len(moving):
             condition, worst = conditioning(columns, moving)

@@ -63,8 +63,9 @@ def steady_runs(logs: Sequence[Prepared], step: float, shortest: float = 5.0) ->
         step: of their grid in s.
         shortest: stretches of fewer seconds are left out.
     """
-    joined = np.concatenate([log.w[log.usable] for log in logs])
-    tolerance = _HELD * np.maximum(np.ptp(joined, axis=0), 1e-12)
+    used = [log.w[log.usable] for log in logs if log.usable.any()]
+    ranges = np.max([w.max(0) for w in used], 0) - np.min([w.min(0) for w in used], 0)
+    tolerance = _HELD * np.maximum(ranges, 1e-12)
     out = []
     for log in logs:
         for begin, end in _held(log, tolerance, round(shortest / step)):

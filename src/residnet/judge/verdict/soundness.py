@@ -46,15 +46,28 @@ class TrainingPoints:
 
 def training_points(logs: Sequence[Prepared]) -> TrainingPoints:
     """Return recorded points spread evenly over the speeds, and those of extreme inputs."""
-    x = np.concatenate([log.smooth[log.usable] for log in logs])
-    w = np.concatenate([log.w[log.usable] for log in logs])
-    x[:, POSE] = 0.0
-    speed = np.hypot(*x[:, VELOCITIES][:, :2].T)
+    # all states of large data would fill the memory: only those of the points are put together
+    used = [np.flatnonzero(log.usable) for log in logs]
+    speed = np.concatenate(
+        [np.hypot(*log.smooth[at, SURGE : SURGE + 2].T) for log, at in zip(logs, used, strict=True)]
+    )
     order = np.argsort(speed, kind="stable")
     even = order[np.linspace(0, len(order) - 1, min(_POINTS, len(order))).round().astype(int)]
-    rows = np.union1d(even, np.concatenate((w.argmin(0), w.argmax(0))))
+    extreme = []
+    for column in range(logs[0].w.shape[1]):
+        w = np.concatenate([log.w[at, column] for log, at in zip(logs, used, strict=True)])
+        extreme += [w.argmin(), w.argmax()]
+    rows = np.union1d(even, np.array(extreme, dtype=even.dtype))
+    ends = np.cumsum([len(at) for at in used])
+    picked = [
+        (log, at[rows[(rows >= end - len(at)) & (rows < end)] - (end - len(at))])
+        for log, at, end in zip(logs, used, ends, strict=True)
+    ]
+    x = np.concatenate([log.smooth[at] for log, at in picked])
+    w = np.concatenate([log.w[at] for log, at in picked])
+    x[:, POSE] = 0.0
     longest = max(float(log.log.t[-1] - log.log.t[0]) for log in logs)
-    return TrainingPoints(torch.from_numpy(x[rows]), torch.from_numpy(w[rows]), longest)
+    return TrainingPoints(torch.from_numpy(x), torch.from_numpy(w), longest)
 
 
 def wrong_damping(model: HybridDynamics, points: TrainingPoints) -> str:
