@@ -112,7 +112,7 @@ SOURCES: dict[str, Source] = {
     "update": _study("jervan2020/update", 4),
     "zigzag": _study("jervan2020/zigzag", 2),
     "measured": _study("jervan2020/measured", 2, data="milliampere"),
-    "woo2018": _study("woo2018/woo2018", 60),
+    "woo2018": _study("woo2018/woo2018", 30),
     "woo2018_linear": _study(
         "woo2018/woo2018", 2, "~heads", "~training", "study=null", "bands=null"
     ),
