@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -11,7 +13,7 @@ from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
 from residnet.dynamics.store import ModelSpec
 from residnet.identification.monitoring.changes import Change, ChangedDynamics
-from residnet.identification.monitoring.monitor import MonitorConfig, Watch
+from residnet.identification.monitoring.monitor import MonitorConfig, Verdict, Watch
 from residnet.identification.monitoring.refitting import recursive_refit
 from residnet.identification.monitoring.watcher import Watcher
 from residnet.identification.monitoring.windows import Piece
@@ -98,6 +100,24 @@ def test_clean_logs_raise_no_alarm(known: tuple[ModelSpec, HybridDynamics], watc
         watcher.restart()
         alarms += any(watcher.take(sums).alarm for sums in watch.sums(windows(log)))
     assert alarms == 0
+
+
+def test_an_alarm_ends_where_scores_have_fallen_clearly_below_the_threshold(
+    known: tuple[ModelSpec, HybridDynamics], watch: Watch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sums = watch.sums(windows(logs(known[1], NONE, 1, 7)[0]))[:1]
+    plain = watch.judge([0], sums)
+    above = iter([-0.1, 0.2, -0.3, -0.9, -1.1, -0.5, 0.1])
+
+    def judge(*_: object) -> Verdict:
+        score = watch.threshold + next(above)
+        suspects = [replace(plain.suspects[0], score=score), *plain.suspects[1:]]
+        return replace(plain, alarm=score > watch.threshold, suspects=suspects)
+
+    monkeypatch.setattr(watch, "judge", judge)
+    watcher = Watcher(watch, 0)
+    alarms = [watcher.take(sums[0]).alarm for _ in range(7)]
+    assert alarms == [False, True, True, True, False, False, True]
 
 
 def test_sample_by_sample_it_says_what_windows_say(

@@ -95,7 +95,8 @@ class Verdict:
     """What a monitor says after a window.
 
     Attributes:
-        alarm: whether the largest score exceeds the threshold.
+        alarm: whether the largest score exceeds the threshold; of a watcher also where it has not
+            fallen clearly below it since it did.
         threshold: of the scores.
         suspects: causes, the one that explains most first.
         innovation: root mean square of the whitened innovations of each channel; 1 on clean logs.

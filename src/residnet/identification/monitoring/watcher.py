@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import replace
 
 import numpy as np
 
@@ -10,9 +11,15 @@ from residnet.identification.monitoring.innovations import Sums
 from residnet.identification.monitoring.monitor import Verdict, Watch
 from residnet.identification.monitoring.windows import Piece
 
+_DEADBAND = 1.0
+"""Standard deviations by which scores fall below the threshold before an alarm ends."""
+
 
 class Watcher:
     """A watch that goes along with measurements, sample by sample.
+
+    A score that wavers about the threshold is one alarm: it ends where all scores lie clearly below
+    the threshold.
 
     Args:
         watch: over a model.
@@ -28,6 +35,7 @@ class Watcher:
         self.recent: deque[tuple[int, Sums]] = deque()
         self.log = 0
         self.closed = True
+        self.alarmed = False
         self.y: list[np.ndarray] = []
         self.w: list[np.ndarray] = []
 
@@ -74,4 +82,7 @@ class Watcher:
         while sum(counts) - counts[0] >= self.windows:
             self.recent.popleft()
             counts.pop(0)
-        return self.watch.judge([log for log, _ in self.recent], [one for _, one in self.recent])
+        verdict = self.watch.judge([log for log, _ in self.recent], [one for _, one in self.recent])
+        lasts = self.alarmed and verdict.largest > verdict.threshold - _DEADBAND
+        self.alarmed = verdict.alarm or lasts
+        return replace(verdict, alarm=self.alarmed)
