@@ -3,7 +3,8 @@
 Each draw takes one of two shipped vessels with scattered parameters, a mixture of manoeuvres,
 noise, random forces and currents, and models of three kinds: a linear baseline, hull terms refitted
 through rollouts, and a closed-form residual. The tables give coverage by protocol and kind of
-manoeuvre over all draws, then the lowest of single draws.
+manoeuvre over all draws, then the lowest of single draws. How much the coverage of single logs
+differs tells how far a band may be off that so many logs calibrate and so many judge.
 
     python scripts/bench/simulated_bands.py [--draws 12] [--seed 0] [--logs 40] [--test 25]
 """
@@ -11,6 +12,7 @@ manoeuvre over all draws, then the lowest of single draws.
 from __future__ import annotations
 
 import argparse
+import math
 import tempfile
 import time
 from collections.abc import Sequence
@@ -37,6 +39,8 @@ VESSELS: dict[str, dict[str, Any]] = {
 """Inputs of each vessel, and the largest standard deviations of its random forces in N and N m."""
 STEP, SECONDS = 0.1, 60.0
 KINDS = ("zigzag", "three_two_one_one", "acceleration_deceleration", "random_steps")
+_ASKED = 0.02
+"""Largest distance of the mean coverage from 0.9 that is asked for."""
 CHANNELS = ("u", "v", "r", "heading", "position", "mean", "whole")
 
 
@@ -136,6 +140,7 @@ def main() -> None:
     given = parser.parse_args()
     torch.set_num_threads(1)
     rows: list[dict[str, Any]] = []
+    apart: list[float] = []
     for number in range(given.draws):
         started = time.process_time()
         random = np.random.default_rng([given.seed, number])
@@ -147,6 +152,7 @@ def main() -> None:
             if "band_coverage" in row and row["model"] != "zero"
         ]
         rows += found
+        apart += scatter(models, test, given.logs)
         of_all = [row["band_coverage"]["mean"] for row in found if row["manoeuvre"] == "all"]
         print(
             f"draw {number + 1}: {vessel}, mean coverage {np.round(of_all, 3).tolist()},"
@@ -154,6 +160,27 @@ def main() -> None:
             flush=True,
         )
     show(rows)
+    allowed = np.array(apart)
+    within = np.mean([math.erf(_ASKED / one / math.sqrt(2.0)) for one in allowed])
+    print(
+        f"\nmean coverage scatters by {np.sqrt((allowed**2).mean()):.3f} (rms over models) where"
+        f" {given.logs} logs calibrate and these judge, as single logs differ: a share of"
+        f" {within:.2f} within {_ASKED} of 0.9 is what bands without a fault have"
+    )
+
+
+def scatter(models: Identified, test: Sequence[Prepared], calibrate: int) -> list[float]:
+    """Return the standard deviation of each model's mean coverage, by how single logs differ."""
+    by_log: dict[tuple[str, str], list[float]] = {}
+    for log in test:
+        for row in models.evaluate([log]).rows:
+            if "band_coverage" in row and row["model"] != "zero" and row["manoeuvre"] == "all":
+                held = by_log.setdefault((row["model"], row["protocol"]), [])
+                held.append(row["band_coverage"]["mean"])
+    return [
+        float(np.std(held, ddof=1)) * math.sqrt(1.0 / calibrate + 1.0 / len(held))
+        for held in by_log.values()
+    ]
 
 
 def show(rows: Sequence[dict[str, Any]]) -> None:
