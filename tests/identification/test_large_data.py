@@ -118,3 +118,22 @@ def test_pages_are_given_back_while_others_work(monkeypatch: pytest.MonkeyPatch)
         time.sleep(0.05)
     assert pages() - before <= 1 << 25
     np.testing.assert_array_equal(values[:: 1 << 18], np.arange(0, values.size, 1 << 18))
+
+
+def test_chosen_rows_of_many_lie_in_a_file(few: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    placed: list[tuple[int, ...]] = []
+    empty = paged.empty
+
+    def counted(shape: tuple[int, ...], dtype: Any = np.float64) -> np.ndarray:
+        placed.append(shape)
+        return empty(shape, dtype)
+
+    monkeypatch.setattr(paged, "empty", counted)
+    values = torch.arange(3000.0, dtype=torch.float64).reshape(1000, 3)
+    keep = torch.arange(1000) % 4 > 0
+    assert torch.equal(paged.taken(values, keep), values[keep])
+    assert torch.equal(paged.taken(values[:, 0], keep), values[keep][:, 0])
+    assert placed == [(750, 3), (750,)]
+    few_rows = torch.arange(1000) < 100
+    assert torch.equal(paged.taken(values, few_rows), values[few_rows])
+    assert len(placed) == 2

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from residnet.core.arrays.paged import forget, row_pieces
+from residnet.core.arrays.paged import forget, row_pieces, taken
 from residnet.core.arrays.tally import Tally
 
 
@@ -46,7 +46,12 @@ class Samples:
     def where(self, keep: Tensor) -> Samples:
         """Return the samples at which `keep` [N] is True."""
         return Samples(
-            self.z[keep], self.target[keep], self.group[keep], self.t[keep], self.kinds, self.names
+            taken(self.z, keep),
+            taken(self.target, keep),
+            taken(self.group, keep),
+            taken(self.t, keep),
+            self.kinds,
+            self.names,
         )
 
     def with_target(self, target: Tensor) -> Samples:

@@ -143,6 +143,17 @@ def row_pieces(count: int) -> Iterator[slice]:
         yield slice(start, min(start + step, count))
 
 
+def taken(values: Tensor, keep: Tensor) -> Tensor:
+    """Return the rows of `values` [N, ...] where `keep` [N] is True; many of them in a file."""
+    out = rows(int(keep.sum()), *values.shape[1:], dtype=values.dtype)
+    begin = 0
+    for part in row_pieces(len(values)):
+        some = values[part][keep[part]]
+        out[begin : begin + len(some)] = some
+        begin += len(some)
+    return out
+
+
 def forget() -> None:
     """Give back the memory of all arrays in files; they are read again when they are next used."""
     with _lock:
