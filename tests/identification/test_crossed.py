@@ -1,4 +1,4 @@
-"""Errors over folds: a model on a baseline is judged by its difference to the baseline."""
+"""Errors over folds: a model on a baseline is judged in proportion to the baseline."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def model(name: str, **notes: Any) -> Any:
     return SimpleNamespace(name=name, notes=notes)
 
 
-def test_a_difference_is_added_to_the_baseline_s_error_over_the_folds() -> None:
+def test_a_baseline_s_error_over_the_folds_is_multiplied_by_the_ratio_of_errors() -> None:
     own = {
         "zero": np.array([0.5, 0.5]),
         "hull": np.array([0.1, 0.1]),
@@ -45,11 +45,22 @@ def test_a_difference_is_added_to_the_baseline_s_error_over_the_folds() -> None:
     assert found is not None
     shares, blocks = found
     errors = {name: float(one.sum()) for name, one in shares.items()}
-    expected = {"zero": 0.9, "hull": 0.6, "net": 0.55, "force": 0.7, "alone": 0.5, "mean": 0.45}
+    expected = {"zero": 0.9, "hull": 0.6, "net": 0.45, "force": 0.9, "alone": 0.54, "mean": 0.375}
     np.testing.assert_allclose([errors[name] for name in expected], [*expected.values()])
-    # what is common to a model and its baseline over the folds does not blur their difference
+    # a model that is its baseline everywhere has no spread against it
+    same = with_crossed({**own, "net": own["hull"]}, LOGS, CROSSED, fitted)
+    assert same is not None
+    assert blocks.standard_error(same[0]["net"], same[0]["hull"]) == 0.0
+    # of the spread over folds, a share as large as the errors differ remains; that of the ratio
+    # is scaled from the validation logs to the folds
+    folds = FOLDS.standard_error(0.75 * CROSSED.shares["hull"], CROSSED.shares["hull"])
+    ratio = 0.6 / 0.2 * LOGS.standard_error(own["net"], 0.75 * own["hull"])
     spread = blocks.standard_error(shares["net"], shares["hull"])
-    assert spread == LOGS.standard_error(own["net"], own["hull"])
+    np.testing.assert_allclose(spread, np.hypot(folds, ratio))
+    # where the baseline errs nowhere on the validation logs there is no ratio
+    perfect = with_crossed({**own, "hull": np.zeros(2)}, LOGS, CROSSED, fitted)
+    assert perfect is not None
+    np.testing.assert_allclose(perfect[0]["net"].sum(), 0.75)
     assert with_crossed(own, LOGS, CROSSED, {**fitted, "other": model("other")}) is None
 
 

@@ -58,9 +58,11 @@ def with_crossed(
 
     A baseline is judged over all folds, and so is one with an unknown force. What else stands on
     it is too expensive to be fitted for each fold: it is judged by its baseline's error over the
-    folds, and by its difference to the baseline on the validation logs. That difference spreads
-    less than either of the two errors, as both run over the same windows (a difference estimator,
-    as in sampling from surveys).
+    folds, times the ratio of its error to the baseline's on the validation logs. That ratio spreads
+    less than either of the two errors, as both run over the same windows (a ratio estimator, as in
+    sampling from surveys: W. G. Cochran, 1977, chapter 6). A difference would not do: folds of
+    other manoeuvres may be easier than the validation logs, and a network that only mends a poor
+    baseline's worst errors would gain more there than there is.
 
     Args:
         own: shares over the validation logs, [B] by model.
@@ -77,8 +79,26 @@ def with_crossed(
             return None
         over_folds = np.mean([crossed.shares[root] for root in roots], axis=0)
         beside = np.mean([own[root] for root in roots], axis=0)
-        out[name] = np.concatenate((over_folds, own[name] - beside))
+        out[name] = _transferred(over_folds, own[name], beside)
     return out, crossed.blocks.beside(blocks)
+
+
+def _transferred(over_folds: np.ndarray, own: np.ndarray, beside: np.ndarray) -> np.ndarray:
+    """Return the shares of a model over folds [F] and, adding up to zero, validation blocks [B].
+
+    The latter are how its error follows the ratio, linearised: they say how uncertain that is.
+
+    Args:
+        over_folds: shares of its baseline, [F].
+        own: its shares over the validation logs, [B].
+        beside: those of its baseline there, [B].
+    """
+    base = float(beside.sum())
+    if base <= 0.0:
+        return np.concatenate((over_folds, own - beside))
+    ratio = float(own.sum()) / base
+    spread = float(over_folds.sum()) / base * (own - ratio * beside)
+    return np.concatenate((ratio * over_folds, spread))
 
 
 def _root(entry: FittedModel, fitted: Mapping[str, FittedModel], crossed: Crossed) -> str:

@@ -101,7 +101,7 @@ class Blocks:
 def difference(one: Contender, other: Contender, blocks: Blocks) -> tuple[float, float]:
     """Return by how much one model errs more than another, and the standard error of that.
 
-    Over folds a network is judged by way of its baseline. Where two networks stand on baselines
+    Over folds a network is judged by way of its baseline, in proportion. Where two networks stand on baselines
     that differ much from log to log, this tells less than the validation logs alone, and where it
     does, these speak. Stretches of fewer than five logs do not: they resemble each other, and tell
     nothing of how logs differ.
