@@ -2,7 +2,8 @@
 
 Each vessel is identified from clean trials in currents that the fit estimates. Then trials of the
 changed vessel, five minutes a seed, go through the monitor, and hours of clean ones. With
---scatter the parameters of the vessels are scattered by about a fifth first.
+--scatter the parameters of the vessels are scattered by about a fifth first. With --seeds 0 only
+clean trials are watched. Of each alarm in these a line tells when it came and what scored highest.
 
     python scripts/bench/monitor.py [--seeds 10] [--hours 2] [--seed 0] [--scatter] [VESSEL...]
 """
@@ -28,7 +29,7 @@ from residnet.data.simulated.trials import SimulatedTrials, simulate
 from residnet.identification.currents import through_currents
 from residnet.identification.fit import fit
 from residnet.identification.models import FittedModel
-from residnet.identification.monitoring.monitor import MonitorConfig, Watch
+from residnet.identification.monitoring.monitor import MonitorConfig, Verdict, Watch
 from residnet.identification.monitoring.watcher import Watcher
 from residnet.identification.monitoring.windows import pieces
 from residnet.identification.prepared import prepare_logs
@@ -162,20 +163,28 @@ def cases(
     return out
 
 
-def watched(
-    watch: Watch, settings: FitSettings, logs: Sequence[Log]
-) -> tuple[list[bool], list[str]]:
-    """Return, window by window, whether the monitor alarms and what it names first."""
+def watched(watch: Watch, settings: FitSettings, logs: Sequence[Log]) -> list[Verdict]:
+    """Return what the monitor says, window by window."""
     watcher = Watcher(watch, 0)
-    alarms, names = [], []
+    out = []
     for log in logs:
         watcher.restart()
         known = prepare(log, "external", settings.signals.columns, settings.prepare)
-        for sums in watch.sums(pieces(known, watcher.steps, 0)):
-            verdict = watcher.take(sums)
-            alarms.append(verdict.alarm)
-            names.append(verdict.suspects[0].change.name)
-    return alarms, names
+        out += [watcher.take(sums) for sums in watch.sums(pieces(known, watcher.steps, 0))]
+    return out
+
+
+def raised(verdicts: Sequence[Verdict]) -> list[int]:
+    """Return the windows at which an alarm begins."""
+    alarms = [False, *(verdict.alarm for verdict in verdicts)]
+    return [k for k in range(len(verdicts)) if alarms[k + 1] and not alarms[k]]
+
+
+def told(verdict: Verdict) -> str:
+    """Return what scores highest, with its size."""
+    top = max(verdict.suspects, key=lambda suspect: suspect.score)
+    size = f"{top.size:+.3f} +- {top.error:.3f}"
+    return f"{top.change.name} {size} scores {top.score:.2f} of {verdict.threshold:.2f}"
 
 
 def main() -> None:
@@ -199,30 +208,31 @@ def main() -> None:
             steps = round(config.window / STEP)
             watch = Watch(model.spec, model.model, [pieces(log, steps, 0) for log in clean], config)
             print(f"{vessel}: threshold {watch.threshold:.2f}", flush=True)
-            for name, (flown, change, right) in cases(vessel, sailed, Path(folder)).items():
+            planted = cases(vessel, sailed, Path(folder)) if given.seeds else {}
+            for name, (flown, change, right) in planted.items():
                 count = PER_SEED * given.seeds
                 logs = trials(flown, SEA[vessel], 7 + given.seed, count)
                 found, first, firsts = 0, 0, []
                 for k in range(given.seeds):
                     part = [change(log) for log in logs[PER_SEED * k : PER_SEED * (k + 1)]]
-                    alarms, names = watched(watch, settings, part)
-                    found += any(alarms)
-                    named = names[-1]
+                    verdicts = watched(watch, settings, part)
+                    alarmed = any(verdict.alarm for verdict in verdicts)
+                    found += alarmed
+                    named = verdicts[-1].suspects[0].change.name
                     firsts.append(named)
-                    first += any(alarms) and named == right
+                    first += alarmed and named == right
                 print(
                     f"  {name:18s} found {found}/{given.seeds}, right cause first"
                     f" {first}/{given.seeds} ({', '.join(sorted(set(firsts)))})",
                     flush=True,
                 )
             logs = trials(sailed, SEA[vessel], 23 + given.seed, round(60 * given.hours))
-            alarms, _ = watched(watch, settings, logs)
-            raised = sum(
-                now and not before
-                for before, now in zip([False, *alarms[:-1]], alarms, strict=True)
-            )
-            hours = len(alarms) * config.window / 3600
-            print(f"  clean: {raised} alarms in {hours:.1f} h", flush=True)
+            verdicts = watched(watch, settings, logs)
+            begun = raised(verdicts)
+            hours = len(verdicts) * config.window / 3600
+            print(f"  clean: {len(begun)} alarms in {hours:.1f} h", flush=True)
+            for k in begun:
+                print(f"    after {k * config.window / 3600:.2f} h: {told(verdicts[k])}")
 
 
 if __name__ == "__main__":

@@ -48,7 +48,7 @@ def calibrate_bands(
     refitted = left_out.models if int(fold.max()) > 0 else [{}]
     out: dict[str, dict[str, Band]] = {}
     for protocol in identified.settings.evaluation.protocols:
-        runs = _Calibration(identified, protocol, config)
+        runs = _Calibration(identified, protocol, config, left_out.failed)
         for k, models in enumerate(refitted):
             own = [log for log, number in zip(identified.train, fold, strict=True) if number == k]
             runs.add(models, own, validation=False)
@@ -69,9 +69,23 @@ def _banded(entry: FittedModel, bands: Mapping[str, Band]) -> FittedModel:
 
 
 class _Calibration:
-    """The free runs that calibrate the bands under one protocol."""
+    """The free runs that calibrate the bands under one protocol.
 
-    def __init__(self, identified: Identified, protocol: str, config: BandsConfig) -> None:
+    Args:
+        identified: the fit.
+        protocol: its name.
+        config: level, folds and starts.
+        failed: why a model cannot be fitted without some of the logs, by its name.
+    """
+
+    def __init__(
+        self,
+        identified: Identified,
+        protocol: str,
+        config: BandsConfig,
+        failed: Mapping[str, str],
+    ) -> None:
+        self.failed = failed
         self.identified = identified
         self.protocol = identified.settings.evaluation.protocols[protocol]
         self.config = config
@@ -135,7 +149,8 @@ class _Calibration:
         logs = len({run.log for run in runs})
         if reference not in known or not self.validated.get(reference):
             band = calibrate(runs, self.config.level, self.step, unit)
-            return replace(band, cautions=(*_alone(logs), *few(logs)))
+            why = self.failed.get(entry.name, "")
+            return replace(band, cautions=(*_alone(logs, why), *few(logs)))
         other = known[reference]
         ratio = _level(runs, other, self.config.level) / _level(
             self.validated[reference], other, self.config.level
@@ -171,8 +186,9 @@ def _scaled(reference: str, logs: int) -> tuple[str, ...]:
     )
 
 
-def _alone(logs: int) -> tuple[str, ...]:
+def _alone(logs: int, why: str) -> tuple[str, ...]:
     return (
         f"Only {logs} validation logs calibrate this band: no model could be fitted without some of"
-        " the training logs. They also chose between models or stopped the training early.",
+        f" the training logs{f' ({why})' if why else ''}. They also chose between models or stopped"
+        " the training early.",
     )
