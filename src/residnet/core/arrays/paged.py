@@ -27,7 +27,8 @@ _ALIGNED = 64
 
 _RESIDENT = 1 << 28
 """Bytes of pages of files beyond which those of arrays are given back."""
-_LOOKED_EVERY = 0.1
+_LOOKED_EVERY = 0.02
+"""Seconds; pages that the system still has come back at gigabytes a second."""
 
 _files: weakref.WeakSet[mmap.mmap] = weakref.WeakSet()
 _lock = Lock()
