@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from known_logs import wavy
 
+from residnet.core.log import Log
 from residnet.data.doctor import inspect
 from residnet.data.doctor.findings import with_channels
+from residnet.data.doctor.kinematics import position_causes
 
 
 @pytest.mark.filterwarnings("error")
@@ -33,3 +35,27 @@ def test_a_moored_vessel_is_inspected() -> None:
     rest = {name: np.zeros(len(log)) for name in "uvr"}
     report = inspect(with_channels(log, **still, **rest), inputs=["delta"])
     assert report.lines()
+
+
+def turn_on_the_spot(seed: int) -> Log:
+    """A vessel that turns steadily, at velocities no larger than their noise."""
+    random = np.random.default_rng(seed)
+    t = 0.05 * np.arange(1200)
+    u, v, r = np.outer((0.03, 0.033, -0.19), 1.0 - np.exp(-t / 0.8))
+
+    def integral(rate: np.ndarray) -> np.ndarray:
+        return np.append(0.0, np.cumsum(0.025 * (rate[1:] + rate[:-1])))
+
+    psi = integral(r)
+    place = integral(np.exp(1j * psi) * (u + 1j * v))
+    noise = random.standard_normal((3, t.size)) * np.array([[0.03], [0.03], [0.003]])
+    channels = {"x": place.real, "y": place.imag, "psi": psi}
+    return Log("spot", t, channels | dict(zip("uvr", np.stack((u, v, r)) + noise, strict=True)))
+
+
+def test_noise_of_velocities_is_no_scale_of_theirs() -> None:
+    # a lever arm can stand for the steady part, and then noise decides on the scale
+    for seed in range(20):
+        causes = position_causes(turn_on_the_spot(seed))
+        gains = [causes[name].values for name in causes if name.startswith("gain")]
+        assert np.abs(np.concatenate([[0.0], *gains])).max() < 0.3, seed

@@ -29,6 +29,8 @@ _MOST_CAUSES = 4
 # standard errors from nothing
 _WORTH = 60.0
 _SURE = 3.5
+_REACH = 7
+"""Samples on either side that smooth a velocity."""
 
 
 @dataclass(frozen=True)
@@ -149,14 +151,27 @@ def _stands_out(values: np.ndarray) -> bool:
 def _smoothed(values: np.ndarray) -> np.ndarray:
     """Return the values [T] smoothed by a parabola over 15 samples; NaN stay where they are.
 
-    Columns then share no noise with what they explain.
+    The parabola is that of the samples around each one, without it and its neighbours: columns then
+    share no noise with what they explain, which holds the noise of these samples. Near the ends of
+    a log they do.
     """
     known = np.isfinite(values)
-    if known.sum() < 15:
+    if known.sum() < 2 * _REACH + 1:
         return values
     at = np.arange(values.size)
     filled = np.interp(at, at[known], values[known])
-    return np.where(known, savgol_filter(filled, 15, 2), np.nan)
+    smooth = savgol_filter(filled, 2 * _REACH + 1, 2)
+    smooth[_REACH:-_REACH] = np.convolve(filled, _around(), "valid")
+    return np.where(known, smooth, np.nan)
+
+
+def _around() -> np.ndarray:
+    """Return the weights [15] of a parabola through the samples around one, at that one."""
+    offsets = np.arange(-_REACH, _REACH + 1)
+    weights = np.zeros(offsets.size)
+    others = np.abs(offsets) > 1
+    weights[others] = np.linalg.pinv(np.vander(offsets[others], 3))[-1]
+    return weights
 
 
 class _Rows:
