@@ -1,7 +1,8 @@
 """Compare rollouts with their matrix products, and an epoch with the usual data loader and loop.
 
-- `rollout`: an LSTM on a linear baseline, 100 steps by RK4 at batch 1,024 in single precision,
-  against the matrix products of its network alone, which no implementation can do without.
+- `rollout`: an LSTM on a linear baseline, 200 steps by RK4 at batch 1,024 in single precision,
+  compiled as free runs of that length are, and as it is, against the matrix products of its
+  network alone, which no implementation can do without.
 - `epoch`: 25 teacher-forced batches of 64 windows of 100 samples for an LSTM, with gradients and
   optimiser, against a Dataset whose DataLoader collates windows and a cell that is called step by
   step. Both have the same network, data and loss.
@@ -19,6 +20,7 @@ import os
 import platform
 import time
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import torch
@@ -30,11 +32,12 @@ from residnet.core.arrays.heap import keep_freed_memory
 from residnet.data.windows import WindowBatches
 from residnet.dynamics.hybrid import HybridDynamics
 from residnet.dynamics.rollout import Rollout
+from residnet.dynamics.scripted import scripted
 from residnet.heads import LstmConfig, ResidualHead
 from residnet.physics.signals import SignalsConfig
 
 _NAMES = ("u", "v", "r", "tau_x", "tau_n")
-_BATCH, _STEPS = 1_024, 100
+_BATCH, _STEPS = 1_024, 200
 _WINDOW, _WINDOWS, _BATCHES = 100, 64, 25
 
 
@@ -78,14 +81,18 @@ def rollouts(repeats: int) -> None:
                 h @ o
 
         with torch.no_grad():
-            whole = least(
-                lambda model=model: Rollout(model)(x0, w, model.initial_state(_BATCH)), repeats
-            )
             bound = least(products, repeats)
-        print(
-            f"rollout, LSTM of {hidden}, batch {_BATCH}: {1e6 * whole / _STEPS:.0f} us a step,"
-            f" products alone {1e6 * bound / _STEPS:.0f} us: {100 * bound / whole:.0f} %"
-        )
+            for how, run in (
+                ("compiled", scripted(Rollout(model), _STEPS)),
+                ("not compiled", Rollout(model)),
+            ):
+                memory = model.initial_state(_BATCH)
+                whole = least(partial(run, x0, w, memory), repeats)
+                print(
+                    f"rollout, LSTM of {hidden}, batch {_BATCH}, {how}:"
+                    f" {1e6 * whole / _STEPS:.0f} us a step,"
+                    f" products alone {1e6 * bound / _STEPS:.0f} us: {100 * bound / whole:.0f} %"
+                )
 
 
 class Windows(Dataset[tuple[Tensor, Tensor]]):

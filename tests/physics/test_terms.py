@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 import torch
@@ -83,6 +85,13 @@ def test_library_equals_numpy() -> None:
     np.testing.assert_allclose(single, np.stack(truth, axis=-1), rtol=3e-5, atol=1e-6)
 
 
+@pytest.mark.parametrize("terms", [NAMES, NAMES[::-1], ["r", "u"], ["u", "u"]])
+def test_library_of_channels_alone(terms: Sequence[str]) -> None:
+    z = torch.randn(3, 4, len(NAMES), dtype=torch.float64)
+    columns = [list(NAMES).index(term) for term in terms]
+    assert torch.equal(TermLibrary(terms, NAMES)(z), z[..., columns])
+
+
 def test_division_keeps_signs_and_leaves_other_gradients_finite() -> None:
     z = torch.tensor([[-2.0, 0.0, 0.5, -4.0, 0.0]], dtype=torch.float64, requires_grad=True)
     out = TermLibrary(["n_port^-1", "u |n_port|^-2", "|u|^-1 r", "v"], NAMES)(z)
@@ -96,6 +105,8 @@ def test_library_of_constants_and_of_nothing() -> None:
     z = torch.randn(4, 2, len(NAMES))
     assert torch.equal(TermLibrary(["1", "1"], NAMES)(z), torch.ones(4, 2, 2))
     assert TermLibrary([], NAMES)(z).shape == (4, 2, 0)
+    beside = TermLibrary(["r", "1"], NAMES)(z)
+    assert torch.equal(beside, torch.stack((z[..., 2], torch.ones(4, 2)), dim=-1))
 
 
 def test_functions_equal_numpy() -> None:

@@ -69,7 +69,10 @@ class Dynamics(nn.Module, ABC):
 
     def integrate(self, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
         """Return the state one step later, [B, nx]."""
-        k = self.rate(x, p, rho)
+        return self.integrate_from(self.rate(x, p, rho), x, p, rho)
+
+    def integrate_from(self, k: Tensor, x: Tensor, p: Tensor, rho: Tensor) -> Tensor:
+        """Return the state one step later [B, nx], where its derivative k [B, nx] is known."""
         total = self.weights[0] * k
         for i in range(1, len(self.nodes)):
             k = self.rate(x + (self.dt * self.nodes[i]) * k, p, rho)

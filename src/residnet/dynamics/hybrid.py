@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from residnet.baselines.base import Baseline
+from residnet.core.layout import heading, position, velocities, yaw_rate
 from residnet.dynamics.base import Dynamics, Integrator
 from residnet.dynamics.disturbance import SIZE, Disturbance, memory_range
 from residnet.heads.base import ResidualHead
@@ -62,13 +63,37 @@ class HybridDynamics(Dynamics):
     def step(self, x: Tensor, w: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return the state and the memory one step of dt later."""
         p = self.signals.prepare(w)
+        z: Tensor = self.signals(x, p)
         if self.disturbance is None:
-            rho, s = self.head(self.signals(x, p), s)
-            return self.integrate(x, p, rho), s
-        rho, own = self.head(self.signals(x, p), s[:, : self.width])
+            rho, s = self.head(z, s)
+            return self.advanced(x, z, p, rho), s
+        rho, own = self.head(z, s[:, : self.width])
         unknown, estimate = self.disturbance(x, s[:, self.width :])
-        after = self.integrate(x, p, rho + unknown)
+        after = self.advanced(x, z, p, rho + unknown)
         return after, torch.cat((own, self.disturbance.remembered(after, estimate)), dim=-1)
+
+    def advanced(self, x: Tensor, z: Tensor, p: Tensor, rho: Tensor) -> Tensor:
+        """Return the state [B, 6] one step later.
+
+        Args:
+            x: states [B, 6].
+            z: their channels [B, nz], which the first stage needs again.
+            p: what `signals.prepare` returned for the step's inputs.
+            rho: residual of the step [B, 3].
+        """
+        nu_dot = self.head.accelerations(self.baseline(z), rho)
+        if self.positions or (self.signals.wind and len(self.nodes) > 1):
+            return self.integrate_from(torch.cat((self.kinematics(x), nu_dot), dim=-1), x, p, rho)
+        # nothing but velocities enters the stages: the heading follows once, the position stays
+        total, turned = self.weights[0] * nu_dot, self.weights[0] * yaw_rate(x)
+        for i in range(1, len(self.nodes)):
+            nu = velocities(x) + (self.dt * self.nodes[i]) * nu_dot
+            nu_dot = self.head.accelerations(self.baseline(self.signals.at(nu, p)), rho)
+            total = total + self.weights[i] * nu_dot
+            turned = turned + self.weights[i] * nu[..., -1]
+        nu = velocities(x) + self.dt * total
+        psi = heading(x) + self.dt * (nu[..., -1] if self.semi_implicit else turned)
+        return torch.cat((position(x), psi.unsqueeze(-1), nu), dim=-1)
 
     def one_step(self, z: Tensor) -> Tensor:
         """Return nu_dot [B, T, 3] along measured channels [B, T, nz] (teacher forcing).

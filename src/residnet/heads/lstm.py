@@ -117,7 +117,7 @@ class LstmCore(nn.Module):
         i, forget, _, o = torch.sigmoid(gates).chunk(4, dim=-1)
         g = gates[:, 2 * self.hidden : 3 * self.hidden]
         block = nn.functional.softsign(g) if self.softsign else quick_tanh(g)
-        c = forget * s[:, self.hidden :] + i * block
+        c = torch.addcmul(forget * s[:, self.hidden :], i, block)
         h = o * (nn.functional.softsign(c) if self.softsign else quick_tanh(c))
         return h, torch.cat((h, c), dim=-1)
 

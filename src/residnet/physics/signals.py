@@ -158,7 +158,8 @@ class Signals(nn.Module):
             parts.append(
                 torch.stack((-speed * torch.cos(direction), -speed * torch.sin(direction)), dim=-1)
             )
-        return torch.cat(parts, dim=-1)
+        # joining a single part would copy it
+        return parts[0] if len(parts) == 1 else torch.cat(parts, dim=-1)
 
     def forward(self, x: Tensor, p: Tensor) -> Tensor:
         """Return the channels z [..., nz].
@@ -168,7 +169,7 @@ class Signals(nn.Module):
             p: what `prepare` returned for the step's inputs.
         """
         if not self.wind:
-            return torch.cat((velocities(x), p), dim=-1)
+            return self.at(velocities(x), p)
         known = p.shape[-1] - 2
         along, across = to_body(p[..., known], p[..., known + 1], x[..., 2])
         along, across = along - x[..., 3], across - x[..., 4]
@@ -177,3 +178,7 @@ class Signals(nn.Module):
         return torch.cat(
             (velocities(x), p[..., :known], torch.stack((along, across, magnitude), dim=-1)), dim=-1
         )
+
+    def at(self, nu: Tensor, p: Tensor) -> Tensor:
+        """Return the channels z [..., nz] at velocities nu [..., 3], where there is no wind."""
+        return torch.cat((nu, p), dim=-1)

@@ -167,9 +167,19 @@ class TermLibrary(nn.Module):
         self.register_buffer("index", gather, persistent=False)
         self.index: Tensor
         self.count = len(columns)
+        # a linear model has the channels alone for terms
+        self.linear = len(columns) > 0 and all(
+            len(column) == 1 and 0 < column[0] <= len(names) for column in columns
+        )
+        channel = gather[0] - 1 if self.linear else gather.new_zeros(0)
+        self.register_buffer("channel", channel, persistent=False)
+        self.channel: Tensor
+        self.same = self.linear and channel.tolist() == list(range(len(names)))
 
     def forward(self, z: Tensor) -> Tensor:
         """Return the channels z [..., nz] -> terms [..., J]."""
+        if self.linear:
+            return z if self.same else z.index_select(-1, self.channel)
         ones = torch.ones_like(z[..., :1])
         parts = [ones, z, z.abs()]
         if self.divides:
